@@ -1,0 +1,1 @@
+"""Client of the Deep SIMBAD service."""

@@ -1,0 +1,1 @@
+"""Active landmark-based self-localization as a service."""

@@ -1,0 +1,198 @@
+"""Every error the product names, in one tree without HTTP words.
+
+A `code` is a stable word that scripts may test; `hints` carry what helps the reader to act (limits, allowed
+values, the missing name). The API translates the branches to HTTP statuses in one table (`deepsimbad.api.problems`),
+the command line to exit code 1 and one line on standard error.
+"""
+
+from typing import Any, ClassVar
+
+
+class DeepSimbadError(Exception):
+    """Root of the tree.
+
+    Args:
+        message: One sentence that says what is wrong and what to do about it.
+        **hints: JSON-ready facts that help (limits, allowed values, counts).
+    """
+
+    code: ClassVar[str] = "error"
+
+    def __init__(self, message: str, **hints: Any) -> None:
+        super().__init__(message)
+        self.message = message
+        self.hints = hints
+
+
+class InvalidInputError(DeepSimbadError):
+    """A value that can never be accepted as it stands."""
+
+    code = "invalid_input"
+
+
+class EmptyBodyError(InvalidInputError):
+    """An observation or frame without content."""
+
+    code = "empty_body"
+
+
+class InvalidImageError(InvalidInputError):
+    """Bytes that are not an image we can decode."""
+
+    code = "undecodable_image"
+
+
+class TruncatedImageError(InvalidImageError):
+    """An image whose end is missing."""
+
+    code = "truncated_image"
+
+
+class InvalidEncodingError(InvalidInputError):
+    """An encoding of the wrong length, or with NaN or infinity in it."""
+
+    code = "invalid_encoding"
+
+
+class InvalidDissimilaritiesError(InvalidInputError):
+    """Dissimilarities that are not r finite numbers."""
+
+    code = "invalid_dissimilarities"
+
+
+class InvalidRankedLandmarksError(InvalidInputError):
+    """Ranked landmarks that are not 1..r distinct ids in range."""
+
+    code = "invalid_ranked_landmarks"
+
+
+class InvalidRouteError(InvalidInputError):
+    """Route positions that are NaN or go backwards."""
+
+    code = "invalid_route"
+
+
+class InvalidMapConfigError(InvalidInputError):
+    """Map parameters that contradict each other or the recordings."""
+
+    code = "invalid_map_config"
+
+
+class TooFewCandidatesError(InvalidMapConfigError):
+    """Fewer landmark candidates than landmarks asked for."""
+
+    code = "too_few_candidates"
+
+
+class InvalidSourceError(InvalidInputError):
+    """A recording that cannot be read."""
+
+    code = "invalid_source"
+
+
+class SettingsError(InvalidInputError):
+    """A setting that cannot be used."""
+
+    code = "invalid_settings"
+
+
+class NotFoundError(DeepSimbadError):
+    """A name or id that nothing answers to."""
+
+    code = "not_found"
+
+
+class UnknownDomainError(NotFoundError):
+    """No such domain."""
+
+    code = "unknown_domain"
+
+
+class UnknownTraverseError(NotFoundError):
+    """No such traverse in the domain."""
+
+    code = "unknown_traverse"
+
+
+class UnknownJobError(NotFoundError):
+    """No such job."""
+
+    code = "unknown_job"
+
+
+class UnknownMapVersionError(NotFoundError):
+    """No such map version in the domain."""
+
+    code = "unknown_map_version"
+
+
+class ConflictError(DeepSimbadError):
+    """The request is sound but the present state forbids it."""
+
+    code = "conflict"
+
+
+class NoActiveMapError(ConflictError):
+    """The domain has no active map yet."""
+
+    code = "no_active_map"
+
+
+class DomainDiffersError(ConflictError):
+    """A domain of that name exists with another configuration."""
+
+    code = "domain_differs"
+
+
+class TraverseInUseError(ConflictError):
+    """A running job still reads the traverse or domain."""
+
+    code = "traverse_in_use"
+
+
+class LostActivationError(ConflictError):
+    """The active map was not the expected one when the swap was tried."""
+
+    code = "lost_activation"
+
+
+class TooLargeError(DeepSimbadError):
+    """More than a limit allows."""
+
+    code = "too_large"
+
+
+class BodyTooLargeError(TooLargeError):
+    """A request body over the byte limit."""
+
+    code = "body_too_large"
+
+
+class ImageTooLargeError(TooLargeError):
+    """An image whose header claims more pixels than the limit."""
+
+    code = "image_too_large"
+
+
+class UnsupportedMediaTypeError(DeepSimbadError):
+    """A missing or unsupported content type."""
+
+    code = "unsupported_media_type"
+
+
+class UnavailableError(DeepSimbadError):
+    """The service cannot answer now; the data is safe."""
+
+    code = "unavailable"
+
+
+class DamagedMapError(UnavailableError):
+    """A map file that fails its digest or cannot be read."""
+
+    code = "damaged_map"
+
+
+class CancelledError(DeepSimbadError):
+    """The work was cancelled on request."""
+
+    code = "cancelled"
