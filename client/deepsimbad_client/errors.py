@@ -1,0 +1,243 @@
+"""Every error the client raises, in one tree.
+
+Three branches: what a recording on disk cannot give (`SourceError`), what the network did not deliver
+(`TransportError`), and what the service answered (`ApiError`, one class per branch of the service's own tree, chosen by
+the problem's stable `code` word and, for a code this version has not heard of, by the HTTP status).
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+
+class DeepSimbadClientError(Exception):
+    """Root of the tree; `message` is one sentence that says what is wrong and what to do about it."""
+
+    code: str = "client_error"
+
+    def __init__(self, message: str) -> None:
+        super().__init__(message)
+        self.message = message
+
+
+class MissingExtraError(DeepSimbadClientError):
+    """A part of the client whose optional dependencies are not installed."""
+
+    code = "missing_extra"
+
+
+class InvalidArgumentError(DeepSimbadClientError, ValueError):
+    """A value given to the client that can never be sent."""
+
+    code = "invalid_argument"
+
+
+class SourceError(DeepSimbadClientError):
+    """A recording that cannot be read as a whole: missing, empty or inconsistent."""
+
+    code = "invalid_source"
+
+
+class BrokenFrameError(SourceError):
+    """One frame of a recording that cannot be read; the rest of the recording is fine."""
+
+    code = "broken_frame"
+
+
+class ReplayError(DeepSimbadClientError):
+    """A replay that cannot go on or be scored."""
+
+    code = "replay"
+
+
+class TransportError(DeepSimbadClientError):
+    """The request was sent as often as allowed and no answer came back."""
+
+    code = "no_answer"
+
+
+class TransportTimeoutError(TransportError):
+    """The service did not answer within the time allowed."""
+
+    code = "timeout"
+
+
+class UnexpectedAnswerError(DeepSimbadClientError):
+    """An answer that is not what the contract says: something else answers at this address."""
+
+    code = "unexpected_answer"
+
+
+class JobFailedError(DeepSimbadClientError):
+    """A job ended without success.
+
+    Args:
+        message: What the service said of it.
+        job: The job as the service last described it (a `deepsimbad_client.models.Job`).
+    """
+
+    code = "job_failed"
+
+    def __init__(self, message: str, job: Any) -> None:
+        super().__init__(message)
+        self.job = job
+
+
+class JobCancelledError(JobFailedError):
+    """A job was cancelled before it ended."""
+
+    code = "cancelled"
+
+
+class ApiError(DeepSimbadClientError):
+    """The service answered with an error (RFC 9457 problem details).
+
+    Args:
+        message: The problem's detail, or the status line when the answer held none.
+        status: The HTTP status.
+        code: The problem's stable code word; `http_<status>` when the answer held none.
+        problem: The whole problem document, with whatever limits and allowed values it names.
+        request_id: The service's id of this request, to quote to its operator.
+        retry_after_s: Seconds the service asked to wait before trying again.
+    """
+
+    def __init__(
+        self,
+        message: str,
+        *,
+        status: int,
+        code: str = "",
+        problem: Mapping[str, Any] | None = None,
+        request_id: str | None = None,
+        retry_after_s: float | None = None,
+    ) -> None:
+        super().__init__(message)
+        self.status = status
+        self.problem: Mapping[str, Any] = dict(problem or {})
+        self.request_id = request_id
+        self.retry_after_s = retry_after_s
+
+    def __str__(self) -> str:
+        parts = [f"{self.status} {self.code}".strip()]
+        if self.request_id:
+            parts.append(f"request {self.request_id}")
+        return f"{self.message} ({', '.join(parts)})"
+
+
+class BadRequestError(ApiError):
+    """400: the request could not be read at all."""
+
+
+class UnauthorizedError(ApiError):
+    """401: no key, or one the service does not know."""
+
+
+class ForbiddenError(ApiError):
+    """403: the key lacks the scope this call needs."""
+
+
+class NotFoundError(ApiError):
+    """404: a name or id that nothing answers to."""
+
+
+class UnknownDomainError(NotFoundError):
+    """No such domain."""
+
+
+class UnknownTraverseError(NotFoundError):
+    """No such traverse in the domain."""
+
+
+class UnknownJobError(NotFoundError):
+    """No such job."""
+
+
+class UnknownMapVersionError(NotFoundError):
+    """No such map version in the domain."""
+
+
+class ConflictError(ApiError):
+    """409: the request is sound but the present state forbids it."""
+
+
+class NoActiveMapError(ConflictError):
+    """The domain has no active map yet."""
+
+
+class DomainDiffersError(ConflictError):
+    """A domain of that name exists with another configuration."""
+
+
+class TraverseInUseError(ConflictError):
+    """A running job still reads the traverse or domain."""
+
+
+class LostActivationError(ConflictError):
+    """The active map was not the expected one when the swap was tried."""
+
+
+class GoneError(ApiError):
+    """410: a retired map, or an expired or deleted session."""
+
+
+class TooLargeError(ApiError):
+    """413: more bytes or pixels than a limit allows."""
+
+
+class UnsupportedMediaTypeError(ApiError):
+    """415: a missing or unsupported content type."""
+
+
+class InvalidInputError(ApiError):
+    """422: a value or body that can never be accepted as it stands."""
+
+
+class RateLimitedError(ApiError):
+    """429: too many requests; `retry_after_s` says how long to wait."""
+
+
+class ServerError(ApiError):
+    """5xx: the service failed."""
+
+
+class UnavailableError(ServerError):
+    """503: the service cannot answer now; its data is safe."""
+
+
+class DamagedMapError(UnavailableError):
+    """A map file on the server fails its digest or cannot be read."""
+
+
+BY_CODE: Mapping[str, type[ApiError]] = {
+    "unknown_domain": UnknownDomainError,
+    "unknown_traverse": UnknownTraverseError,
+    "unknown_job": UnknownJobError,
+    "unknown_map_version": UnknownMapVersionError,
+    "no_active_map": NoActiveMapError,
+    "domain_differs": DomainDiffersError,
+    "traverse_in_use": TraverseInUseError,
+    "lost_activation": LostActivationError,
+    "damaged_map": DamagedMapError,
+}
+
+BY_STATUS: Mapping[int, type[ApiError]] = {
+    400: BadRequestError,
+    401: UnauthorizedError,
+    403: ForbiddenError,
+    404: NotFoundError,
+    409: ConflictError,
+    410: GoneError,
+    413: TooLargeError,
+    415: UnsupportedMediaTypeError,
+    422: InvalidInputError,
+    429: RateLimitedError,
+    503: UnavailableError,
+}
+
+
+def api_error_class(status: int, code: str) -> type[ApiError]:
+    """Choose the class for an answer: by its code word, else by its status, else by the hundred it falls in."""
+    if code in BY_CODE:
+        return BY_CODE[code]
+    if status in BY_STATUS:
+        return BY_STATUS[status]
+    return ServerError if status >= 500 else ApiError
