@@ -1,8 +1,8 @@
 """Every error the client raises, in one tree.
 
 Three branches: what a recording on disk cannot give (`SourceError`), what the network did not deliver
-(`TransportError`), and what the service answered (`ApiError`, one class per branch of the service's own tree, chosen by
-the problem's stable `code` word and, for a code this version has not heard of, by the HTTP status).
+(`TransportError`), and what the service answered (`ApiError`, one class per branch of the service's own tree,
+chosen by the problem's stable `code` word and, for a code this version has not heard of, by the HTTP status).
 """
 
 from collections.abc import Mapping
@@ -112,6 +112,7 @@ class ApiError(DeepSimbadClientError):
     ) -> None:
         super().__init__(message)
         self.status = status
+        self.code = code or f"http_{status}"
         self.problem: Mapping[str, Any] = dict(problem or {})
         self.request_id = request_id
         self.retry_after_s = retry_after_s
@@ -235,7 +236,7 @@ BY_STATUS: Mapping[int, type[ApiError]] = {
 
 
 def api_error_class(status: int, code: str) -> type[ApiError]:
-    """Choose the class for an answer: by its code word, else by its status, else by the hundred it falls in."""
+    """Choose the class for an answer: by its code word, else by its status, else by its hundred."""
     if code in BY_CODE:
         return BY_CODE[code]
     if status in BY_STATUS:
