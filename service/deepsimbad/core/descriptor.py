@@ -1,0 +1,111 @@
+"""The scene descriptor: landmarks ranked by dissimilarity (II-C)."""
+
+from collections.abc import Sequence
+from functools import lru_cache
+from statistics import NormalDist
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from deepsimbad.errors import InvalidDissimilaritiesError, InvalidRankedLandmarksError
+
+MAX_LANDMARKS = 0xFFFF  # landmark ids are uint16 and the last value means "none"
+
+
+def rank_landmarks(dissimilarities: ArrayLike) -> NDArray[np.float32]:
+    """Rank landmarks by ascending dissimilarity, ties by landmark id.
+
+    Args:
+        dissimilarities: [r] or [n, r], smaller is nearer, finite.
+
+    Returns:
+        Ranks of the same shape, float32, 1..r; `ranks[..., i]` is the rank of landmark i.
+
+    Raises:
+        InvalidDissimilaritiesError: Not one or two dimensions, no landmarks, or NaN or infinity somewhere.
+    """
+    values = np.asarray(dissimilarities)
+    if values.ndim not in {1, 2} or values.shape[-1] == 0:
+        raise InvalidDissimilaritiesError(f"dissimilarities have shape {values.shape}; give [r] or [n, r]")
+    if not np.isfinite(values).all():
+        raise InvalidDissimilaritiesError("dissimilarities hold NaN or infinity; every one must be finite")
+    order = np.argsort(values, axis=-1, kind="stable")
+    ranks = np.empty(values.shape, np.float32)
+    ascending = np.arange(1, values.shape[-1] + 1, dtype=np.float32)
+    if values.ndim == 1:
+        ranks[order] = ascending
+    else:
+        np.put_along_axis(ranks, order, np.broadcast_to(ascending, values.shape), axis=-1)
+    return ranks
+
+
+def ranks_from_ranked_landmarks(landmark_ids: Sequence[int], n_landmarks: int) -> NDArray[np.float32]:
+    """Ranks of all landmarks from the nearest ones that a robot sent.
+
+    Args:
+        landmark_ids: Distinct ids from 0, nearest first, 1..r of them.
+        n_landmarks: r.
+
+    Returns:
+        [r] float32. Landmarks that were not sent share the mean of the ranks left.
+
+    Raises:
+        InvalidRankedLandmarksError: None, too many, out of range or listed twice.
+    """
+    n_sent = len(landmark_ids)
+    if not 1 <= n_sent <= n_landmarks:
+        raise InvalidRankedLandmarksError(
+            f"{n_sent} ranked landmarks sent; send 1 to {n_landmarks}, nearest first", n_landmarks=n_landmarks
+        )
+    try:
+        ids = np.asarray(landmark_ids, dtype=np.int64)
+    except (OverflowError, TypeError, ValueError) as error:
+        raise InvalidRankedLandmarksError("ranked landmarks must be whole numbers") from error
+    if ids.min() < 0 or ids.max() >= n_landmarks:
+        raise InvalidRankedLandmarksError(
+            f"a landmark id is out of range; ids run from 0 to {n_landmarks - 1}", n_landmarks=n_landmarks
+        )
+    if np.unique(ids).size != n_sent:
+        raise InvalidRankedLandmarksError("a landmark id is listed twice; ids must be distinct")
+    ranks = np.full(n_landmarks, (n_sent + 1 + n_landmarks) / 2, np.float32)
+    ranks[ids] = np.arange(1, n_sent + 1, dtype=np.float32)
+    return ranks
+
+
+def nearest_landmarks(values: ArrayLike, list_length: int) -> NDArray[np.uint16]:
+    """The h landmarks of lowest value (rank, dissimilarity or z) of every image, ties by landmark id.
+
+    Args:
+        values: [n, r], smaller is nearer.
+        list_length: h, at most r.
+
+    Returns:
+        [h, n] uint16, row j the landmark of rank j + 1 of every image: the memory form of the index.
+    """
+    order = np.argsort(np.asarray(values), axis=1, kind="stable")[:, :list_length]
+    return np.ascontiguousarray(order.T, dtype=np.uint16)
+
+
+def normal_scores(ranks: NDArray[np.float32], n_landmarks: int) -> NDArray[np.float64]:
+    """Normal scores of ranks, `Phi^-1((v - 1/2) / r)`: the nearest landmark gets the lowest.
+
+    Args:
+        ranks: Any shape; whole or half ranks in 1..r.
+        n_landmarks: r.
+
+    Returns:
+        float64 of the same shape, about standard normal over the landmarks of one image.
+    """
+    half_ranks = np.rint(2 * ranks).astype(np.intp)
+    return _scores_of_half_ranks(n_landmarks)[half_ranks]
+
+
+@lru_cache(maxsize=16)
+def _scores_of_half_ranks(n_landmarks: int) -> NDArray[np.float64]:
+    """[2r + 1]; entry 2v is the score of rank v. Entries 0 and 1 are no ranks."""
+    quantile = NormalDist().inv_cdf
+    scores = [np.nan, np.nan]
+    scores += [quantile((half_rank / 2 - 0.5) / n_landmarks) for half_rank in range(2, 2 * n_landmarks + 1)]
+    table = np.array(scores)
+    table.setflags(write=False)
+    return table

@@ -1,0 +1,80 @@
+"""Building what retrieval reads from a traverse's dissimilarities, and the shortlist of an answer (II-C)."""
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from deepsimbad.core.descriptor import nearest_landmarks, rank_landmarks
+from deepsimbad.core.inverted_index import InvertedIndex
+from deepsimbad.core.relevance import Relevance, RetrievalMap
+from deepsimbad.core.statistics import LandmarkStatistics
+from deepsimbad.errors import InvalidMapConfigError
+
+_SCAN_UP_TO = 64  # a longer shortlist is sorted whole
+
+
+def build_retrieval_map(
+    relevance: Relevance,
+    dissimilarities: NDArray[np.float32],
+    list_length: int,
+    encodings: NDArray[np.float32] | None = None,
+) -> RetrievalMap:
+    """Describe every map image by the h landmarks its relevance keeps.
+
+    Args:
+        relevance: What the map is built for.
+        dissimilarities: [n, r] of the training traverse's frames to the landmarks, smaller is nearer.
+        list_length: h.
+        encodings: [n, d] of the same frames; kept for `brute_force` alone.
+
+    Raises:
+        InvalidMapConfigError: No image, or h not within 1..r.
+    """
+    if dissimilarities.ndim != 2 or dissimilarities.shape[0] == 0:
+        raise InvalidMapConfigError("a map needs at least one image")
+    n_landmarks = dissimilarities.shape[1]
+    if not 1 <= list_length <= n_landmarks:
+        raise InvalidMapConfigError(
+            f"list_length {list_length} is not within 1 and the number of landmarks, {n_landmarks}",
+            list_length=list_length,
+            n_landmarks=n_landmarks,
+        )
+    ranks = rank_landmarks(dissimilarities)
+    statistics = LandmarkStatistics.of_map(ranks) if relevance is Relevance.STANDARDISED else None
+    kept = ranks if statistics is None else statistics.standardise(ranks)
+    lists = nearest_landmarks(kept, list_length)
+    values = None
+    if relevance is Relevance.SIMBAD:
+        values = np.take_along_axis(dissimilarities, lists.T.astype(np.intp), axis=1).T.astype(np.float32)
+    index = InvertedIndex(lists, n_landmarks, None if values is None else np.ascontiguousarray(values))
+    return RetrievalMap(relevance, index, statistics, encodings if relevance is Relevance.BRUTE_FORCE else None)
+
+
+def shortlist(values: NDArray[np.floating], length: int) -> NDArray[np.int64]:
+    """The ids of the greatest values, best first, ties by id.
+
+    Args:
+        values: [n] relevances or masses.
+        length: How many, at least 1; at most n come back.
+    """
+    if length <= _SCAN_UP_TO:
+        return _scan(np.ascontiguousarray(values), min(length, values.size))
+    return np.argsort(-values, kind="stable")[:length].astype(np.int64)
+
+
+@njit(cache=True, nogil=True)
+def _scan(values: NDArray[np.floating], length: int) -> NDArray[np.int64]:
+    """One pass that keeps the best so far in order; nearly every value fails the first comparison."""
+    best = np.empty(length, np.int64)
+    n_kept = 0
+    for candidate in range(values.size):
+        value = values[candidate]
+        if n_kept == length and not value > values[best[length - 1]]:
+            continue
+        place = min(n_kept, length - 1)
+        while place > 0 and value > values[best[place - 1]]:
+            best[place] = best[place - 1]
+            place -= 1
+        best[place] = candidate
+        n_kept = min(n_kept + 1, length)
+    return best
