@@ -1,0 +1,77 @@
+"""The contract every evaluator keeps (II-A).
+
+The paper asks of an evaluator one thing only: a dissimilarity between a scene and a landmark. We split it in
+two steps, `encode` and `dissimilarities`, so that each observation is encoded once however often the landmarks
+change.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Protocol, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+Image: TypeAlias = NDArray[np.uint8]
+"""[height, width, 3] BGR, upright, as `evaluators.image.decode_image` gives it."""
+
+Observation: TypeAlias = Image
+"""What an evaluator is shown."""
+
+LandmarkModel: TypeAlias = Mapping[str, NDArray[np.generic]]
+"""All an evaluator must remember of the landmarks, as named arrays the store saves without understanding."""
+
+
+class Evaluator(Protocol):
+    """Measures how far a scene is from each landmark.
+
+    Evaluators are immutable after construction and may be called from several threads.
+    """
+
+    @property
+    def input_size(self) -> tuple[int, int] | None:
+        """(width, height) in pixels a client should resize to; None where no images are taken."""
+
+    @property
+    def encoding_dim(self) -> int | None:
+        """Length d of an encoding; None where ready encodings of any one length are taken."""
+
+    def encode(self, observations: Sequence[Observation]) -> NDArray[np.float32]:
+        """Encode observations, each by itself: no answer depends on its neighbours in the call.
+
+        Args:
+            observations: n images, each [height, width, 3] uint8 BGR of any size.
+
+        Returns:
+            [n, d] float32, finite.
+
+        Raises:
+            InvalidImageError: An array that is not such an image.
+            UnsupportedMediaTypeError: The evaluator takes ready encodings alone.
+        """
+
+    def fit_landmarks(self, encodings: NDArray[np.float32]) -> LandmarkModel:
+        """Turn the selected landmarks into a landmark model.
+
+        Args:
+            encodings: [r, d] float32, in landmark order.
+
+        Returns:
+            Named arrays for `dissimilarities`.
+
+        Raises:
+            InvalidEncodingError: Not [r >= 1, d], or NaN or infinity in it.
+        """
+
+    def dissimilarities(self, encodings: NDArray[np.float32], model: LandmarkModel) -> NDArray[np.float32]:
+        """Compare scenes with landmarks.
+
+        Args:
+            encodings: [n, d] float32.
+            model: What `fit_landmarks` gave.
+
+        Returns:
+            [n, r] float32, at least 0, finite, smaller is nearer.
+
+        Raises:
+            InvalidEncodingError: Wrong length, NaN or infinity, or so large that the dissimilarity overflows.
+        """
