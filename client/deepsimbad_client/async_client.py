@@ -1,0 +1,120 @@
+"""The async client."""
+
+import asyncio
+import random
+from collections.abc import Awaitable, Callable
+from types import TracebackType
+from typing import TYPE_CHECKING, Self
+
+import httpx2
+
+from deepsimbad_client import calls
+from deepsimbad_client.async_admin import AsyncAdmin
+from deepsimbad_client.models import Domain, Health, Localization
+from deepsimbad_client.observation import Image, Numbers, observation
+from deepsimbad_client.retry import RetryPolicy
+from deepsimbad_client.transport import THIN_LINK_TIMEOUT, AsyncTransport, Endpoint
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+
+class AsyncClient:
+    """The awaiting twin of `deepsimbad_client.Client`, which describes every argument and call.
+
+    Attributes:
+        admin: The calls that need a key of scope `admin`.
+    """
+
+    def __init__(
+        self,
+        url: str | None = None,
+        api_key: str | None = None,
+        *,
+        timeout: httpx2.Timeout = THIN_LINK_TIMEOUT,
+        retry: RetryPolicy | None = None,
+        transport: httpx2.AsyncBaseTransport | None = None,
+        sleep: Callable[[float], Awaitable[None]] = asyncio.sleep,
+        jitter: Callable[[], float] = random.random,
+    ) -> None:
+        endpoint = Endpoint(url, api_key, timeout, retry or RetryPolicy())
+        self._transport = AsyncTransport(endpoint, transport=transport, sleep=sleep, jitter=jitter)
+        self.admin = AsyncAdmin(self._transport)
+
+    @property
+    def url(self) -> str:
+        """The service's address."""
+        return self._transport.url
+
+    async def health(self) -> Health:
+        """Whether the process is alive."""
+        return await self._transport.send(calls.health())
+
+    async def ready(self) -> Health:
+        """Whether it can answer now."""
+        return await self._transport.send(calls.ready())
+
+    async def domains(self) -> tuple[Domain, ...]:
+        """Every domain."""
+        return await self._transport.send(calls.domains())
+
+    async def domain(self, name: str) -> Domain:
+        """One domain and its active map."""
+        return await self._transport.send(calls.domain(name))
+
+    async def localize(
+        self,
+        domain: str,
+        image: Image | None = None,
+        *,
+        content_type: str | None = None,
+        ranked_landmarks: Numbers | None = None,
+        dissimilarities: Numbers | None = None,
+        encoding: Numbers | None = None,
+        shortlist: int | None = None,
+    ) -> Localization:
+        """Where one view probably is; give exactly one form of it."""
+        seen = observation(
+            image,
+            content_type=content_type,
+            ranked_landmarks=ranked_landmarks,
+            dissimilarities=dissimilarities,
+            encoding=encoding,
+        )
+        return await self._transport.send(calls.localize(domain, seen, shortlist=shortlist))
+
+    async def relevances(
+        self,
+        domain: str,
+        image: Image | None = None,
+        *,
+        content_type: str | None = None,
+        ranked_landmarks: Numbers | None = None,
+        dissimilarities: Numbers | None = None,
+        encoding: Numbers | None = None,
+    ) -> "NDArray[np.float32]":
+        """How well every map image answers one view: [n] float32, larger is better (needs numpy)."""
+        seen = observation(
+            image,
+            content_type=content_type,
+            ranked_landmarks=ranked_landmarks,
+            dissimilarities=dissimilarities,
+            encoding=encoding,
+        )
+        return await self._transport.send(calls.relevances(domain, seen))
+
+    async def aclose(self) -> None:
+        """Close the connections; the client cannot be used afterwards."""
+        await self._transport.aclose()
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        await self.aclose()

@@ -1,0 +1,160 @@
+"""The blocking client."""
+
+import random
+import time
+from collections.abc import Callable
+from types import TracebackType
+from typing import TYPE_CHECKING, Self
+
+import httpx2
+
+from deepsimbad_client import calls
+from deepsimbad_client.admin import Admin
+from deepsimbad_client.models import Domain, Health, Localization
+from deepsimbad_client.observation import Image, Numbers, observation
+from deepsimbad_client.retry import RetryPolicy
+from deepsimbad_client.transport import THIN_LINK_TIMEOUT, Endpoint, Transport
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+
+class Client:
+    """Talks to one Deep SIMBAD service and blocks; safe to share between threads.
+
+    Connection errors and the answers 429, 502, 503 and 504 are retried with exponential backoff and jitter, or after
+    the service's own `Retry-After`, where repeating is safe: every call here but those of `admin` that act once
+    (`create_traverse`, `remap`, and `activate` with `expected`), which are sent again only when the service surely did
+    not act on them.
+
+    Args:
+        url: The service's address; absent: `$DEEPSIMBAD_URL`, else http://127.0.0.1:8000.
+        api_key: Absent: `$DEEPSIMBAD_API_KEY`, else none is sent.
+        timeout: Connect, read, write and pool timeouts in seconds.
+        retry: How often and how long to try.
+        transport: Another httpx2 transport (tests, proxies, Unix sockets).
+        sleep: Waits between tries.
+        jitter: Draws in 0..1 that spread the waits.
+
+    Attributes:
+        admin: The calls that need a key of scope `admin`.
+    """
+
+    def __init__(
+        self,
+        url: str | None = None,
+        api_key: str | None = None,
+        *,
+        timeout: httpx2.Timeout = THIN_LINK_TIMEOUT,
+        retry: RetryPolicy | None = None,
+        transport: httpx2.BaseTransport | None = None,
+        sleep: Callable[[float], None] = time.sleep,
+        jitter: Callable[[], float] = random.random,
+    ) -> None:
+        endpoint = Endpoint(url, api_key, timeout, retry or RetryPolicy())
+        self._transport = Transport(endpoint, transport=transport, sleep=sleep, jitter=jitter)
+        self.admin = Admin(self._transport)
+
+    @property
+    def url(self) -> str:
+        """The service's address."""
+        return self._transport.url
+
+    def health(self) -> Health:
+        """Whether the process is alive."""
+        return self._transport.send(calls.health())
+
+    def ready(self) -> Health:
+        """Whether it can answer now.
+
+        Raises:
+            UnavailableError: Not yet; its detail says why.
+        """
+        return self._transport.send(calls.ready())
+
+    def domains(self) -> tuple[Domain, ...]:
+        """Every domain."""
+        return self._transport.send(calls.domains())
+
+    def domain(self, name: str) -> Domain:
+        """One domain and its active map.
+
+        Raises:
+            UnknownDomainError: There is none of that name.
+        """
+        return self._transport.send(calls.domain(name))
+
+    def localize(
+        self,
+        domain: str,
+        image: Image | None = None,
+        *,
+        content_type: str | None = None,
+        ranked_landmarks: Numbers | None = None,
+        dissimilarities: Numbers | None = None,
+        encoding: Numbers | None = None,
+        shortlist: int | None = None,
+    ) -> Localization:
+        """Where one view probably is; give exactly one form of it.
+
+        Args:
+            domain: Where to look.
+            image: An encoded image (JPEG, PNG, TIFF, WebP) or its path, sent as it is.
+            content_type: The image's media type; absent: read from its first bytes.
+            ranked_landmarks: Landmark ids, nearest first, 1..r of them.
+            dissimilarities: r finite numbers in landmark order, smaller is nearer.
+            encoding: A ready encoding, where the domain takes them.
+            shortlist: Length of `retrieval` and `belief.top`; absent: the service's default.
+
+        Raises:
+            UnknownDomainError: No such domain.
+            NoActiveMapError: The domain has no map yet.
+            InvalidInputError: The service cannot use the view; its detail says why.
+        """
+        seen = observation(
+            image,
+            content_type=content_type,
+            ranked_landmarks=ranked_landmarks,
+            dissimilarities=dissimilarities,
+            encoding=encoding,
+        )
+        return self._transport.send(calls.localize(domain, seen, shortlist=shortlist))
+
+    def relevances(
+        self,
+        domain: str,
+        image: Image | None = None,
+        *,
+        content_type: str | None = None,
+        ranked_landmarks: Numbers | None = None,
+        dissimilarities: Numbers | None = None,
+        encoding: Numbers | None = None,
+    ) -> "NDArray[np.float32]":
+        """How well every map image answers one view: [n] float32, larger is better (needs numpy).
+
+        Takes the same forms of a view, and raises the same errors, as `localize`.
+        """
+        seen = observation(
+            image,
+            content_type=content_type,
+            ranked_landmarks=ranked_landmarks,
+            dissimilarities=dissimilarities,
+            encoding=encoding,
+        )
+        return self._transport.send(calls.relevances(domain, seen))
+
+    def close(self) -> None:
+        """Close the connections; the client cannot be used afterwards."""
+        self._transport.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()

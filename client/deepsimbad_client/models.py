@@ -1,0 +1,173 @@
+"""What the service answers, as frozen pydantic models.
+
+Fields the contract adds later are kept (`extra="allow"`), states are plain words rather than enums, and values that
+may be unknown are None: a client of this version goes on reading what a newer service says.
+"""
+
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field
+
+ENDED_STATES = frozenset({"succeeded", "failed", "cancelled"})
+
+
+class Answer(BaseModel):
+    """Root of the answers."""
+
+    model_config = ConfigDict(frozen=True, extra="allow", populate_by_name=True)
+
+
+class Health(Answer):
+    """`GET /healthz` and `/readyz`."""
+
+    status: str
+
+
+class Domain(Answer):
+    """One domain and its active map; the map's figures are None while it has none."""
+
+    name: str
+    map_version: int | None = None
+    route_length_m: float | None = None
+    n_map_images: int | None = None
+    n_landmarks: int | None = None
+    list_length: int | None = None
+    evaluator: str | dict[str, Any] | None = None
+    input_size: tuple[int, int] | None = None
+    """(width, height) an image is best resized to before it is sent; None: as it is, or no images at all."""
+    index_bits_per_map_image: float | None = None
+    actions_m: tuple[float, ...] = ()
+    closed: bool = False
+
+
+class Histogram(Answer):
+    """Belief mass in equal stretches of the route."""
+
+    edges_m: tuple[float, ...]
+    """One longer than `mass`."""
+    mass: tuple[float, ...]
+
+
+class Place(Answer):
+    """A map image the belief favours."""
+
+    map_image: int
+    route_position_m: float
+    x_m: float | None = None
+    y_m: float | None = None
+    mass: float
+
+
+class Belief(Answer):
+    """Where on the route the robot probably is."""
+
+    mean_m: float
+    mode_m: float
+    std_m: float
+    credible_95_m: tuple[float, float]
+    """(lo, hi); on a closed route lo > hi crosses the start."""
+    entropy_bits: float
+    off_route: float | None = None
+    histogram: Histogram
+    top: tuple[Place, ...]
+
+
+class Retrieved(Answer):
+    """A map image and how well it answers the query; larger is better."""
+
+    map_image: int
+    route_position_m: float
+    relevance: float
+
+
+class ActionValue(Answer):
+    """What the experience database expects of one move."""
+
+    action_m: float
+    q_value: float | None = None
+
+
+class NextBestView(Answer):
+    """The move that would tell the robot most."""
+
+    planner: str
+    action_m: float
+    actions: tuple[ActionValue, ...] = ()
+
+
+class Localization(Answer):
+    """The answer to one view, best first."""
+
+    map_version: int
+    timings_ms: dict[str, float]
+    belief: Belief
+    retrieval: tuple[Retrieved, ...]
+    next_best_view: NextBestView | None = None
+
+
+class Traverse(Answer):
+    """One recorded drive as the service holds it."""
+
+    name: str
+    n_frames: int = 0
+    missing: tuple[tuple[int, int], ...] = ()
+    """(first, last) ranges of indices that have not arrived, below the greatest that has."""
+
+    def has(self, index: int) -> bool:
+        """Whether the frame of this index has arrived."""
+        n_missing = sum(last - first + 1 for first, last in self.missing)
+        return 0 <= index < self.n_frames + n_missing and not any(
+            first <= index <= last for first, last in self.missing
+        )
+
+
+class FrameStored(Answer):
+    """One frame has arrived."""
+
+    index: int
+    n_frames: int
+
+
+class FramesStored(Answer):
+    """A batch of frames has arrived."""
+
+    n_new: int
+    n_replaced: int
+    n_frames: int
+
+
+class Job(Answer):
+    """A remap on its way, or ended."""
+
+    job_id: str
+    domain: str
+    state: str
+    stage: str | None = None
+    progress: float = 0.0
+    eta_s: float | None = None
+    result: dict[str, Any] | None = None
+    error: str | dict[str, Any] | None = None
+
+    @property
+    def ended(self) -> bool:
+        """Whether nothing more will happen to it."""
+        return self.state in ENDED_STATES
+
+    @property
+    def error_text(self) -> str:
+        """What went wrong, in the service's words; "" when nothing did."""
+        if isinstance(self.error, dict):
+            for key in ("detail", "message", "title", "code"):
+                if self.error.get(key):
+                    return str(self.error[key])
+            return str(self.error)
+        return self.error or ""
+
+
+class MapVersion(Answer):
+    """One map in a domain's history."""
+
+    version: int = Field(validation_alias="version")
+    state: str | None = None
+    created_at: str | None = None
+    metrics: dict[str, Any] | None = None

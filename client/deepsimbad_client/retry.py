@@ -1,0 +1,136 @@
+"""When a request is sent again, and after how long.
+
+Nothing here waits or sends: `Attempts` is told what happened and says what to do, so the blocking and the async client
+share every rule.
+"""
+
+import random
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from email.utils import parsedate_to_datetime
+from enum import Enum, auto
+
+import httpx2
+
+from deepsimbad_client.errors import TransportError, TransportTimeoutError
+
+RETRIED_STATUSES = frozenset({429, 502, 503, 504})
+REFUSED_STATUSES = frozenset({429, 503})
+"""The service turned the request away before acting on it; 502 and 504 come from a proxy that cannot know."""
+UNTOUCHED_FAILURES = (httpx2.ConnectError, httpx2.ConnectTimeout, httpx2.PoolTimeout)
+"""Failures in which the service never saw the request."""
+LASTING_CODES = frozenset({"damaged_map"})
+"""Problems behind a 503 that waiting cannot cure."""
+
+
+class Repeat(Enum):
+    """Which failures make a call safe to send again."""
+
+    ALWAYS = auto()
+    """Idempotent: reads, stateless localizations, puts, deletes, frame batches."""
+    IF_UNTOUCHED = auto()
+    """Acts once: only when the service surely did not act (no connection, 429, 503)."""
+    NEVER = auto()
+    """The caller has its own way to go on."""
+
+
+@dataclass(frozen=True)
+class RetryPolicy:
+    """How patient a client is.
+
+    Attributes:
+        attempts: Times a request is sent in all; 1 never repeats.
+        base_s: Wait before the first repetition, doubled each time.
+        max_backoff_s: Longest such wait.
+        max_retry_after_s: Longest `Retry-After` that is waited out. When the service asks for more, its error is
+            raised at once (with `retry_after_s`) instead of knocking before the time it named.
+    """
+
+    attempts: int = 5
+    base_s: float = 0.25
+    max_backoff_s: float = 8.0
+    max_retry_after_s: float = 60.0
+
+    def backoff_s(self, n_sent: int, jitter: float) -> float:
+        """Wait after the `n_sent`-th try; `jitter` in 0..1 spreads it over its upper half."""
+        longest = min(self.base_s * 2.0 ** (n_sent - 1), self.max_backoff_s)
+        return longest * (0.5 + 0.5 * jitter)
+
+
+def retry_after_s(header: str | None, now: datetime) -> float | None:
+    """Seconds that a `Retry-After` header asks for (seconds or an HTTP date); None when it says nothing usable."""
+    if header is None:
+        return None
+    header = header.strip()
+    if header.isascii() and header.isdigit():
+        return float(header)
+    try:
+        date = parsedate_to_datetime(header)
+    except ValueError:
+        return None
+    if date.tzinfo is None:
+        date = date.replace(tzinfo=UTC)
+    return max(0.0, (date - now).total_seconds())
+
+
+def utc_now() -> datetime:
+    """The time of day, for HTTP dates."""
+    return datetime.now(UTC)
+
+
+@dataclass
+class Attempts:
+    """The tries of one request.
+
+    Attributes:
+        policy: How patient.
+        repeat: What is safe.
+        what: The request in words, for errors.
+        jitter: Draws in 0..1.
+        now: Time of day.
+    """
+
+    policy: RetryPolicy
+    repeat: Repeat
+    what: str
+    jitter: Callable[[], float] = random.random
+    now: Callable[[], datetime] = utc_now
+    n_sent: int = 0
+    answer_lost: bool = field(default=False)
+    """Whether an earlier try may have been acted on without our hearing of it."""
+
+    def after_failure(self, error: httpx2.TransportError) -> float:
+        """Seconds to wait before the next try.
+
+        Raises:
+            TransportError: When there is none.
+        """
+        self.n_sent += 1
+        untouched = isinstance(error, UNTOUCHED_FAILURES)
+        safe = self.repeat is Repeat.ALWAYS or (self.repeat is Repeat.IF_UNTOUCHED and untouched)
+        hopeless = isinstance(error, httpx2.UnsupportedProtocol | httpx2.LocalProtocolError)
+        if safe and not hopeless and self.n_sent < self.policy.attempts:
+            self.answer_lost |= not untouched
+            return self.policy.backoff_s(self.n_sent, self.jitter())
+        kind = TransportTimeoutError if isinstance(error, httpx2.TimeoutException) else TransportError
+        tries = f"{self.n_sent} tries" if self.n_sent > 1 else "one try"
+        reason = str(error) or type(error).__name__
+        raise kind(f"no answer to {self.what} after {tries}: {reason}") from error
+
+    def after_answer(self, response: httpx2.Response) -> float | None:
+        """Seconds to wait before the next try; None when this answer is the last word."""
+        self.n_sent += 1
+        status = response.status_code
+        retried = {
+            Repeat.ALWAYS: RETRIED_STATUSES,
+            Repeat.IF_UNTOUCHED: REFUSED_STATUSES,
+            Repeat.NEVER: frozenset[int](),
+        }[self.repeat]
+        if status not in retried or self.n_sent >= self.policy.attempts:
+            return None
+        asked = retry_after_s(response.headers.get("retry-after"), self.now())
+        if asked is None:
+            self.answer_lost |= status not in REFUSED_STATUSES
+            return self.policy.backoff_s(self.n_sent, self.jitter())
+        return asked if asked <= self.policy.max_retry_after_s else None
