@@ -10,6 +10,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from deepsimbad_client.errors import MissingExtraError, UnexpectedAnswerError, api_error_class
 from deepsimbad_client.models import Answer, Job
+from deepsimbad_client.problem import problem_of
 from deepsimbad_client.retry import retry_after_s, utc_now
 
 if TYPE_CHECKING:
@@ -35,7 +36,7 @@ def raise_for_problem(response: httpx2.Response) -> None:
             f"{response.request.url} answered {status} and points to {where}: "
             "give the service's own address as the server"
         )
-    problem = _problem(response)
+    problem = problem_of(response)
     code = problem.get("code")
     detail = problem.get("detail") or problem.get("title")
     request_id = response.headers.get("x-request-id") or problem.get("request_id")
@@ -48,14 +49,6 @@ def raise_for_problem(response: httpx2.Response) -> None:
         request_id=str(request_id) if request_id else None,
         retry_after_s=retry_after_s(response.headers.get("retry-after"), utc_now()),
     )
-
-
-def _problem(response: httpx2.Response) -> dict[str, Any]:
-    try:
-        document = json.loads(response.content)
-    except ValueError:  # a proxy's own page
-        return {}
-    return document if isinstance(document, dict) else {}
 
 
 def model(kind: type[Model]) -> Callable[[httpx2.Response], Model]:

@@ -38,9 +38,18 @@ class SourceError(DeepSimbadClientError):
 
 
 class BrokenFrameError(SourceError):
-    """One frame of a recording that cannot be read; the rest of the recording is fine."""
+    """One frame of a recording that cannot be read; the rest of the recording is fine.
+
+    Args:
+        message: Which file, and what is wrong with it.
+        reason: The words to count it under, beside a recording's `left_out`.
+    """
 
     code = "broken_frame"
+
+    def __init__(self, message: str, reason: str = "undecodable") -> None:
+        super().__init__(message)
+        self.reason = reason
 
 
 class ReplayError(DeepSimbadClientError):

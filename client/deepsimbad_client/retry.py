@@ -14,6 +14,7 @@ from enum import Enum, auto
 import httpx2
 
 from deepsimbad_client.errors import TransportError, TransportTimeoutError
+from deepsimbad_client.problem import problem_of
 
 RETRIED_STATUSES = frozenset({429, 502, 503, 504})
 REFUSED_STATUSES = frozenset({429, 503})
@@ -128,6 +129,8 @@ class Attempts:
             Repeat.NEVER: frozenset[int](),
         }[self.repeat]
         if status not in retried or self.n_sent >= self.policy.attempts:
+            return None
+        if problem_of(response).get("code") in LASTING_CODES:
             return None
         asked = retry_after_s(response.headers.get("retry-after"), self.now())
         if asked is None:
