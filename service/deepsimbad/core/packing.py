@@ -113,8 +113,8 @@ def _pack(image_ids: NDArray[np.int64]) -> NDArray[np.uint8]:
 @njit(cache=True, nogil=True)
 def _place(blob: NDArray[np.uint8], column: NDArray[np.uint16], landmark: int, empty: int) -> int:
     """Write the landmark at every image of the blob; returns how many, or -1 - image at a bad one."""
-    parameter = np.int64(blob[0] & 31)
-    run_parameter = np.int64(blob[0] >> 5) - 1
+    parameter = int(blob[0]) & 31
+    run_parameter = (int(blob[0]) >> 5) - 1
     stream = blob[1:]
     at, image, n_placed = 0, -1, 0
     if run_parameter >= 0:

@@ -126,8 +126,18 @@ def _brute_force(built: RetrievalMap, query: Query, _: LandmarkStatistics | None
         raise InvalidInputError(
             f"an encoding of {query.encoding.size} numbers; the map's have {built.encodings.shape[1]}"
         )
-    difference = built.encodings - query.encoding
-    return np.asarray(-np.sqrt(np.einsum("nd,nd->n", difference, difference)), np.float32)
+    distances = brute_force_relevances(built.encodings, query.encoding[np.newaxis])
+    return np.asarray(distances[0], np.float32)
+
+
+def brute_force_relevances(
+    encodings: NDArray[np.float32], queries: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """-L2 between every query and every map image, [q, n] float32, by one matrix product."""
+    squares = np.einsum("nd,nd->n", encodings, encodings)
+    query_squares = np.einsum("qd,qd->q", queries, queries)
+    squared = query_squares[:, np.newaxis] + squares - 2.0 * (queries @ encodings.T)
+    return np.asarray(-np.sqrt(np.maximum(squared, 0.0)), np.float32)
 
 
 _RULES: dict[Relevance, Callable[[RetrievalMap, Query, LandmarkStatistics | None], NDArray[np.float32]]] = {

@@ -1,0 +1,1 @@
+"""Offline stages: plain functions with progress and cancel."""
