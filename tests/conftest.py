@@ -4,6 +4,11 @@ import os
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
+
+# Compilation on a first call is no slowness of the code under test, and a run is the same everywhere.
+settings.register_profile("project", deadline=None, derandomize=True, print_blob=True)
+settings.load_profile("project")
 
 PROJECT = Path(__file__).resolve().parent.parent
 

@@ -1,0 +1,54 @@
+"""Ranks, short lists of ranks and normal scores, against their definitions."""
+
+from statistics import NormalDist
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from deepsimbad.core.descriptor import (
+    nearest_landmarks,
+    normal_scores,
+    rank_landmarks,
+    ranks_from_ranked_landmarks,
+)
+from deepsimbad.errors import InvalidDissimilaritiesError, InvalidRankedLandmarksError
+
+
+@given(st.lists(st.integers(0, 6), min_size=1, max_size=30))
+def test_ranks_count_nearer_landmarks_and_earlier_ties(dissimilarities):
+    expected = [
+        1 + sum(1 for j, other in enumerate(dissimilarities) if (other, j) < (own, i))
+        for i, own in enumerate(dissimilarities)
+    ]
+    assert rank_landmarks(dissimilarities).tolist() == expected
+    assert rank_landmarks([dissimilarities] * 2).tolist() == [expected] * 2
+
+
+@pytest.mark.parametrize("bad", [[1.0, float("nan")], [float("inf"), 1.0], [], 3.0])
+def test_bad_dissimilarities_are_refused(bad):
+    with pytest.raises(InvalidDissimilaritiesError):
+        rank_landmarks(bad)
+
+
+def test_unsent_landmarks_share_the_mean_of_the_ranks_left():
+    assert ranks_from_ranked_landmarks([3, 1], 6).tolist() == [4.5, 2.0, 4.5, 1.0, 4.5, 4.5]
+    assert ranks_from_ranked_landmarks([1, 0, 2], 3).tolist() == [2.0, 1.0, 3.0]
+
+
+@pytest.mark.parametrize("bad", [[], [0, 0], [-1], [4], [0, 1, 2, 3, 1], [2**70]])
+def test_bad_ranked_landmarks_are_refused(bad):
+    with pytest.raises(InvalidRankedLandmarksError):
+        ranks_from_ranked_landmarks(bad, 4)
+
+
+def test_normal_scores_are_the_quantiles_of_the_ranks():
+    ranks = np.array([[1, 2.5, 4], [4, 2, 1]], np.float32)
+    expected = [[NormalDist().inv_cdf((v - 0.5) / 4) for v in row] for row in ranks]
+    np.testing.assert_allclose(normal_scores(ranks, 4), expected)
+
+
+def test_nearest_landmarks_are_planar_and_ties_go_by_id():
+    values = np.array([[3.0, 1.0, 1.0, 2.0], [0.0, 5.0, -1.0, 0.0]])
+    assert nearest_landmarks(values, 3).tolist() == [[1, 2], [2, 0], [3, 3]]
