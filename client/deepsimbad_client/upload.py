@@ -1,0 +1,226 @@
+"""Send a recording to a traverse, going on where an earlier attempt stopped."""
+
+import math
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from deepsimbad_client.client import Client
+from deepsimbad_client.errors import (
+    BrokenFrameError,
+    ConflictError,
+    InvalidInputError,
+    SourceError,
+    UnknownTraverseError,
+)
+from deepsimbad_client.in_order import in_order
+from deepsimbad_client.models import Traverse
+from deepsimbad_client.recording import Frame, Recording
+
+BATCH_BYTES = 8 * 2**20
+"""Size of a batch of ready encodings: worth its round trip, and lost cheaply on a thin link."""
+CONCURRENCY = 4
+NAMED_BROKEN_FRAMES = 20
+UNUSABLE_IMAGE_CODES = frozenset({"undecodable_image", "truncated_image", "empty_body"})
+
+
+@dataclass(frozen=True)
+class UploadProgress:
+    """How far an upload is.
+
+    Attributes:
+        n_done: Frames sent, skipped or broken.
+        n_frames: Frames in all.
+        bytes_sent: Bytes of images and encodings sent by this run.
+    """
+
+    n_done: int
+    n_frames: int
+    bytes_sent: int
+
+
+@dataclass
+class UploadReport:
+    """What became of a recording's frames.
+
+    Attributes:
+        n_frames: Frames of the recording that could be sent.
+        n_sent: Frames sent by this run.
+        n_skipped: Frames the service had already.
+        n_broken: Frames that could not be sent, by reason; the rest of the recording is not held up by them.
+        broken_names: The first of them by name.
+        left_out: Frames that the reader had left out before, by reason.
+        bytes_sent: Bytes of images and encodings sent.
+        seconds: How long it took.
+    """
+
+    n_frames: int
+    n_sent: int = 0
+    n_skipped: int = 0
+    n_broken: Counter[str] = field(default_factory=Counter)
+    broken_names: list[str] = field(default_factory=list)
+    left_out: dict[str, int] = field(default_factory=dict)
+    bytes_sent: int = 0
+    seconds: float = 0.0
+
+    @property
+    def n_done(self) -> int:
+        """Frames sent, skipped or broken."""
+        return self.n_sent + self.n_skipped + self.n_broken.total()
+
+    def as_dict(self) -> dict[str, object]:
+        """The report, JSON-ready."""
+        return {
+            "n_frames": self.n_frames,
+            "n_sent": self.n_sent,
+            "n_skipped": self.n_skipped,
+            "n_broken": dict(self.n_broken),
+            "broken_names": self.broken_names,
+            "left_out": self.left_out,
+            "bytes_sent": self.bytes_sent,
+            "seconds": round(self.seconds, 3),
+        }
+
+
+def upload(
+    client: Client,
+    recording: Recording,
+    domain: str,
+    traverse: str,
+    *,
+    concurrency: int = CONCURRENCY,
+    resend: bool = False,
+    on_progress: Callable[[UploadProgress], None] | None = None,
+    clock: Callable[[], float] = time.monotonic,
+) -> UploadReport:
+    """Send the frames of a recording that the service does not have yet.
+
+    Images go one by one, a few at once, resized to what the domain asks for; ready encodings go in batches. A frame
+    that cannot be read here, or decoded there, is counted and passed over.
+
+    Args:
+        client: The client; its key needs the scope `admin`.
+        recording: What to send.
+        domain: An existing domain.
+        traverse: Made when it does not exist.
+        concurrency: Images under way at once.
+        resend: Send also what is there already.
+        on_progress: Told after every frame or batch.
+        clock: Seconds that never go backwards.
+
+    Raises:
+        SourceError: The recording has no frames, or none of them could be sent.
+        ApiError: The service refused more than a frame.
+        TransportError: The service did not answer.
+    """
+    if not recording.frames:
+        raise SourceError(f"{recording.name} has no frames to send")
+    started = clock()
+    input_size = client.domain(domain).input_size
+    there = _open_traverse(client, domain, traverse)
+    report = UploadReport(len(recording.frames), left_out=dict(recording.left_out))
+    rows = [row for row, frame in enumerate(recording.frames) if resend or not there.has(frame.index)]
+    report.n_skipped = len(recording.frames) - len(rows)
+
+    def tell() -> None:
+        if on_progress is not None:
+            on_progress(UploadProgress(report.n_done, report.n_frames, report.bytes_sent))
+
+    tell()
+    if recording.encodings is not None:
+        for n_bytes, batch in _send_batches(client, recording, recording.encodings, domain, traverse, rows):
+            report.n_sent += len(batch)
+            report.bytes_sent += n_bytes
+            tell()
+    else:
+        frames = [recording.frames[row] for row in rows]
+        send = _image_sender(client, recording, domain, traverse, input_size)
+        for frame, outcome in in_order(send, frames, concurrency):
+            if isinstance(outcome, str):
+                report.n_broken[outcome] += 1
+                if len(report.broken_names) < NAMED_BROKEN_FRAMES:
+                    report.broken_names.append(frame.name)
+            else:
+                report.n_sent += 1
+                report.bytes_sent += outcome
+            tell()
+    report.seconds = clock() - started
+    if report.n_sent + report.n_skipped == 0:
+        reasons = ", ".join(f"{count} {reason}" for reason, count in report.n_broken.items())
+        raise SourceError(f"none of the {report.n_frames} frames of {recording.name} could be sent: {reasons}")
+    return report
+
+
+def _open_traverse(client: Client, domain: str, name: str) -> Traverse:
+    try:
+        return client.admin.traverse(domain, name)
+    except UnknownTraverseError:
+        pass
+    try:
+        return client.admin.create_traverse(domain, name)
+    except ConflictError:  # another uploader, or a repetition of our own request, was quicker
+        return client.admin.traverse(domain, name)
+
+
+def _image_sender(
+    client: Client, recording: Recording, domain: str, traverse: str, input_size: tuple[int, int] | None
+) -> Callable[[Frame], int | str]:
+    def send(frame: Frame) -> int | str:
+        """Bytes sent, or the reason why the frame is broken."""
+        try:
+            image = recording.image(frame, input_size)
+            client.admin.put_frame(
+                domain,
+                traverse,
+                frame.index,
+                image.body,
+                content_type=image.content_type,
+                position_m=frame.position_m,
+                timestamp_us=frame.timestamp_us,
+                x_m=frame.x_m,
+                y_m=frame.y_m,
+            )
+        except BrokenFrameError as error:
+            return error.reason
+        except InvalidInputError as error:
+            if error.code not in UNUSABLE_IMAGE_CODES:
+                raise
+            return f"refused by the service as {error.code}"
+        return len(image.body)
+
+    return send
+
+
+def _send_batches(
+    client: Client,
+    recording: Recording,
+    encodings: "np.typing.NDArray[np.float32]",
+    domain: str,
+    traverse: str,
+    rows: Sequence[int],
+) -> Iterator[tuple[int, Sequence[int]]]:
+    batch_size = max(1, BATCH_BYTES // max(1, 4 * encodings.shape[1]))
+    for start in range(0, len(rows), batch_size):
+        batch = rows[start : start + batch_size]
+        frames = [recording.frames[row] for row in batch]
+        values = encodings[batch]
+        known_xy = any(frame.x_m is not None and frame.y_m is not None for frame in frames)
+        known_time = any(frame.timestamp_us is not None for frame in frames)
+        client.admin.put_frames(
+            domain,
+            traverse,
+            encodings=values,
+            index=[frame.index for frame in frames],
+            position_m=[frame.position_m for frame in frames],
+            timestamp_us=[_or(frame.timestamp_us, -1) for frame in frames] if known_time else None,
+            x_m=[_or(frame.x_m, math.nan) for frame in frames] if known_xy else None,
+            y_m=[_or(frame.y_m, math.nan) for frame in frames] if known_xy else None,
+        )
+        yield values.nbytes, batch
+
+
+def _or(value: float | int | None, unknown: float) -> float | int:
+    return unknown if value is None else value
