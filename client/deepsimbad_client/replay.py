@@ -91,6 +91,8 @@ def replay(
     if described.map_version is None or described.n_map_images is None:
         raise ReplayError(f"domain {domain} has no active map to replay against: remap it first")
     frames = recording.frames
+    if not frames:
+        raise ReplayError(f"{recording.name} has no frames to replay")
     identity = {
         "domain": domain,
         "map_version": described.map_version,
@@ -188,7 +190,7 @@ def rank_of_truth(relevance: NDArray[np.float32], true_images: NDArray[np.intp])
 
 
 def _step(query: int, frame: Frame, asked: _Asked, route: MapRoute, truth: Truth) -> Step:
-    asked_for = {
+    asked_for: dict[str, Any] = {
         "query": query,
         "index": frame.index,
         "name": frame.name,
