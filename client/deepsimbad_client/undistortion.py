@@ -1,0 +1,166 @@
+"""Undistortion of the Ladybug3's cameras with the dataset's own look-up tables (`U2D_Cam<k>_1616X1232.txt`).
+
+A table is text: a header line with `width,height` somewhere in it, then `row col v u` for every pixel of the
+undistorted image, saying where in the stored one to look. Two million such lines are parsed once and kept as npz
+in the user's cache folder.
+"""
+
+import hashlib
+import logging
+import os
+import re
+import tempfile
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from deepsimbad_client.errors import SourceError
+from deepsimbad_client.image_files import Image
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, eq=False)
+class UndistortionMap:
+    """Where each pixel of the undistorted image lies in the stored one.
+
+    Attributes:
+        u: [height, width] float32, column in the stored image.
+        v: [height, width] float32, row in the stored image.
+    """
+
+    u: NDArray[np.float32]
+    v: NDArray[np.float32]
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height) of the images it is for, as stored."""
+        return self.u.shape[1], self.u.shape[0]
+
+    def apply(self, stored: Image) -> Image:
+        """Undistort an image in its stored orientation; what the camera did not see becomes black.
+
+        Raises:
+            SourceError: the image is not of the table's size.
+        """
+        if stored.shape[:2] != self.u.shape:
+            raise SourceError(
+                f"the undistortion table is for {self.size[0]} x {self.size[1]} images as stored, these are "
+                f"{stored.shape[1]} x {stored.shape[0]}"
+            )
+        return np.asarray(cv2.remap(stored, self.u, self.v, cv2.INTER_LINEAR), dtype=np.uint8)
+
+
+def find_undistortion_file(path: Path, camera: int) -> Path:
+    """Find one camera's table: `path` itself, or the one for the camera in the folder `path`.
+
+    Raises:
+        SourceError: there is none.
+    """
+    if path.is_file():
+        return path
+    found = sorted(path.glob(f"U2D_Cam{camera}_*.txt"))
+    if not found:
+        raise SourceError(f"no undistortion table for camera {camera}: looked for {path}/U2D_Cam{camera}_*.txt")
+    return found[0]
+
+
+def load_undistortion(path: Path, cache_dir: Path | None = None) -> UndistortionMap:
+    """Load a table, from the cache where this very file was parsed before.
+
+    Args:
+        path: The text file.
+        cache_dir: Where parsed tables are kept; None: `deep-simbad` in the user's cache folder
+            ($XDG_CACHE_HOME, else ~/.cache). A cache that cannot be written is done without.
+
+    Raises:
+        SourceError: the file cannot be read or is not a complete table.
+    """
+    cached = (cache_dir or _user_cache()) / f"undistortion-{_fingerprint(path)}.npz"
+    table = _read_cached(cached)
+    if table is None:
+        table = parse_undistortion(path)
+        _write_cached(cached, table)
+    return table
+
+
+def parse_undistortion(path: Path) -> UndistortionMap:
+    """Parse the text of a table; see `load_undistortion`.
+
+    The pixels' own rows and columns say where they go, so their order does not matter. The header's wording is not
+    known for certain: where its digits do not name the size, a complete grid of pixels does.
+    """
+    try:
+        with path.open(encoding="utf-8", errors="replace") as text:
+            header = text.readline()
+            pixels = np.loadtxt(text, dtype=np.float64, ndmin=2, comments=None)
+    except OSError as error:
+        raise SourceError(f"cannot read the undistortion table {path}: {error.strerror or error}") from error
+    except ValueError as error:
+        raise SourceError(f"{path}: not an undistortion table of `row col v u` lines: {error}") from error
+    if pixels.ndim != 2 or pixels.shape[1] != 4 or not np.isfinite(pixels).all() or pixels[:, :2].min() < 0:
+        raise SourceError(f"{path}: an undistortion table has a header and lines of four numbers `row col v u`")
+    row, column = pixels[:, 0].astype(np.int64), pixels[:, 1].astype(np.int64)
+    width, height = _header_size(header) or (int(column.max()) + 1, int(row.max()) + 1)
+    if row.max() >= height or column.max() >= width or len(np.unique(row * width + column)) != width * height:
+        raise SourceError(
+            f"{path}: {len(pixels)} pixels do not fill the {width} x {height} of the table; the file is cut short "
+            "or is another's"
+        )
+    u = np.empty((height, width), dtype=np.float32)
+    v = np.empty((height, width), dtype=np.float32)
+    v[row, column], u[row, column] = pixels[:, 2], pixels[:, 3]
+    return UndistortionMap(u=u, v=v)
+
+
+def _header_size(header: str) -> tuple[int, int] | None:
+    fields = re.sub(r"[^0-9,]", "", header).split(",")
+    if len(fields) != 2 or not all(fields):
+        return None
+    width, height = int(fields[0]), int(fields[1])
+    return (width, height) if 0 < width < 1 << 15 and 0 < height < 1 << 15 else None
+
+
+def _user_cache() -> Path:
+    base = os.environ.get("XDG_CACHE_HOME")
+    return (Path(base) if base else Path.home() / ".cache") / "deep-simbad"
+
+
+def _fingerprint(path: Path) -> str:
+    """Name this version of the file without reading its 60 MB: where it is, how long, and when it was changed."""
+    try:
+        about = path.stat()
+    except OSError as error:
+        raise SourceError(f"cannot read the undistortion table {path}: {error.strerror or error}") from error
+    identity = f"{path.resolve()}|{about.st_size}|{about.st_mtime_ns}"
+    return hashlib.sha256(identity.encode()).hexdigest()[:24]
+
+
+def _read_cached(cached: Path) -> UndistortionMap | None:
+    try:
+        with np.load(cached, allow_pickle=False) as arrays:
+            return UndistortionMap(u=arrays["u"], v=arrays["v"])
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        logger.warning("the cached undistortion table %s is damaged and is made again: %s", cached, error)
+        return None
+
+
+def _write_cached(cached: Path, table: UndistortionMap) -> None:
+    """Write beside and rename, so that two readers starting together never see half a file."""
+    beside: Path | None = None
+    try:
+        cached.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=cached.parent, suffix=".npz.part", delete=False) as file:
+            beside = Path(file.name)
+            np.savez(file, u=table.u, v=table.v)
+        beside.replace(cached)
+    except OSError as error:
+        logger.warning("cannot keep the parsed undistortion table in %s: %s", cached.parent, error)
+        if beside is not None:
+            beside.unlink(missing_ok=True)
