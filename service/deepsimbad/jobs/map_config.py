@@ -1,0 +1,60 @@
+"""What a remap is asked for."""
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from deepsimbad.core.descriptor import MAX_LANDMARKS
+from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Relevance
+from deepsimbad.errors import InvalidMapConfigError
+
+DEFAULT_N_LANDMARKS = 500
+DEFAULT_LIST_LENGTH = 4
+DEFAULT_TRAINING_EPISODES = 10_000
+
+
+@dataclass(frozen=True)
+class RemapConfig:
+    """Parameters of one remap, kept with the map.
+
+    Attributes:
+        training_traverse: The traverse that becomes the map.
+        landmark_traverse: Where landmarks are selected; None keeps those of the active map (the paper's cheap
+            retraining).
+        n_landmarks: r; None means 500, or as many as the active map has where its landmarks stay.
+        list_length: h.
+        relevance: What the map is built for.
+        training_episodes: Of the next-best-view planner; kept with the map, read once maps learn Q-values.
+        seed: Of everything random in the remap.
+        activate: Serve the new map at once.
+    """
+
+    training_traverse: str
+    landmark_traverse: str | None = None
+    n_landmarks: int | None = None
+    list_length: int = DEFAULT_LIST_LENGTH
+    relevance: Relevance = DEFAULT_RELEVANCE
+    training_episodes: int = DEFAULT_TRAINING_EPISODES
+    seed: int = 0
+    activate: bool = True
+
+    def __post_init__(self) -> None:
+        n_landmarks = self.n_landmarks
+        if n_landmarks is not None and not 1 <= n_landmarks <= MAX_LANDMARKS:
+            raise InvalidMapConfigError(f"n_landmarks must be within 1 and {MAX_LANDMARKS}", n_landmarks=n_landmarks)
+        if self.list_length < 1 or (n_landmarks is not None and self.list_length > n_landmarks):
+            raise InvalidMapConfigError(
+                f"list_length {self.list_length} must be at least 1 and at most n_landmarks",
+                list_length=self.list_length,
+                n_landmarks=n_landmarks,
+            )
+        if self.training_episodes < 0 or self.seed < 0:
+            raise InvalidMapConfigError("training_episodes and seed must not be negative")
+
+    def as_dict(self) -> dict[str, Any]:
+        """The JSON form."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, stored: dict[str, Any]) -> "RemapConfig":
+        """Back from the JSON form."""
+        return cls(**{**stored, "relevance": Relevance(stored["relevance"])})

@@ -1,0 +1,152 @@
+"""Remapping a domain: from stored traverses to a sealed, active map version (design section 5)."""
+
+import time
+from datetime import UTC, datetime
+from typing import Any
+
+import numpy as np
+
+from deepsimbad.core.relevance import RetrievalMap
+from deepsimbad.core.route import Route
+from deepsimbad.errors import DeepSimbadError, InvalidMapConfigError
+from deepsimbad.evaluators.base import Evaluator, LandmarkModel
+from deepsimbad.jobs.build_map import choose_landmarks, describe
+from deepsimbad.jobs.map_config import DEFAULT_N_LANDMARKS, RemapConfig
+from deepsimbad.jobs.progress import Progress
+from deepsimbad.store.catalog import Catalog
+from deepsimbad.store.map_file import MapContents, index_bytes, read_map, write_map
+from deepsimbad.store.map_table import ANY
+from deepsimbad.store.records import DomainRecord
+from deepsimbad.store.sealing import seal
+from deepsimbad.store.traverses import Traverse, TraverseFrames
+
+REMAP_STAGES = {"read frames": 1.0, "select landmarks": 4.0, "describe": 2.0, "seal": 1.0, "activate": 0.1}
+
+
+def remap(
+    catalog: Catalog, domain: str, config: RemapConfig, evaluator: Evaluator, progress: Progress
+) -> dict[str, Any]:
+    """Build, seal and, if asked, activate the next map version of a domain.
+
+    Nothing that serves changes before the last step, and a failed or cancelled remap leaves nothing behind.
+
+    Args:
+        catalog: Of the data directory.
+        domain: Whose traverses are mapped.
+        config: What is asked for.
+        evaluator: The domain's.
+        progress: Reports the stages of REMAP_STAGES; may cancel.
+
+    Returns:
+        `{"map_version", "active", "metrics"}`, as the job's result.
+
+    Raises:
+        DeepSimbadError: Whatever is wrong with the traverses, the parameters or the storage, by name.
+    """
+    record = catalog.domain(domain)
+    seconds: dict[str, float] = {}
+    started = time.perf_counter()
+
+    progress.stage("read frames")
+    training = _frames(catalog, domain, config.training_traverse)
+    route = _route(training, record.closed)
+
+    progress.stage("select landmarks")
+    model = _landmark_model(catalog, record, config, evaluator, progress)
+    seconds["read_and_select"] = time.perf_counter() - started
+
+    progress.stage("describe")
+    described = time.perf_counter()
+    built = describe(training.encodings, evaluator, model, config.relevance, config.list_length, progress.update)
+    seconds["describe"] = time.perf_counter() - described
+
+    progress.stage("seal")
+    version = catalog.begin_map(domain, config.as_dict())
+    try:
+        contents = _contents(record, version, config, model, built, route, training)
+        building = catalog.building_path(domain, version)
+        write_map(building, contents)
+        bits = 8 * index_bytes(building) / route.n_images
+        metrics = {"n_map_images": route.n_images, "index_bits_per_map_image": bits, "seconds": seconds}
+        digest, n_bytes = seal(building, catalog.map_path(domain, version))
+        progress.stage("activate")
+        catalog.seal_map(domain, version, digest, n_bytes, metrics)
+    except BaseException:
+        catalog.discard_map(domain, version)
+        raise
+    if config.activate:
+        catalog.activate(domain, version, ANY)
+    return {"map_version": version, "active": config.activate, "metrics": metrics}
+
+
+def _frames(catalog: Catalog, domain: str, name: str) -> TraverseFrames:
+    with Traverse.open(catalog.data_dir, domain, name) as traverse:
+        frames = traverse.read()
+    if frames.index.size == 0:
+        raise InvalidMapConfigError(f"traverse {name} has no frames yet; upload some first", traverse=name)
+    return frames
+
+
+def _route(frames: TraverseFrames, closed: bool) -> Route:
+    known = bool(np.isfinite(frames.x_m).any() and np.isfinite(frames.y_m).any())
+    return Route(frames.position_m, closed, frames.x_m if known else None, frames.y_m if known else None)
+
+
+def _landmark_model(
+    catalog: Catalog, record: DomainRecord, config: RemapConfig, evaluator: Evaluator, progress: Progress
+) -> LandmarkModel:
+    """Select new landmarks where a landmark traverse is given; else keep the active map's."""
+    if config.landmark_traverse is not None:
+        candidates = _frames(catalog, record.name, config.landmark_traverse).encodings
+        n_landmarks = config.n_landmarks or DEFAULT_N_LANDMARKS
+        return choose_landmarks(candidates, n_landmarks, evaluator, progress.update)
+    if record.active_version is None:
+        raise InvalidMapConfigError(
+            f"domain {record.name} has no active map whose landmarks could stay; give a landmark_traverse"
+        )
+    kept = read_map(catalog.map_path(record.name, record.active_version))
+    n_kept = int(kept.config["n_landmarks"])
+    if config.n_landmarks not in {None, n_kept}:
+        raise InvalidMapConfigError(
+            f"the active map has {n_kept} landmarks, not {config.n_landmarks}; give a landmark_traverse to select anew",
+            n_landmarks=n_kept,
+        )
+    return kept.landmark_model
+
+
+def _contents(
+    record: DomainRecord,
+    version: int,
+    config: RemapConfig,
+    model: LandmarkModel,
+    built: RetrievalMap,
+    route: Route,
+    training: TraverseFrames,
+) -> MapContents:
+    statistics = built.statistics
+    known_times = training.timestamp_us if (training.timestamp_us >= 0).any() else None
+    return MapContents(
+        domain=record.name,
+        version=version,
+        created_at=datetime.now(UTC).isoformat(timespec="seconds"),
+        config={**config.as_dict(), "n_landmarks": built.index.n_landmarks},
+        evaluator=record.evaluator,
+        closed=record.closed,
+        actions_m=record.actions_m,
+        landmark_model=model,
+        lists=built.index.lists,
+        values=built.index.values,
+        encodings=built.encodings,
+        statistics=None if statistics is None else np.stack([statistics.mean, statistics.std]),
+        position_m=route.position_m,
+        timestamp_us=known_times,
+        x_m=route.x_m,
+        y_m=route.y_m,
+        q_values=None,
+        metrics={},
+    )
+
+
+def error_document(error: DeepSimbadError) -> dict[str, Any]:
+    """How a job's row tells a named error."""
+    return {"code": error.code, "message": error.message, **error.hints}
