@@ -41,7 +41,7 @@ class Endpoint:
 
     url: str | None = None
     api_key: str | None = field(default=None, repr=False)
-    timeout: httpx2.Timeout = THIN_LINK_TIMEOUT
+    timeout: httpx2.Timeout = field(default_factory=lambda: THIN_LINK_TIMEOUT)
     retry: RetryPolicy = field(default_factory=RetryPolicy)
 
     def base_url(self) -> str:
