@@ -16,7 +16,7 @@ OPPOSITE_RAD = np.pi / 2
 
 
 @dataclass(frozen=True)
-class Path:
+class RoutePath:
     """Positions in travel order.
 
     Attributes:
@@ -36,16 +36,18 @@ class Path:
 
     def headings_rad(self) -> NDArray[np.float64]:
         """[n] direction of travel, from x towards y; NaN where the path does not tell."""
-        before = np.searchsorted(self.position_m, self.position_m - HEADING_CHORD_M, side="left")
-        after = np.searchsorted(self.position_m, self.position_m + HEADING_CHORD_M, side="right") - 1
+        forward = np.argsort(self.position_m, kind="stable")  # frames taken backwards still look forwards
+        along = self.position_m[forward]
+        before = forward[np.searchsorted(along, self.position_m - HEADING_CHORD_M, side="left")]
+        after = forward[np.searchsorted(along, self.position_m + HEADING_CHORD_M, side="right") - 1]
         dx = self.x_m[after] - self.x_m[before]
         dy = self.y_m[after] - self.y_m[before]
         return np.where((dx == 0) & (dy == 0), np.nan, np.arctan2(dy, dx))
 
 
-def path_of_frames(frames: Sequence[Frame]) -> Path:
+def path_of_frames(frames: Sequence[Frame]) -> RoutePath:
     """The path of a recording's frames."""
-    return Path(
+    return RoutePath(
         np.array([frame.position_m for frame in frames], np.float64),
         np.array([np.nan if frame.x_m is None else frame.x_m for frame in frames], np.float64),
         np.array([np.nan if frame.y_m is None else frame.y_m for frame in frames], np.float64),
@@ -64,7 +66,7 @@ class MapRoute:
     """
 
     map_version: int
-    path: Path
+    path: RoutePath
     closed: bool
     length_m: float
 
@@ -91,7 +93,7 @@ def map_route_of(answer: Localization, *, closed: bool, length_m: float) -> MapR
     for place in answer.belief.top:
         if place.x_m is not None and place.y_m is not None and 0 <= place.map_image < len(position_m):
             x_m[place.map_image], y_m[place.map_image] = place.x_m, place.y_m
-    return MapRoute(answer.map_version, Path(position_m, x_m, y_m), closed, length_m)
+    return MapRoute(answer.map_version, RoutePath(position_m, x_m, y_m), closed, length_m)
 
 
 class Truth:
@@ -106,7 +108,7 @@ class Truth:
         tolerance_m: How far a right answer may be.
     """
 
-    def __init__(self, queries: Path, route: MapRoute, tolerance_m: float) -> None:
+    def __init__(self, queries: RoutePath, route: MapRoute, tolerance_m: float) -> None:
         self._queries = queries
         self._route = route
         self._tolerance_m = tolerance_m

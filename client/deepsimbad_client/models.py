@@ -6,7 +6,7 @@ may be unknown are None: a client of this version goes on reading what a newer s
 
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict
 
 ENDED_STATES = frozenset({"succeeded", "failed", "cancelled"})
 
@@ -14,7 +14,7 @@ ENDED_STATES = frozenset({"succeeded", "failed", "cancelled"})
 class Answer(BaseModel):
     """Root of the answers."""
 
-    model_config = ConfigDict(frozen=True, extra="allow", populate_by_name=True)
+    model_config = ConfigDict(frozen=True, extra="allow")
 
 
 class Health(Answer):
@@ -35,6 +35,9 @@ class Domain(Answer):
     evaluator: str | dict[str, Any] | None = None
     input_size: tuple[int, int] | None = None
     """(width, height) an image is best resized to before it is sent; None: as it is, or no images at all."""
+    encoding_dim: int | None = None
+    """Length of a ready encoding; None: that of the domain's traverses."""
+    relevance: str | None = None
     index_bits_per_map_image: float | None = None
     actions_m: tuple[float, ...] = ()
     closed: bool = False
@@ -167,7 +170,7 @@ class Job(Answer):
 class MapVersion(Answer):
     """One map in a domain's history."""
 
-    version: int = Field(validation_alias="version")
+    version: int
     state: str | None = None
     created_at: str | None = None
     metrics: dict[str, Any] | None = None
