@@ -192,6 +192,18 @@ class DamagedMapError(UnavailableError):
     code = "damaged_map"
 
 
+class DamagedFileError(UnavailableError):
+    """A catalog or traverse file that cannot be read, or that a newer release wrote."""
+
+    code = "damaged_file"
+
+
+class JobInterruptedError(UnavailableError):
+    """The process that ran the job ended before the job did."""
+
+    code = "job_interrupted"
+
+
 class CancelledError(DeepSimbadError):
     """The work was cancelled on request."""
 

@@ -1,0 +1,1 @@
+"""Migrations of the catalog: domains, map versions and jobs."""

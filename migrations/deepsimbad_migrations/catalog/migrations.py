@@ -1,0 +1,58 @@
+"""The catalog's schema, one frozen step after another.
+
+A step that has shipped is never edited: a change is a new step. Run by the service when it opens the file, or by
+`sqlite-utils migrate catalog.sqlite migrations/deepsimbad_migrations/catalog`.
+"""
+
+from sqlite_utils import Database, Migrations
+
+migrations = Migrations("deepsimbad_catalog")
+
+
+@migrations()
+def m001_domains_maps_jobs(db: Database) -> None:
+    """Domains, their map versions, jobs, and the folders of deleted domains that are still to be removed."""
+    db.executescript(
+        """
+        CREATE TABLE domain (
+            name TEXT NOT NULL PRIMARY KEY,
+            evaluator TEXT NOT NULL,
+            closed INTEGER NOT NULL CHECK (closed IN (0, 1)),
+            actions_m TEXT NOT NULL,
+            next_version INTEGER NOT NULL DEFAULT 1,
+            created_at TEXT NOT NULL
+        );
+        CREATE TABLE map (
+            domain TEXT NOT NULL REFERENCES domain (name) ON DELETE CASCADE,
+            version INTEGER NOT NULL CHECK (version >= 1),
+            state TEXT NOT NULL CHECK (state IN ('building', 'sealed', 'active', 'retired')),
+            owner TEXT NOT NULL,
+            created_at TEXT NOT NULL,
+            sha256 TEXT,
+            file_bytes INTEGER,
+            config TEXT NOT NULL,
+            metrics TEXT NOT NULL,
+            PRIMARY KEY (domain, version),
+            CHECK (state = 'building' OR (sha256 IS NOT NULL AND file_bytes IS NOT NULL))
+        );
+        CREATE UNIQUE INDEX map_one_active ON map (domain) WHERE state = 'active';
+        CREATE TABLE job (
+            job_id TEXT NOT NULL PRIMARY KEY,
+            domain TEXT NOT NULL REFERENCES domain (name) ON DELETE CASCADE,
+            kind TEXT NOT NULL,
+            config TEXT NOT NULL,
+            state TEXT NOT NULL CHECK (state IN ('queued', 'running', 'succeeded', 'failed', 'cancelled')),
+            owner TEXT NOT NULL,
+            stage TEXT,
+            progress REAL NOT NULL DEFAULT 0 CHECK (progress BETWEEN 0 AND 1),
+            eta_s REAL,
+            result TEXT,
+            error TEXT,
+            created_at TEXT NOT NULL,
+            started_at TEXT,
+            finished_at TEXT
+        );
+        CREATE INDEX job_domain ON job (domain);
+        CREATE TABLE doomed_folder (domain TEXT NOT NULL PRIMARY KEY);
+        """
+    )

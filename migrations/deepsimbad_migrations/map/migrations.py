@@ -1,0 +1,65 @@
+"""The schema of one map file, one frozen step after another.
+
+A step that has shipped is never edited: a change is a new step. Run by the service when it builds a map, or by
+`sqlite-utils migrate FILE migrations/deepsimbad_migrations/map`.
+"""
+
+from sqlite_utils import Database, Migrations
+
+migrations = Migrations("deepsimbad_map")
+
+_ARRAY_TABLES = (
+    "landmark_model",
+    "landmark_statistics",
+    "route",
+    "listed_dissimilarity",
+    "map_image_encoding",
+    "q_value",
+)
+
+
+@migrations()
+def m001_postings_and_arrays(db: Database) -> None:
+    """The inverted index as packed posting lists, and everything beside it as named arrays.
+
+    `posting` has no rowid: its key is the clustered order, so a list costs its bytes and about eleven more. The array
+    tables hold large bodies and therefore keep their rowid (a row may then fill a page).
+    """
+    db.executescript(
+        """
+        CREATE TABLE map (
+            id INTEGER PRIMARY KEY CHECK (id = 1),
+            domain TEXT NOT NULL,
+            version INTEGER NOT NULL,
+            created_at TEXT NOT NULL,
+            config TEXT NOT NULL,
+            evaluator TEXT NOT NULL,
+            closed INTEGER NOT NULL CHECK (closed IN (0, 1)),
+            actions_m TEXT NOT NULL,
+            metrics TEXT NOT NULL,
+            n_map_images INTEGER NOT NULL,
+            n_landmarks INTEGER NOT NULL,
+            list_length INTEGER NOT NULL,
+            checksum INTEGER NOT NULL
+        );
+        CREATE TABLE posting (
+            landmark INTEGER NOT NULL,
+            rank INTEGER NOT NULL,
+            image_ids BLOB NOT NULL,
+            PRIMARY KEY (landmark, rank)
+        ) WITHOUT ROWID;
+        """
+    )
+    for table in _ARRAY_TABLES:
+        db.execute(
+            f"""
+            CREATE TABLE {table} (
+                name TEXT NOT NULL,
+                part INTEGER NOT NULL,
+                dtype TEXT NOT NULL,
+                shape TEXT NOT NULL,
+                body BLOB NOT NULL,
+                PRIMARY KEY (name, part)
+            )
+            """
+        )

@@ -1,0 +1,35 @@
+"""The schema of one traverse file, one frozen step after another.
+
+A step that has shipped is never edited: a change is a new step. Run by the service when it opens the file, or by
+`sqlite-utils migrate FILE migrations/deepsimbad_migrations/traverse`.
+"""
+
+from sqlite_utils import Database, Migrations
+
+migrations = Migrations("deepsimbad_traverse")
+
+
+@migrations()
+def m001_frames(db: Database) -> None:
+    """Frames with their places, and their encodings apart, so that counting frames does not read encodings."""
+    db.executescript(
+        """
+        CREATE TABLE traverse (
+            id INTEGER PRIMARY KEY CHECK (id = 1),
+            created_at TEXT NOT NULL,
+            encoding_dim INTEGER CHECK (encoding_dim >= 1)
+        );
+        CREATE TABLE frame (
+            frame_index INTEGER PRIMARY KEY CHECK (frame_index >= 0),
+            position_m REAL NOT NULL,
+            timestamp_us INTEGER,
+            x_m REAL,
+            y_m REAL
+        );
+        CREATE TABLE encoding (
+            frame_index INTEGER PRIMARY KEY REFERENCES frame (frame_index) ON DELETE CASCADE,
+            checksum INTEGER NOT NULL,
+            body BLOB NOT NULL
+        );
+        """
+    )

@@ -1,0 +1,80 @@
+"""Named arrays in the array tables of a map file, which all have one layout."""
+
+import math
+import zlib
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sqlite_utils import Database
+
+from deepsimbad.errors import InvalidInputError
+from deepsimbad.store.documents import from_json, to_json
+
+PART_BYTES = 16 * 2**20  # far below SQLite's limit for a value, and all that is held beside the array itself
+_KINDS = "fiu"
+
+
+class Checksum:
+    """A running CRC-32 over everything a map file says, in one fixed order."""
+
+    def __init__(self) -> None:
+        self.value = 0
+
+    def add(self, *parts: str | int | bytes) -> None:
+        """Continue with these."""
+        for part in parts:
+            body = part if isinstance(part, bytes) else str(part).encode("ascii", "backslashreplace")
+            self.value = zlib.crc32(body, self.value)
+
+
+def save_arrays(db: Database, table: str, arrays: Mapping[str, NDArray[Any]], checksum: Checksum) -> None:
+    """Write named arrays into an array table.
+
+    Raises:
+        InvalidInputError: An array does not hold plain numbers.
+    """
+    for name in sorted(arrays):
+        array = np.asarray(arrays[name])
+        if array.dtype.kind not in _KINDS:
+            raise InvalidInputError(f"array {name} of {table} holds {array.dtype}, not numbers")
+        shape = to_json(list(array.shape))
+        numbers = np.ascontiguousarray(array, array.dtype.newbyteorder("<")).reshape(-1)
+        octets = numbers.view(np.uint8)
+        for part, start in enumerate(range(0, max(octets.size, 1), PART_BYTES)):
+            body = octets[start : start + PART_BYTES].tobytes()
+            checksum.add(table, name, part, numbers.dtype.str, shape, body)
+            db.table(table).insert(
+                {"name": name, "part": part, "dtype": numbers.dtype.str, "shape": shape, "body": body}
+            )
+
+
+def load_arrays(db: Database, table: str, checksum: Checksum) -> dict[str, NDArray[Any]]:
+    """Read the named arrays of an array table, frozen; an array of one part is not copied.
+
+    Raises:
+        ValueError: The rows do not make up arrays.
+    """
+    arrays: dict[str, NDArray[Any]] = {}
+    n_filled: dict[str, int] = {}
+    for row in db.table(table).rows_where(order_by="name, part"):
+        name, dtype, body = row["name"], np.dtype(row["dtype"]), row["body"]
+        checksum.add(table, name, row["part"], row["dtype"], row["shape"], body)
+        dimensions = tuple(from_json(row["shape"]))
+        if dtype.kind not in _KINDS:
+            raise ValueError(f"array {name} of {table} holds {dtype}, not numbers")
+        if len(body) == math.prod(dimensions) * dtype.itemsize:
+            arrays[name] = np.frombuffer(body, dtype).reshape(dimensions)
+            n_filled[name] = len(body)
+            continue
+        if name not in arrays:
+            arrays[name], n_filled[name] = np.empty(dimensions, dtype), 0
+        octets = arrays[name].reshape(-1).view(np.uint8)
+        octets[n_filled[name] : n_filled[name] + len(body)] = np.frombuffer(body, np.uint8)
+        n_filled[name] += len(body)
+    for name, array in arrays.items():
+        if n_filled[name] != array.nbytes:
+            raise ValueError(f"array {name} of {table} is not whole")
+        array.setflags(write=False)
+    return arrays

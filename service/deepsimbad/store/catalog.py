@@ -1,0 +1,263 @@
+"""The catalog: which domains, map versions and jobs there are, and which version serves."""
+
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any, Self
+
+from sqlite_utils import Database
+
+from deepsimbad.errors import ConflictError, DamagedMapError, TraverseInUseError, UnknownMapVersionError
+from deepsimbad.store import domain_table, job_table, layout, map_table, unfinished
+from deepsimbad.store.connection import migrate, open_database, use_write_ahead_log, write_transaction
+from deepsimbad.store.documents import from_json, to_json
+from deepsimbad.store.durable import remove_folder, sync_folder
+from deepsimbad.store.faults import storage_faults
+from deepsimbad.store.map_table import AnyVersion
+from deepsimbad.store.ownership import Owner, is_alive
+from deepsimbad.store.records import DomainRecord, JobRecord, MapRecord, MapState
+from deepsimbad_migrations.catalog.migrations import migrations
+
+
+class Catalog:
+    """The one file that says what is true of a data directory; usable from any thread and several processes.
+
+    Every change is one transaction: a crash at any moment leaves the state before it or after it. Every method raises
+    UnavailableError (`hints["reason"]`: disk_full, read_only, busy, ...) or DamagedFileError where the file cannot be
+    used, beside what it names itself.
+
+    Args:
+        data_dir: The data directory.
+        db: The open catalog file.
+    """
+
+    def __init__(self, data_dir: Path, db: Database) -> None:
+        self.data_dir = data_dir
+        self._path = layout.catalog_path(data_dir)
+        self._db = db
+        self._lock = threading.RLock()
+        self._owners = layout.owners_folder(data_dir)
+        self._owner = Owner(self._owners)
+
+    @classmethod
+    def open(cls, data_dir: Path) -> Self:
+        """Open the catalog of a data directory; makes both where they are missing."""
+        path = layout.catalog_path(data_dir)
+        with storage_faults(path), ExitStack() as on_error:
+            data_dir.mkdir(parents=True, exist_ok=True)
+            db = open_database(path, create=True)
+            on_error.callback(db.close)
+            use_write_ahead_log(db)
+            migrate(db, migrations, path)
+            sync_folder(data_dir)
+            on_error.pop_all()
+        return cls(data_dir, db)
+
+    def close(self) -> None:
+        """Close the file. Unfinished work begun through this object counts as abandoned from here on."""
+        with self._lock:
+            self._owner.release()
+            self._db.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+    @contextmanager
+    def _reading(self) -> Iterator[Database]:
+        with self._lock, storage_faults(self._path), self._db.atomic() as db:
+            yield db
+
+    @contextmanager
+    def _writing(self) -> Iterator[Database]:
+        with self._lock, storage_faults(self._path), write_transaction(self._db) as db:
+            yield db
+
+    # Domains
+
+    def create_domain(
+        self, name: str, evaluator: dict[str, Any], closed: bool, actions_m: Sequence[float]
+    ) -> tuple[DomainRecord, bool]:
+        """Make a domain; the same again changes nothing.
+
+        Returns:
+            The domain, and whether it is new.
+
+        Raises:
+            InvalidInputError: The name cannot be a name, or a value has no JSON form.
+            DomainDiffersError: A domain of that name exists with another configuration.
+            ConflictError: Files that no domain owns lie where its files would.
+        """
+        folder = layout.domain_folder(self.data_dir, name)
+        evaluator = from_json(to_json(evaluator))
+        actions = tuple(float(action) for action in actions_m)
+        with self._writing() as db:
+            record, created = domain_table.insert(db, name, evaluator, closed, actions)
+            if created:
+                self._finish_deletion(db, name)
+                if any(path.is_file() for path in folder.rglob("*")):
+                    raise ConflictError(
+                        f"files of an unknown domain lie in {folder.parent.name}/{name}: move them away first"
+                    )
+                layout.traverses_folder(self.data_dir, name).mkdir(parents=True, exist_ok=True)
+                layout.maps_folder(self.data_dir, name).mkdir(parents=True, exist_ok=True)
+                for made in (folder, folder.parent, self.data_dir):
+                    sync_folder(made)
+        return record, created
+
+    def domain(self, name: str) -> DomainRecord:
+        """One domain; raises UnknownDomainError."""
+        with self._reading() as db:
+            return domain_table.get(db, name)
+
+    def domains(self) -> list[DomainRecord]:
+        """Every domain by name."""
+        with self._reading() as db:
+            return domain_table.all_domains(db)
+
+    def delete_domain(self, name: str) -> None:
+        """Delete a domain with its jobs, maps and traverses.
+
+        Raises:
+            UnknownDomainError: There is no such domain.
+            TraverseInUseError: Unfinished work of a living process needs it.
+        """
+        with self._writing() as db:
+            domain_table.get(db, name)
+            builders = [owner for domain, _, owner in map_table.building(db) if domain == name]
+            workers = [owner for _, owner in job_table.unfinished(db, name)]
+            if any(is_alive(self._owners, owner) for owner in {*builders, *workers}):
+                raise TraverseInUseError(f"a job still works on domain {name}: cancel it or wait for its end")
+            domain_table.doom(db, name)
+        with self._writing() as db:  # from here on a crash is finished at the next start
+            self._finish_deletion(db, name)
+
+    def _finish_deletion(self, db: Database, name: str) -> None:
+        if name in domain_table.doomed(db):
+            remove_folder(layout.domain_folder(self.data_dir, name))
+            domain_table.forget_doomed(db, name)
+
+    # Map versions
+
+    def begin_map(self, domain: str, config: dict[str, Any]) -> int:
+        """Take the next version number for a map to be built; raises UnknownDomainError."""
+        with self._writing() as db:
+            domain_table.get(db, domain)
+            return map_table.begin(db, domain, config, self._owner.token())
+
+    def seal_map(self, domain: str, version: int, sha256: str, file_bytes: int, metrics: dict[str, Any]) -> MapRecord:
+        """Note that the sealed file of a version lies at `map_path`.
+
+        Raises:
+            UnknownMapVersionError: The version is not being built.
+            DamagedMapError: The file is missing or has another size.
+        """
+        path = self.map_path(domain, version)
+        with self._writing() as db:
+            record = map_table.seal(db, domain, version, sha256, file_bytes, metrics)
+            if not path.is_file() or path.stat().st_size != file_bytes:
+                raise DamagedMapError(f"{path.name} is not the file that was sealed", file=path.name)
+        return record
+
+    def discard_map(self, domain: str, version: int) -> None:
+        """Forget a version that was being built, files first; raises UnknownMapVersionError."""
+        with self._writing() as db:
+            if map_table.get(db, domain, version).state is not MapState.BUILDING:
+                raise UnknownMapVersionError(
+                    f"domain {domain} is not building a map version {version}", version=version
+                )
+            unfinished.remove_map_files(self.data_dir, domain, version)
+            map_table.delete(db, domain, version)
+
+    def activate(self, domain: str, version: int, expected: int | AnyVersion | None) -> MapRecord:
+        """Let a version serve, forward or back, if the active one is still `expected` (None: none; `ANY`).
+
+        Raises:
+            UnknownDomainError: There is no such domain.
+            UnknownMapVersionError: There is no such version, or it is still being built.
+            LostActivationError: Another version was activated meanwhile.
+        """
+        with self._writing() as db:
+            domain_table.get(db, domain)
+            return map_table.activate(db, domain, version, expected)
+
+    def maps(self, domain: str) -> list[MapRecord]:
+        """Every map version, oldest first; raises UnknownDomainError."""
+        with self._reading() as db:
+            domain_table.get(db, domain)
+            return map_table.of_domain(db, domain)
+
+    def map(self, domain: str, version: int) -> MapRecord:
+        """One map version; raises UnknownDomainError, UnknownMapVersionError."""
+        with self._reading() as db:
+            domain_table.get(db, domain)
+            return map_table.get(db, domain, version)
+
+    def map_path(self, domain: str, version: int) -> Path:
+        """Where the sealed file of a version lies, or will; raises InvalidInputError."""
+        return layout.map_path(self.data_dir, domain, version)
+
+    def building_path(self, domain: str, version: int) -> Path:
+        """Where a version is to be built before it is sealed; raises InvalidInputError."""
+        return layout.building_path(self.data_dir, domain, version)
+
+    # Jobs
+
+    def create_job(self, domain: str, kind: str, config: dict[str, Any]) -> JobRecord:
+        """Note a queued job of this process; raises UnknownDomainError."""
+        with self._writing() as db:
+            domain_table.get(db, domain)
+            return job_table.insert(db, domain, kind, config, self._owner.token())
+
+    def update_job(self, job_id: str, **fields: Any) -> JobRecord:
+        """Change state, stage, progress, eta_s, result or error of a job; one that has ended stays as it is.
+
+        The times of start and end follow from the state.
+
+        Returns:
+            The job as it now stands.
+
+        Raises:
+            UnknownJobError: There is no such job.
+            InvalidInputError: A field cannot be changed or cannot hold the value.
+        """
+        with self._writing() as db:
+            return job_table.update(db, job_id, fields)
+
+    def job(self, job_id: str) -> JobRecord:
+        """One job; raises UnknownJobError."""
+        with self._reading() as db:
+            return job_table.get(db, job_id)
+
+    def jobs(self, domain: str | None = None) -> list[JobRecord]:
+        """Every job, or every job of a domain, oldest first; raises UnknownDomainError."""
+        with self._reading() as db:
+            if domain is not None:
+                domain_table.get(db, domain)
+            return job_table.list_jobs(db, domain)
+
+    # Recovery
+
+    def discard_unfinished(self) -> list[str]:
+        """Clear away what dead processes left: call it once at start, before any work.
+
+        Maps that were being built are discarded, jobs that were queued or running become failed (job_interrupted),
+        folders of deleted domains and files that no map version owns are removed. Work of living processes, this one
+        included, stays.
+
+        Returns:
+            One line for each thing discarded, for the log.
+        """
+        with self._writing() as db:
+            lines = [
+                *unfinished.fail_abandoned_jobs(db, self._owners),
+                *unfinished.discard_abandoned_maps(db, self.data_dir, self._owners),
+                *unfinished.remove_orphans(db, self.data_dir),
+            ]
+            for name in domain_table.doomed(db):
+                self._finish_deletion(db, name)
+                lines.append(f"removed the folder of the deleted domain {name}")
+        return lines

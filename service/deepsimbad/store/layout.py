@@ -1,0 +1,71 @@
+"""Where everything lies under the data directory, and which names may become paths."""
+
+import re
+from pathlib import Path
+
+from deepsimbad.errors import InvalidInputError
+
+NAME_PATTERN = r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}"
+_NAME = re.compile(NAME_PATTERN)
+_MAX_VERSION = 2**53
+
+
+def is_name(name: str) -> bool:
+    """Whether the name of a domain or traverse is one that may exist."""
+    return _NAME.fullmatch(name) is not None
+
+
+def checked_name(name: str, what: str) -> str:
+    """The name itself, safe to become part of a path.
+
+    Raises:
+        InvalidInputError: The name does not match `NAME_PATTERN`.
+    """
+    if not is_name(name):
+        raise InvalidInputError(
+            f"a {what} is named by 1 to 64 letters, digits, '.', '_' or '-', the first a letter or digit",
+            pattern=NAME_PATTERN,
+        )
+    return name
+
+
+def catalog_path(data_dir: Path) -> Path:
+    """The catalog file."""
+    return data_dir / "catalog.sqlite"
+
+
+def owners_folder(data_dir: Path) -> Path:
+    """The folder of the lock files that tell living processes from dead ones."""
+    return data_dir / "owners"
+
+
+def domain_folder(data_dir: Path, domain: str) -> Path:
+    """The folder of one domain; raises InvalidInputError."""
+    return data_dir / "domains" / checked_name(domain, "domain")
+
+
+def traverses_folder(data_dir: Path, domain: str) -> Path:
+    """The folder of a domain's traverses; raises InvalidInputError."""
+    return domain_folder(data_dir, domain) / "traverses"
+
+
+def traverse_path(data_dir: Path, domain: str, name: str) -> Path:
+    """The file of one traverse; raises InvalidInputError."""
+    return traverses_folder(data_dir, domain) / f"{checked_name(name, 'traverse')}.sqlite"
+
+
+def maps_folder(data_dir: Path, domain: str) -> Path:
+    """The folder of a domain's maps; raises InvalidInputError."""
+    return domain_folder(data_dir, domain) / "maps"
+
+
+def map_path(data_dir: Path, domain: str, version: int) -> Path:
+    """The sealed file of one map version; raises InvalidInputError."""
+    if not 1 <= version <= _MAX_VERSION:
+        raise InvalidInputError(f"map versions count from 1; {version} is none")
+    return maps_folder(data_dir, domain) / f"{version:06d}.sqlite"
+
+
+def building_path(data_dir: Path, domain: str, version: int) -> Path:
+    """The file a map version is built in before it is sealed; raises InvalidInputError."""
+    return map_path(data_dir, domain, version).with_suffix(".building")

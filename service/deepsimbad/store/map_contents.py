@@ -1,0 +1,101 @@
+"""What one map version holds, as arrays."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deepsimbad.errors import InvalidMapConfigError
+
+
+@dataclass(frozen=True)
+class MapContents:
+    """Everything a map version holds; read arrays are frozen.
+
+    Attributes:
+        domain: Its domain.
+        version: Its number within the domain.
+        created_at: ISO 8601, UTC.
+        config: The remap's configuration; `n_landmarks` must be in it.
+        evaluator: The evaluator's configuration.
+        closed: Whether the route is a loop.
+        actions_m: The moves, in metres.
+        landmark_model: The evaluator's named arrays.
+        lists: [h, n] uint16; row j holds every map image's landmark of rank j + 1.
+        position_m: Route position of every map image, [n] float64.
+        values: [h, n] float32, the listed dissimilarities (`simbad` alone).
+        encodings: [n, d] float32 (`brute_force` alone).
+        statistics: [2, r] float64, mean and std of the normal scores (`standardised` alone).
+        timestamp_us: [n] int64.
+        x_m: East, [n] float64.
+        y_m: North, [n] float64.
+        q_values: [n, a] float32, the experience database.
+        metrics: What was measured when it was built.
+    """
+
+    domain: str
+    version: int
+    created_at: str
+    config: dict[str, Any]
+    evaluator: dict[str, Any]
+    closed: bool
+    actions_m: tuple[float, ...]
+    landmark_model: Mapping[str, NDArray[Any]]
+    lists: NDArray[np.uint16]
+    position_m: NDArray[np.float64]
+    values: NDArray[np.float32] | None = None
+    encodings: NDArray[np.float32] | None = None
+    statistics: NDArray[np.float64] | None = None
+    timestamp_us: NDArray[np.int64] | None = None
+    x_m: NDArray[np.float64] | None = None
+    y_m: NDArray[np.float64] | None = None
+    q_values: NDArray[np.float32] | None = None
+    metrics: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def n_landmarks(self) -> int:
+        """r."""
+        return int(self.config["n_landmarks"])
+
+    @property
+    def list_length(self) -> int:
+        """h."""
+        return int(self.lists.shape[0])
+
+    @property
+    def n_map_images(self) -> int:
+        """n."""
+        return int(self.lists.shape[1])
+
+    def check(self) -> None:
+        """Check that the parts fit together; raises InvalidMapConfigError."""
+        if not isinstance(self.config.get("n_landmarks"), int):
+            raise InvalidMapConfigError("the map's config does not say n_landmarks")
+        if self.lists.ndim != 2 or self.lists.dtype != np.uint16 or 0 in self.lists.shape:
+            raise InvalidMapConfigError(f"lists are {self.lists.dtype} {self.lists.shape}, not uint16 [h, n]")
+        h, n, r = self.list_length, self.n_map_images, self.n_landmarks
+        if h > r or int(self.lists.max()) >= r:
+            raise InvalidMapConfigError(f"lists of {h} name landmarks that are not among the {r}")
+        for name, shape, dtype in (
+            ("position_m", (n,), np.float64),
+            ("values", (h, n), np.float32),
+            ("encodings", (n, None), np.float32),
+            ("statistics", (2, r), np.float64),
+            ("timestamp_us", (n,), np.int64),
+            ("x_m", (n,), np.float64),
+            ("y_m", (n,), np.float64),
+            ("q_values", (n, len(self.actions_m)), np.float32),
+        ):
+            array = getattr(self, name)
+            if array is not None and not _fits(array, shape, dtype):
+                raise InvalidMapConfigError(f"{name} is {array.dtype} {array.shape}, not {shape}")
+
+
+def _fits(array: NDArray[Any], shape: tuple[int | None, ...], dtype: type[np.generic]) -> bool:
+    return (
+        array.dtype == np.dtype(dtype)
+        and array.ndim == len(shape)
+        and all(want in (None, have) for have, want in zip(array.shape, shape, strict=True))
+    )

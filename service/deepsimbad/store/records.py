@@ -1,0 +1,82 @@
+"""What the catalog knows of a domain, a map version and a job."""
+
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any
+
+
+class MapState(StrEnum):
+    """The life of a map version (design: remapping)."""
+
+    BUILDING = "building"
+    SEALED = "sealed"
+    ACTIVE = "active"
+    RETIRED = "retired"
+
+
+class JobState(StrEnum):
+    """The life of a job."""
+
+    QUEUED = "queued"
+    RUNNING = "running"
+    SUCCEEDED = "succeeded"
+    FAILED = "failed"
+    CANCELLED = "cancelled"
+
+    @property
+    def is_final(self) -> bool:
+        """Whether nothing follows."""
+        return self in (JobState.SUCCEEDED, JobState.FAILED, JobState.CANCELLED)
+
+
+@dataclass(frozen=True)
+class DomainRecord:
+    """One domain.
+
+    Attributes:
+        name: Matches `layout.NAME_PATTERN`.
+        evaluator: The evaluator's configuration, as it was given.
+        closed: Whether the route is a loop.
+        actions_m: The moves a robot may be asked to make, in metres.
+        active_version: The map version that serves, if any.
+        created_at: ISO 8601, UTC.
+    """
+
+    name: str
+    evaluator: dict[str, Any]
+    closed: bool
+    actions_m: tuple[float, ...]
+    active_version: int | None
+    created_at: str
+
+
+@dataclass(frozen=True)
+class MapRecord:
+    """One map version of a domain; `sha256` and `file_bytes` are None while it is being built."""
+
+    version: int
+    state: MapState
+    created_at: str
+    sha256: str | None
+    file_bytes: int | None
+    config: dict[str, Any]
+    metrics: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class JobRecord:
+    """One job; times are ISO 8601 in UTC, `progress` runs from 0 to 1."""
+
+    job_id: str
+    domain: str
+    kind: str
+    config: dict[str, Any]
+    state: JobState
+    stage: str | None
+    progress: float
+    eta_s: float | None
+    result: dict[str, Any] | None
+    error: dict[str, Any] | None
+    created_at: str
+    started_at: str | None
+    finished_at: str | None

@@ -1,0 +1,70 @@
+"""Turning a built map into the file that serves, and checking later that it is still that file."""
+
+import sqlite3
+from pathlib import Path
+
+from deepsimbad.errors import ConflictError, DamagedMapError
+from deepsimbad.store.connection import open_database
+from deepsimbad.store.durable import remove_database, sha256_of, sync_file, sync_folder
+from deepsimbad.store.faults import storage_faults
+from deepsimbad.store.map_file import read_map
+from deepsimbad.store.unfinished import SEALING_SUFFIX
+
+
+def seal(building_path: Path, final_path: Path) -> tuple[str, int]:
+    """Seal a built map: check it, compact it, sync it, name it, make it read-only.
+
+    The final name appears in one rename, after everything under it is on the disk; a crash before leaves no such file.
+    The building file is gone afterwards.
+
+    Returns:
+        (SHA-256 in hex, bytes) of the sealed file.
+
+    Raises:
+        DamagedMapError: What was built cannot be read back.
+        ConflictError: A file of the final name is there.
+        UnavailableError: The disk is full, read-only, ...
+    """
+    sealing_path = final_path.with_suffix(SEALING_SUFFIX)
+    with storage_faults(final_path, DamagedMapError):
+        if final_path.exists():
+            raise ConflictError(f"{final_path.name} is sealed already; a sealed map never changes")
+        remove_database(sealing_path)
+        try:
+            with open_database(building_path) as db:
+                _check_integrity(db.conn, building_path)
+                db.conn.execute("VACUUM INTO ?", [str(sealing_path)])
+            read_map(sealing_path)
+            sealing_path.chmod(0o444)
+            sync_file(sealing_path)
+            digest, n_bytes = sha256_of(sealing_path), sealing_path.stat().st_size
+            sealing_path.rename(final_path)
+        except BaseException:
+            remove_database(sealing_path)
+            raise
+        sync_folder(final_path.parent)
+        remove_database(building_path)
+    return digest, n_bytes
+
+
+def verify(path: Path, sha256: str) -> None:
+    """Check a sealed file against the digest the catalog keeps.
+
+    Raises:
+        DamagedMapError: The file is missing or not the one that was sealed.
+        UnavailableError: The disk failed, ...
+    """
+    if not path.is_file():
+        raise DamagedMapError(f"{path.name} is missing", file=path.name)
+    with storage_faults(path, DamagedMapError):
+        digest = sha256_of(path)
+    if digest != sha256:
+        raise DamagedMapError(
+            f"{path.name} is not the file that was sealed: its SHA-256 differs", file=path.name, sha256=digest
+        )
+
+
+def _check_integrity(connection: sqlite3.Connection, path: Path) -> None:
+    (verdict,) = connection.execute("PRAGMA integrity_check(1)").fetchone()
+    if verdict != "ok":
+        raise DamagedMapError(f"{path.name} is damaged: {verdict}", file=path.name)

@@ -1,0 +1,63 @@
+"""What a crash leaves behind, and how it is cleared away. Every function stands inside a write transaction."""
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+from sqlite_utils import Database
+
+from deepsimbad.errors import JobInterruptedError
+from deepsimbad.store import domain_table, job_table, layout, map_table, ownership
+from deepsimbad.store.durable import remove_database
+from deepsimbad.store.records import JobState, MapState
+
+SEALING_SUFFIX = ".sealing"
+_MAP_FILE = re.compile(r"(\d{6,})\.(sqlite|building|sealing)(?:-journal|-wal|-shm)?")
+
+
+def fail_abandoned_jobs(db: Database, owners: Path) -> Iterator[str]:
+    """End the queued and running jobs of dead processes."""
+    for job_id, owner in job_table.unfinished(db):
+        if not ownership.is_alive(owners, owner):
+            error = {
+                "code": JobInterruptedError.code,
+                "message": "the process that ran the job ended before the job did: start it again",
+            }
+            job_table.update(db, job_id, {"state": JobState.FAILED, "error": error, "eta_s": None})
+            yield f"job {job_id} was interrupted"
+
+
+def discard_abandoned_maps(db: Database, data_dir: Path, owners: Path) -> Iterator[str]:
+    """Discard the maps that dead processes were building, files first."""
+    for domain, version, owner in map_table.building(db):
+        if not ownership.is_alive(owners, owner):
+            remove_map_files(data_dir, domain, version)
+            map_table.delete(db, domain, version)
+            yield f"discarded the unfinished map {version} of domain {domain}"
+    ownership.sweep(owners)
+
+
+def remove_orphans(db: Database, data_dir: Path) -> Iterator[str]:
+    """Remove the map files of known domains that no version owns; folders of unknown domains are left alone.
+
+    The write lock keeps new versions from appearing meanwhile. A lost catalog thus never empties the folders.
+    """
+    for domain in domain_table.all_domains(db):
+        folder = layout.maps_folder(data_dir, domain.name)
+        states = {record.version: record.state for record in map_table.of_domain(db, domain.name)}
+        for path in sorted(folder.iterdir()) if folder.is_dir() else []:
+            match = _MAP_FILE.fullmatch(path.name)
+            if match is None:
+                continue
+            state = states.get(int(match[1]))
+            owned = state is not None if match[2] == "sqlite" else state is MapState.BUILDING
+            if not owned:
+                path.unlink(missing_ok=True)
+                yield f"removed {path.name} of domain {domain.name}, which no map version owns"
+
+
+def remove_map_files(data_dir: Path, domain: str, version: int) -> None:
+    """Remove everything that building a version may have written."""
+    path = layout.map_path(data_dir, domain, version)
+    for file in (layout.building_path(data_dir, domain, version), path.with_suffix(SEALING_SUFFIX), path):
+        remove_database(file)
