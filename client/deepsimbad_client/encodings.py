@@ -1,5 +1,6 @@
 """Ready encodings: `.npy` or `.csv`, one row [d] for each frame, in travel order."""
 
+import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -60,10 +61,12 @@ def read_encodings(path: Path, spacing_m: float) -> EncodingRecording:
 
 def _read_npy(path: Path) -> NDArray[np.generic]:
     try:
-        raw = np.load(path, allow_pickle=False)
+        # Opened here, because numpy leaves a file open that turns out to be damaged.
+        with path.open("rb") as file:
+            raw = np.load(file, allow_pickle=False)
     except OSError as error:
         raise SourceError(f"cannot read {path}: {error.strerror or error}") from error
-    except (ValueError, EOFError) as error:
+    except (ValueError, EOFError, zipfile.BadZipFile) as error:
         raise SourceError(f"{path} is not a .npy of numbers: {error}") from error
     if not isinstance(raw, np.ndarray):
         raw.close()

@@ -10,6 +10,7 @@ import logging
 import os
 import re
 import tempfile
+import warnings
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -91,12 +92,13 @@ def load_undistortion(path: Path, cache_dir: Path | None = None) -> Undistortion
 def parse_undistortion(path: Path) -> UndistortionMap:
     """Parse the text of a table; see `load_undistortion`.
 
-    The pixels' own rows and columns say where they go, so their order does not matter. The header's wording is not
-    known for certain: where its digits do not name the size, a complete grid of pixels does.
+    The pixels' own rows and columns say where they go, so their order does not matter. They must form a complete
+    grid of the size the header names; the header's wording is not known for certain, so it is read leniently.
     """
     try:
-        with path.open(encoding="utf-8", errors="replace") as text:
+        with warnings.catch_warnings(), path.open(encoding="utf-8", errors="replace") as text:
             header = text.readline()
+            warnings.simplefilter("ignore", UserWarning)  # numpy's word for an empty file; we say it better
             pixels = np.loadtxt(text, dtype=np.float64, ndmin=2, comments=None)
     except OSError as error:
         raise SourceError(f"cannot read the undistortion table {path}: {error.strerror or error}") from error
@@ -105,11 +107,12 @@ def parse_undistortion(path: Path) -> UndistortionMap:
     if pixels.ndim != 2 or pixels.shape[1] != 4 or not np.isfinite(pixels).all() or pixels[:, :2].min() < 0:
         raise SourceError(f"{path}: an undistortion table has a header and lines of four numbers `row col v u`")
     row, column = pixels[:, 0].astype(np.int64), pixels[:, 1].astype(np.int64)
-    width, height = _header_size(header) or (int(column.max()) + 1, int(row.max()) + 1)
-    if row.max() >= height or column.max() >= width or len(np.unique(row * width + column)) != width * height:
+    width, height = int(column.max()) + 1, int(row.max()) + 1
+    complete = len(np.unique(row * width + column)) == width * height
+    if not complete or not _header_allows(header, width, height):
         raise SourceError(
-            f"{path}: {len(pixels)} pixels do not fill the {width} x {height} of the table; the file is cut short "
-            "or is another's"
+            f"{path}: {len(pixels)} pixels reaching {width} x {height} are not the whole of the table its header "
+            f"announces ({header.strip()!r}); the file is cut short or is something else"
         )
     u = np.empty((height, width), dtype=np.float32)
     v = np.empty((height, width), dtype=np.float32)
@@ -117,12 +120,15 @@ def parse_undistortion(path: Path) -> UndistortionMap:
     return UndistortionMap(u=u, v=v)
 
 
-def _header_size(header: str) -> tuple[int, int] | None:
+def _header_allows(header: str, width: int, height: int) -> bool:
+    """Whether a header can mean this size.
+
+    Keeping only digits and commas gives `width,height`; where a camera's number stands before them it runs into
+    the width, so the numbers as written count too. A header without two fields says nothing.
+    """
     fields = re.sub(r"[^0-9,]", "", header).split(",")
-    if len(fields) != 2 or not all(fields):
-        return None
-    width, height = int(fields[0]), int(fields[1])
-    return (width, height) if 0 < width < 1 << 15 and 0 < height < 1 << 15 else None
+    as_written = {int(number) for number in re.findall(r"\d+", header)}
+    return len(fields) != 2 or fields == [str(width), str(height)] or {width, height} <= as_written
 
 
 def _user_cache() -> Path:
@@ -142,7 +148,8 @@ def _fingerprint(path: Path) -> str:
 
 def _read_cached(cached: Path) -> UndistortionMap | None:
     try:
-        with np.load(cached, allow_pickle=False) as arrays:
+        # Opened here, because numpy leaves a file open that turns out not to be an archive.
+        with cached.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
             return UndistortionMap(u=arrays["u"], v=arrays["v"])
     except FileNotFoundError:
         return None

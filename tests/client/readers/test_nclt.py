@@ -1,0 +1,181 @@
+import cv2
+import numpy as np
+import pytest
+
+from deepsimbad_client.errors import BrokenFrameError, SourceError
+from deepsimbad_client.nclt import read_nclt
+from deepsimbad_client.recording import positions_m
+from deepsimbad_client.sources import open_source
+
+
+def decoded(encoded):
+    assert encoded.content_type == "image/jpeg"
+    return cv2.imdecode(np.frombuffer(encoded.body, np.uint8), cv2.IMREAD_COLOR)
+
+
+def fill(tree, seconds=4, rate_hz=5, **kwargs):
+    utimes = [tree.start_us + 1_000_000 * i // rate_hz + 37 for i in range(seconds * rate_hz)]
+    for utime in utimes:
+        tree.image_file(utime, **kwargs)
+    tree.truth(tree.walk_north(seconds))
+    return utimes
+
+
+@pytest.mark.parametrize("above", ["", "images"])
+@pytest.mark.parametrize(
+    "truth_place",
+    [
+        "ground_truth/groundtruth_2012-01-22.csv",
+        "2012-01-22/groundtruth_2012-01-22.csv",
+        "2012-01-22/groundtruth.csv",
+        "ground_truth/2012-01-22.csv",
+    ],
+)
+def test_every_layout_is_found(nclt_tree, above, truth_place):
+    nclt_tree.image_file(nclt_tree.start_us + 500_000, above=above)
+    nclt_tree.truth(nclt_tree.walk_north(1), truth_place)
+    recording = open_source(nclt_tree.source)
+    assert recording.name == "2012-01-22"
+    assert [frame.name for frame in recording.frames] == [f"{nclt_tree.start_us + 500_000}.tiff"]
+    assert recording.left_out == {}
+    assert recording.encodings is None
+
+
+def test_frames_lie_where_the_ground_truth_was_when_they_were_taken(nclt_tree):
+    utimes = fill(nclt_tree)
+    frames = open_source(nclt_tree.source).frames
+    assert [frame.index for frame in frames] == list(range(20))
+    assert [frame.timestamp_us for frame in frames] == utimes
+    for frame, utime in zip(frames, utimes, strict=True):
+        since_start = (utime - nclt_tree.start_us) / 1e6
+        assert frame.x_m == pytest.approx(since_start, abs=1e-6)
+        assert frame.position_m == pytest.approx(since_start, abs=1e-6)
+        assert (frame.y_m, frame.heading_rad) == pytest.approx((3.0, 0.0), abs=1e-9)
+
+
+def test_frames_are_upright_resized_and_jpeg(nclt_tree):
+    fill(nclt_tree, seconds=1)
+    recording = open_source(nclt_tree.source)
+    for input_size, shape in ((None, (64, 48)), ((48, 64), (64, 48)), ((200, 200), (64, 48)), ((20, 20), (20, 20))):
+        image = decoded(recording.image(recording.frames[0], input_size))
+        height, width = image.shape[:2]
+        assert (height, width) == shape
+        top, lower = image[height // 4], image[3 * height // 4]
+        assert top[:, 0].min() > 200, "blue above"
+        assert lower[: width // 3, 1].min() > 200, "green at the lower left"
+        assert lower[-(width // 3) :, 2].min() > 200, "red at the lower right"
+
+
+def test_what_has_no_ground_truth_or_no_file_is_left_out_and_counted(nclt_tree):
+    utimes = fill(nclt_tree)
+    rows = nclt_tree.walk_north(4)
+    nclt_tree.truth(rows[100:150] + rows[300:350])  # 1.00..1.49 s and 3.00..3.49 s: 1.51 s between
+    for utime in [*utimes[:10], nclt_tree.start_us + 1, nclt_tree.start_us + 2]:
+        nclt_tree.image_file(utime, b"", camera=1)
+    (nclt_tree.root / "2012-01-22/lb3/Cam5/thumb.tiff").write_bytes(b"")
+    (nclt_tree.root / "2012-01-22/lb3/Cam5/README.txt").write_bytes(b"")
+    recording = open_source(nclt_tree.source)
+    kept = [round((frame.timestamp_us - nclt_tree.start_us) / 1e6, 1) for frame in recording.frames]
+    assert kept == [1.0, 1.2, 1.4, 3.0, 3.2, 3.4]
+    assert recording.left_out == {
+        "before or after the ground truth": 5 + 2,
+        "gap in the ground truth": 7,
+        "missing in Cam5": 2,
+        "file name is not a time": 1,
+    }
+    assert len(read_nclt(nclt_tree.root, nclt_tree.date, max_gap_s=2).frames) == 13
+
+
+def test_a_broken_frame_is_named_when_it_is_read_and_the_others_go_on(nclt_tree):
+    utimes = fill(nclt_tree)
+    whole = nclt_tree.tiff(nclt_tree.picture())
+    nclt_tree.image_file(utimes[3], whole[: len(whole) // 2])
+    nclt_tree.image_file(utimes[4], b"not an image at all")
+    nclt_tree.image_file(utimes[5], nclt_tree.tiff(nclt_tree.picture(32, 24)))
+    nclt_tree.image_file(utimes[6], b"")
+    nclt_tree.image_file(utimes[7], cv2.imencode(".tiff", np.zeros((48, 64), np.uint16))[1].tobytes())
+    recording = open_source(nclt_tree.source)
+    (nclt_tree.root / f"2012-01-22/lb3/Cam5/{utimes[8]}.tiff").unlink()
+    assert len(recording.frames) == 20
+    reasons = {}
+    for frame in recording.frames:
+        try:
+            recording.image(frame, (32, 32))
+        except BrokenFrameError as error:
+            reasons[frame.index] = (error.reason, frame.name in str(error))
+    assert reasons == {
+        3: ("undecodable", True),
+        4: ("undecodable", True),
+        5: ("wrong size", True),
+        6: ("empty file", True),
+        8: ("unreadable file", True),
+    }
+
+
+def test_one_frame_of_another_size_does_not_set_the_measure_even_where_it_is_the_first(nclt_tree):
+    utimes = fill(nclt_tree)
+    nclt_tree.image_file(utimes[0], nclt_tree.tiff(nclt_tree.picture(32, 24)))
+    recording = open_source(nclt_tree.source)
+    with pytest.raises(BrokenFrameError, match="32 x 24, the recording's images are 64 x 48"):
+        recording.image(recording.frames[0], None)
+    recording.image(recording.frames[1], None)
+
+
+def test_any_camera(nclt_tree):
+    fill(nclt_tree, seconds=1, camera=2)
+    assert len(open_source(nclt_tree.source, camera=2).frames) == 5
+    with pytest.raises(SourceError, match=r"lb3/Cam5, .*images/2012-01-22/lb3/Cam5"):
+        open_source(nclt_tree.source)
+    with pytest.raises(SourceError, match="cameras 0 to 5"):
+        open_source(nclt_tree.source, camera=6)
+
+
+def test_errors_say_what_is_missing(nclt_tree):
+    nclt_tree.image_file(5)
+    with pytest.raises(SourceError, match=r"no ground truth .*groundtruth_2012-01-22\.csv.*groundtruth\.csv"):
+        open_source(nclt_tree.source)
+    nclt_tree.truth(nclt_tree.walk_north(1))
+    with pytest.raises(SourceError, match=r"none of the 1 images .* are they of one date"):
+        open_source(nclt_tree.source)
+    (nclt_tree.root / "2012-01-22/lb3/Cam5/5.tiff").unlink()
+    with pytest.raises(SourceError, match=r"no image named <utime>\.tiff"):
+        open_source(nclt_tree.source)
+    with pytest.raises(SourceError, match="nclt:ROOT/DATE"):
+        open_source("nclt:")
+
+
+def test_a_standing_robot_stays_where_it_is(nclt_tree):
+    rng = np.random.default_rng(0)
+    x = np.concatenate((np.arange(0, 5, 0.01), np.full(3000, 5.0), np.arange(5, 10, 0.01)))
+    x, y = x + rng.normal(0, 0.02, len(x)), rng.normal(0, 0.02, len(x))
+    nclt_tree.truth(nclt_tree.row(nclt_tree.start_us + 10_000 * i, x[i], y[i]) for i in range(len(x)))
+    for i in range(199):
+        nclt_tree.image_file(nclt_tree.start_us + 200_000 * i)
+    position = positions_m(open_source(nclt_tree.source))
+    assert position[25 + 145] - position[30] < 0.05, "30 s of standing"
+    assert position[-1] == pytest.approx(10, abs=0.6)
+    assert np.all(np.diff(position) >= 0)
+
+
+def test_undistortion_happens_as_stored_before_the_turn(nclt_tree, tmp_path):
+    fill(nclt_tree, seconds=1)
+    table = tmp_path / "U2D_Cam5_64X48.txt"
+    # Every undistorted pixel looks 8 columns to the right in the stored image.
+    lines = [f"{row} {column} {row:.4f} {column + 8:.4f}" for row in range(48) for column in range(64)]
+    table.write_text("\n".join(["Size: 64,48", *lines]))
+    recording = read_nclt(nclt_tree.root, nclt_tree.date, undistortion=tmp_path, cache_dir=tmp_path / "cache")
+    upright = recording.upright(recording.frames[0])
+    assert upright.shape == (64, 48, 3)
+    # Stored columns run down the upright image, so it has moved up by 8 and its end is what was not seen.
+    assert upright[-8:].max() == 0
+    assert upright[20, 24, 0] > 200
+    assert upright[26, 5, 1] > 200
+
+
+def test_an_undistortion_table_of_another_size_stops_the_reading(nclt_tree, tmp_path):
+    fill(nclt_tree, seconds=1)
+    table = tmp_path / "t.txt"
+    table.write_text("2,2\n0 0 0 0\n0 1 0 1\n1 0 1 0\n1 1 1 1\n")
+    recording = read_nclt(nclt_tree.root, nclt_tree.date, undistortion=table, cache_dir=tmp_path / "cache")
+    with pytest.raises(SourceError, match="2 x 2"):
+        recording.image(recording.frames[0], None)
