@@ -138,9 +138,9 @@ class Admin:
         """
         return self._transport.send(admin_calls.remap(domain, config))
 
-    def jobs(self) -> tuple[Job, ...]:
-        """Every job."""
-        return self._transport.send(admin_calls.jobs())
+    def jobs(self, domain: str | None = None) -> tuple[Job, ...]:
+        """Jobs, newest first, of one domain or all."""
+        return self._transport.send(admin_calls.jobs(domain))
 
     def job(self, job_id: str) -> Job:
         """One job."""
@@ -168,7 +168,7 @@ class Admin:
         """A domain's history of maps."""
         return self._transport.send(admin_calls.maps(domain))
 
-    def activate(self, domain: str, version: int, *, expected: int | None = None) -> None:
+    def activate(self, domain: str, version: int, *, expected: int | None = None) -> MapVersion:
         """Serve another version (or roll back to an older one).
 
         Args:
@@ -179,4 +179,4 @@ class Admin:
         Raises:
             LostActivationError: Another version than the expected one was active.
         """
-        self._transport.send(admin_calls.activate(domain, version, expected))
+        return self._transport.send(admin_calls.activate(domain, version, expected))

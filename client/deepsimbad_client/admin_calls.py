@@ -135,9 +135,9 @@ def remap(domain: str, config: Mapping[str, Any]) -> Call[Job]:
     )
 
 
-def jobs() -> Call[tuple[Job, ...]]:
-    """Every job."""
-    return Call("GET", JOBS, models(Job, "jobs"))
+def jobs(domain: str | None) -> Call[tuple[Job, ...]]:
+    """Jobs, newest first, of one domain or all."""
+    return Call("GET", JOBS, models(Job, "jobs"), params=query(domain=domain))
 
 
 def job(job_id: str) -> Call[Job]:
@@ -160,7 +160,7 @@ def maps(domain: str) -> Call[tuple[MapVersion, ...]]:
     return Call("GET", f"{_domain(domain)}/maps", models(MapVersion, "maps"))
 
 
-def activate(domain: str, version: int, expected: int | None) -> Call[None]:
+def activate(domain: str, version: int, expected: int | None) -> Call[MapVersion]:
     """Serve another version, if the active one is still the `expected` one.
 
     Sent again only when surely unseen: after a lost answer a repetition would report its own success as a lost race.
@@ -171,7 +171,7 @@ def activate(domain: str, version: int, expected: int | None) -> Call[None]:
     return Call(
         "PUT",
         f"{_domain(domain)}/active-map",
-        nothing,
+        model(MapVersion),
         headers=JSON,
         body=document,
         repeat=Repeat.IF_UNTOUCHED if expected is not None else Repeat.ALWAYS,

@@ -109,9 +109,9 @@ class AsyncAdmin:
         """Submit a remap and return its job at once."""
         return await self._transport.send(admin_calls.remap(domain, config))
 
-    async def jobs(self) -> tuple[Job, ...]:
-        """Every job."""
-        return await self._transport.send(admin_calls.jobs())
+    async def jobs(self, domain: str | None = None) -> tuple[Job, ...]:
+        """Jobs, newest first, of one domain or all."""
+        return await self._transport.send(admin_calls.jobs(domain))
 
     async def job(self, job_id: str) -> Job:
         """One job."""
@@ -135,6 +135,6 @@ class AsyncAdmin:
         """A domain's history of maps."""
         return await self._transport.send(admin_calls.maps(domain))
 
-    async def activate(self, domain: str, version: int, *, expected: int | None = None) -> None:
+    async def activate(self, domain: str, version: int, *, expected: int | None = None) -> MapVersion:
         """Serve another version (or roll back to an older one)."""
-        await self._transport.send(admin_calls.activate(domain, version, expected))
+        return await self._transport.send(admin_calls.activate(domain, version, expected))

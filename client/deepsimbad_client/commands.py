@@ -1,0 +1,77 @@
+"""The commands of `deepsimbad-client`.
+
+Exit codes: 0 done, 1 a named error (one line on standard error), 2 wrong usage, 130 cancelled. Results go to standard
+output, progress and remarks to standard error.
+"""
+
+import os
+import sys
+from collections.abc import Sequence
+from importlib import import_module
+
+import click
+
+from deepsimbad_client.errors import DeepSimbadClientError
+from deepsimbad_client.job_commands import jobs, remap
+from deepsimbad_client.place_commands import domains, localize
+from deepsimbad_client.replay_command import replay
+from deepsimbad_client.upload_command import upload
+
+DONE, FAILED, CANCELLED = 0, 1, 130
+ELSEWHERE = {"campus": "deepsimbad_client.campus.command:campus_command"}
+"""Commands that are imported when they are asked for."""
+
+
+class LazyGroup(click.Group):
+    """A group that imports some of its commands late."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """Names of all commands."""
+        return sorted([*super().list_commands(ctx), *ELSEWHERE])
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """One command; None where this installation does not have it."""
+        if cmd_name not in ELSEWHERE:
+            return super().get_command(ctx, cmd_name)
+        module, _, attribute = ELSEWHERE[cmd_name].partition(":")
+        try:
+            command = getattr(import_module(module), attribute)
+        except (ModuleNotFoundError, AttributeError):
+            return None
+        return command if isinstance(command, click.Command) else None
+
+
+@click.group(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
+@click.version_option(package_name="deep-simbad", message="%(version)s")
+def cli() -> None:
+    """Send recordings to a Deep SIMBAD service, map them, and see how well it localizes.
+
+    SOURCE is nclt:ROOT/DATE, a folder of images in name order (with an optional positions.csv), or a .npy or .csv of
+    ready encodings; it may end in #START:STOP[:STEP], Python's slice of its frames.
+    """
+
+
+for command in (upload, remap, replay, localize, domains, jobs):
+    cli.add_command(command)
+
+
+def run(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line; returns its exit code."""
+    try:
+        code = cli.main(
+            None if arguments is None else list(arguments), prog_name="deepsimbad-client", standalone_mode=False
+        )
+    except DeepSimbadClientError as error:
+        one_line = " ".join(str(error).split())
+        sys.stderr.write(f"deepsimbad-client: {error.code}: {one_line}\n")
+        return FAILED
+    except click.ClickException as error:
+        error.show()
+        return error.exit_code
+    except (click.Abort, KeyboardInterrupt):
+        sys.stderr.write("deepsimbad-client: cancelled\n")
+        return CANCELLED
+    except BrokenPipeError:  # whoever read our output has read enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return FAILED
+    return code if isinstance(code, int) else DONE

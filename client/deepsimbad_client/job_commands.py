@@ -1,0 +1,138 @@
+"""`deepsimbad-client remap` and `jobs`."""
+
+import sys
+
+import click
+from rich.console import Console
+
+from deepsimbad_client.client import Client
+from deepsimbad_client.console import REMARKS, JobBar, as_json, job_table
+from deepsimbad_client.follow import follow_job
+from deepsimbad_client.models import Job
+from deepsimbad_client.options import domain_option, json_flag, serving
+
+
+@click.command()
+@domain_option
+@click.option("--training", "--training-traverse", required=True, metavar="TRAVERSE", help="Becomes the map.")
+@click.option(
+    "--landmarks",
+    "--landmark-traverse",
+    metavar="TRAVERSE",
+    help="Where landmarks are chosen; absent: the active map's landmarks stay.",
+)
+@click.option("--n-landmarks", type=click.IntRange(min=1), help="r; absent: the service's default.")
+@click.option("--list-length", type=click.IntRange(min=1), help="h, landmarks a map image keeps.")
+@click.option("--relevance", metavar="NAME", help="standardised, rrf, bag_of_landmarks, simbad or brute_force.")
+@click.option("--training-episodes", type=click.IntRange(min=0), help="Length of the planner's training.")
+@click.option("--seed", type=int)
+@click.option("--activate/--no-activate", default=True, show_default=True, help="Serve the new map at once.")
+@click.option("--wait/--no-wait", default=True, show_default=True, help="Follow the job to its end.")
+@json_flag
+@serving
+def remap(
+    domain: str,
+    training: str,
+    landmarks: str | None,
+    n_landmarks: int | None,
+    list_length: int | None,
+    relevance: str | None,
+    training_episodes: int | None,
+    seed: int | None,
+    activate: bool,
+    wait: bool,
+    json_output: bool,
+    server: str,
+    api_key: str | None,
+) -> None:
+    """Make a new map from uploaded traverses.
+
+    Follows the job to its end.
+
+    Ctrl-C asks whether the job should be cancelled too.
+    """
+    config = {
+        "landmark_traverse": landmarks,
+        "n_landmarks": n_landmarks,
+        "list_length": list_length,
+        "relevance": relevance,
+        "training_episodes": training_episodes,
+        "seed": seed,
+        "activate": activate,
+    }
+    given = {key: value for key, value in config.items() if value is not None}
+    with Client(server, api_key) as client:
+        job = client.admin.remap(domain, training_traverse=training, **given)
+        if wait:
+            job = _follow(client, job)
+    _show_job(job, json_output)
+
+
+@click.command()
+@click.argument("job_id", required=False)
+@click.option("--domain", metavar="NAME", help="Only this domain's.")
+@click.option("--follow", is_flag=True, help="Follow JOB_ID to its end.")
+@click.option("--cancel", is_flag=True, help="Cancel JOB_ID.")
+@json_flag
+@serving
+def jobs(
+    job_id: str | None,
+    domain: str | None,
+    follow: bool,
+    cancel: bool,
+    json_output: bool,
+    server: str,
+    api_key: str | None,
+) -> None:
+    """List jobs, or show, follow or cancel one."""
+    if job_id is None and (follow or cancel):
+        raise click.UsageError("--follow and --cancel need a JOB_ID")
+    with Client(server, api_key) as client:
+        if job_id is None:
+            found = client.admin.jobs(domain)
+            if json_output:
+                click.echo(as_json([job.model_dump(mode="json") for job in found]))
+            else:
+                Console().print(job_table(found))
+            return
+        if cancel:
+            client.admin.cancel_job(job_id)
+        job = client.admin.job(job_id)
+        if follow and not job.ended:
+            job = _follow(client, job)
+    _show_job(job, json_output)
+
+
+def _follow(client: Client, job: Job) -> Job:
+    """Follow a job with a bar; Ctrl-C asks whether it should end too."""
+    try:
+        with JobBar(f"job {job.job_id} on {job.domain}") as bar:
+            bar(job)
+            return follow_job(client, job.job_id, bar)
+    except KeyboardInterrupt:
+        if _answer(f"Cancel job {job.job_id} on the server too?"):
+            client.admin.cancel_job(job.job_id)
+            REMARKS.print(f"job {job.job_id} is being cancelled")
+        else:
+            REMARKS.print(
+                f"job {job.job_id} goes on; see it with: deepsimbad-client jobs {job.job_id} --follow",
+                soft_wrap=True,
+            )
+        raise
+
+
+def _answer(question: str) -> bool:
+    """Ask on a terminal; where there is none, or on a second Ctrl-C, the answer is no."""
+    if not sys.stdin.isatty():
+        return False
+    try:
+        return click.confirm(question, default=False, err=True)
+    except click.Abort:
+        return False
+
+
+def _show_job(job: Job, json_output: bool) -> None:
+    if json_output:
+        click.echo(as_json(job.model_dump(mode="json")))
+    else:
+        Console().print(job_table([job]))
