@@ -1,0 +1,157 @@
+"""The application: its parts, in the order in which they start and stop."""
+
+import logging
+import re
+from collections.abc import AsyncIterator, Callable
+from contextlib import AbstractAsyncContextManager, ExitStack, asynccontextmanager
+from importlib.metadata import PackageNotFoundError, version
+
+from anyio.to_thread import run_sync
+from fastapi import FastAPI
+from starlette.types import Scope
+
+from deepsimbad.api.dependencies import Services
+from deepsimbad.api.envelope import EnvelopeMiddleware
+from deepsimbad.api.limits import BodyLimitMiddleware
+from deepsimbad.api.metrics import Metrics
+from deepsimbad.api.openapi import install_openapi
+from deepsimbad.api.problems import install_problem_handlers
+from deepsimbad.api.routes import (
+    admin_domains,
+    admin_frames,
+    admin_jobs,
+    admin_maps,
+    admin_remaps,
+    admin_traverses,
+    domains,
+    health,
+    localizations,
+)
+from deepsimbad.engine.active_maps import ActiveMaps
+from deepsimbad.engine.evaluator_pool import EvaluatorPool
+from deepsimbad.engine.open_traverses import OpenTraverses
+from deepsimbad.engine.warm_up import warm_up
+from deepsimbad.engine.worker import InferenceWorker
+from deepsimbad.errors import DeepSimbadError
+from deepsimbad.evaluators.registry import EvaluatorKind
+from deepsimbad.jobs.runner import JobRunner
+from deepsimbad.settings import Settings
+from deepsimbad.store.catalog import Catalog
+
+log = logging.getLogger(__name__)
+
+_ROUTERS = (
+    health,
+    domains,
+    localizations,
+    admin_domains,
+    admin_traverses,
+    admin_frames,
+    admin_remaps,
+    admin_jobs,
+    admin_maps,
+)
+_BATCH_PATH = re.compile(r"/v1/admin/domains/[^/]+/traverses/[^/]+/frames")
+_DESCRIPTION = (
+    "Where on a prelearned route a robot is, from what it sees; every error is an RFC 9457 problem document. "
+    "Ids count from 0, ranks from 1, units stand in the names."
+)
+
+
+def create_app(settings: Settings) -> FastAPI:
+    """The service as an ASGI application; its files are opened when it starts.
+
+    Args:
+        settings: All it is told; it reads no environment.
+    """
+    metrics = Metrics()
+    app = FastAPI(
+        title="Deep SIMBAD",
+        version=_version(),
+        description=_DESCRIPTION,
+        lifespan=_lifespan(settings, metrics),
+        redirect_slashes=False,
+        redoc_url=None,
+    )
+    for module in _ROUTERS:
+        app.include_router(module.router)
+    install_problem_handlers(app)
+    install_openapi(app)
+    app.add_middleware(BodyLimitMiddleware, limit_of=_body_limits(settings))
+    app.add_middleware(EnvelopeMiddleware, metrics=metrics)
+    return app
+
+
+def _lifespan(settings: Settings, metrics: Metrics) -> Callable[[FastAPI], AbstractAsyncContextManager[None]]:
+    @asynccontextmanager
+    async def run(app: FastAPI) -> AsyncIterator[None]:
+        with ExitStack() as parts:
+            services = await run_sync(_start, settings, metrics, parts)
+            app.state.services = services
+            yield
+            services.stopping.set()
+            # Jobs and the worker are waited for, which must not hold up the loop that their answers go through.
+            await run_sync(parts.close)
+
+    return run
+
+
+def _start(settings: Settings, metrics: Metrics, parts: ExitStack) -> Services:
+    """Open everything; `parts` closes it again, last opened first."""
+    catalog = parts.enter_context(Catalog.open(settings.data_dir))
+    for line in catalog.discard_unfinished():
+        log.warning("discarded at start", extra={"what": line})
+    evaluators = EvaluatorPool()
+    evaluators.evaluator({"kind": EvaluatorKind.FEATURE_L2.value})
+    for record in catalog.domains():
+        evaluators.evaluator(record.evaluator)
+    active_maps = ActiveMaps(catalog)
+    damaged = active_maps.load_all()
+    worker = InferenceWorker()
+    parts.callback(worker.close)
+    worker.submit(warm_up).result()
+    open_traverses = OpenTraverses(settings.data_dir)
+    parts.callback(open_traverses.close)
+
+    def switched(domain: str) -> None:
+        try:
+            active_maps.refresh(domain)
+        except DeepSimbadError:
+            log.exception("a new map cannot be served", extra={"domain": domain})
+
+    runner = JobRunner(catalog, lambda domain: evaluators.evaluator(catalog.domain(domain).evaluator), switched)
+    parts.callback(runner.close)
+    metrics.watch(lambda: worker.n_waiting, lambda: active_maps.n_loaded)
+    log.info(
+        "ready", extra={"n_domains": len(catalog.domains()), "n_maps": active_maps.n_loaded, "damaged": list(damaged)}
+    )
+    return Services(
+        settings=settings,
+        metrics=metrics,
+        catalog=catalog,
+        active_maps=active_maps,
+        evaluators=evaluators,
+        open_traverses=open_traverses,
+        worker=worker,
+        runner=runner,
+        damaged_at_start=tuple(sorted(damaged)),
+    )
+
+
+def _body_limits(settings: Settings) -> Callable[[Scope], int]:
+    """The most bytes a request may carry: a batch, an image, or JSON."""
+
+    def limit(scope: Scope) -> int:
+        if scope["method"] == "POST" and _BATCH_PATH.fullmatch(scope["path"]):
+            return settings.max_batch_bytes
+        content_type = next((value for name, value in scope["headers"] if name == b"content-type"), b"")
+        return settings.max_image_bytes if content_type.lower().startswith(b"image/") else settings.max_json_bytes
+
+    return limit
+
+
+def _version() -> str:
+    try:
+        return version("deep-simbad")
+    except PackageNotFoundError:  # run from a source tree
+        return "0"

@@ -1,0 +1,87 @@
+"""What routes are given: the parts of the running service, and parameters with their limits."""
+
+import asyncio
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future
+from dataclasses import dataclass, field
+from typing import Annotated, TypeVar, cast
+
+from anyio import CapacityLimiter
+from anyio.to_thread import run_sync
+from fastapi import Depends, Path, Request
+
+from deepsimbad.api.bodies import NAME_PATTERN
+from deepsimbad.api.metrics import Metrics
+from deepsimbad.engine.active_maps import ActiveDomain, ActiveMaps
+from deepsimbad.engine.evaluator_pool import EvaluatorPool
+from deepsimbad.engine.open_traverses import OpenTraverses
+from deepsimbad.engine.worker import InferenceWorker, Priority
+from deepsimbad.evaluators.base import Image
+from deepsimbad.evaluators.image import decode_image
+from deepsimbad.jobs.runner import JobRunner
+from deepsimbad.settings import Settings
+from deepsimbad.store.catalog import Catalog
+
+T = TypeVar("T")
+
+DECODERS = 4  # images decoded at once: each may need max_pixels times 3 bytes
+BATCHES = 1  # batches read into memory at once
+
+
+@dataclass(frozen=True)
+class Services:
+    """The running service.
+
+    Attributes:
+        settings: As it was started.
+        metrics: Counters.
+        catalog: What is true of the data directory.
+        active_maps: Maps in memory.
+        evaluators: Evaluators in memory.
+        open_traverses: Files kept open while frames arrive.
+        worker: Where encoding and scoring run.
+        runner: Where jobs run.
+        damaged_at_start: Domains whose active map could not be loaded at start.
+        stopping: Set when shutdown begins; streams end on it.
+        decoders: Bounds the images being decoded.
+        batches: Bounds the batches being read.
+    """
+
+    settings: Settings
+    metrics: Metrics
+    catalog: Catalog
+    active_maps: ActiveMaps
+    evaluators: EvaluatorPool
+    open_traverses: OpenTraverses
+    worker: InferenceWorker
+    runner: JobRunner
+    damaged_at_start: tuple[str, ...] = ()
+    stopping: threading.Event = field(default_factory=threading.Event)
+    decoders: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(DECODERS))
+    batches: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(BATCHES))
+
+    async def active(self, domain: str) -> ActiveDomain:
+        """A domain and its active map; files are read in a thread."""
+        known = self.active_maps.peek(domain)
+        return known if known is not None else await run_sync(self.active_maps.active, domain)
+
+    async def decode(self, body: bytes) -> Image:
+        """Decode an image in a thread."""
+        return await run_sync(decode_image, body, self.settings.max_pixels, limiter=self.decoders)
+
+    async def infer(self, run: Callable[[], T], priority: Priority = Priority.LIVE) -> T:
+        """Run on the inference worker."""
+        answer: Future[T] = self.worker.submit(run, priority)
+        return await asyncio.wrap_future(answer)
+
+
+async def services_of(request: Request) -> Services:
+    """The running service, for routes. A coroutine, because a plain function would be sent to a thread."""
+    return cast("Services", request.app.state.services)
+
+
+Running = Annotated[Services, Depends(services_of)]
+DomainName = Annotated[str, Path(alias="domain", pattern=NAME_PATTERN, description="A domain's name.")]
+TraverseName = Annotated[str, Path(alias="name", pattern=NAME_PATTERN, description="A traverse's name.")]
+JobId = Annotated[str, Path(pattern=NAME_PATTERN, description="A job's id.")]

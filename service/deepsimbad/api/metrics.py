@@ -1,0 +1,84 @@
+"""What Prometheus scrapes: one registry per application, so that two in one process do not mix."""
+
+from collections.abc import Callable, Mapping
+
+from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
+from prometheus_client.exposition import CONTENT_TYPE_LATEST
+
+_LATENCY_BUCKETS_S = (0.001, 0.002, 0.004, 0.008, 0.016, 0.032, 0.064, 0.125, 0.25, 0.5, 1, 2, 4, 8, 30)
+
+
+class Metrics:
+    """The service's counters, all named `deepsimbad_...`.
+
+    Attributes:
+        content_type: Of `render()`.
+    """
+
+    content_type = CONTENT_TYPE_LATEST
+
+    def __init__(self) -> None:
+        self._registry = CollectorRegistry()
+        self._requests = Counter(
+            "deepsimbad_requests",
+            "Requests answered.",
+            ["method", "route", "status"],
+            registry=self._registry,
+        )
+        self._request_seconds = Histogram(
+            "deepsimbad_request_seconds",
+            "Time from a request's head to the end of its answer.",
+            ["route"],
+            buckets=_LATENCY_BUCKETS_S,
+            registry=self._registry,
+        )
+        self._stage_seconds = Histogram(
+            "deepsimbad_localization_stage_seconds",
+            "Time of the stages of one localization.",
+            ["stage"],
+            buckets=_LATENCY_BUCKETS_S,
+            registry=self._registry,
+        )
+        self._entropy_bits = Histogram(
+            "deepsimbad_belief_entropy_bits",
+            "Entropy of the belief after one view: high when the map no longer tells places apart.",
+            ["domain"],
+            buckets=tuple(range(0, 25, 2)),
+            registry=self._registry,
+        )
+        self._in_flight = Gauge(
+            "deepsimbad_requests_in_flight", "Requests being answered now.", registry=self._registry
+        )
+        self._queue = Gauge(
+            "deepsimbad_inference_queue", "Work waiting for the inference worker.", registry=self._registry
+        )
+        self._active_maps = Gauge("deepsimbad_loaded_maps", "Active maps held in memory.", registry=self._registry)
+
+    def watch(self, queue_length: Callable[[], int], n_active_maps: Callable[[], int]) -> None:
+        """Read these whenever the metrics are scraped."""
+        self._queue.set_function(lambda: float(queue_length()))
+        self._active_maps.set_function(lambda: float(n_active_maps()))
+
+    def request_began(self) -> None:
+        """Count a request as being answered."""
+        self._in_flight.inc()
+
+    def request_ended(self, method: str, route: str, status: int, seconds: float) -> None:
+        """Count a request as answered."""
+        self._in_flight.dec()
+        self._requests.labels(method, route, str(status)).inc()
+        self._request_seconds.labels(route).observe(seconds)
+
+    def localized(self, domain: str, timings_ms: Mapping[str, float], entropy_bits: float) -> None:
+        """Record one localization."""
+        for stage, milliseconds in timings_ms.items():
+            self._stage_seconds.labels(stage).observe(milliseconds / 1000)
+        self._entropy_bits.labels(domain).observe(entropy_bits)
+
+    def forget_domain(self, domain: str) -> None:
+        """Drop what is kept by a domain's name, so that deleted domains do not pile up."""
+        self._entropy_bits.remove_by_labels({"domain": domain})
+
+    def render(self) -> bytes:
+        """The text exposition."""
+        return generate_latest(self._registry)

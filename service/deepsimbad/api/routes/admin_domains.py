@@ -1,0 +1,49 @@
+"""Making and removing domains."""
+
+import logging
+
+from anyio.to_thread import run_sync
+from fastapi import APIRouter, Request, Response
+
+from deepsimbad.api.bodies import DomainBody, declare_json, read_json
+from deepsimbad.api.dependencies import DomainName, Running
+from deepsimbad.api.domain_answers import describe_domain
+from deepsimbad.api.openapi import problems
+from deepsimbad.api.schemas import DomainAnswer
+from deepsimbad.evaluators.registry import evaluator_config
+
+router = APIRouter(prefix="/v1/admin/domains", tags=["admin: domains"])
+log = logging.getLogger(__name__)
+
+
+@router.put(
+    "/{domain}",
+    status_code=201,
+    responses={200: {"model": DomainAnswer, "description": "It was there already"}, **problems(409, 413, 415, 422)},
+    openapi_extra=declare_json(DomainBody),
+)
+async def put_domain(domain: DomainName, request: Request, response: Response, running: Running) -> DomainAnswer:
+    """Make a domain; the same again changes nothing, a different one is a 409."""
+    body = await read_json(request, DomainBody)
+    evaluator = evaluator_config(body.evaluator)
+
+    def make() -> tuple[DomainAnswer, bool]:
+        running.evaluators.evaluator(evaluator.as_dict())  # one that cannot be loaded should not be stored
+        record, created = running.catalog.create_domain(domain, dict(evaluator.as_dict()), body.closed, body.actions_m)
+        return describe_domain(running, record), created
+
+    answer, created = await run_sync(make)
+    response.status_code = 201 if created else 200
+    if created:
+        log.info("domain made", extra={"domain": domain})
+    return answer
+
+
+@router.delete("/{domain}", status_code=204, responses=problems(404, 409, 422))
+async def delete_domain(domain: DomainName, running: Running) -> None:
+    """Remove a domain with its traverses and maps; a job that still works on it is a 409."""
+    await run_sync(running.open_traverses.forget, domain)
+    await run_sync(running.catalog.delete_domain, domain)
+    running.active_maps.forget(domain)
+    running.metrics.forget_domain(domain)
+    log.info("domain deleted", extra={"domain": domain})

@@ -1,0 +1,48 @@
+"""Asking for the next map of a domain."""
+
+from anyio.to_thread import run_sync
+from fastapi import APIRouter, Request, Response
+
+from deepsimbad.api.bodies import RemapBody, declare_json, read_json
+from deepsimbad.api.dependencies import DomainName, Running
+from deepsimbad.api.openapi import problems
+from deepsimbad.api.rendering import render_job
+from deepsimbad.api.schemas import JobAnswer
+from deepsimbad.errors import NoActiveMapError
+from deepsimbad.store.traverses import Traverse
+
+router = APIRouter(prefix="/v1/admin/domains", tags=["admin: maps"])
+
+
+@router.post(
+    "/{domain}/remaps",
+    status_code=202,
+    responses={
+        202: {"headers": {"Location": {"description": "The job.", "schema": {"type": "string"}}}},
+        **problems(404, 409, 413, 415, 422),
+    },
+    openapi_extra=declare_json(RemapBody),
+)
+async def post_remap(domain: DomainName, request: Request, response: Response, running: Running) -> JobAnswer:
+    """Build the next map of a domain as a job; what serves stays until the new map is sealed.
+
+    Without `landmark_traverse` the active map's landmarks stay, which is the cheap way to retrain.
+    """
+    body = await read_json(request, RemapBody)
+    config = body.config()
+
+    def submit() -> JobAnswer:
+        record = running.catalog.domain(domain)
+        for name in (config.training_traverse, config.landmark_traverse):
+            if name is not None:
+                Traverse.open(running.settings.data_dir, domain, name).close()
+        if config.landmark_traverse is None and record.active_version is None:
+            raise NoActiveMapError(
+                f"domain {domain} has no active map whose landmarks could stay; give a landmark_traverse",
+                domain=domain,
+            )
+        return render_job(running.runner.submit(domain, config))
+
+    job = await run_sync(submit)
+    response.headers["Location"] = f"/v1/admin/jobs/{job.job_id}"
+    return job

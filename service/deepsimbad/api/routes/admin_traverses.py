@@ -1,0 +1,94 @@
+"""Traverses of a domain."""
+
+import logging
+
+from anyio.to_thread import run_sync
+from fastapi import APIRouter, Request, Response
+
+from deepsimbad.api.bodies import TraverseBody, declare_json, read_json
+from deepsimbad.api.dependencies import DomainName, Running, TraverseName
+from deepsimbad.api.openapi import problems
+from deepsimbad.api.schemas import TraverseAnswer, TraverseList
+from deepsimbad.errors import ConflictError, UnknownTraverseError
+from deepsimbad.store.traverses import Traverse
+
+router = APIRouter(prefix="/v1/admin/domains/{domain}/traverses", tags=["admin: traverses"])
+log = logging.getLogger(__name__)
+
+
+@router.post(
+    "",
+    status_code=201,
+    responses={
+        200: {"model": TraverseAnswer, "description": "It was there already"},
+        **problems(404, 413, 415, 422),
+    },
+    openapi_extra=declare_json(TraverseBody),
+)
+async def post_traverse(domain: DomainName, request: Request, response: Response, running: Running) -> TraverseAnswer:
+    """Make an empty traverse; one of that name that is there stays as it is."""
+    body = await read_json(request, TraverseBody)
+    data_dir = running.settings.data_dir
+
+    def make() -> tuple[TraverseAnswer, bool]:
+        running.catalog.domain(domain)
+        try:
+            with Traverse.create(data_dir, domain, body.name) as traverse:
+                return _describe(traverse), True
+        except ConflictError:
+            with Traverse.open(data_dir, domain, body.name) as traverse:
+                return _describe(traverse), False
+
+    answer, created = await run_sync(make)
+    response.status_code = 201 if created else 200
+    if created:
+        log.info("traverse made", extra={"domain": domain, "traverse": body.name})
+    return answer
+
+
+@router.get("", responses=problems(404, 422))
+async def list_traverses(domain: DomainName, running: Running) -> TraverseList:
+    """The traverses of a domain, by name."""
+    data_dir = running.settings.data_dir
+
+    def described() -> TraverseList:
+        running.catalog.domain(domain)
+        answers = []
+        for name in Traverse.list(data_dir, domain):
+            try:
+                with Traverse.open(data_dir, domain, name) as traverse:
+                    answers.append(_describe(traverse))
+            except UnknownTraverseError:  # deleted since it was listed
+                continue
+        return TraverseList(traverses=answers)
+
+    return await run_sync(described)
+
+
+@router.get("/{name}", responses=problems(404, 422))
+async def get_traverse(domain: DomainName, name: TraverseName, running: Running) -> TraverseAnswer:
+    """One traverse: how many frames have arrived, and which are missing."""
+
+    def described() -> TraverseAnswer:
+        running.catalog.domain(domain)
+        with Traverse.open(running.settings.data_dir, domain, name) as traverse:
+            return _describe(traverse)
+
+    return await run_sync(described)
+
+
+@router.delete("/{name}", status_code=204, responses=problems(404, 409, 422))
+async def delete_traverse(domain: DomainName, name: TraverseName, running: Running) -> None:
+    """Remove a traverse and its frames; the maps made from it stay."""
+
+    def delete() -> None:
+        running.catalog.domain(domain)
+        running.open_traverses.forget(domain, name)
+        Traverse.delete(running.settings.data_dir, domain, name)
+
+    await run_sync(delete)
+    log.info("traverse deleted", extra={"domain": domain, "traverse": name})
+
+
+def _describe(traverse: Traverse) -> TraverseAnswer:
+    return TraverseAnswer(name=traverse.name, n_frames=traverse.n_frames, missing=traverse.missing)

@@ -1,0 +1,104 @@
+"""Where a single view places the robot: stateless, from a uniform prior."""
+
+from io import BytesIO
+from time import perf_counter
+from typing import Annotated
+
+import numpy as np
+from fastapi import APIRouter, Query, Request, Response
+from numpy.typing import NDArray
+
+from deepsimbad.api.bodies import (
+    BINARY,
+    GREATEST_ID,
+    IMAGE_SCHEMA,
+    JSON,
+    OBSERVATION_SCHEMA,
+    ObservationBody,
+    declare,
+    media_type_of,
+    parse_json,
+    read_bytes,
+)
+from deepsimbad.api.dependencies import DomainName, Running, Services
+from deepsimbad.api.openapi import binary, problems
+from deepsimbad.api.rendering import render_localization
+from deepsimbad.api.schemas import LocalizationAnswer
+from deepsimbad.engine.localizer import localize, retrieve, shortlist_length
+from deepsimbad.engine.observation import View
+from deepsimbad.evaluators.image import MEDIA_TYPES
+
+router = APIRouter(prefix="/v1/domains", tags=["localization"])
+
+OBSERVATION_TYPES = (*MEDIA_TYPES, JSON)
+
+
+@router.post(
+    "/{domain}/localizations",
+    response_model=LocalizationAnswer,
+    responses={
+        200: {"content": dict(binary("float32 npy [n]: the relevance of every map image, in route order"))},
+        **problems(404, 409, 413, 415, 422),
+    },
+    openapi_extra=declare({**dict.fromkeys(MEDIA_TYPES, IMAGE_SCHEMA), JSON: OBSERVATION_SCHEMA}),
+)
+async def post_localization(
+    domain: DomainName,
+    request: Request,
+    running: Running,
+    shortlist: Annotated[
+        int | None,
+        Query(
+            ge=1,
+            le=GREATEST_ID,
+            description="Length of `retrieval` and `top`, up to the number of map images; absent: 10 or all.",
+        ),
+    ] = None,
+) -> Response:
+    """Localize one view.
+
+    The body is the image itself, or what a robot that encodes on board made of it. An image's real format is read
+    from its bytes, whichever of the image types the header names. With `Accept: application/octet-stream` the answer
+    is the relevance of every map image.
+    """
+    began = perf_counter()
+    active = await running.active(domain)
+    media_type = media_type_of(request, OBSERVATION_TYPES)
+    shortlist_length(active.snapshot, shortlist)  # a bad query should not cost an upload
+    view = await read_view(request, running, media_type)
+    evaluator = running.evaluators.evaluator(active.record.evaluator)
+    if prefers_binary(request):
+        retrieval = await running.infer(lambda: retrieve(active.snapshot, evaluator, view))
+        return npy_response(retrieval.relevance)
+    localization = await running.infer(lambda: localize(active.snapshot, evaluator, view, shortlist))
+    answer = render_localization(localization, began)
+    running.metrics.localized(domain, answer.timings_ms, answer.belief.entropy_bits)
+    return Response(answer.model_dump_json(), media_type=JSON)
+
+
+async def read_view(request: Request, running: Services, media_type: str) -> View:
+    """The observation in a request's body."""
+    body = await read_bytes(request)
+    if media_type == JSON:
+        return parse_json(body, ObservationBody).view()
+    return await running.decode(body)
+
+
+def prefers_binary(request: Request) -> bool:
+    """Whether `Accept` asks for the npy rather than for JSON."""
+    wanted = {}
+    for part in request.headers.get("accept", "").split(","):
+        media_type, *parameters = (piece.strip().lower() for piece in part.split(";"))
+        quality = next((piece[2:] for piece in parameters if piece.startswith("q=")), "1")
+        try:
+            wanted[media_type] = float(quality)
+        except ValueError:
+            wanted[media_type] = 0.0
+    return wanted.get(BINARY, 0.0) > wanted.get(JSON, 0.0)
+
+
+def npy_response(values: NDArray[np.float32]) -> Response:
+    """An array as a float32 npy file."""
+    packed = BytesIO()
+    np.save(packed, values.astype(np.float32, copy=False), allow_pickle=False)
+    return Response(packed.getvalue(), media_type=BINARY)

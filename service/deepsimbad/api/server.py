@@ -1,0 +1,59 @@
+"""Serving the application with uvicorn."""
+
+import logging
+from types import FrameType
+
+import uvicorn
+from fastapi import FastAPI
+
+from deepsimbad.api.app import create_app
+from deepsimbad.api.logs import configure_logging
+from deepsimbad.settings import Settings
+
+log = logging.getLogger(__name__)
+
+
+class _Server(uvicorn.Server):
+    """Tells the application that shutdown begins, so that event streams end rather than hold it up."""
+
+    def __init__(self, config: uvicorn.Config, app: FastAPI) -> None:
+        super().__init__(config)
+        self._app = app
+
+    def handle_exit(self, sig: int, frame: FrameType | None) -> None:
+        """A signal came."""
+        services = getattr(self._app.state, "services", None)
+        if services is not None:
+            services.stopping.set()
+        super().handle_exit(sig, frame)
+
+
+def serve(settings: Settings) -> None:
+    """Serve until a signal ends it; requests under way are finished first.
+
+    Args:
+        settings: The settings.
+
+    Raises:
+        SettingsError: The address could be reached from other machines, and the service has no keys.
+    """
+    settings.check_exposure()
+    configure_logging(settings.log_level)
+    log.warning(
+        "no keys are configured: whoever can reach this address may do everything",
+        extra={"host": settings.host, "port": settings.port},
+    )
+    app = create_app(settings)
+    config = uvicorn.Config(
+        app,
+        host=settings.host,
+        port=settings.port,
+        log_config=None,
+        access_log=False,
+        server_header=False,
+        ws="none",
+        timeout_keep_alive=settings.keep_alive_s,
+        timeout_graceful_shutdown=settings.shutdown_grace_s,
+        h11_max_incomplete_event_size=64 * 1024,
+    )
+    _Server(config, app).run()

@@ -1,0 +1,1 @@
+"""What serves a query: core, store and evaluators composed."""

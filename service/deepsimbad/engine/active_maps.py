@@ -1,0 +1,166 @@
+"""The active map of every domain, held in memory and switched by one reference assignment."""
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from deepsimbad.engine.snapshot import MapSnapshot
+from deepsimbad.errors import DamagedMapError, DeepSimbadError, NoActiveMapError
+from deepsimbad.store.catalog import Catalog
+from deepsimbad.store.map_file import index_bytes, read_map
+from deepsimbad.store.records import DomainRecord
+from deepsimbad.store.sealing import verify
+
+log = logging.getLogger(__name__)
+
+_TRUSTED_S = 1.0  # another process (the command line) may activate a map: the catalog is asked again after this
+_DAMAGE_REMEMBERED_S = 5.0  # digesting a large damaged file for every request would be a gift to its sender
+
+
+@dataclass(frozen=True)
+class ActiveDomain:
+    """A domain and its active map, as of one moment."""
+
+    record: DomainRecord
+    snapshot: MapSnapshot
+
+
+@dataclass(frozen=True)
+class _Damage:
+    version: int
+    error: DamagedMapError
+    found_at: float
+
+
+class ActiveMaps:
+    """Active maps by domain, loaded at first need.
+
+    Requests read one dict entry; whoever holds a snapshot keeps it whatever is activated meanwhile.
+
+    Args:
+        catalog: Says which version is active.
+        clock: Monotonic seconds.
+    """
+
+    def __init__(self, catalog: Catalog, clock: Callable[[], float] = time.monotonic) -> None:
+        self._catalog = catalog
+        self._clock = clock
+        self._active: dict[str, ActiveDomain] = {}
+        self._checked_at: dict[str, float] = {}
+        self._damaged: dict[str, _Damage] = {}
+        self._loading = threading.Lock()
+
+    @property
+    def n_loaded(self) -> int:
+        """How many maps are in memory."""
+        return len(self._active)
+
+    def peek(self, domain: str) -> ActiveDomain | None:
+        """The domain and its active map if that is known without touching a file, else None."""
+        if self._clock() - self._checked_at.get(domain, float("-inf")) > _TRUSTED_S:
+            return None
+        return self._active.get(domain)
+
+    def active(self, domain: str) -> ActiveDomain:
+        """The domain and its active map; may read files.
+
+        Raises:
+            UnknownDomainError: No such domain.
+            NoActiveMapError: It has no map yet.
+            DamagedMapError: The map's file is missing, fails its digest or cannot be read.
+        """
+        known = self.peek(domain)
+        if known is not None:
+            return known
+        return self.refresh(domain)
+
+    def snapshot(self, domain: str) -> MapSnapshot:
+        """The domain's active map; raises as `active` does."""
+        return self.active(domain).snapshot
+
+    def refresh(self, domain: str) -> ActiveDomain:
+        """Ask the catalog now, and load the map it names if another is held; raises as `active` does."""
+        with self._loading:
+            try:
+                record = self._catalog.domain(domain)
+                active = ActiveDomain(record, self._current(record))
+            except DeepSimbadError:
+                self._forget(domain)
+                raise
+            self._active[domain] = active
+            self._checked_at[domain] = self._clock()
+            return active
+
+    def forget(self, domain: str) -> None:
+        """Let go of a deleted domain's map."""
+        with self._loading:
+            self._forget(domain)
+
+    def load_all(self) -> dict[str, DamagedMapError]:
+        """Load the active maps of all domains.
+
+        Returns:
+            What is damaged, by domain; each is logged, none keeps the service from starting.
+        """
+        damaged = {}
+        for record in self._catalog.domains():
+            if record.active_version is None:
+                continue
+            try:
+                self.refresh(record.name)
+            except DamagedMapError as error:
+                damaged[record.name] = error
+        return damaged
+
+    def _forget(self, domain: str) -> None:
+        self._active.pop(domain, None)
+        self._checked_at.pop(domain, None)
+
+    def _current(self, record: DomainRecord) -> MapSnapshot:
+        version = record.active_version
+        if version is None:
+            raise NoActiveMapError(
+                f"domain {record.name} has no active map: upload traverses and start a remap", domain=record.name
+            )
+        held = self._active.get(record.name)
+        if held is not None and held.snapshot.version == version and held.record.created_at == record.created_at:
+            return held.snapshot
+        found = self._damaged.get(record.name)
+        if found is not None and found.version == version and self._clock() - found.found_at < _DAMAGE_REMEMBERED_S:
+            raise DamagedMapError(found.error.message, **found.error.hints) from found.error
+        try:
+            return load_snapshot(self._catalog, record.name, version)
+        except DamagedMapError as error:
+            self._damaged[record.name] = _Damage(version, error, self._clock())
+            log.error("damaged map", extra={"domain": record.name, "map_version": version}, exc_info=error)
+            raise
+
+
+def load_snapshot(catalog: Catalog, domain: str, version: int) -> MapSnapshot:
+    """Check a map file's digest and read it.
+
+    Raises:
+        UnknownMapVersionError: No such version.
+        DamagedMapError: The file is missing, fails its digest or contradicts itself.
+    """
+    record = catalog.map(domain, version)
+    path = catalog.map_path(domain, version)
+    try:
+        if record.sha256 is not None:
+            verify(path, record.sha256)
+        return MapSnapshot.from_contents(read_map(path), index_bytes(path))
+    except DamagedMapError as error:
+        # The cause names a file of the server's; the answer names what a person can act on.
+        raise _damaged(domain, version) from error
+    except (DeepSimbadError, OSError, KeyError, TypeError, ValueError) as error:
+        raise _damaged(domain, version) from error
+
+
+def _damaged(domain: str, version: int) -> DamagedMapError:
+    return DamagedMapError(
+        f"map {version} of domain {domain} is damaged: activate another version or start a remap",
+        domain=domain,
+        map_version=version,
+    )

@@ -1,0 +1,58 @@
+"""From a view to its encoding, with every rule that a ready encoding must keep."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deepsimbad.engine.observation import ReadyEncoding
+from deepsimbad.errors import InvalidEncodingError
+from deepsimbad.evaluators.base import Evaluator, Image
+
+
+def encode_view(evaluator: Evaluator, view: Image | ReadyEncoding) -> NDArray[np.float32]:
+    """Encode an image, or check and take a ready encoding.
+
+    Returns:
+        [d] float32, finite.
+
+    Raises:
+        InvalidEncodingError: A ready encoding of the wrong length, or with NaN or infinity.
+        UnsupportedMediaTypeError: An image, where the evaluator takes ready encodings alone.
+    """
+    if isinstance(view, ReadyEncoding):
+        encodings = ready_encodings(evaluator, view.values[np.newaxis])
+    else:
+        encodings = evaluator.encode([view])
+    return encodings.reshape(-1)
+
+
+def ready_encodings(evaluator: Evaluator, values: NDArray[Any]) -> NDArray[np.float32]:
+    """Check encodings that were computed elsewhere.
+
+    Args:
+        evaluator: Says how long they must be, where it knows.
+        values: [n, d] of any float type.
+
+    Returns:
+        [n, d] float32; the array itself where it already was.
+
+    Raises:
+        InvalidEncodingError: Empty, of the wrong length, or NaN, infinity or too large for float32 somewhere.
+    """
+    if values.ndim != 2 or values.size == 0:
+        raise InvalidEncodingError(f"encodings are [n, d] and not empty, not {list(values.shape)}")
+    wanted = evaluator.encoding_dim
+    if wanted is not None and values.shape[1] != wanted:
+        raise InvalidEncodingError(
+            f"an encoding of {values.shape[1]} numbers; this domain's have {wanted}", encoding_dim=wanted
+        )
+    with np.errstate(over="ignore"):  # what overflows is refused below
+        encodings = np.ascontiguousarray(values, np.float32)
+    # In blocks, so that a large batch is not accompanied by as many booleans.
+    for first in range(0, len(encodings), 1024):
+        finite = np.isfinite(encodings[first : first + 1024]).all(axis=1)
+        if not finite.all():
+            row = first + int(np.flatnonzero(~finite)[0])
+            raise InvalidEncodingError(f"encoding {row} holds NaN, infinity or a number too large for float32", row=row)
+    return encodings

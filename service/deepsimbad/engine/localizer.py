@@ -1,0 +1,131 @@
+"""Where a single view places the robot: describe, retrieve, believe (II-C)."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from time import perf_counter
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deepsimbad.core.belief import BeliefSummary, GridBelief
+from deepsimbad.core.descriptor import rank_landmarks, ranks_from_ranked_landmarks
+from deepsimbad.core.relevance import Query, relevances
+from deepsimbad.core.retrieval import shortlist
+from deepsimbad.engine.encoding import encode_view
+from deepsimbad.engine.observation import Dissimilarities, RankedLandmarks, View
+from deepsimbad.engine.snapshot import MapSnapshot
+from deepsimbad.errors import InvalidDissimilaritiesError, InvalidInputError
+from deepsimbad.evaluators.base import Evaluator
+
+DEFAULT_SHORTLIST = 10
+
+
+@dataclass(frozen=True)
+class Retrieval:
+    """How well every map image answers one view.
+
+    Attributes:
+        ranks: [r] float32, 1..r, the landmarks of the view.
+        relevance: [n] float32, larger is better.
+        timings_ms: Milliseconds by stage.
+    """
+
+    ranks: NDArray[np.float32]
+    relevance: NDArray[np.float32]
+    timings_ms: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class Localization:
+    """The answer to one view.
+
+    Attributes:
+        snapshot: The map that answered.
+        retrieval: Of all map images.
+        shortlist: Ids of the most relevant ones, best first.
+        belief: After this one view, from a uniform prior.
+        timings_ms: Milliseconds by stage.
+    """
+
+    snapshot: MapSnapshot
+    retrieval: Retrieval
+    shortlist: NDArray[np.int64]
+    belief: BeliefSummary
+    timings_ms: Mapping[str, float]
+
+
+def localize(snapshot: MapSnapshot, evaluator: Evaluator, view: View, n_shortlist: int | None = None) -> Localization:
+    """Localize one view on its own.
+
+    Args:
+        snapshot: The map.
+        evaluator: The domain's.
+        view: What the robot sent.
+        n_shortlist: Length of the shortlist and of the belief's top, 1..n; None: 10, or n where that is less.
+
+    Raises:
+        InvalidInputError: The view or `n_shortlist` cannot be used with this map.
+    """
+    length = shortlist_length(snapshot, n_shortlist)
+    retrieval = retrieve(snapshot, evaluator, view)
+    began = perf_counter()
+    best = shortlist(retrieval.relevance, length)
+    listed = perf_counter()
+    belief = GridBelief.uniform(snapshot.route).updated(retrieval.relevance, snapshot.update_rule)
+    summary = belief.summary(length)
+    believed = perf_counter()
+    timings_ms = {
+        **retrieval.timings_ms,
+        "shortlist": 1000 * (listed - began),
+        "belief": 1000 * (believed - listed),
+    }
+    return Localization(snapshot, retrieval, best, summary, timings_ms)
+
+
+def retrieve(snapshot: MapSnapshot, evaluator: Evaluator, view: View) -> Retrieval:
+    """The relevance of every map image to one view, by the map's statistics alone."""
+    began = perf_counter()
+    query = describe(snapshot, evaluator, view)
+    described = perf_counter()
+    relevance = relevances(snapshot.retrieval, query)
+    retrieved = perf_counter()
+    timings_ms = {"describe": 1000 * (described - began), "retrieve": 1000 * (retrieved - described)}
+    return Retrieval(query.ranks, relevance, timings_ms)
+
+
+def describe(snapshot: MapSnapshot, evaluator: Evaluator, view: View) -> Query:
+    """Rank the landmarks for a view (II-A, II-C)."""
+    if isinstance(view, RankedLandmarks):
+        return Query(ranks_from_ranked_landmarks(view.landmark_ids, snapshot.n_landmarks))
+    if isinstance(view, Dissimilarities):
+        if view.values.shape != (snapshot.n_landmarks,):
+            raise InvalidDissimilaritiesError(
+                f"{view.values.size} dissimilarities; this map has {snapshot.n_landmarks} landmarks",
+                n_landmarks=snapshot.n_landmarks,
+            )
+        return Query(rank_landmarks(view.values), _as_float32(view.values))
+    encoding = encode_view(evaluator, view)
+    dissimilarities = evaluator.dissimilarities(encoding[None, :], snapshot.landmark_model)[0]
+    return Query(rank_landmarks(dissimilarities), dissimilarities, encoding)
+
+
+def shortlist_length(snapshot: MapSnapshot, wanted: int | None) -> int:
+    """How many map images a shortlist holds.
+
+    Raises:
+        InvalidInputError: More than the map has, or fewer than one.
+    """
+    if wanted is None:
+        return min(DEFAULT_SHORTLIST, snapshot.n_images)
+    if not 1 <= wanted <= snapshot.n_images:
+        raise InvalidInputError(
+            f"shortlist is {wanted}; it must be within 1 and the number of map images, {snapshot.n_images}",
+            minimum=1,
+            maximum=snapshot.n_images,
+        )
+    return wanted
+
+
+def _as_float32(values: NDArray[np.float64]) -> NDArray[np.float32]:
+    limit = np.finfo(np.float32).max  # ranks are already drawn from the full numbers
+    return np.clip(values, -limit, limit).astype(np.float32)

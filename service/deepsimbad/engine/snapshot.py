@@ -1,0 +1,102 @@
+"""One map version as serving needs it: frozen arrays in memory."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deepsimbad.core.belief import DEFAULT_UPDATE, UpdateRule
+from deepsimbad.core.inverted_index import InvertedIndex
+from deepsimbad.core.relevance import Relevance, RetrievalMap
+from deepsimbad.core.route import Route
+from deepsimbad.core.statistics import LandmarkStatistics
+from deepsimbad.evaluators.base import LandmarkModel
+from deepsimbad.store.map_file import MapContents
+
+
+@dataclass(frozen=True)
+class MapSnapshot:
+    """What answers a query; nothing in it changes, so any number of threads may read it.
+
+    Attributes:
+        domain, version, created_at: Which map.
+        config: What it was built with, as stored.
+        metrics: What was measured when it was built.
+        route: Where the map images are.
+        retrieval: The index and what the map's relevance compares besides.
+        landmark_model: For the domain's evaluator.
+        actions_m: The moves of the domain, in metres.
+        index_bytes: Size of the posting tables in the map file.
+    """
+
+    domain: str
+    version: int
+    created_at: str
+    config: Mapping[str, Any]
+    metrics: Mapping[str, Any]
+    route: Route
+    retrieval: RetrievalMap
+    landmark_model: LandmarkModel
+    actions_m: tuple[float, ...]
+    index_bytes: int
+
+    @classmethod
+    def from_contents(cls, contents: MapContents, index_bytes: int) -> Self:
+        """Arrange a map file's contents for serving; its arrays are frozen, not copied.
+
+        Raises:
+            InvalidMapConfigError, InvalidRouteError: The contents contradict each other.
+            KeyError, ValueError: The configuration names no relevance that exists.
+        """
+        for array in (*contents.landmark_model.values(), contents.encodings, contents.timestamp_us):
+            _freeze(array)
+        relevance = Relevance(contents.config["relevance"])
+        statistics = None
+        if contents.statistics is not None:
+            mean, std = contents.statistics
+            statistics = LandmarkStatistics.from_mean_std(mean, std)
+        index = InvertedIndex(contents.lists, int(contents.config["n_landmarks"]), contents.values)
+        return cls(
+            domain=contents.domain,
+            version=contents.version,
+            created_at=contents.created_at,
+            config=contents.config,
+            metrics=contents.metrics,
+            route=Route(contents.position_m, contents.closed, contents.x_m, contents.y_m),
+            retrieval=RetrievalMap(relevance, index, statistics, contents.encodings),
+            landmark_model=contents.landmark_model,
+            actions_m=contents.actions_m,
+            index_bytes=index_bytes,
+        )
+
+    @property
+    def n_images(self) -> int:
+        """n."""
+        return self.retrieval.index.n_images
+
+    @property
+    def n_landmarks(self) -> int:
+        """r."""
+        return self.retrieval.index.n_landmarks
+
+    @property
+    def list_length(self) -> int:
+        """h."""
+        return self.retrieval.index.list_length
+
+    @property
+    def update_rule(self) -> UpdateRule:
+        """How a view changes the belief, where nobody chose."""
+        return DEFAULT_UPDATE[self.retrieval.relevance]
+
+    @property
+    def index_bits_per_map_image(self) -> float:
+        """The paper's figure for the size of a map."""
+        return 8 * self.index_bytes / self.n_images
+
+
+def _freeze(array: NDArray[np.generic] | None) -> None:
+    if array is not None:
+        array.setflags(write=False)

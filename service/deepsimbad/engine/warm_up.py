@@ -1,0 +1,18 @@
+"""Compiling what serving runs before anyone waits for it."""
+
+import numpy as np
+
+from deepsimbad.core.belief import GridBelief, UpdateRule
+from deepsimbad.core.inverted_index import InvertedIndex
+from deepsimbad.core.relevance import Query, Relevance, RetrievalMap, relevances
+from deepsimbad.core.retrieval import shortlist
+from deepsimbad.core.route import Route
+
+
+def warm_up() -> None:
+    """Answer one query on a map of two images; seconds on a fresh machine, milliseconds after."""
+    index = InvertedIndex(np.array([[0, 1]], np.uint16), 2)
+    built = RetrievalMap(Relevance.RRF, index)
+    relevance = relevances(built, Query(np.array([1, 2], np.float32)))
+    shortlist(relevance, 1)
+    GridBelief.uniform(Route(np.array([0.0, 1.0]))).updated(relevance, UpdateRule.ADDITIVE_RELEVANCE).summary(1)
