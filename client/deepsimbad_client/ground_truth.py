@@ -114,8 +114,8 @@ def read_ground_truth(path: Path) -> GroundTruth:
         SourceError: the file cannot be read, or fewer than two usable rows are in it.
     """
     rows = _rows(path)
-    usable = rows[np.isfinite(rows).all(axis=1)]
     # Unix microseconds have 16 digits: below 2^53 a float64 holds every one of them exactly.
+    usable = rows[np.isfinite(rows).all(axis=1) & (np.abs(rows[:, 0]) < 2**53)]
     time_us, first = np.unique(usable[:, 0].astype(np.int64), return_index=True)
     if len(time_us) < 2:
         raise SourceError(

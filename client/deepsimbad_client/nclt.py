@@ -193,7 +193,11 @@ def _images_by_time(folder: Path) -> tuple[dict[int, str], int]:
     """List a camera's folder: Unix microseconds -> file name, and how many TIFFs are not named by a time."""
     names: dict[int, str] = {}
     n_not_times = 0
-    for path in folder.iterdir():
+    try:
+        found = list(folder.iterdir())
+    except OSError as error:
+        raise SourceError(f"cannot read the folder {folder}: {error.strerror or error}") from error
+    for path in found:
         if path.suffix.lower() not in SUFFIXES or path.name.startswith("."):
             continue
         if path.stem.isascii() and path.stem.isdigit() and len(path.stem) <= 18:
