@@ -1,6 +1,8 @@
 """Building a map in memory: landmarks chosen, every training frame described (II-B, II-C)."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from datetime import UTC, datetime
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,7 +10,10 @@ from numpy.typing import NDArray
 from deepsimbad.core.landmark_selection import select_landmarks
 from deepsimbad.core.relevance import Relevance, RetrievalMap
 from deepsimbad.core.retrieval import build_retrieval_map
+from deepsimbad.core.route import Route
 from deepsimbad.evaluators.base import Evaluator, LandmarkModel
+from deepsimbad.store.map_contents import MapContents
+from deepsimbad.store.records import DomainRecord
 
 _FRAMES_A_BLOCK = 1024
 
@@ -51,3 +56,41 @@ def describe(
         on_progress(min(1.0, (start + _FRAMES_A_BLOCK) / len(encodings)))
     dissimilarities = np.concatenate(blocks) if blocks else np.empty((0, 0), np.float32)
     return build_retrieval_map(relevance, dissimilarities, list_length, encodings)
+
+
+def map_contents(
+    domain: DomainRecord,
+    version: int,
+    config: Mapping[str, Any],
+    model: LandmarkModel,
+    built: RetrievalMap,
+    route: Route,
+) -> MapContents:
+    """Everything a map file holds of a described traverse.
+
+    Args:
+        domain: Whose map it is.
+        version: Its number.
+        config: What was asked for; kept with the map.
+        model: The landmarks.
+        built: What retrieval reads.
+        route: Where the map images are.
+    """
+    statistics = built.statistics
+    return MapContents(
+        domain=domain.name,
+        version=version,
+        created_at=datetime.now(UTC).isoformat(timespec="seconds"),
+        config={**config, "relevance": built.relevance.value, "n_landmarks": built.index.n_landmarks},
+        evaluator=domain.evaluator,
+        closed=domain.closed,
+        actions_m=domain.actions_m,
+        landmark_model=model,
+        lists=built.index.lists,
+        position_m=route.position_m,
+        values=built.index.values,
+        encodings=built.encodings,
+        statistics=None if statistics is None else np.stack([statistics.mean, statistics.std]),
+        x_m=route.x_m,
+        y_m=route.y_m,
+    )

@@ -1,8 +1,11 @@
-"""A recording as experiments and map building need it: encodings beside positions."""
+"""A recording as experiments and map building need it: encodings beside positions.
 
-from collections.abc import Callable, Sequence
+Recordings are read by the client's own readers (decision 0003): an image encodes to the same numbers whether it is
+uploaded or read here, because the same reader prepared it.
+"""
+
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,16 +14,9 @@ from deepsimbad.core.route import Route
 from deepsimbad.errors import InvalidSourceError
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.image import decode_image
-
-
-class SourceFrame(Protocol):
-    """What is read of a recording's frame."""
-
-    index: int
-    position_m: float
-    timestamp_us: int | None
-    x_m: float | None
-    y_m: float | None
+from deepsimbad.store.frames import UNKNOWN_TIMESTAMP, TraverseFrames
+from deepsimbad_client.errors import BrokenFrameError
+from deepsimbad_client.recording import Recording
 
 
 @dataclass(frozen=True)
@@ -28,61 +24,86 @@ class EncodedTraverse:
     """One recorded drive, encoded.
 
     Attributes:
-        frame_index: [n] int64, every frame's place in its whole recording.
-        encodings: [n, d] float32.
-        route: The frames' positions, n of them.
-        timestamp_us: [n] int64, -1 where unknown.
+        frames: Encodings and places, n of them, in the order they were driven.
+        route: The frames' positions.
         left_out: Reason -> number of frames that could not be used.
     """
 
-    frame_index: NDArray[np.int64]
-    encodings: NDArray[np.float32]
+    frames: TraverseFrames
     route: Route
-    timestamp_us: NDArray[np.int64]
     left_out: dict[str, int] = field(default_factory=dict)
 
+    @property
+    def encodings(self) -> NDArray[np.float32]:
+        """[n, d] float32."""
+        return self.frames.encodings
 
-def encode_images(
-    frames: Sequence[SourceFrame],
-    read_image: Callable[[int], bytes | None],
-    evaluator: Evaluator,
-    max_pixels: int,
-    on_progress: Callable[[float], None],
-) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Encode a recording's images one by one, so that memory holds one image and all encodings.
+
+def encode_recording(
+    recording: Recording, evaluator: Evaluator, max_pixels: int, on_progress: Callable[[float], None]
+) -> EncodedTraverse:
+    """Encode a recording's images one by one, or take its ready encodings.
 
     Args:
-        frames: The frames, in order.
-        read_image: Gives the image file of the i-th frame, or None where it is broken.
-        evaluator: Encodes.
+        recording: What was driven.
+        evaluator: Encodes the images.
         max_pixels: Limit on an image.
         on_progress: Called with the share done; may raise to cancel.
 
-    Returns:
-        The places [m] of the frames that could be read, and their encodings [m, d].
+    Raises:
+        InvalidSourceError: No frame can be used.
+        InvalidRouteError: The positions go backwards or are NaN.
+    """
+    left_out = dict(recording.left_out)
+    if recording.encodings is not None:
+        kept, encodings = list(range(len(recording.frames))), recording.encodings
+    else:
+        kept, encodings = _encode_images(recording, evaluator, max_pixels, left_out, on_progress)
+    if not kept:
+        raise InvalidSourceError(f"{recording.name} has no frame that can be used: {left_out}")
+    used = [recording.frames[place] for place in kept]
+    frames = TraverseFrames(
+        index=np.array([frame.index for frame in used], np.int64),
+        position_m=np.array([frame.position_m for frame in used], np.float64),
+        timestamp_us=np.array(
+            [UNKNOWN_TIMESTAMP if f.timestamp_us is None else f.timestamp_us for f in used], np.int64
+        ),
+        x_m=np.array([np.nan if frame.x_m is None else frame.x_m for frame in used], np.float64),
+        y_m=np.array([np.nan if frame.y_m is None else frame.y_m for frame in used], np.float64),
+        encodings=encodings,
+    )
+    return EncodedTraverse(frames, route_of(frames), left_out)
+
+
+def route_of(frames: TraverseFrames, closed: bool = False) -> Route:
+    """The frames' positions as a route; x, y only where some frame knows them.
 
     Raises:
-        InvalidSourceError: No frame could be read.
+        InvalidRouteError: The positions go backwards or are NaN.
     """
+    known = bool(np.isfinite(frames.x_m).any() and np.isfinite(frames.y_m).any())
+    return Route(frames.position_m, closed, frames.x_m if known else None, frames.y_m if known else None)
+
+
+def _encode_images(
+    recording: Recording,
+    evaluator: Evaluator,
+    max_pixels: int,
+    left_out: dict[str, int],
+    on_progress: Callable[[float], None],
+) -> tuple[list[int], NDArray[np.float32]]:
+    """Places of the frames that could be read, and their encodings; broken ones are counted under their reason."""
     if evaluator.encoding_dim is None:
         raise InvalidSourceError("this evaluator takes ready encodings alone; give a .npy or .csv file")
-    encodings = np.empty((len(frames), evaluator.encoding_dim), np.float32)
+    encodings = np.empty((len(recording.frames), evaluator.encoding_dim), np.float32)
     kept: list[int] = []
-    for place in range(len(frames)):
-        body = read_image(place)
-        if body is not None:
+    for place, frame in enumerate(recording.frames):
+        try:
+            body = recording.image(frame, evaluator.input_size).body
+        except BrokenFrameError as error:
+            left_out[error.reason] = left_out.get(error.reason, 0) + 1
+        else:
             encodings[len(kept)] = evaluator.encode([decode_image(body, max_pixels)])[0]
             kept.append(place)
-        on_progress((place + 1) / len(frames))
-    if not kept:
-        raise InvalidSourceError("none of the recording's images could be read")
-    return np.array(kept, np.int64), encodings[: len(kept)]
-
-
-def route_of(frames: Sequence[SourceFrame], closed: bool = False) -> Route:
-    """The frames' positions as a route; x, y only where some frame knows them."""
-    x_m = np.array([np.nan if frame.x_m is None else frame.x_m for frame in frames])
-    y_m = np.array([np.nan if frame.y_m is None else frame.y_m for frame in frames])
-    known = bool(np.isfinite(x_m).any() and np.isfinite(y_m).any())
-    position_m = np.array([frame.position_m for frame in frames])
-    return Route(position_m, closed, x_m if known else None, y_m if known else None)
+        on_progress((place + 1) / len(recording.frames))
+    return kept, encodings[: len(kept)]

@@ -1,24 +1,22 @@
 """Remapping a domain: from stored traverses to a sealed, active map version (design section 5)."""
 
 import time
-from datetime import UTC, datetime
+from dataclasses import replace
 from typing import Any
 
-import numpy as np
-
-from deepsimbad.core.relevance import RetrievalMap
-from deepsimbad.core.route import Route
 from deepsimbad.errors import DeepSimbadError, InvalidMapConfigError
 from deepsimbad.evaluators.base import Evaluator, LandmarkModel
-from deepsimbad.jobs.build_map import choose_landmarks, describe
+from deepsimbad.jobs.build_map import choose_landmarks, describe, map_contents
+from deepsimbad.jobs.encoded_traverse import route_of
 from deepsimbad.jobs.map_config import DEFAULT_N_LANDMARKS, RemapConfig
 from deepsimbad.jobs.progress import Progress
 from deepsimbad.store.catalog import Catalog
-from deepsimbad.store.map_file import MapContents, index_bytes, read_map, write_map
+from deepsimbad.store.frames import TraverseFrames
+from deepsimbad.store.map_file import index_bytes, read_map, write_map
 from deepsimbad.store.map_table import ANY
 from deepsimbad.store.records import DomainRecord
 from deepsimbad.store.sealing import seal
-from deepsimbad.store.traverses import Traverse, TraverseFrames
+from deepsimbad.store.traverses import Traverse
 
 REMAP_STAGES = {"read frames": 1.0, "select landmarks": 4.0, "describe": 2.0, "seal": 1.0, "activate": 0.1}
 
@@ -49,7 +47,7 @@ def remap(
 
     progress.stage("read frames")
     training = _frames(catalog, domain, config.training_traverse)
-    route = _route(training, record.closed)
+    route = route_of(training, record.closed)
 
     progress.stage("select landmarks")
     model = _landmark_model(catalog, record, config, evaluator, progress)
@@ -63,12 +61,13 @@ def remap(
     progress.stage("seal")
     version = catalog.begin_map(domain, config.as_dict())
     try:
-        contents = _contents(record, version, config, model, built, route, training)
-        building = catalog.building_path(domain, version)
-        write_map(building, contents)
-        bits = 8 * index_bytes(building) / route.n_images
+        contents = map_contents(record, version, config.as_dict(), model, built, route)
+        known_times = training.timestamp_us if (training.timestamp_us >= 0).any() else None
+        building, sealed = catalog.building_path(domain, version), catalog.map_path(domain, version)
+        write_map(building, replace(contents, timestamp_us=known_times), progress.update)
+        digest, n_bytes = seal(building, sealed)
+        bits = 8 * index_bytes(sealed) / route.n_images
         metrics = {"n_map_images": route.n_images, "index_bits_per_map_image": bits, "seconds": seconds}
-        digest, n_bytes = seal(building, catalog.map_path(domain, version))
         progress.stage("activate")
         catalog.seal_map(domain, version, digest, n_bytes, metrics)
     except BaseException:
@@ -85,11 +84,6 @@ def _frames(catalog: Catalog, domain: str, name: str) -> TraverseFrames:
     if frames.index.size == 0:
         raise InvalidMapConfigError(f"traverse {name} has no frames yet; upload some first", traverse=name)
     return frames
-
-
-def _route(frames: TraverseFrames, closed: bool) -> Route:
-    known = bool(np.isfinite(frames.x_m).any() and np.isfinite(frames.y_m).any())
-    return Route(frames.position_m, closed, frames.x_m if known else None, frames.y_m if known else None)
 
 
 def _landmark_model(
@@ -111,40 +105,7 @@ def _landmark_model(
             f"the active map has {n_kept} landmarks, not {config.n_landmarks}; give a landmark_traverse to select anew",
             n_landmarks=n_kept,
         )
-    return kept.landmark_model
-
-
-def _contents(
-    record: DomainRecord,
-    version: int,
-    config: RemapConfig,
-    model: LandmarkModel,
-    built: RetrievalMap,
-    route: Route,
-    training: TraverseFrames,
-) -> MapContents:
-    statistics = built.statistics
-    known_times = training.timestamp_us if (training.timestamp_us >= 0).any() else None
-    return MapContents(
-        domain=record.name,
-        version=version,
-        created_at=datetime.now(UTC).isoformat(timespec="seconds"),
-        config={**config.as_dict(), "n_landmarks": built.index.n_landmarks},
-        evaluator=record.evaluator,
-        closed=record.closed,
-        actions_m=record.actions_m,
-        landmark_model=model,
-        lists=built.index.lists,
-        values=built.index.values,
-        encodings=built.encodings,
-        statistics=None if statistics is None else np.stack([statistics.mean, statistics.std]),
-        position_m=route.position_m,
-        timestamp_us=known_times,
-        x_m=route.x_m,
-        y_m=route.y_m,
-        q_values=None,
-        metrics={},
-    )
+    return dict(kept.landmark_model)
 
 
 def error_document(error: DeepSimbadError) -> dict[str, Any]:

@@ -1,0 +1,48 @@
+"""The `deepsimbad` command (design section 7).
+
+Exit codes: 0 done, 1 a named error (one line on standard error), 2 usage, 130 cancelled.
+"""
+
+import sys
+from collections.abc import Sequence
+
+import click
+
+from deepsimbad.cli.experiment import experiment
+from deepsimbad.cli.local import info, localize, map_
+from deepsimbad.cli.serve import serve
+from deepsimbad.errors import CancelledError, DeepSimbadError
+from deepsimbad_client.errors import DeepSimbadClientError
+
+_FAILED, _CANCELLED = 1, 130
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(package_name="deep-simbad")
+def deepsimbad() -> None:
+    """Where on a known route a robot is, and which move would tell it most next."""
+
+
+for command in (serve, map_, localize, info, experiment):
+    deepsimbad.add_command(command)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the command and end the process with its exit code."""
+    sys.exit(run(arguments))
+
+
+def run(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; returns its exit code."""
+    try:
+        deepsimbad.main(args=None if arguments is None else list(arguments), standalone_mode=False)
+    except (click.exceptions.Abort, KeyboardInterrupt, CancelledError):
+        click.echo("cancelled", err=True)
+        return _CANCELLED
+    except click.ClickException as error:
+        error.show()
+        return error.exit_code
+    except (DeepSimbadError, DeepSimbadClientError, OSError) as error:
+        click.echo(f"deepsimbad: {' '.join(str(error).split())}", err=True)
+        return _FAILED
+    return 0

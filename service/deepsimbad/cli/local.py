@@ -1,0 +1,148 @@
+"""`deepsimbad map`, `localize` and `info`: the same data directory as the server's, without a server."""
+
+from pathlib import Path
+from time import perf_counter
+
+import click
+from rich.table import Table
+
+from deepsimbad.api.domain_answers import describe_domain
+from deepsimbad.api.rendering import render_localization
+from deepsimbad.cli.options import RELEVANCES, data_dir_option, evaluator_option, spacing_option
+from deepsimbad.cli.terminal import console, progress_bar, write_json
+from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Relevance
+from deepsimbad.engine.active_maps import ActiveMaps
+from deepsimbad.engine.evaluator_pool import EvaluatorPool
+from deepsimbad.engine.localizer import localize as localize_view
+from deepsimbad.errors import InvalidSourceError
+from deepsimbad.evaluators.image import decode_image
+from deepsimbad.evaluators.registry import EvaluatorConfig, make_evaluator
+from deepsimbad.jobs.encoded_traverse import encode_recording
+from deepsimbad.jobs.map_config import DEFAULT_LIST_LENGTH, DEFAULT_N_LANDMARKS, DEFAULT_TRAINING_EPISODES, RemapConfig
+from deepsimbad.jobs.remap import REMAP_STAGES, remap
+from deepsimbad.settings import load_settings
+from deepsimbad.store.catalog import Catalog
+from deepsimbad.store.frames import TraverseFrames
+from deepsimbad.store.traverses import Traverse
+from deepsimbad_client.sources import open_source
+
+_READING = {"read landmarks": 4.0, "read training": 4.0}
+_ACTIONS_M = tuple(float(metres) for metres in range(1, 11))
+
+
+@click.command("map")
+@click.argument("domain")
+@click.option("--landmarks", required=True, help="SOURCE landmarks are selected from.")
+@click.option("--training", required=True, help="SOURCE that becomes the map.")
+@evaluator_option
+@click.option("--n-landmarks", type=click.IntRange(min=1), default=DEFAULT_N_LANDMARKS, show_default=True)
+@click.option("--list-length", type=click.IntRange(min=1), default=DEFAULT_LIST_LENGTH, show_default=True)
+@click.option("--relevance", type=RELEVANCES, default=DEFAULT_RELEVANCE.value, show_default=True)
+@click.option("--training-episodes", type=click.IntRange(min=0), default=DEFAULT_TRAINING_EPISODES, show_default=True)
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
+@click.option("--closed", is_flag=True, help="The end of the route joins its start.")
+@spacing_option
+@data_dir_option
+def map_(
+    domain: str,
+    landmarks: str,
+    training: str,
+    evaluator: EvaluatorConfig,
+    n_landmarks: int,
+    list_length: int,
+    relevance: str,
+    training_episodes: int,
+    seed: int,
+    closed: bool,
+    spacing_m: float,
+    data_dir: Path | None,
+) -> None:
+    """Map a route from two recordings: one gives the landmarks, the other becomes the map.
+
+    SOURCE is nclt:ROOT/DATE, a folder of images (with an optional positions.csv) or a .npy or .csv of ready
+    encodings; each may end in #START:STOP[:STEP].
+    """
+    config = RemapConfig(
+        training_traverse="training",
+        landmark_traverse="landmarks",
+        n_landmarks=n_landmarks,
+        list_length=list_length,
+        relevance=Relevance(relevance),
+        training_episodes=training_episodes,
+        seed=seed,
+    )
+    judge = make_evaluator(evaluator)
+    settings = load_settings(data_dir=data_dir)
+    with Catalog.open(settings.data_dir) as catalog:
+        catalog.create_domain(domain, evaluator.as_dict(), closed, _ACTIONS_M)
+        with progress_bar(_READING | REMAP_STAGES, f"map {domain}") as progress:
+            for role, source in (("landmarks", landmarks), ("training", training)):
+                progress.stage(f"read {role}")
+                recording = open_source(source, spacing_m=spacing_m)
+                encoded = encode_recording(recording, judge, settings.max_pixels, progress.update)
+                _store(catalog, domain, role, encoded.frames)
+            result = remap(catalog, domain, config, judge, progress)
+        click.echo(f"map {result['map_version']} of {domain} is active: {result['metrics']['n_map_images']} images")
+
+
+@click.command()
+@click.argument("domain")
+@click.argument("images", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.option("--json", "as_json", is_flag=True, help="Print the full answers as one JSON list.")
+@data_dir_option
+def localize(domain: str, images: tuple[Path, ...], as_json: bool, data_dir: Path | None) -> None:
+    """Say where on the route each image was probably taken."""
+    settings = load_settings(data_dir=data_dir)
+    with Catalog.open(settings.data_dir) as catalog:
+        active = ActiveMaps(catalog).active(domain)
+        judge = EvaluatorPool().evaluator(active.record.evaluator)
+        found = []
+        for path in images:
+            began = perf_counter()
+            try:
+                body = path.read_bytes()
+            except OSError as error:
+                raise InvalidSourceError(f"cannot read {path}: {error.strerror or error}") from error
+            view = decode_image(body, settings.max_pixels)
+            found.append((localize_view(active.snapshot, judge, view), began))
+    answers = [render_localization(each, began) for each, began in found]
+    if as_json:
+        write_json([{"image": str(path), **answer.model_dump()} for path, answer in zip(images, answers, strict=True)])
+        return
+    table = Table("image", "most likely at", "mean +- std", "95 % within", "entropy")
+    for path, answer in zip(images, answers, strict=True):
+        belief = answer.belief
+        low, high = belief.credible_95_m
+        table.add_row(
+            str(path),
+            f"{belief.mode_m:.1f} m",
+            f"{belief.mean_m:.1f} +- {belief.std_m:.1f} m",
+            f"{low:.1f} .. {high:.1f} m",
+            f"{belief.entropy_bits:.1f} bit",
+        )
+    console().print(table)
+
+
+@click.command()
+@click.argument("domain")
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON document.")
+@data_dir_option
+def info(domain: str, as_json: bool, data_dir: Path | None) -> None:
+    """Describe a domain and its active map."""
+    with Catalog.open(load_settings(data_dir=data_dir).data_dir) as catalog:
+        answer = describe_domain(catalog.domain(domain), EvaluatorPool(), ActiveMaps(catalog))
+    if as_json:
+        write_json(answer.model_dump())
+        return
+    table = Table.grid(padding=(0, 2))
+    for name, value in answer.model_dump().items():
+        table.add_row(name, "-" if value is None else str(value))
+    console().print(table)
+
+
+def _store(catalog: Catalog, domain: str, role: str, frames: TraverseFrames) -> None:
+    """Keep what was read as the domain's traverse of that role, in place of an earlier one."""
+    if role in Traverse.list(catalog.data_dir, domain):
+        Traverse.delete(catalog.data_dir, domain, role)
+    with Traverse.create(catalog.data_dir, domain, role) as traverse:
+        traverse.put_frames(frames)
