@@ -1,0 +1,46 @@
+"""The command that renders a campus: `deepsimbad-client campus ROOT`."""
+
+from pathlib import Path
+
+import click
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from deepsimbad_client.campus.season import PAPER_DATES
+from deepsimbad_client.campus.writer import write_campus
+
+
+@click.command("campus")
+@click.argument("root", type=click.Path(file_okay=False, path_type=Path))
+@click.option(
+    "--seasons",
+    default=",".join(PAPER_DATES),
+    show_default=True,
+    help="Comma-separated: winter, spring, summer, autumn or dates like 2012-05-11; one drive each.",
+)
+@click.option("--frames", default=300, show_default=True, type=click.IntRange(min=1), help="Pictures of every drive.")
+@click.option("--seed", default=0, show_default=True, type=click.IntRange(min=0), help="Equal seeds, equal bytes.")
+@click.option(
+    "--spacing-m", default=1.75, show_default=True, type=click.FloatRange(0.05, 20), help="Metres between pictures."
+)
+def campus_command(root: Path, seasons: str, frames: int, seed: int, spacing_m: float) -> None:
+    """Render drives along one route in several seasons, written under ROOT in NCLT's layout.
+
+    Then nclt:ROOT/2012-01-22 and so on are sources like any recording. Cut short, it goes on where it stopped; with
+    more frames it adds to those that are there.
+    """
+    names = [name.strip() for name in seasons.split(",") if name.strip()]
+    columns = (TextColumn("rendering"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True)) as progress:
+        task = progress.add_task("rendering", total=len(names) * frames)
+
+        def show(done: int, total: int) -> None:
+            progress.update(task, completed=done, total=total)
+
+        drives = write_campus(root, names, frames, seed, spacing_m=spacing_m, on_progress=show)
+    for drive in drives:
+        click.echo(f"nclt:{root}/{drive.date}")
+
+
+if __name__ == "__main__":
+    campus_command()
