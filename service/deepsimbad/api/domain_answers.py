@@ -1,8 +1,8 @@
 """Describing a domain, whatever state its map is in."""
 
+from deepsimbad.api.schemas import DomainAnswer
 from deepsimbad.engine.active_maps import ActiveMaps
 from deepsimbad.engine.evaluator_pool import EvaluatorPool
-from deepsimbad.api.schemas import DomainAnswer
 from deepsimbad.engine.snapshot import MapSnapshot
 from deepsimbad.errors import DamagedMapError, NoActiveMapError
 from deepsimbad.store.records import DomainRecord

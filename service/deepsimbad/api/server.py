@@ -1,6 +1,7 @@
 """Serving the application with uvicorn."""
 
 import logging
+import signal
 from types import FrameType
 
 import uvicorn
@@ -21,11 +22,14 @@ class _Server(uvicorn.Server):
         self._app = app
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
-        """A signal came."""
+        """A signal came: finish what is under way; a second one does not wait."""
         services = getattr(self._app.state, "services", None)
         if services is not None:
             services.stopping.set()
-        super().handle_exit(sig, frame)
+        if sig == signal.SIGTERM and not self.should_exit:
+            self.should_exit = True  # being asked to stop is no failure, so the signal is not raised again
+        else:
+            super().handle_exit(sig, frame)
 
 
 def serve(settings: Settings) -> None:

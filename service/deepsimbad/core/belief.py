@@ -124,9 +124,9 @@ class GridBelief:
             resultant = (self.mass * np.exp(1j * turn * (position - self.route.start_m))).sum()
             mean = self.route.start_m + (np.angle(resultant) / turn) % self.route.length_m
         else:
-            mean = self.mass @ position
+            mean = (self.mass * position).sum()  # not `@`: waking BLAS threads costs more than the product
         offset = self.route.offset_m(position, float(mean))
-        return float(mean), float(np.sqrt(self.mass @ np.square(offset)))
+        return float(mean), float(np.sqrt((self.mass * np.square(offset)).sum()))
 
     def _credible_stretch(self) -> tuple[float, float]:
         """Shortest stretch of images whose masses reach 95 %, by sliding its end for every start."""

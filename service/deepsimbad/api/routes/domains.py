@@ -20,7 +20,7 @@ async def list_domains(running: Running) -> DomainList:
         answers = []
         for record in running.catalog.domains():
             try:
-                answers.append(describe_domain(running, record))
+                answers.append(describe_domain(record, running.evaluators, running.active_maps))
             except UnknownDomainError:  # deleted since it was listed
                 continue
         return DomainList(domains=answers)
@@ -31,4 +31,6 @@ async def list_domains(running: Running) -> DomainList:
 @router.get("/{domain}", responses=problems(404, 422))
 async def get_domain(domain: DomainName, running: Running) -> DomainAnswer:
     """One domain and its active map."""
-    return await run_sync(lambda: describe_domain(running, running.catalog.domain(domain)))
+    return await run_sync(
+        lambda: describe_domain(running.catalog.domain(domain), running.evaluators, running.active_maps)
+    )
