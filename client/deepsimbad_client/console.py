@@ -127,13 +127,15 @@ def job_table(jobs: Sequence[Job]) -> Table:
     """Jobs and how far they are."""
     table = Table(title="jobs", title_justify="left")
     table.add_column("job", style="bold", no_wrap=True)
-    for heading in ("domain", "state", "stage"):
-        table.add_column(heading)
-    table.add_column("progress", justify="right")
-    table.add_column("outcome")
+    table.add_column("domain", overflow="fold")
+    table.add_column("state", no_wrap=True)
+    table.add_column("outcome", overflow="fold")
     for job in jobs:
-        outcome = job.error_text or (f"map {job.result.get('map_version')}" if job.result else "")
-        table.add_row(job.job_id, job.domain, job.state, job.stage or "", f"{100 * job.progress:.0f} %", outcome)
+        if job.ended:
+            outcome = job.error_text or (f"map {job.result.get('map_version')}" if job.result else "")
+        else:
+            outcome = f"{(job.stage or 'waiting').replace('_', ' ')}, {100 * job.progress:.0f} %"
+        table.add_row(job.job_id, job.domain, job.state, outcome)
     return table
 
 

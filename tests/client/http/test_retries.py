@@ -1,0 +1,209 @@
+"""What is sent again, when, and after how long."""
+
+import asyncio
+from collections.abc import Callable, Sequence
+from datetime import UTC, datetime, timedelta
+from email.utils import format_datetime
+
+import httpx2
+import pytest
+
+from deepsimbad_client import AsyncClient, Client, RetryPolicy, errors
+from deepsimbad_client.retry import retry_after_s
+
+OK = {"status": "alive"}
+DOMAIN = {"name": "d"}
+JOB = {"job_id": "1", "domain": "d", "state": "queued"}
+POLICY = RetryPolicy(attempts=4, base_s=1.0, max_backoff_s=3.0, max_retry_after_s=30.0)
+
+Outcome = httpx2.Response | type[httpx2.TransportError]
+
+
+class Script:
+    """Answers one outcome after the other and remembers what was asked."""
+
+    def __init__(self, *outcomes: Outcome) -> None:
+        self.outcomes = list(outcomes)
+        self.requests: list[httpx2.Request] = []
+        self.slept: list[float] = []
+
+    def __call__(self, request: httpx2.Request) -> httpx2.Response:
+        self.requests.append(request)
+        outcome = self.outcomes.pop(0)
+        if isinstance(outcome, httpx2.Response):
+            return outcome
+        raise outcome("scripted", request=request)
+
+    def client(self) -> Client:
+        return Client(
+            "http://service",
+            retry=POLICY,
+            transport=httpx2.MockTransport(self),
+            sleep=self.slept.append,
+            jitter=lambda: 1.0,
+        )
+
+
+def answer(status: int, document: object = None, **headers: str) -> httpx2.Response:
+    named = {name.replace("_", "-"): value for name, value in headers.items()}
+    return httpx2.Response(status, json=document, headers=named)
+
+
+RETRIED: Sequence[Callable[[], Outcome]] = (
+    lambda: httpx2.ConnectError,
+    lambda: httpx2.ConnectTimeout,
+    lambda: httpx2.ReadTimeout,
+    lambda: httpx2.ReadError,
+    lambda: httpx2.WriteError,
+    lambda: httpx2.RemoteProtocolError,
+    lambda: answer(429),
+    lambda: answer(502),
+    lambda: answer(503),
+    lambda: answer(504),
+)
+
+
+@pytest.mark.parametrize("outcome", RETRIED)
+def test_an_idempotent_call_is_sent_again(outcome: Callable[[], Outcome]) -> None:
+    script = Script(outcome(), outcome(), answer(200, OK))
+    assert script.client().health().status == "alive"
+    assert len(script.requests) == 3
+    assert script.slept == [1.0, 2.0]
+
+
+def test_an_upload_is_sent_again_with_its_body() -> None:
+    script = Script(httpx2.ReadError, answer(201, {"index": 3, "n_frames": 1}))
+    image = b"\xff\xd8\xff rest"
+    assert script.client().admin.put_frame("d", "t", 3, image, position_m=1.5).n_frames == 1
+    first, second = script.requests
+    assert first.content == second.content == image
+    assert second.url == "http://service/v1/admin/domains/d/traverses/t/frames/3?position_m=1.5"
+    assert second.headers["content-type"] == "image/jpeg"
+
+
+@pytest.mark.parametrize("outcome", [400, 404, 409, 422, 500, 501])
+def test_other_answers_are_the_last_word(outcome: int) -> None:
+    script = Script(answer(outcome))
+    with pytest.raises(errors.ApiError):
+        script.client().health()
+    assert script.slept == []
+
+
+@pytest.mark.parametrize("failure", [httpx2.ReadTimeout, httpx2.ReadError, httpx2.RemoteProtocolError])
+def test_a_remap_that_may_have_been_taken_is_not_sent_again(failure: type[httpx2.TransportError]) -> None:
+    script = Script(failure)
+    with pytest.raises(errors.TransportError):
+        script.client().admin.remap("d", training_traverse="t")
+    assert len(script.requests) == 1
+
+
+@pytest.mark.parametrize("status", [502, 504])
+def test_a_remap_behind_a_failing_proxy_is_not_sent_again(status: int) -> None:
+    script = Script(answer(status))
+    with pytest.raises(errors.ServerError):
+        script.client().admin.remap("d", training_traverse="t")
+    assert len(script.requests) == 1
+
+
+@pytest.mark.parametrize("refusal", [lambda: httpx2.ConnectError, lambda: answer(503), lambda: answer(429)])
+def test_a_remap_that_was_surely_not_taken_is_sent_again(refusal: Callable[[], Outcome]) -> None:
+    script = Script(refusal(), answer(202, JOB))
+    assert script.client().admin.remap("d", training_traverse="t").job_id == "1"
+
+
+def test_the_last_failure_is_raised_after_the_last_try() -> None:
+    script = Script(*[httpx2.ConnectError] * 4)
+    with pytest.raises(errors.TransportError, match="GET /healthz at http://service after 4 tries") as raised:
+        script.client().health()
+    assert isinstance(raised.value.__cause__, httpx2.ConnectError)
+    assert script.slept == [1.0, 2.0, 3.0]  # doubled, up to the longest
+
+
+def test_a_timeout_has_a_class_of_its_own() -> None:
+    script = Script(*[httpx2.ReadTimeout] * 4)
+    with pytest.raises(errors.TransportTimeoutError):
+        script.client().health()
+
+
+def test_the_last_refusal_is_raised_with_what_the_service_said() -> None:
+    refusals = [answer(429, {"code": "slow_down", "detail": "too fast"}, retry_after="2") for _ in range(4)]
+    script = Script(*refusals)
+    with pytest.raises(errors.RateLimitedError, match="too fast") as raised:
+        script.client().health()
+    assert (raised.value.code, raised.value.retry_after_s) == ("slow_down", 2.0)
+    assert script.slept == [2.0, 2.0, 2.0]
+
+
+def test_retry_after_as_a_date_is_waited_out() -> None:
+    when = format_datetime(datetime.now(UTC) + timedelta(seconds=20), usegmt=True)
+    script = Script(answer(503, retry_after=when), answer(200, OK))
+    script.client().health()
+    assert 15 < script.slept[0] <= 20
+
+
+def test_a_longer_wait_than_the_cap_is_not_begun() -> None:
+    script = Script(answer(503, retry_after="31"))
+    with pytest.raises(errors.UnavailableError) as raised:
+        script.client().health()
+    assert raised.value.retry_after_s == 31
+    assert script.slept == []
+
+
+def test_a_damaged_map_is_not_waited_for() -> None:
+    script = Script(answer(503, {"code": "damaged_map", "detail": "digest"}, retry_after="5"))
+    with pytest.raises(errors.DamagedMapError):
+        script.client().domain("d")
+    assert script.slept == []
+
+
+def test_a_delete_whose_answer_was_lost_is_not_an_error() -> None:
+    script = Script(httpx2.ReadError, answer(404, {"code": "unknown_domain"}))
+    script.client().admin.delete_domain("d")
+    script = Script(httpx2.ConnectError, answer(404, {"code": "unknown_domain"}))
+    with pytest.raises(errors.UnknownDomainError):  # the service never saw the first try
+        script.client().admin.delete_domain("d")
+
+
+def test_jitter_spreads_over_the_upper_half() -> None:
+    assert [POLICY.backoff_s(1, jitter) for jitter in (0.0, 0.5, 1.0)] == [0.5, 0.75, 1.0]
+
+
+@pytest.mark.parametrize(
+    ("header", "seconds"),
+    [
+        (None, None),
+        ("7", 7.0),
+        (" 7 ", 7.0),
+        ("-1", None),
+        ("1.5", None),
+        ("soon", None),
+        ("Wed, 21 Oct 2015 07:28:10 GMT", 10.0),
+        ("Wed, 21 Oct 2015 07:27:00 GMT", 0.0),
+        ("٣", None),
+    ],
+)
+def test_retry_after(header: str | None, seconds: float | None) -> None:
+    assert retry_after_s(header, datetime(2015, 10, 21, 7, 28, tzinfo=UTC)) == seconds
+
+
+def test_the_async_client_obeys_the_same_rules() -> None:
+    slept = []
+
+    async def sleep(seconds: float) -> None:
+        slept.append(seconds)
+
+    async def ask(script: Script) -> str:
+        async with AsyncClient(
+            "http://service",
+            retry=POLICY,
+            transport=httpx2.MockTransport(script),
+            sleep=sleep,
+            jitter=lambda: 1.0,
+        ) as client:
+            return (await client.health()).status
+
+    script = Script(httpx2.ConnectError, answer(503, retry_after="4"), answer(200, OK))
+    assert asyncio.run(ask(script)) == "alive"
+    assert slept == [1.0, 4.0]
+    with pytest.raises(errors.TransportError):
+        asyncio.run(ask(Script(*[httpx2.ReadError] * 4)))

@@ -1,0 +1,189 @@
+"""The client against the real service: nothing between them is pretended."""
+
+import asyncio
+import json
+from pathlib import Path
+
+import cv2
+import httpx2
+import numpy as np
+import pytest
+
+from deepsimbad.api.app import create_app
+from deepsimbad.settings import Settings
+from deepsimbad_client import AsyncClient, Client, errors
+from deepsimbad_client.commands import run
+from deepsimbad_client.remap import remap
+from deepsimbad_client.replay import replay
+from deepsimbad_client.report import summarise
+from deepsimbad_client.sources import open_source
+from deepsimbad_client.upload import upload
+
+ENCODINGS = {"kind": "feature_l2", "extractor": "none"}
+
+
+def mapped(client: Client, domain: str, encodings: Path) -> None:
+    client.admin.put_domain(domain, ENCODINGS)
+    for name in ("landmarks", "summer"):
+        upload(client, open_source(str(encodings / f"{name}.npy")), domain, name)
+    remap(client, domain, "summer", landmark_traverse="landmarks", n_landmarks=50, list_length=4)
+
+
+def test_upload_remap_replay_of_ready_encodings(service: str, encodings: Path, tmp_path: Path) -> None:
+    with Client(service) as client:
+        mapped(client, "route", encodings)
+        described = client.domain("route")
+        assert (described.map_version, described.n_map_images, described.n_landmarks) == (1, 120, 50)
+        done = replay(client, open_source(str(encodings / "winter.npy")), "route", tmp_path, tolerance_m=2)
+        summary = summarise(done)
+    assert summary["n_queries"] == 120
+    assert summary["anr"] < 25
+    relevances = slow_anr(service, encodings / "winter.npy")
+    assert summary["anr"] == pytest.approx(relevances, abs=1e-9)
+
+
+def slow_anr(service: str, queries: Path) -> float:
+    """ANR by its definition, from the answers alone."""
+    shares = []
+    with Client(service) as client:
+        for query, encoding in enumerate(np.load(queries)):
+            values = client.relevances("route", encoding=encoding).tolist()
+            placed = []
+            for true in range(max(0, query - 2), min(len(values), query + 3)):
+                better = sum(other > values[true] for other in values)
+                tied = sum(other == values[true] for other in values) - 1
+                placed.append(better + tied / 2)
+            shares.append(100 * min(placed) / len(values))
+    return sum(shares) / len(shares)
+
+
+def test_an_upload_goes_on_where_it_stopped(service: str, encodings: Path) -> None:
+    with Client(service) as client:
+        client.admin.put_domain("again", ENCODINGS)
+        upload(client, open_source(f"{encodings / 'summer.npy'}#10:30"), "again", "t")
+        assert client.admin.traverse("again", "t").missing == ((0, 9),)
+        report = upload(client, open_source(str(encodings / "summer.npy")), "again", "t")
+        assert (report.n_skipped, report.n_sent) == (20, 100)
+        there = client.admin.traverse("again", "t")
+        assert (there.n_frames, there.missing) == (120, ())
+
+
+def test_images_with_a_broken_one_among_them(service: str, tmp_path: Path) -> None:
+    folder = tmp_path / "images"
+    folder.mkdir()
+    rng = np.random.default_rng(3)
+    for number in range(8):
+        picture = cv2.resize(rng.integers(0, 255, (6, 8, 3), np.uint8), (320, 240), interpolation=cv2.INTER_CUBIC)
+        cv2.imwrite(str(folder / f"{number}.jpg"), picture)
+    (folder / "3.jpg").write_bytes((folder / "3.jpg").read_bytes()[:-500])
+    with Client(service) as client:
+        client.admin.put_domain("pictures", {"kind": "feature_l2"})
+        report = upload(client, open_source(str(folder)), "pictures", "t", concurrency=3)
+        assert (report.n_sent, report.n_broken.total(), report.broken_names) == (7, 1, ["3.jpg"])
+        remap(client, "pictures", "t", landmark_traverse="t", n_landmarks=5, list_length=2)
+        done = replay(client, open_source(str(folder)), "pictures", tmp_path / "out", tolerance_m=0, concurrency=2)
+        summary = summarise(done)
+        assert (summary["n_queries"], sum(summary["n_broken"].values())) == (7, 1)
+        answer = client.localize("pictures", folder / "5.jpg", shortlist=3)
+        assert len(answer.retrieval) == 3
+        assert answer.next_best_view is None
+
+
+def test_errors_arrive_with_their_names(service: str, encodings: Path) -> None:
+    with Client(service) as client:
+        with pytest.raises(errors.UnknownDomainError) as unknown:
+            client.domain("nowhere")
+        assert unknown.value.request_id
+        client.admin.put_domain("empty", ENCODINGS)
+        with pytest.raises(errors.DomainDiffersError):
+            client.admin.put_domain("empty", ENCODINGS, closed=True)
+        with pytest.raises(errors.NoActiveMapError):
+            client.localize("empty", ranked_landmarks=[0])
+        with pytest.raises(errors.UnknownTraverseError):
+            client.admin.traverse("empty", "none")
+        with pytest.raises(errors.UnknownJobError):
+            client.admin.job("none")
+        upload(client, open_source(str(encodings / "summer.npy")), "empty", "summer")
+        with pytest.raises(errors.JobFailedError, match="landmarks"):
+            remap(client, "empty", "summer", landmark_traverse="summer", n_landmarks=500)
+        client.admin.delete_traverse("empty", "summer")
+        client.admin.delete_domain("empty")
+        with pytest.raises(errors.UnknownDomainError):
+            client.admin.delete_domain("empty")
+
+
+def test_versions_are_listed_switched_and_raced(service: str, encodings: Path) -> None:
+    with Client(service) as client:
+        mapped(client, "versions", encodings)
+        remap(client, "versions", "summer", landmark_traverse="landmarks", n_landmarks=40, activate=False)
+        assert [version.version for version in client.admin.maps("versions")] == [2, 1]
+        assert client.domain("versions").map_version == 1
+        assert client.admin.activate("versions", 2, expected=1).state == "active"
+        with pytest.raises(errors.LostActivationError):
+            client.admin.activate("versions", 1, expected=1)
+        client.admin.activate("versions", 1)
+        assert client.domain("versions").map_version == 1
+        (job, _) = client.admin.jobs("versions")
+        assert [heard.state for heard in client.admin.job_events(job.job_id)] == ["succeeded"]
+
+
+def test_the_command_line_end_to_end(
+    service: str, encodings: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("DEEPSIMBAD_URL", service)
+    for name in ("landmarks", "summer"):
+        assert run(["upload", str(encodings / f"{name}.npy"), "--domain", "cli", "--traverse", name, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out.partition("}\n{")[0] + "}")["n_sent"] == 60
+    command = ["remap", "--domain", "cli", "--training", "summer", "--landmarks", "landmarks", "--n-landmarks", "50"]
+    assert run([*command, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["result"]["map_version"] == 1
+    out = tmp_path / "out"
+    command = ["replay", f"{encodings / 'winter.npy'}#:40", "--domain", "cli", "--out", str(out)]
+    assert run([*command, "--json"]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert printed == json.loads((out / "summary.json").read_text())
+    assert len((out / "steps.jsonl").read_text().splitlines()) == 40
+    assert (out / "rank_along_route.png").read_bytes().startswith(b"\x89PNG")
+    assert run([*command, "--json"]) == 0  # a second run has nothing left to ask
+    assert json.loads(capsys.readouterr().out)["anr"] == printed["anr"]
+    assert run([*command, "--tolerance", "9"]) == 1
+    assert "tolerance_m" in capsys.readouterr().err
+    assert run([*command, "--restart", "--no-plots"]) == 0
+    assert "ANR" in capsys.readouterr().out
+    assert run(["domains"]) == 0
+    assert "cli" in capsys.readouterr().out
+    assert run(["jobs"]) == 0
+    assert "succeeded" in capsys.readouterr().out
+    assert run(["remap", "--domain", "cli", "--training", "nothing"]) == 1
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_the_async_client_over_asgi(tmp_path: Path, encodings: Path) -> None:
+    async def scenario() -> None:
+        app = create_app(Settings(data_dir=tmp_path))
+        async with (
+            app.router.lifespan_context(app),
+            AsyncClient("http://service", transport=httpx2.ASGITransport(app)) as client,
+        ):
+            assert (await client.health()).status == "alive"
+            assert (await client.ready()).status == "ready"
+            await client.admin.put_domain("async", ENCODINGS)
+            await client.admin.create_traverse("async", "t")
+            frames = np.load(encodings / "summer.npy")
+            index = np.arange(len(frames))
+            stored = await client.admin.put_frames(
+                "async", "t", encodings=frames, index=index, position_m=index, x_m=index, y_m=0.0 * index
+            )
+            assert stored.n_new == 120
+            job = await client.admin.remap("async", training_traverse="t", landmark_traverse="t", n_landmarks=30)
+            heard = [event async for event in client.admin.job_events(job.job_id)]
+            assert heard[-1].state == "succeeded"
+            asked = [client.localize("async", encoding=frame) for frame in frames[:10]]
+            answers = await asyncio.gather(*asked)
+            assert [answer.retrieval[0].map_image for answer in answers] == list(range(10))
+            assert answers[4].belief.top[0].x_m == 4.0
+            assert (await client.relevances("async", encoding=frames[5])).argmax() == 5
+            with pytest.raises(errors.InvalidInputError):
+                await client.localize("async", encoding=[1.0, 2.0])
+
+    asyncio.run(scenario())
