@@ -8,9 +8,15 @@ from typing import Any, Self
 
 from sqlite_utils import Database
 
-from deepsimbad.errors import ConflictError, DamagedMapError, TraverseInUseError, UnknownMapVersionError
+from deepsimbad.errors import (
+    ConflictError,
+    DamagedFileError,
+    DamagedMapError,
+    TraverseInUseError,
+    UnknownMapVersionError,
+)
 from deepsimbad.store import domain_table, job_table, layout, map_table, unfinished
-from deepsimbad.store.connection import migrate, open_database, use_write_ahead_log, write_transaction
+from deepsimbad.store.connection import check_integrity, migrate, open_database, use_write_ahead_log, write_transaction
 from deepsimbad.store.documents import from_json, to_json
 from deepsimbad.store.durable import remove_folder, sync_folder
 from deepsimbad.store.faults import storage_faults
@@ -46,8 +52,17 @@ class Catalog:
         path = layout.catalog_path(data_dir)
         with storage_faults(path), ExitStack() as on_error:
             data_dir.mkdir(parents=True, exist_ok=True)
+            domains = layout.domains_folder(data_dir)
+            has_domains = domains.is_dir() and any(domains.iterdir())  # looked at before the rows: they come first
             db = open_database(path, create=True)
             on_error.callback(db.close)
+            if has_domains and not db.table_names():
+                raise DamagedFileError(
+                    f"{path.name} is missing or empty beside a folder of domains: put a copy of it back, or move "
+                    "the folder away",
+                    file=path.name,
+                )
+            check_integrity(db, path)
             use_write_ahead_log(db)
             migrate(db, migrations, path)
             sync_folder(data_dir)

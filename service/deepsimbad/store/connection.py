@@ -70,6 +70,15 @@ def write_transaction(db: Database) -> Iterator[Database]:
         raise
 
 
+def check_integrity(
+    db: Database, path: Path, damaged: type[DamagedFileError | DamagedMapError] = DamagedFileError
+) -> None:
+    """Check every page and index of the file; raises DamagedFileError (or `damaged`)."""
+    (verdict,) = db.execute("PRAGMA integrity_check(1)").fetchone()
+    if verdict != "ok":
+        raise damaged(f"{path.name} is damaged: {' '.join(str(verdict).split())}", file=path.name)
+
+
 def pending_migrations(
     db: Database,
     migrations: Migrations,
@@ -81,8 +90,11 @@ def pending_migrations(
     Raises:
         DamagedFileError: (or `damaged`) The file is of another kind, or a newer release wrote it.
     """
-    pending = {migration.name for migration in migrations.pending(db)}
-    applied = {migration.name for migration in migrations.applied(db)}
+    try:
+        pending = {migration.name for migration in migrations.pending(db)}
+        applied = {migration.name for migration in migrations.applied(db)}
+    except (AttributeError, LookupError, TypeError, ValueError) as error:  # a bookkeeping table of another shape
+        raise damaged(f"{path.name} is damaged: its schema cannot be read", file=path.name) from error
     if not applied and db.table_names():
         raise damaged(f"{path.name} is a SQLite file of another kind", file=path.name)
     with Database(memory=True, execute_plugins=False) as nothing:

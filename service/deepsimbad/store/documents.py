@@ -1,11 +1,14 @@
 """JSON columns and times, one way for every table."""
 
+import functools
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
-from typing import Any
+from typing import Any, TypeVar
 
-from deepsimbad.errors import InvalidInputError
+from deepsimbad.errors import DamagedFileError, InvalidInputError
+
+_Record = TypeVar("_Record")
 
 
 def to_json(value: Mapping[str, Any] | Sequence[Any]) -> str:
@@ -24,6 +27,19 @@ def to_json(value: Mapping[str, Any] | Sequence[Any]) -> str:
 def from_json(text: str) -> Any:
     """The value of a JSON column; raises ValueError on damage."""
     return json.loads(text)
+
+
+def row_reader(read: Callable[[tuple[Any, ...]], _Record]) -> Callable[[tuple[Any, ...]], _Record]:
+    """Let a function that makes a record of a row raise DamagedFileError where the row cannot be one."""
+
+    @functools.wraps(read)
+    def read_or_refuse(row: tuple[Any, ...]) -> _Record:
+        try:
+            return read(row)
+        except (TypeError, ValueError, RecursionError) as error:
+            raise DamagedFileError(f"the catalog is damaged: a row cannot be read: {error}") from error
+
+    return read_or_refuse
 
 
 def now() -> str:

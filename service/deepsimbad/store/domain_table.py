@@ -5,7 +5,7 @@ from typing import Any
 from sqlite_utils import Database
 
 from deepsimbad.errors import DomainDiffersError, UnknownDomainError
-from deepsimbad.store.documents import from_json, now, to_json
+from deepsimbad.store.documents import from_json, now, row_reader, to_json
 from deepsimbad.store.layout import is_name
 from deepsimbad.store.records import DomainRecord
 
@@ -15,6 +15,7 @@ _SELECT = """
 """
 
 
+@row_reader
 def _record(row: tuple[Any, ...]) -> DomainRecord:
     name, evaluator, closed, actions_m, active_version, created_at = row
     return DomainRecord(

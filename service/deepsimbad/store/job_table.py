@@ -9,7 +9,7 @@ from typing import Any
 from sqlite_utils import Database
 
 from deepsimbad.errors import InvalidInputError, UnknownJobError
-from deepsimbad.store.documents import from_json, now, to_json
+from deepsimbad.store.documents import from_json, now, row_reader, to_json
 from deepsimbad.store.records import JobRecord, JobState
 
 _SELECT = """
@@ -22,6 +22,7 @@ _DOCUMENTS = ("result", "error")
 _FIELDS = ("state", "stage", "progress", "eta_s", *_DOCUMENTS)
 
 
+@row_reader
 def _record(row: tuple[Any, ...]) -> JobRecord:
     job_id, domain, kind, config, state, stage, progress, eta_s, result, error, *times = row
     return JobRecord(

@@ -39,9 +39,14 @@ def owners_folder(data_dir: Path) -> Path:
     return data_dir / "owners"
 
 
+def domains_folder(data_dir: Path) -> Path:
+    """The folder of all domains."""
+    return data_dir / "domains"
+
+
 def domain_folder(data_dir: Path, domain: str) -> Path:
     """The folder of one domain; raises InvalidInputError."""
-    return data_dir / "domains" / checked_name(domain, "domain")
+    return domains_folder(data_dir) / checked_name(domain, "domain")
 
 
 def traverses_folder(data_dir: Path, domain: str) -> Path:

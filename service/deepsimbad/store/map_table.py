@@ -5,7 +5,7 @@ from typing import Any, Final
 from sqlite_utils import Database
 
 from deepsimbad.errors import LostActivationError, UnknownMapVersionError
-from deepsimbad.store.documents import from_json, now, to_json
+from deepsimbad.store.documents import from_json, now, row_reader, to_json
 from deepsimbad.store.records import MapRecord, MapState
 
 
@@ -24,6 +24,7 @@ _SELECT = "SELECT version, state, created_at, sha256, file_bytes, config, metric
 _MAX_INTEGER = 2**63 - 1
 
 
+@row_reader
 def _record(row: tuple[Any, ...]) -> MapRecord:
     version, state, created_at, sha256, file_bytes, config, metrics = row
     return MapRecord(version, MapState(state), created_at, sha256, file_bytes, from_json(config), from_json(metrics))

@@ -1,10 +1,9 @@
 """Turning a built map into the file that serves, and checking later that it is still that file."""
 
-import sqlite3
 from pathlib import Path
 
 from deepsimbad.errors import ConflictError, DamagedMapError
-from deepsimbad.store.connection import open_database
+from deepsimbad.store.connection import check_integrity, open_database
 from deepsimbad.store.durable import remove_database, sha256_of, sync_file, sync_folder
 from deepsimbad.store.faults import storage_faults
 from deepsimbad.store.map_file import read_map
@@ -32,7 +31,7 @@ def seal(building_path: Path, final_path: Path) -> tuple[str, int]:
         remove_database(sealing_path)
         try:
             with open_database(building_path) as db:
-                _check_integrity(db.conn, building_path)
+                check_integrity(db, building_path, DamagedMapError)
                 db.conn.execute("VACUUM INTO ?", [str(sealing_path)])
             read_map(sealing_path)
             sealing_path.chmod(0o444)
@@ -62,9 +61,3 @@ def verify(path: Path, sha256: str) -> None:
         raise DamagedMapError(
             f"{path.name} is not the file that was sealed: its SHA-256 differs", file=path.name, sha256=digest
         )
-
-
-def _check_integrity(connection: sqlite3.Connection, path: Path) -> None:
-    (verdict,) = connection.execute("PRAGMA integrity_check(1)").fetchone()
-    if verdict != "ok":
-        raise DamagedMapError(f"{path.name} is damaged: {verdict}", file=path.name)

@@ -1,0 +1,305 @@
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from deepsimbad.errors import (
+    ConflictError,
+    DamagedFileError,
+    DeepSimbadError,
+    InvalidEncodingError,
+    InvalidInputError,
+    InvalidRouteError,
+    UnavailableError,
+    UnknownDomainError,
+    UnknownTraverseError,
+)
+from deepsimbad.store.catalog import Catalog
+from deepsimbad.store.frames import TraverseFrames
+from deepsimbad.store.traverses import Traverse
+
+MakeFrames = Callable[..., TraverseFrames]
+
+
+@pytest.fixture
+def summer(campus: Catalog) -> Iterator[Traverse]:
+    with Traverse.create(campus.data_dir, "campus", "summer") as traverse:
+        yield traverse
+
+
+def same(left: TraverseFrames, right: TraverseFrames) -> bool:
+    return all(
+        getattr(left, each.name).dtype == getattr(right, each.name).dtype
+        and np.array_equal(getattr(left, each.name), getattr(right, each.name), equal_nan=True)
+        for each in fields(TraverseFrames)
+    )
+
+
+def test_a_traverse_is_made_listed_opened_and_deleted(campus: Catalog) -> None:
+    data_dir = campus.data_dir
+    assert Traverse.list(data_dir, "campus") == []
+    for name in ("summer", "a.b", "winter"):
+        Traverse.create(data_dir, "campus", name).close()
+    assert Traverse.list(data_dir, "campus") == ["a.b", "summer", "winter"]
+    with pytest.raises(ConflictError):
+        Traverse.create(data_dir, "campus", "summer")
+    Traverse.delete(data_dir, "campus", "summer")
+    assert Traverse.list(data_dir, "campus") == ["a.b", "winter"]
+    for act in (Traverse.open, Traverse.delete):
+        with pytest.raises(UnknownTraverseError):
+            act(data_dir, "campus", "summer")
+        with pytest.raises(UnknownTraverseError):
+            act(data_dir, "city", "summer")
+        with pytest.raises(InvalidInputError):
+            act(data_dir, "campus", "../winter")
+    with pytest.raises(UnknownDomainError):
+        Traverse.create(data_dir, "city", "summer")
+    assert Traverse.list(data_dir, "city") == []
+
+
+def test_frames_come_back_exactly_and_in_index_order(
+    summer: Traverse, campus: Catalog, make_frames: MakeFrames
+) -> None:
+    assert (summer.n_frames, summer.encoding_dim, summer.missing) == (0, None, [])
+    assert summer.read().encodings.shape == (0, 0)
+    frames = make_frames([7, 2, 5, 0])
+    frames = replace(
+        frames,
+        timestamp_us=np.array([1, -1, 2**60, 0]),
+        x_m=np.array([np.nan, -0.0, 1e-300, 1e300]),
+        position_m=np.array([-0.0, -3.25, 1e-9, 1 / 3]),
+    )
+    assert summer.put_frames(frames) == (4, 0)
+    order = np.argsort(frames.index)
+    expected = TraverseFrames(*(getattr(frames, each.name)[order] for each in fields(TraverseFrames)))
+    assert same(summer.read(), expected)
+    assert (summer.n_frames, summer.encoding_dim) == (4, 8)
+    assert summer.missing == [(1, 1), (3, 4), (6, 6)]
+    summer.close()
+    with Traverse.open(campus.data_dir, "campus", "summer") as again:
+        assert same(again.read(), expected)
+
+
+def test_one_frame_is_new_once_and_then_replaced(summer: Traverse) -> None:
+    assert summer.put_frame(3, np.arange(4, dtype=np.float32), 1.5, 10, 0.5, None)
+    assert not summer.put_frame(3, np.ones(4, np.float32), 2.5)
+    frames = summer.read()
+    assert frames.n_frames == summer.n_frames == 1
+    assert frames.encodings.tolist() == [[1, 1, 1, 1]]
+    assert (frames.position_m[0], frames.timestamp_us[0]) == (2.5, -1)
+    assert np.isnan(frames.x_m[0])
+    assert np.isnan(frames.y_m[0])
+
+
+def test_batches_count_what_is_new(summer: Traverse, make_frames: MakeFrames) -> None:
+    assert summer.put_frames(make_frames(range(10))) == (10, 0)
+    assert summer.put_frames(make_frames(range(5, 20), seed=1)) == (10, 5)
+    assert summer.put_frames(make_frames([])) == (0, 0)
+    frames = summer.read()
+    assert np.array_equal(frames.encodings[:5], make_frames(range(10)).encodings[:5])
+    assert np.array_equal(frames.encodings[5:], make_frames(range(5, 20), seed=1).encodings)
+
+
+@pytest.mark.parametrize(
+    ("change", "error"),
+    [
+        ({"index": np.array([0, 1, 1])}, InvalidInputError),
+        ({"index": np.array([0, 1, -1])}, InvalidInputError),
+        ({"index": np.array([0, 1, 2**62])}, InvalidInputError),
+        ({"index": np.array([0.0, 1.0, 2.0])}, InvalidInputError),
+        ({"index": np.array([0, 1])}, InvalidInputError),
+        ({"position_m": np.array([0, np.nan, 1])}, InvalidRouteError),
+        ({"position_m": np.array([0, np.inf, 1])}, InvalidRouteError),
+        ({"position_m": np.array(["a", "b", "c"])}, InvalidInputError),
+        ({"x_m": np.array([0, np.inf, 1])}, InvalidInputError),
+        ({"timestamp_us": np.array([0, -2, 1])}, InvalidInputError),
+        ({"encodings": np.full((3, 8), np.nan, np.float32)}, InvalidEncodingError),
+        ({"encodings": np.full((3, 8), np.inf, np.float32)}, InvalidEncodingError),
+        ({"encodings": np.ones((3, 7), np.float32)}, InvalidEncodingError),
+        ({"encodings": np.ones((3, 0), np.float32)}, InvalidEncodingError),
+        ({"encodings": np.ones(3, np.float32)}, InvalidEncodingError),
+    ],
+)
+def test_bad_frames_change_nothing(
+    summer: Traverse, make_frames: MakeFrames, change: dict[str, np.ndarray], error: type[DeepSimbadError]
+) -> None:
+    summer.put_frames(make_frames([0, 5]))
+    before = summer.read()
+    with pytest.raises(error):
+        summer.put_frames(replace(make_frames([0, 1, 2], seed=1), **change))
+    assert same(summer.read(), before)
+
+
+def test_the_first_bad_batch_does_not_fix_the_length(summer: Traverse, make_frames: MakeFrames) -> None:
+    with pytest.raises(InvalidRouteError):
+        summer.put_frames(replace(make_frames([0]), position_m=np.array([np.nan])))
+    assert summer.encoding_dim is None
+    assert summer.put_frame(0, np.ones(3, np.float32), 0.0)
+
+
+def test_many_threads_put_at_once(summer: Traverse, campus: Catalog, make_frames: MakeFrames) -> None:
+    failures: list[BaseException] = []
+
+    def put(start: int, traverse: Traverse) -> None:
+        try:
+            for index in range(start, start + 20):
+                traverse.put_frame(index, np.full(8, index, np.float32), float(index))
+        except BaseException as error:
+            failures.append(error)
+
+    with Traverse.open(campus.data_dir, "campus", "summer") as other:  # as a second process would
+        threads = [threading.Thread(target=put, args=[20 * i, (summer, other)[i % 2]]) for i in range(4)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    assert failures == []
+    assert summer.read().encodings[:, 0].tolist() == list(range(80))
+    assert summer.missing == []
+
+
+def test_a_deleted_traverse_takes_no_more_frames(summer: Traverse, campus: Catalog, make_frames: MakeFrames) -> None:
+    summer.put_frames(make_frames([0]))
+    Traverse.delete(campus.data_dir, "campus", "summer")
+    with pytest.raises(UnknownTraverseError):
+        summer.put_frames(make_frames([1]))
+    with Traverse.create(campus.data_dir, "campus", "summer") as anew:
+        assert anew.n_frames == 0
+        with pytest.raises(UnknownTraverseError):
+            summer.put_frames(make_frames([1]))
+        assert anew.n_frames == 0
+
+
+def test_a_stale_log_is_not_replayed_into_a_new_traverse(campus: Catalog, make_frames: MakeFrames) -> None:
+    folder = campus.data_dir / "domains/campus/traverses"
+    with Traverse.create(campus.data_dir, "campus", "summer") as old:
+        old.put_frames(make_frames(range(50)))
+        log = (folder / "summer.sqlite-wal").read_bytes()
+    assert len(log) > 1000
+    (folder / "summer.sqlite").unlink()  # a deletion that was cut short: the file is gone, its log is not
+    (folder / "summer.sqlite-wal").write_bytes(log)
+    (folder / "summer.new").write_bytes(b"half made")
+    with Traverse.create(campus.data_dir, "campus", "summer") as new:
+        assert new.n_frames == 0
+        assert new.put_frames(make_frames(range(3))) == (3, 0)
+
+
+def test_a_full_disk_is_named_and_the_old_frames_stay(summer: Traverse, make_frames: MakeFrames) -> None:
+    summer.put_frames(make_frames(range(3)))
+    before = summer.read()
+    (n_pages,) = summer._db.conn.execute("PRAGMA page_count").fetchone()
+    summer._db.conn.execute(f"PRAGMA max_page_count = {n_pages}")
+    with pytest.raises(UnavailableError) as caught:
+        summer.put_frames(make_frames(range(1000), seed=1))
+    assert caught.value.hints["reason"] == "disk_full"
+    assert same(summer.read(), before)
+
+
+def test_every_flipped_byte_is_seen_or_harmless(campus: Catalog, make_frames: MakeFrames) -> None:
+    path = campus.data_dir / "domains/campus/traverses/summer.sqlite"
+    with Traverse.create(campus.data_dir, "campus", "summer") as traverse:
+        traverse.put_frames(make_frames(range(40)))
+        expected = traverse.read()
+    whole = path.read_bytes()
+    generator = np.random.default_rng(0)
+    body = whole.index(expected.encodings[20].tobytes())
+    n_seen = 0
+    for at in [*range(body, body + 8), *generator.integers(0, len(whole), 250).tolist()]:
+        path.write_bytes(whole[:at] + bytes([whole[at] ^ (1 << int(generator.integers(8)))]) + whole[at + 1 :])
+        try:
+            with Traverse.open(campus.data_dir, "campus", "summer") as traverse:
+                assert same(traverse.read(), expected), f"byte {at} changed what was read"
+                assert at not in range(body, body + 8)
+        except (DamagedFileError, UnavailableError):
+            n_seen += 1
+        for suffix in ("-wal", "-shm"):
+            path.with_name(path.name + suffix).unlink(missing_ok=True)
+    assert n_seen > 50
+
+
+def test_a_truncated_or_foreign_file_is_named_and_can_be_deleted(campus: Catalog, make_frames: MakeFrames) -> None:
+    path = campus.data_dir / "domains/campus/traverses/summer.sqlite"
+    with Traverse.create(campus.data_dir, "campus", "summer") as traverse:
+        traverse.put_frames(make_frames(range(400)))
+    whole = path.read_bytes()
+
+    def read() -> None:
+        with Traverse.open(campus.data_dir, "campus", "summer") as traverse:
+            traverse.read()
+
+    catalog_bytes = (campus.data_dir / "catalog.sqlite").read_bytes()
+    for content in (b"", whole[:100], whole[:4096], whole[: len(whole) // 2], b"no database" * 1000, catalog_bytes):
+        path.write_bytes(content)
+        with pytest.raises(DamagedFileError):
+            read()
+    Traverse.delete(campus.data_dir, "campus", "summer")
+    assert Traverse.list(campus.data_dir, "campus") == []
+
+
+WRITER = """
+import sys
+import numpy as np
+from pathlib import Path
+from deepsimbad.store.traverses import Traverse
+with Traverse.open(Path(sys.argv[1]), "campus", "summer") as traverse:
+    for index in range(100_000):
+        traverse.put_frame(index, np.full(512, index, np.float32), float(index))
+        print(index, flush=True)
+"""
+
+
+def test_an_acknowledged_frame_survives_kill_9(summer: Traverse, campus: Catalog) -> None:
+    summer.close()
+    acknowledged = -1
+    with subprocess.Popen(
+        [sys.executable, "-c", WRITER, str(campus.data_dir)], stdout=subprocess.PIPE, text=True
+    ) as writer:
+        assert writer.stdout is not None
+        for line in writer.stdout:
+            acknowledged = int(line)
+            if acknowledged == 60:
+                writer.kill()
+    with Traverse.open(campus.data_dir, "campus", "summer") as traverse:
+        frames = traverse.read()
+    assert frames.n_frames in (acknowledged + 1, acknowledged + 2)
+    assert np.array_equal(frames.encodings[:, 0], np.arange(frames.n_frames))
+
+
+@pytest.mark.slow
+def test_a_whole_campus_uploads_and_reads_in_bounded_memory(campus: Catalog, tmp_path: Path) -> None:
+    """26,208 encodings of 4,096 numbers: one array of 429 MB and little beside it."""
+    script = """
+import sys, resource, time
+import numpy as np
+from pathlib import Path
+from deepsimbad.store.frames import TraverseFrames
+from deepsimbad.store.traverses import Traverse
+n, d, step = 26208, 4096, 1024
+with Traverse.create(Path(sys.argv[1]), "campus", "large") as traverse:
+    block = np.random.default_rng(0).random((step, d), dtype=np.float32)
+    started = time.perf_counter()
+    for start in range(0, n, step):
+        index = np.arange(start, min(start + step, n))
+        unknown = np.full(index.size, np.nan)
+        traverse.put_frames(TraverseFrames(index, index * 1.0, index, unknown, unknown, block[: index.size]))
+    written = time.perf_counter()
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    frames = traverse.read()
+    read = time.perf_counter()
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    assert np.array_equal(frames.encodings[-10:], block[: n % step][-10:])
+print(written - started, read - written, (peak - before) * 1024 / frames.encodings.nbytes)
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", script, str(campus.data_dir)], check=True, capture_output=True, text=True
+    )
+    write_s, read_s, memory_ratio = map(float, done.stdout.split())
+    print(f"written in {write_s:.1f} s, read in {read_s:.2f} s, {memory_ratio:.2f} times the array")
+    assert memory_ratio < 1.1
+    assert write_s < 60
+    assert read_s < 10
