@@ -11,8 +11,8 @@ UPRIGHT_SIZE = (1232, 1616)
 CANVAS_SIZE = (560, 728)
 """Width and height pictures are drawn at: a little more than is seen, so that the robot may nod."""
 
-SCALE = 1232 / 528
-"""Stored pixels per drawn pixel."""
+SEEN_SIZE = (528, 693)
+"""Width and height of the part of the canvas that is seen."""
 
 FOCAL_PX = 300.0
 CENTRE_X = CANVAS_SIZE[0] / 2
@@ -41,9 +41,9 @@ class View:
 
     def to_camera(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """[n, 2] metres to the right of and ahead of the camera, of [n, 2] north and east."""
-        north, east = points[:, 0] - self.north_m, points[:, 1] - self.east_m
         cos, sin = np.cos(self.heading_rad), np.sin(self.heading_rad)
-        return np.stack([east * cos - north * sin, north * cos + east * sin], axis=1)
+        turn = np.array([[-sin, cos], [cos, sin]])
+        return np.asarray((points - (self.north_m, self.east_m)) @ turn, np.float64)
 
 
 def project(right_ahead: NDArray[np.float64], height_m: NDArray[np.float64] | float) -> NDArray[np.float64]:
@@ -51,10 +51,11 @@ def project(right_ahead: NDArray[np.float64], height_m: NDArray[np.float64] | fl
 
     The pitch and roll of a view are applied to the finished picture; heights are above the ground.
     """
-    ahead = np.maximum(right_ahead[:, 1], 1e-3)
-    x = CENTRE_X + FOCAL_PX * right_ahead[:, 0] / ahead
-    y = HORIZON_Y + FOCAL_PX * (EYE_M - height_m) / ahead
-    return np.stack([x, y], axis=1)
+    per_m = FOCAL_PX / np.maximum(right_ahead[:, 1], 1e-3)
+    pixels = np.empty((len(right_ahead), 2))
+    pixels[:, 0] = CENTRE_X + right_ahead[:, 0] * per_m
+    pixels[:, 1] = HORIZON_Y + (EYE_M - height_m) * per_m
+    return pixels
 
 
 def clip_near(polygon: NDArray[np.float64]) -> NDArray[np.float64]:

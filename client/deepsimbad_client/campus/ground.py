@@ -115,7 +115,10 @@ class Ground:
         first, last = max(stretch.start_m, position_m - 4), min(end, position_m + 125)
         if last <= first:
             return np.zeros((0, 2)), np.zeros((0, 2))
-        where = np.append(np.arange(first, last, 1.5), last)
+        # Short pieces near by, where a bend shows; long ones far away.
+        offsets = np.concatenate([np.arange(-4, 21, 1.5), np.arange(23, 60, 4), np.arange(62, 125, 9)])
+        where = position_m + offsets
+        where = np.concatenate([[first], where[(where > first) & (where < last)], [last]])
         half = section.scene.path_half_width_m
         route = self._world.route
         return view.to_camera(route.place(where, -half)), view.to_camera(route.place(where, half))
@@ -137,7 +140,8 @@ class Ground:
                 fill(mask, view.to_camera(hull), 255)
             for tree in section.scene.trees:
                 reach = away * tree.height_m * 0.62
-                if np.hypot(*reach) > LONGEST_SHADOW_M:
+                ahead = float(view.to_camera(tree.place[None])[0, 1])
+                if np.hypot(*reach) > LONGEST_SHADOW_M or not -30 < ahead < 70:
                     continue
                 side = np.array([-away[1], away[0]]) / max(np.hypot(*away), 1e-6) * 0.12
                 trunk = np.stack([tree.place - side, tree.place + side, *(tree.place + reach + [side, -side])])

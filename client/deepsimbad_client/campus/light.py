@@ -1,6 +1,7 @@
 """Daylight of one moment: what sun, sky and haze make of a surface's own colour."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -25,7 +26,7 @@ class Light:
     sunshine: float
     exposure: float
 
-    @property
+    @cached_property
     def sun_direction(self) -> tuple[float, float, float]:
         """Unit vector towards the sun: north, east, up."""
         azimuth = np.deg2rad(self.season.sun_azimuth_deg)
@@ -47,12 +48,12 @@ class Light:
         sun = self.sun_direction
         return self.gain(north * sun[0] + east * sun[1])
 
-    @property
+    @cached_property
     def on_ground(self) -> NDArray[np.float64]:
         """[3] factor for level ground in the open."""
         return self.gain(self.sun_direction[2])
 
-    @property
+    @cached_property
     def in_shade(self) -> NDArray[np.float64]:
         """[3] factor for ground that the sun does not reach."""
         return self.gain(0.0)
@@ -67,7 +68,7 @@ class Light:
         seen = np.array(colour) * gain * (1 - share) + self.air * share
         return tuple(int(value) for value in np.clip(seen, 0, 255))
 
-    @property
+    @cached_property
     def air(self) -> NDArray[np.float64]:
         """[3] what haze looks like."""
         air: NDArray[np.float64] = np.array(self.season.horizon) * self.exposure

@@ -49,10 +49,17 @@ class Passing:
 
     def __init__(self, world: World, seed: int, date: datetime.date, spacing_m: float) -> None:
         self._world, self._seed, self._name = world, seed, date.isoformat()
+        self._parked: dict[int, list[Car]] = {}
         self._pace_m_s = spacing_m / (INTERVAL_US / 1e6)
 
     def parked(self, section: Section) -> list[Car]:
         """The cars that stand in a section's bays during this drive."""
+        index = section.stretch.index
+        if index not in self._parked:
+            self._parked[index] = self._park(section)
+        return self._parked[index]
+
+    def _park(self, section: Section) -> list[Car]:
         cars = []
         for bay in section.scene.bays:
             rng = stream(self._seed, f"bay {self._name}", bay.number)

@@ -41,7 +41,7 @@ def draw_car(
     for outline, ink, top in ((_BODY, paint, 0.86), (_CABIN, glass, 1.0)):
         _prism(canvas, centre, nose, side, outline, ink, paint if top == 1.0 else ink, light)
     near = -1.0 if float(centre @ side) > 0 else 1.0
-    for along in (-1.35, 1.35):
+    for along in (-1.35, 1.35) if distance < 45 else ():
         hub = centre + nose * along + side * near * _HALF_WIDTH_M
         ring = np.linspace(0, 2 * np.pi, 14, endpoint=False)
         rim = np.stack([hub + nose * 0.33 * np.cos(a) for a in ring])
@@ -110,7 +110,7 @@ def draw_person(canvas: Image, look: int, stride: float, light: Light, right_ahe
 
 
 def draw_post(canvas: Image, post: Post, light: Light, right_ahead: NDArray[np.float64]) -> None:
-    """Draw a lamp, sign, bollard, bench or bush at metres right and ahead."""
+    """Draw a lamp, sign, bollard or bench at metres right and ahead."""
     ahead = float(right_ahead[1])
     if ahead < 0.8:
         return
@@ -138,33 +138,12 @@ def draw_post(canvas: Image, post: Post, light: Light, right_ahead: NDArray[np.f
     elif post.kind == "bollard":
         box(-0.1, 0.1, 0, size, metal)
         box(-0.1, 0.1, size * 0.7, size * 0.82, light.colour((60, 200, 220), gain, ahead))
-    elif post.kind == "bench":
+    else:
         wood = light.colour((60, 96, 130), gain, ahead)
         box(-size / 2, size / 2, 0.42, 0.5, wood)
         box(-size / 2, size / 2, 0.62, 0.88, wood)
         for leg in (-0.42, 0.36):
             box(leg * size, leg * size + 0.07, 0, 0.88, metal)
-    else:
-        _bush(canvas, (x, foot), unit * size, light, gain, ahead)
-
-
-def _bush(
-    canvas: Image,
-    foot: tuple[float, float],
-    scale: float,
-    light: Light,
-    gain: NDArray[np.float64],
-    ahead: float,
-) -> None:
-    season = light.season
-    leaf = season.leaves[0] if season.leaf_share > 0.1 else (84, 104, 120)
-    rng = np.random.default_rng(5)
-    for _ in range(26):
-        dx, up, tone = rng.uniform(-0.55, 0.55), rng.uniform(0.12, 0.6), rng.uniform(0.6, 1.2)
-        snowy = season.snow > 0.3 and up > 0.38
-        ink = light.colour((226, 226, 226) if snowy else tuple(v * tone for v in leaf), gain, ahead)
-        middle = (round(foot[0] + dx * scale), round(foot[1] - up * scale))
-        cv2.circle(canvas, middle, max(1, round(0.17 * scale)), ink, -1, cv2.LINE_AA)
 
 
 def _face(canvas: Image, ground: NDArray[np.float64], heights: NDArray[np.float64], ink: Colour) -> None:

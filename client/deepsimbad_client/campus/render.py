@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from deepsimbad_client.campus.camera import CANVAS_SIZE, FOCAL_PX, NEAR_M, SCALE, UPRIGHT_SIZE, View
+from deepsimbad_client.campus.camera import CANVAS_SIZE, FOCAL_PX, NEAR_M, SEEN_SIZE, UPRIGHT_SIZE, View
 from deepsimbad_client.campus.drive import Drive
 from deepsimbad_client.campus.facades import draw_facade
 from deepsimbad_client.campus.ground import Ground
@@ -17,17 +17,17 @@ from deepsimbad_client.campus.light import Light
 from deepsimbad_client.campus.noise import stream
 from deepsimbad_client.campus.passing import Car, Passing
 from deepsimbad_client.campus.props import draw_car, draw_person, draw_post
-from deepsimbad_client.campus.scenery import Tree
+from deepsimbad_client.campus.scenery import Post, Tree
 from deepsimbad_client.campus.season import season_of
 from deepsimbad_client.campus.sky import Sky
-from deepsimbad_client.campus.trees import draw_trees
+from deepsimbad_client.campus.trees import BUSH, draw_trees
 from deepsimbad_client.campus.turf import draw_ground
 from deepsimbad_client.campus.upright import HALF_VIEW, Facades, draw_sprite, wall_normal
 from deepsimbad_client.campus.world import SIGHT_M, World
 
 Image = NDArray[np.uint8]
 
-GRAIN = 5.0
+GRAIN = 4.0
 
 
 class Renderer:
@@ -56,16 +56,17 @@ class Renderer:
         """[1232, 1616, 3] BGR, the picture of a frame as it is stored: turned counter-clockwise."""
         view = self._drive.view(frame)
         canvas = self.canvas(frame, view)
-        # Drawn pixel (x, y), seen from the middle, leans and nods, grows, and turns: stored column is the upright
-        # row, stored row counts the upright columns from the right.
+        # What is drawn, seen from the middle, leans and nods and turns: a stored column is an upright row, and stored
+        # rows count the upright columns from the right. Enlarging comes last because it is dearest.
         lean, nod = -view.roll_rad, FOCAL_PX * np.tan(view.pitch_rad)
-        cos, sin = SCALE * np.cos(lean), SCALE * np.sin(lean)
-        middle_x, middle_y = CANVAS_SIZE[0] / 2, CANVAS_SIZE[1] / 2
+        cos, sin = np.cos(lean), np.sin(lean)
+        middle_x, middle_y = CANVAS_SIZE[0] / 2, CANVAS_SIZE[1] / 2 - nod
+        wide, tall = SEEN_SIZE
+        column = [sin, cos, tall / 2 - sin * middle_x - cos * middle_y]
+        row = [-cos, sin, wide / 2 + cos * middle_x - sin * middle_y]
+        seen = cv2.warpAffine(canvas, np.array([column, row]), (tall, wide), flags=cv2.INTER_LINEAR)
         width, height = UPRIGHT_SIZE
-        column = [sin, cos, height / 2 - sin * middle_x - cos * (middle_y - nod)]
-        row = [-cos, sin, width / 2 + cos * middle_x - sin * (middle_y - nod)]
-        turn = np.array([column, row])
-        picture = cv2.warpAffine(canvas, turn, (height, width), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        picture = cv2.resize(seen, (height, width), interpolation=cv2.INTER_LINEAR)
         shift = stream(self._world.seed + self._number, "grain", frame).integers(0, 64, 2)
         grain = self._grain[shift[0] : shift[0] + width, shift[1] : shift[1] + height]
         return np.asarray(cv2.addWeighted(picture, 1.0, grain, 1.0, -128), np.uint8)
@@ -112,7 +113,10 @@ class Renderer:
             for tree in scene.trees:
                 stand(tree.place, 5.0, partial(self._tree, canvas, light, tree))
             for post in scene.posts:
-                stand(post.place, 1.5, partial(draw_post, canvas, post, light))
+                if post.kind == "bush":
+                    stand(post.place, 1.5, partial(self._bush, canvas, light, post))
+                else:
+                    stand(post.place, 1.5, partial(draw_post, canvas, post, light))
             for car in self._passing.parked(section):
                 stand(car.place, 3.0, partial(self._car, canvas, view, light, car))
         for car in self._passing.driving(position_m, time_s):
@@ -124,6 +128,9 @@ class Renderer:
 
     def _tree(self, canvas: Image, light: Light, tree: Tree, foot: NDArray[np.float64]) -> None:
         draw_sprite(canvas, self._trees[tree.species], foot, tree.height_m, tree.mirrored, light)
+
+    def _bush(self, canvas: Image, light: Light, bush: Post, foot: NDArray[np.float64]) -> None:
+        draw_sprite(canvas, self._trees[BUSH], foot, bush.size_m, False, light)
 
     @staticmethod
     def _car(canvas: Image, view: View, light: Light, car: Car, _: NDArray[np.float64]) -> None:

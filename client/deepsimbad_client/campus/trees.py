@@ -11,6 +11,9 @@ from deepsimbad_client.campus.season import Season
 
 N_SPECIES = 14
 FIRST_CONIFER = 11
+BUSH = N_SPECIES
+"""Number of the bush among the sprites."""
+
 WIDTH, HEIGHT = 320, 400
 LEAVES = 3000
 
@@ -31,15 +34,17 @@ class Sprite:
 
 
 def draw_trees(season: Season, seed: int) -> tuple[Sprite, ...]:
-    """Draw every species as it looks in a season; branches stay where they are from season to season."""
-    return tuple(_draw(species, season, seed) for species in range(N_SPECIES))
+    """Draw every species, and a bush, as it looks in a season; branches stay where they are from season to season."""
+    return tuple(_draw(species, season, seed) for species in range(N_SPECIES + 1))
 
 
 def _draw(species: int, season: Season, seed: int) -> Sprite:
     rng = stream(seed, "tree", species)
     colour = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
     alpha = np.zeros((HEIGHT, WIDTH), np.uint8)
-    if species >= FIRST_CONIFER:
+    if species == BUSH:
+        _bush(colour, alpha, rng, season)
+    elif species >= FIRST_CONIFER:
         _conifer(colour, alpha, rng, season)
     else:
         _broadleaf(colour, alpha, rng, season)
@@ -123,3 +128,17 @@ def _conifer(colour: Image, alpha: Image, rng: np.random.Generator, season: Seas
         end = (int(middle + out * 1.08), int(y + drop * (0.4 if white else 1)))
         cv2.line(colour, start, end, ink, 2, cv2.LINE_AA)
         cv2.line(alpha, start, end, 255, 2 + (k % 2), cv2.LINE_AA)
+
+
+def _bush(colour: Image, alpha: Image, rng: np.random.Generator, season: Season) -> None:
+    own = season.leaves if season.leaf_share > 0.1 else ((84.0, 104.0, 120.0),)
+    spots = rng.normal(0, 1, (900, 2)) * (WIDTH * 0.16, HEIGHT * 0.2)
+    for x, up in spots[np.argsort(spots[:, 1])]:
+        place = (int(np.clip(WIDTH / 2 + x, 10, WIDTH - 10)), int(np.clip(HEIGHT * 0.55 - up, 10, HEIGHT - 6)))
+        tone = rng.uniform(0.6, 1.2) * (1.2 - 0.5 * place[1] / HEIGHT)
+        snowy = season.snow > 0.3 and place[1] < HEIGHT * 0.42
+        leaf = own[int(rng.integers(0, len(own)))]
+        ink = (226, 226, 226) if snowy else tuple(int(min(255, v * tone)) for v in leaf)
+        radius = int(rng.integers(5, 12))
+        cv2.circle(colour, place, radius, ink, -1, cv2.LINE_AA)
+        cv2.circle(alpha, place, radius, 255, -1, cv2.LINE_AA)

@@ -63,7 +63,7 @@ def _cover(tile: NDArray[np.float32], season: Season, rng: np.random.Generator, 
     if season.litter:
         count = int(season.litter * (2500 if bare else 9000))
         places, picks = rng.integers(0, TILE_PX, (count, 2)), rng.integers(0, len(season.leaves), count)
-        sizes, tones = rng.integers(2, 6, count), rng.uniform(0.7, 1.15, count)
+        sizes, tones = rng.integers(1, 5, count), rng.uniform(0.7, 1.15, count)
         for place, pick, size, tone in zip(places, picks, sizes, tones, strict=True):
             ink = tuple(float(v * tone) for v in season.leaves[pick])
             cv2.circle(tile, (int(place[0]), int(place[1])), int(size), ink, -1)
