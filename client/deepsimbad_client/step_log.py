@@ -108,7 +108,7 @@ class StepLog:
     def _resume(self, identity: dict[str, Any], restart: bool) -> dict[int, Step]:
         identity_file = self.folder / "replay.json"
         if not restart and identity_file.exists():
-            earlier = json.loads(identity_file.read_text() or "{}")
+            earlier = _document(identity_file)
             differing = [key for key in identity if earlier.get(key) != identity[key]]
             if differing:
                 was = ", ".join(f"{key} {earlier.get(key)!r}, now {identity[key]!r}" for key in differing)
@@ -140,3 +140,12 @@ class StepLog:
                 ) from error
             done[step.query] = step
         return done
+
+
+def _document(path: Path) -> dict[str, Any]:
+    """The JSON object in a file; empty where the file holds none."""
+    try:
+        document = json.loads(path.read_bytes())
+    except ValueError:
+        return {}
+    return document if isinstance(document, dict) else {}

@@ -1,0 +1,155 @@
+"""Following a job through whatever happens to the connection."""
+
+import json
+from collections.abc import Callable
+from typing import Any
+
+import httpx2
+import pytest
+
+from deepsimbad_client import Client, RetryPolicy, errors, job_commands
+from deepsimbad_client.commands import run
+from deepsimbad_client.follow import follow_job
+from deepsimbad_client.models import Job
+
+EVENTS = "/v1/admin/jobs/7/events"
+
+
+def job(state: str, progress: float = 0.0, **more: Any) -> dict[str, Any]:
+    return {"job_id": "7", "domain": "d", "state": state, "progress": progress, **more}
+
+
+class Broken(httpx2.SyncByteStream):
+    """A stream that gives some events and breaks off."""
+
+    def __init__(self, *events: dict[str, Any]) -> None:
+        self.events = events
+
+    def __iter__(self) -> Any:
+        for event in self.events:
+            yield f"event: progress\ndata: {json.dumps(event)}\n\n".encode()
+        raise httpx2.ReadError("the link is gone")
+
+
+def stream(*events: dict[str, Any]) -> httpx2.Response:
+    text = "".join(f"event: progress\ndata: {json.dumps(event)}\n\n" for event in events)
+    return httpx2.Response(200, content=text.encode(), headers={"content-type": "text/event-stream"})
+
+
+def broken_stream(*events: dict[str, Any]) -> httpx2.Response:
+    return httpx2.Response(200, stream=Broken(*events), headers={"content-type": "text/event-stream"})
+
+
+class Service:
+    """Answers from two queues, of the stream and of single questions, the last of each for ever."""
+
+    def __init__(self, streams: list[Any], answers: list[Any]) -> None:
+        self.queues = {True: streams, False: answers}
+        self.asked: list[str] = []
+        self.now = 0.0
+        self.heard: list[Job] = []
+
+    def __call__(self, request: httpx2.Request) -> httpx2.Response:
+        self.asked.append(request.url.path)
+        queue = self.queues[request.url.path == EVENTS]
+        outcome = queue.pop(0) if len(queue) > 1 else queue[0]
+        if isinstance(outcome, type):
+            raise outcome("scripted", request=request)
+        if callable(outcome):
+            outcome = outcome()
+        return outcome if isinstance(outcome, httpx2.Response) else httpx2.Response(200, json=outcome)
+
+    def sleep(self, seconds: float) -> None:
+        self.now += seconds
+
+    def follow(self, patience_s: float = 60.0) -> Job:
+        retry = RetryPolicy(attempts=1)
+        client = Client("http://service", retry=retry, transport=httpx2.MockTransport(self), sleep=self.sleep)
+        return follow_job(
+            client, "7", self.heard.append, patience_s=patience_s, sleep=self.sleep, clock=lambda: self.now
+        )
+
+
+def test_a_stream_that_lasts_is_all_there_is() -> None:
+    events = lambda: stream(job("running", 0.5), job("succeeded", 1.0))  # noqa: E731
+    service = Service([events], [httpx2.ReadError])
+    assert service.follow().state == "succeeded"
+    assert [heard.progress for heard in service.heard] == [0.5, 1.0]
+    assert service.asked == [EVENTS]
+
+
+def test_a_stream_that_breaks_off_is_listened_to_again() -> None:
+    first: Callable[[], httpx2.Response] = lambda: broken_stream(job("running", 0.2))  # noqa: E731
+    last: Callable[[], httpx2.Response] = lambda: stream(job("succeeded", 1.0))  # noqa: E731
+    service = Service([first, httpx2.ConnectError, last], [httpx2.ConnectError, job("running", 0.6)])
+    assert service.follow().state == "succeeded"
+    assert [heard.progress for heard in service.heard] == [0.2, 0.6, 1.0]
+
+
+def test_without_streams_the_job_is_asked_for() -> None:
+    refusal = lambda: httpx2.Response(404, json={"code": "not_found"})  # noqa: E731
+    service = Service([refusal], [job("queued"), job("running", 0.5), job("succeeded", 1.0)])
+    assert service.follow().state == "succeeded"
+    assert service.asked.count(EVENTS) == 1
+
+
+def test_a_page_instead_of_a_stream_is_no_end() -> None:
+    page = lambda: httpx2.Response(200, content=b"<html>", headers={"content-type": "text/html"})  # noqa: E731
+    service = Service([page], [job("succeeded", 1.0)])
+    assert service.follow().state == "succeeded"
+
+
+@pytest.mark.parametrize(
+    ("state", "error"), [("failed", errors.JobFailedError), ("cancelled", errors.JobCancelledError)]
+)
+def test_a_job_without_success_is_an_error(state: str, error: type[errors.JobFailedError]) -> None:
+    ended = job(state, error={"code": "too_few_candidates", "detail": "only 3 candidates"})
+    with pytest.raises(error) as raised:
+        Service([lambda: stream(ended)], [ended]).follow()
+    assert raised.value.job.state == state
+    assert state != "failed" or "only 3 candidates" in str(raised.value)
+
+
+def test_silence_is_not_waited_out_for_ever() -> None:
+    service = Service([httpx2.ConnectError], [httpx2.ConnectError])
+    with pytest.raises(errors.TransportError):
+        service.follow(patience_s=60)
+    assert 60 < service.now < 120
+
+
+def test_an_unknown_job_is_said_at_once() -> None:
+    unknown = lambda: httpx2.Response(404, json={"code": "unknown_job", "detail": "no job 7"})  # noqa: E731
+    with pytest.raises(errors.UnknownJobError):
+        Service([unknown], [unknown]).follow()
+
+
+@pytest.mark.parametrize("cancel", [True, False])
+def test_ctrl_c_asks_whether_to_cancel(cancel: bool, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
+    asked: list[tuple[str, str]] = []
+
+    def respond(request: httpx2.Request) -> httpx2.Response:
+        asked.append((request.method, request.url.path))
+        if request.url.path == EVENTS:
+            raise KeyboardInterrupt
+        if request.method == "DELETE":
+            return httpx2.Response(204)
+        return httpx2.Response(202, json=job("running"))
+
+    questions: list[str] = []
+
+    def answer(question: str) -> bool:
+        questions.append(question)
+        return cancel
+
+    monkeypatch.setattr(job_commands, "_answer", answer)
+    monkeypatch.setattr(
+        job_commands, "Client", lambda url, key: Client(url, key, transport=httpx2.MockTransport(respond))
+    )
+    assert run(["remap", "--domain", "d", "--training", "t", "--server", "http://service"]) == 130
+    assert questions == ["Cancel job 7 on the server too?"]
+    assert (("DELETE", "/v1/admin/jobs/7") in asked) == cancel
+    assert ("being cancelled" if cancel else "jobs 7 --follow") in capsys.readouterr().err
+
+
+def test_without_a_terminal_nobody_is_asked() -> None:
+    assert job_commands._answer("?") is False
