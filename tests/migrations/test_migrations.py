@@ -1,0 +1,205 @@
+"""Every set of migrations: from empty, through sqlite-utils' own command, and from each frozen past schema."""
+
+import sqlite3
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+from sqlite_utils import Database, Migrations
+
+import deepsimbad_migrations
+from deepsimbad.store.catalog import Catalog
+from deepsimbad.store.map_file import read_map
+from deepsimbad.store.records import JobState
+from deepsimbad.store.traverses import Traverse
+from deepsimbad_migrations.catalog.migrations import migrations as catalog_migrations
+from deepsimbad_migrations.map.migrations import migrations as map_migrations
+from deepsimbad_migrations.traverse.migrations import migrations as traverse_migrations
+
+SETS = {"catalog": catalog_migrations, "map": map_migrations, "traverse": traverse_migrations}
+SCHEMAS = Path(__file__).parent / "schemas"
+FROZEN = sorted(SCHEMAS.glob("*.sql"))
+MIGRATIONS = Path(deepsimbad_migrations.__file__).parent
+
+Schema = dict[str, str]
+
+
+def schema_of(path: Path) -> Schema:
+    with closing(sqlite3.connect(path)) as connection:
+        rows = connection.execute("SELECT name, sql FROM sqlite_schema WHERE sql IS NOT NULL")
+        return {name: " ".join(sql.split()) for name, sql in rows}
+
+
+def rows_of(path: Path) -> dict[str, list[dict[str, object]]]:
+    with closing(sqlite3.connect(path)) as connection:
+        connection.row_factory = sqlite3.Row
+        names = [name for (name,) in connection.execute("SELECT name FROM sqlite_schema WHERE type = 'table'")]
+        return {name: [dict(row) for row in connection.execute(f'SELECT * FROM "{name}"')] for name in names}
+
+
+def apply(path: Path, migrations: Migrations, **options: str) -> None:
+    with Database(sqlite3.connect(path, isolation_level=None)) as db:
+        migrations.apply(db, **options)
+
+
+def run_command(path: Path, folder: Path, *options: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "sqlite_utils", "migrate", str(path), str(folder), *options],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+
+
+@pytest.fixture(params=SETS)
+def kind(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
+
+
+def test_the_command_reaches_the_schema_that_the_service_makes(kind: str, tmp_path: Path) -> None:
+    ours, theirs = tmp_path / "ours.sqlite", tmp_path / "theirs.sqlite"
+    apply(ours, SETS[kind])
+    run_command(theirs, MIGRATIONS / kind)
+    assert schema_of(theirs) == schema_of(ours)
+    assert {"catalog": "domain", "map": "posting", "traverse": "frame"}[kind] in schema_of(ours)
+    before = rows_of(theirs)
+    run_command(theirs, MIGRATIONS / kind)  # again changes nothing
+    assert rows_of(theirs) == before
+    listing = run_command(theirs, MIGRATIONS / kind, "--list").stdout
+    assert SETS[kind].name in listing
+    assert "m001" in listing.split("Pending")[0]
+
+
+def test_the_migrations_import_nothing_of_ours(kind: str, tmp_path: Path) -> None:
+    """As a file of its own, with no package of ours in reach."""
+    code = (
+        "import runpy, sys\n"
+        "class Refuse:\n"
+        "    def find_spec(self, name, *rest):\n"
+        "        if name.split('.')[0].startswith('deepsimbad'): raise ImportError(name)\n"
+        "sys.meta_path.insert(0, Refuse())\n"
+        f"runpy.run_path({str(MIGRATIONS / kind / 'migrations.py')!r})\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
+
+
+def test_every_step_has_a_frozen_dump(kind: str) -> None:
+    with Database(memory=True) as nothing:
+        n_steps = len(SETS[kind].pending(nothing))
+    dumps = [path.name for path in FROZEN if path.name.startswith(f"{kind}_v")]
+    assert dumps == [f"{kind}_v{step}.sql" for step in range(1, n_steps + 1)], (
+        "freeze the new schema: dump a small file of it into tests/migrations/schemas"
+    )
+
+
+@pytest.mark.parametrize("dump", FROZEN, ids=lambda path: path.stem)
+def test_a_shipped_step_is_never_edited(dump: Path, tmp_path: Path) -> None:
+    """Today's steps, stopped where the dump was taken, give the very schema of the dump."""
+    kind, version = dump.stem.rsplit("_v", 1)
+    with Database(memory=True) as nothing:
+        steps = [step.name for step in SETS[kind].pending(nothing)]
+    later = steps[int(version) :]
+    apply(tmp_path / "now.sqlite", SETS[kind], **({"stop_before": later[0]} if later else {}))
+    restore(dump, tmp_path / "then.sqlite")
+    assert schema_of(tmp_path / "now.sqlite") == schema_of(tmp_path / "then.sqlite")
+
+
+def restore(dump: Path, path: Path) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with closing(sqlite3.connect(path)) as connection:
+        connection.executescript(dump.read_text())
+
+
+@pytest.mark.parametrize("dump", FROZEN, ids=lambda path: path.stem)
+@pytest.mark.parametrize("by_command", [False, True], ids=["library", "command"])
+def test_a_past_file_reaches_today_and_keeps_its_rows(dump: Path, by_command: bool, tmp_path: Path) -> None:
+    kind = dump.stem.rsplit("_v", 1)[0]
+    past, new = tmp_path / "past.sqlite", tmp_path / "new.sqlite"
+    restore(dump, past)
+    before = rows_of(past)
+    if by_command:
+        run_command(past, MIGRATIONS / kind)
+    else:
+        apply(past, SETS[kind])
+    apply(new, SETS[kind])
+    assert schema_of(past) == schema_of(new)
+    after = rows_of(past)
+    for table, rows in before.items():
+        if table == "_sqlite_migrations":
+            continue
+        assert len(rows) >= 1 or table in ("doomed_folder", "map_image_encoding"), f"the dump shows no {table}"
+        assert len(after[table]) == len(rows)
+        for old_row, row in zip(rows, after[table], strict=True):
+            assert row.items() >= old_row.items()
+
+
+def the_catalog(data_dir: Path) -> Iterator[object]:
+    with Catalog.open(data_dir) as catalog:
+        yield catalog.domain("campus").active_version
+        yield catalog.maps("campus")[0].metrics
+        yield [job.state for job in catalog.jobs("campus")]
+
+
+def the_traverse(data_dir: Path) -> Iterator[object]:
+    with Traverse.open(data_dir, "campus", "summer") as traverse:
+        frames = traverse.read()
+        yield frames.encodings.tolist()
+        yield (traverse.missing, frames.timestamp_us.tolist())
+
+
+def the_map(data_dir: Path) -> Iterator[object]:
+    contents = read_map(data_dir / "domains/campus/maps/000001.sqlite")
+    yield contents.lists.tolist()
+    yield contents.landmark_model["prototypes"].tolist()
+    yield (contents.closed, contents.actions_m, contents.position_m.tolist(), contents.metrics)
+
+
+@pytest.mark.parametrize(
+    ("dump", "place", "read", "expected"),
+    [
+        ("catalog_v1", "catalog.sqlite", the_catalog, [1, {"anr": 4.5}, [JobState.SUCCEEDED]]),
+        (
+            "traverse_v1",
+            "domains/campus/traverses/summer.sqlite",
+            the_traverse,
+            [[[1, 2], [3, 4], [5, 6]], ([(2, 2)], [10, -1, 30])],
+        ),
+        (
+            "map_v1",
+            "domains/campus/maps/000001.sqlite",
+            the_map,
+            [
+                [[0, 1, 2, 0], [1, 2, 0, 2]],
+                [[0, 1], [2, 3], [4, 5]],
+                (True, (1.0, 2.0, 3.0), [0.0, 1.5, 3.0, 4.5], {"anr": 4.5}),
+            ],
+        ),
+    ],
+)
+def test_todays_code_reads_past_files(
+    dump: str, place: str, read: Callable[[Path], Iterator[object]], expected: list[object], tmp_path: Path
+) -> None:
+    restore(SCHEMAS / f"{dump}.sql", tmp_path / place)
+    if dump == "catalog_v1":
+        assert not (tmp_path / "domains").exists()
+    assert list(read(tmp_path)) == expected
+
+
+def test_a_failed_step_leaves_the_old_schema(kind: str, tmp_path: Path) -> None:
+    path = tmp_path / "a.sqlite"
+    broken = Migrations(SETS[kind].name)
+    broken._migrations = list(SETS[kind]._migrations)
+
+    @broken()
+    def m999_broken(db: Database) -> None:
+        db.execute("CREATE TABLE half_way (a)")
+        raise RuntimeError("power cut")
+
+    apply(path, SETS[kind])
+    before = schema_of(path)
+    with pytest.raises(RuntimeError):
+        apply(path, broken)
+    assert schema_of(path) == before
