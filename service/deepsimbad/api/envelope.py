@@ -5,6 +5,7 @@ import re
 import secrets
 import time
 
+from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from deepsimbad.api.metrics import Metrics
@@ -15,6 +16,7 @@ log = logging.getLogger(__name__)
 _REQUEST_ID = re.compile(rb"[A-Za-z0-9._-]{1,64}")
 _METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"})
 UNROUTED = "(none)"
+_SENDER_LEFT = 499  # as proxies log it; never sent
 
 
 class EnvelopeMiddleware:
@@ -52,6 +54,8 @@ class EnvelopeMiddleware:
         self.metrics.request_began()
         try:
             await self.app(scope, receive, send_marked)
+        except ClientDisconnect:  # nobody is left to be answered
+            status = status or _SENDER_LEFT
         except Exception:
             log.exception("request failed", extra={"request_id": request_id})
             if status == 0:

@@ -1,0 +1,202 @@
+"""The service as a process on loopback: what an in-process transport cannot show."""
+
+import http.client
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import httpx2
+import pytest
+
+SERVE = """
+import sys
+from pathlib import Path
+from deepsimbad.api.server import serve
+from deepsimbad.settings import Settings
+serve(Settings(data_dir=Path(sys.argv[1]), port=int(sys.argv[2])))
+"""
+
+
+@dataclass
+class Server:
+    process: subprocess.Popen[bytes]
+    port: int
+    log: Path
+
+    @property
+    def url(self) -> str:
+        return f"http://127.0.0.1:{self.port}"
+
+    @property
+    def resident_kib(self) -> int:
+        for line in Path(f"/proc/{self.process.pid}/status").read_text().splitlines():
+            if line.startswith("VmHWM:"):  # the most it ever was
+                return int(line.split()[1])
+        raise AssertionError("no VmHWM")
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+        return port
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    folder = tmp_path_factory.mktemp("wire")
+    port = free_port()
+    log = folder / "log"
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("DEEPSIMBAD_")}
+    with log.open("wb") as stderr:
+        process = subprocess.Popen(
+            [sys.executable, "-c", SERVE, str(folder / "data"), str(port)], stderr=stderr, env=environment
+        )
+    started = Server(process, port, log)
+    try:
+        for _ in range(600):
+            try:
+                if httpx2.get(f"{started.url}/readyz").status_code == 200:
+                    break
+            except httpx2.TransportError:
+                time.sleep(0.1)
+            assert process.poll() is None, log.read_text()
+        httpx2.put(f"{started.url}/v1/admin/domains/d", json={"evaluator": {"kind": "feature_l2"}})
+        httpx2.post(f"{started.url}/v1/admin/domains/d/traverses", json={"name": "t"})
+        yield started
+    finally:
+        if process.poll() is None:
+            process.kill()
+        process.wait()
+
+
+FRAME = "/v1/admin/domains/d/traverses/t/frames/0?position_m=0"
+
+
+def send_until_answered(port: int, head: bytes, piece: bytes, n_pieces: int) -> tuple[bytes, int]:
+    """Send a body piece by piece and stop at the first byte of an answer.
+
+    Returns:
+        The answer, and how many pieces had been sent when it began.
+    """
+    with socket.create_connection(("127.0.0.1", port), timeout=30) as connection:
+        connection.sendall(head)
+        began = threading.Event()
+        answer = bytearray()
+
+        def listen() -> None:
+            try:
+                while received := connection.recv(65536):
+                    began.set()
+                    answer.extend(received)
+            except OSError:
+                pass
+
+        listener = threading.Thread(target=listen)
+        listener.start()
+        n_sent = 0
+        try:
+            while n_sent < n_pieces and not began.is_set():
+                connection.sendall(piece)
+                n_sent += 1
+        except OSError:
+            pass
+        connection.shutdown(socket.SHUT_WR)
+        listener.join(30)
+        return bytes(answer), n_sent
+
+
+def problem_of(answer: bytes) -> dict[str, object]:
+    found: dict[str, object] = json.loads(answer.partition(b"\r\n\r\n")[2])
+    return found
+
+
+def test_a_hundred_megabytes_in_chunks_are_refused_while_they_stream(server: Server) -> None:
+    before = server.resident_kib
+    head = f"PUT {FRAME} HTTP/1.1\r\nHost: x\r\nContent-Type: image/jpeg\r\nTransfer-Encoding: chunked\r\n\r\n"
+    piece = b"10000\r\n" + bytes(65536) + b"\r\n"
+    answer, n_sent = send_until_answered(server.port, head.encode(), piece, 1600)
+    assert answer.startswith(b"HTTP/1.1 413 "), answer[:200]
+    assert b"connection: close" in answer.lower()
+    assert problem_of(answer)["code"] == "body_too_large"
+    assert n_sent < 800  # 32 MiB are taken; what lies in the sockets' buffers comes on top
+    assert server.resident_kib - before < 100_000
+
+
+def test_a_declared_length_is_refused_before_a_byte_of_it(server: Server) -> None:
+    head = (
+        f"POST /v1/domains/d/localizations HTTP/1.1\r\nHost: x\r\nContent-Type: image/jpeg\r\n"
+        f"Content-Length: {100 * 1024 * 1024}\r\n\r\n"
+    )
+    with socket.create_connection(("127.0.0.1", server.port), timeout=10) as connection:
+        connection.sendall(head.encode())
+        assert connection.recv(65536).startswith(b"HTTP/1.1 413 ")
+
+
+def test_a_sender_who_reads_only_after_its_last_byte_still_gets_the_answer(server: Server) -> None:
+    before = server.resident_kib
+    for content in (bytes(100 * 1024 * 1024), (bytes(65536) for _ in range(1600))):
+        answer = httpx2.put(f"{server.url}{FRAME}", content=content, headers={"Content-Type": "image/jpeg"})
+        assert (answer.status_code, answer.json()["code"]) == (413, "body_too_large")
+    assert server.resident_kib - before < 100_000
+
+
+def test_a_slow_drip_holds_nobody_up(server: Server) -> None:
+    with socket.create_connection(("127.0.0.1", server.port), timeout=10) as drip:
+        head = f"PUT {FRAME} HTTP/1.1\r\nHost: x\r\nContent-Type: image/jpeg\r\nTransfer-Encoding: chunked\r\n\r\n"
+        drip.sendall(head.encode())
+        for _ in range(20):
+            drip.sendall(b"1\r\nx\r\n")
+            began = time.monotonic()
+            assert httpx2.get(f"{server.url}/healthz").status_code == 200
+            assert time.monotonic() - began < 2
+        drip.sendall(b"0\r\n\r\n")
+        assert drip.recv(65536).startswith(b"HTTP/1.1 422 ")
+
+
+def test_a_long_body_nobody_reads_is_not_waited_for(server: Server) -> None:
+    head = (
+        "POST /v1/domains/none/localizations HTTP/1.1\r\nHost: x\r\nContent-Type: image/jpeg\r\n"
+        "Transfer-Encoding: chunked\r\n\r\n"
+    )
+    answer, n_sent = send_until_answered(server.port, head.encode(), b"10000\r\n" + bytes(65536) + b"\r\n", 1600)
+    assert answer.startswith(b"HTTP/1.1 404 ")
+    assert b"connection: close" in answer.lower()
+    assert n_sent < 200
+
+
+def test_a_small_unread_body_leaves_the_connection_open(server: Server) -> None:
+    connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=10)
+    for _ in range(3):
+        connection.request("POST", "/v1/domains/none/localizations", b"x" * 5000, {"Content-Type": "text/plain"})
+        answer = connection.getresponse()
+        assert answer.status == 404
+        answer.read()
+        assert answer.headers.get("connection") is None
+    connection.close()
+
+
+def test_a_sender_who_leaves_early_is_no_fault_of_ours(server: Server) -> None:
+    with socket.create_connection(("127.0.0.1", server.port), timeout=10) as connection:
+        head = f"PUT {FRAME} HTTP/1.1\r\nHost: x\r\nContent-Type: image/jpeg\r\nContent-Length: 1000\r\n\r\nabc"
+        connection.sendall(head.encode())
+        time.sleep(0.2)
+    time.sleep(0.3)
+    assert httpx2.get(f"{server.url}/healthz").status_code == 200
+    assert "Traceback" not in server.log.read_text()
+
+
+def test_it_says_that_it_runs_open_and_ends_well_when_asked(server: Server) -> None:
+    lines = [json.loads(line) for line in server.log.read_text().splitlines()]
+    assert any("no keys are configured" in line["message"] for line in lines)
+    assert any(line["message"] == "request" and line["request_id"] for line in lines)
+    server.process.send_signal(signal.SIGTERM)
+    assert server.process.wait(15) == 0
