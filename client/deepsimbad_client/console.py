@@ -22,7 +22,13 @@ from deepsimbad_client.models import Domain, Job, Localization
 from deepsimbad_client.step_log import Step
 from deepsimbad_client.upload import UploadProgress
 
-REMARKS = Console(stderr=True, highlight=False)
+REMARKS = Console(stderr=True, highlight=False, markup=False)
+"""Progress and remarks; names may hold brackets, so nothing is read as markup."""
+
+
+def show(table: Table) -> None:
+    """Print a result on standard output."""
+    Console(highlight=False, markup=False).print(table)
 
 
 def as_json(document: Any) -> str:
@@ -37,12 +43,12 @@ class Bar:
         middle = [MofNCompleteColumn()] if counted else [TextColumn("{task.percentage:>3.0f} %")]
         self._progress = Progress(
             SpinnerColumn(finished_text="[green]✓"),
-            TextColumn("{task.description}"),
+            TextColumn("{task.description}", markup=False),
             BarColumn(bar_width=32),
             *middle,
             TimeElapsedColumn(),
             TimeRemainingColumn(),
-            TextColumn("{task.fields[note]}"),
+            TextColumn("{task.fields[note]}", markup=False),
             console=REMARKS,
             disable=not REMARKS.is_terminal,
         )
@@ -59,6 +65,14 @@ class Bar:
         traceback: TracebackType | None,
     ) -> None:
         self._progress.stop()
+
+
+class FrameBar(Bar):
+    """Frames made or read."""
+
+    def __call__(self, n_done: int, n_frames: int) -> None:
+        """Show how many there are."""
+        self._progress.update(self._task, completed=n_done, total=n_frames)
 
 
 class UploadBar(Bar):
@@ -142,21 +156,15 @@ def job_table(jobs: Sequence[Job]) -> Table:
 def place_table(answers: Sequence[tuple[str, Localization]]) -> Table:
     """Where images probably were taken."""
     table = Table(title="places", title_justify="left")
-    table.add_column("image", style="bold")
-    for heading in ("likeliest [m]", "95 % within [m]", "map image", "x [m]", "y [m]"):
-        table.add_column(heading, justify="right")
+    table.add_column("image", style="bold", overflow="fold")
+    knows_xy = any(answer.belief.top[0].x_m is not None for _, answer in answers)
+    for heading in ("likeliest [m]", "95 % within [m]", *(("x [m]", "y [m]") if knows_xy else ())):
+        table.add_column(heading, justify="right", no_wrap=True)
     for name, answer in answers:
-        belief = answer.belief
-        top = belief.top[0]
-        low, high = belief.credible_95_m
-        table.add_row(
-            name,
-            f"{belief.mode_m:.1f}",
-            f"{low:.1f} .. {high:.1f}",
-            str(top.map_image),
-            _shown(top.x_m, ".1f"),
-            _shown(top.y_m, ".1f"),
-        )
+        top = answer.belief.top[0]
+        low, high = answer.belief.credible_95_m
+        place = (_shown(top.x_m, ".1f"), _shown(top.y_m, ".1f")) if knows_xy else ()
+        table.add_row(name, f"{answer.belief.mode_m:.1f}", f"{low:.1f} .. {high:.1f}", *place)
     return table
 
 

@@ -3,10 +3,9 @@
 import sys
 
 import click
-from rich.console import Console
 
 from deepsimbad_client.client import Client
-from deepsimbad_client.console import REMARKS, JobBar, as_json, job_table
+from deepsimbad_client.console import REMARKS, JobBar, as_json, job_table, show
 from deepsimbad_client.follow import follow_job
 from deepsimbad_client.models import Job
 from deepsimbad_client.options import domain_option, json_flag, serving
@@ -93,7 +92,7 @@ def jobs(
             if json_output:
                 click.echo(as_json([job.model_dump(mode="json") for job in found]))
             else:
-                Console().print(job_table(found))
+                show(job_table(found))
             return
         if cancel:
             client.admin.cancel_job(job_id)
@@ -135,4 +134,4 @@ def _show_job(job: Job, json_output: bool) -> None:
     if json_output:
         click.echo(as_json(job.model_dump(mode="json")))
     else:
-        Console().print(job_table([job]))
+        show(job_table([job]))

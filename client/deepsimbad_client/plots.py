@@ -112,7 +112,7 @@ def relevance_heat(replay: Replay, title: str, path: Path) -> Path:
     n_images = replay.route.n_images
     figure, axes = _figure(title, "Relevance of the map to every query", (8.4, 7.2))
     known = values[np.isfinite(values)]
-    low, high = float(np.quantile(known, 0.05)), float(np.quantile(known, 0.998))
+    low, high = float(np.quantile(known, 0.5)), float(np.quantile(known, 0.999))
     picture = axes.imshow(
         values,
         aspect="auto",
@@ -124,9 +124,10 @@ def relevance_heat(replay: Replay, title: str, path: Path) -> Path:
     )
     axes.grid(visible=False)
     aside = 0.02 * n_images
+    dot = float(np.clip(700 / max(1, n_rows), 1.6, 5))
     for side in (-aside, aside):
         queries, images = _true_places(replay)
-        axes.plot(images + side, queries, color="#35d0ba", lw=0, marker=".", ms=1.6, alpha=0.9)
+        axes.plot(images + side, queries, color="#35d0ba", lw=0, marker=".", ms=dot, alpha=0.9)
     axes.plot([], [], color="#35d0ba", lw=1.6, label="the truth lies between these")
     axes.set_xlim(0, n_images)
     axes.set_ylim(n_rows * replay.heat.every, 0)

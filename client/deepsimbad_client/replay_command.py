@@ -3,10 +3,9 @@
 from pathlib import Path
 
 import click
-from rich.console import Console
 
 from deepsimbad_client.client import Client
-from deepsimbad_client.console import REMARKS, ReplayBar, as_json
+from deepsimbad_client.console import REMARKS, ReplayBar, as_json, show
 from deepsimbad_client.options import at_once, domain_option, json_flag, reading, serving
 from deepsimbad_client.replay import TOLERANCE_M
 from deepsimbad_client.replay import replay as replay_recording
@@ -79,5 +78,5 @@ def replay(
     if json_output:
         click.echo(as_json(summary))
     else:
-        Console().print(table(summary))
+        show(table(summary))
     REMARKS.print(f"results in {folder}", soft_wrap=True)

@@ -187,3 +187,28 @@ def test_the_async_client_over_asgi(tmp_path: Path, encodings: Path) -> None:
                 await client.localize("async", encoding=[1.0, 2.0])
 
     asyncio.run(scenario())
+
+
+def test_places_on_the_command_line(
+    service: str, encodings: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "look [here]"
+    folder.mkdir()
+    rng = np.random.default_rng(5)
+    for number in range(6):
+        cv2.imwrite(str(folder / f"{number}.png"), cv2.resize(rng.integers(0, 255, (4, 6, 3), np.uint8), (96, 64)))
+    with Client(service) as client:
+        client.admin.put_domain("places", {"kind": "feature_l2"})
+        upload(client, open_source(str(folder)), "places", "t")
+        remap(client, "places", "t", landmark_traverse="t", n_landmarks=6, list_length=2)
+        mapped(client, "vectors", encodings)
+    command = ["localize", "--server", service, "--json"]
+    assert run([*command, "--domain", "places", str(folder / "4.png"), f"{folder}#1:3"]) == 0
+    placed = json.loads(capsys.readouterr().out)
+    assert [answer["retrieval"][0]["map_image"] for answer in placed] == [4, 1, 2]
+    assert run([*command, "--domain", "vectors", f"{encodings / 'summer.npy'}#7:8"]) == 0
+    assert json.loads(capsys.readouterr().out)[0]["retrieval"][0]["map_image"] == 7
+    assert run(["localize", "--server", service, "--domain", "places", str(folder / "4.png")]) == 0
+    assert "likeliest [m]" in capsys.readouterr().out
+    assert run(["localize", "--server", service, "--domain", "places", str(folder / "9.png")]) == 1
+    assert "no recording" in capsys.readouterr().err
