@@ -85,6 +85,9 @@ def write_campus(
     dates = _checked(seasons, n_frames, seed, spacing_m)
     root = Path(root)
     world = World(seed, drive_length_m(n_frames, spacing_m))
+    order = {"format": FORMAT, "seed": seed, "spacing_m": spacing_m}
+    for date in dates:
+        _agree(root, date.isoformat(), order, n_frames)
     total = len(dates) * n_frames
     written: list[WrittenDrive] = []
     for number, date in enumerate(dates):
@@ -93,7 +96,7 @@ def write_campus(
             if on_progress is not None:
                 on_progress(before + done, total)
 
-        _agree(root / date.isoformat(), {"format": FORMAT, "seed": seed, "spacing_m": spacing_m}, n_frames)
+        _remember(root / date.isoformat() / ORDER_FILE, order, n_frames)
         drive = Drive(world.route, seed, date, n_frames, spacing_m)
         written.append(_write_drive(root, world, drive, date, report, n_threads or os.cpu_count() or 1))
     return written
@@ -112,8 +115,13 @@ def _checked(seasons: Sequence[str], n_frames: int, seed: int, spacing_m: float)
     return dates
 
 
-def _agree(folder: Path, order: dict[str, float], n_frames: int) -> None:
-    """Refuse to mix a drive with one made otherwise; remember how this one is made."""
+def _truth_file(root: Path, date: str) -> Path:
+    return root / "ground_truth" / f"groundtruth_{date}.csv"
+
+
+def _agree(root: Path, date: str, order: dict[str, float], n_frames: int) -> None:
+    """Refuse to mix a drive with one made otherwise, or with a real recording."""
+    folder = root / date
     file = folder / ORDER_FILE
     if file.exists():
         try:
@@ -126,9 +134,13 @@ def _agree(folder: Path, order: dict[str, float], n_frames: int) -> None:
                 f"{folder} was rendered with {there} and {frames_there} frames: "
                 "ask for the same (more frames are added), or choose another folder"
             )
-    elif (folder / "lb3").exists():
-        raise SourceError(f"{folder} holds a recording that is not a rendered campus: choose another folder")
-    folder.mkdir(parents=True, exist_ok=True)
+    elif (folder / "lb3").exists() or _truth_file(root, date).exists():
+        raise SourceError(f"{root} holds {date}, but not as a rendered campus: choose another folder")
+
+
+def _remember(file: Path, order: dict[str, float], n_frames: int) -> None:
+    """Write down how a drive is made, before any of it is."""
+    file.parent.mkdir(parents=True, exist_ok=True)
     text = json.dumps({**order, "n_frames": n_frames}, indent=2) + "\n"
     _replace(file, text.encode())
 
@@ -144,7 +156,7 @@ def _write_drive(
     name = date.isoformat()
     folder = root / name / "lb3" / "Cam5"
     folder.mkdir(parents=True, exist_ok=True)
-    truth = root / "ground_truth" / f"groundtruth_{name}.csv"
+    truth = _truth_file(root, name)
     truth.parent.mkdir(parents=True, exist_ok=True)
     _write_truth(truth, world, drive, date)
     for left in folder.glob(".*.part"):  # of a call that was cut short
