@@ -1,0 +1,29 @@
+"""Run every benchmark and write docs/results/bench.md."""
+
+import sys
+from pathlib import Path
+
+from bench import machine
+from bench.http import http_table
+from bench.landmarks import landmark_table
+from bench.map_file import map_file_table
+from bench.retrieval import retrieval_table
+
+RESULTS = Path(__file__).resolve().parent.parent / "docs" / "results" / "bench.md"
+
+
+def main() -> None:
+    """Print the tables as they are measured, then write them."""
+    lines = ["# Benchmarks", "", "Made by `make bench`. Medians; machines are shared and noisy.", ""]
+    lines += [f"Machine: {machine.describe()}", ""]
+    for table in (retrieval_table, landmark_table, map_file_table, http_table):
+        for line in table():
+            print(line, flush=True)
+            lines.append(line)
+        lines.append("")
+    RESULTS.write_text("\n".join(lines), encoding="utf-8")
+    print(f"\nwritten to {RESULTS}", file=sys.stderr)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,54 @@
+"""Synthetic maps of any size, in the two extremes that matter for size and speed."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deepsimbad.core.descriptor import rank_landmarks
+from deepsimbad.core.inverted_index import InvertedIndex
+from deepsimbad.core.relevance import Relevance, RetrievalMap
+from deepsimbad.core.statistics import LandmarkStatistics
+
+NCLT_IMAGES = 26_208  # one traverse of the paper
+N_LANDMARKS, LIST_LENGTH, ENCODING_DIM = 500, 4, 4096
+
+
+@dataclass(frozen=True)
+class Lists:
+    """Landmark lists [h, n] uint16, and how they came about."""
+
+    name: str
+    lists: NDArray[np.uint16]
+
+
+def scattered_lists(n_images: int, seed: int = 0) -> Lists:
+    """Every image's landmarks drawn anew: nothing to gain from neighbours, the worst case for size."""
+    rng = np.random.default_rng(seed)
+    lists = np.empty((LIST_LENGTH, n_images), np.uint16)
+    lists[0] = rng.integers(0, N_LANDMARKS, n_images)
+    for row in range(1, LIST_LENGTH):
+        lists[row] = rng.integers(0, N_LANDMARKS, n_images)
+        while (clash := (lists[:row] == lists[row]).any(axis=0)).any():
+            lists[row, clash] = rng.integers(0, N_LANDMARKS, int(clash.sum()))
+    return Lists("every image's landmarks drawn at random", lists)
+
+
+def dense_lists(n_images: int, seed: int = 0, smoothness: float = 0.99) -> Lists:
+    """Dissimilarities that drift from image to image, as in a recording at 5 Hz: neighbours share landmarks."""
+    rng = np.random.default_rng(seed)
+    lists = np.empty((LIST_LENGTH, n_images), np.uint16)
+    level = rng.normal(size=N_LANDMARKS).astype(np.float32)
+    fresh = np.float32(np.sqrt(1 - smoothness**2))
+    for image in range(n_images):
+        level = np.float32(smoothness) * level + fresh * rng.normal(size=N_LANDMARKS).astype(np.float32)
+        nearest = np.argpartition(level, LIST_LENGTH)[:LIST_LENGTH]
+        lists[:, image] = nearest[np.argsort(level[nearest])]
+    return Lists("landmarks that drift from image to image", lists)
+
+
+def standardised_map(lists: NDArray[np.uint16], seed: int = 0) -> RetrievalMap:
+    """A map of these lists for the relevance that ships."""
+    rng = np.random.default_rng(seed)
+    statistics = LandmarkStatistics.of_map(rank_landmarks(rng.random((2000, N_LANDMARKS))))
+    return RetrievalMap(Relevance.STANDARDISED, InvertedIndex(lists, N_LANDMARKS), statistics)

@@ -1,0 +1,101 @@
+"""A service of one's own as a child process: for demonstrations, benchmarks and tests."""
+
+import os
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import httpx2
+
+from deepsimbad_client.errors import DeepSimbadClientError
+
+_READY_WITHIN_S = 60.0
+_STOPPED_WITHIN_S = 15.0
+
+
+class LocalServer:
+    """`deepsimbad serve` on a free loopback port, up between `with` and the end of its block.
+
+    Args:
+        data_dir: Its data directory; kept afterwards.
+        log_path: Where its log goes; absent: `server.log` beside the data directory.
+        environment: Variables set besides the present ones.
+
+    Attributes:
+        url: Its address.
+    """
+
+    def __init__(self, data_dir: Path, log_path: Path | None = None, environment: dict[str, str] | None = None) -> None:
+        self._data_dir = data_dir
+        self.log_path = log_path or data_dir.with_name("server.log")
+        self._environment = environment or {}
+        self._port = _free_port()
+        self.url = f"http://127.0.0.1:{self._port}"
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def __enter__(self) -> Self:
+        self.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.stop()
+
+    def start(self) -> None:
+        """Start it and wait until it is ready.
+
+        Raises:
+            DeepSimbadClientError: It ended, or was not ready within a minute; the log's last lines are in the message.
+        """
+        command = [sys.executable, "-m", "deepsimbad", "serve", "--data-dir", str(self._data_dir)]
+        self.log_path.parent.mkdir(parents=True, exist_ok=True)
+        with self.log_path.open("ab") as log:
+            self._process = subprocess.Popen(  # noqa: S603 - our own interpreter and module
+                [*command, "--port", str(self._port)],
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                env={**os.environ, **self._environment},
+            )
+        give_up_at = time.monotonic() + _READY_WITHIN_S
+        while not self._is_ready():
+            if self._process.poll() is not None or time.monotonic() > give_up_at:
+                self.stop()
+                lines = self.log_path.read_text(encoding="utf-8", errors="replace").splitlines()[-5:]
+                raise DeepSimbadClientError(f"the service did not start; its log ends: {' | '.join(lines)}")
+            time.sleep(0.05)
+
+    def wait(self) -> None:
+        """Wait until the process ends by itself."""
+        if self._process is not None:
+            self._process.wait()
+
+    def stop(self) -> None:
+        """Ask it to end, then insist."""
+        if self._process is None:
+            return
+        if self._process.poll() is None:
+            self._process.terminate()
+            try:
+                self._process.wait(_STOPPED_WITHIN_S)
+            except subprocess.TimeoutExpired:
+                self._process.kill()
+                self._process.wait()
+        self._process = None
+
+    def _is_ready(self) -> bool:
+        try:
+            return httpx2.get(f"{self.url}/readyz", timeout=5.0, trust_env=False).status_code == httpx2.codes.OK
+        except httpx2.TransportError:
+            return False
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
