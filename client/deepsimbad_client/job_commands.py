@@ -105,7 +105,8 @@ def jobs(
 def _follow(client: Client, job: Job) -> Job:
     """Follow a job with a bar; Ctrl-C asks whether it should end too."""
     try:
-        with JobBar(f"job {job.job_id} on {job.domain}") as bar:
+        REMARKS.print(f"job {job.job_id}")
+        with JobBar(f"mapping {job.domain}") as bar:
             bar(job)
             return follow_job(client, job.job_id, bar)
     except KeyboardInterrupt:

@@ -78,7 +78,7 @@ def replay(
         tolerance_m: How far a right answer may be, in the plane where both sides know x and y, else along the route.
         concurrency: Queries under way at once; steps are written in order all the same.
         restart: Throw away what an earlier replay left in the folder.
-        on_progress: Told of every new step and how many there are in all.
+        on_progress: Told of every step, those of an earlier run first, and how many there are so far.
         clock: Seconds that never go backwards.
 
     Raises:
@@ -109,6 +109,9 @@ def replay(
         truth = Truth(path_of_frames(frames), route, tolerance_m)
         heat = RelevanceHeat.open(folder / "relevance_heat.npy", len(frames), route.n_images, bool(log.done))
         todo = [query for query in range(len(frames)) if query not in log.done]
+        if on_progress is not None:
+            for number, step in enumerate(log.steps(), start=1):
+                on_progress(step, number)
         for query, asked in in_order(lambda query: ask(frames[query]), todo, concurrency):
             if asked.relevance is not None and len(asked.relevance) != route.n_images:
                 raise _changed_map(domain)
