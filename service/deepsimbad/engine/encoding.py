@@ -9,6 +9,7 @@ from deepsimbad.engine.observation import ReadyEncoding
 from deepsimbad.errors import InvalidEncodingError
 from deepsimbad.evaluators.base import Evaluator, Image
 
+LARGEST_NUMBER = 1e15  # so that squared distances stay finite in float32
 
 def encode_view(evaluator: Evaluator, view: Image | ReadyEncoding) -> NDArray[np.float32]:
     """Encode an image, or check and take a ready encoding.
@@ -38,7 +39,7 @@ def ready_encodings(evaluator: Evaluator, values: NDArray[Any]) -> NDArray[np.fl
         [n, d] float32; the array itself where it already was.
 
     Raises:
-        InvalidEncodingError: Empty, of the wrong length, or NaN, infinity or too large for float32 somewhere.
+        InvalidEncodingError: Empty, of the wrong length, or NaN, infinity or too large a number somewhere.
     """
     if values.ndim != 2 or values.size == 0:
         raise InvalidEncodingError(f"encodings are [n, d] and not empty, not {list(values.shape)}")

@@ -18,6 +18,7 @@ from deepsimbad.errors import InvalidDissimilaritiesError, InvalidInputError
 from deepsimbad.evaluators.base import Evaluator
 
 DEFAULT_SHORTLIST = 10
+_LARGEST_DISSIMILARITY = 1e15
 
 
 @dataclass(frozen=True)
@@ -127,5 +128,5 @@ def shortlist_length(snapshot: MapSnapshot, wanted: int | None) -> int:
 
 
 def _as_float32(values: NDArray[np.float64]) -> NDArray[np.float32]:
-    limit = np.finfo(np.float32).max  # ranks are already drawn from the full numbers
-    return np.clip(values, -limit, limit).astype(np.float32)
+    """Ranks are already drawn from the full numbers; these are compared by squares, which must stay finite."""
+    return np.clip(values, -_LARGEST_DISSIMILARITY, _LARGEST_DISSIMILARITY).astype(np.float32)

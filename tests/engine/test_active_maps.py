@@ -1,0 +1,115 @@
+"""Active maps: loaded when needed, switched at once, never half."""
+
+from dataclasses import dataclass
+
+import pytest
+
+from deepsimbad.engine.active_maps import ActiveMaps
+from deepsimbad.errors import DamagedMapError, NoActiveMapError, UnknownDomainError
+from deepsimbad.store.catalog import Catalog
+from deepsimbad.store.map_table import ANY
+
+from .conftest import N_IMAGES, add_domain, add_map
+
+
+@dataclass
+class Clock:
+    now: float = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()
+
+
+@pytest.fixture
+def maps(catalog: Catalog, clock: Clock) -> ActiveMaps:
+    add_domain(catalog, "d")
+    return ActiveMaps(catalog, clock)
+
+
+def test_nothing_to_serve(maps: ActiveMaps) -> None:
+    with pytest.raises(UnknownDomainError):
+        maps.active("other")
+    with pytest.raises(NoActiveMapError, match="remap"):
+        maps.active("d")
+    assert maps.peek("d") is None
+    assert maps.n_loaded == 0
+
+
+def test_the_active_version_is_loaded_once(catalog: Catalog, maps: ActiveMaps) -> None:
+    catalog.activate("d", add_map(catalog, "d"), ANY)
+    snapshot = maps.snapshot("d")
+    assert (snapshot.version, snapshot.n_images) == (1, N_IMAGES)
+    assert snapshot.index_bits_per_map_image > 0
+    assert maps.snapshot("d") is snapshot
+    assert maps.n_loaded == 1
+
+
+def test_a_switch_is_seen_at_once_when_told_and_soon_when_not(catalog: Catalog, maps: ActiveMaps, clock: Clock) -> None:
+    for _ in range(2):
+        add_map(catalog, "d")
+    catalog.activate("d", 1, ANY)
+    held = maps.snapshot("d")
+    catalog.activate("d", 2, 1)
+    assert maps.snapshot("d").version == 1  # trusted for a second
+    assert maps.refresh("d").snapshot.version == 2
+    assert held.version == 1  # whoever held the old one keeps it
+    catalog.activate("d", 1, 2)
+    clock.now += 1.1
+    assert maps.peek("d") is None
+    assert maps.snapshot("d").version == 1
+
+
+def test_an_unchanged_version_is_not_read_again(catalog: Catalog, maps: ActiveMaps, clock: Clock) -> None:
+    catalog.activate("d", add_map(catalog, "d"), ANY)
+    held = maps.snapshot("d")
+    clock.now += 10
+    assert maps.snapshot("d") is held
+
+
+def test_a_domain_made_anew_under_an_old_name_gets_its_own_map(
+    catalog: Catalog, maps: ActiveMaps, clock: Clock
+) -> None:
+    catalog.activate("d", add_map(catalog, "d"), ANY)
+    held = maps.snapshot("d")
+    catalog.delete_domain("d")
+    add_domain(catalog, "d", closed=True)
+    clock.now += 2
+    with pytest.raises(NoActiveMapError):
+        maps.snapshot("d")
+    catalog.activate("d", add_map(catalog, "d"), ANY)
+    assert maps.snapshot("d") is not held
+
+
+def test_damage_is_named_and_remembered_for_a_while(
+    catalog: Catalog, maps: ActiveMaps, clock: Clock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    catalog.activate("d", add_map(catalog, "d"), ANY)
+    path = catalog.map_path("d", 1)
+    sound = path.read_bytes()
+    path.chmod(0o644)
+    path.write_bytes(sound[:-100] + bytes(100))
+    with pytest.raises(DamagedMapError, match="map 1 of domain d") as caught:
+        maps.snapshot("d")
+    assert caught.value.__cause__ is not None
+    path.write_bytes(sound)
+    with pytest.raises(DamagedMapError):
+        maps.snapshot("d")  # not digested again for every request
+    clock.now += 6
+    assert maps.snapshot("d").version == 1
+
+
+def test_a_damaged_map_does_not_keep_others_from_loading(catalog: Catalog, maps: ActiveMaps) -> None:
+    catalog.activate("d", add_map(catalog, "d"), ANY)
+    add_domain(catalog, "e")
+    catalog.activate("e", add_map(catalog, "e"), ANY)
+    add_domain(catalog, "f")
+    catalog.map_path("d", 1).unlink()
+    assert list(maps.load_all()) == ["d"]
+    assert maps.snapshot("e").domain == "e"
+    maps.forget("e")
+    assert maps.n_loaded == 0
