@@ -84,6 +84,20 @@ def test_a_deleted_traverse_takes_no_more_frames(client: TestClient) -> None:
     assert client.put(f"{base}/t/frames/0?position_m=1", json={"encoding": [1.0] * 3}).status_code == 201
 
 
+def test_what_a_job_needs_is_not_deleted(client: TestClient) -> None:
+    make_ready_domain(client, "needed")
+    app: Any = client.app
+    catalog = app.state.services.catalog
+    job = catalog.create_job("needed", "remap", {"training_traverse": "drive"})  # one that waits
+    for place in ("/v1/admin/domains/needed/traverses/drive", "/v1/admin/domains/needed"):
+        answer = client.delete(place)
+        assert (answer.status_code, answer.json()["code"]) == (409, "traverse_in_use")
+    assert client.delete(f"/v1/admin/jobs/{job.job_id}").status_code == 204
+    assert client.delete("/v1/admin/domains/needed/traverses/drive").status_code == 204
+    assert client.post("/v1/domains/needed/localizations", json={"ranked_landmarks": [0]}).status_code == 200
+    assert client.delete("/v1/admin/domains/needed").status_code == 204
+
+
 def test_one_encoding_length_a_traverse(client: TestClient) -> None:
     client.put("/v1/admin/domains/lengths", json={"evaluator": EVALUATOR})
     base = "/v1/admin/domains/lengths/traverses"

@@ -11,6 +11,7 @@ from deepsimbad.evaluators.base import Evaluator, Image
 
 LARGEST_NUMBER = 1e15  # so that squared distances stay finite in float32
 
+
 def encode_view(evaluator: Evaluator, view: Image | ReadyEncoding) -> NDArray[np.float32]:
     """Encode an image, or check and take a ready encoding.
 

@@ -9,7 +9,7 @@ from deepsimbad.api.bodies import TraverseBody, declare_json, read_json
 from deepsimbad.api.dependencies import DomainName, Running, TraverseName
 from deepsimbad.api.openapi import problems
 from deepsimbad.api.schemas import TraverseAnswer, TraverseList
-from deepsimbad.errors import ConflictError, UnknownTraverseError
+from deepsimbad.errors import ConflictError, TraverseInUseError, UnknownTraverseError
 from deepsimbad.store.traverses import Traverse
 
 router = APIRouter(prefix="/v1/admin/domains/{domain}/traverses", tags=["admin: traverses"])
@@ -79,10 +79,15 @@ async def get_traverse(domain: DomainName, name: TraverseName, running: Running)
 
 @router.delete("/{name}", status_code=204, responses=problems(404, 409, 422))
 async def delete_traverse(domain: DomainName, name: TraverseName, running: Running) -> None:
-    """Remove a traverse and its frames; the maps made from it stay."""
+    """Remove a traverse and its frames; the maps made from it stay. A job that needs it is a 409."""
 
     def delete() -> None:
-        running.catalog.domain(domain)
+        for job in running.catalog.jobs(domain):
+            needed = {job.config.get("training_traverse"), job.config.get("landmark_traverse")}
+            if name in needed and not job.state.is_final:
+                raise TraverseInUseError(
+                    f"job {job.job_id} needs traverse {name}: cancel it or wait for its end", job_id=job.job_id
+                )
         running.open_traverses.forget(domain, name)
         Traverse.delete(running.settings.data_dir, domain, name)
 
