@@ -255,8 +255,8 @@ def _with_runs(generator: np.random.Generator, n: int, r: int, h: int, keep: flo
     current = generator.permutation(r)[:h]
     for image in range(n):
         for place in np.flatnonzero(generator.random(h) > keep):
-            others = np.setdiff1d(np.arange(r), current)
-            current[place] = generator.choice(others)
+            others = [landmark for landmark in generator.integers(0, r, h + 1) if landmark not in current]
+            current[place] = others[0] if others else current[place]
         lists[:, image] = current
     return lists
 

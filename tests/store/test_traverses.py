@@ -189,6 +189,20 @@ def test_a_stale_log_is_not_replayed_into_a_new_traverse(campus: Catalog, make_f
         assert new.put_frames(make_frames(range(3))) == (3, 0)
 
 
+def test_leftovers_are_swept_and_live_logs_stay(
+    summer: Traverse, campus: Catalog, make_frames: MakeFrames, tmp_path: Path
+) -> None:
+    summer.put_frames(make_frames(range(5)))
+    folder = campus.data_dir / "domains/campus/traverses"
+    live = sorted(path.name for path in folder.iterdir())
+    assert "summer.sqlite-wal" in live
+    for name in ("winter.new", "winter.new-journal", "autumn.sqlite-wal", "autumn.sqlite-shm"):
+        (folder / name).write_bytes(b"left over")
+    assert len(campus.discard_unfinished()) == 4
+    assert sorted(path.name for path in folder.iterdir()) == live
+    assert summer.read().n_frames == 5
+
+
 def test_a_full_disk_is_named_and_the_old_frames_stay(summer: Traverse, make_frames: MakeFrames) -> None:
     summer.put_frames(make_frames(range(3)))
     before = summer.read()

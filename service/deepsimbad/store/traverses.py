@@ -63,11 +63,9 @@ class Traverse:
             if path.exists():
                 raise ConflictError(f"domain {domain} has a traverse {name}: delete it first, or choose another name")
             new = path.with_suffix(_NEW_SUFFIX)
-            for leftover in (
-                new,
-                path,
-            ):  # a journal that outlived its file must not be replayed into this one
-                remove_database(leftover)
+            # A log that outlived its file would be replayed into the new one.
+            remove_database(new)
+            remove_database(path)
             with open_database(new, create=True) as db, db.atomic():
                 migrations.apply(db)
                 db.execute("INSERT INTO traverse (id, created_at) VALUES (1, ?)", [now()])
@@ -223,6 +221,21 @@ class Traverse:
         """All frames in index order, every checksum checked; one array of encodings, no copy beside it."""
         with self._reading() as db:
             return frame_table.read(db)
+
+
+def remove_leftovers(data_dir: Path, domain: str) -> list[str]:
+    """Remove what cut-short creations and deletions left in a domain's traverses; returns the files' names."""
+    folder = layout.traverses_folder(data_dir, domain)
+    if not folder.is_dir():
+        return []
+    removed = []
+    with storage_faults(folder), _locked_folder(folder, domain):
+        for path in sorted(folder.iterdir()):
+            owner = path.with_name(path.name.removesuffix("-wal").removesuffix("-shm"))
+            if _NEW_SUFFIX in (path.suffix, path.suffix.partition("-")[0]) or not owner.exists():
+                path.unlink(missing_ok=True)
+                removed.append(path.name)
+    return removed
 
 
 @contextmanager

@@ -7,7 +7,7 @@ from pathlib import Path
 from sqlite_utils import Database
 
 from deepsimbad.errors import JobInterruptedError
-from deepsimbad.store import domain_table, job_table, layout, map_table, ownership
+from deepsimbad.store import domain_table, job_table, layout, map_table, ownership, traverses
 from deepsimbad.store.durable import remove_database
 from deepsimbad.store.records import JobState, MapState
 
@@ -38,9 +38,10 @@ def discard_abandoned_maps(db: Database, data_dir: Path, owners: Path) -> Iterat
 
 
 def remove_orphans(db: Database, data_dir: Path) -> Iterator[str]:
-    """Remove the map files of known domains that no version owns; folders of unknown domains are left alone.
+    """Remove the files of known domains that no map version or traverse owns.
 
-    The write lock keeps new versions from appearing meanwhile. A lost catalog thus never empties the folders.
+    Folders of unknown domains are left alone: a lost catalog never empties them. The write lock keeps new versions
+    from appearing meanwhile.
     """
     for domain in domain_table.all_domains(db):
         folder = layout.maps_folder(data_dir, domain.name)
@@ -54,6 +55,8 @@ def remove_orphans(db: Database, data_dir: Path) -> Iterator[str]:
             if not owned:
                 path.unlink(missing_ok=True)
                 yield f"removed {path.name} of domain {domain.name}, which no map version owns"
+        for name in traverses.remove_leftovers(data_dir, domain.name):
+            yield f"removed {name} of domain {domain.name}, which no traverse owns"
 
 
 def remove_map_files(data_dir: Path, domain: str, version: int) -> None:

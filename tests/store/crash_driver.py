@@ -1,0 +1,183 @@
+"""Kills a child at its n-th step of storage, for every n, and checks after each death that nothing is half done.
+
+Run by test_crash.py in a process of its own (one thread, so that forking is sound). A step is one call that may change
+the disk: a SQL statement, a rename, an unlink, a sync, ... seen by the interpreter's profile hook, not by stand-ins.
+"""
+
+import os
+import shutil
+import signal
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from deepsimbad.store.catalog import Catalog
+from deepsimbad.store.frames import TraverseFrames
+from deepsimbad.store.map_contents import MapContents
+from deepsimbad.store.map_file import read_map, write_map
+from deepsimbad.store.records import JobState, MapState
+from deepsimbad.store.sealing import seal, verify
+from deepsimbad.store.traverses import Traverse
+
+FILE_STEPS = {"rename", "unlink", "fsync", "mkdir", "rmdir", "chmod", "flock", "open", "close"}
+SQL_STEPS = {"execute", "executemany"}
+N_FRAMES = 5
+DONE = ["traverse", "frames", "job", "begun", "written", "sealed", "noted", "active", "finished", "deleted"]
+
+
+def frames() -> TraverseFrames:
+    n = np.arange(N_FRAMES)
+    return TraverseFrames(n, n * 1.0, n, n * 1.0, n * 1.0, np.ones((N_FRAMES, 4), np.float32))
+
+
+def contents(version: int) -> MapContents:
+    lists = np.array([[0, 1, 2, 0], [1, 2, 0, 2]], np.uint16)
+    return MapContents(
+        "campus",
+        version,
+        "",
+        {"n_landmarks": 3},
+        {},
+        False,
+        (1.0,),
+        {"p": np.ones((3, 4), "f4")},
+        lists,
+        np.arange(4.0),
+    )
+
+
+def prepare(data_dir: Path) -> None:
+    """A domain to map and one to delete, both from before."""
+    with Catalog.open(data_dir) as catalog:
+        for name in ("campus", "old"):
+            catalog.create_domain(name, {}, False, [1])
+        Traverse.create(data_dir, "old", "summer").close()
+
+
+def scenario(data_dir: Path, done: Callable[[str], None]) -> None:
+    """Upload, remap, activate, delete; tells after each thing that is acknowledged."""
+    with Catalog.open(data_dir) as catalog:
+        with Traverse.create(data_dir, "campus", "summer") as traverse:
+            done("traverse")
+            traverse.put_frames(frames())
+            done("frames")
+        job = catalog.create_job("campus", "remap", {})
+        done("job")
+        version = catalog.begin_map("campus", {})
+        done("begun")
+        write_map(catalog.building_path("campus", version), contents(version))
+        done("written")
+        digest, n_bytes = seal(catalog.building_path("campus", version), catalog.map_path("campus", version))
+        done("sealed")
+        catalog.seal_map("campus", version, digest, n_bytes, {})
+        done("noted")
+        catalog.activate("campus", version, None)
+        done("active")
+        catalog.update_job(job.job_id, state="succeeded", result={"map_version": version})
+        done("finished")
+        catalog.delete_domain("old")
+        done("deleted")
+
+
+def check(data_dir: Path, done: list[str]) -> None:
+    """After the death: everything acknowledged is there, everything else is there whole or not at all."""
+    with Catalog.open(data_dir) as catalog:
+        catalog.discard_unfinished()
+        expect(catalog.discard_unfinished() == [], "one sweep is enough")
+        expect(list((data_dir / "owners").glob("*")) == [], "no lock file stays")
+
+        names = Traverse.list(data_dir, "campus")
+        expect(names == ["summer"] or (names == [] and "traverse" not in done), "the traverse")
+        if names:
+            with Traverse.open(data_dir, "campus", "summer") as traverse:
+                n_frames = traverse.read().n_frames
+            expect(n_frames == N_FRAMES or (n_frames == 0 and "frames" not in done), "the batch")
+
+        maps = catalog.maps("campus")
+        expect(len(maps) == 1 or (maps == [] and "noted" not in done), "the version")
+        for record in maps:
+            expect(record.state in (MapState.SEALED, MapState.ACTIVE), "no version is half built")
+            verify(catalog.map_path("campus", record.version), record.sha256 or "")
+            read_map(catalog.map_path("campus", record.version))
+        files = sorted(path.name for path in (data_dir / "domains/campus/maps").iterdir())
+        expect(files == [f"{record.version:06d}.sqlite" for record in maps], f"no file is left over: {files}")
+        left = [path.name for path in (data_dir / "domains/campus/traverses").iterdir()]
+        expect(left == [f"{name}.sqlite" for name in names], f"no file is left over: {left}")
+        active = catalog.domain("campus").active_version
+        expect(active == 1 or (active is None and "active" not in done), "the activation")
+
+        jobs = [job.state for job in catalog.jobs()]
+        if "finished" in done:
+            expect(jobs == [JobState.SUCCEEDED], "the finished job")
+        else:
+            expect(jobs in ([], [JobState.FAILED], [JobState.SUCCEEDED]), "no job waits for ever")
+        old = [domain.name for domain in catalog.domains()] == ["campus", "old"]
+        expect(not old or "deleted" not in done, "the deletion")
+        expect((data_dir / "domains/old").exists() == old, "rows and files go together")
+        expect([path.name for path in (data_dir / "domains").glob(".*")] == [], "no grave is left")
+
+    if names:
+        Traverse.delete(data_dir, "campus", "summer")
+    with Catalog.open(data_dir) as catalog:
+        if not old:
+            catalog.create_domain("old", {}, False, [1])
+        version = catalog.activate("campus", maps[0].version, active).version if maps else 0
+        expect(catalog.begin_map("campus", {}) > version, "work goes on")
+        Traverse.create(data_dir, "campus", "summer").close()
+
+
+def expect(truth: bool, what: str) -> None:
+    if not truth:
+        raise SystemExit(f"broken: {what}")
+
+
+def run_until(data_dir: Path, fatal_step: int, steps: set[str], pipe: int) -> None:
+    n_steps = 0
+
+    def hook(_frame: object, event: str, function: object) -> None:
+        nonlocal n_steps
+        if event == "c_call" and getattr(function, "__name__", "") in steps:
+            n_steps += 1
+            if n_steps == fatal_step:
+                os.kill(os.getpid(), signal.SIGKILL)
+
+    sys.setprofile(hook)
+    scenario(data_dir, lambda word: os.write(pipe, f"{word} ".encode()) and None)
+    sys.setprofile(None)
+
+
+def main(folder: Path, stride: int) -> None:
+    """Kill at every file step, and at every `stride`-th step of either kind."""
+    write_map(folder / "warm", contents(1))  # compiles once, before forking
+    for steps, step_by in ((FILE_STEPS, 1), (FILE_STEPS | SQL_STEPS, stride)):
+        fatal_step, survived = 1, False
+        while not survived:
+            data_dir = folder / f"{step_by}-{fatal_step}"
+            prepare(data_dir)
+            reader, writer = os.pipe()
+            child = os.fork()
+            if child == 0:
+                run_until(data_dir, fatal_step, steps, writer)
+                os._exit(0)
+            os.close(writer)
+            _, status = os.waitpid(child, 0)
+            done = os.read(reader, 1000).decode().split()
+            os.close(reader)
+            survived = not os.WIFSIGNALED(status)
+            expect(survived or os.WTERMSIG(status) == signal.SIGKILL, f"the child died of {status}")
+            expect(not survived or (status == 0 and done == DONE), f"the child ended with {status}, {done}")
+            try:
+                check(data_dir, done)
+            except BaseException as error:
+                raise SystemExit(
+                    f"killed at step {fatal_step} of {len(steps)} kinds after {done}: {error!r}"
+                ) from error
+            shutil.rmtree(data_dir)
+            fatal_step += step_by
+        print(fatal_step - step_by, end=" ", flush=True)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), int(sys.argv[2]))
