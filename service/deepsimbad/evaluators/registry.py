@@ -20,17 +20,17 @@ class EvaluatorKind(StrEnum):
 class ExtractorName(StrEnum):
     """The extractors `feature_l2` can use; `none` takes ready encodings alone."""
 
-    HOG = "hog"
+    GRADIENT_GRID = "gradient_grid"
     NONE = "none"
 
 
-DEFAULT_EXTRACTOR = ExtractorName.HOG
+DEFAULT_EXTRACTOR = ExtractorName.GRADIENT_GRID
 
 _EVALUATORS: Mapping[EvaluatorKind, str] = {
     EvaluatorKind.FEATURE_L2: "deepsimbad.evaluators.feature_l2:FeatureL2",
 }
 _EXTRACTORS: Mapping[ExtractorName, str | None] = {
-    ExtractorName.HOG: "deepsimbad.evaluators.extractors.hog:Hog",
+    ExtractorName.GRADIENT_GRID: "deepsimbad.evaluators.extractors.gradient_grid:GradientGrid",
     ExtractorName.NONE: None,
 }
 # Per kind: option -> (default, allowed values). Unknown options are errors: a typing mistake is never silent.

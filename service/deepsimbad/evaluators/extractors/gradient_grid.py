@@ -1,0 +1,91 @@
+"""Gradient grid: which edge directions are where in the picture, coarsely sideways, finely in height.
+
+A relative of HOG (Dalal and Triggs, 2005), chosen by measurement: docs/decisions/0004-embedded-extractor.md. It
+differs from HOG in three ways that matter across seasons and drives:
+
+- edge energy is spread over cells wider than high, because a drive is offset sideways and turned, hardly ever lifted;
+- a cell's energy is divided by that of a neighbourhood, so snow-flat and leafy places count alike;
+- directions enter twice: signed (dark below bright) and unsigned (any edge), because a season may reverse a contrast.
+"""
+
+from typing import ClassVar
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from deepsimbad.evaluators.base import Image
+
+_SIDE = 128  # pixels
+_POOL = 4  # pixels averaged before blurring: nothing finer survives the blur anyway
+_ROWS, _COLUMNS = 16, 8
+_DIRECTIONS = 12  # signed; opposite ones fold to half as many unsigned
+_SHARPNESS = 4  # squarings: a direction's weight is cos^(1 + 2^4) of the angle to it, down to half at 16 degrees
+_BLUR = (1.5, 0.5)  # sigma along x and y, in pooled pixels; a cell is 4 x 2 of them
+_NEIGHBOURHOOD = (2.5, 2.0)  # sigma along x and y, in cells
+_CONTRAST = 32.0  # standard deviation of grey levels an image is brought to
+_LEAST_CONTRAST = 4.0  # grey levels; added to the deviation, so that the noise of a dark image stays small
+_FLOOR = 4.0  # added to the neighbourhood's energy, so that bland stretches stay small
+_POWER = 0.6  # below 1: one strong edge does not drown the others
+
+_ANGLES = 2 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
+_TOWARDS = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)]).astype(np.float32)  # [2, directions]
+
+
+class GradientGrid:
+    """The default extractor: no download, no training, about a millisecond an image."""
+
+    name: ClassVar[str] = "gradient_grid"
+    input_size: ClassVar[tuple[int, int]] = (_SIDE, _SIDE)
+    encoding_dim: ClassVar[int] = _ROWS * _COLUMNS * (_DIRECTIONS + _DIRECTIONS // 2)
+
+    def __call__(self, image: Image) -> NDArray[np.float32]:
+        """See `Extractor`."""
+        energy = _cells(_directional_energy(_normalised_grey(image)))
+        folded = energy[..., : _DIRECTIONS // 2] + energy[..., _DIRECTIONS // 2 :]
+        strength = np.sqrt(np.square(folded).sum(axis=2))
+        around = cv2.GaussianBlur(strength, (0, 0), sigmaX=_NEIGHBOURHOOD[0], sigmaY=_NEIGHBOURHOOD[1])
+        shares = 1.0 / (around[..., None] + _FLOOR)
+        signed, unsigned = _unit((energy * shares) ** _POWER), _unit((folded * shares) ** _POWER)
+        return _unit(np.concatenate([signed, unsigned]))
+
+
+def _normalised_grey(image: Image) -> NDArray[np.float32]:
+    """[side, side] grey levels of fixed contrast."""
+    grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+    if grey.shape != (_SIDE, _SIDE):
+        shrinks = grey.shape[0] >= _SIDE and grey.shape[1] >= _SIDE
+        grey = cv2.resize(grey, (_SIDE, _SIDE), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
+    levels = grey.astype(np.float32)
+    _, deviation = cv2.meanStdDev(levels)
+    return np.asarray(levels * (_CONTRAST / (float(deviation[0, 0]) + _LEAST_CONTRAST)), np.float32)
+
+
+def _directional_energy(levels: NDArray[np.float32]) -> NDArray[np.float32]:
+    """[side, side, directions]: gradient magnitude, shared among the directions nearest its own."""
+    gradient = np.empty((levels.size, 2), np.float32)
+    gradient[:, 0] = cv2.Sobel(levels, cv2.CV_32F, 1, 0, ksize=1).ravel()
+    gradient[:, 1] = cv2.Sobel(levels, cv2.CV_32F, 0, 1, ksize=1).ravel()
+    magnitude = np.sqrt(np.square(gradient).sum(axis=1, keepdims=True))
+    energy = np.maximum(gradient @ _TOWARDS, 0)
+    weight = energy / np.maximum(magnitude, 1e-6)
+    for _ in range(_SHARPNESS):
+        weight *= weight
+    energy *= weight
+    return energy.reshape(_SIDE, _SIDE, _DIRECTIONS)
+
+
+def _cells(energy: NDArray[np.float32]) -> NDArray[np.float32]:
+    """[rows, columns, directions]: blurred, then averaged in each cell."""
+    pooled = cv2.resize(energy, (_SIDE // _POOL, _SIDE // _POOL), interpolation=cv2.INTER_AREA)
+    blurred = cv2.GaussianBlur(pooled, (0, 0), sigmaX=_BLUR[0], sigmaY=_BLUR[1])
+    return np.asarray(cv2.resize(blurred, (_COLUMNS, _ROWS), interpolation=cv2.INTER_AREA), np.float32)
+
+
+def _unit(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Flat and of length 1; of nothing (a uniform image), the vector that favours no element."""
+    flat = values.ravel()
+    length = float(np.linalg.norm(flat))
+    if length < 1e-6:
+        return np.full(flat.size, flat.size**-0.5, np.float32)
+    return np.asarray(flat / length, np.float32)
