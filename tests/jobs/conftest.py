@@ -1,0 +1,58 @@
+"""A catalog with one domain of ready encodings, and drives to put into it."""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from deepsimbad.evaluators.base import Evaluator
+from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
+from deepsimbad.jobs.progress import Progress
+from deepsimbad.jobs.remap import REMAP_STAGES
+from deepsimbad.store.catalog import Catalog
+from deepsimbad.store.frames import UNKNOWN_TIMESTAMP, TraverseFrames
+from deepsimbad.store.traverses import Traverse
+
+DOMAIN = "route"
+READY = {"kind": "feature_l2", "extractor": "none"}
+
+
+@pytest.fixture
+def catalog(tmp_path: Path) -> Iterator[Catalog]:
+    with Catalog.open(tmp_path / "data") as opened:
+        opened.create_domain(DOMAIN, READY, False, (1.0, 2.0))
+        yield opened
+
+
+@pytest.fixture(scope="session")
+def evaluator() -> Evaluator:
+    return make_evaluator(evaluator_config(READY))
+
+
+@pytest.fixture
+def drive(catalog: Catalog) -> Callable[..., np.ndarray]:
+    """Stores a traverse of random encodings; returns them [n, d]."""
+
+    def store(name: str, n: int, seed: int = 0, position_m: Any = None, **known: Any) -> np.ndarray:
+        encodings = np.random.default_rng(seed).normal(size=(n, 6)).astype(np.float32)
+        frames = TraverseFrames(
+            index=np.arange(n),
+            position_m=np.arange(n, dtype=float) if position_m is None else np.asarray(position_m, float),
+            timestamp_us=known.get("timestamp_us", np.full(n, UNKNOWN_TIMESTAMP)),
+            x_m=known.get("x_m", np.full(n, np.nan)),
+            y_m=known.get("y_m", np.full(n, np.nan)),
+            encodings=encodings,
+        )
+        with Traverse.create(catalog.data_dir, DOMAIN, name) as traverse:
+            if n:
+                traverse.put_frames(frames)
+        return encodings
+
+    return store
+
+
+@pytest.fixture
+def quiet() -> Progress:
+    return Progress(REMAP_STAGES)

@@ -1,0 +1,193 @@
+"""Remapping: what the map file holds, what stays when it fails."""
+
+import numpy as np
+import pytest
+
+from deepsimbad.core.relevance import Relevance
+from deepsimbad.errors import (
+    CancelledError,
+    InvalidMapConfigError,
+    InvalidRouteError,
+    TooFewCandidatesError,
+    UnknownDomainError,
+    UnknownTraverseError,
+)
+from deepsimbad.jobs.map_config import RemapConfig
+from deepsimbad.jobs.progress import Progress
+from deepsimbad.jobs.remap import REMAP_STAGES, remap
+from deepsimbad.store.map_file import read_map
+from deepsimbad.store.records import MapState
+from deepsimbad.store.sealing import verify
+
+DOMAIN = "route"
+
+
+def config(**changes):
+    return RemapConfig(**{"training_traverse": "drive", "landmark_traverse": "other", "n_landmarks": 8} | changes)
+
+
+def files_of(catalog):
+    folder = catalog.map_path(DOMAIN, 1).parent
+    return sorted(path.name for path in folder.iterdir()) if folder.is_dir() else []
+
+
+def nearest_first(encoding, prototypes):
+    return sorted(range(len(prototypes)), key=lambda i: (float(np.sum((encoding - prototypes[i]) ** 2)), i))
+
+
+def test_a_map_is_sealed_active_and_holds_the_lists_of_its_landmarks(catalog, drive, evaluator, quiet):
+    candidates = drive("other", 30, seed=1)
+    encodings = drive("drive", 12, position_m=np.arange(12) * 1.5, x_m=np.arange(12) * 1.0, y_m=np.zeros(12))
+    result = remap(catalog, DOMAIN, config(relevance=Relevance.RRF), evaluator, quiet)
+    assert result["map_version"] == 1
+    assert result["active"] is True
+    assert result["metrics"]["n_map_images"] == 12
+    assert result["metrics"]["index_bits_per_map_image"] > 0
+    assert catalog.domain(DOMAIN).active_version == 1
+    record = catalog.map(DOMAIN, 1)
+    assert record.state is MapState.ACTIVE
+    verify(catalog.map_path(DOMAIN, 1), record.sha256)
+    contents = read_map(catalog.map_path(DOMAIN, 1))
+    prototypes = contents.landmark_model["prototypes"]
+    assert {tuple(row) for row in prototypes} <= {tuple(row) for row in candidates}
+    for image, encoding in enumerate(encodings):
+        assert contents.lists[:, image].tolist() == nearest_first(encoding, prototypes)[:4]
+    assert contents.position_m.tolist() == (np.arange(12) * 1.5).tolist()
+    assert contents.x_m.tolist() == list(range(12))
+    assert contents.timestamp_us is None
+    assert contents.config["n_landmarks"] == 8
+    assert contents.config["landmark_traverse"] == "other"
+
+
+def test_times_are_kept_where_they_are_known(catalog, drive, evaluator, quiet):
+    drive("other", 30, seed=1)
+    drive("drive", 5, timestamp_us=np.arange(5) + 7)
+    remap(catalog, DOMAIN, config(), evaluator, quiet)
+    assert read_map(catalog.map_path(DOMAIN, 1)).timestamp_us.tolist() == [7, 8, 9, 10, 11]
+
+
+def test_without_a_landmark_traverse_the_active_maps_landmarks_stay(catalog, drive, evaluator, quiet):
+    drive("other", 30, seed=1)
+    drive("drive", 12)
+    remap(catalog, DOMAIN, config(), evaluator, quiet)
+    drive("later", 9, seed=2)
+    again = config(training_traverse="later", landmark_traverse=None, n_landmarks=None)
+    assert remap(catalog, DOMAIN, again, evaluator, Progress(REMAP_STAGES))["map_version"] == 2
+    first, second = (read_map(catalog.map_path(DOMAIN, version)) for version in (1, 2))
+    assert np.array_equal(first.landmark_model["prototypes"], second.landmark_model["prototypes"])
+    assert second.lists.shape == (4, 9)
+    assert second.config["n_landmarks"] == 8
+    assert catalog.domain(DOMAIN).active_version == 2
+    assert catalog.map(DOMAIN, 1).state is MapState.RETIRED
+
+
+def test_kept_landmarks_have_the_number_they_have(catalog, drive, evaluator, quiet):
+    drive("other", 30, seed=1)
+    drive("drive", 12)
+    remap(catalog, DOMAIN, config(), evaluator, quiet)
+    with pytest.raises(InvalidMapConfigError, match="has 8 landmarks, not 9") as raised:
+        remap(catalog, DOMAIN, config(landmark_traverse=None, n_landmarks=9), evaluator, Progress(REMAP_STAGES))
+    assert raised.value.hints == {"n_landmarks": 8}
+    too_long = config(landmark_traverse=None, n_landmarks=None, list_length=9)
+    with pytest.raises(InvalidMapConfigError, match="list_length 9"):
+        remap(catalog, DOMAIN, too_long, evaluator, Progress(REMAP_STAGES))
+    assert [record.version for record in catalog.maps(DOMAIN)] == [1]
+
+
+def test_a_first_map_needs_landmarks_from_somewhere(catalog, drive, evaluator, quiet):
+    drive("drive", 12)
+    with pytest.raises(InvalidMapConfigError, match="give a landmark_traverse"):
+        remap(catalog, DOMAIN, config(landmark_traverse=None, n_landmarks=None), evaluator, quiet)
+
+
+@pytest.mark.parametrize(("position_m", "frame"), [([0.0, 1.0, 0.5, 2.0, 3.0], 2), ([0.0, 1.0, 2.0, 3.0, 2.999], 4)])
+def test_positions_that_go_backwards_leave_nothing_behind(catalog, drive, evaluator, quiet, position_m, frame):
+    drive("other", 30, seed=1)
+    drive("drive", 5, position_m=position_m)
+    with pytest.raises(InvalidRouteError, match=f"backwards at frame {frame}"):
+        remap(catalog, DOMAIN, config(), evaluator, quiet)
+    assert catalog.maps(DOMAIN) == []
+    assert files_of(catalog) == []
+    assert catalog.domain(DOMAIN).active_version is None
+
+
+def test_standing_still_is_no_going_backwards(catalog, drive, evaluator, quiet):
+    drive("other", 30, seed=1)
+    drive("drive", 4, position_m=[0, 0, 1, 1])
+    assert remap(catalog, DOMAIN, config(), evaluator, quiet)["map_version"] == 1
+
+
+@pytest.mark.parametrize("role", ["drive", "other"])
+def test_a_traverse_without_frames_is_named(catalog, drive, evaluator, quiet, role):
+    drive("other", 0 if role == "other" else 30, seed=1)
+    drive("drive", 0 if role == "drive" else 5)
+    with pytest.raises(InvalidMapConfigError, match=f"traverse {role} has no frames yet"):
+        remap(catalog, DOMAIN, config(), evaluator, quiet)
+    assert catalog.maps(DOMAIN) == []
+
+
+def test_unknown_names_are_named(catalog, drive, evaluator, quiet):
+    drive("drive", 5)
+    with pytest.raises(UnknownTraverseError, match="other"):
+        remap(catalog, DOMAIN, config(), evaluator, quiet)
+    with pytest.raises(UnknownDomainError, match="elsewhere"):
+        remap(catalog, "elsewhere", config(), evaluator, Progress(REMAP_STAGES))
+
+
+def test_fewer_candidates_than_landmarks(catalog, drive, evaluator, quiet):
+    drive("other", 7, seed=1)
+    drive("drive", 5)
+    with pytest.raises(TooFewCandidatesError) as raised:
+        remap(catalog, DOMAIN, config(), evaluator, quiet)
+    assert raised.value.hints == {"n_candidates": 7, "n_landmarks": 8}
+    assert catalog.maps(DOMAIN) == []
+
+
+def test_a_map_of_one_image(catalog, drive, evaluator, quiet):
+    drive("other", 30, seed=1)
+    drive("drive", 1)
+    assert remap(catalog, DOMAIN, config(), evaluator, quiet)["metrics"]["n_map_images"] == 1
+    assert read_map(catalog.map_path(DOMAIN, 1)).lists.shape == (4, 1)
+
+
+def test_a_map_need_not_serve_at_once(catalog, drive, evaluator, quiet):
+    drive("other", 30, seed=1)
+    drive("drive", 5)
+    assert remap(catalog, DOMAIN, config(activate=False), evaluator, quiet)["active"] is False
+    assert catalog.map(DOMAIN, 1).state is MapState.SEALED
+    assert catalog.domain(DOMAIN).active_version is None
+
+
+@pytest.mark.parametrize("relevance", list(Relevance))
+def test_a_map_keeps_what_its_relevance_needs_and_no_more(catalog, drive, evaluator, quiet, relevance):
+    drive("other", 30, seed=1)
+    drive("drive", 5)
+    remap(catalog, DOMAIN, config(relevance=relevance), evaluator, quiet)
+    contents = read_map(catalog.map_path(DOMAIN, 1))
+    assert contents.config["relevance"] == relevance.value
+    assert (contents.statistics is not None) == (relevance is Relevance.STANDARDISED)
+    assert (contents.values is not None) == (relevance is Relevance.SIMBAD)
+    assert (contents.encodings is not None) == (relevance is Relevance.BRUTE_FORCE)
+
+
+@pytest.mark.parametrize("stage", list(REMAP_STAGES))
+def test_cancelled_at_any_stage_it_leaves_nothing_behind(catalog, drive, evaluator, stage):
+    drive("other", 30, seed=1)
+    drive("drive", 5)
+    at = []
+    progress = Progress(REMAP_STAGES, lambda state: at.append(state.stage), lambda: at[-1:] == [before(stage)])
+    with pytest.raises(CancelledError):
+        remap(catalog, DOMAIN, config(), evaluator, progress if stage != "read frames" else cancelled())
+    assert catalog.maps(DOMAIN) == []
+    assert files_of(catalog) == []
+    assert catalog.domain(DOMAIN).active_version is None
+
+
+def before(stage):
+    """Once this stage was told, the next report stops the work."""
+    stages = list(REMAP_STAGES)
+    return stages[max(0, stages.index(stage) - 1)]
+
+
+def cancelled():
+    return Progress(REMAP_STAGES, None, lambda: True)

@@ -1,0 +1,175 @@
+"""Jobs run one after the other, and their rows tell the truth."""
+
+import threading
+import time
+from contextlib import contextmanager
+
+import pytest
+
+from deepsimbad.errors import ConflictError, UnknownDomainError, UnknownJobError
+from deepsimbad.jobs.map_config import RemapConfig
+from deepsimbad.jobs.runner import JobRunner
+from deepsimbad.store.records import JobState
+
+DOMAIN = "route"
+
+WITHIN_S = 20
+CONFIG = RemapConfig("drive", "other", n_landmarks=8)
+
+
+class Gate:
+    """An evaluator source that keeps a job waiting until it is let through."""
+
+    def __init__(self, evaluator):
+        self.entered, self.open = threading.Event(), threading.Event()
+        self.evaluator = evaluator
+
+    def __call__(self, domain):
+        self.entered.set()
+        assert self.open.wait(WITHIN_S)
+        return self.evaluator
+
+
+@contextmanager
+def running(catalog, evaluator_of, on_activated=lambda domain: None):
+    runner = JobRunner(catalog, evaluator_of, on_activated)
+    try:
+        yield runner
+    finally:
+        runner.close()
+
+
+def ended(catalog, job_id):
+    give_up = time.monotonic() + WITHIN_S
+    while time.monotonic() < give_up:
+        job = catalog.job(job_id)
+        if job.state not in {JobState.QUEUED, JobState.RUNNING}:
+            return job
+        time.sleep(0.01)
+    raise AssertionError(f"job {job_id} did not end: {job}")
+
+
+@pytest.fixture
+def drives(drive):
+    drive("other", 30, seed=1)
+    drive("drive", 12)
+
+
+def test_a_job_succeeds_and_its_map_is_announced(catalog, drives, evaluator):
+    activated = []
+    with running(catalog, lambda domain: evaluator, activated.append) as runner:
+        queued = runner.submit(DOMAIN, CONFIG)
+        assert queued.domain == DOMAIN
+        job = ended(catalog, queued.job_id)
+    assert job.state is JobState.SUCCEEDED
+    assert job.result["map_version"] == 1
+    assert job.result["active"] is True
+    assert (job.progress, job.eta_s, job.error) == (1.0, None, None)
+    assert job.created_at <= job.started_at <= job.finished_at
+    assert activated == [DOMAIN]
+
+
+def test_a_map_that_is_not_activated_is_not_announced(catalog, drives, evaluator):
+    activated = []
+    with running(catalog, lambda domain: evaluator, activated.append) as runner:
+        job = ended(catalog, runner.submit(DOMAIN, RemapConfig("drive", "other", 8, activate=False)).job_id)
+    assert job.state is JobState.SUCCEEDED
+    assert activated == []
+
+
+def test_jobs_run_in_the_order_they_came(catalog, drives, evaluator):
+    gate = Gate(evaluator)
+    with running(catalog, gate) as runner:
+        jobs = [runner.submit(DOMAIN, CONFIG) for _ in range(3)]
+        assert gate.entered.wait(WITHIN_S)
+        assert [catalog.job(job.job_id).state for job in jobs] == [JobState.RUNNING, JobState.QUEUED, JobState.QUEUED]
+        gate.open.set()
+        results = [ended(catalog, job.job_id).result["map_version"] for job in jobs]
+    assert results == [1, 2, 3]
+
+
+def test_a_queued_job_is_cancelled_at_once_and_never_runs(catalog, drives, evaluator):
+    gate = Gate(evaluator)
+    with running(catalog, gate) as runner:
+        first, second, third = (runner.submit(DOMAIN, CONFIG) for _ in range(3))
+        assert gate.entered.wait(WITHIN_S)
+        assert runner.cancel(second.job_id).state is JobState.CANCELLED
+        gate.open.set()
+        assert ended(catalog, third.job_id).state is JobState.SUCCEEDED
+    assert catalog.job(second.job_id).state is JobState.CANCELLED
+    assert [record.version for record in catalog.maps(DOMAIN)] == [1, 2]
+    assert catalog.job(first.job_id).state is JobState.SUCCEEDED
+
+
+def test_a_running_job_is_cancelled_at_its_next_report_and_leaves_no_map(catalog, drives, evaluator):
+    gate = Gate(evaluator)
+    with running(catalog, gate) as runner:
+        job = runner.submit(DOMAIN, CONFIG)
+        assert gate.entered.wait(WITHIN_S)
+        runner.cancel(job.job_id)
+        gate.open.set()
+        job = ended(catalog, job.job_id)
+        assert job.state is JobState.CANCELLED
+        assert job.error["code"] == "cancelled"
+        assert catalog.maps(DOMAIN) == []
+        assert ended(catalog, runner.submit(DOMAIN, CONFIG).job_id).state is JobState.SUCCEEDED, "it goes on"
+
+
+def test_a_failed_job_says_why_by_code_and_with_what_helps(catalog, drives, evaluator):
+    with running(catalog, lambda domain: evaluator) as runner:
+        job = ended(catalog, runner.submit(DOMAIN, RemapConfig("drive", "other", n_landmarks=31)).job_id)
+        assert job.state is JobState.FAILED
+        assert job.result is None
+        assert job.error["code"] == "too_few_candidates"
+        assert job.error["n_candidates"] == 30
+        assert "30 candidates for 31 landmarks" in job.error["message"]
+        assert ended(catalog, runner.submit(DOMAIN, CONFIG).job_id).state is JobState.SUCCEEDED, "it goes on"
+
+
+def test_a_job_that_breaks_tells_no_inner_detail_and_the_runner_goes_on(catalog, drives, evaluator, caplog):
+    broken = [True]
+
+    def evaluator_of(domain):
+        if broken.pop():
+            raise ZeroDivisionError("secret")
+        return evaluator
+
+    with running(catalog, evaluator_of) as runner:
+        job = ended(catalog, runner.submit(DOMAIN, CONFIG).job_id)
+        broken.append(False)
+        assert ended(catalog, runner.submit(DOMAIN, CONFIG).job_id).state is JobState.SUCCEEDED
+    assert job.state is JobState.FAILED
+    assert job.error["code"] == "internal_error"
+    assert "secret" not in str(job.error)
+    assert "secret" in caplog.text, "the log has it"
+
+
+def test_unknown_names(catalog, evaluator):
+    with running(catalog, lambda domain: evaluator) as runner:
+        with pytest.raises(UnknownDomainError):
+            runner.submit("elsewhere", CONFIG)
+        with pytest.raises(UnknownJobError):
+            runner.cancel("nothing")
+
+
+def test_cancelling_what_has_ended_changes_nothing(catalog, drives, evaluator):
+    with running(catalog, lambda domain: evaluator) as runner:
+        job = ended(catalog, runner.submit(DOMAIN, CONFIG).job_id)
+        assert runner.cancel(job.job_id).state is JobState.SUCCEEDED
+    assert catalog.job(job.job_id).state is JobState.SUCCEEDED
+
+
+def test_closing_ends_what_runs_and_takes_nothing_new(catalog, drives, evaluator):
+    gate = Gate(evaluator)
+    runner = JobRunner(catalog, gate, lambda domain: None)
+    job = runner.submit(DOMAIN, CONFIG)
+    assert gate.entered.wait(WITHIN_S)
+    closing = threading.Thread(target=runner.close)
+    closing.start()
+    gate.open.set()
+    closing.join(WITHIN_S)
+    assert not closing.is_alive()
+    assert catalog.job(job.job_id).state is JobState.CANCELLED
+    assert catalog.maps(DOMAIN) == []
+    with pytest.raises(ConflictError, match="shutting down"):
+        runner.submit(DOMAIN, CONFIG)
