@@ -86,7 +86,11 @@ def _lifespan(settings: Settings, metrics: Metrics) -> Callable[[FastAPI], Abstr
     @asynccontextmanager
     async def run(app: FastAPI) -> AsyncIterator[None]:
         with ExitStack() as parts:
-            services = await run_sync(_start, settings, metrics, parts)
+            try:
+                services = await run_sync(_start, settings, metrics, parts)
+            except DeepSimbadError as error:
+                app.state.startup_error = error  # the server only reports that there was one
+                raise
             app.state.services = services
             yield
             services.stopping.set()

@@ -9,6 +9,7 @@ from fastapi import FastAPI
 
 from deepsimbad.api.app import create_app
 from deepsimbad.api.logs import configure_logging
+from deepsimbad.errors import DeepSimbadError, UnavailableError
 from deepsimbad.settings import Settings
 
 log = logging.getLogger(__name__)
@@ -40,6 +41,7 @@ def serve(settings: Settings) -> None:
 
     Raises:
         SettingsError: The address could be reached from other machines, and the service has no keys.
+        DeepSimbadError: What kept it from starting, by name.
     """
     settings.check_exposure()
     configure_logging(settings.log_level)
@@ -60,4 +62,10 @@ def serve(settings: Settings) -> None:
         timeout_graceful_shutdown=settings.shutdown_grace_s,
         h11_max_incomplete_event_size=64 * 1024,
     )
-    _Server(config, app).run()
+    try:
+        _Server(config, app).run()
+    except SystemExit as ended:  # how uvicorn says that it could not start
+        why: DeepSimbadError | None = getattr(app.state, "startup_error", None)
+        if why is None:
+            why = UnavailableError(f"cannot listen on {settings.host}:{settings.port}: is the port taken?")
+        raise why from ended

@@ -13,6 +13,7 @@ from deepsimbad.api.dependencies import JobId, Running
 from deepsimbad.api.openapi import problems
 from deepsimbad.api.rendering import render_job
 from deepsimbad.api.schemas import JobAnswer, JobList
+from deepsimbad.errors import UnknownJobError
 from deepsimbad.store.records import JobRecord
 
 router = APIRouter(prefix="/v1/admin/jobs", tags=["admin: jobs"])
@@ -62,7 +63,10 @@ async def get_job_events(
         if job.state.is_final:
             return
         await asyncio.sleep(running.settings.event_poll_s)
-        job = await run_sync(running.catalog.job, job.job_id)
+        try:
+            job = await run_sync(running.catalog.job, job.job_id)
+        except UnknownJobError:  # its domain was deleted
+            return
 
 
 @router.delete("/{job_id}", status_code=204, responses=problems(404, 422))
