@@ -97,7 +97,9 @@ def client(data_dir: Path) -> Iterator[TestClient]:
                 headers={"Content-Type": "image/jpeg"},
             )
             assert stored.status_code == 201, stored.text
-        job = remap(client, "seen", training_traverse="drive", landmark_traverse="drive", n_landmarks=6, list_length=3)
+        job = remap(
+            client, "seen", training_traverse="drive", landmark_traverse="drive", n_landmarks=N_SEEN, list_length=3
+        )
         assert job["state"] == "succeeded", job
         client.put("/v1/admin/domains/unmapped", json={"evaluator": {"kind": "feature_l2"}})
         yield client

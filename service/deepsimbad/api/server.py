@@ -62,6 +62,12 @@ def serve(settings: Settings) -> None:
         timeout_graceful_shutdown=settings.shutdown_grace_s,
         h11_max_incomplete_event_size=64 * 1024,
     )
+
+    def is_news(record: logging.LogRecord) -> bool:
+        """Whoever called gets the named error; its stack in the log would only hide it."""
+        return not (hasattr(app.state, "startup_error") and record.getMessage().startswith("Traceback"))
+
+    logging.getLogger("uvicorn.error").addFilter(is_news)
     try:
         _Server(config, app).run()
     except SystemExit as ended:  # how uvicorn says that it could not start
