@@ -1,0 +1,159 @@
+"""Nordland through real HTTP: landmarks and map from summer, live images from winter, every call stateless.
+
+    python -m bench.nordland
+
+Landmarks come from summer frames 1000..1999, the map from summer 0..999, the robot from winter 0..999. A frame is
+left out where an image that would be used of it shows nothing (a tunnel): its grey levels' standard deviation is at
+most 8 (of the map's frames in either season, of the landmarks' in summer, the only season used of them). One frame
+is one metre; a match within two frames is right.
+"""
+
+import sys
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+
+from bench import machine
+from bench.recordings import RESULTS, real_recordings
+from deepsimbad_client import Client
+from deepsimbad_client.local_server import LocalServer
+from deepsimbad_client.remap import remap
+from deepsimbad_client.replay import replay
+from deepsimbad_client.report import summarise
+from deepsimbad_client.sources import open_source
+from deepsimbad_client.upload import upload
+
+DOMAIN = "nordland"
+RELEVANCES = ("standardised", "rrf", "bag_of_landmarks", "simbad", "brute_force")
+N_LANDMARKS, LIST_LENGTH, TOLERANCE_M = 300, 4, 2.0
+MAP_FRAMES, LANDMARK_FRAMES = range(1000), range(1000, 2000)
+_LEAST_GREY_STD = 8.0
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What was measured.
+
+    Attributes:
+        summaries: The client's own summary of every relevance's replay.
+        n_map_frames_left_out: Of frames 0..999.
+        n_landmark_frames_left_out: Of frames 1000..1999.
+        extractor: The evaluator's configuration, as the service tells it.
+    """
+
+    summaries: dict[str, dict[str, Any]]
+    n_map_frames_left_out: int
+    n_landmark_frames_left_out: int
+    extractor: dict[str, Any]
+
+
+def shows_something(path: Path) -> bool:
+    """Whether a frame is more than darkness."""
+    grey = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    if grey is None:
+        raise FileNotFoundError(f"no image at {path}")
+    return float(grey.std()) > _LEAST_GREY_STD
+
+
+def kept_frames(seasons: tuple[Path, ...], numbers: range) -> list[int]:
+    """The frames that show something in every one of these seasons."""
+    return [each for each in numbers if all(shows_something(season / f"{each:05}.png") for season in seasons)]
+
+
+def season_folder(folder: Path, season: Path, numbers: list[int], first: int) -> Path:
+    """A folder of links to some frames, with their positions: one metre a frame from `first`."""
+    folder.mkdir()
+    lines = ["name,position_m"]
+    for each in numbers:
+        name = f"{each:05}.png"
+        (folder / name).symlink_to((season / name).resolve())
+        lines.append(f"{name},{each - first}")
+    (folder / "positions.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return folder
+
+
+def measure(nordland: Path, work: Path, relevances: tuple[str, ...] = RELEVANCES) -> Measured:
+    """Upload, remap and replay against a service of our own.
+
+    Args:
+        nordland: The folder that holds `summer` and `winter`.
+        work: An empty folder.
+        relevances: The maps to make, one after the other.
+    """
+    summer, winter = nordland / "summer", nordland / "winter"
+    kept, candidates = kept_frames((summer, winter), MAP_FRAMES), kept_frames((summer,), LANDMARK_FRAMES)
+    drives = {
+        "landmarks": season_folder(work / "landmarks", summer, candidates, LANDMARK_FRAMES.start),
+        "map": season_folder(work / "map", summer, kept, MAP_FRAMES.start),
+    }
+    live = open_source(str(season_folder(work / "live", winter, kept, MAP_FRAMES.start)))
+    summaries = {}
+    with LocalServer(work / "data") as server, Client(server.url) as client:
+        client.admin.put_domain(DOMAIN, {"kind": "feature_l2"})
+        for name, folder in drives.items():
+            upload(client, open_source(str(folder)), DOMAIN, name)
+        for relevance in relevances:
+            remap(
+                client,
+                DOMAIN,
+                "map",
+                landmark_traverse="landmarks",
+                n_landmarks=N_LANDMARKS,
+                list_length=LIST_LENGTH,
+                relevance=relevance,
+            )
+            # One query at a time: the time an answer takes is then the service's, not a queue's.
+            driven = replay(client, live, DOMAIN, work / relevance, tolerance_m=TOLERANCE_M, concurrency=1)
+            summaries[relevance] = summarise(driven)
+        extractor = client.domain(DOMAIN).evaluator
+    return Measured(summaries, len(MAP_FRAMES) - len(kept), len(LANDMARK_FRAMES) - len(candidates), dict(extractor))
+
+
+def table(measured: Measured) -> list[str]:
+    """Markdown lines."""
+    lines = ["| relevance | ANR % | R@1 % | R@5 % | ms a call, median |", "|---|---|---|---|---|"]
+    for name, summary in measured.summaries.items():
+        lines.append(
+            f"| {name} | {summary['anr']:.2f} | {summary['recall_at_1']:.1f} | {summary['recall_at_5']:.1f} "
+            f"| {summary['latency_ms']['median']:.1f} |"
+        )
+    first = next(iter(measured.summaries.values()))
+    return [
+        *lines,
+        "",
+        f"{first['n_queries']} queries against {first['n_map_images']} map images. Left out because an image "
+        f"shows nothing (grey levels' standard deviation at most {_LEAST_GREY_STD:g}): "
+        f"{measured.n_map_frames_left_out} of frames 0..999, where either season counts, and "
+        f"{measured.n_landmark_frames_left_out} of the landmarks' 1000..1999 in summer. r = {N_LANDMARKS}, "
+        f"h = {LIST_LENGTH}, tolerance {TOLERANCE_M:g} frames, extractor {measured.extractor['extractor']}. "
+        "ANR: 0 is perfect, 50 chance.",
+    ]
+
+
+def main() -> None:
+    """Measure, print, write `docs/results/nordland-http.md`."""
+    with tempfile.TemporaryDirectory() as work:
+        measured = measure(real_recordings() / "nordland", Path(work))
+    lines = [
+        "# Nordland over HTTP: map summer, drive winter",
+        "",
+        "Real images, posted one by one to a running service, each localized on its own (stateless: the map's "
+        "statistics alone). Landmarks come from another part of the route.",
+        "",
+        "Made by `python -m bench.nordland`.",
+        "",
+        f"Machine: {machine.describe()}",
+        "",
+        *table(measured),
+    ]
+    print("\n".join(lines))
+    RESULTS.mkdir(parents=True, exist_ok=True)
+    (RESULTS / "nordland-http.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    print(f"\nwritten to {RESULTS / 'nordland-http.md'}", file=sys.stderr)
+
+
+if __name__ == "__main__":
+    main()
