@@ -31,13 +31,15 @@ def progress_bar(stages: Mapping[str, float], title: str) -> Iterator[Progress]:
         nonlocal interrupted
         interrupted = True
 
+    errors = Console(stderr=True)
     bars = Bars(
         TextColumn("{task.description}"),
         BarColumn(),
         TaskProgressColumn(),
         TimeRemainingColumn(),
-        console=Console(stderr=True),
+        console=errors,
         transient=True,
+        disable=not errors.is_terminal,  # a log keeps an error's one line, and no blank ones
     )
     task = bars.add_task(title, total=1.0)
 

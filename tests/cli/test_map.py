@@ -1,0 +1,227 @@
+"""`deepsimbad map`, `info` and `localize`: a route mapped and asked without a server."""
+
+import json
+import signal
+import time
+
+import numpy as np
+import pytest
+
+from deepsimbad.store.catalog import Catalog
+from deepsimbad.store.map_file import read_map
+
+READY = ("--evaluator", "feature_l2:none")
+INFO_KEYS = {
+    "name",
+    "map_version",
+    "route_length_m",
+    "n_map_images",
+    "n_landmarks",
+    "list_length",
+    "evaluator",
+    "input_size",
+    "index_bits_per_map_image",
+    "actions_m",
+}
+
+
+def sources(drives, **parts):
+    return (
+        "--landmarks",
+        f"{drives / 'landmarks.npy'}",
+        "--training",
+        f"{drives / 'summer.npy'}{parts.get('part', '')}",
+    )
+
+
+def contents(data_dir, version=1, domain="route"):
+    with Catalog.open(data_dir) as catalog:
+        return read_map(catalog.map_path(domain, version))
+
+
+def test_a_map_is_made_and_described(deepsimbad, drives, tmp_path):
+    ran = deepsimbad("map", "route", *sources(drives), *READY, "--n-landmarks", 20, "--data-dir", tmp_path / "here")
+    assert (ran.code, ran.out, ran.err) == (0, "map 1 of route is active: 80 images\n", "")
+    ran = deepsimbad("info", "route", "--json", "--data-dir", tmp_path / "here")
+    document = json.loads(ran.out)
+    assert (ran.code, ran.err) == (0, "")
+    assert set(document) >= INFO_KEYS
+    assert document["map_version"] == 1
+    assert (document["n_map_images"], document["n_landmarks"], document["list_length"]) == (80, 20, 4)
+    assert document["route_length_m"] == 79.0
+    assert document["actions_m"] == list(range(1, 11))
+    assert document["relevance"] == "standardised"
+
+
+def test_every_option_of_a_map_is_heeded(deepsimbad, drives, tmp_path):
+    options = {
+        "--n-landmarks": 12,
+        "--list-length": 3,
+        "--relevance": "rrf",
+        "--training-episodes": 7,
+        "--seed": 5,
+        "--spacing-m": 2.5,
+    }
+    flat = [part for option in options.items() for part in option]
+    ran = deepsimbad("map", "route", *sources(drives), *READY, *flat, "--closed", "--data-dir", "here")
+    assert ran.code == 0, ran.err
+    made = contents(tmp_path / "here")
+    assert made.lists.shape == (3, 80)
+    assert made.landmark_model["prototypes"].shape == (12, 16)
+    assert made.closed is True
+    assert made.position_m.tolist() == (2.5 * np.arange(80)).tolist()
+    assert made.statistics is None
+    kept = {
+        name: made.config[name] for name in ("n_landmarks", "list_length", "relevance", "training_episodes", "seed")
+    }
+    assert kept == {"n_landmarks": 12, "list_length": 3, "relevance": "rrf", "training_episodes": 7, "seed": 5}
+
+
+def test_a_second_map_is_the_next_version(deepsimbad, drives, tmp_path):
+    for part in ("", "#10:40:2"):
+        ran = deepsimbad("map", "route", *sources(drives, part=part), *READY, "--n-landmarks", 20, "--data-dir", "here")
+        assert ran.code == 0, ran.err
+    assert ran.out == "map 2 of route is active: 15 images\n"
+    made = contents(tmp_path / "here", 2)
+    assert made.position_m.tolist() == list(range(10, 40, 2)), "a slice keeps its frames' positions"
+
+
+def test_the_data_directory_comes_from_the_flag_the_environment_or_here(deepsimbad, drives, tmp_path, monkeypatch):
+    arguments = ("map", "route", *sources(drives), *READY, "--n-landmarks", 20)
+    assert deepsimbad(*arguments).code == 0
+    assert (tmp_path / "deepsimbad-data" / "catalog.sqlite").exists()
+    monkeypatch.setenv("DEEPSIMBAD_DATA_DIR", str(tmp_path / "from environment"))
+    assert deepsimbad(*arguments).code == 0
+    assert (tmp_path / "from environment" / "catalog.sqlite").exists()
+    assert deepsimbad(*arguments, "--data-dir", tmp_path / "from flag").code == 0
+    assert (tmp_path / "from flag" / "catalog.sqlite").exists()
+
+
+def test_images_are_found_where_they_were_taken(deepsimbad, pictures, tmp_path):
+    ran = deepsimbad("map", "route", "--landmarks", pictures, "--training", pictures, "--n-landmarks", 20)
+    assert ran.code == 0, ran.err
+    views = [pictures / "7.png", pictures / "21.png"]
+    ran = deepsimbad("localize", "route", *views, "--json")
+    assert (ran.code, ran.err) == (0, "")
+    answers = json.loads(ran.out)
+    assert [answer["image"] for answer in answers] == [str(view) for view in views]
+    for answer, place in zip(answers, (7, 21), strict=True):
+        assert set(answer) >= {"image", "map_version", "timings_ms", "belief", "retrieval", "next_best_view"}
+        assert answer["retrieval"][0]["map_image"] == place
+        assert answer["belief"]["mode_m"] == 3.0 * place
+        assert answer["next_best_view"] is None
+    table = deepsimbad("localize", "route", *views)
+    assert table.code == 0
+    assert "21.0 m" in table.out
+    assert "63.0 m" in table.out
+
+
+def test_info_for_people_is_no_json(deepsimbad, pictures):
+    deepsimbad("map", "route", "--landmarks", pictures, "--training", pictures, "--n-landmarks", 20)
+    ran = deepsimbad("info", "route")
+    assert ran.code == 0
+    assert "n_map_images" in ran.out
+    with pytest.raises(json.JSONDecodeError):
+        json.loads(ran.out)
+
+
+def named_error(ran, *words):
+    assert ran.code == 1
+    assert ran.out == ""
+    assert len(ran.err.splitlines()) == 1, ran.err
+    assert ran.err.startswith("deepsimbad: ")
+    for word in words:
+        assert word in ran.err
+
+
+def test_named_errors_are_one_line(deepsimbad, drives, pictures, tmp_path):
+    route = ("map", "route", *sources(drives), *READY)
+    named_error(deepsimbad(*route, "--n-landmarks", 61), "60 candidates for 61 landmarks")
+    named_error(deepsimbad(*route, "--n-landmarks", 4, "--list-length", 5), "list_length 5")
+    named_error(deepsimbad("map", "route", "--landmarks", "nowhere", "--training", pictures, *READY), "nowhere")
+    named_error(deepsimbad("map", "route", "--landmarks", pictures, "--training", pictures, *READY), "ready encodings")
+    named_error(deepsimbad("map", "no/name", *sources(drives), *READY), "1 to 64 letters")
+    named_error(deepsimbad("map", "route", *sources(drives), "--evaluator", "feature_l2:crystal_ball"), "extractor")
+    named_error(deepsimbad("info", "nowhere"), "nowhere")
+    named_error(deepsimbad("localize", "nowhere", pictures / "1.png"), "nowhere")
+    named_error(deepsimbad("localize", "route", pictures / "1.png"), "route")  # it has no map
+    named_error(deepsimbad("map", "route", *sources(drives), "--evaluator", "feature_l2"), "another configuration")
+
+
+def test_a_view_that_cannot_be_used_is_named(deepsimbad, pictures, tmp_path):
+    deepsimbad("map", "route", "--landmarks", pictures, "--training", pictures, "--n-landmarks", 20)
+    named_error(deepsimbad("localize", "route", tmp_path / "missing.png"), "missing.png")
+    (tmp_path / "words.png").write_text("words")
+    named_error(deepsimbad("localize", "route", tmp_path / "words.png"), "image")
+    (tmp_path / "half.png").write_bytes((pictures / "1.png").read_bytes()[:-200])
+    named_error(deepsimbad("localize", "route", tmp_path / "half.png"))
+
+
+def test_positions_that_go_backwards_leave_no_map(deepsimbad, drives, tmp_path):
+    ran = deepsimbad("map", "route", *sources(drives, part="#::-1"), *READY, "--n-landmarks", 20)
+    named_error(ran, "backwards")
+    assert not list((tmp_path / "deepsimbad-data").rglob("0*"))
+
+
+def test_a_setting_that_cannot_be_used_is_named(deepsimbad, drives, monkeypatch):
+    monkeypatch.setenv("DEEPSIMBAD_MAX_PIXELS", "many")
+    named_error(deepsimbad("map", "route", *sources(drives), *READY), "max_pixels")
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("map",),
+        ("map", "route"),
+        ("map", "route", "--landmarks", "a", "--training", "b", "--n-landmarks", "0"),
+        ("map", "route", "--landmarks", "a", "--training", "b", "--relevance", "magic"),
+        ("map", "route", "--landmarks", "a", "--training", "b", "--spacing-m", "0"),
+        ("localize", "route"),
+        ("info",),
+        ("info", "route", "--yaml"),
+        ("experiment", "vpr"),
+        ("fly",),
+    ],
+)
+def test_wrong_usage_ends_with_2_and_explains(deepsimbad, arguments):
+    ran = deepsimbad(*arguments)
+    assert (ran.code, ran.out) == (2, "")
+    assert "Usage: " in ran.err
+
+
+@pytest.mark.parametrize("command", [(), ("serve",), ("map",), ("localize",), ("info",), ("experiment", "vpr")])
+def test_every_command_explains_itself(deepsimbad, command):
+    ran = deepsimbad(*command, "--help")
+    assert (ran.code, ran.err) == (0, "")
+    assert ran.out.startswith("Usage: ")
+
+
+def test_the_version_is_the_distributions(process):
+    out, err = process("--version").communicate(timeout=60)
+    assert out.split()[-1].count(".") == 2
+    assert err == ""
+
+
+@pytest.mark.slow
+def test_ctrl_c_cancels_a_map_and_leaves_no_half_of_one(process, drives, tmp_path):
+    rng = np.random.default_rng(0)
+    np.save(tmp_path / "many.npy", rng.normal(size=(16_000, 256)).astype(np.float32))
+    running = process(
+        *("map", "route", "--landmarks", "many.npy", "--training", drives / "summer.npy", *READY, "--data-dir", "here")
+    )
+    stored = tmp_path / "here" / "domains" / "route" / "traverses" / "training.sqlite"
+    give_up = time.monotonic() + 60
+    while not stored.exists():
+        assert running.poll() is None, running.communicate()
+        assert time.monotonic() < give_up
+        time.sleep(0.005)
+    running.send_signal(signal.SIGINT)
+    out, err = running.communicate(timeout=60)
+    assert running.returncode == 130, err
+    assert out == ""
+    assert err == "cancelled\n"
+    maps = stored.parent.parent / "maps"
+    assert not maps.exists() or not list(maps.iterdir())
+    with Catalog.open(tmp_path / "here") as catalog:
+        assert catalog.maps("route") == []
+        assert catalog.domain("route").active_version is None

@@ -1,0 +1,68 @@
+"""`deepsimbad serve`: ready, stopped, refused."""
+
+import signal
+import socket
+import time
+import urllib.error
+import urllib.request
+
+import pytest
+
+pytestmark = pytest.mark.slow
+
+
+def free_port():
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+def wait_until_ready(port, running):
+    give_up = time.monotonic() + 60
+    while time.monotonic() < give_up:
+        assert running.poll() is None, running.communicate()
+        try:
+            with urllib.request.urlopen(f"http://127.0.0.1:{port}/readyz", timeout=5) as answer:
+                return answer.status
+        except urllib.error.URLError:
+            time.sleep(0.05)
+    raise AssertionError("the service did not become ready")
+
+
+@pytest.mark.parametrize(("by", "code"), [(signal.SIGTERM, 0), (signal.SIGINT, 130)])
+def test_it_serves_until_it_is_stopped(process, tmp_path, by, code):
+    port = free_port()
+    running = process("serve", "--port", port, "--data-dir", tmp_path / "here")
+    assert wait_until_ready(port, running) == 200
+    running.send_signal(by)
+    out, err = running.communicate(timeout=60)
+    assert running.returncode == code, err
+    assert out == "", "logs go to standard error"
+    assert (tmp_path / "here" / "catalog.sqlite").exists()
+
+
+def test_host_and_port_come_from_the_environment_too(process, tmp_path):
+    port = free_port()
+    running = process("serve", DEEPSIMBAD_PORT=str(port), DEEPSIMBAD_HOST="127.0.0.1")
+    assert wait_until_ready(port, running) == 200
+    running.terminate()
+    running.communicate(timeout=60)
+    assert (tmp_path / "deepsimbad-data").is_dir()
+
+
+def test_other_machines_are_refused_while_there_are_no_keys(process):
+    running = process("serve", "--host", "0.0.0.0", "--port", free_port())
+    out, err = running.communicate(timeout=60)
+    assert (running.returncode, out) == (1, "")
+    assert len(err.splitlines()) == 1
+    assert "DEEPSIMBAD_ALLOW_OPEN" in err
+
+
+def test_a_port_that_is_taken_is_an_error(process):
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        running = process("serve", "--port", taken.getsockname()[1])
+        _, err = running.communicate(timeout=60)
+    assert running.returncode == 1
+    assert "address already in use" in err.lower()
