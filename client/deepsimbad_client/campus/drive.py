@@ -15,7 +15,7 @@ BLOCK = 100
 
 INTERVAL_US = 700_000
 START_M = 2.0
-WIDEST_M = 1.1
+WIDEST_M = 1.2
 
 
 def drive_length_m(n_frames: int, spacing_m: float) -> float:
@@ -59,18 +59,18 @@ class Drive:
         self.utime = (start + np.arange(blocks * BLOCK) * INTERVAL_US + np.concatenate(jitter))[:n_frames]
         """[n] int64 microseconds, strictly rising."""
         along = position[:n_frames]
-        bias = rng.uniform(-0.35, 0.35)
-        right = bias + 0.42 * smooth_line(stream(seed, f"right {name}"), along / 19)
+        bias = rng.uniform(-0.5, 0.5)
+        right = bias + 0.6 * smooth_line(stream(seed, f"right {name}"), along / 19)
         self._right = np.clip(right, -WIDEST_M, WIDEST_M)
-        lean = rng.normal(0, np.deg2rad(1.0), 2)
-        self._turn = lean[0] + np.deg2rad(2.4) * smooth_line(stream(seed, f"turn {name}"), along / 11)
-        self._pitch = lean[1] * 0.4 + np.deg2rad(0.55) * smooth_line(stream(seed, f"pitch {name}"), along / 2.3)
+        lean = rng.normal(0, np.deg2rad(2.6), 2)
+        self._turn = lean[0] + np.deg2rad(6.0) * smooth_line(stream(seed, f"turn {name}"), along / 11)
+        self._pitch = lean[1] * 0.2 + np.deg2rad(0.55) * smooth_line(stream(seed, f"pitch {name}"), along / 2.3)
         self._roll = np.deg2rad(0.5) * smooth_line(stream(seed, f"roll {name}"), along / 3.1)
         frames = np.arange(n_frames, dtype=np.float64)
         cloud = smooth_line(stream(seed, f"cloud {name}"), frames / 17)
         self.sunniness = cloud
         """[n] smooth noise: how free of clouds the sun is, compared within the drive."""
-        self.exposure = np.exp(0.06 * smooth_line(stream(seed, f"exposure {name}"), frames / 7))
+        self.exposure = np.exp(0.11 * smooth_line(stream(seed, f"exposure {name}"), frames / 7))
         """[n] the camera's gain, about 1."""
 
     def pose_at(self, utime: NDArray[np.float64]) -> Pose:

@@ -41,6 +41,7 @@ def draw_facade(style: FacadeStyle, season: Season, drive: int) -> tuple[Image, 
     if style.floors:
         _windows(picture, style, season, rng, np.random.default_rng([style.seed, drive]), scale)
     _edges(picture, style, season, rng, scale)
+    _dapple(picture, season, np.random.default_rng([style.seed, drive, 1]), scale)
     levels = [picture]
     while min(levels[-1].shape[:2]) >= 12 and len(levels) < 6:
         levels.append(np.asarray(cv2.pyrDown(levels[-1]), np.uint8))
@@ -137,6 +138,17 @@ def _edges(picture: Image, style: FacadeStyle, season: Season, rng: np.random.Ge
             picture[height - 1 - drift[x] :, x] = (232, 230, 228)
     for x in (0, width - 1):
         picture[:, x] = (picture[:, x] * 0.7).astype(np.uint8)
+
+
+def _dapple(picture: Image, season: Season, today: np.random.Generator, scale: float) -> None:
+    """Throw the shadows of what stands around on the wall: branches and roofs, elsewhere in every drive."""
+    height, width = picture.shape[:2]
+    cells = max(1, round(height / (5 * scale))), max(1, round(width / (5 * scale)))
+    depth = tile_noise(today, (height, width), cells, 5)
+    slope = np.linspace(-1, 1, width)[None, :] * today.uniform(-0.8, 0.8)
+    low = np.linspace(-1.2, 1.2, height)[:, None] + slope  # more shade near the ground
+    shade = np.clip((depth + 0.9 * low - today.uniform(-0.6, 1.0)) / 0.25, 0, 1)[:, :, None]
+    picture[:] = (picture * (1 - 0.6 * season.sun_strength * shade)).astype(np.uint8)
 
 
 def _ink(colour: NDArray[np.float64]) -> tuple[int, ...]:

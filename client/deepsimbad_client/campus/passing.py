@@ -15,6 +15,7 @@ CELL_M = 18.0
 """People come in groups, one group or none for every so many metres of route."""
 
 PARKED_SHARE = 0.6
+PEOPLE_SHARE = 0.8
 LANE_M = 1.8
 LOOP_M = 150.0
 
@@ -94,13 +95,13 @@ class Passing:
         first, last = int(max(0.0, position_m - 2 * CELL_M) / CELL_M), int((position_m + SIGHT_M / 2) / CELL_M)
         for cell in range(first, last + 1):
             rng = stream(self._seed, f"people {self._name}", cell)
-            if rng.random() > 0.5:
+            if rng.random() > PEOPLE_SHARE:
                 continue
             home = (cell + float(rng.random())) * CELL_M
             met_s = (home - START_M) / self._pace_m_s + float(rng.normal(0, 6))
             speed = float(rng.uniform(0.9, 1.5)) * float(rng.choice([-1, 0, 1]))
             side = float(rng.choice([-1, 1]))
-            for k in range(int(rng.integers(1, 4))):
+            for k in range(int(rng.integers(1, 5))):
                 right = side * float(rng.uniform(0.9, 3.0))
                 where = home + speed * float(np.clip(time_s - met_s, -40, 40)) + 0.9 * k
                 look = int(rng.integers(0, 1 << 31))

@@ -10,7 +10,7 @@ from deepsimbad_client.campus.scenery import Bay, Material, Post
 
 Zone = Literal["court", "street", "avenue", "twins", "field", "wall", "parking"]
 
-DECK: tuple[Zone, ...] = ("court", "court", "street", "avenue", "twins", "field", "wall", "parking")
+DECK: tuple[Zone, ...] = ("court", "street", "avenue", "twins", "field", "wall", "parking", "twins")
 """Every eight stretches hold these, shuffled."""
 
 MATERIALS: tuple[Material, ...] = ("brick", "sandstone", "concrete", "plaster", "glass", "brick")
@@ -71,8 +71,8 @@ def _court(plot: Plot) -> None:
     rng = plot.rng
     for side in (-1, 1):
         _row(plot, side, (7, 14), 0.85, (5, 17))
-    for _ in range(int(rng.integers(3, 9))):
-        plot.tree(float(rng.uniform(0, plot.length_m)), float(rng.choice([-1, 1]) * rng.uniform(3.8, 8)))
+    for _ in range(int(rng.integers(9, 17))):
+        plot.tree(float(rng.uniform(0, plot.length_m)), float(rng.choice([-1, 1]) * rng.uniform(3.8, 7)))
     for kind in ("lamp", "sign", "bench", "bollard"):
         for _ in range(int(rng.integers(1, 4))):
             _post(plot, kind)
@@ -91,6 +91,8 @@ def _street(plot: Plot) -> None:
     for along in np.arange(2.0, plot.length_m - 4, 6.2):
         place = plot.point(float(along), middle - side * 2.6)
         _bay(plot, place, plot.heading_rad)
+        if rng.random() < 0.6:
+            plot.tree(float(along + 4), -side * float(rng.uniform(3.8, 5)))
     for _ in range(3):
         _post(plot, "sign")
 
@@ -103,7 +105,7 @@ def _avenue(plot: Plot) -> None:
             tall = float(rng.uniform(9, 11))
             plot.tree(float(along), side * float(rng.uniform(4.2, 4.8)), species, height_m=tall)
     for side in (-1, 1):
-        _row(plot, side, (18, 30), 0.55, (6, 15))
+        _row(plot, side, (18, 30), 0.35, (6, 15))
     for _ in range(2):
         _post(plot, "bench")
 
@@ -149,9 +151,10 @@ def _parking(plot: Plot) -> None:
             _bay(plot, plot.point(float(along), side * row), plot.heading_rad + turn)
     _row(plot, side, (27, 33), 0.8, (6, 15))
     _row(plot, -side, (7, 12), 0.7, (5, 14))
+    for _ in range(6):
+        plot.tree(float(rng.uniform(0, plot.length_m)), -side * float(rng.uniform(3.8, 6)))
     for _ in range(2):
         _post(plot, "lamp")
-        plot.tree(float(rng.uniform(0, plot.length_m)), -side * float(rng.uniform(4, 7)))
 
 
 def _bay(plot: Plot, place: np.ndarray[tuple[int, ...], np.dtype[np.float64]], heading: float) -> None:

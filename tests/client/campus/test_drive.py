@@ -31,7 +31,7 @@ def test_drives_differ_but_cover_the_same_ground(route):
     )
     apart = np.abs(first.right_m - second.right_m)
     assert 0.2 < apart.mean() < 2 * WIDEST_M
-    assert 1 < np.rad2deg(np.abs(first.yaw_rad - second.yaw_rad)).mean() < 10
+    assert 1 < np.rad2deg(np.abs(first.yaw_rad - second.yaw_rad)).mean() < 14
 
 
 def test_the_robot_stands_still_at_times_and_never_drives_back(route):
