@@ -1,5 +1,31 @@
-"""`python -m deepsimbad` is the `deepsimbad` command."""
+"""The `deepsimbad` command, which says so in one line where the `service` extra is not installed."""
 
-from deepsimbad.cli import main
+import sys
+from importlib.util import find_spec
 
-main()
+NEEDED = (
+    "click",
+    "cv2",
+    "fastapi",
+    "numba",
+    "numpy",
+    "prometheus_client",
+    "pydantic_settings",
+    "sqlite_utils",
+    "uvicorn",
+)
+
+
+def main() -> None:
+    """Run the command line and exit with its code."""
+    missing = [name for name in NEEDED if find_spec(name) is None]
+    if missing:
+        sys.stderr.write(f"{', '.join(missing)} not installed: pip install 'deep-simbad[service]'\n")
+        sys.exit(1)
+    from deepsimbad.cli import run  # noqa: PLC0415 - only now is it known to be there
+
+    sys.exit(run())
+
+
+if __name__ == "__main__":
+    main()

@@ -3,7 +3,6 @@
 Exit codes: 0 done, 1 a named error (one line on standard error), 2 usage, 130 cancelled.
 """
 
-import sys
 from collections.abc import Sequence
 
 import click
@@ -25,11 +24,6 @@ def deepsimbad() -> None:
 
 for command in (serve, map_, localize, info, experiment):
     deepsimbad.add_command(command)
-
-
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the command and end the process with its exit code."""
-    sys.exit(run(arguments))
 
 
 def run(arguments: Sequence[str] | None = None) -> int:

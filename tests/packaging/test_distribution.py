@@ -1,0 +1,148 @@
+"""What is shipped: the bare wheel is the client alone and works; the service's parts are in it, asked for by extras."""
+
+import json
+import os
+import subprocess
+import sys
+import tarfile
+import tomllib
+import venv
+import zipfile
+from pathlib import Path
+
+import pytest
+
+PROJECT = Path(__file__).resolve().parents[2]
+PACKAGES = {"deepsimbad": "service", "deepsimbad_client": "client", "deepsimbad_migrations": "migrations"}
+NOT_IN_THE_BARE_WHEEL = ("numpy", "cv2", "torch", "numba", "fastapi", "uvicorn", "click", "matplotlib", "sqlite_utils")
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
+
+
+def run(*command, **options):
+    done = subprocess.run(list(map(str, command)), capture_output=True, text=True, check=False, **options)
+    assert done.returncode == 0, f"{command} ended with {done.returncode}:\n{done.stdout}\n{done.stderr}"
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory) -> Path:
+    """A folder with the sdist, and the wheel that was built from it."""
+    folder = tmp_path_factory.mktemp("dist")
+    run(sys.executable, "-m", "build", "--outdir", folder, PROJECT)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def wheel(built) -> Path:
+    (path,) = built.glob("*.whl")
+    return path
+
+
+@pytest.fixture(scope="module")
+def bare(wheel, tmp_path_factory) -> Path:
+    """The folder of programs of a fresh environment that holds the bare wheel."""
+    folder = tmp_path_factory.mktemp("bare") / "env"
+    venv.create(folder, with_pip=True)
+    run(
+        *(folder / "bin" / "python", "-m", "pip", "install", "--quiet", "--disable-pip-version-check"),
+        *("--constraint", PROJECT / "constraints.txt", wheel),
+    )
+    return folder / "bin"
+
+
+def python(bare, code, **environment):
+    return run(bare / "python", "-c", code, cwd=bare, env={"PATH": os.environ["PATH"], **environment})
+
+
+def test_the_wheel_holds_all_three_packages_typed_and_licensed(wheel):
+    with zipfile.ZipFile(wheel) as archive:
+        names = set(archive.namelist())
+        metadata = archive.read(next(name for name in names if name.endswith("/METADATA"))).decode()
+        entry_points = archive.read(next(name for name in names if name.endswith("/entry_points.txt"))).decode()
+    for package, root in PACKAGES.items():
+        sources = {f"{path.relative_to(PROJECT / root)}" for path in (PROJECT / root / package).rglob("*.py")}
+        assert sources, package
+        assert sources <= names, f"missing: {sorted(sources - names)}"
+    assert {"deepsimbad/py.typed", "deepsimbad_client/py.typed"} <= names
+    assert any(name.endswith("licenses/LICENSE") for name in names)
+    assert "License-Expression: MIT" in metadata
+    assert "deepsimbad = deepsimbad.__main__:main" in entry_points
+    assert "deepsimbad-client = deepsimbad_client.cli:main" in entry_points
+    stray = [name for name in names if not name.startswith((*(f"{each}/" for each in PACKAGES), "deep_simbad-"))]
+    assert stray == [], "nothing else is shipped"
+
+
+def test_the_sdist_holds_what_the_wheel_is_built_from(built):
+    (path,) = built.glob("*.tar.gz")
+    with tarfile.open(path) as archive:
+        names = {name.partition("/")[2] for name in archive.getnames()}
+    for root in PACKAGES.values():
+        assert any(name.startswith(f"{root}/") for name in names)
+    assert {"pyproject.toml", "README.md", "CHANGELOG.md", "LICENSE"} <= names
+    assert "client/deepsimbad_client/py.typed" in names
+    kept = (*(f"{root}/" for root in PACKAGES.values()), *(root for root in PACKAGES.values()))
+    top = {name for name in names if name and not name.startswith(kept)}
+    assert top == {"pyproject.toml", "README.md", "CHANGELOG.md", "LICENSE", "PKG-INFO", ".gitignore"}
+
+
+def test_the_default_dependencies_are_the_clients():
+    project = tomllib.loads((PROJECT / "pyproject.toml").read_text())["project"]
+    assert [each.split(">")[0] for each in project["dependencies"]] == ["httpx2", "pydantic"]
+    assert set(project["optional-dependencies"]) >= {"service", "replay", "bench", "dev"}
+
+
+def test_the_bare_wheel_has_no_heavy_package(bare):
+    code = "import importlib.util, json; print(json.dumps([n for n in {} if importlib.util.find_spec(n)]))"
+    assert json.loads(python(bare, code.format(NOT_IN_THE_BARE_WHEEL))) == []
+
+
+def test_the_bare_client_talks_to_a_service(bare):
+    """A service of one answer: what counts is that client, transport and models need nothing more."""
+    code = """
+import json, threading
+from http.server import BaseHTTPRequestHandler, HTTPServer
+import deepsimbad_client
+from deepsimbad_client import AsyncClient, Client
+
+class OneAnswer(BaseHTTPRequestHandler):
+    def do_GET(self):
+        body = json.dumps({"status": "ok"}).encode()
+        self.send_response(200)
+        self.send_header("Content-Type", "application/json")
+        self.send_header("Content-Length", str(len(body)))
+        self.end_headers()
+        self.wfile.write(body)
+    def log_message(self, *_):
+        pass
+
+server = HTTPServer(("127.0.0.1", 0), OneAnswer)
+threading.Thread(target=server.serve_forever, daemon=True).start()
+with Client(f"http://127.0.0.1:{server.server_port}") as client:
+    print(client.health().status)
+server.shutdown()
+"""
+    assert python(bare, code) == "ok\n"
+
+
+def test_the_command_of_the_bare_client_says_what_it_lacks_in_one_line(bare):
+    done = subprocess.run([str(bare / "deepsimbad-client"), "domains"], capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert done.stdout == ""
+    assert len(done.stderr.splitlines()) == 1, done.stderr
+    assert "pip install 'deep-simbad[replay]'" in done.stderr
+
+
+def test_the_command_of_the_bare_service_says_what_it_lacks_in_one_line(bare):
+    done = subprocess.run([str(bare / "deepsimbad"), "info", "campus"], capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert done.stdout == ""
+    assert len(done.stderr.splitlines()) == 1, done.stderr
+    assert "pip install 'deep-simbad[service]'" in done.stderr
+
+
+def test_the_installed_commands_are_there(bare):
+    for command in ("deepsimbad", "deepsimbad-client"):
+        here = Path(sys.executable).parent / command
+        assert "Usage: " in run(here, "--help")
+        assert (bare / command).exists()
