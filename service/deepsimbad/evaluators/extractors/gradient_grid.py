@@ -72,7 +72,7 @@ def _directional_energy(levels: NDArray[np.float32]) -> NDArray[np.float32]:
     for _ in range(_SHARPNESS):
         weight *= weight
     energy *= weight
-    return energy.reshape(_SIDE, _SIDE, _DIRECTIONS)
+    return np.asarray(energy.reshape(_SIDE, _SIDE, _DIRECTIONS), np.float32)
 
 
 def _cells(energy: NDArray[np.float32]) -> NDArray[np.float32]:
