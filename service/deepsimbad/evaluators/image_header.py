@@ -22,6 +22,7 @@ _JPEG_SCAN_END = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]", re.DOTALL)
 _JPEG_MARKER = re.compile(rb"[^\xff]", re.DOTALL)
 _JPEG_MAX_SCANS = 200  # a progressive file uses about ten; thousands of empty ones are an attack on the decoder
 _MAX_PARTS = 100_000  # chunks, segments, strips: a real file has far fewer, walking millions costs seconds
+_TIFF_FIELD_BYTES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4}
 _TIFF_FORMATS = {1: "B", 3: "H", 4: "I", 13: "I"}  # the integer field types: BYTE, SHORT, LONG, IFD
 _TIFF_WIDTH, _TIFF_HEIGHT, _TIFF_SAMPLES, _TIFF_TILE_WIDTH, _TIFF_TILE_HEIGHT = 256, 257, 277, 322, 323
 _TIFF_PARTS = ((273, 279), (324, 325))  # offsets and byte counts of strips, of tiles
@@ -162,11 +163,14 @@ def _tiff_directory(body: bytes) -> dict[int, tuple[int, ...]]:
     fields: dict[int, tuple[int, ...]] = {}
     for entry in range(at + 2, at + 2 + 12 * n_fields, 12):
         tag, kind, count, offset = _unpack(order + "HHII", body, entry, "TIFF")
+        size = count * _TIFF_FIELD_BYTES.get(kind, 0)
+        if size > 4 and offset + size > len(body):
+            _truncated("TIFF")
         if tag in _TIFF_TAGS and tag not in fields and kind in _TIFF_FORMATS:
             if count > _MAX_PARTS:
                 _too_many_parts("TIFF")
             form = f"{order}{count}{_TIFF_FORMATS[kind]}"
-            fields[tag] = _unpack(form, body, offset if struct.calcsize(form) > 4 else entry + 8, "TIFF")
+            fields[tag] = _unpack(form, body, offset if size > 4 else entry + 8, "TIFF")
     return fields
 
 

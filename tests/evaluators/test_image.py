@@ -1,0 +1,200 @@
+"""Decoding: what comes out of every format, and what is refused with which name."""
+
+import io
+import struct
+import tracemalloc
+import zlib
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image as Pillow
+
+from deepsimbad.errors import EmptyBodyError, ImageTooLargeError, InvalidImageError, TruncatedImageError
+from deepsimbad.evaluators.image import MEDIA_TYPES, decode_image
+
+LIMIT = 1_000_000
+
+
+def _saved(image: Pillow.Image, form: str, **options: object) -> bytes:
+    stream = io.BytesIO()
+    image.save(stream, form, **options)
+    return stream.getvalue()
+
+
+def _png(width: int, height: int, *rest: tuple[bytes, bytes]) -> bytes:
+    chunks = ((b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)), *rest)
+    body = b"\x89PNG\r\n\x1a\n"
+    for name, content in chunks:
+        body += struct.pack(">I", len(content)) + name + content + struct.pack(">I", zlib.crc32(name + content))
+    return body
+
+
+def test_every_format_gives_the_picture(body, the_picture):
+    image = decode_image(body, LIMIT)
+    assert image.shape == the_picture.shape
+    assert image.dtype == np.uint8
+    assert np.abs(image.astype(int) - the_picture).mean() < 8  # lossy formats included
+
+
+def test_lossless_formats_give_the_very_pixels(files, the_picture):
+    for name in ("png", "tiff", "deflate tiff", "lossless webp"):
+        np.testing.assert_array_equal(decode_image(files[name], LIMIT), the_picture, err_msg=name)
+
+
+@pytest.mark.parametrize("form", ["PNG", "JPEG", "TIFF", "WEBP"])
+def test_grey_becomes_three_equal_channels(form):
+    grey = Pillow.fromarray(np.tile(np.arange(0, 240, 5, dtype=np.uint8), (32, 1)))
+    image = decode_image(_saved(grey, form), LIMIT)
+    assert image.shape == (32, 48, 3)
+    assert np.ptp(image.astype(int), axis=2).max() <= 1
+    assert image[0, -1, 0] > 200 > 30 > image[0, 0, 0]
+
+
+@pytest.mark.parametrize("form", ["PNG", "TIFF"])
+def test_of_sixteen_bits_the_upper_eight_stay(form):
+    deep = Pillow.fromarray(np.full((32, 48), 0x9C40, np.uint16))
+    assert (decode_image(_saved(deep, form), LIMIT) == 0x9C).all()
+
+
+@pytest.mark.parametrize("form", ["PNG", "JPEG", "TIFF", "WEBP"])
+def test_exif_orientation_is_applied(form, the_picture):
+    orientation = Pillow.Exif()
+    orientation[0x112] = 6  # shown after a quarter turn clockwise
+    image = decode_image(_saved(Pillow.fromarray(the_picture[..., ::-1]), form, exif=orientation), LIMIT)
+    expected = cv2.rotate(the_picture, cv2.ROTATE_90_CLOCKWISE)
+    assert image.shape == expected.shape
+    assert np.abs(image.astype(int) - expected).mean() < 15
+
+
+@pytest.mark.parametrize("form", ["PNG", "WEBP"])
+def test_alpha_is_dropped(form, the_picture):
+    clear = Pillow.fromarray(the_picture[..., ::-1]).convert("RGBA")
+    clear.putalpha(128)
+    image = decode_image(_saved(clear, form, lossless=True), LIMIT)
+    np.testing.assert_array_equal(image, the_picture)
+
+
+def test_palette_bilevel_and_cmyk_decode(the_picture):
+    colours = Pillow.fromarray(the_picture[..., ::-1])
+    for mode, form in (("P", "PNG"), ("1", "PNG"), ("1", "TIFF"), ("CMYK", "JPEG"), ("CMYK", "TIFF")):
+        assert decode_image(_saved(colours.convert(mode), form), LIMIT).shape == the_picture.shape
+
+
+@pytest.mark.parametrize("form", ["PNG", "TIFF", "WEBP"])
+def test_of_many_frames_only_the_first_is_decoded(form):
+    frames = [Pillow.fromarray(np.full((600, 800, 3), level, np.uint8)) for level in range(40, 100)]
+    body = _saved(frames[0], form, save_all=True, append_images=frames[1:])
+    tracemalloc.start()
+    image = decode_image(body, LIMIT)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert abs(int(image.mean()) - 40) <= 1
+    assert peak < 8 * image.nbytes
+
+
+def test_empty_body():
+    with pytest.raises(EmptyBodyError):
+        decode_image(b"", LIMIT)
+
+
+@pytest.mark.parametrize("body", [b"not an image", b"GIF89a" + bytes(40), b"BM" + bytes(60), b"%PDF-1.7", b"{}"])
+def test_not_an_image(body):
+    with pytest.raises(InvalidImageError) as caught:
+        decode_image(body, LIMIT)
+    assert caught.value.code == "undecodable_image"
+    assert caught.value.hints["allowed"] == list(MEDIA_TYPES)
+
+
+def test_every_cut_is_refused(body):
+    whole = decode_image(body, LIMIT)
+    for cut in range(4, len(body) - 1, max(1, len(body) // 60)):
+        try:
+            image = decode_image(body[:cut], LIMIT)
+        except InvalidImageError:
+            continue
+        np.testing.assert_array_equal(image, whole)  # a cut behind the last byte that matters
+
+
+@pytest.mark.parametrize("share", [0.3, 0.6, 0.95])
+def test_a_file_without_its_end_is_named_truncated(body, share):
+    with pytest.raises(TruncatedImageError):
+        decode_image(body[: int(len(body) * share)], LIMIT)
+
+
+def test_a_thumbnail_inside_does_not_hide_a_missing_end(files):
+    thumbnail = files["jpeg"]  # holds an end-of-image marker of its own
+    segment = b"\xff\xe1" + struct.pack(">H", len(thumbnail) + 2) + thumbnail
+    holding = files["jpeg"][:2] + segment + files["jpeg"][2:]
+    assert decode_image(holding, LIMIT).shape == (32, 48, 3)
+    with pytest.raises(TruncatedImageError):
+        decode_image(holding[:-20], LIMIT)
+
+
+def test_the_pixel_limit_is_exact(body):
+    assert decode_image(body, 48 * 32).shape == (32, 48, 3)
+    with pytest.raises(ImageTooLargeError) as caught:
+        decode_image(body, 48 * 32 - 1)
+    assert caught.value.hints == {"width": 48, "height": 32, "max_pixels": 48 * 32 - 1}
+
+
+def _tiff(width: int, height: int, *more: tuple[int, int]) -> bytes:
+    entries = [(256, width), (257, height), (273, 8), (277, 1), (279, 4), *more]
+    directory = b"".join(struct.pack("<HHII", tag, 4, 1, value) for tag, value in entries)
+    return b"II*\x00" + struct.pack("<I", 12) + bytes(4) + struct.pack("<H", len(entries)) + directory + bytes(4)
+
+
+CLAIMS = {
+    "png": _png(60_000, 60_000, (b"IDAT", zlib.compress(b"")), (b"IEND", b"")),
+    "png header alone": _png(60_000, 60_000),
+    "jpeg": b"\xff\xd8\xff\xc0\x00\x11\x08" + struct.pack(">HH", 60_000, 60_000) + b"\x03" + bytes(9) + b"\xff\xd9",
+    "progressive jpeg": b"\xff\xd8\xff\xc2\x00\x11\x08" + struct.pack(">HH", 60_000, 60_000) + bytes(10),
+    "tiff": _tiff(60_000, 60_000),
+    "tiff with huge tiles": _tiff(16, 16, (322, 60_000), (323, 60_000)),
+    "webp lossy": b"RIFF\x20\0\0\0WEBPVP8 \x14\0\0\0\x10\0\0\x9d\x01\x2a"
+    + struct.pack("<HH", 16_383, 16_383)
+    + bytes(10),
+    "webp lossless": b"RIFF\x20\0\0\0WEBPVP8L\x14\0\0\0\x2f\xff\xff\xff\x0f" + bytes(15),
+    "webp extended": b"RIFF\x20\0\0\0WEBPVP8X\x0a\0\0\0\x02\0\0\0" + b"\x5f\xea\0\x5f\xea\0" + bytes(10),
+}
+
+
+@pytest.mark.parametrize("claim", sorted(CLAIMS))
+def test_a_huge_claim_is_refused_before_anything_is_allocated(claim):
+    tracemalloc.start()
+    with pytest.raises(ImageTooLargeError):
+        decode_image(CLAIMS[claim], 50_000_000)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 1_000_000
+
+
+def test_no_pixels_and_damage_are_named(files):
+    broken = bytearray(files["png"])
+    broken[len(broken) // 2] ^= 0xFF
+    many_scans = b"\xff\xda\x00\x02" * 300
+    for body in (
+        _png(0, 5, (b"IEND", b"")),
+        _png(5, 5, (b"IEND", b"")),
+        bytes(broken),
+        files["jpeg"][:-2] + many_scans + b"\xff\xd9",
+        _tiff(16, 16, (277, 60_000)),
+        b"\xff\xd8\xff\xd9",
+    ):
+        with pytest.raises(InvalidImageError) as caught:
+            decode_image(body, LIMIT)
+        assert not isinstance(caught.value, TruncatedImageError)
+
+
+def test_walking_a_file_of_countless_parts_is_given_up():
+    for body in (b"\xff\xd8" + b"\xff\xd0" * 2_000_000, _png(5, 5, *[(b"tEXt", b"")] * 110_000)):
+        with pytest.raises(InvalidImageError, match="parts"):
+            decode_image(body, LIMIT)
+
+
+def test_refusals_print_nothing(files, capfd):
+    for body in (*files.values(), *CLAIMS.values()):
+        for cut in (len(body) // 3, len(body) - 3):
+            with pytest.raises((InvalidImageError, ImageTooLargeError)):
+                decode_image(body[:cut], LIMIT)
+    assert capfd.readouterr() == ("", "")
