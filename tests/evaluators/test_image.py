@@ -24,10 +24,11 @@ def _saved(image: Pillow.Image, form: str, **options: object) -> bytes:
 
 def _png(width: int, height: int, *rest: tuple[bytes, bytes]) -> bytes:
     chunks = ((b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)), *rest)
-    body = b"\x89PNG\r\n\x1a\n"
+    parts = [b"\x89PNG\r\n\x1a\n"]
     for name, content in chunks:
-        body += struct.pack(">I", len(content)) + name + content + struct.pack(">I", zlib.crc32(name + content))
-    return body
+        checksum = struct.pack(">I", zlib.crc32(name + content))
+        parts.append(struct.pack(">I", len(content)) + name + content + checksum)
+    return b"".join(parts)
 
 
 def test_every_format_gives_the_picture(body, the_picture):

@@ -1,0 +1,120 @@
+"""Laws every registered evaluator keeps, whatever it is made of."""
+
+import numpy as np
+import pytest
+
+from deepsimbad.errors import InvalidEncodingError, InvalidImageError, UnsupportedMediaTypeError
+from deepsimbad.evaluators.registry import EvaluatorKind, ExtractorName, evaluator_config, make_evaluator
+
+CONFIGS = [
+    evaluator_config({"kind": kind, "extractor": extractor}).as_dict()
+    for kind in EvaluatorKind
+    for extractor in ExtractorName
+]
+
+
+@pytest.fixture(params=CONFIGS, ids=lambda raw: "-".join(raw.values()))
+def evaluator(request):
+    return make_evaluator(evaluator_config(request.param))
+
+
+def _images(n, seed=0):
+    rng = np.random.default_rng(seed)
+    sizes = [(32, 64), (120, 160), (128, 128), (1, 1), (7, 300), (200, 90)]
+    return [rng.integers(0, 256, (*sizes[k % len(sizes)], 3), dtype=np.uint8) for k in range(n)]
+
+
+def _encodings(evaluator, n, seed=0):
+    if evaluator.input_size is not None:
+        return evaluator.encode(_images(n, seed))
+    return np.random.default_rng(seed).normal(size=(n, 24)).astype(np.float32)
+
+
+def test_encodings_have_the_stated_shape(evaluator):
+    if evaluator.input_size is None:
+        assert evaluator.encoding_dim is None
+        with pytest.raises(UnsupportedMediaTypeError):
+            evaluator.encode(_images(1))
+        return
+    encodings = evaluator.encode(_images(7))
+    assert encodings.shape == (7, evaluator.encoding_dim)
+    assert encodings.dtype == np.float32
+    assert np.isfinite(encodings).all()
+    assert evaluator.encode([]).shape == (0, evaluator.encoding_dim)
+    assert min(evaluator.input_size) >= 1
+
+
+def test_an_image_is_encoded_the_same_alone_again_and_in_company(evaluator):
+    if evaluator.input_size is None:
+        pytest.skip("takes no images")
+    images = _images(5)
+    together = evaluator.encode(images)
+    for row, image in zip(together, images, strict=True):
+        np.testing.assert_array_equal(evaluator.encode([image.copy()])[0], row)
+
+
+def test_encoding_leaves_the_image_alone(evaluator):
+    if evaluator.input_size is None:
+        pytest.skip("takes no images")
+    image = _images(3)[2]
+    before = image.copy()
+    image.setflags(write=False)
+    evaluator.encode([image])
+    np.testing.assert_array_equal(image, before)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [np.zeros((8, 8), np.uint8), np.zeros((8, 8, 4), np.uint8), np.zeros((8, 8, 3)), np.zeros((0, 8, 3), np.uint8)],
+)
+def test_what_is_no_image_is_refused(evaluator, wrong):
+    with pytest.raises((InvalidImageError, UnsupportedMediaTypeError)):
+        evaluator.encode([wrong])
+
+
+def test_dissimilarities_against_every_landmark(evaluator):
+    landmarks, scenes = _encodings(evaluator, 9, 1), _encodings(evaluator, 5, 2)
+    model = evaluator.fit_landmarks(landmarks)
+    answer = evaluator.dissimilarities(scenes, model)
+    assert answer.shape == (5, 9)
+    assert answer.dtype == np.float32
+    assert (answer >= 0).all()
+    assert all(isinstance(name, str) and isinstance(array, np.ndarray) for name, array in model.items())
+
+
+def test_a_landmark_is_nearest_to_itself(evaluator):
+    landmarks = _encodings(evaluator, 9, 1)
+    answer = evaluator.dissimilarities(landmarks, evaluator.fit_landmarks(landmarks))
+    np.testing.assert_array_equal(answer.argmin(axis=1), np.arange(9))
+    assert np.diag(answer).max() < 1e-9
+
+
+def test_a_scene_is_compared_the_same_alone_and_in_company(evaluator):
+    model = evaluator.fit_landmarks(_encodings(evaluator, 50, 1))
+    scenes = _encodings(evaluator, 2100, 2) if evaluator.input_size is None else _encodings(evaluator, 40, 2)
+    together = evaluator.dissimilarities(scenes, model)
+    for k in range(0, len(scenes), 13):
+        alone = evaluator.dissimilarities(scenes[k : k + 1], model)[0]
+        np.testing.assert_allclose(alone, together[k], rtol=2e-7)
+
+
+def test_the_model_survives_a_copy_of_its_arrays_and_of_the_encodings(evaluator):
+    landmarks, scenes = _encodings(evaluator, 6, 1), _encodings(evaluator, 4, 2)
+    model = evaluator.fit_landmarks(landmarks)
+    before = evaluator.dissimilarities(scenes, model)
+    landmarks[:] = 0  # the caller's array is the caller's
+    copied = {name: array.copy() for name, array in model.items()}
+    np.testing.assert_array_equal(evaluator.dissimilarities(scenes, copied), before)
+
+
+def test_bad_encodings_are_refused(evaluator):
+    landmarks = _encodings(evaluator, 4, 1)
+    model = evaluator.fit_landmarks(landmarks)
+    short, holed, huge = landmarks[:, :-1], landmarks.copy(), np.full_like(landmarks, 3e38)
+    holed[2, 1] = np.nan
+    for bad in (short, holed, huge, landmarks[0]):
+        with pytest.raises(InvalidEncodingError):
+            evaluator.dissimilarities(bad, model)
+    for bad in (holed, landmarks[:0], landmarks[0]):
+        with pytest.raises(InvalidEncodingError):
+            evaluator.fit_landmarks(bad)

@@ -1,0 +1,83 @@
+"""Laws of every embedded extractor, and what the default one is good for."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from deepsimbad.evaluators.feature_l2 import FeatureL2
+from deepsimbad.evaluators.image import decode_image
+from deepsimbad.evaluators.registry import ExtractorName, extractor_class
+
+
+@pytest.fixture(params=[e for e in ExtractorName if e is not ExtractorName.NONE])
+def extractor(request):
+    made = extractor_class(request.param)
+    assert made is not None
+    return made()
+
+
+def _scene(seed=0, width=320, height=240):
+    """Smooth blobs: something with edges at every scale."""
+    rng = np.random.default_rng(seed)
+    coarse = rng.integers(0, 256, (9, 12, 3), dtype=np.uint8)
+    return cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
+
+
+@pytest.mark.parametrize("level", [0, 1, 127, 255])
+@pytest.mark.parametrize("size", [(1, 1), (32, 64), (128, 128), (240, 320)])
+def test_a_uniform_image_has_the_one_neutral_encoding(extractor, level, size):
+    encoding = extractor(np.full((*size, 3), level, np.uint8))
+    np.testing.assert_allclose(np.linalg.norm(encoding), 1, rtol=1e-5)
+    np.testing.assert_array_equal(encoding, extractor(np.zeros((10, 10, 3), np.uint8)))
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 500), (500, 1), (2, 3), (33, 65), (240, 320), (1616, 1232)])
+def test_any_size_gives_a_unit_vector(extractor, size):
+    image = np.random.default_rng(0).integers(0, 256, (*size, 3), dtype=np.uint8)
+    encoding = extractor(image)
+    assert encoding.shape == (extractor.encoding_dim,)
+    assert encoding.dtype == np.float32
+    np.testing.assert_allclose(np.linalg.norm(encoding), 1, rtol=1e-5)
+
+
+def test_noise_of_a_dark_frame_is_not_a_scene(extractor):
+    rng = np.random.default_rng(0)
+    dark = [rng.integers(0, 3, (128, 128, 3), dtype=np.uint8) for _ in range(2)]
+    apart = np.linalg.norm(extractor(dark[0]) - extractor(dark[1]))
+    assert apart < np.linalg.norm(extractor(_scene(1)) - extractor(_scene(2)))
+
+
+def test_exposure_hardly_matters(extractor):
+    scene = _scene()
+    darker = (scene * 0.5 + 20).astype(np.uint8)
+    other = np.linalg.norm(extractor(scene) - extractor(_scene(5)))
+    assert np.linalg.norm(extractor(scene) - extractor(darker)) < 0.2 * other
+
+
+def test_a_small_shift_sideways_is_nearer_than_another_place(extractor):
+    scene, shift = _scene(), np.float32([[1, 0, 12], [0, 1, 0]])  # 4 % of the width
+    moved = cv2.warpAffine(scene, shift, (320, 240), borderMode=cv2.BORDER_REPLICATE)
+    other = np.linalg.norm(extractor(scene) - extractor(_scene(5)))
+    assert np.linalg.norm(extractor(scene) - extractor(moved)) < 0.6 * other
+
+
+def test_size_hardly_matters(extractor):
+    scene, other = _scene(), np.linalg.norm(extractor(_scene()) - extractor(_scene(5)))
+    half = cv2.resize(scene, (160, 120), interpolation=cv2.INTER_AREA)
+    assert np.linalg.norm(extractor(scene) - extractor(half)) < 0.3 * other
+
+
+@pytest.mark.real_data
+def test_a_season_later_the_place_is_found(real_data):
+    """Every tenth of 400 frames of the railway, one season against the other, by brute force."""
+    evaluator = FeatureL2()
+
+    def encoded(season: str, frames: range) -> np.ndarray:
+        folder = Path(real_data) / "nordland" / season
+        return evaluator.encode([decode_image((folder / f"{i:05d}.png").read_bytes(), 10**6) for i in frames])
+
+    summer, winter = encoded("summer", range(1000, 1400)), encoded("winter", range(1000, 1400, 10))
+    found = evaluator.dissimilarities(winter, evaluator.fit_landmarks(summer)).argmin(axis=1)
+    assert np.mean(np.abs(found - np.arange(0, 400, 10)) <= 2) >= 0.7
