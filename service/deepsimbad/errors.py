@@ -72,6 +72,30 @@ class InvalidRouteError(InvalidInputError):
     code = "invalid_route"
 
 
+class InvalidMoveError(InvalidInputError):
+    """A move that is NaN, negative or longer than a robot may report."""
+
+    code = "invalid_move"
+
+
+class PastTheEndError(InvalidMoveError):
+    """A move that leads past the end of an open route wherever the robot may be."""
+
+    code = "past_the_end"
+
+
+class InvalidPriorError(InvalidInputError):
+    """A start or prior far off the route, or without a usable deviation."""
+
+    code = "invalid_prior"
+
+
+class IdempotencyKeyReusedError(InvalidInputError):
+    """An idempotency key that came before with another request."""
+
+    code = "idempotency_key_reused"
+
+
 class InvalidMapConfigError(InvalidInputError):
     """Map parameters that contradict each other or the recordings."""
 
@@ -124,6 +148,42 @@ class UnknownMapVersionError(NotFoundError):
     """No such map version in the domain."""
 
     code = "unknown_map_version"
+
+
+class UnknownSessionError(NotFoundError):
+    """No such session."""
+
+    code = "unknown_session"
+
+
+class GoneError(DeepSimbadError):
+    """Something that was there and is no more."""
+
+    code = "gone"
+
+
+class EndedSessionError(GoneError):
+    """A session that expired or was deleted."""
+
+    code = "ended_session"
+
+
+class RetiredMapError(GoneError):
+    """A session whose map version was retired and removed."""
+
+    code = "retired_map"
+
+
+class BusyError(DeepSimbadError):
+    """More than the service takes at once; the same request may succeed later."""
+
+    code = "busy"
+
+
+class TooManySessionsError(BusyError):
+    """The limit on live sessions is reached."""
+
+    code = "too_many_sessions"
 
 
 class ConflictError(DeepSimbadError):

@@ -17,7 +17,7 @@ from deepsimbad.api.schemas import (
     PlaceAnswer,
     RetrievedAnswer,
 )
-from deepsimbad.core.belief import BeliefSummary
+from deepsimbad.core.belief_summary import BeliefSummary
 from deepsimbad.core.route import Route
 from deepsimbad.engine.localizer import Localization
 from deepsimbad.store.records import JobRecord, MapRecord

@@ -99,6 +99,22 @@ def true_images_of(
     return found
 
 
+def same_places(frames: Route, map_route: Route, tolerance_m: float = 2.0) -> NDArray[np.int64]:
+    """Pairs (map image, frame) [k, 2] of the same place: for every frame the nearest of its true map images."""
+    planes = (frames.x_m, frames.y_m, map_route.x_m, map_route.y_m)
+    pairs = []
+    for frame, near in enumerate(true_images_of(frames, map_route, tolerance_m)):
+        if near.size == 0:
+            continue
+        if any(axis is None for axis in planes):
+            apart = np.abs(map_route.offset_m(map_route.position_m[near], float(frames.position_m[frame])))
+        else:
+            x_m, y_m, map_x_m, map_y_m = (np.asarray(axis) for axis in planes)
+            apart = np.hypot(map_x_m[near] - x_m[frame], map_y_m[near] - y_m[frame])
+        pairs.append((int(near[np.argmin(apart)]), frame))
+    return np.array(pairs, np.int64).reshape(-1, 2)
+
+
 def _headings(route: Route, over_m: float = 1.0) -> NDArray[np.float64]:
     """[n] direction of travel in the plane, from the chord over about a metre to either side; NaN if unknown."""
     before = np.searchsorted(route.position_m, route.position_m - over_m, side="left")

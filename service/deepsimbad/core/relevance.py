@@ -1,6 +1,6 @@
 """Relevance: how well every map image answers a query (II-C, III; larger is better).
 
-Four of the paper and one of ours. Three of them give each listed landmark a worth at each rank, and sum it over a
+Four of the paper and two of ours. Four of them give each listed landmark a worth at each rank, and sum it over a
 map image's list; `simbad` and `brute_force` are the paper's baselines that must store more than ids.
 """
 
@@ -11,6 +11,7 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from deepsimbad.core.calibration import Calibration
 from deepsimbad.core.inverted_index import InvertedIndex
 from deepsimbad.core.statistics import LandmarkStatistics
 from deepsimbad.errors import InvalidInputError, InvalidMapConfigError
@@ -20,6 +21,7 @@ class Relevance(StrEnum):
     """The named relevances. A map is built for one of them."""
 
     STANDARDISED = "standardised"
+    CALIBRATED = "calibrated"
     RRF = "rrf"
     BAG_OF_LANDMARKS = "bag_of_landmarks"
     SIMBAD = "simbad"
@@ -51,18 +53,22 @@ class RetrievalMap:
     Attributes:
         relevance: What the lists were built for.
         index: The landmark lists.
-        statistics: Those of the map's traverse, for `standardised`.
+        statistics: What is usual for each landmark: of the map's traverse for `standardised`, of both seasons that
+            the map knows for `calibrated`. A live session starts from them.
+        calibration: How far a listed landmark can be trusted, for `calibrated`.
         encodings: [n, d] float32, for `brute_force`.
     """
 
     relevance: Relevance
     index: InvertedIndex
     statistics: LandmarkStatistics | None = None
+    calibration: Calibration | None = None
     encodings: NDArray[np.float32] | None = None
 
     def __post_init__(self) -> None:
         missing = {
             Relevance.STANDARDISED: self.statistics is None and "landmark statistics",
+            Relevance.CALIBRATED: (self.statistics is None or self.calibration is None) and "a calibration",
             Relevance.SIMBAD: self.index.values is None and "listed dissimilarities",
             Relevance.BRUTE_FORCE: self.encodings is None and "encodings",
         }.get(self.relevance)
@@ -76,7 +82,7 @@ def relevances(built: RetrievalMap, query: Query, live: LandmarkStatistics | Non
     Args:
         built: The map.
         query: The described view.
-        live: A session's own statistics, which `standardised` uses in place of the map's.
+        live: A session's own statistics, in place of the map's.
 
     Returns:
         [n] float32, larger is better.
@@ -94,6 +100,14 @@ def _standardised(built: RetrievalMap, query: Query, live: LandmarkStatistics | 
         raise InvalidMapConfigError("a standardised map needs landmark statistics")
     worth = -statistics.standardise(query.ranks)
     return built.index.sum_listed(_same_at_every_rank(worth, built.index))
+
+
+def _calibrated(built: RetrievalMap, query: Query, live: LandmarkStatistics | None) -> NDArray[np.float32]:
+    """Sum over the list of log-likelihood ratios: seen from here, against seen from anywhere."""
+    statistics = live or built.statistics
+    if statistics is None or built.calibration is None:
+        raise InvalidMapConfigError("a calibrated map needs landmark statistics and a calibration")
+    return built.index.sum_listed(built.calibration.log_ratios(statistics.standardise(query.ranks)))
 
 
 def _rrf(built: RetrievalMap, query: Query, _: LandmarkStatistics | None) -> NDArray[np.float32]:
@@ -130,9 +144,7 @@ def _brute_force(built: RetrievalMap, query: Query, _: LandmarkStatistics | None
     return np.asarray(distances[0], np.float32)
 
 
-def brute_force_relevances(
-    encodings: NDArray[np.float32], queries: NDArray[np.float32]
-) -> NDArray[np.float32]:
+def brute_force_relevances(encodings: NDArray[np.float32], queries: NDArray[np.float32]) -> NDArray[np.float32]:
     """-L2 between every query and every map image, [q, n] float32, by one matrix product."""
     squares = np.einsum("nd,nd->n", encodings, encodings)
     query_squares = np.einsum("qd,qd->q", queries, queries)
@@ -142,6 +154,7 @@ def brute_force_relevances(
 
 _RULES: dict[Relevance, Callable[[RetrievalMap, Query, LandmarkStatistics | None], NDArray[np.float32]]] = {
     Relevance.STANDARDISED: _standardised,
+    Relevance.CALIBRATED: _calibrated,
     Relevance.RRF: _rrf,
     Relevance.BAG_OF_LANDMARKS: _bag_of_landmarks,
     Relevance.SIMBAD: _simbad,

@@ -1,9 +1,12 @@
 """Building what retrieval reads from a traverse's dissimilarities, and the shortlist of an answer (II-C)."""
 
+from dataclasses import dataclass
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from deepsimbad.core.calibration import Calibration, live_prior
 from deepsimbad.core.descriptor import nearest_landmarks, rank_landmarks
 from deepsimbad.core.inverted_index import InvertedIndex
 from deepsimbad.core.relevance import Relevance, RetrievalMap
@@ -13,11 +16,25 @@ from deepsimbad.errors import InvalidMapConfigError
 _SCAN_UP_TO = 64  # a longer shortlist is sorted whole
 
 
+@dataclass(frozen=True)
+class SecondSeason:
+    """What the landmark traverse tells of the route, for `calibrated`.
+
+    Attributes:
+        dissimilarities: [m, r] of its frames to the landmarks.
+        places: [k, 2] int64, (map image, its frame) where both saw the same place; none where they share no route.
+    """
+
+    dissimilarities: NDArray[np.float32]
+    places: NDArray[np.int64]
+
+
 def build_retrieval_map(
     relevance: Relevance,
     dissimilarities: NDArray[np.float32],
     list_length: int,
     encodings: NDArray[np.float32] | None = None,
+    second_season: SecondSeason | None = None,
 ) -> RetrievalMap:
     """Describe every map image by the h landmarks its relevance keeps.
 
@@ -26,6 +43,7 @@ def build_retrieval_map(
         dissimilarities: [n, r] of the training traverse's frames to the landmarks, smaller is nearer.
         list_length: h.
         encodings: [n, d] of the same frames; kept for `brute_force` alone.
+        second_season: Read by `calibrated` alone.
 
     Raises:
         InvalidMapConfigError: No image, or h not within 1..r.
@@ -40,14 +58,33 @@ def build_retrieval_map(
             n_landmarks=n_landmarks,
         )
     ranks = rank_landmarks(dissimilarities)
-    statistics = LandmarkStatistics.of_map(ranks) if relevance is Relevance.STANDARDISED else None
-    kept = ranks if statistics is None else statistics.standardise(ranks)
-    lists = nearest_landmarks(kept, list_length)
+    if relevance in {Relevance.STANDARDISED, Relevance.CALIBRATED}:
+        return _standardised_map(relevance, ranks, list_length, second_season)
+    lists = nearest_landmarks(ranks, list_length)
     values = None
     if relevance is Relevance.SIMBAD:
-        values = np.take_along_axis(dissimilarities, lists.T.astype(np.intp), axis=1).T.astype(np.float32)
-    index = InvertedIndex(lists, n_landmarks, None if values is None else np.ascontiguousarray(values))
-    return RetrievalMap(relevance, index, statistics, encodings if relevance is Relevance.BRUTE_FORCE else None)
+        listed = np.take_along_axis(dissimilarities, lists.T.astype(np.intp), axis=1)
+        values = np.ascontiguousarray(listed.T, np.float32)
+    kept = encodings if relevance is Relevance.BRUTE_FORCE else None
+    return RetrievalMap(relevance, InvertedIndex(lists, n_landmarks, values), encodings=kept)
+
+
+def _standardised_map(
+    relevance: Relevance, ranks: NDArray[np.float32], list_length: int, second: SecondSeason | None
+) -> RetrievalMap:
+    own = LandmarkStatistics.of_map(ranks)
+    scores = own.standardise(ranks)
+    lists = nearest_landmarks(scores, list_length)
+    index = InvertedIndex(lists, ranks.shape[1])
+    if relevance is Relevance.STANDARDISED:
+        return RetrievalMap(relevance, index, own)
+    if second is None or len(second.places) == 0:
+        return RetrievalMap(relevance, index, live_prior([own]), Calibration.learn(scores, lists, None))
+    other_ranks = rank_landmarks(second.dissimilarities)
+    other = LandmarkStatistics.of_map(other_ranks)
+    of_map, of_other = second.places.T
+    calibration = Calibration.learn(scores, lists, (scores[of_map], other.standardise(other_ranks)[of_other]))
+    return RetrievalMap(relevance, index, live_prior([own, other] if calibration.is_learnt else [own]), calibration)
 
 
 def shortlist(values: NDArray[np.floating], length: int) -> NDArray[np.int64]:

@@ -10,6 +10,21 @@ from deepsimbad.errors import InvalidRouteError
 
 
 @dataclass(frozen=True)
+class Places:
+    """The distinct positions of a route; images of one stop share a place.
+
+    Attributes:
+        position_m: [p] float64, strictly increasing.
+        of_image: [n] the place of every map image.
+        n_images: [p] images at every place.
+    """
+
+    position_m: NDArray[np.float64]
+    of_image: NDArray[np.intp]
+    n_images: NDArray[np.intp]
+
+
+@dataclass(frozen=True)
 class Route:
     """Route positions of the map images, in route order.
 
@@ -92,3 +107,32 @@ class Route:
             return offset
         half = self.length_m / 2
         return np.asarray((offset + half) % self.length_m - half)
+
+    @cached_property
+    def places(self) -> Places:
+        """The distinct positions."""
+        position_m, of_image, n_images = np.unique(self.position_m, return_inverse=True, return_counts=True)
+        return Places(position_m, of_image, n_images)
+
+    def nearest_image(self, position_m: NDArray[np.float64]) -> NDArray[np.intp]:
+        """The map image nearest to each position along the route; of two equally near the earlier."""
+        known = self.position_m
+        after = np.clip(np.searchsorted(known, position_m), 1, max(self.n_images - 1, 1))
+        if self.n_images == 1:
+            return np.zeros(np.shape(position_m), np.intp)
+        before = after - 1
+        nearest = np.where(position_m - known[before] <= known[after] - position_m, before, after)
+        if self.closed:  # behind the last image the first may be nearer
+            behind = position_m - known[-1]
+            nearest = np.where(behind > self._closing_gap_m - behind, 0, nearest)
+        return np.asarray(nearest, np.intp)
+
+    def histogram(self, max_bins: int) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
+        """Edges [b + 1] of equal bins over the whole route, and every map image's bin [n]."""
+        n_bins = min(max_bins, self.n_images)
+        width_m = self.length_m / n_bins
+        if width_m <= 0:
+            return np.array([self.start_m, self.start_m]), np.zeros(self.n_images, np.intp)
+        edges_m = np.linspace(self.start_m, self.start_m + self.length_m, n_bins + 1)
+        bins = ((self.position_m - self.start_m) / width_m).astype(np.intp)
+        return edges_m, np.minimum(bins, n_bins - 1, dtype=np.intp)

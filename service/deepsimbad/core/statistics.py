@@ -37,9 +37,11 @@ class LandmarkStatistics:
         return cls(PRIOR_WEIGHT_FRAMES, scores.mean(axis=0), np.square(scores).mean(axis=0))
 
     @classmethod
-    def from_mean_std(cls, mean: NDArray[np.float64], std: NDArray[np.float64]) -> Self:
+    def from_mean_std(
+        cls, mean: NDArray[np.float64], std: NDArray[np.float64], weight: float = PRIOR_WEIGHT_FRAMES
+    ) -> Self:
         """From a map's stored mean and standard deviation, [r] each."""
-        return cls(PRIOR_WEIGHT_FRAMES, mean, np.square(std) + np.square(mean))
+        return cls(weight, mean, np.square(std) + np.square(mean))
 
     @property
     def std(self) -> NDArray[np.float64]:

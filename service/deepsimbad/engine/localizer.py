@@ -7,8 +7,9 @@ from time import perf_counter
 import numpy as np
 from numpy.typing import NDArray
 
-from deepsimbad.core.belief import BeliefSummary, GridBelief
+from deepsimbad.core.belief_summary import BeliefSummary, summarise
 from deepsimbad.core.descriptor import rank_landmarks, ranks_from_ranked_landmarks
+from deepsimbad.core.grid_filter import GridFilter
 from deepsimbad.core.relevance import Query, relevances
 from deepsimbad.core.retrieval import shortlist
 from deepsimbad.engine.encoding import encode_view
@@ -72,8 +73,8 @@ def localize(snapshot: MapSnapshot, evaluator: Evaluator, view: View, n_shortlis
     began = perf_counter()
     best = shortlist(retrieval.relevance, length)
     listed = perf_counter()
-    belief = GridBelief.uniform(snapshot.route).updated(retrieval.relevance, snapshot.update_rule)
-    summary = belief.summary(length)
+    belief = GridFilter.uniform(snapshot.route).updated(retrieval.relevance, snapshot.update_rule, step=0)
+    summary = summarise(snapshot.route, belief.mass, length)
     believed = perf_counter()
     timings_ms = {
         **retrieval.timings_ms,

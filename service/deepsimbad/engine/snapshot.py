@@ -7,11 +7,11 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from deepsimbad.core.belief import DEFAULT_UPDATE, UpdateRule
 from deepsimbad.core.inverted_index import InvertedIndex
 from deepsimbad.core.relevance import Relevance, RetrievalMap
 from deepsimbad.core.route import Route
 from deepsimbad.core.statistics import LandmarkStatistics
+from deepsimbad.core.update_rules import DEFAULT_UPDATE, UpdateRule
 from deepsimbad.evaluators.base import LandmarkModel
 from deepsimbad.store.map_file import MapContents
 
@@ -65,7 +65,7 @@ class MapSnapshot:
             config=contents.config,
             metrics=contents.metrics,
             route=Route(contents.position_m, contents.closed, contents.x_m, contents.y_m),
-            retrieval=RetrievalMap(relevance, index, statistics, contents.encodings),
+            retrieval=RetrievalMap(relevance, index, statistics, encodings=contents.encodings),
             landmark_model=contents.landmark_model,
             actions_m=contents.actions_m,
             index_bytes=index_bytes,

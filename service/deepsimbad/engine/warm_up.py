@@ -2,11 +2,13 @@
 
 import numpy as np
 
-from deepsimbad.core.belief import GridBelief, UpdateRule
+from deepsimbad.core.belief_summary import summarise
+from deepsimbad.core.grid_filter import GridFilter
 from deepsimbad.core.inverted_index import InvertedIndex
 from deepsimbad.core.relevance import Query, Relevance, RetrievalMap, relevances
 from deepsimbad.core.retrieval import shortlist
 from deepsimbad.core.route import Route
+from deepsimbad.core.update_rules import UpdateRule
 
 
 def warm_up() -> None:
@@ -15,4 +17,5 @@ def warm_up() -> None:
     built = RetrievalMap(Relevance.RRF, index)
     relevance = relevances(built, Query(np.array([1, 2], np.float32)))
     shortlist(relevance, 1)
-    GridBelief.uniform(Route(np.array([0.0, 1.0]))).updated(relevance, UpdateRule.ADDITIVE_RELEVANCE).summary(1)
+    belief = GridFilter.uniform(Route(np.array([0.0, 1.0]))).updated(relevance, UpdateRule.ADDITIVE_RELEVANCE, step=0)
+    summarise(belief.route, belief.predicted(0.5, 0.1, step=1).mass, 1)
