@@ -1,0 +1,158 @@
+"""What the pages name is there: targets, calls, settings, options, modules, files, links; and figures agree."""
+
+import importlib.util
+import re
+import shlex
+import tomllib
+from functools import cache
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from deepsimbad.api.app import create_app
+from deepsimbad.cli import deepsimbad
+from deepsimbad.settings import Settings
+from deepsimbad_client.commands import cli as deepsimbad_client
+from deepsimbad_client.transport import KEY_VARIABLE, URL_VARIABLE
+
+PROJECT = Path(__file__).resolve().parents[2]
+METHODS = "GET|POST|PUT|DELETE"
+OTHER_VARIABLES = {URL_VARIABLE, KEY_VARIABLE, "DEEPSIMBAD_REAL_DATA"}
+
+
+def settings_by_variable():
+    return {f"DEEPSIMBAD_{name.upper()}": field for name, field in Settings.model_fields.items()}
+
+
+@pytest.fixture(scope="module")
+def calls(tmp_path_factory):
+    """(method, path with {} for every name) of everything the OpenAPI document lists."""
+    document = create_app(Settings(data_dir=tmp_path_factory.mktemp("none"))).openapi()
+    return {(method.upper(), unnamed(path)) for path, methods in document["paths"].items() for method in methods}
+
+
+def unnamed(path):
+    return re.sub(r"\{[^}]*\}", "{}", path)
+
+
+def test_every_make_target_named_is_there(pages):
+    targets = set(re.findall(r"^([a-z]+):", (PROJECT / "Makefile").read_text(), re.MULTILINE))
+    named = {word for page in pages for word in re.findall(r"\bmake ([a-z]+)", "\n".join(page.commands()))}
+    assert named >= {"demo", "test", "bench", "help"}
+    assert named <= targets
+
+
+def test_every_call_named_is_in_the_openapi_document(pages, calls):
+    named = {
+        (method, unnamed(path))
+        for page in pages
+        for method, path in re.findall(rf"\b({METHODS}) (/[\w./{{}}-]*)", page.text)
+    }
+    assert len(named) > 15
+    assert named <= calls, f"not served: {sorted(named - calls)}"
+
+
+def test_every_call_is_in_the_architecture_page(calls):
+    text = (PROJECT / "docs" / "architecture.md").read_text()
+    named = {(method, unnamed(path)) for method, path in re.findall(rf"`({METHODS}) (/[^`]*)`", text)}
+    assert calls <= named, f"not described: {sorted(calls - named)}"
+
+
+def test_every_variable_named_is_a_setting_and_every_setting_is_named(pages, readme):
+    named = {word for page in pages for word in re.findall(r"DEEPSIMBAD_[A-Z_]+", page.text)}
+    assert named == set(settings_by_variable()) | OTHER_VARIABLES
+    assert set(settings_by_variable()) <= set(re.findall(r"^\| `(DEEPSIMBAD_[A-Z_]+)`", readme.text, re.MULTILINE))
+
+
+@pytest.mark.parametrize("variable", sorted(settings_by_variable()))
+def test_the_table_of_settings_tells_default_and_meaning(readme, variable):
+    field = settings_by_variable()[variable]
+    (row,) = [line for line in readme.text.splitlines() if line.startswith(f"| `{variable}`")]
+    _, _, default, meaning, _ = (cell.strip() for cell in row.split("|"))
+    shown = str(field.default).lower() if isinstance(field.default, bool) else str(field.default)
+    assert default == f"`{shown}`"
+    assert meaning == field.description
+
+
+@cache
+def help_of(program, *command):
+    group = {"deepsimbad": deepsimbad, "deepsimbad-client": deepsimbad_client}[program]
+    ran = CliRunner().invoke(group, [*command, "--help"])
+    assert ran.exit_code == 0, f"{program} has no command {' '.join(command)}"
+    return ran.output
+
+
+def test_every_command_named_exists_and_has_the_options_shown(pages):
+    n_options = 0
+    for page in pages:
+        for text in page.commands():
+            words = shlex.split(text) if re.match(r"deepsimbad(-client)? [a-z]", text) else []
+            if not words:
+                continue
+            depth = 3 if words[1] == "experiment" else 2
+            shown = help_of(words[0], *words[1:depth])
+            for option in (word for word in words if word.startswith("--")):
+                assert re.search(rf"{option}\b", shown), f"{page.path.name}: {text}: no option {option}"
+                n_options += 1
+    assert n_options > 20
+
+
+def test_every_module_that_is_to_be_run_is_there(pages):
+    named = {module for page in pages for text in page.commands() for module in re.findall(r"python -m ([\w.]+)", text)}
+    assert {"bench.nordland", "bench.netvlad"} <= named
+    for module in named:
+        assert importlib.util.find_spec(module), module
+
+
+def test_every_extra_that_is_to_be_installed_is_declared(pages):
+    declared = tomllib.loads((PROJECT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    named = {extra for page in pages for text in page.commands() for extra in re.findall(r"'\.\[(\w+)\]'", text)}
+    assert {"service", "replay"} <= named <= set(declared)
+
+
+def test_every_link_leads_somewhere(pages):
+    n_links = 0
+    for page in pages:
+        for target in re.findall(r"\]\(([^)#]+)\)", page.prose):
+            if not re.match(r"https?://", target):
+                assert (page.path.parent / target).exists(), f"{page.path.name} links to {target}"
+                n_links += 1
+    assert n_links > 10
+
+
+def test_every_source_file_named_is_there(pages):
+    named = {
+        (page.path.name, path)
+        for page in pages
+        for path in re.findall(r"\b((?:service|client|migrations|tests|bench|docs)/[\w./-]+)", page.text)
+    }
+    assert len(named) > 15
+    for page, path in named:
+        assert (PROJECT / path.rstrip(".")).exists(), f"{page} names {path}"
+
+
+def test_the_readmes_figures_are_the_measured_ones(readme):
+    measured = (PROJECT / "docs" / "results" / "nordland-http.md").read_text().splitlines()
+    shown = [line for line in readme.text.splitlines() if re.match(r"\| (standardised|rrf|brute_force) \|", line)]
+    assert len(shown) == 3
+    for row in shown:
+        assert any(row.rstrip("|").strip() in line for line in measured), f"not in nordland-http.md: {row}"
+
+
+def test_every_decision_has_a_number_of_its_own_and_its_three_parts():
+    records = sorted((PROJECT / "docs" / "decisions").glob("*.md"))
+    assert len({int(path.name[:4]) for path in records}) == len(records) >= 6
+    for path in records:
+        text = path.read_text()
+        assert text.startswith(f"# {path.name[:4]} ")
+        assert re.findall(r"^## (\w+)", text, re.MULTILINE)[:3] == [
+            "Context",
+            "Decision",
+            "Consequences",
+        ], path.name
+
+
+def test_pictures_are_few_and_small():
+    pictures = list((PROJECT / "docs" / "images").iterdir())
+    assert sum(path.stat().st_size for path in pictures) < 400_000
