@@ -6,14 +6,17 @@
 """
 
 from deepsimbad_client.async_client import AsyncClient
+from deepsimbad_client.async_session import AsyncSession
 from deepsimbad_client.client import Client
 from deepsimbad_client.errors import ApiError, DeepSimbadClientError
-from deepsimbad_client.models import Belief, Domain, Job, Localization
+from deepsimbad_client.models import Belief, Domain, Job, Localization, SessionAnswer, SessionState
 from deepsimbad_client.retry import RetryPolicy
+from deepsimbad_client.session import Session
 
 __all__ = [
     "ApiError",
     "AsyncClient",
+    "AsyncSession",
     "Belief",
     "Client",
     "DeepSimbadClientError",
@@ -21,4 +24,7 @@ __all__ = [
     "Job",
     "Localization",
     "RetryPolicy",
+    "Session",
+    "SessionAnswer",
+    "SessionState",
 ]

@@ -138,6 +138,19 @@ class Admin:
         """
         return self._transport.send(admin_calls.remap(domain, config))
 
+    def feed_experience(self, domain: str, session_id: str, true_positions_m: Numbers) -> Job:
+        """Teach the next map: where a session's robot truly was at each of its observations, known only afterwards.
+
+        Args:
+            domain: The session's domain.
+            session_id: A session that the service still holds.
+            true_positions_m: A route position for each observation, in order.
+
+        Returns:
+            The job that makes the next map version.
+        """
+        return self._transport.send(admin_calls.feed_experience(domain, session_id, true_positions_m))
+
     def jobs(self, domain: str | None = None) -> tuple[Job, ...]:
         """Jobs, newest first, of one domain or all."""
         return self._transport.send(admin_calls.jobs(domain))

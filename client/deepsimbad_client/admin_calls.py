@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 from deepsimbad_client.answers import model, models, nothing, require_numpy
 from deepsimbad_client.call import JSON, Call, json_body, name_in_path, query
 from deepsimbad_client.models import Domain, FramesStored, FrameStored, Job, MapVersion, Traverse
-from deepsimbad_client.observation import Observation
+from deepsimbad_client.observation import Numbers, Observation
 from deepsimbad_client.retry import Repeat
 
 if TYPE_CHECKING:
@@ -131,6 +131,23 @@ def remap(domain: str, config: Mapping[str, Any]) -> Call[Job]:
         model(Job),
         headers=JSON,
         body=json_body(config),
+        repeat=Repeat.IF_UNTOUCHED,
+    )
+
+
+def feed_experience(domain: str, session_id: str, true_positions_m: Numbers) -> Call[Job]:
+    """Feed back where a session's robot truly was; a second request would be a second job.
+
+    Raises:
+        InvalidArgumentError: A position is NaN or infinite.
+    """
+    positions = true_positions_m.tolist() if hasattr(true_positions_m, "tolist") else true_positions_m
+    return Call(
+        "POST",
+        f"{_domain(domain)}/experience",
+        model(Job),
+        headers=JSON,
+        body=json_body({"session_id": session_id, "true_positions_m": list(positions)}),
         repeat=Repeat.IF_UNTOUCHED,
     )
 

@@ -9,7 +9,7 @@ import httpx2
 from pydantic import TypeAdapter, ValidationError
 
 from deepsimbad_client.errors import MissingExtraError, UnexpectedAnswerError, api_error_class
-from deepsimbad_client.models import Answer, Job
+from deepsimbad_client.models import Answer, Job, NextBestView
 from deepsimbad_client.problem import problem_of
 from deepsimbad_client.retry import retry_after_s, utc_now
 
@@ -82,6 +82,11 @@ def models(kind: type[Model], key: str) -> Callable[[httpx2.Response], tuple[Mod
 def nothing(response: httpx2.Response) -> None:
     """A parser of answers without content."""
     del response
+
+
+def next_best_view_of(response: httpx2.Response) -> NextBestView | None:
+    """A parser of the move to make next; None where the map can name none."""
+    return None if response.content.strip() == b"null" else model(NextBestView)(response)
 
 
 def float_array(response: httpx2.Response) -> "NDArray[np.float32]":

@@ -109,6 +109,10 @@ class AsyncAdmin:
         """Submit a remap and return its job at once."""
         return await self._transport.send(admin_calls.remap(domain, config))
 
+    async def feed_experience(self, domain: str, session_id: str, true_positions_m: Numbers) -> Job:
+        """Teach the next map where a session's robot truly was at each of its observations."""
+        return await self._transport.send(admin_calls.feed_experience(domain, session_id, true_positions_m))
+
     async def jobs(self, domain: str | None = None) -> tuple[Job, ...]:
         """Jobs, newest first, of one domain or all."""
         return await self._transport.send(admin_calls.jobs(domain))

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Self
 
 import httpx2
 
-from deepsimbad_client import calls
+from deepsimbad_client import calls, session_calls
 from deepsimbad_client.async_admin import AsyncAdmin
+from deepsimbad_client.async_session import AsyncSession
 from deepsimbad_client.models import Domain, Health, Localization
 from deepsimbad_client.observation import Image, Numbers, observation
 from deepsimbad_client.retry import RetryPolicy
@@ -103,6 +104,34 @@ class AsyncClient:
             encoding=encoding,
         )
         return await self._transport.send(calls.relevances(domain, seen))
+
+    async def session(
+        self,
+        domain: str,
+        start_position_m: float | None = None,
+        start_std_m: float | None = None,
+        *,
+        seed: int | None = None,
+        planner: str | None = None,
+        belief: str | None = None,
+        update: str | None = None,
+        keep: bool = False,
+    ) -> AsyncSession:
+        """Begin a session; use it as `async with await client.session(...) as session`."""
+        call = session_calls.start(
+            domain,
+            start_position_m=start_position_m,
+            start_std_m=start_std_m,
+            seed=seed,
+            planner=planner,
+            belief=belief,
+            update=update,
+        )
+        return AsyncSession(self._transport, await self._transport.send(call), keep=keep)
+
+    async def attach_session(self, session_id: str, *, keep: bool = True) -> AsyncSession:
+        """Find a session again that was kept."""
+        return AsyncSession(self._transport, await self._transport.send(session_calls.state(session_id)), keep=keep)
 
     async def aclose(self) -> None:
         """Close the connections; the client cannot be used afterwards."""

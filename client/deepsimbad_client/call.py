@@ -29,7 +29,7 @@ class Call(Generic[T]):
         headers: On top of the client's own.
         body: The content, if any.
         repeat: When it is safe to send again.
-        gone_is_done: A 404 after a try whose answer was lost means that try did it (deletes).
+        gone_is_done: A 404 or 410 after a try whose answer was lost means that try did it (deletes).
     """
 
     method: str

@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Self
 
 import httpx2
 
-from deepsimbad_client import calls
+from deepsimbad_client import calls, session_calls
 from deepsimbad_client.admin import Admin
 from deepsimbad_client.models import Domain, Health, Localization
 from deepsimbad_client.observation import Image, Numbers, observation
 from deepsimbad_client.retry import RetryPolicy
+from deepsimbad_client.session import Session
 from deepsimbad_client.transport import THIN_LINK_TIMEOUT, Endpoint, Transport
 
 if TYPE_CHECKING:
@@ -143,6 +144,57 @@ class Client:
             encoding=encoding,
         )
         return self._transport.send(calls.relevances(domain, seen))
+
+    def session(
+        self,
+        domain: str,
+        start_position_m: float | None = None,
+        start_std_m: float | None = None,
+        *,
+        seed: int | None = None,
+        planner: str | None = None,
+        belief: str | None = None,
+        update: str | None = None,
+        keep: bool = False,
+    ) -> Session:
+        """Begin a session: the service keeps this robot's belief from view to view.
+
+        Args:
+            domain: Where the robot is.
+            start_position_m: About where it starts along the route; absent: anywhere.
+            start_std_m: How well that is known; absent: the service's default.
+            seed: Of everything drawn at random; absent: the service draws one.
+            planner: Who chooses the next view (`nnql`, `random`, `constant:3`, ...); absent: the service's default.
+            belief: `particle` or `grid`; absent: the service's default.
+            update: How a view changes the belief; absent: the map's default.
+            keep: Let it outlive its `with` block.
+
+        Raises:
+            UnknownDomainError: No such domain.
+            NoActiveMapError: The domain has no map yet.
+            InvalidPriorError: The start is far off the route.
+            TooManySessionsError: The service holds as many as it may.
+        """
+        call = session_calls.start(
+            domain,
+            start_position_m=start_position_m,
+            start_std_m=start_std_m,
+            seed=seed,
+            planner=planner,
+            belief=belief,
+            update=update,
+        )
+        return Session(self._transport, self._transport.send(call), keep=keep)
+
+    def attach_session(self, session_id: str, *, keep: bool = True) -> Session:
+        """Find a session again that was kept.
+
+        Raises:
+            UnknownSessionError: No such session.
+            EndedSessionError: It expired or was deleted.
+            RetiredMapError: Its map was removed.
+        """
+        return Session(self._transport, self._transport.send(session_calls.state(session_id)), keep=keep)
 
     def close(self) -> None:
         """Close the connections; the client cannot be used afterwards."""

@@ -165,6 +165,10 @@ class UnknownMapVersionError(NotFoundError):
     """No such map version in the domain."""
 
 
+class UnknownSessionError(NotFoundError):
+    """No such session, or one that ended long ago."""
+
+
 class ConflictError(ApiError):
     """409: the request is sound but the present state forbids it."""
 
@@ -189,6 +193,14 @@ class GoneError(ApiError):
     """410: a retired map, or an expired or deleted session."""
 
 
+class EndedSessionError(GoneError):
+    """The session expired or was deleted: start another."""
+
+
+class RetiredMapError(GoneError):
+    """The map that the session began on is no more: start another session on the present one."""
+
+
 class TooLargeError(ApiError):
     """413: more bytes or pixels than a limit allows."""
 
@@ -201,8 +213,28 @@ class InvalidInputError(ApiError):
     """422: a value or body that can never be accepted as it stands."""
 
 
+class InvalidMoveError(InvalidInputError):
+    """A move that is NaN, negative or longer than a robot may report."""
+
+
+class PastTheEndError(InvalidMoveError):
+    """A move that leads past the end of an open route wherever the robot may be."""
+
+
+class InvalidPriorError(InvalidInputError):
+    """A start or prior far off the route, or without a usable deviation."""
+
+
+class IdempotencyKeyReusedError(InvalidInputError):
+    """The idempotency key came before with another observation."""
+
+
 class RateLimitedError(ApiError):
     """429: too many requests; `retry_after_s` says how long to wait."""
+
+
+class TooManySessionsError(RateLimitedError):
+    """The service holds as many live sessions as it may."""
 
 
 class ServerError(ApiError):
@@ -222,6 +254,14 @@ BY_CODE: Mapping[str, type[ApiError]] = {
     "unknown_traverse": UnknownTraverseError,
     "unknown_job": UnknownJobError,
     "unknown_map_version": UnknownMapVersionError,
+    "unknown_session": UnknownSessionError,
+    "ended_session": EndedSessionError,
+    "retired_map": RetiredMapError,
+    "invalid_move": InvalidMoveError,
+    "past_the_end": PastTheEndError,
+    "invalid_prior": InvalidPriorError,
+    "idempotency_key_reused": IdempotencyKeyReusedError,
+    "too_many_sessions": TooManySessionsError,
     "no_active_map": NoActiveMapError,
     "domain_differs": DomainDiffersError,
     "traverse_in_use": TraverseInUseError,

@@ -108,6 +108,29 @@ class Localization(Answer):
     next_best_view: NextBestView | None = None
 
 
+class SessionState(Answer):
+    """A live session between two observations."""
+
+    session_id: str
+    domain: str
+    map_version: int
+    n_observations: int
+    expires_at: str | float | None = None
+    belief: Belief
+    next_best_view: NextBestView | None = None
+
+
+class SessionAnswer(Answer):
+    """The answer to one observation of a session: the belief over all its views so far, and the move to make next."""
+
+    map_version: int
+    timings_ms: dict[str, float]
+    n_observations: int | None = None
+    belief: Belief
+    retrieval: tuple[Retrieved, ...] = ()
+    next_best_view: NextBestView | None = None
+
+
 class Traverse(Answer):
     """One recorded drive as the service holds it."""
 

@@ -84,7 +84,7 @@ def read(call: Call[T], response: httpx2.Response, attempts: Attempts) -> T:
         ApiError: The service refused.
         UnexpectedAnswerError: Something else answers at this address.
     """
-    if not (response.status_code == 404 and call.gone_is_done and attempts.answer_lost):
+    if not (response.status_code in {404, 410} and call.gone_is_done and attempts.answer_lost):
         raise_for_problem(response)
     return call.parse(response)
 

@@ -1,0 +1,146 @@
+"""A live session of the blocking client."""
+
+from types import TracebackType
+from typing import TYPE_CHECKING, Self
+
+from deepsimbad_client import session_calls
+from deepsimbad_client.errors import DeepSimbadClientError, GoneError
+from deepsimbad_client.models import NextBestView, SessionAnswer, SessionState
+from deepsimbad_client.observation import Image, Numbers, observation
+from deepsimbad_client.transport import Transport
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+
+class Session:
+    """One robot's belief, kept by the service and moved on by every observation.
+
+    Made by `Client.session` or `Client.attach_session`. It is a context manager: the session ends with the block unless
+    `keep` says otherwise. One session belongs to one robot: views sent by two threads at once count in the order of
+    their arrival.
+
+    Attributes:
+        session_id: By which `Client.attach_session` finds it again, from this process or another.
+        domain: Its domain.
+        map_version: The map it began on and keeps, whatever is activated later.
+        opened: What the service said when it was made or found.
+        keep: Whether it outlives the block.
+    """
+
+    def __init__(self, transport: Transport, opened: SessionState, *, keep: bool) -> None:
+        self._transport = transport
+        self.opened = opened
+        self.keep = keep
+        self._deleted = False
+
+    @property
+    def session_id(self) -> str:
+        """By which the session is found again."""
+        return self.opened.session_id
+
+    @property
+    def domain(self) -> str:
+        """The session's domain."""
+        return self.opened.domain
+
+    @property
+    def map_version(self) -> int:
+        """The map that the session began on."""
+        return self.opened.map_version
+
+    def observe(
+        self,
+        image: Image | None = None,
+        *,
+        action_m: float | None = None,
+        action_std_m: float | None = None,
+        content_type: str | None = None,
+        ranked_landmarks: Numbers | None = None,
+        dissimilarities: Numbers | None = None,
+        encoding: Numbers | None = None,
+        shortlist: int | None = None,
+        idempotency_key: str | None = None,
+    ) -> SessionAnswer:
+        """Tell what the robot sees now, after the metres it has moved; give exactly one form of the view.
+
+        A lost answer is asked for again and counts once. To repeat an observation yourself after a `TransportError`,
+        choose its key, and send the same again under it.
+
+        Args:
+            image: An encoded image (JPEG, PNG, TIFF, WebP) or its path, sent as it is.
+            action_m: Metres really moved since the last view; absent: stood still. Ignored for the first view.
+            action_std_m: How well that is known; absent: the service's usual odometry.
+            content_type: The image's media type; absent: read from its first bytes.
+            ranked_landmarks: Landmark ids, nearest first, 1..r of them.
+            dissimilarities: r finite numbers in landmark order, smaller is nearer.
+            encoding: A ready encoding, where the domain takes them.
+            shortlist: Length of `retrieval` and `belief.top`; absent: the service's default.
+            idempotency_key: Names this observation; absent: a new one.
+
+        Raises:
+            InvalidMoveError: The move is negative or too long; `PastTheEndError`: past the end of the route.
+            InvalidInputError: The service cannot use the view; its detail says why.
+            GoneError: The session has ended, or its map was removed.
+        """
+        seen = observation(
+            image,
+            content_type=content_type,
+            ranked_landmarks=ranked_landmarks,
+            dissimilarities=dissimilarities,
+            encoding=encoding,
+        )
+        call = session_calls.observe(
+            self.session_id,
+            seen,
+            action_m=action_m,
+            action_std_m=action_std_m,
+            shortlist=shortlist,
+            idempotency_key=idempotency_key,
+        )
+        return self._transport.send(call)
+
+    def state(self) -> SessionState:
+        """What it believes now, and how many views that rests on."""
+        return self._transport.send(session_calls.state(self.session_id))
+
+    def belief_masses(self) -> "NDArray[np.float32]":
+        """The whole belief: [n] float32 over the map images, sums to 1 (needs numpy)."""
+        return self._transport.send(session_calls.belief_masses(self.session_id))
+
+    def next_best_view(self) -> NextBestView | None:
+        """The move that would tell most, without another view; None where the map can name none."""
+        return self._transport.send(session_calls.next_best_view(self.session_id))
+
+    def set_prior(self, position_m: float, std_m: float) -> SessionState:
+        """Forget the belief for one around a position: the robot was carried, or got a fix.
+
+        Raises:
+            InvalidPriorError: The position is far off the route, or the deviation cannot be one.
+        """
+        return self._transport.send(session_calls.set_prior(self.session_id, position_m, std_m))
+
+    def delete(self) -> None:
+        """End the session; nothing more can be asked of it."""
+        self._transport.send(session_calls.delete(self.session_id))
+        self._deleted = True
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        if self.keep or self._deleted:
+            return
+        try:
+            self.delete()
+        except GoneError:
+            pass  # it has expired, which is as good
+        except DeepSimbadClientError:
+            if error is None:  # else the block's own error matters more; the session expires by itself
+                raise
