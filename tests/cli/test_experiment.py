@@ -18,7 +18,7 @@ KEYS = {
     "config",
     "seconds",
 }
-ALL = {"standardised", "rrf", "bag_of_landmarks", "simbad", "brute_force"}
+FIVE = {"standardised", "rrf", "bag_of_landmarks", "simbad", "brute_force"}
 
 
 @pytest.fixture
@@ -32,7 +32,7 @@ def test_json_is_one_document_with_the_stable_keys(deepsimbad, triplet):
     assert (ran.code, ran.err) == (0, "")
     document = json.loads(ran.out)
     assert set(document) == KEYS
-    assert set(document["anr"]) == set(document["recall_at_1"]) == set(document["recall_at_5"]) == ALL
+    assert set(document["anr"]) == set(document["recall_at_1"]) == set(document["recall_at_5"]) >= FIVE
     assert all(0 <= anr < 20 for anr in document["anr"].values()), document["anr"]
     assert document["default"] == "standardised"
     assert (document["n_queries"], document["n_left_out"]) == (80, 0)

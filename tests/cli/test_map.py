@@ -157,6 +157,31 @@ def test_a_view_that_cannot_be_used_is_named(deepsimbad, pictures, tmp_path):
     named_error(deepsimbad("localize", "route", tmp_path / "half.png"))
 
 
+def damaged(data_dir):
+    """Overwrite the middle of the first map."""
+    with Catalog.open(data_dir) as catalog:
+        path = catalog.map_path("route", 1)
+    path.chmod(0o644)
+    body = bytearray(path.read_bytes())
+    body[4096:8192] = bytes(4096)
+    path.write_bytes(body)
+
+
+@pytest.mark.slow
+def test_a_damaged_map_is_named_in_one_line(deepsimbad, process, pictures, tmp_path):
+    """As a process, because a library's log would bypass what this one captures."""
+    deepsimbad("map", "route", "--landmarks", pictures, "--training", pictures, "--n-landmarks", 20)
+    damaged(tmp_path / "deepsimbad-data")
+    out, err = process("localize", "route", pictures / "1.png").communicate(timeout=60)
+    assert out == ""
+    assert err.startswith("deepsimbad: map 1 of domain route is damaged")
+    assert len(err.splitlines()) == 1, err
+    described = process("info", "route", "--json")
+    out, err = described.communicate(timeout=60)
+    assert (described.returncode, err) == (0, "")
+    assert json.loads(out)["map_problem"] == "damaged_map"
+
+
 def test_positions_that_go_backwards_leave_no_map(deepsimbad, drives, tmp_path):
     ran = deepsimbad("map", "route", *sources(drives, part="#::-1"), *READY, "--n-landmarks", 20)
     named_error(ran, "backwards")

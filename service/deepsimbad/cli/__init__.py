@@ -3,6 +3,7 @@
 Exit codes: 0 done, 1 a named error (one line on standard error), 2 usage, 130 cancelled.
 """
 
+import logging
 from collections.abc import Sequence
 
 import click
@@ -28,6 +29,8 @@ for command in (serve, map_, localize, info, experiment):
 
 def run(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code."""
+    # Only `serve` writes a log; elsewhere an error is one line, without the trace that a library logs beside it.
+    logging.getLogger("deepsimbad").addHandler(logging.NullHandler())
     try:
         deepsimbad.main(args=None if arguments is None else list(arguments), standalone_mode=False)
     except (click.exceptions.Abort, KeyboardInterrupt, CancelledError):
