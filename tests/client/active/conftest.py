@@ -1,0 +1,240 @@
+"""A small service that keeps sessions, behind httpx2's MockTransport, and recordings to drive against it."""
+
+import hashlib
+import json
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import httpx2
+import numpy as np
+import pytest
+
+from deepsimbad_client import Client, RetryPolicy
+from deepsimbad_client.recording import Recording
+from deepsimbad_client.sources import open_source
+
+N_IMAGES = 150
+ACTIONS_M = tuple(float(metres) for metres in range(1, 11))
+
+
+@dataclass
+class FakeSession:
+    mass: np.ndarray
+    planner: str
+    rng: np.random.Generator
+    n_observations: int = 0
+    answers: dict[str, tuple[str, dict[str, Any]]] = field(default_factory=dict)
+    ended: bool = False
+
+
+class FakeService:
+    """Map images every metre; an observation `{"encoding": [p, s]}` says p metres, give or take s.
+
+    Attributes:
+        asked: Every request, as "VERB path".
+        lose_answers: Called with every request that was acted on; True: its answer is lost on the way.
+        plans: Whether next-best views are given.
+    """
+
+    def __init__(self) -> None:
+        self.sessions: dict[str, FakeSession] = {}
+        self.asked: list[str] = []
+        self.keys: list[str] = []
+        self.lose_answers: Callable[[httpx2.Request], bool] = lambda request: False
+        self.plans = True
+        self.map_version = 3
+        self._lock = threading.Lock()
+
+    def client(self) -> Client:
+        return Client(
+            "http://service",
+            retry=RetryPolicy(attempts=3),
+            transport=httpx2.MockTransport(self),
+            sleep=lambda seconds: None,
+        )
+
+    def __call__(self, request: httpx2.Request) -> httpx2.Response:
+        with self._lock:
+            self.asked.append(f"{request.method} {request.url.path}")
+            response = self._route(request)
+            if self.lose_answers(request):
+                raise httpx2.ReadTimeout("lost", request=request)
+            return response
+
+    def _route(self, request: httpx2.Request) -> httpx2.Response:
+        match request.method, request.url.path.strip("/").split("/")[1:]:
+            case "GET", ["domains", name]:
+                return httpx2.Response(200, json=self._domain(name))
+            case "POST", ["domains", _, "localizations"]:
+                mass = self._updated(np.full(N_IMAGES, 1 / N_IMAGES), json.loads(request.content))
+                answer = self._answer(mass, None, int(request.url.params["shortlist"]))
+                return httpx2.Response(200, json=answer)
+            case "POST", ["domains", name, "sessions"]:
+                return self._start(name, json.loads(request.content or b"{}"))
+            case verb, ["sessions", session_id, *rest]:
+                session = self.sessions.get(session_id)
+                if session is None:
+                    return problem(404, "unknown_session")
+                if session.ended:
+                    return problem(410, "ended_session")
+                return self._of_session(verb, rest, session_id, session, request)
+        return problem(404, "not_found")
+
+    def _domain(self, name: str) -> dict[str, Any]:
+        return {
+            "name": name,
+            "map_version": self.map_version,
+            "n_map_images": N_IMAGES,
+            "route_length_m": N_IMAGES - 1.0,
+            "actions_m": ACTIONS_M,
+            "input_size": None,
+        }
+
+    def _start(self, name: str, body: dict[str, Any]) -> httpx2.Response:
+        planner = body.get("planner", "telling")
+        if planner == "nonsense":
+            return problem(422, "invalid_input")
+        session_id = f"s{len(self.sessions)}"
+        rng = np.random.default_rng(body.get("seed"))
+        self.sessions[session_id] = FakeSession(np.full(N_IMAGES, 1 / N_IMAGES), planner, rng)
+        return httpx2.Response(201, json=self._state(session_id))
+
+    def _of_session(
+        self, verb: str, rest: list[str], session_id: str, session: FakeSession, request: httpx2.Request
+    ) -> httpx2.Response:
+        match verb, rest:
+            case "GET", []:
+                return httpx2.Response(200, json=self._state(session_id))
+            case "GET", ["belief"]:
+                packed = BytesIO()
+                np.save(packed, session.mass.astype(np.float32))
+                return httpx2.Response(200, content=packed.getvalue())
+            case "GET", ["next-best-view"]:
+                return httpx2.Response(200, content=json.dumps(self._plan(session)).encode())
+            case "PUT", ["prior"]:
+                prior = json.loads(request.content)
+                if not 0 <= prior["position_m"] < N_IMAGES:
+                    return problem(422, "invalid_prior")
+                away = (np.arange(N_IMAGES) - prior["position_m"]) / prior["std_m"]
+                session.mass = normal(np.exp(-0.5 * away**2))
+                return httpx2.Response(200, json=self._state(session_id))
+            case "DELETE", []:
+                session.ended = True
+                return httpx2.Response(204)
+            case "POST", ["observations"]:
+                return self._observe(session, request)
+        return problem(405, "method_not_allowed")
+
+    def _observe(self, session: FakeSession, request: httpx2.Request) -> httpx2.Response:
+        key = request.headers["idempotency-key"]
+        self.keys.append(key)
+        digest = hashlib.sha256(bytes(str(request.url), "ascii") + request.content).hexdigest()
+        if key in session.answers:
+            was, answer = session.answers[key]
+            return httpx2.Response(200, json=answer) if was == digest else problem(422, "idempotency_key_reused")
+        action_m = float(request.url.params.get("action_m", 0))
+        if action_m < 0 or action_m > 10 * ACTIONS_M[-1]:
+            return problem(422, "invalid_move")
+        view = json.loads(request.content)
+        if len(view["encoding"]) != 2:
+            return problem(422, "undecodable_image")
+        if session.n_observations:
+            moved = np.zeros(N_IMAGES)
+            steps = round(action_m)
+            moved[steps:] = session.mass[: N_IMAGES - steps]
+            if moved.sum() < 1e-3:
+                return problem(422, "past_the_end")
+            session.mass = normal(moved)
+        session.mass = self._updated(session.mass, view)
+        session.n_observations += 1
+        answer = self._answer(session.mass, session, 10)
+        session.answers[key] = (digest, answer)
+        return httpx2.Response(200, json=answer)
+
+    @staticmethod
+    def _updated(mass: np.ndarray, view: dict[str, Any]) -> np.ndarray:
+        place, spread = view["encoding"]
+        return normal(mass * (np.exp(-0.5 * ((np.arange(N_IMAGES) - place) / spread) ** 2) + 0.02))
+
+    def _plan(self, session: FakeSession | None) -> dict[str, Any] | None:
+        if session is None or not self.plans:
+            return None
+        planner = session.planner
+        action_m = 7.0
+        if planner == "random":
+            action_m = float(session.rng.choice(ACTIONS_M))
+        elif planner.startswith("constant:"):
+            action_m = float(planner.partition(":")[2])
+        return {"planner": planner, "action_m": action_m, "actions": []}
+
+    def _state(self, session_id: str) -> dict[str, Any]:
+        session = self.sessions[session_id]
+        answer = self._answer(session.mass, session, 10)
+        return {
+            "session_id": session_id,
+            "domain": "route",
+            "map_version": self.map_version,
+            "n_observations": session.n_observations,
+            "expires_at": "2030-01-01T00:00:00Z",
+            "belief": answer["belief"],
+            "next_best_view": answer["next_best_view"],
+        }
+
+    def _answer(self, mass: np.ndarray, session: FakeSession | None, shortlist: int) -> dict[str, Any]:
+        order = np.argsort(-mass, kind="stable")[:shortlist]
+        top = [
+            {"map_image": int(i), "route_position_m": float(i), "x_m": None, "y_m": None, "mass": float(mass[i])}
+            for i in order
+        ]
+        inside = np.flatnonzero(np.cumsum(mass) > 0.025)[0], np.flatnonzero(np.cumsum(mass) >= 0.975)[0]
+        positive = mass[mass > 0]
+        return {
+            "map_version": self.map_version,
+            "timings_ms": {"total": 0.5},
+            "n_observations": session.n_observations if session else 1,
+            "belief": {
+                "mean_m": float(mass @ np.arange(N_IMAGES)),
+                "mode_m": float(mass.argmax()),
+                "std_m": 1.0,
+                "credible_95_m": [float(inside[0]), float(inside[1])],
+                "entropy_bits": float(-(positive * np.log2(positive)).sum()),
+                "off_route": 0.01,
+                "histogram": {
+                    "edges_m": np.linspace(0, N_IMAGES - 1, 51).tolist(),
+                    "mass": mass.reshape(50, 3).sum(1).tolist(),
+                },
+                "top": top,
+            },
+            "retrieval": [
+                {"map_image": int(i), "route_position_m": float(i), "relevance": float(mass[i])} for i in order
+            ],
+            "next_best_view": self._plan(session),
+        }
+
+
+def normal(mass: np.ndarray) -> np.ndarray:
+    return np.asarray(mass / mass.sum())
+
+
+def problem(status: int, code: str) -> httpx2.Response:
+    return httpx2.Response(status, json={"code": code, "detail": f"refused as {code}"})
+
+
+@pytest.fixture
+def fake() -> FakeService:
+    return FakeService()
+
+
+@pytest.fixture
+def drive(tmp_path: Path) -> Recording:
+    """A drive of the fake service's route, a frame every metre, some views far more telling than others."""
+    rng = np.random.default_rng(1)
+    place = np.arange(N_IMAGES, dtype=float)
+    spread = np.where(np.arange(N_IMAGES) % 7 == 0, 1.5, 25.0)
+    views = np.column_stack([place + rng.normal(size=N_IMAGES) * spread / 3, spread])
+    np.save(tmp_path / "drive.npy", views.astype(np.float32))
+    return open_source(str(tmp_path / "drive.npy"))
