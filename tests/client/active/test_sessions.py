@@ -48,9 +48,8 @@ def test_what_travels(client: Client, fake: Any) -> None:
         return False
 
     fake.lose_answers = remember
-    with client.session(
-        "route", 12.5, 3, seed=0, planner="nnql", belief="particle", update="log_likelihood"
-    ) as session:
+    wishes = {"planner": "nnql", "belief": "particle", "update": "log_likelihood"}
+    with client.session("route", 12.5, 3, seed=0, **wishes) as session:
         session.observe(encoding=[1, 2], action_m=1.5, action_std_m=0.25, shortlist=3, idempotency_key="mine")
         session.observe(encoding=[1, 2])
     created, given, bare, _ = seen
