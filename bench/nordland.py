@@ -41,13 +41,13 @@ class Measured:
         summaries: The client's own summary of every relevance's replay.
         n_map_frames_left_out: Of frames 0..999.
         n_landmark_frames_left_out: Of frames 1000..1999.
-        extractor: The evaluator's configuration, as the service tells it.
+        extractor: The domain's, as the service names it.
     """
 
     summaries: dict[str, dict[str, Any]]
     n_map_frames_left_out: int
     n_landmark_frames_left_out: int
-    extractor: dict[str, Any]
+    extractor: str
 
 
 def shows_something(path: Path) -> bool:
@@ -108,8 +108,9 @@ def measure(nordland: Path, work: Path, relevances: tuple[str, ...] = RELEVANCES
             # One query at a time: the time an answer takes is then the service's, not a queue's.
             driven = replay(client, live, DOMAIN, work / relevance, tolerance_m=TOLERANCE_M, concurrency=1)
             summaries[relevance] = summarise(driven)
-        extractor = client.domain(DOMAIN).evaluator
-    return Measured(summaries, len(MAP_FRAMES) - len(kept), len(LANDMARK_FRAMES) - len(candidates), dict(extractor))
+        evaluator = client.domain(DOMAIN).evaluator
+    extractor = evaluator["extractor"] if isinstance(evaluator, dict) else str(evaluator)
+    return Measured(summaries, len(MAP_FRAMES) - len(kept), len(LANDMARK_FRAMES) - len(candidates), extractor)
 
 
 def table(measured: Measured) -> list[str]:
@@ -128,7 +129,7 @@ def table(measured: Measured) -> list[str]:
         f"shows nothing (grey levels' standard deviation at most {_LEAST_GREY_STD:g}): "
         f"{measured.n_map_frames_left_out} of frames 0..999, where either season counts, and "
         f"{measured.n_landmark_frames_left_out} of the landmarks' 1000..1999 in summer. r = {N_LANDMARKS}, "
-        f"h = {LIST_LENGTH}, tolerance {TOLERANCE_M:g} frames, extractor {measured.extractor['extractor']}. "
+        f"h = {LIST_LENGTH}, tolerance {TOLERANCE_M:g} frames, extractor {measured.extractor}. "
         "ANR: 0 is perfect, 50 chance.",
     ]
 

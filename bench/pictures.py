@@ -30,7 +30,8 @@ def contact_sheet(campus: Path) -> NDArray[np.uint8]:
         tiles = []
         for share in _PLACES:
             frame = min(drive.frames, key=lambda frame: abs(frame.position_m - share * furthest_m))
-            tiles.append(cv2.resize(_middle(drive.upright(frame)), _TILE, interpolation=cv2.INTER_AREA))
+            tile = cv2.resize(_middle(drive.upright(frame)), _TILE, interpolation=cv2.INTER_AREA)
+            tiles.append(np.asarray(tile, np.uint8))
         rows.append(_joined(tiles, axis=1))
     return _joined(rows, axis=0)
 

@@ -17,7 +17,6 @@ from deepsimbad_client.commands import cli as deepsimbad_client
 from deepsimbad_client.transport import KEY_VARIABLE, URL_VARIABLE
 
 PROJECT = Path(__file__).resolve().parents[2]
-PARTS = ["Context", "Decision", "Consequences"]
 METHODS = "GET|POST|PUT|DELETE"
 OTHER_VARIABLES = {URL_VARIABLE, KEY_VARIABLE, "DEEPSIMBAD_REAL_DATA"}
 
@@ -141,14 +140,16 @@ def test_the_readmes_figures_are_the_measured_ones(readme):
         assert any(row.rstrip("|").strip() in line for line in measured), f"not in nordland-http.md: {row}"
 
 
-def test_every_decision_has_a_number_of_its_own_and_its_three_parts():
+def test_every_decision_has_a_number_of_its_own_and_its_parts():
     records = sorted((PROJECT / "docs" / "decisions").glob("*.md"))
     assert len({int(path.name[:4]) for path in records}) == len(records) >= 6
     for path in records:
         text = path.read_text()
         assert text.startswith(f"# {path.name[:4]} ")
-        parts = [part for part in re.findall(r"^## (\w+)", text, re.MULTILINE) if part in PARTS]
-        assert parts == PARTS, path.name
+        parts = re.findall(r"^## (\w+)", text, re.MULTILINE)
+        assert parts[0] == "Context", path.name
+        assert "Decision" in parts, path.name
+        assert len(parts) >= 3, f"{path.name} says nothing of what follows"
 
 
 def test_pictures_are_few_and_small():
