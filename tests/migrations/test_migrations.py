@@ -155,6 +155,7 @@ def the_map(data_dir: Path) -> Iterator[object]:
     yield contents.lists.tolist()
     yield contents.landmark_model["prototypes"].tolist()
     yield (contents.closed, contents.actions_m, contents.position_m.tolist(), contents.metrics)
+    yield contents.q_values.round(2).tolist()
 
 
 @pytest.mark.parametrize(
@@ -175,6 +176,18 @@ def the_map(data_dir: Path) -> Iterator[object]:
                 [[0, 1, 2, 0], [1, 2, 0, 2]],
                 [[0, 1], [2, 3], [4, 5]],
                 (True, (1.0, 2.0, 3.0), [0.0, 1.5, 3.0, 4.5], {"anr": 4.5}),
+                [[0.0, 0.0, 0.0]] * 4,
+            ],
+        ),
+        (
+            "map_v2",
+            "domains/campus/maps/000001.sqlite",
+            the_map,
+            [
+                [[0, 1, 2, 0], [1, 2, 0, 2]],
+                [[0, 1], [2, 3], [4, 5]],
+                (True, (1.0, 2.0, 3.0), [0.0, 1.5, 3.0, 4.5], {"anr": 4.5}),
+                [[0.0, 25.0, 50.0], [75.0, 100.0, 125.0], [150.0, 175.0, 200.0], [225.0, 250.0, 275.0]],
             ],
         ),
     ],

@@ -27,7 +27,10 @@ MakeMap = Callable[..., MapContents]
 def same(left: MapContents, right: MapContents) -> bool:
     for each in fields(MapContents):
         one, two = getattr(left, each.name), getattr(right, each.name)
-        if each.name == "landmark_model":
+        if each.name == "q_values":
+            if not _same_experience(one, two):
+                return False
+        elif each.name == "landmark_model":
             if one.keys() != two.keys() or not all(_same_array(one[name], two[name]) for name in one):
                 return False
         elif isinstance(one, np.ndarray):
@@ -40,6 +43,14 @@ def same(left: MapContents, right: MapContents) -> bool:
 
 def _same_array(one: np.ndarray, two: np.ndarray) -> bool:
     return two is not None and one.dtype == two.dtype and np.array_equal(one, two, equal_nan=True)
+
+
+def _same_experience(one: np.ndarray | None, two: np.ndarray | None) -> bool:
+    """To half of one of 65,535 steps from the lowest to the highest."""
+    if one is None or two is None:
+        return one is two
+    step = (float(one.max()) - float(one.min())) / 65_535
+    return one.shape == two.shape and two.dtype == np.float32 and np.abs(one - two).max() <= step
 
 
 def everything(make_map: MakeMap) -> MapContents:
@@ -90,6 +101,28 @@ def test_an_array_of_many_parts(make_map: MakeMap, tmp_path: Path, monkeypatch: 
     back = read_map(tmp_path / "map")
     assert np.array_equal(back.encodings, contents.encodings)
     assert np.array_equal(back.landmark_model["prototypes"], contents.landmark_model["prototypes"])
+
+
+def test_the_experience_database_takes_two_bytes_a_value_and_loses_nothing_twice(
+    make_map: MakeMap, tmp_path: Path
+) -> None:
+    n = 26_208
+    generator = np.random.default_rng(0)
+    learnt = (1e-4 + 950 * generator.random((n, 10))).astype(np.float32)
+    actions_m = tuple(float(m) for m in range(1, 11))
+    write_map(tmp_path / "once", make_map(n=n, r=500, q_values=learnt, actions_m=actions_m))
+    once = read_map(tmp_path / "once")
+    assert once.q_values is not None
+    assert np.abs(once.q_values - learnt).max() < 0.008
+    assert table_bytes(tmp_path / "once")["q_value"] / n <= 21
+    write_map(tmp_path / "twice", once)
+    twice = read_map(tmp_path / "twice")
+    assert np.array_equal(once.q_values, twice.q_values)
+    flat = np.full((n, 10), 1e-4, np.float32)
+    write_map(tmp_path / "flat", make_map(n=n, r=500, q_values=flat, actions_m=actions_m))
+    assert np.array_equal(read_map(tmp_path / "flat").q_values, flat)
+    with pytest.raises(InvalidInputError, match="NaN"):
+        write_map(tmp_path / "nan", make_map(q_values=np.full((60, 3), np.nan, np.float32)))
 
 
 @pytest.mark.parametrize(
@@ -204,6 +237,12 @@ def _alter(path: Path, *statements: str) -> None:
         "UPDATE route SET name = 'unheard_of' WHERE name = 'x_m'",
         "DELETE FROM route WHERE name = 'position_m'",
         "DROP TABLE q_value",
+        "DELETE FROM q_value",
+        "UPDATE q_value SET step = NULL",
+        "UPDATE q_value SET step = 2.0 * step",
+        "UPDATE q_value SET body = zeroblob(40)",
+        "UPDATE q_value SET shape = '[6000000000, 3]'",
+        "INSERT INTO q_value SELECT 1, name, dtype, shape, lowest, step, body FROM q_value",
         "PRAGMA journal_mode = WAL",
     ],
 )

@@ -63,3 +63,28 @@ def m001_postings_and_arrays(db: Database) -> None:
             )
             """
         )
+
+
+@migrations()
+def m002_packed_experience(db: Database) -> None:
+    """The experience database in one small b-tree: Q-values as whole steps above the lowest, compressed.
+
+    With `part` as the key there is no second b-tree. Rows of before, plain numbers, stay as they are: they have no
+    `step`.
+    """
+    db.executescript(
+        """
+        CREATE TABLE q_value_packed (
+            part INTEGER PRIMARY KEY,
+            name TEXT NOT NULL,
+            dtype TEXT NOT NULL,
+            shape TEXT NOT NULL,
+            lowest REAL,
+            step REAL,
+            body BLOB NOT NULL
+        );
+        INSERT INTO q_value_packed (part, name, dtype, shape, body) SELECT part, name, dtype, shape, body FROM q_value;
+        DROP TABLE q_value;
+        ALTER TABLE q_value_packed RENAME TO q_value;
+        """
+    )

@@ -15,6 +15,7 @@ from deepsimbad.store.arrays import Checksum, load_arrays, save_arrays
 from deepsimbad.store.connection import open_database, pending_migrations
 from deepsimbad.store.documents import from_json, to_json
 from deepsimbad.store.durable import remove_database
+from deepsimbad.store.experience import EXPERIENCE_TABLE, load_experience, save_experience
 from deepsimbad.store.faults import storage_faults
 from deepsimbad.store.map_contents import MapContents
 from deepsimbad.store.pages import bytes_by_table, fitting_page_size
@@ -41,7 +42,7 @@ _TABLES: dict[str, tuple[str, ...]] = {
     "landmark_statistics": ("statistics",),
     "listed_dissimilarity": ("values",),
     "map_image_encoding": ("encodings",),
-    "q_value": ("q_values",),
+    EXPERIENCE_TABLE: ("q_values",),
     "route": ("position_m", "timestamp_us", "x_m", "y_m"),
 }
 _MODEL_TABLE = "landmark_model"
@@ -109,7 +110,10 @@ def _write(
     save_arrays(db, _MODEL_TABLE, contents.landmark_model, checksum)
     for table, names in _TABLES.items():
         present = {name: getattr(contents, name) for name in names if getattr(contents, name) is not None}
-        save_arrays(db, table, present, checksum)
+        if table == EXPERIENCE_TABLE:
+            save_experience(db, contents.q_values, checksum)
+        else:
+            save_arrays(db, table, present, checksum)
         report(0.7)
     db.table("map").insert({"id": 1, **description, "checksum": checksum.value})
 
@@ -145,7 +149,8 @@ def _read(db: Database, path: Path) -> MapContents:
     model = load_arrays(db, _MODEL_TABLE, checksum)
     arrays: dict[str, NDArray[Any]] = {}
     for table in _TABLES:
-        arrays |= load_arrays(db, table, checksum)
+        load = load_experience if table == EXPERIENCE_TABLE else load_arrays
+        arrays |= load(db, table, checksum)
     if checksum.value != stored["checksum"]:
         raise DamagedMapError(f"{path.name} is damaged: it does not match its checksum", file=path.name)
     lists = unpack_index(postings, stored["list_length"], stored["n_map_images"])
