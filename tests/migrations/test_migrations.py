@@ -14,12 +14,20 @@ import deepsimbad_migrations
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.map_file import read_map
 from deepsimbad.store.records import JobState
+from deepsimbad.store.session_records import PriorRow
+from deepsimbad.store.sessions import SessionStore
 from deepsimbad.store.traverses import Traverse
 from deepsimbad_migrations.catalog.migrations import migrations as catalog_migrations
 from deepsimbad_migrations.map.migrations import migrations as map_migrations
+from deepsimbad_migrations.session.migrations import migrations as session_migrations
 from deepsimbad_migrations.traverse.migrations import migrations as traverse_migrations
 
-SETS = {"catalog": catalog_migrations, "map": map_migrations, "traverse": traverse_migrations}
+SETS = {
+    "catalog": catalog_migrations,
+    "map": map_migrations,
+    "traverse": traverse_migrations,
+    "session": session_migrations,
+}
 SCHEMAS = Path(__file__).parent / "schemas"
 FROZEN = sorted(SCHEMAS.glob("*.sql"))
 MIGRATIONS = Path(deepsimbad_migrations.__file__).parent
@@ -64,7 +72,7 @@ def test_the_command_reaches_the_schema_that_the_service_makes(kind: str, tmp_pa
     apply(ours, SETS[kind])
     run_command(theirs, MIGRATIONS / kind)
     assert schema_of(theirs) == schema_of(ours)
-    assert {"catalog": "domain", "map": "posting", "traverse": "frame"}[kind] in schema_of(ours)
+    assert {"catalog": "domain", "map": "posting", "traverse": "frame", "session": "journal"}[kind] in schema_of(ours)
     before = rows_of(theirs)
     run_command(theirs, MIGRATIONS / kind)  # again changes nothing
     assert rows_of(theirs) == before
@@ -158,6 +166,18 @@ def the_map(data_dir: Path) -> Iterator[object]:
     yield contents.q_values.round(2).tolist()
 
 
+def the_sessions(data_dir: Path) -> Iterator[object]:
+    with SessionStore.open(data_dir) as store:
+        (alive,) = store.living()
+        yield (alive.session_id, alive.config, alive.n_events, alive.expires_at)
+        snapshot, rows = store.history(alive.number, until=3)
+        assert snapshot is not None
+        yield (snapshot.sequence, snapshot.arrays["mass"].tolist(), [row.sequence for row in rows])
+        _, (first, second) = store.history(alive.number, until=2)
+        yield (first, second) == (first, PriorRow(2, 4620.0, 1.5, 2.0))
+        yield store.named(alive.number, "k1")
+
+
 @pytest.mark.parametrize(
     ("dump", "place", "read", "expected"),
     [
@@ -167,6 +187,12 @@ def the_map(data_dir: Path) -> Iterator[object]:
             "domains/campus/traverses/summer.sqlite",
             the_traverse,
             [[[1, 2], [3, 4], [5, 6]], ([(2, 2)], [10, -1, 30])],
+        ),
+        (
+            "session_v1",
+            "sessions.sqlite",
+            the_sessions,
+            [("a" * 32, {"filter": "grid", "seed": 7}, 3, 4630.0), (2, [0.25, 0.75], [3]), True, (1, b"\x01\x02")],
         ),
         (
             "map_v1",

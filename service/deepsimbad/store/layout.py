@@ -34,6 +34,11 @@ def catalog_path(data_dir: Path) -> Path:
     return data_dir / "catalog.sqlite"
 
 
+def sessions_path(data_dir: Path) -> Path:
+    """The file of live sessions."""
+    return data_dir / "sessions.sqlite"
+
+
 def owners_folder(data_dir: Path) -> Path:
     """The folder of the lock files that tell living processes from dead ones."""
     return data_dir / "owners"

@@ -1,0 +1,145 @@
+"""The statements on journals and what belongs to them. Every function stands inside a transaction of its caller."""
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sqlite_utils import Database
+
+from deepsimbad.store.documents import from_json, row_reader, to_json
+from deepsimbad.store.session_records import IdempotencyKey, JournalRow, ObservedRow, PriorRow, StateSnapshot
+
+_INSERT = """
+    INSERT INTO journal (session, sequence, kind, written_at, expires_at, idempotency_key, request_digest,
+                         action_m, action_std_m, ranks, dissimilarities, encoding, is_flat, position_m, std_m)
+    VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)
+"""
+_SELECT = """
+    SELECT sequence, kind, expires_at, idempotency_key, request_digest, action_m, action_std_m, ranks,
+           dissimilarities, encoding, is_flat, position_m, std_m
+    FROM journal
+"""
+_MOST_IN_TWO_BYTES = 0xFFFF // 2
+
+
+def append(db: Database, session: int, row: JournalRow, written_at: float) -> None:
+    """Write a row; an IntegrityError where the sequence number or the key is taken."""
+    if isinstance(row, PriorRow):
+        values: tuple[Any, ...] = (
+            *("prior", written_at, row.expires_at),
+            *(None, None, None, None, None, None, None, 0),
+            *(row.position_m, row.std_m),
+        )
+    else:
+        named = row.idempotency
+        values = (
+            *("observation", written_at, row.expires_at),
+            *((named.key, named.digest) if named else (None, None)),
+            *(row.action_m, row.action_std_m, pack_ranks(row.ranks)),
+            *(_pack_float32(row.dissimilarities), _pack_float32(row.encoding), int(row.is_flat)),
+            *(None, None),
+        )
+    db.conn.execute(_INSERT, (session, row.sequence, *values))
+
+
+@row_reader
+def _row(found: tuple[Any, ...]) -> JournalRow:
+    sequence, kind, expires_at, key, digest, action_m, action_std_m, ranks, *views, is_flat, position_m, std_m = found
+    if kind == "prior":
+        return PriorRow(sequence, expires_at, position_m, std_m)
+    dissimilarities, encoding = (None if one is None else np.frombuffer(one, "<f4") for one in views)
+    return ObservedRow(
+        sequence,
+        expires_at,
+        action_m,
+        action_std_m,
+        unpack_ranks(ranks),
+        dissimilarities,
+        encoding,
+        bool(is_flat),
+        None if key is None else IdempotencyKey(key, digest),
+    )
+
+
+def read(db: Database, session: int, after: int, until: int) -> list[JournalRow]:
+    """The rows after one, up to and with another, in order."""
+    rows = db.execute(
+        f"{_SELECT} WHERE session = ? AND sequence > ? AND sequence <= ? ORDER BY sequence", [session, after, until]
+    )
+    return [_row(row) for row in rows]
+
+
+def named(db: Database, session: int, key: str) -> tuple[int, bytes] | None:
+    """Sequence number and request digest of the row with this idempotency key."""
+    found: tuple[int, bytes] | None = db.conn.execute(
+        "SELECT sequence, request_digest FROM journal WHERE session = ? AND idempotency_key = ?", (session, key)
+    ).fetchone()
+    return found
+
+
+def save_snapshot(db: Database, session: int, snapshot: StateSnapshot) -> None:
+    """Put a session's snapshot in place of its earlier one."""
+    db.execute("DELETE FROM snapshot WHERE session = ?", [session])
+    rows = []
+    for name, array in snapshot.arrays.items():
+        numbers = np.ascontiguousarray(array, array.dtype.newbyteorder("<"))
+        shape = to_json(list(array.shape))
+        rows.append((session, name, snapshot.sequence, numbers.dtype.str, shape, numbers.tobytes()))
+    db.conn.executemany(
+        "INSERT INTO snapshot (session, name, sequence, dtype, shape, body) VALUES (?, ?, ?, ?, ?, ?)", rows
+    )
+
+
+def read_snapshot(db: Database, session: int) -> StateSnapshot | None:
+    """A session's snapshot, if it has one."""
+    rows = db.execute("SELECT name, sequence, dtype, shape, body FROM snapshot WHERE session = ?", [session]).fetchall()
+    return _snapshot(tuple(rows)) if rows else None
+
+
+@row_reader
+def _snapshot(rows: tuple[Any, ...]) -> StateSnapshot:
+    arrays = {}
+    for name, _, dtype, shape, body in rows:
+        dimensions = tuple(from_json(shape))
+        if len(body) != math.prod(dimensions) * np.dtype(dtype).itemsize:
+            raise ValueError(f"array {name} is not whole")
+        arrays[name] = np.frombuffer(body, dtype).reshape(dimensions)
+    return StateSnapshot(rows[0][1], arrays)
+
+
+def save_true_positions(db: Database, session: int, position_m: NDArray[np.float64], received_at: float) -> None:
+    """Keep where the robot truly was at every observation of a session; the same again replaces it."""
+    db.execute(
+        "INSERT OR REPLACE INTO true_positions (session, received_at, position_m) VALUES (?, ?, ?)",
+        [session, received_at, np.ascontiguousarray(position_m, "<f8").tobytes()],
+    )
+
+
+def true_positions(db: Database, session: int) -> NDArray[np.float64] | None:
+    """What was fed back of a session, one position for every observation."""
+    row = db.execute("SELECT position_m FROM true_positions WHERE session = ?", [session]).fetchone()
+    return None if row is None else np.frombuffer(row[0], "<f8")
+
+
+def n_observations(db: Database, session: int) -> int:
+    """How many of a session's rows are observations."""
+    found = db.execute("SELECT count(*) FROM journal WHERE session = ? AND kind = 'observation'", [session])
+    return int(found.fetchone()[0])
+
+
+def pack_ranks(ranks: NDArray[np.float32]) -> bytes:
+    """Twice the ranks, which are whole or half numbers, as unsigned integers: 2 bytes each where they fit."""
+    doubled = np.rint(2.0 * ranks.astype(np.float64))
+    return doubled.astype("<u2" if ranks.size <= _MOST_IN_TWO_BYTES else "<u4").tobytes()
+
+
+def unpack_ranks(body: bytes) -> NDArray[np.float32]:
+    """What `pack_ranks` packed."""
+    n_two = len(body) // 2  # more than fit in two bytes each can only be half as many of four
+    dtype = "<u2" if n_two <= _MOST_IN_TWO_BYTES else "<u4"
+    return np.asarray(np.frombuffer(body, dtype) / 2, np.float32)
+
+
+def _pack_float32(values: NDArray[np.float32] | None) -> bytes | None:
+    return None if values is None else np.ascontiguousarray(values, "<f4").tobytes()

@@ -1,0 +1,78 @@
+"""The statements on sessions. Every function stands inside a transaction of its caller."""
+
+from typing import Any
+
+from sqlite_utils import Database
+
+from deepsimbad.errors import UnknownSessionError
+from deepsimbad.store.documents import from_json, row_reader, to_json
+from deepsimbad.store.session_records import SessionRecord
+
+_SELECT = """
+    SELECT session.number, session_id, domain, map_version, map_sha256, config, created_at,
+           coalesce(latest.expires_at, session.expires_at), coalesce(latest.sequence, 0), ending
+    FROM session LEFT JOIN journal AS latest
+      ON latest.session = session.number
+     AND latest.sequence = (SELECT max(sequence) FROM journal WHERE session = session.number)
+"""
+
+
+@row_reader
+def _record(row: tuple[Any, ...]) -> SessionRecord:
+    number, session_id, domain, map_version, map_sha256, config, *rest = row
+    return SessionRecord(number, session_id, domain, map_version, map_sha256, from_json(config), *rest)
+
+
+def insert(db: Database, record: SessionRecord) -> SessionRecord:
+    """Insert a session; its number is given by the file."""
+    db.execute(
+        """
+        INSERT INTO session (session_id, domain, map_version, map_sha256, config, created_at, expires_at)
+        VALUES (?, ?, ?, ?, ?, ?, ?)
+        """,
+        [
+            record.session_id,
+            record.domain,
+            record.map_version,
+            record.map_sha256,
+            to_json(record.config),
+            record.created_at,
+            record.expires_at,
+        ],
+    )
+    return get(db, record.session_id)
+
+
+def get(db: Database, session_id: str) -> SessionRecord:
+    """One session, living or ended; raises UnknownSessionError."""
+    row = None
+    if session_id.isascii():
+        row = db.execute(f"{_SELECT} WHERE session_id = ?", [session_id]).fetchone()
+    if row is None:
+        raise UnknownSessionError(f"there is no session {session_id!a}")
+    return _record(row)
+
+
+def living(db: Database) -> list[SessionRecord]:
+    """Every session that has not ended, oldest first."""
+    return [_record(row) for row in db.execute(f"{_SELECT} WHERE session.ended_at IS NULL ORDER BY session.number")]
+
+
+def living_of_domain(db: Database, domain: str) -> list[SessionRecord]:
+    """Every session of a domain that has not ended, oldest first."""
+    rows = db.execute(f"{_SELECT} WHERE domain = ? AND session.ended_at IS NULL ORDER BY session.number", [domain])
+    return [_record(row) for row in rows]
+
+
+def end(db: Database, number: int, ending: str, ended_at: float) -> bool:
+    """End a session; its journal stays until it is purged. Returns whether it had lived until now."""
+    ended = db.execute(
+        "UPDATE session SET ended_at = ?, ending = ? WHERE number = ? AND ended_at IS NULL", [ended_at, ending, number]
+    ).rowcount
+    db.execute("DELETE FROM snapshot WHERE session = ?", [number])
+    return bool(ended)
+
+
+def purge(db: Database, ended_before: float) -> int:
+    """Forget the sessions that ended before a moment, journals and all; returns how many."""
+    return int(db.execute("DELETE FROM session WHERE ended_at < ?", [ended_before]).rowcount)

@@ -1,0 +1,150 @@
+"""The file of live sessions: whatever was acknowledged to a robot survives kill -9 and a power cut."""
+
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+from sqlite_utils import Database
+
+from deepsimbad.store import journal_table, layout, session_table
+from deepsimbad.store.connection import migrate, open_database, use_write_ahead_log
+from deepsimbad.store.durable import sync_folder
+from deepsimbad.store.faults import storage_faults
+from deepsimbad.store.group_commit import GroupCommit
+from deepsimbad.store.session_records import JournalRow, SessionRecord, StateSnapshot
+from deepsimbad_migrations.session.migrations import migrations
+
+
+class SessionStore:
+    """Sessions and their journals; usable from any thread.
+
+    Writes are futures: done when they are on the disk, those of one moment in one transaction. Reads see what is
+    done. Every method, and every future, raises UnavailableError or DamagedFileError where the file cannot be used.
+
+    Args:
+        path: The file.
+        reading: The open file, for reads.
+        writing: The open file a second time, for writes.
+        on_commit: Called with the number of writes of every transaction.
+    """
+
+    def __init__(self, path: Path, reading: Database, writing: Database, on_commit: Callable[[int], None]) -> None:
+        self._path = path
+        self._db = reading
+        self._writing = writing
+        self._lock = threading.Lock()
+        self._commits = GroupCommit(writing, path, on_commit)
+
+    @classmethod
+    def open(cls, data_dir: Path, on_commit: Callable[[int], None] = lambda _: None) -> Self:
+        """Open the sessions of a data directory; makes the file where it is missing."""
+        path = layout.sessions_path(data_dir)
+        with storage_faults(path), ExitStack() as on_error:
+            data_dir.mkdir(parents=True, exist_ok=True)
+            writing = open_database(path, create=True)
+            on_error.callback(writing.close)
+            use_write_ahead_log(writing)
+            migrate(writing, migrations, path)
+            reading = open_database(path)
+            on_error.callback(reading.close)
+            sync_folder(data_dir)
+            on_error.pop_all()
+        return cls(path, reading, writing, on_commit)
+
+    def close(self) -> None:
+        """Commit what waits, then close the file."""
+        self._commits.close()
+        with self._lock:
+            self._db.close()
+            self._writing.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+    @contextmanager
+    def _reading(self) -> Iterator[Database]:
+        with self._lock, storage_faults(self._path), self._db.atomic() as db:
+            yield db
+
+    # Sessions
+
+    def create(self, record: SessionRecord) -> Future[SessionRecord]:
+        """Keep a new session; answers with the number that it got."""
+        return self._commits.submit(lambda db: session_table.insert(db, record))
+
+    def find(self, session_id: str) -> SessionRecord:
+        """One session, living or ended; raises UnknownSessionError."""
+        with self._reading() as db:
+            return session_table.get(db, session_id)
+
+    def living(self) -> list[SessionRecord]:
+        """Every session that has not ended, oldest first."""
+        with self._reading() as db:
+            return session_table.living(db)
+
+    def living_of_domain(self, domain: str) -> list[SessionRecord]:
+        """Every session of a domain that has not ended, oldest first."""
+        with self._reading() as db:
+            return session_table.living_of_domain(db, domain)
+
+    def end(self, number: int, ending: str, ended_at: float) -> Future[bool]:
+        """End a session ("deleted", "expired"); answers whether it had lived until now."""
+        return self._commits.submit(lambda db: session_table.end(db, number, ending, ended_at))
+
+    def purge(self, ended_before: float) -> Future[int]:
+        """Forget the sessions that ended before a moment; answers how many."""
+        return self._commits.submit(lambda db: session_table.purge(db, ended_before))
+
+    # What happened to them
+
+    def append(
+        self, number: int, row: JournalRow, written_at: float, snapshot: StateSnapshot | None = None
+    ) -> Future[None]:
+        """Write the next row of a session's journal, and with it a snapshot of the state after an earlier row.
+
+        The future raises InvalidInputError where another process has written a row of that sequence number.
+        """
+
+        def write(db: Database) -> None:
+            journal_table.append(db, number, row, written_at)
+            if snapshot is not None:
+                journal_table.save_snapshot(db, number, snapshot)
+
+        return self._commits.submit(write)
+
+    def history(self, number: int, until: int) -> tuple[StateSnapshot | None, list[JournalRow]]:
+        """What makes up the state after a row: the snapshot, if it is from before that row, and the rows since."""
+        with self._reading() as db:
+            snapshot = journal_table.read_snapshot(db, number)
+            if snapshot is not None and snapshot.sequence >= until:
+                snapshot = None
+            return snapshot, journal_table.read(db, number, snapshot.sequence if snapshot else 0, until)
+
+    def named(self, number: int, key: str) -> tuple[int, bytes] | None:
+        """Sequence number and request digest of the observation with this idempotency key."""
+        with self._lock, storage_faults(self._path):  # one statement needs no transaction, and this is on the hot path
+            return journal_table.named(self._db, number, key)
+
+    # Experience
+
+    def n_observations(self, number: int) -> int:
+        """How many observations a session's journal holds."""
+        with self._reading() as db:
+            return journal_table.n_observations(db, number)
+
+    def save_true_positions(self, number: int, position_m: NDArray[np.float64], received_at: float) -> Future[None]:
+        """Keep where the robot truly was at every observation of a session."""
+        return self._commits.submit(lambda db: journal_table.save_true_positions(db, number, position_m, received_at))
+
+    def true_positions(self, number: int) -> NDArray[np.float64] | None:
+        """What was fed back of a session, one position for every observation."""
+        with self._reading() as db:
+            return journal_table.true_positions(db, number)

@@ -1,0 +1,169 @@
+"""The file of live sessions."""
+
+import sqlite3
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from deepsimbad.errors import DamagedFileError, InvalidInputError, UnknownSessionError
+from deepsimbad.store.journal_table import pack_ranks, unpack_ranks
+from deepsimbad.store.session_records import IdempotencyKey, ObservedRow, PriorRow, SessionRecord, StateSnapshot
+from deepsimbad.store.sessions import SessionStore
+
+RECORD = SessionRecord(0, "s1", "campus", 3, "f" * 64, {"filter": "grid", "seed": 2**53}, 100.0, 200.0, 0, None)
+RANKS = np.array([1, 2.5, 2.5, 4], np.float32)
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Iterator[SessionStore]:
+    with SessionStore.open(tmp_path) as opened:
+        yield opened
+
+
+def observed(sequence: int, **changes: object) -> ObservedRow:
+    return replace(ObservedRow(sequence, 200.0 + sequence, 3.0, None, RANKS), **changes)  # type: ignore[arg-type]
+
+
+def test_a_session_is_found_again_as_it_was(store: SessionStore, tmp_path: Path) -> None:
+    made = store.create(RECORD).result()
+    assert made == replace(RECORD, number=made.number)
+    assert store.find("s1") == made
+    store.append(made.number, observed(1), 101.0).result()
+    store.append(made.number, PriorRow(2, 333.0, 1.0, 2.0), 102.0).result()
+    assert store.living() == [replace(made, expires_at=333.0, n_events=2)]
+    store.close()
+    with SessionStore.open(tmp_path) as again:
+        assert again.find("s1") == replace(made, expires_at=333.0, n_events=2)
+
+
+@pytest.mark.parametrize("name", ["s2", "", "\ud800", "s1 "])
+def test_an_unknown_session(store: SessionStore, name: str) -> None:
+    store.create(RECORD).result()
+    with pytest.raises(UnknownSessionError):
+        store.find(name)
+
+
+def test_rows_come_back_bit_for_bit(store: SessionStore) -> None:
+    number = store.create(RECORD).result().number
+    rng = np.random.default_rng(0)
+    row = observed(
+        1,
+        action_m=0.1 + 0.2,
+        action_std_m=1e-300,
+        dissimilarities=rng.normal(size=4).astype(np.float32),
+        encoding=rng.normal(size=7).astype(np.float32),
+        is_flat=True,
+        idempotency=IdempotencyKey("k", b"\x00\xff"),
+    )
+    store.append(number, row, 1.0).result()
+    _, (found,) = store.history(number, 1)
+    assert isinstance(found, ObservedRow)
+    for name in ("ranks", "dissimilarities", "encoding"):
+        assert getattr(found, name).dtype == np.float32
+        np.testing.assert_array_equal(getattr(found, name), getattr(row, name))
+    plain = {"ranks": RANKS, "dissimilarities": None, "encoding": None}
+    assert str(replace(found, **plain)) == str(replace(row, **plain))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("n_landmarks", [1, 2, 500, 32_767, 32_768, 65_535])
+def test_ranks_of_any_map_fit(n_landmarks: int) -> None:
+    ranks = np.random.default_rng(1).permutation(n_landmarks).astype(np.float32) + 1
+    ranks[: n_landmarks // 2] = (n_landmarks + 1) / 2
+    packed = pack_ranks(ranks)
+    assert len(packed) == n_landmarks * (2 if n_landmarks < 32_768 else 4)
+    np.testing.assert_array_equal(unpack_ranks(packed), ranks)
+
+
+def test_a_sequence_number_or_key_is_taken_once(store: SessionStore) -> None:
+    number = store.create(RECORD).result().number
+    named = IdempotencyKey("k", b"d")
+    store.append(number, observed(1, idempotency=named), 1.0).result()
+    with pytest.raises(InvalidInputError):
+        store.append(number, observed(1), 1.0).result()
+    with pytest.raises(InvalidInputError):
+        store.append(number, observed(2, idempotency=named), 1.0).result()
+    assert store.named(number, "k") == (1, b"d")
+    assert store.named(number, "other") is None
+    other = store.create(replace(RECORD, session_id="s2")).result().number
+    store.append(other, observed(1, idempotency=named), 1.0).result()  # keys are a session's own
+    assert len(store.history(number, 9)[1]) == 1
+
+
+def test_history_begins_behind_the_snapshot(store: SessionStore) -> None:
+    number = store.create(RECORD).result().number
+    arrays = {"mass": np.array([0.1, 0.9]), "count": np.array(3), "none": np.zeros((0, 2), np.float32)}
+    for sequence in range(1, 6):
+        snapshot = StateSnapshot(sequence - 1, arrays) if sequence in {3, 5} else None
+        store.append(number, observed(sequence), 1.0, snapshot).result()
+    snapshot, rows = store.history(number, 5)
+    assert snapshot is not None
+    assert snapshot.sequence == 4
+    assert [row.sequence for row in rows] == [5]
+    for name, array in arrays.items():
+        assert snapshot.arrays[name].dtype == array.dtype
+        np.testing.assert_array_equal(snapshot.arrays[name], array)
+    snapshot, rows = store.history(number, 4)  # a state from before the snapshot is made from the beginning
+    assert snapshot is None
+    assert [row.sequence for row in rows] == [1, 2, 3, 4]
+
+
+def test_ended_sessions_are_remembered_until_they_are_purged(store: SessionStore) -> None:
+    numbers = [store.create(replace(RECORD, session_id=f"s{n}")).result().number for n in range(3)]
+    for number in numbers:
+        store.append(number, observed(1), 1.0).result()
+    assert store.end(numbers[0], "deleted", 1000.0).result() is True
+    assert store.end(numbers[0], "expired", 1001.0).result() is False
+    assert store.end(numbers[1], "expired", 2000.0).result() is True
+    assert [one.session_id for one in store.living()] == ["s2"]
+    assert [one.session_id for one in store.living_of_domain("campus")] == ["s2"]
+    assert store.living_of_domain("elsewhere") == []
+    assert store.find("s0").ending == "deleted"
+    assert store.purge(1500.0).result() == 1
+    with pytest.raises(UnknownSessionError):
+        store.find("s0")
+    assert store.history(numbers[0], 9) == (None, [])
+    assert store.find("s1").ending == "expired"
+    assert store.n_observations(numbers[1]) == 1  # its journal may still be learnt from
+
+
+def test_true_positions(store: SessionStore) -> None:
+    number = store.create(RECORD).result().number
+    store.append(number, observed(1), 1.0).result()
+    store.append(number, PriorRow(2, 1.0, 1.0, 1.0), 1.0).result()
+    store.append(number, observed(3), 1.0).result()
+    assert store.n_observations(number) == 2
+    assert store.true_positions(number) is None
+    for position_m in ([1.0, 2.0], [1.0, 2.5]):
+        store.save_true_positions(number, np.array(position_m), 5.0).result()
+    found = store.true_positions(number)
+    assert found is not None
+    assert found.tolist() == [1.0, 2.5]
+
+
+def test_a_file_of_another_kind_is_named(tmp_path: Path) -> None:
+    (tmp_path / "sessions.sqlite").write_bytes(b"no database at all, " * 100)
+    with pytest.raises(DamagedFileError, match=r"sessions\.sqlite"):
+        SessionStore.open(tmp_path)
+
+
+def test_a_damaged_row_is_named(store: SessionStore, tmp_path: Path) -> None:
+    number = store.create(RECORD).result().number
+    store.append(number, observed(1), 1.0, StateSnapshot(1, {"mass": np.ones(3)})).result()
+    with sqlite3.connect(tmp_path / "sessions.sqlite") as other:
+        other.execute("UPDATE snapshot SET body = x'00'")
+    other.close()
+    with pytest.raises(DamagedFileError):
+        store.history(number, 2)
+
+
+def test_an_append_is_on_the_disk_when_it_is_answered(store: SessionStore, tmp_path: Path) -> None:
+    number = store.create(RECORD).result().number
+    store.append(number, observed(1), 1.0).result()
+    for name in ("sessions.sqlite", "sessions.sqlite-wal"):  # what a power cut would leave
+        (tmp_path / "copy").mkdir(exist_ok=True)
+        (tmp_path / "copy" / name).write_bytes((tmp_path / name).read_bytes())
+    with SessionStore.open(tmp_path / "copy") as found:
+        assert found.find("s1").n_events == 1
