@@ -5,24 +5,17 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.colors import LogNorm
-from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 from numpy.typing import NDArray
 
 from deepsimbad_client.map_route import Truth, path_of_frames
+from deepsimbad_client.plot_style import CHANCE, DOT, GRID, INK, LINE, new_figure, quiet, saved
 from deepsimbad_client.recording import Frame
 from deepsimbad_client.replay import Replay
 from deepsimbad_client.step_log import Step
 
-INK = "#22303c"
-QUIET = "#8a97a3"
-GRID = "#e3e8ec"
-DOT = "#7fa3cf"
-LINE = "#1f4e8c"
-CHANCE = "#d1495b"
 LEAST_PERCENT = 0.01
 """Ranks are drawn on a logarithmic axis; a perfect 0 stands at its foot."""
 PERCENT_TICKS = (0.01, 0.1, 1, 10, 50, 100)
@@ -50,7 +43,7 @@ def rank_along_route(scored: Sequence[Step], title: str, path: Path) -> Path:
     position_m = np.array([step.position_m for step in scored])
     percent = _ranks(scored)
     order = np.argsort(position_m, kind="stable")
-    figure, axes = _figure(title, "Rank of the true place along the route", (11, 4.6))
+    figure, axes = new_figure(title, "Rank of the true place along the route", (11, 4.6))
     axes.scatter(position_m, np.maximum(percent, LEAST_PERCENT), s=11, color=DOT, alpha=0.75, lw=0, label="query")
     window = max(5, len(scored) // 40) | 1
     smooth = _running_median(percent[order], window)
@@ -69,13 +62,13 @@ def rank_along_route(scored: Sequence[Step], title: str, path: Path) -> Path:
     axes.set_ylabel("map images placed before the truth [%]")
     axes.margins(x=0.01)
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncol=4, frameon=False, fontsize=9)
-    return _save(figure, path)
+    return saved(figure, path)
 
 
 def rank_distribution(scored: Sequence[Step], title: str, path: Path) -> Path:
     """Draw how many queries came how near the top: a histogram and, over it, the share up to each rank."""
     percent = np.maximum(_ranks(scored), LEAST_PERCENT)
-    figure, axes = _figure(title, "How near the top the true place comes", (8.6, 4.6))
+    figure, axes = new_figure(title, "How near the top the true place comes", (8.6, 4.6))
     bins = np.geomspace(LEAST_PERCENT, 100, 33)
     axes.hist(percent, bins=bins.tolist(), color=DOT, edgecolor="white", lw=0.6)
     axes.set_ylabel("queries", color=DOT)
@@ -87,7 +80,7 @@ def rank_distribution(scored: Sequence[Step], title: str, path: Path) -> Path:
     share.step(np.append(ordered, 100), np.append(cumulative, 100), where="post", color=LINE, lw=2)
     share.set_ylim(0, 103)
     share.set_ylabel("queries up to this rank [%]", color=LINE)
-    _quiet(share)
+    quiet(share)
     share.spines["right"].set_visible(True)
     share.spines["right"].set_color(GRID)
     share.grid(visible=False)
@@ -102,7 +95,7 @@ def rank_distribution(scored: Sequence[Step], title: str, path: Path) -> Path:
             fontsize=9,
             color=INK,
         )
-    return _save(figure, path)
+    return saved(figure, path)
 
 
 def relevance_heat(replay: Replay, title: str, path: Path) -> Path:
@@ -110,7 +103,7 @@ def relevance_heat(replay: Replay, title: str, path: Path) -> Path:
     values = np.asarray(replay.heat.values, np.float32)
     n_rows = len(values)
     n_images = replay.route.n_images
-    figure, axes = _figure(title, "Relevance of the map to every query", (8.4, 7.2))
+    figure, axes = new_figure(title, "Relevance of the map to every query", (8.4, 7.2))
     known = values[np.isfinite(values)]
     low, high = float(np.quantile(known, 0.5)), float(np.quantile(known, 0.999))
     picture = axes.imshow(
@@ -137,7 +130,7 @@ def relevance_heat(replay: Replay, title: str, path: Path) -> Path:
     bar.set_label("standard deviations above the query's mean", color=INK)
     bar.outline.set_visible(False)
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.08), frameon=False, fontsize=9)
-    return _save(figure, path)
+    return saved(figure, path)
 
 
 def route_map(replay: Replay, scored: Sequence[Step], title: str, path: Path) -> Path:
@@ -147,7 +140,7 @@ def route_map(replay: Replay, scored: Sequence[Step], title: str, path: Path) ->
     y = np.array([step.y_m for step in placed], float)
     error = np.array([step.error_m for step in placed], float)
     route = replay.route.path
-    figure, axes = _figure(title, "Where the best match misses", (8.6, 7.2))
+    figure, axes = new_figure(title, "Where the best match misses", (8.6, 7.2))
     axes.plot(route.x_m, route.y_m, color="#c9d2d9", lw=5, solid_capstyle="round", zorder=1, label="map")
     tolerance = float(replay.identity["tolerance_m"])
     far = [step for step in placed if (step.error_m or 0) > 5 * tolerance and step.best_x_m is not None]
@@ -176,7 +169,7 @@ def route_map(replay: Replay, scored: Sequence[Step], title: str, path: Path) ->
     bar.ax.yaxis.set_minor_locator(NullLocator())
     bar.outline.set_visible(False)
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.08), ncol=2, frameon=False, fontsize=9)
-    return _save(figure, path)
+    return saved(figure, path)
 
 
 def _true_places(replay: Replay) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -201,25 +194,6 @@ def _running_median(values: NDArray[np.float64], window: int) -> NDArray[np.floa
     return np.array([np.median(values[max(0, at - half) : at + half + 1]) for at in range(len(values))])
 
 
-def _figure(title: str, heading: str, size: tuple[float, float]) -> tuple[Figure, Axes]:
-    figure = Figure(figsize=size, dpi=130, layout="constrained", facecolor="white")
-    FigureCanvasAgg(figure)
-    axes = figure.subplots()
-    axes.set_title(heading, loc="left", fontsize=14, fontweight="bold", color=INK, pad=24)
-    axes.text(0, 1.025, title, transform=axes.transAxes, fontsize=10, color=QUIET, parse_math=False)
-    _quiet(axes)
-    return figure, axes
-
-
-def _quiet(axes: Axes) -> None:
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.spines[["left", "bottom"]].set_color(QUIET)
-    axes.tick_params(colors=INK, which="both", color=GRID)
-    axes.xaxis.label.set_color(INK)
-    axes.grid(color=GRID, lw=0.8)
-    axes.set_axisbelow(True)
-
-
 def _percent_axis(axes: Axes, which: str) -> None:
     axis = axes.xaxis if which == "x" else axes.yaxis
     if which == "x":
@@ -231,8 +205,3 @@ def _percent_axis(axes: Axes, which: str) -> None:
     axis.set_major_locator(FixedLocator(PERCENT_TICKS))
     axis.set_minor_locator(NullLocator())
     axis.set_major_formatter(FuncFormatter(lambda value, _: "0" if value <= LEAST_PERCENT else f"{value:g}"))
-
-
-def _save(figure: Figure, path: Path) -> Path:
-    figure.savefig(path)
-    return path

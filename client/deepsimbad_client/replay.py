@@ -105,7 +105,7 @@ def replay(
     }
     ask = _asker(client, recording, domain, described.input_size, clock)
     with StepLog(folder, identity, restart=restart) as log:
-        route = _fetch_route(client, recording, described)
+        route = fetch_route(client, recording, described)
         truth = Truth(path_of_frames(frames), route, tolerance_m)
         heat = RelevanceHeat.open(folder / "relevance_heat.npy", len(frames), route.n_images, bool(log.done))
         todo = [query for query in range(len(frames)) if query not in log.done]
@@ -114,7 +114,7 @@ def replay(
                 on_progress(step, number)
         for query, asked in in_order(lambda query: ask(frames[query]), todo, concurrency):
             if asked.relevance is not None and len(asked.relevance) != route.n_images:
-                raise _changed_map(domain)
+                raise changed_map(domain)
             step = _step(query, frames[query], asked, route, truth)
             if asked.relevance is not None:
                 heat.add(query, asked.relevance)
@@ -123,16 +123,21 @@ def replay(
                 on_progress(step, len(log.done))
         heat.flush()
         if client.domain(domain).map_version != described.map_version:
-            raise _changed_map(domain)
+            raise changed_map(domain)
         return Replay(folder, log.steps(), route, heat, identity, clock() - started)
 
 
-def _changed_map(domain: str) -> ReplayError:
+def changed_map(domain: str) -> ReplayError:
+    """The error for a map that was switched while a replay ran."""
     return ReplayError(f"the active map of {domain} changed during the replay: restart it against the new one")
 
 
-def _fetch_route(client: Client, recording: Recording, domain: Domain) -> MapRoute:
-    """Learn where every map image lies from one answer that lists them all."""
+def fetch_route(client: Client, recording: Recording, domain: Domain) -> MapRoute:
+    """Learn where every map image lies from one answer that lists them all.
+
+    Raises:
+        ReplayError: No frame can be used, or the active map is not the one described.
+    """
     for query, frame in enumerate(recording.frames):
         view: dict[str, Any]
         if recording.encodings is not None:
@@ -151,7 +156,7 @@ def _fetch_route(client: Client, recording: Recording, domain: Domain) -> MapRou
             continue
         route = map_route_of(answer, closed=domain.closed, length_m=domain.route_length_m or 0.0)
         if answer.map_version != domain.map_version or route.n_images != domain.n_map_images:
-            raise _changed_map(domain.name)
+            raise changed_map(domain.name)
         return route
     raise ReplayError(f"none of the {len(recording.frames)} frames of {recording.name} can be used")
 

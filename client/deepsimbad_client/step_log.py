@@ -1,13 +1,11 @@
 """The steps of a replay as lines of JSON, appended as they come and read again when it goes on."""
 
-import json
-import os
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from deepsimbad_client.errors import ReplayError
+from deepsimbad_client.journal import Journal
 
 
 @dataclass(frozen=True)
@@ -59,7 +57,7 @@ _FIELDS = frozenset(field.name for field in fields(Step))
 
 
 class StepLog:
-    """A replay's folder: `replay.json` says what is replayed, `steps.jsonl` what came back so far.
+    """A passive replay's folder: `replay.json` says what is replayed, `steps.jsonl` what came back so far.
 
     Args:
         folder: Made when it does not exist.
@@ -71,19 +69,12 @@ class StepLog:
     """
 
     def __init__(self, folder: Path, identity: dict[str, Any], *, restart: bool = False) -> None:
-        self.folder = folder
-        self._steps_file = folder / "steps.jsonl"
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            self.done = self._resume(identity, restart)
-            self._stream = self._steps_file.open("ab")
-        except OSError as error:
-            raise ReplayError(f"cannot write to {folder}: {error.strerror or error}") from error
+        self._journal = Journal(folder, "steps.jsonl", identity, _step, "step", restart=restart)
+        self.done = {step.query: step for step in self._journal.earlier}
 
     def append(self, step: Step) -> None:
         """Write a step down; it is in the hands of the operating system when this returns."""
-        self._stream.write(json.dumps(asdict(step), allow_nan=False).encode() + b"\n")
-        self._stream.flush()
+        self._journal.append(asdict(step))
         self.done[step.query] = step
 
     def steps(self) -> list[Step]:
@@ -92,7 +83,7 @@ class StepLog:
 
     def close(self) -> None:
         """Close the file."""
-        self._stream.close()
+        self._journal.close()
 
     def __enter__(self) -> Self:
         return self
@@ -105,47 +96,6 @@ class StepLog:
     ) -> None:
         self.close()
 
-    def _resume(self, identity: dict[str, Any], restart: bool) -> dict[int, Step]:
-        identity_file = self.folder / "replay.json"
-        if not restart and identity_file.exists():
-            earlier = _document(identity_file)
-            differing = [key for key in identity if earlier.get(key) != identity[key]]
-            if differing:
-                was = ", ".join(f"{key} {earlier.get(key)!r}, now {identity[key]!r}" for key in differing)
-                raise ReplayError(
-                    f"{self.folder} holds another replay ({was}): name another folder, or restart this one"
-                )
-            return self._read()
-        self._steps_file.unlink(missing_ok=True)
-        written = identity_file.with_suffix(".tmp")
-        written.write_text(json.dumps(identity, indent=2) + "\n")
-        written.replace(identity_file)
-        return {}
 
-    def _read(self) -> dict[int, Step]:
-        """Read the whole lines; a torn last one, left by a crash, is cut off."""
-        if not self._steps_file.exists():
-            return {}
-        content = self._steps_file.read_bytes()
-        whole = content[: content.rfind(b"\n") + 1]
-        if len(whole) != len(content):
-            os.truncate(self._steps_file, len(whole))
-        done = {}
-        for number, line in enumerate(whole.splitlines(), start=1):
-            try:
-                step = Step(**{key: value for key, value in json.loads(line).items() if key in _FIELDS})
-            except (ValueError, TypeError, AttributeError) as error:
-                raise ReplayError(
-                    f"line {number} of {self._steps_file} is no step: restart the replay or repair it"
-                ) from error
-            done[step.query] = step
-        return done
-
-
-def _document(path: Path) -> dict[str, Any]:
-    """The JSON object in a file; empty where the file holds none."""
-    try:
-        document = json.loads(path.read_bytes())
-    except ValueError:
-        return {}
-    return document if isinstance(document, dict) else {}
+def _step(document: dict[str, Any]) -> Step:
+    return Step(**{key: value for key, value in document.items() if key in _FIELDS})
