@@ -163,7 +163,7 @@ class Client:
             domain: Where the robot is.
             start_position_m: About where it starts along the route; absent: anywhere.
             start_std_m: How well that is known; absent: the service's default.
-            seed: Of everything drawn at random; absent: the service draws one.
+            seed: Of everything drawn at random; absent: the service's default.
             planner: Who chooses the next view (`nnql`, `random`, `constant:3`, ...); absent: the service's default.
             belief: `particle` or `grid`; absent: the service's default.
             update: How a view changes the belief; absent: the map's default.

@@ -37,6 +37,7 @@ class FakeService:
     Attributes:
         asked: Every request, as "VERB path".
         lose_answers: Called with every request that was acted on; True: its answer is lost on the way.
+        doubt: What every place is given whatever is seen.
         plans: Whether next-best views are given.
     """
 
@@ -47,6 +48,7 @@ class FakeService:
         self.lose_answers: Callable[[httpx2.Request], bool] = lambda request: False
         self.plans = True
         self.map_version = 3
+        self.doubt = 0.02
         self._lock = threading.Lock()
 
     def client(self) -> Client:
@@ -70,7 +72,10 @@ class FakeService:
             case "GET", ["domains", name]:
                 return httpx2.Response(200, json=self._domain(name))
             case "POST", ["domains", _, "localizations"]:
-                mass = self._updated(np.full(N_IMAGES, 1 / N_IMAGES), json.loads(request.content))
+                view = json.loads(request.content)
+                if len(view["encoding"]) != 2:
+                    return problem(422, "undecodable_image")
+                mass = self._updated(np.full(N_IMAGES, 1 / N_IMAGES), view)
                 answer = self._answer(mass, None, int(request.url.params["shortlist"]))
                 return httpx2.Response(200, json=answer)
             case "POST", ["domains", name, "sessions"]:
@@ -155,10 +160,9 @@ class FakeService:
         session.answers[key] = (digest, answer)
         return httpx2.Response(200, json=answer)
 
-    @staticmethod
-    def _updated(mass: np.ndarray, view: dict[str, Any]) -> np.ndarray:
+    def _updated(self, mass: np.ndarray, view: dict[str, Any]) -> np.ndarray:
         place, spread = view["encoding"]
-        return normal(mass * (np.exp(-0.5 * ((np.arange(N_IMAGES) - place) / spread) ** 2) + 0.02))
+        return normal(mass * (np.exp(-0.5 * ((np.arange(N_IMAGES) - place) / spread) ** 2) + self.doubt))
 
     def _plan(self, session: FakeSession | None) -> dict[str, Any] | None:
         if session is None or not self.plans:
