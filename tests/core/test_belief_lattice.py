@@ -1,0 +1,117 @@
+"""The training lattice against the filter that serves."""
+
+import numpy as np
+import pytest
+
+from deepsimbad.core.belief_lattice import Lattice, Moves, moves_along, step_beliefs, uniform_beliefs
+from deepsimbad.core.grid_filter import GridFilter
+from deepsimbad.core.metrics import rank_of_truth
+from deepsimbad.core.route import Route
+from deepsimbad.core.update_rules import UpdateRule, evidence
+
+STILL = -1
+
+
+def equal_route(n: int, spacing_m: float, closed: bool) -> Route:
+    return Route(5.0 + spacing_m * np.arange(n), closed)
+
+
+def at_first_view(moves: Moves, action: int, first: bool) -> Moves:
+    shift = np.array([STILL if first else moves.shift[action]])
+    return Moves(shift, moves.fraction[[action]], moves.taps[[action]])
+
+
+@pytest.mark.parametrize("closed", [False, True])
+@pytest.mark.parametrize("rule", [UpdateRule.ADDITIVE_RELEVANCE, UpdateRule.LOG_LIKELIHOOD])
+@pytest.mark.parametrize(("spacing_m", "actions_m"), [(1.0, (1.0, 4.0)), (0.2, (1.0, 3.0)), (0.5, (1.3, 0.2))])
+def test_on_equal_steps_the_beliefs_are_those_of_the_grid_filter(closed, rule, spacing_m, actions_m):
+    route = equal_route(120, spacing_m, closed)
+    lattice = Lattice.along(route, 0.0)  # not cut to the moves: the cells are the images
+    assert lattice.n_cells == 120
+    stds_m = [0.72, 0.33]  # cut off between two images, so that rounding decides nothing
+    moves = moves_along(lattice, actions_m, stds_m)
+    beliefs = uniform_beliefs(lattice, 1)
+    slow = GridFilter.uniform(route)
+    rng = np.random.default_rng(3)
+    for step in range(9):
+        action = int(rng.integers(2))
+        relevance = rng.gamma(0.3, 4.0, 120).astype(np.float32)
+        if step:
+            slow = slow.predicted(actions_m[action], stds_m[action], step)
+        slow = slow.updated(relevance, rule, step)
+        factors = evidence(relevance, rule).astype(np.float32)[np.newaxis]
+        truth = int(rng.integers(120))
+        rank = step_beliefs(
+            lattice,
+            beliefs,
+            at_first_view(moves, action, step == 0),
+            factors,
+            np.array([truth]),
+            additive=rule is UpdateRule.ADDITIVE_RELEVANCE,
+        )
+        mass = beliefs[0].astype(np.float64) / beliefs[0].sum(dtype=np.float64)
+        assert np.abs(mass - slow.mass).max() <= 2e-5 * slow.mass.max()
+        assert rank[0] == rank_of_truth(beliefs[0], np.array([truth]))
+
+
+def test_beliefs_do_not_touch_each_other_and_ranks_count_images():
+    route = equal_route(50, 1.0, closed=False)
+    lattice = Lattice.along(route, 1.0)
+    moves = moves_along(lattice, (1.0, 5.0), (0.4, 0.9))
+    rng = np.random.default_rng(0)
+    seen = rng.random((3, 50), np.float32)
+    both = uniform_beliefs(lattice, 3)
+    each = [uniform_beliefs(lattice, 1) for _ in range(3)]
+    for turn in range(4):
+        action = rng.integers(0, 2, 3)
+        steps = Moves(moves.shift[action] if turn else np.full(3, STILL), moves.fraction[action], moves.taps[action])
+        ranks = step_beliefs(lattice, both, steps, seen, np.array([7, 40, -1]), additive=True)
+        assert ranks[2] == -1
+        for place, belief in enumerate(each):
+            one = Moves(steps.shift[[place]], steps.fraction[[place]], steps.taps[[place]])
+            alone = step_beliefs(lattice, belief, one, seen[[place]], np.array([7]), additive=True)
+            assert np.array_equal(both[place], belief[0])
+            assert place > 0 or alone[0] == ranks[0] == rank_of_truth(belief[0], np.array([7]))
+
+
+def test_uneven_images_take_the_cell_nearest_to_them():
+    position_m = np.array([0.0, 0.0, 0.0, 1.1, 1.9, 3.0, 3.0, 6.0])
+    lattice = Lattice.along(Route(position_m), 1.0)
+    assert lattice.step_m == 1.0
+    assert lattice.cell_of_image.tolist() == [0, 0, 0, 1, 2, 3, 3, 6]
+    assert lattice.images_in_cell.tolist() == [3, 1, 1, 2, 0, 0, 1]
+    assert [position_m[i] for i in lattice.image_of_cell] == [0.0, 1.1, 1.9, 3.0, 3.0, 6.0, 6.0]
+    seen = np.array([[0, 0, 0, 1, 5, 2, 2, 0]], np.float32)
+    first = Moves(np.array([STILL]), np.zeros(1, np.float32), np.ones((1, 1), np.float32))
+    rank = step_beliefs(lattice, uniform_beliefs(lattice, 1), first, seen, np.array([5]), additive=True)
+    assert rank[0] == 1 + 0.5  # the image at 1.9 is better, the other at 3.0 is tied
+
+
+def test_a_belief_that_would_be_wholly_past_the_end_stays():
+    lattice = Lattice.along(equal_route(10, 1.0, closed=False), 1.0)
+    beliefs = np.zeros((1, 10), np.float32)
+    beliefs[0, 8] = 1
+    moves = moves_along(lattice, (3.0,), (0.0,))
+    rank = step_beliefs(lattice, beliefs, moves, np.ones((1, 10), np.float32), np.array([8]), additive=False)
+    assert rank[0] == 0
+    assert beliefs[0].argmax() == 8
+
+
+def test_evidence_against_every_place_is_not_believed():
+    lattice = Lattice.along(equal_route(10, 1.0, closed=False), 1.0)
+    beliefs = uniform_beliefs(lattice, 1)
+    moves = moves_along(lattice, (1.0,), (0.0,))
+    step_beliefs(lattice, beliefs, moves, np.zeros((1, 10), np.float32), np.array([8]), additive=False)
+    assert beliefs[0, 0] == 0
+    assert np.allclose(beliefs[0, 1:], 10 / 9)
+
+
+def test_one_place_and_one_image():
+    for position_m in ([2.0], [2.0, 2.0, 2.0]):
+        lattice = Lattice.along(Route(np.array(position_m)), 1.0)
+        assert lattice.n_cells == len(position_m) or lattice.n_cells == 1
+        beliefs = uniform_beliefs(lattice, 1)
+        moves = moves_along(lattice, (1.0,), (0.5,))
+        seen = np.ones((1, len(position_m)), np.float32)
+        rank = step_beliefs(lattice, beliefs, moves, seen, np.array([0]), additive=True)
+        assert rank[0] == 0.5 * (len(position_m) - 1)
