@@ -88,3 +88,20 @@ def m002_packed_experience(db: Database) -> None:
         ALTER TABLE q_value_packed RENAME TO q_value;
         """
     )
+
+
+@migrations()
+def m003_calibration(db: Database) -> None:
+    """What two seasons of the route taught: trust in landmarks, telling places, views from off the route."""
+    db.execute(
+        """
+        CREATE TABLE calibration (
+            name TEXT NOT NULL,
+            part INTEGER NOT NULL,
+            dtype TEXT NOT NULL,
+            shape TEXT NOT NULL,
+            body BLOB NOT NULL,
+            PRIMARY KEY (name, part)
+        )
+        """
+    )

@@ -81,7 +81,7 @@ def vpr(
             truth = true_images_of(queries.route, mapped.route, tolerance)
         else:
             truth = read_ground_truth(ground_truth, queries.frames.index, mapped.frames.index)
-        report = run_vpr(config, judge, candidates.encodings, mapped, queries, truth, progress)
+        report = run_vpr(config, judge, candidates, mapped, queries, truth, progress)
     sources = {
         "landmarks": landmarks,
         "training": training,

@@ -1,30 +1,30 @@
 """How far each landmark can be trusted across seasons, learnt where two seasons of one route are known (ours).
 
-A map knows the route in two domains: the training traverse that became the map, and the landmark traverse. Wherever
-both saw the same place, their standardised scores of a landmark are a sample of what a live view of a third season
-will score against the map. Their correlation `rho` says how much of a landmark's score belongs to the place. Between
-two standard normal scores of that correlation, the log-likelihood ratio of "seen from the place that lists it" against
-"seen from anywhere" is, for equal spread,
+A map knows the route in two domains: the training traverse that becomes the map, and the landmark traverse. Where both
+saw the same place, their standardised scores of a landmark are a sample of what a view of a third season will score
+against the map. Their correlation `rho` says how much of a landmark's score belongs to the place. A map image lists
+the landmarks that were near in both seasons, and between its score z_m and the query's z_q, standard normal with
+correlation rho, the log-likelihood ratio of "seen from the place that lists it" against "seen from anywhere" is, for
+equal spread,
 
-    rho * z_q * z_m - rho^2 * z_m^2 / 2
+    rho * z_m * z_q - (rho * z_m)^2 / 2.
 
-with z_q the score in the query and z_m the map image's. The map stores no z_m; its mean over the images that list the
-landmark at that rank stands for it.
+The map stores no z_m; its mean over the images that list the landmark at that rank stands for it.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from deepsimbad.core.statistics import LandmarkStatistics
 
-# A live season differs from both that the map knows: its own views soon say more than their statistics do.
+# A live season differs from those that the map knows: its own views soon say more than their statistics do.
 CALIBRATED_PRIOR_WEIGHT_FRAMES = 20.0
 # Without two seasons of one place nothing can be learnt; this is what the development recordings show on average.
 DEFAULT_CORRELATION = 0.6
+SECOND_SEASON_WEIGHT = 0.6  # of its score against the map's own, in choosing what an image lists
 _LEAST_MEAN_CORRELATION = 0.15  # below, the two traverses did not see the same places, whatever their positions say
 _LEAST_PAIRS = 30
 _BOUNDS = (0.05, 0.95)
@@ -36,50 +36,74 @@ class Calibration:
     """The model of every landmark.
 
     Attributes:
-        correlation: [r] float64, rho.
+        correlation: [r] float64, rho: of what an image's list says with a view of another season.
         listed_score: [h, r] float64, mean standardised score of landmark i where a map image lists it at rank j + 1.
-        is_learnt: Whether the correlations were learnt from two seasons, or are the default.
+        is_of_two_seasons: Whether the correlations were learnt, or are the default.
     """
 
     correlation: NDArray[np.float64]
     listed_score: NDArray[np.float64]
-    is_learnt: bool
+    is_of_two_seasons: bool = False
+
+    def log_ratios(self, scores: NDArray[np.float64]) -> NDArray[np.float64]:
+        """What every landmark is worth at every rank of a list, [h, r], for a query's standardised scores [r]."""
+        expected = self.correlation * self.listed_score
+        return expected * scores - np.square(expected) / 2
+
+
+@dataclass(frozen=True)
+class SeasonsOfRoute:
+    """The standardised scores of the map images over the seasons that are known.
+
+    Attributes:
+        scores: [n, r] float64, of both seasons where both are known, else of the map's own; about standard normal.
+        correlation: [r] float64, of these scores with a season not yet seen.
+        are_two: Whether a second season was learnt from.
+    """
+
+    scores: NDArray[np.float64]
+    correlation: NDArray[np.float64]
+    are_two: bool
 
     @classmethod
     def learn(
         cls,
-        map_scores: NDArray[np.float64],
-        lists: NDArray[np.uint16],
-        pairs: tuple[NDArray[np.float64], NDArray[np.float64]] | None,
-    ) -> Self:
-        """Learn from the map, and from places seen in two seasons where there are any.
+        own: NDArray[np.float64],
+        second: NDArray[np.float64] | None = None,
+        places: NDArray[np.int64] | None = None,
+    ) -> "SeasonsOfRoute":
+        """Combine the seasons.
 
         Args:
-            map_scores: [n, r] standardised scores of the map images, by the map's own statistics.
-            lists: [h, n], their lists.
-            pairs: Standardised scores of the same places in the map and in the landmark traverse, [m, r] each, each by
-                its own traverse's statistics; None where the traverses share no place.
+            own: [n, r] scores of the map images by the map's own statistics.
+            second: [m, r] scores of the landmark traverse's frames by theirs.
+            places: [k, 2] (map image, frame) of the same place.
         """
-        correlation = np.full(map_scores.shape[1], DEFAULT_CORRELATION)
-        is_learnt = False
-        if pairs is not None and len(pairs[0]) >= _LEAST_PAIRS:
-            in_map, in_landmarks = pairs
-            learnt = np.einsum("mr,mr->r", in_map, in_landmarks) / len(in_map)
-            if learnt.mean() >= _LEAST_MEAN_CORRELATION:
-                correlation, is_learnt = np.clip(learnt, *_BOUNDS), True
-        return cls(correlation, _listed_scores(map_scores, lists), is_learnt)
+        single = cls(own, np.full(own.shape[1], DEFAULT_CORRELATION), are_two=False)
+        if second is None or places is None or len(places) < _LEAST_PAIRS:
+            return single
+        of_map, of_second = places.T
+        between = np.einsum("kr,kr->r", own[of_map], second[of_second]) / len(places)
+        if between.mean() < _LEAST_MEAN_CORRELATION:
+            return single
+        between = np.clip(between, *_BOUNDS)
+        weight = SECOND_SEASON_WEIGHT
+        spread = np.sqrt(1 + weight**2 + 2 * weight * between)
+        scores = own.copy()
+        scores[of_map] = (own[of_map] + weight * second[of_second]) / spread
+        # Of a weighted mean of two equally related measurements with a third (Spearman and Brown).
+        return cls(scores, np.clip(between * (1 + weight) / spread, *_BOUNDS), are_two=True)
 
-    def log_ratios(self, scores: NDArray[np.float64]) -> NDArray[np.float64]:
-        """What every landmark is worth at every rank of a list.
-
-        Args:
-            scores: [r] standardised scores of the query.
-
-        Returns:
-            [h, r].
-        """
-        expected = self.correlation * self.listed_score
-        return expected * scores - np.square(expected) / 2
+    def calibration(self, lists: NDArray[np.uint16]) -> Calibration:
+        """The model for images that list these landmarks, [h, n]."""
+        n_landmarks = self.scores.shape[1]
+        images = np.arange(lists.shape[1])
+        means = np.empty((len(lists), n_landmarks))
+        for rank, row in enumerate(lists):
+            listed = self.scores[images, row]
+            total = np.bincount(row, listed, n_landmarks) + _PSEUDO_IMAGES * listed.mean()
+            means[rank] = total / (np.bincount(row, minlength=n_landmarks) + _PSEUDO_IMAGES)
+        return Calibration(self.correlation, means, self.are_two)
 
 
 def live_prior(seasons: Sequence[LandmarkStatistics]) -> LandmarkStatistics:
@@ -89,14 +113,3 @@ def live_prior(seasons: Sequence[LandmarkStatistics]) -> LandmarkStatistics:
         np.mean([season.mean for season in seasons], axis=0),
         np.mean([season.square for season in seasons], axis=0),
     )
-
-
-def _listed_scores(map_scores: NDArray[np.float64], lists: NDArray[np.uint16]) -> NDArray[np.float64]:
-    n_landmarks = map_scores.shape[1]
-    means = np.empty((len(lists), n_landmarks))
-    images = np.arange(lists.shape[1])
-    for rank, row in enumerate(lists):
-        listed = map_scores[images, row]
-        total = np.bincount(row, listed, n_landmarks) + _PSEUDO_IMAGES * listed.mean()
-        means[rank] = total / (np.bincount(row, minlength=n_landmarks) + _PSEUDO_IMAGES)
-    return means

@@ -28,7 +28,7 @@ class Relevance(StrEnum):
     BRUTE_FORCE = "brute_force"
 
 
-DEFAULT_RELEVANCE = Relevance.STANDARDISED
+DEFAULT_RELEVANCE = Relevance.CALIBRATED
 
 
 @dataclass(frozen=True)
@@ -44,6 +44,16 @@ class Query:
     ranks: NDArray[np.float32]
     dissimilarities: NDArray[np.float32] | None = None
     encoding: NDArray[np.float32] | None = None
+
+    @classmethod
+    def uninformative(cls, n_landmarks: int) -> "Query":
+        """A view that shows nothing, a wall of grey: all landmarks share the mean rank."""
+        return cls(np.full(n_landmarks, (n_landmarks + 1) / 2, np.float32))
+
+    @property
+    def is_informative(self) -> bool:
+        """Whether some landmark is nearer than another; a view that says nothing must not move a belief."""
+        return bool(self.ranks.min() < self.ranks.max())
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from deepsimbad.core.calibration import Calibration, live_prior
+from deepsimbad.core.calibration import SeasonsOfRoute, live_prior
 from deepsimbad.core.descriptor import nearest_landmarks, rank_landmarks
 from deepsimbad.core.inverted_index import InvertedIndex
 from deepsimbad.core.relevance import Relevance, RetrievalMap
@@ -74,17 +74,19 @@ def _standardised_map(
 ) -> RetrievalMap:
     own = LandmarkStatistics.of_map(ranks)
     scores = own.standardise(ranks)
-    lists = nearest_landmarks(scores, list_length)
-    index = InvertedIndex(lists, ranks.shape[1])
     if relevance is Relevance.STANDARDISED:
-        return RetrievalMap(relevance, index, own)
-    if second is None or len(second.places) == 0:
-        return RetrievalMap(relevance, index, live_prior([own]), Calibration.learn(scores, lists, None))
-    other_ranks = rank_landmarks(second.dissimilarities)
-    other = LandmarkStatistics.of_map(other_ranks)
-    of_map, of_other = second.places.T
-    calibration = Calibration.learn(scores, lists, (scores[of_map], other.standardise(other_ranks)[of_other]))
-    return RetrievalMap(relevance, index, live_prior([own, other] if calibration.is_learnt else [own]), calibration)
+        return RetrievalMap(relevance, InvertedIndex(nearest_landmarks(scores, list_length), ranks.shape[1]), own)
+    known = [own]
+    seasons = SeasonsOfRoute.learn(scores)
+    if second is not None and len(second.places):
+        other_ranks = rank_landmarks(second.dissimilarities)
+        other = LandmarkStatistics.of_map(other_ranks)
+        seasons = SeasonsOfRoute.learn(scores, other.standardise(other_ranks), second.places)
+        if seasons.are_two:
+            known.append(other)
+    lists = nearest_landmarks(seasons.scores, list_length)
+    index = InvertedIndex(lists, ranks.shape[1])
+    return RetrievalMap(relevance, index, live_prior(known), seasons.calibration(lists))
 
 
 def shortlist(values: NDArray[np.floating], length: int) -> NDArray[np.int64]:

@@ -17,6 +17,7 @@ from deepsimbad.engine.observation import Dissimilarities, RankedLandmarks, View
 from deepsimbad.engine.snapshot import MapSnapshot
 from deepsimbad.errors import InvalidDissimilaritiesError, InvalidInputError
 from deepsimbad.evaluators.base import Evaluator
+from deepsimbad.evaluators.image import is_blank
 
 DEFAULT_SHORTLIST = 10
 _LARGEST_DISSIMILARITY = 1e15
@@ -89,14 +90,16 @@ def retrieve(snapshot: MapSnapshot, evaluator: Evaluator, view: View) -> Retriev
     began = perf_counter()
     query = describe(snapshot, evaluator, view)
     described = perf_counter()
-    relevance = relevances(snapshot.retrieval, query)
+    relevance = np.zeros(snapshot.n_images, np.float32)
+    if query.is_informative:
+        relevance = relevances(snapshot.retrieval, query)
     retrieved = perf_counter()
     timings_ms = {"describe": 1000 * (described - began), "retrieve": 1000 * (retrieved - described)}
     return Retrieval(query.ranks, relevance, timings_ms)
 
 
 def describe(snapshot: MapSnapshot, evaluator: Evaluator, view: View) -> Query:
-    """Rank the landmarks for a view (II-A, II-C)."""
+    """Rank the landmarks for a view (II-A, II-C); one that shows nothing comes out as uninformative."""
     if isinstance(view, RankedLandmarks):
         return Query(ranks_from_ranked_landmarks(view.landmark_ids, snapshot.n_landmarks))
     if isinstance(view, Dissimilarities):
@@ -105,7 +108,11 @@ def describe(snapshot: MapSnapshot, evaluator: Evaluator, view: View) -> Query:
                 f"{view.values.size} dissimilarities; this map has {snapshot.n_landmarks} landmarks",
                 n_landmarks=snapshot.n_landmarks,
             )
+        if np.ptp(view.values) == 0:
+            return Query.uninformative(snapshot.n_landmarks)
         return Query(rank_landmarks(view.values), _as_float32(view.values))
+    if isinstance(view, np.ndarray) and is_blank(view):
+        return Query.uninformative(snapshot.n_landmarks)
     encoding = encode_view(evaluator, view)
     dissimilarities = evaluator.dissimilarities(encoding[None, :], snapshot.landmark_model)[0]
     return Query(rank_landmarks(dissimilarities), dissimilarities, encoding)

@@ -7,10 +7,12 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from deepsimbad.core.calibration import CALIBRATED_PRIOR_WEIGHT_FRAMES, Calibration
 from deepsimbad.core.inverted_index import InvertedIndex
 from deepsimbad.core.relevance import Relevance, RetrievalMap
 from deepsimbad.core.route import Route
 from deepsimbad.core.statistics import LandmarkStatistics
+from deepsimbad.core.telling import OffRouteModel, bits_ahead
 from deepsimbad.core.update_rules import DEFAULT_UPDATE, UpdateRule
 from deepsimbad.evaluators.base import LandmarkModel
 from deepsimbad.store.map_file import MapContents
@@ -27,8 +29,11 @@ class MapSnapshot:
         route: Where the map images are.
         retrieval: The index and what the map's relevance compares besides.
         landmark_model: For the domain's evaluator.
-        actions_m: The moves of the domain, in metres.
+        actions_m: [a] the moves of the domain in metres, ascending.
         index_bytes: Size of the posting tables in the map file.
+        q_values: [n, a] float32, the experience database; None where the map has none.
+        bits_ahead: [n, a] float32, how telling the place is where every move leads; None where nobody knows.
+        off_route: How a view from off the route is known; None where that was not learnt.
     """
 
     domain: str
@@ -39,8 +44,11 @@ class MapSnapshot:
     route: Route
     retrieval: RetrievalMap
     landmark_model: LandmarkModel
-    actions_m: tuple[float, ...]
+    actions_m: NDArray[np.float64]
     index_bytes: int
+    q_values: NDArray[np.float32] | None
+    bits_ahead: NDArray[np.float32] | None
+    off_route: OffRouteModel | None
 
     @classmethod
     def from_contents(cls, contents: MapContents, index_bytes: int) -> Self:
@@ -53,10 +61,8 @@ class MapSnapshot:
         for array in (*contents.landmark_model.values(), contents.encodings, contents.timestamp_us):
             _freeze(array)
         relevance = Relevance(contents.config["relevance"])
-        statistics = None
-        if contents.statistics is not None:
-            mean, std = contents.statistics
-            statistics = LandmarkStatistics.from_mean_std(mean, std)
+        actions_m = np.array(sorted(contents.actions_m))
+        route = Route(contents.position_m, contents.closed, contents.x_m, contents.y_m)
         index = InvertedIndex(contents.lists, int(contents.config["n_landmarks"]), contents.values)
         return cls(
             domain=contents.domain,
@@ -64,10 +70,19 @@ class MapSnapshot:
             created_at=contents.created_at,
             config=contents.config,
             metrics=contents.metrics,
-            route=Route(contents.position_m, contents.closed, contents.x_m, contents.y_m),
-            retrieval=RetrievalMap(relevance, index, statistics, encodings=contents.encodings),
+            route=route,
+            retrieval=RetrievalMap(
+                relevance,
+                index,
+                _statistics(contents, relevance),
+                _calibration(contents),
+                contents.encodings,
+            ),
+            q_values=contents.q_values,
+            bits_ahead=None if contents.telling_bits is None else bits_ahead(route, contents.telling_bits, actions_m),
+            off_route=None if contents.off_route_model is None else OffRouteModel(*contents.off_route_model.tolist()),
             landmark_model=contents.landmark_model,
-            actions_m=contents.actions_m,
+            actions_m=actions_m,
             index_bytes=index_bytes,
         )
 
@@ -95,6 +110,21 @@ class MapSnapshot:
     def index_bits_per_map_image(self) -> float:
         """The paper's figure for the size of a map."""
         return 8 * self.index_bytes / self.n_images
+
+
+def _statistics(contents: MapContents, relevance: Relevance) -> LandmarkStatistics | None:
+    if contents.statistics is None:
+        return None
+    mean, std = contents.statistics
+    if relevance is Relevance.CALIBRATED:
+        return LandmarkStatistics.from_mean_std(mean, std, CALIBRATED_PRIOR_WEIGHT_FRAMES)
+    return LandmarkStatistics.from_mean_std(mean, std)
+
+
+def _calibration(contents: MapContents) -> Calibration | None:
+    if contents.correlation is None or contents.listed_score is None:
+        return None
+    return Calibration(contents.correlation, contents.listed_score)
 
 
 def _freeze(array: NDArray[np.generic] | None) -> None:

@@ -17,6 +17,8 @@ __all__ = ["MEDIA_TYPES", "decode_image"]
 # Bad input is answered by a named error; OpenCV's own words about it would only fill the server's log.
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
 
+_BLANK_BELOW_STD = 1.0  # grey levels of 256
+
 
 def decode_image(body: bytes, max_pixels: int) -> Image:
     """Decode one image.
@@ -54,3 +56,8 @@ def decode_image(body: bytes, max_pixels: int) -> Image:
     if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
         raise InvalidImageError(f"the image decodes to {list(image.shape)} {image.dtype}, not to 8-bit colour")
     return np.ascontiguousarray(image)
+
+
+def is_blank(image: Image) -> bool:
+    """Whether an image shows nothing: grey levels that differ by no more than a sensor's noise does in the dark."""
+    return float(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY).std()) < _BLANK_BELOW_STD

@@ -1,17 +1,24 @@
 """Building a map in memory: landmarks chosen, every training frame described (II-B, II-C)."""
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from deepsimbad.core.calibration import Calibration
 from deepsimbad.core.landmark_selection import select_landmarks
+from deepsimbad.core.metrics import same_places
 from deepsimbad.core.relevance import Relevance, RetrievalMap
-from deepsimbad.core.retrieval import build_retrieval_map
+from deepsimbad.core.retrieval import SecondSeason, build_retrieval_map
 from deepsimbad.core.route import Route
+from deepsimbad.core.telling import Telling
+from deepsimbad.errors import InvalidMapConfigError
 from deepsimbad.evaluators.base import Evaluator, LandmarkModel
+from deepsimbad.jobs.encoded_traverse import route_of
+from deepsimbad.store.frames import TraverseFrames
 from deepsimbad.store.map_contents import MapContents
 from deepsimbad.store.records import DomainRecord
 
@@ -32,30 +39,72 @@ def choose_landmarks(
     return evaluator.fit_landmarks(candidates[select_landmarks(candidates, n_landmarks, on_progress)])
 
 
+@dataclass(frozen=True)
+class Described:
+    """A described traverse.
+
+    Attributes:
+        built: The part of the map that retrieval reads.
+        telling: What a second season of the route taught; None where none is known.
+    """
+
+    built: RetrievalMap
+    telling: Telling | None
+
+
 def describe(
-    encodings: NDArray[np.float32],
+    training: TraverseFrames,
+    route: Route,
     evaluator: Evaluator,
     model: LandmarkModel,
     relevance: Relevance,
     list_length: int,
+    second: TraverseFrames | None,
     on_progress: Callable[[float], None],
-) -> RetrievalMap:
-    """Describe every training frame by its landmarks.
+) -> Described:
+    """Describe every training frame by its landmarks, and learn from a second season where there is one.
 
     Args:
-        encodings: [n, d] of the training traverse, in route order.
+        training: The traverse that becomes the map.
+        route: Its positions.
         evaluator: Measures dissimilarities.
         model: The landmarks.
-        relevance: What the map is built for.
+        relevance: What the map is built for; only `calibrated` learns from a second season.
         list_length: h.
+        second: Another drive, of the same route or not.
         on_progress: Called with the share done; may raise to cancel.
     """
+    two = relevance is Relevance.CALIBRATED and second is not None
+    own = _dissimilarities(training.encodings, evaluator, model, lambda share: on_progress(share / 2 if two else share))
+    season = None
+    if two and second is not None:
+        other = _dissimilarities(second.encodings, evaluator, model, lambda share: on_progress(0.5 + share / 4))
+        season = SecondSeason(other, same_places(route_of(second), route))
+    built = build_retrieval_map(relevance, own, list_length, training.encodings, season)
+    telling = None
+    if season is not None and built.calibration is not None and built.calibration.is_of_two_seasons:
+        # Judged by lists that do not know the second season, as no list knows the season to come.
+        unaware = build_retrieval_map(relevance, own, list_length)
+        telling = Telling.learn(replace(unaware, calibration=_unaware(built, unaware)), season, route)
+    on_progress(1.0)
+    return Described(built, telling)
+
+
+def _unaware(built: RetrievalMap, unaware: RetrievalMap) -> Calibration:
+    """The lists of one season with the trust in landmarks that two seasons taught."""
+    if built.calibration is None or unaware.calibration is None:
+        raise InvalidMapConfigError("only calibrated maps learn what is telling")
+    return replace(unaware.calibration, correlation=built.calibration.correlation)
+
+
+def _dissimilarities(
+    encodings: NDArray[np.float32], evaluator: Evaluator, model: LandmarkModel, on_progress: Callable[[float], None]
+) -> NDArray[np.float32]:
     blocks = []
     for start in range(0, len(encodings), _FRAMES_A_BLOCK):
         blocks.append(evaluator.dissimilarities(encodings[start : start + _FRAMES_A_BLOCK], model))
         on_progress(min(1.0, (start + _FRAMES_A_BLOCK) / len(encodings)))
-    dissimilarities = np.concatenate(blocks) if blocks else np.empty((0, 0), np.float32)
-    return build_retrieval_map(relevance, dissimilarities, list_length, encodings)
+    return np.concatenate(blocks) if blocks else np.empty((0, 0), np.float32)
 
 
 def map_contents(
@@ -63,7 +112,7 @@ def map_contents(
     version: int,
     config: Mapping[str, Any],
     model: LandmarkModel,
-    built: RetrievalMap,
+    described: Described,
     route: Route,
 ) -> MapContents:
     """Everything a map file holds of a described traverse.
@@ -73,10 +122,11 @@ def map_contents(
         version: Its number.
         config: What was asked for; kept with the map.
         model: The landmarks.
-        built: What retrieval reads.
+        described: What retrieval and planning read.
         route: Where the map images are.
     """
-    statistics = built.statistics
+    built, telling = described.built, described.telling
+    statistics, calibration = built.statistics, built.calibration
     return MapContents(
         domain=domain.name,
         version=version,
@@ -91,6 +141,10 @@ def map_contents(
         values=built.index.values,
         encodings=built.encodings,
         statistics=None if statistics is None else np.stack([statistics.mean, statistics.std]),
+        correlation=None if calibration is None else calibration.correlation,
+        listed_score=None if calibration is None else calibration.listed_score,
+        telling_bits=None if telling is None else telling.bits,
+        off_route_model=None if telling is None else np.array([telling.off_route.slope, telling.off_route.intercept]),
         x_m=route.x_m,
         y_m=route.y_m,
     )

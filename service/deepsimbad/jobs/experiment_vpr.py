@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from deepsimbad.core.descriptor import rank_landmarks
 from deepsimbad.core.landmark_selection import select_landmarks
-from deepsimbad.core.metrics import RetrievalScorer, RetrievalScores
+from deepsimbad.core.metrics import RetrievalScorer, RetrievalScores, same_places
 from deepsimbad.core.relevance import (
     DEFAULT_RELEVANCE,
     Query,
@@ -21,10 +21,10 @@ from deepsimbad.core.relevance import (
     brute_force_relevances,
     relevances,
 )
-from deepsimbad.core.retrieval import build_retrieval_map
+from deepsimbad.core.retrieval import SecondSeason, build_retrieval_map
 from deepsimbad.core.route import Route
 from deepsimbad.evaluators.base import Evaluator, LandmarkModel
-from deepsimbad.jobs.build_map import map_contents
+from deepsimbad.jobs.build_map import Described, map_contents
 from deepsimbad.jobs.encoded_traverse import EncodedTraverse
 from deepsimbad.jobs.progress import Progress
 from deepsimbad.store.map_file import index_bytes, write_map
@@ -95,7 +95,7 @@ def vpr_stages(config: VprConfig) -> dict[str, float]:
 def run_vpr(
     config: VprConfig,
     evaluator: Evaluator,
-    landmark_candidates: NDArray[np.float32],
+    landmarks: EncodedTraverse,
     training: EncodedTraverse,
     test: EncodedTraverse,
     true_images: Sequence[NDArray[np.int64]],
@@ -106,7 +106,7 @@ def run_vpr(
     Args:
         config: What is compared.
         evaluator: Measures dissimilarities of encodings.
-        landmark_candidates: [m, d] encodings of the landmark traverse.
+        landmarks: The landmark traverse; where it drove the mapped route, `calibrated` learns from it.
         training: The mapped traverse.
         test: The queries, in the order they were driven.
         true_images: For every test frame the map images that count as true.
@@ -122,14 +122,18 @@ def run_vpr(
         started = now
 
     progress.stage("select landmarks")
-    chosen = select_landmarks(landmark_candidates, config.n_landmarks, progress.update)
-    model = evaluator.fit_landmarks(landmark_candidates[chosen])
+    chosen = select_landmarks(landmarks.encodings, config.n_landmarks, progress.update)
+    model = evaluator.fit_landmarks(landmarks.encodings[chosen])
     lap("select landmarks")
 
     progress.stage("describe")
     map_dissimilarities = evaluator.dissimilarities(training.encodings, model)
-    progress.update(0.5)
+    progress.update(0.3)
     test_dissimilarities = evaluator.dissimilarities(test.encodings, model)
+    progress.update(0.6)
+    second = SecondSeason(
+        evaluator.dissimilarities(landmarks.encodings, model), same_places(landmarks.route, training.route)
+    )
     queries = [
         Query(ranks, dissimilarities, encoding)
         for ranks, dissimilarities, encoding in zip(
@@ -142,7 +146,7 @@ def run_vpr(
     maps: dict[Relevance, RetrievalMap] = {}
     for name in config.relevances:
         progress.stage(f"query by {name.value}")
-        maps[name] = build_retrieval_map(name, map_dissimilarities, config.list_length, training.encodings)
+        maps[name] = build_retrieval_map(name, map_dissimilarities, config.list_length, training.encodings, second)
         scores[name] = _score(maps[name], queries, true_images, progress.update)
         lap(f"query by {name.value}")
     sized = maps.get(DEFAULT_RELEVANCE, maps[config.relevances[0]])
@@ -154,7 +158,7 @@ def _bits_per_map_image(built: RetrievalMap, model: LandmarkModel, route: Route)
     domain = DomainRecord("experiment", {}, closed=False, actions_m=(), active_version=None, created_at="")
     with tempfile.TemporaryDirectory() as folder:
         building, sealed = Path(folder) / "1.building", Path(folder) / "1.sqlite"
-        write_map(building, map_contents(domain, 1, {}, model, built, route))
+        write_map(building, map_contents(domain, 1, {}, model, Described(built, None), route))
         seal(building, sealed)
         return 8 * index_bytes(sealed) / route.n_images
 

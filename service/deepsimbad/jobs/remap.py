@@ -55,13 +55,14 @@ def remap(
 
     progress.stage("describe")
     described = time.perf_counter()
-    built = describe(training.encodings, evaluator, model, config.relevance, config.list_length, progress.update)
+    second = _second_season(catalog, record, config)
+    found = describe(training, route, evaluator, model, config.relevance, config.list_length, second, progress.update)
     seconds["describe"] = time.perf_counter() - described
 
     progress.stage("seal")
     version = catalog.begin_map(domain, config.as_dict())
     try:
-        contents = map_contents(record, version, config.as_dict(), model, built, route)
+        contents = map_contents(record, version, config.as_dict(), model, found, route)
         known_times = training.timestamp_us if (training.timestamp_us >= 0).any() else None
         building, sealed = catalog.building_path(domain, version), catalog.map_path(domain, version)
         write_map(building, replace(contents, timestamp_us=known_times), progress.update)
@@ -84,6 +85,22 @@ def _frames(catalog: Catalog, domain: str, name: str) -> TraverseFrames:
     if frames.index.size == 0:
         raise InvalidMapConfigError(f"traverse {name} has no frames yet; upload some first", traverse=name)
     return frames
+
+
+def _second_season(catalog: Catalog, record: DomainRecord, config: RemapConfig) -> TraverseFrames | None:
+    """The drive that a calibrated map learns from: the landmark traverse, else what the active map was made of."""
+    candidates = [config.landmark_traverse]
+    if config.landmark_traverse is None and record.active_version is not None:
+        before = catalog.map(record.name, record.active_version).config
+        candidates = [before["training_traverse"], before["landmark_traverse"]]
+    for name in candidates:
+        if (
+            name is not None
+            and name != config.training_traverse
+            and name in Traverse.list(catalog.data_dir, record.name)
+        ):
+            return _frames(catalog, record.name, name)
+    return None
 
 
 def _landmark_model(

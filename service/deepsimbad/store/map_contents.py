@@ -27,7 +27,11 @@ class MapContents:
         position_m: Route position of every map image, [n] float64.
         values: [h, n] float32, the listed dissimilarities (`simbad` alone).
         encodings: [n, d] float32 (`brute_force` alone).
-        statistics: [2, r] float64, mean and std of the normal scores (`standardised` alone).
+        statistics: [2, r] float64, mean and std of the normal scores (`standardised` and `calibrated`).
+        correlation: [r] float64, how far each landmark can be trusted across seasons (`calibrated` alone).
+        listed_score: [h, r] float64, mean score of a landmark where it is listed at a rank (`calibrated` alone).
+        telling_bits: [n] float32, by how many bits a view from a place narrows the map down, where that was learnt.
+        off_route_model: [2] float64, slope and intercept of the log-odds of being off the route, where learnt.
         timestamp_us: [n] int64.
         x_m: East, [n] float64.
         y_m: North, [n] float64.
@@ -48,6 +52,10 @@ class MapContents:
     values: NDArray[np.float32] | None = None
     encodings: NDArray[np.float32] | None = None
     statistics: NDArray[np.float64] | None = None
+    correlation: NDArray[np.float64] | None = None
+    listed_score: NDArray[np.float64] | None = None
+    telling_bits: NDArray[np.float32] | None = None
+    off_route_model: NDArray[np.float64] | None = None
     timestamp_us: NDArray[np.int64] | None = None
     x_m: NDArray[np.float64] | None = None
     y_m: NDArray[np.float64] | None = None
@@ -83,6 +91,10 @@ class MapContents:
             ("values", (h, n), np.float32),
             ("encodings", (n, None), np.float32),
             ("statistics", (2, r), np.float64),
+            ("correlation", (r,), np.float64),
+            ("listed_score", (h, r), np.float64),
+            ("telling_bits", (n,), np.float32),
+            ("off_route_model", (2,), np.float64),
             ("timestamp_us", (n,), np.int64),
             ("x_m", (n,), np.float64),
             ("y_m", (n,), np.float64),
