@@ -48,6 +48,15 @@ class Settings(BaseSettings):
         float, Field(description="A job's event stream looks for news this often.", gt=0, le=10)
     ] = 0.25
 
+    session_ttl_s: Annotated[
+        float, Field(description="A session ends when nothing was observed in it for so long.", gt=0, le=31_536_000)
+    ] = 3600.0
+    max_sessions: Annotated[int, Field(description="Sessions that may live at once.", ge=1)] = 1000
+    snapshot_every: Annotated[
+        int, Field(description="Observations of a session between two snapshots of its belief.", ge=1)
+    ] = 32
+    session_sweep_s: Annotated[float, Field(description="Expired sessions are looked for this often.", gt=0)] = 30.0
+
     @property
     def is_loopback(self) -> bool:
         """Whether only this machine can reach the service."""

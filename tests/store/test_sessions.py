@@ -55,7 +55,6 @@ def test_rows_come_back_bit_for_bit(store: SessionStore) -> None:
         action_std_m=1e-300,
         dissimilarities=rng.normal(size=4).astype(np.float32),
         encoding=rng.normal(size=7).astype(np.float32),
-        is_flat=True,
         idempotency=IdempotencyKey("k", b"\x00\xff"),
     )
     store.append(number, row, 1.0).result()

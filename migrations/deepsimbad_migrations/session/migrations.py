@@ -46,7 +46,6 @@ def m001_sessions_and_journal(db: Database) -> None:
             ranks BLOB,
             dissimilarities BLOB,
             encoding BLOB,
-            is_flat INTEGER NOT NULL DEFAULT 0 CHECK (is_flat IN (0, 1)),
             position_m REAL,
             std_m REAL,
             CHECK ((idempotency_key IS NULL) = (request_digest IS NULL)),

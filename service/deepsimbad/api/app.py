@@ -1,5 +1,6 @@
 """The application: its parts, in the order in which they start and stop."""
 
+import asyncio
 import logging
 import re
 from collections.abc import AsyncIterator, Callable
@@ -26,10 +27,13 @@ from deepsimbad.api.routes import (
     domains,
     health,
     localizations,
+    sessions,
 )
 from deepsimbad.engine.active_maps import ActiveMaps
 from deepsimbad.engine.evaluator_pool import EvaluatorPool
 from deepsimbad.engine.open_traverses import OpenTraverses
+from deepsimbad.engine.pinned_maps import PinnedMaps
+from deepsimbad.engine.sessions import Sessions
 from deepsimbad.engine.warm_up import warm_up
 from deepsimbad.engine.worker import InferenceWorker
 from deepsimbad.errors import DeepSimbadError
@@ -37,6 +41,7 @@ from deepsimbad.evaluators.registry import EvaluatorKind
 from deepsimbad.jobs.runner import JobRunner
 from deepsimbad.settings import Settings
 from deepsimbad.store.catalog import Catalog
+from deepsimbad.store.sessions import SessionStore
 
 log = logging.getLogger(__name__)
 
@@ -44,6 +49,7 @@ _ROUTERS = (
     health,
     domains,
     localizations,
+    sessions,
     admin_domains,
     admin_traverses,
     admin_frames,
@@ -92,12 +98,24 @@ def _lifespan(settings: Settings, metrics: Metrics) -> Callable[[FastAPI], Abstr
                 app.state.startup_error = error  # the server only reports that there was one
                 raise
             app.state.services = services
+            sweeping = asyncio.create_task(_sweep(services.sessions, settings.session_sweep_s))
             yield
+            sweeping.cancel()
             services.stopping.set()
             # Jobs and the worker are waited for, which must not hold up the loop that their answers go through.
             await run_sync(parts.close)
 
     return run
+
+
+async def _sweep(live: Sessions, every_s: float) -> None:
+    """End sessions as they expire, so that their memory is free though nobody asks."""
+    while True:
+        await asyncio.sleep(every_s)
+        try:
+            await live.sweep()
+        except DeepSimbadError:
+            log.exception("expired sessions could not be ended")
 
 
 def _start(settings: Settings, metrics: Metrics, parts: ExitStack) -> Services:
@@ -114,6 +132,15 @@ def _start(settings: Settings, metrics: Metrics, parts: ExitStack) -> Services:
     worker = InferenceWorker()
     parts.callback(worker.close)
     worker.submit(warm_up).result()
+    store = parts.enter_context(SessionStore.open(settings.data_dir, metrics.committed))
+    live = Sessions(
+        store,
+        PinnedMaps(catalog, active_maps, evaluators),
+        worker,
+        ttl_s=settings.session_ttl_s,
+        max_sessions=settings.max_sessions,
+        snapshot_every=settings.snapshot_every,
+    )
     open_traverses = OpenTraverses(settings.data_dir)
     parts.callback(open_traverses.close)
 
@@ -125,9 +152,15 @@ def _start(settings: Settings, metrics: Metrics, parts: ExitStack) -> Services:
 
     runner = JobRunner(catalog, lambda domain: evaluators.evaluator(catalog.domain(domain).evaluator), switched)
     parts.callback(runner.close)
-    metrics.watch(lambda: worker.n_waiting, lambda: active_maps.n_loaded)
+    metrics.watch(lambda: worker.n_waiting, lambda: active_maps.n_loaded, lambda: live.n_living)
     log.info(
-        "ready", extra={"n_domains": len(catalog.domains()), "n_maps": active_maps.n_loaded, "damaged": list(damaged)}
+        "ready",
+        extra={
+            "n_domains": len(catalog.domains()),
+            "n_maps": active_maps.n_loaded,
+            "n_sessions": live.n_living,
+            "damaged": list(damaged),
+        },
     )
     return Services(
         settings=settings,
@@ -136,6 +169,7 @@ def _start(settings: Settings, metrics: Metrics, parts: ExitStack) -> Services:
         active_maps=active_maps,
         evaluators=evaluators,
         open_traverses=open_traverses,
+        sessions=live,
         worker=worker,
         runner=runner,
         damaged_at_start=tuple(sorted(damaged)),

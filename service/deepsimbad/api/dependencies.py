@@ -16,6 +16,7 @@ from deepsimbad.api.metrics import Metrics
 from deepsimbad.engine.active_maps import ActiveDomain, ActiveMaps
 from deepsimbad.engine.evaluator_pool import EvaluatorPool
 from deepsimbad.engine.open_traverses import OpenTraverses
+from deepsimbad.engine.sessions import Sessions
 from deepsimbad.engine.worker import InferenceWorker, Priority
 from deepsimbad.evaluators.base import Image
 from deepsimbad.evaluators.image import decode_image
@@ -40,6 +41,7 @@ class Services:
         active_maps: Maps in memory.
         evaluators: Evaluators in memory.
         open_traverses: Files kept open while frames arrive.
+        sessions: Live beliefs.
         worker: Where encoding and scoring run.
         runner: Where jobs run.
         damaged_at_start: Domains whose active map could not be loaded at start.
@@ -54,6 +56,7 @@ class Services:
     active_maps: ActiveMaps
     evaluators: EvaluatorPool
     open_traverses: OpenTraverses
+    sessions: Sessions
     worker: InferenceWorker
     runner: JobRunner
     damaged_at_start: tuple[str, ...] = ()
@@ -84,4 +87,5 @@ async def services_of(request: Request) -> Services:
 Running = Annotated[Services, Depends(services_of)]
 DomainName = Annotated[str, Path(alias="domain", pattern=NAME_PATTERN, description="A domain's name.")]
 TraverseName = Annotated[str, Path(alias="name", pattern=NAME_PATTERN, description="A traverse's name.")]
+SessionId = Annotated[str, Path(pattern=NAME_PATTERN, description="A session's id.")]
 JobId = Annotated[str, Path(pattern=NAME_PATTERN, description="A job's id.")]

@@ -6,6 +6,7 @@ from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, gene
 from prometheus_client.exposition import CONTENT_TYPE_LATEST
 
 _LATENCY_BUCKETS_S = (0.001, 0.002, 0.004, 0.008, 0.016, 0.032, 0.064, 0.125, 0.25, 0.5, 1, 2, 4, 8, 30)
+_BATCH_BUCKETS = (1, 2, 4, 8, 16, 32, 64, 128, 256)
 
 
 class Metrics:
@@ -46,6 +47,18 @@ class Metrics:
             buckets=tuple(range(0, 25, 2)),
             registry=self._registry,
         )
+        self._observations = Counter(
+            "deepsimbad_observations",
+            "Observations of sessions: accepted, repeated (counted before), or the code of what was wrong.",
+            ["outcome"],
+            registry=self._registry,
+        )
+        self._commit_writes = Histogram(
+            "deepsimbad_session_commit_writes",
+            "Writes that shared one transaction of the sessions' file.",
+            buckets=_BATCH_BUCKETS,
+            registry=self._registry,
+        )
         self._in_flight = Gauge(
             "deepsimbad_requests_in_flight", "Requests being answered now.", registry=self._registry
         )
@@ -53,11 +66,15 @@ class Metrics:
             "deepsimbad_inference_queue", "Work waiting for the inference worker.", registry=self._registry
         )
         self._active_maps = Gauge("deepsimbad_loaded_maps", "Active maps held in memory.", registry=self._registry)
+        self._sessions = Gauge("deepsimbad_sessions", "Sessions that have not ended.", registry=self._registry)
 
-    def watch(self, queue_length: Callable[[], int], n_active_maps: Callable[[], int]) -> None:
+    def watch(
+        self, queue_length: Callable[[], int], n_active_maps: Callable[[], int], n_sessions: Callable[[], int]
+    ) -> None:
         """Read these whenever the metrics are scraped."""
         self._queue.set_function(lambda: float(queue_length()))
         self._active_maps.set_function(lambda: float(n_active_maps()))
+        self._sessions.set_function(lambda: float(n_sessions()))
 
     def request_began(self) -> None:
         """Count a request as being answered."""
@@ -74,6 +91,14 @@ class Metrics:
         for stage, milliseconds in timings_ms.items():
             self._stage_seconds.labels(stage).observe(milliseconds / 1000)
         self._entropy_bits.labels(domain).observe(entropy_bits)
+
+    def observed(self, outcome: str) -> None:
+        """Count an observation of a session: "accepted", "repeated" or an error's code."""
+        self._observations.labels(outcome).inc()
+
+    def committed(self, n_writes: int) -> None:
+        """Record one transaction of the sessions' file."""
+        self._commit_writes.observe(n_writes)
 
     def forget_domain(self, domain: str) -> None:
         """Drop what is kept by a domain's name, so that deleted domains do not pile up."""

@@ -10,14 +10,17 @@ from pydantic import BaseModel
 from deepsimbad.api.bodies import DECLARED_BODIES
 from deepsimbad.api.problems import MEDIA_TYPE
 from deepsimbad.api.schemas import Problem
+from deepsimbad.api.session_bodies import DECLARED_SESSION_BODIES
 
 _REFERENCE = "#/components/schemas/{model}"
 _DESCRIPTIONS = {
     404: "An unknown name or id",
     409: "The present state forbids it",
+    410: "A session that has ended, or whose map is no more",
     413: "More bytes or pixels than a limit allows",
     415: "A missing or unsupported Content-Type; `allowed` lists what is taken",
     422: "A value that can never be accepted; `errors` or the other members say which",
+    429: "More than the service takes at once; try again after Retry-After seconds",
     500: "The service failed; the fault is its own",
     503: "The service cannot answer now; try again after Retry-After seconds",
 }
@@ -46,7 +49,7 @@ def install_openapi(app: FastAPI) -> None:
         if app.openapi_schema is None:
             made = get_openapi(title=app.title, version=app.version, description=app.description, routes=app.routes)
             schemas = made.setdefault("components", {}).setdefault("schemas", {})
-            models: tuple[type[BaseModel], ...] = (Problem, *DECLARED_BODIES)
+            models: tuple[type[BaseModel], ...] = (Problem, *DECLARED_BODIES, *DECLARED_SESSION_BODIES)
             for model in models:
                 schema = model.model_json_schema(ref_template=_REFERENCE)
                 schemas.update(schema.pop("$defs", {}))

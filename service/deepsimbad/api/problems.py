@@ -15,9 +15,11 @@ from starlette.responses import Response
 from starlette.types import Scope
 
 from deepsimbad.errors import (
+    BusyError,
     CancelledError,
     ConflictError,
     DeepSimbadError,
+    GoneError,
     InvalidInputError,
     NotFoundError,
     SettingsError,
@@ -38,6 +40,8 @@ STATUS_OF_BRANCH: Mapping[type[BaseException], HTTPStatus] = {
     NotFoundError: HTTPStatus.NOT_FOUND,
     ConflictError: HTTPStatus.CONFLICT,
     CancelledError: HTTPStatus.CONFLICT,
+    GoneError: HTTPStatus.GONE,
+    BusyError: HTTPStatus.TOO_MANY_REQUESTS,
     TooLargeError: HTTPStatus.REQUEST_ENTITY_TOO_LARGE,
     UnsupportedMediaTypeError: HTTPStatus.UNSUPPORTED_MEDIA_TYPE,
     UnavailableError: HTTPStatus.SERVICE_UNAVAILABLE,
@@ -111,7 +115,9 @@ def error_response(scope: Scope, error: DeepSimbadError) -> Response:
     if status >= HTTPStatus.INTERNAL_SERVER_ERROR:
         log.warning("%s: %s", error.code, error.message, exc_info=error)
     summary = (type(error).__doc__ or "").strip().partition("\n")[0].rstrip(".")
-    return problem_response(scope, status, error.code, error.message, title=summary, hints=error.hints)
+    retry_after_s = error.hints.get("retry_after_s")
+    headers = None if retry_after_s is None else {"Retry-After": str(retry_after_s)}
+    return problem_response(scope, status, error.code, error.message, title=summary, hints=error.hints, headers=headers)
 
 
 def unexpected_response(scope: Scope) -> Response:

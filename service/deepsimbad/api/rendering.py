@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepsimbad.api.schemas import (
+    ActionAnswer,
     BeliefAnswer,
     HistogramAnswer,
     JobAnswer,
@@ -14,10 +15,12 @@ from deepsimbad.api.schemas import (
     JobResult,
     LocalizationAnswer,
     MapAnswer,
+    NextBestViewAnswer,
     PlaceAnswer,
     RetrievedAnswer,
 )
 from deepsimbad.core.belief_summary import BeliefSummary
+from deepsimbad.core.planners import Plan
 from deepsimbad.core.route import Route
 from deepsimbad.engine.localizer import Localization
 from deepsimbad.store.records import JobRecord, MapRecord
@@ -31,16 +34,7 @@ def render_localization(localization: Localization, began: float) -> Localizatio
         began: `perf_counter()` when the request arrived.
     """
     route = localization.snapshot.route
-    ids = localization.shortlist
-    retrieval = [
-        RetrievedAnswer.model_construct(map_image=image, route_position_m=position_m, relevance=relevance)
-        for image, position_m, relevance in zip(
-            ids.tolist(),
-            route.position_m[ids].tolist(),
-            localization.retrieval.relevance[ids].tolist(),
-            strict=True,
-        )
-    ]
+    retrieval = render_shortlist(route, localization.shortlist, localization.retrieval.relevance)
     belief = render_belief(route, localization.belief)
     timings_ms = {stage: round(spent, 3) for stage, spent in localization.timings_ms.items()}
     timings_ms["total"] = round(1000 * (perf_counter() - began), 3)
@@ -50,6 +44,31 @@ def render_localization(localization: Localization, began: float) -> Localizatio
         belief=belief,
         retrieval=retrieval,
         next_best_view=None,
+    )
+
+
+def render_shortlist(route: Route, ids: NDArray[np.int64], relevance: NDArray[np.float32]) -> list[RetrievedAnswer]:
+    """Map images with their places and relevances."""
+    return [
+        RetrievedAnswer.model_construct(map_image=image, route_position_m=position_m, relevance=worth)
+        for image, position_m, worth in zip(
+            ids.tolist(), route.position_m[ids].tolist(), relevance[ids].tolist(), strict=True
+        )
+    ]
+
+
+def render_plan(plan: Plan | None, actions_m: NDArray[np.float64]) -> NextBestViewAnswer | None:
+    """A recommended move; None where there is none."""
+    if plan is None:
+        return None
+    values = [None] * actions_m.size if plan.values is None else plan.values.tolist()
+    return NextBestViewAnswer.model_construct(
+        planner=plan.planner,
+        action_m=plan.action_m,
+        actions=[
+            ActionAnswer.model_construct(action_m=action_m, q_value=value)
+            for action_m, value in zip(actions_m.tolist(), values, strict=True)
+        ],
     )
 
 

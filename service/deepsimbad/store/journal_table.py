@@ -12,12 +12,12 @@ from deepsimbad.store.session_records import IdempotencyKey, JournalRow, Observe
 
 _INSERT = """
     INSERT INTO journal (session, sequence, kind, written_at, expires_at, idempotency_key, request_digest,
-                         action_m, action_std_m, ranks, dissimilarities, encoding, is_flat, position_m, std_m)
-    VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)
+                         action_m, action_std_m, ranks, dissimilarities, encoding, position_m, std_m)
+    VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)
 """
 _SELECT = """
     SELECT sequence, kind, expires_at, idempotency_key, request_digest, action_m, action_std_m, ranks,
-           dissimilarities, encoding, is_flat, position_m, std_m
+           dissimilarities, encoding, position_m, std_m
     FROM journal
 """
 _MOST_IN_TWO_BYTES = 0xFFFF // 2
@@ -28,7 +28,7 @@ def append(db: Database, session: int, row: JournalRow, written_at: float) -> No
     if isinstance(row, PriorRow):
         values: tuple[Any, ...] = (
             *("prior", written_at, row.expires_at),
-            *(None, None, None, None, None, None, None, 0),
+            *(None, None, None, None, None, None, None),
             *(row.position_m, row.std_m),
         )
     else:
@@ -37,7 +37,7 @@ def append(db: Database, session: int, row: JournalRow, written_at: float) -> No
             *("observation", written_at, row.expires_at),
             *((named.key, named.digest) if named else (None, None)),
             *(row.action_m, row.action_std_m, pack_ranks(row.ranks)),
-            *(_pack_float32(row.dissimilarities), _pack_float32(row.encoding), int(row.is_flat)),
+            *(_pack_float32(row.dissimilarities), _pack_float32(row.encoding)),
             *(None, None),
         )
     db.conn.execute(_INSERT, (session, row.sequence, *values))
@@ -45,7 +45,7 @@ def append(db: Database, session: int, row: JournalRow, written_at: float) -> No
 
 @row_reader
 def _row(found: tuple[Any, ...]) -> JournalRow:
-    sequence, kind, expires_at, key, digest, action_m, action_std_m, ranks, *views, is_flat, position_m, std_m = found
+    sequence, kind, expires_at, key, digest, action_m, action_std_m, ranks, *views, position_m, std_m = found
     if kind == "prior":
         return PriorRow(sequence, expires_at, position_m, std_m)
     dissimilarities, encoding = (None if one is None else np.frombuffer(one, "<f4") for one in views)
@@ -57,7 +57,6 @@ def _row(found: tuple[Any, ...]) -> JournalRow:
         unpack_ranks(ranks),
         dissimilarities,
         encoding,
-        bool(is_flat),
         None if key is None else IdempotencyKey(key, digest),
     )
 

@@ -56,10 +56,9 @@ class ObservedRow:
         expires_at: When the session ends after it.
         action_m: Metres moved before the view.
         action_std_m: Their standard deviation; None: the usual one.
-        ranks: [r] float32, whole or half ranks.
+        ranks: [r] float32, whole or half ranks; all alike where the view had nothing to rank by.
         dissimilarities: [r] float32, where the map's relevance compares them.
         encoding: [d] float32, where the map's relevance compares it.
-        is_flat: Whether the view had no contrast to rank by.
         idempotency: How a repetition is known, if it can be.
     """
 
@@ -70,7 +69,6 @@ class ObservedRow:
     ranks: NDArray[np.float32]
     dissimilarities: NDArray[np.float32] | None = None
     encoding: NDArray[np.float32] | None = None
-    is_flat: bool = False
     idempotency: IdempotencyKey | None = None
 
 

@@ -5,7 +5,7 @@ CREATE TABLE "_sqlite_migrations" (
    "name" TEXT,
    "applied_at" TEXT
 );
-INSERT INTO "_sqlite_migrations" VALUES(1,'deepsimbad_session','m001_sessions_and_journal','2026-11-22 03:02:37.253059+00:00');
+INSERT INTO "_sqlite_migrations" VALUES(1,'deepsimbad_session','m001_sessions_and_journal','2026-11-22 03:12:49.570986+00:00');
 CREATE TABLE journal (
             session INTEGER NOT NULL REFERENCES session (number) ON DELETE CASCADE,
             sequence INTEGER NOT NULL CHECK (sequence >= 1),
@@ -19,16 +19,15 @@ CREATE TABLE journal (
             ranks BLOB,
             dissimilarities BLOB,
             encoding BLOB,
-            is_flat INTEGER NOT NULL DEFAULT 0 CHECK (is_flat IN (0, 1)),
             position_m REAL,
             std_m REAL,
             CHECK ((idempotency_key IS NULL) = (request_digest IS NULL)),
             CHECK (kind = 'prior' OR (action_m IS NOT NULL AND ranks IS NOT NULL)),
             CHECK (kind = 'observation' OR (position_m IS NOT NULL AND std_m IS NOT NULL))
         );
-INSERT INTO "journal" VALUES(1,1,'observation',1010.0,4610.0,'k1',X'0102',0.0,NULL,X'020005000500',NULL,NULL,0,NULL,NULL);
-INSERT INTO "journal" VALUES(1,2,'prior',1020.0,4620.0,NULL,NULL,NULL,NULL,NULL,NULL,NULL,0,1.5,2.0);
-INSERT INTO "journal" VALUES(1,3,'observation',1030.0,4630.0,NULL,NULL,3.0,0.5,X'060002000400',X'0000003F0000803E0000C03E',X'0000803F00000040',1,NULL,NULL);
+INSERT INTO "journal" VALUES(1,1,'observation',1010.0,4610.0,'k1',X'0102',0.0,NULL,X'020005000500',NULL,NULL,NULL,NULL);
+INSERT INTO "journal" VALUES(1,2,'prior',1020.0,4620.0,NULL,NULL,NULL,NULL,NULL,NULL,NULL,1.5,2.0);
+INSERT INTO "journal" VALUES(1,3,'observation',1030.0,4630.0,NULL,NULL,3.0,0.5,X'060002000400',X'0000003F0000803E0000C03E',X'0000803F00000040',NULL,NULL);
 CREATE TABLE session (
             number INTEGER PRIMARY KEY,
             session_id TEXT NOT NULL UNIQUE,

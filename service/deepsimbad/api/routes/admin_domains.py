@@ -41,9 +41,10 @@ async def put_domain(domain: DomainName, request: Request, response: Response, r
 
 @router.delete("/{domain}", status_code=204, responses=problems(404, 409, 422))
 async def delete_domain(domain: DomainName, running: Running) -> None:
-    """Remove a domain with its traverses and maps; a job that still works on it is a 409."""
+    """Remove a domain with its traverses and maps, and end its sessions; a job that still works on it is a 409."""
     await run_sync(running.open_traverses.forget, domain)
     await run_sync(running.catalog.delete_domain, domain)
     running.active_maps.forget(domain)
+    await running.sessions.end_domain(domain)
     running.metrics.forget_domain(domain)
     log.info("domain deleted", extra={"domain": domain})

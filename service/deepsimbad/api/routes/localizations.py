@@ -78,7 +78,11 @@ async def post_localization(
 
 async def read_view(request: Request, running: Services, media_type: str) -> View:
     """The observation in a request's body."""
-    body = await read_bytes(request)
+    return await view_in(await read_bytes(request), running, media_type)
+
+
+async def view_in(body: bytes, running: Services, media_type: str) -> View:
+    """The observation in a body that has been read."""
     if media_type == JSON:
         return parse_json(body, ObservationBody).view()
     return await running.decode(body)

@@ -1,0 +1,42 @@
+"""From a session's view to its answers' models."""
+
+from datetime import UTC, datetime
+from time import perf_counter
+from typing import Any
+
+from deepsimbad.api.rendering import render_belief, render_plan, render_shortlist
+from deepsimbad.api.session_schemas import ObservationAnswer, SessionAnswer
+from deepsimbad.engine.session_view import SessionView
+
+
+def render_session(view: SessionView) -> SessionAnswer:
+    """A session as it stands."""
+    return SessionAnswer.model_construct(**_members(view))
+
+
+def render_observation(view: SessionView, began: float) -> ObservationAnswer:
+    """A session after an observation.
+
+    Args:
+        view: The session.
+        began: `perf_counter()` when the request arrived.
+    """
+    retrieval = [] if view.relevance is None else render_shortlist(view.snapshot.route, view.shortlist, view.relevance)
+    members = _members(view)
+    timings_ms = {stage: round(spent, 3) for stage, spent in view.timings_ms.items()}
+    timings_ms["total"] = round(1000 * (perf_counter() - began), 3)
+    return ObservationAnswer.model_construct(**members, retrieval=retrieval, timings_ms=timings_ms)
+
+
+def _members(view: SessionView) -> dict[str, Any]:
+    snapshot = view.snapshot
+    expires_at = datetime.fromtimestamp(view.expires_at, UTC).isoformat(timespec="milliseconds")
+    return {
+        "session_id": view.session_id,
+        "domain": snapshot.domain,
+        "map_version": snapshot.version,
+        "n_observations": view.n_observations,
+        "expires_at": expires_at.replace("+00:00", "Z"),
+        "belief": render_belief(snapshot.route, view.belief),
+        "next_best_view": render_plan(view.plan, snapshot.actions_m),
+    }

@@ -1,0 +1,26 @@
+"""What the calls of a session answer."""
+
+from typing import Annotated
+
+from pydantic import Field
+
+from deepsimbad.api.schemas import Answer, BeliefAnswer, NextBestViewAnswer, RetrievedAnswer
+
+
+class SessionAnswer(Answer):
+    """A session as it stands."""
+
+    session_id: str
+    domain: str
+    map_version: Annotated[int, Field(description="The map it began on and keeps.")]
+    n_observations: Annotated[int, Field(description="Views that its belief rests on.")]
+    expires_at: Annotated[str, Field(description="When it ends unless something happens to it; ISO 8601, UTC.")]
+    belief: BeliefAnswer
+    next_best_view: Annotated[NextBestViewAnswer | None, Field(description="null where the map can name none.")]
+
+
+class ObservationAnswer(SessionAnswer):
+    """A session after one more observation."""
+
+    timings_ms: Annotated[dict[str, float], Field(description="Milliseconds by stage, and their `total`.")]
+    retrieval: Annotated[list[RetrievedAnswer], Field(description="Map images most relevant to this view, best first.")]

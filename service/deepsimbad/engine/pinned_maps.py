@@ -1,0 +1,83 @@
+"""The map versions that sessions are pinned to: held as long as a session holds them, loaded once for all of them."""
+
+import threading
+from weakref import WeakValueDictionary
+
+from deepsimbad.engine.active_maps import ActiveDomain, ActiveMaps, load_snapshot
+from deepsimbad.engine.evaluator_pool import EvaluatorPool
+from deepsimbad.engine.snapshot import MapSnapshot
+from deepsimbad.errors import DeepSimbadError, RetiredMapError, UnknownDomainError, UnknownMapVersionError
+from deepsimbad.evaluators.base import Evaluator
+from deepsimbad.store.catalog import Catalog
+from deepsimbad.store.records import DomainRecord, MapState
+
+_Key = tuple[str, int, str]  # domain, version, digest: a domain that was deleted and made anew has other maps
+
+
+class PinnedMaps:
+    """Map versions by what identifies them for ever; usable from any thread.
+
+    Args:
+        catalog: Says which versions there are.
+        active_maps: The versions that serve, which are in memory anyway.
+        evaluators: Of all domains.
+    """
+
+    def __init__(self, catalog: Catalog, active_maps: ActiveMaps, evaluators: EvaluatorPool) -> None:
+        self._catalog = catalog
+        self._active_maps = active_maps
+        self._evaluators = evaluators
+        self._held: WeakValueDictionary[_Key, MapSnapshot] = WeakValueDictionary()
+        self._lock = threading.Lock()
+
+    def pin(self, active: ActiveDomain) -> tuple[str, Evaluator]:
+        """Digest of a domain's active map, and the domain's evaluator; may read files.
+
+        Raises:
+            UnknownMapVersionError, UnknownDomainError: The domain was deleted meanwhile.
+        """
+        snapshot = active.snapshot
+        digest = self._catalog.map(snapshot.domain, snapshot.version).sha256 or ""
+        with self._lock:
+            self._held[snapshot.domain, snapshot.version, digest] = snapshot
+        return digest, self._evaluators.evaluator(active.record.evaluator)
+
+    def take(self, domain: str, version: int, digest: str) -> tuple[MapSnapshot, Evaluator]:
+        """A map version and its domain's evaluator; may read files.
+
+        Raises:
+            RetiredMapError: The version is no more.
+            DamagedMapError: Its file is damaged, or missing though the version serves.
+        """
+        with self._lock:
+            try:
+                record = self._catalog.domain(domain)
+                known = self._catalog.map(domain, version)
+            except (UnknownDomainError, UnknownMapVersionError) as error:
+                raise _retired(domain, version) from error
+            is_removed = known.state is not MapState.ACTIVE and not self._catalog.map_path(domain, version).exists()
+            snapshot = self._held.get((domain, version, digest))
+            if known.sha256 != digest or (is_removed and snapshot is None):
+                raise _retired(domain, version)
+            if snapshot is None:
+                snapshot = self._load(record, version)
+                self._held[domain, version, digest] = snapshot
+        return snapshot, self._evaluators.evaluator(record.evaluator)
+
+    def _load(self, record: DomainRecord, version: int) -> MapSnapshot:
+        if record.active_version == version:
+            try:
+                active = self._active_maps.snapshot(record.name)
+            except DeepSimbadError:
+                active = None
+            if active is not None and active.version == version:
+                return active
+        return load_snapshot(self._catalog, record.name, version)
+
+
+def _retired(domain: str, version: int) -> RetiredMapError:
+    return RetiredMapError(
+        f"map {version} of domain {domain}, which the session was begun on, is no more: begin a new session",
+        domain=domain,
+        map_version=version,
+    )

@@ -1,0 +1,247 @@
+"""The live sessions: each moves on in order of arrival, and nothing is answered before it is on the disk."""
+
+import asyncio
+import secrets
+import time
+from collections.abc import Callable, Coroutine
+from dataclasses import replace
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deepsimbad.core.planners import Plan
+from deepsimbad.engine.active_maps import ActiveDomain
+from deepsimbad.engine.live_session import LiveSession, Loaded, Observation
+from deepsimbad.engine.localizer import describe, shortlist_length
+from deepsimbad.engine.observation import View
+from deepsimbad.engine.pinned_maps import PinnedMaps
+from deepsimbad.engine.session_config import SessionConfig, check_move, check_prior, check_start
+from deepsimbad.engine.session_registry import DELETED, SessionRegistry
+from deepsimbad.engine.session_state import SessionEngine
+from deepsimbad.engine.session_view import SessionView, view_of
+from deepsimbad.engine.worker import InferenceWorker
+from deepsimbad.errors import IdempotencyKeyReusedError, InvalidInputError, UnavailableError
+from deepsimbad.store.session_records import IdempotencyKey, JournalRow, ObservedRow, PriorRow, SessionRecord
+from deepsimbad.store.sessions import SessionStore
+
+T = TypeVar("T")
+
+
+class Sessions:
+    """All sessions of the service; used from one event loop.
+
+    A change that was begun is finished even if its asker goes away: it may already be on the disk. One that fails
+    leaves the session as it was.
+
+    Args:
+        store: Where they are kept.
+        maps: What they are pinned to.
+        worker: Where views are described and beliefs computed.
+        ttl_s: A session ends when nothing happened to it for so long.
+        max_sessions: How many may live at once.
+        snapshot_every: Rows of a journal between two snapshots: how much is replayed after a start.
+        clock: Seconds since 1970.
+    """
+
+    def __init__(
+        self,
+        store: SessionStore,
+        maps: PinnedMaps,
+        worker: InferenceWorker,
+        *,
+        ttl_s: float,
+        max_sessions: int,
+        snapshot_every: int,
+        clock: Callable[[], float] = time.time,
+    ) -> None:
+        self._store = store
+        self._maps = maps
+        self._worker = worker
+        self._ttl_s = ttl_s
+        self._snapshot_every = snapshot_every
+        self._clock = clock
+        self._registry = SessionRegistry(store, maps, max_sessions, clock)
+        self._under_way: set[asyncio.Task[Any]] = set()
+
+    @property
+    def n_living(self) -> int:
+        """How many sessions have not ended, as far as is known without looking."""
+        return self._registry.n_living
+
+    async def begin(self, active: ActiveDomain, config: SessionConfig) -> SessionView:
+        """Begin a session on a domain's active map.
+
+        Raises:
+            InvalidInputError: The start or the configuration cannot be.
+            TooManySessionsError: As many live as may.
+        """
+        check_start(active.snapshot.route, config)
+        return await self._finished(self._begin(active, config))
+
+    async def observe(self, session_id: str, observation: Observation) -> SessionView:
+        """Move a session on by a move and the view after it.
+
+        Raises:
+            UnknownSessionError, EndedSessionError, RetiredMapError: There is no such session, or no more.
+            InvalidInputError: The move, the view or the shortlist cannot be.
+            IdempotencyKeyReusedError: The key named another observation.
+        """
+        live = await self._registry.find(session_id)
+        return await self._finished(self._observe(live, observation))
+
+    async def set_prior(self, session_id: str, position_m: float, std_m: float) -> SessionView:
+        """Replace a session's belief by one around a position; raises InvalidPriorError."""
+        live = await self._registry.find(session_id)
+        return await self._finished(self._set_prior(live, position_m, std_m))
+
+    async def view(self, session_id: str, n_shortlist: int | None = None) -> SessionView:
+        """What a session believes now."""
+        live, loaded = await self._read(session_id)
+        expires_at = live.expires_at
+        return await self._compute(lambda: view_of(session_id, expires_at, loaded.engine, loaded.state, n_shortlist))
+
+    async def mass(self, session_id: str) -> NDArray[np.float64]:
+        """[n] mass of every map image in a session's belief; sums to 1."""
+        _, loaded = await self._read(session_id)
+        return await self._compute(lambda: loaded.state.belief.belief.mass)
+
+    async def next_best_view(self, session_id: str) -> tuple[Plan | None, NDArray[np.float64]]:
+        """The move to make next, without a new view (None where the map can name none), and the moves there are."""
+        _, loaded = await self._read(session_id)
+        engine, state = loaded.engine, loaded.state
+        if state.step is not None:
+            return state.step.plan, engine.snapshot.actions_m
+        return await self._compute(lambda: engine.localizer.plan(state.belief)), engine.snapshot.actions_m
+
+    async def end(self, session_id: str) -> None:
+        """End a session."""
+        await self._finished(self._registry.end(await self._registry.find(session_id), DELETED))
+
+    async def end_domain(self, domain: str) -> None:
+        """End the sessions of a domain that was deleted."""
+        for live in self._registry.of_domain(domain):
+            if live.ending is None:
+                await self._finished(self._registry.end(live, DELETED))
+
+    async def sweep(self) -> None:
+        """End what has expired, and forget what ended long ago."""
+        await self._finished(self._registry.sweep())
+
+    async def _begin(self, active: ActiveDomain, config: SessionConfig) -> SessionView:
+        await self._registry.reserve()
+        begun = None
+        try:
+            digest, evaluator = await asyncio.to_thread(self._maps.pin, active)
+            snapshot, session_id, now = active.snapshot, secrets.token_hex(16), self._clock()
+            expires_at = now + self._ttl_s
+
+            def start() -> tuple[Loaded, SessionView]:
+                engine = SessionEngine.of(config, snapshot, evaluator)
+                state = engine.start()
+                return Loaded(engine, state), view_of(session_id, expires_at, engine, state)
+
+            loaded, answer = await self._compute(start)
+            new = SessionRecord(
+                0, session_id, snapshot.domain, snapshot.version, digest, config.as_dict(), now, expires_at, 0, None
+            )
+            kept = await asyncio.wrap_future(self._store.create(new))
+            begun = LiveSession(kept, expires_at, loaded)
+            return answer
+        finally:
+            self._registry.settle(begun)
+
+    async def _observe(self, live: LiveSession, observation: Observation) -> SessionView:
+        """Everything in order under the session's lock: describe, compute, write, publish."""
+        async with live.lock:
+            loaded = await self._registry.loaded(live)
+            shortlist_length(loaded.engine.snapshot, observation.n_shortlist)  # a bad one should not move the session
+            check_move(loaded.engine.snapshot, observation.action_m, observation.action_std_m)
+            view = await observation.view()
+            expires_at = self._clock() + self._ttl_s
+            stepped = await self._compute(lambda: self._step(live, loaded, observation, view, expires_at))
+            if isinstance(stepped, int):
+                return await self._repeated(live, loaded, stepped, observation.n_shortlist)
+            row, moved_on, answer = stepped
+            await self._commit(live, loaded, row, moved_on)
+            return answer
+
+    def _step(
+        self, live: LiveSession, loaded: Loaded, observation: Observation, view: View, expires_at: float
+    ) -> tuple[ObservedRow, Loaded, SessionView] | int:
+        """The next row and what it leads to; or the row's number, if the observation was counted before."""
+        named = observation.idempotency
+        if named is not None and (earlier := self._counted_before(live, named)) is not None:
+            return earlier
+        engine = loaded.engine
+        query = describe(engine.snapshot, engine.evaluator, view)
+        row = engine.row_of(
+            query, loaded.state.sequence + 1, expires_at, observation.action_m, observation.action_std_m, named
+        )
+        state = engine.applied(loaded.state, row)
+        answer = view_of(live.session_id, expires_at, engine, state, observation.n_shortlist)
+        return row, Loaded(engine, state), answer
+
+    def _counted_before(self, live: LiveSession, named: IdempotencyKey) -> int | None:
+        found = self._store.named(live.record.number, named.key)
+        if found is None:
+            return None
+        sequence, digest = found
+        if digest != named.digest:
+            raise IdempotencyKeyReusedError(
+                "this idempotency key came before with another observation: choose a new one"
+            )
+        return sequence
+
+    async def _repeated(self, live: LiveSession, loaded: Loaded, sequence: int, n_shortlist: int | None) -> SessionView:
+        """The answer that an observation had; computed again, since the same journal leads to the same belief."""
+        if loaded.state.sequence != sequence:
+            loaded = await asyncio.to_thread(self._registry.restored, live.record, sequence)
+        then, expires_at = loaded, live.expires_at
+        answer = await self._compute(lambda: view_of(live.session_id, expires_at, then.engine, then.state, n_shortlist))
+        return replace(answer, is_repeated=True)
+
+    async def _set_prior(self, live: LiveSession, position_m: float, std_m: float) -> SessionView:
+        async with live.lock:
+            loaded = await self._registry.loaded(live)
+            check_prior(loaded.engine.snapshot.route, position_m, std_m)
+            row = PriorRow(loaded.state.sequence + 1, self._clock() + self._ttl_s, position_m, std_m)
+
+            def step() -> tuple[Loaded, SessionView]:
+                state = loaded.engine.applied(loaded.state, row)
+                return Loaded(loaded.engine, state), view_of(live.session_id, row.expires_at, loaded.engine, state)
+
+            moved_on, answer = await self._compute(step)
+            await self._commit(live, loaded, row, moved_on)
+            return answer
+
+    async def _commit(self, live: LiveSession, before: Loaded, row: JournalRow, after: Loaded) -> None:
+        """Write a row, then publish what it leads to."""
+        snapshot = None
+        if before.state.sequence > 0 and before.state.sequence % self._snapshot_every == 0:
+            # Of the state before the row, so that a restart replays at least the last row and has its whole step.
+            snapshot = before.engine.snapshot_of(before.state)
+        try:
+            await asyncio.wrap_future(self._store.append(live.record.number, row, self._clock(), snapshot))
+        except BaseException as error:
+            live.loaded = None  # what the file holds is the truth: it is read again at the next touch
+            if isinstance(error, InvalidInputError):
+                raise UnavailableError("another process moved this session on: try again") from error
+            raise
+        live.expires_at, live.loaded = row.expires_at, after
+
+    async def _read(self, session_id: str) -> tuple[LiveSession, Loaded]:
+        live = await self._registry.find(session_id)
+        if live.loaded is not None:
+            return live, live.loaded
+        async with live.lock:
+            return live, await self._registry.loaded(live)
+
+    async def _compute(self, run: Callable[[], T]) -> T:
+        return await asyncio.wrap_future(self._worker.submit(run))
+
+    async def _finished(self, change: Coroutine[Any, Any, T]) -> T:
+        task = asyncio.ensure_future(change)
+        self._under_way.add(task)
+        task.add_done_callback(self._under_way.discard)
+        return await asyncio.shield(task)
