@@ -7,22 +7,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from deepsimbad_client.client import Client
 from deepsimbad_client.episode_log import Episode, EpisodeLog, EpisodeStep, write_steps
-from deepsimbad_client.errors import ReplayError
 from deepsimbad_client.in_order import in_order
-from deepsimbad_client.judge import TRUTH_WITHIN_M, Judge
+from deepsimbad_client.judge import TRUTH_WITHIN_M
 from deepsimbad_client.map_route import MapRoute
 from deepsimbad_client.models import Domain
 from deepsimbad_client.recording import Recording
-from deepsimbad_client.replay import changed_map, fetch_route
+from deepsimbad_client.replay import changed_map
+from deepsimbad_client.stage import DEFAULT_PLANNER, Stage
 from deepsimbad_client.upload import CONCURRENCY
-from deepsimbad_client.walk import Walk, drive
 
-DEFAULT_PLANNER = "default"
-"""Asks the service for the planner that ships."""
 EPISODES = 20
 STEPS = 10
 
@@ -93,18 +88,12 @@ def active_replay(
         TransportError: The service did not answer.
     """
     started = clock()
-    described = client.domain(domain)
-    if described.map_version is None or described.n_map_images is None:
-        raise ReplayError(f"domain {domain} has no active map to replay against: remap it first")
-    walk = Walk(recording, described.input_size)
-    longest_m = max(described.actions_m, default=10.0)
-    starts = [walk.start(steps, longest_m, seed, episode) for episode in range(episodes)]
+    stage = Stage.of(client, recording, domain)
+    starts = [stage.start(steps, seed, episode) for episode in range(episodes)]
     planners = tuple(dict.fromkeys(planners))
-    identity = _identity(recording, described, steps, seed)
+    identity = _identity(recording, stage.domain, steps, seed)
     stopping = threading.Event()
     with EpisodeLog(folder, identity, restart=restart) as log:
-        route = fetch_route(client, recording, described)
-        judge = Judge(recording, route)
         wanted = [(planner, episode) for episode in range(episodes) for planner in planners]
         n_done = 0
         for key in wanted:
@@ -114,7 +103,7 @@ def active_replay(
 
         def work(key: tuple[str, int]) -> Episode:
             planner, number = key
-            return _run(client, described, walk, judge, planner, number, starts[number], steps, clock, stopping)
+            return _run(stage, planner, number, starts[number], steps, clock, stopping)
 
         todo = [key for key in wanted if key not in log.done]
         n_done = len(wanted) - len(todo)
@@ -123,12 +112,12 @@ def active_replay(
             n_done += 1
             if on_progress is not None:
                 on_progress(episode, n_done)
-        if client.domain(domain).map_version != described.map_version:
+        if client.domain(domain).map_version != stage.domain.map_version:
             raise changed_map(domain)
         by_planner = {name: [log.done[name, number] for number in range(episodes)] for name in planners}
     write_steps((each for name in planners for each in by_planner[name]), folder)
     identity |= {"planners": list(planners), "n_episodes": episodes}
-    return ActiveReplay(folder, planners, by_planner, route, identity, clock() - started)
+    return ActiveReplay(folder, planners, by_planner, stage.judge.route, identity, clock() - started)
 
 
 def _identity(recording: Recording, described: Domain, steps: int, seed: int) -> dict[str, Any]:
@@ -148,10 +137,7 @@ def _identity(recording: Recording, described: Domain, steps: int, seed: int) ->
 
 
 def _run(
-    client: Client,
-    described: Domain,
-    walk: Walk,
-    judge: Judge,
+    stage: Stage,
     planner: str,
     number: int,
     start: tuple[int, int],
@@ -160,27 +146,14 @@ def _run(
     stopping: threading.Event,
 ) -> Episode:
     row, seed = start
-    route = judge.route
     done: list[EpisodeStep] = []
     named = planner
     edges_m = (0.0, 0.0)
-    with client.session(described.name, seed=seed, planner=None if planner == DEFAULT_PLANNER else planner) as session:
-        if session.map_version != described.map_version:
-            raise changed_map(described.name)
-        views = drive(
-            session,
-            walk,
-            row,
-            steps,
-            clock,
-            route_middle_m=float(np.median(route.path.position_m)),
-            route_length_m=route.length_m,
-        )
-        for seen in views:
+    with stage.session(planner, seed) as session:
+        for seen, step in stage.play(session, row, steps, clock):
             if stopping.is_set():
                 raise _Stopped
-            travelled_m = (done[-1].travelled_m if done else 0.0) + seen.action_m
-            done.append(judge.step(seen, session.belief_masses(), travelled_m))
+            done.append(step)
             edges = seen.answer.belief.histogram.edges_m
             edges_m = (edges[0], edges[-1])
             if seen.answer.next_best_view is not None:

@@ -7,9 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.table import Table
 
-from deepsimbad_client.active_replay import DEFAULT_PLANNER, ActiveReplay
+from deepsimbad_client.active_replay import ActiveReplay
 from deepsimbad_client.bootstrap import Interval, Resampling, mean_known
 from deepsimbad_client.episode_log import Episode, EpisodeStep
+from deepsimbad_client.stage import DEFAULT_PLANNER
 
 NEAR_M = (5.0, 10.0)
 _DIGITS = 4
@@ -38,7 +39,7 @@ def distances_m(replay: ActiveReplay) -> list[float]:
     """Metres travelled at which planners are compared: as far as half of the episodes of any planner come."""
     furthest = max(float(np.median(figures(each, "travelled_m")[:, -1])) for each in replay.episodes.values())
     apart = max(1.0, float(np.ceil(furthest / _MOST_DISTANCES)))
-    return [float(metres) for metres in np.arange(apart, furthest + 1e-9, apart)]
+    return [float(metres) for metres in np.arange(0, furthest + 1e-9, apart)]
 
 
 def summarise_active(replay: ActiveReplay) -> dict[str, Any]:
@@ -90,25 +91,41 @@ def planner_table(summary: dict[str, Any]) -> Table:
     table = Table(
         title=f"{config['recording']} against {config['domain']}, map {config['map_version']}: "
         f"{summary['n_episodes']} episodes of {config['steps']} moves",
-        caption="ANR after each move: 0 is perfect, 50 is chance. In brackets: 95 % of resampled starts.",
+        caption="ANR after each move: 0 is perfect, 50 is chance. 95 %: over resampled starts, the same for all.",
         title_justify="left",
         caption_justify="left",
     )
-    table.add_column("planner", style="bold")
-    for heading in ("ANR %", f"{first} is better by", "error [m]", "within 5 m", "within 10 m", "moved"):
-        table.add_column(heading, justify="right")
+    table.add_column("planner", style="bold", no_wrap=True)
+    for heading in ("ANR %", "95 %", f"{first} gains", "95 %"):
+        table.add_column(heading, justify="right", no_wrap=True)
     for name in config["planners"]:
-        last = {figure: values[-1] for figure, values in summary["by_step"][name].items()}
-        against = summary["against"].get(name)
-        better = "" if against is None else _ranged(against["anr"], against["interval_95"], -1)
+        against = summary["against"].get(name, {"anr": None, "interval_95": None})
         table.add_row(
             shown_name(name, summary["planner_named"][name]),
-            _ranged(summary["anr"][name], summary["interval_95"][name]),
-            better,
-            _shown(last["median_error_m"], ".1f"),
+            _shown(summary["anr"][name], ".2f"),
+            _ends(summary["interval_95"][name]),
+            "" if name == first else _shown(None if against["anr"] is None else -against["anr"], ".2f"),
+            "" if name == first else _ends(against["interval_95"], -1),
+        )
+    return table
+
+
+def localized_table(summary: dict[str, Any]) -> Table:
+    """How well planners know where they are after their last move."""
+    config = summary["config"]
+    table = Table(title=f"after {config['steps']} moves", title_justify="left")
+    table.add_column("planner", style="bold", no_wrap=True)
+    for heading in ("median error", "within 5 m", "within 10 m", "moved", "forgot"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    for name in config["planners"]:
+        last = {figure: values[-1] for figure, values in summary["by_step"][name].items()}
+        table.add_row(
+            shown_name(name, summary["planner_named"][name]),
+            _shown(last["median_error_m"], ".1f", " m"),
             _shown(last["within_5_m"], ".0f", " %"),
             _shown(last["within_10_m"], ".0f", " %"),
             _shown(summary["travelled_m"][name], ".0f", " m"),
+            str(summary["n_forgot"][name]),
         )
     return table
 
@@ -191,11 +208,11 @@ def _interval(interval: Interval) -> list[float] | None:
     return None if interval is None else [round(end, _DIGITS) for end in interval]
 
 
-def _ranged(value: float | None, interval: list[float] | None, sign: int = 1) -> str:
-    if value is None or interval is None:
+def _ends(interval: list[float] | None, sign: int = 1) -> str:
+    if interval is None:
         return "-"
     low, high = sorted(sign * end for end in interval)
-    return f"{sign * value:.2f} [{low:.2f}, {high:.2f}]"
+    return f"{low:.2f} .. {high:.2f}"
 
 
 def _shown(value: float | None, form: str, unit: str = "") -> str:

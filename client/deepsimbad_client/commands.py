@@ -16,6 +16,7 @@ from deepsimbad_client.job_commands import jobs, remap
 from deepsimbad_client.place_commands import domains, localize
 from deepsimbad_client.replay_command import replay
 from deepsimbad_client.upload_command import upload
+from deepsimbad_client.watch_command import watch
 
 DONE, FAILED, CANCELLED = 0, 1, 130
 ELSEWHERE = {"campus": "deepsimbad_client.campus.command:campus_command"}
@@ -51,7 +52,7 @@ def cli() -> None:
     """
 
 
-for command in (upload, remap, replay, localize, domains, jobs):
+for command in (upload, remap, replay, watch, localize, domains, jobs):
     cli.add_command(command)
 
 

@@ -18,6 +18,7 @@ from rich.progress import (
 )
 from rich.table import Table
 
+from deepsimbad_client.episode_log import Episode
 from deepsimbad_client.models import Domain, Job, Localization
 from deepsimbad_client.step_log import Step
 from deepsimbad_client.upload import UploadProgress
@@ -112,6 +113,22 @@ class ReplayBar(Bar):
             self._scored += 1
         if self._scored:
             note = f"ANR {self._sum / self._scored:.2f} %"
+        self._progress.update(self._task, completed=n_done, note=note)
+
+
+class EpisodeBar(Bar):
+    """Episodes driven, and every planner's averaged normalised rank so far."""
+
+    def __init__(self, label: str, total: int) -> None:
+        super().__init__(label, total)
+        self._ranks: dict[str, list[float]] = {}
+
+    def __call__(self, episode: Episode, n_done: int) -> None:
+        """Show how far an active replay is."""
+        ranks = self._ranks.setdefault(episode.planner, [])
+        ranks += [step.rank_percent for step in episode.steps[1:] if step.rank_percent is not None]
+        means = {planner: sum(each) / len(each) for planner, each in self._ranks.items() if each}
+        note = "  ".join(f"{planner} {mean:.1f} %" for planner, mean in means.items())
         self._progress.update(self._task, completed=n_done, note=note)
 
 
