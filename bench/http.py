@@ -32,7 +32,7 @@ def http_table() -> Iterator[str]:
         LocalServer(Path(folder) / "data") as server,
         Client(server.url) as client,
     ):
-        _make_map(client, rng)
+        make_map(client, rng)
         for count in (N_LANDMARKS, 4):
             sent = ranked[:count]
             yield f"| {count} ranked landmarks | a bare HTTP/1.1 connection | {_bare(server.url, sent)} |"
@@ -58,7 +58,7 @@ def _post(connection: http.client.HTTPConnection, body: bytes) -> None:
         raise RuntimeError(answer.decode())
 
 
-def _make_map(client: Client, rng: np.random.Generator) -> None:
+def make_map(client: Client, rng: np.random.Generator) -> None:
     """Upload a wandering traverse and map it, through the same calls a user has."""
     wander = np.cumsum(rng.normal(size=(NCLT_IMAGES, _DIM)), axis=0)
     encodings = (wander / np.linalg.norm(wander, axis=1, keepdims=True)).astype(np.float32)

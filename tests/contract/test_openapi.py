@@ -13,6 +13,13 @@ GET /metrics
 GET /v1/domains
 GET /v1/domains/{domain}
 POST /v1/domains/{domain}/localizations
+POST /v1/domains/{domain}/sessions
+POST /v1/sessions/{session_id}/observations
+GET /v1/sessions/{session_id}
+GET /v1/sessions/{session_id}/belief
+GET /v1/sessions/{session_id}/next-best-view
+PUT /v1/sessions/{session_id}/prior
+DELETE /v1/sessions/{session_id}
 PUT /v1/admin/domains/{domain}
 DELETE /v1/admin/domains/{domain}
 POST /v1/admin/domains/{domain}/traverses

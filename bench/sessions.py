@@ -1,0 +1,145 @@
+"""`POST observations` with ready ranks over loopback, durable: one robot, and many at once."""
+
+import asyncio
+import json
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from time import perf_counter
+from typing import Any, Self
+from urllib.parse import urlsplit
+
+import numpy as np
+
+from bench.http import make_map
+from bench.timing import Timing
+from bench.worlds import N_LANDMARKS, NCLT_IMAGES
+from deepsimbad_client import Client
+from deepsimbad_client.local_server import LocalServer
+
+ROBOTS = 50
+_ONE_ROBOT_VIEWS, _EACH_ROBOT_VIEWS, _WARM_UP = 300, 40, 20
+_ACTION_M = 1.0
+
+
+def session_table() -> Iterator[str]:
+    """Markdown lines."""
+    yield f"## Sessions: `POST observations` on loopback, {NCLT_IMAGES:,} map images, {N_LANDMARKS} ranks, durable"
+    yield ""
+    yield "| robots | an observation | observations a second in all | errors | counted by the service |"
+    yield "|---|---|---|---|---|"
+    with tempfile.TemporaryDirectory() as folder, LocalServer(Path(folder) / "data") as server:
+        with Client(server.url) as client:
+            make_map(client, np.random.default_rng(0))
+        asyncio.run(drive(server.url, 1, _WARM_UP))
+        for n_robots, n_views in ((1, _ONE_ROBOT_VIEWS), (ROBOTS, _EACH_ROBOT_VIEWS)):
+            driven = asyncio.run(drive(server.url, n_robots, n_views))
+            yield (
+                f"| {n_robots} | {driven.timing} | {driven.per_second:.0f} | {driven.n_errors} "
+                f"| {driven.n_counted} of {n_robots * n_views} |"
+            )
+    yield ""
+    yield f"Inside the service, in ms, {ROBOTS} robots: {driven.stages}"
+
+
+@dataclass(frozen=True)
+class Driven:
+    """What many robots met with.
+
+    Attributes:
+        timing: Of every observation, from its first byte sent to the last of its answer.
+        seconds: From the first to the last of all.
+        n_errors: Answers that were no belief.
+        n_counted: Observations that the service says it has.
+        stages: Median milliseconds of the stages in the service.
+    """
+
+    timing: Timing
+    seconds: float
+    n_errors: int
+    n_counted: int
+    stages: str
+
+    @property
+    def per_second(self) -> float:
+        """Observations answered a second."""
+        return len(self.timing.seconds) / self.seconds
+
+
+async def drive(url: str, n_robots: int, n_views: int) -> Driven:
+    """Let robots observe at once, each as fast as it is answered."""
+    rng = np.random.default_rng(1)
+    bodies = [
+        json.dumps({"ranked_landmarks": rng.permutation(N_LANDMARKS).tolist()}).encode() for _ in range(n_robots + 20)
+    ]
+    robots = [await _Robot.begin(url) for _ in range(n_robots)]
+    began = perf_counter()
+    await asyncio.gather(*(robot.observe(bodies[place:], n_views) for place, robot in enumerate(robots)))
+    seconds = perf_counter() - began
+    n_counted = sum([await robot.n_observations() for robot in robots])
+    for robot in robots:
+        robot.close()
+    every = [spent for robot in robots for spent in robot.seconds]
+    stages: dict[str, list[float]] = {}
+    for robot in robots:
+        for timings_ms in robot.timings_ms:
+            for stage, spent in timings_ms.items():
+                stages.setdefault(stage, []).append(spent)
+    medians = ", ".join(f"{stage} {np.median(spent):.2f}" for stage, spent in stages.items())
+    return Driven(Timing(tuple(every)), seconds, sum(robot.n_errors for robot in robots), n_counted, medians)
+
+
+class _Robot:
+    """One session over one bare connection, so that the sender costs the machine as little as may be."""
+
+    def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        self._reader, self._writer = reader, writer
+        self.session_id = ""
+        self.seconds: list[float] = []
+        self.timings_ms: list[dict[str, float]] = []
+        self.n_errors = 0
+
+    @classmethod
+    async def begin(cls, url: str) -> Self:
+        """Connect and begin a session."""
+        where = urlsplit(url)
+        robot = cls(*await asyncio.open_connection(where.hostname, where.port))
+        status, answer = await robot._request("POST", "/v1/domains/bench/sessions", b"{}")
+        if status != 201:
+            raise RuntimeError(f"no session: {answer!r}")
+        robot.session_id = json.loads(answer)["session_id"]
+        return robot
+
+    async def observe(self, bodies: list[bytes], n_views: int) -> None:
+        """Observe again and again."""
+        path = f"/v1/sessions/{self.session_id}/observations?action_m={_ACTION_M}"
+        for view in range(n_views):
+            began = perf_counter()
+            status, answer = await self._request("POST", path, bodies[view % len(bodies)], f"view-{view}")
+            self.seconds.append(perf_counter() - began)
+            if status == 200:
+                if view % 10 == 0:
+                    self.timings_ms.append(json.loads(answer)["timings_ms"])
+            else:
+                self.n_errors += 1
+
+    async def n_observations(self) -> int:
+        """How many the service has counted."""
+        _, answer = await self._request("GET", f"/v1/sessions/{self.session_id}", b"")
+        document: dict[str, Any] = json.loads(answer)
+        return int(document["n_observations"])
+
+    def close(self) -> None:
+        self._writer.close()
+
+    async def _request(self, method: str, path: str, body: bytes, key: str = "") -> tuple[int, bytes]:
+        named = f"Idempotency-Key: {key}\r\n" if key else ""
+        head = (
+            f"{method} {path} HTTP/1.1\r\nHost: bench\r\nContent-Type: application/json\r\n"
+            f"{named}Content-Length: {len(body)}\r\n\r\n"
+        )
+        self._writer.write(head.encode() + body)
+        answer_head = await self._reader.readuntil(b"\r\n\r\n")
+        length = int(answer_head.lower().partition(b"content-length:")[2].partition(b"\r\n")[0])
+        return int(answer_head[9:12]), await self._reader.readexactly(length)
