@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +28,14 @@ class LearningCurve:
     reward_share: tuple[float, ...]
     greedy_reward_share: float
     random_reward_share: float
+
+    def as_dict(self) -> dict[str, Any]:
+        """JSON-ready."""
+        return {
+            "reward_share": [round(share, 4) for share in self.reward_share],
+            "greedy_reward_share": self.greedy_reward_share,
+            "random_reward_share": self.random_reward_share,
+        }
 
 
 def train(

@@ -46,10 +46,12 @@ class Described:
     Attributes:
         built: The part of the map that retrieval reads.
         telling: What a second season of the route taught; None where none is known.
+        rehearsal: The map made without the second season's lists, for training on that season; None: as `built`.
     """
 
     built: RetrievalMap
     telling: Telling | None
+    rehearsal: RetrievalMap | None = None
 
 
 def describe(
@@ -81,13 +83,14 @@ def describe(
         other = _dissimilarities(second.encodings, evaluator, model, lambda share: on_progress(0.5 + share / 4))
         season = SecondSeason(other, same_places(route_of(second), route))
     built = build_retrieval_map(relevance, own, list_length, training.encodings, season)
-    telling = None
+    telling, rehearsal = None, None
     if season is not None and built.calibration is not None and built.calibration.is_of_two_seasons:
         # Judged by lists that do not know the second season, as no list knows the season to come.
         unaware = build_retrieval_map(relevance, own, list_length)
-        telling = Telling.learn(replace(unaware, calibration=_unaware(built, unaware)), season, route)
+        rehearsal = replace(unaware, calibration=_unaware(built, unaware))
+        telling = Telling.learn(rehearsal, season, route)
     on_progress(1.0)
-    return Described(built, telling)
+    return Described(built, telling, rehearsal)
 
 
 def _unaware(built: RetrievalMap, unaware: RetrievalMap) -> Calibration:

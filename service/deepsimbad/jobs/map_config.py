@@ -23,7 +23,7 @@ class RemapConfig:
         n_landmarks: r; None means 500, or as many as the active map has where its landmarks stay.
         list_length: h.
         relevance: What the map is built for.
-        training_episodes: Of the next-best-view planner; kept with the map, read once maps learn Q-values.
+        training_episodes: Of the experience database that NNQL plans by; 0: the map has none.
         seed: Of everything random in the remap.
         activate: Serve the new map at once.
     """

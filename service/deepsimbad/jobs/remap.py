@@ -2,14 +2,17 @@
 
 import time
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
+from deepsimbad.core.nnql import NnqlConfig
 from deepsimbad.errors import DeepSimbadError, InvalidMapConfigError
 from deepsimbad.evaluators.base import Evaluator, LandmarkModel
 from deepsimbad.jobs.build_map import choose_landmarks, describe, map_contents
 from deepsimbad.jobs.encoded_traverse import route_of
 from deepsimbad.jobs.map_config import DEFAULT_N_LANDMARKS, RemapConfig
 from deepsimbad.jobs.progress import Progress
+from deepsimbad.jobs.train_nnql import DescribedDrive, train_nnql
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.frames import TraverseFrames
 from deepsimbad.store.map_file import index_bytes, read_map, write_map
@@ -18,7 +21,14 @@ from deepsimbad.store.records import DomainRecord
 from deepsimbad.store.sealing import seal
 from deepsimbad.store.traverses import Traverse
 
-REMAP_STAGES = {"read frames": 1.0, "select landmarks": 4.0, "describe": 2.0, "seal": 1.0, "activate": 0.1}
+REMAP_STAGES = {
+    "read frames": 1.0,
+    "select landmarks": 4.0,
+    "describe": 2.0,
+    "train": 3.0,
+    "seal": 1.0,
+    "activate": 0.1,
+}
 
 
 def remap(
@@ -59,16 +69,35 @@ def remap(
     found = describe(training, route, evaluator, model, config.relevance, config.list_length, second, progress.update)
     seconds["describe"] = time.perf_counter() - described
 
+    progress.stage("train")
+    experience = None
+    if config.training_episodes:
+        other = None if second is None else DescribedDrive.of(second, record.closed, evaluator, model)
+        experience = train_nnql(
+            found.rehearsal or found.built,
+            route,
+            record.actions_m,
+            partial(DescribedDrive.of, training, record.closed, evaluator, model),
+            other,
+            NnqlConfig(n_episodes=config.training_episodes, seed=config.seed),
+            progress.update,
+        )
+        seconds["train"] = experience.metrics["seconds"]
+
     progress.stage("seal")
     version = catalog.begin_map(domain, config.as_dict())
     try:
         contents = map_contents(record, version, config.as_dict(), model, found, route)
         known_times = training.timestamp_us if (training.timestamp_us >= 0).any() else None
         building, sealed = catalog.building_path(domain, version), catalog.map_path(domain, version)
-        write_map(building, replace(contents, timestamp_us=known_times), progress.update)
+        contents = replace(
+            contents, timestamp_us=known_times, q_values=None if experience is None else experience.q_values
+        )
+        write_map(building, contents, progress.update)
         digest, n_bytes = seal(building, sealed)
         bits = 8 * index_bytes(sealed) / route.n_images
         metrics = {"n_map_images": route.n_images, "index_bits_per_map_image": bits, "seconds": seconds}
+        metrics["training"] = None if experience is None else experience.metrics
         progress.stage("activate")
         catalog.seal_map(domain, version, digest, n_bytes, metrics)
     except BaseException:
