@@ -124,7 +124,7 @@ class RemapBody(JsonBody):
     )
     relevance: Relevance = DEFAULT_RELEVANCE
     training_episodes: Annotated[
-        int, Field(strict=True, ge=0, le=10_000_000, description="Of the experience database that `nnql` plans by; 0: none.")
+        int, Field(strict=True, ge=0, le=10_000_000, description="Of what the planner `nnql` knows; 0: nothing.")
     ] = DEFAULT_TRAINING_EPISODES
     seed: Annotated[int, Field(strict=True, ge=0, le=GREATEST_EXACT_INTEGER)] = 0
     activate: Annotated[bool, Field(strict=True, description="Switch to the new map when it is sealed.")] = True
