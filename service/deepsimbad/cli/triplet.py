@@ -80,7 +80,8 @@ def read_triplet(
         "spacing_m": spacing_m,
         "left_out": {role: traverse.left_out for role, traverse in zip(roles, traverses, strict=True)},
     }
-    return Triplet(*traverses, evaluator=judge, sources=sources)
+    first, second, third = traverses
+    return Triplet(first, second, third, judge, sources)
 
 
 def written(document: dict[str, Any], json_file: Path | None) -> bool:

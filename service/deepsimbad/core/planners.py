@@ -112,7 +112,7 @@ class NnqlPlanner:
         if view.q_values is None or view.relevance is None:
             return None
         nearest = shortlist(view.relevance, self.n_neighbours)
-        values = view.q_values[nearest].mean(axis=0, dtype=np.float64)
+        values = _mean_rows(view.q_values, nearest)
         return Plan(self.name, float(view.actions_m[np.argmax(values)]), values)
 
 
@@ -144,6 +144,15 @@ def _averaged(mass: NDArray[np.float64], rows: NDArray[np.float32]) -> NDArray[n
         for place in range(averages.size):
             averages[place] += mass[image] * rows[image, place]
     return averages
+
+
+@njit(cache=True, nogil=True)
+def _mean_rows(table: NDArray[np.float32], rows: NDArray[np.int64]) -> NDArray[np.float64]:
+    means = np.zeros(table.shape[1])
+    for row in rows:
+        for place in range(means.size):
+            means[place] += table[row, place] / rows.size
+    return means
 
 
 def parse_planner(text: str, actions_m: Sequence[float]) -> Planner:

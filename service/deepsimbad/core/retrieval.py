@@ -14,6 +14,7 @@ from deepsimbad.core.statistics import LandmarkStatistics
 from deepsimbad.errors import InvalidMapConfigError
 
 _SCAN_UP_TO = 64  # a longer shortlist is sorted whole
+_BLOCK = 256  # values that are looked at in one vectorised sweep
 
 
 @dataclass(frozen=True)
@@ -102,18 +103,31 @@ def shortlist(values: NDArray[np.floating], length: int) -> NDArray[np.int64]:
 
 
 @njit(cache=True, nogil=True)
+def _count_above(block: NDArray[np.floating], threshold: float) -> int:
+    """How many values are greater. Counting vectorises where an early exit would not."""
+    count = 0
+    for place in range(block.size):
+        count += block[place] > threshold
+    return count
+
+
+@njit(cache=True, nogil=True)
 def _scan(values: NDArray[np.floating], length: int) -> NDArray[np.int64]:
-    """One pass that keeps the best so far in order; nearly every value fails the first comparison."""
+    """One pass that keeps the best so far in order; a block with nothing better is passed over whole."""
     best = np.empty(length, np.int64)
     n_kept = 0
-    for candidate in range(values.size):
-        value = values[candidate]
-        if n_kept == length and not value > values[best[length - 1]]:
+    for start in range(0, values.size, _BLOCK):
+        block = values[start : start + _BLOCK]
+        if n_kept == length and _count_above(block, values[best[length - 1]]) == 0:
             continue
-        place = min(n_kept, length - 1)
-        while place > 0 and value > values[best[place - 1]]:
-            best[place] = best[place - 1]
-            place -= 1
-        best[place] = candidate
-        n_kept = min(n_kept + 1, length)
+        for candidate in range(start, start + block.size):
+            value = values[candidate]
+            if n_kept == length and not value > values[best[length - 1]]:
+                continue
+            place = min(n_kept, length - 1)
+            while place > 0 and value > values[best[place - 1]]:
+                best[place] = best[place - 1]
+                place -= 1
+            best[place] = candidate
+            n_kept = min(n_kept + 1, length)
     return best
