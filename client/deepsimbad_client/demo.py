@@ -1,7 +1,8 @@
 """`make demo`: a campus is rendered in three seasons, mapped, and driven again against a live service.
 
-The paper's triplet WI-SP-SU: landmarks from winter, the map from spring, the robot comes in summer. Everything goes
-through the service's HTTP interface, as a robot's would.
+The paper's triplet WI-SP-SU: landmarks from winter, the map from spring, the robot comes in summer. First every view is
+localized on its own, then an active robot chooses where to look next. Everything goes through the service's HTTP
+interface, as a robot's would.
 """
 
 import sys
@@ -13,6 +14,7 @@ import click
 from rich.console import Console
 from rich.table import Table
 
+from deepsimbad_client.active_demo import EPISODES, compare_planners, steps_that_fit, tell_episode
 from deepsimbad_client.campus import PAPER_DATES, write_campus
 from deepsimbad_client.campus.season import SeasonName
 from deepsimbad_client.client import Client
@@ -24,14 +26,16 @@ from deepsimbad_client.remap import remap
 from deepsimbad_client.replay import Replay, replay
 from deepsimbad_client.report import summarise, write_summary
 from deepsimbad_client.sources import open_source
+from deepsimbad_client.stage import Stage
 from deepsimbad_client.upload import upload
 
 DOMAIN = "campus"
 SEASONS: tuple[SeasonName, SeasonName, SeasonName] = ("winter", "spring", "summer")
 LANDMARK_SEASON, MAP_SEASON, LIVE_SEASON = SEASONS
 # The one that ships comes last: it stays active.
-RELEVANCES = ("brute_force", "bag_of_landmarks", "simbad", "rrf", "standardised")
+RELEVANCES = ("brute_force", "bag_of_landmarks", "simbad", "rrf", "standardised", "calibrated")
 _N_LANDMARKS = 250
+_TRAINING_EPISODES = 2000
 
 _say = Console(highlight=False, soft_wrap=True).print
 
@@ -65,7 +69,8 @@ def demo(folder: Path, frames: int, seed: int) -> None:
         _show_one(client, drives[LIVE_SEASON])
         shipped = scored[RELEVANCES[-1]].replay
         pictures = draw_all(shipped, shipped.folder)
-        _say("6. Pictures: " + ", ".join(str(picture) for picture in pictures))
+        pictures += _drive_actively(client, drives[LIVE_SEASON], folder / "active")
+        _say("8. Pictures: " + ", ".join(str(picture) for picture in pictures))
         if sys.stdin.isatty() and sys.stdout.isatty():
             _say(f"\nThe service stays up at {server.url} (API: {server.url}/docs). Ctrl-C ends it.")
             server.wait()
@@ -93,6 +98,7 @@ def _drive(client: Client, live: Recording, relevance: str, folder: Path) -> Sco
             landmark_traverse=LANDMARK_SEASON,
             n_landmarks=_N_LANDMARKS,
             relevance=relevance,
+            training_episodes=_TRAINING_EPISODES if relevance == RELEVANCES[-1] else 0,
             on_progress=bar,
         )
     with ReplayBar(f"driving by {relevance}", len(live.frames)) as bar:
@@ -101,6 +107,22 @@ def _drive(client: Client, live: Recording, relevance: str, folder: Path) -> Sco
     write_summary(summary, driven.folder)
     bits = (job.result or {}).get("metrics", {}).get("index_bits_per_map_image")
     return Scored(driven, summary, bits)
+
+
+def _drive_actively(client: Client, live: Recording, folder: Path) -> list[Path]:
+    """One episode in words, then the default planner against blind moves; returns the pictures."""
+    stage = Stage.of(client, live, DOMAIN)
+    steps = steps_that_fit(live, max(stage.domain.actions_m))
+    if steps < 1:
+        _say("6. The drive is too short for an active robot: give it more --frames")
+        return []
+    _say(f"6. An active robot, put down anywhere on the {LIVE_SEASON} drive, chooses its own next views:")
+    tell_episode(stage, steps, _say)
+    _say(f"7. The same from {EPISODES} random starts, against blind moves:")
+    tables, pictures, _ = compare_planners(client, live, DOMAIN, folder, steps)
+    for table in tables:
+        _say(table)
+    return pictures
 
 
 def _table(scored: dict[str, Scored]) -> Table:

@@ -28,9 +28,9 @@ def told(step: EpisodeStep) -> str:
         f"{step.entropy_bits:.1f} bits of doubt."
     )
     if step.true_route_m is None or step.error_m is None:
-        truth = "The map does not hold the place where it truly is."
+        truth = "Truly it is where the map knows no place."
     else:
-        truth = f"Truly it is at {step.true_route_m:.1f} m, {step.error_m:.1f} m from there."
+        truth = f"Truly it is by {step.true_route_m:.1f} m, on the ground {step.error_m:.1f} m from there."
     asks = "" if step.next_action_m is None else f" It asks to see what is {step.next_action_m:g} m ahead."
     return f"{seen} {believes} {truth}{asks}"
 

@@ -82,8 +82,14 @@ class Walk:
         rng = np.random.default_rng([seed, episode])
         return int(rng.integers(n_starts)), int(rng.integers(2**31))
 
-    def nearest(self, commanded_m: float, broken: frozenset[int]) -> int:
+    def nearest(self, commanded_m: float, broken: frozenset[int], beyond_m: float = -np.inf) -> int:
         """The usable row recorded nearest to a place; past the recording's end its last, before it its first.
+
+        Args:
+            commanded_m: The place.
+            broken: Rows that cannot be used.
+            beyond_m: Only frames farther along than this, where there are any: a robot told to move does move, though
+                the next frame may be farther than it was told, and does not look at the same picture twice.
 
         Raises:
             ReplayError: Every frame is broken.
@@ -91,6 +97,8 @@ class Walk:
         usable = np.delete(np.arange(len(self.position_m)), sorted(broken))
         if not usable.size:
             raise ReplayError(f"none of the frames of {self.recording.name} can be used")
+        ahead = usable[self.position_m[usable] > beyond_m]
+        usable = ahead if ahead.size else usable
         along = self.position_m[usable]
         nearest = nearest_frame(along, float(np.clip(commanded_m, along[0], along[-1])))
         return int(usable[0 if nearest is None else nearest])
@@ -154,7 +162,7 @@ def drive(
                 if error.code not in UNUSABLE_IMAGE_CODES:
                     raise
                 broken |= {row}
-            row = walk.nearest(here_m + (commanded_m or 0.0), broken)
+            row = walk.nearest(here_m + (commanded_m or 0.0), broken, here_m if commanded_m else -np.inf)
         yield Seen(step, row, commanded_m, action_m if step else 0.0, answer, latency_ms, forgot)
         if step == steps:
             return
@@ -164,4 +172,4 @@ def drive(
             )
         here_m = float(walk.position_m[row])
         commanded_m = answer.next_best_view.action_m
-        row = walk.nearest(here_m + commanded_m, broken)
+        row = walk.nearest(here_m + commanded_m, broken, here_m if commanded_m > 0 else -np.inf)
