@@ -39,6 +39,13 @@ EXPECTED = {
     errors.UnavailableError: 503,
     errors.DamagedMapError: 503,
     errors.CancelledError: 409,
+    errors.GoneError: 410,
+    errors.EndedSessionError: 410,
+    errors.RetiredMapError: 410,
+    errors.BusyError: 429,
+    errors.TooManySessionsError: 429,
+    errors.PastTheEndError: 422,
+    errors.UnknownSessionError: 404,
     errors.DeepSimbadError: 500,
 }
 
@@ -85,6 +92,8 @@ def test_hints_that_json_cannot_hold_still_travel() -> None:
 
 def test_unavailable_says_when_to_try_again() -> None:
     assert int(error_response(SCOPE, errors.UnavailableError("x")).headers["retry-after"]) > 0
+    assert int(error_response(SCOPE, errors.BusyError("x")).headers["retry-after"]) > 0
+    assert error_response(SCOPE, errors.BusyError("x", retry_after_s=17)).headers["retry-after"] == "17"
     assert "retry-after" not in error_response(SCOPE, errors.ConflictError("x")).headers
 
 

@@ -20,7 +20,8 @@ def test_the_answer_has_every_member_of_the_contract(client: TestClient) -> None
     found = answer.json()
     assert set(found) == {"map_version", "timings_ms", "belief", "retrieval", "next_best_view"}
     assert found["map_version"] == 1
-    assert found["next_best_view"] is None
+    assert set(found["next_best_view"]) == {"planner", "action_m", "actions"}
+    assert [action["action_m"] for action in found["next_best_view"]["actions"]] == list(range(1, 11))
     belief = found["belief"]
     assert set(belief) == {
         "mean_m",

@@ -26,7 +26,7 @@ def map_contents(
     evaluator = FeatureL2("none")
     model = evaluator.fit_landmarks(rng.normal(size=(N_LANDMARKS, DIM)).astype(np.float32))
     built = build_retrieval_map(relevance, evaluator.dissimilarities(encodings, model), LIST_LENGTH, encodings)
-    statistics = built.statistics
+    statistics, calibration = built.statistics, built.calibration
     return MapContents(
         domain=domain,
         version=version,
@@ -40,6 +40,8 @@ def map_contents(
         values=built.index.values,
         encodings=built.encodings,
         statistics=None if statistics is None else np.stack([statistics.mean, statistics.std]),
+        correlation=None if calibration is None else calibration.correlation,
+        listed_score=None if calibration is None else calibration.listed_score,
         position_m=np.arange(N_IMAGES) * 1.5,
         timestamp_us=None,
         x_m=None,
@@ -49,11 +51,11 @@ def map_contents(
     )
 
 
-def add_map(catalog: Catalog, domain: str) -> int:
+def add_map(catalog: Catalog, domain: str, relevance: Relevance = Relevance.STANDARDISED, closed: bool = False) -> int:
     """Build and seal the next version; not activated."""
     version = catalog.begin_map(domain, {})
     building = catalog.building_path(domain, version)
-    write_map(building, map_contents(domain, version))
+    write_map(building, map_contents(domain, version, relevance, closed))
     digest, n_bytes = seal(building, catalog.map_path(domain, version))
     catalog.seal_map(domain, version, digest, n_bytes, {})
     return version

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from deepsimbad.core.relevance import Relevance
+from deepsimbad.core.update_rules import LOG_LIKELIHOOD_WEIGHT
 from deepsimbad.engine.localizer import localize, retrieve
 from deepsimbad.engine.observation import Dissimilarities, RankedLandmarks, ReadyEncoding
 from deepsimbad.engine.snapshot import MapSnapshot
@@ -46,12 +47,12 @@ def test_standardised_belief_is_the_normalised_exponential() -> None:
     z = [(NormalDist().inv_cdf((rank + 0.5) / N_LANDMARKS) - mean[i]) / std[i] for rank, i in enumerate(ranked)]
     slow = np.array([-sum(z[contents.lists[j, m]] for j in range(LIST_LENGTH)) for m in range(N_IMAGES)])
     np.testing.assert_allclose(found.retrieval.relevance, slow, rtol=1e-5, atol=1e-6)
-    mass = np.exp(slow - slow.max())
+    mass = np.exp(LOG_LIKELIHOOD_WEIGHT * (slow - slow.max()))
     mass /= mass.sum()  # images are evenly spaced: a uniform prior weighs them alike
     np.testing.assert_allclose(found.belief.top_mass, np.sort(mass)[::-1], rtol=1e-4)
     assert found.belief.mean_m == pytest.approx(mass @ contents.position_m, rel=1e-4)
     assert found.shortlist.tolist() == np.argsort(-found.retrieval.relevance, kind="stable").tolist()
-    assert set(found.timings_ms) == {"describe", "retrieve", "shortlist", "belief"}
+    assert set(found.timings_ms) == {"describe", "retrieve", "shortlist", "belief", "plan"}
 
 
 @pytest.mark.parametrize("relevance", list(Relevance))

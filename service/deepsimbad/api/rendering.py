@@ -43,7 +43,7 @@ def render_localization(localization: Localization, began: float) -> Localizatio
         timings_ms=timings_ms,
         belief=belief,
         retrieval=retrieval,
-        next_best_view=None,
+        next_best_view=render_plan(localization.plan, localization.snapshot.actions_m),
     )
 
 

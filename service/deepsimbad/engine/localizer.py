@@ -10,8 +10,11 @@ from numpy.typing import NDArray
 from deepsimbad.core.belief_summary import BeliefSummary, summarise
 from deepsimbad.core.descriptor import rank_landmarks, ranks_from_ranked_landmarks
 from deepsimbad.core.grid_filter import GridFilter
+from deepsimbad.core.planners import Plan
 from deepsimbad.core.relevance import Query, relevances
 from deepsimbad.core.retrieval import shortlist
+from deepsimbad.core.telling import LEFT_ROUTE_AT_START, off_route_probability
+from deepsimbad.engine.active_localizer import ActiveLocalizer, LocalizerConfig, LocalizerState
 from deepsimbad.engine.encoding import encode_view
 from deepsimbad.engine.observation import Dissimilarities, RankedLandmarks, View
 from deepsimbad.engine.snapshot import MapSnapshot
@@ -47,6 +50,7 @@ class Localization:
         retrieval: Of all map images.
         shortlist: Ids of the most relevant ones, best first.
         belief: After this one view, from a uniform prior.
+        plan: The move that would tell most next; None where the map can name none.
         timings_ms: Milliseconds by stage.
     """
 
@@ -54,6 +58,7 @@ class Localization:
     retrieval: Retrieval
     shortlist: NDArray[np.int64]
     belief: BeliefSummary
+    plan: Plan | None
     timings_ms: Mapping[str, float]
 
 
@@ -75,14 +80,21 @@ def localize(snapshot: MapSnapshot, evaluator: Evaluator, view: View, n_shortlis
     best = shortlist(retrieval.relevance, length)
     listed = perf_counter()
     belief = GridFilter.uniform(snapshot.route).updated(retrieval.relevance, snapshot.update_rule, step=0)
-    summary = summarise(snapshot.route, belief.mass, length)
+    off_route = _off_route(snapshot, retrieval.relevance)
+    summary = summarise(snapshot.route, belief.mass, length, off_route)
     believed = perf_counter()
+    plan = None
+    if snapshot.bits_ahead is not None or snapshot.q_values is not None:
+        seen = LocalizerState(belief, None, retrieval.relevance, off_route, 1)
+        plan = ActiveLocalizer(snapshot, LocalizerConfig()).plan(seen)
+    planned = perf_counter()
     timings_ms = {
         **retrieval.timings_ms,
         "shortlist": 1000 * (listed - began),
         "belief": 1000 * (believed - listed),
+        "plan": 1000 * (planned - believed),
     }
-    return Localization(snapshot, retrieval, best, summary, timings_ms)
+    return Localization(snapshot, retrieval, best, summary, plan, timings_ms)
 
 
 def retrieve(snapshot: MapSnapshot, evaluator: Evaluator, view: View) -> Retrieval:
@@ -133,6 +145,14 @@ def shortlist_length(snapshot: MapSnapshot, wanted: int | None) -> int:
             maximum=snapshot.n_images,
         )
     return wanted
+
+
+def _off_route(snapshot: MapSnapshot, relevance: NDArray[np.float32]) -> float | None:
+    """Probability that the view is from nowhere on the route; None where the map has not learnt to tell."""
+    if snapshot.off_route is None:
+        return None
+    log_odds = snapshot.off_route.log_odds(relevance) if relevance.any() else 0.0
+    return off_route_probability(LEFT_ROUTE_AT_START, log_odds)
 
 
 def _as_float32(values: NDArray[np.float64]) -> NDArray[np.float32]:

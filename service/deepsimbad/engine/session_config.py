@@ -60,12 +60,11 @@ class SessionConfig:
 
 def check_start(route: Route, config: SessionConfig) -> None:
     """Refuse a start that is no belief on the route; raises InvalidPriorError."""
-    if config.start_position_m is not None:
-        check_prior(route, config.start_position_m, config.start_std_m)
+    check_prior(route, config.start_position_m, config.start_std_m)
 
 
-def check_prior(route: Route, position_m: float, std_m: float) -> None:
-    """Refuse a prior that is no belief on the route.
+def check_prior(route: Route, position_m: float | None, std_m: float) -> None:
+    """Refuse a prior that is no belief on the route; no position is anywhere on it.
 
     Raises:
         InvalidPriorError: NaN or infinity, a deviation that is not positive, or a position so far beyond the route
@@ -75,6 +74,8 @@ def check_prior(route: Route, position_m: float, std_m: float) -> None:
         raise InvalidPriorError(
             f"a standard deviation of {std_m} m cannot be one: it must be above 0 and at most {_LARGEST_STD_M:g}"
         )
+    if position_m is None:
+        return
     first_m, last_m = route.start_m, float(route.position_m[-1])
     if route.closed:
         last_m = route.start_m + route.length_m

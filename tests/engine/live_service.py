@@ -1,0 +1,87 @@
+"""What the tests of sessions stand on: a data directory with one mapped domain, and a service that can be restarted."""
+
+import asyncio
+from collections.abc import Awaitable, Callable, Coroutine, Iterator
+from contextlib import contextmanager
+from typing import Any, TypeVar
+
+import numpy as np
+
+from deepsimbad.engine.active_maps import ActiveMaps
+from deepsimbad.engine.evaluator_pool import EvaluatorPool
+from deepsimbad.engine.live_session import Observation
+from deepsimbad.engine.observation import RankedLandmarks, ReadyEncoding, View
+from deepsimbad.engine.pinned_maps import PinnedMaps
+from deepsimbad.engine.sessions import Sessions
+from deepsimbad.engine.worker import InferenceWorker
+from deepsimbad.store.catalog import Catalog
+from deepsimbad.store.session_records import IdempotencyKey
+from deepsimbad.store.sessions import SessionStore
+
+from .conftest import DIM, N_LANDMARKS
+
+T = TypeVar("T")
+TTL_S = 100.0
+
+
+class Clock:
+    def __init__(self) -> None:
+        self.now = 1_000_000.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+class Live:
+    """One run of a service over a data directory."""
+
+    def __init__(self, catalog: Catalog, clock: Clock, **options: Any) -> None:
+        self.catalog = catalog
+        self.store = SessionStore.open(catalog.data_dir)
+        self.worker = InferenceWorker()
+        self.active_maps = ActiveMaps(catalog)
+        self.sessions = Sessions(
+            self.store,
+            PinnedMaps(catalog, self.active_maps, EvaluatorPool()),
+            self.worker,
+            **{"ttl_s": TTL_S, "max_sessions": 20, "snapshot_every": 4, "clock": clock, **options},
+        )
+
+    def close(self) -> None:
+        self.worker.close()
+        self.store.close()
+
+
+@contextmanager
+def running(catalog: Catalog, clock: Clock | None = None, **options: Any) -> Iterator[Live]:
+    live = Live(catalog, clock or Clock(), **options)
+    try:
+        yield live
+    finally:
+        live.close()
+
+
+def run(
+    catalog: Catalog, body: Callable[[Live], Coroutine[Any, Any, T]], clock: Clock | None = None, **options: Any
+) -> T:
+    """Run a coroutine against a service that is started for it, and stopped after it."""
+    with running(catalog, clock, **options) as live:
+        return asyncio.run(body(live))
+
+
+def viewed(view: View) -> Callable[[], Awaitable[View]]:
+    async def give() -> View:
+        return view
+
+    return give
+
+
+def ranked(seed: int, action_m: float = 1.5, key: str | None = None, digest: bytes = b"d", **more: Any) -> Observation:
+    ids = np.random.default_rng(seed).permutation(N_LANDMARKS)[: 1 + seed % N_LANDMARKS]
+    named = None if key is None else IdempotencyKey(key, digest)
+    return Observation(viewed(RankedLandmarks(tuple(ids.tolist()))), action_m, idempotency=named, **more)
+
+
+def encoded(seed: int, action_m: float = 1.5) -> Observation:
+    values = np.random.default_rng(seed).normal(size=DIM)
+    return Observation(viewed(ReadyEncoding(values)), action_m)

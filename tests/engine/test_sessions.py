@@ -1,0 +1,467 @@
+"""Live sessions: order, durability, repetition, endings. A restart is a second service on the same files."""
+
+import asyncio
+import threading
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from deepsimbad.core.filters import FilterKind
+from deepsimbad.core.relevance import Relevance
+from deepsimbad.engine.active_localizer import ActiveLocalizer, LocalizerConfig
+from deepsimbad.engine.localizer import describe
+from deepsimbad.engine.session_config import SessionConfig
+from deepsimbad.errors import (
+    EndedSessionError,
+    IdempotencyKeyReusedError,
+    InvalidInputError,
+    InvalidMoveError,
+    InvalidPriorError,
+    PastTheEndError,
+    RetiredMapError,
+    TooManySessionsError,
+    UnavailableError,
+    UnknownSessionError,
+)
+from deepsimbad.evaluators.feature_l2 import FeatureL2
+from deepsimbad.store.catalog import Catalog
+from deepsimbad.store.map_table import ANY
+
+from .conftest import N_IMAGES, add_domain, add_map
+from .live_service import TTL_S, Clock, Live, encoded, ranked, run, running
+
+Masses = NDArray[np.float64]
+
+
+@pytest.fixture
+def mapped(catalog: Catalog) -> Catalog:
+    add_domain(catalog, "d")
+    catalog.activate("d", add_map(catalog, "d"), ANY)
+    return catalog
+
+
+async def begun(live: Live, **config: Any) -> str:
+    return (await live.sessions.begin(live.active_maps.active("d"), SessionConfig(**config))).session_id
+
+
+def test_a_session_is_the_localizer_step_by_step(mapped: Catalog) -> None:
+    async def body(live: Live) -> None:
+        session_id = await begun(live, seed=3)
+        snapshot = live.active_maps.snapshot("d")
+        localizer = ActiveLocalizer(snapshot, LocalizerConfig(seed=3))
+        state = localizer.start()
+        for seed in range(6):
+            observation = ranked(seed)
+            view = await live.sessions.observe(session_id, observation)
+            query = describe(snapshot, FeatureL2("none"), await observation.view())
+            state = localizer.step(state, query, observation.action_m).state
+            np.testing.assert_array_equal(await live.sessions.mass(session_id), state.belief.mass)
+            assert view.n_observations == seed + 1
+            assert view.plan == localizer.plan(state)
+        assert (await live.sessions.view(session_id)).belief.entropy_bits == view.belief.entropy_bits
+        plan, _ = await live.sessions.next_best_view(session_id)
+        assert plan == view.plan
+
+    run(mapped, body)
+
+
+@pytest.mark.parametrize("kind", list(FilterKind))
+@pytest.mark.parametrize("relevance", list(Relevance))
+def test_a_belief_goes_on_bit_for_bit_after_a_restart(catalog: Catalog, kind: FilterKind, relevance: Relevance) -> None:
+    add_domain(catalog, "d", closed=True)
+    catalog.activate("d", add_map(catalog, "d", relevance, closed=True), ANY)
+    whole, masses = "", {}
+
+    async def unbroken(live: Live) -> None:
+        nonlocal whole
+        whole = await begun(live, belief=kind, seed=5, start_position_m=9.0)
+        for seed in range(13):
+            await live.sessions.observe(whole, encoded(seed))
+            if seed == 6:
+                await live.sessions.set_prior(whole, 20.0, 4.0)
+            masses[seed] = await live.sessions.mass(whole)
+
+    run(catalog, unbroken)
+    broken = ""
+    for seed in range(13):  # a restart before every observation
+
+        async def once(live: Live, seed: int = seed) -> None:
+            nonlocal broken
+            if seed == 0:
+                broken = await begun(live, belief=kind, seed=5, start_position_m=9.0)
+            assert (await live.sessions.view(broken)).n_observations == seed
+            await live.sessions.observe(broken, encoded(seed))
+            if seed == 6:
+                await live.sessions.set_prior(broken, 20.0, 4.0)
+
+        run(catalog, once)
+
+        async def look(live: Live, seed: int = seed) -> None:
+            assert (await live.sessions.mass(broken)).tobytes() == masses[seed].tobytes()
+
+        run(catalog, look)
+
+
+def test_two_at_once_are_answered_in_order_of_arrival(mapped: Catalog) -> None:
+    async def body(live: Live) -> tuple[list[int], Masses, Masses]:
+        at_once, one_by_one = await begun(live), await begun(live)
+        gate = asyncio.Event()
+        slow = ranked(0)
+
+        async def late() -> Any:
+            await gate.wait()  # its image takes long to decode; it arrived first all the same
+            return await slow.view()
+
+        first = asyncio.create_task(live.sessions.observe(at_once, replace(slow, view=late)))
+        others = [asyncio.create_task(live.sessions.observe(at_once, ranked(seed))) for seed in range(1, 12)]
+        await asyncio.sleep(0.05)
+        assert not any(task.done() for task in (first, *others))
+        gate.set()
+        answers = await asyncio.gather(first, *others)
+        for seed in range(12):
+            await live.sessions.observe(one_by_one, ranked(seed))
+        numbers = [answer.n_observations for answer in answers]
+        return numbers, await live.sessions.mass(at_once), await live.sessions.mass(one_by_one)
+
+    numbers, at_once, one_by_one = run(mapped, body)
+    assert numbers == list(range(1, 13))
+    np.testing.assert_array_equal(at_once, one_by_one)
+
+
+def hold_commits(live: Live) -> threading.Event:
+    """Nothing reaches the disk until the event is set."""
+    let_go = threading.Event()
+    live.store._commits.submit(lambda db: let_go.wait(10))
+    return let_go
+
+
+def test_nothing_is_seen_before_it_is_on_the_disk(mapped: Catalog) -> None:
+    async def body(live: Live) -> None:
+        session_id = await begun(live)
+        before = await live.sessions.mass(session_id)
+        let_go = hold_commits(live)
+        posted = asyncio.create_task(live.sessions.observe(session_id, ranked(1)))
+        await asyncio.sleep(0.1)
+        assert not posted.done()
+        assert (await live.sessions.view(session_id)).n_observations == 0
+        np.testing.assert_array_equal(await live.sessions.mass(session_id), before)
+        let_go.set()
+        assert (await posted).n_observations == 1
+
+    run(mapped, body)
+
+
+def test_an_asker_that_goes_away_changes_nothing(mapped: Catalog) -> None:
+    async def body(live: Live) -> str:
+        session_id = await begun(live)
+        let_go = hold_commits(live)
+        posted = asyncio.create_task(live.sessions.observe(session_id, ranked(1, key="k")))
+        await asyncio.sleep(0.05)
+        posted.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await posted
+        let_go.set()
+        again = await live.sessions.observe(session_id, ranked(1, key="k"))
+        assert again.is_repeated
+        assert again.n_observations == 1
+        assert (await live.sessions.observe(session_id, ranked(2))).n_observations == 2
+        return session_id
+
+    session_id = run(mapped, body)
+    assert run(mapped, lambda live: live.sessions.view(session_id)).n_observations == 2
+
+
+def test_what_cannot_be_written_leaves_the_session_as_it_was(mapped: Catalog) -> None:
+    async def body(live: Live) -> None:
+        failed, fine = await begun(live), await begun(live)
+        await live.sessions.observe(failed, ranked(1))
+        before = await live.sessions.mass(failed)
+        live.store._commits.submit(lambda db: db.execute("PRAGMA query_only = ON")).result()
+        with pytest.raises(UnavailableError, match=r"sessions\.sqlite"):
+            await live.sessions.observe(failed, ranked(2))
+        with pytest.raises(UnavailableError):
+            await begun(live)
+        np.testing.assert_array_equal(await live.sessions.mass(failed), before)
+        live.store._writing.execute("PRAGMA query_only = OFF")
+        for seed in (1, 2, 3):
+            await live.sessions.observe(fine, ranked(seed))
+        for seed in (2, 3):
+            await live.sessions.observe(failed, ranked(seed))
+        np.testing.assert_array_equal(await live.sessions.mass(failed), await live.sessions.mass(fine))
+        assert live.sessions.n_living == 2
+
+    run(mapped, body)
+
+
+def test_another_process_on_the_same_sessions(mapped: Catalog) -> None:
+    with running(mapped) as ours, running(mapped) as theirs:
+
+        async def body() -> None:
+            session_id = await begun(ours)
+            assert (await theirs.sessions.observe(session_id, ranked(1))).n_observations == 1
+            with pytest.raises(UnavailableError, match="another process"):
+                await ours.sessions.observe(session_id, ranked(2))
+            assert (await ours.sessions.observe(session_id, ranked(2))).n_observations == 2
+
+        asyncio.run(body())
+
+
+def test_a_repeated_observation_counts_once_and_has_its_own_answer(mapped: Catalog) -> None:
+    answers: list[Any] = []
+    session_id = ""
+
+    async def first(live: Live) -> None:
+        nonlocal session_id
+        session_id = await begun(live)
+        answers.extend([await live.sessions.observe(session_id, ranked(seed, key=f"k{seed}")) for seed in range(7)])
+        await check(live)
+
+    async def check(live: Live) -> None:
+        for seed in (6, 5, 0, 3):
+            again = await live.sessions.observe(session_id, ranked(seed, key=f"k{seed}"))
+            assert again.is_repeated
+            assert again.n_observations == seed + 1
+            assert again.belief.mean_m == answers[seed].belief.mean_m
+            np.testing.assert_array_equal(again.belief.top_mass, answers[seed].belief.top_mass)
+            np.testing.assert_array_equal(again.relevance, answers[seed].relevance)
+            assert again.plan == answers[seed].plan
+        with pytest.raises(IdempotencyKeyReusedError):
+            await live.sessions.observe(session_id, ranked(5, key="k5", digest=b"other"))
+        assert (await live.sessions.view(session_id)).n_observations == 7
+
+    run(mapped, first)
+    run(mapped, check)
+
+    async def twins(live: Live) -> list[Any]:
+        return await asyncio.gather(*(live.sessions.observe(session_id, ranked(8, key="twin")) for _ in range(5)))
+
+    found = run(mapped, twins)
+    assert [one.is_repeated for one in found] == [False, True, True, True, True]
+    assert {one.n_observations for one in found} == {8}
+    assert len({one.belief.mean_m for one in found}) == 1
+
+
+def test_a_session_expires_when_nothing_happens(mapped: Catalog) -> None:
+    clock = Clock()
+
+    async def body(live: Live) -> tuple[str, str]:
+        idle, busy = await begun(live), await begun(live)
+        clock.now += TTL_S - 1
+        await live.sessions.observe(busy, ranked(1))
+        await live.sessions.view(idle)  # looking is not happening
+        clock.now += 2
+        with pytest.raises(EndedSessionError, match="expired"):
+            await live.sessions.view(idle)
+        with pytest.raises(EndedSessionError, match="expired"):
+            await live.sessions.observe(idle, ranked(1))
+        assert live.sessions.n_living == 1
+        assert (await live.sessions.view(busy)).expires_at == clock.now - 2 + TTL_S
+        return idle, busy
+
+    idle, busy = run(mapped, body, clock)
+
+    async def later(live: Live) -> None:
+        with pytest.raises(EndedSessionError):
+            await live.sessions.view(idle)
+        assert (await live.sessions.view(busy)).n_observations == 1  # a restart forgets no expiry
+        clock.now += TTL_S
+        await live.sessions.sweep()
+        assert live.sessions.n_living == 0
+        with pytest.raises(EndedSessionError):
+            await live.sessions.observe(busy, ranked(1))
+        clock.now += 86_401
+        await live.sessions.sweep()
+        for session_id in (idle, busy):
+            with pytest.raises(UnknownSessionError):
+                await live.sessions.view(session_id)
+
+    run(mapped, later, clock)
+
+
+def test_a_deleted_session_is_gone_even_for_who_waited(mapped: Catalog) -> None:
+    async def body(live: Live) -> None:
+        session_id = await begun(live)
+        let_go = hold_commits(live)
+        ending = asyncio.create_task(live.sessions.end(session_id))
+        await asyncio.sleep(0.05)
+        late = asyncio.create_task(live.sessions.observe(session_id, ranked(1)))
+        await asyncio.sleep(0.05)
+        let_go.set()
+        await ending
+        with pytest.raises(EndedSessionError, match="deleted"):
+            await late
+        with pytest.raises(EndedSessionError, match="deleted"):
+            await live.sessions.end(session_id)
+        with pytest.raises(UnknownSessionError):
+            await live.sessions.end("0" * 32)
+
+    run(mapped, body)
+
+
+def test_only_so_many_live_at_once(mapped: Catalog) -> None:
+    clock = Clock()
+
+    async def body(live: Live) -> None:
+        found = await asyncio.gather(*(begun(live) for _ in range(6)), return_exceptions=True)
+        refused = [one for one in found if isinstance(one, TooManySessionsError)]
+        ids = [one for one in found if isinstance(one, str)]
+        assert (len(ids), len(refused)) == (4, 2)
+        assert 1 <= refused[0].hints["retry_after_s"] <= 60
+        await live.sessions.end(ids[0])
+        await begun(live)
+        with pytest.raises(TooManySessionsError):
+            await begun(live)
+        clock.now += TTL_S + 1
+        await begun(live)  # the expired ones made room
+        assert live.sessions.n_living == 1
+
+    run(mapped, body, clock, max_sessions=4)
+
+
+def test_a_session_keeps_the_map_it_began_on(mapped: Catalog) -> None:
+    first = ""
+
+    async def body(live: Live) -> None:
+        nonlocal first
+        first = await begun(live)
+        await live.sessions.observe(first, ranked(1))
+        mapped.activate("d", add_map(mapped, "d"), ANY)
+        live.active_maps.refresh("d")
+        assert (await live.sessions.observe(first, ranked(2))).snapshot.version == 1
+        second = await begun(live)
+        assert (await live.sessions.view(second)).snapshot.version == 2
+
+    run(mapped, body)
+    assert run(mapped, lambda live: live.sessions.observe(first, ranked(3))).snapshot.version == 1
+    mapped.map_path("d", 1).unlink()
+    with pytest.raises(RetiredMapError, match="begin a new session"):
+        run(mapped, lambda live: live.sessions.observe(first, ranked(4)))
+
+
+def test_a_domain_made_anew_has_other_maps(mapped: Catalog) -> None:
+    session_id = run(mapped, begun)
+    mapped.delete_domain("d")
+    with pytest.raises(RetiredMapError):
+        run(mapped, lambda live: live.sessions.view(session_id))
+    add_domain(mapped, "d")
+    mapped.activate("d", add_map(mapped, "d", Relevance.RRF), ANY)
+    with pytest.raises(RetiredMapError):
+        run(mapped, lambda live: live.sessions.view(session_id))
+
+
+def test_a_deleted_domain_ends_its_sessions(mapped: Catalog) -> None:
+    async def body(live: Live) -> None:
+        session_id = await begun(live)
+        await live.sessions.end_domain("other")
+        await live.sessions.view(session_id)
+        await live.sessions.end_domain("d")
+        with pytest.raises(EndedSessionError):
+            await live.sessions.view(session_id)
+
+    run(mapped, body)
+
+
+NAN, INFINITY = float("nan"), float("inf")
+
+
+@pytest.mark.parametrize("action_m", [NAN, INFINITY, -INFINITY, -0.001, 20.001])  # the longest action is 2 m
+@pytest.mark.parametrize("member", ["action_m", "action_std_m"])
+def test_moves_that_no_robot_makes(mapped: Catalog, action_m: float, member: str) -> None:
+    async def body(live: Live) -> None:
+        session_id = await begun(live)
+        for n_before in (0, 1):
+            with pytest.raises(InvalidMoveError) as caught:
+                changed: dict[str, Any] = {member: action_m}
+                await live.sessions.observe(session_id, replace(ranked(1), **changed))
+            assert caught.value.hints == {"minimum": 0.0, "maximum": 20.0}
+            assert (await live.sessions.view(session_id)).n_observations == n_before
+            await live.sessions.observe(session_id, replace(ranked(1), action_m=20.0, action_std_m=0.0))
+
+    run(mapped, body)
+
+
+def test_past_the_end_is_refused_and_nothing_changes(mapped: Catalog) -> None:
+    end_m = (N_IMAGES - 1) * 1.5
+
+    async def body(live: Live) -> None:
+        session_id = await begun(live, start_position_m=end_m, start_std_m=0.1)
+        await live.sessions.observe(session_id, ranked(1, action_m=20.0))  # ignored for the first view
+        before = await live.sessions.mass(session_id)
+        with pytest.raises(PastTheEndError):
+            await live.sessions.observe(session_id, ranked(2, action_m=20.0))
+        np.testing.assert_array_equal(await live.sessions.mass(session_id), before)
+        assert (await live.sessions.observe(session_id, ranked(2, action_m=0.0))).n_observations == 2
+
+    run(mapped, body)
+
+
+@pytest.mark.parametrize(
+    ("position_m", "std_m"),
+    [(NAN, 1), (INFINITY, 1), (10, NAN), (10, 0), (10, -1), (10, INFINITY), (10, 1e7), (-4, 1), (47, 1), (1e9, 100)],
+)
+def test_priors_far_off_the_route(mapped: Catalog, position_m: float, std_m: float) -> None:
+    async def body(live: Live) -> None:
+        with pytest.raises(InvalidPriorError):
+            await begun(live, start_position_m=float(position_m), start_std_m=float(std_m))
+        session_id = await begun(live)
+        with pytest.raises(InvalidPriorError):
+            await live.sessions.set_prior(session_id, float(position_m), float(std_m))
+        assert live.sessions.n_living == 1
+
+    run(mapped, body)
+
+
+def test_a_prior_replaces_the_belief(mapped: Catalog) -> None:
+    async def body(live: Live) -> None:
+        session_id = await begun(live, start_position_m=6.0, start_std_m=0.2)
+        view = await live.sessions.set_prior(session_id, 30.0, 1.0)
+        assert view.belief.mode_m == 30.0
+        assert view.n_observations == 0
+        assert (await live.sessions.set_prior(session_id, -2.0, 1.0)).belief.mode_m == 0.0  # a little beside is allowed
+
+    run(mapped, body)
+
+
+@pytest.mark.parametrize("config", [{"planner": "clever"}, {"planner": "constant:77"}])
+def test_a_configuration_that_cannot_be(mapped: Catalog, config: dict[str, Any]) -> None:
+    async def body(live: Live) -> None:
+        with pytest.raises(InvalidInputError):
+            await begun(live, **config)
+        assert live.sessions.n_living == 0
+
+    run(mapped, body, max_sessions=1)
+    run(mapped, begun, max_sessions=1)
+
+
+@pytest.mark.parametrize("length", [0, N_IMAGES + 1])
+def test_a_bad_shortlist_does_not_move_the_session(mapped: Catalog, length: int) -> None:
+    async def body(live: Live) -> None:
+        session_id = await begun(live)
+        with pytest.raises(InvalidInputError):
+            await live.sessions.observe(session_id, ranked(1, n_shortlist=length))
+        assert (await live.sessions.view(session_id)).n_observations == 0
+
+    run(mapped, body)
+
+
+def test_a_killed_service_loses_nothing(mapped: Catalog, tmp_path: Path) -> None:
+    """The files as they are at that moment, without any closing, are enough."""
+
+    async def body(live: Live) -> tuple[str, Masses, dict[str, bytes]]:
+        session_id = await begun(live)
+        for seed in range(9):
+            await live.sessions.observe(session_id, ranked(seed))
+        files = {path.name: path.read_bytes() for path in tmp_path.glob("sessions.sqlite*")}
+        return session_id, await live.sessions.mass(session_id), files
+
+    session_id, mass, files = run(mapped, body)
+    for path in tmp_path.glob("sessions.sqlite*"):
+        path.unlink()
+    for name, content in files.items():
+        if not name.endswith("-shm"):
+            (tmp_path / name).write_bytes(content)
+    np.testing.assert_array_equal(run(mapped, lambda live: live.sessions.mass(session_id)), mass)
