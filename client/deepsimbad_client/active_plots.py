@@ -32,9 +32,9 @@ def draw_active(replay: ActiveReplay, summary: Mapping[str, Any], folder: Path) 
     drawn = [belief_strips(shown, title, folder / "belief_by_step.png")]
     if any(value is not None for value in summary["anr"].values()):
         drawn += [by_step(summary, title, folder / "by_step.png"), by_distance(summary, title, folder)]
-    placed = [episode for episode in shown if any(step.x_m is not None for step in episode.steps)]
+    placed = [each for each in replay.episodes[first] if any(step.x_m is not None for step in each.steps)]
     if replay.route.path.knows_xy and placed:
-        drawn.append(walk_map(placed[0], replay.route.path, title, folder / "walk.png"))
+        drawn.append(walk_map(max(placed, key=_astray_m), replay.route.path, title, folder / "walk.png"))
     return drawn
 
 
@@ -137,7 +137,7 @@ def walk_map(episode: Episode, route: RoutePath, title: str, path: Path) -> Path
     """Draw the route from above with one episode's walk on it, joined to where the belief put it."""
     steps = [step for step in episode.steps if step.x_m is not None and step.y_m is not None]
     x, y = (np.array([getattr(step, name) for step in steps], float) for name in ("x_m", "y_m"))
-    figure, axes = new_figure(title, f"One walk, episode {episode.episode}", (8.6, 7.2))
+    figure, axes = new_figure(title, f"A walk and where it was believed to be (episode {episode.episode})", (8.6, 7.2))
     axes.plot(route.x_m, route.y_m, color="#d5dce1", lw=5, solid_capstyle="round", zorder=1, label="map")
     wrong = [[(step.x_m, step.y_m), (step.mode_x_m, step.mode_y_m)] for step in steps if step.mode_x_m is not None]
     axes.add_collection(LineCollection(wrong, colors=CHANCE, linewidths=1, alpha=0.6, zorder=2))  # type: ignore[arg-type]
@@ -167,6 +167,11 @@ def walk_map(episode: Episode, route: RoutePath, title: str, path: Path) -> Path
     bar.outline.set_visible(False)
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.08), ncol=2, frameon=False, fontsize=9)
     return saved(figure, path)
+
+
+def _astray_m(episode: Episode) -> float:
+    """How far off the belief was in all: the walk that was hardest to find out about is the one worth a picture."""
+    return sum(step.error_m or 0.0 for step in episode.steps)
 
 
 def _colours(summary: Mapping[str, Any]) -> list[tuple[str, str]]:

@@ -104,7 +104,7 @@ def planner_table(summary: dict[str, Any]) -> Table:
             shown_name(name, summary["planner_named"][name]),
             _shown(summary["anr"][name], ".2f"),
             _ends(summary["interval_95"][name]),
-            "" if name == first else _shown(None if against["anr"] is None else -against["anr"], ".2f"),
+            "" if name == first else _shown(None if against["anr"] is None else -against["anr"], "z.2f"),
             "" if name == first else _ends(against["interval_95"], -1),
         )
     return table

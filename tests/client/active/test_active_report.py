@@ -1,0 +1,180 @@
+"""Figures, intervals and tables of active replays, against slow references."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from deepsimbad_client.active_plots import draw_active
+from deepsimbad_client.active_replay import ActiveReplay
+from deepsimbad_client.active_report import (
+    at_distance,
+    distance_table,
+    localized_table,
+    planner_table,
+    summarise_active,
+)
+from deepsimbad_client.bootstrap import Resampling, mean_known
+from deepsimbad_client.episode_log import Episode, EpisodeStep
+from deepsimbad_client.map_route import MapRoute, RoutePath
+
+
+def step(number: int, rank: float | None, error_m: float | None, action_m: float, travelled_m: float) -> EpisodeStep:
+    place = 10.0 + travelled_m
+    return EpisodeStep(
+        step=number,
+        index=number,
+        name=f"{number}.jpg",
+        position_m=place,
+        x_m=place,
+        y_m=1.0,
+        commanded_m=None if number == 0 else action_m,
+        action_m=action_m,
+        travelled_m=travelled_m,
+        forgot=False,
+        true_map_image=None if rank is None else int(place),
+        true_route_m=None if rank is None else place,
+        rank=rank,
+        rank_percent=rank,
+        mode_m=place + (error_m or 0),
+        mode_x_m=place + (error_m or 0),
+        mode_y_m=0.0,
+        low_m=0.0,
+        high_m=99.0,
+        error_m=error_m,
+        entropy_bits=5.0 - number,
+        off_route=None,
+        next_action_m=action_m,
+        latency_ms=2.0,
+        mass=(0.25, 0.5, 0.125, 0.125),
+    )
+
+
+def episode(planner: str, number: int, ranks: list[float | None], action_m: float) -> Episode:
+    steps = tuple(
+        step(at, rank, None if rank is None else 2 * rank, action_m if at else 0.0, at * action_m)
+        for at, rank in enumerate(ranks)
+    )
+    return Episode(planner, "telling" if planner == "default" else planner, number, number, (0.0, 99.0), steps)
+
+
+def replay_of(**ranks: list[list[float | None]]) -> ActiveReplay:
+    """Planners' ranks [episode][step]; `default` moves 2 m, the others 5 m."""
+    moves = {name: 2.0 if name == "default" else 5.0 for name in ranks}
+    episodes = {
+        name: [episode(name, number, each, moves[name]) for number, each in enumerate(rows)]
+        for name, rows in ranks.items()
+    }
+    along = np.arange(100.0)
+    route = MapRoute(1, RoutePath(along, along, np.zeros(100)), False, 99.0)
+    identity: dict[str, Any] = {"recording": "drive", "domain": "route", "map_version": 1, "steps": 2, "seed": 0}
+    return ActiveReplay(Path(), tuple(ranks), episodes, route, identity | {"planners": list(ranks)}, 1.0)
+
+
+def test_figures_by_hand() -> None:
+    replay = replay_of(
+        default=[[50.0, 1.0, 2.0], [40.0, 3.0, None]],
+        random=[[50.0, 8.0, 6.0], [40.0, 3.0, 3.0]],
+    )
+    summary = summarise_active(replay)
+    assert summary["anr"] == {"default": 2.0, "random": 5.0}  # the first view does not count
+    assert summary["n_frames"] == {"default": 3, "random": 4}
+    assert summary["n_left_out"] == {"default": 1, "random": 0}
+    assert summary["against"]["random"]["anr"] == -3.0
+    low, high = summary["against"]["random"]["interval_95"]
+    assert low < -3 < high == 0.0
+    ours = summary["by_step"]["default"]
+    assert ours["anr"] == [45.0, 2.0, 2.0]
+    assert ours["error_m"] == [90.0, 4.0, 4.0]
+    assert ours["within_5_m"] == [0.0, 50.0, 100.0]
+    assert ours["within_10_m"] == [0.0, 100.0, 100.0]
+    assert ours["travelled_m"] == [0.0, 2.0, 4.0]
+    assert summary["planner_named"] == {"default": "telling", "random": "random"}
+    json.dumps(summary, allow_nan=False)
+
+
+def test_at_equal_distance_what_was_known_by_then() -> None:
+    replay = replay_of(default=[[50.0, 10.0, 2.0]], random=[[50.0, 8.0, 6.0]])
+    assert at_distance(replay.episodes["default"], "rank_percent", 3.9).tolist() == [10.0]
+    assert at_distance(replay.episodes["default"], "rank_percent", 4.0).tolist() == [2.0]
+    assert np.isnan(at_distance(replay.episodes["default"], "rank_percent", 4.1)).all()
+    assert at_distance(replay.episodes["random"], "rank_percent", 4.1).tolist() == [50.0]
+    by_distance = summarise_active(replay)["by_distance"]
+    assert by_distance["random"]["travelled_m"] == [float(metres) for metres in range(11)]
+    assert by_distance["random"]["anr"] == [50.0] * 5 + [8.0] * 5 + [6.0]
+    assert by_distance["default"]["anr"] == [50.0, 50.0, 10.0, 10.0, 2.0] + [None] * 6
+
+
+def test_beyond_where_half_of_the_episodes_come_nothing_is_told() -> None:
+    short = [episode("default", number, [9.0, 1.0, 1.0], 1.0) for number in range(3)]
+    far = episode("default", 3, [9.0, 1.0, 1.0], 5.0)
+    replay = replay_of(default=[[0.0, 0.0, 0.0]])
+    mixed = ActiveReplay(Path(), ("default",), {"default": [*short, far]}, replay.route, replay.identity, 0.0)
+    told = summarise_active(mixed)["by_distance"]["default"]
+    assert told["travelled_m"] == [0.0, 1.0, 2.0]
+    assert told["n_episodes"] == [4, 4, 4]
+
+
+def test_intervals_against_a_bootstrap_by_hand() -> None:
+    rng = np.random.default_rng(3)
+    ours, theirs = rng.normal(0, 1, (30, 4)), rng.normal(0.5, 1, (30, 4))
+    ours[3, 2] = np.nan
+    drawn = []
+    for _ in range(4000):
+        picked = rng.integers(30, size=30)
+        drawn.append(np.nanmean(ours[picked]) - np.nanmean(theirs[picked]))
+    expected = np.percentile(drawn, [2.5, 97.5])
+    found = Resampling.of(30).difference(ours, theirs)
+    assert found == pytest.approx(tuple(expected), abs=0.03)
+    assert Resampling.of(30).interval(ours) == Resampling.of(30).interval(ours)
+
+
+def test_pairing_takes_out_what_the_starts_have_in_common() -> None:
+    rng = np.random.default_rng(0)
+    start = rng.normal(0, 10, (50, 1))
+    resampling = Resampling.of(50)
+    paired = resampling.difference(start + 1.0, start)
+    alone = resampling.interval(start)
+    assert paired == pytest.approx((1.0, 1.0))
+    assert alone is not None
+    assert alone[1] - alone[0] > 3
+
+
+def test_nothing_known_is_none_and_never_nan() -> None:
+    replay = replay_of(default=[[None, None, None]], random=[[None, None, None]])
+    summary = summarise_active(replay)
+    json.dumps(summary, allow_nan=False)
+    assert summary["anr"] == {"default": None, "random": None}
+    assert summary["interval_95"]["default"] is None
+    assert summary["against"]["random"] == {"anr": None, "interval_95": None}
+    assert mean_known(np.array([np.nan])) is None
+    for table in (planner_table(summary), localized_table(summary), distance_table(summary)):
+        Console(quiet=True).print(table)
+
+
+def test_tables_name_every_planner(capsys: pytest.CaptureFixture[str]) -> None:
+    replay = replay_of(default=[[50.0, 1.0, 2.0], [40.0, 3.0, 1.0]], random=[[50.0, 8.0, 6.0], [40.0, 3.0, 3.0]])
+    summary = summarise_active(replay)
+    console = Console(width=80)
+    for table in (planner_table(summary), localized_table(summary), distance_table(summary)):
+        console.print(table)
+    printed = capsys.readouterr().out
+    assert printed.count("telling (default)") == 3
+    assert printed.count("random") == 3
+    assert "3.25" in printed  # how much better the first is
+    assert "…" not in printed
+
+
+def test_every_picture_is_drawn(tmp_path: Path) -> None:
+    replay = replay_of(default=[[50.0, 1.0, 2.0], [40.0, 3.0, None]], random=[[50.0, 8.0, 6.0], [40.0, 3.0, 3.0]])
+    drawn = draw_active(replay, summarise_active(replay), tmp_path)
+    assert [path.name for path in drawn] == ["belief_by_step.png", "by_step.png", "by_distance.png", "walk.png"]
+    assert all(path.read_bytes().startswith(b"\x89PNG") for path in drawn)
+
+
+def test_pictures_of_a_replay_whose_truth_is_unknown(tmp_path: Path) -> None:
+    replay = replay_of(default=[[None, None, None]])
+    assert len(draw_active(replay, summarise_active(replay), tmp_path)) == 2
