@@ -166,6 +166,17 @@ def the_map(data_dir: Path) -> Iterator[object]:
     yield contents.q_values.round(2).tolist()
 
 
+def the_calibrated_map(data_dir: Path) -> Iterator[object]:
+    yield from the_map(data_dir)
+    contents = read_map(data_dir / "domains/campus/maps/000001.sqlite")
+    assert contents.telling_bits is not None
+    assert contents.correlation is not None
+    assert contents.listed_score is not None
+    assert contents.off_route_model is not None
+    yield (contents.correlation.tolist(), contents.listed_score.tolist())
+    yield (contents.telling_bits.tolist(), contents.off_route_model.tolist())
+
+
 def the_sessions(data_dir: Path) -> Iterator[object]:
     with SessionStore.open(data_dir) as store:
         (alive,) = store.living()
@@ -214,6 +225,19 @@ def the_sessions(data_dir: Path) -> Iterator[object]:
                 [[0, 1], [2, 3], [4, 5]],
                 (True, (1.0, 2.0, 3.0), [0.0, 1.5, 3.0, 4.5], {"anr": 4.5}),
                 [[0.0, 25.0, 50.0], [75.0, 100.0, 125.0], [150.0, 175.0, 200.0], [225.0, 250.0, 275.0]],
+            ],
+        ),
+        (
+            "map_v3",
+            "domains/campus/maps/000001.sqlite",
+            the_calibrated_map,
+            [
+                [[0, 1, 2, 0], [1, 2, 0, 2]],
+                [[0, 1], [2, 3], [4, 5]],
+                (True, (1.0, 2.0, 3.0), [0.0, 1.5, 3.0, 4.5], {"anr": 4.5}),
+                [[0.0, 25.0, 50.0], [75.0, 100.0, 125.0], [150.0, 175.0, 200.0], [225.0, 250.0, 275.0]],
+                ([0.25, 0.5, 0.75], [[-2.0, -1.5, -1.0], [-1.0, -0.5, -0.25]]),
+                ([4.0, 3.0, 2.0, 1.0], [-1.5, 0.5]),
             ],
         ),
     ],

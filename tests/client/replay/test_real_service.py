@@ -86,7 +86,8 @@ def test_images_with_a_broken_one_among_them(service: str, tmp_path: Path) -> No
         assert (summary["n_queries"], sum(summary["n_broken"].values())) == (7, 1)
         answer = client.localize("pictures", folder / "5.jpg", shortlist=3)
         assert len(answer.retrieval) == 3
-        assert answer.next_best_view is None
+        assert answer.next_best_view is not None
+        assert answer.next_best_view.planner == "telling"
 
 
 def test_errors_arrive_with_their_names(service: str, encodings: Path) -> None:
