@@ -374,8 +374,8 @@ def test_moves_that_no_robot_makes(mapped: Catalog, action_m: float, member: str
     async def body(live: Live) -> None:
         session_id = await begun(live)
         for n_before in (0, 1):
+            changed: dict[str, Any] = {member: action_m}
             with pytest.raises(InvalidMoveError) as caught:
-                changed: dict[str, Any] = {member: action_m}
                 await live.sessions.observe(session_id, replace(ranked(1), **changed))
             assert caught.value.hints == {"minimum": 0.0, "maximum": 20.0}
             assert (await live.sessions.view(session_id)).n_observations == n_before
