@@ -4,6 +4,7 @@ import json
 from typing import Any
 
 import numpy as np
+import pytest
 from starlette.testclient import TestClient
 
 from .conftest import DIM, N_READY, NPZ, encoded, make_ready_domain, npz, picture, ready_encodings, remap
@@ -105,6 +106,40 @@ def test_one_encoding_length_a_traverse(client: TestClient) -> None:
     assert client.put(f"{base}/t/frames/0?position_m=1", json={"encoding": [1.0, 2.0]}).status_code == 201
     answer = client.put(f"{base}/t/frames/1?position_m=1", json={"encoding": [1.0]})
     assert (answer.status_code, answer.json()["code"]) == (422, "invalid_encoding")
+
+
+@pytest.mark.parametrize("dim", [64, 4096])
+def test_a_domain_of_images_takes_ready_encodings_of_any_one_length(client: TestClient, dim: int) -> None:
+    """By batch and one by one; the first frame of a traverse decides how long they are."""
+    name = f"any-{dim}"
+    assert client.put(f"/v1/admin/domains/{name}", json={"evaluator": {"kind": "feature_l2"}}).status_code == 201
+    base = f"/v1/admin/domains/{name}/traverses"
+    encodings = np.random.default_rng(dim).integers(-9, 10, (20, dim)).astype(np.float16)
+    assert client.post(base, json={"name": "drive"}).status_code == 201
+    for index in range(2):
+        body = {"encoding": encodings[index].tolist()}
+        assert client.put(f"{base}/drive/frames/{index}?position_m={index}", json=body).status_code == 201
+    n = np.arange(2, 20)
+    stored = client.post(
+        f"{base}/drive/frames", content=npz(encodings=encodings[2:], index=n, position_m=n), headers=NPZ
+    )
+    assert stored.json() == {"n_new": 18, "n_replaced": 0, "n_frames": 20}
+
+    image = client.put(
+        f"{base}/drive/frames/20?position_m=20", content=encoded(picture(1)), headers={"Content-Type": "image/jpeg"}
+    )
+    assert (image.status_code, image.json()["code"]) == (422, "invalid_encoding")
+    assert str(dim) in image.json()["detail"]
+
+    job = remap(client, name, training_traverse="drive", landmark_traverse="drive", n_landmarks=20)
+    assert job["state"] == "succeeded", job
+    localizations = f"/v1/domains/{name}/localizations"
+    assert client.post(localizations, json={"ranked_landmarks": [7, 3, 11]}).json()["retrieval"]
+    found = client.post(localizations, json={"encoding": encodings[13].tolist()}).json()
+    assert found["retrieval"][0]["map_image"] == 13
+    image = client.post(localizations, content=encoded(picture(1)), headers={"Content-Type": "image/jpeg"})
+    assert (image.status_code, image.json()["code"]) == (422, "invalid_encoding")
+    assert f"landmarks of {dim}" in image.json()["detail"]
 
 
 def test_an_image_and_its_encoding_are_the_same_frame(client: TestClient) -> None:

@@ -35,8 +35,8 @@ def evaluator() -> Evaluator:
 def drive(catalog: Catalog) -> Callable[..., np.ndarray]:
     """Stores a traverse of random encodings; returns them [n, d]."""
 
-    def store(name: str, n: int, seed: int = 0, position_m: Any = None, **known: Any) -> np.ndarray:
-        encodings = np.random.default_rng(seed).normal(size=(n, 6)).astype(np.float32)
+    def store(name: str, n: int, seed: int = 0, position_m: Any = None, d: int = 6, **known: Any) -> np.ndarray:
+        encodings = np.random.default_rng(seed).normal(size=(n, d)).astype(np.float32)
         frames = TraverseFrames(
             index=np.arange(n),
             position_m=np.arange(n, dtype=float) if position_m is None else np.asarray(position_m, float),

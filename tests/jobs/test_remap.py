@@ -6,6 +6,7 @@ import pytest
 from deepsimbad.core.relevance import Relevance
 from deepsimbad.errors import (
     CancelledError,
+    InvalidEncodingError,
     InvalidMapConfigError,
     InvalidRouteError,
     TooFewCandidatesError,
@@ -141,6 +142,22 @@ def test_fewer_candidates_than_landmarks(catalog, drive, evaluator, quiet):
         remap(catalog, DOMAIN, config(), evaluator, quiet)
     assert raised.value.hints == {"n_candidates": 7, "n_landmarks": 8}
     assert catalog.maps(DOMAIN) == []
+
+
+def test_traverses_of_two_encoders_are_named(catalog, drive, evaluator, quiet):
+    drive("winter", 8, d=4)
+    drive("summer", 8)
+    with pytest.raises(InvalidEncodingError, match="winter holds encodings of 4 numbers, traverse summer of 6"):
+        remap(catalog, DOMAIN, RemapConfig("summer", "winter", n_landmarks=5), evaluator, quiet)
+    assert catalog.domain(DOMAIN).active_version is None
+
+
+def test_the_active_maps_landmarks_may_come_from_another_encoder(catalog, drive, evaluator, quiet):
+    drive("summer", 8)
+    drive("winter", 8, d=4)
+    remap(catalog, DOMAIN, RemapConfig("summer", "summer", n_landmarks=5), evaluator, quiet)
+    with pytest.raises(InvalidEncodingError, match="4 numbers cannot be compared with landmarks of 6"):
+        remap(catalog, DOMAIN, RemapConfig("winter"), evaluator, quiet)
 
 
 def test_a_map_of_one_image(catalog, drive, evaluator, quiet):

@@ -228,9 +228,9 @@ OBSERVATION_SCHEMA = {
             "Distinct landmark ids from 0, nearest first, 1..r of them; the rest share the mean of the ranks left.",
         ),
         _only("dissimilarities", {"type": "number"}, "r finite numbers in landmark order, smaller is nearer."),
-        _only("encoding", {"type": "number"}, "A ready encoding, of the length of the domain's."),
+        _only("encoding", {"type": "number"}, "A ready encoding, as long as those the map was made of."),
     ]
 }
-ENCODING_SCHEMA = _only("encoding", {"type": "number"}, "A ready encoding, of the length of the domain's.")
+ENCODING_SCHEMA = _only("encoding", {"type": "number"}, "A ready encoding, as long as the others of the traverse.")
 IMAGE_SCHEMA: dict[str, Any] = {"type": "string", "format": "binary"}
 DECLARED_BODIES: tuple[type[JsonBody], ...] = (DomainBody, TraverseBody, RemapBody, ActiveMapBody)

@@ -52,7 +52,10 @@ class DomainAnswer(Answer):
         Field(description="[width, height] in pixels to resize an image to; null: no images are taken."),
     ]
     encoding_dim: Annotated[
-        int | None, Field(description="Length of a ready encoding; null: that of the domain's traverses.")
+        int | None,
+        Field(
+            description="Length of an image's encoding; null: no images are taken. Ready ones may have any one length."
+        ),
     ]
     closed: Annotated[bool, Field(description="Whether the end of the route joins its start.")]
     actions_m: Annotated[list[float], Field(description="The moves a planner may choose, in metres.")]

@@ -9,8 +9,6 @@ from deepsimbad.engine.observation import ReadyEncoding
 from deepsimbad.errors import InvalidEncodingError
 from deepsimbad.evaluators.base import Evaluator, Image
 
-LARGEST_NUMBER = 1e15  # so that squared distances stay finite in float32
-
 
 def encode_view(evaluator: Evaluator, view: Image | ReadyEncoding) -> NDArray[np.float32]:
     """Encode an image, or check and take a ready encoding.
@@ -19,36 +17,33 @@ def encode_view(evaluator: Evaluator, view: Image | ReadyEncoding) -> NDArray[np
         [d] float32, finite.
 
     Raises:
-        InvalidEncodingError: A ready encoding of the wrong length, or with NaN or infinity.
+        InvalidEncodingError: A ready encoding that is empty, or with NaN or infinity.
         UnsupportedMediaTypeError: An image, where the evaluator takes ready encodings alone.
     """
     if isinstance(view, ReadyEncoding):
-        encodings = ready_encodings(evaluator, view.values[np.newaxis])
+        encodings = ready_encodings(view.values[np.newaxis])
     else:
         encodings = evaluator.encode([view])
     return encodings.reshape(-1)
 
 
-def ready_encodings(evaluator: Evaluator, values: NDArray[Any]) -> NDArray[np.float32]:
+def ready_encodings(values: NDArray[Any]) -> NDArray[np.float32]:
     """Check encodings that were computed elsewhere.
 
+    They may have any one length, in a domain with an extractor too: the traverse they join and the landmarks they are
+    compared with hold them to it.
+
     Args:
-        evaluator: Says how long they must be, where it knows.
         values: [n, d] of any float type.
 
     Returns:
         [n, d] float32; the array itself where it already was.
 
     Raises:
-        InvalidEncodingError: Empty, of the wrong length, or NaN, infinity or too large a number somewhere.
+        InvalidEncodingError: Empty, or NaN, infinity or too large a number somewhere.
     """
     if values.ndim != 2 or values.size == 0:
         raise InvalidEncodingError(f"encodings are [n, d] and not empty, not {list(values.shape)}")
-    wanted = evaluator.encoding_dim
-    if wanted is not None and values.shape[1] != wanted:
-        raise InvalidEncodingError(
-            f"an encoding of {values.shape[1]} numbers; this domain's have {wanted}", encoding_dim=wanted
-        )
     with np.errstate(over="ignore"):  # what overflows is refused below
         encodings = np.ascontiguousarray(values, np.float32)
     # In blocks, so that a large batch is not accompanied by as many booleans.

@@ -33,7 +33,7 @@ class Evaluator(Protocol):
 
     @property
     def encoding_dim(self) -> int | None:
-        """Length d of an encoding; None where ready encodings of any one length are taken."""
+        """Length d of what `encode` gives; None where no images are taken. Ready encodings may have any one length."""
 
     def encode(self, observations: Sequence[Observation]) -> NDArray[np.float32]:
         """Encode observations, each by itself: no answer depends on its neighbours in the call.

@@ -66,7 +66,8 @@ class FeatureL2:
         prototypes = np.asarray(model["prototypes"], np.float64)
         if encodings.ndim != 2 or encodings.shape[1] != prototypes.shape[1]:
             raise InvalidEncodingError(
-                f"a landmark has {prototypes.shape[1]} numbers, these encodings are {list(encodings.shape)}",
+                f"an encoding of {encodings.shape[-1]} numbers cannot be compared with landmarks of "
+                f"{prototypes.shape[1]}: they come from another encoder",
                 encoding_dim=prototypes.shape[1],
             )
         squared = np.einsum("ij,ij->i", prototypes, prototypes)

@@ -6,7 +6,7 @@ from functools import partial
 from typing import Any
 
 from deepsimbad.core.nnql import NnqlConfig
-from deepsimbad.errors import DeepSimbadError, InvalidMapConfigError
+from deepsimbad.errors import DeepSimbadError, InvalidEncodingError, InvalidMapConfigError
 from deepsimbad.evaluators.base import Evaluator, LandmarkModel
 from deepsimbad.jobs.build_map import choose_landmarks, describe, map_contents
 from deepsimbad.jobs.encoded_traverse import route_of
@@ -60,12 +60,12 @@ def remap(
     route = route_of(training, record.closed)
 
     progress.stage("select landmarks")
-    model = _landmark_model(catalog, record, config, evaluator, progress)
+    model = _landmark_model(catalog, record, config, training, evaluator, progress)
     seconds["read_and_select"] = time.perf_counter() - started
 
     progress.stage("describe")
     described = time.perf_counter()
-    second = _second_season(catalog, record, config)
+    second = _second_season(catalog, record, config, training)
     found = describe(training, route, evaluator, model, config.relevance, config.list_length, second, progress.update)
     seconds["describe"] = time.perf_counter() - described
 
@@ -116,7 +116,13 @@ def _frames(catalog: Catalog, domain: str, name: str) -> TraverseFrames:
     return frames
 
 
-def _second_season(catalog: Catalog, record: DomainRecord, config: RemapConfig) -> TraverseFrames | None:
+def _length(frames: TraverseFrames) -> int:
+    return int(frames.encodings.shape[1])
+
+
+def _second_season(
+    catalog: Catalog, record: DomainRecord, config: RemapConfig, training: TraverseFrames
+) -> TraverseFrames | None:
     """The drive that a calibrated map learns from: the landmark traverse, else what the active map was made of."""
     candidates = [config.landmark_traverse]
     if config.landmark_traverse is None and record.active_version is not None:
@@ -128,18 +134,30 @@ def _second_season(catalog: Catalog, record: DomainRecord, config: RemapConfig) 
             and name != config.training_traverse
             and name in Traverse.list(catalog.data_dir, record.name)
         ):
-            return _frames(catalog, record.name, name)
+            second = _frames(catalog, record.name, name)
+            if _length(second) == _length(training):  # else it was made anew, by another encoder
+                return second
     return None
 
 
 def _landmark_model(
-    catalog: Catalog, record: DomainRecord, config: RemapConfig, evaluator: Evaluator, progress: Progress
+    catalog: Catalog,
+    record: DomainRecord,
+    config: RemapConfig,
+    training: TraverseFrames,
+    evaluator: Evaluator,
+    progress: Progress,
 ) -> LandmarkModel:
     """Select new landmarks where a landmark traverse is given; else keep the active map's."""
     if config.landmark_traverse is not None:
-        candidates = _frames(catalog, record.name, config.landmark_traverse).encodings
+        drive = _frames(catalog, record.name, config.landmark_traverse)
+        if _length(drive) != _length(training):
+            raise InvalidEncodingError(
+                f"traverse {config.landmark_traverse} holds encodings of {_length(drive)} numbers, traverse "
+                f"{config.training_traverse} of {_length(training)}; both must come from the same encoder"
+            )
         n_landmarks = config.n_landmarks or DEFAULT_N_LANDMARKS
-        return choose_landmarks(candidates, n_landmarks, evaluator, progress.update)
+        return choose_landmarks(drive.encodings, n_landmarks, evaluator, progress.update)
     if record.active_version is None:
         raise InvalidMapConfigError(
             f"domain {record.name} has no active map whose landmarks could stay; give a landmark_traverse"

@@ -103,14 +103,14 @@ async def put_frame(
 )
 async def post_frames(domain: DomainName, name: TraverseName, request: Request, running: Running) -> BatchAnswer:
     """Store a batch of frames whose encodings are known, all or none; the same indices again replace them."""
-    record = await run_sync(running.catalog.domain, domain)
+    await run_sync(running.catalog.domain, domain)
     await run_sync(_check_traverse, running, domain, name)
     media_type_of(request, (BINARY,))
     max_bytes = running.settings.max_batch_bytes
 
     def store(spool: IO[bytes]) -> BatchAnswer:
         frames = read_batch(spool, max_bytes)
-        encodings = ready_encodings(running.evaluators.evaluator(record.evaluator), frames.encodings)
+        encodings = ready_encodings(frames.encodings)
         with running.open_traverses.lend(domain, name) as traverse:
             n_new, n_replaced = traverse.put_frames(replace(frames, encodings=encodings))
             return BatchAnswer(n_new=n_new, n_replaced=n_replaced, n_frames=traverse.n_frames)
