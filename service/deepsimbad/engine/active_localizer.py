@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from deepsimbad.core.filters import BeliefFilter, FilterKind, motion_std_m
 from deepsimbad.core.grid_filter import GridFilter
+from deepsimbad.core.off_route import OFF_ROUTE_AT_START, agreement_of, off_route_probability
 from deepsimbad.core.particle_filter import DEFAULT_N_PARTICLES, ParticleFilter
 from deepsimbad.core.planners import DEFAULT_PLANNER, Plan, PlanningView, parse_planner
 from deepsimbad.core.relevance import Query, relevances
 from deepsimbad.core.statistics import LandmarkStatistics
-from deepsimbad.core.telling import LEFT_ROUTE_AT_START, off_route_probability
 from deepsimbad.core.update_rules import UpdateRule
 from deepsimbad.engine.snapshot import MapSnapshot
 
@@ -93,7 +93,7 @@ class ActiveLocalizer:
 
     def start(self, position_m: float | None = None, std_m: float = 5.0) -> LocalizerState:
         """Before any view: around a position, or anywhere on the route."""
-        off_route = None if self._map.off_route is None else LEFT_ROUTE_AT_START
+        off_route = None if self._map.off_route is None else OFF_ROUTE_AT_START
         return LocalizerState(self._prior(position_m, std_m), self._map.retrieval.statistics, None, off_route, 0)
 
     def step(
@@ -116,15 +116,13 @@ class ActiveLocalizer:
         if query.is_informative:
             live = live.observing(query.ranks) if live else None
             relevance = relevances(self._map.retrieval, query, live)
-        if off_route is not None and self._map.off_route is not None:
-            log_odds = self._map.off_route.log_odds(relevance) if query.is_informative else 0.0
-            off_route = off_route_probability(off_route, log_odds)
         clock.append(perf_counter())
 
         belief, number = state.belief, state.n_observations
         if number > 0:
             std_m = motion_std_m(action_m) if action_std_m is None else action_std_m
             belief = belief.predicted(action_m, std_m, number)
+            off_route = self._off_route(off_route, belief, query, relevance)
         clock.append(perf_counter())
 
         if query.is_informative:
@@ -137,6 +135,16 @@ class ActiveLocalizer:
         stages = ("retrieve", "predict", "update", "plan")
         timings_ms = {name: 1000 * (end - start) for name, start, end in zip(stages, clock, clock[1:], strict=False)}
         return Step(after, plan, timings_ms)
+
+    def _off_route(
+        self, before: float | None, predicted: BeliefFilter, query: Query, relevance: NDArray[np.float32]
+    ) -> float | None:
+        """Whether the view fits where the belief expected it; says nothing of a view that shows nothing."""
+        model = self._map.off_route
+        if before is None or model is None:
+            return None
+        log_odds = model.log_odds(agreement_of(predicted.mass, relevance)) if query.is_informative else 0.0
+        return off_route_probability(before, log_odds)
 
     def plan(self, state: LocalizerState) -> Plan | None:
         """The next best view from what is known now."""

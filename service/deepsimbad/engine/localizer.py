@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from deepsimbad.core.belief_summary import BeliefSummary, summarise
 from deepsimbad.core.descriptor import rank_landmarks, ranks_from_ranked_landmarks
 from deepsimbad.core.grid_filter import GridFilter
+from deepsimbad.core.off_route import OFF_ROUTE_AT_START
 from deepsimbad.core.planners import Plan
 from deepsimbad.core.relevance import Query, relevances
 from deepsimbad.core.retrieval import shortlist
-from deepsimbad.core.telling import LEFT_ROUTE_AT_START, off_route_probability
 from deepsimbad.engine.active_localizer import ActiveLocalizer, LocalizerConfig, LocalizerState
 from deepsimbad.engine.encoding import encode_view
 from deepsimbad.engine.observation import Dissimilarities, RankedLandmarks, View
@@ -80,7 +80,8 @@ def localize(snapshot: MapSnapshot, evaluator: Evaluator, view: View, n_shortlis
     best = shortlist(retrieval.relevance, length)
     listed = perf_counter()
     belief = GridFilter.uniform(snapshot.route).updated(retrieval.relevance, snapshot.update_rule, step=0)
-    off_route = _off_route(snapshot, retrieval.relevance)
+    # One view from a belief that expects nothing says nothing about being off the route.
+    off_route = None if snapshot.off_route is None else OFF_ROUTE_AT_START
     summary = summarise(snapshot.route, belief.mass, length, off_route)
     believed = perf_counter()
     plan = None
@@ -145,14 +146,6 @@ def shortlist_length(snapshot: MapSnapshot, wanted: int | None) -> int:
             maximum=snapshot.n_images,
         )
     return wanted
-
-
-def _off_route(snapshot: MapSnapshot, relevance: NDArray[np.float32]) -> float | None:
-    """Probability that the view is from nowhere on the route; None where the map has not learnt to tell."""
-    if snapshot.off_route is None:
-        return None
-    log_odds = snapshot.off_route.log_odds(relevance) if relevance.any() else 0.0
-    return off_route_probability(LEFT_ROUTE_AT_START, log_odds)
 
 
 def _as_float32(values: NDArray[np.float64]) -> NDArray[np.float32]:

@@ -9,10 +9,11 @@ from numpy.typing import NDArray
 
 from deepsimbad.core.calibration import CALIBRATED_PRIOR_WEIGHT_FRAMES, Calibration
 from deepsimbad.core.inverted_index import InvertedIndex
+from deepsimbad.core.off_route import OffRouteModel
 from deepsimbad.core.relevance import Relevance, RetrievalMap
 from deepsimbad.core.route import Route
 from deepsimbad.core.statistics import LandmarkStatistics
-from deepsimbad.core.telling import OffRouteModel, bits_ahead
+from deepsimbad.core.telling import bits_ahead
 from deepsimbad.core.update_rules import DEFAULT_UPDATE, UpdateRule
 from deepsimbad.evaluators.base import LandmarkModel
 from deepsimbad.store.map_file import MapContents

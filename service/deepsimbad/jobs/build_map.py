@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 from deepsimbad.core.calibration import Calibration
 from deepsimbad.core.landmark_selection import select_landmarks
 from deepsimbad.core.metrics import same_places
+from deepsimbad.core.off_route import OffRouteModel
 from deepsimbad.core.relevance import Relevance, RetrievalMap
 from deepsimbad.core.retrieval import SecondSeason, build_retrieval_map
 from deepsimbad.core.route import Route
-from deepsimbad.core.telling import Telling
+from deepsimbad.core.telling import telling_bits
 from deepsimbad.errors import InvalidMapConfigError
 from deepsimbad.evaluators.base import Evaluator, LandmarkModel
 from deepsimbad.jobs.encoded_traverse import route_of
@@ -45,13 +46,16 @@ class Described:
 
     Attributes:
         built: The part of the map that retrieval reads.
-        telling: What a second season of the route taught; None where none is known.
-        rehearsal: The map made without the second season's lists, for training on that season; None: as `built`.
+        rehearsal: The map made without the second season's lists, for learning from that season as from one to come;
+            None: as `built`.
+        telling_bits: [n] float32, how telling every place is; None where no second season is known.
+        off_route: How a robot off the route is known; None as well.
     """
 
     built: RetrievalMap
-    telling: Telling | None
     rehearsal: RetrievalMap | None = None
+    telling_bits: NDArray[np.float32] | None = None
+    off_route: OffRouteModel | None = None
 
 
 def describe(
@@ -83,14 +87,15 @@ def describe(
         other = _dissimilarities(second.encodings, evaluator, model, lambda share: on_progress(0.5 + share / 4))
         season = SecondSeason(other, same_places(route_of(second), route))
     built = build_retrieval_map(relevance, own, list_length, training.encodings, season)
-    telling, rehearsal = None, None
-    if season is not None and built.calibration is not None and built.calibration.is_of_two_seasons:
-        # Judged by lists that do not know the second season, as no list knows the season to come.
-        unaware = build_retrieval_map(relevance, own, list_length)
-        rehearsal = replace(unaware, calibration=_unaware(built, unaware))
-        telling = Telling.learn(rehearsal, season, route)
-    on_progress(1.0)
-    return Described(built, telling, rehearsal)
+    if season is None or built.calibration is None or not built.calibration.is_of_two_seasons:
+        on_progress(1.0)
+        return Described(built)
+    # Judged by lists that do not know the second season, as no list knows the season to come.
+    unaware = build_retrieval_map(relevance, own, list_length)
+    rehearsal = replace(unaware, calibration=_unaware(built, unaware))
+    bits = telling_bits(rehearsal, season, route)
+    on_progress(0.9)
+    return Described(built, rehearsal, bits, OffRouteModel.learn(rehearsal, season, route))
 
 
 def _unaware(built: RetrievalMap, unaware: RetrievalMap) -> Calibration:
@@ -128,7 +133,7 @@ def map_contents(
         described: What retrieval and planning read.
         route: Where the map images are.
     """
-    built, telling = described.built, described.telling
+    built, off_route = described.built, described.off_route
     statistics, calibration = built.statistics, built.calibration
     return MapContents(
         domain=domain.name,
@@ -146,8 +151,8 @@ def map_contents(
         statistics=None if statistics is None else np.stack([statistics.mean, statistics.std]),
         correlation=None if calibration is None else calibration.correlation,
         listed_score=None if calibration is None else calibration.listed_score,
-        telling_bits=None if telling is None else telling.bits,
-        off_route_model=None if telling is None else np.array([telling.off_route.slope, telling.off_route.intercept]),
+        telling_bits=described.telling_bits,
+        off_route_model=None if off_route is None else np.array([off_route.slope, off_route.intercept]),
         x_m=route.x_m,
         y_m=route.y_m,
     )

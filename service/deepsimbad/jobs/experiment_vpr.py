@@ -158,7 +158,7 @@ def _bits_per_map_image(built: RetrievalMap, model: LandmarkModel, route: Route)
     domain = DomainRecord("experiment", {}, closed=False, actions_m=(), active_version=None, created_at="")
     with tempfile.TemporaryDirectory() as folder:
         building, sealed = Path(folder) / "1.building", Path(folder) / "1.sqlite"
-        write_map(building, map_contents(domain, 1, {}, model, Described(built, None), route))
+        write_map(building, map_contents(domain, 1, {}, model, Described(built), route))
         seal(building, sealed)
         return 8 * index_bytes(sealed) / route.n_images
 
