@@ -1,0 +1,106 @@
+"""Whether the robot is on the route at all: the model against planted samples, and walks on and off a made-up route."""
+
+import math
+
+import numpy as np
+import pytest
+
+from deepsimbad.core.off_route import OFF_ROUTE_AT_START, OffRouteModel, agreement_of, off_route_probability
+from deepsimbad.core.relevance import Relevance
+from deepsimbad.core.retrieval import SecondSeason, build_retrieval_map
+from deepsimbad.core.route import Route
+
+
+def test_agreement_is_by_how_much_belief_explains_a_view_better_than_chance():
+    rng = np.random.default_rng(3)
+    mass, relevance = rng.dirichlet(np.ones(50)), rng.normal(size=50).astype(np.float32) * 5
+    believed = sum(mass[m] * math.exp(0.3 * relevance[m]) for m in range(50))
+    chance = sum(math.exp(0.3 * relevance[m]) for m in range(50)) / 50
+    assert agreement_of(mass, relevance) == pytest.approx(math.log(believed / chance), rel=1e-5)
+
+
+def test_agreement_of_a_belief_that_knows_nothing_is_none():
+    relevance = np.random.default_rng(3).normal(size=50).astype(np.float32) * 5
+    assert agreement_of(np.full(50, 0.02), relevance) == pytest.approx(0, abs=1e-6)
+    assert agreement_of(np.full(50, 0.02), relevance - 1e4) == pytest.approx(0, abs=1e-3), "worse on the whole map"
+    assert np.isfinite(agreement_of(np.eye(50)[0], np.array([-3e4, *([3e4] * 49)], np.float32)))
+
+
+def test_the_model_is_that_of_two_planted_samples():
+    """For two normal samples of equal spread s the log-odds are linear with slope (off - on) / s^2."""
+    rng = np.random.default_rng(4)
+    on, off = 2 + 0.7 * rng.standard_normal(40_000), 1 + 0.7 * rng.standard_normal(40_000)
+    model = OffRouteModel.fit(on, off)
+    assert model.slope == pytest.approx(-1 / 0.49, rel=0.03)
+    assert -model.intercept / model.slope == pytest.approx(1.5, abs=0.02), "even odds halfway"
+
+
+def test_probabilities_of_the_model_are_calibrated():
+    rng = np.random.default_rng(5)
+    on, off = rng.exponential(2.0, 50_000), rng.exponential(0.7, 50_000)  # whose log-odds are linear
+    model = OffRouteModel.fit(on, off)
+    evidence = np.r_[on, off]
+    is_off = np.r_[np.zeros(50_000), np.ones(50_000)]
+    told = 1 / (1 + np.exp(-(model.intercept + model.slope * evidence)))
+    for low in (0.1, 0.3, 0.5, 0.7):
+        among = (told >= low) & (told < low + 0.2)
+        assert is_off[among].mean() == pytest.approx(told[among].mean(), abs=0.02)
+
+
+@pytest.mark.parametrize("off", [np.zeros(30), np.full(30, 100.0)], ids=["all alike", "wholly apart"])
+def test_a_model_of_degenerate_samples_is_finite(off):
+    model = OffRouteModel.fit(np.zeros(30), off)
+    assert np.isfinite([model.slope, model.intercept]).all()
+
+
+def test_one_view_settles_nothing_alone():
+    model = OffRouteModel(-2.0, 0.5)
+    assert [model.log_odds(agreement) for agreement in (-90, 0, 0.5, 90)] == [3, 0.5, -0.5, -3]
+
+
+def test_the_probability_follows_bayes_rule():
+    before, log_odds = 0.3, 1.2
+    moved = 0.3 * 0.95 + 0.7 * 0.01
+    likelihood = math.exp(log_odds)
+    expected = moved * likelihood / (moved * likelihood + (1 - moved))
+    assert off_route_probability(before, log_odds) == pytest.approx(expected)
+
+
+def test_the_probability_rises_and_falls_with_the_views():
+    probability = OFF_ROUTE_AT_START
+    told = [probability := off_route_probability(probability, 1.0) for _ in range(10)]
+    assert told == sorted(told)
+    assert 0.95 < told[-1] < 1
+    back = [probability := off_route_probability(probability, -1.0) for _ in range(10)]
+    assert back == sorted(back, reverse=True)
+    assert 0 < back[-1] < 0.01
+
+
+def test_a_view_that_says_nothing_tends_to_the_balance_of_leaving_and_returning():
+    probability = 0.9
+    for _ in range(500):
+        probability = off_route_probability(probability, 0.0)
+    assert probability == pytest.approx(0.01 / 0.06, rel=1e-6)
+
+
+def route_in_two_seasons(n, noise):
+    rng = np.random.default_rng(7)
+    place = rng.normal(size=(n, 40))
+    second = place + noise * rng.normal(size=place.shape)
+    places = np.stack([np.arange(n), np.arange(n)], axis=1)
+    season = SecondSeason(second.astype(np.float32), places)
+    built = build_retrieval_map(Relevance.CALIBRATED, place.astype(np.float32), 4, second_season=season)
+    return built, season, Route(np.arange(float(n)))
+
+
+def test_it_learns_that_agreement_speaks_for_the_route():
+    model = OffRouteModel.learn(*route_in_two_seasons(400, noise=0.5))
+    assert model.slope < 0
+    assert model.log_odds(0.0) > 0, "a belief that explains a view no better than chance is off"
+    assert model.log_odds(3.0) < -1
+
+
+def test_where_seasons_share_too_short_a_stretch_nothing_is_learnt():
+    built, season, route = route_in_two_seasons(400, noise=0.5)
+    short = SecondSeason(season.dissimilarities, season.places[:30])
+    assert OffRouteModel.learn(built, short, route) is None
