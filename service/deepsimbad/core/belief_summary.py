@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from deepsimbad.core.retrieval import shortlist
@@ -89,9 +90,22 @@ def _credible_stretch(route: Route, mass: NDArray[np.float64]) -> tuple[float, f
     position, n = route.position_m, mass.size
     twice = np.r_[mass, mass] if route.closed else mass
     unrolled = np.r_[position, position + route.length_m] if route.closed else position
-    before = np.r_[0.0, np.cumsum(twice)]
-    wanted = before[:n] + _CREDIBLE_SHARE * (1 - 1e-12)
-    last = np.searchsorted(before[1:], wanted)  # the image whose mass reaches the share
-    starts = np.flatnonzero(last < twice.size)
-    best = starts[np.argmin(unrolled[last[starts]] - unrolled[starts])]
-    return float(position[best]), float(position[last[best] % n])
+    first, last = _shortest_stretch(np.r_[0.0, np.cumsum(twice)], unrolled, n)
+    return float(position[first]), float(position[last % n])
+
+
+@njit(cache=True, nogil=True)
+def _shortest_stretch(before: NDArray[np.float64], position_m: NDArray[np.float64], n_starts: int) -> tuple[int, int]:
+    """First and last image of the stretch; `before` is the mass before every image, and after the last."""
+    best_first, best_last, shortest_m = 0, position_m.size - 1, np.inf
+    last = 0
+    for first in range(n_starts):
+        wanted = before[first] + _CREDIBLE_SHARE * (1 - 1e-12)
+        while last < position_m.size and before[last + 1] < wanted:  # on to the image whose mass reaches the share
+            last += 1
+        if last == position_m.size:
+            break
+        length_m = position_m[last] - position_m[first]
+        if length_m < shortest_m:
+            best_first, best_last, shortest_m = first, last, length_m
+    return best_first, best_last

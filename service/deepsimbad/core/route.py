@@ -129,6 +129,15 @@ class Route:
 
     def histogram(self, max_bins: int) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
         """Edges [b + 1] of equal bins over the whole route, and every map image's bin [n]."""
+        if max_bins not in self._histograms:  # the same for every belief on the route
+            self._histograms[max_bins] = self._histogram(max_bins)
+        return self._histograms[max_bins]
+
+    @cached_property
+    def _histograms(self) -> dict[int, tuple[NDArray[np.float64], NDArray[np.intp]]]:
+        return {}
+
+    def _histogram(self, max_bins: int) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
         n_bins = min(max_bins, self.n_images)
         width_m = self.length_m / n_bins
         if width_m <= 0:
