@@ -13,6 +13,8 @@ from deepsimbad.core.update_rules import UpdateRule, evidence, weigh
 from deepsimbad.errors import PastTheEndError
 
 _SIGMAS = 4.0  # a move's error is cut off here
+_CELLS_A_SIGMA = 1024.0  # of the table that stands for the normal curve; exact to 1e-7
+_NORMAL = np.exp(-0.5 * np.square(np.arange(int(_SIGMAS * _CELLS_A_SIGMA) + 3) / _CELLS_A_SIGMA))
 _NEGLIGIBLE = 1e-12  # of the mean mass: a place with less is not spread any further
 
 
@@ -117,6 +119,16 @@ def _shift(
     return moved
 
 
+@njit(cache=True, nogil=True, inline="always")
+def _normal(deviations: float) -> float:
+    """`exp(-x^2 / 2)` for x in 0..4, from a table: exponentials would be most of a step's time."""
+    place = deviations * _CELLS_A_SIGMA
+    cell = int(place)
+    share = place - cell
+    weight: float = _NORMAL[cell] * (1 - share) + _NORMAL[cell + 1] * share
+    return weight
+
+
 @njit(cache=True, nogil=True)
 def _spread(  # noqa: PLR0912 - one pass over a band and its two wrapped ends
     mass: NDArray[np.float64], position_m: NDArray[np.float64], std_m: float, length_m: float
@@ -141,21 +153,18 @@ def _spread(  # noqa: PLR0912 - one pass over a band and its two wrapped ends
             stop += 1
         total = 0.0
         for j in range(first, stop):
-            off = (position_m[j] - position_m[i]) / std_m
-            weights[j] = np.exp(-0.5 * off * off)
+            weights[j] = _normal(abs(position_m[j] - position_m[i]) / std_m)
             total += weights[j]
         around_first, around_stop = 0, 0
         if length_m > 0:  # beyond a closed route's ends
             while around_stop < first and position_m[around_stop] + length_m - position_m[i] <= reach:
-                off = (position_m[around_stop] + length_m - position_m[i]) / std_m
-                weights[around_stop] = np.exp(-0.5 * off * off)
+                weights[around_stop] = _normal((position_m[around_stop] + length_m - position_m[i]) / std_m)
                 total += weights[around_stop]
                 around_stop += 1
             around_first = n
             while around_first > stop and position_m[i] + length_m - position_m[around_first - 1] <= reach:
                 around_first -= 1
-                off = (position_m[i] + length_m - position_m[around_first]) / std_m
-                weights[around_first] = np.exp(-0.5 * off * off)
+                weights[around_first] = _normal((position_m[i] + length_m - position_m[around_first]) / std_m)
                 total += weights[around_first]
         share = mass[i] / total
         for j in range(first, stop):
