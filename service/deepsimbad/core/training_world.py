@@ -2,6 +2,7 @@
 
 from concurrent.futures import Executor
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,8 @@ from deepsimbad.core.live_views import LiveViews, of_episodes
 from deepsimbad.core.nnql import NnqlConfig
 from deepsimbad.core.route import Route
 from deepsimbad.core.update_rules import UpdateRule
+
+_EPISODES_AT_ONCE = 12  # of one thread: their beliefs and evidence stay in the second-level cache
 
 
 @dataclass(frozen=True)
@@ -125,17 +128,13 @@ class Walk:
         e = self.frames.size
         self.nearest = np.empty((e, min(self.world.views.n_neighbours, self.world.n_images)), np.int64)
         self.ranks = np.empty(e)
-        if self._pool is None:
-            self._see_some(action, slice(0, e))
-            return
-        halves = slice(0, e // 2), slice(e // 2, e)
-        for seen in [self._pool.submit(self._see_some, action, half) for half in halves]:
-            seen.result()
+        parts = [slice(first, first + _EPISODES_AT_ONCE) for first in range(0, e, _EPISODES_AT_ONCE)]
+        see = map if self._pool is None else self._pool.map
+        for _ in see(partial(self._see_some, action), parts):
+            pass
 
     def _see_some(self, action: NDArray[np.int64], some: slice) -> None:
         world, moved, frames = self.world, action[some], self.frames[some]
-        if frames.size == 0:
-            return
         evidence, nearest = world.views.look(frames, of_episodes(self._live, some))
         self.nearest[some] = nearest
         moves = Moves(
