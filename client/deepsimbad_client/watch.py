@@ -114,8 +114,9 @@ def _show(state: SessionState, console: Console, live: Live | None) -> None:
     if live is None:
         low, high = belief.credible_95_m
         asked = "" if state.next_best_view is None else f", asks for {state.next_best_view.action_m:g} m"
+        views = "1 view" if state.n_observations == 1 else f"{state.n_observations} views"
         console.print(
-            f"{state.n_observations} views: likeliest at {belief.mode_m:.1f} m, 95 % within {low:.0f} .. {high:.0f} m, "
+            f"{views}: likeliest at {belief.mode_m:.1f} m, 95 % within {low:.0f} .. {high:.0f} m, "
             f"{belief.entropy_bits:.1f} bits of doubt{asked}",
             soft_wrap=True,
         )

@@ -178,4 +178,4 @@ def test_watching_another_robot(mapped: Client, winter: Recording, capsys: pytes
     ending.start()
     assert run(["watch", "--session", robot.session_id, "--pause", "0.05", "--server", mapped.url]) == 0
     ending.join()
-    assert capsys.readouterr().out.startswith("1 views: likeliest at")
+    assert capsys.readouterr().out.startswith("1 view: likeliest at")
