@@ -7,6 +7,7 @@ from bench import machine
 from bench.http import http_table
 from bench.landmarks import landmark_table
 from bench.map_file import map_file_table
+from bench.nnql import nnql_table
 from bench.retrieval import retrieval_table
 from bench.sessions import session_table
 
@@ -17,7 +18,7 @@ def main() -> None:
     """Print the tables as they are measured, then write them."""
     lines = ["# Benchmarks", "", "Made by `make bench`. Medians; machines are shared and noisy.", ""]
     lines += [f"Machine: {machine.describe()}", ""]
-    for table in (retrieval_table, landmark_table, map_file_table, http_table, session_table):
+    for table in (retrieval_table, landmark_table, map_file_table, nnql_table, http_table, session_table):
         for line in table():
             print(line, flush=True)
             lines.append(line)

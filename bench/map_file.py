@@ -10,7 +10,7 @@ from bench.timing import duration, timed
 from bench.worlds import ENCODING_DIM, N_LANDMARKS, NCLT_IMAGES, Lists, dense_lists, scattered_lists, standardised_map
 from deepsimbad.core.route import Route
 from deepsimbad.engine.snapshot import MapSnapshot
-from deepsimbad.jobs.build_map import map_contents
+from deepsimbad.jobs.build_map import Described, map_contents
 from deepsimbad.store.map_contents import MapContents
 from deepsimbad.store.map_file import index_bytes, read_map, table_bytes, write_map
 from deepsimbad.store.records import DomainRecord
@@ -34,7 +34,7 @@ def map_file_table() -> Iterator[str]:
 
 
 def _row(lists: Lists) -> tuple[str, dict[str, int]]:
-    contents = _contents(lists)
+    contents = contents_of(lists)
     with tempfile.TemporaryDirectory() as folder:
         building, sealed = Path(folder) / "1.building", Path(folder) / "1.sqlite"
         writing = timed(lambda: write_map(building, contents), repeats=3)
@@ -54,10 +54,13 @@ def _row(lists: Lists) -> tuple[str, dict[str, int]]:
         return row, table_bytes(sealed)
 
 
-def _contents(lists: Lists) -> MapContents:
+def contents_of(lists: Lists) -> MapContents:
+    """A map of these lists, with a landmark model of the paper's size."""
     domain = DomainRecord(
         "bench", {"kind": "feature_l2"}, closed=False, actions_m=(1.0,), active_version=None, created_at=""
     )
     prototypes = np.random.default_rng(0).normal(size=(N_LANDMARKS, ENCODING_DIM)).astype(np.float32)
-    route = Route(np.arange(NCLT_IMAGES) * 0.2)
-    return map_contents(domain, 1, {}, {"prototypes": prototypes}, standardised_map(lists.lists), route)
+    route = Route(np.asarray(np.arange(NCLT_IMAGES) * 0.2, np.float64))
+    return map_contents(
+        domain, 1, {}, {"prototypes": prototypes}, Described(standardised_map(lists.lists), None), route
+    )
