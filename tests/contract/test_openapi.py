@@ -29,6 +29,7 @@ DELETE /v1/admin/domains/{domain}/traverses/{name}
 PUT /v1/admin/domains/{domain}/traverses/{name}/frames/{index}
 POST /v1/admin/domains/{domain}/traverses/{name}/frames
 POST /v1/admin/domains/{domain}/remaps
+POST /v1/admin/domains/{domain}/experience
 GET /v1/admin/domains/{domain}/maps
 PUT /v1/admin/domains/{domain}/active-map
 GET /v1/admin/jobs

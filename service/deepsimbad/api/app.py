@@ -19,6 +19,7 @@ from deepsimbad.api.openapi import install_openapi
 from deepsimbad.api.problems import install_problem_handlers
 from deepsimbad.api.routes import (
     admin_domains,
+    admin_experience,
     admin_frames,
     admin_jobs,
     admin_maps,
@@ -54,6 +55,7 @@ _ROUTERS = (
     admin_traverses,
     admin_frames,
     admin_remaps,
+    admin_experience,
     admin_jobs,
     admin_maps,
 )
@@ -150,7 +152,7 @@ def _start(settings: Settings, metrics: Metrics, parts: ExitStack) -> Services:
         except DeepSimbadError:
             log.exception("a new map cannot be served", extra={"domain": domain})
 
-    runner = JobRunner(catalog, lambda domain: evaluators.evaluator(catalog.domain(domain).evaluator), switched)
+    runner = JobRunner(catalog, lambda domain: evaluators.evaluator(catalog.domain(domain).evaluator), switched, store)
     parts.callback(runner.close)
     metrics.watch(lambda: worker.n_waiting, lambda: active_maps.n_loaded, lambda: live.n_living)
     log.info(
@@ -170,6 +172,7 @@ def _start(settings: Settings, metrics: Metrics, parts: ExitStack) -> Services:
         evaluators=evaluators,
         open_traverses=open_traverses,
         sessions=live,
+        session_store=store,
         worker=worker,
         runner=runner,
         damaged_at_start=tuple(sorted(damaged)),

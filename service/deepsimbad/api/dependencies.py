@@ -23,6 +23,7 @@ from deepsimbad.evaluators.image import decode_image
 from deepsimbad.jobs.runner import JobRunner
 from deepsimbad.settings import Settings
 from deepsimbad.store.catalog import Catalog
+from deepsimbad.store.sessions import SessionStore
 
 T = TypeVar("T")
 
@@ -42,6 +43,7 @@ class Services:
         evaluators: Evaluators in memory.
         open_traverses: Files kept open while frames arrive.
         sessions: Live beliefs.
+        session_store: Their file.
         worker: Where encoding and scoring run.
         runner: Where jobs run.
         damaged_at_start: Domains whose active map could not be loaded at start.
@@ -57,6 +59,7 @@ class Services:
     evaluators: EvaluatorPool
     open_traverses: OpenTraverses
     sessions: Sessions
+    session_store: SessionStore
     worker: InferenceWorker
     runner: JobRunner
     damaged_at_start: tuple[str, ...] = ()

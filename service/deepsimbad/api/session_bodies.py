@@ -51,13 +51,13 @@ class ExperienceBody(JsonBody):
 
     session_id: Name
     true_positions_m: Annotated[
-        list[StrictFloat],
+        list[StrictFloat | None],
         Field(
             min_length=1,
             max_length=MAX_OBSERVATIONS_FED_BACK,
-            description="One route position for every observation of the session.",
+            description="One route position for every observation of the session; null where it is unknown.",
         ),
     ]
 
 
-DECLARED_SESSION_BODIES: tuple[type[JsonBody], ...] = (SessionBody, PriorBody)
+DECLARED_SESSION_BODIES: tuple[type[JsonBody], ...] = (SessionBody, PriorBody, ExperienceBody)

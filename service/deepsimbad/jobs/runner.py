@@ -8,23 +8,28 @@ from typing import Any
 
 from deepsimbad.errors import CancelledError, ConflictError, DeepSimbadError
 from deepsimbad.evaluators.base import Evaluator
+from deepsimbad.jobs.learn_online import LEARN_STAGES, learn_online
 from deepsimbad.jobs.map_config import RemapConfig
 from deepsimbad.jobs.progress import Progress, ProgressState
 from deepsimbad.jobs.remap import REMAP_STAGES, error_document, remap
+from deepsimbad.jobs.session_walks import EXPERIENCE, ExperienceConfig, walks_of
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.records import JobRecord, JobState
+from deepsimbad.store.sessions import SessionStore
 
 _log = logging.getLogger(__name__)
 _MAX_QUEUED = 100
+REMAP = "remap"
 
 
 class JobRunner:
-    """Runs remaps in the order they came.
+    """Runs remaps, and what sessions taught, in the order they came.
 
     Args:
         catalog: Where jobs are recorded.
         evaluator_of: Gives the evaluator of a domain.
         on_activated: Called with the domain's name after a job activated a map.
+        sessions: What experience is learnt from; None: from nothing.
     """
 
     def __init__(
@@ -32,18 +37,20 @@ class JobRunner:
         catalog: Catalog,
         evaluator_of: Callable[[str], Evaluator],
         on_activated: Callable[[str], None],
+        sessions: SessionStore | None = None,
     ) -> None:
         self._catalog = catalog
         self._evaluator_of = evaluator_of
         self._on_activated = on_activated
+        self._sessions = sessions
         self._waiting: queue.Queue[str | None] = queue.Queue()
         self._cancelled: dict[str, threading.Event] = {}
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="jobs", daemon=True)
         self._thread.start()
 
-    def submit(self, domain: str, config: RemapConfig) -> JobRecord:
-        """Queue a remap.
+    def submit(self, domain: str, config: RemapConfig | ExperienceConfig) -> JobRecord:
+        """Queue a remap, or the learning of what a session taught.
 
         Raises:
             UnknownDomainError: No such domain.
@@ -53,7 +60,8 @@ class JobRunner:
             raise ConflictError("the service is shutting down and takes no new job")
         if self._waiting.qsize() >= _MAX_QUEUED:
             raise ConflictError(f"{_MAX_QUEUED} jobs wait already; try again later", limit=_MAX_QUEUED)
-        job = self._catalog.create_job(domain, "remap", config.as_dict())
+        kind = REMAP if isinstance(config, RemapConfig) else EXPERIENCE
+        job = self._catalog.create_job(domain, kind, config.as_dict())
         self._cancelled[job.job_id] = threading.Event()
         self._waiting.put(job.job_id)
         return job
@@ -98,17 +106,12 @@ class JobRunner:
         self._catalog.update_job(job_id, state=JobState.RUNNING)
         ending: dict[str, Any]
         try:
-            result = remap(
-                self._catalog,
-                job.domain,
-                RemapConfig.from_dict(job.config),
-                self._evaluator_of(job.domain),
-                Progress(
-                    REMAP_STAGES,
-                    lambda state: self._record(job_id, state),
-                    lambda: cancelled.is_set() or self._closing.is_set(),
-                ),
+            progress = Progress(
+                LEARN_STAGES if job.kind == EXPERIENCE else REMAP_STAGES,
+                lambda state: self._record(job_id, state),
+                lambda: cancelled.is_set() or self._closing.is_set(),
             )
+            result = self._work(job, progress)
             if result["active"]:
                 self._on_activated(job.domain)
             ending = {"state": JobState.SUCCEEDED, "result": result, "progress": 1.0}
@@ -122,6 +125,13 @@ class JobRunner:
             broken = {"code": "internal_error", "message": "the job broke; the service's log tells where"}
             ending = {"state": JobState.FAILED, "error": broken}
         self._catalog.update_job(job_id, eta_s=None, **ending)
+
+    def _work(self, job: JobRecord, progress: Progress) -> dict[str, Any]:
+        if job.kind == EXPERIENCE and self._sessions is not None:
+            walks = walks_of(self._sessions, self._catalog, job.domain, job.config["session_id"])
+            return learn_online(self._catalog, job.domain, walks, progress)
+        config = RemapConfig.from_dict(job.config)
+        return remap(self._catalog, job.domain, config, self._evaluator_of(job.domain), progress)
 
     def _record(self, job_id: str, state: ProgressState) -> None:
         self._catalog.update_job(job_id, stage=state.stage, progress=state.progress, eta_s=state.eta_s)

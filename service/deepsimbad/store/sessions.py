@@ -128,6 +128,11 @@ class SessionStore:
                 snapshot = None
             return snapshot, journal_table.read(db, number, snapshot.sequence if snapshot else 0, until)
 
+    def journal(self, number: int) -> list[JournalRow]:
+        """All that happened to a session, in order."""
+        with self._reading() as db:
+            return journal_table.read(db, number, 0, 2**62)
+
     def named(self, number: int, key: str) -> tuple[int, bytes] | None:
         """Sequence number and request digest of the observation with this idempotency key."""
         with self._lock, storage_faults(self._path):  # one statement needs no transaction, and this is on the hot path

@@ -1,0 +1,123 @@
+"""A session's journal and the true positions fed back, as walks that the experience database can learn from."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from deepsimbad.core.known_walk import KnownWalk
+from deepsimbad.core.relevance import Query
+from deepsimbad.errors import ConflictError, InvalidInputError, NoActiveMapError, UnknownSessionError
+from deepsimbad.store.catalog import Catalog
+from deepsimbad.store.map_file import read_map
+from deepsimbad.store.session_records import ObservedRow, SessionRecord
+from deepsimbad.store.sessions import SessionStore
+
+EXPERIENCE = "experience"  # the kind of job
+
+
+@dataclass(frozen=True)
+class ExperienceConfig:
+    """What is to be learnt from: a session whose true positions have been kept."""
+
+    session_id: str
+
+    def as_dict(self) -> dict[str, Any]:
+        """JSON-ready."""
+        return {"session_id": self.session_id}
+
+
+def keep_true_positions(
+    store: SessionStore,
+    catalog: Catalog,
+    domain: str,
+    session_id: str,
+    positions_m: Sequence[float | None],
+    received_at: float,
+) -> None:
+    """Keep where a session's robot truly was; an ended session may still be told of.
+
+    Args:
+        store: The sessions.
+        catalog: Of the data directory.
+        domain: Which the session must be of.
+        session_id: The session.
+        positions_m: One for every observation; None where it is unknown.
+        received_at: Seconds since 1970.
+
+    Raises:
+        UnknownDomainError, UnknownSessionError: There is none such, or the session ended long ago.
+        NoActiveMapError: There is no map that could learn.
+        InvalidInputError: As many positions as observations there are not, or one is not finite.
+        ConflictError: The session was begun on a map of other landmarks than the one that serves.
+    """
+    active = catalog.domain(domain).active_version
+    record = _session_of(store, domain, session_id)
+    if active is None:
+        raise NoActiveMapError(f"domain {domain} has no active map that could learn")
+    if any(one is not None and not math.isfinite(one) for one in positions_m):
+        raise InvalidInputError("a true position is NaN or infinite; give null where it is unknown")
+    n_observations = store.n_observations(record.number)
+    if len(positions_m) != n_observations:
+        raise InvalidInputError(
+            f"{len(positions_m)} true positions for {n_observations} observations: give one for each",
+            n_observations=n_observations,
+        )
+    _check_landmarks(catalog, record, active)
+    known = np.array([math.nan if one is None else one for one in positions_m], np.float64)
+    store.save_true_positions(record.number, known, received_at).result()
+
+
+def walks_of(store: SessionStore, catalog: Catalog, domain: str, session_id: str) -> list[KnownWalk]:
+    """The walks of a session: one from every place where its belief was replaced to the next.
+
+    Raises:
+        UnknownDomainError, UnknownSessionError: There is none such, or the session ended long ago.
+        InvalidInputError: Its true positions were never fed back.
+        ConflictError: It was begun on a map of other landmarks than the one that serves.
+    """
+    record = _session_of(store, domain, session_id)
+    known = store.true_positions(record.number)
+    if known is None:
+        raise InvalidInputError(f"the true positions of session {session_id} are not known")
+    _check_landmarks(catalog, record, catalog.domain(domain).active_version)
+    walks: list[list[ObservedRow]] = [[]]
+    for row in store.journal(record.number):
+        if isinstance(row, ObservedRow):
+            walks[-1].append(row)
+        else:
+            walks.append([])
+    ends = np.cumsum([len(walk) for walk in walks])
+    return [
+        KnownWalk(
+            tuple(Query(row.ranks, row.dissimilarities, row.encoding) for row in walk),
+            np.array([row.action_m for row in walk], np.float64),
+            known[end - len(walk) : end],
+        )
+        for walk, end in zip(walks, ends.tolist(), strict=True)
+        if len(walk) > 1
+    ]
+
+
+def _session_of(store: SessionStore, domain: str, session_id: str) -> SessionRecord:
+    record = store.find(session_id)
+    if record.domain != domain:
+        raise UnknownSessionError(f"domain {domain} has no session {session_id}")
+    return record
+
+
+def _check_landmarks(catalog: Catalog, record: SessionRecord, active: int | None) -> None:
+    """What a session kept are ranks of its own map's landmarks; another map's cannot be compared with them."""
+    if active is None or record.map_version == active:
+        return
+    ours, theirs = (
+        read_map(catalog.map_path(record.domain, version)).landmark_model for version in (record.map_version, active)
+    )
+    if ours.keys() != theirs.keys() or not all(np.array_equal(ours[name], theirs[name]) for name in ours):
+        raise ConflictError(
+            f"session {record.session_id} was begun on map {record.map_version}; map {active}, which serves, has other "
+            "landmarks and cannot learn from it",
+            map_version=active,
+        )
