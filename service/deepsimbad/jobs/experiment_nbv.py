@@ -1,7 +1,8 @@
 """The paper's active experiment (III, Fig. 7): every planner from the same starts, ours beside the paper's."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -9,13 +10,14 @@ from numpy.typing import NDArray
 
 from deepsimbad.core.descriptor import rank_landmarks
 from deepsimbad.core.metrics import same_places
+from deepsimbad.core.nnql import NnqlConfig
 from deepsimbad.core.planners import CONSTANT, DEFAULT_PLANNER, NNQL, RANDOM
 from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Query, Relevance
 from deepsimbad.core.update_rules import DEFAULT_UPDATE, UpdateRule
 from deepsimbad.engine.active_localizer import ActiveLocalizer, LocalizerConfig
 from deepsimbad.engine.snapshot import MapSnapshot
 from deepsimbad.errors import InvalidMapConfigError
-from deepsimbad.evaluators.base import Evaluator
+from deepsimbad.evaluators.base import Evaluator, LandmarkModel
 from deepsimbad.jobs.build_map import choose_landmarks, describe, map_contents
 from deepsimbad.jobs.encoded_traverse import EncodedTraverse
 from deepsimbad.jobs.episodes import (
@@ -30,6 +32,7 @@ from deepsimbad.jobs.episodes import (
 )
 from deepsimbad.jobs.paired import Comparison, compare, mean_interval
 from deepsimbad.jobs.progress import Progress
+from deepsimbad.jobs.train_nnql import DescribedDrive, train_nnql
 from deepsimbad.store.records import DomainRecord
 
 CLAIRVOYANT = "clairvoyant"
@@ -64,13 +67,21 @@ class NbvConfig:
 
 
 @dataclass(frozen=True)
+class _Setup:
+    name: str
+    relevance: Relevance
+    update: UpdateRule
+    action_std_m: float | None
+
+
+@dataclass(frozen=True)
 class NbvReport:
     """What every planner scored.
 
     Attributes:
+        config: What was compared.
         ours, paper: Rank shares [episodes, steps] by planner, under our set-up and the paper's.
         travelled_m: Metres [episodes, steps] by planner, under our set-up.
-        seconds: Seconds by set-up.
     """
 
     config: NbvConfig
@@ -120,7 +131,7 @@ def nbv_stages(config: NbvConfig) -> dict[str, float]:
     """The stages `run_nbv` reports, with their weights."""
     stages = {"select landmarks": 2.0}
     for setup in ("ours", "paper"):
-        stages |= {f"map ({setup})": 1.0}
+        stages |= {f"map ({setup})": 1.0, f"train ({setup})": 4.0}
         stages |= {f"{name} ({setup})": 4.0 if name in {RANDOM, CLAIRVOYANT} else 1.0 for name in _names(config)}
     return stages
 
@@ -151,31 +162,19 @@ def run_nbv(
         raise InvalidMapConfigError(f"the test traverse is shorter than an episode of {travel_m:g} m")
 
     results: dict[str, dict[str, list[Episode]]] = {}
-    for setup, relevance, update, action_std_m in (
-        ("ours", config.relevance, config.update, None),
-        ("paper", *PAPER, PAPER_ACTION_STD_M),
-    ):
-        progress.stage(f"map ({setup})")
-        found = describe(
-            training.frames,
-            training.route,
-            evaluator,
-            model,
-            relevance,
-            config.list_length,
-            landmarks.frames,
-            progress.update,
-        )
-        domain = DomainRecord("experiment", {}, False, config.actions_m, None, "")
-        contents = map_contents(domain, 1, {}, model, found, training.route)
-        snapshot = MapSnapshot.from_contents(contents, index_bytes=0)
-        results[setup] = {}
+    setups = (
+        _Setup("ours", config.relevance, config.update, None),
+        _Setup("paper", *PAPER, PAPER_ACTION_STD_M),
+    )
+    for setup in setups:
+        snapshot = _mapped(config, setup, evaluator, model, landmarks, training, progress)
+        results[setup.name] = {}
         for name in _names(config):
-            progress.stage(f"{name} ({setup})")
-            localizer = ActiveLocalizer(snapshot, LocalizerConfig(update=update, planner=_planner(name)))
-            runner = EpisodeRunner(localizer, drive, config.n_steps, action_std_m)
+            progress.stage(f"{name} ({setup.name})")
+            localizer = ActiveLocalizer(snapshot, LocalizerConfig(update=setup.update, planner=_planner(name, config)))
+            runner = EpisodeRunner(localizer, drive, config.n_steps, setup.action_std_m)
             chooser = _chooser(name, runner, config)
-            results[setup][name] = _episodes(runner, starts, chooser, name == RANDOM, progress.update)
+            results[setup.name][name] = _episodes(runner, starts, chooser, name == RANDOM, progress.update)
     ours = results["ours"]
     return NbvReport(
         config,
@@ -185,17 +184,60 @@ def run_nbv(
     )
 
 
+def _mapped(
+    config: NbvConfig,
+    setup: _Setup,
+    evaluator: Evaluator,
+    model: LandmarkModel,
+    landmarks: EncodedTraverse,
+    training: EncodedTraverse,
+    progress: Progress,
+) -> MapSnapshot:
+    """The map with its experience database, as a remap makes it."""
+    progress.stage(f"map ({setup.name})")
+    route = training.route
+    found = describe(
+        training.frames,
+        route,
+        evaluator,
+        model,
+        setup.relevance,
+        config.list_length,
+        landmarks.frames,
+        progress.update,
+    )
+    domain = DomainRecord("experiment", {}, False, config.actions_m, None, "")
+    contents = map_contents(domain, 1, {}, model, found, route)
+    progress.stage(f"train ({setup.name})")
+    experience = train_nnql(
+        found.rehearsal or found.built,
+        route,
+        config.actions_m,
+        partial(DescribedDrive.of, training.frames, False, evaluator, model),
+        DescribedDrive.of(landmarks.frames, False, evaluator, model),
+        NnqlConfig(
+            config.training_episodes,
+            config.n_steps,
+            update=setup.update,
+            motion_std_m=setup.action_std_m,
+            seed=config.seed,
+        ),
+        progress.update,
+    )
+    return MapSnapshot.from_contents(replace(contents, q_values=experience.q_values), index_bytes=0)
+
+
 def _names(config: NbvConfig) -> list[str]:
-    return [RANDOM, *(_constant(each) for each in config.actions_m), CLAIRVOYANT, DEFAULT_PLANNER]
+    return [RANDOM, *(_constant(each) for each in config.actions_m), CLAIRVOYANT, NNQL, DEFAULT_PLANNER]
 
 
 def _constant(action_m: float) -> str:
     return f"{CONSTANT}_{action_m:g}"
 
 
-def _planner(name: str) -> str:
+def _planner(name: str, config: NbvConfig) -> str:
     """The localizer's own planner; those that only an experiment has are choosers, and it then costs nothing."""
-    return name if name in {NNQL, DEFAULT_PLANNER} else f"{CONSTANT}:1"
+    return name if name in {NNQL, DEFAULT_PLANNER} else f"{CONSTANT}:{config.actions_m[0]:g}"
 
 
 def _chooser(name: str, runner: EpisodeRunner, config: NbvConfig) -> Chooser:
