@@ -210,6 +210,26 @@ def test_another_process_on_the_same_sessions(mapped: Catalog) -> None:
         asyncio.run(body())
 
 
+def test_a_session_that_another_process_moved_on_does_not_expire(mapped: Catalog) -> None:
+    clock = Clock()
+    with running(mapped, clock) as ours, running(mapped, clock) as theirs:
+
+        async def body() -> None:
+            session_id = await begun(ours)
+            clock.now += TTL_S - 1
+            await theirs.sessions.observe(session_id, ranked(1))
+            clock.now += 2
+            await ours.sessions.sweep()
+            assert (await ours.sessions.view(session_id)).n_observations == 1
+            await theirs.sessions.end(session_id)
+            clock.now += TTL_S
+            await ours.sessions.sweep()
+            with pytest.raises(EndedSessionError, match="deleted"):
+                await ours.sessions.view(session_id)
+
+        asyncio.run(body())
+
+
 def test_a_repeated_observation_counts_once_and_has_its_own_answer(mapped: Catalog) -> None:
     answers: list[Any] = []
     session_id = ""

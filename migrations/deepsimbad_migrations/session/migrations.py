@@ -32,7 +32,6 @@ def m001_sessions_and_journal(db: Database) -> None:
             CHECK ((ended_at IS NULL) = (ending IS NULL))
         );
         CREATE INDEX session_ended ON session (ended_at);
-        CREATE INDEX session_domain ON session (domain);
         CREATE TABLE journal (
             session INTEGER NOT NULL REFERENCES session (number) ON DELETE CASCADE,
             sequence INTEGER NOT NULL CHECK (sequence >= 1),

@@ -65,7 +65,9 @@ def ranks_from_ranked_landmarks(landmark_ids: Sequence[int], n_landmarks: int) -
         raise InvalidRankedLandmarksError(
             f"a landmark id is out of range; ids run from 0 to {n_landmarks - 1}", n_landmarks=n_landmarks
         )
-    if np.unique(ids).size != n_sent:
+    is_sent = np.zeros(n_landmarks, np.bool_)
+    is_sent[ids] = True
+    if np.count_nonzero(is_sent) != n_sent:
         raise InvalidRankedLandmarksError("a landmark id is listed twice; ids must be distinct")
     ranks = np.full(n_landmarks, (n_sent + 1 + n_landmarks) / 2, np.float32)
     ranks[ids] = np.arange(1, n_sent + 1, dtype=np.float32)

@@ -134,10 +134,15 @@ class SessionRegistry:
         async with live.lock:
             if live.ending is not None:
                 raise ended(live.session_id, live.ending)
-            await asyncio.wrap_future(self._store.end(live.record.number, ending, self._clock()))
-            live.ending = ending
+            has_ended = await asyncio.wrap_future(self._store.end(live.record.number, ending, self._clock()))
             live.loaded = None
-            self._living.pop(live.session_id, None)
+            if has_ended:
+                live.ending = ending
+            else:  # another process ended it, or moved it on
+                record = await asyncio.to_thread(self._store.find, live.session_id)
+                live.ending, live.expires_at = record.ending, record.expires_at
+            if live.ending is not None:
+                self._living.pop(live.session_id, None)
 
     async def sweep(self) -> None:
         """End what has expired, and forget what ended long ago."""

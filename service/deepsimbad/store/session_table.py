@@ -58,18 +58,22 @@ def living(db: Database) -> list[SessionRecord]:
     return [_record(row) for row in db.execute(f"{_SELECT} WHERE session.ended_at IS NULL ORDER BY session.number")]
 
 
-def living_of_domain(db: Database, domain: str) -> list[SessionRecord]:
-    """Every session of a domain that has not ended, oldest first."""
-    rows = db.execute(f"{_SELECT} WHERE domain = ? AND session.ended_at IS NULL ORDER BY session.number", [domain])
-    return [_record(row) for row in rows]
-
-
 def end(db: Database, number: int, ending: str, ended_at: float) -> bool:
-    """End a session; its journal stays until it is purged. Returns whether it had lived until now."""
+    """End a session; its journal stays until it is purged.
+
+    Returns:
+        Whether it has ended by this: it had not before, and has indeed expired where that is to be its ending.
+    """
     ended = db.execute(
-        "UPDATE session SET ended_at = ?, ending = ? WHERE number = ? AND ended_at IS NULL", [ended_at, ending, number]
+        """
+        UPDATE session SET ended_at = :at, ending = :ending
+        WHERE number = :number AND ended_at IS NULL AND (:ending != 'expired' OR :at >= coalesce(
+            (SELECT expires_at FROM journal WHERE session = :number ORDER BY sequence DESC LIMIT 1), expires_at))
+        """,
+        {"at": ended_at, "ending": ending, "number": number},
     ).rowcount
-    db.execute("DELETE FROM snapshot WHERE session = ?", [number])
+    if ended:
+        db.execute("DELETE FROM snapshot WHERE session = ?", [number])
     return bool(ended)
 
 

@@ -74,6 +74,11 @@ class SessionStore:
         with self._lock, storage_faults(self._path), self._db.atomic() as db:
             yield db
 
+    def check(self) -> None:
+        """Raise what keeps the file from being read."""
+        with self._reading() as db:
+            db.execute("SELECT number FROM session LIMIT 1").fetchall()
+
     # Sessions
 
     def create(self, record: SessionRecord) -> Future[SessionRecord]:
@@ -90,13 +95,8 @@ class SessionStore:
         with self._reading() as db:
             return session_table.living(db)
 
-    def living_of_domain(self, domain: str) -> list[SessionRecord]:
-        """Every session of a domain that has not ended, oldest first."""
-        with self._reading() as db:
-            return session_table.living_of_domain(db, domain)
-
     def end(self, number: int, ending: str, ended_at: float) -> Future[bool]:
-        """End a session ("deleted", "expired"); answers whether it had lived until now."""
+        """End a session ("deleted", "expired"); answers whether it lived until now, and has expired if that is why."""
         return self._commits.submit(lambda db: session_table.end(db, number, ending, ended_at))
 
     def purge(self, ended_before: float) -> Future[int]:

@@ -5,7 +5,7 @@ CREATE TABLE "_sqlite_migrations" (
    "name" TEXT,
    "applied_at" TEXT
 );
-INSERT INTO "_sqlite_migrations" VALUES(1,'deepsimbad_session','m001_sessions_and_journal','2026-11-22 03:12:49.570986+00:00');
+INSERT INTO "_sqlite_migrations" VALUES(1,'deepsimbad_session','m001_sessions_and_journal','2026-11-22 03:34:06.033303+00:00');
 CREATE TABLE journal (
             session INTEGER NOT NULL REFERENCES session (number) ON DELETE CASCADE,
             sequence INTEGER NOT NULL CHECK (sequence >= 1),
@@ -63,7 +63,6 @@ INSERT INTO "true_positions" VALUES(1,1050.0,X'000000000000F03F0000000000001040'
 CREATE UNIQUE INDEX "idx__sqlite_migrations_migration_set_name"
     ON "_sqlite_migrations" ("migration_set", "name");
 CREATE INDEX session_ended ON session (ended_at);
-CREATE INDEX session_domain ON session (domain);
 CREATE UNIQUE INDEX journal_sequence ON journal (session, sequence);
 CREATE UNIQUE INDEX journal_key ON journal (session, idempotency_key) WHERE idempotency_key IS NOT NULL;
 COMMIT;

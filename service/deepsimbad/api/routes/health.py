@@ -25,10 +25,11 @@ async def healthz() -> Health:
 
 @router.get("/readyz", responses=problems())
 async def readyz(running: Running) -> Readiness:
-    """The evaluators are loaded and the catalog can be read; 503 until then and while shutting down."""
+    """The evaluators are loaded, the catalog and the sessions can be read; 503 until then and while shutting down."""
     if running.stopping.is_set():
         raise UnavailableError("the service is shutting down")
     await run_sync(running.catalog.domains)
+    await run_sync(running.session_store.check)
     return Readiness(status="ready", damaged_maps=list(running.damaged_at_start))
 
 
