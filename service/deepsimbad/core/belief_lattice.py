@@ -62,7 +62,7 @@ class Lattice:
         if shortest_action_m > step_m and not route.closed:
             step_m = shortest_action_m / round(shortest_action_m / step_m)
         n_cells = max(1, round(route.length_m / step_m) + (0 if route.closed else 1))
-        cells_m = route.start_m + step_m * np.arange(n_cells)
+        cells_m = np.asarray(route.start_m + step_m * np.arange(n_cells), np.float64)
         nearest = np.rint((route.position_m - route.start_m) / step_m).astype(np.int64)
         cell_of_image = nearest % n_cells if route.closed else np.minimum(nearest, n_cells - 1)
         return cls(
