@@ -212,7 +212,7 @@ def _ends(interval: list[float] | None, sign: int = 1) -> str:
     if interval is None:
         return "-"
     low, high = sorted(sign * end for end in interval)
-    return f"{low:.2f} .. {high:.2f}"
+    return f"{low:z.2f} .. {high:z.2f}"
 
 
 def _shown(value: float | None, form: str, unit: str = "") -> str:
