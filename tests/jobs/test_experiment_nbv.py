@@ -1,0 +1,239 @@
+"""The active experiment: in the paper's set-up against a slow reference, on random and on real data; the report."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from deepsimbad.errors import CancelledError, InvalidMapConfigError
+from deepsimbad.jobs.encoded_traverse import encode_recording
+from deepsimbad.jobs.experiment_nbv import NbvConfig, NbvReport, nbv_stages, run_nbv
+from deepsimbad.jobs.progress import Progress
+from deepsimbad_client.sources import open_source
+
+QUICK = NbvConfig(n_landmarks=40, actions_m=(1.0, 2.0, 4.0), n_steps=4, training_episodes=60, episodes=60)
+PLANNERS = {"random", "constant_1", "constant_2", "constant_4", "clairvoyant", "nnql", "telling"}
+
+
+@pytest.fixture(scope="session")
+def drives(tmp_path_factory):
+    """One route in three seasons, a metre between frames."""
+    folder = tmp_path_factory.mktemp("nbv")
+    rng = np.random.default_rng(0)
+    places = rng.normal(size=(110, 8))
+    for role, noise in (("landmarks", 0.4), ("training", 0.2), ("test", 1.0)):
+        np.save(folder / f"{role}.npy", (places + noise * rng.normal(size=places.shape)).astype(np.float32))
+    return {role: str(folder / f"{role}.npy") for role in ("landmarks", "training", "test")}
+
+
+def experiment(sources, evaluator, config, progress=None, spacing_m=1.0):
+    driven = [
+        encode_recording(open_source(sources[role], spacing_m=spacing_m), evaluator, 1, lambda _: None)
+        for role in ("landmarks", "training", "test")
+    ]
+    return run_nbv(config, evaluator, *driven, progress or Progress(nbv_stages(config)))
+
+
+@pytest.fixture(scope="module")
+def report(drives, evaluator) -> NbvReport:
+    return experiment(drives, evaluator, QUICK)
+
+
+# --- the slow reference: the paper's relevance, update and motion on frames a metre apart, nothing of the product's --
+
+
+def slow_paper(rows, config, moves):
+    """Rank shares [episodes, steps] where episode e makes moves[e] from the e-th start."""
+    candidates, mapped, live = rows
+    apart = np.array([((candidates - each) ** 2).sum(axis=1) for each in candidates])
+    np.fill_diagonal(apart, np.inf)
+    chosen = sorted(range(len(candidates)), key=lambda c: (-apart[c].min(), c))[: config.n_landmarks]
+    landmarks = candidates[chosen]
+
+    def ranks_of(encodings):
+        order = [np.argsort(((landmarks - each) ** 2).sum(axis=1), kind="stable") for each in encodings]
+        return np.argsort(order, axis=1) + 1
+
+    map_ranks, live_ranks = ranks_of(mapped), ranks_of(live)
+    features = np.where(map_ranks <= config.list_length, 1 / map_ranks, 0.0)
+    relevance = (1 / live_ranks) @ features.T  # [frames, images]
+    n = len(mapped)
+    last_start = len(live) - 1 - config.n_steps * int(max(config.actions_m))
+    starts = np.random.default_rng(config.seed).choice(np.arange(last_start + 1), config.episodes)
+    off = np.subtract.outer(np.arange(n), np.arange(n))
+    blur = np.where(np.abs(off) <= 4 * 0.7, np.exp(-0.5 * (off / 0.7) ** 2), 0.0)
+    blur /= blur.sum(axis=1, keepdims=True)
+    shares = np.empty((config.episodes, config.n_steps))
+    for episode, start in enumerate(starts):
+        frame = int(start)
+        weights = np.full(n, 1.0) + relevance[frame]
+        belief = weights / weights.sum()
+        for step, action in enumerate(moves[episode]):
+            frame += int(action)
+            moved = np.zeros(n)
+            moved[int(action) :] = belief[: n - int(action)]
+            weights = n * (moved / moved.sum()) @ blur + relevance[frame]
+            belief = weights / weights.sum()
+            tied = np.isclose(belief, belief[frame], rtol=1e-7, atol=0)
+            shares[episode, step] = ((belief[~tied] > belief[frame]).sum() + 0.5 * (tied.sum() - 1)) / n
+    return shares
+
+
+def random_moves(report):
+    """The moves that the random planner drew: they depend on the seed alone, not on what is believed."""
+    return np.diff(report.travelled_m["random"], axis=1, prepend=0)
+
+
+def test_the_papers_set_up_agrees_with_the_slow_reference(drives, report):
+    rows = [np.load(drives[role]).astype(np.float64) for role in ("landmarks", "training", "test")]
+    for action_m in QUICK.actions_m:
+        moves = np.full((QUICK.episodes, QUICK.n_steps), action_m)
+        expected = slow_paper(rows, QUICK, moves)
+        assert expected.mean() > 0.01, "all were found, so nothing was compared"
+        np.testing.assert_allclose(report.paper[f"constant_{action_m:g}"], expected, atol=1.01 / 110)
+        assert report.paper[f"constant_{action_m:g}"].mean() == pytest.approx(expected.mean(), abs=2e-4)
+    moves = random_moves(report)
+    assert set(np.unique(moves)) == set(QUICK.actions_m)
+    np.testing.assert_allclose(report.paper["random"], slow_paper(rows, QUICK, moves), atol=1.01 / 110)
+
+
+@cache
+def real_report(folder, evaluator) -> tuple[NbvReport, list[np.ndarray]]:
+    sources = {
+        role: str(folder / f"{name}.npy") for role, name in zip(("landmarks", "training", "test"), ORDER, strict=True)
+    }
+    config = NbvConfig(episodes=300, training_episodes=500)
+    return experiment(sources, evaluator, config), [np.load(path).astype(np.float64) for path in sources.values()]
+
+
+ORDER = ("nr", "nq", "nq2")
+
+
+@pytest.mark.slow
+@pytest.mark.real_data
+def test_real_netvlad_agrees_with_the_reference(real_data, evaluator):
+    report, rows = real_report(real_data / "nordland_netvlad64", evaluator)
+    for action_m in (1.0, 5.0, 10.0):
+        expected = slow_paper(rows, report.config, np.full((300, 10), action_m))
+        assert 100 * report.paper[f"constant_{action_m:g}"].mean() == pytest.approx(100 * expected.mean(), abs=0.01)
+    expected = slow_paper(rows, report.config, random_moves(report))
+    assert 100 * report.paper["random"].mean() == pytest.approx(100 * expected.mean(), abs=0.01)
+
+
+@pytest.mark.slow
+@pytest.mark.real_data
+def test_real_netvlad_in_order_of_what_they_know(real_data, evaluator):
+    report, _ = real_report(real_data / "nordland_netvlad64", evaluator)
+    mean = {name: shares.mean() for name, shares in report.ours.items()}
+    assert mean["clairvoyant"] < mean["telling"] < mean["random"]
+    assert all(report.ours[name].mean() < report.paper[name].mean() for name in report.ours)
+
+
+# --- what is compared ----------------------------------------------------------------------------------------------
+
+
+def test_every_planner_is_there_twice(report):
+    assert set(report.ours) == set(report.paper) == set(report.travelled_m) == PLANNERS
+    assert {shares.shape for shares in (*report.ours.values(), *report.paper.values())} == {(60, 4)}
+    for shares in report.ours.values():
+        assert 0 <= shares.min() <= shares.max() < 1
+
+
+def test_every_planner_has_the_same_starts(drives, report, evaluator):
+    """With one move to choose from, all planners are one."""
+    config = replace(QUICK, actions_m=(2.0,), episodes=20)
+    only = experiment(drives, evaluator, config)
+    for name, shares in only.ours.items():
+        np.testing.assert_array_equal(shares, only.ours["constant_2"], err_msg=name)
+        np.testing.assert_array_equal(only.paper[name], only.paper["constant_2"], err_msg=name)
+    assert set(report.config.actions_m) == {1, 2, 4}, "the other tests are of several moves"
+
+
+def test_travelled_distance_is_the_sum_of_the_moves(report):
+    for action_m in QUICK.actions_m:
+        travelled = report.travelled_m[f"constant_{action_m:g}"]
+        assert (travelled == action_m * np.arange(1, 5)).all()
+    for name in PLANNERS:
+        assert set(np.unique(np.diff(report.travelled_m[name], axis=1, prepend=0))) <= {1.0, 2.0, 4.0}
+    assert len({tuple(each) for each in report.travelled_m["random"].tolist()}) > 20
+
+
+def test_the_clairvoyant_is_no_worse_than_any_single_move(report):
+    first = report.ours["clairvoyant"][:, 0]
+    for action_m in QUICK.actions_m:
+        assert (first <= report.ours[f"constant_{action_m:g}"][:, 0]).all()
+
+
+def test_the_truth_is_the_map_image_nearest_in_metres(drives, evaluator):
+    """Part of the mapped drive itself, driven again: frame i of the test is not map image i."""
+    config = replace(QUICK, episodes=30, training_episodes=0)
+    same = experiment({**drives, "test": drives["training"] + "#31:90:2"}, evaluator, config)
+    assert same.ours["constant_4"].mean() < 0.002
+    assert same.paper["constant_4"].mean() < 0.02
+
+
+def test_the_same_seed_gives_the_same_again(drives, report, evaluator):
+    again = experiment(drives, evaluator, QUICK)
+    other = experiment(drives, evaluator, replace(QUICK, seed=1))
+    for name, shares in report.ours.items():
+        np.testing.assert_array_equal(again.ours[name], shares)
+        assert (other.ours[name] != shares).any()
+
+
+def test_a_test_drive_too_short_is_named(drives, evaluator):
+    short = {**drives, "test": drives["test"] + "#:16"}
+    with pytest.raises(InvalidMapConfigError, match="16 m"):
+        experiment(short, evaluator, QUICK)
+
+
+def test_stages_are_reported_and_the_whole_can_be_cancelled(drives, evaluator):
+    told = []
+    experiment(drives, evaluator, replace(QUICK, episodes=5), Progress(nbv_stages(QUICK), told.append))
+    assert list(dict.fromkeys(state.stage for state in told)) == list(nbv_stages(QUICK))
+    stop = Progress(nbv_stages(QUICK), None, lambda: True)
+    with pytest.raises(CancelledError):
+        experiment(drives, evaluator, QUICK, stop)
+
+
+# --- the report ----------------------------------------------------------------------------------------------------
+
+
+def test_the_document_tells_what_was_measured(report):
+    document = report.as_dict({"training": "here"})
+    for name, shares in report.ours.items():
+        assert document["anr"][name] == pytest.approx(100 * shares.mean())
+        assert document["anr_paper"][name] == pytest.approx(100 * report.paper[name].mean())
+        low, high = document["interval_95"][name]
+        assert low <= document["anr"][name] <= high
+        assert document["anr_by_step"][name] == pytest.approx([100 * shares[:, step].mean() for step in range(4)])
+    assert document["default"] == "telling"
+    constants = {name: anr for name, anr in document["anr"].items() if name.startswith("constant")}
+    assert document["best_constant"] == min(constants, key=constants.get)
+    assert set(document["difference_95"]) == {"telling - random", f"telling - {document['best_constant']}"}
+    assert document["n_episodes"] == 60
+    assert document["config"]["training"] == "here"
+    assert document["config"]["actions_m"] == (1.0, 2.0, 4.0)
+
+
+def test_differences_are_those_of_the_same_starts():
+    """The default is better by one hundredth everywhere; how hard a start is does not blur that."""
+    hard = np.random.default_rng(0).random((200, 3)) / 2
+    ours = {"telling": hard, "random": hard + 0.01, "constant_1": hard + 0.2, "constant_9": hard + 0.02}
+    report = NbvReport(QUICK, ours, ours, {name: np.ones((200, 3)) for name in ours})
+    difference = report.as_dict({})["difference_95"]
+    assert difference["telling - random"] == pytest.approx([-1, -1])
+    assert difference["telling - constant_9"] == pytest.approx([-2, -2])
+    assert report.best_constant == "constant_9"
+
+
+def test_at_a_distance_the_last_view_before_it_counts():
+    shares = np.array([[0.5, 0.4, 0.3], [0.6, 0.2, 0.1], [0.9, 0.9, 0.9]])
+    travelled = np.array([[4.0, 9.0, 12.0], [10.0, 20.0, 30.0], [1.0, 2.0, 3.0]])
+    ours = dict.fromkeys(("telling", "random", "constant_1"), shares)
+    document = NbvReport(QUICK, ours, ours, dict.fromkeys(ours, travelled)).as_dict({})
+    at = document["anr_at_distance_m"]["random"]
+    # 10 m: the second view of the first episode (9 m), the first of the second; the third never went so far
+    assert at["10"] == pytest.approx(100 * (0.4 + 0.6) / 2)
+    assert at["20"] == pytest.approx(100 * 0.2)
+    assert at["50"] is None
