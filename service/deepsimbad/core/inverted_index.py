@@ -32,6 +32,12 @@ def _sum_listed(lists: NDArray[np.uint16], tables: NDArray[np.float32], sums: ND
                 block[m] += table[row[m]]
 
 
+@njit(cache=True, nogil=True)
+def _sum_listed_many(lists: NDArray[np.uint16], tables: NDArray[np.float32], sums: NDArray[np.float32]) -> None:
+    for query in range(len(tables)):
+        _sum_listed(lists, tables[query], sums[query])
+
+
 @cache
 def _second_core() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(max_workers=1, thread_name_prefix="index")
@@ -100,6 +106,21 @@ class InvertedIndex:
             other = _second_core().submit(_sum_listed, self.lists[:, half:], worth, sums[half:])
             _sum_listed(self.lists[:, :half], worth, sums[:half])
             other.result()
+        return sums
+
+    def sum_listed_many(self, tables: NDArray[np.float32]) -> NDArray[np.float32]:
+        """`sum_listed` of many queries in this thread.
+
+        Args:
+            tables: [e, h, r].
+
+        Returns:
+            [e, n] float32.
+        """
+        if tables.shape[1:] != (self.list_length, self.n_landmarks):
+            raise InvalidMapConfigError(f"tables have shape {tables.shape}, not [e, h, r]")
+        sums = np.empty((len(tables), self.n_images), np.float32)
+        _sum_listed_many(self.lists, np.ascontiguousarray(tables, np.float32), sums)
         return sums
 
     def append(self, lists: NDArray[np.uint16], values: NDArray[np.float32] | None = None) -> Self:

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepsimbad.core.relevance import Query, Relevance, RetrievalMap, relevances
-from deepsimbad.core.retrieval import shortlist
+from deepsimbad.core.retrieval import shortlists
 from deepsimbad.core.statistics import LandmarkStatistics
 from deepsimbad.core.update_rules import LOG_LIKELIHOOD_WEIGHT, UpdateRule, evidence
 
@@ -49,19 +49,15 @@ class LiveViews:
             Evidence [e, n] float32, and the nearest map images [e, k] int64, best first.
         """
         relevance = self.relevance(frames, live)
-        nearest = _nearest(relevance, min(self.n_neighbours, relevance.shape[1]))
+        nearest = shortlists(relevance, self.n_neighbours)
         return _evidence(relevance, self.rule), nearest
 
     def relevance(self, frames: NDArray[np.int64], live: LandmarkStatistics | None) -> NDArray[np.float32]:
         """[e, n] float32; row by row what `core.relevance.relevances` gives."""
-        index = self.built.index
-        rows = np.empty((frames.size, index.n_images), np.float32)
         worth = worth_tables(self.built, self.ranks[frames], live)
-        for row, frame in enumerate(frames):
-            rows[row] = (
-                relevances(self.built, self._query(int(frame))) if worth is None else index.sum_listed(worth[row])
-            )
-        return rows
+        if worth is not None:
+            return self.built.index.sum_listed_many(worth)
+        return np.stack([relevances(self.built, self._query(int(frame))) for frame in frames])
 
     def _query(self, frame: int) -> Query:
         return Query(
@@ -112,7 +108,3 @@ def _evidence(relevance: NDArray[np.float32], rule: UpdateRule) -> NDArray[np.fl
     for row in relevance:
         row[:] = evidence(row, rule)
     return relevance
-
-
-def _nearest(relevance: NDArray[np.float32], k: int) -> NDArray[np.int64]:
-    return np.stack([shortlist(row, k) for row in relevance])

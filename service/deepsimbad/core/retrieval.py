@@ -131,3 +131,12 @@ def _scan(values: NDArray[np.floating], length: int) -> NDArray[np.int64]:
             best[place] = candidate
             n_kept = min(n_kept + 1, length)
     return best
+
+
+@njit(cache=True, nogil=True)
+def shortlists(values: NDArray[np.floating], length: int) -> NDArray[np.int64]:
+    """`shortlist` of many views, [e, n] to [e, length]; at most n of each."""
+    best = np.empty((len(values), min(length, values.shape[1])), np.int64)
+    for row in range(len(values)):
+        best[row] = _scan(values[row], best.shape[1])
+    return best

@@ -14,7 +14,7 @@ from deepsimbad.core.nnql import NnqlConfig
 from deepsimbad.core.route import Route
 from deepsimbad.core.update_rules import UpdateRule
 
-_EPISODES_AT_ONCE = 12  # of one thread: their beliefs and evidence stay in the second-level cache
+_CELLS_AT_ONCE = 300_000  # of one thread: its episodes' beliefs and evidence stay in the second-level cache
 
 
 @dataclass(frozen=True)
@@ -128,7 +128,8 @@ class Walk:
         e = self.frames.size
         self.nearest = np.empty((e, min(self.world.views.n_neighbours, self.world.n_images)), np.int64)
         self.ranks = np.empty(e)
-        parts = [slice(first, first + _EPISODES_AT_ONCE) for first in range(0, e, _EPISODES_AT_ONCE)]
+        size = max(1, min(-(-e // 2), _CELLS_AT_ONCE // self.world.lattice.n_cells))
+        parts = [slice(first, first + size) for first in range(0, e, size)]
         see = map if self._pool is None else self._pool.map
         for _ in see(partial(self._see_some, action), parts):
             pass
