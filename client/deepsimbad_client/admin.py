@@ -143,8 +143,8 @@ class Admin:
 
         Args:
             domain: The session's domain.
-            session_id: A session that the service still holds.
-            true_positions_m: A route position for each observation, in order.
+            session_id: The session; it may have ended a while ago.
+            true_positions_m: A position along the map's route for each observation, in order; None where unknown.
 
         Returns:
             The job that makes the next map version.

@@ -1,5 +1,6 @@
 """The calls that make, fill, remap and switch domains; they need a key of scope `admin`."""
 
+import math
 from collections.abc import Mapping, Sequence
 from io import BytesIO
 from typing import TYPE_CHECKING, Any
@@ -136,18 +137,19 @@ def remap(domain: str, config: Mapping[str, Any]) -> Call[Job]:
 
 
 def feed_experience(domain: str, session_id: str, true_positions_m: Numbers) -> Call[Job]:
-    """Feed back where a session's robot truly was; a second request would be a second job.
+    """Feed back where a session's robot truly was, None or NaN where unknown; a second request would be a second job.
 
     Raises:
-        InvalidArgumentError: A position is NaN or infinite.
+        InvalidArgumentError: A position is infinite or no number.
     """
-    positions = true_positions_m.tolist() if hasattr(true_positions_m, "tolist") else true_positions_m
+    plain = true_positions_m.tolist() if hasattr(true_positions_m, "tolist") else list(true_positions_m)
+    known = [None if isinstance(each, float) and math.isnan(each) else each for each in plain]
     return Call(
         "POST",
         f"{_domain(domain)}/experience",
         model(Job),
         headers=JSON,
-        body=json_body({"session_id": session_id, "true_positions_m": list(positions)}),
+        body=json_body({"session_id": session_id, "true_positions_m": known}),
         repeat=Repeat.IF_UNTOUCHED,
     )
 

@@ -223,6 +223,8 @@ def test_experience_is_fed_back() -> None:
         return httpx2.Response(202, json={"job_id": "j", "domain": "d", "state": "queued"})
 
     with Client("http://service", transport=httpx2.MockTransport(respond)) as client:
-        assert client.admin.feed_experience("d", "s1", np.array([1.0, 4.5])).job_id == "j"
+        assert client.admin.feed_experience("d", "s1", np.array([1.0, np.nan, 4.5])).job_id == "j"
+        with pytest.raises(errors.InvalidArgumentError):
+            client.admin.feed_experience("d", "s1", [float("inf")])
     assert asked[0].url.path == "/v1/admin/domains/d/experience"
-    assert json.loads(asked[0].content) == {"session_id": "s1", "true_positions_m": [1.0, 4.5]}
+    assert json.loads(asked[0].content) == {"session_id": "s1", "true_positions_m": [1.0, None, 4.5]}

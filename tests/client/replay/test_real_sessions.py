@@ -13,6 +13,7 @@ from deepsimbad_client import AsyncClient, Client, errors
 from deepsimbad_client.active_replay import active_replay
 from deepsimbad_client.active_report import summarise_active
 from deepsimbad_client.commands import run
+from deepsimbad_client.follow import follow_job
 from deepsimbad_client.recording import Recording
 from deepsimbad_client.remap import remap
 from deepsimbad_client.sources import open_source
@@ -168,6 +169,23 @@ def test_the_active_commands_end_to_end(
     assert run(["watch"]) == 2
     assert run(["watch", "--session", "s", "--domain", "active"]) == 2
     assert run(["watch", "--session", "nowhere"]) == 1
+
+
+def test_what_became_known_later_improves_the_next_map(service: str, encodings: Path, winter: Recording) -> None:
+    views = np.asarray(winter.encodings)
+    with Client(service) as client:
+        client.admin.put_domain("learning", {"kind": "feature_l2", "extractor": "none"})
+        for name in ("landmarks", "summer"):
+            upload(client, open_source(str(encodings / f"{name}.npy")), "learning", name)
+        remap(client, "learning", "summer", landmark_traverse="landmarks", n_landmarks=50, training_episodes=20)
+        with client.session("learning") as session:
+            for at in (40, 43, 46):
+                session.observe(encoding=views[at], action_m=3)
+        job = client.admin.feed_experience("learning", session.session_id, [40.0, None, 46.0])
+        done = follow_job(client, job.job_id)
+        assert done.result is not None
+        assert done.result["map_version"] == 2
+        assert client.domain("learning").map_version == 2
 
 
 def test_watching_another_robot(mapped: Client, winter: Recording, capsys: pytest.CaptureFixture[str]) -> None:
