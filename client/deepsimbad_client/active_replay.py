@@ -3,7 +3,7 @@
 import threading
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,8 @@ from deepsimbad_client.upload import CONCURRENCY
 
 EPISODES = 20
 STEPS = 10
+EPISODES_WITH_MASS = 10
+"""Of so many the belief along the route is kept for pictures; of thousands it would fill the memory."""
 
 
 @dataclass(frozen=True)
@@ -153,7 +155,7 @@ def _run(
         for seen, step in stage.play(session, row, steps, clock):
             if stopping.is_set():
                 raise _Stopped
-            done.append(step)
+            done.append(step if number < EPISODES_WITH_MASS else replace(step, mass=()))
             edges = seen.answer.belief.histogram.edges_m
             edges_m = (edges[0], edges[-1])
             if seen.answer.next_best_view is not None:

@@ -41,7 +41,7 @@ class EpisodeStep:
         off_route: Probability that the robot is nowhere on the route; None where not told.
         next_action_m: The move asked for next; None where none was named.
         latency_ms: Time from posting the view to the answer.
-        mass: The belief in equal stretches of the map's route.
+        mass: The belief in equal stretches of the map's route; of the first few episodes alone.
     """
 
     step: int

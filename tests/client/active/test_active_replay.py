@@ -196,3 +196,8 @@ def test_a_map_switched_meanwhile(fake: Any, drive: Recording, tmp_path: Path) -
     fake.lose_answers = switch
     with pytest.raises(errors.ReplayError, match="changed during the replay"):
         driven(fake, drive, tmp_path)
+
+
+def test_of_many_episodes_few_keep_their_whole_belief(fake: Any, drive: Recording, tmp_path: Path) -> None:
+    episodes = driven(fake, drive, tmp_path, planners=["random"], episodes=12).episodes["random"]
+    assert [bool(episode.steps[0].mass) for episode in episodes] == [True] * 10 + [False] * 2
