@@ -37,7 +37,8 @@ class Live:
 
     def __init__(self, catalog: Catalog, clock: Clock, **options: Any) -> None:
         self.catalog = catalog
-        self.store = SessionStore.open(catalog.data_dir)
+        self.commits: list[int] = []
+        self.store = SessionStore.open(catalog.data_dir, self.commits.append)
         self.worker = InferenceWorker()
         self.active_maps = ActiveMaps(catalog)
         self.sessions = Sessions(

@@ -132,6 +132,29 @@ def test_two_at_once_are_answered_in_order_of_arrival(mapped: Catalog) -> None:
     np.testing.assert_array_equal(at_once, one_by_one)
 
 
+def test_many_robots_share_commits_and_lose_nothing(mapped: Catalog) -> None:
+    n_robots, n_views = 20, 12
+
+    async def drive(live: Live, robot: int) -> tuple[str, list[int]]:
+        session_id = await begun(live, seed=robot)
+        views = [await live.sessions.observe(session_id, ranked(100 * robot + view)) for view in range(n_views)]
+        return session_id, [view.n_observations for view in views]
+
+    async def body(live: Live) -> list[str]:
+        driven = await asyncio.gather(*(drive(live, robot) for robot in range(n_robots)))
+        assert all(numbers == list(range(1, n_views + 1)) for _, numbers in driven)
+        assert sum(live.commits) == n_robots * (1 + n_views)
+        assert len(live.commits) < sum(live.commits)
+        return [session_id for session_id, _ in driven]
+
+    ids = run(mapped, body)
+
+    async def again(live: Live) -> list[int]:
+        return [(await live.sessions.view(session_id)).n_observations for session_id in ids]
+
+    assert run(mapped, again) == [n_views] * n_robots
+
+
 def hold_commits(live: Live) -> threading.Event:
     """Nothing reaches the disk until the event is set."""
     let_go = threading.Event()

@@ -119,12 +119,31 @@ def test_ended_sessions_are_remembered_until_they_are_purged(store: SessionStore
     assert store.end(numbers[1], "expired", 2000.0).result() is True
     assert [one.session_id for one in store.living()] == ["s2"]
     assert store.find("s0").ending == "deleted"
-    assert store.purge(1500.0).result() == 1
+    while store.purge(1500.0).result():
+        pass
     with pytest.raises(UnknownSessionError):
         store.find("s0")
     assert store.history(numbers[0], 9) == (None, [])
     assert store.find("s1").ending == "expired"
     assert store.n_observations(numbers[1]) == 1  # its journal may still be learnt from
+
+
+def test_a_long_journal_is_forgotten_in_pieces(store: SessionStore, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("deepsimbad.store.sessions.PURGED_AT_ONCE", 4)
+    number = store.create(RECORD).result().number
+    kept = store.create(replace(RECORD, session_id="s2")).result().number
+    for sequence in range(1, 11):
+        for each in (number, kept):
+            store.append(each, observed(sequence), 1.0).result()
+    store.end(number, "deleted", 5.0).result()
+    left = []
+    while store.purge(6.0).result():
+        left.append(store.n_observations(number))
+        assert store.find("s1").ending == "deleted"
+    assert left == [6, 2]
+    with pytest.raises(UnknownSessionError):
+        store.find("s1")
+    assert store.n_observations(kept) == 10
 
 
 def test_true_positions(store: SessionStore) -> None:

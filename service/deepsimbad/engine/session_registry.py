@@ -52,7 +52,7 @@ class SessionRegistry:
             TooManySessionsError: As many live as may.
         """
         if self._is_full:
-            await self.sweep()
+            await self.expire()
         if self._is_full:
             soonest_s = min((live.expires_at for live in self._living.values()), default=0.0) - self._clock()
             raise TooManySessionsError(
@@ -144,12 +144,16 @@ class SessionRegistry:
             if live.ending is not None:
                 self._living.pop(live.session_id, None)
 
-    async def sweep(self) -> None:
-        """End what has expired, and forget what ended long ago."""
+    async def expire(self) -> None:
+        """End what has expired."""
         for live in [live for live in self._living.values() if self.is_due(live)]:
             if self.is_due(live) and live.ending is None:  # neither moved on nor ended since the list was made
                 await self.end(live, EXPIRED)
-        await asyncio.wrap_future(self._store.purge(self._clock() - REMEMBERED_S))
+
+    async def purge(self) -> None:
+        """Forget what ended long ago."""
+        while await asyncio.wrap_future(self._store.purge(self._clock() - REMEMBERED_S)):
+            pass
 
 
 def _living(record: SessionRecord) -> LiveSession:

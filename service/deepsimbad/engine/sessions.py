@@ -126,7 +126,8 @@ class Sessions:
 
     async def sweep(self) -> None:
         """End what has expired, and forget what ended long ago."""
-        await self._finished(self._registry.sweep())
+        await self._finished(self._registry.expire())
+        await self._finished(self._registry.purge())
 
     async def _begin(self, active: ActiveDomain, config: SessionConfig) -> SessionView:
         await self._registry.reserve()

@@ -77,6 +77,22 @@ def end(db: Database, number: int, ending: str, ended_at: float) -> bool:
     return bool(ended)
 
 
-def purge(db: Database, ended_before: float) -> int:
-    """Forget the sessions that ended before a moment, journals and all; returns how many."""
-    return int(db.execute("DELETE FROM session WHERE ended_at < ?", [ended_before]).rowcount)
+def purge(db: Database, ended_before: float, max_rows: int) -> bool:
+    """Forget sessions that ended before a moment, journals first, a limited number of rows at a time.
+
+    Returns:
+        Whether there is more to forget.
+    """
+    n_rows = db.execute(
+        """
+        DELETE FROM journal WHERE rowid IN (
+            SELECT journal.rowid FROM session JOIN journal ON journal.session = session.number
+            WHERE ended_at < ? LIMIT ?
+        )
+        """,
+        [ended_before, max_rows],
+    ).rowcount
+    if n_rows >= max_rows:
+        return True
+    db.execute("DELETE FROM session WHERE ended_at < ?", [ended_before])
+    return False

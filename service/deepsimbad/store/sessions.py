@@ -19,6 +19,8 @@ from deepsimbad.store.group_commit import GroupCommit
 from deepsimbad.store.session_records import JournalRow, SessionRecord, StateSnapshot
 from deepsimbad_migrations.session.migrations import migrations
 
+PURGED_AT_ONCE = 1000  # rows
+
 
 class SessionStore:
     """Sessions and their journals; usable from any thread.
@@ -99,9 +101,9 @@ class SessionStore:
         """End a session ("deleted", "expired"); answers whether it lived until now, and has expired if that is why."""
         return self._commits.submit(lambda db: session_table.end(db, number, ending, ended_at))
 
-    def purge(self, ended_before: float) -> Future[int]:
-        """Forget the sessions that ended before a moment; answers how many."""
-        return self._commits.submit(lambda db: session_table.purge(db, ended_before))
+    def purge(self, ended_before: float) -> Future[bool]:
+        """Forget some of what ended before a moment, so little that no robot waits for it; answers if more is left."""
+        return self._commits.submit(lambda db: session_table.purge(db, ended_before, PURGED_AT_ONCE))
 
     # What happened to them
 
