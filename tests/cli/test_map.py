@@ -140,22 +140,34 @@ def test_named_errors_are_one_line(deepsimbad, drives, pictures, tmp_path):
     named_error(deepsimbad(*route, "--n-landmarks", 61), "60 candidates for 61 landmarks")
     named_error(deepsimbad(*route, "--n-landmarks", 4, "--list-length", 5), "list_length 5")
     named_error(deepsimbad("map", "route", "--landmarks", "nowhere", "--training", pictures, *READY), "nowhere")
-    named_error(deepsimbad("map", "route", "--landmarks", pictures, "--training", pictures, *READY), "ready encodings")
+    images = ("--landmarks", pictures, "--training", pictures, "--n-landmarks", 20)
+    named_error(deepsimbad("map", "route", *images, *READY), "ready encodings")
     named_error(deepsimbad("map", "no/name", *sources(drives), *READY), "1 to 64 letters")
     named_error(deepsimbad("map", "route", *sources(drives), "--evaluator", "feature_l2:crystal_ball"), "extractor")
     named_error(deepsimbad("info", "nowhere"), "nowhere")
     named_error(deepsimbad("localize", "nowhere", pictures / "1.png"), "nowhere")
     named_error(deepsimbad("localize", "route", pictures / "1.png"), "route")  # it has no map
-    named_error(deepsimbad("map", "route", *sources(drives), "--evaluator", "feature_l2"), "another configuration")
+    named_error(deepsimbad("map", "route", *images, "--evaluator", "feature_l2"), "another configuration")
 
 
 def test_a_view_that_cannot_be_used_is_named(deepsimbad, pictures, tmp_path):
     deepsimbad("map", "route", "--landmarks", pictures, "--training", pictures, "--n-landmarks", 20)
     named_error(deepsimbad("localize", "route", tmp_path / "missing.png"), "missing.png")
     (tmp_path / "words.png").write_text("words")
-    named_error(deepsimbad("localize", "route", tmp_path / "words.png"), "image")
+    named_error(deepsimbad("localize", "route", pictures / "1.png", tmp_path / "words.png"), "words.png: ", "image")
     (tmp_path / "half.png").write_bytes((pictures / "1.png").read_bytes()[:-200])
     named_error(deepsimbad("localize", "route", tmp_path / "half.png"))
+
+
+@pytest.mark.parametrize("command", [("info", "route"), ("localize", "route", "view.png")])
+def test_asking_makes_no_data_directory(deepsimbad, tmp_path, command):
+    named_error(deepsimbad(*command, "--data-dir", "mistyped"), "no domains in mistyped", "--data-dir")
+    assert not (tmp_path / "mistyped").exists()
+
+
+def test_too_few_candidates_are_named_before_anything_is_made(deepsimbad, drives, tmp_path):
+    named_error(deepsimbad("map", "route", *sources(drives), *READY), "for 500 landmarks", "--n-landmarks")
+    assert not (tmp_path / "deepsimbad-data").exists()
 
 
 def damaged(data_dir):

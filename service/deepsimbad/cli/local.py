@@ -14,7 +14,13 @@ from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Relevance
 from deepsimbad.engine.active_maps import ActiveMaps
 from deepsimbad.engine.evaluator_pool import EvaluatorPool
 from deepsimbad.engine.localizer import localize as localize_view
-from deepsimbad.errors import InvalidSourceError
+from deepsimbad.errors import (
+    ImageTooLargeError,
+    InvalidImageError,
+    InvalidSourceError,
+    TooFewCandidatesError,
+    UnknownDomainError,
+)
 from deepsimbad.evaluators.image import decode_image
 from deepsimbad.evaluators.registry import EvaluatorConfig, make_evaluator
 from deepsimbad.jobs.encoded_traverse import encode_recording
@@ -23,6 +29,7 @@ from deepsimbad.jobs.remap import REMAP_STAGES, remap
 from deepsimbad.settings import load_settings
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.frames import TraverseFrames
+from deepsimbad.store.layout import catalog_path, checked_name
 from deepsimbad.store.traverses import Traverse
 from deepsimbad_client.sources import open_source
 
@@ -71,14 +78,24 @@ def map_(
         training_episodes=training_episodes,
         seed=seed,
     )
+    checked_name(domain, "domain")
     judge = make_evaluator(evaluator)
     settings = load_settings(data_dir=data_dir)
+    # A mistake in what was typed should cost no minutes of encoding, and leave no domain behind.
+    recordings = {
+        role: open_source(source, spacing_m=spacing_m)
+        for role, source in (("landmarks", landmarks), ("training", training))
+    }
+    n_candidates = len(recordings["landmarks"].frames)
+    if n_candidates < n_landmarks:
+        raise TooFewCandidatesError(
+            f"{n_candidates} candidates for {n_landmarks} landmarks; ask for fewer (--n-landmarks) or drive further"
+        )
     with Catalog.open(settings.data_dir) as catalog:
         catalog.create_domain(domain, evaluator.as_dict(), closed, _ACTIONS_M)
         with progress_bar(_READING | REMAP_STAGES, f"map {domain}") as progress:
-            for role, source in (("landmarks", landmarks), ("training", training)):
+            for role, recording in recordings.items():
                 progress.stage(f"read {role}")
-                recording = open_source(source, spacing_m=spacing_m)
                 encoded = encode_recording(recording, judge, settings.max_pixels, progress.update)
                 _store(catalog, domain, role, encoded.frames)
             result = remap(catalog, domain, config, judge, progress)
@@ -93,7 +110,7 @@ def map_(
 def localize(domain: str, images: tuple[Path, ...], as_json: bool, data_dir: Path | None) -> None:
     """Say where on the route each image was probably taken."""
     settings = load_settings(data_dir=data_dir)
-    with Catalog.open(settings.data_dir) as catalog:
+    with _existing_catalog(settings.data_dir) as catalog:
         active = ActiveMaps(catalog).active(domain)
         judge = EvaluatorPool().evaluator(active.record.evaluator)
         found = []
@@ -103,7 +120,10 @@ def localize(domain: str, images: tuple[Path, ...], as_json: bool, data_dir: Pat
                 body = path.read_bytes()
             except OSError as error:
                 raise InvalidSourceError(f"cannot read {path}: {error.strerror or error}") from error
-            view = decode_image(body, settings.max_pixels)
+            try:
+                view = decode_image(body, settings.max_pixels)
+            except (InvalidImageError, ImageTooLargeError) as error:
+                raise type(error)(f"{path}: {error.message}", **error.hints) from error
             found.append((localize_view(active.snapshot, judge, view), began))
     answers = [render_localization(each, began) for each, began in found]
     if as_json:
@@ -129,7 +149,7 @@ def localize(domain: str, images: tuple[Path, ...], as_json: bool, data_dir: Pat
 @data_dir_option
 def info(domain: str, as_json: bool, data_dir: Path | None) -> None:
     """Describe a domain and its active map."""
-    with Catalog.open(load_settings(data_dir=data_dir).data_dir) as catalog:
+    with _existing_catalog(load_settings(data_dir=data_dir).data_dir) as catalog:
         answer = describe_domain(catalog.domain(domain), EvaluatorPool(), ActiveMaps(catalog))
     if as_json:
         write_json(answer.model_dump())
@@ -138,6 +158,15 @@ def info(domain: str, as_json: bool, data_dir: Path | None) -> None:
     for name, value in answer.model_dump().items():
         table.add_row(name, "-" if value is None else str(value))
     console().print(table)
+
+
+def _existing_catalog(data_dir: Path) -> Catalog:
+    """A question must not make the folder it asks about."""
+    if not catalog_path(data_dir).is_file():
+        raise UnknownDomainError(
+            f"there are no domains in {data_dir}: name their folder with --data-dir, or make one with `deepsimbad map`"
+        )
+    return Catalog.open(data_dir)
 
 
 def _store(catalog: Catalog, domain: str, role: str, frames: TraverseFrames) -> None:
