@@ -500,6 +500,11 @@ def test_an_empty_traverse_fails_the_remap(client: TestClient) -> None:
     assert remap(client, "ready", training_traverse="empty")["state"] == "failed"
 
 
+def test_our_own_rules_speak_for_themselves(client: TestClient) -> None:
+    answer = client.post("/v1/domains/ready/localizations", json={})
+    assert answer.json()["detail"] == "body: give exactly one of ranked_landmarks, dissimilarities, encoding"
+
+
 def test_unknown_jobs_and_maps(client: TestClient) -> None:
     check(client.get("/v1/admin/jobs/none"), 404, "unknown_job")
     check(client.get("/v1/admin/jobs/none/events"), 404, "unknown_job")

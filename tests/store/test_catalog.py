@@ -125,7 +125,7 @@ def test_activation_is_a_compare_and_swap(campus: Catalog) -> None:
     building = campus.begin_map("campus", {})
     with pytest.raises(UnknownMapVersionError):
         campus.activate("campus", building, ANY)
-    with pytest.raises(LostActivationError):
+    with pytest.raises(LostActivationError, match="serves no map, not map version 2"):
         campus.activate("campus", first, second)
     assert campus.domain("campus").active_version is None
     campus.activate("campus", first, None)

@@ -167,7 +167,10 @@ def install_problem_handlers(app: FastAPI) -> None:
 
 def _invalid_request(found: Iterable[tuple[tuple[Any, ...], str, str]]) -> InvalidRequestError:
     """One error of up to 20 findings, each (place, message, type)."""
-    errors = [{"loc": list(loc), "msg": message, "type": kind} for loc, message, kind in found][:20]
+    # pydantic puts its own words before those of our validators
+    errors = [
+        {"loc": list(loc), "msg": message.removeprefix("Value error, "), "type": kind} for loc, message, kind in found
+    ][:20]
     first = errors[0] if errors else {"loc": [], "msg": "unreadable", "type": "unreadable"}
     place = ".".join(str(part) for part in first["loc"])
     return InvalidRequestError(f"{place}: {first['msg']}", errors=errors)

@@ -92,13 +92,17 @@ def activate(db: Database, domain: str, version: int, expected: int | AnyVersion
     active = None if row is None else int(row[0])
     if not isinstance(expected, AnyVersion) and active != expected:
         raise LostActivationError(
-            f"domain {domain} serves map version {active}, not {expected}: look again before you swap",
+            f"domain {domain} serves {_named(active)}, not {_named(expected)}: look again before you swap",
             active=active,
             expected=expected,
         )
     db.execute("UPDATE map SET state = 'retired' WHERE domain = ? AND state = 'active'", [domain])
     db.execute("UPDATE map SET state = 'active' WHERE domain = ? AND version = ?", [domain, version])
     return get(db, domain, version)
+
+
+def _named(version: int | None) -> str:
+    return "no map" if version is None else f"map version {version}"
 
 
 def building(db: Database) -> list[tuple[str, int, str]]:
