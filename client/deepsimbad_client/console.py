@@ -1,6 +1,7 @@
 """What the commands show: progress on standard error, tables and JSON on standard output."""
 
 import json
+import os
 from collections.abc import Sequence
 from types import TracebackType
 from typing import Any, Self
@@ -25,11 +26,15 @@ from deepsimbad_client.upload import UploadProgress
 
 REMARKS = Console(stderr=True, highlight=False, markup=False)
 """Progress and remarks; names may hold brackets, so nothing is read as markup."""
+PIPE_COLUMNS = 160
 
 
 def show(table: Table) -> None:
-    """Print a result on standard output."""
-    Console(highlight=False, markup=False).print(table)
+    """Print a result on standard output; in a pipe or a file names and numbers stay whole."""
+    console = Console(highlight=False, markup=False)
+    if not console.is_terminal and "COLUMNS" not in os.environ:
+        console.width = PIPE_COLUMNS
+    console.print(table)
 
 
 def as_json(document: Any) -> str:

@@ -36,7 +36,7 @@ class Domain(Answer):
     input_size: tuple[int, int] | None = None
     """(width, height) an image is best resized to before it is sent; None: as it is, or no images at all."""
     encoding_dim: int | None = None
-    """Length of a ready encoding; None: that of the domain's traverses."""
+    """Length of an image's encoding; None: no images are taken. Ready ones may have any one length."""
     relevance: str | None = None
     index_bits_per_map_image: float | None = None
     actions_m: tuple[float, ...] = ()
