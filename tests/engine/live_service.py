@@ -49,6 +49,7 @@ class Live:
         )
 
     def close(self) -> None:
+        self.sessions.close()
         self.worker.close()
         self.store.close()
 

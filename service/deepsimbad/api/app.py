@@ -143,6 +143,7 @@ def _start(settings: Settings, metrics: Metrics, parts: ExitStack) -> Services:
         max_sessions=settings.max_sessions,
         snapshot_every=settings.snapshot_every,
     )
+    parts.callback(live.close)
     open_traverses = OpenTraverses(settings.data_dir)
     parts.callback(open_traverses.close)
 

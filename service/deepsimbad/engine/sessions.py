@@ -4,6 +4,7 @@ import asyncio
 import secrets
 import time
 from collections.abc import Callable, Coroutine
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any, TypeVar
 
@@ -61,6 +62,7 @@ class Sessions:
         self._ttl_s = ttl_s
         self._snapshot_every = snapshot_every
         self._clock = clock
+        self._summaries = ThreadPoolExecutor(1, "summaries")
         self._registry = SessionRegistry(store, maps, max_sessions, clock)
         self._under_way: set[asyncio.Task[Any]] = set()
 
@@ -68,6 +70,10 @@ class Sessions:
     def n_living(self) -> int:
         """How many sessions have not ended, as far as is known without looking."""
         return self._registry.n_living
+
+    def close(self) -> None:
+        """End the thread of summaries."""
+        self._summaries.shutdown()
 
     async def begin(self, active: ActiveDomain, config: SessionConfig) -> SessionView:
         """Begin a session on a domain's active map.
@@ -98,8 +104,7 @@ class Sessions:
     async def view(self, session_id: str, n_shortlist: int | None = None) -> SessionView:
         """What a session believes now."""
         live, loaded = await self._read(session_id)
-        expires_at = live.expires_at
-        return await self._compute(lambda: view_of(session_id, expires_at, loaded.engine, loaded.state, n_shortlist))
+        return await self._summarised(session_id, live.expires_at, loaded, n_shortlist)
 
     async def mass(self, session_id: str) -> NDArray[np.float64]:
         """[n] mass of every map image in a session's belief; sums to 1."""
@@ -137,18 +142,18 @@ class Sessions:
             snapshot, session_id, now = active.snapshot, secrets.token_hex(16), self._clock()
             expires_at = now + self._ttl_s
 
-            def start() -> tuple[Loaded, SessionView]:
+            def start() -> Loaded:
                 engine = SessionEngine.of(config, snapshot, evaluator)
-                state = engine.start()
-                return Loaded(engine, state), view_of(session_id, expires_at, engine, state)
+                return Loaded(engine, engine.start())
 
-            loaded, answer = await self._compute(start)
+            loaded = await self._compute(start)
+            told = self._summarised(session_id, expires_at, loaded)
             new = SessionRecord(
                 0, session_id, snapshot.domain, snapshot.version, digest, config.as_dict(), now, expires_at, 0, None
             )
             kept = await asyncio.wrap_future(self._store.create(new))
             begun = LiveSession(kept, expires_at, loaded)
-            return answer
+            return await told
         finally:
             self._registry.settle(begun)
 
@@ -163,13 +168,14 @@ class Sessions:
             stepped = await self._compute(lambda: self._step(live, loaded, observation, view, expires_at))
             if isinstance(stepped, int):
                 return await self._repeated(live, loaded, stepped, observation.n_shortlist)
-            row, moved_on, answer = stepped
-            await self._commit(live, loaded, row, moved_on)
-            return answer
+            row, moved_on = stepped
+            told = self._summarised(live.session_id, expires_at, moved_on, observation.n_shortlist)
+            await self._commit(live, loaded, row, moved_on)  # the disk and the summary take their time together
+            return await told
 
     def _step(
         self, live: LiveSession, loaded: Loaded, observation: Observation, view: View, expires_at: float
-    ) -> tuple[ObservedRow, Loaded, SessionView] | int:
+    ) -> tuple[ObservedRow, Loaded] | int:
         """The next row and what it leads to; or the row's number, if the observation was counted before."""
         named = observation.idempotency
         if named is not None and (earlier := self._counted_before(live, named)) is not None:
@@ -180,8 +186,7 @@ class Sessions:
             query, loaded.state.sequence + 1, expires_at, observation.action_m, observation.action_std_m, named
         )
         state = engine.applied(loaded.state, row)
-        answer = view_of(live.session_id, expires_at, engine, state, observation.n_shortlist)
-        return row, Loaded(engine, state), answer
+        return row, Loaded(engine, state)
 
     def _counted_before(self, live: LiveSession, named: IdempotencyKey) -> int | None:
         found = self._store.named(live.record.number, named.key)
@@ -198,8 +203,7 @@ class Sessions:
         """The answer that an observation had; computed again, since the same journal leads to the same belief."""
         if loaded.state.sequence != sequence:
             loaded = await asyncio.to_thread(self._registry.restored, live.record, sequence)
-        then, expires_at = loaded, live.expires_at
-        answer = await self._compute(lambda: view_of(live.session_id, expires_at, then.engine, then.state, n_shortlist))
+        answer = await self._summarised(live.session_id, live.expires_at, loaded, n_shortlist)
         return replace(answer, is_repeated=True)
 
     async def _set_prior(self, live: LiveSession, position_m: float, std_m: float) -> SessionView:
@@ -207,14 +211,11 @@ class Sessions:
             loaded = await self._registry.loaded(live)
             check_prior(loaded.engine.snapshot.route, position_m, std_m)
             row = PriorRow(loaded.state.sequence + 1, self._clock() + self._ttl_s, position_m, std_m)
-
-            def step() -> tuple[Loaded, SessionView]:
-                state = loaded.engine.applied(loaded.state, row)
-                return Loaded(loaded.engine, state), view_of(live.session_id, row.expires_at, loaded.engine, state)
-
-            moved_on, answer = await self._compute(step)
+            state = await self._compute(lambda: loaded.engine.applied(loaded.state, row))
+            moved_on = Loaded(loaded.engine, state)
+            told = self._summarised(live.session_id, row.expires_at, moved_on)
             await self._commit(live, loaded, row, moved_on)
-            return answer
+            return await told
 
     async def _commit(self, live: LiveSession, before: Loaded, row: JournalRow, after: Loaded) -> None:
         """Write a row, then publish what it leads to."""
@@ -237,6 +238,14 @@ class Sessions:
             return live, live.loaded
         async with live.lock:
             return live, await self._registry.loaded(live)
+
+    def _summarised(
+        self, session_id: str, expires_at: float, loaded: Loaded, n_shortlist: int | None = None
+    ) -> asyncio.Future[SessionView]:
+        """A summary to come, from a thread of its own: what only reads should not keep a robot's next step waiting."""
+        return asyncio.wrap_future(
+            self._summaries.submit(view_of, session_id, expires_at, loaded.engine, loaded.state, n_shortlist)
+        )
 
     async def _compute(self, run: Callable[[], T]) -> T:
         return await asyncio.wrap_future(self._worker.submit(run))
