@@ -218,6 +218,7 @@ def test_a_truncated_image_moves_nothing(client: TestClient) -> None:
         (b'{"seed": 1.5}', "invalid_request"),
         (b'{"belief": "guess"}', "invalid_request"),
         (b'{"update": "guess"}', "invalid_request"),
+        (b'{"planner": ""}', "invalid_request"),
         (b'{"planner": "clever"}', "invalid_input"),
         (b'{"planner": "constant:3.5"}', "invalid_input"),
         (b'{"colour": 1}', "invalid_request"),

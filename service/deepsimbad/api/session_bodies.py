@@ -26,7 +26,7 @@ class SessionBody(JsonBody):
         Field(description="Of whatever is random in it; null: 0."),
     ] = None
     planner: Annotated[
-        Annotated[str, Field(max_length=64)] | None,
+        Annotated[str, Field(min_length=1, max_length=64)] | None,
         Field(description="Who recommends moves: `telling`, `nnql`, `random`, `constant:<m>`; null: the default."),
     ] = None
     belief: Annotated[FilterKind | None, Field(description="The filter; null: grid.")] = None
