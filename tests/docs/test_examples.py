@@ -121,10 +121,26 @@ def test_a_posted_image_is_answered_with_a_belief(workplace):
     answer = json.loads(workplace.answer_of("localizations?shortlist=3").out)
     assert len(answer["retrieval"]) == len(answer["belief"]["top"]) == 3
     assert {"mean_m", "mode_m", "credible_95_m", "entropy_bits", "histogram"} <= set(answer["belief"])
-    assert answer["next_best_view"] is None
+    assert answer["next_best_view"]["planner"] == "telling"
     assert json.loads(workplace.answer_of("ranked_landmarks").out)["map_version"] == 1
     domain = json.loads(workplace.answer_of("curl http://127.0.0.1:8000/v1/domains/campus").out)
     assert np.load(workplace.folder / "relevances.npy").shape == (domain["n_map_images"],)
+
+
+def test_the_session_is_begun_moved_on_and_ended(workplace):
+    session = (workplace.folder / "session").read_text().split()
+    assert [len(word) for word in session] == [32]
+    first = json.loads(workplace.answer_of('/observations"').out)
+    second = json.loads(workplace.answer_of("observations?action_m=0").out)
+    assert (first["n_observations"], second["n_observations"]) == (1, 2)
+    assert second["belief"]["entropy_bits"] <= first["belief"]["entropy_bits"]
+    assert second["belief"]["off_route"] is None, "36 frames are too short a route to learn from"
+    assert json.loads(workplace.answer_of("/next-best-view").out) == second["next_best_view"]
+    mass = np.load(workplace.folder / "belief.npy")
+    assert mass.sum() == pytest.approx(1, abs=1e-3)
+    carried = json.loads(workplace.answer_of("/prior").out)
+    assert carried["belief"]["mean_m"] == pytest.approx(10, abs=1)
+    assert workplace.answer_of("-X DELETE").code == 0
 
 
 def test_an_error_is_a_problem_document(workplace):
@@ -134,13 +150,15 @@ def test_an_error_is_a_problem_document(workplace):
 
 
 def test_the_replay_leaves_its_files(workplace):
-    left = {path.name for path in (workplace.folder / "replays" / "summer").iterdir()}
-    assert left >= {"steps.jsonl", "summary.json"}
-    assert any(name.endswith(".png") for name in left)
+    for replay in ("summer", "active"):
+        left = {path.name for path in (workplace.folder / "replays" / replay).iterdir()}
+        assert left >= {"steps.jsonl", "summary.json"}
+        assert any(name.endswith(".png") for name in left)
 
 
 def test_the_experiments_leave_their_figures(workplace):
     assert json.loads((workplace.folder / "vpr.json").read_text())["n_queries"] == 50
+    assert "telling" in json.loads((workplace.folder / "nbv.json").read_text())["anr"]
     assert "standardised" in workplace.answer_of("experiment vpr --landmarks nclt:").out
 
 
