@@ -5,6 +5,7 @@ localized on its own, then an active robot chooses where to look next. Everythin
 interface, as a robot's would.
 """
 
+import signal
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -158,7 +159,8 @@ def _show_one(client: Client, live: Recording) -> None:
 
 
 def main() -> None:
-    """Run the demonstration."""
+    """Run the demonstration; asked to end, it takes its service with it."""
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     try:
         demo()
     except DeepSimbadClientError as error:

@@ -263,3 +263,18 @@ def test_ctrl_c_cancels_a_map_and_leaves_no_half_of_one(process, drives, tmp_pat
     with Catalog.open(tmp_path / "here") as catalog:
         assert catalog.maps("route") == []
         assert catalog.domain("route").active_version is None
+
+
+def test_landmarks_default_to_every_frame_of_a_short_recording(deepsimbad, drives, tmp_path):
+    assert deepsimbad("map", "route", *sources(drives), *READY, "--data-dir", tmp_path / "here").code == 0
+    landmarks = np.load(drives / "landmarks.npy")
+    assert contents(tmp_path / "here").n_landmarks == len(landmarks)
+
+
+def test_a_domain_is_deleted_when_that_is_confirmed(deepsimbad, drives, tmp_path):
+    here = ("--data-dir", tmp_path / "here")
+    deepsimbad("map", "route", *sources(drives), *READY, "--n-landmarks", 20, *here)
+    ran = deepsimbad("delete", "route", "--yes", *here)
+    assert (ran.code, ran.out) == (0, "domain route is deleted\n")
+    assert deepsimbad("info", "route", *here).code == 1
+    assert deepsimbad("delete", "route", "--yes", *here).code == 1

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import click
 
 from deepsimbad.cli.experiment import experiment
-from deepsimbad.cli.local import info, localize, map_
+from deepsimbad.cli.local import delete, info, localize, map_
 from deepsimbad.cli.serve import serve
 from deepsimbad.errors import CancelledError, DeepSimbadError
 from deepsimbad_client.errors import DeepSimbadClientError
@@ -23,7 +23,7 @@ def deepsimbad() -> None:
     """Where on a known route a robot is, and which move would tell it most next."""
 
 
-for command in (serve, map_, localize, info, experiment):
+for command in (serve, map_, localize, info, delete, experiment):
     deepsimbad.add_command(command)
 
 

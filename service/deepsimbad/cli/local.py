@@ -42,7 +42,11 @@ _ACTIONS_M = tuple(float(metres) for metres in range(1, 11))
 @click.option("--landmarks", required=True, help="SOURCE landmarks are selected from.")
 @click.option("--training", required=True, help="SOURCE that becomes the map.")
 @evaluator_option
-@click.option("--n-landmarks", type=click.IntRange(min=1), default=DEFAULT_N_LANDMARKS, show_default=True)
+@click.option(
+    "--n-landmarks",
+    type=click.IntRange(min=1),
+    help=f"How many landmarks.  [default: {DEFAULT_N_LANDMARKS}, or every frame of a shorter recording]",
+)
 @click.option("--list-length", type=click.IntRange(min=1), default=DEFAULT_LIST_LENGTH, show_default=True)
 @click.option("--relevance", type=RELEVANCES, default=DEFAULT_RELEVANCE.value, show_default=True)
 @click.option("--training-episodes", type=click.IntRange(min=0), default=DEFAULT_TRAINING_EPISODES, show_default=True)
@@ -55,7 +59,7 @@ def map_(
     landmarks: str,
     training: str,
     evaluator: EvaluatorConfig,
-    n_landmarks: int,
+    n_landmarks: int | None,
     list_length: int,
     relevance: str,
     training_episodes: int,
@@ -87,7 +91,7 @@ def map_(
         for role, source in (("landmarks", landmarks), ("training", training))
     }
     n_candidates = len(recordings["landmarks"].frames)
-    if n_candidates < n_landmarks:
+    if n_landmarks is not None and n_candidates < n_landmarks:
         raise TooFewCandidatesError(
             f"{n_candidates} candidates for {n_landmarks} landmarks; ask for fewer (--n-landmarks) or drive further"
         )
@@ -141,6 +145,17 @@ def localize(domain: str, images: tuple[Path, ...], as_json: bool, data_dir: Pat
             f"{belief.entropy_bits:.1f} bit",
         )
     console().print(table)
+
+
+@click.command()
+@click.argument("domain")
+@click.confirmation_option("--yes", prompt="Delete the domain with its recordings and maps?")
+@data_dir_option
+def delete(domain: str, data_dir: Path | None) -> None:
+    """Delete a domain with everything it holds."""
+    with _existing_catalog(load_settings(data_dir=data_dir).data_dir) as catalog:
+        catalog.delete_domain(domain)
+    click.echo(f"domain {domain} is deleted")
 
 
 @click.command()

@@ -20,7 +20,8 @@ class RemapConfig:
         training_traverse: The traverse that becomes the map.
         landmark_traverse: Where landmarks are selected; None keeps those of the active map (the paper's cheap
             retraining).
-        n_landmarks: r; None means 500, or as many as the active map has where its landmarks stay.
+        n_landmarks: r; None means 500 or, of a shorter landmark traverse, every frame; and as many as the active map
+            has where its landmarks stay.
         list_length: h.
         relevance: What the map is built for.
         training_episodes: Of the experience database that NNQL plans by; 0: the map has none.

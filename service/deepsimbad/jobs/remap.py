@@ -6,6 +6,7 @@ from functools import partial
 from typing import Any
 
 from deepsimbad.core.nnql import NnqlConfig
+from deepsimbad.core.relevance import Relevance
 from deepsimbad.errors import DeepSimbadError, InvalidEncodingError, InvalidMapConfigError
 from deepsimbad.evaluators.base import Evaluator, LandmarkModel
 from deepsimbad.jobs.build_map import choose_landmarks, describe, map_contents
@@ -71,7 +72,8 @@ def remap(
 
     progress.stage("train")
     experience = None
-    if config.training_episodes:
+    # The baseline that compares whole encodings would need hours for it, and serves no robot.
+    if config.training_episodes and config.relevance is not Relevance.BRUTE_FORCE:
         other = None if second is None else DescribedDrive.of(second, record.closed, evaluator, model)
         experience = train_nnql(
             found.rehearsal or found.built,
@@ -156,7 +158,7 @@ def _landmark_model(
                 f"traverse {config.landmark_traverse} holds encodings of {_length(drive)} numbers, traverse "
                 f"{config.training_traverse} of {_length(training)}; both must come from the same encoder"
             )
-        n_landmarks = config.n_landmarks or DEFAULT_N_LANDMARKS
+        n_landmarks = config.n_landmarks or min(DEFAULT_N_LANDMARKS, len(drive.encodings))
         return choose_landmarks(drive.encodings, n_landmarks, evaluator, progress.update)
     if record.active_version is None:
         raise InvalidMapConfigError(
