@@ -166,7 +166,8 @@ def test_asking_makes_no_data_directory(deepsimbad, tmp_path, command):
 
 
 def test_too_few_candidates_are_named_before_anything_is_made(deepsimbad, drives, tmp_path):
-    named_error(deepsimbad("map", "route", *sources(drives), *READY), "for 500 landmarks", "--n-landmarks")
+    ran = deepsimbad("map", "route", *sources(drives), *READY, "--n-landmarks", 500)
+    named_error(ran, "for 500 landmarks", "--n-landmarks")
     assert not (tmp_path / "deepsimbad-data").exists()
 
 
