@@ -130,7 +130,7 @@ def table(measured: Measured) -> list[str]:
         f"{measured.n_map_frames_left_out} of frames 0..999, where either season counts, and "
         f"{measured.n_landmark_frames_left_out} of the landmarks' 1000..1999 in summer. r = {N_LANDMARKS}, "
         f"h = {LIST_LENGTH}, tolerance {TOLERANCE_M:g} frames, extractor {measured.extractor}. "
-        "ANR: 0 is perfect, 50 chance.",
+        "ANR: 0 is perfect, 50 chance. Times are of a machine shared with other work.",
     ]
 
 

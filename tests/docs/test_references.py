@@ -134,10 +134,27 @@ def test_every_source_file_named_is_there(pages):
 
 def test_the_readmes_figures_are_the_measured_ones(readme):
     measured = (PROJECT / "docs" / "results" / "nordland-http.md").read_text().splitlines()
-    shown = [line for line in readme.text.splitlines() if re.match(r"\| (standardised|rrf|brute_force) \|", line)]
-    assert len(shown) == 3
+    shown = [line for line in readme.text.splitlines() if re.match(r"\| (calibrated|standardised|rrf|brute_force) \|", line)]
+    assert len(shown) == 4
     for row in shown:
         assert any(row.rstrip("|").strip() in line for line in measured), f"not in nordland-http.md: {row}"
+
+
+def test_the_readmes_planners_are_the_measured_ones(readme):
+    """Its means under both set-ups, from the first and the last column of the page."""
+    page = (PROJECT / "docs" / "results" / "nbv-netvlad64.md").read_text().split("## ")[0]
+    measured = {
+        name: (mean, paper)
+        for name, mean, paper in re.findall(
+            r"^\| \**(\w+)\**(?: \(default\))? \| \*\*([\d.]+)\*\* \|.*\| ([\d.]+) \|$", page, re.M
+        )
+    }
+    rows = re.findall(
+        r"^\| `?(telling|constant:\d+|nnql|random|clairvoyant)\b[^|]*\| ([\d.]+) \| ([\d.]+) \|$", readme.text, re.M
+    )
+    assert len(rows) == 5
+    for name, *shown in rows:
+        assert tuple(shown) == measured[name.replace(":", "_")], name
 
 
 def test_every_decision_has_a_number_of_its_own_and_its_parts():
