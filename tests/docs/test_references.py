@@ -134,7 +134,9 @@ def test_every_source_file_named_is_there(pages):
 
 def test_the_readmes_figures_are_the_measured_ones(readme):
     measured = (PROJECT / "docs" / "results" / "nordland-http.md").read_text().splitlines()
-    shown = [line for line in readme.text.splitlines() if re.match(r"\| (calibrated|standardised|rrf|brute_force) \|", line)]
+    shown = [
+        line for line in readme.text.splitlines() if re.match(r"\| (calibrated|standardised|rrf|brute_force) \|", line)
+    ]
     assert len(shown) == 4
     for row in shown:
         assert any(row.rstrip("|").strip() in line for line in measured), f"not in nordland-http.md: {row}"
