@@ -117,9 +117,7 @@ class RemapBody(JsonBody):
     ] = None
     n_landmarks: Annotated[
         Annotated[int, Field(strict=True, ge=1, le=MAX_LANDMARKS)] | None,
-        Field(
-            description="r; null: 500, all frames of a shorter drive, or the active map's where they stay."
-        ),
+        Field(description="r; null: 500, all frames of a shorter drive, or the active map's where they stay."),
     ] = None
     list_length: Annotated[int, Field(strict=True, ge=1, le=MAX_LANDMARKS, description="h, at most r")] = (
         DEFAULT_LIST_LENGTH

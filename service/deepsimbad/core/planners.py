@@ -15,7 +15,7 @@ from deepsimbad.errors import InvalidInputError
 NNQL, TELLING, RANDOM, CONSTANT = "nnql", "telling", "random", "constant"
 DEFAULT_PLANNER = TELLING
 NNQL_NEIGHBOURS = 4  # k of the paper
-_BITS_PER_METRE = 0.2  # what a longer move is worth for being less like the view before
+_BITS_PER_METRE = 0.12  # what a longer move is worth for being less like the view before
 
 
 @dataclass(frozen=True)
