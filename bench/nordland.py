@@ -75,6 +75,18 @@ def season_folder(folder: Path, season: Path, numbers: list[int], first: int) ->
     return folder
 
 
+def drive_folders(nordland: Path, work: Path) -> tuple[dict[str, Path], int, int]:
+    """Folders `landmarks`, `map` and `live`, and how many frames of map and landmarks were left out."""
+    summer, winter = nordland / "summer", nordland / "winter"
+    kept, candidates = kept_frames((summer, winter), MAP_FRAMES), kept_frames((summer,), LANDMARK_FRAMES)
+    drives = {
+        "landmarks": season_folder(work / "landmarks", summer, candidates, LANDMARK_FRAMES.start),
+        "map": season_folder(work / "map", summer, kept, MAP_FRAMES.start),
+        "live": season_folder(work / "live", winter, kept, MAP_FRAMES.start),
+    }
+    return drives, len(MAP_FRAMES) - len(kept), len(LANDMARK_FRAMES) - len(candidates)
+
+
 def measure(nordland: Path, work: Path, relevances: tuple[str, ...] = RELEVANCES) -> Measured:
     """Upload, remap and replay against a service of our own.
 
@@ -83,13 +95,8 @@ def measure(nordland: Path, work: Path, relevances: tuple[str, ...] = RELEVANCES
         work: An empty folder.
         relevances: The maps to make, one after the other.
     """
-    summer, winter = nordland / "summer", nordland / "winter"
-    kept, candidates = kept_frames((summer, winter), MAP_FRAMES), kept_frames((summer,), LANDMARK_FRAMES)
-    drives = {
-        "landmarks": season_folder(work / "landmarks", summer, candidates, LANDMARK_FRAMES.start),
-        "map": season_folder(work / "map", summer, kept, MAP_FRAMES.start),
-    }
-    live = open_source(str(season_folder(work / "live", winter, kept, MAP_FRAMES.start)))
+    drives, n_map_left_out, n_landmarks_left_out = drive_folders(nordland, work)
+    live = open_source(str(drives.pop("live")))
     summaries = {}
     with LocalServer(work / "data") as server, Client(server.url) as client:
         client.admin.put_domain(DOMAIN, {"kind": "feature_l2"})
@@ -110,7 +117,7 @@ def measure(nordland: Path, work: Path, relevances: tuple[str, ...] = RELEVANCES
             summaries[relevance] = summarise(driven)
         evaluator = client.domain(DOMAIN).evaluator
     extractor = evaluator["extractor"] if isinstance(evaluator, dict) else str(evaluator)
-    return Measured(summaries, len(MAP_FRAMES) - len(kept), len(LANDMARK_FRAMES) - len(candidates), extractor)
+    return Measured(summaries, n_map_left_out, n_landmarks_left_out, extractor)
 
 
 def table(measured: Measured) -> list[str]:
