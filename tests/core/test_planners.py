@@ -22,10 +22,9 @@ ACTIONS_M = np.arange(1.0, 11.0)
 N_IMAGES = 200
 
 
-def sharp(image):
-    mass = np.zeros(N_IMAGES)
-    mass[image] = 1.0
-    return mass
+def sharp(place):
+    """One place in mind, and as much doubt about it: the rest of the mass lies anywhere."""
+    return 0.5 * np.eye(N_IMAGES)[place] + 0.5 / N_IMAGES
 
 
 def view_of(mass=None, bits=None, closed=False, **more):
@@ -69,6 +68,12 @@ def test_a_robot_that_knows_nothing_goes_far(bits):
     assert TellingPlanner().plan(view_of(None, bits)).action_m == 10
 
 
+def test_a_robot_that_is_sure_goes_far(bits):
+    """No view can tell it more, and a far one errs unlike the last."""
+    bits[53] = 7
+    assert TellingPlanner().plan(view_of(np.eye(N_IMAGES)[50], bits)).action_m == 10
+
+
 def test_where_nobody_knows_what_is_telling_it_goes_far():
     plan = TellingPlanner().plan(view_of(sharp(3)))
     assert (plan.action_m, plan.values) == (10, None)
@@ -79,7 +84,9 @@ def test_the_value_of_a_move_is_its_mean_bits_and_a_little_for_every_metre(bits)
     plan = TellingPlanner().plan(view_of(mass, bits))
     for action_m, value in zip(ACTIONS_M.astype(int).tolist(), plan.values.tolist(), strict=True):
         ahead = [bits[m + action_m] if m + action_m < N_IMAGES else bits.mean() for m in range(N_IMAGES)]
-        assert value == pytest.approx(sum(mass[m] * ahead[m] for m in range(N_IMAGES)) + 0.12 * action_m, rel=1e-5)
+        doubt = -np.log2(sum(each**2 for each in mass)) / np.log2(N_IMAGES)
+        expected = doubt**0.5 * sum(mass[m] * ahead[m] for m in range(N_IMAGES)) + 0.12 * action_m
+        assert value == pytest.approx(expected, rel=1e-5)
 
 
 def test_two_places_in_mind_agree_on_what_suits_both(bits):
@@ -88,7 +95,7 @@ def test_two_places_in_mind_agree_on_what_suits_both(bits):
     bits[[54, 59]] = 4
     bits[[156, 159]] = 4
     assert TellingPlanner().plan(view_of(sharp(50), bits)).action_m == 9
-    bits[[54, 156]] = 6
+    bits[[54, 156]] = 8
     assert TellingPlanner().plan(view_of(sharp(50), bits)).action_m == 4
     assert TellingPlanner().plan(view_of(0.5 * sharp(50) + 0.5 * sharp(150), bits)).action_m == 9
 

@@ -161,7 +161,9 @@ def test_a_step_is_describe_retrieve_predict_update_plan(
             off_route = moved * math.exp(log_odds) / (moved * math.exp(log_odds) + 1 - moved)
         assert step.state.off_route == pytest.approx(off_route, rel=1e-3)
         assert snapshot.bits_ahead is not None
-        values = [0.2 * a + np.dot(mass, snapshot.bits_ahead[:, i]) for i, a in enumerate(ACTIONS_M)]
+        doubt = -math.log2(np.square(mass).sum()) / math.log2(len(mass))
+        mean_bits = [np.dot(mass, snapshot.bits_ahead[:, i]) for i in range(len(ACTIONS_M))]
+        values = [0.12 * a + math.sqrt(doubt) * bits for a, bits in zip(ACTIONS_M, mean_bits, strict=True)]
         assert step.plan is not None
         assert step.plan.values is not None
         np.testing.assert_allclose(step.plan.values, values, rtol=1e-4)

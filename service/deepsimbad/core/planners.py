@@ -121,8 +121,9 @@ class TellingPlanner:
     """Ours: looks ahead over the map, under the whole belief.
 
     The value of a move is the number of bits that views from where it leads are known to be worth, averaged over the
-    belief, and a little for every metre. While the belief is flat that average is much the same everywhere, so the
-    robot moves on as far as it can; once it has a place in mind it seeks the telling places before it.
+    belief, less the less doubt there is left for them to remove, and a little for every metre. While the belief is
+    flat that average is much the same everywhere, so the robot moves on as far as it can; once it has a few places in
+    mind it seeks the telling ones before them; once it is sure it moves on, to views that are unlike the last.
     """
 
     bits_per_metre: float = _BITS_PER_METRE
@@ -132,8 +133,16 @@ class TellingPlanner:
         """See `Planner.plan`; where nobody knows what is telling, the longest move."""
         if view.bits_ahead is None:
             return Plan(self.name, float(view.actions_m[-1]))
-        values = self.bits_per_metre * view.actions_m + _averaged(view.mass, view.bits_ahead)
+        worth = np.sqrt(_doubt(view.mass)) * _averaged(view.mass, view.bits_ahead)
+        values = self.bits_per_metre * view.actions_m + worth
         return Plan(self.name, float(view.actions_m[np.argmax(values)]), values)
+
+
+def _doubt(mass: NDArray[np.float64]) -> float:
+    """What is left of the greatest doubt there can be, 0..1: the entropy (of order 2) over that of no knowledge."""
+    if mass.size == 1:
+        return 0.0
+    return float(-np.log2(np.square(mass).sum()) / np.log2(mass.size))
 
 
 @njit(cache=True, nogil=True)
