@@ -23,7 +23,7 @@ from deepsimbad_client.console import FrameBar, JobBar, ReplayBar, UploadBar
 from deepsimbad_client.errors import DeepSimbadClientError
 from deepsimbad_client.local_server import LocalServer
 from deepsimbad_client.plots import draw_all
-from deepsimbad_client.recording import Recording, sliced
+from deepsimbad_client.recording import Recording
 from deepsimbad_client.remap import remap
 from deepsimbad_client.replay import Replay, replay
 from deepsimbad_client.report import summarise, write_summary
@@ -65,10 +65,9 @@ def demo(folder: Path, frames: int, seed: int) -> None:
     with LocalServer(folder / "data") as server, Client(server.url) as client:
         _say(f"2. The service runs at {server.url}; its log is {server.log_path}")
         _upload(client, drives)
-        _say(f"4. Map {MAP_SEASON}, drive {LIVE_SEASON}, every other frame: every relevance by the live service")
-        queries = sliced(drives[LIVE_SEASON], slice(None, None, 2))  # enough for the table
+        _say(f"4. Map {MAP_SEASON}, drive {LIVE_SEASON}: every relevance by the live service")
         n_landmarks = min(_N_LANDMARKS, len(drives[LANDMARK_SEASON].frames))
-        scored = {name: _drive(client, queries, name, n_landmarks, folder) for name in RELEVANCES}
+        scored = {name: _drive(client, drives[LIVE_SEASON], name, n_landmarks, folder) for name in RELEVANCES}
         _say(_table(scored))
         _show_one(client, drives[LIVE_SEASON])
         shipped = scored[RELEVANCES[-1]].replay
