@@ -8,18 +8,30 @@ from bench.http import http_table
 from bench.landmarks import landmark_table
 from bench.map_file import map_file_table
 from bench.nnql import nnql_table
+from bench.restart import restart_table
 from bench.retrieval import retrieval_table
 from bench.sessions import session_table
 from bench.step import step_table
 
 RESULTS = Path(__file__).resolve().parent.parent / "docs" / "results" / "bench.md"
 
+TABLES = (
+    retrieval_table,
+    landmark_table,
+    map_file_table,
+    nnql_table,
+    step_table,
+    http_table,
+    session_table,
+    restart_table,
+)
+
 
 def main() -> None:
     """Print the tables as they are measured, then write them."""
     lines = ["# Benchmarks", "", "Made by `make bench`. Medians; machines are shared and noisy.", ""]
     lines += [f"Machine: {machine.describe()}", ""]
-    for table in (retrieval_table, landmark_table, map_file_table, nnql_table, step_table, http_table, session_table):
+    for table in TABLES:
         for line in table():
             print(line, flush=True)
             lines.append(line)

@@ -88,6 +88,13 @@ class LocalServer:
                 self._process.wait()
         self._process = None
 
+    def kill(self) -> None:
+        """End it at once, as a power cut would."""
+        if self._process is not None:
+            self._process.kill()
+            self._process.wait()
+            self._process = None
+
     def _is_ready(self) -> bool:
         try:
             return httpx2.get(f"{self.url}/readyz", timeout=5.0, trust_env=False).status_code == httpx2.codes.OK

@@ -51,10 +51,6 @@ class World:
             del footprints[:-NEIGHBOURS]
         self._starts = np.array([section.stretch.start_m for section in self.sections])
 
-    def section_at(self, position_m: float) -> Section:
-        """The section that holds a route position."""
-        return self.sections[self._index(position_m)]
-
     def ahead(self, position_m: float) -> list[Section]:
         """The sections that may be seen from a route position, nearest first."""
         return self.sections[self._index(position_m - BEHIND_M) : self._index(position_m + SIGHT_M) + 1]
