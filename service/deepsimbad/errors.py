@@ -120,6 +120,12 @@ class SettingsError(InvalidInputError):
     code = "invalid_settings"
 
 
+class InvalidArchiveError(InvalidInputError):
+    """A backup or exported map that is not one, is incomplete or fails its digest."""
+
+    code = "invalid_archive"
+
+
 class NotFoundError(DeepSimbadError):
     """A name or id that nothing answers to."""
 
@@ -156,6 +162,12 @@ class UnknownSessionError(NotFoundError):
     code = "unknown_session"
 
 
+class UnknownKeyError(NotFoundError):
+    """No such API key."""
+
+    code = "unknown_key"
+
+
 class GoneError(DeepSimbadError):
     """Something that was there and is no more."""
 
@@ -184,6 +196,12 @@ class TooManySessionsError(BusyError):
     """The limit on live sessions is reached."""
 
     code = "too_many_sessions"
+
+
+class RateLimitedError(BusyError):
+    """More requests in a row than one key may send."""
+
+    code = "rate_limited"
 
 
 class ConflictError(DeepSimbadError):
@@ -216,6 +234,24 @@ class LostActivationError(ConflictError):
     code = "lost_activation"
 
 
+class MapInUseError(ConflictError):
+    """The map version serves, or a session is pinned to it."""
+
+    code = "map_in_use"
+
+
+class TooManyDomainsError(ConflictError):
+    """The limit on domains is reached."""
+
+    code = "too_many_domains"
+
+
+class DataDirInUseError(ConflictError):
+    """Another service runs on the data directory."""
+
+    code = "data_dir_in_use"
+
+
 class TooLargeError(DeepSimbadError):
     """More than a limit allows."""
 
@@ -234,16 +270,52 @@ class ImageTooLargeError(TooLargeError):
     code = "image_too_large"
 
 
+class HeadersTooLargeError(TooLargeError):
+    """Request headers over the limit."""
+
+    code = "headers_too_large"
+
+
 class UnsupportedMediaTypeError(DeepSimbadError):
     """A missing or unsupported content type."""
 
     code = "unsupported_media_type"
 
 
+class AccessError(DeepSimbadError):
+    """A request that may not be made so."""
+
+    code = "access"
+
+
+class UnauthorizedError(AccessError):
+    """No API key, or one that is unknown, revoked or expired."""
+
+    code = "unauthorized"
+
+
+class ForbiddenError(AccessError):
+    """An API key without the scope that the call needs."""
+
+    code = "forbidden"
+
+
+class RequestTimeoutError(DeepSimbadError):
+    """A request whose bytes stopped coming."""
+
+    code = "request_timeout"
+
+
 class UnavailableError(DeepSimbadError):
     """The service cannot answer now; the data is safe."""
 
     code = "unavailable"
+
+
+class OverloadedError(UnavailableError):
+    """More requests at once than the service answers in good time."""
+
+    code = "overloaded"
 
 
 class DamagedMapError(UnavailableError):

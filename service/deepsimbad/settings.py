@@ -40,6 +40,39 @@ class Settings(BaseSettings):
         int, Field(description="Most pixels an image's header may claim (width times height).", ge=1)
     ] = 50_000_000
 
+    max_header_bytes: Annotated[int, Field(description="Most bytes of a request's headers.", ge=1024)] = 64 * 1024
+    max_body_memory_bytes: Annotated[
+        int, Field(description="Bodies held in memory at once, all requests together, in bytes.", ge=1)
+    ] = 512 * MEBIBYTE
+    max_requests: Annotated[int, Field(description="Requests under way at once; more are answered 503.", ge=1)] = 256
+    max_queue: Annotated[
+        int, Field(description="Views waiting for the inference worker; more are answered 503.", ge=1)
+    ] = 128
+    max_uploads: Annotated[int, Field(description="Batches of frames on their way at once.", ge=1)] = 4
+    max_event_streams: Annotated[int, Field(description="Job event streams open at once.", ge=1)] = 64
+    max_connections: Annotated[int, Field(description="Connections open at once; more are closed.", ge=1)] = 1024
+    max_domains: Annotated[int, Field(description="Domains that may exist.", ge=1)] = 1000
+    rate_limit_per_s: Annotated[
+        float, Field(description="Requests a second that one key may send, in the long run; 0: any number.", ge=0)
+    ] = 200.0
+    rate_limit_burst: Annotated[
+        int, Field(description="Requests that one key may send at once before its rate counts.", ge=1)
+    ] = 400
+    cors_origins: Annotated[
+        tuple[str, ...], Field(description="Origins whose pages may call the service (CORS), a JSON list; empty: none.")
+    ] = ()
+    tls_certificate: Annotated[Path | None, Field(description="PEM file to serve HTTPS with; none: HTTP.")] = None
+    tls_key: Annotated[Path | None, Field(description="PEM file of the certificate's key.")] = None
+
+    header_timeout_s: Annotated[
+        float, Field(description="A connection is closed where a request's headers take longer.", gt=0)
+    ] = 10.0
+    stall_timeout_s: Annotated[
+        float,
+        Field(
+            description="A connection is closed where a body's, or an answer's, bytes stop moving for so long.", gt=0
+        ),
+    ] = 30.0
     keep_alive_s: Annotated[int, Field(description="An idle connection is closed after this.", ge=1)] = 75
     shutdown_grace_s: Annotated[
         int, Field(description="Requests under way at shutdown get this long to finish.", ge=0)
@@ -47,6 +80,13 @@ class Settings(BaseSettings):
     event_poll_s: Annotated[
         float, Field(description="A job's event stream looks for news this often.", gt=0, le=10)
     ] = 0.25
+
+    keep_maps: Annotated[
+        int, Field(description="Retired map versions kept a domain, to roll back to; older files are removed.", ge=1)
+    ] = 5
+    job_threads: Annotated[
+        int, Field(description="Threads that a job computes in; 0: one less than there are cores.", ge=0)
+    ] = 0
 
     session_ttl_s: Annotated[
         float, Field(description="A session ends when nothing was observed in it for so long.", gt=0, le=31_536_000)

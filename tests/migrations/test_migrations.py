@@ -151,6 +151,12 @@ def the_catalog(data_dir: Path) -> Iterator[object]:
         yield [job.state for job in catalog.jobs("campus")]
 
 
+def the_catalog_with_keys(data_dir: Path) -> Iterator[object]:
+    yield from the_catalog(data_dir)
+    with Catalog.open(data_dir) as catalog:
+        yield [catalog.maps("campus")[0].activated_at, catalog.jobs()[0].n_starts]
+
+
 def the_traverse(data_dir: Path) -> Iterator[object]:
     with Traverse.open(data_dir, "campus", "summer") as traverse:
         frames = traverse.read()
@@ -193,6 +199,12 @@ def the_sessions(data_dir: Path) -> Iterator[object]:
     ("dump", "place", "read", "expected"),
     [
         ("catalog_v1", "catalog.sqlite", the_catalog, [1, {"anr": 4.5}, [JobState.SUCCEEDED]]),
+        (
+            "catalog_v2",
+            "catalog.sqlite",
+            the_catalog_with_keys,
+            [1, {"anr": 4.5}, [JobState.SUCCEEDED], ["2026-11-20T10:00:00.000Z", 2]],
+        ),
         (
             "traverse_v1",
             "domains/campus/traverses/summer.sqlite",
@@ -246,7 +258,7 @@ def test_todays_code_reads_past_files(
     dump: str, place: str, read: Callable[[Path], Iterator[object]], expected: list[object], tmp_path: Path
 ) -> None:
     restore(SCHEMAS / f"{dump}.sql", tmp_path / place)
-    if dump == "catalog_v1":
+    if dump.startswith("catalog"):
         assert not (tmp_path / "domains").exists()
     assert list(read(tmp_path)) == expected
 

@@ -56,3 +56,25 @@ def m001_domains_maps_jobs(db: Database) -> None:
         CREATE TABLE doomed_folder (domain TEXT NOT NULL PRIMARY KEY);
         """
     )
+
+
+@migrations()
+def m002_keys_served_times_job_starts(db: Database) -> None:
+    """API keys' hashes, when a map version served and when its file was removed, how often a job was started."""
+    db.executescript(
+        """
+        CREATE TABLE api_key (
+            key_id TEXT NOT NULL PRIMARY KEY,
+            name TEXT NOT NULL,
+            scope TEXT NOT NULL CHECK (scope IN ('localize', 'admin')),
+            secret_sha256 TEXT NOT NULL,
+            created_at TEXT NOT NULL,
+            expires_at TEXT,
+            revoked_at TEXT
+        );
+        ALTER TABLE map ADD COLUMN activated_at TEXT;
+        ALTER TABLE map ADD COLUMN retired_at TEXT;
+        ALTER TABLE map ADD COLUMN removed_at TEXT;
+        ALTER TABLE job ADD COLUMN n_starts INTEGER NOT NULL DEFAULT 0;
+        """
+    )

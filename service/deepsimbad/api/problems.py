@@ -15,13 +15,17 @@ from starlette.responses import Response
 from starlette.types import Scope
 
 from deepsimbad.errors import (
+    AccessError,
     BusyError,
     CancelledError,
     ConflictError,
     DeepSimbadError,
+    ForbiddenError,
     GoneError,
+    HeadersTooLargeError,
     InvalidInputError,
     NotFoundError,
+    RequestTimeoutError,
     SettingsError,
     TooLargeError,
     UnavailableError,
@@ -37,11 +41,15 @@ RETRY_AFTER_S = 5
 STATUS_OF_BRANCH: Mapping[type[BaseException], HTTPStatus] = {
     SettingsError: HTTPStatus.INTERNAL_SERVER_ERROR,
     InvalidInputError: HTTPStatus.UNPROCESSABLE_ENTITY,
+    AccessError: HTTPStatus.UNAUTHORIZED,
+    ForbiddenError: HTTPStatus.FORBIDDEN,
     NotFoundError: HTTPStatus.NOT_FOUND,
+    RequestTimeoutError: HTTPStatus.REQUEST_TIMEOUT,
     ConflictError: HTTPStatus.CONFLICT,
     CancelledError: HTTPStatus.CONFLICT,
     GoneError: HTTPStatus.GONE,
     BusyError: HTTPStatus.TOO_MANY_REQUESTS,
+    HeadersTooLargeError: HTTPStatus.REQUEST_HEADER_FIELDS_TOO_LARGE,
     TooLargeError: HTTPStatus.REQUEST_ENTITY_TOO_LARGE,
     UnsupportedMediaTypeError: HTTPStatus.UNSUPPORTED_MEDIA_TYPE,
     UnavailableError: HTTPStatus.SERVICE_UNAVAILABLE,

@@ -14,7 +14,7 @@ from deepsimbad.store.records import JobRecord, JobState
 
 _SELECT = """
     SELECT job_id, domain, kind, config, state, stage, progress, eta_s, result, error,
-           created_at, started_at, finished_at
+           created_at, started_at, finished_at, n_starts
     FROM job
 """
 _JOB_ID = re.compile(r"[0-9a-f]{32}")
@@ -24,7 +24,7 @@ _FIELDS = ("state", "stage", "progress", "eta_s", *_DOCUMENTS)
 
 @row_reader
 def _record(row: tuple[Any, ...]) -> JobRecord:
-    job_id, domain, kind, config, state, stage, progress, eta_s, result, error, *times = row
+    job_id, domain, kind, config, state, stage, progress, eta_s, result, error, *rest = row
     return JobRecord(
         job_id,
         domain,
@@ -36,7 +36,7 @@ def _record(row: tuple[Any, ...]) -> JobRecord:
         eta_s,
         None if result is None else from_json(result),
         None if error is None else from_json(error),
-        *times,
+        *rest,
     )
 
 

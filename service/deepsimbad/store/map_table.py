@@ -20,14 +20,19 @@ class AnyVersion:
 ANY: Final = AnyVersion()
 """Activate whatever is active now."""
 
-_SELECT = "SELECT version, state, created_at, sha256, file_bytes, config, metrics FROM map"
+_SELECT = """
+    SELECT version, state, created_at, sha256, file_bytes, config, metrics, activated_at, retired_at, removed_at
+    FROM map
+"""
 _MAX_INTEGER = 2**63 - 1
 
 
 @row_reader
 def _record(row: tuple[Any, ...]) -> MapRecord:
-    version, state, created_at, sha256, file_bytes, config, metrics = row
-    return MapRecord(version, MapState(state), created_at, sha256, file_bytes, from_json(config), from_json(metrics))
+    version, state, created_at, sha256, file_bytes, config, metrics, *times = row
+    return MapRecord(
+        version, MapState(state), created_at, sha256, file_bytes, from_json(config), from_json(metrics), *times
+    )
 
 
 def begin(db: Database, domain: str, config: dict[str, Any], owner: str) -> int:
@@ -96,8 +101,14 @@ def activate(db: Database, domain: str, version: int, expected: int | AnyVersion
             active=active,
             expected=expected,
         )
-    db.execute("UPDATE map SET state = 'retired' WHERE domain = ? AND state = 'active'", [domain])
-    db.execute("UPDATE map SET state = 'active' WHERE domain = ? AND version = ?", [domain, version])
+    db.execute(
+        "UPDATE map SET state = 'retired', retired_at = ? WHERE domain = ? AND state = 'active' AND version != ?",
+        [now(), domain, version],
+    )
+    db.execute(
+        "UPDATE map SET state = 'active', activated_at = ? WHERE domain = ? AND version = ? AND state != 'active'",
+        [now(), domain, version],
+    )
     return get(db, domain, version)
 
 

@@ -52,7 +52,10 @@ class DomainRecord:
 
 @dataclass(frozen=True)
 class MapRecord:
-    """One map version of a domain; `sha256` and `file_bytes` are None while it is being built."""
+    """One map version of a domain; `sha256` and `file_bytes` are None while it is being built.
+
+    Times are ISO 8601 in UTC: when it last began to serve, last ceased to, and when its file was removed.
+    """
 
     version: int
     state: MapState
@@ -61,11 +64,14 @@ class MapRecord:
     file_bytes: int | None
     config: dict[str, Any]
     metrics: dict[str, Any]
+    activated_at: str | None
+    retired_at: str | None
+    removed_at: str | None
 
 
 @dataclass(frozen=True)
 class JobRecord:
-    """One job; times are ISO 8601 in UTC, `progress` runs from 0 to 1."""
+    """One job; times are ISO 8601 in UTC, `progress` runs from 0 to 1, `n_starts` counts how often work on it began."""
 
     job_id: str
     domain: str
@@ -80,3 +86,4 @@ class JobRecord:
     created_at: str
     started_at: str | None
     finished_at: str | None
+    n_starts: int
