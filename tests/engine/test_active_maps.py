@@ -7,9 +7,11 @@ import pytest
 from deepsimbad.engine.active_maps import ActiveMaps
 from deepsimbad.errors import DamagedMapError, NoActiveMapError, UnknownDomainError
 from deepsimbad.store.catalog import Catalog
+from deepsimbad.store.map_file import write_map
 from deepsimbad.store.map_table import ANY
+from deepsimbad.store.sealing import seal
 
-from .conftest import N_IMAGES, add_domain, add_map
+from .conftest import N_IMAGES, add_domain, add_map, map_contents
 
 
 @dataclass
@@ -113,3 +115,14 @@ def test_a_damaged_map_does_not_keep_others_from_loading(catalog: Catalog, maps:
     assert maps.snapshot("e").domain == "e"
     maps.forget("e")
     assert maps.n_loaded == 0
+
+
+def test_domain_and_version_are_the_catalogs_and_not_the_files(catalog: Catalog, maps: ActiveMaps) -> None:
+    """A map that was moved here from another server keeps its bytes, and with them its old name."""
+    version = catalog.begin_map("d", {})
+    write_map(catalog.building_path("d", version), map_contents("elsewhere", 7))
+    digest, n_bytes = seal(catalog.building_path("d", version), catalog.map_path("d", version))
+    catalog.seal_map("d", version, digest, n_bytes, {})
+    catalog.activate("d", version, ANY)
+    snapshot = maps.snapshot("d")
+    assert (snapshot.domain, snapshot.version) == ("d", 1)

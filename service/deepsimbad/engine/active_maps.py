@@ -4,7 +4,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from deepsimbad.engine.snapshot import MapSnapshot
 from deepsimbad.errors import DamagedMapError, DeepSimbadError, NoActiveMapError
@@ -139,7 +139,7 @@ class ActiveMaps:
 
 
 def load_snapshot(catalog: Catalog, domain: str, version: int) -> MapSnapshot:
-    """Check a map file's digest and read it.
+    """Check a map file's digest and read it; domain and version are the catalog's, whatever the file calls them.
 
     Raises:
         UnknownMapVersionError: No such version.
@@ -150,7 +150,9 @@ def load_snapshot(catalog: Catalog, domain: str, version: int) -> MapSnapshot:
     try:
         if record.sha256 is not None:
             verify(path, record.sha256)
-        return MapSnapshot.from_contents(read_map(path), index_bytes(path))
+        # A map moved here from another server says in its file what it was called there.
+        contents = replace(read_map(path), domain=domain, version=version)
+        return MapSnapshot.from_contents(contents, index_bytes(path))
     except DamagedMapError as error:
         # The cause names a file of the server's; the answer names what a person can act on.
         raise _damaged(domain, version) from error
