@@ -5,7 +5,7 @@ PYTHON ?= $(shell for p in python3.11 python3.12 python3.13 python3 python; do \
   $$p -c 'import sys, venv, ensurepip; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && { echo $$p; break; }; done)
 BIN := .venv/bin
 
-.PHONY: help install demo test check lint bench clean
+.PHONY: help install demo test check lint bench soak load clean
 
 help: ## this list
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 10
@@ -36,6 +36,12 @@ test: lint ## every check
 bench: install ## the benchmark tables under docs/results/
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[bench]'
 	$(BIN)/python -m bench
+
+soak: install ## kills the service 200 times under load and looks for what it acknowledged: docs/results/soak.md
+	$(BIN)/python -m bench.soak --out docs/results/soak.md
+
+load: install ## an hour of 20 robots with remaps and rollbacks: docs/results/load.md
+	$(BIN)/python -m bench.load --out docs/results/load.md
 
 clean: ## removes what the other targets made
 	rm -rf .venv demo-output .mypy_cache .ruff_cache .pytest_cache .import_linter_cache

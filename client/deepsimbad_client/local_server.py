@@ -70,6 +70,17 @@ class LocalServer:
                 raise DeepSimbadClientError(f"the service did not start; its log ends: {' | '.join(lines)}")
             time.sleep(0.05)
 
+    @property
+    def pid(self) -> int:
+        """Of the process.
+
+        Raises:
+            DeepSimbadClientError: It is not up.
+        """
+        if self._process is None:
+            raise DeepSimbadClientError("the service is not up")
+        return self._process.pid
+
     def wait(self) -> None:
         """Wait until the process ends by itself."""
         if self._process is not None:

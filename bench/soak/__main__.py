@@ -1,0 +1,70 @@
+"""`python -m bench.soak`, and `make soak`: the report of one soak."""
+
+import argparse
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from bench.machine import describe
+from bench.soak.trial import LONGEST_LIFE_S, Soak, soak
+
+
+def report(found: Soak) -> Iterator[str]:
+    """Markdown lines."""
+    ready = np.array(found.ready_s)
+    yield "# kill -9 under load"
+    yield ""
+    yield "Made by `make soak`: the service is killed at random moments while robots observe, begin and end sessions,"
+    yield "traverses are uploaded and deleted, and maps are made, activated and rolled back; then everything that was"
+    yield "acknowledged is looked for. A run that misses anything, or finds a damaged file, ends with an error instead."
+    yield ""
+    yield f"Machine: {describe()}"
+    yield ""
+    yield "| | |"
+    yield "|---|---|"
+    yield f"| kills, each 0 to {LONGEST_LIFE_S:g} s after the service was ready | {found.n_kills} |"
+    for who, count in found.n_acknowledged.items():
+        yield f"| acknowledged writes: {who.lower()} | {count:,} |"
+    yield "| acknowledged writes lost | 0 |"
+    yield "| damaged files (`deepsimbad check`, and bit by bit) | 0 |"
+    yield f"| remaps that succeeded, many of them across kills | {found.n_remaps} |"
+    yield f"| remaps given up, and saying so, after three deaths under them | {found.n_interrupted} |"
+    yield (
+        f"| start of the process to `/readyz` 200 | median {np.median(ready):.2f} s, "
+        f"95 % within {np.quantile(ready, 0.95):.2f} s, longest {ready.max():.2f} s |"
+    )
+    yield ""
+    yield "What uploader and mapper were about when it died (robots observed all the time):"
+    yield ""
+    yield "| | kills |"
+    yield "|---|---|"
+    for what, count in sorted(found.doing.items(), key=lambda each: -each[1]):
+        yield f"| {what} | {count} |"
+
+
+def main() -> None:
+    """Run one soak and print its report."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--kills", type=int, default=200)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--out", type=Path, help="write the report here as well")
+    given = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        found = soak(
+            Path(folder) / "data",
+            given.kills,
+            given.seed,
+            lambda done: print(f"\r{done} of {given.kills} kills", end="", file=sys.stderr, flush=True),
+        )
+    text = "\n".join(report(found)) + "\n"
+    print(file=sys.stderr)
+    print(text, end="")
+    if given.out is not None:
+        given.out.write_text(text, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,113 @@
+"""Someone who remaps the domain again and again, activates, and rolls back."""
+
+import time
+from typing import Any
+
+import numpy as np
+
+from bench.soak.actor import Actor, expect
+from bench.soak.link import Link
+from bench.soak.world import BASE, DOMAIN, remap_config
+
+_POLL_S = 0.03
+_FINAL = {"succeeded", "failed", "cancelled"}
+
+
+class Mapper(Actor):
+    """Knows which versions may serve: those that it was told, and those that a request without an answer named.
+
+    Args:
+        seed: Of what it chooses.
+    """
+
+    def __init__(self, seed: int) -> None:
+        self._rng = np.random.default_rng(seed)
+        self._job: dict[str, Any] | None = None
+        self._asking = False
+        self._may_serve: set[int] = {1}
+        self._ended: dict[str, dict[str, Any]] = {}
+        self._sealed: dict[int, str] = {}
+        self.n_interrupted = 0
+
+    @property
+    def n_remaps(self) -> int:
+        """Remaps that succeeded."""
+        return sum(job["state"] == "succeeded" for job in self._ended.values())
+
+    def act(self, link: Link) -> None:
+        """Ask for a remap, follow it, or switch versions."""
+        if self._job is None and not self._asking and self._rng.random() < 0.5 and len(self._sealed) > 1:
+            self._switch(link)
+        elif self._job is None:
+            self._ask(link)
+        else:
+            self._follow(link)
+
+    def _ask(self, link: Link) -> None:
+        self.doing, self._asking = "asking for a remap", True
+        landmarks = "summer" if self._rng.random() < 0.5 else None
+        config = remap_config("spring", landmarks, activate=bool(self._rng.random() < 0.7))
+        self._job = link.ask("POST", f"{BASE}/remaps", config)
+        self._asking = False
+        self.n_acknowledged += 1
+
+    def _follow(self, link: Link) -> None:
+        job = link.ask("GET", f"/v1/admin/jobs/{self._job['job_id']}") if self._job else {}
+        self.doing = f"remap: {job['stage'] or job['state']}"
+        if job["state"] in _FINAL:
+            self._end(link, job)
+        else:
+            time.sleep(_POLL_S)
+
+    def _end(self, link: Link, job: dict[str, Any]) -> None:
+        self._job, self._ended[job["job_id"]] = None, job
+        if job["state"] == "succeeded":
+            version = job["result"]["map_version"]
+            if job["result"]["active"]:
+                self._may_serve = {version}
+            self._learn_versions(link)
+            expect(version in self._sealed, f"job {job['job_id']} made map {version}, which is not there")
+        else:
+            # Three deaths in a row while one job ran: it says so, and the domain goes on with what it had.
+            expect((job["error"] or {}).get("code") == "job_interrupted", f"a remap failed: {job}")
+            self.n_interrupted += 1
+
+    def _switch(self, link: Link) -> None:
+        self.doing = "activating"
+        served = link.ask("GET", f"/v1/domains/{DOMAIN}")["map_version"]
+        there = [record["version"] for record in self._learn_versions(link) if record["removed_at"] is None]
+        version = int(self._rng.choice([each for each in there if each != served] or [served]))
+        self.doing = "activating" if version > served else "rolling back"
+        self._may_serve = {served, version}
+        link.ask("PUT", f"{BASE}/active-map", {"version": version, "expected": served})
+        self._may_serve = {version}
+        self.n_acknowledged += 1
+
+    def _learn_versions(self, link: Link) -> list[dict[str, Any]]:
+        records: list[dict[str, Any]] = link.ask("GET", f"{BASE}/maps?limit=1000")["maps"]
+        sealed = [record for record in records if record["state"] != "building"]
+        self._sealed = {record["version"]: record["sha256"] for record in sealed}
+        return sealed
+
+    def check(self, link: Link) -> None:
+        """What serves is what was told, no sealed version and no job is lost, and the job under way goes on."""
+        served = link.ask("GET", f"/v1/domains/{DOMAIN}")
+        expect(served["map_problem"] is None, f"the map does not answer: {served}")
+        version = served["map_version"]
+        records = {record["version"]: record for record in link.ask("GET", f"{BASE}/maps?limit=1000")["maps"]}
+        newer = {each for each in records if each > max(self._sealed, default=0)}
+        allowed = self._may_serve | (newer if self._job is not None or self._asking else set())
+        expect(version in allowed, f"map {version} serves, of {sorted(allowed)}")
+        expect(records[version]["state"] == "active", f"map {version} serves but is {records[version]['state']}")
+        for known, digest in self._sealed.items():
+            expect(records.get(known, {}).get("sha256") == digest, f"map {known} is lost or another")
+        for job_id, told in list(self._ended.items())[-5:]:
+            expect(link.ask("GET", f"/v1/admin/jobs/{job_id}") == told, f"job {job_id} has changed its end")
+        if self._asking:  # the job may have been noted without an answer
+            jobs = link.ask("GET", f"/v1/admin/jobs?domain={DOMAIN}&limit=1")["jobs"]
+            if jobs and jobs[0]["job_id"] not in self._ended:
+                self._job = jobs[0]
+            self._asking = False
+        if self._job is not None:
+            job = link.ask("GET", f"/v1/admin/jobs/{self._job['job_id']}")
+            expect(job["state"] != "cancelled", f"nobody cancelled {job}")

@@ -1,0 +1,93 @@
+"""Robots that observe as fast as they are answered."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bench.soak.actor import Actor, expect
+from bench.soak.link import Link
+from bench.soak.world import DOMAIN, N_LANDMARKS
+from deepsimbad.core.filters import FilterKind
+from deepsimbad.engine.active_localizer import ActiveLocalizer, LocalizerConfig
+from deepsimbad.engine.active_maps import load_snapshot
+from deepsimbad.engine.localizer import describe
+from deepsimbad.engine.observation import RankedLandmarks
+from deepsimbad.evaluators.feature_l2 import FeatureL2
+from deepsimbad.store.catalog import Catalog
+
+ACTION_M = 1.5
+BINARY = {"Accept": "application/octet-stream"}
+
+
+def ranks(robot: int, view: int) -> list[int]:
+    """What a robot sees at its n-th view."""
+    found: list[int] = np.random.default_rng([robot, view]).permutation(N_LANDMARKS).tolist()
+    return found
+
+
+class Robot(Actor):
+    """One session for as long as it may live; every observation has a key, so that it can be sent again.
+
+    Args:
+        number: Of the robot; seeds everything it sees.
+        kind: Its filter.
+        session_length: It ends its session after so many observations and begins another; None: never.
+    """
+
+    def __init__(self, number: int, kind: FilterKind, session_length: int | None = None) -> None:
+        self.number = number
+        self.kind = kind
+        self._session_length = session_length
+        self._ended: list[str] = []
+        self._session_id = ""
+        self._n_told = 0
+        self._belief: dict[str, Any] = {}
+
+    def act(self, link: Link) -> None:
+        """Begin, observe, or end."""
+        if not self._session_id:
+            self.doing = "beginning a session"
+            body = {"seed": self.number, "belief": self.kind.value}
+            self._session_id = link.ask("POST", f"/v1/domains/{DOMAIN}/sessions", body)["session_id"]
+            self._n_told = 0
+        elif self._n_told == self._session_length:
+            self.doing = "ending a session"
+            ending, self._session_id = self._session_id, ""  # whether it ended or not, it is not used again
+            link.ask("DELETE", f"/v1/sessions/{ending}")
+            self._ended.append(ending)
+        else:
+            self.doing = "observing"
+            path = f"/v1/sessions/{self._session_id}/observations?action_m={ACTION_M}"
+            view = {"ranked_landmarks": ranks(self.number, self._n_told)}
+            answer = link.ask("POST", path, view, {"Idempotency-Key": f"view-{self._n_told}"})
+            expect(answer["n_observations"] == self._n_told + 1, f"robot {self.number} was miscounted")
+            self._n_told, self._belief = self._n_told + 1, answer["belief"]
+        self.n_acknowledged += 1
+
+    def check(self, link: Link) -> None:
+        """The session has every observation that was answered, and the belief that was told."""
+        if not self._session_id:
+            return
+        state = link.ask("GET", f"/v1/sessions/{self._session_id}")
+        # One more may be on the disk than was told of: the kill came between the commit and the answer.
+        n_more = state["n_observations"] - self._n_told
+        expect(n_more in {0, 1}, f"robot {self.number}: {state['n_observations']} of {self._n_told} observations")
+        if n_more == 0 and self._n_told:
+            expect(state["belief"] == self._belief, f"robot {self.number} has another belief")
+
+    def check_bits(self, link: Link, data_dir: Path) -> None:
+        """The mass of every map image equals that of all views in one go, without a service, bit for bit."""
+        if not self._session_id:
+            return
+        state = link.ask("GET", f"/v1/sessions/{self._session_id}")
+        found: bytes = link.ask("GET", f"/v1/sessions/{self._session_id}/belief", headers=BINARY)
+        with Catalog.open(data_dir) as catalog:
+            snapshot = load_snapshot(catalog, DOMAIN, state["map_version"])
+        localizer = ActiveLocalizer(snapshot, LocalizerConfig(filter=self.kind, seed=self.number))
+        reference = localizer.start()
+        for view in range(state["n_observations"]):
+            query = describe(snapshot, FeatureL2("none"), RankedLandmarks(tuple(ranks(self.number, view))))
+            reference = localizer.step(reference, query, ACTION_M).state
+        expected = reference.belief.mass.astype(np.float32).tobytes()
+        expect(found.endswith(expected), f"robot {self.number}'s belief differs from that of an undisturbed drive")

@@ -1,0 +1,120 @@
+"""The soak itself: start, let everybody act, kill, check, start again."""
+
+import json
+import subprocess
+import sys
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from bench.soak.actor import Actor, expect
+from bench.soak.link import Link
+from bench.soak.mapper import Mapper
+from bench.soak.robot import Robot
+from bench.soak.uploader import Uploader
+from bench.soak.world import make_domain
+from deepsimbad.core.filters import FilterKind
+from deepsimbad_client.local_server import LocalServer
+
+N_ROBOTS, SHORT_SESSION = 4, 25
+LONGEST_LIFE_S = 3.0
+ENVIRONMENT = {"DEEPSIMBAD_SNAPSHOT_EVERY": "8", "DEEPSIMBAD_LOG_LEVEL": "ERROR", "DEEPSIMBAD_KEEP_MAPS": "3"}
+
+
+@dataclass
+class Soak:
+    """What a soak met with.
+
+    Attributes:
+        n_kills: How often the service was killed.
+        ready_s: Seconds from each start after a kill to the first `/readyz` that answers 200.
+        n_acknowledged: Writes that were answered, by who asked; none was lost, or the soak would have ended.
+        doing: What was going on at the moments of the kills; robots observe at all of them.
+        n_remaps: Remaps that succeeded, many of them across kills.
+        n_interrupted: Remaps that gave up after the service had died three times under them.
+    """
+
+    n_kills: int = 0
+    ready_s: list[float] = field(default_factory=list)
+    n_acknowledged: Counter[str] = field(default_factory=Counter)
+    doing: Counter[str] = field(default_factory=Counter)
+    n_remaps: int = 0
+    n_interrupted: int = 0
+
+
+def soak(data_dir: Path, n_kills: int, seed: int, on_kill: Callable[[int], None] = lambda _: None) -> Soak:
+    """Kill a service under load; raises LostError where anything acknowledged is lost or any file is damaged.
+
+    Args:
+        data_dir: An empty folder.
+        n_kills: How often.
+        seed: Of the moments and of what the others do; the service's own pace makes every run another one all the same.
+        on_kill: Told after each kill how many there were.
+    """
+    rng = np.random.default_rng(seed)
+    found = Soak()
+    server = LocalServer(data_dir, environment=ENVIRONMENT)
+    server.start()
+    try:
+        with Link(server.url) as link:
+            make_domain(link)
+        kinds = list(FilterKind)
+        robots = [Robot(number, kinds[number % len(kinds)]) for number in range(N_ROBOTS)]
+        robots += [Robot(N_ROBOTS + number, kinds[number], SHORT_SESSION) for number in range(2)]
+        uploader, mapper = Uploader(), Mapper(seed)
+        actors: list[Actor] = [*robots, uploader, mapper]
+        for _ in range(n_kills):
+            _live_and_die(server, actors, float(rng.uniform(0.0, LONGEST_LIFE_S)))
+            found.doing.update([uploader.doing, mapper.doing])
+            began = time.perf_counter()
+            server.start()
+            found.ready_s.append(time.perf_counter() - began)
+            with Link(server.url) as link:
+                expect(link.ask("GET", "/readyz")["damaged_maps"] == [], "a map is damaged")
+                for actor in actors:
+                    actor.check(link)
+            found.n_kills += 1
+            on_kill(found.n_kills)
+        with Link(server.url) as link:
+            for robot in robots:
+                robot.check_bits(link, data_dir)
+        uploader.check_bits(data_dir)
+        _check_every_file(data_dir)
+    finally:
+        server.kill()
+    for actor in actors:
+        found.n_acknowledged[type(actor).__name__] += actor.n_acknowledged
+    found.n_remaps, found.n_interrupted = mapper.n_remaps, mapper.n_interrupted
+    return found
+
+
+def _live_and_die(server: LocalServer, actors: list[Actor], life_s: float) -> None:
+    broken: list[BaseException] = []
+
+    def act(actor: Actor) -> None:
+        try:
+            actor.until_gone(server.url)
+        except BaseException as error:  # raised again by the soak's own thread
+            broken.append(error)
+
+    threads = [threading.Thread(target=act, args=(actor,)) for actor in actors]
+    for thread in threads:
+        thread.start()
+    time.sleep(life_s)
+    server.kill()
+    for thread in threads:
+        thread.join()
+    if broken:
+        raise broken[0]
+
+
+def _check_every_file(data_dir: Path) -> None:
+    command = [sys.executable, "-m", "deepsimbad", "check", "--json", "--data-dir", str(data_dir)]
+    checked = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603 - our own interpreter
+    expect(checked.returncode == 0, f"deepsimbad check: {checked.stdout} {checked.stderr}")
+    json.loads(checked.stdout)

@@ -1,0 +1,110 @@
+"""Someone who uploads one traverse after the other, in batches and frame by frame, and deletes some."""
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.soak.actor import Actor, expect
+from bench.soak.link import Link, RefusedError
+from bench.soak.world import BASE, DIM, DOMAIN, NPZ, packed
+from deepsimbad.store.traverses import Traverse
+
+BATCH, FRAMES, KEPT = 10, 120, 3
+_NOT_FOUND = 404
+
+
+def encoding(traverse: int, index: int) -> NDArray[np.float32]:
+    """[d] of one frame."""
+    return np.random.default_rng([2, traverse, index]).normal(size=DIM).astype(np.float32)
+
+
+class Uploader(Actor):
+    """Keeps the last few traverses; what it remembers of each is the set of frames that were acknowledged."""
+
+    def __init__(self) -> None:
+        self._number = 0
+        self._is_made = False
+        self._n_sent = 0
+        self._in_flight: set[int] = set()
+        self._told: dict[int, set[int]] = {}
+        self._deleting: int | None = None
+        self._deleted: list[int] = []
+
+    def act(self, link: Link) -> None:
+        """Make a traverse, add frames to it, or delete the oldest."""
+        if self._deleting is not None or len(self._told) > KEPT:
+            self._delete(link)
+        elif not self._is_made:
+            self.doing = "making a traverse"
+            link.ask("POST", f"{BASE}/traverses", {"name": name_of(self._number)})
+            self._is_made, self._n_sent, self._told[self._number] = True, 0, set()
+        elif self._n_sent >= FRAMES:
+            self._number, self._is_made = self._number + 1, False
+            return
+        else:
+            self._add(link)
+        self.n_acknowledged += 1
+
+    def _add(self, link: Link) -> None:
+        self.doing = "uploading frames"
+        path = f"{BASE}/traverses/{name_of(self._number)}/frames"
+        is_batch = self._n_sent % (2 * BATCH) == 0
+        index = range(self._n_sent, self._n_sent + (BATCH if is_batch else 1))
+        self._in_flight = set(index)
+        encodings = np.stack([encoding(self._number, each) for each in index])
+        if is_batch:
+            link.ask(
+                "POST", path, packed(encodings=encodings, index=np.array(index), position_m=1.0 * np.array(index)), NPZ
+            )
+        else:
+            link.ask("PUT", f"{path}/{index[0]}?position_m={index[0]}", {"encoding": encodings[0].tolist()})
+        self._told[self._number] |= self._in_flight
+        self._in_flight = set()
+        self._n_sent = index[-1] + 1
+
+    def _delete(self, link: Link) -> None:
+        self.doing = "deleting a traverse"
+        self._deleting = self._deleting if self._deleting is not None else min(self._told)
+        try:
+            link.ask("DELETE", f"{BASE}/traverses/{name_of(self._deleting)}")
+        except RefusedError as error:  # it was deleted before the service died
+            if error.status != _NOT_FOUND:
+                raise
+        self._told.pop(self._deleting, None)
+        self._deleted.append(self._deleting)
+        self._deleting = None
+
+    def check(self, link: Link) -> None:
+        """No acknowledged frame is missing, no half batch is there, no deleted traverse is back."""
+        for number, told in self._told.items():
+            if number == self._deleting:
+                continue
+            answer = link.ask("GET", f"{BASE}/traverses/{name_of(number)}")
+            more = self._in_flight if number == self._number else set()
+            expect(answer["n_frames"] in {len(told), len(told | more)}, f"{name_of(number)}: {answer} of {len(told)}")
+            gaps = {index for first, last in answer["missing"] for index in range(first, last + 1)}
+            expect(not gaps & told, f"{name_of(number)} misses frames {sorted(gaps & told)}")
+        for number in self._deleted[-3:]:
+            try:
+                link.ask("GET", f"{BASE}/traverses/{name_of(number)}")
+            except RefusedError as error:
+                expect(error.status == _NOT_FOUND, f"{name_of(number)}: {error}")
+            else:
+                expect(False, f"{name_of(number)} was deleted and is back")
+
+    def check_bits(self, data_dir: Path) -> None:
+        """Every acknowledged frame holds the very numbers that were sent."""
+        for number, told in self._told.items():
+            if number == self._deleting:
+                continue
+            with Traverse.open(data_dir, DOMAIN, name_of(number)) as traverse:
+                frames = traverse.read()
+            found = dict(zip(frames.index.tolist(), frames.encodings, strict=True))
+            for index in told:
+                expect(np.array_equal(found[index], encoding(number, index)), f"{name_of(number)} frame {index}")
+
+
+def name_of(number: int) -> str:
+    """Of a traverse."""
+    return f"drive-{number}"
