@@ -3,6 +3,7 @@
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from datetime import timedelta
 from pathlib import Path
 from typing import Any, Self
 
@@ -12,18 +13,23 @@ from deepsimbad.errors import (
     ConflictError,
     DamagedFileError,
     DamagedMapError,
+    InvalidInputError,
     TraverseInUseError,
     UnknownMapVersionError,
 )
-from deepsimbad.store import domain_table, job_table, layout, map_table, unfinished
+from deepsimbad.store import domain_table, job_table, key_table, layout, map_table, unfinished
+from deepsimbad.store.api_key import ApiKey
 from deepsimbad.store.connection import check_integrity, migrate, open_database, use_write_ahead_log, write_transaction
-from deepsimbad.store.documents import from_json, to_json
+from deepsimbad.store.documents import after, from_json, to_json
 from deepsimbad.store.durable import remove_folder, sync_folder
 from deepsimbad.store.faults import storage_faults
+from deepsimbad.store.list_page import ListPage
 from deepsimbad.store.map_table import AnyVersion
 from deepsimbad.store.ownership import Owner, is_alive
-from deepsimbad.store.records import DomainRecord, JobRecord, MapRecord, MapState
+from deepsimbad.store.records import DomainRecord, JobRecord, KeyRecord, KeyScope, MapRecord, MapState
 from deepsimbad_migrations.catalog.migrations import migrations
+
+_MAX_KEY_NAME = 100
 
 
 class Catalog:
@@ -94,9 +100,21 @@ class Catalog:
     # Domains
 
     def create_domain(
-        self, name: str, evaluator: dict[str, Any], closed: bool, actions_m: Sequence[float]
+        self,
+        name: str,
+        evaluator: dict[str, Any],
+        closed: bool,
+        actions_m: Sequence[float],
+        max_domains: int | None = None,
     ) -> tuple[DomainRecord, bool]:
         """Make a domain; the same again changes nothing.
+
+        Args:
+            name: What to call it.
+            evaluator: Its evaluator's configuration.
+            closed: Whether the route is a loop.
+            actions_m: Moves in metres.
+            max_domains: How many there may be, this one included; None: any number.
 
         Returns:
             The domain, and whether it is new.
@@ -104,12 +122,15 @@ class Catalog:
         Raises:
             InvalidInputError: The name cannot be a name, or a value has no JSON form.
             DomainDiffersError: A domain of that name exists with another configuration.
+            TooManyDomainsError: There are `max_domains` already, and it is none of them.
             ConflictError: Files that no domain owns lie where its files would.
         """
         folder = layout.domain_folder(self.data_dir, name)
         evaluator = from_json(to_json(evaluator))
         actions = tuple(float(action) for action in actions_m)
         with self._writing() as db:
+            if max_domains is not None:
+                domain_table.check_room(db, name, max_domains)
             record, created = domain_table.insert(db, name, evaluator, closed, actions)
             if created:
                 self._finish_deletion(db, name)
@@ -205,6 +226,12 @@ class Catalog:
             domain_table.get(db, domain)
             return map_table.of_domain(db, domain)
 
+    def newest_maps(self, domain: str, before: int | None, limit: int) -> ListPage[MapRecord, int]:
+        """A page of a domain's map versions, newest first, behind version `before`; raises UnknownDomainError."""
+        with self._reading() as db:
+            domain_table.get(db, domain)
+            return map_table.newest(db, domain, before, limit)
+
     def map(self, domain: str, version: int) -> MapRecord:
         """One map version; raises UnknownDomainError, UnknownMapVersionError."""
         with self._reading() as db:
@@ -253,6 +280,47 @@ class Catalog:
             if domain is not None:
                 domain_table.get(db, domain)
             return job_table.list_jobs(db, domain)
+
+    def newest_jobs(self, domain: str | None, before: int | None, limit: int) -> ListPage[JobRecord, int]:
+        """A page of jobs, newest first, behind the key `before`; raises UnknownDomainError."""
+        with self._reading() as db:
+            if domain is not None:
+                domain_table.get(db, domain)
+            return job_table.newest(db, domain, before, limit)
+
+    # Keys
+
+    def create_key(
+        self, scope: KeyScope, name: str = "", lifetime: timedelta | None = None
+    ) -> tuple[KeyRecord, ApiKey]:
+        """Make an API key; its secret is returned here and can never be had again.
+
+        Args:
+            scope: What it opens.
+            name: What to call it, at most 100 printable letters; may be empty.
+            lifetime: From now on, above 0; None: it does not expire.
+
+        Raises:
+            InvalidInputError: The name or the lifetime cannot be kept.
+        """
+        if len(name) > _MAX_KEY_NAME or not name.isprintable():
+            raise InvalidInputError(f"a key is named by at most {_MAX_KEY_NAME} printable letters")
+        if lifetime is not None and lifetime <= timedelta(0):
+            raise InvalidInputError("a key lives for more than no time at all")
+        expires_at = None if lifetime is None else after(lifetime)
+        key = ApiKey.new()
+        with self._writing() as db:
+            return key_table.insert(db, key, scope, name, expires_at), key
+
+    def keys(self) -> list[KeyRecord]:
+        """Every API key that was ever created, revoked ones too, oldest first."""
+        with self._reading() as db:
+            return key_table.all_keys(db)
+
+    def revoke_key(self, key_id: str) -> KeyRecord:
+        """Let a key open nothing any more; raises UnknownKeyError."""
+        with self._writing() as db:
+            return key_table.revoke(db, key_id)
 
     # Recovery
 

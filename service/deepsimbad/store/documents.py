@@ -3,7 +3,7 @@
 import functools
 import json
 from collections.abc import Callable, Mapping, Sequence
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from typing import Any, TypeVar
 
 from deepsimbad.errors import DamagedFileError, InvalidInputError
@@ -44,4 +44,16 @@ def row_reader(read: Callable[[tuple[Any, ...]], _Record]) -> Callable[[tuple[An
 
 def now() -> str:
     """The present moment in UTC as ISO 8601, to the millisecond; texts sort as times do."""
-    return datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+    return _text(datetime.now(UTC))
+
+
+def after(wait: timedelta) -> str:
+    """The moment that follows now by `wait`, as `now` writes it; raises InvalidInputError past the year 9999."""
+    try:
+        return _text(datetime.now(UTC) + wait)
+    except OverflowError as error:
+        raise InvalidInputError("a time past the year 9999 cannot be kept") from error
+
+
+def _text(moment: datetime) -> str:
+    return moment.isoformat(timespec="milliseconds").replace("+00:00", "Z")

@@ -4,7 +4,7 @@ from typing import Any
 
 from sqlite_utils import Database
 
-from deepsimbad.errors import DomainDiffersError, UnknownDomainError
+from deepsimbad.errors import DomainDiffersError, TooManyDomainsError, UnknownDomainError
 from deepsimbad.store.documents import from_json, now, row_reader, to_json
 from deepsimbad.store.layout import is_name
 from deepsimbad.store.records import DomainRecord
@@ -43,6 +43,16 @@ def get(db: Database, name: str) -> DomainRecord:
 def all_domains(db: Database) -> list[DomainRecord]:
     """Every domain by name."""
     return [_record(row) for row in db.execute(f"{_SELECT} ORDER BY domain.name")]
+
+
+def check_room(db: Database, name: str, max_domains: int) -> None:
+    """Refuse a name that would be one domain too many; raises TooManyDomainsError."""
+    (n_domains,) = db.execute("SELECT count(*) FROM domain").fetchone()
+    if n_domains >= max_domains and find(db, name) is None:
+        raise TooManyDomainsError(
+            f"there are {n_domains} domains, as many as may be: delete one, or raise the setting max_domains",
+            max_domains=max_domains,
+        )
 
 
 def insert(

@@ -1,4 +1,4 @@
-"""What the catalog knows of a domain, a map version and a job."""
+"""What the catalog knows of a domain, a map version, a job and an API key."""
 
 from dataclasses import dataclass
 from enum import StrEnum
@@ -27,6 +27,17 @@ class JobState(StrEnum):
     def is_final(self) -> bool:
         """Whether nothing follows."""
         return self in (JobState.SUCCEEDED, JobState.FAILED, JobState.CANCELLED)
+
+
+class KeyScope(StrEnum):
+    """What an API key opens; `admin` includes `localize`."""
+
+    LOCALIZE = "localize"
+    ADMIN = "admin"
+
+    def includes(self, needed: "KeyScope") -> bool:
+        """Whether a key of this scope may do what needs the other."""
+        return self is KeyScope.ADMIN or self is needed
 
 
 @dataclass(frozen=True)
@@ -87,3 +98,30 @@ class JobRecord:
     started_at: str | None
     finished_at: str | None
     n_starts: int
+
+
+@dataclass(frozen=True)
+class KeyRecord:
+    """One API key, without its secret.
+
+    Attributes:
+        key_id: Twelve hexadecimal digits, a part of the key.
+        name: What its maker calls it; may be empty.
+        scope: What it opens.
+        secret_sha256: Digest of the secret, hexadecimal.
+        created_at: ISO 8601, UTC, as the other times.
+        expires_at: From when on it opens nothing; None: never.
+        revoked_at: Since when it opens nothing; None: it was not revoked.
+    """
+
+    key_id: str
+    name: str
+    scope: KeyScope
+    secret_sha256: str
+    created_at: str
+    expires_at: str | None
+    revoked_at: str | None
+
+    def is_usable(self, at: str) -> bool:
+        """Whether it opens anything at a time (as `documents.now` writes it)."""
+        return self.revoked_at is None and (self.expires_at is None or at < self.expires_at)

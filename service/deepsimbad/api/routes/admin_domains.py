@@ -29,7 +29,9 @@ async def put_domain(domain: DomainName, request: Request, response: Response, r
 
     def make() -> tuple[DomainAnswer, bool]:
         running.evaluators.evaluator(evaluator.as_dict())  # one that cannot be loaded should not be stored
-        record, created = running.catalog.create_domain(domain, dict(evaluator.as_dict()), body.closed, body.actions_m)
+        record, created = running.catalog.create_domain(
+            domain, dict(evaluator.as_dict()), body.closed, body.actions_m, running.settings.max_domains
+        )
         return describe_domain(record, running.evaluators, running.active_maps), created
 
     answer, created = await run_sync(make)
