@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from datetime import UTC, datetime
 from typing import Any
 
 from deepsimbad.core.known_walk import KnownWalk, transitions_of
@@ -10,10 +9,10 @@ from deepsimbad.core.nnql import NnqlConfig, initial_q_values, learn
 from deepsimbad.engine.snapshot import MapSnapshot
 from deepsimbad.errors import NoActiveMapError
 from deepsimbad.jobs.progress import Progress
+from deepsimbad.jobs.seal_version import seal_version
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.map_contents import MapContents
-from deepsimbad.store.map_file import index_bytes, read_map, write_map
-from deepsimbad.store.sealing import seal
+from deepsimbad.store.map_file import read_map
 
 LEARN_STAGES = {"read map": 1.0, "learn": 2.0, "seal": 1.0, "activate": 0.1}
 
@@ -66,19 +65,10 @@ def learn_online(
     contents = read_map(catalog.map_path(domain, active))
     progress.stage("learn")
     learnt, n_learnt = with_experience(contents, walks, config or NnqlConfig())
-    metrics = {**before.metrics, "experience": {"from_version": active, "n_walks": len(walks), "n_moves": n_learnt}}
+    experience = {"from_version": active, "n_walks": len(walks), "n_moves": n_learnt}
     progress.stage("seal")
-    version = catalog.begin_map(domain, before.config)
-    try:
-        created_at = datetime.now(UTC).isoformat(timespec="seconds")
-        building, sealed = catalog.building_path(domain, version), catalog.map_path(domain, version)
-        write_map(building, replace(learnt, version=version, created_at=created_at), progress.update)
-        digest, n_bytes = seal(building, sealed)
-        metrics["index_bits_per_map_image"] = 8 * index_bytes(sealed) / contents.n_map_images
-        progress.stage("activate")
-        catalog.seal_map(domain, version, digest, n_bytes, metrics)
-    except BaseException:
-        catalog.discard_map(domain, version)
-        raise
-    catalog.activate(domain, version, active)
-    return {"map_version": version, "active": True, "metrics": metrics}
+    metrics = {**before.metrics, "experience": experience}
+    sealed = seal_version(catalog, domain, learnt, before.config, metrics, progress.update)
+    progress.stage("activate")
+    catalog.activate(domain, sealed.version, active)
+    return {"map_version": sealed.version, "active": True, "metrics": sealed.metrics}

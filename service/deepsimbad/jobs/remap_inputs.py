@@ -1,0 +1,110 @@
+"""What a remap reads before it begins: traverses and, where landmarks stay, the active map."""
+
+from dataclasses import dataclass
+
+from deepsimbad.core.route import Route
+from deepsimbad.errors import InvalidEncodingError, InvalidMapConfigError
+from deepsimbad.jobs.encoded_traverse import route_of
+from deepsimbad.jobs.map_config import RemapConfig
+from deepsimbad.store.catalog import Catalog
+from deepsimbad.store.frames import TraverseFrames
+from deepsimbad.store.map_contents import MapContents
+from deepsimbad.store.map_file import read_map
+from deepsimbad.store.records import DomainRecord
+from deepsimbad.store.traverses import Traverse
+
+
+@dataclass(frozen=True)
+class RemapInputs:
+    """Everything a remap depends on, as it was when it was read.
+
+    Attributes:
+        domain: Whose map is made.
+        config: What is asked for.
+        training: The traverse that becomes the map.
+        route: Its positions.
+        candidates: The traverse landmarks are selected from; None: those of `kept` stay.
+        kept: The active map whose landmarks stay; None where they are selected.
+        second: The drive that a calibrated map learns from: the landmark traverse, else what the active map was made
+            of; None where there is none of the same encoder.
+    """
+
+    domain: DomainRecord
+    config: RemapConfig
+    training: TraverseFrames
+    route: Route
+    candidates: TraverseFrames | None
+    kept: MapContents | None
+    second: TraverseFrames | None
+
+
+def read_inputs(catalog: Catalog, domain: str, config: RemapConfig) -> RemapInputs:
+    """Read what a remap needs, every traverse once.
+
+    Raises:
+        UnknownDomainError, UnknownTraverseError: There is none such.
+        InvalidMapConfigError: A traverse is empty, or no landmarks could stay.
+        InvalidRouteError: The training traverse goes backwards.
+        InvalidEncodingError: The traverses come from two encoders.
+    """
+    record = catalog.domain(domain)
+    training = _frames(catalog, domain, config.training_traverse)
+    read = {config.training_traverse: training}
+    route = route_of(training, record.closed)
+    candidates = kept = None
+    if config.landmark_traverse is None:
+        kept = _active_map(catalog, record, config)
+    else:
+        if config.landmark_traverse not in read:
+            read[config.landmark_traverse] = _frames(catalog, domain, config.landmark_traverse)
+        candidates = read[config.landmark_traverse]
+        if _length(candidates) != _length(training):
+            raise InvalidEncodingError(
+                f"traverse {config.landmark_traverse} holds encodings of {_length(candidates)} numbers, traverse "
+                f"{config.training_traverse} of {_length(training)}; both must come from the same encoder"
+            )
+    second = _second_season(catalog, record, config, read)
+    return RemapInputs(record, config, training, route, candidates, kept, second)
+
+
+def _frames(catalog: Catalog, domain: str, name: str) -> TraverseFrames:
+    with Traverse.open(catalog.data_dir, domain, name) as traverse:
+        frames = traverse.read()
+    if frames.index.size == 0:
+        raise InvalidMapConfigError(f"traverse {name} has no frames yet; upload some first", traverse=name)
+    return frames
+
+
+def _length(frames: TraverseFrames) -> int:
+    return int(frames.encodings.shape[1])
+
+
+def _second_season(
+    catalog: Catalog, record: DomainRecord, config: RemapConfig, read: dict[str, TraverseFrames]
+) -> TraverseFrames | None:
+    names = [config.landmark_traverse]
+    if config.landmark_traverse is None and record.active_version is not None:
+        before = catalog.map(record.name, record.active_version).config
+        names = [before["training_traverse"], before["landmark_traverse"]]
+    known = Traverse.list(catalog.data_dir, record.name)
+    for name in names:
+        if name is not None and name != config.training_traverse and name in known:
+            second = read[name] if name in read else _frames(catalog, record.name, name)
+            if _length(second) == _length(read[config.training_traverse]):  # else another encoder made it anew
+                return second
+    return None
+
+
+def _active_map(catalog: Catalog, record: DomainRecord, config: RemapConfig) -> MapContents:
+    if record.active_version is None:
+        raise InvalidMapConfigError(
+            f"domain {record.name} has no active map whose landmarks could stay; give a landmark_traverse"
+        )
+    kept = read_map(catalog.map_path(record.name, record.active_version))
+    if config.n_landmarks not in {None, kept.n_landmarks}:
+        raise InvalidMapConfigError(
+            f"the active map has {kept.n_landmarks} landmarks, not {config.n_landmarks}; give a landmark_traverse to "
+            "select anew",
+            n_landmarks=kept.n_landmarks,
+        )
+    return kept
