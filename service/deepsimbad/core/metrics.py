@@ -74,9 +74,13 @@ class RetrievalScorer:
 
 
 def true_images_of(
-    query: Route, map_route: Route, tolerance_m: float, max_heading_rad: float = np.pi / 2
+    query: Route,
+    map_route: Route,
+    tolerance_m: float,
+    max_heading_rad: float = np.pi / 2,
+    frames: NDArray[np.int64] | None = None,
 ) -> list[NDArray[np.int64]]:
-    """For every query frame the map images within the tolerance.
+    """For every query frame, or for some of them, the map images within the tolerance.
 
     In the plane (x, y) where both routes know it; else along the route. A map image within the tolerance in the
     plane but driven in another direction shows something else, so heading, taken from the paths themselves, must
@@ -88,11 +92,12 @@ def true_images_of(
     if query.x_m is None or query.y_m is None or map_route.x_m is None or map_route.y_m is None:
         return [
             np.flatnonzero(np.abs(map_route.offset_m(map_route.position_m, at)) <= tolerance_m)
-            for at in query.position_m
+            for at in (query.position_m if frames is None else query.position_m[frames])
         ]
     query_heading, map_heading = _headings(query), _headings(map_route)
     found = []
-    for x, y, heading in zip(query.x_m, query.y_m, query_heading, strict=True):
+    columns = np.stack([query.x_m, query.y_m, query_heading], axis=1)
+    for x, y, heading in columns if frames is None else columns[frames]:
         near = np.hypot(map_route.x_m - x, map_route.y_m - y) <= tolerance_m
         turn = np.abs((map_heading - heading + np.pi) % (2 * np.pi) - np.pi)
         found.append(np.flatnonzero(near & ~(turn > max_heading_rad)))  # an unknown heading excludes nothing

@@ -57,6 +57,13 @@ class LandmarkStatistics:
         square = self.square + (np.square(scores) - self.square) / weight
         return type(self)(weight, mean, square)
 
+    def pooled(self, n_frames: float, other: "LandmarkStatistics", n_others: float) -> Self:
+        """The statistics of two drives together, each counted by its frames; the weight stays this one's."""
+        share = n_others / (n_frames + n_others)
+        mean = self.mean + (other.mean - self.mean) * share
+        square = self.square + (other.square - self.square) * share
+        return type(self)(self.weight, mean, square)
+
     def standardise(self, ranks: NDArray[np.float32]) -> NDArray[np.float64]:
         """z of ranks, [r] or [n, r]: normal scores less their mean, over their spread. Lowest is nearest."""
         return (normal_scores(ranks, ranks.shape[-1]) - self.mean) / self.std

@@ -81,10 +81,12 @@ def describe(
         on_progress: Called with the share done; may raise to cancel.
     """
     two = relevance is Relevance.CALIBRATED and second is not None
-    own = _dissimilarities(training.encodings, evaluator, model, lambda share: on_progress(share / 2 if two else share))
+    own = dissimilarities_to(
+        training.encodings, evaluator, model, lambda share: on_progress(share / 2 if two else share)
+    )
     season = None
     if two and second is not None:
-        other = _dissimilarities(second.encodings, evaluator, model, lambda share: on_progress(0.5 + share / 4))
+        other = dissimilarities_to(second.encodings, evaluator, model, lambda share: on_progress(0.5 + share / 4))
         season = SecondSeason(other, same_places(route_of(second), route))
     built = build_retrieval_map(relevance, own, list_length, training.encodings, season)
     if season is None or built.calibration is None or not built.calibration.is_of_two_seasons:
@@ -105,9 +107,17 @@ def _unaware(built: RetrievalMap, unaware: RetrievalMap) -> Calibration:
     return replace(unaware.calibration, correlation=built.calibration.correlation)
 
 
-def _dissimilarities(
+def dissimilarities_to(
     encodings: NDArray[np.float32], evaluator: Evaluator, model: LandmarkModel, on_progress: Callable[[float], None]
 ) -> NDArray[np.float32]:
+    """[n, r] of frames to landmarks, block by block.
+
+    Args:
+        encodings: [n, d].
+        evaluator: Measures them.
+        model: The landmarks.
+        on_progress: Called with the share done; may raise to cancel.
+    """
     blocks = []
     for start in range(0, len(encodings), _FRAMES_A_BLOCK):
         blocks.append(evaluator.dissimilarities(encodings[start : start + _FRAMES_A_BLOCK], model))

@@ -1,5 +1,6 @@
 """What a remap is asked for."""
 
+import math
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -26,7 +27,14 @@ class RemapConfig:
         relevance: What the map is built for.
         training_episodes: Of the experience database that NNQL plans by; 0: the map has none.
         seed: Of everything random in the remap.
-        activate: Serve the new map at once.
+        activate: Serve the new map at once, whatever was activated while it was built: the last word wins. With a gate
+            only in place of the map it was compared with.
+        check_traverse: Drive that the new map and the active one are compared on; None: frames of the training
+            traverse that are held out.
+        gate_margin: By how many percentage points of ANR the new map may be worse than the active one and still take
+            over; None: whatever it is.
+        append: Add the training traverse to a copy of the active map, whose images, landmarks, lists and experience
+            stay; n_landmarks, list_length and relevance are the active map's.
     """
 
     training_traverse: str
@@ -37,6 +45,9 @@ class RemapConfig:
     training_episodes: int = DEFAULT_TRAINING_EPISODES
     seed: int = 0
     activate: bool = True
+    check_traverse: str | None = None
+    gate_margin: float | None = None
+    append: bool = False
 
     def __post_init__(self) -> None:
         n_landmarks = self.n_landmarks
@@ -50,6 +61,16 @@ class RemapConfig:
             )
         if self.training_episodes < 0 or self.seed < 0:
             raise InvalidMapConfigError("training_episodes and seed must not be negative")
+        if self.gate_margin is not None and not (math.isfinite(self.gate_margin) and self.gate_margin >= 0):
+            raise InvalidMapConfigError("gate_margin is in percentage points of ANR, finite and not negative")
+        if self.check_traverse == self.training_traverse:
+            raise InvalidMapConfigError(
+                "a map finds the frames it was made of at once: give another check_traverse, or none to hold frames out"
+            )
+        if self.append and self.landmark_traverse is not None:
+            raise InvalidMapConfigError(
+                "what is appended is described by the active map's landmarks: landmark_traverse must be null"
+            )
 
     def as_dict(self) -> dict[str, Any]:
         """The JSON form."""
