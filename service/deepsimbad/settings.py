@@ -4,7 +4,7 @@ import ipaddress
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import Field, ValidationError
+from pydantic import Field
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from deepsimbad.errors import SettingsError
@@ -15,10 +15,17 @@ MEBIBYTE = 1024 * 1024
 class Settings(BaseSettings):
     """Settings of the service. Each has an environment variable: `DEEPSIMBAD_` and its name in capitals.
 
-    Arguments given to the constructor go before the environment, the environment before the defaults.
+    Arguments given to the constructor go before the environment, the environment before the defaults;
+    `settings_sources.load_settings` reads a settings file as well.
     """
 
-    model_config = SettingsConfigDict(env_prefix="DEEPSIMBAD_", frozen=True, extra="forbid")
+    model_config = SettingsConfigDict(
+        env_prefix="DEEPSIMBAD_",
+        env_ignore_empty=True,  # a compose file passes on what is not set as an empty text
+        frozen=True,
+        extra="forbid",
+        allow_inf_nan=False,
+    )
 
     data_dir: Annotated[Path, Field(description="Folder of the catalog, traverses and maps.")] = Path("deepsimbad-data")
     host: Annotated[str, Field(description="Address to listen on.", min_length=1)] = "127.0.0.1"
@@ -107,35 +114,19 @@ class Settings(BaseSettings):
         except ValueError:
             return False
 
-    def check_exposure(self) -> None:
-        """Refuse to be reachable from other machines while the service has no keys.
+    def check_exposure(self, n_keys: int) -> None:
+        """Refuse to be reachable from other machines while the service asks for no key.
+
+        Args:
+            n_keys: Keys that were ever created, revoked ones too.
 
         Raises:
-            SettingsError: `host` is not a loopback address and `allow_open` is off.
+            SettingsError: There is none, `host` is not a loopback address and `allow_open` is off.
         """
-        if not self.is_loopback and not self.allow_open:
+        if n_keys == 0 and not self.is_loopback and not self.allow_open:
             raise SettingsError(
-                f"refusing to serve without keys on {self.host}, which other machines can reach: "
-                "listen on 127.0.0.1, or set DEEPSIMBAD_ALLOW_OPEN=true if the network is trusted",
+                f"refusing to serve without keys on {self.host}, which other machines can reach: make a key with "
+                "`deepsimbad keys create --scope admin`, listen on 127.0.0.1, or set DEEPSIMBAD_ALLOW_OPEN=true if "
+                "the network is trusted",
                 host=self.host,
             )
-
-
-def load_settings(**given: object) -> Settings:
-    """Settings from the arguments given, the environment and the defaults, in this order.
-
-    Args:
-        **given: Settings by name; those that are None count as not given.
-
-    Returns:
-        The settings.
-
-    Raises:
-        SettingsError: A name is unknown or a value cannot be used.
-    """
-    try:
-        return Settings(**{name: value for name, value in given.items() if value is not None})  # type: ignore[arg-type]
-    except ValidationError as error:
-        first = error.errors(include_url=False, include_input=False)[0]
-        name = ".".join(str(part) for part in first["loc"])
-        raise SettingsError(f"setting {name!r} cannot be used: {first['msg']}", setting=name) from error

@@ -1,5 +1,6 @@
 """Settings: where they come from, and what is refused."""
 
+import os
 from pathlib import Path
 
 import pytest
@@ -7,13 +8,16 @@ from pydantic import ValidationError
 
 from deepsimbad.api.server import serve
 from deepsimbad.errors import SettingsError
-from deepsimbad.settings import Settings, load_settings
+from deepsimbad.settings import Settings
+from deepsimbad.settings_sources import Origin, load_settings, trace_settings, unknown_variables
 
 
 @pytest.fixture(autouse=True)
-def _empty_environment(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in Settings.model_fields:
-        monkeypatch.delenv(f"DEEPSIMBAD_{name.upper()}", raising=False)
+def _empty_environment(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    for name in os.environ:
+        if name.startswith("DEEPSIMBAD_"):
+            monkeypatch.delenv(name)
+    monkeypatch.chdir(tmp_path)
 
 
 def test_defaults_environment_and_arguments(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -38,6 +42,8 @@ def test_settings_do_not_change() -> None:
         ({"max_pixels": 0}, "max_pixels"),
         ({"log_level": "LOUD"}, "log_level"),
         ({"host": ""}, "host"),
+        ({"session_ttl_s": float("nan")}, "session_ttl_s"),
+        ({"rate_limit_per_s": float("inf")}, "rate_limit_per_s"),
         ({"colour": "red"}, "colour"),
     ],
 )
@@ -46,6 +52,79 @@ def test_a_wrong_setting_is_named(given: dict[str, object], name: str) -> None:
         load_settings(**given)
     assert caught.value.hints == {"setting": name}
     assert name in caught.value.message
+    assert "the command line" in caught.value.message
+
+
+def test_flags_go_before_the_environment_before_the_file_before_defaults(monkeypatch: pytest.MonkeyPatch) -> None:
+    Path("some.toml").write_text('port = 1\nmax_pixels = 2\nhost = "10.0.0.1"\ncors_origins = ["https://a"]\n')
+    monkeypatch.setenv("DEEPSIMBAD_PORT", "3")
+    monkeypatch.setenv("DEEPSIMBAD_HOST", "10.0.0.2")
+    traced = trace_settings(Path("some.toml"), port=4, data_dir=None)
+    settings, origins = traced.settings, traced.origins
+    assert (settings.port, origins["port"]) == (4, Origin.FLAG)
+    assert (settings.host, origins["host"]) == ("10.0.0.2", Origin.ENVIRONMENT)
+    assert (settings.max_pixels, origins["max_pixels"]) == (2, Origin.FILE)
+    assert (settings.cors_origins, origins["cors_origins"]) == (("https://a",), Origin.FILE)
+    assert (settings.data_dir, origins["data_dir"]) == (Path("deepsimbad-data"), Origin.DEFAULT)
+    assert set(origins) == set(Settings.model_fields)
+
+
+def test_the_file_is_that_of_the_flag_the_environment_or_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert trace_settings().file is None
+    for number, name in enumerate(("deepsimbad.toml", "environment.toml", "flag.toml"), 1):
+        Path(name).write_text(f"port = {number}")
+    assert load_settings().port == 1
+    monkeypatch.setenv("DEEPSIMBAD_CONFIG", "environment.toml")
+    assert load_settings().port == 2
+    assert load_settings(Path("flag.toml")).port == 3
+    monkeypatch.setenv("DEEPSIMBAD_CONFIG", "gone.toml")
+    with pytest.raises(SettingsError, match=r"no settings file gone\.toml, which DEEPSIMBAD_CONFIG names"):
+        load_settings()
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (b"prot = 1", "no setting 'prot', which stands in bad.toml: did you mean 'port'"),
+        (b"[server]\nport = 1", "no setting 'server', which stands in bad.toml"),
+        (b"port = 70000", "setting 'port' of bad.toml cannot be used"),
+        (b"header_timeout_s = nan", "setting 'header_timeout_s' of bad.toml cannot be used"),
+        (b"port = ", "bad.toml is not TOML"),
+        (b"host = '\xff'", "bad.toml is not TOML"),
+        (b"port = 1\nport = 2", "bad.toml is not TOML"),
+    ],
+)
+def test_a_wrong_file_is_named_with_what_is_wrong(content: bytes, said: str) -> None:
+    Path("bad.toml").write_bytes(content)
+    with pytest.raises(SettingsError) as caught:
+        load_settings(Path("bad.toml"))
+    assert said in caught.value.message
+
+
+def test_a_folder_is_no_settings_file() -> None:
+    Path("deepsimbad.toml").mkdir()
+    with pytest.raises(SettingsError, match="no settings file"):
+        load_settings()
+
+
+@pytest.mark.parametrize(
+    ("variable", "value"), [("DEEPSIMBAD_PORT", "many"), ("DEEPSIMBAD_CORS_ORIGINS", "https://not.json")]
+)
+def test_a_wrong_variable_is_named(monkeypatch: pytest.MonkeyPatch, variable: str, value: str) -> None:
+    monkeypatch.setenv(variable, value)
+    with pytest.raises(SettingsError, match=rf"of the environment \({variable}\) cannot be used"):
+        load_settings()
+
+
+def test_an_empty_variable_counts_as_not_set(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DEEPSIMBAD_TLS_KEY", "")
+    assert load_settings().tls_key is None
+
+
+def test_variables_that_are_no_settings_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("DEEPSIMBAD_PROT", "DEEPSIMBAD_PORT", "DEEPSIMBAD_CONFIG", "DEEPSIMBAD_URL"):
+        monkeypatch.setenv(name, "1")
+    assert unknown_variables() == ["DEEPSIMBAD_PROT"]
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "127.3.2.1", "::1", "localhost"])

@@ -12,17 +12,25 @@ from click.testing import CliRunner
 
 from deepsimbad.api.app import create_app
 from deepsimbad.cli import deepsimbad
+from deepsimbad.cli.settings import shown as shown_setting
 from deepsimbad.settings import Settings
+from deepsimbad.settings_sources import CONFIG_VARIABLE, load_settings, variable_of
 from deepsimbad_client.commands import cli as deepsimbad_client
 from deepsimbad_client.transport import KEY_VARIABLE, URL_VARIABLE
 
 PROJECT = Path(__file__).resolve().parents[2]
 METHODS = "GET|POST|PUT|DELETE"
-OTHER_VARIABLES = {URL_VARIABLE, KEY_VARIABLE, "DEEPSIMBAD_REAL_DATA"}
+OTHER_VARIABLES = {URL_VARIABLE, KEY_VARIABLE, CONFIG_VARIABLE, "DEEPSIMBAD_REAL_DATA"}
 
 
 def settings_by_variable():
-    return {f"DEEPSIMBAD_{name.upper()}": field for name, field in Settings.model_fields.items()}
+    return {variable_of(name): field for name, field in Settings.model_fields.items()}
+
+
+@pytest.fixture(scope="module")
+def settings_page(pages):
+    (page,) = [page for page in pages if page.path == PROJECT / "docs" / "settings.md"]
+    return page
 
 
 @pytest.fixture(scope="module")
@@ -59,20 +67,28 @@ def test_every_call_is_in_the_architecture_page(calls):
     assert calls <= named, f"not described: {sorted(calls - named)}"
 
 
-def test_every_variable_named_is_a_setting_and_every_setting_is_named(pages, readme):
+def test_every_variable_named_is_a_setting_and_every_setting_is_named(pages, settings_page):
     named = {word for page in pages for word in re.findall(r"DEEPSIMBAD_[A-Z_]+", page.text)}
     assert named == set(settings_by_variable()) | OTHER_VARIABLES
-    assert set(settings_by_variable()) <= set(re.findall(r"^\| `(DEEPSIMBAD_[A-Z_]+)`", readme.text, re.MULTILINE))
+    assert set(settings_by_variable()) <= set(
+        re.findall(r"^\| `(DEEPSIMBAD_[A-Z_]+)`", settings_page.text, re.MULTILINE)
+    )
 
 
 @pytest.mark.parametrize("variable", sorted(settings_by_variable()))
-def test_the_table_of_settings_tells_default_and_meaning(readme, variable):
+def test_the_table_of_settings_tells_default_and_meaning(settings_page, variable):
     field = settings_by_variable()[variable]
-    (row,) = [line for line in readme.text.splitlines() if line.startswith(f"| `{variable}`")]
+    (row,) = [line for line in settings_page.text.splitlines() if line.startswith(f"| `{variable}`")]
     _, _, default, meaning, _ = (cell.strip() for cell in row.split("|"))
-    shown = str(field.default).lower() if isinstance(field.default, bool) else str(field.default)
-    assert default == f"`{shown}`"
+    assert default == f"`{shown_setting(field.default)}`"
     assert meaning == field.description
+
+
+def test_the_settings_file_shown_is_one(settings_page, tmp_path):
+    (example,) = settings_page.blocks("toml")
+    (tmp_path / "shown.toml").write_text(example)
+    settings = load_settings(tmp_path / "shown.toml")
+    assert settings.keep_maps == tomllib.loads(example)["keep_maps"]
 
 
 @cache

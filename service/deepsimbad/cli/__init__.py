@@ -11,6 +11,7 @@ import click
 from deepsimbad.cli.experiment import experiment
 from deepsimbad.cli.local import delete, info, localize, map_
 from deepsimbad.cli.serve import serve
+from deepsimbad.cli.settings import settings
 from deepsimbad.errors import CancelledError, DeepSimbadError
 from deepsimbad_client.errors import DeepSimbadClientError
 
@@ -23,7 +24,7 @@ def deepsimbad() -> None:
     """Where on a known route a robot is, and which move would tell it most next."""
 
 
-for command in (serve, map_, localize, info, delete, experiment):
+for command in (serve, map_, localize, info, delete, experiment, settings):
     deepsimbad.add_command(command)
 
 

@@ -8,7 +8,7 @@ from rich.table import Table
 
 from deepsimbad.api.domain_answers import describe_domain
 from deepsimbad.api.rendering import render_localization
-from deepsimbad.cli.options import RELEVANCES, data_dir_option, evaluator_option, spacing_option
+from deepsimbad.cli.options import RELEVANCES, data_dir_option, evaluator_option, given_settings, spacing_option
 from deepsimbad.cli.terminal import console, progress_bar, write_json
 from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Relevance
 from deepsimbad.engine.active_maps import ActiveMaps
@@ -26,7 +26,6 @@ from deepsimbad.evaluators.registry import EvaluatorConfig, make_evaluator
 from deepsimbad.jobs.encoded_traverse import encode_recording
 from deepsimbad.jobs.map_config import DEFAULT_LIST_LENGTH, DEFAULT_N_LANDMARKS, DEFAULT_TRAINING_EPISODES, RemapConfig
 from deepsimbad.jobs.remap import REMAP_STAGES, remap
-from deepsimbad.settings import load_settings
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.frames import TraverseFrames
 from deepsimbad.store.layout import catalog_path, checked_name
@@ -84,7 +83,7 @@ def map_(
     )
     checked_name(domain, "domain")
     judge = make_evaluator(evaluator)
-    settings = load_settings(data_dir=data_dir)
+    settings = given_settings(data_dir=data_dir)
     # A mistake in what was typed should cost no minutes of encoding, and leave no domain behind.
     recordings = {
         role: open_source(source, spacing_m=spacing_m)
@@ -113,7 +112,7 @@ def map_(
 @data_dir_option
 def localize(domain: str, images: tuple[Path, ...], as_json: bool, data_dir: Path | None) -> None:
     """Say where on the route each image was probably taken."""
-    settings = load_settings(data_dir=data_dir)
+    settings = given_settings(data_dir=data_dir)
     with _existing_catalog(settings.data_dir) as catalog:
         active = ActiveMaps(catalog).active(domain)
         judge = EvaluatorPool().evaluator(active.record.evaluator)
@@ -153,7 +152,7 @@ def localize(domain: str, images: tuple[Path, ...], as_json: bool, data_dir: Pat
 @data_dir_option
 def delete(domain: str, data_dir: Path | None) -> None:
     """Delete a domain with everything it holds."""
-    with _existing_catalog(load_settings(data_dir=data_dir).data_dir) as catalog:
+    with _existing_catalog(given_settings(data_dir=data_dir).data_dir) as catalog:
         catalog.delete_domain(domain)
     click.echo(f"domain {domain} is deleted")
 
@@ -164,7 +163,7 @@ def delete(domain: str, data_dir: Path | None) -> None:
 @data_dir_option
 def info(domain: str, as_json: bool, data_dir: Path | None) -> None:
     """Describe a domain and its active map."""
-    with _existing_catalog(load_settings(data_dir=data_dir).data_dir) as catalog:
+    with _existing_catalog(given_settings(data_dir=data_dir).data_dir) as catalog:
         answer = describe_domain(catalog.domain(domain), EvaluatorPool(), ActiveMaps(catalog))
     if as_json:
         write_json(answer.model_dump())

@@ -8,19 +8,60 @@ import click
 
 from deepsimbad.core.relevance import Relevance
 from deepsimbad.evaluators.registry import EvaluatorConfig, EvaluatorKind, ExtractorName, evaluator_config
+from deepsimbad.settings import Settings
+from deepsimbad.settings_sources import TracedSettings, trace_settings
 
 _Command = TypeVar("_Command", bound=Callable[..., Any])
+
+_CONFIG = "deepsimbad.config"
 
 RELEVANCES = click.Choice([relevance.value for relevance in Relevance])
 
 
 def data_dir_option(command: _Command) -> _Command:
-    """`--data-dir`, else $DEEPSIMBAD_DATA_DIR, else ./deepsimbad-data."""
+    """`--data-dir`, else as settings say, else ./deepsimbad-data; with `--config`."""
     return click.option(
         "--data-dir",
         type=click.Path(file_okay=False, path_type=Path),
         help="Folder of domains and maps.  [default: $DEEPSIMBAD_DATA_DIR, else ./deepsimbad-data]",
+    )(config_option(command))
+
+
+def config_option(command: _Command) -> _Command:
+    """`--config FILE`, which `given_settings` reads."""
+    return click.option(
+        "--config",
+        type=click.Path(path_type=Path),
+        expose_value=False,
+        callback=_remember_config,
+        help="TOML file of settings.  [default: $DEEPSIMBAD_CONFIG, else ./deepsimbad.toml if it is there]",
     )(command)
+
+
+def address_options(command: _Command) -> _Command:
+    """`--host` and `--port`."""
+    host = click.option("--host", help="Address to listen on.  [default: $DEEPSIMBAD_HOST, else 127.0.0.1]")
+    port = click.option(
+        "--port", type=int, help="Port to listen on; 0 takes a free one.  [default: $DEEPSIMBAD_PORT, else 8000]"
+    )
+    return host(port(command))
+
+
+def given_settings(**flags: object) -> Settings:
+    """The settings of the command that runs: its flags, the environment, the settings file, the defaults.
+
+    Args:
+        **flags: Settings by name; None counts as not given.
+
+    Raises:
+        SettingsError: The file cannot be read, a name is unknown or a value cannot be used.
+    """
+    return traced_settings(**flags).settings
+
+
+def traced_settings(**flags: object) -> TracedSettings:
+    """As `given_settings`, with the origin of every setting."""
+    return trace_settings(click.get_current_context().meta.get(_CONFIG), **flags)
 
 
 def evaluator_option(command: _Command) -> _Command:
@@ -44,6 +85,10 @@ def spacing_option(command: _Command) -> _Command:
         show_default=True,
         help="Metres between frames of a source without positions.",
     )(command)
+
+
+def _remember_config(context: click.Context, _parameter: click.Parameter, value: Path | None) -> None:
+    context.meta[_CONFIG] = value
 
 
 def _evaluator(_context: click.Context, _parameter: click.Parameter, value: str) -> EvaluatorConfig:

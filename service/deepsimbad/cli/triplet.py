@@ -8,13 +8,12 @@ from typing import Any, TypeVar
 
 import click
 
-from deepsimbad.cli.options import evaluator_option, spacing_option
+from deepsimbad.cli.options import config_option, evaluator_option, given_settings, spacing_option
 from deepsimbad.cli.terminal import write_json
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.registry import EvaluatorConfig, make_evaluator
 from deepsimbad.jobs.encoded_traverse import EncodedTraverse, encode_recording
 from deepsimbad.jobs.progress import Progress
-from deepsimbad.settings import load_settings
 from deepsimbad_client.sources import open_source
 
 READING_STAGES = {"read landmarks": 2.0, "read training": 2.0, "read test": 2.0}
@@ -58,6 +57,7 @@ def triplet_options(command: _Command) -> _Command:
             flag_value=STANDARD_OUTPUT,
             help="Write the result as JSON to FILE; without FILE to standard output.",
         ),
+        config_option,
     )
     return reduce(lambda decorated, option: option(decorated), reversed(options), command)
 
@@ -67,7 +67,7 @@ def read_triplet(
 ) -> Triplet:
     """Read and encode the three recordings; reports READING_STAGES."""
     judge = make_evaluator(evaluator)
-    max_pixels = load_settings().max_pixels
+    max_pixels = given_settings().max_pixels
     traverses = []
     for stage, source in zip(READING_STAGES, (landmarks, training, test), strict=True):
         progress.stage(stage)
