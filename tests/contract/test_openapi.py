@@ -32,6 +32,7 @@ POST /v1/admin/domains/{domain}/remaps
 POST /v1/admin/domains/{domain}/experience
 GET /v1/admin/domains/{domain}/maps
 PUT /v1/admin/domains/{domain}/active-map
+GET /v1/admin/sessions
 GET /v1/admin/jobs
 GET /v1/admin/jobs/{job_id}
 GET /v1/admin/jobs/{job_id}/events

@@ -319,3 +319,68 @@ def test_two_at_once_over_http(client: TestClient) -> None:
     answers = portal.call(both)
     assert sorted(one.json()["n_observations"] for one in answers) == list(range(1, 9))
     assert client.get(path).json()["n_observations"] == 8
+
+
+def test_a_session_begun_twice_under_one_key_is_one(client: TestClient) -> None:
+    make_ready_domain(client, "repeated")
+    key = {"Idempotency-Key": "a-robot's-start"}
+    body = {"seed": 3, "start_position_m": 20}
+
+    def begun(content: dict[str, Any], headers: dict[str, str] = key, domain: str = "repeated") -> httpx2.Response:
+        return client.post(f"/v1/domains/{domain}/sessions", json=content, headers=headers)
+
+    first, again = begun(body), begun(body)
+    assert (first.status_code, again.status_code) == (201, 201)
+    assert first.json() == again.json()
+    assert first.headers["location"] == again.headers["location"] == path_of(first.json())
+    assert begun({**body, "planner": None, "start_std_m": 5.0}).json() == first.json()  # the same, written out
+    listed = client.get("/v1/admin/sessions", params={"domain": "repeated"}).json()["sessions"]
+    assert len(listed) == 1
+
+    refused(begun({"seed": 4}), 422, "idempotency_key_reused")
+    refused(begun({**body, "start_position_m": 1e9}), 422, "idempotency_key_reused")
+    others = [begun(body, {}), begun(body, {"Idempotency-Key": "another"}), begun(body, key, "ready")]
+    assert len({first.json()["session_id"], *(one.json()["session_id"] for one in others)}) == 4
+
+    client.post(f"{path_of(first.json())}/observations", json=RANKS)
+    late = begun(body)
+    assert (late.status_code, late.json()["n_observations"]) == (201, 1)
+    client.delete(path_of(first.json()))
+    refused(begun(body), 410, "ended_session")
+
+
+@pytest.mark.parametrize("key", ["", " ", "a b", "x" * 256, "\x7f"])
+def test_a_key_of_a_session_that_cannot_be_one(client: TestClient, key: str) -> None:
+    answer = client.post("/v1/domains/ready/sessions", json={}, headers={"Idempotency-Key": key})
+    refused(answer, 422, "invalid_request")
+
+
+def test_a_start_repeated_after_a_restart_or_at_once_is_one_session(tmp_path: Path) -> None:
+    begin_under_key = {"json": {}, "headers": {"Idempotency-Key": "once"}}
+    with TestClient(create_app(small_settings(tmp_path))) as before:
+        make_ready_domain(before, "d")
+        first = before.post("/v1/domains/d/sessions", **begin_under_key).json()  # type: ignore[arg-type]
+    with TestClient(create_app(small_settings(tmp_path))) as after:
+        again = after.post("/v1/domains/d/sessions", **begin_under_key)  # type: ignore[arg-type]
+        assert (again.status_code, again.json()) == (201, first)
+
+    async def at_once() -> list[httpx2.Response]:
+        app = create_app(small_settings(tmp_path, max_sessions=9))
+        async with (
+            app.router.lifespan_context(app),
+            httpx2.AsyncClient(transport=httpx2.ASGITransport(app), base_url="http://service") as robot,
+        ):
+            asked = [
+                robot.post("/v1/domains/d/sessions", json={}, headers={"Idempotency-Key": "together"}) for _ in range(8)
+            ]
+            answers = await asyncio.gather(*asked)
+            session = path_of(answers[0].json())
+            seen = await asyncio.gather(*(robot.post(f"{session}/observations", json=RANKS) for _ in range(5)))
+            assert sorted(one.json()["n_observations"] for one in seen) == [1, 2, 3, 4, 5]
+            listed = (await robot.get("/v1/admin/sessions")).json()["sessions"]
+            assert len(listed) == 2
+            return answers
+
+    answers = asyncio.run(at_once())
+    assert {answer.status_code for answer in answers} == {201}
+    assert len({answer.json()["session_id"] for answer in answers}) == 1

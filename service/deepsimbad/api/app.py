@@ -24,6 +24,7 @@ from deepsimbad.api.routes import (
     admin_jobs,
     admin_maps,
     admin_remaps,
+    admin_sessions,
     admin_traverses,
     domains,
     health,
@@ -58,6 +59,7 @@ _ROUTERS = (
     admin_experience,
     admin_jobs,
     admin_maps,
+    admin_sessions,
 )
 _BATCH_PATH = re.compile(r"/v1/admin/domains/[^/]+/traverses/[^/]+/frames")
 _DESCRIPTION = (

@@ -4,6 +4,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+Next = Annotated[str | None, Field(description="Ask for the list `after` this for its next page; null: it ends here.")]
 IndexRange = Annotated[tuple[int, int], Field(description="First and last index of a gap, both inside it.")]
 
 
@@ -156,6 +157,7 @@ class TraverseList(Answer):
     """The traverses of a domain, by name."""
 
     traverses: list[TraverseAnswer]
+    next: Next
 
 
 class FrameAnswer(Answer):
@@ -210,6 +212,7 @@ class JobList(Answer):
     """Jobs, newest first."""
 
     jobs: list[JobAnswer]
+    next: Next
 
 
 class MapAnswer(Answer):
@@ -228,3 +231,4 @@ class MapList(Answer):
     """The versions of a domain's map, newest first."""
 
     maps: list[MapAnswer]
+    next: Next

@@ -4,7 +4,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from deepsimbad.api.schemas import Answer, BeliefAnswer, NextBestViewAnswer, RetrievedAnswer
+from deepsimbad.api.schemas import Answer, BeliefAnswer, Next, NextBestViewAnswer, RetrievedAnswer
 
 
 class SessionAnswer(Answer):
@@ -24,3 +24,21 @@ class ObservationAnswer(SessionAnswer):
 
     timings_ms: Annotated[dict[str, float], Field(description="Milliseconds by stage, and their `total`.")]
     retrieval: Annotated[list[RetrievedAnswer], Field(description="Map images most relevant to this view, best first.")]
+
+
+class ListedSessionAnswer(Answer):
+    """A session in a list, without its belief."""
+
+    session_id: str
+    domain: str
+    map_version: Annotated[int, Field(description="The map it began on and keeps.")]
+    n_observations: Annotated[int, Field(description="Views that were told.")]
+    created_at: Annotated[str, Field(description="ISO 8601, UTC.")]
+    expires_at: Annotated[str, Field(description="When it ends unless something happens to it; ISO 8601, UTC.")]
+
+
+class SessionList(Answer):
+    """Living sessions, newest first."""
+
+    sessions: list[ListedSessionAnswer]
+    next: Next

@@ -8,7 +8,7 @@ from deepsimbad.engine.live_session import LiveSession, Loaded, ended
 from deepsimbad.engine.pinned_maps import PinnedMaps
 from deepsimbad.engine.session_config import SessionConfig
 from deepsimbad.engine.session_state import SessionEngine
-from deepsimbad.errors import DamagedFileError, TooManySessionsError
+from deepsimbad.errors import DamagedFileError, TooManySessionsError, UnknownSessionError
 from deepsimbad.store.session_records import SessionRecord
 from deepsimbad.store.sessions import SessionStore
 
@@ -66,11 +66,18 @@ class SessionRegistry:
         """Put a session in the room made for it, or give the room back."""
         self._n_reserved -= 1
         if live is not None:
-            self._living[live.session_id] = live
+            self._living.setdefault(live.session_id, live)  # a repeated request may have found it on the disk already
 
     @property
     def _is_full(self) -> bool:
         return len(self._living) + self._n_reserved >= self._max_sessions
+
+    async def knows(self, session_id: str) -> bool:
+        """Whether there is a session of that id, or was one lately."""
+        try:
+            return session_id in self._living or bool(await asyncio.to_thread(self._store.find, session_id))
+        except UnknownSessionError:
+            return False
 
     async def find(self, session_id: str) -> LiveSession:
         """A living session.

@@ -23,7 +23,15 @@ from deepsimbad.engine.session_state import SessionEngine
 from deepsimbad.engine.session_view import SessionView, view_of
 from deepsimbad.engine.worker import InferenceWorker
 from deepsimbad.errors import IdempotencyKeyReusedError, InvalidInputError, UnavailableError
-from deepsimbad.store.session_records import IdempotencyKey, JournalRow, ObservedRow, PriorRow, SessionRecord
+from deepsimbad.store.list_page import ListPage
+from deepsimbad.store.session_records import (
+    IdempotencyKey,
+    JournalRow,
+    ListedSession,
+    ObservedRow,
+    PriorRow,
+    SessionRecord,
+)
 from deepsimbad.store.sessions import SessionStore
 
 T = TypeVar("T")
@@ -75,15 +83,25 @@ class Sessions:
         """End the thread of summaries."""
         self._summaries.shutdown()
 
-    async def begin(self, active: ActiveDomain, config: SessionConfig) -> SessionView:
+    async def begin(self, active: ActiveDomain, config: SessionConfig, session_id: str | None = None) -> SessionView:
         """Begin a session on a domain's active map.
+
+        Args:
+            active: The domain and its map.
+            config: How it begins.
+            session_id: Its id, where a repetition of the request would have the same: the session that was begun by
+                the first one is answered then, as it stands. None: a new one.
 
         Raises:
             InvalidInputError: The start or the configuration cannot be.
             TooManySessionsError: As many live as may.
+            IdempotencyKeyReusedError: A session of that id was begun with another configuration.
+            EndedSessionError: The session of that id has ended.
         """
+        if session_id is not None and await self._registry.knows(session_id):
+            return await self._begun_before(session_id, config)
         check_start(active.snapshot.route, config)
-        return await self._finished(self._begin(active, config))
+        return await self._finished(self._begin(active, config, session_id or secrets.token_hex(16)))
 
     async def observe(self, session_id: str, observation: Observation) -> SessionView:
         """Move a session on by a move and the view after it.
@@ -119,6 +137,10 @@ class Sessions:
             return state.step.plan, engine.snapshot.actions_m
         return await self._compute(lambda: engine.localizer.plan(state.belief)), engine.snapshot.actions_m
 
+    async def newest(self, domain: str | None, before: int | None, limit: int) -> ListPage[ListedSession, int]:
+        """A page of the living sessions, of a domain or all, newest first, behind number `before`."""
+        return await asyncio.to_thread(self._store.newest_living, domain, before, limit, self._clock())
+
     async def end(self, session_id: str) -> None:
         """End a session."""
         await self._finished(self._registry.end(await self._registry.find(session_id), DELETED))
@@ -134,12 +156,20 @@ class Sessions:
         await self._finished(self._registry.expire())
         await self._finished(self._registry.purge())
 
-    async def _begin(self, active: ActiveDomain, config: SessionConfig) -> SessionView:
+    async def _begun_before(self, session_id: str, config: SessionConfig) -> SessionView:
+        live = await self._registry.find(session_id)
+        if live.record.config != config.as_dict():
+            raise IdempotencyKeyReusedError(
+                "this idempotency key began a session with another configuration: choose a new one"
+            )
+        return await self.view(session_id)
+
+    async def _begin(self, active: ActiveDomain, config: SessionConfig, session_id: str) -> SessionView:
         await self._registry.reserve()
         begun = None
         try:
             digest, evaluator = await asyncio.to_thread(self._maps.pin, active)
-            snapshot, session_id, now = active.snapshot, secrets.token_hex(16), self._clock()
+            snapshot, now = active.snapshot, self._clock()
             expires_at = now + self._ttl_s
 
             def start() -> Loaded:
@@ -152,10 +182,13 @@ class Sessions:
                 0, session_id, snapshot.domain, snapshot.version, digest, config.as_dict(), now, expires_at, 0, None
             )
             kept = await asyncio.wrap_future(self._store.create(new))
-            begun = LiveSession(kept, expires_at, loaded)
-            return await told
+            if replace(kept, number=0) == new:
+                begun = LiveSession(kept, expires_at, loaded)
+            answer = await told
         finally:
             self._registry.settle(begun)
+        # Else the same request was on its way twice, and the other one was quicker.
+        return answer if begun is not None else await self._begun_before(session_id, config)
 
     async def _observe(self, live: LiveSession, observation: Observation) -> SessionView:
         """Everything in order under the session's lock: describe, compute, write, publish."""

@@ -10,13 +10,15 @@ from sqlite_utils import Database
 
 from deepsimbad.errors import InvalidInputError, UnknownJobError
 from deepsimbad.store.documents import from_json, now, row_reader, to_json
+from deepsimbad.store.list_page import ListPage
 from deepsimbad.store.records import JobRecord, JobState
 
 _SELECT = """
     SELECT job_id, domain, kind, config, state, stage, progress, eta_s, result, error,
-           created_at, started_at, finished_at, n_starts
+           created_at, started_at, finished_at, n_starts, rowid
     FROM job
 """
+_MAX_ROWID = 2**63 - 1
 _JOB_ID = re.compile(r"[0-9a-f]{32}")
 _DOCUMENTS = ("result", "error")
 _FIELDS = ("state", "stage", "progress", "eta_s", *_DOCUMENTS)
@@ -24,7 +26,7 @@ _FIELDS = ("state", "stage", "progress", "eta_s", *_DOCUMENTS)
 
 @row_reader
 def _record(row: tuple[Any, ...]) -> JobRecord:
-    job_id, domain, kind, config, state, stage, progress, eta_s, result, error, *rest = row
+    job_id, domain, kind, config, state, stage, progress, eta_s, result, error, *rest, _ = row
     return JobRecord(
         job_id,
         domain,
@@ -68,6 +70,15 @@ def list_jobs(db: Database, domain: str | None) -> list[JobRecord]:
     if domain is None:
         return [_record(row) for row in db.execute(f"{_SELECT} ORDER BY rowid")]
     return [_record(row) for row in db.execute(f"{_SELECT} WHERE domain = ? ORDER BY rowid", [domain])]
+
+
+def newest(db: Database, domain: str | None, before: int | None, limit: int) -> ListPage[JobRecord, int]:
+    """Jobs of a domain or all, newest first, from the one after the key `before` on."""
+    found = db.execute(
+        f"{_SELECT} WHERE domain = coalesce(?, domain) AND rowid < ? ORDER BY rowid DESC LIMIT ?",
+        [domain, _MAX_ROWID if before is None else before, limit + 1],
+    )
+    return ListPage.of(((row[-1], _record(row)) for row in found), limit)
 
 
 def update(db: Database, job_id: str, fields: Mapping[str, Any]) -> JobRecord:

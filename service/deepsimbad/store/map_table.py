@@ -6,6 +6,7 @@ from sqlite_utils import Database
 
 from deepsimbad.errors import LostActivationError, UnknownMapVersionError
 from deepsimbad.store.documents import from_json, now, row_reader, to_json
+from deepsimbad.store.list_page import ListPage
 from deepsimbad.store.records import MapRecord, MapState
 
 
@@ -62,6 +63,15 @@ def get(db: Database, domain: str, version: int) -> MapRecord:
 def of_domain(db: Database, domain: str) -> list[MapRecord]:
     """Every version of the domain, oldest first."""
     return [_record(row) for row in db.execute(f"{_SELECT} WHERE domain = ? ORDER BY version", [domain])]
+
+
+def newest(db: Database, domain: str, before: int | None, limit: int) -> ListPage[MapRecord, int]:
+    """Versions of the domain, newest first, from the one after version `before` on."""
+    found = db.execute(
+        f"{_SELECT} WHERE domain = ? AND version < ? ORDER BY version DESC LIMIT ?",
+        [domain, _MAX_INTEGER if before is None else before, limit + 1],
+    )
+    return ListPage.of(((record.version, record) for record in map(_record, found)), limit)
 
 
 def seal(db: Database, domain: str, version: int, sha256: str, file_bytes: int, metrics: dict[str, Any]) -> MapRecord:

@@ -35,6 +35,19 @@ class SessionRecord:
 
 
 @dataclass(frozen=True)
+class ListedSession:
+    """A session in a list.
+
+    Attributes:
+        session: As it stands.
+        n_observations: How many views its journal holds.
+    """
+
+    session: SessionRecord
+    n_observations: int
+
+
+@dataclass(frozen=True)
 class IdempotencyKey:
     """By which a request that comes again is known.
 

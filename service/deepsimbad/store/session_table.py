@@ -6,7 +6,10 @@ from sqlite_utils import Database
 
 from deepsimbad.errors import UnknownSessionError
 from deepsimbad.store.documents import from_json, row_reader, to_json
+from deepsimbad.store.list_page import ListPage
 from deepsimbad.store.session_records import SessionRecord
+
+_MAX_NUMBER = 2**63 - 1
 
 _SELECT = """
     SELECT session.number, session_id, domain, map_version, map_sha256, config, created_at,
@@ -24,11 +27,12 @@ def _record(row: tuple[Any, ...]) -> SessionRecord:
 
 
 def insert(db: Database, record: SessionRecord) -> SessionRecord:
-    """Insert a session; its number is given by the file."""
+    """Insert a session, whose number is given by the file; where there is one of that id, it stays and is returned."""
     db.execute(
         """
         INSERT INTO session (session_id, domain, map_version, map_sha256, config, created_at, expires_at)
         VALUES (?, ?, ?, ?, ?, ?, ?)
+        ON CONFLICT (session_id) DO NOTHING
         """,
         [
             record.session_id,
@@ -56,6 +60,22 @@ def get(db: Database, session_id: str) -> SessionRecord:
 def living(db: Database) -> list[SessionRecord]:
     """Every session that has not ended, oldest first."""
     return [_record(row) for row in db.execute(f"{_SELECT} WHERE session.ended_at IS NULL ORDER BY session.number")]
+
+
+def newest_living(
+    db: Database, domain: str | None, before: int | None, limit: int, at: float
+) -> ListPage[SessionRecord, int]:
+    """Sessions of a domain or all that live at a moment, newest first, from the one after number `before` on."""
+    found = db.execute(
+        f"""
+        {_SELECT}
+        WHERE session.ended_at IS NULL AND session.number < ? AND domain = coalesce(?, domain)
+          AND coalesce(latest.expires_at, session.expires_at) > ?
+        ORDER BY session.number DESC LIMIT ?
+        """,
+        [_MAX_NUMBER if before is None else before, domain, at, limit + 1],
+    )
+    return ListPage.of(((record.number, record) for record in map(_record, found)), limit)
 
 
 def end(db: Database, number: int, ending: str, ended_at: float) -> bool:

@@ -16,7 +16,8 @@ from deepsimbad.store.connection import migrate, open_database, use_write_ahead_
 from deepsimbad.store.durable import sync_folder
 from deepsimbad.store.faults import storage_faults
 from deepsimbad.store.group_commit import GroupCommit
-from deepsimbad.store.session_records import JournalRow, SessionRecord, StateSnapshot
+from deepsimbad.store.list_page import ListPage
+from deepsimbad.store.session_records import JournalRow, ListedSession, SessionRecord, StateSnapshot
 from deepsimbad_migrations.session.migrations import migrations
 
 PURGED_AT_ONCE = 1000  # rows
@@ -84,7 +85,7 @@ class SessionStore:
     # Sessions
 
     def create(self, record: SessionRecord) -> Future[SessionRecord]:
-        """Keep a new session; answers with the number that it got."""
+        """Keep a new session; answers with the number that it got, or the session that has this id already."""
         return self._commits.submit(lambda db: session_table.insert(db, record))
 
     def find(self, session_id: str) -> SessionRecord:
@@ -96,6 +97,18 @@ class SessionStore:
         """Every session that has not ended, oldest first."""
         with self._reading() as db:
             return session_table.living(db)
+
+    def newest_living(
+        self, domain: str | None, before: int | None, limit: int, at: float
+    ) -> ListPage[ListedSession, int]:
+        """A page of the sessions that live at a moment, of a domain or all, newest first, behind number `before`.
+
+        Counting views can take a while, so it reads through a connection of its own: no robot waits for a list.
+        """
+        with storage_faults(self._path), open_database(self._path, read_only=True) as db, db.atomic():
+            page = session_table.newest_living(db, domain, before, limit, at)
+            listed = [ListedSession(one, journal_table.n_observations(db, one.number)) for one in page.records]
+            return ListPage(tuple(listed), page.last_key)
 
     def end(self, number: int, ending: str, ended_at: float) -> Future[bool]:
         """End a session ("deleted", "expired"); answers whether it lived until now, and has expired if that is why."""

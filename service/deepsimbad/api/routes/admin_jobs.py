@@ -11,6 +11,7 @@ from fastapi.sse import EventSourceResponse, ServerSentEvent
 from deepsimbad.api.bodies import NAME_PATTERN
 from deepsimbad.api.dependencies import JobId, Running
 from deepsimbad.api.openapi import problems
+from deepsimbad.api.paging import USUALLY_AT_ONCE, AfterJob, Limit, cursor_of, number_of
 from deepsimbad.api.rendering import render_job
 from deepsimbad.api.schemas import JobAnswer, JobList
 from deepsimbad.errors import UnknownJobError
@@ -28,10 +29,12 @@ async def _found(job_id: JobId, running: Running) -> JobRecord:
 async def list_jobs(
     running: Running,
     domain: Annotated[str | None, Query(pattern=NAME_PATTERN, description="Only this domain's; absent: all.")] = None,
+    limit: Limit = USUALLY_AT_ONCE,
+    after: AfterJob = None,
 ) -> JobList:
     """Jobs, newest first."""
-    records = await run_sync(running.catalog.jobs, domain)
-    return JobList(jobs=[render_job(record) for record in reversed(records)])
+    page = await run_sync(running.catalog.newest_jobs, domain, number_of(after), limit)
+    return JobList(jobs=[render_job(record) for record in page.records], next=cursor_of("jobs", page.last_key))
 
 
 @router.get("/{job_id}", responses=problems(404, 422))

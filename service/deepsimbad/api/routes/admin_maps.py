@@ -8,6 +8,7 @@ from fastapi import APIRouter, Request
 from deepsimbad.api.bodies import ActiveMapBody, declare_json, read_json
 from deepsimbad.api.dependencies import DomainName, Running
 from deepsimbad.api.openapi import problems
+from deepsimbad.api.paging import USUALLY_AT_ONCE, AfterMap, Limit, cursor_of, number_of
 from deepsimbad.api.rendering import render_map
 from deepsimbad.api.schemas import MapAnswer, MapList
 from deepsimbad.engine.active_maps import load_snapshot
@@ -20,10 +21,12 @@ log = logging.getLogger(__name__)
 
 
 @router.get("/{domain}/maps", responses=problems(404, 422))
-async def list_maps(domain: DomainName, running: Running) -> MapList:
+async def list_maps(
+    domain: DomainName, running: Running, limit: Limit = USUALLY_AT_ONCE, after: AfterMap = None
+) -> MapList:
     """The history of a domain's map, newest version first."""
-    records = await run_sync(running.catalog.maps, domain)
-    return MapList(maps=[render_map(record) for record in reversed(records)])
+    page = await run_sync(running.catalog.newest_maps, domain, number_of(after), limit)
+    return MapList(maps=[render_map(record) for record in page.records], next=cursor_of("maps", page.last_key))
 
 
 @router.put(

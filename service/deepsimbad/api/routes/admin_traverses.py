@@ -8,8 +8,10 @@ from fastapi import APIRouter, Request, Response
 from deepsimbad.api.bodies import TraverseBody, declare_json, read_json
 from deepsimbad.api.dependencies import DomainName, Running, TraverseName
 from deepsimbad.api.openapi import problems
+from deepsimbad.api.paging import USUALLY_AT_ONCE, AfterTraverse, Limit, cursor_of, name_of
 from deepsimbad.api.schemas import TraverseAnswer, TraverseList
 from deepsimbad.errors import ConflictError, TraverseInUseError, UnknownTraverseError
+from deepsimbad.store.list_page import ListPage
 from deepsimbad.store.traverses import Traverse
 
 router = APIRouter(prefix="/v1/admin/domains/{domain}/traverses", tags=["admin: traverses"])
@@ -47,20 +49,25 @@ async def post_traverse(domain: DomainName, request: Request, response: Response
 
 
 @router.get("", responses=problems(404, 422))
-async def list_traverses(domain: DomainName, running: Running) -> TraverseList:
+async def list_traverses(
+    domain: DomainName, running: Running, limit: Limit = USUALLY_AT_ONCE, after: AfterTraverse = None
+) -> TraverseList:
     """The traverses of a domain, by name."""
     data_dir = running.settings.data_dir
+    first = name_of(after)
 
     def described() -> TraverseList:
         running.catalog.domain(domain)
+        names = [name for name in Traverse.list(data_dir, domain) if first is None or name > first]
+        page = ListPage.of(((name, name) for name in names), limit)
         answers = []
-        for name in Traverse.list(data_dir, domain):
+        for name in page.records:  # a file each, so that those of other pages stay closed
             try:
                 with Traverse.open(data_dir, domain, name) as traverse:
                     answers.append(_describe(traverse))
             except UnknownTraverseError:  # deleted since it was listed
                 continue
-        return TraverseList(traverses=answers)
+        return TraverseList(traverses=answers, next=cursor_of("traverses", page.last_key))
 
     return await run_sync(described)
 
@@ -83,7 +90,7 @@ async def delete_traverse(domain: DomainName, name: TraverseName, running: Runni
 
     def delete() -> None:
         for job in running.catalog.jobs(domain):
-            needed = {job.config.get("training_traverse"), job.config.get("landmark_traverse")}
+            needed = {job.config.get(role) for role in ("training_traverse", "landmark_traverse", "check_traverse")}
             if name in needed and not job.state.is_final:
                 raise TraverseInUseError(
                     f"job {job.job_id} needs traverse {name}: cancel it or wait for its end", job_id=job.job_id

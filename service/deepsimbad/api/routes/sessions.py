@@ -41,11 +41,22 @@ Shortlist = Annotated[
         description="Length of `retrieval` and `top`, up to the number of map images; absent: 10 or all.",
     ),
 ]
+_KEY_PATTERN = r"^[\x21-\x7e]{1,255}$"
 Key = Annotated[
-    Annotated[str, Field(pattern=r"^[\x21-\x7e]{1,255}$")] | None,
+    Annotated[str, Field(pattern=_KEY_PATTERN)] | None,
     Header(
         alias="Idempotency-Key",
         description="The same key with the same observation again counts once, and has the same answer.",
+    ),
+]
+
+
+KeyOfSession = Annotated[
+    Annotated[str, Field(pattern=_KEY_PATTERN)] | None,
+    Header(
+        alias="Idempotency-Key",
+        description="The same key with the same body again begins no second session: the first one is answered, as it "
+        "stands. Choose one that nobody else will, such as a UUID.",
     ),
 ]
 
@@ -56,15 +67,21 @@ Key = Annotated[
     response_model=SessionAnswer,
     responses={
         201: {"headers": {"Location": {"description": "The session.", "schema": {"type": "string"}}}},
-        **problems(404, 409, 413, 415, 422, 429),
+        **problems(404, 409, 410, 413, 415, 422, 429),
     },
     openapi_extra=declare_json(SessionBody),
 )
-async def post_session(domain: DomainName, request: Request, running: Running) -> Response:
+async def post_session(
+    domain: DomainName, request: Request, running: Running, idempotency_key: KeyOfSession = None
+) -> Response:
     """Begin a session on the domain's active map, which it keeps whatever is activated later."""
     active = await running.active(domain)
     config = (await read_json(request, SessionBody)).config()
-    view = await running.sessions.begin(active, config)
+    session_id = None
+    if idempotency_key is not None:
+        # The key alone names the session, so that a repetition finds it after a restart too.
+        session_id = hashlib.sha256(f"session\n{domain}\n{idempotency_key}".encode()).hexdigest()[:32]
+    view = await running.sessions.begin(active, config, session_id)
     body = render_session(view).model_dump_json()
     return Response(body, 201, {"Location": f"/v1/sessions/{view.session_id}"}, JSON)
 
@@ -108,6 +125,7 @@ async def post_observation(
         running.metrics.observed(error.code)
         raise
     answer = render_observation(view, began)
+    request.state.domain = answer.domain
     running.metrics.observed("repeated" if view.is_repeated else "accepted")
     running.metrics.localized(answer.domain, answer.timings_ms, answer.belief.entropy_bits)
     return Response(answer.model_dump_json(), media_type=JSON)
