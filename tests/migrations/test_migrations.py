@@ -14,7 +14,7 @@ import deepsimbad_migrations
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.map_file import read_map
 from deepsimbad.store.records import JobState
-from deepsimbad.store.session_records import PriorRow
+from deepsimbad.store.session_records import ClockRecord, PriorRow
 from deepsimbad.store.sessions import SessionStore
 from deepsimbad.store.traverses import Traverse
 from deepsimbad_migrations.catalog.migrations import migrations as catalog_migrations
@@ -195,6 +195,12 @@ def the_sessions(data_dir: Path) -> Iterator[object]:
         yield store.named(alive.number, "k1")
 
 
+def the_sessions_with_a_clock(data_dir: Path) -> Iterator[object]:
+    yield from the_sessions(data_dir)
+    with SessionStore.open(data_dir) as store:
+        yield store.clock()
+
+
 @pytest.mark.parametrize(
     ("dump", "place", "read", "expected"),
     [
@@ -216,6 +222,18 @@ def the_sessions(data_dir: Path) -> Iterator[object]:
             "sessions.sqlite",
             the_sessions,
             [("a" * 32, {"filter": "grid", "seed": 7}, 3, 4630.0), (2, [0.25, 0.75], [3]), True, (1, b"\x01\x02")],
+        ),
+        (
+            "session_v2",
+            "sessions.sqlite",
+            the_sessions_with_a_clock,
+            [
+                ("a" * 32, {"filter": "grid", "seed": 7}, 3, 4630.0),
+                (2, [0.25, 0.75], [3]),
+                True,
+                (1, b"\x01\x02"),
+                (ClockRecord("b-1", 900.0, 1050.0), 1040.0),
+            ],
         ),
         (
             "map_v1",

@@ -69,3 +69,22 @@ def m001_sessions_and_journal(db: Database) -> None:
         );
         """
     )
+
+
+@migrations()
+def m002_clock(db: Database) -> None:
+    """The one moment that the sessions' clock is carried on from; seconds since 1970.
+
+    `boot` names the run of the operating system, `booted_at` when it began by the sessions' clock, `seen_at` the latest
+    moment noted.
+    """
+    db.executescript(
+        """
+        CREATE TABLE clock (
+            number INTEGER PRIMARY KEY CHECK (number = 1),
+            boot TEXT,
+            booted_at REAL NOT NULL,
+            seen_at REAL NOT NULL
+        );
+        """
+    )

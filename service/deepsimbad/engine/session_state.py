@@ -87,6 +87,19 @@ class SessionEngine:
         step = self.localizer.step(state.belief, query, row.action_m, row.action_std_m)
         return SessionState(row.sequence, step.state, step)
 
+    def followed(self, state: SessionState, row: JournalRow) -> SessionState:
+        """The state after the next row of a journal, which could follow when it was written.
+
+        Raises:
+            DamagedFileError: It is not the next one, or cannot be of this session.
+        """
+        if row.sequence != state.sequence + 1:
+            raise DamagedFileError(f"row {state.sequence + 1} of a session's journal is missing")
+        try:
+            return self.applied(state, row)
+        except (DeepSimbadError, KeyError, TypeError, ValueError, IndexError) as error:
+            raise DamagedFileError(f"a session's journal cannot be followed: {error}") from error
+
     def replayed(self, snapshot: StateSnapshot | None, rows: Sequence[JournalRow]) -> SessionState:
         """The state that a journal leads to; the same bits as when it was written.
 
@@ -98,9 +111,7 @@ class SessionEngine:
             if snapshot is not None:
                 state = SessionState(snapshot.sequence, self.localizer.from_arrays(snapshot.arrays))
             for row in rows:
-                if row.sequence != state.sequence + 1:
-                    raise DamagedFileError(f"row {state.sequence + 1} of a session's journal is missing")
-                state = self.applied(state, row)
+                state = self.followed(state, row)
         except DamagedFileError:
             raise
         except (DeepSimbadError, KeyError, TypeError, ValueError, IndexError) as error:

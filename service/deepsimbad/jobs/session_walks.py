@@ -1,14 +1,15 @@
 """A session's journal and the true positions fed back, as walks that the experience database can learn from."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from deepsimbad.core.known_walk import KnownWalk
 from deepsimbad.core.relevance import Query
+from deepsimbad.engine.truths import checked_truths
 from deepsimbad.errors import ConflictError, InvalidInputError, NoActiveMapError, UnknownSessionError
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.map_file import read_map
@@ -36,7 +37,7 @@ def keep_true_positions(
     session_id: str,
     positions_m: Sequence[float | None],
     received_at: float,
-) -> None:
+) -> NDArray[np.float64] | None:
     """Keep where a session's robot truly was; an ended session may still be told of.
 
     Args:
@@ -46,6 +47,9 @@ def keep_true_positions(
         session_id: The session.
         positions_m: One for every observation; None where it is unknown.
         received_at: Seconds since 1970.
+
+    Returns:
+        What had been kept before, if anything: [n] positions of the first n observations, NaN where unknown.
 
     Raises:
         UnknownDomainError, UnknownSessionError: There is none such, or the session ended long ago.
@@ -57,17 +61,9 @@ def keep_true_positions(
     record = _session_of(store, domain, session_id)
     if active is None:
         raise NoActiveMapError(f"domain {domain} has no active map that could learn")
-    if any(one is not None and not math.isfinite(one) for one in positions_m):
-        raise InvalidInputError("a true position is NaN or infinite; give null where it is unknown")
-    n_observations = store.n_observations(record.number)
-    if len(positions_m) != n_observations:
-        raise InvalidInputError(
-            f"{len(positions_m)} true positions for {n_observations} observations: give one for each",
-            n_observations=n_observations,
-        )
+    known = checked_truths(positions_m, store.n_observations(record.number))
     _check_landmarks(catalog, record, active)
-    known = np.array([math.nan if one is None else one for one in positions_m], np.float64)
-    store.save_true_positions(record.number, known, received_at).result()
+    return store.save_true_positions(record.number, known, received_at).result()
 
 
 def walks_of(store: SessionStore, catalog: Catalog, domain: str, session_id: str) -> list[KnownWalk]:

@@ -44,6 +44,11 @@ class GroupCommit:
         self._thread = threading.Thread(target=self._work, name="commits", daemon=True)
         self._thread.start()
 
+    @property
+    def is_alive(self) -> bool:
+        """Whether the thread is there to commit."""
+        return self._thread.is_alive()
+
     def submit(self, run: Callable[[Database], T]) -> Future[T]:
         """Queue a write.
 
