@@ -17,8 +17,9 @@ from deepsimbad.errors import (
     TraverseInUseError,
     UnknownMapVersionError,
 )
-from deepsimbad.store import domain_table, job_table, key_table, layout, map_table, unfinished
+from deepsimbad.store import domain_table, job_queue, job_table, key_table, layout, map_table, unfinished
 from deepsimbad.store.api_key import ApiKey
+from deepsimbad.store.checkpoints import sweep_checkpoints
 from deepsimbad.store.connection import check_integrity, migrate, open_database, use_write_ahead_log, write_transaction
 from deepsimbad.store.documents import after, from_json, to_json
 from deepsimbad.store.durable import remove_folder, sync_folder
@@ -159,14 +160,14 @@ class Catalog:
 
         Raises:
             UnknownDomainError: There is no such domain.
-            TraverseInUseError: Unfinished work of a living process needs it.
+            TraverseInUseError: A job on it has not ended, or a living process builds a map of it.
         """
         with self._writing() as db:
             domain_table.get(db, name)
-            builders = [owner for domain, _, owner in map_table.building(db) if domain == name]
-            workers = [owner for _, owner in job_table.unfinished(db, name)]
-            if any(is_alive(self._owners, owner) for owner in {*builders, *workers}):
-                raise TraverseInUseError(f"a job still works on domain {name}: cancel it or wait for its end")
+            builders = {owner for domain, _, owner in map_table.building(db) if domain == name}
+            # A job whose process died counts as well: the next service goes on with it.
+            if job_table.unfinished(db, name) or any(is_alive(self._owners, owner) for owner in builders):
+                raise TraverseInUseError(f"a job on domain {name} has not ended: cancel it or wait for its end")
             domain_table.doom(db, name)
         with self._writing() as db:  # from here on a crash is finished at the next start
             self._finish_deletion(db, name)
@@ -238,6 +239,11 @@ class Catalog:
             domain_table.get(db, domain)
             return map_table.get(db, domain, version)
 
+    def map_of_job(self, domain: str, job_id: str) -> MapRecord | None:
+        """The version that a job has sealed, whatever became of it since; raises UnknownDomainError."""
+        made = [record for record in self.maps(domain) if record.metrics.get("job_id") == job_id]
+        return made[-1] if made else None
+
     def map_path(self, domain: str, version: int) -> Path:
         """Where the sealed file of a version lies, or will; raises InvalidInputError."""
         return layout.map_path(self.data_dir, domain, version)
@@ -268,6 +274,26 @@ class Catalog:
         """
         with self._writing() as db:
             return job_table.update(db, job_id, fields)
+
+    def start_job(self, job_id: str) -> JobRecord:
+        """Let a queued job run; one that is not queued any more stays as it is. Raises UnknownJobError."""
+        with self._writing() as db:
+            return job_queue.start(db, job_id)
+
+    def cancel_queued_job(self, job_id: str) -> JobRecord:
+        """Cancel a job that has not begun; any other stays as it is. Raises UnknownJobError."""
+        with self._writing() as db:
+            return job_queue.cancel_queued(db, job_id)
+
+    def give_back_job(self, job_id: str) -> JobRecord:
+        """Let a running job wait for the next service, as this one stops. Raises UnknownJobError."""
+        with self._writing() as db:
+            return job_queue.give_back(db, job_id)
+
+    def waiting_jobs(self) -> list[str]:
+        """The queued jobs of this process by id, oldest first; among them those it took over from dead ones."""
+        with self._reading() as db:
+            return job_queue.waiting(db, self._owner.mark)
 
     def job(self, job_id: str) -> JobRecord:
         """One job; raises UnknownJobError."""
@@ -327,20 +353,29 @@ class Catalog:
     def discard_unfinished(self) -> list[str]:
         """Clear away what dead processes left: call it once at start, before any work.
 
-        Maps that were being built are discarded, jobs that were queued or running become failed (job_interrupted),
-        folders of deleted domains and files that no map version owns are removed. Work of living processes, this one
-        included, stays.
+        Maps that were being built are discarded, jobs that were queued or running wait for this process
+        (`waiting_jobs`), folders of deleted domains, checkpoints of ended jobs and files that no map version owns are
+        removed. A job that was started too often, and its service died each time, fails (job_interrupted). Work of
+        living processes, this one included, stays.
 
         Returns:
-            One line for each thing discarded, for the log.
+            One line for each thing done, for the log.
         """
         with self._writing() as db:
             lines = [
-                *unfinished.fail_abandoned_jobs(db, self._owners),
+                *unfinished.take_over_abandoned_jobs(db, self._owners, self._owner.token),
                 *unfinished.discard_abandoned_maps(db, self.data_dir, self._owners),
                 *unfinished.remove_orphans(db, self.data_dir),
             ]
+            unended = {job_id for job_id, _ in job_table.unfinished(db)}
+            swept = sweep_checkpoints(self.data_dir, unended)
+            lines += [f"removed the checkpoints of the ended job {job_id}" for job_id in swept]
             for name in domain_table.doomed(db):
                 self._finish_deletion(db, name)
                 lines.append(f"removed the folder of the deleted domain {name}")
         return lines
+
+    def discard_abandoned_maps(self) -> list[str]:
+        """Discard the maps that dead processes were building; returns one line for each."""
+        with self._writing() as db:
+            return list(unfinished.discard_abandoned_maps(db, self.data_dir, self._owners))

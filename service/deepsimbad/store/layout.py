@@ -8,6 +8,7 @@ from deepsimbad.errors import InvalidInputError
 NAME_PATTERN = r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}"
 _NAME = re.compile(NAME_PATTERN)
 _MAX_VERSION = 2**53
+_JOB_ID = re.compile(r"[0-9a-f]{32}")
 
 
 def is_name(name: str) -> bool:
@@ -42,6 +43,18 @@ def sessions_path(data_dir: Path) -> Path:
 def owners_folder(data_dir: Path) -> Path:
     """The folder of the lock files that tell living processes from dead ones."""
     return data_dir / "owners"
+
+
+def jobs_folder(data_dir: Path) -> Path:
+    """The folder of what unfinished jobs have made so far."""
+    return data_dir / "jobs"
+
+
+def job_folder(data_dir: Path, job_id: str) -> Path:
+    """The folder of one unfinished job; raises InvalidInputError."""
+    if _JOB_ID.fullmatch(job_id) is None:
+        raise InvalidInputError("a job is named by 32 hexadecimal digits")
+    return jobs_folder(data_dir) / job_id
 
 
 def domains_folder(data_dir: Path) -> Path:

@@ -26,6 +26,11 @@ class Owner:
         self._token = secrets.token_hex(16)
         self._descriptor: int | None = None
 
+    @property
+    def mark(self) -> str:
+        """The mark, whether anything carries it yet or not."""
+        return self._token
+
     def token(self) -> str:
         """The mark to write beside unfinished work; alive until `release`."""
         path = self._folder / self._token

@@ -1,30 +1,44 @@
 """What a crash leaves behind, and how it is cleared away. Every function stands inside a write transaction."""
 
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from sqlite_utils import Database
 
 from deepsimbad.errors import JobInterruptedError
-from deepsimbad.store import domain_table, job_table, layout, map_table, ownership, traverses
+from deepsimbad.store import domain_table, job_queue, job_table, layout, map_table, ownership, traverses
 from deepsimbad.store.durable import remove_database
 from deepsimbad.store.records import JobState, MapState
 
 SEALING_SUFFIX = ".sealing"
+MAX_STARTS = 3  # of a job whose service died each time: it may be what kills it
 _MAP_FILE = re.compile(r"(\d{6,})\.(sqlite|building|sealing)(?:-journal|-wal|-shm)?")
 
 
-def fail_abandoned_jobs(db: Database, owners: Path) -> Iterator[str]:
-    """End the queued and running jobs of dead processes."""
-    for job_id, owner in job_table.unfinished(db):
-        if not ownership.is_alive(owners, owner):
+def take_over_abandoned_jobs(db: Database, owners: Path, owner: Callable[[], str]) -> Iterator[str]:
+    """Let the queued and running jobs of dead processes wait again; one that died at every start fails.
+
+    Args:
+        db: The catalog.
+        owners: The folder of lock files.
+        owner: Gives the mark of this process; asked only where there is such a job.
+    """
+    for job_id, before in job_table.unfinished(db):
+        if ownership.is_alive(owners, before):
+            continue
+        job = job_table.get(db, job_id)
+        if job.state is JobState.RUNNING and job.n_starts >= MAX_STARTS:
             error = {
                 "code": JobInterruptedError.code,
-                "message": "the process that ran the job ended before the job did: start it again",
+                "message": f"it was started {job.n_starts} times and the service died each time",
+                "n_starts": job.n_starts,
             }
             job_table.update(db, job_id, {"state": JobState.FAILED, "error": error, "eta_s": None})
-            yield f"job {job_id} was interrupted"
+            yield f"job {job_id} failed: {error['message']}"
+        else:
+            job_queue.take_over(db, job_id, owner())
+            yield f"job {job_id} was interrupted and waits again"
 
 
 def discard_abandoned_maps(db: Database, data_dir: Path, owners: Path) -> Iterator[str]:
