@@ -43,6 +43,7 @@ from deepsimbad.evaluators.registry import EvaluatorKind
 from deepsimbad.jobs.runner import JobRunner
 from deepsimbad.settings import Settings
 from deepsimbad.store.catalog import Catalog
+from deepsimbad.store.service_lock import ServiceLock
 from deepsimbad.store.sessions import SessionStore
 
 log = logging.getLogger(__name__)
@@ -124,6 +125,7 @@ async def _sweep(live: Sessions, every_s: float) -> None:
 
 def _start(settings: Settings, metrics: Metrics, parts: ExitStack) -> Services:
     """Open everything; `parts` closes it again, last opened first."""
+    parts.enter_context(ServiceLock.take(settings.data_dir, f"{settings.host}:{settings.port}"))
     catalog = parts.enter_context(Catalog.open(settings.data_dir))
     for line in catalog.discard_unfinished():
         log.warning("discarded at start", extra={"what": line})

@@ -21,6 +21,7 @@ from deepsimbad.store import domain_table, job_queue, job_table, key_table, layo
 from deepsimbad.store.api_key import ApiKey
 from deepsimbad.store.checkpoints import sweep_checkpoints
 from deepsimbad.store.connection import check_integrity, migrate, open_database, use_write_ahead_log, write_transaction
+from deepsimbad.store.data_dir import make_data_dir
 from deepsimbad.store.documents import after, from_json, to_json
 from deepsimbad.store.durable import remove_folder, sync_folder
 from deepsimbad.store.faults import storage_faults
@@ -57,8 +58,8 @@ class Catalog:
     def open(cls, data_dir: Path) -> Self:
         """Open the catalog of a data directory; makes both where they are missing."""
         path = layout.catalog_path(data_dir)
+        make_data_dir(data_dir)
         with storage_faults(path), ExitStack() as on_error:
-            data_dir.mkdir(parents=True, exist_ok=True)
             domains = layout.domains_folder(data_dir)
             has_domains = domains.is_dir() and any(domains.iterdir())  # looked at before the rows: they come first
             db = open_database(path, create=True)

@@ -23,6 +23,9 @@ _REASONS_BY_ERRNO = {
     errno.EMFILE: "too_many_open_files",
     errno.ENFILE: "too_many_open_files",
     errno.ENOENT: "missing",
+    errno.ENOLCK: "no_locks",
+    errno.EOPNOTSUPP: "no_locks",
+    errno.ENOSYS: "no_locks",
 }
 _REASONS_BY_SQLITE = {  # primary result codes
     sqlite3.SQLITE_FULL: "disk_full",
@@ -47,6 +50,7 @@ _SENTENCES = {
     "too_many_open_files": "too many files are open",
     "out_of_memory": "no memory is left",
     "closed": "it is closed",
+    "no_locks": "its file system locks no files: keep the data directory on a local disk",
 }
 
 
@@ -68,8 +72,12 @@ def storage_faults(path: Path, damaged: type[DamagedFileError | DamagedMapError]
     except sqlite3.Error as error:
         raise _from_sqlite(error, path, damaged) from error
     except OSError as error:
-        reason = _REASONS_BY_ERRNO.get(error.errno or 0, "io_error")
-        raise _unavailable(path, reason) from error
+        raise _unavailable(path, reason_of(error)) from error
+
+
+def reason_of(error: OSError) -> str:
+    """The word for what the system answered: disk_full, read_only, missing, ...; else io_error."""
+    return _REASONS_BY_ERRNO.get(error.errno or 0, "io_error")
 
 
 def _from_sqlite(error: sqlite3.Error, path: Path, damaged: type[DamagedFileError | DamagedMapError]) -> Exception:

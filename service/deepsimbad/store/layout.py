@@ -40,6 +40,11 @@ def sessions_path(data_dir: Path) -> Path:
     return data_dir / "sessions.sqlite"
 
 
+def service_lock_path(data_dir: Path) -> Path:
+    """The file that the one service of a data directory holds locked."""
+    return data_dir / "service.lock"
+
+
 def owners_folder(data_dir: Path) -> Path:
     """The folder of the lock files that tell living processes from dead ones."""
     return data_dir / "owners"

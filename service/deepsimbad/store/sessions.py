@@ -13,6 +13,7 @@ from sqlite_utils import Database
 
 from deepsimbad.store import journal_table, layout, session_table
 from deepsimbad.store.connection import migrate, open_database, use_write_ahead_log
+from deepsimbad.store.data_dir import make_data_dir
 from deepsimbad.store.durable import sync_folder
 from deepsimbad.store.faults import storage_faults
 from deepsimbad.store.group_commit import GroupCommit
@@ -47,8 +48,8 @@ class SessionStore:
     def open(cls, data_dir: Path, on_commit: Callable[[int], None] = lambda _: None) -> Self:
         """Open the sessions of a data directory; makes the file where it is missing."""
         path = layout.sessions_path(data_dir)
+        make_data_dir(data_dir)
         with storage_faults(path), ExitStack() as on_error:
-            data_dir.mkdir(parents=True, exist_ok=True)
             writing = open_database(path, create=True)
             on_error.callback(writing.close)
             use_write_ahead_log(writing)
