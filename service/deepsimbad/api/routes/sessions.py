@@ -79,8 +79,10 @@ async def post_session(
     config = (await read_json(request, SessionBody)).config()
     session_id = None
     if idempotency_key is not None:
-        # The key alone names the session, so that a repetition finds it after a restart too.
-        session_id = hashlib.sha256(f"session\n{domain}\n{idempotency_key}".encode()).hexdigest()[:32]
+        # The id follows from the key, so that a repetition finds the session after a restart too. Whoever holds another
+        # API key has other sessions, though the words they choose be the same.
+        asker = getattr(request.state, "key_id", "")
+        session_id = hashlib.sha256(f"session\n{asker}\n{domain}\n{idempotency_key}".encode()).hexdigest()[:32]
     view = await running.sessions.begin(active, config, session_id)
     body = render_session(view).model_dump_json()
     return Response(body, 201, {"Location": f"/v1/sessions/{view.session_id}"}, JSON)
