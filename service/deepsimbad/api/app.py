@@ -34,12 +34,15 @@ from deepsimbad.api.routes import (
 from deepsimbad.engine.active_maps import ActiveMaps
 from deepsimbad.engine.evaluator_pool import EvaluatorPool
 from deepsimbad.engine.open_traverses import OpenTraverses
+    truths,
 from deepsimbad.engine.pinned_maps import PinnedMaps
 from deepsimbad.engine.sessions import Sessions
 from deepsimbad.engine.warm_up import warm_up
 from deepsimbad.engine.worker import InferenceWorker
 from deepsimbad.errors import DeepSimbadError
 from deepsimbad.evaluators.registry import EvaluatorKind
+from deepsimbad.engine.steady_clock import SteadyClock
+from deepsimbad.engine.truths import Truths
 from deepsimbad.jobs.runner import JobRunner
 from deepsimbad.settings import Settings
 from deepsimbad.store.catalog import Catalog
@@ -58,6 +61,7 @@ _ROUTERS = (
     admin_frames,
     admin_remaps,
     admin_experience,
+    truths,
     admin_jobs,
     admin_maps,
     admin_sessions,
@@ -103,7 +107,8 @@ def _lifespan(settings: Settings, metrics: Metrics) -> Callable[[FastAPI], Abstr
                 app.state.startup_error = error  # the server only reports that there was one
                 raise
             app.state.services = services
-            sweeping = asyncio.create_task(_sweep(services.sessions, settings.session_sweep_s))
+            sweeping = asyncio.create_task(_sweep(services, settings.session_sweep_s))
+            following = asyncio.create_task(keys.follow())
             yield
             sweeping.cancel()
             services.stopping.set()
@@ -113,17 +118,19 @@ def _lifespan(settings: Settings, metrics: Metrics) -> Callable[[FastAPI], Abstr
     return run
 
 
-async def _sweep(live: Sessions, every_s: float) -> None:
-    """End sessions as they expire, so that their memory is free though nobody asks."""
+async def _sweep(services: Services, every_s: float) -> None:
+    """End sessions as they expire, so that their memory is free though nobody asks; note the time they live by."""
     while True:
         await asyncio.sleep(every_s)
         try:
-            await live.sweep()
+            await services.sessions.sweep()
+            if services.sessions.n_living:
+                await asyncio.wrap_future(services.session_store.note_clock(services.clock.record()))
         except DeepSimbadError:
             log.exception("expired sessions could not be ended")
 
 
-def _start(settings: Settings, metrics: Metrics, parts: ExitStack) -> Services:
+def _start(settings: Settings, metrics: Metrics, keys: KeyRing, parts: ExitStack) -> Services:
     """Open everything; `parts` closes it again, last opened first."""
     parts.enter_context(ServiceLock.take(settings.data_dir, f"{settings.host}:{settings.port}"))
     catalog = parts.enter_context(Catalog.open(settings.data_dir))
@@ -141,7 +148,7 @@ def _start(settings: Settings, metrics: Metrics, parts: ExitStack) -> Services:
     store = parts.enter_context(SessionStore.open(settings.data_dir, metrics.committed))
     live = Sessions(
         store,
-        PinnedMaps(catalog, active_maps, evaluators),
+        pinned_maps,
         worker,
         ttl_s=settings.session_ttl_s,
         max_sessions=settings.max_sessions,
@@ -163,6 +170,8 @@ def _start(settings: Settings, metrics: Metrics, parts: ExitStack) -> Services:
     log.info(
         "ready",
         extra={
+    clock = SteadyClock.of(store)
+    pinned_maps = PinnedMaps(catalog, active_maps, evaluators)
             "n_domains": len(catalog.domains()),
             "n_maps": active_maps.n_loaded,
             "n_sessions": live.n_living,
@@ -170,6 +179,7 @@ def _start(settings: Settings, metrics: Metrics, parts: ExitStack) -> Services:
         },
     )
     return Services(
+        clock=clock,
         settings=settings,
         metrics=metrics,
         catalog=catalog,
@@ -201,3 +211,5 @@ def _version() -> str:
         return version("deep-simbad")
     except PackageNotFoundError:  # run from a source tree
         return "0"
+        truths=Truths(store, pinned_maps, worker, clock),
+        clock=clock,

@@ -17,6 +17,8 @@ from deepsimbad.engine.active_maps import ActiveDomain, ActiveMaps
 from deepsimbad.engine.evaluator_pool import EvaluatorPool
 from deepsimbad.engine.open_traverses import OpenTraverses
 from deepsimbad.engine.sessions import Sessions
+from deepsimbad.engine.steady_clock import SteadyClock
+from deepsimbad.engine.truths import Truths
 from deepsimbad.engine.worker import InferenceWorker, Priority
 from deepsimbad.evaluators.base import Image
 from deepsimbad.evaluators.image import decode_image
@@ -44,6 +46,8 @@ class Services:
         open_traverses: Files kept open while frames arrive.
         sessions: Live beliefs.
         session_store: Their file.
+        truths: What their beliefs were worth.
+        clock: What they live by.
         worker: Where encoding and scoring run.
         runner: Where jobs run.
         damaged_at_start: Domains whose active map could not be loaded at start.
@@ -60,6 +64,8 @@ class Services:
     open_traverses: OpenTraverses
     sessions: Sessions
     session_store: SessionStore
+    truths: Truths
+    clock: SteadyClock
     worker: InferenceWorker
     runner: JobRunner
     damaged_at_start: tuple[str, ...] = ()

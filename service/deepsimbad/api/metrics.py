@@ -1,11 +1,12 @@
 """What Prometheus scrapes: one registry per application, so that two in one process do not mix."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
 from prometheus_client.exposition import CONTENT_TYPE_LATEST
 
 _LATENCY_BUCKETS_S = (0.001, 0.002, 0.004, 0.008, 0.016, 0.032, 0.064, 0.125, 0.25, 0.5, 1, 2, 4, 8, 30)
+_PERCENT_BUCKETS = (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 30, 40, 50, 75, 100)
 _BATCH_BUCKETS = (1, 2, 4, 8, 16, 32, 64, 128, 256)
 
 
@@ -45,6 +46,14 @@ class Metrics:
             "Entropy of the belief after one view: high when the map no longer tells places apart.",
             ["domain"],
             buckets=tuple(range(0, 25, 2)),
+            registry=self._registry,
+        )
+        self._live_anr_percent = Histogram(
+            "deepsimbad_live_anr_percent",
+            "Normalised rank of the true map image in a session's belief, in percent, once the truth was told: 0 is "
+            "perfect, 50 chance.",
+            ["domain"],
+            buckets=_PERCENT_BUCKETS,
             registry=self._registry,
         )
         self._observations = Counter(
@@ -92,6 +101,12 @@ class Metrics:
             self._stage_seconds.labels(stage).observe(milliseconds / 1000)
         self._entropy_bits.labels(domain).observe(entropy_bits)
 
+    def fed_back(self, domain: str, rank_shares: Iterable[float]) -> None:
+        """Record where beliefs had placed the truth: shares of the map, 0..1, one for every observation."""
+        ranks = self._live_anr_percent.labels(domain)
+        for share in rank_shares:
+            ranks.observe(100 * share)
+
     def observed(self, outcome: str) -> None:
         """Count an observation of a session: "accepted", "repeated" or an error's code."""
         self._observations.labels(outcome).inc()
@@ -102,7 +117,8 @@ class Metrics:
 
     def forget_domain(self, domain: str) -> None:
         """Drop what is kept by a domain's name, so that deleted domains do not pile up."""
-        self._entropy_bits.remove_by_labels({"domain": domain})
+        for histogram in (self._entropy_bits, self._live_anr_percent):
+            histogram.remove_by_labels({"domain": domain})
 
     def render(self) -> bytes:
         """The text exposition."""

@@ -46,10 +46,9 @@ class PriorBody(JsonBody):
     std_m: Annotated[StrictFloat, Field(description="Standard deviation, above 0.")]
 
 
-class ExperienceBody(JsonBody):
+class TruthsBody(JsonBody):
     """Where the robot truly was, known later."""
 
-    session_id: Name
     true_positions_m: Annotated[
         list[StrictFloat | None],
         Field(
@@ -60,4 +59,10 @@ class ExperienceBody(JsonBody):
     ]
 
 
-DECLARED_SESSION_BODIES: tuple[type[JsonBody], ...] = (SessionBody, PriorBody, ExperienceBody)
+class ExperienceBody(TruthsBody):
+    """Where the robot of a session truly was."""
+
+    session_id: Name
+
+
+DECLARED_SESSION_BODIES: tuple[type[JsonBody], ...] = (SessionBody, PriorBody, TruthsBody, ExperienceBody)

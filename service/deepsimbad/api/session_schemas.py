@@ -42,3 +42,20 @@ class SessionList(Answer):
 
     sessions: list[ListedSessionAnswer]
     next: Next
+
+
+class TruthsAnswer(Answer):
+    """How well a session knew where its robot was."""
+
+    n_scored: Annotated[int, Field(description="Observations whose true position is known.", ge=0)]
+    n_left_out: Annotated[int, Field(description="Observations whose true position is unknown.", ge=0)]
+    anr: Annotated[
+        float | None,
+        Field(
+            description="Averaged normalised rank of the true map image in the belief, in percent: 0 is perfect, 50 "
+            "chance; null where no true position is known.",
+            ge=0,
+            le=100,
+        ),
+    ]
+    map_version: Annotated[int, Field(description="The map that the session is pinned to.")]

@@ -119,12 +119,7 @@ class SessionRegistry:
             record: The session.
             until: The last row that counts; None: all of them.
         """
-        snapshot, evaluator = self._maps.take(record.domain, record.map_version, record.map_sha256)
-        try:
-            config = SessionConfig.from_dict(record.config)
-        except (KeyError, TypeError, ValueError) as error:
-            raise DamagedFileError(f"session {record.session_id} cannot be read: {error}") from error
-        engine = SessionEngine.of(config, snapshot, evaluator)
+        engine = engine_of(record, self._maps)
         last = self._store.find(record.session_id).n_events if until is None else until
         return Loaded(engine, engine.replayed(*self._store.history(record.number, last)))
 
@@ -161,6 +156,21 @@ class SessionRegistry:
         """Forget what ended long ago."""
         while await asyncio.wrap_future(self._store.purge(self._clock() - REMEMBERED_S)):
             pass
+
+
+def engine_of(record: SessionRecord, maps: PinnedMaps) -> SessionEngine:
+    """What moves a session on, whether it lives or has ended; may read files.
+
+    Raises:
+        RetiredMapError: Its map is no more.
+        DamagedMapError, DamagedFileError: The map or the session cannot be read.
+    """
+    snapshot, evaluator = maps.take(record.domain, record.map_version, record.map_sha256)
+    try:
+        config = SessionConfig.from_dict(record.config)
+    except (KeyError, TypeError, ValueError) as error:
+        raise DamagedFileError(f"session {record.session_id} cannot be read: {error}") from error
+    return SessionEngine.of(config, snapshot, evaluator)
 
 
 def _living(record: SessionRecord) -> LiveSession:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sqlite_utils import Database
 
-from deepsimbad.store import journal_table, layout, session_table
+from deepsimbad.store import clock_table, journal_table, layout, session_table
 from deepsimbad.store.connection import migrate, open_database, use_write_ahead_log
 from deepsimbad.store.data_dir import make_data_dir
 from deepsimbad.store.durable import sync_folder
@@ -82,6 +82,22 @@ class SessionStore:
         """Raise what keeps the file from being read."""
         with self._reading() as db:
             db.execute("SELECT number FROM session LIMIT 1").fetchall()
+
+    @property
+    def commits(self) -> bool:
+        """Whether the thread that writes is alive."""
+        return self._commits.is_alive
+
+    # Their clock
+
+    def clock(self) -> tuple[ClockRecord | None, float | None]:
+        """The moment that was noted last, and when the last thing happened that the sessions tell of."""
+        with self._reading() as db:
+            return clock_table.read(db), clock_table.latest_event(db)
+
+    def note_clock(self, record: ClockRecord) -> Future[None]:
+        """Note a moment, in place of the one before."""
+        return self._commits.submit(lambda db: clock_table.save(db, record))
 
     # Sessions
 
@@ -154,6 +170,11 @@ class SessionStore:
         with self._lock, storage_faults(self._path):  # one statement needs no transaction, and this is on the hot path
             return journal_table.named(self._db, number, key)
 
+    def journal_part(self, number: int, after: int, until: int) -> list[JournalRow]:
+        """The rows after one, up to and with another, in order."""
+        with self._reading() as db:
+            return journal_table.read(db, number, after, until)
+
     # Experience
 
     def n_observations(self, number: int) -> int:
@@ -161,9 +182,17 @@ class SessionStore:
         with self._reading() as db:
             return journal_table.n_observations(db, number)
 
-    def save_true_positions(self, number: int, position_m: NDArray[np.float64], received_at: float) -> Future[None]:
-        """Keep where the robot truly was at every observation of a session."""
-        return self._commits.submit(lambda db: journal_table.save_true_positions(db, number, position_m, received_at))
+    def save_true_positions(
+        self, number: int, position_m: NDArray[np.float64], received_at: float
+    ) -> Future[NDArray[np.float64] | None]:
+        """Keep where the robot truly was at every observation of a session; answers with what was kept before."""
+
+        def write(db: Database) -> NDArray[np.float64] | None:
+            before = journal_table.true_positions(db, number)
+            journal_table.save_true_positions(db, number, position_m, received_at)
+            return before
+
+        return self._commits.submit(write)
 
     def true_positions(self, number: int) -> NDArray[np.float64] | None:
         """What was fed back of a session, one position for every observation."""

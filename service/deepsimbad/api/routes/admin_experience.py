@@ -1,9 +1,11 @@
 """Feeding back where a session's robot truly was."""
 
-import time
+import logging
 
+import numpy as np
 from anyio.to_thread import run_sync
 from fastapi import APIRouter, Request, Response
+from numpy.typing import NDArray
 
 from deepsimbad.api.bodies import declare_json, read_json
 from deepsimbad.api.dependencies import DomainName, Running
@@ -11,7 +13,10 @@ from deepsimbad.api.openapi import problems
 from deepsimbad.api.rendering import render_job
 from deepsimbad.api.schemas import JobAnswer
 from deepsimbad.api.session_bodies import ExperienceBody
+from deepsimbad.errors import DeepSimbadError
 from deepsimbad.jobs.session_walks import ExperienceConfig, keep_true_positions
+
+log = logging.getLogger(__name__)
 
 router = APIRouter(prefix="/v1/admin/domains", tags=["admin: maps"])
 
@@ -29,15 +34,22 @@ async def post_experience(domain: DomainName, request: Request, response: Respon
     """Let the next map version learn from a session, whose true positions are known by now, as a job.
 
     The next version is the active one with a better experience database; the session may have ended up to a day ago.
+    What it tells of the live answers counts as it does for `truths`.
     """
     body = await read_json(request, ExperienceBody)
 
-    def submit() -> JobAnswer:
-        keep_true_positions(
-            running.session_store, running.catalog, domain, body.session_id, body.true_positions_m, time.time()
+    def submit() -> tuple[JobAnswer, NDArray[np.float64] | None]:
+        before_m = keep_true_positions(
+            running.session_store, running.catalog, domain, body.session_id, body.true_positions_m, running.clock()
         )
-        return render_job(running.runner.submit(domain, ExperienceConfig(body.session_id)))
+        return render_job(running.runner.submit(domain, ExperienceConfig(body.session_id))), before_m
 
-    answer = await run_sync(submit)
+    answer, before_m = await run_sync(submit)
+    try:
+        ranked = await running.truths.rank(body.session_id, body.true_positions_m)
+    except DeepSimbadError as error:  # the job is on its way all the same
+        log.warning("truths could not be ranked: %s", error, extra={"domain": domain, "session_id": body.session_id})
+    else:
+        await run_sync(running.metrics.fed_back, domain, ranked.new_since(before_m).tolist())
     response.headers["Location"] = f"/v1/admin/jobs/{answer.job_id}"
     return answer

@@ -1,0 +1,144 @@
+"""`POST /v1/sessions/{session_id}/truths`: how good the live answers were."""
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from starlette.testclient import TestClient
+
+from deepsimbad.api.app import create_app
+
+from .conftest import N_READY, make_ready_domain, ready_encodings, remap, small_settings, wait_for
+
+STEP_M = 4.0
+
+
+@pytest.fixture
+def service(tmp_path: Path) -> Iterator[TestClient]:
+    with TestClient(create_app(small_settings(tmp_path)), raise_server_exceptions=False) as client:
+        make_ready_domain(client, "ready")
+        yield client
+
+
+def walked(client: TestClient, n_views: int = 5) -> tuple[str, list[float], list[float]]:
+    """A session that drives along the map itself, where it was, and the rank share of the truth after every view."""
+    session_id = client.post("/v1/domains/ready/sessions", json={}).json()["session_id"]
+    shares = []
+    for view in range(n_views):
+        body = {"encoding": (ready_encodings()[2 * view] + 0.8).tolist()}
+        moved = client.post(f"/v1/sessions/{session_id}/observations?action_m={STEP_M}", json=body)
+        assert moved.status_code == 200, moved.text
+        shown = client.get(f"/v1/sessions/{session_id}?shortlist={N_READY}").json()["belief"]["top"]
+        mass = {place["map_image"]: place["mass"] for place in shown}
+        better = sum(other > mass[2 * view] for other in mass.values())
+        tied = sum(other == mass[2 * view] for other in mass.values()) - 1
+        shares.append((better + tied / 2) / N_READY)
+    return session_id, [STEP_M * view for view in range(n_views)], shares
+
+
+def told(client: TestClient, session_id: str, positions_m: list[Any]) -> Any:
+    answer = client.post(f"/v1/sessions/{session_id}/truths", json={"true_positions_m": positions_m})
+    assert answer.status_code == 200, answer.text
+    return answer.json()
+
+
+def counted(client: TestClient) -> tuple[int, float]:
+    """How many observations the metric has counted, and their ranks' sum in percent."""
+    text = client.get("/metrics").text
+    found = dict(re.findall(r'^deepsimbad_live_anr_percent_(count|sum)\{domain="ready"\} (\S+)$', text, re.MULTILINE))
+    return int(float(found.get("count", 0))), float(found.get("sum", 0))
+
+
+def test_the_answer_is_the_anr_of_the_beliefs_that_were_answered(service: TestClient) -> None:
+    session_id, positions_m, shares = walked(service)
+    assert len(set(shares)) > 1, "else nothing is shown"
+    expected = 100 * float(np.mean(shares))
+    answer = told(service, session_id, positions_m)
+    assert answer == {"n_scored": 5, "n_left_out": 0, "anr": pytest.approx(expected), "map_version": 1}
+    assert counted(service) == (5, pytest.approx(100 * sum(shares)))
+    some = told(service, session_id, [None, *positions_m[1:3], None, None])
+    assert some == {"n_scored": 2, "n_left_out": 3, "anr": pytest.approx(50 * sum(shares[1:3])), "map_version": 1}
+    none = told(service, session_id, [None] * 5)
+    assert none == {"n_scored": 0, "n_left_out": 5, "anr": None, "map_version": 1}
+
+
+def test_an_observation_is_counted_once(service: TestClient) -> None:
+    session_id, positions_m, shares = walked(service)
+    told(service, session_id, [*positions_m[:3], None, None])
+    assert counted(service) == (3, pytest.approx(100 * sum(shares[:3])))
+    told(service, session_id, [*positions_m[:3], None, None])
+    assert counted(service)[0] == 3
+    told(service, session_id, positions_m)
+    assert counted(service) == (5, pytest.approx(100 * sum(shares)))
+    service.post(f"/v1/sessions/{session_id}/observations", json={"ranked_landmarks": [1]})
+    told(service, session_id, [*positions_m, 16.0])
+    assert counted(service)[0] == 6
+    assert service.get(f"/v1/sessions/{session_id}").json()["n_observations"] == 6, "telling moves nothing"
+
+
+def test_experience_counts_as_well_and_the_same_positions_only_once(service: TestClient) -> None:
+    session_id, positions_m, shares = walked(service)
+    service.delete(f"/v1/sessions/{session_id}")
+    body = {"session_id": session_id, "true_positions_m": positions_m}
+    job = service.post("/v1/admin/domains/ready/experience", json=body).json()
+    assert counted(service) == (5, pytest.approx(100 * sum(shares)))
+    told(service, session_id, positions_m)
+    service.post("/v1/admin/domains/ready/experience", json=body)
+    assert counted(service)[0] == 5
+    assert wait_for(service, job["job_id"])["state"] == "succeeded"
+
+
+def test_the_season_may_have_turned_meanwhile(service: TestClient) -> None:
+    """Another map serves, with other landmarks: the session's own still tells."""
+    session_id, positions_m, shares = walked(service)
+    remap(service, "ready", training_traverse="drive", landmark_traverse="drive", n_landmarks=7)
+    service.delete(f"/v1/sessions/{session_id}")
+    answer = told(service, session_id, positions_m)
+    assert answer["map_version"] == 1
+    assert answer["anr"] == pytest.approx(100 * float(np.mean(shares)))
+
+
+def test_a_deleted_domain_takes_its_series_along(service: TestClient) -> None:
+    session_id, positions_m, _ = walked(service)
+    told(service, session_id, positions_m)
+    assert service.delete("/v1/admin/domains/ready").status_code == 204
+    assert 'domain="ready"' not in service.get("/metrics").text
+    answer = service.post(f"/v1/sessions/{session_id}/truths", json={"true_positions_m": positions_m})
+    assert (answer.status_code, answer.json()["code"]) == (410, "retired_map")
+    assert 'domain="ready"' not in service.get("/metrics").text
+
+
+@pytest.mark.parametrize(
+    ("body", "code"),
+    [
+        (b'{"true_positions_m": [1, 2, 3]}', "invalid_input"),
+        (b'{"true_positions_m": [1]}', "invalid_input"),
+        (b'{"true_positions_m": [1, NaN]}', "invalid_input"),
+        (b'{"true_positions_m": [1, 1e999]}', "invalid_input"),
+        (b'{"true_positions_m": []}', "invalid_request"),
+        (b'{"true_positions_m": ["1", 2]}', "invalid_request"),
+        (b'{"true_positions_m": [true, 2]}', "invalid_request"),
+        (b'{"true_positions_m": null}', "invalid_request"),
+        (b'{"true_positions_m": [1, 2], "more": 1}', "invalid_request"),
+        (b'{}', "invalid_request"),
+        (b'[1, 2]', "invalid_request"),
+        (b'', "empty_body"),
+    ],
+)  # fmt: skip
+def test_truths_that_cannot_be(service: TestClient, body: bytes, code: str) -> None:
+    session_id, _, _ = walked(service, 2)
+    path = f"/v1/sessions/{session_id}/truths"
+    answer = service.post(path, content=body, headers={"Content-Type": "application/json"})
+    assert (answer.status_code, answer.json()["code"]) == (422, code), answer.text
+    assert counted(service)[0] == 0
+
+
+def test_nobody_and_other_content(service: TestClient) -> None:
+    answer = service.post("/v1/sessions/nobody/truths", json={"true_positions_m": [1]})
+    assert (answer.status_code, answer.json()["code"]) == (404, "unknown_session")
+    session_id, _, _ = walked(service, 1)
+    answer = service.post(f"/v1/sessions/{session_id}/truths", content=b"x", headers={"Content-Type": "text/plain"})
+    assert answer.status_code == 415
