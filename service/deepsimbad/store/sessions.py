@@ -18,7 +18,7 @@ from deepsimbad.store.durable import sync_folder
 from deepsimbad.store.faults import storage_faults
 from deepsimbad.store.group_commit import GroupCommit
 from deepsimbad.store.list_page import ListPage
-from deepsimbad.store.session_records import JournalRow, ListedSession, SessionRecord, StateSnapshot
+from deepsimbad.store.session_records import ClockRecord, JournalRow, ListedSession, SessionRecord, StateSnapshot
 from deepsimbad_migrations.session.migrations import migrations
 
 PURGED_AT_ONCE = 1000  # rows
