@@ -91,7 +91,8 @@ class Triplet:
         config = replace(config, update=self.setup.update, motion_std_m=self.setup.motion_std_m)
         if live in {LANDMARK_DRIVE, HELD_OUT}:
             second = landmarks if live == LANDMARK_DRIVE else None
-            return train_nnql(rehearsal, self.route, ACTIONS_M, lambda: own, second, config, lambda _: None).q_values
+            experience = train_nnql(rehearsal, self.route, ACTIONS_M, lambda: own, second, config, lambda _: None, 2)
+            return experience.q_values
         world = self._world(built if live == TEST_DRIVE else rehearsal, own if live == ITSELF else test, config)
         return train(world, config, lambda _: None, pool)[0]
 

@@ -23,6 +23,7 @@ from deepsimbad.errors import (
 )
 from deepsimbad.evaluators.image import decode_image
 from deepsimbad.evaluators.registry import EvaluatorConfig, make_evaluator
+from deepsimbad.jobs.cores import available_cores
 from deepsimbad.jobs.encoded_traverse import encode_recording
 from deepsimbad.jobs.map_config import DEFAULT_LIST_LENGTH, DEFAULT_N_LANDMARKS, DEFAULT_TRAINING_EPISODES, RemapConfig
 from deepsimbad.jobs.remap import REMAP_STAGES, remap
@@ -101,7 +102,7 @@ def map_(
                 progress.stage(f"read {role}")
                 encoded = encode_recording(recording, judge, settings.max_pixels, progress.update)
                 _store(catalog, domain, role, encoded.frames)
-            result = remap(catalog, domain, config, judge, progress)
+            result = remap(catalog, domain, config, judge, progress, n_threads=available_cores())
         click.echo(f"map {result['map_version']} of {domain} is active: {result['metrics']['n_map_images']} images")
 
 

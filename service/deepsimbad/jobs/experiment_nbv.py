@@ -19,6 +19,7 @@ from deepsimbad.engine.snapshot import MapSnapshot
 from deepsimbad.errors import InvalidMapConfigError
 from deepsimbad.evaluators.base import Evaluator, LandmarkModel
 from deepsimbad.jobs.build_map import choose_landmarks, describe, map_contents
+from deepsimbad.jobs.cores import available_cores
 from deepsimbad.jobs.encoded_traverse import EncodedTraverse
 from deepsimbad.jobs.episodes import (
     Chooser,
@@ -223,6 +224,7 @@ def _mapped(
             seed=config.seed,
         ),
         progress.update,
+        available_cores(),
     )
     return MapSnapshot.from_contents(replace(contents, q_values=experience.q_values), index_bytes=0)
 

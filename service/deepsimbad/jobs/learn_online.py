@@ -9,10 +9,11 @@ from deepsimbad.core.nnql import NnqlConfig, initial_q_values, learn
 from deepsimbad.engine.snapshot import MapSnapshot
 from deepsimbad.errors import NoActiveMapError
 from deepsimbad.jobs.progress import Progress
-from deepsimbad.jobs.seal_version import seal_version
+from deepsimbad.jobs.seal_version import activate_once, seal_version
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.map_contents import MapContents
 from deepsimbad.store.map_file import read_map
+from deepsimbad.store.records import MapRecord
 
 LEARN_STAGES = {"read map": 1.0, "learn": 2.0, "seal": 1.0, "activate": 0.1}
 
@@ -39,7 +40,12 @@ def with_experience(contents: MapContents, walks: Sequence[KnownWalk], config: N
 
 
 def learn_online(
-    catalog: Catalog, domain: str, walks: Sequence[KnownWalk], progress: Progress, config: NnqlConfig | None = None
+    catalog: Catalog,
+    domain: str,
+    walks: Sequence[KnownWalk],
+    progress: Progress,
+    config: NnqlConfig | None = None,
+    job_id: str | None = None,
 ) -> dict[str, Any]:
     """Seal and activate the next map version: the active one with a better experience database.
 
@@ -49,6 +55,7 @@ def learn_online(
         walks: Sessions on it whose true positions are known.
         progress: Reports the stages of LEARN_STAGES; may cancel.
         config: The hyperparameters; None: the paper's.
+        job_id: The job that this is; None: it is none.
 
     Returns:
         `{"map_version", "active", "metrics"}`, as the job's result.
@@ -68,7 +75,16 @@ def learn_online(
     experience = {"from_version": active, "n_walks": len(walks), "n_moves": n_learnt}
     progress.stage("seal")
     metrics = {**before.metrics, "experience": experience}
-    sealed = seal_version(catalog, domain, learnt, before.config, metrics, progress.update)
+    sealed = seal_version(catalog, domain, learnt, before.config, metrics, progress.update, job_id)
+    return serve_learnt(catalog, domain, sealed, progress)
+
+
+def serve_learnt(catalog: Catalog, domain: str, sealed: MapRecord, progress: Progress) -> dict[str, Any]:
+    """The last stage of `learn_online`, and all that is left of a job that was interrupted after it sealed its version.
+
+    Raises:
+        LostActivationError: Another map was activated meanwhile.
+    """
     progress.stage("activate")
-    catalog.activate(domain, sealed.version, active)
+    activate_once(catalog, domain, sealed, sealed.metrics["experience"]["from_version"])
     return {"map_version": sealed.version, "active": True, "metrics": sealed.metrics}

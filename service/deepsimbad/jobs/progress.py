@@ -50,6 +50,16 @@ class Progress:
         self._started_s = clock()
         self._reported_s = float("-inf")
         self._stage = ""
+        self._skipped = 0.0
+
+    def check(self) -> None:
+        """Raise CancelledError if the work was cancelled; reports nothing."""
+        if self._is_cancelled is not None and self._is_cancelled():
+            raise CancelledError(f"cancelled while it was at: {self._stage}" if self._stage else "cancelled")
+
+    def skip(self) -> None:
+        """The present stage was done before: it counts as done, but says nothing of how fast the work goes."""
+        self._skipped += self._weights[self._stage] / sum(self._weights.values())
 
     def stage(self, name: str) -> None:
         """Begin a stage; those before it count as done."""
@@ -67,8 +77,7 @@ class Progress:
         self._report(share, always=False)
 
     def _report(self, share: float, *, always: bool) -> None:
-        if self._is_cancelled is not None and self._is_cancelled():
-            raise CancelledError(f"cancelled while it was at: {self._stage}")
+        self.check()
         now_s = self._clock()
         if self._on_change is None or (not always and now_s - self._reported_s < self._interval_s):
             return
@@ -77,5 +86,6 @@ class Progress:
         before = sum(self._weights[name] for name in names[: names.index(self._stage)])
         done = (before + share * self._weights[self._stage]) / sum(self._weights.values())
         elapsed_s = now_s - self._started_s
-        eta_s = elapsed_s * (1 - done) / done if done > 0.01 else None
+        worked = done - self._skipped
+        eta_s = elapsed_s * (1 - done) / worked if worked > 0.01 else None
         self._on_change(ProgressState(self._stage, done, eta_s))

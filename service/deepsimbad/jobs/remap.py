@@ -1,8 +1,5 @@
 """Remapping a domain: from stored traverses to a sealed, active map version (design section 5)."""
 
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -15,11 +12,22 @@ from deepsimbad.jobs.build_map import Described, choose_landmarks, describe, map
 from deepsimbad.jobs.map_config import DEFAULT_N_LANDMARKS, RemapConfig
 from deepsimbad.jobs.progress import Progress
 from deepsimbad.jobs.remap_inputs import RemapInputs, read_inputs
-from deepsimbad.jobs.seal_version import seal_version
+from deepsimbad.jobs.seal_version import activate_once, seal_version
+from deepsimbad.jobs.stage_results import (
+    pack_described,
+    pack_experience,
+    pack_model,
+    unpack_described,
+    unpack_experience,
+    unpack_model,
+)
+from deepsimbad.jobs.stages import Stages
 from deepsimbad.jobs.train_nnql import DescribedDrive, Experience, train_nnql
 from deepsimbad.store.catalog import Catalog
+from deepsimbad.store.checkpoints import Checkpoints
 from deepsimbad.store.map_contents import MapContents
 from deepsimbad.store.map_table import ANY
+from deepsimbad.store.records import MapRecord
 
 REMAP_STAGES = {
     "read frames": 1.0,
@@ -32,7 +40,13 @@ REMAP_STAGES = {
 
 
 def remap(
-    catalog: Catalog, domain: str, config: RemapConfig, evaluator: Evaluator, progress: Progress
+    catalog: Catalog,
+    domain: str,
+    config: RemapConfig,
+    evaluator: Evaluator,
+    progress: Progress,
+    checkpoints: Checkpoints | None = None,
+    n_threads: int = 1,
 ) -> dict[str, Any]:
     """Build, seal and, if asked, activate the next map version of a domain.
 
@@ -44,6 +58,9 @@ def remap(
         config: What is asked for.
         evaluator: The domain's.
         progress: Reports the stages of REMAP_STAGES; may cancel.
+        checkpoints: Of the job that this is; a job that was interrupted goes on behind its last finished stage, and one
+            that has sealed its version makes no other. None: it is no job.
+        n_threads: Threads to compute in.
 
     Returns:
         `{"map_version", "active", "metrics"}`, as the job's result.
@@ -51,36 +68,52 @@ def remap(
     Raises:
         DeepSimbadError: Whatever is wrong with the traverses, the parameters or the storage, by name.
     """
-    seconds: dict[str, float] = {}
-    with _timed(progress, "read frames", seconds):
-        inputs = read_inputs(catalog, domain, config)
-    with _timed(progress, "select landmarks", seconds):
-        model = _landmark_model(inputs, evaluator, progress)
-    with _timed(progress, "describe", seconds):
-        found = _described(inputs, evaluator, model, progress)
-    with _timed(progress, "train", seconds):
-        experience = _trained(inputs, evaluator, model, found, progress)
-    progress.stage("seal")
-    metrics = {
-        "n_map_images": inputs.route.n_images,
-        "seconds": seconds,
-        "training": None if experience is None else experience.metrics,
-    }
-    contents = _contents(inputs, model, found, experience)
-    sealed = seal_version(catalog, domain, contents, config.as_dict(), metrics, progress.update)
+    sealed = None if checkpoints is None else catalog.map_of_job(domain, checkpoints.job_id)
+    if sealed is None:
+        sealed = _built(catalog, domain, config, evaluator, progress, checkpoints, n_threads)
     progress.stage("activate")
     if config.activate:
-        catalog.activate(domain, sealed.version, ANY)
+        activate_once(catalog, domain, sealed, ANY)
     return {"map_version": sealed.version, "active": config.activate, "metrics": sealed.metrics}
 
 
-@contextmanager
-def _timed(progress: Progress, stage: str, seconds: dict[str, float]) -> Iterator[None]:
-    """Begin a stage; its seconds are noted at its end."""
-    progress.stage(stage)
-    began = time.perf_counter()
-    yield
-    seconds[stage.replace(" ", "_")] = time.perf_counter() - began
+def _built(
+    catalog: Catalog,
+    domain: str,
+    config: RemapConfig,
+    evaluator: Evaluator,
+    progress: Progress,
+    checkpoints: Checkpoints | None,
+    n_threads: int,
+) -> MapRecord:
+    """The next version, sealed. What is decided of it later must stand in its metrics: a resumed job reads no more."""
+    stages = Stages(progress, checkpoints)
+    inputs = stages.run("read frames", partial(read_inputs, catalog, domain, config))
+    if checkpoints is not None:
+        stages.inputs = inputs.digest()
+    model = stages.run_once(
+        "select landmarks", partial(_landmark_model, inputs, evaluator, progress), pack_model, unpack_model
+    )
+    found = stages.run_once(
+        "describe",
+        partial(_described, inputs, evaluator, model, progress),
+        pack_described,
+        partial(unpack_described, encodings=inputs.training.encodings),
+    )
+    experience = None
+    # The baseline that compares whole encodings would need hours for it, and serves no robot.
+    if config.training_episodes and config.relevance is not Relevance.BRUTE_FORCE:
+        train = partial(_trained, inputs, evaluator, model, found, progress, n_threads)
+        experience = stages.run_once("train", train, pack_experience, unpack_experience)
+    progress.stage("seal")
+    metrics = {
+        "n_map_images": inputs.route.n_images,
+        "seconds": stages.seconds,
+        "training": None if experience is None else experience.metrics,
+    }
+    contents = _contents(inputs, model, found, experience)
+    job_id = None if checkpoints is None else checkpoints.job_id
+    return seal_version(catalog, domain, contents, config.as_dict(), metrics, progress.update, job_id)
 
 
 def _landmark_model(inputs: RemapInputs, evaluator: Evaluator, progress: Progress) -> LandmarkModel:
@@ -108,13 +141,15 @@ def _described(inputs: RemapInputs, evaluator: Evaluator, model: LandmarkModel, 
 
 
 def _trained(
-    inputs: RemapInputs, evaluator: Evaluator, model: LandmarkModel, found: Described, progress: Progress
-) -> Experience | None:
-    """The experience database; None where none is asked for."""
+    inputs: RemapInputs,
+    evaluator: Evaluator,
+    model: LandmarkModel,
+    found: Described,
+    progress: Progress,
+    n_threads: int,
+) -> Experience:
+    """The experience database."""
     config, closed = inputs.config, inputs.domain.closed
-    # The baseline that compares whole encodings would need hours for it, and serves no robot.
-    if not config.training_episodes or config.relevance is Relevance.BRUTE_FORCE:
-        return None
     return train_nnql(
         found.rehearsal or found.built,
         inputs.route,
@@ -123,6 +158,7 @@ def _trained(
         None if inputs.second is None else DescribedDrive.of(inputs.second, closed, evaluator, model),
         NnqlConfig(n_episodes=config.training_episodes, seed=config.seed),
         progress.update,
+        n_threads,
     )
 
 

@@ -1,6 +1,14 @@
 """What a remap reads before it begins: traverses and, where landmarks stay, the active map."""
 
+import hashlib
+import json
+from collections.abc import Mapping
 from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from deepsimbad.core.route import Route
 from deepsimbad.errors import InvalidEncodingError, InvalidMapConfigError
@@ -36,6 +44,42 @@ class RemapInputs:
     candidates: TraverseFrames | None
     kept: MapContents | None
     second: TraverseFrames | None
+
+    def digest(self) -> str:
+        """SHA-256 over all of it, in hex: equal digests, equal map. Another release counts as another input."""
+        sha256 = hashlib.sha256()
+        said = {
+            "release": _release(),
+            "config": self.config.as_dict(),
+            "evaluator": self.domain.evaluator,
+            "closed": self.domain.closed,
+            "actions_m": list(self.domain.actions_m),
+            "kept": None if self.kept is None else self.kept.config,
+        }
+        sha256.update(json.dumps(said, sort_keys=True).encode())
+        digests: dict[int, bytes] = {}  # one traverse may stand in two places
+        for frames in (self.training, self.candidates, self.second):
+            digest = b"" if frames is None else digests.get(id(frames)) or _digest(frames.__dict__)
+            digests[id(frames)] = digest
+            sha256.update(digest or b"none")
+        sha256.update(b"none" if self.kept is None else _digest(self.kept.landmark_model))
+        return sha256.hexdigest()
+
+
+def _digest(arrays: Mapping[str, NDArray[Any]]) -> bytes:
+    sha256 = hashlib.sha256()
+    for name in sorted(arrays):
+        array = np.ascontiguousarray(arrays[name])
+        sha256.update(f"{name} {array.dtype.str} {array.shape}".encode())
+        sha256.update(array.data)
+    return sha256.digest()
+
+
+def _release() -> str:
+    try:
+        return version("deep-simbad")
+    except PackageNotFoundError:  # run from a source tree
+        return "0"
 
 
 def read_inputs(catalog: Catalog, domain: str, config: RemapConfig) -> RemapInputs:

@@ -8,6 +8,7 @@ from typing import Any
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.map_contents import MapContents
 from deepsimbad.store.map_file import index_bytes, write_map
+from deepsimbad.store.map_table import AnyVersion
 from deepsimbad.store.records import MapRecord
 from deepsimbad.store.sealing import seal
 
@@ -19,6 +20,7 @@ def seal_version(
     config: Mapping[str, Any],
     metrics: Mapping[str, Any],
     on_progress: Callable[[float], None],
+    job_id: str | None,
 ) -> MapRecord:
     """Write and seal a map as the domain's next version; a failure or cancel leaves nothing of it.
 
@@ -29,6 +31,8 @@ def seal_version(
         config: What was asked for; kept in the catalog.
         metrics: What was measured; the size of the index is added.
         on_progress: Called with the share written; may raise to cancel.
+        job_id: Whose work it is; kept with the metrics in the transaction that seals the version, so that the job, once
+            interrupted, finds what it made (`Catalog.map_of_job`) and does not make it twice.
 
     Returns:
         The sealed version; it does not serve yet.
@@ -41,7 +45,24 @@ def seal_version(
         digest, n_bytes = seal(building, sealed)
         bits = 8 * index_bytes(sealed) / contents.n_map_images
         on_progress(1.0)
-        return catalog.seal_map(domain, version, digest, n_bytes, {**metrics, "index_bits_per_map_image": bits})
+        measured = {**metrics, "index_bits_per_map_image": bits, "job_id": job_id}
+        return catalog.seal_map(domain, version, digest, n_bytes, measured)
     except BaseException:
         catalog.discard_map(domain, version)
         raise
+
+
+def activate_once(catalog: Catalog, domain: str, sealed: MapRecord, expected: int | AnyVersion | None) -> None:
+    """Let a version serve that a job has sealed, unless that was done before the job was interrupted.
+
+    Args:
+        catalog: Of the data directory.
+        domain: Whose map it is.
+        sealed: The version.
+        expected: As for `Catalog.activate`.
+
+    Raises:
+        LostActivationError: Another version is active than the expected one.
+    """
+    if sealed.activated_at is None:  # else it served already, and whoever rolled it back since meant it
+        catalog.activate(domain, sealed.version, expected)

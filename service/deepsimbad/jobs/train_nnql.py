@@ -9,6 +9,7 @@ then the other way round.
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from typing import Any, Self
@@ -31,7 +32,6 @@ from deepsimbad.jobs.encoded_traverse import route_of
 from deepsimbad.store.frames import TraverseFrames
 
 EPISODES_A_MAP_IMAGE = 25  # more would visit every entry of a small map again and again
-_THREADS = 2
 _FRAMES_A_BLOCK = 1024
 _LEAST_PLACES = 30  # that a second drive must share with the map to be driven through it
 _CHECKED_PLACES = 200
@@ -94,8 +94,9 @@ def train_nnql(
     second: DescribedDrive | None,
     config: NnqlConfig,
     on_progress: Callable[[float], None],
+    n_threads: int = 1,
 ) -> Experience:
-    """Learn a map's Q-values.
+    """Learn a map's Q-values; how many threads there are changes nothing of them.
 
     Args:
         built: The map; its lists must not have been made with knowledge of the second drive.
@@ -105,6 +106,7 @@ def train_nnql(
         second: Another drive, of the same route or not.
         config: The hyperparameters; small maps take fewer episodes than it says.
         on_progress: Called with the share done; may raise to cancel.
+        n_threads: Threads to compute in.
     """
     started = time.perf_counter()
     ascending = tuple(sorted(actions_m))
@@ -112,7 +114,7 @@ def train_nnql(
     true_image = None if second is None else _true_images(built, route, second)
     q_values = initial_q_values(route.n_images, len(ascending), config)
     curves: list[LearningCurve] = []
-    with ThreadPoolExecutor(_THREADS) as pool:
+    with ThreadPoolExecutor(n_threads) if n_threads > 1 else nullcontext() as pool:
         if second is not None and true_image is not None:
             used = replace(config, n_episodes=n_episodes)
             world = _world(built, route, second, true_image, ascending, used)
