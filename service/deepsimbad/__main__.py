@@ -7,6 +7,7 @@ NEEDED = (
     "click",
     "cv2",
     "fastapi",
+    "fastapi_offline",
     "numba",
     "numpy",
     "prometheus_client",

@@ -1,15 +1,17 @@
 """What an operator may set: one frozen object, read by the command line and the API alone."""
 
 import ipaddress
+import re
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import Field
+from pydantic import Field, field_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from deepsimbad.errors import SettingsError
 
 MEBIBYTE = 1024 * 1024
+_ORIGIN = re.compile(r"\*|[a-z][a-z0-9+.-]*://[^/\s*?#@]+")
 
 
 class Settings(BaseSettings):
@@ -103,6 +105,14 @@ class Settings(BaseSettings):
         int, Field(description="Observations of a session between two snapshots of its belief.", ge=1)
     ] = 32
     session_sweep_s: Annotated[float, Field(description="Expired sessions are looked for this often.", gt=0)] = 30.0
+
+    @field_validator("cors_origins")
+    @classmethod
+    def _origins(cls, origins: tuple[str, ...]) -> tuple[str, ...]:
+        for origin in origins:
+            if _ORIGIN.fullmatch(origin) is None:  # any other text would silently match nobody
+                raise ValueError(f'{origin!r} is no origin: write it as "https://host" or "https://host:port", or "*"')
+        return origins
 
     @property
     def is_loopback(self) -> bool:

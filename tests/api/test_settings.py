@@ -5,11 +5,15 @@ from pathlib import Path
 
 import pytest
 from pydantic import ValidationError
+from starlette.testclient import TestClient
 
+from deepsimbad.api.app import create_app
 from deepsimbad.api.server import serve
 from deepsimbad.errors import SettingsError
 from deepsimbad.settings import Settings
 from deepsimbad.settings_sources import Origin, load_settings, trace_settings, unknown_variables
+from deepsimbad.store.catalog import Catalog
+from deepsimbad.store.records import KeyScope
 
 
 @pytest.fixture(autouse=True)
@@ -129,7 +133,7 @@ def test_variables_that_are_no_settings_are_found(monkeypatch: pytest.MonkeyPatc
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "127.3.2.1", "::1", "localhost"])
 def test_loopback_needs_no_keys(host: str) -> None:
-    Settings(host=host).check_exposure()
+    Settings(host=host).check_exposure(n_keys=0)
 
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.168.1.2", "robot.example.org", "10.0.0.1"])
@@ -137,4 +141,33 @@ def test_other_addresses_are_refused_without_keys(host: str, tmp_path: Path) -> 
     with pytest.raises(SettingsError, match="without keys"):
         serve(Settings(host=host, data_dir=tmp_path / "untouched"))
     assert not (tmp_path / "untouched").exists()
-    Settings(host=host, allow_open=True).check_exposure()
+    with pytest.raises(SettingsError):
+        Settings(host=host).check_exposure(n_keys=0)
+    Settings(host=host, allow_open=True).check_exposure(n_keys=0)
+    Settings(host=host).check_exposure(n_keys=1)
+
+
+def test_keys_that_are_all_revoked_let_it_start_for_it_is_closed(tmp_path: Path) -> None:
+    with Catalog.open(tmp_path) as catalog:
+        record, _ = catalog.create_key(KeyScope.ADMIN)
+        catalog.revoke_key(record.key_id)
+    with TestClient(create_app(Settings(host="0.0.0.0", data_dir=tmp_path))) as client:
+        assert client.get("/v1/domains").status_code == 401
+
+
+def test_an_existing_folder_without_keys_is_refused_on_other_addresses(tmp_path: Path) -> None:
+    Catalog.open(tmp_path).close()
+    app = create_app(Settings(host="::", data_dir=tmp_path))
+    with pytest.raises(SettingsError, match="without keys"), TestClient(app):
+        pass
+
+
+@pytest.mark.parametrize("origin", ["https://map.example.org", "http://localhost:5173", "*", "app://robot"])
+def test_origins(origin: str) -> None:
+    assert Settings(cors_origins=(origin,)).cors_origins == (origin,)
+
+
+@pytest.mark.parametrize("origin", ["", "map.example.org", "https://a/", "https://a/b", "https://*.a", "null", "*."])
+def test_what_is_no_origin_is_refused(origin: str) -> None:
+    with pytest.raises(ValidationError, match="is no origin"):
+        Settings(cors_origins=(origin,))

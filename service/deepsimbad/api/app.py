@@ -9,14 +9,17 @@ from importlib.metadata import PackageNotFoundError, version
 
 from anyio.to_thread import run_sync
 from fastapi import FastAPI
+from starlette.middleware.cors import CORSMiddleware
 from starlette.types import Scope
 
+from deepsimbad.api.auth import AuthMiddleware, KeyRing
 from deepsimbad.api.dependencies import Services
 from deepsimbad.api.envelope import EnvelopeMiddleware
 from deepsimbad.api.limits import BodyLimitMiddleware
 from deepsimbad.api.metrics import Metrics
 from deepsimbad.api.openapi import install_openapi
 from deepsimbad.api.problems import install_problem_handlers
+from deepsimbad.api.rate_limit import RateLimit
 from deepsimbad.api.routes import (
     admin_domains,
     admin_experience,
@@ -26,23 +29,24 @@ from deepsimbad.api.routes import (
     admin_remaps,
     admin_sessions,
     admin_traverses,
+    docs,
     domains,
     health,
     localizations,
     sessions,
+    truths,
 )
 from deepsimbad.engine.active_maps import ActiveMaps
 from deepsimbad.engine.evaluator_pool import EvaluatorPool
 from deepsimbad.engine.open_traverses import OpenTraverses
-    truths,
 from deepsimbad.engine.pinned_maps import PinnedMaps
 from deepsimbad.engine.sessions import Sessions
+from deepsimbad.engine.steady_clock import SteadyClock
+from deepsimbad.engine.truths import Truths
 from deepsimbad.engine.warm_up import warm_up
 from deepsimbad.engine.worker import InferenceWorker
 from deepsimbad.errors import DeepSimbadError
 from deepsimbad.evaluators.registry import EvaluatorKind
-from deepsimbad.engine.steady_clock import SteadyClock
-from deepsimbad.engine.truths import Truths
 from deepsimbad.jobs.runner import JobRunner
 from deepsimbad.settings import Settings
 from deepsimbad.store.catalog import Catalog
@@ -53,20 +57,23 @@ log = logging.getLogger(__name__)
 
 _ROUTERS = (
     health,
+    docs,
     domains,
     localizations,
     sessions,
+    truths,
     admin_domains,
     admin_traverses,
     admin_frames,
     admin_remaps,
     admin_experience,
-    truths,
     admin_jobs,
     admin_maps,
     admin_sessions,
 )
 _BATCH_PATH = re.compile(r"/v1/admin/domains/[^/]+/traverses/[^/]+/frames")
+_CORS_SENT = ("Authorization", "X-API-Key", "Content-Type", "X-Request-ID", "Idempotency-Key", "Range")
+_CORS_SHOWN = ("X-Request-ID", "Retry-After", "Location", "ETag", "Repr-Digest", "WWW-Authenticate")
 _DESCRIPTION = (
     "Where on a prelearned route a robot is, from what it sees; every error is an RFC 9457 problem document. "
     "Ids count from 0, ranks from 1, units stand in the names."
@@ -80,12 +87,14 @@ def create_app(settings: Settings) -> FastAPI:
         settings: All it is told; it reads no environment.
     """
     metrics = Metrics()
+    keys = KeyRing()
     app = FastAPI(
         title="Deep SIMBAD",
         version=_version(),
         description=_DESCRIPTION,
-        lifespan=_lifespan(settings, metrics),
+        lifespan=_lifespan(settings, metrics, keys),
         redirect_slashes=False,
+        docs_url=None,  # the framework's page loads its script from another host
         redoc_url=None,
     )
     for module in _ROUTERS:
@@ -93,16 +102,28 @@ def create_app(settings: Settings) -> FastAPI:
     install_problem_handlers(app)
     install_openapi(app)
     app.add_middleware(BodyLimitMiddleware, limit_of=_body_limits(settings))
+    rate_limit = RateLimit(settings.rate_limit_per_s, settings.rate_limit_burst)
+    app.add_middleware(AuthMiddleware, keys=keys, rate_limit=rate_limit)
+    if settings.cors_origins:
+        app.add_middleware(
+            CORSMiddleware,
+            allow_origins=settings.cors_origins,
+            allow_methods=("GET", "POST", "PUT", "DELETE"),
+            allow_headers=_CORS_SENT,
+            expose_headers=_CORS_SHOWN,
+        )
     app.add_middleware(EnvelopeMiddleware, metrics=metrics)
     return app
 
 
-def _lifespan(settings: Settings, metrics: Metrics) -> Callable[[FastAPI], AbstractAsyncContextManager[None]]:
+def _lifespan(
+    settings: Settings, metrics: Metrics, keys: KeyRing
+) -> Callable[[FastAPI], AbstractAsyncContextManager[None]]:
     @asynccontextmanager
     async def run(app: FastAPI) -> AsyncIterator[None]:
         with ExitStack() as parts:
             try:
-                services = await run_sync(_start, settings, metrics, parts)
+                services = await run_sync(_start, settings, metrics, keys, parts)
             except DeepSimbadError as error:
                 app.state.startup_error = error  # the server only reports that there was one
                 raise
@@ -111,6 +132,7 @@ def _lifespan(settings: Settings, metrics: Metrics) -> Callable[[FastAPI], Abstr
             following = asyncio.create_task(keys.follow())
             yield
             sweeping.cancel()
+            following.cancel()
             services.stopping.set()
             # Jobs and the worker are waited for, which must not hold up the loop that their answers go through.
             await run_sync(parts.close)
@@ -134,6 +156,8 @@ def _start(settings: Settings, metrics: Metrics, keys: KeyRing, parts: ExitStack
     """Open everything; `parts` closes it again, last opened first."""
     parts.enter_context(ServiceLock.take(settings.data_dir, f"{settings.host}:{settings.port}"))
     catalog = parts.enter_context(Catalog.open(settings.data_dir))
+    keys.load(catalog.keys)
+    settings.check_exposure(keys.n_created)
     for line in catalog.discard_unfinished():
         log.warning("discarded at start", extra={"what": line})
     evaluators = EvaluatorPool()
@@ -146,6 +170,8 @@ def _start(settings: Settings, metrics: Metrics, keys: KeyRing, parts: ExitStack
     parts.callback(worker.close)
     worker.submit(warm_up).result()
     store = parts.enter_context(SessionStore.open(settings.data_dir, metrics.committed))
+    clock = SteadyClock.of(store)
+    pinned_maps = PinnedMaps(catalog, active_maps, evaluators)
     live = Sessions(
         store,
         pinned_maps,
@@ -153,6 +179,7 @@ def _start(settings: Settings, metrics: Metrics, keys: KeyRing, parts: ExitStack
         ttl_s=settings.session_ttl_s,
         max_sessions=settings.max_sessions,
         snapshot_every=settings.snapshot_every,
+        clock=clock,
     )
     parts.callback(live.close)
     open_traverses = OpenTraverses(settings.data_dir)
@@ -167,11 +194,14 @@ def _start(settings: Settings, metrics: Metrics, keys: KeyRing, parts: ExitStack
     runner = JobRunner(catalog, lambda domain: evaluators.evaluator(catalog.domain(domain).evaluator), switched, store)
     parts.callback(runner.close)
     metrics.watch(lambda: worker.n_waiting, lambda: active_maps.n_loaded, lambda: live.n_living)
+    exposure = {"host": settings.host, "port": settings.port, "n_keys": keys.n_usable}
+    if keys.n_created == 0:
+        log.warning("runs open: no key was ever created, so whoever reaches this address may do all", extra=exposure)
+    else:
+        log.info("asks for keys", extra=exposure)
     log.info(
         "ready",
         extra={
-    clock = SteadyClock.of(store)
-    pinned_maps = PinnedMaps(catalog, active_maps, evaluators)
             "n_domains": len(catalog.domains()),
             "n_maps": active_maps.n_loaded,
             "n_sessions": live.n_living,
@@ -179,7 +209,6 @@ def _start(settings: Settings, metrics: Metrics, keys: KeyRing, parts: ExitStack
         },
     )
     return Services(
-        clock=clock,
         settings=settings,
         metrics=metrics,
         catalog=catalog,
@@ -188,6 +217,8 @@ def _start(settings: Settings, metrics: Metrics, keys: KeyRing, parts: ExitStack
         open_traverses=open_traverses,
         sessions=live,
         session_store=store,
+        truths=Truths(store, pinned_maps, worker, clock),
+        clock=clock,
         worker=worker,
         runner=runner,
         damaged_at_start=tuple(sorted(damaged)),
@@ -211,5 +242,3 @@ def _version() -> str:
         return version("deep-simbad")
     except PackageNotFoundError:  # run from a source tree
         return "0"
-        truths=Truths(store, pinned_maps, worker, clock),
-        clock=clock,

@@ -15,6 +15,15 @@ log = logging.getLogger(__name__)
 
 _REQUEST_ID = re.compile(rb"[A-Za-z0-9._-]{1,64}")
 _METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"})
+# What every answer carries unless its route says otherwise: nothing here is for a browser to guess, keep or embed.
+SECURITY_HEADERS = (
+    (b"x-content-type-options", b"nosniff"),
+    (b"cache-control", b"no-store"),
+    (b"content-security-policy", b"default-src 'none'; frame-ancestors 'none'"),
+    (b"referrer-policy", b"no-referrer"),
+    (b"x-frame-options", b"DENY"),
+    (b"cross-origin-resource-policy", b"same-origin"),
+)
 UNROUTED = "(none)"
 _SENDER_LEFT = 499  # as proxies log it; never sent
 
@@ -34,7 +43,7 @@ class EnvelopeMiddleware:
         if scope["type"] != "http":
             await self.app(scope, receive, send)
             return
-        request_id = _request_id(scope)
+        request_id = request_id_of(scope)
         scope.setdefault("state", {})["request_id"] = request_id
         header = (b"x-request-id", request_id.encode("ascii"))
         status = 0
@@ -43,11 +52,9 @@ class EnvelopeMiddleware:
             nonlocal status
             if message["type"] == "http.response.start":
                 status = message["status"]
-                message["headers"] = [
-                    *message.get("headers", ()),
-                    header,
-                    (b"x-content-type-options", b"nosniff"),
-                ]
+                given = list(message.get("headers", ()))
+                names = {name.lower() for name, _ in given}
+                message["headers"] = [*given, header, *(each for each in SECURITY_HEADERS if each[0] not in names)]
             await send(message)
 
         started = time.perf_counter()
@@ -57,7 +64,7 @@ class EnvelopeMiddleware:
         except ClientDisconnect:  # nobody is left to be answered
             status = status or _SENDER_LEFT
         except Exception:
-            log.exception("request failed", extra={"request_id": request_id})
+            log.exception("request failed", extra={"request_id": request_id, **_known(scope)})
             if status == 0:
                 await unexpected_response(scope)(scope, receive, send_marked)
         finally:
@@ -75,11 +82,20 @@ class EnvelopeMiddleware:
                         "path": scope["path"],
                         "status": status,
                         "ms": round(seconds * 1000, 2),
+                        **_known(scope),
                     },
                 )
 
 
-def _request_id(scope: Scope) -> str:
+def _known(scope: Scope) -> dict[str, str]:
+    """Whose request it is, and of which domain, where that is known."""
+    found = {"key_id": scope["state"].get("key_id"), "domain": scope["state"].get("domain")}
+    found["domain"] = found["domain"] or scope.get("path_params", {}).get("domain")
+    return {name: value for name, value in found.items() if value is not None}
+
+
+def request_id_of(scope: Scope) -> str:
+    """The sender's own id for its request where that is well formed, else a new one."""
     for name, value in scope["headers"]:
         if name == b"x-request-id" and _REQUEST_ID.fullmatch(value):
             return str(value, "ascii")

@@ -25,10 +25,12 @@ from deepsimbad.errors import (
     HeadersTooLargeError,
     InvalidInputError,
     NotFoundError,
+    OverloadedError,
     RequestTimeoutError,
     SettingsError,
     TooLargeError,
     UnavailableError,
+    UnreadableRequestError,
     UnsupportedMediaTypeError,
 )
 
@@ -45,6 +47,7 @@ STATUS_OF_BRANCH: Mapping[type[BaseException], HTTPStatus] = {
     ForbiddenError: HTTPStatus.FORBIDDEN,
     NotFoundError: HTTPStatus.NOT_FOUND,
     RequestTimeoutError: HTTPStatus.REQUEST_TIMEOUT,
+    UnreadableRequestError: HTTPStatus.BAD_REQUEST,
     ConflictError: HTTPStatus.CONFLICT,
     CancelledError: HTTPStatus.CONFLICT,
     GoneError: HTTPStatus.GONE,
@@ -111,6 +114,8 @@ def problem_response(
         "request_id": scope.get("state", {}).get("request_id"),
     }
     sent = dict(headers or {})
+    if status == HTTPStatus.UNAUTHORIZED:
+        sent.setdefault("WWW-Authenticate", "Bearer")
     if status in {HTTPStatus.SERVICE_UNAVAILABLE, HTTPStatus.TOO_MANY_REQUESTS}:
         sent.setdefault("Retry-After", str(RETRY_AFTER_S))
     # json escapes everything outside ASCII, so text that cannot be encoded (lone surrogates) still travels.
@@ -120,7 +125,7 @@ def problem_response(
 def error_response(scope: Scope, error: DeepSimbadError) -> Response:
     """Render an error of the tree."""
     status = status_of(error)
-    if status >= HTTPStatus.INTERNAL_SERVER_ERROR:
+    if status >= HTTPStatus.INTERNAL_SERVER_ERROR and not isinstance(error, OverloadedError):
         log.warning("%s: %s", error.code, error.message, exc_info=error)
     summary = (type(error).__doc__ or "").strip().partition("\n")[0].rstrip(".")
     retry_after_s = error.hints.get("retry_after_s")

@@ -11,8 +11,7 @@ from deepsimbad.api.app import create_app
 from deepsimbad.api.logs import configure_logging
 from deepsimbad.errors import DeepSimbadError, UnavailableError
 from deepsimbad.settings import Settings
-
-log = logging.getLogger(__name__)
+from deepsimbad.store.layout import catalog_path
 
 
 class _Server(uvicorn.Server):
@@ -43,12 +42,9 @@ def serve(settings: Settings) -> None:
         SettingsError: The address could be reached from other machines, and the service has no keys.
         DeepSimbadError: What kept it from starting, by name.
     """
-    settings.check_exposure()
+    if not catalog_path(settings.data_dir).is_file():  # then there is no key, and no need to make the folder first
+        settings.check_exposure(n_keys=0)
     configure_logging(settings.log_level)
-    log.warning(
-        "no keys are configured: whoever can reach this address may do everything",
-        extra={"host": settings.host, "port": settings.port},
-    )
     app = create_app(settings)
     config = uvicorn.Config(
         app,

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 import click
 
 from deepsimbad.cli.experiment import experiment
+from deepsimbad.cli.keys import keys
 from deepsimbad.cli.local import delete, info, localize, map_
 from deepsimbad.cli.serve import serve
 from deepsimbad.cli.settings import settings
@@ -24,7 +25,7 @@ def deepsimbad() -> None:
     """Where on a known route a robot is, and which move would tell it most next."""
 
 
-for command in (serve, map_, localize, info, delete, experiment, settings):
+for command in (serve, map_, localize, info, delete, experiment, keys, settings):
     deepsimbad.add_command(command)
 
 

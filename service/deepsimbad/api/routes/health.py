@@ -17,12 +17,14 @@ class MetricsResponse(Response):
     media_type = "text/plain"
 
 
+@router.head("/healthz", include_in_schema=False)
 @router.get("/healthz", responses=problems())
 async def healthz() -> Health:
     """The process lives; a supervisor restarts it where this stays unanswered."""
     return Health(status="alive")
 
 
+@router.head("/readyz", include_in_schema=False)
 @router.get("/readyz", responses=problems())
 async def readyz(running: Running) -> Readiness:
     """The evaluators are loaded, the catalog and the sessions can be read; 503 until then and while shutting down."""

@@ -1,0 +1,180 @@
+"""Who may ask: API keys, looked at before a byte of a body is read."""
+
+import asyncio
+import hmac
+import logging
+import time
+from collections.abc import Callable, Sequence
+
+from anyio.to_thread import run_sync
+from starlette.types import ASGIApp, Receive, Scope, Send
+
+from deepsimbad.api.limits import BodyLimitMiddleware
+from deepsimbad.api.problems import error_response
+from deepsimbad.api.rate_limit import RateLimit
+from deepsimbad.errors import DeepSimbadError, ForbiddenError, UnauthorizedError, UnavailableError
+from deepsimbad.store.api_key import ApiKey
+from deepsimbad.store.documents import now
+from deepsimbad.store.records import KeyRecord, KeyScope
+
+log = logging.getLogger(__name__)
+
+REREAD_S = 1.0  # a key that was made or revoked counts within this time
+KEPT_S = 60.0  # a catalog that cannot be read lets the last known keys count for so long
+_NO_DIGEST = "0" * 64  # what a key that does not exist is compared with
+_HOW = "send a key as `Authorization: Bearer <key>` or `X-API-Key: <key>`; `deepsimbad keys create` makes one"
+
+
+class KeyRing:
+    """The keys as the catalog had them a moment ago. Asking it costs no I/O; `follow` keeps it up to date.
+
+    Where no key was ever created the service is open. Once a key was seen it is closed for good, whatever is read.
+
+    Args:
+        clock: Seconds that never go back.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._read: Callable[[], Sequence[KeyRecord]] | None = None
+        self._read_at: float | None = None
+        self._keys: dict[str, KeyRecord] = {}
+
+    def load(self, read: Callable[[], Sequence[KeyRecord]]) -> None:
+        """Read the keys for the first time, and name what reads them from then on; raises what that raises."""
+        self._read = read
+        self._keep(read())
+
+    async def follow(self) -> None:
+        """Read the keys again and again, until cancelled."""
+        while True:
+            await self.reread()
+            await asyncio.sleep(REREAD_S)
+
+    async def reread(self) -> None:
+        """Read the keys again; where that fails those known stay, for a while."""
+        if self._read is None:
+            return
+        try:
+            found = await run_sync(self._read)
+        except Exception as error:  # whatever it is, the next try may succeed
+            log.warning("the keys cannot be read: %s", error)
+            return
+        was_open = not self._keys
+        self._keep(found)
+        if was_open and self._keys:
+            log.info("the first key was created: from now on a key is asked")
+
+    def _keep(self, found: Sequence[KeyRecord]) -> None:
+        if found or not self._keys:
+            self._keys = {record.key_id: record for record in found}
+        self._read_at = self._clock()
+
+    @property
+    def is_open(self) -> bool:
+        """Whether no key is asked; raises UnavailableError where the keys have not been known for too long."""
+        if self._read_at is None or self._clock() - self._read_at > KEPT_S:
+            raise UnavailableError("the keys cannot be read, so nobody can be let in; try again")
+        return not self._keys
+
+    @property
+    def n_created(self) -> int:
+        """How many keys there are, those that open nothing any more too."""
+        return len(self._keys)
+
+    @property
+    def n_usable(self) -> int:
+        """How many keys open something now."""
+        at = now()
+        return sum(record.is_usable(at) for record in self._keys.values())
+
+    def holder(self, presented: str) -> KeyRecord:
+        """The key that was presented.
+
+        Raises:
+            UnauthorizedError: It is none, is unknown, revoked or expired.
+        """
+        key = ApiKey.parse(presented)
+        if key is None:
+            raise UnauthorizedError(f"the key is malformed: {_HOW}")
+        record = self._keys.get(key.key_id)
+        # Always one comparison, so that its time does not tell which ids exist.
+        is_right = hmac.compare_digest(key.secret_sha256, _NO_DIGEST if record is None else record.secret_sha256)
+        if record is None or not is_right:
+            raise UnauthorizedError("the key is not known here")
+        if not record.is_usable(now()):  # told to its holder alone
+            what = "expired" if record.revoked_at is None else "was revoked"
+            raise UnauthorizedError(f"the key {what}: ask the operator for another", key_id=record.key_id)
+        return record
+
+
+class AuthMiddleware:
+    """Lets nobody past without a key of the scope that the path needs, nor more often than the rate limit allows.
+
+    `/v1/admin/...` needs `admin`, the rest of `/v1/...` needs `localize`; other paths need no key. A refusal is
+    answered before the body is read.
+    """
+
+    def __init__(self, app: ASGIApp, keys: KeyRing, rate_limit: RateLimit) -> None:
+        self.app = app
+        self.keys = keys
+        self.rate_limit = rate_limit
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:  # noqa: D102 - ASGI
+        needed = None if scope["type"] != "http" else needed_scope(scope["path"])
+        if needed is not None:
+            try:
+                self._check(scope, needed)
+            except DeepSimbadError as error:
+                # Counts nothing, but closes the connection with care under a body that nobody reads.
+                refusal = BodyLimitMiddleware(error_response(scope, error), _any_length)
+                await refusal(scope, receive, send)
+                return
+        await self.app(scope, receive, send)
+
+    def _check(self, scope: Scope, needed: KeyScope) -> None:
+        if self.keys.is_open:
+            return
+        record = self.keys.holder(presented_key(scope))
+        scope.setdefault("state", {})["key_id"] = record.key_id
+        self.rate_limit.take(record.key_id)
+        if not record.scope.includes(needed):
+            raise ForbiddenError(
+                f"this call needs a key of scope {needed}; this one has {record.scope}", needed=needed.value
+            )
+
+
+def needed_scope(path: str) -> KeyScope | None:
+    """The scope that a decoded path needs; None: no key is asked."""
+    if path == "/v1/admin" or path.startswith("/v1/admin/"):
+        return KeyScope.ADMIN
+    if path == "/v1" or path.startswith("/v1/"):
+        return KeyScope.LOCALIZE
+    return None
+
+
+def presented_key(scope: Scope) -> str:
+    """The one key in a request's headers; raises UnauthorizedError where there is none, or more than one."""
+    bearer: list[bytes] = []
+    own: list[bytes] = []
+    n_authorizations = 0
+    for name, value in scope["headers"]:
+        if name == b"authorization":
+            n_authorizations += 1
+            scheme, _, credentials = value.partition(b" ")
+            if scheme.lower() == b"bearer":  # another scheme is someone else's, a proxy's say
+                bearer.append(credentials.strip(b" "))
+        elif name == b"x-api-key":
+            own.append(value.strip(b" "))
+    if not bearer and not own:
+        raise UnauthorizedError(f"no key came: {_HOW}")
+    if n_authorizations > 1 or len(own) > 1 or len({*bearer, *own}) > 1:
+        raise UnauthorizedError("more than one key came: send one")
+    try:
+        return (bearer or own)[0].decode("ascii")
+    except UnicodeDecodeError as error:
+        raise UnauthorizedError(f"the key is malformed: {_HOW}") from error
+
+
+def _any_length(_: Scope) -> int:
+    return 1 << 62

@@ -1,0 +1,94 @@
+"""`deepsimbad keys`: making, listing and revoking API keys, beside a running service or without one."""
+
+from datetime import timedelta
+from pathlib import Path
+
+import click
+from rich.markup import escape
+from rich.table import Table
+
+from deepsimbad.cli.options import data_dir_option, given_settings
+from deepsimbad.cli.terminal import console, write_json
+from deepsimbad.errors import UnknownKeyError
+from deepsimbad.store.api_key import ApiKey
+from deepsimbad.store.catalog import Catalog
+from deepsimbad.store.documents import now
+from deepsimbad.store.layout import catalog_path
+from deepsimbad.store.records import KeyRecord, KeyScope
+
+
+@click.group()
+def keys() -> None:
+    """API keys. While none was ever created the service runs open; a running one heeds changes within a second."""
+
+
+@keys.command()
+@click.option(
+    "--scope",
+    type=click.Choice([scope.value for scope in KeyScope]),
+    required=True,
+    help="What it opens: `localize` is for robots, `admin` for everything.",
+)
+@click.option("--name", default="", help="What to call it, for `keys list`.")
+@click.option("--expires-days", type=click.FloatRange(min=0, min_open=True), help="Days it lives.  [default: for ever]")
+@data_dir_option
+def create(scope: str, name: str, expires_days: float | None, data_dir: Path | None) -> None:
+    """Make a key and print it, alone, on standard output. It is shown this once: only a digest is kept."""
+    lifetime = None if expires_days is None else timedelta(days=min(expires_days, timedelta.max.days))
+    with Catalog.open(given_settings(data_dir=data_dir).data_dir) as catalog:
+        is_first = not catalog.keys()
+        record, key = catalog.create_key(KeyScope(scope), name, lifetime)
+    click.echo(key.text)
+    until = "" if record.expires_at is None else f" until {record.expires_at}"
+    click.echo(f"key {record.key_id} opens {scope}{until}; keep it now, it cannot be shown again", err=True)
+    if is_first:
+        click.echo("it is the first: from now on every call under /v1 asks for a key", err=True)
+
+
+@keys.command("list")
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON list.")
+@data_dir_option
+def list_(as_json: bool, data_dir: Path | None) -> None:
+    """List every key that was ever created, without the secrets."""
+    folder = given_settings(data_dir=data_dir).data_dir
+    records = []
+    if catalog_path(folder).is_file():  # a question must not make the folder it asks about
+        with Catalog.open(folder) as catalog:
+            records = catalog.keys()
+    if as_json:
+        write_json([_described(record) for record in records])
+        return
+    table = Table("key", "name", "scope", "state", "created", "expires", "revoked")
+    for record in records:
+        table.add_row(*("-" if value is None else escape(value) for value in _described(record).values()))
+    console().print(table)
+
+
+@keys.command()
+@click.argument("key_id")
+@data_dir_option
+def revoke(key_id: str, data_dir: Path | None) -> None:
+    """Let a key open nothing any more. KEY_ID is what `keys list` shows; a whole key, a leaked one say, does too."""
+    whole = ApiKey.parse(key_id)
+    folder = given_settings(data_dir=data_dir).data_dir
+    if not catalog_path(folder).is_file():
+        raise UnknownKeyError(f"there are no keys in {folder}: name their folder with --data-dir")
+    with Catalog.open(folder) as catalog:
+        record = catalog.revoke_key(key_id if whole is None else whole.key_id)
+        known = catalog.keys()
+    click.echo(f"key {record.key_id} is revoked", err=True)
+    if not any(other.is_usable(now()) for other in known):
+        click.echo("no usable key is left: the service stays closed until one is created", err=True)
+
+
+def _described(record: KeyRecord) -> dict[str, str | None]:
+    state = "usable" if record.is_usable(now()) else "expired"
+    return {
+        "key_id": record.key_id,
+        "name": record.name,
+        "scope": record.scope.value,
+        "state": state if record.revoked_at is None else "revoked",
+        "created_at": record.created_at,
+        "expires_at": record.expires_at,
+        "revoked_at": record.revoked_at,
+    }

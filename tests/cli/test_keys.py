@@ -1,0 +1,63 @@
+"""`deepsimbad keys`."""
+
+import json
+import re
+
+import pytest
+
+KEY = re.compile(r"dsk_([0-9a-f]{12})_[A-Za-z0-9_-]{43}")
+
+
+def test_a_key_is_printed_alone(deepsimbad, tmp_path):
+    ran = deepsimbad("keys", "create", "--scope", "admin", "--name", "the operator", "--data-dir", tmp_path / "d")
+    assert ran.code == 0
+    found = KEY.fullmatch(ran.out.rstrip("\n"))
+    assert found
+    assert ran.out.count("\n") == 1
+    assert "first" in ran.err
+    assert ran.out.strip() not in ran.err
+    second = deepsimbad("keys", "create", "--scope", "localize", "--expires-days", "2", "--data-dir", tmp_path / "d")
+    assert "first" not in second.err
+    listed = json.loads(deepsimbad("keys", "list", "--json", "--data-dir", tmp_path / "d").out)
+    assert [(key["key_id"], key["name"], key["scope"], key["state"]) for key in listed] == [
+        (found[1], "the operator", "admin", "usable"),
+        (KEY.fullmatch(second.out.strip())[1], "", "localize", "usable"),
+    ]
+    assert listed[0]["expires_at"] is None
+    assert listed[1]["expires_at"] > listed[1]["created_at"]
+
+
+def test_a_revoked_key_is_listed_as_such(deepsimbad):
+    first = KEY.fullmatch(deepsimbad("keys", "create", "--scope", "admin").out.strip())
+    second = KEY.fullmatch(deepsimbad("keys", "create", "--scope", "admin", "--name", "[red]x").out.strip())
+    ran = deepsimbad("keys", "revoke", first[1])
+    assert (ran.code, ran.out) == (0, "")
+    assert "stays closed" not in ran.err
+    ran = deepsimbad("keys", "revoke", second[0])
+    assert ran.code == 0, "a whole key names itself"
+    assert "stays closed" in ran.err
+    assert second[0] not in ran.err
+    listed = json.loads(deepsimbad("keys", "list", "--json").out)
+    assert [key["state"] for key in listed] == ["revoked", "revoked"]
+    table = deepsimbad("keys", "list").out
+    assert first[1] in table
+    assert "[red]x" in table
+    assert first[0] not in table
+
+
+def test_mistakes_are_named_and_change_nothing(deepsimbad, tmp_path):
+    assert deepsimbad("keys", "create").code == 2
+    assert deepsimbad("keys", "create", "--scope", "root").code == 2
+    assert deepsimbad("keys", "create", "--scope", "admin", "--expires-days", "0").code == 2
+    for arguments in (("revoke", "0123456789ab"), ("create", "--scope", "admin", "--name", "a\nb")):
+        ran = deepsimbad("keys", *arguments)
+        assert (ran.code, ran.out, ran.err.count("\n")) == (1, "", 1)
+    ran = deepsimbad("keys", "create", "--scope", "admin", "--expires-days", "1e300")
+    assert (ran.code, ran.out) == (1, "")
+    assert json.loads(deepsimbad("keys", "list", "--json").out) == []
+
+
+@pytest.mark.parametrize("command", [("list",), ("list", "--json"), ("revoke", "0123456789ab")])
+def test_a_question_makes_no_folder(deepsimbad, tmp_path, command):
+    deepsimbad("keys", *command, "--data-dir", tmp_path / "nowhere")
+    assert not (tmp_path / "nowhere").exists()
