@@ -10,6 +10,7 @@ from deepsimbad.engine.snapshot import MapSnapshot
 from deepsimbad.errors import DamagedMapError, DeepSimbadError, NoActiveMapError
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.map_file import index_bytes, read_map
+from deepsimbad.store.map_table import removed
 from deepsimbad.store.records import DomainRecord
 from deepsimbad.store.sealing import verify
 
@@ -143,9 +144,12 @@ def load_snapshot(catalog: Catalog, domain: str, version: int) -> MapSnapshot:
 
     Raises:
         UnknownMapVersionError: No such version.
+        RetiredMapError: Its file was removed.
         DamagedMapError: The file is missing, fails its digest or contradicts itself.
     """
     record = catalog.map(domain, version)
+    if record.removed_at is not None:
+        raise removed(domain, version)
     path = catalog.map_path(domain, version)
     try:
         if record.sha256 is not None:
@@ -153,14 +157,14 @@ def load_snapshot(catalog: Catalog, domain: str, version: int) -> MapSnapshot:
         # A map moved here from another server says in its file what it was called there.
         contents = replace(read_map(path), domain=domain, version=version)
         return MapSnapshot.from_contents(contents, index_bytes(path))
-    except DamagedMapError as error:
-        # The cause names a file of the server's; the answer names what a person can act on.
-        raise _damaged(domain, version) from error
     except (DeepSimbadError, OSError, KeyError, TypeError, ValueError) as error:
-        raise _damaged(domain, version) from error
+        raise _unreadable(catalog, domain, version) from error
 
 
-def _damaged(domain: str, version: int) -> DamagedMapError:
+def _unreadable(catalog: Catalog, domain: str, version: int) -> DeepSimbadError:
+    """The cause names a file of the server's; this names what a person can act on."""
+    if catalog.map(domain, version).removed_at is not None:  # just now
+        return removed(domain, version)
     return DamagedMapError(
         f"map {version} of domain {domain} is damaged: activate another version or start a remap",
         domain=domain,

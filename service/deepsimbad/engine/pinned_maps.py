@@ -1,12 +1,21 @@
 """The map versions that sessions are pinned to: held as long as a session holds them, loaded once for all of them."""
 
 import threading
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
 from weakref import WeakValueDictionary
 
 from deepsimbad.engine.active_maps import ActiveDomain, ActiveMaps, load_snapshot
 from deepsimbad.engine.evaluator_pool import EvaluatorPool
 from deepsimbad.engine.snapshot import MapSnapshot
-from deepsimbad.errors import DeepSimbadError, RetiredMapError, UnknownDomainError, UnknownMapVersionError
+from deepsimbad.errors import (
+    DeepSimbadError,
+    RetiredMapError,
+    UnavailableError,
+    UnknownDomainError,
+    UnknownMapVersionError,
+)
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.records import DomainRecord, MapState
@@ -29,15 +38,46 @@ class PinnedMaps:
         self._evaluators = evaluators
         self._held: WeakValueDictionary[_Key, MapSnapshot] = WeakValueDictionary()
         self._lock = threading.Lock()
+        self._n_beginning: Counter[tuple[str, int]] = Counter()
+        self._counting = threading.Lock()
+
+    @contextmanager
+    def beginning(self, snapshot: MapSnapshot) -> Iterator[None]:
+        """A session is about to begin on a version, which keeps its file until the session's own row says that it must.
+
+        Entered before the catalog is asked in `pin`; who removes a version notes that in the catalog and asks here
+        then, so that one of the two sees the other.
+        """
+        key = snapshot.domain, snapshot.version
+        with self._counting:
+            self._n_beginning[key] += 1
+        try:
+            yield
+        finally:
+            with self._counting:
+                self._n_beginning[key] -= 1
+                if not self._n_beginning[key]:
+                    del self._n_beginning[key]
+
+    def is_beginning(self, domain: str, version: int) -> bool:
+        """Whether a session is about to begin on a version. Waits for nobody who reads a file."""
+        with self._counting:
+            return (domain, version) in self._n_beginning
 
     def pin(self, active: ActiveDomain) -> tuple[str, Evaluator]:
         """Digest of a domain's active map, and the domain's evaluator; may read files.
 
+        Called inside `beginning`.
+
         Raises:
             UnknownMapVersionError, UnknownDomainError: The domain was deleted meanwhile.
+            UnavailableError: Another map serves by now, and this one was removed: ask for the active map again.
         """
         snapshot = active.snapshot
-        digest = self._catalog.map(snapshot.domain, snapshot.version).sha256 or ""
+        known = self._catalog.map(snapshot.domain, snapshot.version)
+        if known.removed_at is not None:
+            raise UnavailableError(f"domain {snapshot.domain} was given another map this moment: try again")
+        digest = known.sha256 or ""
         with self._lock:
             self._held[snapshot.domain, snapshot.version, digest] = snapshot
         return digest, self._evaluators.evaluator(active.record.evaluator)

@@ -168,20 +168,21 @@ class Sessions:
         await self._registry.reserve()
         begun = None
         try:
-            digest, evaluator = await asyncio.to_thread(self._maps.pin, active)
-            snapshot, now = active.snapshot, self._clock()
-            expires_at = now + self._ttl_s
+            with self._maps.beginning(active.snapshot):
+                digest, evaluator = await asyncio.to_thread(self._maps.pin, active)
+                snapshot, now = active.snapshot, self._clock()
+                expires_at = now + self._ttl_s
 
-            def start() -> Loaded:
-                engine = SessionEngine.of(config, snapshot, evaluator)
-                return Loaded(engine, engine.start())
+                def start() -> Loaded:
+                    engine = SessionEngine.of(config, snapshot, evaluator)
+                    return Loaded(engine, engine.start())
 
-            loaded = await self._compute(start)
-            told = self._summarised(session_id, expires_at, loaded)
-            new = SessionRecord(
-                0, session_id, snapshot.domain, snapshot.version, digest, config.as_dict(), now, expires_at, 0, None
-            )
-            kept = await asyncio.wrap_future(self._store.create(new))
+                loaded = await self._compute(start)
+                told = self._summarised(session_id, expires_at, loaded)
+                new = SessionRecord(
+                    0, session_id, snapshot.domain, snapshot.version, digest, config.as_dict(), now, expires_at, 0, None
+                )
+                kept = await asyncio.wrap_future(self._store.create(new))
             if replace(kept, number=0) == new:
                 begun = LiveSession(kept, expires_at, loaded)
             answer = await told

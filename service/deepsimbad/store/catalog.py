@@ -1,7 +1,7 @@
 """The catalog: which domains, map versions and jobs there are, and which version serves."""
 
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from datetime import timedelta
 from pathlib import Path
@@ -17,7 +17,7 @@ from deepsimbad.errors import (
     TraverseInUseError,
     UnknownMapVersionError,
 )
-from deepsimbad.store import domain_table, job_queue, job_table, key_table, layout, map_table, unfinished
+from deepsimbad.store import domain_table, job_queue, job_table, key_table, layout, map_removal, map_table, unfinished
 from deepsimbad.store.api_key import ApiKey
 from deepsimbad.store.checkpoints import sweep_checkpoints
 from deepsimbad.store.connection import check_integrity, migrate, open_database, use_write_ahead_log, write_transaction
@@ -28,7 +28,7 @@ from deepsimbad.store.faults import storage_faults
 from deepsimbad.store.list_page import ListPage
 from deepsimbad.store.map_table import AnyVersion
 from deepsimbad.store.ownership import Owner, is_alive
-from deepsimbad.store.records import DomainRecord, JobRecord, KeyRecord, KeyScope, MapRecord, MapState
+from deepsimbad.store.records import DomainRecord, JobRecord, KeptMap, KeyRecord, KeyScope, MapRecord, MapState
 from deepsimbad_migrations.catalog.migrations import migrations
 
 _MAX_KEY_NAME = 100
@@ -216,11 +216,37 @@ class Catalog:
         Raises:
             UnknownDomainError: There is no such domain.
             UnknownMapVersionError: There is no such version, or it is still being built.
+            RetiredMapError: Its file was removed.
             LostActivationError: Another version was activated meanwhile.
         """
         with self._writing() as db:
             domain_table.get(db, domain)
             return map_table.activate(db, domain, version, expected)
+
+    def kept_maps(self) -> list[KeptMap]:
+        """Every sealed version of all domains that still has its file."""
+        with self._reading() as db:
+            return map_removal.kept(db)
+
+    def remove_map(self, domain: str, version: int, is_pinned: Callable[[], bool]) -> None:
+        """Remove the file of a version; its row stays, retired.
+
+        Args:
+            domain: Of the version.
+            version: Its number.
+            is_pinned: Asked while nothing changes in this catalog: who pins a version first, and then finds it here
+                without `removed_at`, keeps it. It must not wait for anyone who waits for the catalog.
+
+        Raises:
+            UnknownDomainError, UnknownMapVersionError: There is no such version.
+            RetiredMapError: It was removed before.
+            MapInUseError: It serves, is being built, or is pinned.
+        """
+        with self._writing() as db:
+            domain_table.get(db, domain)
+            map_removal.mark_removed(db, domain, version, is_pinned)
+        with self._writing() as db:  # from here on a crash is finished at the next start
+            map_removal.unlink_removed(db, self.data_dir, domain, version)
 
     def maps(self, domain: str) -> list[MapRecord]:
         """Every map version, oldest first; raises UnknownDomainError."""

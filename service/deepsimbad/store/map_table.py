@@ -4,7 +4,7 @@ from typing import Any, Final
 
 from sqlite_utils import Database
 
-from deepsimbad.errors import LostActivationError, UnknownMapVersionError
+from deepsimbad.errors import LostActivationError, RetiredMapError, UnknownMapVersionError
 from deepsimbad.store.documents import from_json, now, row_reader, to_json
 from deepsimbad.store.list_page import ListPage
 from deepsimbad.store.records import MapRecord, MapState
@@ -98,9 +98,12 @@ def activate(db: Database, domain: str, version: int, expected: int | AnyVersion
 
     Raises:
         UnknownMapVersionError: There is no such version, or it is still being built.
+        RetiredMapError: Its file was removed.
         LostActivationError: Another version is active than the expected one.
     """
     chosen = get(db, domain, version)
+    if chosen.removed_at is not None:
+        raise removed(domain, version)
     if chosen.state is MapState.BUILDING:
         raise UnknownMapVersionError(f"map version {version} of domain {domain} is still being built", version=version)
     row = db.execute("SELECT version FROM map WHERE domain = ? AND state = 'active'", [domain]).fetchone()
@@ -120,6 +123,15 @@ def activate(db: Database, domain: str, version: int, expected: int | AnyVersion
         [now(), domain, version],
     )
     return get(db, domain, version)
+
+
+def removed(domain: str, version: int) -> RetiredMapError:
+    """What is said of a version whose file is no more."""
+    return RetiredMapError(
+        f"map {version} of domain {domain} was retired and its file removed: it cannot serve again",
+        domain=domain,
+        map_version=version,
+    )
 
 
 def _named(version: int | None) -> str:

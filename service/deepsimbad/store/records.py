@@ -81,6 +81,16 @@ class MapRecord:
 
 
 @dataclass(frozen=True)
+class KeptMap:
+    """A sealed map version that still has its file; `retired_at` as in `MapRecord`."""
+
+    domain: str
+    version: int
+    state: MapState
+    retired_at: str | None
+
+
+@dataclass(frozen=True)
 class JobRecord:
     """One job; times are ISO 8601 in UTC, `progress` runs from 0 to 1, `n_starts` counts how often work on it began."""
 

@@ -78,6 +78,11 @@ def newest_living(
     return ListPage.of(((record.number, record) for record in map(_record, found)), limit)
 
 
+def pins(db: Database) -> set[tuple[str, int]]:
+    """Domain and map version of every session that has not ended."""
+    return set(db.execute("SELECT DISTINCT domain, map_version FROM session WHERE ended_at IS NULL"))
+
+
 def end(db: Database, number: int, ending: str, ended_at: float) -> bool:
     """End a session; its journal stays until it is purged.
 

@@ -115,6 +115,11 @@ class SessionStore:
         with self._reading() as db:
             return session_table.living(db)
 
+    def pins(self) -> set[tuple[str, int]]:
+        """Domain and map version of every session that has not ended."""
+        with self._reading() as db:
+            return session_table.pins(db)
+
     def newest_living(
         self, domain: str | None, before: int | None, limit: int, at: float
     ) -> ListPage[ListedSession, int]:
@@ -165,15 +170,15 @@ class SessionStore:
         with self._reading() as db:
             return journal_table.read(db, number, 0, 2**62)
 
-    def named(self, number: int, key: str) -> tuple[int, bytes] | None:
-        """Sequence number and request digest of the observation with this idempotency key."""
-        with self._lock, storage_faults(self._path):  # one statement needs no transaction, and this is on the hot path
-            return journal_table.named(self._db, number, key)
-
     def journal_part(self, number: int, after: int, until: int) -> list[JournalRow]:
         """The rows after one, up to and with another, in order."""
         with self._reading() as db:
             return journal_table.read(db, number, after, until)
+
+    def named(self, number: int, key: str) -> tuple[int, bytes] | None:
+        """Sequence number and request digest of the observation with this idempotency key."""
+        with self._lock, storage_faults(self._path):  # one statement needs no transaction, and this is on the hot path
+            return journal_table.named(self._db, number, key)
 
     # Experience
 

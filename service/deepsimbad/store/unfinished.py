@@ -59,14 +59,15 @@ def remove_orphans(db: Database, data_dir: Path) -> Iterator[str]:
     """
     for domain in domain_table.all_domains(db):
         folder = layout.maps_folder(data_dir, domain.name)
-        states = {record.version: record.state for record in map_table.of_domain(db, domain.name)}
+        records = {record.version: record for record in map_table.of_domain(db, domain.name)}
         for path in sorted(folder.iterdir()) if folder.is_dir() else []:
             match = _MAP_FILE.fullmatch(path.name)
             if match is None:
                 continue
-            state = states.get(int(match[1]))
-            owned = state is not None if match[2] == "sqlite" else state is MapState.BUILDING
-            if not owned:
+            record = records.get(int(match[1]))
+            is_building = record is not None and record.state is MapState.BUILDING
+            is_kept = record is not None and record.removed_at is None
+            if not (is_kept if match[2] == "sqlite" else is_building):
                 path.unlink(missing_ok=True)
                 yield f"removed {path.name} of domain {domain.name}, which no map version owns"
         for name in traverses.remove_leftovers(data_dir, domain.name):
