@@ -93,5 +93,5 @@ def test_a_lock_that_the_file_system_refuses_is_named(tmp_path: Path, monkeypatc
         raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
 
     monkeypatch.setattr(fcntl, "flock", refuse)
-    with pytest.raises(UnavailableError, match="locks no files .* local disk"):
+    with pytest.raises(UnavailableError, match=r"locks no files .* local disk"):
         ServiceLock.take(tmp_path, "x")

@@ -29,6 +29,7 @@ from deepsimbad.store.list_page import ListPage
 from deepsimbad.store.map_table import AnyVersion
 from deepsimbad.store.ownership import Owner, is_alive
 from deepsimbad.store.records import DomainRecord, JobRecord, KeptMap, KeyRecord, KeyScope, MapRecord, MapState
+from deepsimbad.store.write_ahead_log import check_log
 from deepsimbad_migrations.catalog.migrations import migrations
 
 _MAX_KEY_NAME = 100
@@ -62,6 +63,7 @@ class Catalog:
         with storage_faults(path), ExitStack() as on_error:
             domains = layout.domains_folder(data_dir)
             has_domains = domains.is_dir() and any(domains.iterdir())  # looked at before the rows: they come first
+            check_log(path)
             db = open_database(path, create=True)
             on_error.callback(db.close)
             if has_domains and not db.table_names():

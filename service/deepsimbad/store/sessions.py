@@ -19,6 +19,7 @@ from deepsimbad.store.faults import storage_faults
 from deepsimbad.store.group_commit import GroupCommit
 from deepsimbad.store.list_page import ListPage
 from deepsimbad.store.session_records import ClockRecord, JournalRow, ListedSession, SessionRecord, StateSnapshot
+from deepsimbad.store.write_ahead_log import check_log
 from deepsimbad_migrations.session.migrations import migrations
 
 PURGED_AT_ONCE = 1000  # rows
@@ -50,6 +51,7 @@ class SessionStore:
         path = layout.sessions_path(data_dir)
         make_data_dir(data_dir)
         with storage_faults(path), ExitStack() as on_error:
+            check_log(path)
             writing = open_database(path, create=True)
             on_error.callback(writing.close)
             use_write_ahead_log(writing)

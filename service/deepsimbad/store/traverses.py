@@ -24,6 +24,7 @@ from deepsimbad.store.documents import now
 from deepsimbad.store.durable import remove_database, sync_file, sync_folder
 from deepsimbad.store.faults import storage_faults
 from deepsimbad.store.frames import UNKNOWN_TIMESTAMP, TraverseFrames
+from deepsimbad.store.write_ahead_log import check_log
 from deepsimbad_migrations.traverse.migrations import migrations
 
 IndexRanges = list[tuple[int, int]]  # the class has a `list` of its own
@@ -80,6 +81,7 @@ class Traverse:
         path = layout.traverse_path(data_dir, domain, name)
         if not path.is_file():
             raise UnknownTraverseError(f"domain {domain} has no traverse {name}", known=cls.list(data_dir, domain)[:20])
+        check_log(path)
         with storage_faults(path), ExitStack() as on_error:
             db = open_database(path)
             on_error.callback(db.close)
