@@ -6,9 +6,11 @@ from contextlib import contextmanager
 
 import pytest
 
-from deepsimbad.errors import ConflictError, UnknownDomainError, UnknownJobError
+from deepsimbad.errors import ConflictError, JobInterruptedError, UnknownDomainError, UnknownJobError
 from deepsimbad.jobs.map_config import RemapConfig
+from deepsimbad.jobs.perform import InThisProcess
 from deepsimbad.jobs.runner import JobRunner
+from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.records import JobState
 
 DOMAIN = "route"
@@ -18,21 +20,21 @@ CONFIG = RemapConfig("drive", "other", n_landmarks=8)
 
 
 class Gate:
-    """An evaluator source that keeps a job waiting until it is let through."""
+    """Does jobs in this process, each once it is let through."""
 
-    def __init__(self, evaluator):
+    def __init__(self, data_dir):
         self.entered, self.open = threading.Event(), threading.Event()
-        self.evaluator = evaluator
+        self.run_job = InThisProcess(data_dir)
 
-    def __call__(self, domain):
+    def __call__(self, job, on_progress, is_cancelled):
         self.entered.set()
         assert self.open.wait(WITHIN_S)
-        return self.evaluator
+        return self.run_job(job, on_progress, is_cancelled)
 
 
 @contextmanager
-def running(catalog, evaluator_of, on_activated=lambda domain: None):
-    runner = JobRunner(catalog, evaluator_of, on_activated)
+def running(catalog, run_job=None, on_activated=lambda domain: None):
+    runner = JobRunner(catalog, run_job or InThisProcess(catalog.data_dir), on_activated)
     try:
         yield runner
     finally:
@@ -55,9 +57,9 @@ def drives(drive):
     drive("drive", 12)
 
 
-def test_a_job_succeeds_and_its_map_is_announced(catalog, drives, evaluator):
+def test_a_job_succeeds_and_its_map_is_announced(catalog, drives):
     activated = []
-    with running(catalog, lambda domain: evaluator, activated.append) as runner:
+    with running(catalog, on_activated=activated.append) as runner:
         queued = runner.submit(DOMAIN, CONFIG)
         assert queued.domain == DOMAIN
         job = ended(catalog, queued.job_id)
@@ -69,16 +71,16 @@ def test_a_job_succeeds_and_its_map_is_announced(catalog, drives, evaluator):
     assert activated == [DOMAIN]
 
 
-def test_a_map_that_is_not_activated_is_not_announced(catalog, drives, evaluator):
+def test_a_map_that_is_not_activated_is_not_announced(catalog, drives):
     activated = []
-    with running(catalog, lambda domain: evaluator, activated.append) as runner:
+    with running(catalog, on_activated=activated.append) as runner:
         job = ended(catalog, runner.submit(DOMAIN, RemapConfig("drive", "other", 8, activate=False)).job_id)
     assert job.state is JobState.SUCCEEDED
     assert activated == []
 
 
-def test_jobs_run_in_the_order_they_came(catalog, drives, evaluator):
-    gate = Gate(evaluator)
+def test_jobs_run_in_the_order_they_came(catalog, drives):
+    gate = Gate(catalog.data_dir)
     with running(catalog, gate) as runner:
         jobs = [runner.submit(DOMAIN, CONFIG) for _ in range(3)]
         assert gate.entered.wait(WITHIN_S)
@@ -88,8 +90,8 @@ def test_jobs_run_in_the_order_they_came(catalog, drives, evaluator):
     assert results == [1, 2, 3]
 
 
-def test_a_queued_job_is_cancelled_at_once_and_never_runs(catalog, drives, evaluator):
-    gate = Gate(evaluator)
+def test_a_queued_job_is_cancelled_at_once_and_never_runs(catalog, drives):
+    gate = Gate(catalog.data_dir)
     with running(catalog, gate) as runner:
         first, second, third = (runner.submit(DOMAIN, CONFIG) for _ in range(3))
         assert gate.entered.wait(WITHIN_S)
@@ -101,8 +103,8 @@ def test_a_queued_job_is_cancelled_at_once_and_never_runs(catalog, drives, evalu
     assert catalog.job(first.job_id).state is JobState.SUCCEEDED
 
 
-def test_a_running_job_is_cancelled_at_its_next_report_and_leaves_no_map(catalog, drives, evaluator):
-    gate = Gate(evaluator)
+def test_a_running_job_is_cancelled_at_its_next_report_and_leaves_no_map(catalog, drives):
+    gate = Gate(catalog.data_dir)
     with running(catalog, gate) as runner:
         job = runner.submit(DOMAIN, CONFIG)
         assert gate.entered.wait(WITHIN_S)
@@ -115,8 +117,8 @@ def test_a_running_job_is_cancelled_at_its_next_report_and_leaves_no_map(catalog
         assert ended(catalog, runner.submit(DOMAIN, CONFIG).job_id).state is JobState.SUCCEEDED, "it goes on"
 
 
-def test_a_failed_job_says_why_by_code_and_with_what_helps(catalog, drives, evaluator):
-    with running(catalog, lambda domain: evaluator) as runner:
+def test_a_failed_job_says_why_by_code_and_with_what_helps(catalog, drives):
+    with running(catalog) as runner:
         job = ended(catalog, runner.submit(DOMAIN, RemapConfig("drive", "other", n_landmarks=31)).job_id)
         assert job.state is JobState.FAILED
         assert job.result is None
@@ -126,15 +128,16 @@ def test_a_failed_job_says_why_by_code_and_with_what_helps(catalog, drives, eval
         assert ended(catalog, runner.submit(DOMAIN, CONFIG).job_id).state is JobState.SUCCEEDED, "it goes on"
 
 
-def test_a_job_that_breaks_tells_no_inner_detail_and_the_runner_goes_on(catalog, drives, evaluator, caplog):
+def test_a_job_that_breaks_tells_no_inner_detail_and_the_runner_goes_on(catalog, drives, caplog):
     broken = [True]
+    whole = InThisProcess(catalog.data_dir)
 
-    def evaluator_of(domain):
+    def run_job(job, on_progress, is_cancelled):
         if broken.pop():
             raise ZeroDivisionError("secret")
-        return evaluator
+        return whole(job, on_progress, is_cancelled)
 
-    with running(catalog, evaluator_of) as runner:
+    with running(catalog, run_job) as runner:
         job = ended(catalog, runner.submit(DOMAIN, CONFIG).job_id)
         broken.append(False)
         assert ended(catalog, runner.submit(DOMAIN, CONFIG).job_id).state is JobState.SUCCEEDED
@@ -144,32 +147,109 @@ def test_a_job_that_breaks_tells_no_inner_detail_and_the_runner_goes_on(catalog,
     assert "secret" in caplog.text, "the log has it"
 
 
-def test_unknown_names(catalog, evaluator):
-    with running(catalog, lambda domain: evaluator) as runner:
+def test_unknown_names(catalog):
+    with running(catalog) as runner:
         with pytest.raises(UnknownDomainError):
             runner.submit("elsewhere", CONFIG)
         with pytest.raises(UnknownJobError):
             runner.cancel("nothing")
 
 
-def test_cancelling_what_has_ended_changes_nothing(catalog, drives, evaluator):
-    with running(catalog, lambda domain: evaluator) as runner:
+def test_cancelling_what_has_ended_changes_nothing(catalog, drives):
+    with running(catalog) as runner:
         job = ended(catalog, runner.submit(DOMAIN, CONFIG).job_id)
         assert runner.cancel(job.job_id).state is JobState.SUCCEEDED
     assert catalog.job(job.job_id).state is JobState.SUCCEEDED
 
 
-def test_closing_ends_what_runs_and_takes_nothing_new(catalog, drives, evaluator):
-    gate = Gate(evaluator)
+def test_closing_leaves_what_runs_and_what_waits_to_the_next_service(catalog, drives):
+    gate = Gate(catalog.data_dir)
     runner = JobRunner(catalog, gate, lambda domain: None)
-    job = runner.submit(DOMAIN, CONFIG)
+    first, second = (runner.submit(DOMAIN, CONFIG) for _ in range(2))
     assert gate.entered.wait(WITHIN_S)
     closing = threading.Thread(target=runner.close)
     closing.start()
     gate.open.set()
     closing.join(WITHIN_S)
     assert not closing.is_alive()
-    assert catalog.job(job.job_id).state is JobState.CANCELLED
+    stopped = catalog.job(first.job_id)
+    assert (stopped.state, stopped.n_starts, stopped.stage) == (JobState.QUEUED, 0, None)
+    assert catalog.job(second.job_id).state is JobState.QUEUED
     assert catalog.maps(DOMAIN) == []
     with pytest.raises(ConflictError, match="shutting down"):
         runner.submit(DOMAIN, CONFIG)
+    data_dir = catalog.data_dir
+    catalog.close()
+    with Catalog.open(data_dir) as again:
+        assert len(again.discard_unfinished()) == 2
+        with running(again):
+            assert [ended(again, job.job_id).result["map_version"] for job in (first, second)] == [1, 2]
+        assert again.discard_unfinished() == []
+
+
+def test_a_job_that_was_cancelled_as_the_service_stops_stays_cancelled(catalog, drives):
+    gate = Gate(catalog.data_dir)
+    runner = JobRunner(catalog, gate, lambda domain: None)
+    job = runner.submit(DOMAIN, CONFIG)
+    assert gate.entered.wait(WITHIN_S)
+    runner.cancel(job.job_id)
+    closing = threading.Thread(target=runner.close)
+    closing.start()
+    gate.open.set()
+    closing.join(WITHIN_S)
+    assert catalog.job(job.job_id).state is JobState.CANCELLED
+
+
+def dying(catalog, before):
+    """Does a job until its process dies, before or after its last step."""
+
+    def run_job(job, on_progress, is_cancelled):
+        if not before:
+            InThisProcess(catalog.data_dir)(job, on_progress, is_cancelled)
+        with Catalog.open(catalog.data_dir) as child:
+            version = child.begin_map(DOMAIN, {})
+            child.building_path(DOMAIN, version).write_bytes(b"half a map")
+        raise JobInterruptedError("the job's process was ended by SIGKILL", signal="SIGKILL")
+
+    return run_job
+
+
+def test_a_job_whose_process_died_has_failed_and_leaves_no_half_map(catalog, drives):
+    with running(catalog, dying(catalog, before=True)) as runner:
+        job = ended(catalog, runner.submit(DOMAIN, CONFIG).job_id)
+    assert job.state is JobState.FAILED
+    assert (job.error["code"], job.error["signal"]) == ("job_interrupted", "SIGKILL")
+    assert catalog.maps(DOMAIN) == []
+    assert not catalog.building_path(DOMAIN, 1).exists()
+
+
+def test_a_job_whose_process_died_behind_its_last_step_has_succeeded(catalog, drives):
+    activated = []
+    with running(catalog, dying(catalog, before=False), activated.append) as runner:
+        job = ended(catalog, runner.submit(DOMAIN, CONFIG).job_id)
+    assert (job.state, job.result["map_version"], job.error) == (JobState.SUCCEEDED, 1, None)
+    assert activated == [DOMAIN]
+
+
+def test_no_checkpoint_outlives_its_job(catalog, drives):
+    seen = []
+
+    def watching(job, on_progress, is_cancelled):
+        def look(state):
+            seen.extend(path.name for path in (catalog.data_dir / "jobs" / job.job_id).iterdir())
+            on_progress(state)
+
+        return InThisProcess(catalog.data_dir)(job, look, is_cancelled)
+
+    with running(catalog, watching) as runner:
+        ended(catalog, runner.submit(DOMAIN, CONFIG).job_id)
+        ended(catalog, runner.submit(DOMAIN, RemapConfig("drive", "other", n_landmarks=31)).job_id)
+    assert set(seen) == {"select_landmarks.checkpoint", "describe.checkpoint", "train.checkpoint"}
+    assert list((catalog.data_dir / "jobs").iterdir()) == []
+
+
+def test_an_unknown_kind_of_job_fails_by_name(catalog, drives):
+    job_id = catalog.create_job(DOMAIN, "levitate", {}).job_id
+    with running(catalog):
+        job = ended(catalog, job_id)
+    assert (job.state, job.error["code"]) == (JobState.FAILED, "invalid_input")

@@ -15,11 +15,13 @@ from starlette.types import Scope
 from deepsimbad.api.auth import AuthMiddleware, KeyRing
 from deepsimbad.api.dependencies import Services
 from deepsimbad.api.envelope import EnvelopeMiddleware
+from deepsimbad.api.job_watch import watched
 from deepsimbad.api.limits import BodyLimitMiddleware
 from deepsimbad.api.metrics import Metrics
 from deepsimbad.api.openapi import install_openapi
 from deepsimbad.api.problems import install_problem_handlers
 from deepsimbad.api.rate_limit import RateLimit
+from deepsimbad.api.readiness import ReadinessCheck
 from deepsimbad.api.routes import (
     admin_domains,
     admin_experience,
@@ -36,10 +38,12 @@ from deepsimbad.api.routes import (
     sessions,
     truths,
 )
+from deepsimbad.api.state_metrics import StateCollector, WatchedState
 from deepsimbad.engine.active_maps import ActiveMaps
 from deepsimbad.engine.evaluator_pool import EvaluatorPool
 from deepsimbad.engine.open_traverses import OpenTraverses
 from deepsimbad.engine.pinned_maps import PinnedMaps
+from deepsimbad.engine.retention import Retention
 from deepsimbad.engine.sessions import Sessions
 from deepsimbad.engine.steady_clock import SteadyClock
 from deepsimbad.engine.truths import Truths
@@ -47,6 +51,9 @@ from deepsimbad.engine.warm_up import warm_up
 from deepsimbad.engine.worker import InferenceWorker
 from deepsimbad.errors import DeepSimbadError
 from deepsimbad.evaluators.registry import EvaluatorKind
+from deepsimbad.jobs.cores import job_threads
+from deepsimbad.jobs.job_process import InAnotherProcess
+from deepsimbad.jobs.perform import RunJob
 from deepsimbad.jobs.runner import JobRunner
 from deepsimbad.settings import Settings
 from deepsimbad.store.catalog import Catalog
@@ -80,19 +87,21 @@ _DESCRIPTION = (
 )
 
 
-def create_app(settings: Settings) -> FastAPI:
+def create_app(settings: Settings, run_job: RunJob | None = None) -> FastAPI:
     """The service as an ASGI application; its files are opened when it starts.
 
     Args:
         settings: All it is told; it reads no environment.
+        run_job: Does jobs; None: each in a process of its own (decision 0011).
     """
+    run_job = run_job or InAnotherProcess(settings.data_dir, job_threads(settings.job_threads))
     metrics = Metrics()
     keys = KeyRing()
     app = FastAPI(
         title="Deep SIMBAD",
-        version=_version(),
+        version=release(),
         description=_DESCRIPTION,
-        lifespan=_lifespan(settings, metrics, keys),
+        lifespan=_lifespan(settings, metrics, keys, run_job),
         redirect_slashes=False,
         docs_url=None,  # the framework's page loads its script from another host
         redoc_url=None,
@@ -117,13 +126,13 @@ def create_app(settings: Settings) -> FastAPI:
 
 
 def _lifespan(
-    settings: Settings, metrics: Metrics, keys: KeyRing
+    settings: Settings, metrics: Metrics, keys: KeyRing, run_job: RunJob
 ) -> Callable[[FastAPI], AbstractAsyncContextManager[None]]:
     @asynccontextmanager
     async def run(app: FastAPI) -> AsyncIterator[None]:
         with ExitStack() as parts:
             try:
-                services = await run_sync(_start, settings, metrics, keys, parts)
+                services = await run_sync(_start, settings, metrics, keys, run_job, parts)
             except DeepSimbadError as error:
                 app.state.startup_error = error  # the server only reports that there was one
                 raise
@@ -146,13 +155,14 @@ async def _sweep(services: Services, every_s: float) -> None:
         await asyncio.sleep(every_s)
         try:
             await services.sessions.sweep()
+            await run_sync(services.retention.prune)
             if services.sessions.n_living:
                 await asyncio.wrap_future(services.session_store.note_clock(services.clock.record()))
         except DeepSimbadError:
             log.exception("expired sessions could not be ended")
 
 
-def _start(settings: Settings, metrics: Metrics, keys: KeyRing, parts: ExitStack) -> Services:
+def _start(settings: Settings, metrics: Metrics, keys: KeyRing, run_job: RunJob, parts: ExitStack) -> Services:
     """Open everything; `parts` closes it again, last opened first."""
     parts.enter_context(ServiceLock.take(settings.data_dir, f"{settings.host}:{settings.port}"))
     catalog = parts.enter_context(Catalog.open(settings.data_dir))
@@ -185,15 +195,38 @@ def _start(settings: Settings, metrics: Metrics, keys: KeyRing, parts: ExitStack
     open_traverses = OpenTraverses(settings.data_dir)
     parts.callback(open_traverses.close)
 
+    retention = Retention(catalog, store, pinned_maps, settings.keep_maps)
+    retention.prune()
+
     def switched(domain: str) -> None:
         try:
             active_maps.refresh(domain)
+            retention.prune(domain)
         except DeepSimbadError:
             log.exception("a new map cannot be served", extra={"domain": domain})
 
-    runner = JobRunner(catalog, lambda domain: evaluators.evaluator(catalog.domain(domain).evaluator), switched, store)
+    runner = JobRunner(catalog, watched(run_job, metrics), switched)
     parts.callback(runner.close)
-    metrics.watch(lambda: worker.n_waiting, lambda: active_maps.n_loaded, lambda: live.n_living)
+    readiness = ReadinessCheck(
+        catalog,
+        store,
+        clock,
+        [
+            ("the inference worker", lambda: worker.is_alive),
+            ("the thread that writes sessions", lambda: store.is_committing),
+            ("the thread that runs jobs", lambda: runner.is_alive),
+        ],
+    )
+    state = WatchedState(
+        version=release(),
+        data_dir=settings.data_dir,
+        catalog=catalog,
+        active_maps=active_maps,
+        faults=readiness.faults,
+        queue_length=lambda: worker.n_waiting,
+        n_sessions=lambda: live.n_living,
+    )
+    metrics.watch(StateCollector(state))
     exposure = {"host": settings.host, "port": settings.port, "n_keys": keys.n_usable}
     if keys.n_created == 0:
         log.warning("runs open: no key was ever created, so whoever reaches this address may do all", extra=exposure)
@@ -217,11 +250,12 @@ def _start(settings: Settings, metrics: Metrics, keys: KeyRing, parts: ExitStack
         open_traverses=open_traverses,
         sessions=live,
         session_store=store,
+        retention=retention,
         truths=Truths(store, pinned_maps, worker, clock),
         clock=clock,
         worker=worker,
         runner=runner,
-        damaged_at_start=tuple(sorted(damaged)),
+        readiness=readiness,
     )
 
 
@@ -237,7 +271,8 @@ def _body_limits(settings: Settings) -> Callable[[Scope], int]:
     return limit
 
 
-def _version() -> str:
+def release() -> str:
+    """The version that was installed."""
     try:
         return version("deep-simbad")
     except PackageNotFoundError:  # run from a source tree

@@ -1,4 +1,4 @@
-"""One thread that runs jobs one after the other and keeps their rows true."""
+"""One thread that has jobs done one after the other and keeps their rows true."""
 
 import logging
 import queue
@@ -6,48 +6,44 @@ import threading
 from collections.abc import Callable
 from typing import Any
 
-from deepsimbad.errors import CancelledError, ConflictError, DeepSimbadError
-from deepsimbad.evaluators.base import Evaluator
-from deepsimbad.jobs.learn_online import LEARN_STAGES, learn_online
+from deepsimbad.errors import CancelledError, ConflictError, DeepSimbadError, JobInterruptedError
 from deepsimbad.jobs.map_config import RemapConfig
-from deepsimbad.jobs.progress import Progress, ProgressState
-from deepsimbad.jobs.remap import REMAP_STAGES, error_document, remap
-from deepsimbad.jobs.session_walks import EXPERIENCE, ExperienceConfig, walks_of
+from deepsimbad.jobs.perform import REMAP, RunJob, error_document
+from deepsimbad.jobs.progress import ProgressState
+from deepsimbad.jobs.session_walks import EXPERIENCE, ExperienceConfig
 from deepsimbad.store.catalog import Catalog
+from deepsimbad.store.checkpoints import remove_checkpoints
 from deepsimbad.store.records import JobRecord, JobState
-from deepsimbad.store.sessions import SessionStore
 
 _log = logging.getLogger(__name__)
 _MAX_QUEUED = 100
-REMAP = "remap"
 
 
 class JobRunner:
-    """Runs remaps, and what sessions taught, in the order they came.
+    """Runs remaps, and what sessions taught, in the order they came; first those that an earlier service left.
 
     Args:
-        catalog: Where jobs are recorded.
-        evaluator_of: Gives the evaluator of a domain.
+        catalog: Where jobs are recorded; `Catalog.discard_unfinished` has been called.
+        run_job: Does a job; called in one thread that lives until `close`.
         on_activated: Called with the domain's name after a job activated a map.
-        sessions: What experience is learnt from; None: from nothing.
     """
 
-    def __init__(
-        self,
-        catalog: Catalog,
-        evaluator_of: Callable[[str], Evaluator],
-        on_activated: Callable[[str], None],
-        sessions: SessionStore | None = None,
-    ) -> None:
+    def __init__(self, catalog: Catalog, run_job: RunJob, on_activated: Callable[[str], None]) -> None:
         self._catalog = catalog
-        self._evaluator_of = evaluator_of
+        self._run_job = run_job
         self._on_activated = on_activated
-        self._sessions = sessions
         self._waiting: queue.Queue[str | None] = queue.Queue()
         self._cancelled: dict[str, threading.Event] = {}
         self._closing = threading.Event()
+        for job_id in catalog.waiting_jobs():
+            self._queue(job_id)
         self._thread = threading.Thread(target=self._run, name="jobs", daemon=True)
         self._thread.start()
+
+    @property
+    def is_alive(self) -> bool:
+        """Whether the thread is there to take up jobs."""
+        return self._thread.is_alive()
 
     def submit(self, domain: str, config: RemapConfig | ExperienceConfig) -> JobRecord:
         """Queue a remap, or the learning of what a session taught.
@@ -62,8 +58,7 @@ class JobRunner:
             raise ConflictError(f"{_MAX_QUEUED} jobs wait already; try again later", limit=_MAX_QUEUED)
         kind = REMAP if isinstance(config, RemapConfig) else EXPERIENCE
         job = self._catalog.create_job(domain, kind, config.as_dict())
-        self._cancelled[job.job_id] = threading.Event()
-        self._waiting.put(job.job_id)
+        self._queue(job.job_id)
         return job
 
     def cancel(self, job_id: str) -> JobRecord:
@@ -72,66 +67,90 @@ class JobRunner:
         Raises:
             UnknownJobError: No such job.
         """
-        job = self._catalog.job(job_id)
+        job = self._catalog.cancel_queued_job(job_id)
         event = self._cancelled.get(job_id)
         if event is not None:
             event.set()
-        if job.state is JobState.QUEUED:
-            job = self._catalog.update_job(job_id, state=JobState.CANCELLED, eta_s=None)
         return job
 
     def close(self) -> None:
-        """Cancel what runs and wait for its clean end."""
+        """Stop what runs and wait for its clean end; it and what is queued are left to the next service."""
         self._closing.set()
         self._waiting.put(None)
         self._thread.join()
 
+    def _queue(self, job_id: str) -> None:
+        self._cancelled[job_id] = threading.Event()
+        self._waiting.put(job_id)
+
     def _run(self) -> None:
-        while True:
-            job_id = self._waiting.get()
-            if job_id is None:
-                return
+        while (job_id := self._waiting.get()) is not None and not self._closing.is_set():
             try:
                 self._run_one(job_id)
             except DeepSimbadError:
-                _log.exception("the state of job %s could not be recorded", job_id)
+                _log.exception("the state of a job could not be recorded", extra={"job_id": job_id})
             finally:
                 self._cancelled.pop(job_id, None)
 
     def _run_one(self, job_id: str) -> None:
-        job = self._catalog.job(job_id)
-        if job.state is not JobState.QUEUED:  # cancelled, or its domain deleted, while it waited
+        job = self._catalog.start_job(job_id)
+        if job.state is not JobState.RUNNING:  # cancelled while it waited
+            self._forget_checkpoints(job_id)
             return
         cancelled = self._cancelled[job_id]
-        self._catalog.update_job(job_id, state=JobState.RUNNING)
         ending: dict[str, Any]
         try:
-            progress = Progress(
-                LEARN_STAGES if job.kind == EXPERIENCE else REMAP_STAGES,
+            result = self._run_job(
+                job,
                 lambda state: self._record(job_id, state),
                 lambda: cancelled.is_set() or self._closing.is_set(),
             )
-            result = self._work(job, progress)
-            if result["active"]:
-                self._on_activated(job.domain)
-            ending = {"state": JobState.SUCCEEDED, "result": result, "progress": 1.0}
+            ending = self._succeeded(job, result)
         except CancelledError as error:
-            ending = {"state": JobState.CANCELLED, "error": error_document(error)}
+            self._clear_away()
+            if not cancelled.is_set():  # the service stops: nobody gave the job up
+                self._catalog.give_back_job(job_id)
+                return
+            ending = self._done_all_the_same(job) or {"state": JobState.CANCELLED, "error": error_document(error)}
+        except JobInterruptedError as error:
+            _log.error("a job's process died", extra={"job_id": job_id, "why": error.message})
+            self._clear_away()
+            ending = self._done_all_the_same(job) or {"state": JobState.FAILED, "error": error_document(error)}
         except DeepSimbadError as error:
-            _log.warning("job %s failed: %s", job_id, error)
+            _log.warning("a job failed", extra={"job_id": job_id, "code": error.code, "why": error.message})
             ending = {"state": JobState.FAILED, "error": error_document(error)}
         except Exception:
-            _log.exception("job %s broke", job_id)
+            _log.exception("a job broke", extra={"job_id": job_id})
             broken = {"code": "internal_error", "message": "the job broke; the service's log tells where"}
             ending = {"state": JobState.FAILED, "error": broken}
         self._catalog.update_job(job_id, eta_s=None, **ending)
+        self._forget_checkpoints(job_id)
 
-    def _work(self, job: JobRecord, progress: Progress) -> dict[str, Any]:
-        if job.kind == EXPERIENCE and self._sessions is not None:
-            walks = walks_of(self._sessions, self._catalog, job.domain, job.config["session_id"])
-            return learn_online(self._catalog, job.domain, walks, progress)
-        config = RemapConfig.from_dict(job.config)
-        return remap(self._catalog, job.domain, config, self._evaluator_of(job.domain), progress)
+    def _succeeded(self, job: JobRecord, result: dict[str, Any]) -> dict[str, Any]:
+        if result["active"]:
+            self._on_activated(job.domain)
+        return {"state": JobState.SUCCEEDED, "result": result, "progress": 1.0}
+
+    def _done_all_the_same(self, job: JobRecord) -> dict[str, Any] | None:
+        """The ending of a job that was stopped, or died, behind its last step; None where it was before that."""
+        made = self._catalog.map_of_job(job.domain, job.job_id)
+        if made is None or made.activated_at is None:
+            return None
+        return self._succeeded(job, {"map_version": made.version, "active": True, "metrics": made.metrics})
+
+    def _clear_away(self) -> None:
+        """Discard the map that a killed process was building."""
+        for line in self._catalog.discard_abandoned_maps():
+            _log.info("discarded", extra={"what": line})
+
+    def _forget_checkpoints(self, job_id: str) -> None:
+        try:
+            remove_checkpoints(self._catalog.data_dir, job_id)
+        except DeepSimbadError as error:  # the next start sweeps them away
+            _log.warning("checkpoints not removed", extra={"job_id": job_id, "why": error.message})
 
     def _record(self, job_id: str, state: ProgressState) -> None:
-        self._catalog.update_job(job_id, stage=state.stage, progress=state.progress, eta_s=state.eta_s)
+        try:
+            self._catalog.update_job(job_id, stage=state.stage, progress=state.progress, eta_s=state.eta_s)
+        except DeepSimbadError as error:  # no reason to give hours of work up
+            _log.warning("progress not recorded", extra={"job_id": job_id, "why": error.message})
