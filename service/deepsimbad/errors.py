@@ -181,7 +181,7 @@ class EndedSessionError(GoneError):
 
 
 class RetiredMapError(GoneError):
-    """A session whose map version was retired and removed."""
+    """A map version whose file was removed, or a session on one."""
 
     code = "retired_map"
 

@@ -127,7 +127,31 @@ class RemapBody(JsonBody):
         int, Field(strict=True, ge=0, le=10_000_000, description="Of what the planner `nnql` knows; 0: nothing.")
     ] = DEFAULT_TRAINING_EPISODES
     seed: Annotated[int, Field(strict=True, ge=0, le=GREATEST_EXACT_INTEGER)] = 0
-    activate: Annotated[bool, Field(strict=True, description="Switch to the new map when it is sealed.")] = True
+    activate: Annotated[
+        bool, Field(strict=True, description="Switch to the new map when it is sealed, whatever serves by then.")
+    ] = True
+    check_traverse: Annotated[
+        Name | None,
+        Field(
+            description="Drive that the new map and the active one are compared on; "
+            "null: every tenth frame of the training traverse, held out."
+        ),
+    ] = None
+    gate_margin: Annotated[
+        Annotated[float, Field(strict=True, ge=0, le=100, allow_inf_nan=False)] | None,
+        Field(
+            description="Percentage points of ANR by which the new map may be worse than the active one; "
+            "one that is worse is sealed but not activated. null: no gate."
+        ),
+    ] = None
+    append: Annotated[
+        bool,
+        Field(
+            strict=True,
+            description="Add the training traverse to a copy of the active map, whose images and landmarks stay; "
+            "landmark_traverse must be null.",
+        ),
+    ] = False
 
     def config(self) -> RemapConfig:
         """The job's form; raises InvalidMapConfigError."""

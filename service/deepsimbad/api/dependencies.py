@@ -11,11 +11,13 @@ from anyio import CapacityLimiter
 from anyio.to_thread import run_sync
 from fastapi import Depends, Path, Request
 
-from deepsimbad.api.bodies import NAME_PATTERN
+from deepsimbad.api.bodies import GREATEST_ID, NAME_PATTERN
 from deepsimbad.api.metrics import Metrics
+from deepsimbad.api.readiness import ReadinessCheck
 from deepsimbad.engine.active_maps import ActiveDomain, ActiveMaps
 from deepsimbad.engine.evaluator_pool import EvaluatorPool
 from deepsimbad.engine.open_traverses import OpenTraverses
+from deepsimbad.engine.retention import Retention
 from deepsimbad.engine.sessions import Sessions
 from deepsimbad.engine.steady_clock import SteadyClock
 from deepsimbad.engine.truths import Truths
@@ -46,6 +48,7 @@ class Services:
         open_traverses: Files kept open while frames arrive.
         sessions: Live beliefs.
         session_store: Their file.
+        retention: Which old maps keep their files.
         truths: What their beliefs were worth.
         clock: What they live by.
         worker: Where encoding and scoring run.
@@ -64,6 +67,7 @@ class Services:
     open_traverses: OpenTraverses
     sessions: Sessions
     session_store: SessionStore
+    retention: Retention
     truths: Truths
     clock: SteadyClock
     worker: InferenceWorker
@@ -97,4 +101,5 @@ Running = Annotated[Services, Depends(services_of)]
 DomainName = Annotated[str, Path(alias="domain", pattern=NAME_PATTERN, description="A domain's name.")]
 TraverseName = Annotated[str, Path(alias="name", pattern=NAME_PATTERN, description="A traverse's name.")]
 SessionId = Annotated[str, Path(pattern=NAME_PATTERN, description="A session's id.")]
+MapVersion = Annotated[int, Path(ge=1, le=GREATEST_ID, description="A map version's number.")]
 JobId = Annotated[str, Path(pattern=NAME_PATTERN, description="A job's id.")]

@@ -21,7 +21,7 @@ _DESCRIPTIONS = {
     404: "An unknown name or id",
     408: "A body whose bytes stopped coming",
     409: "The present state forbids it",
-    410: "A session that has ended, or whose map is no more",
+    410: "A session that has ended, or a map that is no more",
     413: "More bytes or pixels than a limit allows",
     415: "A missing or unsupported Content-Type; `allowed` lists what is taken",
     416: "A range outside the file",

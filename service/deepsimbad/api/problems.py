@@ -63,9 +63,10 @@ _TITLE_OF_CODE = {
     "invalid_request": "A value of the request cannot be accepted",
     "not_found": "Nothing answers to this path",
     "method_not_allowed": "The path does not answer to this method",
+    "range_not_satisfiable": "The range begins behind the end",
     "internal_error": "The service failed; the fault is its own",
 }
-_CODE_OF_STATUS = {404: "not_found", 405: "method_not_allowed"}
+_CODE_OF_STATUS = {404: "not_found", 405: "method_not_allowed", 416: "range_not_satisfiable"}
 
 
 class InvalidRequestError(InvalidInputError):

@@ -221,6 +221,9 @@ class MapAnswer(Answer):
     version: int
     state: Literal["building", "sealed", "active", "retired"]
     created_at: str
+    activated_at: Annotated[str | None, Field(description="When it last began to serve.")]
+    retired_at: Annotated[str | None, Field(description="When it last ceased to serve.")]
+    removed_at: Annotated[str | None, Field(description="When its file was removed; it cannot serve again.")]
     sha256: str | None
     file_bytes: int | None
     config: dict[str, Any]

@@ -158,10 +158,10 @@ def load_snapshot(catalog: Catalog, domain: str, version: int) -> MapSnapshot:
         contents = replace(read_map(path), domain=domain, version=version)
         return MapSnapshot.from_contents(contents, index_bytes(path))
     except (DeepSimbadError, OSError, KeyError, TypeError, ValueError) as error:
-        raise _unreadable(catalog, domain, version) from error
+        raise unreadable(catalog, domain, version) from error
 
 
-def _unreadable(catalog: Catalog, domain: str, version: int) -> DeepSimbadError:
+def unreadable(catalog: Catalog, domain: str, version: int) -> DeepSimbadError:
     """The cause names a file of the server's; this names what a person can act on."""
     if catalog.map(domain, version).removed_at is not None:  # just now
         return removed(domain, version)

@@ -35,13 +35,16 @@ class Retention:
     def prune(self, domain: str | None = None) -> int:
         """Remove what is beyond keeping, of one domain or all; answers how many versions it was.
 
-        What cannot be removed now, because of a session or the disk, is tried again the next time.
+        What cannot be removed now, because of a session or the disk, is tried again the next time: whoever asks has
+        something else to do that must not fail for it.
         """
-        kept = self._catalog.kept_maps()
-        beyond = [one for one in beyond_keeping(kept, self._keep_maps) if domain in {None, one.domain}]
-        if not beyond:
+        try:
+            kept = self._catalog.kept_maps()
+            beyond = [one for one in beyond_keeping(kept, self._keep_maps) if domain in {None, one.domain}]
+            pinned = self._sessions.pins() if beyond else set()
+        except DeepSimbadError:
+            log.exception("old maps could not be looked for")
             return 0
-        pinned = self._sessions.pins()
         n_removed = 0
         for one in beyond:
             if (one.domain, one.version) in pinned:

@@ -1,14 +1,21 @@
 """Remapping a domain: from stored traverses to a sealed, active map version (design section 5)."""
 
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from deepsimbad.core.nnql import NnqlConfig
 from deepsimbad.core.relevance import Relevance
-from deepsimbad.errors import DeepSimbadError
+from deepsimbad.engine.snapshot import MapSnapshot
+from deepsimbad.errors import LostActivationError
 from deepsimbad.evaluators.base import Evaluator, LandmarkModel
+from deepsimbad.jobs.append import append_frames
 from deepsimbad.jobs.build_map import Described, choose_landmarks, describe, map_contents
+from deepsimbad.jobs.check_map import CheckedMap, CheckFrames, check_map
 from deepsimbad.jobs.map_config import DEFAULT_N_LANDMARKS, RemapConfig
 from deepsimbad.jobs.progress import Progress
 from deepsimbad.jobs.remap_inputs import RemapInputs, read_inputs
@@ -34,6 +41,7 @@ REMAP_STAGES = {
     "select landmarks": 4.0,
     "describe": 2.0,
     "train": 3.0,
+    "check": 0.5,
     "seal": 1.0,
     "activate": 0.1,
 }
@@ -50,7 +58,10 @@ def remap(
 ) -> dict[str, Any]:
     """Build, seal and, if asked, activate the next map version of a domain.
 
-    Nothing that serves changes before the last step, and a failed or cancelled remap leaves nothing behind.
+    Nothing that serves changes before the last step, and a failed or cancelled remap leaves nothing behind. The last
+    word wins: what was activated or rolled back while the remap ran gives way to the new map. With a gate the new map
+    takes over only from the map it was compared with; else, or where it lost, it stays sealed and
+    `metrics.check.why` says so.
 
     Args:
         catalog: Of the data directory.
@@ -72,9 +83,16 @@ def remap(
     if sealed is None:
         sealed = _built(catalog, domain, config, evaluator, progress, checkpoints, n_threads)
     progress.stage("activate")
-    if config.activate:
-        activate_once(catalog, domain, sealed, ANY)
-    return {"map_version": sealed.version, "active": config.activate, "metrics": sealed.metrics}
+    check = sealed.metrics["check"]
+    active = config.activate and check["passed"] is not False
+    if active:
+        try:
+            activate_once(catalog, domain, sealed, ANY if config.gate_margin is None else check["active_version"])
+        except LostActivationError as error:
+            active = False
+            why = f"{error.message}; the new map was compared with another one, and stays sealed"
+            check = {**check, "why": why}
+    return {"map_version": sealed.version, "active": active, "metrics": {**sealed.metrics, "check": check}}
 
 
 def _built(
@@ -91,6 +109,58 @@ def _built(
     inputs = stages.run("read frames", partial(read_inputs, catalog, domain, config))
     if checkpoints is not None:
         stages.inputs = inputs.digest()
+    if inputs.kept is not None and config.append:
+        made = _appended(catalog, inputs, inputs.kept, evaluator, stages, progress)
+    else:
+        made = _mapped(inputs, evaluator, stages, progress, n_threads)
+    check = stages.run("check", partial(_checked, catalog, inputs, made, evaluator, progress))
+    progress.stage("seal")
+    metrics = {
+        "n_map_images": made.contents.n_map_images,
+        "seconds": stages.seconds,
+        "training": made.training,
+        "check": check,
+    }
+    job_id = None if checkpoints is None else checkpoints.job_id
+    return seal_version(catalog, domain, made.contents, made.config, metrics, progress.update, job_id)
+
+
+@dataclass(frozen=True)
+class _Made:
+    """A map that is not yet sealed.
+
+    Attributes:
+        contents: All of it; its version is not known yet.
+        config: As the catalog keeps it.
+        images: [m] int64, the map image that every frame of the training traverse became.
+        training: How its experience database was learnt; None where it has none.
+    """
+
+    contents: MapContents
+    config: Mapping[str, Any]
+    images: NDArray[np.int64]
+    training: Mapping[str, Any] | None
+
+
+def _appended(
+    catalog: Catalog,
+    inputs: RemapInputs,
+    before: MapContents,
+    evaluator: Evaluator,
+    stages: Stages,
+    progress: Progress,
+) -> _Made:
+    """A copy of the active map with the training traverse among its images."""
+    record = catalog.map(inputs.domain.name, inputs.domain.active_version or 0)
+    append = partial(append_frames, before, record.version, inputs.config, inputs.training, evaluator, progress.update)
+    appended = stages.run("describe", append)
+    contents = replace(appended.contents, domain=inputs.domain.name)
+    return _Made(contents, contents.config, appended.images, record.metrics.get("training"))
+
+
+def _mapped(inputs: RemapInputs, evaluator: Evaluator, stages: Stages, progress: Progress, n_threads: int) -> _Made:
+    """The training traverse as a map of its own."""
+    config = inputs.config
     model = stages.run_once(
         "select landmarks", partial(_landmark_model, inputs, evaluator, progress), pack_model, unpack_model
     )
@@ -105,15 +175,23 @@ def _built(
     if config.training_episodes and config.relevance is not Relevance.BRUTE_FORCE:
         train = partial(_trained, inputs, evaluator, model, found, progress, n_threads)
         experience = stages.run_once("train", train, pack_experience, unpack_experience)
-    progress.stage("seal")
-    metrics = {
-        "n_map_images": inputs.route.n_images,
-        "seconds": stages.seconds,
-        "training": None if experience is None else experience.metrics,
-    }
     contents = _contents(inputs, model, found, experience)
-    job_id = None if checkpoints is None else checkpoints.job_id
-    return seal_version(catalog, domain, contents, config.as_dict(), metrics, progress.update, job_id)
+    training = None if experience is None else experience.metrics
+    return _Made(contents, config.as_dict(), np.arange(inputs.route.n_images), training)
+
+
+def _checked(
+    catalog: Catalog, inputs: RemapInputs, made: _Made, evaluator: Evaluator, progress: Progress
+) -> dict[str, Any]:
+    """How the new map compares with the active one."""
+    config, closed = inputs.config, inputs.domain.closed
+    if config.check_traverse is not None and inputs.check is not None:
+        frames = CheckFrames.of_traverse(config.check_traverse, inputs.check, closed)
+    else:
+        frames = CheckFrames.held_out(config.training_traverse, inputs.training, closed, made.images)
+    new = MapSnapshot.from_contents(made.contents, index_bytes=0)
+    checked = CheckedMap(new.retrieval, new.route, new.landmark_model)
+    return check_map(catalog, inputs.domain.name, checked, frames, config.gate_margin, evaluator, progress.update)
 
 
 def _landmark_model(inputs: RemapInputs, evaluator: Evaluator, progress: Progress) -> LandmarkModel:
@@ -173,8 +251,3 @@ def _contents(
         timestamp_us=times if (times >= 0).any() else None,
         q_values=None if experience is None else experience.q_values,
     )
-
-
-def error_document(error: DeepSimbadError) -> dict[str, Any]:
-    """How a job's row tells a named error."""
-    return {"code": error.code, "message": error.message, **error.hints}

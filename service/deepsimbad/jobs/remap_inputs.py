@@ -34,7 +34,8 @@ class RemapInputs:
         candidates: The traverse landmarks are selected from; None: those of `kept` stay.
         kept: The active map whose landmarks stay; None where they are selected.
         second: The drive that a calibrated map learns from: the landmark traverse, else what the active map was made
-            of; None where there is none of the same encoder.
+            of; None where there is none of the same encoder, or where frames are appended.
+        check: The drive that the new map is checked on; None: on frames of `training` that are held out.
     """
 
     domain: DomainRecord
@@ -44,6 +45,7 @@ class RemapInputs:
     candidates: TraverseFrames | None
     kept: MapContents | None
     second: TraverseFrames | None
+    check: TraverseFrames | None = None
 
     def digest(self) -> str:
         """SHA-256 over all of it, in hex: equal digests, equal map. Another release counts as another input."""
@@ -88,7 +90,7 @@ def read_inputs(catalog: Catalog, domain: str, config: RemapConfig) -> RemapInpu
     Raises:
         UnknownDomainError, UnknownTraverseError: There is none such.
         InvalidMapConfigError: A traverse is empty, or no landmarks could stay.
-        InvalidRouteError: The training traverse goes backwards.
+        InvalidRouteError: The training or the check traverse goes backwards.
         InvalidEncodingError: The traverses come from two encoders.
     """
     record = catalog.domain(domain)
@@ -102,13 +104,16 @@ def read_inputs(catalog: Catalog, domain: str, config: RemapConfig) -> RemapInpu
         if config.landmark_traverse not in read:
             read[config.landmark_traverse] = _frames(catalog, domain, config.landmark_traverse)
         candidates = read[config.landmark_traverse]
-        if _length(candidates) != _length(training):
-            raise InvalidEncodingError(
-                f"traverse {config.landmark_traverse} holds encodings of {_length(candidates)} numbers, traverse "
-                f"{config.training_traverse} of {_length(training)}; both must come from the same encoder"
-            )
-    second = _second_season(catalog, record, config, read)
-    return RemapInputs(record, config, training, route, candidates, kept, second)
+        _check_length(config.landmark_traverse, candidates, config.training_traverse, training)
+    check = None
+    if config.check_traverse is not None:
+        if config.check_traverse not in read:
+            read[config.check_traverse] = _frames(catalog, domain, config.check_traverse)
+        check = read[config.check_traverse]
+        _check_length(config.check_traverse, check, config.training_traverse, training)
+        route_of(check, record.closed)  # said now, not after the map is built
+    second = None if config.append else _second_season(catalog, record, config, read)
+    return RemapInputs(record, config, training, route, candidates, kept, second, check)
 
 
 def _frames(catalog: Catalog, domain: str, name: str) -> TraverseFrames:
@@ -121,6 +126,14 @@ def _frames(catalog: Catalog, domain: str, name: str) -> TraverseFrames:
 
 def _length(frames: TraverseFrames) -> int:
     return int(frames.encodings.shape[1])
+
+
+def _check_length(name: str, frames: TraverseFrames, training_name: str, training: TraverseFrames) -> None:
+    if _length(frames) != _length(training):
+        raise InvalidEncodingError(
+            f"traverse {name} holds encodings of {_length(frames)} numbers, traverse "
+            f"{training_name} of {_length(training)}; both must come from the same encoder"
+        )
 
 
 def _second_season(
@@ -142,7 +155,9 @@ def _second_season(
 def _active_map(catalog: Catalog, record: DomainRecord, config: RemapConfig) -> MapContents:
     if record.active_version is None:
         raise InvalidMapConfigError(
-            f"domain {record.name} has no active map whose landmarks could stay; give a landmark_traverse"
+            f"domain {record.name} has no active map that could be appended to"
+            if config.append
+            else f"domain {record.name} has no active map whose landmarks could stay; give a landmark_traverse"
         )
     kept = read_map(catalog.map_path(record.name, record.active_version))
     if config.n_landmarks not in {None, kept.n_landmarks}:

@@ -26,14 +26,16 @@ router = APIRouter(prefix="/v1/admin/domains", tags=["admin: maps"])
 async def post_remap(domain: DomainName, request: Request, response: Response, running: Running) -> JobAnswer:
     """Build the next map of a domain as a job; what serves stays until the new map is sealed.
 
-    Without `landmark_traverse` the active map's landmarks stay, which is the cheap way to retrain.
+    Without `landmark_traverse` the active map's landmarks stay, which is the cheap way to retrain; with `append` its
+    images stay too, and the training traverse is added to them. The new map is compared with the active one
+    (`metrics.check` of the result), and with a `gate_margin` sealed but not activated where it is worse by more.
     """
     body = await read_json(request, RemapBody)
     config = body.config()
 
     def submit() -> JobAnswer:
         record = running.catalog.domain(domain)
-        for name in (config.training_traverse, config.landmark_traverse):
+        for name in (config.training_traverse, config.landmark_traverse, config.check_traverse):
             if name is not None:
                 Traverse.open(running.settings.data_dir, domain, name).close()
         if config.landmark_traverse is None and record.active_version is None:
