@@ -53,7 +53,7 @@ class Services:
         clock: What they live by.
         worker: Where encoding and scoring run.
         runner: Where jobs run.
-        damaged_at_start: Domains whose active map could not be loaded at start.
+        readiness: Whether all of it works.
         stopping: Set when shutdown begins; streams end on it.
         decoders: Bounds the images being decoded.
         batches: Bounds the batches being read.
@@ -72,7 +72,7 @@ class Services:
     clock: SteadyClock
     worker: InferenceWorker
     runner: JobRunner
-    damaged_at_start: tuple[str, ...] = ()
+    readiness: ReadinessCheck
     stopping: threading.Event = field(default_factory=threading.Event)
     decoders: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(DECODERS))
     batches: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(BATCHES))

@@ -1,12 +1,29 @@
-"""What Prometheus scrapes: one registry per application, so that two in one process do not mix."""
+"""What Prometheus scrapes: one registry per application, so that two in one process do not mix.
 
-from collections.abc import Callable, Iterable, Mapping
+Every metric is explained in `docs/operations.md`, and a test compares.
+"""
 
-from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
+import threading
+from collections.abc import Iterable, Mapping
+
+from prometheus_client import (
+    CollectorRegistry,
+    Counter,
+    Gauge,
+    Histogram,
+    ProcessCollector,
+    disable_created_metrics,
+    generate_latest,
+)
 from prometheus_client.exposition import CONTENT_TYPE_LATEST
+
+from deepsimbad.api.state_metrics import StateCollector
+
+disable_created_metrics()  # a gauge beside every counter that says when it began; nobody asks
 
 _LATENCY_BUCKETS_S = (0.001, 0.002, 0.004, 0.008, 0.016, 0.032, 0.064, 0.125, 0.25, 0.5, 1, 2, 4, 8, 30)
 _PERCENT_BUCKETS = (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 30, 40, 50, 75, 100)
+_JOB_BUCKETS_S = (1, 2, 5, 10, 20, 30, 60, 120, 300, 600, 1800, 3600, 7200)
 _BATCH_BUCKETS = (1, 2, 4, 8, 16, 32, 64, 128, 256)
 
 
@@ -68,22 +85,31 @@ class Metrics:
             buckets=_BATCH_BUCKETS,
             registry=self._registry,
         )
+        self._refused = Counter(
+            "deepsimbad_refused_requests",
+            "Requests and connections turned away for what they are or how many, by reason.",
+            ["reason"],
+            registry=self._registry,
+        )
+        self._job_seconds = Histogram(
+            "deepsimbad_job_seconds",
+            "Time from a job's start to its end.",
+            ["kind", "state"],
+            buckets=_JOB_BUCKETS_S,
+            registry=self._registry,
+        )
         self._in_flight = Gauge(
             "deepsimbad_requests_in_flight", "Requests being answered now.", registry=self._registry
         )
-        self._queue = Gauge(
-            "deepsimbad_inference_queue", "Work waiting for the inference worker.", registry=self._registry
-        )
-        self._active_maps = Gauge("deepsimbad_loaded_maps", "Active maps held in memory.", registry=self._registry)
-        self._sessions = Gauge("deepsimbad_sessions", "Sessions that have not ended.", registry=self._registry)
+        ProcessCollector(registry=self._registry)
+        self._state: StateCollector | None = None
+        self._domains: set[str] = set()  # that have series here
+        self._scrape = threading.Lock()
 
-    def watch(
-        self, queue_length: Callable[[], int], n_active_maps: Callable[[], int], n_sessions: Callable[[], int]
-    ) -> None:
-        """Read these whenever the metrics are scraped."""
-        self._queue.set_function(lambda: float(queue_length()))
-        self._active_maps.set_function(lambda: float(n_active_maps()))
-        self._sessions.set_function(lambda: float(n_sessions()))
+    def watch(self, state: StateCollector) -> None:
+        """Show this state too, from now on."""
+        self._state = state
+        self._registry.register(state)
 
     def request_began(self) -> None:
         """Count a request as being answered."""
@@ -99,10 +125,12 @@ class Metrics:
         """Record one localization."""
         for stage, milliseconds in timings_ms.items():
             self._stage_seconds.labels(stage).observe(milliseconds / 1000)
+        self._domains.add(domain)
         self._entropy_bits.labels(domain).observe(entropy_bits)
 
     def fed_back(self, domain: str, rank_shares: Iterable[float]) -> None:
         """Record where beliefs had placed the truth: shares of the map, 0..1, one for every observation."""
+        self._domains.add(domain)
         ranks = self._live_anr_percent.labels(domain)
         for share in rank_shares:
             ranks.observe(100 * share)
@@ -115,11 +143,25 @@ class Metrics:
         """Record one transaction of the sessions' file."""
         self._commit_writes.observe(n_writes)
 
+    def refused(self, reason: str) -> None:
+        """Count what was turned away: an error's code, or another word of ours."""
+        self._refused.labels(reason).inc()
+
+    def job_ended(self, kind: str, state: str, seconds: float) -> None:
+        """Record how long a job ran until it ended so."""
+        self._job_seconds.labels(kind, state).observe(seconds)
+
     def forget_domain(self, domain: str) -> None:
         """Drop what is kept by a domain's name, so that deleted domains do not pile up."""
+        self._domains.discard(domain)
         for histogram in (self._entropy_bits, self._live_anr_percent):
             histogram.remove_by_labels({"domain": domain})
 
     def render(self) -> bytes:
-        """The text exposition."""
-        return generate_latest(self._registry)
+        """The text exposition; reads files."""
+        with self._scrape:
+            census = None if self._state is None else self._state.look()
+            if census is not None:  # a view that was on its way brought a deleted domain back
+                for domain in self._domains.difference(census.domains):
+                    self.forget_domain(domain)
+            return generate_latest(self._registry)

@@ -39,7 +39,7 @@ class Readiness(Answer):
 
     status: Literal["ready"]
     damaged_maps: Annotated[
-        list[str], Field(description="Domains whose active map was damaged at the start; all others are served.")
+        list[str], Field(description="Domains whose active map cannot be loaded; all others are served.")
     ]
 
 

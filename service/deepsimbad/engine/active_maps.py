@@ -51,12 +51,29 @@ class ActiveMaps:
         self._active: dict[str, ActiveDomain] = {}
         self._checked_at: dict[str, float] = {}
         self._damaged: dict[str, _Damage] = {}
+        self._announced: dict[str, int] = {}
         self._loading = threading.Lock()
 
     @property
     def n_loaded(self) -> int:
         """How many maps are in memory."""
         return len(self._active)
+
+    def loaded(self) -> list[ActiveDomain]:
+        """The domains whose maps are in memory, by name."""
+        return sorted(self._active.copy().values(), key=lambda one: one.record.name)
+
+    def damaged(self) -> dict[str, int]:
+        """The active versions that cannot be loaded, by domain; each is tried again, which reads its file."""
+        still = {}
+        for domain in sorted(self._damaged.copy()):
+            try:
+                self.refresh(domain)
+            except DamagedMapError as error:
+                still[domain] = int(error.hints["map_version"])
+            except DeepSimbadError:  # deleted, or has no active map any more
+                self._damaged.pop(domain, None)
+        return still
 
     def peek(self, domain: str) -> ActiveDomain | None:
         """The domain and its active map if that is known without touching a file, else None."""
@@ -91,6 +108,8 @@ class ActiveMaps:
                 self._forget(domain)
                 raise
             self._active[domain] = active
+            self._damaged.pop(domain, None)
+            self._announce(domain, active.snapshot.version)
             self._checked_at[domain] = self._clock()
             return active
 
@@ -98,6 +117,8 @@ class ActiveMaps:
         """Let go of a deleted domain's map."""
         with self._loading:
             self._forget(domain)
+            self._damaged.pop(domain, None)
+            self._announced.pop(domain, None)
 
     def load_all(self) -> dict[str, DamagedMapError]:
         """Load the active maps of all domains.
@@ -109,6 +130,7 @@ class ActiveMaps:
         for record in self._catalog.domains():
             if record.active_version is None:
                 continue
+            self._announced[record.name] = record.active_version  # it served before, which is no news
             try:
                 self.refresh(record.name)
             except DamagedMapError as error:
@@ -132,11 +154,20 @@ class ActiveMaps:
         if found is not None and found.version == version and self._clock() - found.found_at < _DAMAGE_REMEMBERED_S:
             raise DamagedMapError(found.error.message, **found.error.hints) from found.error
         try:
-            return load_snapshot(self._catalog, record.name, version)
+            snapshot = load_snapshot(self._catalog, record.name, version)
         except DamagedMapError as error:
             self._damaged[record.name] = _Damage(version, error, self._clock())
             log.error("damaged map", extra={"domain": record.name, "map_version": version}, exc_info=error)
             raise
+        return snapshot
+
+    def _announce(self, domain: str, version: int) -> None:
+        """Say in the log that another version serves than before, whoever switched it."""
+        before = self._announced.get(domain)
+        if before != version:
+            what = "map activated" if before is None or version > before else "map rolled back"
+            log.info(what, extra={"domain": domain, "map_version": version, "before": before})
+            self._announced[domain] = version
 
 
 def load_snapshot(catalog: Catalog, domain: str, version: int) -> MapSnapshot:

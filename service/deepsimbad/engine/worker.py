@@ -50,6 +50,11 @@ class InferenceWorker:
         """How many functions wait."""
         return self._queue.qsize()
 
+    @property
+    def is_alive(self) -> bool:
+        """Whether the thread is there to run them."""
+        return self._thread.is_alive()
+
     def submit(self, run: Callable[[], T], priority: Priority = Priority.LIVE) -> Future[T]:
         """Queue a function.
 

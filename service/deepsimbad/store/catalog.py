@@ -19,6 +19,8 @@ from deepsimbad.errors import (
 )
 from deepsimbad.store import domain_table, job_queue, job_table, key_table, layout, map_removal, map_table, unfinished
 from deepsimbad.store.api_key import ApiKey
+from deepsimbad.store.census import Census
+from deepsimbad.store.census import take as take_census
 from deepsimbad.store.checkpoints import sweep_checkpoints
 from deepsimbad.store.connection import check_integrity, migrate, open_database, use_write_ahead_log, write_transaction
 from deepsimbad.store.data_dir import make_data_dir
@@ -100,6 +102,18 @@ class Catalog:
     def _writing(self) -> Iterator[Database]:
         with self._lock, storage_faults(self._path), write_transaction(self._db) as db:
             yield db
+
+    def check(self) -> None:
+        """Raise what keeps the file from being read."""
+        with self._reading() as db:
+            db.execute("SELECT name FROM domain LIMIT 1").fetchall()
+        if not self._path.exists():  # an open file goes on without its name, until it is closed
+            raise DamagedFileError(f"{self._path.name} was removed under the running service", file=self._path.name)
+
+    def census(self) -> Census:
+        """What the catalog holds, counted."""
+        with self._reading() as db:
+            return take_census(db)
 
     # Domains
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sqlite_utils import Database
 
+from deepsimbad.errors import DamagedFileError
 from deepsimbad.store import clock_table, journal_table, layout, session_table
 from deepsimbad.store.connection import migrate, open_database, use_write_ahead_log
 from deepsimbad.store.data_dir import make_data_dir
@@ -84,9 +85,11 @@ class SessionStore:
         """Raise what keeps the file from being read."""
         with self._reading() as db:
             db.execute("SELECT number FROM session LIMIT 1").fetchall()
+        if not self._path.exists():  # an open file goes on without its name, until it is closed
+            raise DamagedFileError(f"{self._path.name} was removed under the running service", file=self._path.name)
 
     @property
-    def commits(self) -> bool:
+    def is_committing(self) -> bool:
         """Whether the thread that writes is alive."""
         return self._commits.is_alive
 

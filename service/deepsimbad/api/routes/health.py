@@ -27,15 +27,20 @@ async def healthz() -> Health:
 @router.head("/readyz", include_in_schema=False)
 @router.get("/readyz", responses=problems())
 async def readyz(running: Running) -> Readiness:
-    """The evaluators are loaded, the catalog and the sessions can be read; 503 until then and while shutting down."""
+    """What serves is there: threads that work, a catalog and sessions that can be read and written, room on the disk.
+
+    Else 503, and `faults` says what is wrong; while shutting down too. A damaged map keeps its own domain alone from
+    being served, and is told here.
+    """
     if running.stopping.is_set():
-        raise UnavailableError("the service is shutting down")
-    await run_sync(running.catalog.domains)
-    await run_sync(running.session_store.check)
-    return Readiness(status="ready", damaged_maps=list(running.damaged_at_start))
+        raise UnavailableError("the service is shutting down", faults=["the service is shutting down"])
+    faults = await run_sync(running.readiness.faults)
+    if faults:
+        raise UnavailableError("; ".join(faults), faults=list(faults))
+    return Readiness(status="ready", damaged_maps=list(await run_sync(running.active_maps.damaged)))
 
 
 @router.get("/metrics", response_class=MetricsResponse, responses=problems())
 async def metrics(running: Running) -> Response:
     """What Prometheus scrapes."""
-    return Response(running.metrics.render(), media_type=running.metrics.content_type)
+    return Response(await run_sync(running.metrics.render), media_type=running.metrics.content_type)
