@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from starlette.testclient import TestClient
 
 from deepsimbad.api.app import create_app
+from deepsimbad.jobs.perform import InThisProcess
 from deepsimbad.settings import Settings
 
 N_READY, DIM, N_LANDMARKS = 40, 8, 10
@@ -84,7 +85,7 @@ def data_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def client(data_dir: Path) -> Iterator[TestClient]:
     """Shared by all tests of a run: a test that changes a domain makes its own."""
-    app = create_app(small_settings(data_dir))
+    app = create_app(small_settings(data_dir), InThisProcess(data_dir))  # small jobs, and many of them
     with TestClient(app, raise_server_exceptions=False) as client:
         make_ready_domain(client, "ready")
         assert client.put("/v1/admin/domains/seen", json={"evaluator": {"kind": "feature_l2"}}).status_code == 201

@@ -10,6 +10,7 @@ from starlette.testclient import TestClient
 
 from deepsimbad.api.app import create_app
 from deepsimbad.engine.active_maps import load_snapshot
+from deepsimbad.jobs.perform import InThisProcess
 
 from .conftest import N_LANDMARKS, make_ready_domain, ready_encodings, remap, small_settings, wait_for
 
@@ -18,7 +19,8 @@ PATH = "/v1/admin/domains/ready/experience"
 
 @pytest.fixture
 def service(tmp_path: Path) -> Iterator[TestClient]:
-    with TestClient(create_app(small_settings(tmp_path)), raise_server_exceptions=False) as client:
+    app = create_app(small_settings(tmp_path), InThisProcess(tmp_path))
+    with TestClient(app, raise_server_exceptions=False) as client:
         make_ready_domain(client, "ready")
         yield client
 

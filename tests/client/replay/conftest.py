@@ -11,12 +11,13 @@ import pytest
 import uvicorn
 
 from deepsimbad.api.app import create_app
+from deepsimbad.jobs.perform import InThisProcess
 from deepsimbad.settings import Settings
 
 
 @contextmanager
 def serving(data_dir: Path) -> Iterator[str]:
-    app = create_app(Settings(data_dir=data_dir))
+    app = create_app(Settings(data_dir=data_dir), InThisProcess(data_dir))
     config = uvicorn.Config(app, host="127.0.0.1", port=0, log_level="warning", ws="none", lifespan="on")
     server = uvicorn.Server(config)
     thread = threading.Thread(target=server.run)
