@@ -300,6 +300,12 @@ class ForbiddenError(AccessError):
     code = "forbidden"
 
 
+class UnreadableRequestError(DeepSimbadError):
+    """Bytes that are no request."""
+
+    code = "unreadable_request"
+
+
 class RequestTimeoutError(DeepSimbadError):
     """A request whose bytes stopped coming."""
 
