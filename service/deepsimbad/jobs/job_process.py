@@ -22,7 +22,6 @@ _log = logging.getLogger(__name__)
 _MODULE = "deepsimbad.jobs.job_child"
 _THREAD_VARIABLES = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 _LOOK_AGAIN_S = 0.1
-_STOPS_WITHIN_S = 3.0  # after a cancel; then it is killed, which costs no more than a crash
 _ENDS_WITHIN_S = 10.0  # after its last word
 _READ_AT_ONCE = 1 << 16
 
@@ -39,11 +38,13 @@ class InAnotherProcess:
     Args:
         data_dir: The data directory.
         n_threads: Threads the child computes in.
+        stops_within_s: A child that does not stop so soon after a cancel is killed, which harms nothing either.
     """
 
-    def __init__(self, data_dir: Path, n_threads: int) -> None:
+    def __init__(self, data_dir: Path, n_threads: int, stops_within_s: float = 3.0) -> None:
         self._data_dir = data_dir
         self._n_threads = n_threads
+        self._stops_within_s = stops_within_s
 
     def __call__(
         self, job: JobRecord, on_progress: Callable[[ProgressState], None], is_cancelled: Callable[[], bool]
@@ -58,8 +59,9 @@ class InAnotherProcess:
         }
         limits = dict.fromkeys(_THREAD_VARIABLES, str(self._n_threads))  # read when the libraries load, not later
         with _Child(order, limits) as child:
+            _log.info("job begins", extra={"job_id": job.job_id, "kind": job.kind, "pid": child.pid})
             result = None
-            for message in child.messages(is_cancelled):
+            for message in child.messages(is_cancelled, self._stops_within_s):
                 match message:
                     case {"progress": [stage, progress, eta_s]}:
                         on_progress(ProgressState(stage, progress, eta_s))
@@ -117,7 +119,12 @@ class _Child:
             if pipe is not None:
                 pipe.close()
 
-    def messages(self, is_cancelled: Callable[[], bool]) -> Iterator[dict[str, Any]]:
+    @property
+    def pid(self) -> int:
+        """Its process id."""
+        return self._process.pid
+
+    def messages(self, is_cancelled: Callable[[], bool], stops_within_s: float) -> Iterator[dict[str, Any]]:
         """What it says, until it says no more; a cancel is handed on, and enforced where it is not obeyed."""
         process = self._process
         if process.stdout is None or process.stderr is None:
@@ -138,7 +145,7 @@ class _Child:
                     yield _message(line) if descriptor == messages else _said(line)
             if kill_at is None and is_cancelled():
                 self._send(b"cancel\n")
-                kill_at = time.monotonic() + _STOPS_WITHIN_S
+                kill_at = time.monotonic() + stops_within_s
             elif kill_at is not None and time.monotonic() > kill_at and not self._was_killed:
                 self._was_killed = True
                 process.kill()

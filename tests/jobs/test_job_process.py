@@ -1,0 +1,253 @@
+"""Jobs in a process of their own: the same results and errors, out of everybody's way, and never an orphan."""
+
+import json
+import logging
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from contextlib import contextmanager
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from deepsimbad.errors import CancelledError, DeepSimbadError, JobInterruptedError, TooFewCandidatesError
+from deepsimbad.jobs.cores import available_cores, job_threads
+from deepsimbad.jobs.job_process import BrokenJobError, InAnotherProcess
+from deepsimbad.jobs.map_config import RemapConfig
+from deepsimbad.jobs.perform import REMAP, InThisProcess
+from deepsimbad.store.checkpoints import Checkpoints
+from deepsimbad.store.map_file import read_map
+
+DOMAIN = "route"
+WITHIN_S = 30
+CONFIG = RemapConfig("drive", "other", n_landmarks=8, training_episodes=200)
+COMMAND = [sys.executable, "-P", "-m", "deepsimbad.jobs.job_child"]
+
+
+def never():
+    return False
+
+
+def nothing(state):
+    return None
+
+
+@pytest.fixture
+def job(catalog, drive):
+    drive("other", 60, seed=1)
+    drive("drive", 60)
+    return catalog.start_job(catalog.create_job(DOMAIN, REMAP, CONFIG.as_dict()).job_id)
+
+
+def test_the_map_is_the_one_that_this_process_would_make(catalog, job, caplog):
+    seen = []
+    with caplog.at_level(logging.INFO, "deepsimbad"):
+        result = InAnotherProcess(catalog.data_dir, 1)(job, seen.append, never)
+    assert result["map_version"] == 1
+    assert result["metrics"] == catalog.map(DOMAIN, 1).metrics
+    assert (seen[0].stage, seen[-1].stage) == ("read frames", "activate")
+    other = catalog.start_job(catalog.create_job(DOMAIN, REMAP, CONFIG.as_dict()).job_id)
+    InThisProcess(catalog.data_dir)(other, nothing, never)
+    here, there = (asdict(replace(read_map(catalog.map_path(DOMAIN, v)), version=0, created_at="")) for v in (1, 2))
+    assert here.keys() == there.keys()
+    for name in here:
+        np.testing.assert_equal(here[name], there[name], name)
+
+
+def test_errors_come_back_by_name_with_what_helps(catalog, job):
+    failing = replace(job, config={**job.config, "n_landmarks": 61})
+    with pytest.raises(TooFewCandidatesError, match="60 candidates for 61") as raised:
+        InAnotherProcess(catalog.data_dir, 1)(failing, nothing, never)
+    assert raised.value.hints == {"n_candidates": 60, "n_landmarks": 61}
+
+
+def test_what_breaks_has_its_stack_in_the_notes_alone(catalog, job):
+    with pytest.raises(BrokenJobError) as raised:
+        InAnotherProcess(catalog.data_dir, 1)(replace(job, config={"levitate": True}), nothing, never)
+    assert "levitate" not in str(raised.value)
+    assert "Traceback" in raised.value.__notes__[0]
+
+
+def test_its_log_lines_are_the_services_with_the_jobs_id(catalog, job, caplog):
+    with Checkpoints.open(catalog.data_dir, job.job_id) as held:
+        held.save("select landmarks", "other inputs", {}, {})
+    with caplog.at_level(logging.INFO, "deepsimbad"):
+        InAnotherProcess(catalog.data_dir, 1)(job, nothing, never)
+    (record,) = [record for record in caplog.records if record.getMessage() == "checkpoint not used"]
+    assert (record.levelname, record.name) == ("WARNING", "deepsimbad.store.checkpoints")
+    assert (record.__dict__["job_id"], record.__dict__["stage"]) == (job.job_id, "select landmarks")
+
+
+def about(pid, what):
+    return Path("/proc", str(pid), what)
+
+
+class Doing:
+    """A job in a child that waits, because its checkpoints are held here."""
+
+    def __init__(self, catalog, job, caplog, run_job=None):
+        self.cancelled, self.ending = threading.Event(), None
+        self._run_job = run_job or InAnotherProcess(catalog.data_dir, 3)
+        self._caplog = caplog
+        self._thread = threading.Thread(target=self._run, args=[job])
+        self._thread.start()
+        self.pid = self._until(self._begun)
+
+    def _run(self, job):
+        try:
+            self.ending = self._run_job(job, nothing, self.cancelled.is_set)
+        except DeepSimbadError as error:
+            self.ending = error
+
+    def _begun(self):
+        return next((record.__dict__["pid"] for record in self._caplog.records if "pid" in record.__dict__), None)
+
+    def _until(self, answer):
+        give_up = time.monotonic() + WITHIN_S
+        while not (found := answer()):
+            assert time.monotonic() < give_up
+            time.sleep(0.01)
+        return found
+
+    def until_ready(self):
+        """Until it yields to everyone and listens: its listening thread is there."""
+        self._until(lambda: len(list(about(self.pid, "task").iterdir())) > 1)
+
+    def ended(self):
+        self._thread.join(WITHIN_S)
+        assert not self._thread.is_alive()
+        return self.ending
+
+
+@contextmanager
+def held(catalog, job, caplog, run_job=None):
+    with caplog.at_level(logging.INFO, "deepsimbad"), Checkpoints.open(catalog.data_dir, job.job_id):
+        doing = Doing(catalog, job, caplog, run_job)
+        try:
+            yield doing
+        finally:
+            doing.cancelled.set()
+            doing.ended()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the scheduling classes are Linux's")
+def test_it_yields_to_everyone_and_computes_in_the_threads_it_is_given(catalog, job, caplog):
+    with held(catalog, job, caplog) as doing:
+        doing.until_ready()
+        assert os.sched_getscheduler(doing.pid) == os.SCHED_IDLE
+        assert os.getpriority(os.PRIO_PROCESS, doing.pid) == 19
+        environment = about(doing.pid, "environ").read_text(encoding="utf-8").split("\0")
+        given = dict(each.split("=", 1) for each in environment if "=" in each)
+        assert {name: given[name] for name in given if name.endswith("_NUM_THREADS")}.items() >= {
+            ("NUMBA_NUM_THREADS", "3"),
+            ("OMP_NUM_THREADS", "3"),
+            ("OPENBLAS_NUM_THREADS", "3"),
+        }
+        assert int(about(doing.pid, "oom_score_adj").read_text(encoding="ascii")) >= 500
+        for task in about(doing.pid, "task").iterdir():
+            assert os.sched_getscheduler(int(task.name)) == os.SCHED_IDLE, "every thread of it"
+
+
+def test_a_cancel_is_heard(catalog, job, caplog):
+    with held(catalog, job, caplog) as doing:
+        doing.cancelled.set()
+        error = doing.ended()
+    assert isinstance(error, CancelledError)
+    assert "killed" not in error.message
+    assert catalog.maps(DOMAIN) == []
+
+
+def test_a_cancel_is_enforced(catalog, job, caplog):
+    with held(catalog, job, caplog, InAnotherProcess(catalog.data_dir, 1, stops_within_s=0.2)) as doing:
+        os.kill(doing.pid, signal.SIGSTOP)
+        doing.cancelled.set()
+        error = doing.ended()
+    assert isinstance(error, CancelledError)
+    assert "killed" in error.message
+
+
+@pytest.mark.parametrize(
+    ("sent", "said"), [(signal.SIGKILL, "where memory runs out"), (signal.SIGSEGV, "ended by SIGSEGV")]
+)
+def test_a_death_names_its_signal(catalog, job, caplog, sent, said):
+    with held(catalog, job, caplog) as doing:
+        os.kill(doing.pid, sent)
+        error = doing.ended()
+    assert isinstance(error, JobInterruptedError)
+    assert said in error.message
+    assert error.hints == {"signal": sent.name}
+
+
+def test_what_stops_the_service_does_not_stop_its_job_first(catalog, job, caplog):
+    with held(catalog, job, caplog) as doing:
+        doing.until_ready()
+        for sent in (signal.SIGINT, signal.SIGTERM):
+            os.kill(doing.pid, sent)
+        time.sleep(0.2)
+        os.kill(doing.pid, 0)
+        assert doing.ending is None
+        assert os.getsid(doing.pid) != os.getsid(0), "Ctrl-C is for the service alone"
+
+
+def test_without_its_parent_it_ends(catalog, job):
+    order = {
+        "job": asdict(job),
+        "data_dir": str(catalog.data_dir),
+        "n_threads": 1,
+        "parent_pid": os.getpid(),
+        "log_level": logging.INFO,
+    }
+    with Checkpoints.open(catalog.data_dir, job.job_id):
+        for changed, closes in (({}, True), ({"parent_pid": 1}, False)):
+            with subprocess.Popen(COMMAND, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL) as child:
+                assert child.stdin is not None
+                child.stdin.write(json.dumps(order | changed).encode() + b"\n")
+                child.stdin.flush()
+                if closes:
+                    child.stdin.close()
+                assert child.wait(WITHIN_S) == 3
+    unsaid = subprocess.run(COMMAND, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, check=False, timeout=WITHIN_S)
+    assert (unsaid.returncode, unsaid.stdout) == (3, b"")
+
+
+SERVICE = """
+import sys, threading
+from pathlib import Path
+from deepsimbad.jobs.job_process import InAnotherProcess
+import logging
+logging.basicConfig(level=logging.INFO, stream=sys.stdout, format="%(pid)s")
+data_dir = Path(sys.argv[1])
+with Catalog.open(data_dir) as catalog:
+    job = catalog.job(sys.argv[2])
+    InAnotherProcess(data_dir, 1)(job, lambda state: None, lambda: False)
+"""
+
+
+def test_killed_together_with_its_parent(catalog, job):
+    with Checkpoints.open(catalog.data_dir, job.job_id):
+        command = [sys.executable, "-c", SERVICE, str(catalog.data_dir), job.job_id]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as service:
+            assert service.stdout is not None
+            pid = int(service.stdout.readline())
+            service.kill()
+        give_up = time.monotonic() + WITHIN_S
+        while is_running(pid):
+            assert time.monotonic() < give_up
+            time.sleep(0.01)
+
+
+def is_running(pid):
+    try:
+        return about(pid, "stat").read_text(encoding="utf-8").rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+def test_threads_of_jobs():
+    assert job_threads(5) == 5
+    assert 1 <= job_threads(0) <= max(1, available_cores() - 1)
