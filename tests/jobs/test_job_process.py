@@ -219,6 +219,7 @@ SERVICE = """
 import sys, threading
 from pathlib import Path
 from deepsimbad.jobs.job_process import InAnotherProcess
+from deepsimbad.store.catalog import Catalog
 import logging
 logging.basicConfig(level=logging.INFO, stream=sys.stdout, format="%(pid)s")
 data_dir = Path(sys.argv[1])
