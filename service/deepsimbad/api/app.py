@@ -10,6 +10,7 @@ from importlib.metadata import PackageNotFoundError, version
 from anyio.to_thread import run_sync
 from fastapi import FastAPI
 from starlette.middleware.cors import CORSMiddleware
+from starlette.routing import Route
 from starlette.types import Scope
 
 from deepsimbad.api.auth import AuthMiddleware, KeyRing
@@ -108,7 +109,8 @@ def create_app(settings: Settings, run_job: RunJob | None = None) -> FastAPI:
     )
     for module in _ROUTERS:
         app.include_router(module.router)
-    install_problem_handlers(app)
+    routes = [route for module in _ROUTERS for route in module.router.routes if isinstance(route, Route)]
+    install_problem_handlers(app, routes)
     install_openapi(app)
     app.add_middleware(BodyLimitMiddleware, limit_of=_body_limits(settings))
     rate_limit = RateLimit(settings.rate_limit_per_s, settings.rate_limit_burst)

@@ -1,5 +1,6 @@
 """The OpenAPI document: what the framework derives, and what it cannot know."""
 
+import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -33,6 +34,18 @@ _DESCRIPTIONS = {
 }
 _RETRY_AFTER = {"Retry-After": {"description": "Seconds to wait.", "schema": {"type": "integer", "minimum": 1}}}
 _CHALLENGE = {"WWW-Authenticate": {"description": "How to authenticate.", "schema": {"const": "Bearer"}}}
+# What an answer gives to the calls whose path needs just these: call, status, parameters.
+_LINKS = (
+    ("PUT /v1/admin/domains/{domain}", "201", {"domain": "$request.path.domain"}),
+    (
+        "POST /v1/admin/domains/{domain}/traverses",
+        "201",
+        {"domain": "$request.path.domain", "name": "$response.body#/name"},
+    ),
+    ("POST /v1/admin/domains/{domain}/remaps", "202", {"job_id": "$response.body#/job_id"}),
+    ("POST /v1/admin/domains/{domain}/experience", "202", {"job_id": "$response.body#/job_id"}),
+    ("POST /v1/domains/{domain}/sessions", "201", {"session_id": "$response.body#/session_id"}),
+)
 _HEADERS = {401: _CHALLENGE, 429: _RETRY_AFTER, 503: _RETRY_AFTER}
 _SECURITY_SCHEMES = {
     "bearer": {
@@ -84,9 +97,15 @@ def install_openapi(app: FastAPI) -> None:
                 schemas.update(schema.pop("$defs", {}))
                 schemas[model.__name__] = schema
             components["securitySchemes"] = _SECURITY_SCHEMES
-            for path, operations in made["paths"].items():
-                for operation in operations.values():
-                    _declare_what_comes_first(operation, needed_scope(path))
+            _write_pairs_plainly(schemas)
+            operations = {
+                f"{method.upper()} {path}": operation
+                for path, by_method in made["paths"].items()
+                for method, operation in by_method.items()
+            }
+            for name, operation in operations.items():
+                _declare_what_comes_first(operation, needed_scope(name.partition(" ")[2]))
+            _link(operations)
             app.openapi_schema = made
         return app.openapi_schema
 
@@ -104,3 +123,26 @@ def _declare_what_comes_first(operation: dict[str, Any], needed: KeyScope | None
     for status in statuses:
         operation["responses"].setdefault(str(status), _problem(status))
     operation["responses"] = dict(sorted(operation["responses"].items()))
+
+
+def _link(operations: Mapping[str, dict[str, Any]]) -> None:
+    """Say of the answers that make something which calls take it."""
+    for source, status, parameters in _LINKS:
+        links = operations[source]["responses"][status].setdefault("links", {})
+        for target, operation in operations.items():
+            if target != source and set(re.findall(r"\{(\w+)\}", target)) == set(parameters):
+                name = operation["operationId"]
+                links[name] = {"operationId": name, "parameters": dict(parameters)}
+
+
+def _write_pairs_plainly(schema: Any) -> None:
+    """Write arrays of so many items of one kind with `items`: many readers of such documents know no `prefixItems`."""
+    if isinstance(schema, dict):
+        kinds = schema.get("prefixItems")
+        if isinstance(kinds, list) and all(kind == kinds[0] for kind in kinds):
+            schema["items"] = schema.pop("prefixItems")[0]
+        for part in schema.values():
+            _write_pairs_plainly(part)
+    elif isinstance(schema, list):
+        for part in schema:
+            _write_pairs_plainly(part)

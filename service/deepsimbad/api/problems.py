@@ -12,6 +12,7 @@ from fastapi.exceptions import RequestValidationError
 from pydantic import ValidationError
 from starlette.exceptions import HTTPException
 from starlette.responses import Response
+from starlette.routing import Route
 from starlette.types import Scope
 
 from deepsimbad.errors import (
@@ -114,6 +115,7 @@ def problem_response(
         "code": code,
         "request_id": scope.get("state", {}).get("request_id"),
     }
+    scope.setdefault("state", {})["code"] = code  # for the log
     sent = dict(headers or {})
     if status == HTTPStatus.UNAUTHORIZED:
         sent.setdefault("WWW-Authenticate", "Bearer")
@@ -151,8 +153,13 @@ def invalid_request(error: ValidationError, where: str) -> InvalidRequestError:
     return _invalid_request(((where, *one["loc"]), one["msg"], one["type"]) for one in found)
 
 
-def install_problem_handlers(app: FastAPI) -> None:
-    """Let every error that leaves a route of `app` be answered as a problem."""
+def install_problem_handlers(app: FastAPI, routes: Sequence[Route] = ()) -> None:
+    """Let every error that leaves a route of `app` be answered as a problem.
+
+    Args:
+        app: The application.
+        routes: Its routes, whose methods stand in `Allow` where a path does not answer to one.
+    """
 
     async def from_tree(request: Request, error: Exception) -> Response:
         if not isinstance(error, DeepSimbadError):
@@ -172,11 +179,21 @@ def install_problem_handlers(app: FastAPI) -> None:
             raise error
         code = _CODE_OF_STATUS.get(error.status_code, f"http_{error.status_code}")
         detail = f"{request.method} {_instance(request.scope)}: {error.detail}"
-        return problem_response(request.scope, error.status_code, code, detail, headers=error.headers)
+        headers = dict(error.headers or {})
+        if error.status_code == HTTPStatus.METHOD_NOT_ALLOWED:  # the framework names those of one route
+            headers["Allow"] = _allowed(routes, request.scope["path"]) or headers.get("Allow", "")
+        return problem_response(request.scope, error.status_code, code, detail, headers=headers)
 
     app.add_exception_handler(DeepSimbadError, from_tree)
     app.add_exception_handler(RequestValidationError, from_validation)
     app.add_exception_handler(HTTPException, from_http)
+
+
+def _allowed(routes: Sequence[Route], path: str) -> str:
+    """The methods that a path answers to, as the header `Allow` lists them."""
+    return ", ".join(
+        sorted({method for each in routes if each.path_regex.match(path) for method in each.methods or ()})
+    )
 
 
 def _invalid_request(found: Iterable[tuple[tuple[Any, ...], str, str]]) -> InvalidRequestError:
