@@ -1,23 +1,21 @@
 """The administrator's calls of the blocking client."""
 
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from deepsimbad_client import admin_calls
-from deepsimbad_client.answers import job_of_event
-from deepsimbad_client.models import Domain, FramesStored, FrameStored, Job, MapVersion, Traverse
+from deepsimbad_client.map_admin import MapAdmin
+from deepsimbad_client.models import Domain, FramesStored, FrameStored, Traverse
 from deepsimbad_client.observation import Image, Numbers, observation
-from deepsimbad_client.transport import Transport
+from deepsimbad_client.paging import each
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
 
-class Admin:
-    """Makes, fills, remaps and switches domains."""
-
-    def __init__(self, transport: Transport) -> None:
-        self._transport = transport
+class Admin(MapAdmin):
+    """Makes and fills domains; and, as `MapAdmin`, remaps and switches them."""
 
     def put_domain(
         self,
@@ -49,8 +47,12 @@ class Admin:
         return self._transport.send(admin_calls.create_traverse(domain, name))
 
     def traverses(self, domain: str) -> tuple[Traverse, ...]:
-        """Every traverse of a domain."""
-        return self._transport.send(admin_calls.traverses(domain))
+        """Every traverse of a domain, by name."""
+        return tuple(self.iter_traverses(domain))
+
+    def iter_traverses(self, domain: str) -> Iterator[Traverse]:
+        """Yield every traverse of a domain, by name, a page at a time."""
+        return each(self._transport, partial(admin_calls.traverses, domain))
 
     def traverse(self, domain: str, name: str) -> Traverse:
         """One traverse: how many frames have arrived and which are missing."""
@@ -127,69 +129,3 @@ class Admin:
                 y_m=y_m,
             )
         )
-
-    def remap(self, domain: str, **config: Any) -> Job:
-        """Submit a remap and return its job at once; `deepsimbad_client.remap.remap` also follows it.
-
-        Args:
-            domain: The domain to map anew.
-            **config: `training_traverse` and, where they should differ from the service's defaults,
-                `landmark_traverse`, `n_landmarks`, `list_length`, `relevance`, `training_episodes`, `seed`, `activate`.
-        """
-        return self._transport.send(admin_calls.remap(domain, config))
-
-    def feed_experience(self, domain: str, session_id: str, true_positions_m: Numbers) -> Job:
-        """Teach the next map: where a session's robot truly was at each of its observations, known only afterwards.
-
-        Args:
-            domain: The session's domain.
-            session_id: The session; it may have ended a while ago.
-            true_positions_m: A position along the map's route for each observation, in order; None where unknown.
-
-        Returns:
-            The job that makes the next map version.
-        """
-        return self._transport.send(admin_calls.feed_experience(domain, session_id, true_positions_m))
-
-    def jobs(self, domain: str | None = None) -> tuple[Job, ...]:
-        """Jobs, newest first, of one domain or all."""
-        return self._transport.send(admin_calls.jobs(domain))
-
-    def job(self, job_id: str) -> Job:
-        """One job."""
-        return self._transport.send(admin_calls.job(job_id))
-
-    def job_events(self, job_id: str) -> Iterator[Job]:
-        """Yield the job each time it has moved, the last time ended; one connection, not renewed when it breaks.
-
-        Raises:
-            TransportError: The connection failed or broke off.
-        """
-        with self._transport.stream(admin_calls.job_events(job_id)) as events:
-            for event in events:
-                job = job_of_event(event.data)
-                if job is not None:
-                    yield job
-                if event.event == "done":
-                    return
-
-    def cancel_job(self, job_id: str) -> None:
-        """Ask a job to stop; it ends as cancelled soon after."""
-        self._transport.send(admin_calls.cancel_job(job_id))
-
-    def maps(self, domain: str) -> tuple[MapVersion, ...]:
-        """A domain's history of maps."""
-        return self._transport.send(admin_calls.maps(domain))
-
-    def activate(self, domain: str, version: int, *, expected: int | None = None) -> MapVersion:
-        """Serve another version (or roll back to an older one).
-
-        Args:
-            domain: The domain.
-            version: The version to serve.
-            expected: The version believed active now; absent: whichever is.
-
-        Raises:
-            LostActivationError: Another version than the expected one was active.
-        """
-        return self._transport.send(admin_calls.activate(domain, version, expected))

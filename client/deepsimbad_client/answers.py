@@ -10,6 +10,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from deepsimbad_client.errors import MissingExtraError, UnexpectedAnswerError, api_error_class
 from deepsimbad_client.models import Answer, Job, NextBestView
+from deepsimbad_client.page import Page
 from deepsimbad_client.problem import problem_of
 from deepsimbad_client.retry import retry_after_s, utc_now
 
@@ -64,19 +65,31 @@ def model(kind: type[Model]) -> Callable[[httpx2.Response], Model]:
 
 
 def models(kind: type[Model], key: str) -> Callable[[httpx2.Response], tuple[Model, ...]]:
-    """A parser of a list of models, bare or under `key` (where a page says more about itself)."""
+    """A parser of a whole list of models, bare or under `key`."""
+    of_page = page(kind, key)
+    return lambda response: of_page(response).entries
+
+
+def page(kind: type[Model], key: str) -> Callable[[httpx2.Response], Page[Model]]:
+    """A parser of one page of a list of models under `key`; a list that says nothing of a next page is whole."""
     adapter = TypeAdapter(tuple[kind, ...])  # type: ignore[valid-type]
 
-    def parse(response: httpx2.Response) -> tuple[Model, ...]:
+    def parse(response: httpx2.Response) -> Page[Model]:
         try:
             document = json.loads(response.content)
-            if isinstance(document, dict):
-                document = document[key]
-            return adapter.validate_python(document)
+            if not isinstance(document, dict):
+                return Page(adapter.validate_python(document), None)
+            behind = document.get("next")
+            return Page(adapter.validate_python(document[key]), None if behind is None else str(behind))
         except (ValueError, KeyError) as error:
             raise _unexpected(response, error) from error
 
     return parse
+
+
+def text(response: httpx2.Response) -> str:
+    """A parser of plain text."""
+    return response.text
 
 
 def nothing(response: httpx2.Response) -> None:

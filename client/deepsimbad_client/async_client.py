@@ -56,6 +56,10 @@ class AsyncClient:
         """Whether it can answer now."""
         return await self._transport.send(calls.ready())
 
+    async def metrics(self) -> str:
+        """What the service counts, in Prometheus' text format."""
+        return await self._transport.send(calls.metrics())
+
     async def domains(self) -> tuple[Domain, ...]:
         """Every domain."""
         return await self._transport.send(calls.domains())
@@ -116,6 +120,7 @@ class AsyncClient:
         belief: str | None = None,
         update: str | None = None,
         keep: bool = False,
+        idempotency_key: str | None = None,
     ) -> AsyncSession:
         """Begin a session; use it as `async with await client.session(...) as session`."""
         call = session_calls.start(
@@ -126,6 +131,7 @@ class AsyncClient:
             planner=planner,
             belief=belief,
             update=update,
+            idempotency_key=idempotency_key,
         )
         return AsyncSession(self._transport, await self._transport.send(call), keep=keep)
 

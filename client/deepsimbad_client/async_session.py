@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Self
 
 from deepsimbad_client import session_calls
 from deepsimbad_client.errors import DeepSimbadClientError, GoneError
-from deepsimbad_client.models import NextBestView, SessionAnswer, SessionState
+from deepsimbad_client.models import NextBestView, SessionAnswer, SessionState, TruthScore
 from deepsimbad_client.observation import Image, Numbers, observation
 from deepsimbad_client.transport import AsyncTransport
 
@@ -88,6 +88,10 @@ class AsyncSession:
             InvalidPriorError: The position is far off the route, or the deviation cannot be one.
         """
         return await self._transport.send(session_calls.set_prior(self.session_id, position_m, std_m))
+
+    async def truths(self, true_positions_m: Numbers) -> TruthScore:
+        """Tell where the robot truly was at each of its observations, known only afterwards."""
+        return await self._transport.send(session_calls.truths(self.session_id, true_positions_m))
 
     async def delete(self) -> None:
         """End the session; nothing more can be asked of it."""

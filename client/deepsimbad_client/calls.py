@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from deepsimbad_client.answers import float_array, model, models
+from deepsimbad_client.answers import float_array, model, models, text
 from deepsimbad_client.call import Call, name_in_path, query
 from deepsimbad_client.models import Domain, Health, Localization
 from deepsimbad_client.observation import Observation
@@ -21,6 +21,11 @@ def health() -> Call[Health]:
 def ready() -> Call[Health]:
     """Can it answer now; its 503 is the answer, so it is never asked again on its own."""
     return Call("GET", "/readyz", model(Health), repeat=Repeat.NEVER)
+
+
+def metrics() -> Call[str]:
+    """What Prometheus would scrape."""
+    return Call("GET", "/metrics", text)
 
 
 def domains() -> Call[tuple[Domain, ...]]:

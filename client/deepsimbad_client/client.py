@@ -24,10 +24,10 @@ if TYPE_CHECKING:
 class Client:
     """Talks to one Deep SIMBAD service and blocks; safe to share between threads.
 
-    Connection errors and the answers 429, 502, 503 and 504 are retried with exponential backoff and jitter, or after
-    the service's own `Retry-After`, where repeating is safe: every call here but those of `admin` that act once
-    (`create_traverse`, `remap`, and `activate` with `expected`), which are sent again only when the service surely did
-    not act on them.
+    Connection errors and the answers 408, 429, 502, 503 and 504 are retried with exponential backoff and jitter, or
+    after the service's own `Retry-After`, where repeating is safe: every call here but those of `admin` that act once
+    (`create_traverse`, `remap`, `feed_experience`, and `activate` with `expected`), which are sent again only when the
+    service surely did not act on them. A refused key (401, 403) is never tried again.
 
     Args:
         url: The service's address; absent: `$DEEPSIMBAD_URL`, else http://127.0.0.1:8000.
@@ -73,6 +73,10 @@ class Client:
             UnavailableError: Not yet; its detail says why.
         """
         return self._transport.send(calls.ready())
+
+    def metrics(self) -> str:
+        """What the service counts, in Prometheus' text format."""
+        return self._transport.send(calls.metrics())
 
     def domains(self) -> tuple[Domain, ...]:
         """Every domain."""
@@ -156,8 +160,11 @@ class Client:
         belief: str | None = None,
         update: str | None = None,
         keep: bool = False,
+        idempotency_key: str | None = None,
     ) -> Session:
         """Begin a session: the service keeps this robot's belief from view to view.
+
+        A lost answer is asked for again and begins no second session.
 
         Args:
             domain: Where the robot is.
@@ -168,6 +175,8 @@ class Client:
             belief: `particle` or `grid`; absent: the service's default.
             update: How a view changes the belief; absent: the map's default.
             keep: Let it outlive its `with` block.
+            idempotency_key: Names this beginning, so that it can be repeated after a `TransportError`; absent: a new
+                one.
 
         Raises:
             UnknownDomainError: No such domain.
@@ -183,6 +192,7 @@ class Client:
             planner=planner,
             belief=belief,
             update=update,
+            idempotency_key=idempotency_key,
         )
         return Session(self._transport, self._transport.send(call), keep=keep)
 

@@ -11,8 +11,11 @@ from importlib import import_module
 
 import click
 
+from deepsimbad_client.delete_commands import delete_domain, delete_map, delete_session, delete_traverse
 from deepsimbad_client.errors import DeepSimbadClientError
 from deepsimbad_client.job_commands import jobs, remap
+from deepsimbad_client.list_commands import sessions, traverses
+from deepsimbad_client.map_commands import activate, download, maps, rollback
 from deepsimbad_client.place_commands import domains, localize
 from deepsimbad_client.replay_command import replay
 from deepsimbad_client.upload_command import upload
@@ -52,7 +55,13 @@ def cli() -> None:
     """
 
 
-for command in (upload, remap, replay, watch, localize, domains, jobs):
+COMMANDS = (
+    *(upload, remap, replay, watch, localize),
+    *(domains, traverses, jobs, sessions, maps),
+    *(activate, rollback, download),
+    *(delete_domain, delete_traverse, delete_map, delete_session),
+)
+for command in COMMANDS:
     cli.add_command(command)
 
 

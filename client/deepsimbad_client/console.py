@@ -1,8 +1,7 @@
-"""What the commands show: progress on standard error, tables and JSON on standard output."""
+"""How the commands show things: progress on standard error, results on standard output."""
 
 import json
 import os
-from collections.abc import Sequence
 from types import TracebackType
 from typing import Any, Self
 
@@ -20,7 +19,7 @@ from rich.progress import (
 from rich.table import Table
 
 from deepsimbad_client.episode_log import Episode
-from deepsimbad_client.models import Domain, Job, Localization
+from deepsimbad_client.models import Job
 from deepsimbad_client.step_log import Step
 from deepsimbad_client.upload import UploadProgress
 
@@ -97,9 +96,24 @@ class JobBar(Bar):
         super().__init__(label, 1.0, counted=False)
 
     def __call__(self, job: Job) -> None:
-        """Show how far a job is."""
-        stage = (job.stage or job.state).replace("_", " ")
+        """Show how far a job is; one whose service was restarted waits in the queue again."""
+        stage = "waiting for its turn" if job.state == "queued" else (job.stage or job.state).replace("_", " ")
         self._progress.update(self._task, completed=job.progress, note=stage)
+
+    def silent(self, seconds: float) -> None:
+        """Show that nothing has been heard for a while."""
+        self._progress.update(self._task, note=f"no answer for {seconds:.0f} s, still trying")
+
+
+class DownloadBar(Bar):
+    """Bytes that are there."""
+
+    def __init__(self, label: str) -> None:
+        super().__init__(label, None, counted=False)
+
+    def __call__(self, n_bytes: int, n_in_all: int | None) -> None:
+        """Show how much of a file has come."""
+        self._progress.update(self._task, completed=n_bytes, total=n_in_all, note=f"{n_bytes / 1e6:.1f} MB")
 
 
 class ReplayBar(Bar):
@@ -135,60 +149,3 @@ class EpisodeBar(Bar):
         means = {planner: sum(each) / len(each) for planner, each in self._ranks.items() if each}
         note = "  ".join(f"{planner} {mean:.1f} %" for planner, mean in means.items())
         self._progress.update(self._task, completed=n_done, note=note)
-
-
-def domain_table(domains: Sequence[Domain]) -> Table:
-    """Domains and their active maps."""
-    table = Table(title="domains", title_justify="left")
-    table.add_column("name", style="bold")
-    for heading in ("map", "images", "route [m]", "landmarks", "list", "bits/image", "evaluator"):
-        table.add_column(heading, justify="left" if heading == "evaluator" else "right")
-    for domain in domains:
-        evaluator = domain.evaluator
-        kind = evaluator.get("kind", "") if isinstance(evaluator, dict) else evaluator
-        table.add_row(
-            domain.name,
-            _shown(domain.map_version),
-            _shown(domain.n_map_images),
-            _shown(domain.route_length_m, ".0f"),
-            _shown(domain.n_landmarks),
-            _shown(domain.list_length),
-            _shown(domain.index_bits_per_map_image, ".1f"),
-            str(kind or ""),
-        )
-    return table
-
-
-def job_table(jobs: Sequence[Job]) -> Table:
-    """Jobs and how far they are."""
-    table = Table(title="jobs", title_justify="left")
-    table.add_column("job", style="bold", no_wrap=True)
-    table.add_column("domain", overflow="fold")
-    table.add_column("state", no_wrap=True)
-    table.add_column("outcome", overflow="fold")
-    for job in jobs:
-        if job.ended:
-            outcome = job.error_text or (f"map {job.result.get('map_version')}" if job.result else "")
-        else:
-            outcome = f"{(job.stage or 'waiting').replace('_', ' ')}, {100 * job.progress:.0f} %"
-        table.add_row(job.job_id, job.domain, job.state, outcome)
-    return table
-
-
-def place_table(answers: Sequence[tuple[str, Localization]]) -> Table:
-    """Where images probably were taken."""
-    table = Table(title="places", title_justify="left")
-    table.add_column("image", style="bold", overflow="fold")
-    knows_xy = any(answer.belief.top[0].x_m is not None for _, answer in answers)
-    for heading in ("likeliest [m]", "95 % within [m]", *(("x [m]", "y [m]") if knows_xy else ())):
-        table.add_column(heading, justify="right", no_wrap=True)
-    for name, answer in answers:
-        top = answer.belief.top[0]
-        low, high = answer.belief.credible_95_m
-        place = (_shown(top.x_m, ".1f"), _shown(top.y_m, ".1f")) if knows_xy else ()
-        table.add_row(name, f"{answer.belief.mode_m:.1f}", f"{low:.1f} .. {high:.1f}", *place)
-    return table
-
-
-def _shown(value: float | None, form: str = "") -> str:
-    return "-" if value is None else format(value, form)

@@ -76,6 +76,24 @@ class UnexpectedAnswerError(DeepSimbadClientError):
     code = "unexpected_answer"
 
 
+class DamagedDownloadError(DeepSimbadClientError):
+    """A file that came has another digest than the service named."""
+
+    code = "damaged_download"
+
+
+class NotSavedError(DeepSimbadClientError):
+    """A file that cannot be written here."""
+
+    code = "not_saved"
+
+
+class NoEarlierMapError(DeepSimbadClientError):
+    """There is no map to roll back to."""
+
+    code = "no_earlier_map"
+
+
 class JobFailedError(DeepSimbadClientError):
     """A job ended without success.
 
@@ -126,23 +144,45 @@ class ApiError(DeepSimbadClientError):
         self.request_id = request_id
         self.retry_after_s = retry_after_s
 
+    @property
+    def advice(self) -> str:
+        """What the caller can do about it, where the service may not have said so; "" where there is nothing to add."""
+        return ""
+
     def __str__(self) -> str:
         parts = [f"{self.status} {self.code}".strip()]
         if self.request_id:
             parts.append(f"request {self.request_id}")
-        return f"{self.message} ({', '.join(parts)})"
+        told = f"{self.message} ({', '.join(parts)})"
+        return f"{told}; {self.advice}" if self.advice else told
 
 
 class BadRequestError(ApiError):
     """400: the request could not be read at all."""
 
 
+_KEY_ADVICE = (
+    "`deepsimbad keys create --scope {scope}` makes one where the service runs; give it in $DEEPSIMBAD_API_KEY or "
+    "--api-key"
+)
+
+
 class UnauthorizedError(ApiError):
     """401: no key, or one the service does not know."""
+
+    @property
+    def advice(self) -> str:
+        """How to come by a key."""
+        return _KEY_ADVICE.format(scope="localize|admin")
 
 
 class ForbiddenError(ApiError):
     """403: the key lacks the scope this call needs."""
+
+    @property
+    def advice(self) -> str:
+        """How to come by the right key."""
+        return _KEY_ADVICE.format(scope=self.problem.get("needed", "admin"))
 
 
 class NotFoundError(ApiError):
@@ -169,6 +209,10 @@ class UnknownSessionError(NotFoundError):
     """No such session, or one that ended long ago."""
 
 
+class RequestTimeoutError(ApiError):
+    """408: the request's bytes stopped coming, so the service gave it up."""
+
+
 class ConflictError(ApiError):
     """409: the request is sound but the present state forbids it."""
 
@@ -189,6 +233,14 @@ class LostActivationError(ConflictError):
     """The active map was not the expected one when the swap was tried."""
 
 
+class MapInUseError(ConflictError):
+    """The map version serves, is being built, or a living session keeps it."""
+
+
+class TooManyDomainsError(ConflictError):
+    """The service holds as many domains as it may."""
+
+
 class GoneError(ApiError):
     """410: a retired map, or an expired or deleted session."""
 
@@ -203,6 +255,10 @@ class RetiredMapError(GoneError):
 
 class TooLargeError(ApiError):
     """413: more bytes or pixels than a limit allows."""
+
+
+class HeadersTooLargeError(TooLargeError):
+    """431: the request's headers, the key among them, are longer than the service takes."""
 
 
 class UnsupportedMediaTypeError(ApiError):
@@ -226,7 +282,7 @@ class InvalidPriorError(InvalidInputError):
 
 
 class IdempotencyKeyReusedError(InvalidInputError):
-    """The idempotency key came before with another observation."""
+    """The idempotency key came before with another request."""
 
 
 class RateLimitedError(ApiError):
@@ -245,11 +301,23 @@ class UnavailableError(ServerError):
     """503: the service cannot answer now; its data is safe."""
 
 
+class OverloadedError(UnavailableError):
+    """More requests at once than the service answers in good time; `retry_after_s` says when to come again."""
+
+
 class DamagedMapError(UnavailableError):
     """A map file on the server fails its digest or cannot be read."""
 
 
 BY_CODE: Mapping[str, type[ApiError]] = {
+    "unauthorized": UnauthorizedError,
+    "forbidden": ForbiddenError,
+    "request_timeout": RequestTimeoutError,
+    "headers_too_large": HeadersTooLargeError,
+    "rate_limited": RateLimitedError,
+    "overloaded": OverloadedError,
+    "map_in_use": MapInUseError,
+    "too_many_domains": TooManyDomainsError,
     "unknown_domain": UnknownDomainError,
     "unknown_traverse": UnknownTraverseError,
     "unknown_job": UnknownJobError,
@@ -274,12 +342,14 @@ BY_STATUS: Mapping[int, type[ApiError]] = {
     401: UnauthorizedError,
     403: ForbiddenError,
     404: NotFoundError,
+    408: RequestTimeoutError,
     409: ConflictError,
     410: GoneError,
     413: TooLargeError,
     415: UnsupportedMediaTypeError,
     422: InvalidInputError,
     429: RateLimitedError,
+    431: HeadersTooLargeError,
     503: UnavailableError,
 }
 

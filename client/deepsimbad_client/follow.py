@@ -6,6 +6,7 @@ from collections.abc import Callable
 from deepsimbad_client.client import Client
 from deepsimbad_client.errors import ApiError, JobCancelledError, JobFailedError, TransportError
 from deepsimbad_client.models import Job
+from deepsimbad_client.retry import RETRIED_STATUSES
 
 PATIENCE_S = 600.0
 POLL_S = 1.0
@@ -17,6 +18,7 @@ def follow_job(
     job_id: str,
     on_progress: Callable[[Job], None] | None = None,
     *,
+    on_silence: Callable[[float], None] | None = None,
     patience_s: float = PATIENCE_S,
     sleep: Callable[[float], None] = time.sleep,
     clock: Callable[[], float] = time.monotonic,
@@ -24,12 +26,14 @@ def follow_job(
     """Follow a job until it has succeeded.
 
     Listens to its event stream; where that breaks off, asks for the job now and then until the service answers again
-    and listens anew; where there is no stream at all, goes on asking.
+    and listens anew; where there is no stream at all, goes on asking. A service that was restarted takes the job up
+    again: it is queued once more, and its progress may be less than it was.
 
     Args:
         client: The client.
         job_id: The job.
         on_progress: Told of the job each time something is heard of it.
+        on_silence: Told the seconds since then each time the service has not answered.
         patience_s: Longest silence of the service that is waited out.
         sleep: Waits.
         clock: Seconds that never go backwards.
@@ -57,17 +61,15 @@ def follow_job(
                         return _outcome(job)
             except TransportError:
                 pass
-            except ApiError:
-                streams = False
+            except ApiError as error:
+                streams = _passes(error)
         try:
             job = client.admin.job(job_id)
-        except TransportError:
-            if clock() - heard > patience_s:
+        except (TransportError, ApiError) as error:
+            if not _passes(error) or clock() - heard > patience_s:
                 raise
-            wait_s = min(2 * wait_s, LONGEST_POLL_S)
-        except ApiError as error:
-            if error.status < 500 or clock() - heard > patience_s:
-                raise
+            if on_silence is not None:
+                on_silence(clock() - heard)
             wait_s = min(2 * wait_s, LONGEST_POLL_S)
         else:
             heard = clock()
@@ -76,6 +78,11 @@ def follow_job(
             if job.ended:
                 return _outcome(job)
         sleep(wait_s)
+
+
+def _passes(error: TransportError | ApiError) -> bool:
+    """Whether the service may answer again later."""
+    return isinstance(error, TransportError) or error.status >= 500 or error.status in RETRIED_STATUSES
 
 
 def _tell(on_progress: Callable[[Job], None] | None, job: Job) -> None:

@@ -5,10 +5,11 @@ import sys
 import click
 
 from deepsimbad_client.client import Client
-from deepsimbad_client.console import REMARKS, JobBar, as_json, job_table, show
+from deepsimbad_client.console import REMARKS, JobBar, as_json, show
 from deepsimbad_client.follow import follow_job
 from deepsimbad_client.models import Job
 from deepsimbad_client.options import domain_option, json_flag, serving
+from deepsimbad_client.tables import job_table
 
 
 @click.command()
@@ -26,6 +27,20 @@ from deepsimbad_client.options import domain_option, json_flag, serving
 @click.option("--training-episodes", type=click.IntRange(min=0), help="Length of the planner's training.")
 @click.option("--seed", type=int)
 @click.option("--activate/--no-activate", default=True, show_default=True, help="Serve the new map at once.")
+@click.option(
+    "--check",
+    "--check-traverse",
+    metavar="TRAVERSE",
+    help="Drive that the new map and the active one are compared on; absent: frames held out of the training one.",
+)
+@click.option(
+    "--gate",
+    "--gate-margin",
+    type=click.FloatRange(min=0),
+    metavar="MARGIN",
+    help="Serve the new map only if its ANR is worse than the active one's by no more than so many percentage points.",
+)
+@click.option("--append", is_flag=True, help="Add the drive to a copy of the active map, whose landmarks stay.")
 @click.option("--wait/--no-wait", default=True, show_default=True, help="Follow the job to its end.")
 @json_flag
 @serving
@@ -39,6 +54,9 @@ def remap(
     training_episodes: int | None,
     seed: int | None,
     activate: bool,
+    check: str | None,
+    gate: float | None,
+    append: bool,
     wait: bool,
     json_output: bool,
     server: str,
@@ -46,10 +64,12 @@ def remap(
 ) -> None:
     """Make a new map from uploaded traverses.
 
-    Follows the job to its end.
+    Follows the job to its end, through lost connections and a restarted service.
 
     Ctrl-C asks whether the job should be cancelled too.
     """
+    if append and landmarks is not None:
+        raise click.UsageError("--append keeps the active map's landmarks: leave --landmarks out")
     config = {
         "landmark_traverse": landmarks,
         "n_landmarks": n_landmarks,
@@ -58,6 +78,9 @@ def remap(
         "training_episodes": training_episodes,
         "seed": seed,
         "activate": activate,
+        "check_traverse": check,
+        "gate_margin": gate,
+        "append": True if append else None,
     }
     given = {key: value for key, value in config.items() if value is not None}
     with Client(server, api_key) as client:
@@ -108,7 +131,7 @@ def _follow(client: Client, job: Job) -> Job:
         REMARKS.print(f"job {job.job_id}")
         with JobBar(f"mapping {job.domain}") as bar:
             bar(job)
-            return follow_job(client, job.job_id, bar)
+            return follow_job(client, job.job_id, bar, on_silence=bar.silent)
     except KeyboardInterrupt:
         if _answer(f"Cancel job {job.job_id} on the server too?"):
             client.admin.cancel_job(job.job_id)
@@ -134,5 +157,10 @@ def _answer(question: str) -> bool:
 def _show_job(job: Job, json_output: bool) -> None:
     if json_output:
         click.echo(as_json(job.model_dump(mode="json")))
-    else:
-        show(job_table([job]))
+        return
+    show(job_table([job]))
+    made = (job.result or {}).get("map_version")
+    if job.state == "succeeded" and made is not None and not (job.result or {}).get("active", True):
+        why = job.check.get("why")
+        click.echo(f"map {made} was sealed but not activated{f': {why}' if why else ''}".rstrip("."))
+        click.echo(f"serve it all the same: deepsimbad-client activate {job.domain} {made}")

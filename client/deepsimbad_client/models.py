@@ -131,6 +131,27 @@ class SessionAnswer(Answer):
     next_best_view: NextBestView | None = None
 
 
+class ListedSession(Answer):
+    """A living session in a list, without its belief."""
+
+    session_id: str
+    domain: str
+    map_version: int
+    n_observations: int
+    created_at: str | None = None
+    expires_at: str | float | None = None
+
+
+class TruthScore(Answer):
+    """How well a session knew where its robot was, by truths told later."""
+
+    n_scored: int
+    n_left_out: int
+    anr: float | None = None
+    """Averaged normalised rank in percent, 0 is perfect, 50 chance; None where no truth is known."""
+    map_version: int
+
+
 class Traverse(Answer):
     """One recorded drive as the service holds it."""
 
@@ -180,6 +201,11 @@ class Job(Answer):
         return self.state in ENDED_STATES
 
     @property
+    def check(self) -> dict[str, Any]:
+        """How its map compares with the one active before; empty where that was not looked at."""
+        return _check_in((self.result or {}).get("metrics"))
+
+    @property
     def error_text(self) -> str:
         """What went wrong, in the service's words; "" when nothing did."""
         if isinstance(self.error, dict):
@@ -191,9 +217,29 @@ class Job(Answer):
 
 
 class MapVersion(Answer):
-    """One map in a domain's history."""
+    """One map in a domain's history; what a service of an older release does not say is None."""
 
     version: int
     state: str | None = None
+    """building, sealed (never served), active or retired."""
     created_at: str | None = None
+    activated_at: str | None = None
+    """When it last began to serve."""
+    retired_at: str | None = None
+    """When it last ceased to."""
+    removed_at: str | None = None
+    """When its file was removed; it cannot be served any more."""
+    sha256: str | None = None
+    file_bytes: int | None = None
+    config: dict[str, Any] | None = None
     metrics: dict[str, Any] | None = None
+
+    @property
+    def check(self) -> dict[str, Any]:
+        """How it compares with the map that was active when it was made; empty where that was not looked at."""
+        return _check_in(self.metrics)
+
+
+def _check_in(metrics: Any) -> dict[str, Any]:
+    check = metrics.get("check") if isinstance(metrics, dict) else None
+    return check if isinstance(check, dict) else {}

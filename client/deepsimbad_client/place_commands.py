@@ -7,12 +7,13 @@ from typing import Any
 import click
 
 from deepsimbad_client.client import Client
-from deepsimbad_client.console import as_json, domain_table, place_table, show
+from deepsimbad_client.console import as_json, show
 from deepsimbad_client.encodings import SUFFIXES
 from deepsimbad_client.folder import FolderRecording
 from deepsimbad_client.options import domain_option, json_flag, serving
 from deepsimbad_client.recording import Frame, Recording
 from deepsimbad_client.sources import open_source
+from deepsimbad_client.tables import domain_table, place_table
 
 
 @click.command()

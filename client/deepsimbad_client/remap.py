@@ -20,6 +20,9 @@ def remap(
     training_episodes: int | None = None,
     seed: int | None = None,
     activate: bool | None = None,
+    check_traverse: str | None = None,
+    gate_margin: float | None = None,
+    append: bool | None = None,
     on_progress: Callable[[Job], None] | None = None,
     patience_s: float = PATIENCE_S,
 ) -> Job:
@@ -36,11 +39,15 @@ def remap(
         training_episodes: Length of the planner's training.
         seed: Seed of whatever is random.
         activate: Whether the new map serves at once.
+        check_traverse: The drive that the new map and the active one are compared on.
+        gate_margin: By how many percentage points of ANR the new map may be worse and still be activated.
+        append: Whether the traverse is added to a copy of the active map.
         on_progress: Told of the job each time something is heard of it; first when it is submitted.
         patience_s: Longest silence of the service that is waited out.
 
     Returns:
-        The job, succeeded; its `result` holds `map_version`, `active` and `metrics`.
+        The job, succeeded; its `result` holds `map_version`, `active` and `metrics`. Where the new map lost against the
+        active one by more than the gate's margin, `active` is false and `check["why"]` says so.
 
     Raises:
         JobFailedError: The service could not make the map.
@@ -58,6 +65,9 @@ def remap(
             training_episodes=training_episodes,
             seed=seed,
             activate=activate,
+            check_traverse=check_traverse,
+            gate_margin=gate_margin,
+            append=append,
         ),
     )
     if on_progress is not None:

@@ -16,12 +16,15 @@ import httpx2
 from deepsimbad_client.errors import TransportError, TransportTimeoutError
 from deepsimbad_client.problem import problem_of
 
-RETRIED_STATUSES = frozenset({429, 502, 503, 504})
-REFUSED_STATUSES = frozenset({429, 503})
-"""The service turned the request away before acting on it; 502 and 504 come from a proxy that cannot know."""
+RETRIED_STATUSES = frozenset({408, 429, 502, 503, 504})
+REFUSED_STATUSES = frozenset({408, 429, 503})
+"""The request was turned away before it was acted on, 408 because not all of it came.
+
+502 and 504 come from a proxy that cannot know.
+"""
 UNTOUCHED_FAILURES = (httpx2.ConnectError, httpx2.ConnectTimeout, httpx2.PoolTimeout)
 """Failures in which the service never saw the request."""
-LASTING_CODES = frozenset({"damaged_map"})
+LASTING_CODES = frozenset({"damaged_map", "damaged_file"})
 """Problems behind a 503 that waiting cannot cure."""
 
 
@@ -31,7 +34,7 @@ class Repeat(Enum):
     ALWAYS = auto()
     """Idempotent: reads, stateless localizations, puts, deletes, frame batches."""
     IF_UNTOUCHED = auto()
-    """Acts once: only when the service surely did not act (no connection, 429, 503)."""
+    """Acts once: only when the service surely did not act (no connection, 408, 429, 503)."""
     NEVER = auto()
     """The caller has its own way to go on."""
 

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Self
 
 from deepsimbad_client import session_calls
 from deepsimbad_client.errors import DeepSimbadClientError, GoneError
-from deepsimbad_client.models import NextBestView, SessionAnswer, SessionState
+from deepsimbad_client.models import NextBestView, SessionAnswer, SessionState, TruthScore
 from deepsimbad_client.observation import Image, Numbers, observation
 from deepsimbad_client.transport import Transport
 
@@ -120,6 +120,20 @@ class Session:
             InvalidPriorError: The position is far off the route, or the deviation cannot be one.
         """
         return self._transport.send(session_calls.set_prior(self.session_id, position_m, std_m))
+
+    def truths(self, true_positions_m: Numbers) -> TruthScore:
+        """Tell where the robot truly was at each of its observations, known only afterwards: how good were the answers?
+
+        The service raises its alarm by this; the map learns nothing from it (`Admin.feed_experience`). The same truths
+        again count once.
+
+        Args:
+            true_positions_m: A position along the map's route for each observation, in order; None where unknown.
+
+        Raises:
+            InvalidInputError: As many positions as observations there are not.
+        """
+        return self._transport.send(session_calls.truths(self.session_id, true_positions_m))
 
     def delete(self) -> None:
         """End the session; nothing more can be asked of it."""

@@ -4,12 +4,12 @@ import math
 from typing import TYPE_CHECKING
 from uuid import uuid4
 
-from deepsimbad_client.answers import float_array, model, next_best_view_of, nothing
+from deepsimbad_client.answers import float_array, model, next_best_view_of, nothing, page
 from deepsimbad_client.call import JSON, Call, json_body, name_in_path, query
 from deepsimbad_client.errors import InvalidArgumentError
-from deepsimbad_client.models import NextBestView, SessionAnswer, SessionState
-from deepsimbad_client.observation import Observation
-from deepsimbad_client.retry import Repeat
+from deepsimbad_client.models import ListedSession, NextBestView, SessionAnswer, SessionState, TruthScore
+from deepsimbad_client.observation import Numbers, Observation
+from deepsimbad_client.page import PAGE_LENGTH, Page
 
 if TYPE_CHECKING:
     import numpy as np
@@ -27,8 +27,9 @@ def start(
     planner: str | None,
     belief: str | None,
     update: str | None,
+    idempotency_key: str | None = None,
 ) -> Call[SessionState]:
-    """Begin a session; a second request would be a second one, so it is sent again only when surely unseen."""
+    """Begin a session; its key makes it one session however often it is sent."""
     document = {
         "start_position_m": start_position_m,
         "start_std_m": start_std_m,
@@ -41,9 +42,18 @@ def start(
         "POST",
         f"/v1/domains/{name_in_path('domain', domain)}/sessions",
         model(SessionState),
-        headers=JSON,
+        headers={**JSON, KEY_HEADER: idempotency_key or uuid4().hex},
         body=json_body(document),
-        repeat=Repeat.IF_UNTOUCHED,
+    )
+
+
+def living(domain: str | None, after: str | None) -> Call[Page[ListedSession]]:
+    """A page of the living sessions, newest first, of one domain or all; it needs a key of scope `admin`."""
+    return Call(
+        "GET",
+        "/v1/admin/sessions",
+        page(ListedSession, "sessions"),
+        params=query(domain=domain, limit=PAGE_LENGTH, after=after),
     )
 
 
@@ -101,6 +111,22 @@ def set_prior(session_id: str, position_m: float, std_m: float) -> Call[SessionS
     """Replace the belief by one around a position; the same again changes nothing."""
     document = {"position_m": float(position_m), "std_m": float(std_m)}
     return Call("PUT", f"{_session(session_id)}/prior", model(SessionState), headers=JSON, body=json_body(document))
+
+
+def truths(session_id: str, true_positions_m: Numbers) -> Call[TruthScore]:
+    """Tell where the robot truly was, None or NaN where unknown; the same again counts once.
+
+    Raises:
+        InvalidArgumentError: A position is infinite or no number.
+    """
+    document = {"true_positions_m": known_positions(true_positions_m)}
+    return Call("POST", f"{_session(session_id)}/truths", model(TruthScore), headers=JSON, body=json_body(document))
+
+
+def known_positions(true_positions_m: Numbers) -> list[float | None]:
+    """Positions as JSON takes them: NaN becomes None."""
+    plain = true_positions_m.tolist() if hasattr(true_positions_m, "tolist") else list(true_positions_m)
+    return [None if isinstance(each, float) and math.isnan(each) else each for each in plain]
 
 
 def delete(session_id: str) -> Call[None]:

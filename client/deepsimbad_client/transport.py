@@ -7,13 +7,14 @@ import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from contextlib import asynccontextmanager, contextmanager
 from dataclasses import dataclass, field
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import httpx2
 
 from deepsimbad_client.answers import raise_for_problem
 from deepsimbad_client.call import Call
 from deepsimbad_client.errors import InvalidArgumentError, TransportError, TransportTimeoutError
+from deepsimbad_client.map_download import BEYOND_THE_END, MapDownload
 from deepsimbad_client.retry import Attempts, RetryPolicy
 
 T = TypeVar("T")
@@ -120,7 +121,7 @@ class Transport:
             ApiError: The service refused.
             UnexpectedAnswerError: Something else answers at this address.
         """
-        attempts = Attempts(self._retry, call.repeat, f"{call} at {self.url}", self._jitter)
+        attempts = self._attempts(call)
         while True:
             try:
                 response = self._http.send(request_of(call, self._http))
@@ -150,6 +151,53 @@ class Transport:
                 yield iter(httpx2.EventSource(response))
             finally:
                 response.close()
+
+    def fetch(self, download: MapDownload) -> None:
+        """Receive a file until all of it is there; after a break it goes on where it stopped.
+
+        As long as something comes every now and then it never gives up.
+
+        Raises:
+            TransportError: No answer came.
+            ApiError: The service refused.
+            UnexpectedAnswerError: Something else answers at this address.
+            NotSavedError: The file cannot be written.
+        """
+        attempts = self._attempts(download.call)
+        while True:
+            n_received = download.n_received
+            try:
+                wait_s = self._received(download, attempts)
+            except httpx2.TransportError as error:
+                if download.n_received > n_received:
+                    attempts = self._attempts(download.call)
+                wait_s = attempts.after_failure(error)
+            finally:
+                download.pause()
+            if wait_s is None:
+                return
+            self._sleep(wait_s)
+
+    def _received(self, download: MapDownload, attempts: Attempts) -> float | None:
+        """Receive what comes; answers how long to wait before asking for more, None where nothing is missing."""
+        response = self._http.send(request_of(download.asking(), self._http), stream=True)
+        try:
+            if download.begin(response):
+                for piece in response.iter_bytes():
+                    download.write(piece)
+                return None
+            response.read()
+            if response.status_code == BEYOND_THE_END and download.start_over():
+                return 0.0
+            wait_s = attempts.after_answer(response)
+            if wait_s is None:
+                raise_for_problem(response)
+            return wait_s
+        finally:
+            response.close()
+
+    def _attempts(self, call: Call[Any]) -> Attempts:
+        return Attempts(self._retry, call.repeat, f"{call} at {self.url}", self._jitter)
 
     def close(self) -> None:
         """Close the connections."""
@@ -181,7 +229,7 @@ class AsyncTransport:
 
     async def send(self, call: Call[T]) -> T:
         """See `Transport.send`."""
-        attempts = Attempts(self._retry, call.repeat, f"{call} at {self.url}", self._jitter)
+        attempts = self._attempts(call)
         while True:
             try:
                 response = await self._http.send(request_of(call, self._http))
@@ -206,6 +254,44 @@ class AsyncTransport:
                 yield aiter(httpx2.EventSource(response))
             finally:
                 await response.aclose()
+
+    async def fetch(self, download: MapDownload) -> None:
+        """See `Transport.fetch`."""
+        attempts = self._attempts(download.call)
+        while True:
+            n_received = download.n_received
+            try:
+                wait_s = await self._received(download, attempts)
+            except httpx2.TransportError as error:
+                if download.n_received > n_received:
+                    attempts = self._attempts(download.call)
+                wait_s = attempts.after_failure(error)
+            finally:
+                download.pause()
+            if wait_s is None:
+                return
+            await self._sleep(wait_s)
+
+    async def _received(self, download: MapDownload, attempts: Attempts) -> float | None:
+        """Receive what comes; answers how long to wait before asking for more, None where nothing is missing."""
+        response = await self._http.send(request_of(download.asking(), self._http), stream=True)
+        try:
+            if await asyncio.to_thread(download.begin, response):
+                async for piece in response.aiter_bytes():
+                    download.write(piece)
+                return None
+            await response.aread()
+            if response.status_code == BEYOND_THE_END and download.start_over():
+                return 0.0
+            wait_s = attempts.after_answer(response)
+            if wait_s is None:
+                raise_for_problem(response)
+            return wait_s
+        finally:
+            await response.aclose()
+
+    def _attempts(self, call: Call[Any]) -> Attempts:
+        return Attempts(self._retry, call.repeat, f"{call} at {self.url}", self._jitter)
 
     async def aclose(self) -> None:
         """Close the connections."""

@@ -2,8 +2,9 @@
 
 import pytest
 
-from deepsimbad_client.console import domain_table, show
+from deepsimbad_client.console import show
 from deepsimbad_client.models import Domain
+from deepsimbad_client.tables import domain_table
 
 
 def test_a_table_in_a_pipe_cuts_no_name(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:

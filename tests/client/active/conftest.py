@@ -45,6 +45,7 @@ class FakeService:
         self.sessions: dict[str, FakeSession] = {}
         self.asked: list[str] = []
         self.keys: list[str] = []
+        self.begun: dict[str, str] = {}
         self.lose_answers: Callable[[httpx2.Request], bool] = lambda request: False
         self.plans = True
         self.map_version = 3
@@ -79,7 +80,7 @@ class FakeService:
                 answer = self._answer(mass, None, int(request.url.params["shortlist"]))
                 return httpx2.Response(200, json=answer)
             case "POST", ["domains", name, "sessions"]:
-                return self._start(name, json.loads(request.content or b"{}"))
+                return self._start(name, json.loads(request.content or b"{}"), request.headers["idempotency-key"])
             case verb, ["sessions", session_id, *rest]:
                 session = self.sessions.get(session_id)
                 if session is None:
@@ -99,12 +100,15 @@ class FakeService:
             "input_size": None,
         }
 
-    def _start(self, name: str, body: dict[str, Any]) -> httpx2.Response:
+    def _start(self, name: str, body: dict[str, Any], key: str) -> httpx2.Response:
+        if key in self.begun:
+            return httpx2.Response(201, json=self._state(self.begun[key]))
         planner = body.get("planner", "telling")
         if planner == "nonsense":
             return problem(422, "invalid_input")
         session_id = f"s{len(self.sessions)}"
         rng = np.random.default_rng(body.get("seed"))
+        self.begun[key] = session_id
         self.sessions[session_id] = FakeSession(np.full(N_IMAGES, 1 / N_IMAGES), planner, rng)
         return httpx2.Response(201, json=self._state(session_id))
 

@@ -11,6 +11,22 @@ import pytest
 
 from deepsimbad_client import AsyncClient, AsyncSession, Client, Session, errors
 
+STATE = {
+    "session_id": "s1",
+    "domain": "d",
+    "map_version": 4,
+    "n_observations": 0,
+    "belief": {
+        "mean_m": 0.0,
+        "mode_m": 0.0,
+        "std_m": 0.0,
+        "credible_95_m": [0.0, 0.0],
+        "entropy_bits": 0.0,
+        "histogram": {"edges_m": [0.0, 1.0], "mass": [1.0]},
+        "top": [],
+    },
+}
+
 
 @pytest.fixture
 def client(fake: Any) -> Client:
@@ -96,11 +112,40 @@ def test_an_observation_given_up_is_repeated_under_its_key(fake: Any, client: Cl
             session.observe(encoding=[51.0, 4.0], idempotency_key="first")
 
 
-def test_a_start_whose_answer_was_lost_is_not_sent_twice(fake: Any, client: Client) -> None:
+def test_a_start_whose_answer_was_lost_begins_one_session(fake: Any, client: Client) -> None:
+    lost = iter([True, True, False, False])
+    fake.lose_answers = lambda request: next(lost)
+    assert client.session("route").session_id == "s0"
+    assert fake.asked == ["POST /v1/domains/route/sessions"] * 3
+    assert client.session("route").session_id == "s1"
+
+
+def test_a_start_given_up_is_repeated_under_its_key(fake: Any, client: Client) -> None:
     fake.lose_answers = lambda request: True
     with pytest.raises(errors.TransportTimeoutError):
-        client.session("route")
-    assert fake.asked == ["POST /v1/domains/route/sessions"]
+        client.session("route", idempotency_key="mine")
+    fake.lose_answers = lambda request: False
+    assert client.session("route", idempotency_key="mine").session_id == "s0"
+    assert list(fake.begun) == ["mine"]
+
+
+def test_truths_are_told() -> None:
+    asked: list[httpx2.Request] = []
+
+    def respond(request: httpx2.Request) -> httpx2.Response:
+        asked.append(request)
+        if request.url.path.endswith("/truths"):
+            return httpx2.Response(200, json={"n_scored": 2, "n_left_out": 1, "anr": 3.5, "map_version": 4})
+        return httpx2.Response(201, json=STATE)
+
+    with Client("http://service", transport=httpx2.MockTransport(respond)) as client:
+        session = client.session("d", keep=True)
+        score = session.truths(np.array([1.0, np.nan, 4.5]))
+        with pytest.raises(errors.InvalidArgumentError):
+            session.truths([float("inf")])
+    assert (score.n_scored, score.n_left_out, score.anr, score.map_version) == (2, 1, 3.5, 4)
+    assert asked[-1].url.path == "/v1/sessions/s1/truths"
+    assert json.loads(asked[-1].content) == {"true_positions_m": [1.0, None, 4.5]}
 
 
 def test_a_delete_whose_answer_was_lost_is_done(fake: Any, client: Client) -> None:

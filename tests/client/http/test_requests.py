@@ -19,6 +19,7 @@ from deepsimbad_client import AsyncClient, Client, admin, async_admin, async_cli
 from deepsimbad_client.errors import BY_CODE, BY_STATUS, InvalidArgumentError
 from deepsimbad_client.models import Domain, Traverse
 from deepsimbad_client.observation import media_type_of, observation
+from deepsimbad_client.retry import RETRIED_STATUSES
 
 BELIEF = {
     "mean_m": 1.0,
@@ -203,7 +204,7 @@ def test_every_code_has_its_class(code: str) -> None:
     assert raised.value.problem["limit"] == 5
 
 
-@pytest.mark.parametrize("status", [status for status in BY_STATUS if status not in {429, 503}])
+@pytest.mark.parametrize("status", [status for status in BY_STATUS if status not in RETRIED_STATUSES])
 def test_an_unheard_code_falls_back_on_the_status(status: int) -> None:
     recorder = Recorder(httpx2.Response(status, json={"code": "of_the_future"}, headers={"x-request-id": "abc"}))
     service = Client("http://service", transport=httpx2.MockTransport(recorder))

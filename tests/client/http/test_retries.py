@@ -56,6 +56,7 @@ RETRIED: Sequence[Callable[[], Outcome]] = (
     lambda: httpx2.ReadError,
     lambda: httpx2.WriteError,
     lambda: httpx2.RemoteProtocolError,
+    lambda: answer(408),
     lambda: answer(429),
     lambda: answer(502),
     lambda: answer(503),
@@ -105,7 +106,9 @@ def test_a_remap_behind_a_failing_proxy_is_not_sent_again(status: int) -> None:
     assert len(script.requests) == 1
 
 
-@pytest.mark.parametrize("refusal", [lambda: httpx2.ConnectError, lambda: answer(503), lambda: answer(429)])
+@pytest.mark.parametrize(
+    "refusal", [lambda: httpx2.ConnectError, lambda: answer(503), lambda: answer(429), lambda: answer(408)]
+)
 def test_a_remap_that_was_surely_not_taken_is_sent_again(refusal: Callable[[], Outcome]) -> None:
     script = Script(refusal(), answer(202, JOB))
     assert script.client().admin.remap("d", training_traverse="t").job_id == "1"
@@ -162,6 +165,33 @@ def test_a_delete_whose_answer_was_lost_is_not_an_error() -> None:
     script = Script(httpx2.ConnectError, answer(404, {"code": "unknown_domain"}))
     with pytest.raises(errors.UnknownDomainError):  # the service never saw the first try
         script.client().admin.delete_domain("d")
+
+
+@pytest.mark.parametrize(
+    ("status", "problem", "scope"),
+    [
+        (401, {"code": "unauthorized", "detail": "the key is not known here"}, "localize|admin"),
+        (403, {"code": "forbidden", "detail": "it has localize", "needed": "admin"}, "admin"),
+    ],
+)
+def test_a_refused_key_is_not_tried_again_and_the_error_says_how_to_come_by_one(
+    status: int, problem: dict[str, str], scope: str
+) -> None:
+    script = Script(answer(status, problem, retry_after="1"))
+    with pytest.raises(errors.ApiError, match=problem["detail"]) as raised:
+        script.client().domain("d")
+    assert script.slept == []
+    assert f"`deepsimbad keys create --scope {scope}`" in str(raised.value)
+    assert "$DEEPSIMBAD_API_KEY" in str(raised.value)
+
+
+def test_overload_is_waited_out_as_long_as_the_service_says() -> None:
+    overloaded = {"code": "overloaded", "detail": "too much at once"}
+    script = Script(answer(503, overloaded, retry_after="3"), answer(200, DOMAIN))
+    assert script.client().domain("d").name == "d"
+    assert script.slept == [3.0]
+    with pytest.raises(errors.OverloadedError):
+        Script(*[answer(503, overloaded) for _ in range(4)]).client().domain("d")
 
 
 def test_jitter_spreads_over_the_upper_half() -> None:
