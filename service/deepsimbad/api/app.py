@@ -5,7 +5,6 @@ import logging
 import re
 from collections.abc import AsyncIterator, Callable
 from contextlib import AbstractAsyncContextManager, ExitStack, asynccontextmanager
-from importlib.metadata import PackageNotFoundError, version
 
 from anyio.to_thread import run_sync
 from fastapi import FastAPI
@@ -57,6 +56,7 @@ from deepsimbad.jobs.job_process import InAnotherProcess
 from deepsimbad.jobs.perform import RunJob
 from deepsimbad.jobs.runner import JobRunner
 from deepsimbad.settings import Settings
+from deepsimbad.release import release
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.service_lock import ServiceLock
 from deepsimbad.store.sessions import SessionStore
@@ -271,11 +271,3 @@ def _body_limits(settings: Settings) -> Callable[[Scope], int]:
         return settings.max_image_bytes if content_type.lower().startswith(b"image/") else settings.max_json_bytes
 
     return limit
-
-
-def release() -> str:
-    """The version that was installed."""
-    try:
-        return version("deep-simbad")
-    except PackageNotFoundError:  # run from a source tree
-        return "0"

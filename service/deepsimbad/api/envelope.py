@@ -24,6 +24,25 @@ SECURITY_HEADERS = (
     (b"x-frame-options", b"DENY"),
     (b"cross-origin-resource-policy", b"same-origin"),
 )
+# Codes of answers that turn a request away for what it is or how many there are, before it is looked into.
+REFUSALS = frozenset(
+    {
+        "unauthorized",
+        "forbidden",
+        "rate_limited",
+        "overloaded",
+        "too_many_sessions",
+        "too_many_domains",
+        "body_too_large",
+        "image_too_large",
+        "headers_too_large",
+        "request_timeout",
+    }
+)
+_NAMED = ("domain", "session_id", "job_id")  # parameters of paths
+_NOTED = ("key_id", "domain", "code", "limit")  # by whoever learnt it
+_NOTHING: dict[str, str] = {}
+_LONGEST_PATH = 256  # of a path in the log: the sender chooses it
 UNROUTED = "(none)"
 _SENDER_LEFT = 499  # as proxies log it; never sent
 
@@ -73,25 +92,29 @@ class EnvelopeMiddleware:
             route = getattr(scope.get("route"), "path", UNROUTED)
             method = scope["method"] if scope["method"] in _METHODS else "OTHER"
             self.metrics.request_ended(method, route, status, seconds)
+            known = _known(scope)
+            if known.get("code") in REFUSALS:
+                self.metrics.refused(known.get("limit", known["code"]))
             if log.isEnabledFor(logging.INFO):
                 log.info(
                     "request",
                     extra={
                         "request_id": request_id,
                         "method": method,
-                        "path": scope["path"],
+                        "path": scope["path"][:_LONGEST_PATH],
                         "status": status,
                         "ms": round(seconds * 1000, 2),
-                        **_known(scope),
+                        **known,
                     },
                 )
 
 
 def _known(scope: Scope) -> dict[str, str]:
-    """Whose request it is, and of which domain, where that is known."""
-    found = {"key_id": scope["state"].get("key_id"), "domain": scope["state"].get("domain")}
-    found["domain"] = found["domain"] or scope.get("path_params", {}).get("domain")
-    return {name: value for name, value in found.items() if value is not None}
+    """Whose request it is, what it is about and the code of what was wrong, as far as each is known."""
+    named, noted = scope.get("path_params") or _NOTHING, scope["state"]
+    known = {name: noted[name] for name in _NOTED if name in noted}
+    known |= {name: named[name] for name in _NAMED if name in named}
+    return known
 
 
 def request_id_of(scope: Scope) -> str:

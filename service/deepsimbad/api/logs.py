@@ -4,7 +4,11 @@ import json
 import logging
 import logging.config
 import time
+from functools import lru_cache
+from itertools import islice
 
+_ENCODER = json.JSONEncoder(default=str)
+_N_STANDARD = len(logging.makeLogRecord({}).__dict__)
 _STANDARD = frozenset(logging.makeLogRecord({}).__dict__) | {"message", "asctime", "taskName", "color_message"}
 
 
@@ -13,21 +17,29 @@ class JsonFormatter(logging.Formatter):
 
     def format(self, record: logging.LogRecord) -> str:
         """Render a record."""
-        when = time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime(record.created))
         line = {
-            "time": f"{when}.{int(record.msecs):03d}Z",
+            "time": f"{_second(int(record.created))}.{int(record.msecs):03d}Z",
             "level": record.levelname,
             "logger": record.name,
             "message": record.getMessage(),
         }
-        line |= {name: value for name, value in record.__dict__.items() if name not in _STANDARD}
+        # What was given as `extra` was put behind what every record has.
+        extra = islice(record.__dict__.items(), _N_STANDARD, None)
+        line |= {name: value for name, value in extra if name not in _STANDARD}
         if record.exc_info:
             line["exception"] = self.formatException(record.exc_info)
-        return json.dumps(line, default=str)
+        return _ENCODER.encode(line)
+
+
+@lru_cache(maxsize=2)
+def _second(since_1970: int) -> str:
+    return time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime(since_1970))
 
 
 def configure_logging(level: str) -> None:
     """Send everything at `level` and above to standard error as JSON lines; uvicorn's own lines too."""
+    # No line of ours tells these, and every record would look them up.
+    logging.logThreads = logging.logProcesses = logging.logMultiprocessing = logging.logAsyncioTasks = False
     logging.config.dictConfig(
         {
             "version": 1,

@@ -3,6 +3,7 @@
 import logging
 import signal
 from types import FrameType
+from typing import Any
 
 import uvicorn
 from fastapi import FastAPI
@@ -10,8 +11,11 @@ from fastapi import FastAPI
 from deepsimbad.api.app import create_app
 from deepsimbad.api.logs import configure_logging
 from deepsimbad.errors import DeepSimbadError, UnavailableError
+from deepsimbad.release import release
 from deepsimbad.settings import Settings
 from deepsimbad.store.layout import catalog_path
+
+log = logging.getLogger(__name__)
 
 
 class _Server(uvicorn.Server):
@@ -45,6 +49,14 @@ def serve(settings: Settings) -> None:
     if not catalog_path(settings.data_dir).is_file():  # then there is no key, and no need to make the folder first
         settings.check_exposure(n_keys=0)
     configure_logging(settings.log_level)
+    log.info(
+        "starting",
+        extra={
+            "version": release(),
+            "data_dir": str(settings.data_dir.resolve()),
+            "settings": _changed(settings),
+        },
+    )
     app = create_app(settings)
     config = uvicorn.Config(
         app,
@@ -71,3 +83,12 @@ def serve(settings: Settings) -> None:
         if why is None:
             why = UnavailableError(f"cannot listen on {settings.host}:{settings.port}: is the port taken?")
         raise why from ended
+
+
+def _changed(settings: Settings) -> dict[str, Any]:
+    """The settings that are not as they come; none of them is a secret."""
+    return {
+        name: getattr(settings, name)
+        for name, field in Settings.model_fields.items()
+        if name != "data_dir" and getattr(settings, name) != field.default
+    }
