@@ -1,0 +1,239 @@
+"""Appending a drive to the active map: what stays, what is new, what is refused."""
+
+import numpy as np
+import pytest
+
+from deepsimbad.core.descriptor import rank_landmarks
+from deepsimbad.core.nnql import NnqlConfig
+from deepsimbad.core.relevance import Query, Relevance, relevances
+from deepsimbad.engine.active_maps import load_snapshot
+from deepsimbad.errors import InvalidEncodingError, InvalidMapConfigError
+from deepsimbad.jobs.append import append_frames
+from deepsimbad.jobs.map_config import RemapConfig
+from deepsimbad.jobs.progress import Progress
+from deepsimbad.jobs.remap import REMAP_STAGES, remap
+from deepsimbad.store.frames import TraverseFrames
+from deepsimbad.store.map_contents import MapContents
+from deepsimbad.store.map_file import read_map
+from deepsimbad.store.traverses import Traverse
+
+DOMAIN = "route"
+
+
+@pytest.fixture
+def run(catalog, evaluator):
+    def run(training, **config):
+        return remap(catalog, DOMAIN, RemapConfig(training, **config), evaluator, Progress(REMAP_STAGES))
+
+    return run
+
+
+@pytest.fixture
+def first(drive, run):
+    """A map of 40 images a metre apart, and a traverse `more` of 10 between and 5 behind them."""
+
+    def make(**config):
+        drive("landmarks", 30, seed=1)
+        old = drive("drive", 40, seed=2)
+        run("drive", landmark_traverse="landmarks", n_landmarks=12, **config)
+        new = drive("more", 15, seed=3, position_m=np.r_[np.arange(10) + 20.25, np.arange(5) + 45.0])
+        return old, new
+
+    return make
+
+
+def contents(catalog, version):
+    return read_map(catalog.map_path(DOMAIN, version))
+
+
+def test_the_old_drives_frames_are_not_read(first, run, catalog):
+    first(training_episodes=0)
+    for name in ("drive", "landmarks"):
+        Traverse.delete(catalog.data_dir, DOMAIN, name)
+    result = run("more", append=True)
+    assert result["active"] is True
+    assert result["metrics"]["n_map_images"] == 55
+    assert catalog.domain(DOMAIN).active_version == 2
+
+
+@pytest.mark.parametrize("relevance", list(Relevance))
+def test_old_images_stay_and_appended_places_are_found(first, run, catalog, evaluator, relevance):
+    old, new = first(relevance=relevance, training_episodes=0)
+    run("more", append=True)
+    before, after = contents(catalog, 1), contents(catalog, 2)
+    is_old = np.isin(after.position_m, np.arange(40.0))
+    assert is_old.sum() == 40
+    assert (np.diff(after.position_m) >= 0).all()
+    assert np.array_equal(after.lists[:, is_old], before.lists)
+    assert np.array_equal(after.landmark_model["prototypes"], before.landmark_model["prototypes"])
+    for name in ("correlation", "listed_score", "off_route_model"):
+        assert np.array_equal(getattr(after, name), getattr(before, name))
+    for name in ("values", "encodings"):
+        kept, has = getattr(before, name), getattr(after, name)
+        assert (kept is None) == (has is None)
+    if relevance is Relevance.SIMBAD:
+        assert np.array_equal(after.values[:, is_old], before.values)
+    if relevance is Relevance.BRUTE_FORCE:
+        assert np.array_equal(after.encodings[is_old], old)
+        assert np.array_equal(after.encodings[~is_old], new)
+    snapshot = load_snapshot(catalog, DOMAIN, 2)
+    found = [
+        rank(snapshot, evaluator, encoding, image) for encoding, image in zip(new, np.flatnonzero(~is_old), strict=True)
+    ]
+    assert np.mean(found) < 3  # of 55 images
+
+
+def rank(snapshot, evaluator, encoding, image):
+    dissimilarities = evaluator.dissimilarities(encoding[np.newaxis], snapshot.landmark_model)[0]
+    relevance = relevances(snapshot.retrieval, Query(rank_landmarks(dissimilarities), dissimilarities, encoding))
+    return np.count_nonzero(relevance > relevance[image])
+
+
+def test_experience_comes_from_the_nearest_old_image(first, run, catalog):
+    """New images at 45 m and on are further from all old ones than the longest move."""
+    first(training_episodes=200)
+    run("more", append=True)
+    before, after = contents(catalog, 1), contents(catalog, 2)
+    is_old = np.isin(after.position_m, np.arange(40.0))
+    step = float(np.ptp(before.q_values) + np.ptp(after.q_values)) / 65_535  # as fine as the file keeps them
+    assert after.q_values[is_old] == pytest.approx(before.q_values, abs=step)
+    near, far = after.q_values[~is_old][:10], after.q_values[~is_old][10:]
+    assert near == pytest.approx(before.q_values[20:30], abs=step)
+    assert far == pytest.approx(np.full_like(far, NnqlConfig().initial_q), abs=step)
+
+
+def test_telling_bits_of_what_is_far_are_the_mean(catalog, evaluator):
+    rng = np.random.default_rng(0)
+    before = a_map(evaluator, rng)
+    frames = TraverseFrames(
+        index=np.arange(2),
+        position_m=np.array([3.2, 90.0]),
+        timestamp_us=np.array([5, 6]),
+        x_m=np.array([1.0, np.nan]),
+        y_m=np.array([2.0, np.nan]),
+        encodings=rng.normal(size=(2, 6)).astype(np.float32),
+    )
+    made = append_frames(before, 7, RemapConfig("more", append=True), frames, evaluator, lambda _: None)
+    assert made.images.tolist() == [4, 10]
+    bits = made.contents.telling_bits
+    assert bits[made.images] == pytest.approx([before.telling_bits[3], before.telling_bits.mean()])
+    assert np.delete(bits, made.images).tolist() == before.telling_bits.tolist()
+    assert made.contents.timestamp_us.tolist() == [-1, -1, -1, -1, 5, -1, -1, -1, -1, -1, 6]
+    assert made.contents.x_m[4] == 1.0
+    assert np.isnan(np.delete(made.contents.x_m, 4)).all()
+    assert made.contents.off_route_model is before.off_route_model
+
+
+def a_map(evaluator, rng):
+    model = evaluator.fit_landmarks(rng.normal(size=(5, 6)).astype(np.float32))
+    return MapContents(
+        domain=DOMAIN,
+        version=1,
+        created_at="2026-01-01T00:00:00Z",
+        config={"relevance": "rrf", "n_landmarks": 5, "list_length": 2, "training_traverse": "drive"},
+        evaluator={},
+        closed=False,
+        actions_m=(1.0, 2.0),
+        landmark_model=model,
+        lists=rng.integers(0, 5, (2, 9)).astype(np.uint16),
+        position_m=np.arange(9.0),
+        telling_bits=rng.random(9).astype(np.float32),
+        off_route_model=np.array([1.0, 2.0]),
+    )
+
+
+def test_times_and_coordinates_are_merged(drive, run, catalog):
+    drive("landmarks", 30, seed=1)
+    drive("drive", 4, timestamp_us=np.arange(4) + 100, x_m=np.arange(4.0), y_m=np.zeros(4))
+    run("drive", landmark_traverse="landmarks", n_landmarks=8, training_episodes=0)
+    drive("more", 2, seed=3, position_m=[1.5, 2.5], timestamp_us=[7, 8], x_m=[1.5, np.nan], y_m=[0.0, np.nan])
+    run("more", append=True)
+    after = contents(catalog, 2)
+    assert after.timestamp_us.tolist() == [100, 101, 7, 102, 8, 103]
+    assert after.x_m[:4].tolist() == [0.0, 1.0, 1.5, 2.0]
+    assert np.isnan(after.x_m[4])
+
+
+def test_the_config_records_what_was_appended(first, run, catalog, drive):
+    first(training_episodes=100, list_length=3)
+    run("more", append=True)
+    drive("third", 5, seed=4)
+    run("third", append=True, check_traverse="more", gate_margin=100.0)
+    for config in (catalog.map(DOMAIN, 3).config, contents(catalog, 3).config):
+        assert config["training_traverse"] == "drive"
+        assert config["landmark_traverse"] == "landmarks"
+        assert (config["list_length"], config["n_landmarks"], config["relevance"]) == (3, 12, "calibrated")
+        assert config["appended"] == [
+            {"traverse": "more", "n_frames": 15, "to_version": 1},
+            {"traverse": "third", "n_frames": 5, "to_version": 2},
+        ]
+        assert (config["append"], config["check_traverse"], config["gate_margin"]) == (True, "more", 100.0)
+    assert catalog.map(DOMAIN, 3).metrics["training"] == catalog.map(DOMAIN, 1).metrics["training"]
+    assert contents(catalog, 3).n_map_images == 60
+    # The next remap that keeps the landmarks learns from what the map was first made of.
+    drive("fourth", 40, seed=5)
+    assert run("fourth", training_episodes=0)["map_version"] == 4
+
+
+def test_held_out_frames_are_those_that_were_appended(first, run):
+    first(training_episodes=0)
+    check = run("more", append=True)["metrics"]["check"]
+    assert (check["frames"], check["n_queries"] + check["n_left_out"]) == ("held_out", 2)
+    assert check["active_version"] == 1
+
+
+def test_a_gate_keeps_an_append_back_too(catalog, evaluator, drive, run):
+    drive("landmarks", 30, seed=1)
+    drive("drive", 40, seed=2)
+    run("drive", landmark_traverse="landmarks", n_landmarks=12, training_episodes=0)
+    drive("day", 40, seed=2)  # the same views
+    drive("noise", 400, seed=3, position_m=np.arange(400) / 10 + 0.01)
+    result = run("noise", append=True, check_traverse="day", gate_margin=0.0)
+    assert result["active"] is False
+    assert catalog.domain(DOMAIN).active_version == 1
+
+
+@pytest.mark.parametrize(
+    ("wrong", "match"),
+    [
+        ({"n_landmarks": 11}, "has 12 landmarks, not 11"),
+        ({"list_length": 5}, "list_length 3, not 5"),
+        ({"relevance": Relevance.RRF}, "relevance calibrated, not rrf"),
+    ],
+)
+def test_what_is_appended_must_be_alike(first, run, catalog, wrong, match):
+    first(training_episodes=0, list_length=3)
+    with pytest.raises(InvalidMapConfigError, match=match):
+        run("more", append=True, **wrong)
+    assert [record.version for record in catalog.maps(DOMAIN)] == [1]
+
+
+def test_there_must_be_a_map_to_append_to(drive, run):
+    drive("more", 5)
+    with pytest.raises(InvalidMapConfigError, match="no active map that could be appended to"):
+        run("more", append=True)
+    with pytest.raises(InvalidMapConfigError, match="landmark_traverse must be null"):
+        RemapConfig("more", "landmarks", append=True)
+
+
+def test_frames_of_another_encoder_cannot_be_appended(first, run, drive, catalog):
+    first(training_episodes=0)
+    drive("other", 5, d=7)
+    with pytest.raises(InvalidEncodingError, match="7 numbers cannot be compared"):
+        run("other", append=True)
+    assert len(catalog.maps(DOMAIN)) == 1
+
+
+def test_a_loop_takes_the_frames_of_any_turn(catalog, evaluator, drive):
+    catalog.delete_domain(DOMAIN)
+    catalog.create_domain(DOMAIN, {"kind": "feature_l2", "extractor": "none"}, True, (1.0, 2.0))
+    drive("drive", 40, seed=2)
+    given = {"landmark_traverse": "drive", "n_landmarks": 12, "training_episodes": 50}
+    remap(catalog, DOMAIN, RemapConfig("drive", **given), evaluator, Progress(REMAP_STAGES))
+    drive("lap", 30, seed=3, position_m=np.arange(30) + 30.5)  # past the start after 10 m
+    remap(catalog, DOMAIN, RemapConfig("lap", append=True), evaluator, Progress(REMAP_STAGES))
+    after = contents(catalog, 2)
+    assert after.n_map_images == 70
+    assert after.position_m.max() == 39.5
+    snapshot = load_snapshot(catalog, DOMAIN, 2)
+    assert snapshot.route.length_m == pytest.approx(40.0, abs=0.51)
