@@ -528,7 +528,7 @@ def test_a_connection_over_the_limit_is_closed_at_once(service: Service) -> None
                 assert one_more.recv(65536) == b""
             except ConnectionError:
                 pass
-        assert service.refused["connections"] == 1
+        assert service.refused["max_connections"] == 1
         for connection in held:
             connection.sendall(GET)
             assert read_one(connection).endswith(b"GET / 0")

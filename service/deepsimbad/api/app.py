@@ -12,6 +12,7 @@ from starlette.middleware.cors import CORSMiddleware
 from starlette.routing import Route
 from starlette.types import Scope
 
+from deepsimbad.api.admission import AdmissionLimits, AdmissionMiddleware
 from deepsimbad.api.auth import AuthMiddleware, KeyRing
 from deepsimbad.api.dependencies import Services
 from deepsimbad.api.envelope import EnvelopeMiddleware
@@ -48,15 +49,15 @@ from deepsimbad.engine.sessions import Sessions
 from deepsimbad.engine.steady_clock import SteadyClock
 from deepsimbad.engine.truths import Truths
 from deepsimbad.engine.warm_up import warm_up
-from deepsimbad.engine.worker import InferenceWorker
+from deepsimbad.engine.worker import InferenceWorker, Priority
 from deepsimbad.errors import DeepSimbadError
 from deepsimbad.evaluators.registry import EvaluatorKind
 from deepsimbad.jobs.cores import job_threads
 from deepsimbad.jobs.job_process import InAnotherProcess
 from deepsimbad.jobs.perform import RunJob
 from deepsimbad.jobs.runner import JobRunner
-from deepsimbad.settings import Settings
 from deepsimbad.release import release
+from deepsimbad.settings import Settings
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.service_lock import ServiceLock
 from deepsimbad.store.sessions import SessionStore
@@ -113,6 +114,18 @@ def create_app(settings: Settings, run_job: RunJob | None = None) -> FastAPI:
     install_problem_handlers(app, routes)
     install_openapi(app)
     app.add_middleware(BodyLimitMiddleware, limit_of=_body_limits(settings))
+
+    def queue_is_full(priority: Priority) -> bool:
+        services: Services = app.state.services
+        return services.worker.is_full(priority)
+
+    app.add_middleware(
+        AdmissionMiddleware,
+        limits=AdmissionLimits(
+            settings.max_requests, settings.max_uploads, settings.max_event_streams, settings.max_body_memory_bytes
+        ),
+        queue_is_full=queue_is_full,
+    )
     rate_limit = RateLimit(settings.rate_limit_per_s, settings.rate_limit_burst)
     app.add_middleware(AuthMiddleware, keys=keys, rate_limit=rate_limit)
     if settings.cors_origins:
@@ -178,7 +191,7 @@ def _start(settings: Settings, metrics: Metrics, keys: KeyRing, run_job: RunJob,
         evaluators.evaluator(record.evaluator)
     active_maps = ActiveMaps(catalog)
     damaged = active_maps.load_all()
-    worker = InferenceWorker()
+    worker = InferenceWorker(max_waiting=settings.max_queue)
     parts.callback(worker.close)
     worker.submit(warm_up).result()
     store = parts.enter_context(SessionStore.open(settings.data_dir, metrics.committed))

@@ -9,8 +9,7 @@ from collections.abc import Callable, Sequence
 from anyio.to_thread import run_sync
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from deepsimbad.api.limits import BodyLimitMiddleware
-from deepsimbad.api.problems import error_response
+from deepsimbad.api.limits import refuse_unread
 from deepsimbad.api.rate_limit import RateLimit
 from deepsimbad.errors import DeepSimbadError, ForbiddenError, UnauthorizedError, UnavailableError
 from deepsimbad.store.api_key import ApiKey
@@ -126,9 +125,7 @@ class AuthMiddleware:
             try:
                 self._check(scope, needed)
             except DeepSimbadError as error:
-                # Counts nothing, but closes the connection with care under a body that nobody reads.
-                refusal = BodyLimitMiddleware(error_response(scope, error), _any_length)
-                await refusal(scope, receive, send)
+                await refuse_unread(scope, receive, send, error)
                 return
         await self.app(scope, receive, send)
 
@@ -174,7 +171,3 @@ def presented_key(scope: Scope) -> str:
         return (bearer or own)[0].decode("ascii")
     except UnicodeDecodeError as error:
         raise UnauthorizedError(f"the key is malformed: {_HOW}") from error
-
-
-def _any_length(_: Scope) -> int:
-    return 1 << 62

@@ -33,6 +33,7 @@ T = TypeVar("T")
 
 DECODERS = 4  # images decoded at once: each may need max_pixels times 3 bytes
 BATCHES = 1  # batches read into memory at once
+HEALTH = 2  # threads that nothing but questions about health may take
 
 
 @dataclass(frozen=True)
@@ -57,6 +58,7 @@ class Services:
         stopping: Set when shutdown begins; streams end on it.
         decoders: Bounds the images being decoded.
         batches: Bounds the batches being read.
+        health: Threads of their own for questions about health, which should not wait behind what they ask about.
     """
 
     settings: Settings
@@ -76,6 +78,7 @@ class Services:
     stopping: threading.Event = field(default_factory=threading.Event)
     decoders: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(DECODERS))
     batches: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(BATCHES))
+    health: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(HEALTH))
 
     async def active(self, domain: str) -> ActiveDomain:
         """A domain and its active map; files are read in a thread."""

@@ -1,5 +1,6 @@
 """What every request is wrapped in: an id, a log line, a measurement, and an answer even to our own faults."""
 
+import asyncio
 import logging
 import re
 import secrets
@@ -9,7 +10,8 @@ from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from deepsimbad.api.metrics import Metrics
-from deepsimbad.api.problems import unexpected_response
+from deepsimbad.api.problems import error_response, unexpected_response
+from deepsimbad.errors import UnavailableError
 
 log = logging.getLogger(__name__)
 
@@ -44,6 +46,7 @@ _NOTED = ("key_id", "domain", "code", "limit")  # by whoever learnt it
 _NOTHING: dict[str, str] = {}
 _LONGEST_PATH = 256  # of a path in the log: the sender chooses it
 UNROUTED = "(none)"
+STOPPING = UnavailableError("the service is shutting down")
 _SENDER_LEFT = 499  # as proxies log it; never sent
 
 
@@ -80,6 +83,9 @@ class EnvelopeMiddleware:
         self.metrics.request_began()
         try:
             await self.app(scope, receive, send_marked)
+        except asyncio.CancelledError:  # the server stops and waits no longer
+            if status == 0:
+                await error_response(scope, STOPPING)(scope, receive, send_marked)
         except ClientDisconnect:  # nobody is left to be answered
             status = status or _SENDER_LEFT
         except Exception:

@@ -115,7 +115,10 @@ def problem_response(
         "code": code,
         "request_id": scope.get("state", {}).get("request_id"),
     }
-    scope.setdefault("state", {})["code"] = code  # for the log
+    noted = scope.setdefault("state", {})  # for the log
+    noted["code"] = code
+    if isinstance(document.get("limit"), str):
+        noted["limit"] = document["limit"]
     sent = dict(headers or {})
     if status == HTTPStatus.UNAUTHORIZED:
         sent.setdefault("WWW-Authenticate", "Bearer")

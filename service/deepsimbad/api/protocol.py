@@ -88,7 +88,7 @@ class LimitedProtocol(HttpToolsProtocol):
         super().connection_made(transport)
         if len(self.connections) > self.limits.max_connections:
             self._refusal = OverloadedError("too many connections")
-            self.limits.refused("connections")
+            self.limits.refused("max_connections")
             transport.abort()
             return
         self._since = self.loop.time()

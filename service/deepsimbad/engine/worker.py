@@ -9,7 +9,7 @@ from enum import IntEnum
 from queue import PriorityQueue
 from typing import Any, TypeVar
 
-from deepsimbad.errors import UnavailableError
+from deepsimbad.errors import OverloadedError, UnavailableError
 
 T = TypeVar("T")
 
@@ -35,9 +35,15 @@ class InferenceWorker:
 
     One thread, because encoders and scoring already use the cores they need: two at once would only make both late.
     A batch must be submitted in pieces short enough that a live view can wait for one.
+
+    Args:
+        name: Of the thread.
+        max_waiting: How many functions of one priority may wait; None: any number.
     """
 
-    def __init__(self, name: str = "inference") -> None:
+    def __init__(self, name: str = "inference", max_waiting: int | None = None) -> None:
+        self._max_waiting = max_waiting
+        self._n_waiting = dict.fromkeys(Priority, 0)
         self._queue: PriorityQueue[_Work] = PriorityQueue()
         self._arrivals = itertools.count()
         self._open = True
@@ -49,6 +55,10 @@ class InferenceWorker:
     def n_waiting(self) -> int:
         """How many functions wait."""
         return self._queue.qsize()
+
+    def is_full(self, priority: Priority = Priority.LIVE) -> bool:
+        """Whether as many functions of a priority wait as may."""
+        return self._max_waiting is not None and self._n_waiting[priority] >= self._max_waiting
 
     @property
     def is_alive(self) -> bool:
@@ -63,11 +73,15 @@ class InferenceWorker:
 
         Raises:
             UnavailableError: The worker has been closed.
+            OverloadedError: As many wait as may.
         """
         answer: Future[T] = Future()
         with self._lock:
             if not self._open:
                 raise UnavailableError("the service is shutting down")
+            if self.is_full(priority):
+                raise queue_is_full()
+            self._n_waiting[priority] += 1
             self._queue.put(_Work(priority, next(self._arrivals), run, answer))
         return answer
 
@@ -82,6 +96,8 @@ class InferenceWorker:
 
     def _work(self) -> None:
         while (work := self._queue.get()).priority is not Priority._CLOSE:
+            with self._lock:
+                self._n_waiting[work.priority] -= 1
             if not work.answer.set_running_or_notify_cancel():
                 continue
             try:
@@ -91,3 +107,10 @@ class InferenceWorker:
             else:
                 work.answer.set_result(result)
             del work  # or the last answer's arrays live until the next query
+
+
+def queue_is_full() -> OverloadedError:
+    """What is raised where a function would have to wait behind too many."""
+    return OverloadedError(
+        "too many views wait to be looked at: try again in a moment", retry_after_s=1, limit="max_queue"
+    )

@@ -34,13 +34,17 @@ async def readyz(running: Running) -> Readiness:
     """
     if running.stopping.is_set():
         raise UnavailableError("the service is shutting down", faults=["the service is shutting down"])
-    faults = await run_sync(running.readiness.faults)
+    faults = await run_sync(running.readiness.faults, limiter=running.health)
     if faults:
         raise UnavailableError("; ".join(faults), faults=list(faults))
-    return Readiness(status="ready", damaged_maps=list(await run_sync(running.active_maps.damaged)))
+    return Readiness(
+        status="ready", damaged_maps=list(await run_sync(running.active_maps.damaged, limiter=running.health))
+    )
 
 
 @router.get("/metrics", response_class=MetricsResponse, responses=problems())
 async def metrics(running: Running) -> Response:
     """What Prometheus scrapes."""
-    return Response(await run_sync(running.metrics.render), media_type=running.metrics.content_type)
+    return Response(
+        await run_sync(running.metrics.render, limiter=running.health), media_type=running.metrics.content_type
+    )
