@@ -1,10 +1,15 @@
 """The OpenAPI document says what the service does."""
 
+import json
 import re
 from typing import Any
 
 import pytest
 from starlette.testclient import TestClient
+
+from deepsimbad.api.bodies import DECLARED_BODIES, ObservationBody
+from deepsimbad.api.examples import ENCODED_ON_BOARD
+from deepsimbad.api.session_bodies import DECLARED_SESSION_BODIES
 
 OPERATIONS = """
 GET /healthz
@@ -19,6 +24,7 @@ GET /v1/sessions/{session_id}
 GET /v1/sessions/{session_id}/belief
 GET /v1/sessions/{session_id}/next-best-view
 PUT /v1/sessions/{session_id}/prior
+POST /v1/sessions/{session_id}/truths
 DELETE /v1/sessions/{session_id}
 PUT /v1/admin/domains/{domain}
 DELETE /v1/admin/domains/{domain}
@@ -31,6 +37,8 @@ POST /v1/admin/domains/{domain}/traverses/{name}/frames
 POST /v1/admin/domains/{domain}/remaps
 POST /v1/admin/domains/{domain}/experience
 GET /v1/admin/domains/{domain}/maps
+GET /v1/admin/domains/{domain}/maps/{version}/file
+DELETE /v1/admin/domains/{domain}/maps/{version}
 PUT /v1/admin/domains/{domain}/active-map
 GET /v1/admin/sessions
 GET /v1/admin/jobs
@@ -103,8 +111,40 @@ def test_bodies_and_answers_by_media_type(operations: dict[str, Any]) -> None:
 def test_names_carry_their_pattern(operations: dict[str, Any]) -> None:
     for name, operation in operations.items():
         for parameter in operation.get("parameters", []):
-            if parameter["in"] == "path" and parameter["name"] != "index":
+            if parameter["in"] == "path" and parameter["name"] not in {"index", "version"}:
                 assert parameter["schema"]["pattern"] == "^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$", name
+
+
+def test_every_body_has_an_example_that_is_taken(document: dict[str, Any]) -> None:
+    for model in (*DECLARED_BODIES, *DECLARED_SESSION_BODIES):
+        (example,) = document["components"]["schemas"][model.__name__]["examples"]
+        model.model_validate_json(json.dumps(example))
+    ObservationBody.model_validate_json(json.dumps(ENCODED_ON_BOARD))
+
+
+def test_every_parameter_in_a_path_has_an_example(operations: dict[str, Any]) -> None:
+    for name, operation in operations.items():
+        for parameter in operation.get("parameters", []):
+            assert "example" in parameter or parameter["in"] != "path", (name, parameter["name"])
+
+
+def test_links_lead_to_operations_and_give_what_their_paths_need(operations: dict[str, Any]) -> None:
+    by_id = {operation["operationId"]: name for name, operation in operations.items()}
+    assert len(by_id) == len(operations)
+    reached = set()
+    for operation in operations.values():
+        for answer in operation["responses"].values():
+            for link in answer.get("links", {}).values():
+                target = by_id[link["operationId"]]
+                reached.add(target)
+                assert set(re.findall(r"{(\w+)}", target)) == set(link["parameters"])
+    assert {name for name in operations if "{session_id}" in name or "{job_id}" in name} <= reached
+
+
+def test_pairs_are_written_for_every_reader(document: dict[str, Any]) -> None:
+    assert "prefixItems" not in json.dumps(document)
+    size = document["components"]["schemas"]["DomainAnswer"]["properties"]["input_size"]["anyOf"][0]
+    assert size == {"type": "array", "items": {"type": "integer"}, "minItems": 2, "maxItems": 2}
 
 
 def test_every_member_of_an_answer_is_required(document: dict[str, Any]) -> None:

@@ -10,6 +10,7 @@ from pydantic import BaseModel
 
 from deepsimbad.api.auth import needed_scope
 from deepsimbad.api.bodies import DECLARED_BODIES
+from deepsimbad.api.examples import write_examples
 from deepsimbad.api.problems import MEDIA_TYPE
 from deepsimbad.api.schemas import Problem
 from deepsimbad.api.session_bodies import DECLARED_SESSION_BODIES
@@ -106,6 +107,7 @@ def install_openapi(app: FastAPI) -> None:
             for name, operation in operations.items():
                 _declare_what_comes_first(operation, needed_scope(name.partition(" ")[2]))
             _link(operations)
+            write_examples(operations, schemas)
             app.openapi_schema = made
         return app.openapi_schema
 
