@@ -8,6 +8,7 @@ from collections.abc import Sequence
 
 import click
 
+from deepsimbad.cli.backup import backup, restore
 from deepsimbad.cli.experiment import experiment
 from deepsimbad.cli.keys import keys
 from deepsimbad.cli.local import delete, info, localize, map_
@@ -25,7 +26,7 @@ def deepsimbad() -> None:
     """Where on a known route a robot is, and which move would tell it most next."""
 
 
-for command in (serve, map_, localize, info, delete, experiment, keys, settings):
+for command in (serve, map_, localize, info, delete, experiment, keys, settings, backup, restore):
     deepsimbad.add_command(command)
 
 

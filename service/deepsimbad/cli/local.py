@@ -8,7 +8,14 @@ from rich.table import Table
 
 from deepsimbad.api.domain_answers import describe_domain
 from deepsimbad.api.rendering import render_localization
-from deepsimbad.cli.options import RELEVANCES, data_dir_option, evaluator_option, given_settings, spacing_option
+from deepsimbad.cli.options import (
+    RELEVANCES,
+    data_dir_option,
+    evaluator_option,
+    existing_data_dir,
+    given_settings,
+    spacing_option,
+)
 from deepsimbad.cli.terminal import console, progress_bar, write_json
 from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Relevance
 from deepsimbad.engine.active_maps import ActiveMaps
@@ -19,7 +26,6 @@ from deepsimbad.errors import (
     InvalidImageError,
     InvalidSourceError,
     TooFewCandidatesError,
-    UnknownDomainError,
 )
 from deepsimbad.evaluators.image import decode_image
 from deepsimbad.evaluators.registry import EvaluatorConfig, make_evaluator
@@ -29,7 +35,7 @@ from deepsimbad.jobs.map_config import DEFAULT_LIST_LENGTH, DEFAULT_N_LANDMARKS,
 from deepsimbad.jobs.remap import REMAP_STAGES, remap
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.frames import TraverseFrames
-from deepsimbad.store.layout import catalog_path, checked_name
+from deepsimbad.store.layout import checked_name
 from deepsimbad.store.traverses import Traverse
 from deepsimbad_client.sources import open_source
 
@@ -114,7 +120,7 @@ def map_(
 def localize(domain: str, images: tuple[Path, ...], as_json: bool, data_dir: Path | None) -> None:
     """Say where on the route each image was probably taken."""
     settings = given_settings(data_dir=data_dir)
-    with _existing_catalog(settings.data_dir) as catalog:
+    with Catalog.open(existing_data_dir(settings.data_dir)) as catalog:
         active = ActiveMaps(catalog).active(domain)
         judge = EvaluatorPool().evaluator(active.record.evaluator)
         found = []
@@ -153,7 +159,7 @@ def localize(domain: str, images: tuple[Path, ...], as_json: bool, data_dir: Pat
 @data_dir_option
 def delete(domain: str, data_dir: Path | None) -> None:
     """Delete a domain with everything it holds."""
-    with _existing_catalog(given_settings(data_dir=data_dir).data_dir) as catalog:
+    with Catalog.open(existing_data_dir(given_settings(data_dir=data_dir).data_dir)) as catalog:
         catalog.delete_domain(domain)
     click.echo(f"domain {domain} is deleted")
 
@@ -164,7 +170,7 @@ def delete(domain: str, data_dir: Path | None) -> None:
 @data_dir_option
 def info(domain: str, as_json: bool, data_dir: Path | None) -> None:
     """Describe a domain and its active map."""
-    with _existing_catalog(given_settings(data_dir=data_dir).data_dir) as catalog:
+    with Catalog.open(existing_data_dir(given_settings(data_dir=data_dir).data_dir)) as catalog:
         answer = describe_domain(catalog.domain(domain), EvaluatorPool(), ActiveMaps(catalog))
     if as_json:
         write_json(answer.model_dump())
@@ -173,15 +179,6 @@ def info(domain: str, as_json: bool, data_dir: Path | None) -> None:
     for name, value in answer.model_dump().items():
         table.add_row(name, "-" if value is None else str(value))
     console().print(table)
-
-
-def _existing_catalog(data_dir: Path) -> Catalog:
-    """A question must not make the folder it asks about."""
-    if not catalog_path(data_dir).is_file():
-        raise UnknownDomainError(
-            f"there are no domains in {data_dir}: name their folder with --data-dir, or make one with `deepsimbad map`"
-        )
-    return Catalog.open(data_dir)
 
 
 def _store(catalog: Catalog, domain: str, role: str, frames: TraverseFrames) -> None:

@@ -7,9 +7,11 @@ from typing import Any, TypeVar
 import click
 
 from deepsimbad.core.relevance import Relevance
+from deepsimbad.errors import UnknownDomainError
 from deepsimbad.evaluators.registry import EvaluatorConfig, EvaluatorKind, ExtractorName, evaluator_config
 from deepsimbad.settings import Settings
 from deepsimbad.settings_sources import TracedSettings, trace_settings
+from deepsimbad.store.layout import catalog_path
 
 _Command = TypeVar("_Command", bound=Callable[..., Any])
 
@@ -74,6 +76,19 @@ def evaluator_option(command: _Command) -> _Command:
         callback=_evaluator,
         help=f"How images are compared with landmarks: a kind, or one of {names}.",
     )(command)
+
+
+def existing_data_dir(data_dir: Path) -> Path:
+    """The folder itself, where it holds a catalog: a question must not make the folder it asks about.
+
+    Raises:
+        UnknownDomainError: It holds none.
+    """
+    if not catalog_path(data_dir).is_file():
+        raise UnknownDomainError(
+            f"there are no domains in {data_dir}: name their folder with --data-dir, or make one with `deepsimbad map`"
+        )
+    return data_dir
 
 
 def spacing_option(command: _Command) -> _Command:

@@ -1,15 +1,18 @@
 """How every SQLite file is opened, brought to today's schema and written to."""
 
 import sqlite3
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TypeVar
 
 from sqlite_utils import Database, Migrations
 
 from deepsimbad.errors import DamagedFileError, DamagedMapError
 
 BUSY_TIMEOUT_S = 10.0
+
+_Answer = TypeVar("_Answer")
 
 
 def open_database(path: Path, *, read_only: bool = False, create: bool = False, immutable: bool = False) -> Database:
@@ -46,6 +49,40 @@ def open_database(path: Path, *, read_only: bool = False, create: bool = False, 
     except BaseException:
         connection.close()
         raise
+
+
+def look_at(path: Path, ask: Callable[[Database], _Answer]) -> _Answer:
+    """Ask a file something without leaving a trace of the asking, whether others write to it meanwhile or not.
+
+    A reader that SQLite lets join a write-ahead log creates the log where nobody has it open, and leaves it there. So
+    a file without a log is read as one that does not change, and read again where it did.
+
+    Args:
+        path: The file.
+        ask: Called with the open file; a second time if need be, so it should begin from the beginning.
+
+    Raises:
+        sqlite3.Error: As SQLite says it; callers stand inside `storage_faults`.
+    """
+    log = path.with_name(f"{path.name}-wal")
+    if not log.exists():
+        before = _age(path)
+        try:
+            with open_database(path, immutable=True) as db:
+                answer = ask(db)
+        except BaseException:
+            if _age(path) == before and not log.exists():
+                raise
+        else:
+            if _age(path) == before and not log.exists():
+                return answer
+    with open_database(path, read_only=True) as db:
+        return ask(db)
+
+
+def _age(path: Path) -> tuple[int, int, int]:
+    found = path.stat()
+    return found.st_ino, found.st_size, found.st_mtime_ns
 
 
 def use_write_ahead_log(db: Database) -> None:
@@ -105,6 +142,27 @@ def pending_migrations(
             file=path.name,
         )
     return bool(pending)
+
+
+@contextmanager
+def in_todays_schema(
+    db: Database,
+    migrations: Migrations,
+    path: Path,
+    damaged: type[DamagedFileError | DamagedMapError] = DamagedFileError,
+) -> Iterator[Database]:
+    """The file as it is where its schema is today's, else a copy in memory that is brought to it.
+
+    Raises:
+        DamagedFileError: (or `damaged`) The file is of another kind, or a newer release wrote it.
+    """
+    if not pending_migrations(db, migrations, path, damaged):
+        yield db
+        return
+    with Database(sqlite3.connect(":memory:", isolation_level=None), execute_plugins=False) as copy:
+        db.conn.backup(copy.conn)
+        migrations.apply(copy)
+        yield copy
 
 
 def migrate(db: Database, migrations: Migrations, path: Path) -> None:

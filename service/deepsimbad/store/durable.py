@@ -1,9 +1,15 @@
 """Files that are on the disk when we say so, and their digests."""
 
+import errno
 import hashlib
 import os
 import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+
+_NO_HARD_LINKS = {errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK, errno.EACCES}
 
 
 def sync_file(path: Path) -> None:
@@ -18,6 +24,35 @@ def sync_file(path: Path) -> None:
 def sync_folder(folder: Path) -> None:
     """Wait until the folder's entries (new, renamed or removed files) are on the disk."""
     sync_file(folder)
+
+
+@contextmanager
+def written_aside(file: Path) -> Iterator[Path]:
+    """Let a new file appear whole or not at all, and never in the place of another.
+
+    Yields:
+        A path to write it at, in a folder beside it that holds whatever else is needed meanwhile and goes away.
+
+    Raises:
+        FileExistsError: There is a file of that name.
+        OSError: The disk is full, ...
+    """
+    if file.exists():
+        raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(file))
+    folder = Path(tempfile.mkdtemp(prefix=f".{file.name}.", suffix=".part", dir=file.parent))
+    try:
+        new = folder / file.name
+        yield new
+        sync_file(new)
+        try:
+            os.link(new, file)  # unlike a rename it never replaces
+        except OSError as error:
+            if error.errno not in _NO_HARD_LINKS or file.exists():
+                raise
+            new.rename(file)
+        sync_folder(file.parent)
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def sha256_of(path: Path) -> str:

@@ -3,6 +3,8 @@
 import struct
 import zlib
 from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from sqlite_utils import Database
@@ -84,23 +86,11 @@ def read(db: Database) -> TraverseFrames:
         y_m=np.empty(n, np.float64),
         encodings=np.empty((n, dim), np.float32),
     )
-    rows = db.execute(
-        """
-        SELECT frame.frame_index, position_m, timestamp_us, x_m, y_m, checksum, body
-        FROM frame LEFT JOIN encoding ON encoding.frame_index = frame.frame_index
-        ORDER BY frame.frame_index
-        """
-    )
     n_read = 0
-    for index, position_m, timestamp_us, x_m, y_m, checksum, body in rows:
-        try:
-            if _checksum((position_m, timestamp_us, x_m, y_m), body) != checksum:
-                raise ValueError("the checksum differs")
-            if len(body) != 4 * dim:  # a single number would be broadcast
-                raise ValueError("the encoding has another length")
-            frames.encodings[n_read] = np.frombuffer(body, "<f4")
-        except (TypeError, ValueError, IndexError, struct.error) as error:
-            raise _damaged(f"frame {index} is not what was stored") from error
+    for index, position_m, timestamp_us, x_m, y_m, encoding in _checked_rows(db, dim):
+        if n_read == n:
+            break
+        frames.encodings[n_read] = encoding
         frames.index[n_read] = index
         frames.position_m[n_read] = position_m
         frames.timestamp_us[n_read] = UNKNOWN_TIMESTAMP if timestamp_us is None else timestamp_us
@@ -110,6 +100,39 @@ def read(db: Database) -> TraverseFrames:
     if n_read != n:
         raise _damaged(f"it holds {n_read} frames of {n}")
     return frames
+
+
+def verify(db: Database, path: Path) -> int:
+    """Check every frame's checksum, holding one at a time; returns how many there are.
+
+    Raises:
+        DamagedFileError: A frame is not what was stored; names the file.
+    """
+    try:
+        return sum(1 for _ in _checked_rows(db, encoding_dim(db) or 0))
+    except DamagedFileError as error:
+        raise DamagedFileError(f"{path.name}: {error.message}", file=path.name) from error
+
+
+def _checked_rows(db: Database, dim: int) -> Iterator[tuple[Any, ...]]:
+    """Index, place and encoding of every frame in index order; raises DamagedFileError."""
+    rows = db.execute(
+        """
+        SELECT frame.frame_index, position_m, timestamp_us, x_m, y_m, checksum, body
+        FROM frame LEFT JOIN encoding ON encoding.frame_index = frame.frame_index
+        ORDER BY frame.frame_index
+        """
+    )
+    for index, position_m, timestamp_us, x_m, y_m, checksum, body in rows:
+        try:
+            if _checksum((position_m, timestamp_us, x_m, y_m), body) != checksum:
+                raise ValueError("the checksum differs")
+            if len(body) != 4 * dim:  # a single number would be broadcast
+                raise ValueError("the encoding has another length")
+            encoding = np.frombuffer(body, "<f4")
+        except (TypeError, ValueError, struct.error) as error:
+            raise _damaged(f"frame {index} is not what was stored") from error
+        yield index, position_m, timestamp_us, x_m, y_m, encoding
 
 
 def _place(frames: TraverseFrames, row: int) -> _Place:

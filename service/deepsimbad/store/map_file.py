@@ -1,6 +1,5 @@
 """One map version as a self-contained file: landmark model, inverted index, route, experience."""
 
-import sqlite3
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,7 +11,7 @@ from sqlite_utils import Database
 from deepsimbad.core.packing import pack_index, unpack_index
 from deepsimbad.errors import DamagedMapError, InvalidMapConfigError
 from deepsimbad.store.arrays import Checksum, load_arrays, save_arrays
-from deepsimbad.store.connection import open_database, pending_migrations
+from deepsimbad.store.connection import in_todays_schema, open_database
 from deepsimbad.store.documents import from_json, to_json
 from deepsimbad.store.durable import remove_database
 from deepsimbad.store.experience import EXPERIENCE_TABLE, load_experience, save_experience
@@ -196,13 +195,8 @@ def _opened(path: Path) -> Iterator[Database]:
         with open_database(path, immutable=True) as db:
             if not db.table_names():
                 raise DamagedMapError(f"{path.name} is damaged: it is empty", file=path.name)
-            if not pending_migrations(db, migrations, path, DamagedMapError):
-                yield db
-                return
-            with Database(sqlite3.connect(":memory:", isolation_level=None), execute_plugins=False) as copy:
-                db.conn.backup(copy.conn)
-                migrations.apply(copy)
-                yield copy
+            with in_todays_schema(db, migrations, path, DamagedMapError) as current:
+                yield current
 
 
 __all__ = ["MapContents", "index_bytes", "read_map", "table_bytes", "write_map"]

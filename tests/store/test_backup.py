@@ -1,0 +1,417 @@
+"""A backup holds everything acknowledged before it began; a restore is whole or not at all."""
+
+import hashlib
+import io
+import json
+import shutil
+import stat
+import tarfile
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from deepsimbad.errors import (
+    CancelledError,
+    ConflictError,
+    DamagedFileError,
+    DamagedMapError,
+    DataDirInUseError,
+    InvalidArchiveError,
+    InvalidInputError,
+)
+from deepsimbad.store import archive as archive_module
+from deepsimbad.store.archive import MANIFEST
+from deepsimbad.store.backup import back_up, is_member
+from deepsimbad.store.catalog import Catalog
+from deepsimbad.store.frames import TraverseFrames
+from deepsimbad.store.map_contents import MapContents
+from deepsimbad.store.map_file import read_map, write_map
+from deepsimbad.store.map_table import ANY
+from deepsimbad.store.restore import restore
+from deepsimbad.store.sealing import seal, verify
+from deepsimbad.store.service_lock import ServiceLock
+from deepsimbad.store.session_records import ObservedRow, SessionRecord
+from deepsimbad.store.sessions import SessionStore
+from deepsimbad.store.traverses import Traverse
+
+MakeMap = Callable[..., MapContents]
+MakeFrames = Callable[..., TraverseFrames]
+
+
+def silent(_: float) -> None:
+    pass
+
+
+def add_map(catalog: Catalog, make_map: MakeMap, domain: str = "campus") -> int:
+    version = catalog.begin_map(domain, {})
+    write_map(catalog.building_path(domain, version), make_map(version=version, seed=version, domain=domain))
+    digest, n_bytes = seal(catalog.building_path(domain, version), catalog.map_path(domain, version))
+    catalog.seal_map(domain, version, digest, n_bytes, {})
+    return version
+
+
+def add_session(store: SessionStore, catalog: Catalog, name: str, version: int) -> SessionRecord:
+    digest = catalog.map("campus", version).sha256 or ""
+    record = SessionRecord(0, name, "campus", version, digest, {}, 0.0, 9e9, 0, None)
+    return store.create(record).result()
+
+
+def observe(store: SessionStore, number: int, sequence: int) -> None:
+    store.append(number, ObservedRow(sequence, 9e9, 1.0, None, np.arange(1, 21, dtype=np.float32)), 0.0).result()
+
+
+@pytest.fixture
+def furnished(campus: Catalog, make_map: MakeMap, make_frames: MakeFrames) -> Catalog:
+    """Two maps, one active, and one being built; two traverses; a domain with nothing in it; a session."""
+    for _ in range(2):
+        add_map(campus, make_map)
+    campus.activate("campus", 1, ANY)
+    campus.activate("campus", 2, 1)
+    campus.building_path("campus", campus.begin_map("campus", {})).write_bytes(b"half")
+    campus.create_domain("empty", {}, False, [1])
+    for seed, name in enumerate(("summer", "winter")):
+        with Traverse.create(campus.data_dir, "campus", name) as traverse:
+            traverse.put_frames(make_frames(np.arange(50), seed=seed))
+    with SessionStore.open(campus.data_dir) as store:
+        session = add_session(store, campus, "robot", 1)
+        for sequence in range(1, 4):
+            observe(store, session.number, sequence)
+    return campus
+
+
+@pytest.fixture
+def archive(furnished: Catalog, tmp_path: Path) -> Path:
+    back_up(furnished.data_dir, tmp_path / "backup.tar", "1.2", silent)
+    return tmp_path / "backup.tar"
+
+
+def test_everything_comes_back(furnished: Catalog, archive: Path, tmp_path: Path) -> None:
+    there = tmp_path / "there"
+    shares: list[float] = []
+    report = restore(archive, there, shares.append)
+    assert (report.n_files, report.release) == (6, "1.2")
+    assert shares == sorted(shares)
+    assert shares[-1] == 1.0
+    with Catalog.open(there) as catalog, SessionStore.open(there) as store:
+        assert catalog.domains() == furnished.domains()
+        assert len(catalog.discard_unfinished()) == 1, "the map that was being built"
+        assert catalog.maps("campus") == furnished.maps("campus")[:2]
+        for record in catalog.maps("campus"):
+            path = catalog.map_path("campus", record.version)
+            verify(path, record.sha256 or "")
+            assert stat.S_IMODE(path.stat().st_mode) == 0o444
+            assert read_map(path).version == record.version
+        for name in ("summer", "winter"):
+            with Traverse.open(there, "campus", name) as here, Traverse.open(furnished.data_dir, "campus", name) as old:
+                assert (here.read().encodings == old.read().encodings).all()
+        assert store.find("robot").n_events == 3
+        Traverse.create(there, "empty", "new").close()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["backup.tar", "data", "there"], "nothing is left beside"
+
+
+def test_it_is_a_tar_file_with_a_manifest(archive: Path) -> None:
+    with tarfile.open(archive) as tar:
+        names = tar.getnames()
+        packed = tar.extractfile("manifest.json")
+        assert packed is not None
+        manifest = json.loads(packed.read())
+    assert names[:2] == ["sessions.sqlite", "catalog.sqlite"], "sessions are copied before what they speak of"
+    assert names[-2:] == ["manifest.json", "archive.sha256"]
+    assert [one["name"] for one in manifest["files"]] == names[:-2]
+    assert {"format", "format_version", "release", "created_at"} < set(manifest)
+    assert stat.S_IMODE(archive.stat().st_mode) == 0o600
+
+
+def test_the_data_directory_is_left_as_it_was(furnished: Catalog, tmp_path: Path) -> None:
+    furnished.close()
+    before = {path: path.read_bytes() for path in furnished.data_dir.rglob("*") if path.is_file()}
+    back_up(furnished.data_dir, tmp_path / "backup.tar", "0", silent)
+    assert {path: path.read_bytes() for path in furnished.data_dir.rglob("*") if path.is_file()} == before
+
+
+def test_a_file_is_never_replaced(furnished: Catalog, tmp_path: Path) -> None:
+    (tmp_path / "mine").write_text("precious")
+    with pytest.raises(ConflictError, match="never replaces"):
+        back_up(furnished.data_dir, tmp_path / "mine", "0", silent)
+    assert (tmp_path / "mine").read_text() == "precious"
+    with pytest.raises(InvalidInputError, match="no folder"):
+        back_up(furnished.data_dir, tmp_path / "nowhere" / "x", "0", silent)
+
+
+def test_a_cancelled_backup_or_restore_leaves_nothing(furnished: Catalog, archive: Path, tmp_path: Path) -> None:
+    def cancel(share: float) -> None:
+        if share > 0.4:
+            raise CancelledError("cancelled")
+
+    before = sorted(tmp_path.iterdir())
+    with pytest.raises(CancelledError):
+        back_up(furnished.data_dir, tmp_path / "other.tar", "0", cancel)
+    with pytest.raises(CancelledError):
+        restore(archive, tmp_path / "there", cancel)
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_what_is_damaged_is_named_and_not_backed_up(furnished: Catalog, tmp_path: Path) -> None:
+    path = furnished.map_path("campus", 1)
+    whole = path.read_bytes()
+    path.chmod(0o644)
+    path.write_bytes(whole[:5000] + bytes([whole[5000] ^ 1]) + whole[5001:])
+    with pytest.raises(DamagedMapError, match="map 1 of domain campus is damaged"):
+        back_up(furnished.data_dir, tmp_path / "backup.tar", "0", silent)
+    path.unlink()
+    with pytest.raises(DamagedMapError, match="map 1 of domain campus is missing"):
+        back_up(furnished.data_dir, tmp_path / "backup.tar", "0", silent)
+    path.write_bytes(whole)
+    traverse = furnished.data_dir / "domains/campus/traverses/winter.sqlite"
+    with Traverse.open(furnished.data_dir, "campus", "winter") as opened:
+        body = opened.read().encodings[7].tobytes()
+    content = traverse.read_bytes()
+    at = content.index(body)
+    traverse.write_bytes(content[:at] + bytes([content[at] ^ 1]) + content[at + 1 :])
+    with pytest.raises(DamagedFileError, match=r"winter\.sqlite.*frame 7"):
+        back_up(furnished.data_dir, tmp_path / "backup.tar", "0", silent)
+    assert not (tmp_path / "backup.tar").exists()
+
+
+def test_every_flipped_or_missing_byte_is_refused(archive: Path, tmp_path: Path) -> None:
+    whole = archive.read_bytes()
+    rng = np.random.default_rng(0)
+    places = [0, 100, len(whole) - 1, len(whole) - 1500, *rng.integers(0, len(whole), 40).tolist()]
+    for at in places:
+        archive.write_bytes(whole[:at] + bytes([whole[at] ^ (1 << rng.integers(8))]) + whole[at + 1 :])
+        with pytest.raises(InvalidArchiveError):
+            restore(archive, tmp_path / "there", silent)
+    for length in (0, 1, 511, 1024, 2048, len(whole) // 2, len(whole) - 1024, len(whole) - 1):
+        archive.write_bytes(whole[:length])
+        with pytest.raises(InvalidArchiveError):
+            restore(archive, tmp_path / "there", silent)
+    archive.write_bytes(whole + b"\0")
+    with pytest.raises(InvalidArchiveError):
+        restore(archive, tmp_path / "there", silent)
+    archive.unlink()
+    with pytest.raises(InvalidArchiveError, match="No such file"):
+        restore(archive, tmp_path / "there", silent)
+    assert not (tmp_path / "there").exists()
+    assert not list(tmp_path.glob("*.restoring"))
+
+
+def forged(tmp_path: Path, names: list[str], about: dict[str, Any], kind: bytes = tarfile.REGTYPE) -> Path:
+    """An archive whose digests are all right, by someone who means harm."""
+    content = b"x" * 700
+    members = [{"name": name, "bytes": 700, "sha256": hashlib.sha256(content).hexdigest()} for name in names]
+    manifest = {"format": "deepsimbad-backup", "format_version": 1, **about, "files": members}
+    body = b""
+    for name, packed in [*((name, content) for name in names), (MANIFEST, json.dumps(manifest).encode())]:
+        info = tarfile.TarInfo(name)
+        info.size = len(packed)
+        if name != MANIFEST:
+            info.type, info.linkname = kind, "" if kind == tarfile.REGTYPE else "/etc/passwd"
+        body += info.tobuf() + packed + bytes(-len(packed) % tarfile.BLOCKSIZE)
+    path = tmp_path / "forged.tar"
+    path.write_bytes(body + archive_module._seal(hashlib.sha256(body).hexdigest()))
+    return path
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "../evil",
+        "/etc/evil",
+        "domains/../../evil.sqlite",
+        "domains/campus/traverses/../../../evil.sqlite",
+        "domains/campus/maps/1.sqlite",
+        "domains/.hidden/traverses/a.sqlite",
+        "catalog.sqlite/../evil",
+        "catalog.sqlite-wal",
+        "domains/campus/traverses/a.sqlite\n",
+        "owners/" + "0" * 32,
+    ],
+)
+def test_a_name_that_leads_elsewhere_is_refused(tmp_path: Path, name: str) -> None:
+    assert not is_member(name)
+    path = forged(tmp_path, ["catalog.sqlite", name], {})
+    before = sorted(tmp_path.rglob("*"))
+    with pytest.raises(InvalidArchiveError, match="has no place in it"):
+        restore(path, tmp_path / "there", silent)
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize("kind", [tarfile.SYMTYPE, tarfile.LNKTYPE, tarfile.FIFOTYPE, tarfile.DIRTYPE, tarfile.CHRTYPE])
+def test_anything_but_a_plain_file_is_refused(tmp_path: Path, kind: bytes) -> None:
+    path = forged(tmp_path, ["catalog.sqlite"], {}, kind)
+    with pytest.raises(InvalidArchiveError, match="is no plain file"):
+        restore(path, tmp_path / "there", silent)
+
+
+def test_what_is_no_backup_is_refused(tmp_path: Path) -> None:
+    wrong: list[tuple[list[str], dict[str, Any], str]] = [
+        (["catalog.sqlite", "catalog.sqlite"], {}, "there twice"),
+        (["sessions.sqlite"], {}, "no backup of a data directory"),
+        (["catalog.sqlite"], {"format": "other"}, "no backup of a data directory"),
+        (["catalog.sqlite"], {"format_version": 2}, "newer release"),
+    ]
+    for names, about, said in wrong:
+        with pytest.raises(InvalidArchiveError, match=said):
+            restore(forged(tmp_path, names, about), tmp_path / "there", silent)
+    with pytest.raises(DamagedFileError, match=r"catalog\.sqlite"):
+        restore(forged(tmp_path, ["catalog.sqlite"], {}), tmp_path / "there", silent)
+    with tarfile.open(tmp_path / "plain.tar", "w") as tar:
+        tar.addfile(tarfile.TarInfo("catalog.sqlite"), io.BytesIO())
+    with pytest.raises(InvalidArchiveError):
+        restore(tmp_path / "plain.tar", tmp_path / "there", silent)
+    assert not (tmp_path / "there").exists()
+
+
+def test_only_an_empty_folder_is_restored_into(archive: Path, furnished: Catalog, tmp_path: Path) -> None:
+    with pytest.raises(ConflictError, match="not empty"):
+        restore(archive, furnished.data_dir, silent)
+    there = tmp_path / "there"
+    with ServiceLock.take(there, "127.0.0.1:8000"), pytest.raises(DataDirInUseError):
+        restore(archive, there, silent)
+    restore(archive, there, silent)  # only the lock of a service that has ended lies in it
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(ConflictError, match="no folder"):
+        restore(archive, tmp_path / "file", silent)
+
+
+def test_a_restore_that_was_killed_is_begun_anew(archive: Path, tmp_path: Path) -> None:
+    killed = tmp_path / "there.restoring"
+    (killed / "domains").mkdir(parents=True)
+    (killed / "catalog.sqlite").write_bytes(b"half")
+    with pytest.raises(ConflictError, match="in the way"):
+        restore(archive, tmp_path / "there", silent)  # it does not say that it is a restore's
+    (killed / ".restoring").touch()
+    restore(archive, tmp_path / "there", silent)
+    assert not killed.exists()
+    with Catalog.open(tmp_path / "there") as catalog:
+        assert len(catalog.domains()) == 2
+
+
+def test_a_link_to_a_folder_is_followed(archive: Path, tmp_path: Path) -> None:
+    (tmp_path / "real").mkdir()
+    (tmp_path / "link").symlink_to(tmp_path / "real")
+    restore(archive, tmp_path / "link", silent)
+    assert (tmp_path / "link").is_symlink()
+    assert (tmp_path / "real" / "catalog.sqlite").exists()
+
+
+def test_a_map_that_is_removed_meanwhile_is_in_neither_copy(furnished: Catalog, tmp_path: Path) -> None:
+    n_pieces = 0
+
+    def remove(_: float) -> None:
+        nonlocal n_pieces
+        n_pieces += 1
+        if n_pieces == 2:  # sessions and catalog are copied
+            furnished.remove_map("campus", 1, lambda: False)
+
+    report = back_up(furnished.data_dir, tmp_path / "backup.tar", "0", remove)
+    assert (report.n_maps, report.n_traverses) == (1, 2)
+    restore(tmp_path / "backup.tar", tmp_path / "there", silent)
+    with Catalog.open(tmp_path / "there") as catalog:
+        assert catalog.map("campus", 1).removed_at is not None
+        assert not catalog.map_path("campus", 1).exists()
+
+
+def test_a_domain_that_is_made_anew_meanwhile_is_copied_as_it_is_now(furnished: Catalog, tmp_path: Path) -> None:
+    n_pieces = 0
+
+    def replace(_: float) -> None:
+        nonlocal n_pieces
+        n_pieces += 1
+        if n_pieces == 2:
+            furnished.delete_domain("empty")
+            furnished.create_domain("empty", {}, True, [5])
+            Traverse.create(furnished.data_dir, "empty", "t").close()
+
+    back_up(furnished.data_dir, tmp_path / "backup.tar", "0", replace)
+    restore(tmp_path / "backup.tar", tmp_path / "there", silent)
+    with Catalog.open(tmp_path / "there") as catalog:
+        assert catalog.domain("empty").closed
+        assert Traverse.list(tmp_path / "there", "empty") == ["t"]
+
+
+@pytest.mark.slow
+def test_while_everything_goes_on(
+    furnished: Catalog, make_map: MakeMap, make_frames: MakeFrames, tmp_path: Path
+) -> None:
+    """Observations, uploads, maps that are activated and removed: all that came before a backup is in it."""
+    n_rows, n_frames = [3], [0]
+    ended = threading.Event()
+    failed: list[BaseException] = []
+
+    def robots() -> None:
+        with SessionStore.open(furnished.data_dir) as store:
+            number = store.find("robot").number
+            while not ended.is_set():
+                observe(store, number, n_rows[0] + 1)
+                n_rows[0] += 1
+                pinned = furnished.domain("campus").active_version or 0
+                add_session(store, furnished, f"robot-{n_rows[0]}", pinned)
+
+    def uploads() -> None:
+        with Traverse.create(furnished.data_dir, "campus", "now") as traverse:
+            while not ended.is_set():
+                traverse.put_frames(make_frames(np.arange(n_frames[0], n_frames[0] + 5)))
+                n_frames[0] += 5
+
+    def maps() -> None:
+        while not ended.is_set():
+            version = add_map(furnished, make_map)
+            furnished.activate("campus", version, ANY)
+            if version > 6:
+                furnished.remove_map("campus", version - 3, lambda: False)
+
+    def domains() -> None:
+        while not ended.is_set():
+            furnished.create_domain("passing", {}, False, [1])
+            add_map(furnished, make_map, "passing")
+            Traverse.create(furnished.data_dir, "passing", "t").close()
+            furnished.delete_domain("passing")
+
+    def guarded(work: Callable[[], None]) -> Callable[[], None]:
+        def run() -> None:
+            try:
+                work()
+            except BaseException as error:
+                failed.append(error)
+
+        return run
+
+    threads = [threading.Thread(target=guarded(work)) for work in (robots, uploads, maps, domains)]
+    for thread in threads:
+        thread.start()
+    try:
+        for number in range(8):
+            told = n_rows[0], n_frames[0], furnished.domain("campus").active_version or 0
+            archive, there = tmp_path / f"{number}.tar", tmp_path / f"there-{number}"
+            back_up(furnished.data_dir, archive, "0", silent)
+            restore(archive, there, silent)
+            check(there, *told)
+            shutil.rmtree(there)
+    finally:
+        ended.set()
+        for thread in threads:
+            thread.join()
+    assert not failed, failed
+    assert n_rows[0] > 10
+
+
+def check(there: Path, n_rows: int, n_frames: int, version: int) -> None:
+    with Catalog.open(there) as catalog, SessionStore.open(there) as store:
+        catalog.discard_unfinished()
+        assert store.find("robot").n_events >= n_rows
+        assert (catalog.domain("campus").active_version or 0) >= version
+        known = {(record.version, record.sha256) for record in catalog.maps("campus")}
+        for session in store.living():
+            assert (session.map_version, session.map_sha256) in known
+        for domain in catalog.domains():
+            for record in catalog.maps(domain.name):
+                if record.removed_at is None:
+                    verify(catalog.map_path(domain.name, record.version), record.sha256 or "")
+        if n_frames:
+            with Traverse.open(there, "campus", "now") as traverse:
+                assert traverse.read().n_frames >= n_frames
