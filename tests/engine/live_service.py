@@ -41,9 +41,10 @@ class Live:
         self.store = SessionStore.open(catalog.data_dir, self.commits.append)
         self.worker = InferenceWorker()
         self.active_maps = ActiveMaps(catalog)
+        self.maps = PinnedMaps(catalog, self.active_maps, EvaluatorPool())
         self.sessions = Sessions(
             self.store,
-            PinnedMaps(catalog, self.active_maps, EvaluatorPool()),
+            self.maps,
             self.worker,
             **{"ttl_s": TTL_S, "max_sessions": 20, "snapshot_every": 4, "clock": clock, **options},
         )
