@@ -65,7 +65,7 @@ def _take(db: Database) -> Census:
         SELECT domain,
                CASE WHEN state = 'succeeded' AND json_extract(result, '$.metrics.check.passed') = 0
                     THEN ? ELSE state END,
-               max(finished_at)
+               finished_at, max(finished_at || printf('#%016d', rowid))
         FROM job WHERE kind = 'remap' AND finished_at IS NOT NULL GROUP BY domain ORDER BY domain
         """,
         [GATE_LOST],
@@ -74,7 +74,7 @@ def _take(db: Database) -> Census:
         domains=[record.name for record in domain_table.all_domains(db)],
         jobs={state: counted.get(state.value, 0) for state in JobState},
         serving=[ServingMap(domain, version, _seconds(at)) for domain, version, at in serving],
-        remaps=[LastRemap(domain, outcome, _seconds(at)) for domain, outcome, at in remaps],
+        remaps=[LastRemap(domain, outcome, _seconds(at)) for domain, outcome, at, _ in remaps],
     )
 
 
