@@ -113,6 +113,7 @@ def create_app(settings: Settings, run_job: RunJob | None = None) -> FastAPI:
     routes = [route for module in _ROUTERS for route in module.router.routes if isinstance(route, Route)]
     install_problem_handlers(app, routes)
     install_openapi(app)
+    app.state.metrics = metrics  # the server counts too
     app.add_middleware(BodyLimitMiddleware, limit_of=_body_limits(settings))
 
     def queue_is_full(priority: Priority) -> bool:

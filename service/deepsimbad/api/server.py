@@ -1,7 +1,10 @@
 """Serving the application with uvicorn."""
 
+import asyncio
 import logging
 import signal
+import ssl
+from collections.abc import Callable
 from types import FrameType
 from typing import Any
 
@@ -10,6 +13,9 @@ from fastapi import FastAPI
 
 from deepsimbad.api.app import create_app
 from deepsimbad.api.logs import configure_logging
+from deepsimbad.api.open_files import allow_open_files
+from deepsimbad.api.protocol import WireLimits, protocol_class
+from deepsimbad.api.tls import loop_for_tls, tls_context
 from deepsimbad.errors import DeepSimbadError, UnavailableError
 from deepsimbad.release import release
 from deepsimbad.settings import Settings
@@ -30,10 +36,26 @@ class _Server(uvicorn.Server):
         services = getattr(self._app.state, "services", None)
         if services is not None:
             services.stopping.set()
-        if sig == signal.SIGTERM and not self.should_exit:
+        if self.should_exit:
+            self.force_exit = True
+        elif sig == signal.SIGTERM:
             self.should_exit = True  # being asked to stop is no failure, so the signal is not raised again
         else:
             super().handle_exit(sig, frame)
+
+
+class _Config(uvicorn.Config):
+    """With a loop of ours where connections begin with a handshake."""
+
+    def __init__(self, app: FastAPI, settings: Settings, context: ssl.SSLContext | None, **more: Any) -> None:
+        super().__init__(app, ssl_context_factory=None if context is None else lambda *_: context, **more)
+        self._handshake_timeout_s = None if context is None else settings.header_timeout_s
+
+    def get_loop_factory(self) -> Callable[[], asyncio.AbstractEventLoop] | None:
+        """What makes the event loop."""
+        if self._handshake_timeout_s is None:
+            return super().get_loop_factory()
+        return loop_for_tls(self._handshake_timeout_s)
 
 
 def serve(settings: Settings) -> None:
@@ -43,12 +65,15 @@ def serve(settings: Settings) -> None:
         settings: The settings.
 
     Raises:
-        SettingsError: The address could be reached from other machines, and the service has no keys.
+        SettingsError: The address could be reached from other machines, and the service has no keys; or the
+            certificate or its key cannot be used.
         DeepSimbadError: What kept it from starting, by name.
     """
     if not catalog_path(settings.data_dir).is_file():  # then there is no key, and no need to make the folder first
         settings.check_exposure(n_keys=0)
+    context = tls_context(settings.tls_certificate, settings.tls_key)
     configure_logging(settings.log_level)
+    allow_open_files(settings.max_connections)
     log.info(
         "starting",
         extra={
@@ -58,17 +83,27 @@ def serve(settings: Settings) -> None:
         },
     )
     app = create_app(settings)
-    config = uvicorn.Config(
+    limits = WireLimits(
+        header_timeout_s=settings.header_timeout_s,
+        stall_timeout_s=settings.stall_timeout_s,
+        max_header_bytes=settings.max_header_bytes,
+        max_connections=settings.max_connections,
+        refused=app.state.metrics.refused,
+    )
+    config = _Config(
         app,
+        settings,
+        context,
+        http=protocol_class(limits),
         host=settings.host,
         port=settings.port,
         log_config=None,
         access_log=False,
         server_header=False,
+        proxy_headers=False,
         ws="none",
         timeout_keep_alive=settings.keep_alive_s,
         timeout_graceful_shutdown=settings.shutdown_grace_s,
-        h11_max_incomplete_event_size=64 * 1024,
     )
 
     def is_news(record: logging.LogRecord) -> bool:
