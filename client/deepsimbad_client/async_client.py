@@ -11,7 +11,7 @@ import httpx2
 from deepsimbad_client import calls, session_calls
 from deepsimbad_client.async_admin import AsyncAdmin
 from deepsimbad_client.async_session import AsyncSession
-from deepsimbad_client.models import Domain, Health, Localization
+from deepsimbad_client.models import Domain, Health, Localization, TruthScore
 from deepsimbad_client.observation import Image, Numbers, observation
 from deepsimbad_client.retry import RetryPolicy
 from deepsimbad_client.transport import THIN_LINK_TIMEOUT, AsyncTransport, Endpoint
@@ -138,6 +138,10 @@ class AsyncClient:
     async def attach_session(self, session_id: str, *, keep: bool = True) -> AsyncSession:
         """Find a session again that was kept."""
         return AsyncSession(self._transport, await self._transport.send(session_calls.state(session_id)), keep=keep)
+
+    async def truths(self, session_id: str, true_positions_m: Numbers) -> TruthScore:
+        """Tell where a session's robot truly was; the session may have ended a while ago."""
+        return await self._transport.send(session_calls.truths(session_id, true_positions_m))
 
     async def aclose(self) -> None:
         """Close the connections; the client cannot be used afterwards."""

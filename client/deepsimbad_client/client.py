@@ -10,7 +10,7 @@ import httpx2
 
 from deepsimbad_client import calls, session_calls
 from deepsimbad_client.admin import Admin
-from deepsimbad_client.models import Domain, Health, Localization
+from deepsimbad_client.models import Domain, Health, Localization, TruthScore
 from deepsimbad_client.observation import Image, Numbers, observation
 from deepsimbad_client.retry import RetryPolicy
 from deepsimbad_client.session import Session
@@ -205,6 +205,15 @@ class Client:
             RetiredMapError: Its map was removed.
         """
         return Session(self._transport, self._transport.send(session_calls.state(session_id)), keep=keep)
+
+    def truths(self, session_id: str, true_positions_m: Numbers) -> TruthScore:
+        """Tell where a session's robot truly was, as `Session.truths` does; the session may have ended a while ago.
+
+        Raises:
+            UnknownSessionError: No such session, or it ended long ago.
+            InvalidInputError: As many positions as observations there are not.
+        """
+        return self._transport.send(session_calls.truths(session_id, true_positions_m))
 
     def close(self) -> None:
         """Close the connections; the client cannot be used afterwards."""

@@ -9,7 +9,7 @@ from deepsimbad_client.console import REMARKS, JobBar, as_json, show
 from deepsimbad_client.follow import follow_job
 from deepsimbad_client.models import Job
 from deepsimbad_client.options import domain_option, json_flag, serving
-from deepsimbad_client.tables import job_table
+from deepsimbad_client.tables import gate_verdict, job_table
 
 
 @click.command()
@@ -159,8 +159,13 @@ def _show_job(job: Job, json_output: bool) -> None:
         click.echo(as_json(job.model_dump(mode="json")))
         return
     show(job_table([job]))
-    made = (job.result or {}).get("map_version")
-    if job.state == "succeeded" and made is not None and not (job.result or {}).get("active", True):
-        why = job.check.get("why")
-        click.echo(f"map {made} was sealed but not activated{f': {why}' if why else ''}".rstrip("."))
-        click.echo(f"serve it all the same: deepsimbad-client activate {job.domain} {made}")
+    result = job.result or {}
+    made = result.get("map_version")
+    why = gate_verdict(job.check)
+    if made is None:
+        return
+    if not result.get("active", True):
+        click.echo(f"map {made} was sealed but not activated{f': {why}' if why else ''}")
+        click.echo(f"to serve it all the same: deepsimbad-client activate {job.domain} {made}")
+    elif why:
+        click.echo(f"map {made}: {why}")

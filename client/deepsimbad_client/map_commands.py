@@ -8,7 +8,7 @@ from deepsimbad_client.client import Client
 from deepsimbad_client.console import DownloadBar, as_json, show
 from deepsimbad_client.models import MapVersion
 from deepsimbad_client.options import json_flag, serving
-from deepsimbad_client.tables import map_table
+from deepsimbad_client.tables import gate_verdict, map_table
 
 
 @click.command()
@@ -24,8 +24,9 @@ def maps(domain: str, json_output: bool, server: str, api_key: str | None) -> No
         return
     show(map_table(domain, found))
     for version in found:
-        if version.check.get("why"):
-            click.echo(f"map {version.version}: {version.check['why']}")
+        why = gate_verdict(version.check)
+        if why:
+            click.echo(f"map {version.version}: {why}")
 
 
 @click.command()

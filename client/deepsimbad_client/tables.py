@@ -78,6 +78,11 @@ def map_table(domain: str, maps: Sequence[MapVersion]) -> Table:
     return table
 
 
+def gate_verdict(check: Mapping[str, Any]) -> str:
+    """Why a gate was lost, or could not be held, in one sentence; "" where there was none or nothing to say."""
+    return str(check.get("why") or "") if check.get("gate_margin") is not None else ""
+
+
 def _gate(check: Mapping[str, Any]) -> str:
     if check.get("passed") is None:
         return "-"

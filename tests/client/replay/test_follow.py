@@ -1,13 +1,15 @@
 """Following a job through whatever happens to the connection."""
 
+import io
 import json
 from collections.abc import Callable
 from typing import Any
 
 import httpx2
 import pytest
+from rich.console import Console
 
-from deepsimbad_client import Client, RetryPolicy, errors, job_commands
+from deepsimbad_client import Client, RetryPolicy, console, errors, job_commands
 from deepsimbad_client.commands import run
 from deepsimbad_client.follow import follow_job
 from deepsimbad_client.models import Job
@@ -48,6 +50,7 @@ class Service:
         self.asked: list[str] = []
         self.now = 0.0
         self.heard: list[Job] = []
+        self.silences: list[float] = []
 
     def __call__(self, request: httpx2.Request) -> httpx2.Response:
         self.asked.append(request.url.path)
@@ -66,7 +69,13 @@ class Service:
         retry = RetryPolicy(attempts=1)
         client = Client("http://service", retry=retry, transport=httpx2.MockTransport(self), sleep=self.sleep)
         return follow_job(
-            client, "7", self.heard.append, patience_s=patience_s, sleep=self.sleep, clock=lambda: self.now
+            client,
+            "7",
+            self.heard.append,
+            on_silence=self.silences.append,
+            patience_s=patience_s,
+            sleep=self.sleep,
+            clock=lambda: self.now,
         )
 
 
@@ -84,6 +93,41 @@ def test_a_stream_that_breaks_off_is_listened_to_again() -> None:
     service = Service([first, httpx2.ConnectError, last], [httpx2.ConnectError, job("running", 0.6)])
     assert service.follow().state == "succeeded"
     assert [heard.progress for heard in service.heard] == [0.2, 0.6, 1.0]
+
+
+def test_a_restarted_service_takes_the_job_up_again() -> None:
+    """It was far, goes back to the queue while the service starts, and is resumed behind its last finished stage."""
+    before: Callable[[], httpx2.Response] = lambda: broken_stream(job("running", 0.7))  # noqa: E731
+    starting = lambda: httpx2.Response(503, json={"code": "unavailable"})  # noqa: E731
+    after: Callable[[], httpx2.Response] = lambda: stream(  # noqa: E731
+        job("queued", 0.0), job("running", 0.5), job("succeeded", 1.0)
+    )
+    service = Service([before, httpx2.ConnectError, starting, after], [httpx2.ConnectError, starting, job("queued")])
+    assert service.follow().state == "succeeded"
+    assert [(heard.state, heard.progress) for heard in service.heard] == [
+        ("running", 0.7),
+        ("queued", 0.0),
+        ("queued", 0.0),
+        ("running", 0.5),
+        ("succeeded", 1.0),
+    ]
+    assert service.silences == [0.0, 2.0]
+
+
+@pytest.mark.parametrize("status", [408, 429, 502, 503])
+def test_a_service_with_too_much_to_do_is_asked_again(status: int) -> None:
+    busy = lambda: httpx2.Response(status, json={"code": "busy"})  # noqa: E731
+    last: Callable[[], httpx2.Response] = lambda: stream(job("succeeded", 1.0))  # noqa: E731
+    service = Service([busy, last], [busy])
+    assert service.follow().state == "succeeded"
+    assert service.asked.count(EVENTS) == 2
+
+
+@pytest.mark.parametrize(("status", "error"), [(401, errors.UnauthorizedError), (403, errors.ForbiddenError)])
+def test_a_key_that_was_revoked_meanwhile_ends_it(status: int, error: type[errors.ApiError]) -> None:
+    refused = lambda: httpx2.Response(status, json={"detail": "no"})  # noqa: E731
+    with pytest.raises(error, match="keys create"):
+        Service([refused], [refused]).follow()
 
 
 def test_without_streams_the_job_is_asked_for() -> None:
@@ -149,6 +193,20 @@ def test_ctrl_c_asks_whether_to_cancel(cancel: bool, monkeypatch: pytest.MonkeyP
     assert questions == ["Cancel job 7 on the server too?"]
     assert (("DELETE", "/v1/admin/jobs/7") in asked) == cancel
     assert ("being cancelled" if cancel else "jobs 7 --follow") in capsys.readouterr().err
+
+
+def test_the_bar_shows_what_happens(monkeypatch: pytest.MonkeyPatch) -> None:
+    shown = Console(file=io.StringIO(), force_terminal=True, width=100)
+    monkeypatch.setattr(console, "REMARKS", shown)
+    with console.JobBar("mapping d") as bar:
+        for state in (job("running", 0.7, stage="train_planner"), job("queued"), job("running", 0.4, stage="rank")):
+            bar(Job.model_validate(state))
+            bar._progress.refresh()
+        bar.silent(12.4)
+        bar._progress.refresh()
+    printed = shown.file.getvalue()  # type: ignore[attr-defined]
+    for words in ("train planner", "70 %", "waiting for its turn", "rank", "40 %", "no answer for 12 s, still trying"):
+        assert words in printed
 
 
 def test_without_a_terminal_nobody_is_asked() -> None:

@@ -1,0 +1,212 @@
+"""A map on its way into a file: every byte checked, nothing fetched twice, nothing half in its place."""
+
+import asyncio
+import hashlib
+from base64 import b64encode
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx2
+import pytest
+
+from deepsimbad_client import AsyncClient, Client, RetryPolicy, errors
+
+BODY = bytes(range(256)) * 400
+OTHER = BODY[::-1]
+PATH = "/v1/admin/domains/d/maps/3/file"
+
+
+def sha256(body: bytes) -> str:
+    return hashlib.sha256(body).hexdigest()
+
+
+class Broken(httpx2.SyncByteStream, httpx2.AsyncByteStream):
+    """The beginning of a body, then the end of the link."""
+
+    def __init__(self, body: bytes) -> None:
+        self.body = body
+
+    def __iter__(self) -> Iterator[bytes]:
+        yield self.body
+        raise httpx2.ReadError("the link is gone")
+
+    async def __aiter__(self) -> Any:
+        yield self.body
+        raise httpx2.ReadError("the link is gone")
+
+
+class Shelf:
+    """Serves a file as the service does; `breaks` says after how many bytes each answer breaks off.
+
+    Attributes:
+        ranges: What was asked for, "" for the whole.
+    """
+
+    def __init__(self, body: bytes = BODY, breaks: tuple[int | None, ...] = (), **headers: str | None) -> None:
+        self.body = body
+        self.breaks = list(breaks)
+        self.headers = headers
+        self.ranges: list[str] = []
+        self.slept: list[float] = []
+
+    def __call__(self, request: httpx2.Request) -> httpx2.Response:
+        assert request.url.path == PATH
+        assert request.headers["accept-encoding"] == "identity"
+        asked = request.headers.get("range", "")
+        self.ranges.append(asked)
+        etag = f'"sha256:{sha256(self.body)}"'
+        headers = {"etag": etag, "content-length": str(len(self.body)), **self.headers}
+        status, content = 200, self.body
+        if asked and request.headers["if-range"] == etag:
+            first = int(asked.removeprefix("bytes=").removesuffix("-"))
+            if first >= len(self.body):
+                return httpx2.Response(416, json={"code": "invalid_range", "detail": "beyond the end"})
+            status, content = 206, self.body[first:]
+            headers["content-range"] = f"bytes {first}-{len(self.body) - 1}/{len(self.body)}"
+            headers["content-length"] = str(len(content))
+        kept = {name.replace("_", "-"): value for name, value in headers.items() if value is not None}
+        stop = self.breaks.pop(0) if self.breaks else None
+        if stop is None:
+            return httpx2.Response(status, content=content, headers=kept)
+        return httpx2.Response(status, stream=Broken(content[:stop]), headers=kept)
+
+    def client(self, attempts: int = 3) -> Client:
+        return Client(
+            "http://service",
+            retry=RetryPolicy(attempts=attempts),
+            transport=httpx2.MockTransport(self),
+            sleep=self.slept.append,
+        )
+
+
+def test_a_map_arrives_whole(tmp_path: Path) -> None:
+    told: list[tuple[int, int | None]] = []
+    with Shelf().client() as client:
+        there = client.admin.download_map(
+            "d", 3, tmp_path / "m.sqlite", on_progress=lambda *progress: told.append(progress)
+        )
+    assert (there.path, there.sha256, there.file_bytes) == (tmp_path / "m.sqlite", sha256(BODY), len(BODY))
+    assert there.path.read_bytes() == BODY
+    assert list(tmp_path.iterdir()) == [there.path]
+    assert told[-1] == (len(BODY), len(BODY))
+
+
+def test_a_break_goes_on_where_it_was_however_often(tmp_path: Path) -> None:
+    shelf = Shelf(breaks=(10_000,) * 8)
+    with shelf.client(attempts=2) as client:  # every try brings something, so it never gives up
+        client.admin.download_map("d", 3, tmp_path / "m.sqlite")
+    assert (tmp_path / "m.sqlite").read_bytes() == BODY
+    assert shelf.ranges == ["", *(f"bytes={n}0000-" for n in range(1, 9))]
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+def test_a_later_try_goes_on_too(tmp_path: Path) -> None:
+    shelf = Shelf(breaks=(30_000, 0, 0))
+    with shelf.client(attempts=2) as client:
+        with pytest.raises(errors.TransportError, match=r"maps/3/file"):
+            client.admin.download_map("d", 3, tmp_path / "m.sqlite")
+        assert not (tmp_path / "m.sqlite").exists()
+        client.admin.download_map("d", 3, tmp_path / "m.sqlite")
+    assert shelf.ranges[-1] == "bytes=30000-"
+    assert (tmp_path / "m.sqlite").read_bytes() == BODY
+
+
+def test_another_file_by_now_is_fetched_from_its_beginning(tmp_path: Path) -> None:
+    with Shelf(breaks=(30_000, 0)).client(attempts=1) as client, pytest.raises(errors.TransportError):
+        client.admin.download_map("d", 3, tmp_path / "m.sqlite")
+    other = Shelf(OTHER)
+    with other.client() as client:
+        client.admin.download_map("d", 3, tmp_path / "m.sqlite")
+    assert other.ranges == ["bytes=30000-"]
+    assert (tmp_path / "m.sqlite").read_bytes() == OTHER
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+@pytest.mark.parametrize("n_there", [len(BODY), len(BODY) + 5])
+def test_a_part_without_a_rest_is_fetched_anew(tmp_path: Path, n_there: int) -> None:
+    (tmp_path / f"m.sqlite.{sha256(BODY)}.part").write_bytes((BODY + b"12345")[:n_there])
+    shelf = Shelf()
+    with shelf.client() as client:
+        client.admin.download_map("d", 3, tmp_path / "m.sqlite")
+    assert shelf.ranges == [f"bytes={n_there}-", ""]
+    assert (tmp_path / "m.sqlite").read_bytes() == BODY
+
+
+def test_a_part_that_was_spoilt_is_found_out_and_dropped(tmp_path: Path) -> None:
+    (tmp_path / f"m.sqlite.{sha256(BODY)}.part").write_bytes(b"x" * 100)
+    with Shelf().client() as client:
+        with pytest.raises(errors.DamagedDownloadError, match=sha256(BODY)):
+            client.admin.download_map("d", 3, tmp_path / "m.sqlite")
+        assert list(tmp_path.iterdir()) == []
+        client.admin.download_map("d", 3, tmp_path / "m.sqlite")
+    assert (tmp_path / "m.sqlite").read_bytes() == BODY
+
+
+def test_a_damaged_file_never_replaces_a_good_one(tmp_path: Path) -> None:
+    (tmp_path / "m.sqlite").write_bytes(b"good")
+    with (
+        Shelf(etag=f'"sha256:{sha256(OTHER)}"').client() as client,
+        pytest.raises(errors.DamagedDownloadError),
+    ):
+        client.admin.download_map("d", 3, tmp_path / "m.sqlite")
+    assert (tmp_path / "m.sqlite").read_bytes() == b"good"
+
+
+def test_the_digest_may_stand_in_repr_digest_alone(tmp_path: Path) -> None:
+    digest = b64encode(hashlib.sha256(BODY).digest()).decode()
+    with Shelf(etag=None, repr_digest=f"sha-512=:AAAA:, sha-256=:{digest}:").client() as client:
+        assert client.admin.download_map("d", 3, tmp_path / "m").sha256 == sha256(BODY)
+
+
+@pytest.mark.parametrize("repr_digest", [None, "sha-256=:AAAA:", "sha-256=:=:", "md5=:AAAA:"])
+def test_a_file_of_no_digest_is_not_taken(tmp_path: Path, repr_digest: str | None) -> None:
+    with (
+        Shelf(etag='W/"1"', repr_digest=repr_digest).client() as client,
+        pytest.raises(errors.UnexpectedAnswerError, match="sha256"),
+    ):
+        client.admin.download_map("d", 3, tmp_path / "m")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_refusals_have_their_names_and_are_waited_out_where_they_pass(tmp_path: Path) -> None:
+    answers = [
+        httpx2.Response(503, json={"code": "overloaded"}, headers={"retry-after": "7"}),
+        httpx2.Response(410, json={"code": "retired_map", "detail": "map 3 was removed"}),
+    ]
+    slept: list[float] = []
+    transport = httpx2.MockTransport(lambda request: answers.pop(0))
+    with (
+        Client("http://service", transport=transport, sleep=slept.append) as client,
+        pytest.raises(errors.RetiredMapError, match="was removed"),
+    ):
+        client.admin.download_map("d", 3, tmp_path / "m")
+    assert slept == [7.0]
+
+
+def test_a_place_where_no_file_can_lie_is_refused_before_anything_is_asked(tmp_path: Path) -> None:
+    shelf = Shelf()
+    with shelf.client() as client:
+        for path in (tmp_path, tmp_path / "nowhere" / "m"):
+            with pytest.raises(errors.InvalidArgumentError):
+                client.admin.download_map("d", 3, path)
+        with pytest.raises(errors.NotSavedError, match="name too long"):
+            client.admin.download_map("d", 3, tmp_path / ("m" * 250))
+    assert shelf.ranges == [""]
+
+
+def test_the_async_client_fetches_the_same(tmp_path: Path) -> None:
+    shelf = Shelf(breaks=(10_000, 20_000))
+
+    async def sleep(seconds: float) -> None:
+        shelf.slept.append(seconds)
+
+    async def fetch() -> None:
+        async with AsyncClient("http://service", transport=httpx2.MockTransport(shelf), sleep=sleep) as client:
+            there = await client.admin.download_map("d", 3, str(tmp_path / "m.sqlite"))
+            assert there.sha256 == sha256(BODY)
+
+    asyncio.run(fetch())
+    assert (tmp_path / "m.sqlite").read_bytes() == BODY
+    assert shelf.ranges == ["", "bytes=10000-", "bytes=30000-"]
+    assert len(shelf.slept) == 2

@@ -1,0 +1,166 @@
+"""What an administrator does from a terminal, against the real service."""
+
+import hashlib
+import json
+import re
+import sqlite3
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from deepsimbad_client import Client, errors
+from deepsimbad_client.commands import run
+from deepsimbad_client.remap import remap
+from deepsimbad_client.sources import open_source
+from deepsimbad_client.upload import upload
+
+ENCODINGS = {"kind": "feature_l2", "extractor": "none"}
+
+
+@pytest.fixture(scope="module")
+def domain(service: str, encodings: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
+    """A domain with one map, of summer, and a drive of noise to make worse ones of."""
+    noise = tmp_path_factory.mktemp("noise") / "noise.npy"
+    np.save(noise, np.random.default_rng(1).normal(size=(120, 32)).astype(np.float32))
+    with Client(service) as client:
+        client.admin.put_domain("season", ENCODINGS)
+        for name in ("landmarks", "summer", "winter"):
+            upload(client, open_source(str(encodings / f"{name}.npy")), "season", name)
+        upload(client, open_source(str(noise)), "season", "noise")
+        remap(client, "season", "summer", landmark_traverse="landmarks", n_landmarks=50, training_episodes=0)
+    return "season"
+
+
+@pytest.fixture
+def out(service: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Runs a command that succeeds, and gives what it printed."""
+    monkeypatch.setenv("DEEPSIMBAD_URL", service)
+
+    def printed(*command: str) -> str:
+        assert run(list(command)) == 0, capsys.readouterr().err
+        return capsys.readouterr().out
+
+    return printed
+
+
+def test_a_worse_map_is_sealed_not_served_and_says_why(service: str, domain: str, out: Any) -> None:
+    remap_noise = ["remap", "--domain", domain, "--training", "noise", "--check", "winter", "--gate", "0.5"]
+    told = out(*remap_noise, "--training-episodes", "0")
+    assert "sealed but not activated" in told
+    lines = told.splitlines()
+    (reason,) = [line for line in lines if line.startswith("map 2 was sealed but not activated: ")]
+    assert "ANR" in reason
+    assert lines[-1].endswith(f"deepsimbad-client activate {domain} 2")
+    job = json.loads(out(*remap_noise, "--training-episodes", "0", "--json"))
+    assert job["state"] == "succeeded"
+    assert job["result"]["active"] is False
+    assert job["result"]["metrics"]["check"]["why"]
+    with Client(service) as client:
+        assert client.domain(domain).map_version == 1
+
+    table = out("maps", domain)
+    assert "lost +0.5" in table
+    assert table.count("sealed") == 2
+    assert any(line.startswith("map 2: ") and "ANR" in line for line in table.splitlines())
+    (active,) = [line for line in table.splitlines() if re.search(r"\b1 │ active", line)]
+    assert " now " in active
+    listed = json.loads(out("maps", domain, "--json"))
+    assert [version["state"] for version in listed] == ["sealed", "sealed", "active"]
+
+
+def test_a_map_as_good_passes_its_gate_and_a_rollback_undoes_it(service: str, domain: str, out: Any) -> None:
+    command = ["remap", "--domain", domain, "--training", "summer", "--check", "winter", "--gate", "5"]
+    job = json.loads(out(*command, "--training-episodes", "0", "--json"))
+    made = job["result"]["map_version"]
+    assert job["result"]["active"] is True
+    assert out("rollback", domain) == f"{domain} serves map 1\n"
+    assert json.loads(out("rollback", domain, "--json"))["version"] == made
+    assert out("activate", domain, "1", "--expected", str(made)) == f"{domain} serves map 1\n"
+    with Client(service) as client:
+        assert client.domain(domain).map_version == 1
+    assert run(["activate", domain, str(made), "--expected", "99"]) == 1
+    assert run(["activate", domain, "999"]) == 1
+
+
+def test_a_drive_is_appended(service: str, domain: str, encodings: Path, out: Any) -> None:
+    with Client(service) as client:
+        before = client.domain(domain)
+        job = json.loads(
+            out("remap", "--domain", domain, "--training", "winter", "--append", "--no-activate", "--json")
+        )
+        client.admin.activate(domain, job["result"]["map_version"], expected=before.map_version)
+        after = client.domain(domain)
+        client.admin.activate(domain, before.map_version or 0)
+    assert (before.n_map_images, after.n_map_images) == (120, 240)
+    assert run(["remap", "--domain", domain, "--training", "winter", "--append", "--landmarks", "landmarks"]) == 2
+
+
+def test_a_map_is_fetched_and_deleted(service: str, domain: str, tmp_path: Path, out: Any, capsys: Any) -> None:
+    file = tmp_path / "map.sqlite"
+    there = json.loads(out("download", domain, "1", str(file), "--json"))
+    assert there["sha256"] == hashlib.sha256(file.read_bytes()).hexdigest()
+    with Client(service) as client:
+        (first,) = [version for version in client.admin.maps(domain) if version.version == 1]
+        assert (there["sha256"], there["file_bytes"]) == (first.sha256, first.file_bytes)
+    with sqlite3.connect(file) as db:
+        assert db.execute("PRAGMA integrity_check").fetchone() == ("ok",)
+    db.close()
+    assert run(["download", domain, "1", str(file)]) == 2
+    assert "--force" in capsys.readouterr().err
+    assert there["sha256"] in out("download", domain, "1", str(file), "--force")
+
+    assert run(["delete-map", domain, "1", "--yes"]) == 1  # it serves
+    assert "map_in_use" in capsys.readouterr().err
+    out("delete-map", domain, "2", "--yes")
+    assert run(["download", domain, "2", str(tmp_path / "gone")]) == 1
+    assert "retired_map" in capsys.readouterr().err
+    assert "removed" in out("maps", domain)
+
+
+def test_sessions_and_traverses_are_listed_and_ended(service: str, domain: str, out: Any, capsys: Any) -> None:
+    with Client(service) as client:
+        session = client.session(domain, keep=True)
+        session.observe(ranked_landmarks=[1, 2, 3])
+        score = client.truths(session.session_id, [3.0])
+        assert (score.n_scored, score.map_version) == (1, session.map_version)
+        assert score.anr is not None
+        assert 0 <= score.anr <= 100
+        assert session.truths([None]).anr is None
+    shown = out("sessions", "--domain", domain)
+    assert session.session_id in shown
+    (listed,) = json.loads(out("sessions", "--domain", domain, "--json"))
+    assert (listed["session_id"], listed["n_observations"]) == (session.session_id, 1)
+    out("delete-session", session.session_id, "--yes")
+    assert json.loads(out("sessions", "--domain", domain, "--json")) == []
+
+    with Client(service) as client:
+        client.admin.create_traverse(domain, "gaps")
+        for index in (0, 3):
+            client.admin.put_frame(domain, "gaps", index, encoding=[1.0, 2.0], position_m=float(index))
+    assert "1-2" in out("traverses", domain)
+    names = [traverse["name"] for traverse in json.loads(out("traverses", domain, "--json"))]
+    assert names == ["gaps", "landmarks", "noise", "summer", "winter"]
+    out("delete-traverse", domain, "gaps", "--yes")
+    with Client(service) as client, pytest.raises(errors.UnknownTraverseError):
+        client.admin.traverse(domain, "gaps")
+
+
+def test_nothing_is_deleted_where_nobody_can_be_asked(service: str, domain: str, out: Any, capsys: Any) -> None:
+    for command in (["delete-domain", domain], ["delete-traverse", domain, "winter"], ["delete-map", domain, "1"]):
+        assert run(command) == 2
+        assert "--yes" in capsys.readouterr().err
+    with Client(service) as client:
+        assert client.admin.traverse(domain, "winter").n_frames == 120
+        client.admin.put_domain("brief", ENCODINGS)
+        out("delete-domain", "brief", "--yes")
+        with pytest.raises(errors.UnknownDomainError):
+            client.domain("brief")
+
+
+def test_nothing_to_roll_back_to(service: str, capsys: Any, out: Any) -> None:
+    with Client(service) as client:
+        client.admin.put_domain("fresh", ENCODINGS)
+    assert run(["rollback", "fresh"]) == 1
+    assert "no_earlier_map" in capsys.readouterr().err
