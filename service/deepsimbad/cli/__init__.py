@@ -14,6 +14,7 @@ from deepsimbad.cli.keys import keys
 from deepsimbad.cli.local import delete, info, localize, map_
 from deepsimbad.cli.serve import serve
 from deepsimbad.cli.settings import settings
+from deepsimbad.cli.transfer import export, import_
 from deepsimbad.errors import CancelledError, DeepSimbadError
 from deepsimbad_client.errors import DeepSimbadClientError
 
@@ -26,7 +27,7 @@ def deepsimbad() -> None:
     """Where on a known route a robot is, and which move would tell it most next."""
 
 
-for command in (serve, map_, localize, info, delete, experiment, keys, settings, backup, restore):
+for command in (serve, map_, localize, info, delete, experiment, keys, settings, backup, restore, export, import_):
     deepsimbad.add_command(command)
 
 

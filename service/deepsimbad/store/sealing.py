@@ -1,5 +1,6 @@
 """Turning a built map into the file that serves, and checking later that it is still that file."""
 
+import shutil
 from pathlib import Path
 
 from deepsimbad.errors import ConflictError, DamagedMapError
@@ -44,6 +45,36 @@ def seal(building_path: Path, final_path: Path) -> tuple[str, int]:
         sync_folder(final_path.parent)
         remove_database(building_path)
     return digest, n_bytes
+
+
+def adopt(source: Path, final_path: Path, sha256: str) -> int:
+    """Let the copy of a file that was sealed elsewhere take a final name; made as `seal` makes one.
+
+    Returns:
+        Its bytes.
+
+    Raises:
+        DamagedMapError: The copy does not match its digest.
+        ConflictError: A file of the final name is there.
+        UnavailableError: The disk is full, read-only, ...
+    """
+    sealing_path = final_path.with_suffix(SEALING_SUFFIX)
+    with storage_faults(final_path, DamagedMapError):
+        if final_path.exists():
+            raise ConflictError(f"{final_path.name} is sealed already; a sealed map never changes")
+        remove_database(sealing_path)
+        try:
+            shutil.copyfile(source, sealing_path)
+            verify(sealing_path, sha256)
+            sealing_path.chmod(0o444)
+            sync_file(sealing_path)
+            n_bytes = sealing_path.stat().st_size
+            sealing_path.rename(final_path)
+        except BaseException:
+            remove_database(sealing_path)
+            raise
+        sync_folder(final_path.parent)
+    return n_bytes
 
 
 def verify(path: Path, sha256: str) -> None:

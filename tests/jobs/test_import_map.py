@@ -1,0 +1,235 @@
+"""A map moved between servers: the same bytes, checked, or nothing."""
+
+import hashlib
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from deepsimbad.engine.active_maps import ActiveMaps
+from deepsimbad.errors import (
+    ConflictError,
+    DamagedMapError,
+    DomainDiffersError,
+    InvalidArchiveError,
+    InvalidInputError,
+    NoActiveMapError,
+    RetiredMapError,
+    UnknownMapVersionError,
+)
+from deepsimbad.jobs.import_map import import_map
+from deepsimbad.store.catalog import Catalog
+from deepsimbad.store.exported_map import export_map
+from deepsimbad.store.map_contents import MapContents
+from deepsimbad.store.map_file import write_map
+from deepsimbad.store.map_table import ANY
+from deepsimbad.store.records import MapState
+from deepsimbad.store.sealing import seal
+
+EVALUATOR = {"kind": "feature_l2", "extractor": "none"}
+ACTIONS_M = (1.0, 2.0)
+Add = Callable[..., int]
+
+
+def contents(domain: str, version: int, **changes: Any) -> MapContents:
+    rng = np.random.default_rng(version)
+    parts: dict[str, Any] = {
+        "config": {"relevance": "rrf", "n_landmarks": 9, "training_traverse": "summer", "landmark_traverse": "winter"},
+        "evaluator": EVALUATOR,
+        "closed": False,
+        "actions_m": ACTIONS_M,
+        "landmark_model": {"prototypes": rng.random((9, 4), dtype=np.float32)},
+        "lists": np.argsort(rng.random((30, 9)), axis=1)[:, :3].T.astype(np.uint16).copy(),
+        "position_m": np.arange(30.0),
+        "metrics": {"anr": 4.5},
+    }
+    return MapContents(domain=domain, version=version, created_at="2026-01-01T00:00:00Z", **{**parts, **changes})
+
+
+def add(catalog: Catalog, domain: str, **changes: Any) -> int:
+    """Build, seal and activate the next version."""
+    version = catalog.begin_map(domain, {})
+    write_map(catalog.building_path(domain, version), contents(domain, version, **changes))
+    digest, n_bytes = seal(catalog.building_path(domain, version), catalog.map_path(domain, version))
+    catalog.seal_map(domain, version, digest, n_bytes, {})
+    catalog.activate(domain, version, ANY)
+    return version
+
+
+@pytest.fixture
+def there(tmp_path: Path) -> Iterator[Catalog]:
+    """A server whose domain has two maps, the second active."""
+    with Catalog.open(tmp_path / "there") as catalog:
+        catalog.create_domain("campus", EVALUATOR, False, ACTIONS_M)
+        add(catalog, "campus")
+        add(catalog, "campus")
+        yield catalog
+
+
+@pytest.fixture
+def here(tmp_path: Path) -> Iterator[Catalog]:
+    """A server with nothing on it."""
+    with Catalog.open(tmp_path / "here") as catalog:
+        yield catalog
+
+
+@pytest.fixture
+def exported(there: Catalog, tmp_path: Path) -> Path:
+    export_map(there, "campus", None, tmp_path / "campus.map")
+    return tmp_path / "campus.map"
+
+
+def test_the_bytes_travel_unchanged(there: Catalog, here: Catalog, tmp_path: Path) -> None:
+    file = tmp_path / "first.map"
+    sent = export_map(there, "campus", 1, file)
+    assert file.read_bytes() == there.map_path("campus", 1).read_bytes()
+    got = import_map(here, file, "garden", f"sha256:{sent.sha256.upper()}")
+    assert (got.domain, got.map_version, got.active, got.domain_is_new) == ("garden", 1, True, True)
+    assert here.map_path("garden", 1).read_bytes() == file.read_bytes()
+    record = here.map("garden", 1)
+    assert (record.sha256, record.state, record.metrics["anr"]) == (sent.sha256, MapState.ACTIVE, 4.5)
+    assert record.config["imported"] == {"domain": "campus", "version": 1, "sha256": sent.sha256}
+    assert record.config["training_traverse"] is None, "a traverse of that name here is another drive"
+    snapshot = ActiveMaps(here).snapshot("garden")
+    assert (snapshot.domain, snapshot.version, snapshot.n_images) == ("garden", 1, 30)
+
+
+def test_the_active_version_and_the_old_name_unless_told(exported: Path, here: Catalog) -> None:
+    assert import_map(here, exported).domain == "campus"
+    again = import_map(here, exported, activate=False)
+    assert (again.map_version, again.active, again.domain_is_new) == (2, False, False)
+    assert here.domain("campus").active_version == 1
+    assert here.map("campus", 2).state is MapState.SEALED
+    assert here.map("campus", 1).config["imported"]["version"] == 2
+
+
+def test_an_export_is_refused_by_name(there: Catalog, tmp_path: Path) -> None:
+    there.create_domain("empty", {}, False, [1])
+    building = there.begin_map("campus", {})
+    there.remove_map("campus", 1, lambda: False)
+    for domain, version, error in (
+        ("empty", None, NoActiveMapError),
+        ("campus", 9, UnknownMapVersionError),
+        ("campus", building, UnknownMapVersionError),
+        ("campus", 1, RetiredMapError),
+    ):
+        with pytest.raises(error):
+            export_map(there, domain, version, tmp_path / "x")
+    with pytest.raises(InvalidInputError, match="no folder"):
+        export_map(there, "campus", 2, tmp_path / "no" / "x")
+    (tmp_path / "mine").write_text("precious")
+    with pytest.raises(ConflictError, match="never replaces"):
+        export_map(there, "campus", 2, tmp_path / "mine")
+    path = there.map_path("campus", 2)
+    path.chmod(0o644)
+    path.write_bytes(path.read_bytes()[:-1] + b"?")
+    with pytest.raises(DamagedMapError, match="map 2 of domain campus is damaged"):
+        export_map(there, "campus", 2, tmp_path / "x")
+    path.unlink()
+    with pytest.raises(DamagedMapError, match="missing"):
+        export_map(there, "campus", 2, tmp_path / "x")
+    assert not (tmp_path / "x").exists()
+    assert (tmp_path / "mine").read_text() == "precious"
+
+
+def test_a_domain_that_differs_is_left_alone(exported: Path, here: Catalog) -> None:
+    others: list[dict[str, Any]] = [
+        {"evaluator": {"kind": "feature_l2", "extractor": "gradient_grid"}},
+        {"closed": True},
+        {"actions_m": (1.0, 3.0)},
+    ]
+    for number, changes in enumerate(others):
+        parts: dict[str, Any] = {"evaluator": EVALUATOR, "closed": False, "actions_m": ACTIONS_M} | changes
+        here.create_domain(f"d{number}", parts["evaluator"], parts["closed"], parts["actions_m"])
+        with pytest.raises(DomainDiffersError):
+            import_map(here, exported, f"d{number}")
+        assert here.maps(f"d{number}") == []
+
+
+def test_every_flipped_byte_that_matters_is_refused(exported: Path, here: Catalog, tmp_path: Path) -> None:
+    """With the digest every byte matters; without it what the file's own checksum covers does."""
+    whole = exported.read_bytes()
+    digest = hashlib.sha256(whole).hexdigest()
+    bad = tmp_path / "bad.map"
+    rng = np.random.default_rng(0)
+    kept = contents("campus", 2)
+    for at in rng.integers(0, len(whole), 30).tolist():
+        bad.write_bytes(whole[:at] + bytes([whole[at] ^ (1 << rng.integers(8))]) + whole[at + 1 :])
+        with pytest.raises(InvalidArchiveError, match="another file"):
+            import_map(here, bad, sha256=digest)
+    places = [whole.index(kept.position_m.tobytes()) + 11, whole.index(b"feature_l2") + 3, 3]
+    for at in places:
+        bad.write_bytes(whole[:at] + bytes([whole[at] ^ 2]) + whole[at + 1 :])
+        with pytest.raises(InvalidArchiveError, match="no map that can serve here"):
+            import_map(here, bad)
+    for content in (b"", b"no map at all" * 400, whole[: len(whole) // 2]):
+        bad.write_bytes(content)
+        with pytest.raises(InvalidArchiveError):
+            import_map(here, bad)
+    with pytest.raises(InvalidArchiveError, match="cannot be read"):
+        import_map(here, tmp_path / "gone")
+    with pytest.raises(InvalidArchiveError, match="cannot be read"):
+        import_map(here, tmp_path)
+    assert here.domains() == []
+
+
+def test_a_map_of_an_evaluator_that_is_not_here_is_refused(there: Catalog, here: Catalog, tmp_path: Path) -> None:
+    there.create_domain("new", {"kind": "telepathy"}, False, ACTIONS_M)
+    add(there, "new", evaluator={"kind": "telepathy"})
+    export_map(there, "new", None, tmp_path / "new.map")
+    with pytest.raises(InvalidArchiveError, match="the evaluator's kind must be one of"):
+        import_map(here, tmp_path / "new.map")
+    export_map(there, "campus", None, tmp_path / "campus.map")
+    with pytest.raises(InvalidInputError, match="a domain is named by"):
+        import_map(here, tmp_path / "campus.map", "../elsewhere")
+    assert here.domains() == []
+
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+from deepsimbad.jobs.import_map import import_map
+from deepsimbad.store.catalog import Catalog
+n_calls = 0
+def hook(_frame, event, function):
+    global n_calls
+    if event == "c_call" and getattr(function, "__name__", "") in {"rename", "fsync", "chmod", "unlink"}:
+        n_calls += 1
+        if n_calls == int(sys.argv[3]):
+            os.kill(os.getpid(), signal.SIGKILL)
+catalog = Catalog.open(Path(sys.argv[1]))
+sys.setprofile(hook)
+import_map(catalog, Path(sys.argv[2]))
+"""
+
+
+@pytest.mark.slow
+def test_an_import_that_is_killed_leaves_nothing_of_its_map(exported: Path, tmp_path: Path) -> None:
+    n_killed = 0
+    for step in range(1, 30):
+        data_dir = tmp_path / f"killed-{step}"
+        done = subprocess.run(
+            [sys.executable, "-c", KILLED, str(data_dir), str(exported), str(step)],
+            check=False,
+            env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
+        )
+        with Catalog.open(data_dir) as catalog:
+            catalog.discard_unfinished()
+            names = [record.name for record in catalog.domains()]
+            maps = catalog.maps("campus") if names else []
+            files = sorted(path.name for path in data_dir.glob("domains/*/maps/*"))
+            assert files == [f"{record.version:06d}.sqlite" for record in maps]
+            for record in maps:
+                assert catalog.map_path("campus", record.version).read_bytes() == exported.read_bytes()
+        if done.returncode == 0:
+            break
+        assert done.returncode == -signal.SIGKILL
+        n_killed += 1
+    assert n_killed > 4
+    assert maps[0].state is MapState.ACTIVE
