@@ -1,0 +1,34 @@
+"""What schemathesis sends as image or batch: real ones now and then, so that it gets behind the decoders.
+
+Loaded by the command `schemathesis`, in its own process; not a test.
+"""
+
+import io
+
+import cv2
+import numpy as np
+import schemathesis
+from hypothesis import strategies as st
+
+DIM = 8  # as the encodings of the domain `ready`
+
+
+def _images(extension: str) -> st.SearchStrategy[bytes]:
+    def image(seed: int) -> bytes:
+        pixels = np.random.default_rng(seed).integers(0, 255, (24, 32, 3), np.uint8)
+        return bytes(cv2.imencode(extension, pixels)[1].tobytes())
+
+    whole = st.integers(0, 9).map(image)
+    return st.one_of(whole, st.binary(max_size=64), st.tuples(whole, st.integers(0, 200)).map(lambda c: c[0][: c[1]]))
+
+
+def _batch(n: int) -> bytes:
+    packed = io.BytesIO()
+    encodings = np.random.default_rng(n).normal(size=(n, DIM)).astype(np.float32)
+    np.savez(packed, encodings=encodings, index=np.arange(n), position_m=np.arange(n, dtype=float))
+    return packed.getvalue()
+
+
+for _type, _extension in (("jpeg", ".jpg"), ("png", ".png"), ("tiff", ".tiff"), ("webp", ".webp")):
+    schemathesis.openapi.media_type(f"image/{_type}", _images(_extension))
+schemathesis.openapi.media_type("application/octet-stream", st.one_of(st.integers(0, 5).map(_batch), st.binary()))
