@@ -98,7 +98,7 @@ class _Child:
             stderr=subprocess.PIPE,
             env={**os.environ, **limits},
             bufsize=0,
-            start_new_session=True,  # Ctrl-C is for the service alone
+            process_group=0,  # Ctrl-C is for the service alone; a session of its own would be scheduled as its equal
         )
         self._was_killed = False
         self._send(json.dumps(order).encode() + b"\n")
