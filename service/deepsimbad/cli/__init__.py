@@ -9,6 +9,7 @@ from collections.abc import Sequence
 import click
 
 from deepsimbad.cli.backup import backup, restore
+from deepsimbad.cli.check import check
 from deepsimbad.cli.experiment import experiment
 from deepsimbad.cli.keys import keys
 from deepsimbad.cli.local import delete, info, localize, map_
@@ -27,7 +28,10 @@ def deepsimbad() -> None:
     """Where on a known route a robot is, and which move would tell it most next."""
 
 
-for command in (serve, map_, localize, info, delete, experiment, keys, settings, backup, restore, export, import_):
+for command in (
+    *(serve, map_, localize, info, delete, experiment, keys, settings),
+    *(backup, restore, export, import_, check),
+):
     deepsimbad.add_command(command)
 
 
@@ -36,7 +40,7 @@ def run(arguments: Sequence[str] | None = None) -> int:
     # Only `serve` writes a log; elsewhere an error is one line, without the trace that a library logs beside it.
     logging.getLogger("deepsimbad").addHandler(logging.NullHandler())
     try:
-        deepsimbad.main(args=None if arguments is None else list(arguments), standalone_mode=False)
+        code = deepsimbad.main(args=None if arguments is None else list(arguments), standalone_mode=False)
     except (click.exceptions.Abort, KeyboardInterrupt, CancelledError):
         click.echo("cancelled", err=True)
         return _CANCELLED
@@ -46,4 +50,4 @@ def run(arguments: Sequence[str] | None = None) -> int:
     except (DeepSimbadError, DeepSimbadClientError, OSError) as error:
         click.echo(f"deepsimbad: {' '.join(str(error).split())}", err=True)
         return _FAILED
-    return 0
+    return code if isinstance(code, int) else 0  # what a command exits with, where it says so

@@ -147,6 +147,16 @@ class Checkpoints:
         _log.warning("checkpoint not used", extra={"job_id": self.job_id, "stage": stage, "why": why})
 
 
+def is_whole(path: Path) -> bool:
+    """Whether a stage's file is what was saved."""
+    try:
+        with path.open("rb") as stream:
+            digest, body = stream.read(_DIGEST_BYTES), stream.read()
+    except OSError:
+        return False
+    return hashlib.sha256(body).digest() == digest
+
+
 def remove_checkpoints(data_dir: Path, job_id: str) -> bool:
     """Remove the folder of a job that has ended; returns whether it is gone (else somebody works on the job)."""
     folder = layout.job_folder(data_dir, job_id)
