@@ -9,7 +9,19 @@ from deepsimbad_client.async_client import AsyncClient
 from deepsimbad_client.async_session import AsyncSession
 from deepsimbad_client.client import Client
 from deepsimbad_client.errors import ApiError, DeepSimbadClientError
-from deepsimbad_client.models import Belief, Domain, Job, Localization, SessionAnswer, SessionState
+from deepsimbad_client.map_download import MapFile
+from deepsimbad_client.models import (
+    Belief,
+    Domain,
+    Job,
+    ListedSession,
+    Localization,
+    MapVersion,
+    SessionAnswer,
+    SessionState,
+    Traverse,
+    TruthScore,
+)
 from deepsimbad_client.retry import RetryPolicy
 from deepsimbad_client.session import Session
 
@@ -22,9 +34,14 @@ __all__ = [
     "DeepSimbadClientError",
     "Domain",
     "Job",
+    "ListedSession",
     "Localization",
+    "MapFile",
+    "MapVersion",
     "RetryPolicy",
     "Session",
     "SessionAnswer",
     "SessionState",
+    "Traverse",
+    "TruthScore",
 ]

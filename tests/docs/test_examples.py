@@ -4,6 +4,7 @@ What differs from a person's machine is replaced word by word: the address, the 
 in its layout) and the number of landmarks, which a small campus cannot give.
 """
 
+import hashlib
 import json
 import os
 import shutil
@@ -154,6 +155,17 @@ def test_the_replay_leaves_its_files(workplace):
         left = {path.name for path in (workplace.folder / "replays" / replay).iterdir()}
         assert left >= {"steps.jsonl", "summary.json"}
         assert any(name.endswith(".png") for name in left)
+
+
+def test_the_map_of_another_season_is_made_rolled_back_and_fetched(workplace):
+    assert "active then" in workplace.answer_of("deepsimbad-client maps").out
+    assert workplace.answer_of("deepsimbad-client activate").out == "campus serves map 2\n"
+    assert workplace.answer_of("deepsimbad-client rollback").out == "campus serves map 1\n"
+    with Client(workplace.url) as client:
+        second, first = client.admin.maps("campus")
+    assert (first.state, second.state) == ("active", "retired")
+    assert second.check["traverse"] == "winter"
+    assert hashlib.sha256((workplace.folder / "spring.sqlite").read_bytes()).hexdigest() == first.sha256
 
 
 def test_the_experiments_leave_their_figures(workplace):
