@@ -139,7 +139,8 @@ def check_map(
     scored = np.isfinite(ranks)
     anr_active = None
     if not scored.any():
-        why = f"the new map holds no place within {TOLERANCE_M:g} m of a frame of traverse {frames.source}"
+        without = "" if frames.own_images is None else "without the held-out frames "
+        why = f"{without}the new map holds no place within {TOLERANCE_M:g} m of a frame of traverse {frames.source}"
     elif theirs is not None and not np.isfinite(theirs[scored]).any():
         why = f"map {active_version}, which serves, and the new one share no place of traverse {frames.source}"
     elif theirs is not None:

@@ -154,7 +154,7 @@ def _appended(
     record = catalog.map(inputs.domain.name, inputs.domain.active_version or 0)
     append = partial(append_frames, before, record.version, inputs.config, inputs.training, evaluator, progress.update)
     appended = stages.run("describe", append)
-    contents = replace(appended.contents, domain=inputs.domain.name)
+    contents = appended.contents
     return _Made(contents, contents.config, appended.images, record.metrics.get("training"))
 
 

@@ -27,7 +27,7 @@ def seal_version(
     Args:
         catalog: Of the data directory.
         domain: Whose map it is.
-        contents: What it holds; its version and time are set here.
+        contents: What it holds; its domain, version and time are set here.
         config: What was asked for; kept in the catalog.
         metrics: What was measured; the size of the index is added.
         on_progress: Called with the share written; may raise to cancel.
@@ -41,7 +41,7 @@ def seal_version(
     try:
         building, sealed = catalog.building_path(domain, version), catalog.map_path(domain, version)
         created_at = datetime.now(UTC).isoformat(timespec="seconds")
-        write_map(building, replace(contents, version=version, created_at=created_at), on_progress)
+        write_map(building, replace(contents, domain=domain, version=version, created_at=created_at), on_progress)
         digest, n_bytes = seal(building, sealed)
         bits = 8 * index_bytes(sealed) / contents.n_map_images
         on_progress(1.0)
