@@ -8,6 +8,7 @@ from bench.http import http_table
 from bench.landmarks import landmark_table
 from bench.map_file import map_file_table
 from bench.nnql import nnql_table
+from bench.remap import remap_table
 from bench.restart import restart_table
 from bench.retrieval import retrieval_table
 from bench.sessions import session_table
@@ -24,6 +25,7 @@ TABLES = (
     http_table,
     session_table,
     restart_table,
+    remap_table,
 )
 
 

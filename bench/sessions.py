@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
 from typing import Any, Self
-from urllib.parse import urlsplit
 
 import numpy as np
 
+from bench.bare_connection import BareConnection
 from bench.http import make_map
 from bench.timing import Timing
 from bench.worlds import N_LANDMARKS, NCLT_IMAGES
@@ -91,10 +91,10 @@ async def drive(url: str, n_robots: int, n_views: int) -> Driven:
 
 
 class _Robot:
-    """One session over one bare connection, so that the sender costs the machine as little as may be."""
+    """One session over one bare connection."""
 
-    def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        self._reader, self._writer = reader, writer
+    def __init__(self, connection: BareConnection) -> None:
+        self._connection = connection
         self.session_id = ""
         self.seconds: list[float] = []
         self.timings_ms: list[dict[str, float]] = []
@@ -103,9 +103,8 @@ class _Robot:
     @classmethod
     async def begin(cls, url: str) -> Self:
         """Connect and begin a session."""
-        where = urlsplit(url)
-        robot = cls(*await asyncio.open_connection(where.hostname, where.port))
-        status, answer = await robot._request("POST", "/v1/domains/bench/sessions", b"{}")
+        robot = cls(await BareConnection.to(url))
+        status, answer = await robot._connection.request("POST", "/v1/domains/bench/sessions", b"{}")
         if status != 201:
             raise RuntimeError(f"no session: {answer!r}")
         robot.session_id = json.loads(answer)["session_id"]
@@ -116,7 +115,7 @@ class _Robot:
         path = f"/v1/sessions/{self.session_id}/observations?action_m={_ACTION_M}"
         for view in range(n_views):
             began = perf_counter()
-            status, answer = await self._request("POST", path, bodies[view % len(bodies)], f"view-{view}")
+            status, answer = await self._connection.request("POST", path, bodies[view % len(bodies)], f"view-{view}")
             self.seconds.append(perf_counter() - began)
             if status == 200:
                 if view % 10 == 0:
@@ -126,20 +125,9 @@ class _Robot:
 
     async def n_observations(self) -> int:
         """How many the service has counted."""
-        _, answer = await self._request("GET", f"/v1/sessions/{self.session_id}", b"")
+        _, answer = await self._connection.request("GET", f"/v1/sessions/{self.session_id}")
         document: dict[str, Any] = json.loads(answer)
         return int(document["n_observations"])
 
     def close(self) -> None:
-        self._writer.close()
-
-    async def _request(self, method: str, path: str, body: bytes, key: str = "") -> tuple[int, bytes]:
-        named = f"Idempotency-Key: {key}\r\n" if key else ""
-        head = (
-            f"{method} {path} HTTP/1.1\r\nHost: bench\r\nContent-Type: application/json\r\n"
-            f"{named}Content-Length: {len(body)}\r\n\r\n"
-        )
-        self._writer.write(head.encode() + body)
-        answer_head = await self._reader.readuntil(b"\r\n\r\n")
-        length = int(answer_head.lower().partition(b"content-length:")[2].partition(b"\r\n")[0])
-        return int(answer_head[9:12]), await self._reader.readexactly(length)
+        self._connection.close()

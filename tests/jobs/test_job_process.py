@@ -15,7 +15,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from deepsimbad.errors import CancelledError, DeepSimbadError, JobInterruptedError, TooFewCandidatesError
+from deepsimbad.errors import (
+    CancelledError,
+    DeepSimbadError,
+    JobInterruptedError,
+    TooFewCandidatesError,
+    UnavailableError,
+)
 from deepsimbad.jobs.cores import available_cores, job_threads
 from deepsimbad.jobs.job_process import BrokenJobError, InAnotherProcess
 from deepsimbad.jobs.map_config import RemapConfig
@@ -253,3 +259,9 @@ def is_running(pid):
 def test_threads_of_jobs():
     assert job_threads(5) == 5
     assert 1 <= job_threads(0) <= max(1, available_cores() - 1)
+
+
+def test_where_no_process_can_be_started_the_job_fails_by_name(catalog, job, monkeypatch):
+    monkeypatch.setattr(sys, "executable", str(catalog.data_dir / "nothing"))
+    with pytest.raises(UnavailableError, match="no process could be started"):
+        InAnotherProcess(catalog.data_dir, 1)(job, nothing, never)

@@ -14,7 +14,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from deepsimbad.errors import CancelledError, DeepSimbadError, JobInterruptedError
+from deepsimbad.errors import CancelledError, DeepSimbadError, JobInterruptedError, UnavailableError
 from deepsimbad.jobs.progress import ProgressState
 from deepsimbad.store.records import JobRecord
 
@@ -91,15 +91,20 @@ class _Child:
     """
 
     def __init__(self, order: dict[str, Any], limits: dict[str, str]) -> None:
-        self._process = subprocess.Popen(  # noqa: S603 - our own interpreter and module
-            [sys.executable, "-P", "-m", _MODULE],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            env={**os.environ, **limits},
-            bufsize=0,
-            process_group=0,  # Ctrl-C is for the service alone; a session of its own would be scheduled as its equal
-        )
+        try:
+            self._process = subprocess.Popen(  # noqa: S603 - our own interpreter and module
+                [sys.executable, "-P", "-m", _MODULE],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                env={**os.environ, **limits},
+                bufsize=0,
+                process_group=0,  # Ctrl-C is for the service alone; as a session of its own it would be its equal
+            )
+        except OSError as error:
+            raise UnavailableError(
+                f"no process could be started for the job: {error.strerror}", reason="no_process"
+            ) from error
         self._was_killed = False
         self._send(json.dumps(order).encode() + b"\n")
 

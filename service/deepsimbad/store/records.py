@@ -92,7 +92,10 @@ class KeptMap:
 
 @dataclass(frozen=True)
 class JobRecord:
-    """One job; times are ISO 8601 in UTC, `progress` runs from 0 to 1, `n_starts` counts how often work on it began."""
+    """One job; times are ISO 8601 in UTC, `progress` runs from 0 to 1.
+
+    `n_starts` counts how often work on it began, but for the starts that an orderly stop of the service ended.
+    """
 
     job_id: str
     domain: str
