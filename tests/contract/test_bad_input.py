@@ -524,7 +524,7 @@ def test_our_own_fault_tells_nothing_but_its_id(client: TestClient, monkeypatch:
     def broken(*_: Any) -> None:
         raise RuntimeError("a secret of the inside")
 
-    monkeypatch.setattr(app.state.services.catalog, "maps", broken)
+    monkeypatch.setattr(app.state.services.catalog, "newest_maps", broken)
     answer = client.get("/v1/admin/domains/ready/maps", headers={"X-Request-ID": "mine-1"})
     check(answer, 500, "internal_error")
     assert answer.headers["x-request-id"] == "mine-1"

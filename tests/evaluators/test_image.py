@@ -199,3 +199,32 @@ def test_refusals_print_nothing(files, capfd):
             with pytest.raises((InvalidImageError, ImageTooLargeError)):
                 decode_image(body[:cut], LIMIT)
     assert capfd.readouterr() == ("", "")
+
+
+def test_picture_data_that_unpack_to_more_than_the_picture_are_not_unpacked():
+    """A decoder unpacks all of it, though it only needs the first few rows."""
+    packer = zlib.compressobj(9)
+    start = packer.compress(b"") + packer.flush(zlib.Z_FULL_FLUSH)
+    mebibyte = packer.compress(bytes(1 << 20)) + packer.flush(zlib.Z_FULL_FLUSH)
+    bomb = _png(16, 16, (b"IDAT", start + mebibyte * 20_000), (b"IEND", b""))
+    assert len(bomb) < 32 << 20
+    with pytest.raises(InvalidImageError, match="more than the pixels"):
+        decode_image(bomb, 300)
+
+
+def test_a_large_png_passes(the_picture):
+    noisy = np.random.default_rng(0).integers(0, 255, (500, 500, 3), np.uint8)
+    body = cv2.imencode(".png", noisy)[1].tobytes()
+    assert len(body) > 1 << 18
+    np.testing.assert_array_equal(decode_image(body, 250_000), noisy)
+    rows = body.index(b"IDAT")
+    with pytest.raises(InvalidImageError):
+        decode_image(_png(500, 500, (b"IDAT", b"x" + body[rows + 4 : -16]), (b"IEND", b"")), 250_000)
+
+
+def test_passes_over_a_large_picture_are_counted():
+    large = np.zeros((7000, 7000), np.uint8)
+    body = cv2.imencode(".jpg", large, [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])[1].tobytes()
+    last_pass = body[body.rindex(b"\xff\xda") : -2]
+    with pytest.raises(InvalidImageError, match="scans"):
+        decode_image(body[:-2] + last_pass * 40 + b"\xff\xd9", 49_000_000)

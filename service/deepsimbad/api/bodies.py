@@ -7,7 +7,7 @@ deeply nested JSON with 400, and takes NaN.
 from typing import Annotated, Any, Self, TypeVar
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, StrictFloat, StrictInt, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, FailFast, Field, StrictFloat, StrictInt, ValidationError, model_validator
 from starlette.requests import Request
 
 from deepsimbad.api.problems import InvalidRequestError, invalid_request
@@ -23,6 +23,7 @@ NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$"
 MAX_LANDMARKS = 0xFFFF
 GREATEST_EXACT_INTEGER = 2**53 - 1
 GREATEST_ID = 2**31 - 1
+_MAX_COLONS = 1000  # far more than any body here has members
 
 Body = TypeVar("Body", bound="JsonBody")
 Name = Annotated[
@@ -42,9 +43,9 @@ class ObservationBody(JsonBody):
     NaN and infinity pass here, and are refused by what knows the right code for them.
     """
 
-    ranked_landmarks: list[StrictInt] = []
-    dissimilarities: list[StrictFloat] = []
-    encoding: list[StrictFloat] = []
+    ranked_landmarks: Annotated[list[StrictInt], FailFast()] = []
+    dissimilarities: Annotated[list[StrictFloat], FailFast()] = []
+    encoding: Annotated[list[StrictFloat], FailFast()] = []
 
     @model_validator(mode="after")
     def _one(self) -> Self:
@@ -64,7 +65,7 @@ class ObservationBody(JsonBody):
 class EncodingBody(JsonBody):
     """A frame that was encoded elsewhere."""
 
-    encoding: list[StrictFloat]
+    encoding: Annotated[list[StrictFloat], FailFast()]
 
     def view(self) -> ReadyEncoding:
         """The engine's form."""
@@ -216,6 +217,11 @@ async def read_json(request: Request, kind: type[Body]) -> Body:
 
 def parse_json(body: bytes, kind: type[Body]) -> Body:
     """Check the bytes of a JSON body; raises InvalidRequestError."""
+    # Every unknown member and every wrong element of a list (but for FailFast) costs an error of its own: megabytes
+    # of them take seconds and gigabytes.
+    if body.count(b":") > _MAX_COLONS:
+        what = f"more than {_MAX_COLONS} members, which no body here has"
+        raise InvalidRequestError(f"body: {what}", errors=[{"loc": ["body"], "msg": what, "type": "too_many_members"}])
     try:
         return kind.model_validate_json(body)
     except ValidationError as error:

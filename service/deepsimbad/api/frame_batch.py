@@ -16,6 +16,8 @@ REQUIRED = ("encodings", "index", "position_m")
 _END_OF_DIRECTORY = b"PK\x05\x06"
 _LARGE_DIRECTORY = b"PK\x06\x07"
 _MAX_HEADER_BYTES = 4096
+_MAX_RATIO = 100  # of unpacked to packed; encodings shrink by a tenth, only noughts by more than a hundred
+_ANY_RATIO_BYTES = 1 << 24
 
 
 class InvalidBatchError(InvalidInputError):
@@ -80,6 +82,9 @@ def _read_members(archive: zipfile.ZipFile, max_bytes: int) -> dict[str, NDArray
             f"the batch unpacks to {declared} bytes; at most {max_bytes} are taken, send fewer frames at once",
             max_bytes=max_bytes,
         )
+    packed = sum(member.compress_size for member in archive.infolist())
+    if declared > max(_ANY_RATIO_BYTES, _MAX_RATIO * packed):
+        raise InvalidBatchError(f"the batch unpacks to {declared} bytes from {packed}: these are no encodings")
     for name, member in zip(names, archive.infolist(), strict=True):
         with archive.open(member) as stream:
             _check_header(name, stream, member.file_size)

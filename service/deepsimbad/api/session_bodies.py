@@ -2,7 +2,7 @@
 
 from typing import Annotated
 
-from pydantic import Field, StrictFloat
+from pydantic import FailFast, Field, StrictFloat
 
 from deepsimbad.api.bodies import GREATEST_EXACT_INTEGER, JsonBody, Name
 from deepsimbad.core.filters import FilterKind
@@ -56,6 +56,7 @@ class TruthsBody(JsonBody):
             max_length=MAX_OBSERVATIONS_FED_BACK,
             description="One route position for every observation of the session; null where it is unknown.",
         ),
+        FailFast(),
     ]
 
 

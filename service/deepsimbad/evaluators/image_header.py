@@ -21,6 +21,9 @@ _JPEG_END, _JPEG_SCAN = 0xD9, 0xDA
 _JPEG_SCAN_END = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]", re.DOTALL)
 _JPEG_MARKER = re.compile(rb"[^\xff]", re.DOTALL)
 _JPEG_MAX_SCANS = 200  # a progressive file uses about ten; thousands of empty ones are an attack on the decoder
+_JPEG_MAX_SCANNED = 2_000_000_000  # pixels of all scans together: each costs the decoder a pass over the picture
+_PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # by colour type
+_PNG_UNPACKED = 1 << 18  # bytes of picture data: what is packed in less keeps a decoder for a quarter of a second
 _MAX_PARTS = 100_000  # chunks, segments, strips: a real file has far fewer, walking millions costs seconds
 _TIFF_FIELD_BYTES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4}
 _TIFF_FORMATS = {1: "B", 3: "H", 4: "I", 13: "I"}  # the integer field types: BYTE, SHORT, LONG, IFD
@@ -94,17 +97,40 @@ def _png_size(body: bytes) -> tuple[int, int]:
 
 
 def _png_whole(body: bytes) -> None:
-    at = len(_PNG_SIGNATURE)
+    at, packed = len(_PNG_SIGNATURE), []
     for _ in range(_MAX_PARTS):
         (length,) = _unpack(">I", body, at, "PNG")
         name, end = body[at + 4 : at + 8], at + 8 + length
         (checksum,) = _unpack(">I", body, end, "PNG")
         if zlib.crc32(memoryview(body)[at + 4 : end]) != checksum:
             raise InvalidImageError("the PNG file is damaged: a checksum does not fit")
-        if name == b"IEND":
+        if name == b"IDAT":
+            packed.append(memoryview(body)[at + 8 : end])
+        elif name == b"IEND":
+            _check_png_unpacks(body, packed)
             return
         at = end + 4
     _too_many_parts("PNG")
+
+
+def _check_png_unpacks(body: bytes, packed: list[memoryview]) -> None:
+    """Refuse picture data that unpack to far more than the header's pixels: a decoder would unpack it all."""
+    if sum(map(len, packed)) <= _PNG_UNPACKED:
+        return
+    width, height, bits, colour = _unpack(">IIBB", body, len(_PNG_SIGNATURE) + 8, "PNG")
+    # Twice, for interlacing adds a little.
+    most = 2 * height * (1 + width * bits * _PNG_CHANNELS.get(colour, 4) // 8) + (1 << 16)
+    unpacker, n_bytes = zlib.decompressobj(), 0
+    try:
+        for piece in packed:
+            rest: bytes | memoryview = piece
+            while len(rest) > 0 and not unpacker.eof:
+                n_bytes += len(unpacker.decompress(rest, 1 << 20))
+                rest = unpacker.unconsumed_tail
+                if n_bytes > most:
+                    raise InvalidImageError("the PNG file unpacks to more than the pixels that its header claims")
+    except zlib.error as error:
+        raise InvalidImageError("the PNG file is damaged: its picture cannot be unpacked") from error
 
 
 # JPEG: segments of (FF, marker, length, content); after SOS, entropy-coded data to the next marker; EOI last.
@@ -144,11 +170,14 @@ def _jpeg_size(body: bytes) -> tuple[int, int]:
 
 
 def _jpeg_whole(body: bytes) -> None:
-    frames = scans = 0
-    for marker, _ in _jpeg_segments(body):
-        frames += marker in _JPEG_FRAMES
+    frames = scans = n_pixels = 0
+    for marker, at in _jpeg_segments(body):
+        if marker in _JPEG_FRAMES:
+            frames += 1
+            _, height, width = _unpack(">BHH", body, at, "JPEG")
+            n_pixels = height * width
         scans += marker == _JPEG_SCAN
-        if frames > 1 or scans > _JPEG_MAX_SCANS:
+        if frames > 1 or scans > _JPEG_MAX_SCANS or scans * n_pixels > _JPEG_MAX_SCANNED:
             raise InvalidImageError(f"the JPEG file has {frames} frames and {scans} scans")
     if scans == 0:
         raise InvalidImageError("the JPEG file has no picture in it")
