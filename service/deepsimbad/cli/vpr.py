@@ -8,8 +8,8 @@ from rich.table import Table
 from deepsimbad.cli.options import RELEVANCES
 from deepsimbad.cli.terminal import console, progress_bar
 from deepsimbad.cli.triplet import READING_STAGES, read_triplet, triplet_options, written
-from deepsimbad.core.metrics import true_images_of
 from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Relevance
+from deepsimbad.core.true_images import true_images_of
 from deepsimbad.evaluators.registry import EvaluatorConfig
 from deepsimbad.jobs.experiment_vpr import VprConfig, VprReport, run_vpr, vpr_stages
 from deepsimbad.jobs.ground_truth import read_ground_truth

@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 from deepsimbad.core.calibration import Calibration
 from deepsimbad.core.landmark_selection import select_landmarks
-from deepsimbad.core.metrics import same_places
 from deepsimbad.core.off_route import OffRouteModel
 from deepsimbad.core.relevance import Relevance, RetrievalMap
 from deepsimbad.core.retrieval import SecondSeason, build_retrieval_map
 from deepsimbad.core.route import Route
 from deepsimbad.core.telling import telling_bits
+from deepsimbad.core.true_images import same_places
 from deepsimbad.errors import InvalidMapConfigError
 from deepsimbad.evaluators.base import Evaluator, LandmarkModel
 from deepsimbad.jobs.encoded_traverse import route_of

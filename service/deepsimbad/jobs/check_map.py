@@ -28,9 +28,10 @@ from numpy.typing import NDArray
 
 from deepsimbad.core.descriptor import rank_landmarks
 from deepsimbad.core.live_views import LiveViews
-from deepsimbad.core.metrics import rank_of_truth, true_images_of
+from deepsimbad.core.metrics import rank_of_truth
 from deepsimbad.core.relevance import Relevance, RetrievalMap, brute_force_relevances
 from deepsimbad.core.route import Route
+from deepsimbad.core.true_images import true_images_of
 from deepsimbad.core.update_rules import DEFAULT_UPDATE
 from deepsimbad.engine.active_maps import load_snapshot
 from deepsimbad.errors import DamagedMapError, InvalidEncodingError, RetiredMapError

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepsimbad.core.descriptor import rank_landmarks
-from deepsimbad.core.metrics import same_places
 from deepsimbad.core.nnql import NnqlConfig
 from deepsimbad.core.planners import CONSTANT, DEFAULT_PLANNER, NNQL, RANDOM
 from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Query, Relevance
+from deepsimbad.core.true_images import same_places
 from deepsimbad.core.update_rules import DEFAULT_UPDATE, UpdateRule
 from deepsimbad.engine.active_localizer import ActiveLocalizer, LocalizerConfig
 from deepsimbad.engine.snapshot import MapSnapshot

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from deepsimbad.core.descriptor import rank_landmarks
 from deepsimbad.core.landmark_selection import select_landmarks
-from deepsimbad.core.metrics import RetrievalScorer, RetrievalScores, same_places
+from deepsimbad.core.metrics import RetrievalScorer, RetrievalScores
 from deepsimbad.core.relevance import (
     DEFAULT_RELEVANCE,
     Query,
@@ -23,6 +23,7 @@ from deepsimbad.core.relevance import (
 )
 from deepsimbad.core.retrieval import SecondSeason, build_retrieval_map
 from deepsimbad.core.route import Route
+from deepsimbad.core.true_images import same_places
 from deepsimbad.evaluators.base import Evaluator, LandmarkModel
 from deepsimbad.jobs.build_map import Described, map_contents
 from deepsimbad.jobs.encoded_traverse import EncodedTraverse

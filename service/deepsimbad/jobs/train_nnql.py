@@ -20,12 +20,13 @@ from numpy.typing import NDArray
 from deepsimbad.core.descriptor import rank_landmarks
 from deepsimbad.core.inverted_index import InvertedIndex
 from deepsimbad.core.live_views import LiveViews
-from deepsimbad.core.metrics import rank_of_truth, same_places
+from deepsimbad.core.metrics import rank_of_truth
 from deepsimbad.core.nnql import NnqlConfig, initial_q_values
 from deepsimbad.core.nnql_training import LearningCurve, train
 from deepsimbad.core.relevance import RetrievalMap
 from deepsimbad.core.route import Route
 from deepsimbad.core.training_world import TrainingWorld
+from deepsimbad.core.true_images import same_places
 from deepsimbad.core.update_rules import DEFAULT_UPDATE
 from deepsimbad.evaluators.base import Evaluator, LandmarkModel
 from deepsimbad.jobs.encoded_traverse import route_of
