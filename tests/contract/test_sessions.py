@@ -13,6 +13,7 @@ import pytest
 from starlette.testclient import TestClient
 
 from deepsimbad.api.app import create_app
+from deepsimbad.jobs.perform import InThisProcess
 
 from .conftest import DIM, N_LANDMARKS, N_READY, encoded, make_ready_domain, picture, remap, small_settings
 
@@ -357,7 +358,7 @@ def test_a_key_of_a_session_that_cannot_be_one(client: TestClient, key: str) -> 
 
 def test_a_start_repeated_after_a_restart_or_at_once_is_one_session(tmp_path: Path) -> None:
     begin_under_key = {"json": {}, "headers": {"Idempotency-Key": "once"}}
-    with TestClient(create_app(small_settings(tmp_path))) as before:
+    with TestClient(create_app(small_settings(tmp_path), InThisProcess(tmp_path))) as before:
         make_ready_domain(before, "d")
         first = before.post("/v1/domains/d/sessions", **begin_under_key).json()  # type: ignore[arg-type]
     with TestClient(create_app(small_settings(tmp_path))) as after:

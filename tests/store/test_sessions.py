@@ -184,3 +184,34 @@ def test_an_append_is_on_the_disk_when_it_is_answered(store: SessionStore, tmp_p
         (tmp_path / "copy" / name).write_bytes((tmp_path / name).read_bytes())
     with SessionStore.open(tmp_path / "copy") as found:
         assert found.find("s1").n_events == 1
+
+
+def test_living_sessions_are_listed_page_by_page_newest_first(store: SessionStore) -> None:
+    numbers = [
+        store.create(replace(RECORD, session_id=f"s{n}", domain="campus" if n % 2 else "yard")).result().number
+        for n in range(6)
+    ]
+    store.append(numbers[1], observed(1), 101.0).result()
+    store.append(numbers[1], PriorRow(2, 400.0, 1.0, 2.0), 102.0).result()
+    store.append(numbers[1], observed(3, expires_at=400.0), 103.0).result()
+    store.end(numbers[4], "deleted", 104.0).result()
+
+    def names(domain: str | None, before: int | None, limit: int, at: float) -> tuple[list[str], int | None]:
+        page = store.newest_living(domain, before, limit, at)
+        return [listed.session.session_id for listed in page.records], page.last_key
+
+    assert names(None, None, 10, 150.0) == (["s5", "s3", "s2", "s1", "s0"], None)
+    assert names(None, None, 2, 150.0) == (["s5", "s3"], numbers[3])
+    assert names(None, numbers[3], 3, 150.0) == (["s2", "s1", "s0"], None)
+    assert names("campus", None, 2, 150.0) == (["s5", "s3"], numbers[3])
+    assert names("campus", numbers[3], 2, 150.0) == (["s1"], None)
+    assert names("nowhere", None, 2, 150.0) == ([], None)
+    assert names(None, None, 10, 250.0) == (["s1"], None)  # the others have expired, though nobody has looked yet
+    (listed,) = store.newest_living(None, None, 10, 250.0).records
+    assert (listed.n_observations, listed.session.n_events, listed.session.expires_at) == (2, 3, 400.0)
+
+
+def test_a_session_of_an_id_that_is_taken_is_the_one_there(store: SessionStore) -> None:
+    first = store.create(RECORD).result()
+    assert store.create(replace(RECORD, domain="another", created_at=150.0)).result() == first
+    assert store.living() == [first]
