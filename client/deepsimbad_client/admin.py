@@ -43,7 +43,7 @@ class Admin(MapAdmin):
         self._transport.send(admin_calls.delete_domain(name))
 
     def create_traverse(self, domain: str, name: str) -> Traverse:
-        """Make an empty traverse."""
+        """Make an empty traverse; one of that name that is there stays as it is."""
         return self._transport.send(admin_calls.create_traverse(domain, name))
 
     def traverses(self, domain: str) -> tuple[Traverse, ...]:

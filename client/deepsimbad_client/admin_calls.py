@@ -9,7 +9,6 @@ from deepsimbad_client.call import JSON, Call, json_body, name_in_path, query
 from deepsimbad_client.models import Domain, FramesStored, FrameStored, Traverse
 from deepsimbad_client.observation import Observation
 from deepsimbad_client.page import PAGE_LENGTH, Page
-from deepsimbad_client.retry import Repeat
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -35,7 +34,7 @@ def delete_domain(name: str) -> Call[None]:
 
 
 def create_traverse(domain: str, name: str) -> Call[Traverse]:
-    """Make an empty traverse."""
+    """Make an empty traverse; one of that name that is there stays as it is."""
     name_in_path("traverse", name)
     return Call(
         "POST",
@@ -43,7 +42,6 @@ def create_traverse(domain: str, name: str) -> Call[Traverse]:
         model(Traverse),
         headers=JSON,
         body=json_body({"name": name}),
-        repeat=Repeat.IF_UNTOUCHED,
     )
 
 

@@ -33,7 +33,7 @@ class AsyncAdmin(AsyncMapAdmin):
         await self._transport.send(admin_calls.delete_domain(name))
 
     async def create_traverse(self, domain: str, name: str) -> Traverse:
-        """Make an empty traverse."""
+        """Make an empty traverse; one of that name that is there stays as it is."""
         return await self._transport.send(admin_calls.create_traverse(domain, name))
 
     async def traverses(self, domain: str) -> tuple[Traverse, ...]:

@@ -26,8 +26,8 @@ class Client:
 
     Connection errors and the answers 408, 429, 502, 503 and 504 are retried with exponential backoff and jitter, or
     after the service's own `Retry-After`, where repeating is safe: every call here but those of `admin` that act once
-    (`create_traverse`, `remap`, `feed_experience`, and `activate` with `expected`), which are sent again only when the
-    service surely did not act on them. A refused key (401, 403) is never tried again.
+    (`remap`, `feed_experience`, and `activate` with `expected`), which are sent again only when the service surely did
+    not act on them. A refused key (401, 403) is never tried again.
 
     Args:
         url: The service's address; absent: `$DEEPSIMBAD_URL`, else http://127.0.0.1:8000.

@@ -1,6 +1,7 @@
 """`deepsimbad-client remap` and `jobs`."""
 
 import sys
+from itertools import islice
 
 import click
 
@@ -93,6 +94,7 @@ def remap(
 @click.command()
 @click.argument("job_id", required=False)
 @click.option("--domain", metavar="NAME", help="Only this domain's.")
+@click.option("--last", type=click.IntRange(min=1), metavar="N", help="Only the newest N.")
 @click.option("--follow", is_flag=True, help="Follow JOB_ID to its end.")
 @click.option("--cancel", is_flag=True, help="Cancel JOB_ID.")
 @json_flag
@@ -100,6 +102,7 @@ def remap(
 def jobs(
     job_id: str | None,
     domain: str | None,
+    last: int | None,
     follow: bool,
     cancel: bool,
     json_output: bool,
@@ -111,7 +114,7 @@ def jobs(
         raise click.UsageError("--follow and --cancel need a JOB_ID")
     with Client(server, api_key) as client:
         if job_id is None:
-            found = client.admin.jobs(domain)
+            found = tuple(islice(client.admin.iter_jobs(domain), last))
             if json_output:
                 click.echo(as_json([job.model_dump(mode="json") for job in found]))
             else:

@@ -7,6 +7,7 @@ import sqlite3
 from pathlib import Path
 from typing import Any
 
+import httpx2
 import numpy as np
 import pytest
 
@@ -119,6 +120,28 @@ def test_a_map_is_fetched_and_deleted(service: str, domain: str, tmp_path: Path,
     assert "removed" in out("maps", domain)
 
 
+def test_a_download_goes_on_where_an_earlier_one_stopped(service: str, domain: str, tmp_path: Path) -> None:
+    answered: list[tuple[int, int]] = []
+
+    def note(response: httpx2.Response) -> None:
+        answered.append((response.status_code, int(response.headers.get("content-length", 0))))
+
+    with Client(service) as client:
+        whole = client.admin.download_map(domain, 1, tmp_path / "whole")
+        client._transport._http.event_hooks = {"request": [], "response": [note]}
+        (tmp_path / f"map.{whole.sha256}.part").write_bytes(whole.path.read_bytes()[:50_000])
+        again = client.admin.download_map(domain, 1, tmp_path / "map")
+        assert answered.pop() == (206, whole.file_bytes - 50_000)
+        (tmp_path / f"map.{'0' * 64}.part").write_bytes(b"of another map")
+        client.admin.download_map(domain, 1, tmp_path / "map")
+        assert answered.pop() == (200, whole.file_bytes)
+        (tmp_path / f"map.{whole.sha256}.part").write_bytes(whole.path.read_bytes())
+        client.admin.download_map(domain, 1, tmp_path / "map")
+        assert [status for status, _ in answered] == [416, 200]
+    assert (again.sha256, again.file_bytes) == (whole.sha256, whole.file_bytes)
+    assert {path.name for path in tmp_path.iterdir()} == {"whole", "map"}
+
+
 def test_sessions_and_traverses_are_listed_and_ended(service: str, domain: str, out: Any, capsys: Any) -> None:
     with Client(service) as client:
         session = client.session(domain, keep=True)
@@ -157,6 +180,12 @@ def test_nothing_is_deleted_where_nobody_can_be_asked(service: str, domain: str,
         out("delete-domain", "brief", "--yes")
         with pytest.raises(errors.UnknownDomainError):
             client.domain("brief")
+
+
+def test_the_newest_jobs_alone(service: str, domain: str, out: Any) -> None:
+    every = json.loads(out("jobs", "--domain", domain, "--json"))
+    assert len(every) > 2
+    assert json.loads(out("jobs", "--domain", domain, "--last", "2", "--json")) == every[:2]
 
 
 def test_nothing_to_roll_back_to(service: str, capsys: Any, out: Any) -> None:
