@@ -1,0 +1,67 @@
+# The service in a container, without root.
+#
+#   docker build --tag deep-simbad .
+#   docker run --rm --volume deep-simbad:/var/lib/deepsimbad deep-simbad keys create --scope admin
+#   docker run --detach --publish 127.0.0.1:8000:8000 --volume deep-simbad:/var/lib/deepsimbad deep-simbad
+#
+# It listens on every address of its network, so it refuses to start until the first key was created. Any command of
+# `deepsimbad` can stand in the place of `keys create ...`.
+#
+# VARIANT=cuda builds on NVIDIA's CUDA runtime instead of plain Debian. Nothing in this release computes on a GPU
+# (docs/decisions/0002-no-torch-yet.md), so it makes nothing faster: it is the base for images that add an evaluator of
+# their own, which then finds driver libraries and a Python of the same make. EXTRAS and PIP_EXTRA_INDEX_URL say what is
+# installed besides, and from where.
+ARG VARIANT=cpu
+
+FROM python:3.11-slim-bookworm AS base-cpu
+
+FROM nvidia/cuda:12.8.1-base-ubuntu24.04 AS base-cuda
+# hadolint ignore=DL3008
+RUN apt-get update \
+    && apt-get install --yes --no-install-recommends python3 python3-venv \
+    && rm -rf /var/lib/apt/lists/*
+
+# hadolint ignore=DL3006
+FROM base-${VARIANT} AS build
+ARG EXTRAS=service
+ARG PIP_EXTRA_INDEX_URL=
+WORKDIR /src
+COPY pyproject.toml constraints.txt README.md CHANGELOG.md LICENSE ./
+COPY service service
+COPY client client
+COPY migrations migrations
+RUN python3 -m venv /opt/deepsimbad \
+    && /opt/deepsimbad/bin/python -m pip install --no-cache-dir --disable-pip-version-check --constraint constraints.txt ".[${EXTRAS}]" \
+    && /opt/deepsimbad/bin/python -m pip uninstall --yes --quiet --disable-pip-version-check pip setuptools
+# The hot loops are compiled here rather than in front of the first robot. numba takes them for the same kind of
+# processor alone; on another kind it compiles anew, into the volume.
+RUN install -d /var/lib/deepsimbad/data /var/lib/deepsimbad/cache \
+    && NUMBA_CACHE_DIR=/var/lib/deepsimbad/cache /opt/deepsimbad/bin/python -c "from deepsimbad.engine.warm_up import warm_up; warm_up()"
+
+# hadolint ignore=DL3006
+FROM base-${VARIANT} AS service
+ARG VERSION=0.1.0
+LABEL org.opencontainers.image.title="Deep SIMBAD" \
+      org.opencontainers.image.description="Active visual self-localization as a service" \
+      org.opencontainers.image.version="${VERSION}" \
+      org.opencontainers.image.licenses="MIT" \
+      org.opencontainers.image.documentation="docs/operations.md"
+COPY --from=build /opt/deepsimbad /opt/deepsimbad
+COPY --from=build --chown=10001:10001 /var/lib/deepsimbad /var/lib/deepsimbad
+ENV PATH=/opt/deepsimbad/bin:$PATH \
+    HOME=/var/lib/deepsimbad \
+    PYTHONUNBUFFERED=1 \
+    PYTHONDONTWRITEBYTECODE=1 \
+    NUMBA_CACHE_DIR=/var/lib/deepsimbad/cache \
+    DEEPSIMBAD_DATA_DIR=/var/lib/deepsimbad/data \
+    DEEPSIMBAD_HOST=0.0.0.0 \
+    DEEPSIMBAD_PORT=8000
+USER 10001:10001
+WORKDIR /var/lib/deepsimbad
+VOLUME /var/lib/deepsimbad
+EXPOSE 8000
+# Plain HTTP: where the service itself speaks TLS, give `docker run` another --health-cmd.
+HEALTHCHECK --interval=15s --timeout=5s --start-period=60s --retries=3 \
+    CMD ["/opt/deepsimbad/bin/python", "-c", "import os, urllib.request as r; r.urlopen('http://127.0.0.1:' + os.environ['DEEPSIMBAD_PORT'] + '/readyz', timeout=4)"]
+ENTRYPOINT ["/opt/deepsimbad/bin/deepsimbad"]
+CMD ["serve"]
