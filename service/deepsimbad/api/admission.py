@@ -20,7 +20,7 @@ class AdmissionLimits:
     """What may be under way at once.
 
     Attributes:
-        max_requests: Requests whose body has come and whose answer has not gone.
+        max_requests: Requests whose body has come and whose answer has not begun.
         max_uploads: Batches of frames on their way, or being stored.
         max_event_streams: Streams of job events.
         max_body_memory_bytes: Of bodies, those being received too.
@@ -59,8 +59,9 @@ class Shares:
 class AdmissionMiddleware:
     """Lets a request in where there is room for it, and takes its share back when its answer has gone.
 
-    A request counts as under way from when its body has come: those that send slowly, or never to the end, take a
-    connection and what they have sent of memory, and nobody's turn. Health, readiness and metrics are always answered.
+    A request counts as under way from when its body has come to when its answer begins: whoever sends or reads slowly,
+    or never to the end, takes a connection and memory for what was sent, but nobody's turn. Health, readiness and
+    metrics are always answered.
 
     Args:
         app: The wrapped application.
@@ -84,7 +85,7 @@ class AdmissionMiddleware:
             await refuse_unread(scope, receive, send, error)
             return
         try:
-            await self.app(scope, share, send)
+            await self.app(scope, share, share.sender(send))
         finally:
             share.give_back()
 
@@ -100,7 +101,7 @@ class _Share:
         self.is_event_stream = path.endswith("/events") and path.startswith("/v1/admin/jobs/")
         self.joins = _joins(method, path)
         self.framing = framing_of(scope)
-        self.is_counted = False
+        self.was_counted = self.is_counted = False
         self.n_body_bytes = 0  # beyond what is free
         self.n_free_bytes = FREE_BYTES
 
@@ -117,9 +118,9 @@ class _Share:
         if self.is_upload:
             _check(shares.n_uploads, limits.max_uploads, "batches of frames on their way", "max_uploads")
             shares.n_uploads += 1
-        elif self.framing.declared is not None:
+        elif (self.framing.declared or 0) <= limits.max_body_memory_bytes:  # more is for another to refuse, for good
             # Only asked, not taken: who announces much and sends nothing should keep nobody out.
-            shares.check_bytes(self.framing.declared - FREE_BYTES)
+            shares.check_bytes((self.framing.declared or 0) - FREE_BYTES)
         if not self.framing.has_body:
             self._count()
 
@@ -128,21 +129,36 @@ class _Share:
         if message["type"] == "http.request" and self.framing.has_body and not self.is_event_stream:
             if not self.is_upload:  # those go to the disk as they come
                 self._hold(len(message.get("body", b"")))
-            if not message.get("more_body", False) and not self.is_counted:
+            if not message.get("more_body", False) and not self.was_counted:
                 self.shares.check_requests()
                 self._count()
         return message
 
+    def sender(self, send: Send) -> Send:
+        """`send`, which ends the request's turn with the first of its answer."""
+
+        async def sends(message: Message) -> None:
+            if self.is_counted:
+                self._uncount()
+            await send(message)
+
+        return sends
+
     def give_back(self) -> None:
         """The answer has gone, or nobody waits for it."""
-        self.shares.n_requests -= self.is_counted
+        if self.is_counted:
+            self._uncount()
         self.shares.n_uploads -= self.is_upload
         self.shares.n_event_streams -= self.is_event_stream
         self.shares.n_body_bytes -= self.n_body_bytes
 
     def _count(self) -> None:
-        self.is_counted = True
+        self.was_counted = self.is_counted = True
         self.shares.n_requests += 1
+
+    def _uncount(self) -> None:
+        self.is_counted = False
+        self.shares.n_requests -= 1
 
     def _hold(self, n_bytes: int) -> None:
         n_free = min(n_bytes, self.n_free_bytes)
