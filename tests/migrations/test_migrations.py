@@ -212,6 +212,12 @@ def the_sessions_with_a_clock(data_dir: Path) -> Iterator[object]:
             [1, {"anr": 4.5}, [JobState.SUCCEEDED], ["2026-11-20T10:00:00.000Z", 2]],
         ),
         (
+            "catalog_v3",
+            "catalog.sqlite",
+            the_catalog_with_keys,
+            [1, {"anr": 4.5}, [JobState.SUCCEEDED], ["2026-11-20T10:00:00.000Z", 2]],
+        ),
+        (
             "traverse_v1",
             "domains/campus/traverses/summer.sqlite",
             the_traverse,
@@ -225,6 +231,18 @@ def the_sessions_with_a_clock(data_dir: Path) -> Iterator[object]:
         ),
         (
             "session_v2",
+            "sessions.sqlite",
+            the_sessions_with_a_clock,
+            [
+                ("a" * 32, {"filter": "grid", "seed": 7}, 3, 4630.0),
+                (2, [0.25, 0.75], [3]),
+                True,
+                (1, b"\x01\x02"),
+                (ClockRecord("b-1", 900.0, 1050.0), 1040.0),
+            ],
+        ),
+        (
+            "session_v3",
             "sessions.sqlite",
             the_sessions_with_a_clock,
             [

@@ -78,3 +78,10 @@ def m002_keys_served_times_job_starts(db: Database) -> None:
         ALTER TABLE job ADD COLUMN n_starts INTEGER NOT NULL DEFAULT 0;
         """
     )
+
+
+@migrations()
+def m003_row_checksums(db: Database) -> None:
+    """A checksum in every row; NULL where none was computed yet."""
+    for table in ("domain", "map", "job", "api_key"):
+        db.execute(f"ALTER TABLE {table} ADD COLUMN checksum INTEGER")

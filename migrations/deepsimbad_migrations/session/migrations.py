@@ -88,3 +88,10 @@ def m002_clock(db: Database) -> None:
         );
         """
     )
+
+
+@migrations()
+def m003_row_checksums(db: Database) -> None:
+    """A checksum in every row; NULL where none was computed yet."""
+    for table in ("session", "journal", "snapshot", "true_positions", "clock"):
+        db.execute(f"ALTER TABLE {table} ADD COLUMN checksum INTEGER")

@@ -31,6 +31,7 @@ from deepsimbad.store.list_page import ListPage
 from deepsimbad.store.map_table import AnyVersion
 from deepsimbad.store.ownership import Owner, is_alive
 from deepsimbad.store.records import DomainRecord, JobRecord, KeptMap, KeyRecord, KeyScope, MapRecord, MapState
+from deepsimbad.store.row_checksums import CATALOG_TABLES, RowChecksums, verify_rows
 from deepsimbad.store.write_ahead_log import check_log
 from deepsimbad_migrations.catalog.migrations import migrations
 
@@ -47,12 +48,14 @@ class Catalog:
     Args:
         data_dir: The data directory.
         db: The open catalog file.
+        checksums: Of its rows.
     """
 
-    def __init__(self, data_dir: Path, db: Database) -> None:
+    def __init__(self, data_dir: Path, db: Database, checksums: RowChecksums) -> None:
         self.data_dir = data_dir
         self._path = layout.catalog_path(data_dir)
         self._db = db
+        self._checksums = checksums
         self._lock = threading.RLock()
         self._owners = layout.owners_folder(data_dir)
         self._owner = Owner(self._owners)
@@ -77,9 +80,12 @@ class Catalog:
             check_integrity(db, path)
             use_write_ahead_log(db)
             migrate(db, migrations, path)
+            checksums = RowChecksums(db, CATALOG_TABLES)
+            checksums.fill_if_new()
+            verify_rows(db, CATALOG_TABLES, path.name)
             sync_folder(data_dir)
             on_error.pop_all()
-        return cls(data_dir, db)
+        return cls(data_dir, db, checksums)
 
     def close(self) -> None:
         """Close the file. Unfinished work begun through this object counts as abandoned from here on."""
@@ -102,6 +108,7 @@ class Catalog:
     def _writing(self) -> Iterator[Database]:
         with self._lock, storage_faults(self._path), write_transaction(self._db) as db:
             yield db
+            self._checksums.note()
 
     def check(self) -> None:
         """Raise what keeps the file from being read."""

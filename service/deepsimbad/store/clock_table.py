@@ -2,6 +2,7 @@
 
 from sqlite_utils import Database
 
+from deepsimbad.store.row_checksums import SESSIONS_FILE, verify_rows
 from deepsimbad.store.session_records import ClockRecord
 
 
@@ -14,7 +15,8 @@ def save(db: Database, record: ClockRecord) -> None:
 
 
 def read(db: Database) -> ClockRecord | None:
-    """The moment noted last; None in a file that never noted one."""
+    """The moment noted last; None in a file that never noted one. Raises DamagedFileError where it is damaged."""
+    verify_rows(db, ["clock"], SESSIONS_FILE)
     row = db.execute("SELECT boot, booted_at, seen_at FROM clock").fetchone()
     return None if row is None else ClockRecord(*row)
 

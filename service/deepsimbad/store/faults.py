@@ -71,6 +71,8 @@ def storage_faults(path: Path, damaged: type[DamagedFileError | DamagedMapError]
         yield
     except sqlite3.Error as error:
         raise _from_sqlite(error, path, damaged) from error
+    except UnicodeDecodeError as error:  # of a message in which SQLite quotes what is in the file
+        raise damaged(f"{path.name} is damaged: it holds text that is none", file=path.name) from error
     except OSError as error:
         raise _unavailable(path, reason_of(error)) from error
 

@@ -21,6 +21,7 @@ from deepsimbad.store.connection import in_todays_schema, look_at
 from deepsimbad.store.faults import storage_faults
 from deepsimbad.store.map_file import read_map
 from deepsimbad.store.records import MapRecord, MapState
+from deepsimbad.store.row_checksums import CATALOG_TABLES, SESSION_TABLES, verify_rows
 from deepsimbad.store.sealing import verify
 from deepsimbad.store.write_ahead_log import check_log
 from deepsimbad_migrations.catalog.migrations import migrations as catalog_migrations
@@ -48,6 +49,7 @@ def catalog_listing(path: Path) -> CatalogListing:
 
     def read(db: Database) -> CatalogListing:
         with in_todays_schema(db, catalog_migrations, path) as current:
+            verify_rows(current, CATALOG_TABLES, path.name)
             domains = [record.name for record in domain_table.all_domains(current)]
             job_table.list_jobs(current, None)
             key_table.all_keys(current)
@@ -71,7 +73,8 @@ def sessions_problems(path: Path) -> list[str]:
 
     def read(db: Database) -> list[str]:
         with in_todays_schema(db, session_migrations, path) as current:
-            lines = []
+            lines: list[str] = []
+            verify_rows(current, SESSION_TABLES, path.name)
             clock_table.read(current)
             for session in session_table.living(current):
                 rows = journal_table.read(current, session.number, 0, 2**62)

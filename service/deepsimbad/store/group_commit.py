@@ -32,12 +32,20 @@ class GroupCommit:
         db: An open file that nothing else writes through.
         path: The file, for messages.
         on_commit: Called with the number of writes of every transaction.
+        before_commit: Called as the last thing inside every transaction.
     """
 
-    def __init__(self, db: Database, path: Path, on_commit: Callable[[int], None] = lambda _: None) -> None:
+    def __init__(
+        self,
+        db: Database,
+        path: Path,
+        on_commit: Callable[[int], None] = lambda _: None,
+        before_commit: Callable[[], None] = lambda: None,
+    ) -> None:
         self._db = db
         self._path = path
         self._on_commit = on_commit
+        self._before_commit = before_commit
         self._waiting: SimpleQueue[_Write | None] = SimpleQueue()
         self._open = True
         self._lock = threading.Lock()
@@ -101,6 +109,7 @@ class GroupCommit:
         try:
             with storage_faults(self._path), write_transaction(self._db) as db:
                 results = [write.run(db) for write in batch]
+                self._before_commit()
         except BaseException as error:
             if len(batch) == 1:
                 _settle(batch[0].done, error=error)

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from sqlite_utils import Database
 
 from deepsimbad.store.documents import from_json, row_reader, to_json
+from deepsimbad.store.row_checksums import SESSIONS_FILE, verify_some
 from deepsimbad.store.session_records import IdempotencyKey, JournalRow, ObservedRow, PriorRow, StateSnapshot
 
 _INSERT = """
@@ -62,7 +63,9 @@ def _row(found: tuple[Any, ...]) -> JournalRow:
 
 
 def read(db: Database, session: int, after: int, until: int) -> list[JournalRow]:
-    """The rows after one, up to and with another, in order."""
+    """The rows after one, up to and with another, in order; raises DamagedFileError where one is damaged."""
+    some = "session = ? AND sequence > ? AND sequence <= ?"
+    verify_some(db, "journal", some, [session, after, until], SESSIONS_FILE)
     rows = db.execute(
         f"{_SELECT} WHERE session = ? AND sequence > ? AND sequence <= ? ORDER BY sequence", [session, after, until]
     )
@@ -92,6 +95,7 @@ def save_snapshot(db: Database, session: int, snapshot: StateSnapshot) -> None:
 
 def read_snapshot(db: Database, session: int) -> StateSnapshot | None:
     """A session's snapshot, if it has one."""
+    verify_some(db, "snapshot", "session = ?", [session], SESSIONS_FILE)
     rows = db.execute("SELECT name, sequence, dtype, shape, body FROM snapshot WHERE session = ?", [session]).fetchall()
     return _snapshot(tuple(rows)) if rows else None
 
@@ -117,6 +121,7 @@ def save_true_positions(db: Database, session: int, position_m: NDArray[np.float
 
 def true_positions(db: Database, session: int) -> NDArray[np.float64] | None:
     """What was fed back of a session, one position for every observation."""
+    verify_some(db, "true_positions", "session = ?", [session], SESSIONS_FILE)
     row = db.execute("SELECT position_m FROM true_positions WHERE session = ?", [session]).fetchone()
     return None if row is None else np.frombuffer(row[0], "<f8")
 

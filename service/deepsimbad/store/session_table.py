@@ -7,6 +7,7 @@ from sqlite_utils import Database
 from deepsimbad.errors import UnknownSessionError
 from deepsimbad.store.documents import from_json, row_reader, to_json
 from deepsimbad.store.list_page import ListPage
+from deepsimbad.store.row_checksums import SESSIONS_FILE, verify_some
 from deepsimbad.store.session_records import SessionRecord
 
 _MAX_NUMBER = 2**63 - 1
@@ -44,11 +45,17 @@ def insert(db: Database, record: SessionRecord) -> SessionRecord:
             record.expires_at,
         ],
     )
-    return get(db, record.session_id)
+    return _get(db, record.session_id)  # its checksum comes with the end of the transaction
 
 
 def get(db: Database, session_id: str) -> SessionRecord:
-    """One session, living or ended; raises UnknownSessionError."""
+    """One session, living or ended; raises UnknownSessionError, DamagedFileError."""
+    if session_id.isascii():
+        verify_some(db, "session", "session_id = ?", [session_id], SESSIONS_FILE)
+    return _get(db, session_id)
+
+
+def _get(db: Database, session_id: str) -> SessionRecord:
     row = None
     if session_id.isascii():
         row = db.execute(f"{_SELECT} WHERE session_id = ?", [session_id]).fetchone()
@@ -58,7 +65,8 @@ def get(db: Database, session_id: str) -> SessionRecord:
 
 
 def living(db: Database) -> list[SessionRecord]:
-    """Every session that has not ended, oldest first."""
+    """Every session that has not ended, oldest first; raises DamagedFileError where one is not what was stored."""
+    verify_some(db, "session", "ended_at IS NULL", (), SESSIONS_FILE)
     return [_record(row) for row in db.execute(f"{_SELECT} WHERE session.ended_at IS NULL ORDER BY session.number")]
 
 

@@ -13,17 +13,19 @@ from sqlite_utils import Database
 
 from deepsimbad.errors import DamagedFileError
 from deepsimbad.store import clock_table, journal_table, layout, session_table
-from deepsimbad.store.connection import migrate, open_database, use_write_ahead_log
+from deepsimbad.store.connection import check_integrity, migrate, open_database, use_write_ahead_log
 from deepsimbad.store.data_dir import make_data_dir
 from deepsimbad.store.durable import sync_folder
 from deepsimbad.store.faults import storage_faults
 from deepsimbad.store.group_commit import GroupCommit
 from deepsimbad.store.list_page import ListPage
+from deepsimbad.store.row_checksums import SESSION_TABLES, RowChecksums
 from deepsimbad.store.session_records import ClockRecord, JournalRow, ListedSession, SessionRecord, StateSnapshot
 from deepsimbad.store.write_ahead_log import check_log
 from deepsimbad_migrations.session.migrations import migrations
 
 PURGED_AT_ONCE = 1000  # rows
+_CHECKED_AT_START_BYTES = 64 * 1024 * 1024  # a service shall be ready soon; `deepsimbad check` reads more
 
 
 class SessionStore:
@@ -36,15 +38,23 @@ class SessionStore:
         path: The file.
         reading: The open file, for reads.
         writing: The open file a second time, for writes.
+        checksums: Of the rows that are written.
         on_commit: Called with the number of writes of every transaction.
     """
 
-    def __init__(self, path: Path, reading: Database, writing: Database, on_commit: Callable[[int], None]) -> None:
+    def __init__(
+        self,
+        path: Path,
+        reading: Database,
+        writing: Database,
+        checksums: RowChecksums,
+        on_commit: Callable[[int], None],
+    ) -> None:
         self._path = path
         self._db = reading
         self._writing = writing
         self._lock = threading.Lock()
-        self._commits = GroupCommit(writing, path, on_commit)
+        self._commits = GroupCommit(writing, path, on_commit, checksums.note)
 
     @classmethod
     def open(cls, data_dir: Path, on_commit: Callable[[int], None] = lambda _: None) -> Self:
@@ -56,12 +66,16 @@ class SessionStore:
             writing = open_database(path, create=True)
             on_error.callback(writing.close)
             use_write_ahead_log(writing)
+            if path.stat().st_size <= _CHECKED_AT_START_BYTES:
+                check_integrity(writing, path)
             migrate(writing, migrations, path)
+            checksums = RowChecksums(writing, SESSION_TABLES)
+            checksums.fill_if_new()
             reading = open_database(path)
             on_error.callback(reading.close)
             sync_folder(data_dir)
             on_error.pop_all()
-        return cls(path, reading, writing, on_commit)
+        return cls(path, reading, writing, checksums, on_commit)
 
     def close(self) -> None:
         """Commit what waits, then close the file."""
