@@ -173,7 +173,9 @@ async def _ask(url: str, waits: Waits, until: "asyncio.Task[Any]") -> None:
     connection = await BareConnection.to(url)
     path = f"/v1/domains/{_DOMAIN}/localizations"
     if waits.what == "observations":
-        _, begun = await connection.request("POST", f"/v1/domains/{_DOMAIN}/sessions", b"{}")
+        status, begun = await connection.request("POST", f"/v1/domains/{_DOMAIN}/sessions", b"{}")
+        if status != 201:
+            raise RuntimeError(f"no session: {begun!r}")
         path = f"/v1/sessions/{json.loads(begun)['session_id']}/observations?action_m=1"
     n_asked, is_last = 0, False
     while not is_last:
