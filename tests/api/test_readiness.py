@@ -81,10 +81,11 @@ def refuse_writes(client: TestClient) -> None:
 def fill_disk(client: TestClient) -> None:
     """As much room as is needed now, and not a page more."""
     services_of(client).session_store.note_clock(services_of(client).clock.record()).result()
-    writing(client).conn.execute("PRAGMA max_page_count = 1")
-    writing(client).conn.execute("CREATE TEMP TRIGGER fill AFTER INSERT ON clock BEGIN "
-                                 "INSERT INTO true_positions VALUES (NULL, 0, zeroblob(100000)); END")  # fmt: skip
-    writing(client).conn.execute("PRAGMA foreign_keys = OFF")
+    writing(client).conn.execute("CREATE TABLE filler (bytes BLOB)")
+    writing(client).conn.execute(
+        "CREATE TRIGGER fill AFTER INSERT ON clock BEGIN INSERT INTO filler VALUES (zeroblob(100000)); END"
+    )
+    writing(client).conn.execute("PRAGMA max_page_count = 1")  # no fewer than there are
 
 
 def close_catalog(client: TestClient) -> None:

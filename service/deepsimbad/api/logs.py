@@ -3,6 +3,7 @@
 import json
 import logging
 import logging.config
+import sys
 import time
 from functools import lru_cache
 from itertools import islice
@@ -39,7 +40,9 @@ def _second(since_1970: int) -> str:
 def configure_logging(level: str) -> None:
     """Send everything at `level` and above to standard error as JSON lines; uvicorn's own lines too."""
     # No line of ours tells these, and every record would look them up.
-    logging.logThreads = logging.logProcesses = logging.logMultiprocessing = logging.logAsyncioTasks = False
+    logging.logThreads = logging.logProcesses = logging.logMultiprocessing = False
+    if sys.version_info >= (3, 12):
+        logging.logAsyncioTasks = False
     logging.config.dictConfig(
         {
             "version": 1,
