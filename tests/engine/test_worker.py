@@ -6,7 +6,7 @@ from collections.abc import Iterator
 import pytest
 
 from deepsimbad.engine.worker import InferenceWorker, Priority
-from deepsimbad.errors import InvalidInputError, UnavailableError
+from deepsimbad.errors import InvalidInputError, OverloadedError, UnavailableError
 
 
 @pytest.fixture
@@ -64,3 +64,24 @@ def test_closing_finishes_what_is_queued_and_takes_no_more() -> None:
     with pytest.raises(UnavailableError):
         worker.submit(lambda: None)
     worker.close()
+
+
+def test_no_more_of_one_priority_wait_than_may() -> None:
+    worker, gate, begun = InferenceWorker(max_waiting=2), threading.Event(), threading.Event()
+    try:
+        running = worker.submit(lambda: (begun.set(), gate.wait(30)))
+        assert begun.wait(30)
+        waiting = [worker.submit(lambda: 1, priority) for priority in (Priority.LIVE, Priority.BATCH) for _ in range(2)]
+        for priority in (Priority.LIVE, Priority.BATCH):
+            assert worker.is_full(priority)
+            with pytest.raises(OverloadedError) as caught:
+                worker.submit(lambda: 1, priority)
+            assert caught.value.hints["retry_after_s"] == 1
+        gate.set()
+        running.result(30)
+        assert [answer.result(30) for answer in waiting] == [1] * 4
+        assert not worker.is_full(Priority.LIVE)
+        assert worker.submit(lambda: 2).result(30) == 2
+    finally:
+        gate.set()
+        worker.close()

@@ -118,9 +118,12 @@ class _Share:
         if self.is_upload:
             _check(shares.n_uploads, limits.max_uploads, "batches of frames on their way", "max_uploads")
             shares.n_uploads += 1
-        elif (self.framing.declared or 0) <= limits.max_body_memory_bytes:  # more is for another to refuse, for good
-            # Only asked, not taken: who announces much and sends nothing should keep nobody out.
-            shares.check_bytes((self.framing.declared or 0) - FREE_BYTES)
+        else:
+            n_needed = (self.framing.declared or 0) - FREE_BYTES
+            # Only asked, not taken: who announces much and sends nothing should keep nobody out. More than there is
+            # for all is another's to refuse, for good.
+            if n_needed <= limits.max_body_memory_bytes:
+                shares.check_bytes(n_needed)
         if not self.framing.has_body:
             self._count()
 
