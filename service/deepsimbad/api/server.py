@@ -3,6 +3,7 @@
 import asyncio
 import logging
 import signal
+import socket
 import ssl
 from collections.abc import Callable
 from types import FrameType
@@ -42,6 +43,14 @@ class _Server(uvicorn.Server):
             self.should_exit = True  # being asked to stop is no failure, so the signal is not raised again
         else:
             super().handle_exit(sig, frame)
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """End connections and requests, then the application: also where nobody waits, its files are closed."""
+        await super().shutdown(sockets)
+        if self.force_exit:
+            for task in self.server_state.tasks:
+                task.cancel()
+            await self.lifespan.shutdown()
 
 
 class _Config(uvicorn.Config):

@@ -1,0 +1,258 @@
+"""Asked to stop: what was acknowledged is there afterwards, what was begun is finished, and then it ends."""
+
+import http.client
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytestmark = pytest.mark.slow
+
+N_LANDMARKS = 30
+ENVIRONMENT = {name: value for name, value in os.environ.items() if not name.startswith("DEEPSIMBAD_")}
+
+
+class Service:
+    """`deepsimbad serve` on a data directory, again and again."""
+
+    def __init__(self, data_dir: Path) -> None:
+        with closing(socket.socket()) as probe:
+            probe.bind(("127.0.0.1", 0))
+            self.port: int = probe.getsockname()[1]
+        self.data_dir = data_dir
+        self.log = data_dir.parent / "log"
+        self.process: subprocess.Popen[bytes] | None = None
+
+    def start(self, **settings: object) -> None:
+        command = [sys.executable, "-m", "deepsimbad", "serve", "--data-dir", self.data_dir, "--port", str(self.port)]
+        given = {f"DEEPSIMBAD_{name.upper()}": str(value) for name, value in settings.items()}
+        with self.log.open("ab") as stderr:
+            self.process = subprocess.Popen(command, stderr=stderr, env=ENVIRONMENT | given, cwd=self.data_dir.parent)
+        until(self._is_ready)
+
+    def _is_ready(self) -> bool:
+        assert self.process is not None
+        assert self.process.poll() is None, self.log.read_text()
+        try:
+            return self.request("GET", "/readyz")[0] == 200
+        except OSError:
+            return False
+
+    def signal(self, number: int) -> None:
+        assert self.process is not None
+        self.process.send_signal(number)
+
+    def ended(self) -> int:
+        assert self.process is not None
+        return self.process.wait(60)
+
+    def connect(self) -> socket.socket:
+        return socket.create_connection(("127.0.0.1", self.port), timeout=60)
+
+    def request(self, method: str, path: str, body: Any = None) -> tuple[int, bytes]:
+        with closing(http.client.HTTPConnection("127.0.0.1", self.port, timeout=60)) as connection:
+            sent = body if isinstance(body, bytes) or body is None else json.dumps(body)
+            kind = "application/octet-stream" if isinstance(body, bytes) else "application/json"
+            connection.request(method, path, sent, {"Content-Type": kind})
+            answer = connection.getresponse()
+            return answer.status, answer.read()
+
+    def ask(self, method: str, path: str, body: Any = None) -> Any:
+        status, content = self.request(method, path, body)
+        assert status < 300, content
+        return json.loads(content) if content else None
+
+
+def until(met: Callable[[], Any]) -> None:
+    for _ in range(6000):
+        if met():
+            return
+        time.sleep(0.01)
+    raise AssertionError("it did not come about")
+
+
+@pytest.fixture
+def service(tmp_path: Path) -> Iterator[Service]:
+    made = Service(tmp_path / "data")
+    made.start()
+    make_map(made)
+    try:
+        yield made
+        assert "Traceback" not in made.log.read_text()
+    finally:
+        if made.process is not None and made.process.poll() is None:
+            made.process.kill()
+            made.process.wait()
+
+
+def make_map(service: Service) -> None:
+    file = service.data_dir.parent / "batch.npz"
+    encodings = np.random.default_rng(0).normal(size=(200, 8)).astype(np.float32)
+    np.savez(file, encodings=encodings, index=np.arange(200), position_m=np.arange(200.0))
+    base = "/v1/admin/domains/loop"
+    service.ask("PUT", base, {"evaluator": {"kind": "feature_l2", "extractor": "none"}, "closed": True})
+    service.ask("POST", f"{base}/traverses", {"name": "t"})
+    service.ask("POST", f"{base}/traverses/t/frames", file.read_bytes())
+    config = {"training_traverse": "t", "landmark_traverse": "t", "n_landmarks": N_LANDMARKS, "training_episodes": 0}
+    job = service.ask("POST", f"{base}/remaps", config)
+    while job["state"] in {"queued", "running"}:
+        time.sleep(0.02)
+        job = service.ask("GET", f"/v1/admin/jobs/{job['job_id']}")
+    assert job["state"] == "succeeded", job
+
+
+@dataclass
+class Robot:
+    """Observes as fast as it is answered, on one connection, and remembers what it was told."""
+
+    service: Service
+    number: int
+    session_id: str = ""
+    n_told: int = 0
+    belief: Any = None
+    refusals: list[int] = field(default_factory=list)
+
+    def begin(self) -> None:
+        self.session_id = self.service.ask("POST", "/v1/domains/loop/sessions", {"seed": self.number})["session_id"]
+
+    def until_refused(self) -> None:
+        connection = http.client.HTTPConnection("127.0.0.1", self.service.port, timeout=60)
+        rng = np.random.default_rng(self.number)
+        try:
+            while True:
+                body = json.dumps({"ranked_landmarks": rng.permutation(N_LANDMARKS).tolist()})
+                path = f"/v1/sessions/{self.session_id}/observations?action_m=1"
+                connection.request("POST", path, body, {"Content-Type": "application/json"})
+                answer = connection.getresponse()
+                content = answer.read()
+                if answer.status != 200:
+                    self.refusals.append(answer.status)
+                    return
+                told = json.loads(content)
+                self.n_told, self.belief = told["n_observations"], told["belief"]
+        except (OSError, http.client.HTTPException):
+            return
+        finally:
+            connection.close()
+
+    def check_nothing_is_lost(self) -> None:
+        state = self.service.ask("GET", f"/v1/sessions/{self.session_id}")
+        # A robot is answered before its connection closes: nothing is there that it was not told of.
+        assert (state["n_observations"], state["belief"]) == (self.n_told, self.belief)
+
+
+@pytest.mark.parametrize(("by", "code"), [(signal.SIGTERM, 0), (signal.SIGINT, 130)])
+def test_what_was_acknowledged_is_there_afterwards(service: Service, by: int, code: int) -> None:
+    robots = [Robot(service, number) for number in range(8)]
+    for robot in robots:
+        robot.begin()
+    for _ in range(3):
+        threads = [threading.Thread(target=robot.until_refused) for robot in robots]
+        before = sum(robot.n_told for robot in robots)
+        for thread in threads:
+            thread.start()
+        until(lambda least=before + 100: sum(robot.n_told for robot in robots) >= least)
+        service.signal(by)
+        assert service.ended() == code
+        for thread in threads:
+            thread.join(60)
+        service.start()
+        for robot in robots:
+            assert robot.refusals == []
+            robot.check_nothing_is_lost()
+
+
+def send_frame(service: Service, n_sent: int) -> socket.socket:
+    """A request whose body has come in part."""
+    body = json.dumps({"encoding": [1.0] * 8}).encode()
+    connection = service.connect()
+    head = "PUT /v1/admin/domains/loop/traverses/t/frames/7?position_m=7 HTTP/1.1\r\nHost: x\r\n"
+    head += f"Content-Type: application/json\r\nContent-Length: {len(body)}\r\n\r\n"
+    connection.sendall(head.encode() + body[:n_sent])
+    return connection
+
+
+def read_all(connection: socket.socket) -> bytes:
+    received = b""
+    while more := connection.recv(65536):
+        received += more
+    return received
+
+
+def is_stopping(service: Service) -> bool:
+    try:
+        with service.connect():
+            return False
+    except OSError:
+        return True
+
+
+def test_what_is_under_way_is_finished_and_what_is_idle_is_closed(service: Service) -> None:
+    with service.connect() as idle, service.connect() as fresh, send_frame(service, 5) as under_way:
+        idle.sendall(b"GET /healthz HTTP/1.1\r\nHost: x\r\n\r\n")
+        assert idle.recv(65536).startswith(b"HTTP/1.1 200 ")
+        service.signal(signal.SIGTERM)
+        assert idle.recv(65536) == b""
+        assert fresh.recv(65536) == b""
+        until(lambda: is_stopping(service))
+        under_way.sendall(json.dumps({"encoding": [1.0] * 8}).encode()[5:])
+        answer = read_all(under_way)
+        assert answer.startswith(b"HTTP/1.1 200 ")
+        assert b"connection: close" in answer
+    assert service.ended() == 0
+
+
+def test_who_takes_too_long_is_told_so(service: Service) -> None:
+    service.signal(signal.SIGTERM)
+    assert service.ended() == 0
+    service.start(shutdown_grace_s=1)
+    with send_frame(service, 5) as under_way:
+        time.sleep(0.1)
+        service.signal(signal.SIGTERM)
+        head, _, content = read_all(under_way).partition(b"\r\n\r\n")
+        assert head.startswith(b"HTTP/1.1 503 ")
+        assert json.loads(content)["code"] == "unavailable"
+    assert service.ended() == 0
+
+
+def test_event_streams_end(service: Service) -> None:
+    config = {"training_traverse": "t", "landmark_traverse": "t", "n_landmarks": N_LANDMARKS}
+    job = service.ask("POST", "/v1/admin/domains/loop/remaps", config | {"training_episodes": 1_000_000})
+    with service.connect() as stream:
+        stream.sendall(f"GET /v1/admin/jobs/{job['job_id']}/events HTTP/1.1\r\nHost: x\r\n\r\n".encode())
+        assert b"event: progress" in stream.recv(65536) + stream.recv(65536)
+        service.signal(signal.SIGTERM)
+        assert read_all(stream).endswith(b"0\r\n\r\n")
+    assert service.ended() == 0
+    service.start()
+    assert service.ask("GET", f"/v1/admin/jobs/{job['job_id']}")["state"] in {"queued", "running", "succeeded"}
+    service.ask("DELETE", f"/v1/admin/jobs/{job['job_id']}")
+
+
+@pytest.mark.parametrize(("by", "code"), [(signal.SIGTERM, 0), (signal.SIGINT, 130)])
+def test_a_second_signal_does_not_wait(service: Service, by: int, code: int) -> None:
+    service.signal(signal.SIGTERM)
+    assert service.ended() == 0
+    service.start(shutdown_grace_s=600, stall_timeout_s=600)
+    robot = Robot(service, 1)
+    robot.begin()
+    with send_frame(service, 5):
+        time.sleep(0.1)
+        service.signal(by)
+        until(lambda: is_stopping(service))
+        service.signal(by)
+        assert service.ended() == code
+    service.start()
+    assert service.ask("GET", f"/v1/sessions/{robot.session_id}")["n_observations"] == 0
