@@ -137,6 +137,7 @@ def test_harmed_files(ours: tuple[TestClient, Path, Telling], harm: str) -> None
     assert telling.n_errors >= 3
 
 
+@pytest.mark.slow
 def test_a_catalog_and_sessions_that_are_gone(ours: tuple[TestClient, Path, Telling]) -> None:
     client, data_dir, telling = ours
     app: Any = client.app
