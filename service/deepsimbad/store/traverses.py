@@ -67,11 +67,15 @@ class Traverse:
             # A log that outlived its file would be replayed into the new one.
             remove_database(new)
             remove_database(path)
-            with open_database(new, create=True) as db, db.atomic():
-                migrations.apply(db)
-                db.execute("INSERT INTO traverse (id, created_at) VALUES (1, ?)", [now()])
-            sync_file(new)
-            new.rename(path)
+            try:
+                with open_database(new, create=True) as db, db.atomic():
+                    migrations.apply(db)
+                    db.execute("INSERT INTO traverse (id, created_at) VALUES (1, ?)", [now()])
+                sync_file(new)
+                new.rename(path)
+            except BaseException:
+                remove_database(new)
+                raise
             sync_folder(path.parent)
         return cls.open(data_dir, domain, name)
 

@@ -1,6 +1,7 @@
 """What a crash leaves behind, and how it is cleared away. Every function stands inside a write transaction."""
 
 import re
+import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -54,8 +55,8 @@ def discard_abandoned_maps(db: Database, data_dir: Path, owners: Path) -> Iterat
 def remove_orphans(db: Database, data_dir: Path) -> Iterator[str]:
     """Remove the files of known domains that no map version or traverse owns.
 
-    Folders of unknown domains are left alone: a lost catalog never empties them. The write lock keeps new versions
-    from appearing meanwhile.
+    Folders of unknown domains are left alone, unless they are empty: a lost catalog never empties them. The write lock
+    keeps new versions from appearing meanwhile.
     """
     for domain in domain_table.all_domains(db):
         folder = layout.maps_folder(data_dir, domain.name)
@@ -72,6 +73,16 @@ def remove_orphans(db: Database, data_dir: Path) -> Iterator[str]:
                 yield f"removed {path.name} of domain {domain.name}, which no map version owns"
         for name in traverses.remove_leftovers(data_dir, domain.name):
             yield f"removed {name} of domain {domain.name}, which no traverse owns"
+    known = {domain.name for domain in domain_table.all_domains(db)}
+    folder = layout.domains_folder(data_dir)
+    for path in sorted(folder.iterdir()) if folder.is_dir() else []:
+        if path.name not in known and layout.is_name(path.name) and _is_empty(path):
+            shutil.rmtree(path)
+            yield f"removed the empty folder {path.name}, which no domain owns"
+
+
+def _is_empty(folder: Path) -> bool:
+    return folder.is_dir() and all(path.is_dir() and not path.is_symlink() for path in folder.rglob("*"))
 
 
 def remove_map_files(data_dir: Path, domain: str, version: int) -> None:
