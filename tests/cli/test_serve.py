@@ -58,6 +58,25 @@ def test_other_machines_are_refused_while_there_are_no_keys(process):
     assert "DEEPSIMBAD_ALLOW_OPEN" in err
 
 
+def test_with_a_key_other_machines_may_reach_it(deepsimbad, process, tmp_path):
+    key = deepsimbad("keys", "create", "--scope", "localize", "--data-dir", tmp_path / "keyed").out.strip()
+    port = free_port()
+    running = process("serve", "--host", "0.0.0.0", "--port", port, "--data-dir", tmp_path / "keyed")
+    assert wait_until_ready(port, running) == 200
+    place = f"http://127.0.0.1:{port}/v1/domains"
+    with pytest.raises(urllib.error.HTTPError) as refused:
+        urllib.request.urlopen(place, timeout=5)
+    assert refused.value.status == 401
+    asked = urllib.request.Request(place, headers={"Authorization": f"Bearer {key}"})
+    with urllib.request.urlopen(asked, timeout=5) as answer:
+        assert answer.status == 200
+    running.terminate()
+    _, err = running.communicate(timeout=60)
+    assert "asks for keys" in err
+    assert "runs open" not in err
+    assert key not in err
+
+
 def test_a_port_that_is_taken_is_an_error(process):
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))

@@ -44,6 +44,17 @@ def test_every_answer_carries_them_once(client: TestClient, method: str, path: s
         assert answer.headers.get_list(name) == [value], name
 
 
+def test_a_map_file_may_be_kept_by_who_asked_for_it(client: TestClient) -> None:
+    place = "/v1/admin/domains/ready/maps/1/file"
+    answer = client.get(place)
+    assert answer.status_code == 200
+    again = client.get(place, headers={"If-None-Match": answer.headers["etag"]})
+    assert again.status_code == 304
+    for each in (answer, again):
+        assert each.headers.get_list("cache-control") == ["private, no-cache"]
+        assert each.headers["x-content-type-options"] == "nosniff"
+
+
 def test_our_own_fault_carries_them_too(client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
     app: Any = client.app
 

@@ -81,8 +81,14 @@ _ROUTERS = (
     admin_sessions,
 )
 _BATCH_PATH = re.compile(r"/v1/admin/domains/[^/]+/traverses/[^/]+/frames")
-_CORS_SENT = ("Authorization", "X-API-Key", "Content-Type", "X-Request-ID", "Idempotency-Key", "Range")
-_CORS_SHOWN = ("X-Request-ID", "Retry-After", "Location", "ETag", "Repr-Digest", "WWW-Authenticate")
+_CORS_SENT = (
+    *("Authorization", "X-API-Key", "Content-Type", "X-Request-ID", "Idempotency-Key"),
+    *("Range", "If-Range", "If-None-Match"),
+)
+_CORS_SHOWN = (
+    *("X-Request-ID", "Retry-After", "Location", "WWW-Authenticate"),
+    *("ETag", "Repr-Digest", "Content-Range", "Content-Disposition"),
+)
 _DESCRIPTION = (
     "Where on a prelearned route a robot is, from what it sees; every error is an RFC 9457 problem document. "
     "Ids count from 0, ranks from 1, units stand in the names."

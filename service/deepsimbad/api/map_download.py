@@ -99,6 +99,10 @@ class _MapResponse(StreamingResponse):
                 await run_sync(self._file.close)
 
 
+# It may be kept by who asked, and asked for again: a domain made anew counts its versions from 1 again.
+_KEPT = {"Cache-Control": "private, no-cache"}
+
+
 def map_response(file: MapFile, filename: str, headers: Headers) -> Response:
     """The answer to a request for a map file, which it closes.
 
@@ -112,13 +116,14 @@ def map_response(file: MapFile, filename: str, headers: Headers) -> Response:
     """
     told = {
         "Accept-Ranges": "bytes",
+        **_KEPT,
         "ETag": file.etag,
         "Repr-Digest": file.digest,
         "Content-Disposition": f'attachment; filename="{filename}"',
     }
     if _names(headers.get("if-none-match"), file.etag):
         file.close()
-        return Response(status_code=HTTPStatus.NOT_MODIFIED, headers={"ETag": file.etag})
+        return Response(status_code=HTTPStatus.NOT_MODIFIED, headers={**_KEPT, "ETag": file.etag})
     part = None
     if headers.get("if-range") in {None, file.etag}:
         part = _part(headers.get("range"), file.n_bytes)
