@@ -6,6 +6,7 @@ import time
 import urllib.error
 import urllib.request
 
+import httpx2
 import pytest
 
 pytestmark = pytest.mark.slow
@@ -64,12 +65,8 @@ def test_with_a_key_other_machines_may_reach_it(deepsimbad, process, tmp_path):
     running = process("serve", "--host", "0.0.0.0", "--port", port, "--data-dir", tmp_path / "keyed")
     assert wait_until_ready(port, running) == 200
     place = f"http://127.0.0.1:{port}/v1/domains"
-    with pytest.raises(urllib.error.HTTPError) as refused:
-        urllib.request.urlopen(place, timeout=5)
-    assert refused.value.status == 401
-    asked = urllib.request.Request(place, headers={"Authorization": f"Bearer {key}"})
-    with urllib.request.urlopen(asked, timeout=5) as answer:
-        assert answer.status == 200
+    assert httpx2.get(place).status_code == 401
+    assert httpx2.get(place, headers={"Authorization": f"Bearer {key}"}).status_code == 200
     running.terminate()
     _, err = running.communicate(timeout=60)
     assert "asks for keys" in err
