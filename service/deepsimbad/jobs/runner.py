@@ -4,9 +4,16 @@ import logging
 import queue
 import threading
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
-from deepsimbad.errors import CancelledError, ConflictError, DeepSimbadError, JobInterruptedError
+from deepsimbad.errors import (
+    CancelledError,
+    ConflictError,
+    DamagedFileError,
+    DeepSimbadError,
+    JobInterruptedError,
+    UnavailableError,
+)
 from deepsimbad.jobs.map_config import RemapConfig
 from deepsimbad.jobs.perform import REMAP, RunJob, error_document
 from deepsimbad.jobs.progress import ProgressState
@@ -17,6 +24,9 @@ from deepsimbad.store.records import JobRecord, JobState
 
 _log = logging.getLogger(__name__)
 _MAX_QUEUED = 100
+_WRITTEN_AGAIN_S = 1.0
+
+_Written = TypeVar("_Written")
 
 
 class JobRunner:
@@ -93,7 +103,7 @@ class JobRunner:
                 self._cancelled.pop(job_id, None)
 
     def _run_one(self, job_id: str) -> None:
-        job = self._catalog.start_job(job_id)
+        job = self._written(lambda: self._catalog.start_job(job_id))
         if job.state is not JobState.RUNNING:  # cancelled while it waited
             self._forget_checkpoints(job_id)
             return
@@ -107,23 +117,24 @@ class JobRunner:
             )
             ending = self._succeeded(job, result)
         except CancelledError as error:
-            self._clear_away()
+            self._written(self._clear_away)
             if not cancelled.is_set():  # the service stops: nobody gave the job up
                 self._catalog.give_back_job(job_id)
                 return
             ending = self._done_all_the_same(job) or {"state": JobState.CANCELLED, "error": error_document(error)}
         except JobInterruptedError as error:
             _log.error("a job's process died", extra={"job_id": job_id, "why": error.message})
-            self._clear_away()
+            self._written(self._clear_away)
             ending = self._done_all_the_same(job) or {"state": JobState.FAILED, "error": error_document(error)}
         except DeepSimbadError as error:
             _log.warning("a job failed", extra={"job_id": job_id, "code": error.code, "why": error.message})
+            self._written(self._clear_away)
             ending = {"state": JobState.FAILED, "error": error_document(error)}
         except Exception:
             _log.exception("a job broke", extra={"job_id": job_id})
             broken = {"code": "internal_error", "message": "the job broke; the service's log tells where"}
             ending = {"state": JobState.FAILED, "error": broken}
-        self._catalog.update_job(job_id, eta_s=None, **ending)
+        self._written(lambda: self._catalog.update_job(job_id, eta_s=None, **ending))
         self._forget_checkpoints(job_id)
 
     def _succeeded(self, job: JobRecord, result: dict[str, Any]) -> dict[str, Any]:
@@ -137,6 +148,23 @@ class JobRunner:
         if made is None or made.activated_at is None:
             return None
         return self._succeeded(job, {"map_version": made.version, "active": True, "metrics": made.metrics})
+
+    def _written(self, write: Callable[[], _Written]) -> _Written:
+        """Write to the catalog, and again until a full disk has room; no job waits for ever for its end to be noted.
+
+        Raises:
+            UnavailableError: The service stops meanwhile: the next one finds the job as it stands.
+            DamagedFileError: Waiting would not help.
+        """
+        while True:
+            try:
+                return write()
+            except DamagedFileError:
+                raise
+            except UnavailableError as error:
+                _log.warning("the catalog cannot be written", extra={"why": error.message})
+                if self._closing.wait(_WRITTEN_AGAIN_S):
+                    raise
 
     def _clear_away(self) -> None:
         """Discard the map that a killed process was building."""

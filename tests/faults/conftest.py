@@ -1,0 +1,229 @@
+"""A small mapped data directory, and the service as a process whose disk can be taken away from it."""
+
+import io
+import os
+import shutil
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self
+
+import httpx2
+import numpy as np
+import pytest
+
+ENVIRONMENT = {name: value for name, value in os.environ.items() if not name.startswith("DEEPSIMBAD_")}
+READY_WITHIN_S = 60.0
+N_PLACES, DIM, N_LANDMARKS = 60, 8, 12
+NPZ = {"Content-Type": "application/octet-stream"}
+
+
+@dataclass(frozen=True)
+class Ran:
+    code: int
+    out: str
+    err: str
+
+    @property
+    def line(self) -> str:
+        """The one line on standard error that a named error is."""
+        assert (self.code, self.out) == (1, ""), self
+        (line,) = self.err.splitlines()
+        assert line.startswith("deepsimbad: ")
+        return line
+
+
+def command(*arguments: object) -> Ran:
+    """Run `deepsimbad` in a process of its own."""
+    done = subprocess.run(
+        [sys.executable, "-m", "deepsimbad", *map(str, arguments)],
+        env=ENVIRONMENT,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=120,
+    )
+    return Ran(done.returncode, done.stdout, done.stderr)
+
+
+class Service:
+    """`deepsimbad serve` as a process between `with` and the end of its block, and requests to it.
+
+    Its log goes through a pipe, so that it is not on the disk that is taken away.
+    """
+
+    def __init__(self, data_dir: Path) -> None:
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            self._port = int(probe.getsockname()[1])
+        self._data_dir = data_dir
+        self._client = httpx2.Client(base_url=f"http://127.0.0.1:{self._port}", timeout=60, trust_env=False)
+        self.log: list[str] = []
+
+    def __enter__(self) -> Self:
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "deepsimbad", "serve", "--data-dir", str(self._data_dir), "--port", str(self._port)],
+            env=ENVIRONMENT,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        self._reading = threading.Thread(target=self._read)
+        self._reading.start()
+        give_up = time.monotonic() + READY_WITHIN_S
+        while not self._is_ready():
+            assert self._process.poll() is None, "".join(self.log)
+            assert time.monotonic() < give_up, "".join(self.log)
+            time.sleep(0.05)
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self._process.terminate()
+        self._ended()
+
+    def kill(self) -> None:
+        """End it as a power cut would."""
+        self._process.kill()
+        self._ended()
+
+    @property
+    def pid(self) -> int:
+        return self._process.pid
+
+    def ask(self, method: str, path: str, **more: Any) -> httpx2.Response:
+        return self._client.request(method, path, **more)
+
+    def told(self, method: str, path: str, **more: Any) -> Any:
+        """The answer to a request that succeeds."""
+        answer = self.ask(method, path, **more)
+        assert answer.status_code < 300, answer.text
+        return answer.json() if answer.content else None
+
+    def refused(self, method: str, path: str, **more: Any) -> dict[str, Any]:
+        """The problem that a request meets: named, and of no other kind than documented."""
+        answer = self.ask(method, path, **more)
+        assert answer.status_code >= 400, answer.text
+        assert answer.headers["content-type"] == "application/problem+json"
+        problem: dict[str, Any] = answer.json()
+        assert problem["code"] != "internal_error", "".join(self.log)
+        return problem
+
+    def observe(self, session_id: str, view: int, **more: Any) -> dict[str, Any]:
+        """What a robot sends, the same again for the same view."""
+        ranks = np.random.default_rng(view).permutation(N_LANDMARKS).tolist()
+        return {
+            "path": f"/v1/sessions/{session_id}/observations?action_m=1",
+            "json": {"ranked_landmarks": ranks},
+            "headers": {"Idempotency-Key": f"view-{view}"},
+            **more,
+        }
+
+    def ended_job(self, job_id: str) -> dict[str, Any]:
+        """A job, once it has ended."""
+        give_up = time.monotonic() + 60
+        while time.monotonic() < give_up:
+            job: dict[str, Any] = self.told("GET", f"/v1/admin/jobs/{job_id}")
+            if job["state"] in {"succeeded", "failed", "cancelled"}:
+                return job
+            time.sleep(0.05)
+        raise AssertionError("the job did not end")
+
+    def _is_ready(self) -> bool:
+        try:
+            return self.ask("GET", "/readyz").status_code == 200
+        except httpx2.TransportError:
+            return False
+
+    def _read(self) -> None:
+        assert self._process.stderr is not None
+        self.log.extend(self._process.stderr)
+
+    def _ended(self) -> None:
+        try:
+            self._process.wait(20)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._reading.join()
+        if self._process.stderr is not None:
+            self._process.stderr.close()
+        self._client.close()
+
+
+def batch(first: int, n: int = N_PLACES) -> bytes:
+    """Frames of a drive as an upload."""
+    packed = io.BytesIO()
+    index = np.arange(first, first + n)
+    encodings = np.random.default_rng(7).normal(size=(first + n, DIM))[first:]
+    np.savez(packed, encodings=encodings.astype(np.float32), index=index, position_m=index * 1.0)
+    return packed.getvalue()
+
+
+REMAP = {
+    "training_traverse": "drive",
+    "landmark_traverse": "drive",
+    "n_landmarks": N_LANDMARKS,
+    "list_length": 3,
+    "training_episodes": 10,
+}
+
+
+@pytest.fixture(scope="session")
+def furnished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A data directory with two mapped domains, `loop` with two versions; never touched."""
+    data_dir = tmp_path_factory.mktemp("furnished") / "data"
+    with Service(data_dir) as service:
+        for domain, n_maps in (("loop", 2), ("yard", 1)):
+            body = {"evaluator": {"kind": "feature_l2", "extractor": "none"}, "closed": domain == "loop"}
+            service.told("PUT", f"/v1/admin/domains/{domain}", json=body)
+            service.told("POST", f"/v1/admin/domains/{domain}/traverses", json={"name": "drive"})
+            path = f"/v1/admin/domains/{domain}/traverses/drive/frames"
+            service.told("POST", path, content=batch(0), headers=NPZ)
+            for _ in range(n_maps):
+                job = service.told("POST", f"/v1/admin/domains/{domain}/remaps", json=REMAP)
+                assert service.ended_job(job["job_id"])["state"] == "succeeded"
+    return data_dir
+
+
+@pytest.fixture
+def data_dir(furnished: Path, tmp_path: Path) -> Path:
+    """A copy of it to damage."""
+    return Path(shutil.copytree(furnished, tmp_path / "data"))
+
+
+def begin(service: Service, n_views: int = 3) -> str:
+    """A session with some views, each acknowledged."""
+    session_id: str = service.told("POST", "/v1/domains/loop/sessions", json={"belief": "grid"})["session_id"]
+    for view in range(n_views):
+        answer = service.told("POST", **service.observe(session_id, view))
+        assert answer["n_observations"] == view + 1
+    return session_id
+
+
+def check_is_clean(data_dir: Path, may_have_left_over: bool = False) -> None:
+    """Nothing is damaged, and nothing lies about that belongs to nothing."""
+    ran = command("check", "--data-dir", data_dir)
+    assert ran.code == 0, ran
+    assert ran.out == "" or may_have_left_over, ran
+
+
+@contextmanager
+def small_disk(n_bytes: int) -> Iterator[Path]:
+    """A file system of its own, of so many bytes; skips where none may be mounted."""
+    folder = Path(tempfile.mkdtemp())
+    mount = ["mount", "-t", "tmpfs", "-o", f"size={n_bytes}", "tmpfs", str(folder)]
+    if shutil.which("mount") is None or subprocess.run(mount, capture_output=True, check=False).returncode:
+        folder.rmdir()
+        pytest.skip("no file system can be mounted here: it takes the rights of root")
+    try:
+        yield folder
+    finally:
+        subprocess.run(["umount", "--lazy", str(folder)], check=True)
+        folder.rmdir()

@@ -1,0 +1,195 @@
+"""A disk that takes no more: named, nothing acknowledged is lost, and it goes on when there is room again.
+
+Two ways to fill it: a small file system, where one can be mounted, and the kernel's limit on the size of files, which
+can be put on the running service anywhere.
+"""
+
+import resource
+import shutil
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from sqlite_utils import Database
+
+from deepsimbad.errors import InvalidMapConfigError, UnavailableError
+from deepsimbad.jobs.map_config import RemapConfig
+from deepsimbad.jobs.runner import JobRunner
+from deepsimbad.store.catalog import Catalog
+from deepsimbad.store.records import JobRecord, JobState
+
+from .conftest import NPZ, REMAP, Service, batch, begin, check_is_clean, command, small_disk
+
+pytestmark = pytest.mark.slow
+Fill = Callable[[Path, Service], AbstractContextManager[None]]
+FULL = {"disk_full", "io_error"}  # SQLite calls a file that may not grow a failed write
+
+
+@contextmanager
+def no_room_left(folder: Path, _service: Service) -> Iterator[None]:
+    """Fill the file system to its last block."""
+    filler = folder / "filler"
+    with filler.open("wb", buffering=0) as stream:
+        for piece in (bytes(65536), bytes(4096), b"x"):
+            try:
+                while True:
+                    stream.write(piece)
+            except OSError:
+                continue
+    try:
+        yield
+    finally:
+        filler.unlink()
+
+
+@contextmanager
+def no_file_grows(_folder: Path, service: Service) -> Iterator[None]:
+    """Let the service write to no file."""
+    before = resource.prlimit(service.pid, resource.RLIMIT_FSIZE, (0, resource.RLIM_INFINITY))
+    try:
+        yield
+    finally:
+        resource.prlimit(service.pid, resource.RLIMIT_FSIZE, before)
+
+
+@pytest.fixture(params=["file system", "limit"])
+def disk(request: pytest.FixtureRequest, furnished: Path, tmp_path: Path) -> Iterator[tuple[Path, Fill]]:
+    if request.param == "limit":
+        yield Path(shutil.copytree(furnished, tmp_path / "data")), no_file_grows
+    else:
+        with small_disk(24 * 2**20) as folder:
+            yield Path(shutil.copytree(furnished, folder / "data")), no_room_left
+
+
+def test_the_service_names_it_and_goes_on_when_there_is_room(disk: tuple[Path, Fill]) -> None:
+    data_dir, full = disk
+    with Service(data_dir) as service:
+        session_id = begin(service, 3)
+        frames = "/v1/admin/domains/yard/traverses/drive/frames"
+        told = service.told("POST", frames, content=batch(60, 20), headers=NPZ)
+        assert told["n_frames"] == 80
+        with full(data_dir.parent, service):
+            problems = [
+                service.refused("POST", **service.observe(session_id, 3)),
+                service.refused("POST", frames, content=batch(80, 20), headers=NPZ),
+                service.refused("PUT", "/v1/admin/domains/new", json={"evaluator": {"kind": "feature_l2"}}),
+                service.refused("POST", "/v1/admin/domains/yard/traverses", json={"name": "more"}),
+                service.refused("POST", "/v1/admin/domains/yard/remaps", json=REMAP),
+                service.refused("POST", "/v1/domains/loop/sessions", json={}),
+                service.refused("PUT", "/v1/admin/domains/loop/active-map", json={"version": 1}),
+            ]
+            for problem in problems:
+                assert (problem["status"], problem["code"]) == (503, "unavailable"), problem
+                assert problem["reason"] in FULL, problem
+            # Whoever only asks is answered all the same.
+            assert service.told("GET", f"/v1/sessions/{session_id}")["n_observations"] == 3
+            view = service.told("POST", "/v1/domains/loop/localizations", json={"ranked_landmarks": [1, 2, 3]})
+            assert view["map_version"] == 2
+            assert service.told("GET", "/v1/admin/domains/yard/traverses/drive")["n_frames"] == 80
+        again = service.told("POST", **service.observe(session_id, 3))
+        assert again["n_observations"] == 4
+        assert service.told("POST", frames, content=batch(80, 20), headers=NPZ)["n_frames"] == 100
+        job = service.told("POST", "/v1/admin/domains/yard/remaps", json=REMAP)
+        assert service.ended_job(job["job_id"])["state"] == "succeeded"
+        assert service.told("GET", "/v1/domains/loop")["map_version"] == 2
+        service.kill()
+        check_is_clean(data_dir, may_have_left_over=True)
+    with Service(data_dir) as service:
+        assert service.told("GET", f"/v1/sessions/{session_id}")["n_observations"] == 4
+        assert service.told("GET", "/v1/admin/domains/yard/traverses/drive")["n_frames"] == 100
+    check_is_clean(data_dir)
+
+
+def test_a_job_that_finds_the_disk_full_says_so_and_leaves_nothing(furnished: Path) -> None:
+    """Even where that itself cannot be written before there is room again."""
+    with small_disk(24 * 2**20) as folder:
+        data_dir = Path(shutil.copytree(furnished, folder / "data"))
+        before = sorted(path.name for path in (data_dir / "domains/yard/maps").iterdir())
+        with Service(data_dir) as service:
+            service.told("POST", "/v1/admin/domains/yard/traverses/drive/frames", content=batch(60, 2000), headers=NPZ)
+            job_id = service.told("POST", "/v1/admin/domains/yard/remaps", json=REMAP | {"training_episodes": 20_000})[
+                "job_id"
+            ]
+            with no_room_left(folder, service):
+                view = service.told("POST", "/v1/domains/yard/localizations", json={"ranked_landmarks": [1, 2, 3]})
+                assert view["map_version"] == 1
+                time.sleep(5)
+            job = service.ended_job(job_id)
+            assert (job["state"], job["error"]["code"]) == ("failed", "unavailable"), job
+            assert "no space is left" in job["error"]["detail"]
+            assert sorted(path.name for path in (data_dir / "domains/yard/maps").iterdir()) == before
+            job = service.told("POST", "/v1/admin/domains/yard/remaps", json=REMAP)
+            assert service.ended_job(job["job_id"])["state"] == "succeeded"
+        check_is_clean(data_dir)
+
+
+@pytest.mark.parametrize("what", ["backup", "restore", "export", "import"])
+def test_commands_leave_no_half_file(furnished: Path, tmp_path: Path, what: str) -> None:
+    source = Path(shutil.copytree(furnished, tmp_path / "data"))
+    assert command("backup", tmp_path / "b.tar", "--data-dir", source).code == 0
+    assert command("export", "loop", tmp_path / "m.map", "--data-dir", source).code == 0
+    with small_disk(16 * 1024 if what == "export" else 64 * 1024) as folder:
+        ran = {
+            "backup": lambda: command("backup", folder / "b.tar", "--data-dir", source),
+            "restore": lambda: command("restore", tmp_path / "b.tar", "--data-dir", folder / "there"),
+            "export": lambda: command("export", "loop", folder / "m.map", "--data-dir", source),
+            "import": lambda: command("import", tmp_path / "m.map", "--data-dir", folder),
+        }[what]()
+        assert "no space is left" in ran.line, ran
+        if what != "import":
+            assert list(folder.iterdir()) == []
+        else:
+            assert not list(folder.rglob("maps/*"))
+
+
+def test_the_end_of_a_job_is_noted_once_there_is_room(tmp_path: Path) -> None:
+    with Catalog.open(tmp_path) as catalog:
+        catalog.create_domain("campus", {}, False, [1])
+        is_full = threading.Event()
+
+        def fill_up(job: JobRecord, on_progress: object, is_cancelled: object) -> dict[str, Any]:
+            (n_pages,) = catalog._db.execute("PRAGMA page_count").fetchone()
+            catalog._db.execute(f"PRAGMA max_page_count = {n_pages}")
+            is_full.set()
+            raise InvalidMapConfigError("x" * 100_000)  # more than fits
+
+        runner = JobRunner(catalog, fill_up, lambda domain: None)
+        try:
+            job = runner.submit("campus", RemapConfig(training_traverse="t"))
+            assert is_full.wait(10)
+            time.sleep(0.5)
+            assert catalog.job(job.job_id).state is JobState.RUNNING
+            catalog._db.execute("PRAGMA max_page_count = 1000000")
+            give_up = time.monotonic() + 20
+            while (found := catalog.job(job.job_id)).state is JobState.RUNNING:
+                assert time.monotonic() < give_up
+                time.sleep(0.05)
+            assert (found.state, found.error and found.error["code"]) == (JobState.FAILED, "invalid_map_config")
+        finally:
+            runner.close()
+
+
+def test_without_a_disk_to_fill_the_file_itself_may_be_full(tmp_path: Path) -> None:
+    """SQLite's own limit on pages stands for the full disk, where nothing can be mounted."""
+    with Catalog.open(tmp_path) as catalog:
+        catalog.create_domain("campus", {}, False, [1])
+        db: Database = catalog._db
+        (n_pages,) = db.execute("PRAGMA page_count").fetchone()
+        db.execute(f"PRAGMA max_page_count = {n_pages}")
+
+        def fill() -> None:
+            for number in range(200):
+                catalog.create_domain(f"campus-{number}", {"note": "x" * 2000}, False, [1])
+
+        with pytest.raises(UnavailableError) as caught:
+            fill()
+        assert caught.value.hints["reason"] == "disk_full"
+        known = [domain.name for domain in catalog.domains()]
+        db.execute("PRAGMA max_page_count = 1000000")
+        catalog.create_domain("after", {}, False, [1])
+        assert [domain.name for domain in catalog.domains()] == ["after", *known]
+    check_is_clean(tmp_path)
