@@ -47,6 +47,14 @@ def now() -> str:
     return _text(datetime.now(UTC))
 
 
+def now_behind(latest: str | None) -> str:
+    """The present moment, or one just behind another where the clock does not show a later one."""
+    moment = datetime.now(UTC)
+    if latest is None or _text(moment) > latest:
+        return _text(moment)
+    return _text(datetime.fromisoformat(latest) + timedelta(milliseconds=1))
+
+
 def after(wait: timedelta) -> str:
     """The moment that follows now by `wait`, as `now` writes it; raises InvalidInputError past the year 9999."""
     try:

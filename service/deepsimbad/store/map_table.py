@@ -5,7 +5,7 @@ from typing import Any, Final
 from sqlite_utils import Database
 
 from deepsimbad.errors import LostActivationError, RetiredMapError, UnknownMapVersionError
-from deepsimbad.store.documents import from_json, now, row_reader, to_json
+from deepsimbad.store.documents import from_json, now, now_behind, row_reader, to_json
 from deepsimbad.store.list_page import ListPage
 from deepsimbad.store.records import MapRecord, MapState
 
@@ -114,9 +114,11 @@ def activate(db: Database, domain: str, version: int, expected: int | AnyVersion
             active=active,
             expected=expected,
         )
+    # Which one served last must be known though the clock was set back meanwhile: it is the one to roll back to.
+    (latest,) = db.execute("SELECT max(retired_at) FROM map WHERE domain = ?", [domain]).fetchone()
     db.execute(
         "UPDATE map SET state = 'retired', retired_at = ? WHERE domain = ? AND state = 'active' AND version != ?",
-        [now(), domain, version],
+        [now_behind(latest), domain, version],
     )
     db.execute(
         "UPDATE map SET state = 'active', activated_at = ? WHERE domain = ? AND version = ? AND state != 'active'",

@@ -1,0 +1,27 @@
+"""The second service on a data directory does not start, and the first one does not notice."""
+
+from pathlib import Path
+
+import pytest
+
+from .conftest import Service, begin, check_is_clean, command
+
+pytestmark = pytest.mark.slow
+
+
+def test_the_second_refuses_before_it_listens(data_dir: Path, tmp_path: Path) -> None:
+    with Service(data_dir) as service:
+        session_id = begin(service)
+        ran = command("serve", "--port", 0, "--data-dir", data_dir)
+        assert (ran.code, ran.out) == (1, "")
+        last = ran.err.splitlines()[-1]
+        assert last.startswith(f"deepsimbad: another service (process {service.pid}, listening on 127.0.0.1:")
+        assert "Uvicorn running" not in ran.err
+        assert service.told("POST", **service.observe(session_id, 3))["n_observations"] == 4
+        assert command("backup", tmp_path / "b.tar", "--data-dir", data_dir).code == 0
+        assert "another service" in command("restore", tmp_path / "b.tar", "--data-dir", data_dir).line
+        assert command("info", "loop", "--data-dir", data_dir).code == 0, "a command is no service"
+        service.kill()
+    with Service(data_dir) as service:
+        assert service.told("GET", f"/v1/sessions/{session_id}")["n_observations"] == 4
+    check_is_clean(data_dir)
