@@ -25,7 +25,10 @@ def report(found: Soak) -> Iterator[str]:
     yield ""
     yield "| | |"
     yield "|---|---|"
-    yield f"| kills, each 0 to {LONGEST_LIFE_S:g} s after the service was ready | {found.n_kills} |"
+    yield (
+        f"| kills, each 0 to {LONGEST_LIFE_S:g} s after the service was ready: in turn at any time, during an upload, "
+        f"a remap, an activation, a rollback | {found.n_kills} |"
+    )
     for who, count in found.n_acknowledged.items():
         yield f"| acknowledged writes: {who.lower()} | {count:,} |"
     yield "| acknowledged writes lost | 0 |"
@@ -37,7 +40,7 @@ def report(found: Soak) -> Iterator[str]:
         f"95 % within {np.quantile(ready, 0.95):.2f} s, longest {ready.max():.2f} s |"
     )
     yield ""
-    yield "What uploader and mapper were about when it died (robots observed all the time):"
+    yield "What uploader and mapper were about when it died (robots observe all the time):"
     yield ""
     yield "| | kills |"
     yield "|---|---|"

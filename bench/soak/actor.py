@@ -1,5 +1,6 @@
 """What all who use the service while it dies have in common."""
 
+import time
 from abc import ABC, abstractmethod
 
 from bench.soak.link import GoneError, Link
@@ -21,10 +22,12 @@ class Actor(ABC):
     Attributes:
         doing: What it was about when it last spoke; read at the moment of a kill.
         n_acknowledged: Writes that were answered.
+        rests_s: Between two things it does: all of them together shall not take every core, or no job gets anywhere.
     """
 
     doing = "nothing"
     n_acknowledged = 0
+    rests_s = 0.0
 
     def until_gone(self, url: str) -> None:
         """Act again and again; returns when the service dies."""
@@ -32,6 +35,7 @@ class Actor(ABC):
             try:
                 while True:
                     self.act(link)
+                    time.sleep(self.rests_s)
             except GoneError:
                 return
 

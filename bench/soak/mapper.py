@@ -10,6 +10,7 @@ from bench.soak.link import Link
 from bench.soak.world import BASE, DOMAIN, remap_config
 
 _POLL_S = 0.03
+_SWITCHES = 6  # between two remaps, on average
 _FINAL = {"succeeded", "failed", "cancelled"}
 
 
@@ -36,7 +37,12 @@ class Mapper(Actor):
 
     def act(self, link: Link) -> None:
         """Ask for a remap, follow it, or switch versions."""
-        if self._job is None and not self._asking and self._rng.random() < 0.5 and len(self._sealed) > 1:
+        if (
+            self._job is None
+            and not self._asking
+            and len(self._sealed) > 1
+            and self._rng.random() < _SWITCHES / (_SWITCHES + 1)
+        ):
             self._switch(link)
         elif self._job is None:
             self._ask(link)

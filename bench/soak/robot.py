@@ -35,6 +35,8 @@ class Robot(Actor):
         session_length: It ends its session after so many observations and begins another; None: never.
     """
 
+    rests_s = 0.02
+
     def __init__(self, number: int, kind: FilterKind, session_length: int | None = None) -> None:
         self.number = number
         self.kind = kind

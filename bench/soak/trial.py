@@ -22,7 +22,9 @@ from deepsimbad.core.filters import FilterKind
 from deepsimbad_client.local_server import LocalServer
 
 N_ROBOTS, SHORT_SESSION = 4, 25
-LONGEST_LIFE_S = 3.0
+LONGEST_LIFE_S = 4.0
+_AIMS = ("", "uploading", "remap:", "activating", "rolling back")  # in turn: at any moment, or in the middle of this
+_AIMING_S, _INTO_IT_S = 5.0, {"remap:": 2.0, "uploading": 0.01, "activating": 0.02, "rolling back": 0.02}
 ENVIRONMENT = {"DEEPSIMBAD_SNAPSHOT_EVERY": "8", "DEEPSIMBAD_LOG_LEVEL": "ERROR", "DEEPSIMBAD_KEEP_MAPS": "3"}
 
 
@@ -68,8 +70,8 @@ def soak(data_dir: Path, n_kills: int, seed: int, on_kill: Callable[[int], None]
         robots += [Robot(N_ROBOTS + number, kinds[number], SHORT_SESSION) for number in range(2)]
         uploader, mapper = Uploader(), Mapper(seed)
         actors: list[Actor] = [*robots, uploader, mapper]
-        for _ in range(n_kills):
-            _live_and_die(server, actors, float(rng.uniform(0.0, LONGEST_LIFE_S)))
+        for kill in range(n_kills):
+            _live_and_die(server, actors, _AIMS[kill % len(_AIMS)], rng)
             found.doing.update([uploader.doing, mapper.doing])
             began = time.perf_counter()
             server.start()
@@ -93,7 +95,7 @@ def soak(data_dir: Path, n_kills: int, seed: int, on_kill: Callable[[int], None]
     return found
 
 
-def _live_and_die(server: LocalServer, actors: list[Actor], life_s: float) -> None:
+def _live_and_die(server: LocalServer, actors: list[Actor], aim: str, rng: np.random.Generator) -> None:
     broken: list[BaseException] = []
 
     def act(actor: Actor) -> None:
@@ -105,7 +107,11 @@ def _live_and_die(server: LocalServer, actors: list[Actor], life_s: float) -> No
     threads = [threading.Thread(target=act, args=(actor,)) for actor in actors]
     for thread in threads:
         thread.start()
-    time.sleep(life_s)
+    time.sleep(float(rng.uniform(0.0, LONGEST_LIFE_S)))
+    give_up_at = time.monotonic() + _AIMING_S
+    while not any(actor.doing.startswith(aim) for actor in actors) and time.monotonic() < give_up_at:
+        time.sleep(0.0005)
+    time.sleep(float(rng.uniform(0.0, _INTO_IT_S.get(aim, 0.0))))
     server.kill()
     for thread in threads:
         thread.join()

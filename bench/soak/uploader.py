@@ -22,6 +22,8 @@ def encoding(traverse: int, index: int) -> NDArray[np.float32]:
 class Uploader(Actor):
     """Keeps the last few traverses; what it remembers of each is the set of frames that were acknowledged."""
 
+    rests_s = 0.02
+
     def __init__(self) -> None:
         self._number = 0
         self._is_made = False
