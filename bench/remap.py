@@ -25,6 +25,7 @@ EPISODES = 10_000
 MOST_SECONDS, MOST_SECONDS_UNDER_LOAD, MOST_MEDIAN_RATIO, MOST_P99_RATIO = 60.0, 120.0, 1.5, 3.0
 _IDLE_S = 30.0
 _PAUSE_S = 0.02  # between an answer and the next request of the same robot
+_SESSION_LENGTH = 500  # moves of 1 m, then another: the route has an end
 _SPACING_M = 0.2
 _BLOCK = 1024
 _DOMAIN = "bench"
@@ -72,11 +73,16 @@ def remap_table() -> Iterator[str]:
     for before, after in zip(idle, during, strict=True):
         yield (
             f"| `POST {before.what}` | {before} | {after} | {after.median_s / before.median_s:.2f} "
-            f"| {after.p99_s / before.p99_s:.2f} | {before.n_failed + after.n_failed} of {after.n_all + before.n_all} "
-            f"| {after.versions} |"
+            f"| {after.p99_s / before.p99_s:.2f} | {_counted(before.failures + after.failures)} "
+            f"of {after.n_all + before.n_all} | {after.versions} |"
         )
     yield ""
     yield f"That remap took {remap.seconds:.1f} s (at most {MOST_SECONDS_UNDER_LOAD:.0f})."
+
+
+def _counted(failures: list[str]) -> str:
+    """How many, and which."""
+    return f"{len(failures)} ({', '.join(sorted(set(failures)))})" if failures else "0"
 
 
 @dataclass(frozen=True)
@@ -99,13 +105,13 @@ class Waits:
     Attributes:
         what: The call.
         seconds: Of every answer.
-        n_failed: Answers that were no belief.
+        failures: Status and code of answers that were no belief.
         map_versions: Of the answers, as they came, changes alone.
     """
 
     what: str
     seconds: list[float] = field(default_factory=list)
-    n_failed: int = 0
+    failures: list[str] = field(default_factory=list)
     map_versions: list[int] = field(default_factory=list)
 
     @property
@@ -172,26 +178,29 @@ async def _ask(url: str, waits: Waits, until: "asyncio.Task[Any]") -> None:
     bodies = [json.dumps({"ranked_landmarks": rng.permutation(N_LANDMARKS).tolist()}).encode() for _ in range(50)]
     connection = await BareConnection.to(url)
     path = f"/v1/domains/{_DOMAIN}/localizations"
-    if waits.what == "observations":
-        status, begun = await connection.request("POST", f"/v1/domains/{_DOMAIN}/sessions", b"{}")
-        if status != 201:
-            raise RuntimeError(f"no session: {begun!r}")
-        path = f"/v1/sessions/{json.loads(begun)['session_id']}/observations?action_m=1"
     n_asked, is_last = 0, False
     while not is_last:
         is_last = until.done()
+        if waits.what == "observations" and n_asked % _SESSION_LENGTH == 0:
+            path = f"/v1/sessions/{await _session(connection)}/observations?action_m=1"
         began = time.perf_counter()
         status, answer = await connection.request("POST", path, bodies[n_asked % len(bodies)])
         waits.seconds.append(time.perf_counter() - began)
-        if status == 200:
-            version = json.loads(answer)["map_version"]
-            if waits.map_versions[-1:] != [version]:
-                waits.map_versions.append(version)
-        else:
-            waits.n_failed += 1
+        said = json.loads(answer)
+        if status != 200:
+            waits.failures.append(f"{status} {said['code']}")
+        elif waits.map_versions[-1:] != [said["map_version"]]:
+            waits.map_versions.append(said["map_version"])
         n_asked += 1
         await asyncio.sleep(_PAUSE_S)
     connection.close()
+
+
+async def _session(connection: BareConnection) -> str:
+    status, answer = await connection.request("POST", f"/v1/domains/{_DOMAIN}/sessions", b"{}")
+    if status != 201:
+        raise RuntimeError(f"no session: {answer!r}")
+    return str(json.loads(answer)["session_id"])
 
 
 def write_seasons(data_dir: Path) -> None:
