@@ -9,8 +9,8 @@ from typing import Any, ClassVar
 import httptools
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol, RequestResponseCycle
 
+from deepsimbad.api.outgoing import n_pending_bytes, taken_mark
 from deepsimbad.api.refusal import render_refusal
-from deepsimbad.api.unsent import n_unsent_bytes
 from deepsimbad.errors import (
     DeepSimbadError,
     HeadersTooLargeError,
@@ -77,8 +77,8 @@ class LimitedProtocol(HttpToolsProtocol):
         self._running: RequestResponseCycle | None = None  # uvicorn's `cycle` is the newest, which may still wait
         self._refusal: DeepSimbadError | None = None
         self._n_dropped = 0
-        self._unsent: int | None = None  # of an answer, when last looked at; None: not watched
-        self._unsent_since = 0.0
+        self._taken: int | None = None  # a mark of how much of the answers the peer has; None: not watched
+        self._taken_since = 0.0
         self._look: asyncio.TimerHandle | None = None
         self._look_at = 0.0
 
@@ -132,10 +132,14 @@ class LimitedProtocol(HttpToolsProtocol):
         self._watch_answer()
 
     def shutdown(self) -> None:  # noqa: D102
-        if self._refusal is not None and not self._is_under_way:
-            self.transport.close()
+        is_refused = self._refusal is not None and not self._is_under_way
+        if is_refused or self.cycle is None or self.cycle.response_complete:
+            self._close()
         else:
             super().shutdown()
+
+    def timeout_keep_alive_handler(self) -> None:  # noqa: D102
+        self._close()
 
     # The parser's side
 
@@ -208,7 +212,7 @@ class LimitedProtocol(HttpToolsProtocol):
 
     def on_response_complete(self) -> None:  # noqa: D102
         super().on_response_complete()
-        if self.transport.get_write_buffer_size() > 0:
+        if self.scheme == "https" or self.transport.get_write_buffer_size() > 0:
             self._watch_answer()
         if self._refusal is not None and not self._is_under_way:
             self._unset_keepalive_if_required()
@@ -232,16 +236,16 @@ class LimitedProtocol(HttpToolsProtocol):
     def _look_now(self) -> None:
         self._look = None
         now = self.loop.time()
-        if self._unsent is not None and not self._answer_moves(now):
+        if self._taken is not None and not self._answer_moves(now):
             return
-        if self._refusal is not None:
+        if self._refusal is not None or self.transport.is_closing():
             return
         if self._place in {_FRESH, _HEAD}:
             self._time_out_at(now, self._since + self.limits.header_timeout_s)
         elif self._place == _BODY:
             if self.flow.read_paused or self.cycle.waiting_for_100_continue:  # it is we who do not read
                 self._since = now
-                self._look_by(now + self.limits.stall_timeout_s / _LOOKS_PER_STALL)
+                self._look_by(now + self._look_every_s)
             else:
                 self._time_out_at(now, self._since + self.limits.stall_timeout_s)
 
@@ -250,7 +254,7 @@ class LimitedProtocol(HttpToolsProtocol):
             self._look_by(at)
         elif self._place == _FRESH:
             self.limits.refused("silent_connection")
-            self.transport.close()
+            self.transport.abort()  # nothing was written, and the peer of a handshake might not let it close
         elif self._place == _HEAD:
             limit_s = self.limits.header_timeout_s
             self._refuse(RequestTimeoutError(f"the request's headers were not whole after {limit_s:g} s"))
@@ -259,24 +263,37 @@ class LimitedProtocol(HttpToolsProtocol):
             self._refuse(RequestTimeoutError(f"no byte of the request's body came for {limit_s:g} s"))
 
     def _watch_answer(self) -> None:
-        if self._unsent is None:
-            self._unsent, self._unsent_since = n_unsent_bytes(self.transport), self.loop.time()
-            self._look_by(self._unsent_since + self.limits.stall_timeout_s / _LOOKS_PER_STALL)
+        if self._taken is None:
+            self._taken, self._taken_since = taken_mark(self.transport), self.loop.time()
+            self._look_by(self._taken_since + self._look_every_s)
 
     def _answer_moves(self, now: float) -> bool:
         """Whether the peer takes what it asked for; the connection is cut where it does not."""
-        if self.transport.get_write_buffer_size() == 0:
-            self._unsent = None
+        if n_pending_bytes(self.transport) == 0:
+            self._taken = None
+            if self.transport.is_closing():  # by a handshake that the peer leaves open
+                self.transport.abort()
+                return False
             return True
-        n_unsent = n_unsent_bytes(self.transport)
-        if n_unsent != self._unsent:
-            self._unsent, self._unsent_since = n_unsent, now
-        if now - self._unsent_since >= self.limits.stall_timeout_s:
+        taken = taken_mark(self.transport)
+        if taken != self._taken:
+            self._taken, self._taken_since = taken, now
+        if now - self._taken_since >= self.limits.stall_timeout_s:
             self.limits.refused("answer_not_read")
             self.transport.abort()
             return False
-        self._look_by(now + self.limits.stall_timeout_s / _LOOKS_PER_STALL)
+        self._look_by(now + self._look_every_s)
         return True
+
+    @property
+    def _look_every_s(self) -> float:
+        return min(self.limits.stall_timeout_s / _LOOKS_PER_STALL, LINGER_S)
+
+    def _close(self) -> None:
+        """Close when what was written has gone; cut where the peer does not let it."""
+        if self.scheme == "https" or self.transport.get_write_buffer_size() > 0:
+            self._watch_answer()
+        self.transport.close()
 
     # Refusing
 
@@ -290,7 +307,7 @@ class LimitedProtocol(HttpToolsProtocol):
             _disconnect(own)
             if own.response_started:  # there is only one answer a request
                 self.limits.refused(error.code)
-                self.transport.close()
+                self._close()
                 return
         elif own is not None:
             self.pipeline.popleft()  # its head was whole, so it waits there, newest first; it never runs
@@ -310,6 +327,9 @@ class LimitedProtocol(HttpToolsProtocol):
             extra={"request_id": request_id, "status": status, "code": error.code, "peer": (self.client or ("",))[0]},
         )
         self.transport.write(answer)
+        if isinstance(error, RequestTimeoutError):  # nothing of it is on its way
+            self._close()
+            return
         if self.transport.can_write_eof():
             self.transport.write_eof()
         self.flow.resume_reading()  # closing on unread bytes would reset the connection under the answer
@@ -323,10 +343,11 @@ class LimitedProtocol(HttpToolsProtocol):
             self._end_linger()
 
     def _end_linger(self) -> None:
-        if self.transport.get_write_buffer_size() > 0:
-            self.transport.abort()
+        self._look = None
+        if n_pending_bytes(self.transport) == 0:
+            self.transport.abort()  # all is with the peer, who may still be sending
         else:
-            self.transport.close()
+            self._close()
 
 
 def _disconnect(cycle: RequestResponseCycle) -> None:

@@ -14,6 +14,9 @@ except ImportError:  # where it cannot be installed
     from asyncio import SelectorEventLoop as _Loop  # type: ignore[assignment]
 
 
+_SHUTDOWN_TIMEOUT_S = 3600.0  # the protocol itself cuts who does not move; who does gets the end of a long answer
+
+
 def tls_context(certificate: Path | None, key: Path | None) -> ssl.SSLContext | None:
     """What to serve HTTPS with.
 
@@ -67,7 +70,7 @@ def loop_for_tls(handshake_timeout_s: float) -> Callable[[], asyncio.AbstractEve
     class Loop(_Loop):
         async def create_server(self, *args: Any, **kwargs: Any) -> Any:
             if kwargs.get("ssl") is not None:
-                kwargs["ssl_handshake_timeout"] = handshake_timeout_s
+                kwargs |= {"ssl_handshake_timeout": handshake_timeout_s, "ssl_shutdown_timeout": _SHUTDOWN_TIMEOUT_S}
             return await super().create_server(*args, **kwargs)
 
     return Loop
