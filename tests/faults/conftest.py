@@ -57,13 +57,18 @@ class Service:
     """`deepsimbad serve` as a process between `with` and the end of its block, and requests to it.
 
     Its log goes through a pipe, so that it is not on the disk that is taken away.
+
+    Args:
+        data_dir: Its data directory.
+        ready: Whether to wait until it is ready; else until it answers at all.
     """
 
-    def __init__(self, data_dir: Path) -> None:
+    def __init__(self, data_dir: Path, ready: bool = True) -> None:
         with socket.socket() as probe:
             probe.bind(("127.0.0.1", 0))
             self._port = int(probe.getsockname()[1])
         self._data_dir = data_dir
+        self._asked_first = "/readyz" if ready else "/healthz"
         self._client = httpx2.Client(base_url=f"http://127.0.0.1:{self._port}", timeout=60, trust_env=False)
         self.log: list[str] = []
 
@@ -137,7 +142,7 @@ class Service:
 
     def _is_ready(self) -> bool:
         try:
-            return self.ask("GET", "/readyz").status_code == 200
+            return self.ask("GET", self._asked_first).status_code == 200
         except httpx2.TransportError:
             return False
 
