@@ -136,3 +136,35 @@ def test_a_request_without_body_is_left_alone() -> None:
     sender = Sender([b""])
     ask(reads_nothing, sender)
     assert sender.answers == [START, END]
+
+
+@pytest.mark.parametrize(
+    ("headers", "allowed"),
+    [
+        ({"content_encoding": "gzip", "content_length": "5"}, "identity"),
+        ({"content_encoding": "GZIP", "transfer_encoding": "chunked"}, "identity"),
+        ({"content_encoding": "identity, br", "content_length": "5"}, "identity"),
+        ({"transfer_encoding": "gzip, chunked"}, "chunked"),
+        ({"transfer_encoding": "identity"}, "chunked"),
+    ],
+)
+def test_a_packed_body_is_refused(headers: dict[str, str], allowed: str) -> None:
+    sender = Sender([b"12345"])
+    ask(reads_all, sender, **headers)
+    assert sender.status == 415
+    assert json.loads(sender.answers[1]["body"])["allowed"] == [allowed]
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [
+        {"content_encoding": "gzip"},  # of no body
+        {"content_encoding": "identity", "content_length": "5"},
+        {"content_encoding": "", "content_length": "5"},
+        {"transfer_encoding": "Chunked"},
+    ],
+)
+def test_a_body_as_it_is_passes(headers: dict[str, str]) -> None:
+    sender = Sender([b"12345"])
+    ask(reads_all, sender, **headers)
+    assert sender.status == 200
