@@ -50,12 +50,14 @@ class Described:
             None: as `built`.
         telling_bits: [n] float32, how telling every place is; None where no second season is known.
         off_route: How a robot off the route is known; None as well.
+        second_dissimilarities: [m, r] float32 of the second drive, where they were computed: training wants them too.
     """
 
     built: RetrievalMap
     rehearsal: RetrievalMap | None = None
     telling_bits: NDArray[np.float32] | None = None
     off_route: OffRouteModel | None = None
+    second_dissimilarities: NDArray[np.float32] | None = None
 
 
 def describe(
@@ -84,20 +86,20 @@ def describe(
     own = dissimilarities_to(
         training.encodings, evaluator, model, lambda share: on_progress(share / 2 if two else share)
     )
-    season = None
+    season = other = None
     if two and second is not None:
         other = dissimilarities_to(second.encodings, evaluator, model, lambda share: on_progress(0.5 + share / 4))
         season = SecondSeason(other, same_places(route_of(second), route))
     built = build_retrieval_map(relevance, own, list_length, training.encodings, season)
     if season is None or built.calibration is None or not built.calibration.is_of_two_seasons:
         on_progress(1.0)
-        return Described(built)
+        return Described(built, second_dissimilarities=other)
     # Judged by lists that do not know the second season, as no list knows the season to come.
     unaware = build_retrieval_map(relevance, own, list_length)
     rehearsal = replace(unaware, calibration=_unaware(built, unaware))
     bits = telling_bits(rehearsal, season, route)
     on_progress(0.9)
-    return Described(built, rehearsal, bits, OffRouteModel.learn(rehearsal, season, route))
+    return Described(built, rehearsal, bits, OffRouteModel.learn(rehearsal, season, route), other)
 
 
 def _unaware(built: RetrievalMap, unaware: RetrievalMap) -> Calibration:

@@ -228,12 +228,15 @@ def _trained(
 ) -> Experience:
     """The experience database."""
     config, closed = inputs.config, inputs.domain.closed
+    second = None
+    if inputs.second is not None:
+        second = DescribedDrive.of(inputs.second, closed, evaluator, model, found.second_dissimilarities)
     return train_nnql(
         found.rehearsal or found.built,
         inputs.route,
         inputs.domain.actions_m,
         partial(DescribedDrive.of, inputs.training, closed, evaluator, model),
-        None if inputs.second is None else DescribedDrive.of(inputs.second, closed, evaluator, model),
+        second,
         NnqlConfig(n_episodes=config.training_episodes, seed=config.seed),
         progress.update,
         n_threads,

@@ -40,7 +40,7 @@ def unpack_experience(kept: Checkpoint) -> Experience:
 
 
 def pack_described(found: Described) -> Checkpoint:
-    """A described traverse, without its encodings: those are in the traverse's file."""
+    """A described traverse, without its encodings and the second drive's dissimilarities: their traverses are there."""
     arrays: dict[str, NDArray[Any]] = {}
     document: dict[str, Any] = {}
     for name, built in ((_BUILT, found.built), (_REHEARSAL, found.rehearsal)):

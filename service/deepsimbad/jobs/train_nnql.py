@@ -55,9 +55,18 @@ class DescribedDrive:
     encodings: NDArray[np.float32]
 
     @classmethod
-    def of(cls, frames: TraverseFrames, closed: bool, evaluator: Evaluator, model: LandmarkModel) -> Self:
-        """Describe a traverse by a map's landmarks."""
+    def of(
+        cls,
+        frames: TraverseFrames,
+        closed: bool,
+        evaluator: Evaluator,
+        model: LandmarkModel,
+        dissimilarities: NDArray[np.float32] | None = None,
+    ) -> Self:
+        """Describe a traverse by a map's landmarks, or take the description that is known."""
         encodings = frames.encodings
+        if dissimilarities is not None:
+            return cls(route_of(frames, closed), dissimilarities, encodings)
         blocks = [
             evaluator.dissimilarities(encodings[start : start + _FRAMES_A_BLOCK], model)
             for start in range(0, len(encodings), _FRAMES_A_BLOCK)
