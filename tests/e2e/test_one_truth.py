@@ -7,7 +7,8 @@ import sys
 import numpy as np
 import pytest
 
-from deepsimbad.core.metrics import RetrievalScorer, true_images_of
+from deepsimbad.core.metrics import RetrievalScorer
+from deepsimbad.core.true_images import true_images_of
 from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
 from deepsimbad.jobs.encoded_traverse import encode_recording
 from deepsimbad.store.catalog import Catalog

@@ -8,7 +8,7 @@ from statistics import NormalDist
 import numpy as np
 import pytest
 
-from deepsimbad.core.metrics import true_images_of
+from deepsimbad.core.true_images import true_images_of
 from deepsimbad.core.relevance import Relevance
 from deepsimbad.errors import CancelledError, TooFewCandidatesError
 from deepsimbad.jobs.encoded_traverse import encode_recording
