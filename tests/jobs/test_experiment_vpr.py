@@ -8,8 +8,8 @@ from statistics import NormalDist
 import numpy as np
 import pytest
 
-from deepsimbad.core.true_images import true_images_of
 from deepsimbad.core.relevance import Relevance
+from deepsimbad.core.true_images import true_images_of
 from deepsimbad.errors import CancelledError, TooFewCandidatesError
 from deepsimbad.jobs.encoded_traverse import encode_recording
 from deepsimbad.jobs.experiment_vpr import VprConfig, run_vpr, vpr_stages
