@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import httptools
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol, RequestResponseCycle
 
-from deepsimbad.api.outgoing import n_pending_bytes, taken_mark
+from deepsimbad.api.outgoing import Outgoing, n_pending_bytes
 from deepsimbad.api.refusal import render_refusal
 from deepsimbad.errors import (
     DeepSimbadError,
@@ -77,8 +77,7 @@ class LimitedProtocol(HttpToolsProtocol):
         self._running: RequestResponseCycle | None = None  # uvicorn's `cycle` is the newest, which may still wait
         self._refusal: DeepSimbadError | None = None
         self._n_dropped = 0
-        self._taken: int | None = None  # a mark of how much of the answers the peer has; None: not watched
-        self._taken_since = 0.0
+        self._outgoing: Outgoing  # as soon as there is a transport
         self._look: asyncio.TimerHandle | None = None
         self._look_at = 0.0
 
@@ -86,6 +85,7 @@ class LimitedProtocol(HttpToolsProtocol):
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]  # noqa: D102
         super().connection_made(transport)
+        self._outgoing = Outgoing(transport)
         if len(self.connections) > self.limits.max_connections:
             self._refusal = OverloadedError("too many connections")
             self.limits.refused("max_connections")
@@ -236,7 +236,7 @@ class LimitedProtocol(HttpToolsProtocol):
     def _look_now(self) -> None:
         self._look = None
         now = self.loop.time()
-        if self._taken is not None and not self._answer_moves(now):
+        if self._outgoing.is_watched and not self._answer_moves(now):
             return
         if self._refusal is not None or self.transport.is_closing():
             return
@@ -263,22 +263,19 @@ class LimitedProtocol(HttpToolsProtocol):
             self._refuse(RequestTimeoutError(f"no byte of the request's body came for {limit_s:g} s"))
 
     def _watch_answer(self) -> None:
-        if self._taken is None:
-            self._taken, self._taken_since = taken_mark(self.transport), self.loop.time()
-            self._look_by(self._taken_since + self._look_every_s)
+        if not self._outgoing.is_watched:
+            now = self.loop.time()
+            self._outgoing.watch(now)
+            self._look_by(now + self._look_every_s)
 
     def _answer_moves(self, now: float) -> bool:
         """Whether the peer takes what it asked for; the connection is cut where it does not."""
-        if n_pending_bytes(self.transport) == 0:
-            self._taken = None
+        stalled_s = self._outgoing.stalled_s(now)
+        if stalled_s is None:
             if self.transport.is_closing():  # by a handshake that the peer leaves open
                 self.transport.abort()
-                return False
-            return True
-        taken = taken_mark(self.transport)
-        if taken != self._taken:
-            self._taken, self._taken_since = taken, now
-        if now - self._taken_since >= self.limits.stall_timeout_s:
+            return not self.transport.is_closing()
+        if stalled_s >= self.limits.stall_timeout_s:
             self.limits.refused("answer_not_read")
             self.transport.abort()
             return False
