@@ -84,8 +84,8 @@ class Service:
         self._reading.start()
         give_up = time.monotonic() + READY_WITHIN_S
         while not self._is_ready():
-            assert self._process.poll() is None, "".join(self.log)
-            assert time.monotonic() < give_up, "".join(self.log)
+            assert self._process.poll() is None, "".join(self.log[-5:])
+            assert time.monotonic() < give_up, "".join(self.log[-5:])
             time.sleep(0.05)
         return self
 
@@ -117,7 +117,7 @@ class Service:
         assert answer.status_code >= 400, answer.text
         assert answer.headers["content-type"] == "application/problem+json"
         problem: dict[str, Any] = answer.json()
-        assert problem["code"] != "internal_error", "".join(self.log)
+        assert problem["code"] != "internal_error", "".join(self.log[-5:])
         return problem
 
     def observe(self, session_id: str, view: int, **more: Any) -> dict[str, Any]:
@@ -140,6 +140,13 @@ class Service:
             time.sleep(0.05)
         raise AssertionError("the job did not end")
 
+    def logged(self, message: str) -> None:
+        """Wait until the service has logged something."""
+        give_up = time.monotonic() + 60
+        while not any(f'"message": "{message}"' in line for line in list(self.log)):
+            assert time.monotonic() < give_up, self.log[-5:]
+            time.sleep(0.05)
+
     def _is_ready(self) -> bool:
         try:
             return self.ask("GET", self._asked_first).status_code == 200
@@ -148,7 +155,8 @@ class Service:
 
     def _read(self) -> None:
         assert self._process.stderr is not None
-        self.log.extend(self._process.stderr)
+        for line in self._process.stderr:
+            self.log.append(line)
 
     def _ended(self) -> None:
         try:
