@@ -7,11 +7,11 @@ import pytest
 
 from deepsimbad.core.calibration import DEFAULT_CORRELATION, SeasonsOfRoute, live_prior
 from deepsimbad.core.descriptor import rank_landmarks
-from deepsimbad.core.metrics import same_places
 from deepsimbad.core.relevance import Query, Relevance, relevances
 from deepsimbad.core.retrieval import SecondSeason, build_retrieval_map
 from deepsimbad.core.route import Route
 from deepsimbad.core.statistics import LandmarkStatistics
+from deepsimbad.core.true_images import same_places
 
 N_IMAGES, N_LANDMARKS, LIST_LENGTH = 80, 12, 3
 
