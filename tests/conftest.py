@@ -10,6 +10,8 @@ from hypothesis import settings
 settings.register_profile("project", deadline=None, derandomize=True, print_blob=True)
 settings.load_profile("project")
 
+os.environ.pop("COLUMNS", None)  # a parallel run sets one, too narrow for the tables that a pipe gets
+
 PROJECT = Path(__file__).resolve().parent.parent
 
 
