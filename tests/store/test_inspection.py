@@ -134,6 +134,7 @@ def test_what_a_crash_leaves_is_no_damage(furnished: Path) -> None:
         "domains/campus/notes.txt",
         "domains/campus/traverses/autumn.new",
         "domains/campus/traverses/gone.sqlite-wal",
+        "domains/empty",
         "domains/stranger",
         "jobs/" + "0" * 32,
         "what.is.this",
@@ -143,6 +144,7 @@ def test_what_a_crash_leaves_is_no_damage(furnished: Path) -> None:
             (furnished / name).touch()
         else:
             (furnished / name).mkdir()
+    (furnished / "domains/stranger/precious").touch()
     found = inspected(furnished)
     assert found.damaged == ()
     assert [finding.file for finding in found.left_over] == left
