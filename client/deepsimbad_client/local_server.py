@@ -62,10 +62,17 @@ class LocalServer:
                 stderr=log,
                 env={**os.environ, **self._environment},
             )
+        try:
+            self._wait_until_ready()
+        except BaseException:  # nobody else would end it
+            self.stop()
+            raise
+
+    def _wait_until_ready(self) -> None:
         give_up_at = time.monotonic() + _READY_WITHIN_S
         while not self._is_ready():
-            if self._process.poll() is not None or time.monotonic() > give_up_at:
-                self.stop()
+            has_ended = self._process is None or self._process.poll() is not None
+            if has_ended or time.monotonic() > give_up_at:
                 lines = self.log_path.read_text(encoding="utf-8", errors="replace").splitlines()[-5:]
                 raise DeepSimbadClientError(f"the service did not start; its log ends: {' | '.join(lines)}")
             time.sleep(0.05)
