@@ -103,6 +103,31 @@ def test_an_old_log_that_is_written_over_is_whole(written: sqlite3.Connection, t
         check_log(died(tmp_path, bytes(flipped)))
 
 
+def test_a_power_cut_inside_a_commit_is_no_damage(written: sqlite3.Connection, tmp_path: Path) -> None:
+    """The system writes the pages of an unfinished transaction out in any order, its last one perhaps first."""
+    written.execute("PRAGMA wal_checkpoint")
+    written.execute("INSERT INTO t VALUES ('acknowledged')")
+    log = tmp_path / "live.sqlite-wal"
+    before = log.read_bytes()
+    written.execute("INSERT INTO t VALUES (?)", [bytes(5 * PAGE)])
+    after = log.read_bytes()
+    changed = [at for at in range(32, len(after), FRAME) if before[at : at + FRAME] != after[at : at + FRAME]]
+    assert len(changed) > 3, "the slots of an older generation were written over"
+    for missing in changed[:-1]:
+        for first, last in ((missing, missing + FRAME), (missing - 100, missing + FRAME - 100)):
+            if first < changed[0]:
+                continue
+            torn = after[:first] + before[first:last] + after[last:]
+            path = died(tmp_path, torn)
+            check_log(path)
+            assert rows_sqlite_finds(path) == N_ROWS + 1, "what was acknowledged is there"
+    written.execute("INSERT INTO t VALUES ('acknowledged too')")
+    whole = log.read_bytes()
+    lost = whole[: changed[0]] + before[changed[0] : changed[0] + FRAME] + whole[changed[0] + FRAME :]
+    with pytest.raises(DamagedFileError):  # only the last transaction can be one that was never acknowledged
+        check_log(died(tmp_path, lost))
+
+
 def test_what_was_rolled_back_is_no_damage(written: sqlite3.Connection, tmp_path: Path) -> None:
     written.execute("PRAGMA cache_size = 5")
     written.execute("BEGIN")

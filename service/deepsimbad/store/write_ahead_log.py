@@ -2,7 +2,8 @@
 
 After a crash SQLite takes from the log what it can verify and silently forgets the rest. That is right for a
 transaction that was being written, and wrong for one that was acknowledged and then damaged on the disk: it would be
-lost without a word. So the log is looked through before SQLite sees it. Its format is described at
+lost without a word. So the log is looked through before SQLite sees it; only its last transaction can be one that was
+never acknowledged, since every commit waits for the disk (synchronous FULL). Its format is described at
 https://sqlite.org/fileformat2.html#walformat.
 """
 
@@ -45,7 +46,7 @@ def check_log(database: Path) -> None:
             return
     raise DamagedFileError(
         f"{log.name} is damaged at byte {place}: changes that were acknowledged can no longer be read. Restore a "
-        f"backup, or move {log.name} away to go on without its changes",
+        f"backup, or go on with what lies before it: sqlite3 {database.name} 'PRAGMA wal_checkpoint(TRUNCATE)'",
         file=log.name,
         byte=place,
     )
@@ -83,7 +84,8 @@ def _damaged_frame(stream: BinaryIO, header: bytes, page_size: int, *, is_first:
     power, _, _ = _weights(page_size)
     stream.seek(_HEADER_BYTES)
     n_at_once = max(1, _BYTES_AT_ONCE // frame_bytes)
-    n_seen, first_bad = 0, None
+    n_seen, first_bad, n_lost = 0, None, 0
+    is_torn = False
     while block := stream.read(n_at_once * frame_bytes):
         n = len(block) // frame_bytes
         if n == 0:
@@ -91,7 +93,9 @@ def _damaged_frame(stream: BinaryIO, header: bytes, page_size: int, *, is_first:
         frames = _frames(block, header, page_size)
         is_current = (frames.fields[:, 2:4] == salts).all(axis=1)
         is_commit = is_current & (frames.fields[:, 1] != 0)
+        is_stale = (frames.fields[:, 2:4] != salts).all(axis=1)  # a flipped byte changes one of the two salts
         stored = frames.fields[:, 4:6]
+        n_commits = int(is_commit.sum())
         if first_bad is None:
             follows = np.concatenate([before[np.newaxis], stored[:-1]]) @ power.T + frames.added
             is_good = is_current & (follows == stored).all(axis=1)
@@ -100,14 +104,21 @@ def _damaged_frame(stream: BinaryIO, header: bytes, page_size: int, *, is_first:
                 first_bad = n_seen + bad
                 ends_the_file = _HEADER_BYTES + (first_bad + 1) * frame_bytes == n_bytes
                 # A slot that was used before may hold a new header over an old page after a kill; a fresh one cannot.
-                was_fresh = is_first and ends_the_file and frames.fields[bad, 1] != 0
-                if is_commit[bad + 1 :].any() or was_fresh:
+                if is_first and ends_the_file and frames.fields[bad, 1] != 0:
                     return _HEADER_BYTES + first_bad * frame_bytes
+                is_torn = bool(is_stale[bad : bad + 2].any())
+                n_commits = int(is_commit[bad + 1 :].sum())
+            else:
+                n_commits = 0
             before = stored[-1]
-        elif is_commit.any():
-            return _HEADER_BYTES + first_bad * frame_bytes
+        elif first_bad == n_seen - 1:  # the last of the block before
+            is_torn = is_torn or bool(is_stale[0])
+        n_lost += n_commits
         n_seen += n
-    return None
+    # A power cut while one transaction is being written leaves pages of it out in any order: the slot of one that is
+    # missing, or the one behind it, is as the log's generation before left it. It was the last, and not acknowledged.
+    is_damaged = n_lost > 1 or (n_lost == 1 and not is_torn)
+    return _HEADER_BYTES + first_bad * frame_bytes if is_damaged and first_bad is not None else None
 
 
 def _frames(block: bytes, header: bytes, page_size: int) -> _Frames:
