@@ -58,6 +58,12 @@ def triplet_options(command: _Command) -> _Command:
             help="Write the result as JSON to FILE; without FILE to standard output.",
         ),
         config_option,
+        click.option(  # as every command does, so that a script may give it to all of them
+            "--data-dir",
+            type=click.Path(file_okay=False, path_type=Path),
+            expose_value=False,
+            help="Taken as by every command; an experiment reads and keeps nothing there.",
+        ),
     )
     return reduce(lambda decorated, option: option(decorated), reversed(options), command)
 
