@@ -110,3 +110,16 @@ def test_a_check_raises_and_reports_nothing(seen):
     with pytest.raises(CancelledError):
         progress.check()
     assert seen == []
+
+
+def test_a_stage_that_takes_longer_than_expected_tells_so_by_its_own_pace(clock, seen):
+    progress = Progress({"select": 6.0, "train": 3.0, "seal": 1.0}, seen.append, interval_s=0, clock=clock)
+    progress.stage("select")
+    clock.now_s += 6
+    progress.stage("train")
+    assert seen[-1].eta_s == pytest.approx(4.0), "nothing is known of it yet but its weight"
+    clock.now_s += 30
+    progress.update(0.1)
+    assert seen[-1].eta_s == pytest.approx(270 + 36 / 0.63 * 0.1)
+    progress.update(1.0)
+    assert seen[-1].eta_s == pytest.approx(36 / 0.9 * 0.1)

@@ -14,7 +14,8 @@ class ProgressState:
     Attributes:
         stage: The stage under way.
         progress: Share of all stages done, 0..1.
-        eta_s: Seconds that are probably left; None while too little is done to tell.
+        eta_s: Seconds that are probably left: of the stage under way by its own pace, of those after it by the pace of
+            all; None while too little is done to tell.
     """
 
     stage: str
@@ -49,6 +50,7 @@ class Progress:
         self._clock = clock
         self._started_s = clock()
         self._reported_s = float("-inf")
+        self._stage_began_s = self._started_s
         self._stage = ""
         self._skipped = 0.0
 
@@ -66,6 +68,7 @@ class Progress:
         if name not in self._weights:
             raise ValueError(f"stage {name!r} is not one of {list(self._weights)}")
         self._stage = name
+        self._stage_began_s = self._clock()
         self._report(0.0, always=True)
 
     def update(self, share: float) -> None:
@@ -83,9 +86,20 @@ class Progress:
             return
         self._reported_s = now_s
         names = list(self._weights)
-        before = sum(self._weights[name] for name in names[: names.index(self._stage)])
-        done = (before + share * self._weights[self._stage]) / sum(self._weights.values())
-        elapsed_s = now_s - self._started_s
+        total = sum(self._weights.values())
+        before = sum(self._weights[name] for name in names[: names.index(self._stage)]) / total
+        weight = self._weights[self._stage] / total
+        done = before + share * weight
+        self._on_change(ProgressState(self._stage, done, self._eta_s(now_s, share, weight, done)))
+
+    def _eta_s(self, now_s: float, share: float, weight: float, done: float) -> float | None:
         worked = done - self._skipped
-        eta_s = elapsed_s * (1 - done) / worked if worked > 0.01 else None
-        self._on_change(ProgressState(self._stage, done, eta_s))
+        if worked <= 0.01:
+            return None
+        pace_s = (now_s - self._started_s) / worked
+        # A stage may take a multiple of its expected share: of how long to train was asked for, its weight knows nothing.
+        if share > 0.01:
+            of_stage_s = (now_s - self._stage_began_s) * (1 - share) / share
+        else:
+            of_stage_s = pace_s * weight * (1 - share)
+        return of_stage_s + pace_s * max(0.0, 1 - done - weight * (1 - share))
