@@ -24,7 +24,11 @@ from deepsimbad_client.tables import gate_verdict, job_table
 )
 @click.option("--n-landmarks", type=click.IntRange(min=1), help="r; absent: the service's default.")
 @click.option("--list-length", type=click.IntRange(min=1), help="h, landmarks a map image keeps.")
-@click.option("--relevance", metavar="NAME", help="standardised, rrf, bag_of_landmarks, simbad or brute_force.")
+@click.option(
+    "--relevance",
+    metavar="NAME",
+    help="calibrated, standardised, rrf, bag_of_landmarks, simbad or brute_force; absent: the service's default.",
+)
 @click.option("--training-episodes", type=click.IntRange(min=0), help="Length of the planner's training.")
 @click.option("--seed", type=int)
 @click.option("--activate/--no-activate", default=True, show_default=True, help="Serve the new map at once.")

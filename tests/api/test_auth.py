@@ -284,6 +284,21 @@ def test_scopes(catalog: Catalog) -> None:
     assert call.n_reached == 4
 
 
+def test_the_log_line_of_a_revoked_key_says_whose(catalog: Catalog) -> None:
+    record, key = catalog.create_key(KeyScope.LOCALIZE)
+    ring = ring_of(catalog)
+    catalog.revoke_key(record.key_id)
+    asyncio.run(ring.reread())
+    scope = scope_of("/v1/domains", bearer(key.text))
+    answer = Caller(ring)(scope)
+    assert answer is not None
+    assert answer[0] == 401
+    assert scope["state"]["key_id"] == record.key_id
+    forged = scope_of("/v1/domains", bearer(ApiKey(record.key_id, ApiKey.new().secret).text))
+    Caller(ring)(forged)
+    assert "key_id" not in forged["state"], "who only knows an id is nobody"
+
+
 def test_refused_before_the_body(catalog: Catalog) -> None:
     catalog.create_key(KeyScope.ADMIN)
     call = Caller(ring_of(catalog))

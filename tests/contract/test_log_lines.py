@@ -2,6 +2,8 @@
 
 import logging
 import re
+import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -10,6 +12,9 @@ import pytest
 from starlette.testclient import TestClient
 
 from deepsimbad.api.app import create_app
+from deepsimbad.errors import CancelledError
+from deepsimbad.store.catalog import Catalog
+from deepsimbad.store.records import JobState
 
 from .conftest import make_ready_domain, remap, small_settings
 
@@ -101,3 +106,27 @@ def test_jobs_and_maps_that_serve_are_told(tmp_path: Path, lines: pytest.LogCapt
         ("map rolled back", 1, 2),
     ]
     assert all(line["domain"] == "ready" for line in switched)
+
+
+def test_a_job_that_the_service_stops_with_is_not_told_as_cancelled(
+    tmp_path: Path, lines: pytest.LogCaptureFixture
+) -> None:
+    with TestClient(create_app(small_settings(tmp_path))) as client:
+        make_ready_domain(client, "ready")
+    began = threading.Event()
+
+    def until_stopped(job: Any, on_progress: Any, is_cancelled: Any) -> dict[str, Any]:
+        began.set()
+        while not is_cancelled():
+            time.sleep(0.01)
+        raise CancelledError("stopped")
+
+    lines.clear()
+    with TestClient(create_app(small_settings(tmp_path), until_stopped)) as client:
+        job_id = client.post("/v1/admin/domains/ready/remaps", json={"training_traverse": "drive"}).json()["job_id"]
+        assert began.wait(20)
+    told_of_jobs = [record.message for record in lines.records if record.message.startswith("job ")]
+    assert told_of_jobs == ["job started", "job stopped"]
+    catalog = Catalog.open(tmp_path)
+    assert catalog.job(job_id).state is JobState.QUEUED, "the next service goes on with it"
+    catalog.close()

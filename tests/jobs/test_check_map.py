@@ -184,6 +184,14 @@ def test_maps_of_different_stretches_cannot_be_compared(store, made, seasons):
     assert check["anr"] is not None
 
 
+def test_a_check_on_the_drive_that_the_active_map_is_made_of_says_so(made, seasons):
+    made(training_traverse="good")
+    check = made(training_traverse="bad", check_traverse="good", gate_margin=0.0)["metrics"]["check"]
+    assert (check["anr_active"], check["active_version"]) == (None, 1)
+    assert "map 1, which serves, was made of traverse good itself" in check["why"]
+    assert "check on another drive" in check["why"]
+
+
 def test_a_map_without_any_place_of_the_check_traverse_loses_its_gate(store, made, seasons, catalog):
     made(training_traverse="good")
     store("elsewhere", season(0.2, 5), 1000.0 + np.arange(PLACES))

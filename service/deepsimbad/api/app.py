@@ -227,7 +227,10 @@ def _start(settings: Settings, metrics: Metrics, keys: KeyRing, run_job: RunJob,
         except DeepSimbadError:
             log.exception("a new map cannot be served", extra={"domain": domain})
 
-    runner = JobRunner(catalog, watched(run_job, metrics), switched)
+    def goes_on(job_id: str) -> bool:
+        return runner.gives_back(job_id)
+
+    runner = JobRunner(catalog, watched(run_job, metrics, goes_on), switched)
     parts.callback(runner.close)
     readiness = ReadinessCheck(
         catalog,

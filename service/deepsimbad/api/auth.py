@@ -132,8 +132,13 @@ class AuthMiddleware:
     def _check(self, scope: Scope, needed: KeyScope) -> None:
         if self.keys.is_open:
             return
-        record = self.keys.holder(presented_key(scope))
-        scope.setdefault("state", {})["key_id"] = record.key_id
+        noted = scope.setdefault("state", {})  # for the log
+        try:
+            record = self.keys.holder(presented_key(scope))
+        except UnauthorizedError as error:
+            noted |= {name: value for name, value in error.hints.items() if name == "key_id"}  # revoked or expired
+            raise
+        noted["key_id"] = record.key_id
         self.rate_limit.take(record.key_id)
         if not record.scope.includes(needed):
             raise ForbiddenError(

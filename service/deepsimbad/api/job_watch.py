@@ -14,12 +14,13 @@ from deepsimbad.store.records import JobRecord, JobState
 log = logging.getLogger(__name__)
 
 
-def watched(run_job: RunJob, metrics: Metrics) -> RunJob:
+def watched(run_job: RunJob, metrics: Metrics, gives_back: Callable[[str], bool]) -> RunJob:
     """The same, watched.
 
     Args:
         run_job: Does a job.
         metrics: Told how long it took.
+        gives_back: Whether the job of this id, which was stopped, goes on at the next start.
     """
 
     def run(
@@ -33,16 +34,19 @@ def watched(run_job: RunJob, metrics: Metrics) -> RunJob:
             result = run_job(job, on_progress, is_cancelled)
             state = JobState.SUCCEEDED
             told = {"map_version": result["map_version"], "active": result["active"]}
-        except CancelledError:  # or the service stops, and the next one goes on with it
-            state = JobState.CANCELLED
+        except CancelledError:
+            state = JobState.QUEUED if gives_back(job.job_id) else JobState.CANCELLED
             raise
         except DeepSimbadError as error:
             told = {"code": error.code, "why": error.message}
             raise
         finally:
             seconds = time.perf_counter() - began
-            metrics.job_ended(job.kind, state.value, seconds)
-            log.info("job ended", extra={**about, "state": state.value, "seconds": round(seconds, 2), **told})
+            if state is JobState.QUEUED:  # the service stops; the next one goes on with it
+                log.info("job stopped", extra={**about, "seconds": round(seconds, 2)})
+            else:
+                metrics.job_ended(job.kind, state.value, seconds)
+                log.info("job ended", extra={**about, "state": state.value, "seconds": round(seconds, 2), **told})
         return result
 
     return run

@@ -130,7 +130,7 @@ def check_map(
     """
     active_version, active, why = _active_map(catalog, domain)
     ranks = _normalised_ranks(new, frames, frames.own_images, evaluator, lambda share: on_progress(share / 2))
-    theirs = None
+    theirs = known = None
     if active is not None:
         try:
             known = _images_of_frames(catalog, domain, active_version, active, frames)
@@ -142,6 +142,11 @@ def check_map(
     if not scored.any():
         without = "" if frames.own_images is None else "without the held-out frames "
         why = f"{without}the new map holds no place within {TOLERANCE_M:g} m of a frame of traverse {frames.source}"
+    elif known is not None and known.size and theirs is not None and not np.isfinite(theirs[scored]).any():
+        why = (
+            f"map {active_version}, which serves, was made of traverse {frames.source} itself, so the two were not "
+            "compared: check on another drive"
+        )
     elif theirs is not None and not np.isfinite(theirs[scored]).any():
         why = f"map {active_version}, which serves, and the new one share no place of traverse {frames.source}"
     elif theirs is not None:

@@ -83,6 +83,11 @@ class JobRunner:
             event.set()
         return job
 
+    def gives_back(self, job_id: str) -> bool:
+        """Whether a job that stops now is left to the next service; False: it was cancelled, or nothing stops it."""
+        cancelled = self._cancelled.get(job_id)
+        return self._closing.is_set() and not (cancelled is not None and cancelled.is_set())
+
     def close(self) -> None:
         """Stop what runs and wait for its clean end; it and what is queued are left to the next service."""
         self._closing.set()
