@@ -210,6 +210,28 @@ import_map(catalog, Path(sys.argv[2]))
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"landmark_model": {"other": np.zeros((9, 4), np.float32)}},
+        {"landmark_model": {"prototypes": np.zeros((8, 4), np.float32)}},
+        {"landmark_model": {"prototypes": np.zeros((9, 0), np.float32)}},
+        {"landmark_model": {"prototypes": np.full((9, 4), np.nan, np.float32)}},
+        {"actions_m": ()},
+        {"actions_m": (-1.0, 2.0)},
+        {"actions_m": (2.0, 1.0)},
+        {"actions_m": (1.0, "2")},
+    ],
+)
+def test_a_map_that_could_answer_nothing_is_refused(here: Catalog, tmp_path: Path, changes: dict[str, Any]) -> None:
+    """A file with a right digest may still be one that no release wrote."""
+    write_map(tmp_path / "building", contents("campus", 1, **changes))
+    seal(tmp_path / "building", tmp_path / "crafted.sqlite")
+    with pytest.raises(InvalidArchiveError, match="no map that can serve here"):
+        import_map(here, tmp_path / "crafted.sqlite")
+    assert here.domains() == []
+
+
 def test_an_import_that_is_killed_leaves_nothing_of_its_map(exported: Path, tmp_path: Path) -> None:
     n_killed = 0
     for step in range(1, 30):

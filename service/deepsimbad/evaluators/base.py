@@ -62,6 +62,17 @@ class Evaluator(Protocol):
             InvalidEncodingError: Not [r >= 1, d], or NaN or infinity in it.
         """
 
+    def check_model(self, model: LandmarkModel, n_landmarks: int) -> None:
+        """Check that a landmark model, of whatever origin, can be compared with.
+
+        Args:
+            model: Named arrays.
+            n_landmarks: r.
+
+        Raises:
+            InvalidEncodingError: It is not what `fit_landmarks` gives of r landmarks.
+        """
+
     def dissimilarities(self, encodings: NDArray[np.float32], model: LandmarkModel) -> NDArray[np.float32]:
         """Compare scenes with landmarks.
 

@@ -57,6 +57,14 @@ class FeatureL2:
         prototypes.setflags(write=False)
         return {"prototypes": prototypes}
 
+    def check_model(self, model: LandmarkModel, n_landmarks: int) -> None:
+        """See `Evaluator.check_model`."""
+        prototypes = model.get("prototypes")
+        if prototypes is None or prototypes.ndim != 2 or len(prototypes) != n_landmarks:
+            has = "none" if prototypes is None else list(prototypes.shape)
+            raise InvalidEncodingError(f"{n_landmarks} landmarks have prototypes [{n_landmarks}, d], not {has}")
+        self.fit_landmarks(np.asarray(prototypes, np.float32))
+
     def dissimilarities(self, encodings: NDArray[np.float32], model: LandmarkModel) -> NDArray[np.float32]:
         """See `Evaluator.dissimilarities`: [n, r] squared L2.
 

@@ -2,12 +2,14 @@
 
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import pairwise
+from math import isfinite
 from pathlib import Path
 from typing import Any
 
 from deepsimbad.engine.snapshot import MapSnapshot
-from deepsimbad.errors import DamagedMapError, DeepSimbadError, InvalidArchiveError
-from deepsimbad.evaluators.registry import evaluator_config
+from deepsimbad.errors import DamagedMapError, DeepSimbadError, InvalidArchiveError, InvalidInputError
+from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.durable import sha256_of
 from deepsimbad.store.layout import is_name
@@ -93,7 +95,8 @@ def _read(file: Path, sha256: str | None) -> tuple[str, MapContents, dict[str, A
         contents = read_map(file)
         if not is_name(contents.domain):
             raise DamagedMapError(f"{file.name} is damaged: its domain has no name")
-        evaluator_config(contents.evaluator)
+        _check_actions(contents.actions_m)
+        make_evaluator(evaluator_config(contents.evaluator)).check_model(contents.landmark_model, contents.n_landmarks)
         n_bytes = index_bytes(file)
         snapshot = MapSnapshot.from_contents(contents, n_bytes)
     except (DeepSimbadError, KeyError, TypeError, ValueError, OverflowError) as error:
@@ -101,3 +104,10 @@ def _read(file: Path, sha256: str | None) -> tuple[str, MapContents, dict[str, A
         raise InvalidArchiveError(f"{file} is no map that can serve here: {why}", file=str(file)) from error
     measured = {"n_map_images": snapshot.n_images, "index_bits_per_map_image": snapshot.index_bits_per_map_image}
     return digest, contents, {**contents.metrics, **measured}
+
+
+def _check_actions(actions_m: tuple[float, ...]) -> None:
+    """The file did not come through the door at which domains are made; raises InvalidInputError."""
+    ascends = all(shorter < longer for shorter, longer in pairwise((0.0, *actions_m)))
+    if not actions_m or not ascends or not isfinite(actions_m[-1]):
+        raise InvalidInputError(f"its actions_m {list(actions_m)} are no moves that ascend")
