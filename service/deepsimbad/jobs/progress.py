@@ -97,7 +97,7 @@ class Progress:
         if worked <= 0.01:
             return None
         pace_s = (now_s - self._started_s) / worked
-        # A stage may take a multiple of its expected share: of how long to train was asked for, its weight knows nothing.
+        # A stage may take a multiple of its expected share: its weight does not know how many episodes were asked for.
         if share > 0.01:
             of_stage_s = (now_s - self._stage_began_s) * (1 - share) / share
         else:
