@@ -97,6 +97,18 @@ def test_unavailable_says_when_to_try_again() -> None:
     assert "retry-after" not in error_response(SCOPE, errors.ConflictError("x")).headers
 
 
+def test_a_503_is_logged_with_its_request_and_with_a_stack_where_something_stands_behind_it(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    with pytest.raises(errors.UnavailableError) as caught:
+        raise errors.UnavailableError("x is full") from OSError("no space")
+    for error in (errors.UnavailableError("12 MiB are free"), caught.value):
+        error_response(SCOPE, error)
+    told, behind = (vars(record) for record in caplog.records)
+    assert (told["request_id"], told["exc_info"]) == ("r1", None)
+    assert (behind["request_id"], behind["exc_info"][1]) == ("r1", caught.value)
+
+
 def test_a_framework_error_is_a_problem_too() -> None:
     app = FastAPI()
     install_problem_handlers(app)
