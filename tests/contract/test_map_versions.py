@@ -120,7 +120,9 @@ def test_an_unmapped_domain_has_nothing_to_append_to(client: TestClient) -> None
     client.put("/v1/admin/domains/empty-append", json={"evaluator": {"kind": "feature_l2", "extractor": "none"}})
     upload(client, "empty-append", "drive", ready_encodings(), np.arange(N_READY))
     asked = {"training_traverse": "drive", "append": True}
-    refused(client.post("/v1/admin/domains/empty-append/remaps", json=asked), 409, "no_active_map")
+    answer = client.post("/v1/admin/domains/empty-append/remaps", json=asked)
+    refused(answer, 409, "no_active_map")
+    assert "make one first, without append" in answer.json()["detail"]
 
 
 def test_a_check_traverse_is_not_deleted_under_its_job(client: TestClient, domain: str) -> None:

@@ -39,10 +39,12 @@ async def post_remap(domain: DomainName, request: Request, response: Response, r
             if name is not None:
                 Traverse.open(running.settings.data_dir, domain, name).close()
         if config.landmark_traverse is None and record.active_version is None:
-            raise NoActiveMapError(
-                f"domain {domain} has no active map whose landmarks could stay; give a landmark_traverse",
-                domain=domain,
+            wanted = (
+                "that could be appended to; make one first, without append"
+                if config.append
+                else "whose landmarks could stay; give a landmark_traverse"
             )
+            raise NoActiveMapError(f"domain {domain} has no active map {wanted}", domain=domain)
         return render_job(running.runner.submit(domain, config))
 
     job = await run_sync(submit)
