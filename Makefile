@@ -28,10 +28,10 @@ lint: install
 	$(BIN)/lint-imports
 
 check: lint ## every check but the slow ones
-	$(BIN)/pytest -m "not slow"
+	$(BIN)/pytest -n auto --dist loadfile -m "not slow"
 
 test: lint ## every check
-	$(BIN)/pytest
+	$(BIN)/pytest -n auto --dist loadfile
 
 bench: install ## the benchmark tables under docs/results/
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[bench]'
