@@ -3,9 +3,11 @@
 import hashlib
 import os
 import signal
+import sqlite3
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -229,6 +231,22 @@ def test_a_map_that_could_answer_nothing_is_refused(here: Catalog, tmp_path: Pat
     seal(tmp_path / "building", tmp_path / "crafted.sqlite")
     with pytest.raises(InvalidArchiveError, match="no map that can serve here"):
         import_map(here, tmp_path / "crafted.sqlite")
+    assert here.domains() == []
+
+
+@pytest.mark.parametrize(
+    "statement",
+    [
+        "CREATE TRIGGER more AFTER INSERT ON map BEGIN SELECT 1; END",
+        "CREATE VIEW endless AS WITH RECURSIVE c(n) AS (SELECT 0 UNION ALL SELECT n + 1 FROM c) SELECT n FROM c",
+        "CREATE VIRTUAL TABLE texts USING fts5(body)",
+    ],
+)
+def test_a_map_whose_schema_would_run_something_is_refused(exported: Path, here: Catalog, statement: str) -> None:
+    with closing(sqlite3.connect(exported)) as db:
+        db.execute(statement)
+    with pytest.raises(InvalidArchiveError, match="what no release writes"):
+        import_map(here, exported)
     assert here.domains() == []
 
 

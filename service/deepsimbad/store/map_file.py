@@ -33,6 +33,7 @@ _DESCRIPTION = (  # the columns of `map` in the order of the checksum
     "n_landmarks",
     "list_length",
 )
+_NO_PLAIN_TABLE = "SELECT 1 FROM sqlite_schema WHERE type NOT IN ('table', 'index') OR rootpage = 0 LIMIT 1"
 _WAL_HEADER = bytes([2, 2])  # read and write version at offset 18 of a file that may have a write-ahead log
 
 
@@ -193,6 +194,8 @@ def _opened(path: Path) -> Iterator[Database]:
             if stream.read(20)[18:] == _WAL_HEADER:  # its newest rows may lie beside it
                 raise DamagedMapError(f"{path.name} was opened for writing after it was sealed", file=path.name)
         with open_database(path, immutable=True) as db:
+            if db.execute(_NO_PLAIN_TABLE).fetchone() is not None:  # reading it would run what its maker wrote
+                raise DamagedMapError(f"{path.name} is damaged: it holds what no release writes", file=path.name)
             if not db.table_names():
                 raise DamagedMapError(f"{path.name} is damaged: it is empty", file=path.name)
             with in_todays_schema(db, migrations, path, DamagedMapError) as current:
