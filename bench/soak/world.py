@@ -46,7 +46,7 @@ def remap_config(training: str, landmarks: str | None, **more: Any) -> dict[str,
 
 def make_domain(link: Link) -> None:
     """The domain, its drives and its first map."""
-    link.ask("PUT", BASE, {"evaluator": {"kind": "feature_l2", "extractor": "none"}, "closed": True})
+    link.ask("PUT", BASE, {"evaluator": {"kind": "feature_l2"}, "closed": True})  # the embedded extractor
     for seed, name in enumerate(DRIVES):
         upload(link, name, encodings_of(seed))
     job = link.ask("POST", f"{BASE}/remaps", remap_config(*DRIVES))
