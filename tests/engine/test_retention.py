@@ -1,8 +1,9 @@
 """Which old maps keep their files: the newest, and those that a session lives on."""
 
 import asyncio
+import sqlite3
 import threading
-from contextlib import suppress
+from contextlib import closing, suppress
 from itertools import pairwise
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from deepsimbad.engine.retention import Retention, beyond_keeping
 from deepsimbad.engine.session_config import SessionConfig
 from deepsimbad.errors import MapInUseError, RetiredMapError, UnavailableError, UnknownMapVersionError
 from deepsimbad.store.catalog import Catalog
+from deepsimbad.store.layout import catalog_path
 from deepsimbad.store.map_table import ANY
 from deepsimbad.store.records import KeptMap, MapState
 
@@ -64,6 +66,14 @@ def test_the_newest_retired_by_when_they_ceased_to_serve_are_kept() -> None:
     assert beyond(history, 2) == [2, 5]
     assert beyond(history, 3) == [5]
     assert beyond(history, 4) == []
+
+
+def test_the_one_that_served_last_is_the_newest_though_the_clock_was_set_back(mapped: Catalog) -> None:
+    next_map(mapped)
+    with closing(sqlite3.connect(catalog_path(mapped.data_dir))) as db, db:  # as noted by a clock that ran ahead
+        db.execute("UPDATE map SET retired_at = '2999-01-01T00:00:00.000Z' WHERE version = 1")
+    next_map(mapped)
+    assert beyond(mapped.kept_maps(), 1) == [1], "version 2 served last"
 
 
 def test_of_sealed_ones_only_those_that_lost_are_beyond() -> None:
