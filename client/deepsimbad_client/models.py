@@ -194,6 +194,8 @@ class Job(Answer):
     eta_s: float | None = None
     result: dict[str, Any] | None = None
     error: str | dict[str, Any] | None = None
+    created_at: str | None = None
+    finished_at: str | None = None
 
     @property
     def ended(self) -> bool:

@@ -38,9 +38,12 @@ def job_table(jobs: Sequence[Job]) -> Table:
     table.add_column("job", style="bold", no_wrap=True)
     table.add_column("domain", overflow="fold")
     table.add_column("state", no_wrap=True)
+    table.add_column("asked for", no_wrap=True)
+    table.add_column("ended", no_wrap=True)
     table.add_column("outcome", overflow="fold")
     for job in jobs:
-        table.add_row(job.job_id, job.domain, job.state, _outcome(job))
+        times = (_minute(job.created_at), _minute(job.finished_at))
+        table.add_row(job.job_id, job.domain, job.state, *times, _outcome(job))
     return table
 
 
@@ -50,7 +53,10 @@ def _outcome(job: Job) -> str:
     if job.error_text or not job.result:
         return job.error_text
     made = f"map {job.result.get('map_version')}"
-    return made if job.result.get("active", True) else f"{made}, sealed but not activated"
+    if job.result.get("active", True):
+        return made
+    has_lost = (job.result.get("metrics", {}).get("check") or {}).get("passed") is False
+    return f"{made}, sealed but not activated{': its gate was lost' if has_lost else ''}"
 
 
 def map_table(domain: str, maps: Sequence[MapVersion]) -> Table:
@@ -58,7 +64,10 @@ def map_table(domain: str, maps: Sequence[MapVersion]) -> Table:
     table = Table(title=f"maps of {domain}", title_justify="left")
     table.add_column("map", style="bold", justify="right")
     table.add_column("state", no_wrap=True)
-    for heading in ("ANR [%]", "active then [%]", "gate", "size"):
+    for heading in ("ANR [%]", "active then [%]"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    table.add_column("checked on", overflow="fold")
+    for heading in ("gate", "size"):
         table.add_column(heading, justify="right", no_wrap=True)
     for heading in ("made", "served since", "until"):
         table.add_column(heading, no_wrap=True)
@@ -69,6 +78,7 @@ def map_table(domain: str, maps: Sequence[MapVersion]) -> Table:
             version.state or "",
             _shown(check.get("anr"), ".2f"),
             _shown(check.get("anr_active"), ".2f"),
+            "-" if not check else check.get("traverse") or "held-out frames",
             _gate(check),
             "removed" if version.removed_at else _size(version.file_bytes),
             _minute(version.created_at),

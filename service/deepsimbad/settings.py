@@ -59,7 +59,9 @@ class Settings(BaseSettings):
     ] = 128
     max_uploads: Annotated[int, Field(description="Batches of frames on their way at once.", ge=1)] = 4
     max_event_streams: Annotated[int, Field(description="Job event streams open at once.", ge=1)] = 64
-    max_connections: Annotated[int, Field(description="Connections open at once; more are closed.", ge=1)] = 1024
+    max_connections: Annotated[
+        int, Field(description="Connections open at once; for one more the longest silent is closed.", ge=1)
+    ] = 1024
     max_domains: Annotated[int, Field(description="Domains that may exist.", ge=1)] = 1000
     rate_limit_per_s: Annotated[
         float, Field(description="Requests a second that one key may send, in the long run; 0: any number.", ge=0)

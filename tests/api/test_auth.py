@@ -123,6 +123,18 @@ def test_all_revoked_is_closed(catalog: Catalog) -> None:
     assert caught.value.hints == {"key_id": record.key_id}
 
 
+def test_a_long_answer_ends_with_its_key(catalog: Catalog) -> None:
+    ring = ring_of(catalog)
+    assert ring.still_opens(None)
+    record, _ = catalog.create_key(KeyScope.ADMIN)
+    asyncio.run(ring.reread())
+    assert ring.still_opens(record.key_id)
+    assert not ring.still_opens(None), "it was let in while no key was asked"
+    catalog.revoke_key(record.key_id)
+    asyncio.run(ring.reread())
+    assert not ring.still_opens(record.key_id)
+
+
 def test_once_closed_it_never_opens_again(catalog: Catalog) -> None:
     catalog.create_key(KeyScope.ADMIN)
     kept = catalog.keys()

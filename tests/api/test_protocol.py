@@ -539,22 +539,25 @@ def test_an_upgrade_is_not_taken_up(service: Service) -> None:
 # Many connections
 
 
-def test_a_connection_over_the_limit_is_closed_at_once(service: Service) -> None:
+@pytest.mark.parametrize("silent", [0, MAX_CONNECTIONS - 1], ids=["all-have-asked", "one-never-asked"])
+def test_one_connection_more_closes_the_longest_silent(service: Service, silent: int) -> None:
+    """Where all have asked, the first; where one never asked, that one, though it came last."""
     held = []
     try:
-        for _ in range(MAX_CONNECTIONS):
+        for place in range(MAX_CONNECTIONS):
             connection = service.connect()
             held.append(connection)
-            connection.sendall(GET)
-            assert read_one(connection).endswith(b"GET / 0")
+            if silent == 0 or place != silent:
+                connection.sendall(GET)
+                assert read_one(connection).endswith(b"GET / 0")
+        n_refused = service.refused["max_connections"]
         with service.connect() as one_more:
-            try:
-                one_more.sendall(GET)
-                assert one_more.recv(65536) == b""
-            except ConnectionError:
-                pass
-        assert service.refused["max_connections"] == 1
-        for connection in held:
+            one_more.sendall(GET)
+            assert read_one(one_more).endswith(b"GET / 0")
+        assert service.refused["max_connections"] == n_refused + 1
+        with contextlib.suppress(ConnectionError):
+            assert held[silent].recv(65536) == b""
+        for connection in held[:silent] + held[silent + 1 :]:
             connection.sendall(GET)
             assert read_one(connection).endswith(b"GET / 0")
     finally:

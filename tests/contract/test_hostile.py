@@ -298,6 +298,7 @@ def test_more_connections_than_may_be(served: Served, robot: Robot) -> None:
     with contextlib.ExitStack() as stack:
         held = [stack.enter_context(served.connect()) for _ in range(2 * MAX_CONNECTIONS)]
         robot.answered_more(50)  # those that are there go on
+        assert ask(served, "GET", "/healthz")[0] == 200  # and who has something to say is let in
         for connection in held:
             with contextlib.suppress(ConnectionError):
                 assert connection.recv(1) == b""

@@ -65,6 +65,15 @@ def test_the_answer_is_the_anr_of_the_beliefs_that_were_answered(service: TestCl
     assert none == {"n_scored": 0, "n_left_out": 5, "anr": None, "map_version": 1}
 
 
+def test_a_truth_far_from_the_map_says_nothing_of_it(service: TestClient) -> None:
+    session_id, positions_m, shares = walked(service, 3)
+    last_m = 2.0 * (N_READY - 1)
+    answer = told(service, session_id, [positions_m[0], 1e9, last_m + 10.5])
+    assert answer == {"n_scored": 1, "n_left_out": 2, "anr": pytest.approx(100 * shares[0]), "map_version": 1}
+    assert counted(service)[0] == 1
+    assert told(service, session_id, [None, None, last_m + 9.5])["n_scored"] == 1
+
+
 def test_an_observation_is_counted_once(service: TestClient) -> None:
     session_id, positions_m, shares = walked(service)
     told(service, session_id, [*positions_m[:3], None, None])

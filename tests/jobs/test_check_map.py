@@ -179,15 +179,17 @@ def test_maps_of_different_stretches_cannot_be_compared(store, made, seasons):
     store("elsewhere", season(0.2, 5), 1000.0 + np.arange(PLACES))
     result = made(training_traverse="elsewhere", gate_margin=0.0)
     check = result["metrics"]["check"]
-    assert (check["anr_active"], check["passed"], result["active"]) == (None, True, True)
+    assert (check["anr_active"], check["passed"], result["active"]) == (None, False, False)
     assert "share no place of traverse elsewhere" in check["why"]
     assert check["anr"] is not None
 
 
 def test_a_check_on_the_drive_that_the_active_map_is_made_of_says_so(made, seasons):
     made(training_traverse="good")
-    check = made(training_traverse="bad", check_traverse="good", gate_margin=0.0)["metrics"]["check"]
+    result = made(training_traverse="bad", check_traverse="good", gate_margin=0.0)
+    check = result["metrics"]["check"]
     assert (check["anr_active"], check["active_version"]) == (None, 1)
+    assert (check["passed"], result["active"]) == (False, False)
     assert "map 1, which serves, was made of traverse good itself" in check["why"]
     assert "check on another drive" in check["why"]
 
@@ -220,7 +222,7 @@ def test_an_active_map_of_another_encoder_cannot_be_compared(store, made, season
     store("its-landmarks", other + 0.1)
     result = made(training_traverse="new-encoder", landmark_traverse="its-landmarks", gate_margin=0.0)
     check = result["metrics"]["check"]
-    assert (check["anr_active"], check["active_version"], check["passed"]) == (None, 1, True)
+    assert (check["anr_active"], check["active_version"], check["passed"]) == (None, 1, False)
     assert "another length" in check["why"]
 
 

@@ -280,6 +280,7 @@ def _start(settings: Settings, metrics: Metrics, keys: KeyRing, run_job: RunJob,
         clock=clock,
         worker=worker,
         runner=runner,
+        keys=keys,
         readiness=readiness,
     )
 

@@ -76,6 +76,13 @@ class KeyRing:
             raise UnavailableError("the keys cannot be read, so nobody can be let in; try again")
         return not self._keys
 
+    def still_opens(self, key_id: str | None) -> bool:
+        """Whether a request let in with a key (None: while no key was asked) would be let in now; for long answers."""
+        if key_id is None:
+            return not self._keys
+        record = self._keys.get(key_id)
+        return record is not None and record.is_usable(now())
+
     @property
     def n_created(self) -> int:
         """How many keys there are, those that open nothing any more too."""

@@ -11,6 +11,7 @@ from anyio import CapacityLimiter
 from anyio.to_thread import run_sync
 from fastapi import Depends, Path, Request
 
+from deepsimbad.api.auth import KeyRing
 from deepsimbad.api.bodies import GREATEST_ID, NAME_PATTERN
 from deepsimbad.api.metrics import Metrics
 from deepsimbad.api.readiness import ReadinessCheck
@@ -54,6 +55,7 @@ class Services:
         clock: What they live by.
         worker: Where encoding and scoring run.
         runner: Where jobs run.
+        keys: Who may ask.
         readiness: Whether all of it works.
         stopping: Set when shutdown begins; streams end on it.
         decoders: Bounds the images being decoded.
@@ -74,6 +76,7 @@ class Services:
     clock: SteadyClock
     worker: InferenceWorker
     runner: JobRunner
+    keys: KeyRing
     readiness: ReadinessCheck
     stopping: threading.Event = field(default_factory=threading.Event)
     decoders: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(DECODERS))

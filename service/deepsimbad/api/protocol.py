@@ -86,13 +86,25 @@ class LimitedProtocol(HttpToolsProtocol):
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]  # noqa: D102
         super().connection_made(transport)
         self._outgoing = Outgoing(transport)
-        if len(self.connections) > self.limits.max_connections:
-            self._refusal = OverloadedError("too many connections")
-            self.limits.refused("max_connections")
-            transport.abort()
-            return
         self._since = self.loop.time()
+        if len(self.connections) > self.limits.max_connections:
+            self._make_room()
+        if self._refusal is not None:
+            return
         self._look_by(self._since + self.limits.header_timeout_s)
+
+    def _make_room(self) -> None:
+        """Close a connection that asks for nothing; where all are at work, this new one.
+
+        Those that never asked go first, then those between two requests, the longest silent first: whoever opens
+        connections and says nothing loses them to those who have something to say.
+        """
+        others = [other for other in self.connections if isinstance(other, LimitedProtocol) and other is not self]
+        silent = [other for other in others if other._refusal is None and other._is_silent]
+        chosen = min(silent, key=lambda other: (other.cycle is not None, other._since), default=self)
+        chosen._refusal = OverloadedError("too many connections")
+        self.limits.refused("max_connections")
+        chosen.transport.abort()
 
     def connection_lost(self, exc: Exception | None) -> None:  # noqa: D102
         if self._look is not None:
@@ -221,6 +233,11 @@ class LimitedProtocol(HttpToolsProtocol):
     @property
     def _is_under_way(self) -> bool:
         return self._running is not None and not self._running.response_complete
+
+    @property
+    def _is_silent(self) -> bool:
+        """Whether no request of this connection is read or answered."""
+        return self._place != _BODY and not self._is_under_way and not self.pipeline
 
     # Time
 

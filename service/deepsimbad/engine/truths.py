@@ -23,6 +23,7 @@ from deepsimbad.store.sessions import SessionStore
 T = TypeVar("T")
 
 _ROWS_AT_ONCE = 64  # of a journal in memory: 130 kB with 500 landmarks
+_FARTHEST_M = 10.0  # a truth farther from every map image is of no place of the map: another road, another frame
 _PIECE_S = 0.01  # a live view waits no longer for a replay than this and one step
 
 
@@ -34,7 +35,7 @@ class RankedTruths:
         domain, map_version: Of the session.
         position_m: [n_observations] the truth along the route; NaN where unknown.
         rank_share: [n_observations] share of the map images that the belief placed before the true one, 0..1; NaN where
-            the truth is unknown.
+            the truth is unknown, or farther than 10 m from the map.
     """
 
     domain: str
@@ -49,7 +50,7 @@ class RankedTruths:
 
     @property
     def n_left_out(self) -> int:
-        """Observations whose truth is unknown."""
+        """Observations whose truth is unknown, or is no place of the map."""
         return int(self.rank_share.size) - self.n_scored
 
     @property
@@ -139,9 +140,13 @@ class Truths:
         record, engine, known = await asyncio.to_thread(self._prepared, session_id, positions_m)
         share = np.full(known.size, np.nan)
         n_needed = int(np.flatnonzero(~np.isnan(known)).max(initial=-1)) + 1  # what follows need not be replayed
-        truth = true_images(engine.snapshot.route, known)
+        route = engine.snapshot.route
+        truth = true_images(route, known)
         await self._replay(record, engine, truth[:n_needed], share[:n_needed])
-        share[np.isnan(known)] = np.nan
+        apart_m = [
+            abs(float(route.offset_m(route.position_m[image], at))) for image, at in zip(truth, known, strict=True)
+        ]
+        share[~(np.array(apart_m) <= _FARTHEST_M)] = np.nan  # unknown ones too
         return record, RankedTruths(record.domain, record.map_version, known, share)
 
     def _prepared(

@@ -113,8 +113,9 @@ def check_map(
 ) -> dict[str, Any]:
     """Score a new map, and the active one beside it.
 
-    A gate is lost where the new ANR is greater than the active one by more than the margin, or where the new map holds
-    no place of the traverse it was to be checked on. What cannot be compared passes, and `why` says so.
+    A gate is lost where the new ANR is greater than the active one by more than the margin, and where the two cannot be
+    compared on these frames though a sound map serves: who asks for a gate wants no map to take over unseen. Where no
+    map serves, or a damaged one, there is nothing to lose and the gate passes. `why` says which it was.
 
     Args:
         catalog: Of the data directory.
@@ -155,7 +156,7 @@ def check_map(
     anr = float(100 * ranks[scored].mean()) if scored.any() else None
     passed: bool | None = None
     if gate_margin is not None:
-        passed = anr is not None or frames.own_images is not None
+        passed = anr_active is not None or active is None
         if anr is not None and anr_active is not None and anr > anr_active + gate_margin:
             passed = False
             why = (

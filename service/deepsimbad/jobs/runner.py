@@ -13,6 +13,7 @@ from deepsimbad.errors import (
     DeepSimbadError,
     JobInterruptedError,
     UnavailableError,
+    UnknownJobError,
 )
 from deepsimbad.jobs.map_config import RemapConfig
 from deepsimbad.jobs.perform import REMAP, RunJob, error_document
@@ -108,7 +109,10 @@ class JobRunner:
                 self._cancelled.pop(job_id, None)
 
     def _run_one(self, job_id: str) -> None:
-        job = self._written(lambda: self._catalog.start_job(job_id))
+        try:
+            job = self._written(lambda: self._catalog.start_job(job_id))
+        except UnknownJobError:  # cancelled while it waited, and then its domain was deleted
+            return
         if job.state is not JobState.RUNNING:  # cancelled while it waited
             self._forget_checkpoints(job_id)
             return

@@ -5,7 +5,7 @@ from collections.abc import AsyncIterator
 from typing import Annotated
 
 from anyio.to_thread import run_sync
-from fastapi import APIRouter, Depends, Query
+from fastapi import APIRouter, Depends, Query, Request
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 
 from deepsimbad.api.bodies import NAME_PATTERN
@@ -52,14 +52,15 @@ async def get_job(job: Annotated[JobRecord, Depends(_found)]) -> JobAnswer:
     },
 )
 async def get_job_events(
-    job: Annotated[JobRecord, Depends(_found)], running: Running
+    job: Annotated[JobRecord, Depends(_found)], request: Request, running: Running
 ) -> AsyncIterator[ServerSentEvent]:
     """Follow a job: server-sent events, each holding the job as JSON; the last one is named `done`.
 
-    The stream may end earlier when the service shuts down: ask for the job again.
+    The stream may end earlier, when the service shuts down or the key is revoked: ask for the job again.
     """
     told: JobRecord | None = None
-    while not running.stopping.is_set():
+    key_id: str | None = request.scope.get("state", {}).get("key_id")
+    while not running.stopping.is_set() and running.keys.still_opens(key_id):
         if job != told:
             told = job
             yield ServerSentEvent(data=render_job(job), event="done" if job.state.is_final else "progress")
