@@ -16,6 +16,7 @@ from starlette.testclient import TestClient
 from deepsimbad.api import routes
 from deepsimbad.api.app import create_app
 from deepsimbad.cli import run as deepsimbad
+from deepsimbad.jobs.perform import InThisProcess
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.records import KeyScope
 
@@ -41,7 +42,9 @@ def keyed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Keyed]:
     with Catalog.open(data_dir) as catalog:
         _, admin = catalog.create_key(KeyScope.ADMIN, "admin")
         _, robot = catalog.create_key(KeyScope.LOCALIZE, "robot")
-    with TestClient(create_app(small_settings(data_dir)), raise_server_exceptions=False) as client:
+    with TestClient(
+        create_app(small_settings(data_dir), InThisProcess(data_dir)), raise_server_exceptions=False
+    ) as client:
         client.headers["Authorization"] = f"Bearer {admin.text}"
         make_ready_domain(client, "ready")
         del client.headers["Authorization"]

@@ -13,6 +13,7 @@ from starlette.testclient import TestClient
 
 from deepsimbad.api.app import create_app
 from deepsimbad.api.dependencies import Services
+from deepsimbad.jobs.perform import InThisProcess
 from deepsimbad.store.catalog import Catalog
 
 from .conftest import N_READY, NPZ, make_ready_domain, npz, ready_encodings, remap, small_settings
@@ -22,7 +23,9 @@ Samples = dict[str, float]
 
 @pytest.fixture
 def service(tmp_path: Path) -> Iterator[TestClient]:
-    with TestClient(create_app(small_settings(tmp_path)), raise_server_exceptions=False) as client:
+    with TestClient(
+        create_app(small_settings(tmp_path), InThisProcess(tmp_path)), raise_server_exceptions=False
+    ) as client:
         make_ready_domain(client, "ready")
         yield client
 
@@ -93,11 +96,13 @@ def test_sessions_disk_release_and_process(service: TestClient, tmp_path: Path) 
 
 
 def test_a_damaged_map_is_shown_until_another_serves(tmp_path: Path) -> None:
-    with TestClient(create_app(small_settings(tmp_path))) as client:
+    with TestClient(create_app(small_settings(tmp_path), InThisProcess(tmp_path))) as client:
         make_ready_domain(client, "ready")
         assert remap(client, "ready", training_traverse="drive")["state"] == "succeeded"
     (tmp_path / "domains/ready/maps/000002.sqlite").unlink()
-    with TestClient(create_app(small_settings(tmp_path)), raise_server_exceptions=False) as client:
+    with TestClient(
+        create_app(small_settings(tmp_path), InThisProcess(tmp_path)), raise_server_exceptions=False
+    ) as client:
         found = scraped(client)
         assert found['deepsimbad_map_damaged{domain="ready"}'] == 1
         assert found['deepsimbad_active_map_version{domain="ready"}'] == 2
@@ -109,11 +114,13 @@ def test_a_damaged_map_is_shown_until_another_serves(tmp_path: Path) -> None:
 
 
 def test_a_map_put_back_is_not_damaged_any_more(tmp_path: Path) -> None:
-    with TestClient(create_app(small_settings(tmp_path))) as client:
+    with TestClient(create_app(small_settings(tmp_path), InThisProcess(tmp_path))) as client:
         make_ready_domain(client, "ready")
     path = tmp_path / "domains/ready/maps/000001.sqlite"
     path.rename(tmp_path / "aside")
-    with TestClient(create_app(small_settings(tmp_path)), raise_server_exceptions=False) as client:
+    with TestClient(
+        create_app(small_settings(tmp_path), InThisProcess(tmp_path)), raise_server_exceptions=False
+    ) as client:
         assert client.get("/readyz").json()["damaged_maps"] == ["ready"]
         (tmp_path / "aside").rename(path)
         active_maps = services_of(client).active_maps

@@ -261,7 +261,7 @@ def test_sessions_nobody_knows(client: TestClient) -> None:
 
 def test_limits_expiry_and_metrics(tmp_path: Path) -> None:
     settings = small_settings(tmp_path, max_sessions=2, session_ttl_s=0.6, session_sweep_s=0.05)
-    with TestClient(create_app(settings), raise_server_exceptions=False) as client:
+    with TestClient(create_app(settings, InThisProcess(tmp_path)), raise_server_exceptions=False) as client:
         make_ready_domain(client, "ready")
         first, _ = begin(client), begin(client)
         client.post(f"{path_of(first)}/observations", json=RANKS, headers={"Idempotency-Key": "k"})
@@ -285,19 +285,23 @@ def test_limits_expiry_and_metrics(tmp_path: Path) -> None:
 
 def test_a_restart_and_a_retired_map(tmp_path: Path) -> None:
     key = {"Idempotency-Key": "k"}
-    with TestClient(create_app(small_settings(tmp_path))) as first:
+    with TestClient(create_app(small_settings(tmp_path), InThisProcess(tmp_path))) as first:
         make_ready_domain(first, "ready")
         path = path_of(begin(first))
         seen = first.post(f"{path}/observations", json=RANKS, headers=key).json()
         remap(first, "ready", training_traverse="drive", landmark_traverse="drive", n_landmarks=9)
         assert first.get("/v1/domains/ready").json()["map_version"] == 2
         assert first.post(f"{path}/observations", json=RANKS).json()["map_version"] == 1
-    with TestClient(create_app(small_settings(tmp_path)), raise_server_exceptions=False) as second:
+    with TestClient(
+        create_app(small_settings(tmp_path), InThisProcess(tmp_path)), raise_server_exceptions=False
+    ) as second:
         again = second.post(f"{path}/observations", json=RANKS, headers=key).json()
         assert {**again, "timings_ms": {}, "expires_at": ""} == {**seen, "timings_ms": {}, "expires_at": ""}
         assert second.get(path).json()["n_observations"] == 2
     (tmp_path / "domains" / "ready" / "maps" / "000001.sqlite").unlink()
-    with TestClient(create_app(small_settings(tmp_path)), raise_server_exceptions=False) as third:
+    with TestClient(
+        create_app(small_settings(tmp_path), InThisProcess(tmp_path)), raise_server_exceptions=False
+    ) as third:
         problem = refused(third.post(f"{path}/observations", json=RANKS), 410, "retired_map")
         assert "begin a new session" in problem["detail"]
         assert problem["map_version"] == 1
@@ -361,7 +365,7 @@ def test_a_start_repeated_after_a_restart_or_at_once_is_one_session(tmp_path: Pa
     with TestClient(create_app(small_settings(tmp_path), InThisProcess(tmp_path))) as before:
         make_ready_domain(before, "d")
         first = before.post("/v1/domains/d/sessions", **begin_under_key).json()  # type: ignore[arg-type]
-    with TestClient(create_app(small_settings(tmp_path))) as after:
+    with TestClient(create_app(small_settings(tmp_path), InThisProcess(tmp_path))) as after:
         again = after.post("/v1/domains/d/sessions", **begin_under_key)  # type: ignore[arg-type]
         assert (again.status_code, again.json()) == (201, first)
 

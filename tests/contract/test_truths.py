@@ -10,6 +10,7 @@ import pytest
 from starlette.testclient import TestClient
 
 from deepsimbad.api.app import create_app
+from deepsimbad.jobs.perform import InThisProcess
 
 from .conftest import N_READY, make_ready_domain, ready_encodings, remap, small_settings, wait_for
 
@@ -18,7 +19,9 @@ STEP_M = 4.0
 
 @pytest.fixture
 def service(tmp_path: Path) -> Iterator[TestClient]:
-    with TestClient(create_app(small_settings(tmp_path)), raise_server_exceptions=False) as client:
+    with TestClient(
+        create_app(small_settings(tmp_path), InThisProcess(tmp_path)), raise_server_exceptions=False
+    ) as client:
         make_ready_domain(client, "ready")
         yield client
 
