@@ -1,6 +1,7 @@
 """Fixtures shared by every test."""
 
 import os
+import signal
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,9 @@ settings.register_profile("project", deadline=None, derandomize=True, print_blob
 settings.load_profile("project")
 
 os.environ.pop("COLUMNS", None)  # a parallel run sets one, too narrow for the tables that a pipe gets
+
+# A run in the background of a script ignores Ctrl-C, and so would every process that the tests begin and interrupt.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 PROJECT = Path(__file__).resolve().parent.parent
 
