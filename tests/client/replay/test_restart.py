@@ -45,6 +45,6 @@ def test_a_job_is_followed_through_a_restart(tmp_path: Path, encodings: Path, is
             follower.join(240)
         (done,) = ended
     assert done.state == "succeeded"
-    assert (done.result or {})["map_version"] == 1
+    assert (done.result or {})["map_version"] in {1, 2}  # a number that was begun is not used again
     assert not last.ended
     assert len(heard) > heard.index(last) + 1
