@@ -100,8 +100,8 @@ class Route:
         cells = (before + after) / 2
         return cells if cells.sum() > 0 else np.ones(self.n_images)
 
-    def offset_m(self, position_m: NDArray[np.float64], from_m: float) -> NDArray[np.float64]:
-        """Signed metres along the route from one position to others; the short way round a closed route."""
+    def offset_m(self, position_m: NDArray[np.float64], from_m: float | NDArray[np.float64]) -> NDArray[np.float64]:
+        """Signed metres along the route to positions, from one or each from its own; the short way on a closed one."""
         offset = np.asarray(position_m, np.float64) - from_m
         if not self.closed or self.length_m <= 0:
             return offset

@@ -154,12 +154,11 @@ class ActiveMaps:
         if found is not None and found.version == version and self._clock() - found.found_at < _DAMAGE_REMEMBERED_S:
             raise DamagedMapError(found.error.message, **found.error.hints) from found.error
         try:
-            snapshot = load_snapshot(self._catalog, record.name, version)
+            return load_snapshot(self._catalog, record.name, version)
         except DamagedMapError as error:
             self._damaged[record.name] = _Damage(version, error, self._clock())
             log.error("damaged map", extra={"domain": record.name, "map_version": version}, exc_info=error)
             raise
-        return snapshot
 
     def _announce(self, domain: str, version: int) -> None:
         """Say in the log that another version serves than before, whoever switched it."""

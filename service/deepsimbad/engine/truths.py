@@ -143,10 +143,8 @@ class Truths:
         route = engine.snapshot.route
         truth = true_images(route, known)
         await self._replay(record, engine, truth[:n_needed], share[:n_needed])
-        apart_m = [
-            abs(float(route.offset_m(route.position_m[image], at))) for image, at in zip(truth, known, strict=True)
-        ]
-        share[~(np.array(apart_m) <= _FARTHEST_M)] = np.nan  # unknown ones too
+        apart_m = np.abs(route.offset_m(route.position_m[truth], known))
+        share[~(apart_m <= _FARTHEST_M)] = np.nan  # unknown ones too
         return record, RankedTruths(record.domain, record.map_version, known, share)
 
     def _prepared(

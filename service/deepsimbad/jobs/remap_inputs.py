@@ -4,7 +4,6 @@ import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 import numpy as np
@@ -14,6 +13,7 @@ from deepsimbad.core.route import Route
 from deepsimbad.errors import InvalidEncodingError, InvalidMapConfigError
 from deepsimbad.jobs.encoded_traverse import route_of
 from deepsimbad.jobs.map_config import RemapConfig
+from deepsimbad.release import release
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.frames import TraverseFrames
 from deepsimbad.store.map_contents import MapContents
@@ -51,7 +51,7 @@ class RemapInputs:
         """SHA-256 over all of it, in hex: equal digests, equal map. Another release counts as another input."""
         sha256 = hashlib.sha256()
         said = {
-            "release": _release(),
+            "release": release(),
             "config": self.config.as_dict(),
             "evaluator": self.domain.evaluator,
             "closed": self.domain.closed,
@@ -75,13 +75,6 @@ def _digest(arrays: Mapping[str, NDArray[Any]]) -> bytes:
         sha256.update(f"{name} {array.dtype.str} {array.shape}".encode())
         sha256.update(array.data)
     return sha256.digest()
-
-
-def _release() -> str:
-    try:
-        return version("deep-simbad")
-    except PackageNotFoundError:  # run from a source tree
-        return "0"
 
 
 def read_inputs(catalog: Catalog, domain: str, config: RemapConfig) -> RemapInputs:

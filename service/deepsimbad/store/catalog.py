@@ -5,10 +5,7 @@ from typing import Any
 
 from sqlite_utils import Database
 
-from deepsimbad.errors import (
-    ConflictError,
-    TraverseInUseError,
-)
+from deepsimbad.errors import ConflictError, TraverseInUseError
 from deepsimbad.store import domain_table, job_table, layout, map_table, unfinished
 from deepsimbad.store.census import Census
 from deepsimbad.store.census import take as take_census

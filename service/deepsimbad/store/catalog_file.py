@@ -1,6 +1,5 @@
 """The catalog's file: how it is opened, checked, read and written."""
 
-import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -16,13 +15,14 @@ from deepsimbad.store.connection import check_integrity, migrate, open_database,
 from deepsimbad.store.data_dir import make_data_dir
 from deepsimbad.store.durable import sync_folder
 from deepsimbad.store.faults import storage_faults
+from deepsimbad.store.open_file import OpenFile
 from deepsimbad.store.ownership import Owner
 from deepsimbad.store.row_checksums import CATALOG_TABLES, RowChecksums, verify_rows
 from deepsimbad.store.write_ahead_log import check_log
 from deepsimbad_migrations.catalog.migrations import migrations
 
 
-class CatalogFile:
+class CatalogFile(OpenFile):
     """The open file; its parts say what stands in it. Usable from any thread and several processes.
 
     Args:
@@ -32,11 +32,9 @@ class CatalogFile:
     """
 
     def __init__(self, data_dir: Path, db: Database, checksums: RowChecksums) -> None:
+        super().__init__(layout.catalog_path(data_dir), db)
         self.data_dir = data_dir
-        self._path = layout.catalog_path(data_dir)
-        self._db = db
         self._checksums = checksums
-        self._lock = threading.RLock()
         self._owners = layout.owners_folder(data_dir)
         self._owner = Owner(self._owners)
 
@@ -71,18 +69,7 @@ class CatalogFile:
         """Close the file. Unfinished work begun through this object counts as abandoned from here on."""
         with self._lock:
             self._owner.release()
-            self._db.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self.close()
-
-    @contextmanager
-    def _reading(self) -> Iterator[Database]:
-        with self._lock, storage_faults(self._path), self._db.atomic() as db:
-            yield db
+            super().close()
 
     @contextmanager
     def _writing(self) -> Iterator[Database]:

@@ -1,15 +1,15 @@
 """Every file of a data directory read and compared with what the catalog says of it; nothing is changed."""
 
-import re
-from collections.abc import Callable, Iterator
+import time
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from deepsimbad.errors import DeepSimbadError
 from deepsimbad.store import layout
 from deepsimbad.store.checkpoints import is_whole
 from deepsimbad.store.file_checks import (
-    CatalogListing,
     catalog_listing,
     catalog_problems,
     has_file,
@@ -17,11 +17,9 @@ from deepsimbad.store.file_checks import (
     sessions_problems,
     traverse_problems,
 )
-from deepsimbad.store.records import MapRecord, MapState
+from deepsimbad.store.left_over import Entry, entries, left_over
 
-_SIDE_FILE = re.compile(r"(.+\.sqlite)-(?:wal|shm|journal)")
-_MAP_WORK = re.compile(r"(\d{6,})\.(?:building|sealing)(?:-journal|-wal|-shm)?")
-_NO_CATALOG = "the catalog cannot be read, so nobody knows whether it is needed"
+_LASTING_S = 0.5  # what a living process makes or removes is soon owned or gone
 
 
 @dataclass(frozen=True)
@@ -49,10 +47,11 @@ class Inspection:
 
 @dataclass(frozen=True)
 class _Task:
-    """A file to read, and what gives its problems."""
+    """A file to read, what gives its problems, and which file it was when it was looked for: its inode, if any."""
 
     path: Path
     problems: Callable[[], list[str]]
+    inode: int | None
 
 
 def inspect(data_dir: Path, on_progress: Callable[[float], None]) -> Inspection:
@@ -64,7 +63,8 @@ def inspect(data_dir: Path, on_progress: Callable[[float], None]) -> Inspection:
         data_dir: The data directory.
         on_progress: Called with 0..1; what it raises (a cancel) ends the inspection.
     """
-    tasks, left_over = _look(data_dir)
+    tasks, unneeded = _look(data_dir)
+    looked_at = time.monotonic()
     sizes = [_size(task.path) for task in tasks]
     n_bytes, n_read = max(1, sum(sizes)), 0
     suspects = []
@@ -73,96 +73,75 @@ def inspect(data_dir: Path, on_progress: Callable[[float], None]) -> Inspection:
             suspects.append(task.path)
         n_read += size
         on_progress(n_read / n_bytes)
-    again, left_again = _look(data_dir) if suspects or left_over else (tasks, left_over)
+    if unneeded:
+        time.sleep(max(0.0, looked_at + _LASTING_S - time.monotonic()))
+    again, still_unneeded = _look(data_dir) if suspects or unneeded else (tasks, unneeded)
     damaged = [
         Finding(_named(data_dir, task.path), line)
         for task in again
         if task.path in suspects
-        for line in dict.fromkeys(task.problems())
+        for line in _lasting_problems(task)
     ]
-    confirmed = [finding for finding in left_again if finding in left_over]
+    confirmed = [
+        Finding(_named(data_dir, entry.path), what)
+        for entry, what in sorted(still_unneeded.items())
+        if entry in unneeded  # else it is another one of that name, on its way in or out
+    ]
     return Inspection(len(tasks), tuple(damaged), tuple(confirmed))
 
 
-def _look(data_dir: Path) -> tuple[list[_Task], list[Finding]]:
+def _look(data_dir: Path) -> tuple[list[_Task], dict[Entry, str]]:
     """What there is to read, and what is there though nothing needs it, as of now."""
+    present = entries(data_dir)  # before the catalog is read: it knows of whatever is there before it is
     catalog, sessions = layout.catalog_path(data_dir), layout.sessions_path(data_dir)
-    tasks = [_Task(catalog, lambda: catalog_problems(catalog))]
-    if sessions.exists():
-        tasks.append(_Task(sessions, lambda: sessions_problems(sessions)))
+    tasks = [_task(catalog, catalog_problems), *_tasks([sessions], sessions_problems)]
     try:
         listing = catalog_listing(catalog)
     except DeepSimbadError:
         listing = None
     domains = layout.domains_folder(data_dir)
-    present = {path.name for path in domains.iterdir()} if domains.is_dir() else set()
-    known = set(listing.maps) if listing else {name for name in present if layout.is_name(name)}
+    folders = (entry.path.name for entry in present if entry.path.parent == domains)
+    known = set(listing.maps) if listing else {name for name in folders if layout.is_name(name)}
     for name in sorted(known):
         maps = listing.maps[name] if listing else None
-        tasks += [_map_task(data_dir, name, record) for record in maps or [] if has_file(record)]
-        folder = layout.traverses_folder(data_dir, name)
-        tasks += [_traverse_task(path) for path in sorted(folder.glob("*.sqlite"))]
-    tasks += [_Task(path, _checkpoint_problems(path)) for path in sorted(data_dir.glob("jobs/*/*.checkpoint"))]
-    return tasks, sorted(_left_over(data_dir, listing, present - known), key=lambda finding: finding.file)
+        for record in maps or []:
+            if has_file(record):
+                path = layout.map_path(data_dir, name, record.version)
+                tasks.append(_task(path, partial(map_problems, record=record)))
+        tasks += _tasks(layout.traverses_folder(data_dir, name).glob("*.sqlite"), traverse_problems)
+    tasks += _tasks(data_dir.glob("jobs/*/*.checkpoint"), _checkpoint_problems)
+    return tasks, left_over(data_dir, present, listing)
 
 
-def _map_task(data_dir: Path, domain: str, record: MapRecord) -> _Task:
-    path = layout.map_path(data_dir, domain, record.version)
-    return _Task(path, lambda: map_problems(path, record))
+def _task(path: Path, problems: Callable[[Path], list[str]]) -> _Task:
+    return _Task(path, partial(problems, path), _inode(path))
 
 
-def _traverse_task(path: Path) -> _Task:
-    return _Task(path, lambda: traverse_problems(path))
+def _tasks(found: Iterable[Path], problems: Callable[[Path], list[str]]) -> list[_Task]:
+    """Files that may be there or not, in the order of their paths."""
+    tasks = [_task(path, problems) for path in sorted(found)]
+    return [task for task in tasks if task.inode is not None]
 
 
-def _checkpoint_problems(path: Path) -> Callable[[], list[str]]:
-    return lambda: [] if is_whole(path) else [f"{path.name} is damaged: the job will do this stage anew"]
+def _lasting_problems(task: _Task) -> list[str]:
+    """None if the file went, or another took its place, while it was read."""
+    lines = list(dict.fromkeys(task.problems()))
+    return lines if _inode(task.path) == task.inode else []
 
 
-def _left_over(data_dir: Path, listing: CatalogListing | None, strangers: set[str]) -> Iterator[Finding]:
-    known = {"catalog.sqlite", "sessions.sqlite", "service.lock", "owners", "jobs", "domains", "lost+found"}
-    for path in _entries(data_dir):
-        side = _SIDE_FILE.fullmatch(path.name)
-        if path.name not in known and not (side and side[1] in known and (data_dir / side[1]).exists()):
-            yield Finding(_named(data_dir, path), "nothing of this name belongs here")
-    for name in strangers:
-        why = "it belongs to no domain" if listing else _NO_CATALOG
-        yield Finding(_named(data_dir, layout.domains_folder(data_dir) / name), why)
-    if listing is None:
-        return
-    for path in _entries(layout.jobs_folder(data_dir)):
-        if path.name not in listing.unended_jobs:
-            yield Finding(_named(data_dir, path), "its job has ended")
-    for name, maps in listing.maps.items():
-        yield from _left_over_of_domain(data_dir, name, maps)
-
-
-def _left_over_of_domain(data_dir: Path, domain: str, maps: list[MapRecord]) -> Iterator[Finding]:
-    for path in _entries(layout.domain_folder(data_dir, domain)):
-        if path.name not in {"traverses", "maps"}:
-            yield Finding(_named(data_dir, path), "nothing of this name belongs here")
-    for path in _entries(layout.traverses_folder(data_dir, domain)):
-        side = _SIDE_FILE.fullmatch(path.name)
-        if path.suffix != ".sqlite" and not (side and path.with_name(side[1]).exists()):
-            yield Finding(_named(data_dir, path), "no traverse owns it")
-    for path in _entries(layout.maps_folder(data_dir, domain)):
-        if not _is_owned(path, maps):
-            yield Finding(_named(data_dir, path), "no map version owns it")
-
-
-def _is_owned(path: Path, maps: list[MapRecord]) -> bool:
-    work = _MAP_WORK.fullmatch(path.name)
-    if work is not None:
-        return any(record.version == int(work[1]) and record.state is MapState.BUILDING for record in maps)
-    return any(path.name == f"{record.version:06d}.sqlite" and record.removed_at is None for record in maps)
-
-
-def _entries(folder: Path) -> list[Path]:
-    return sorted(folder.iterdir()) if folder.is_dir() else []
+def _checkpoint_problems(path: Path) -> list[str]:
+    return [] if is_whole(path) else [f"{path.name} is damaged: the job will do this stage anew"]
 
 
 def _named(data_dir: Path, path: Path) -> str:
     return path.relative_to(data_dir).as_posix()
+
+
+def _inode(path: Path) -> int | None:
+    try:
+        return path.stat().st_ino
+    except OSError:
+        return None
 
 
 def _size(path: Path) -> int:

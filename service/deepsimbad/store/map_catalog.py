@@ -4,10 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from deepsimbad.errors import (
-    DamagedMapError,
-    UnknownMapVersionError,
-)
+from deepsimbad.errors import DamagedMapError, UnknownMapVersionError
 from deepsimbad.store import domain_table, layout, map_removal, map_table, unfinished
 from deepsimbad.store.catalog_file import CatalogFile
 from deepsimbad.store.list_page import ListPage

@@ -1,6 +1,8 @@
 """Turning a built map into the file that serves, and checking later that it is still that file."""
 
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from deepsimbad.errors import ConflictError, DamagedMapError
@@ -25,24 +27,13 @@ def seal(building_path: Path, final_path: Path) -> tuple[str, int]:
         ConflictError: A file of the final name is there.
         UnavailableError: The disk is full, read-only, ...
     """
-    sealing_path = final_path.with_suffix(SEALING_SUFFIX)
-    with storage_faults(final_path, DamagedMapError):
-        if final_path.exists():
-            raise ConflictError(f"{final_path.name} is sealed already; a sealed map never changes")
-        remove_database(sealing_path)
-        try:
-            with open_database(building_path) as db:
-                check_integrity(db, building_path, DamagedMapError)
-                db.conn.execute("VACUUM INTO ?", [str(sealing_path)])
-            read_map(sealing_path)
-            sealing_path.chmod(0o444)
-            sync_file(sealing_path)
-            digest, n_bytes = sha256_of(sealing_path), sealing_path.stat().st_size
-            sealing_path.rename(final_path)
-        except BaseException:
-            remove_database(sealing_path)
-            raise
-        sync_folder(final_path.parent)
+    with _taking_its_name(final_path) as sealing_path:
+        with open_database(building_path) as db:
+            check_integrity(db, building_path, DamagedMapError)
+            db.conn.execute("VACUUM INTO ?", [str(sealing_path)])
+        read_map(sealing_path)
+        digest, n_bytes = sha256_of(sealing_path), sealing_path.stat().st_size
+    with storage_faults(building_path):
         remove_database(building_path)
     return digest, n_bytes
 
@@ -58,23 +49,29 @@ def adopt(source: Path, final_path: Path, sha256: str) -> int:
         ConflictError: A file of the final name is there.
         UnavailableError: The disk is full, read-only, ...
     """
+    with _taking_its_name(final_path) as sealing_path:
+        shutil.copyfile(source, sealing_path)
+        verify(sealing_path, sha256)
+    return final_path.stat().st_size
+
+
+@contextmanager
+def _taking_its_name(final_path: Path) -> Iterator[Path]:
+    """Where to write what, at the end of the block, is made read-only, synced and given its final name, or removed."""
     sealing_path = final_path.with_suffix(SEALING_SUFFIX)
     with storage_faults(final_path, DamagedMapError):
         if final_path.exists():
             raise ConflictError(f"{final_path.name} is sealed already; a sealed map never changes")
         remove_database(sealing_path)
         try:
-            shutil.copyfile(source, sealing_path)
-            verify(sealing_path, sha256)
+            yield sealing_path
             sealing_path.chmod(0o444)
             sync_file(sealing_path)
-            n_bytes = sealing_path.stat().st_size
             sealing_path.rename(final_path)
         except BaseException:
             remove_database(sealing_path)
             raise
         sync_folder(final_path.parent)
-    return n_bytes
 
 
 def verify(path: Path, sha256: str) -> None:

@@ -1,9 +1,8 @@
 """The file of live sessions: whatever was acknowledged to a robot survives kill -9 and a power cut."""
 
-import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import Future
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Self
 
@@ -19,6 +18,7 @@ from deepsimbad.store.durable import sync_folder
 from deepsimbad.store.faults import storage_faults
 from deepsimbad.store.group_commit import GroupCommit
 from deepsimbad.store.list_page import ListPage
+from deepsimbad.store.open_file import OpenFile
 from deepsimbad.store.row_checksums import SESSION_TABLES, RowChecksums
 from deepsimbad.store.session_records import ClockRecord, JournalRow, ListedSession, SessionRecord, StateSnapshot
 from deepsimbad.store.write_ahead_log import check_log
@@ -28,7 +28,7 @@ PURGED_AT_ONCE = 1000  # rows
 _CHECKED_AT_START_BYTES = 64 * 1024 * 1024  # a service shall be ready soon; `deepsimbad check` reads more
 
 
-class SessionStore:
+class SessionStore(OpenFile):
     """Sessions and their journals; usable from any thread.
 
     Writes are futures: done when they are on the disk, those of one moment in one transaction. Reads see what is
@@ -50,10 +50,8 @@ class SessionStore:
         checksums: RowChecksums,
         on_commit: Callable[[int], None],
     ) -> None:
-        self._path = path
-        self._db = reading
+        super().__init__(path, reading)
         self._writing = writing
-        self._lock = threading.Lock()
         self._commits = GroupCommit(writing, path, on_commit, checksums.note)
 
     @classmethod
@@ -81,19 +79,8 @@ class SessionStore:
         """Commit what waits, then close the file."""
         self._commits.close()
         with self._lock:
-            self._db.close()
+            super().close()
             self._writing.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self.close()
-
-    @contextmanager
-    def _reading(self) -> Iterator[Database]:
-        with self._lock, storage_faults(self._path), self._db.atomic() as db:
-            yield db
 
     def check(self) -> None:
         """Raise what keeps the file from being read."""

@@ -2,7 +2,6 @@
 
 import fcntl
 import os
-import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -24,6 +23,7 @@ from deepsimbad.store.documents import now
 from deepsimbad.store.durable import remove_database, sync_file, sync_folder
 from deepsimbad.store.faults import storage_faults
 from deepsimbad.store.frames import UNKNOWN_TIMESTAMP, TraverseFrames
+from deepsimbad.store.open_file import OpenFile
 from deepsimbad.store.write_ahead_log import check_log
 from deepsimbad_migrations.traverse.migrations import migrations
 
@@ -31,7 +31,7 @@ IndexRanges = list[tuple[int, int]]  # the class has a `list` of its own
 _NEW_SUFFIX = ".new"  # a file being made; never a traverse's own ending
 
 
-class Traverse:
+class Traverse(OpenFile):
     """One traverse file; usable from any thread and several processes.
 
     A put that returned survives kill -9 and a power cut; one that did not is there whole or not at all. Every method
@@ -44,10 +44,8 @@ class Traverse:
     """
 
     def __init__(self, name: str, path: Path, db: Database) -> None:
+        super().__init__(path, db)
         self.name = name
-        self._path = path
-        self._db = db
-        self._lock = threading.RLock()
         self._inode = path.stat().st_ino
 
     @classmethod
@@ -124,22 +122,6 @@ class Traverse:
             if not folder.is_dir():
                 return []
             return sorted(path.stem for path in folder.iterdir() if path.suffix == ".sqlite")
-
-    def close(self) -> None:
-        """Close the file."""
-        with self._lock:
-            self._db.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self.close()
-
-    @contextmanager
-    def _reading(self) -> Iterator[Database]:
-        with self._lock, storage_faults(self._path), self._db.atomic() as db:
-            yield db
 
     @contextmanager
     def _writing(self) -> Iterator[Database]:

@@ -26,6 +26,7 @@ from deepsimbad_client.cli import main
 main()
 """
 PATIENCE_S = 60
+N_PRESSES = 20
 
 
 class Endless(BaseHTTPRequestHandler):
@@ -98,23 +99,41 @@ class Terminal:
 
     def wait_for(self, words: bytes) -> None:
         """Read until the words stand on the screen."""
-        give_up = time.monotonic() + PATIENCE_S
-        while words not in self.shown:
-            assert time.monotonic() < give_up, self.shown
-            ready, _, _ = select.select([self.own], [], [], 1)
-            if ready:
-                self.shown += self._read()
-            else:
-                assert self.process.poll() is None, self.shown
+        assert self._shows(words, PATIENCE_S), self.shown
 
-    def type(self, keys: bytes) -> None:
-        os.write(self.own, keys)
+    def press_ctrl_c(self, then: bytes | None) -> None:
+        """Interrupt until the words stand on the screen, or, with None, until the command ends.
 
-    def ends(self) -> int:
-        """The exit code; what is still shown is read."""
-        while more := self._read():
-            self.shown += more
+        Pressed in the instant before Python waits for input or for bytes, Ctrl-C is only seen when that wait ends: a
+        person presses it again, and so does this.
+        """
+        for _ in range(N_PRESSES):
+            os.write(self.own, CTRL_C)
+            if self._shows(then, PATIENCE_S / N_PRESSES):
+                return
+        raise AssertionError(self.shown)
+
+    def answer(self, keys: bytes) -> int:
+        """Type what the command waits for; returns its exit code."""
+        if keys == CTRL_C:
+            self.press_ctrl_c(then=None)
+        else:
+            os.write(self.own, keys)
+            assert self._shows(None, PATIENCE_S), self.shown
         return self.process.wait(PATIENCE_S)
+
+    def _shows(self, words: bytes | None, within_s: float) -> bool:
+        """Whether the words come to stand on the screen, or the command ends where there are none to wait for."""
+        give_up = time.monotonic() + within_s
+        while words is None or words not in self.shown:
+            ready, _, _ = select.select([self.own], [], [], max(0.0, give_up - time.monotonic()))
+            if not ready:
+                return False
+            more = self._read()
+            if not more:
+                return words is None
+            self.shown += more
+        return True
 
     def _read(self) -> bytes:
         try:
@@ -157,10 +176,8 @@ def test_ctrl_c_asks_whether_to_cancel(
 ) -> None:
     window = terminal("remap", "--domain", "d", "--training", "t")
     window.wait_for(b"train planner")
-    window.type(CTRL_C)
-    window.wait_for(b"Cancel job 7 on the server too? [y/N]")
-    window.type(reply)
-    assert window.ends() == 130
+    window.press_ctrl_c(then=b"Cancel job 7 on the server too? [y/N]")
+    assert window.answer(reply) == 130
     assert told in window.shown
     assert b"Traceback" not in window.shown
     assert endless.deleted == (["/v1/admin/jobs/7"] if is_cancelled else [])  # type: ignore[attr-defined]
@@ -169,10 +186,8 @@ def test_ctrl_c_asks_whether_to_cancel(
 def test_a_job_that_is_followed_later_is_asked_about_too(endless: ThreadingHTTPServer, terminal: Any) -> None:
     window = terminal("jobs", "7", "--follow")
     window.wait_for(b"train planner")
-    window.type(CTRL_C)
-    window.wait_for(b"[y/N]")
-    window.type(b"y\n")
-    assert window.ends() == 130
+    window.press_ctrl_c(then=b"[y/N]")
+    assert window.answer(b"y\n") == 130
     assert endless.deleted == ["/v1/admin/jobs/7"]  # type: ignore[attr-defined]
 
 
@@ -182,6 +197,5 @@ def test_a_deletion_is_asked_about(
 ) -> None:
     window = terminal("delete-traverse", "d", "t")
     window.wait_for(b"Delete traverse t of domain d with its 12 frames? [y/N]")
-    window.type(reply)
-    assert window.ends() == code
+    assert window.answer(reply) == code
     assert endless.deleted == ["/v1/admin/domains/d/traverses/t"] * n_deleted  # type: ignore[attr-defined]
