@@ -40,10 +40,10 @@ def check(answer: Any, limit: str) -> None:
 def test_a_full_queue(busy: TestClient) -> None:
     session = busy.post("/v1/domains/ready/sessions", json={}).json()
     worker, gate, begun = services_of(busy).worker, threading.Event(), threading.Event()
+    worker.submit(lambda: (begun.set(), gate.wait(60)))
+    assert begun.wait(60)
+    waiting = worker.submit(lambda: None)
     try:
-        worker.submit(lambda: (begun.set(), gate.wait(60)))
-        assert begun.wait(60)
-        worker.submit(lambda: None)
         check(busy.post(READY, json=VIEW), "max_queue")
         check(busy.post("/v1/domains/ready/sessions", json={}), "max_queue")
         check(busy.post(f"/v1/sessions/{session['session_id']}/observations", json=VIEW), "max_queue")
@@ -55,6 +55,7 @@ def test_a_full_queue(busy: TestClient) -> None:
         assert 'deepsimbad_refused_requests_total{reason="max_queue"} 4.0' in busy.get("/metrics").text
     finally:
         gate.set()
+    waiting.result(60)
     assert busy.post(READY, json=VIEW).status_code == 200
     found = busy.get(f"/v1/sessions/{session['session_id']}").json()
     assert found["n_observations"] == 0
