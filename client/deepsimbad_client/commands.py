@@ -11,6 +11,7 @@ from importlib import import_module
 
 import click
 
+from deepsimbad_client.console import show_waits
 from deepsimbad_client.delete_commands import delete_domain, delete_map, delete_session, delete_traverse
 from deepsimbad_client.errors import DeepSimbadClientError
 from deepsimbad_client.job_commands import jobs, remap
@@ -67,6 +68,7 @@ for command in COMMANDS:
 
 def run(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns its exit code."""
+    show_waits()
     try:
         code = cli.main(
             None if arguments is None else list(arguments), prog_name="deepsimbad-client", standalone_mode=False

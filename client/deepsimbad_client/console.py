@@ -1,6 +1,7 @@
 """How the commands show things: progress on standard error, results on standard output."""
 
 import json
+import logging
 import os
 from types import TracebackType
 from typing import Any, Self
@@ -34,6 +35,23 @@ def show(table: Table) -> None:
     if not console.is_terminal and "COLUMNS" not in os.environ:
         console.width = PIPE_COLUMNS
     console.print(table)
+
+
+class Remarks(logging.Handler):
+    """Shows log records to a person, above the progress bar if there is one."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Show one."""
+        REMARKS.print(record.getMessage())
+
+
+def show_waits() -> None:
+    """Tell a person at a terminal why nothing happens while a call waits to be sent again."""
+    if REMARKS.is_terminal:
+        retries = logging.getLogger("deepsimbad_client.retry")
+        retries.setLevel(logging.INFO)
+        retries.handlers = [Remarks()]
+        retries.propagate = False
 
 
 def as_json(document: Any) -> str:

@@ -4,6 +4,7 @@ Nothing here waits or sends: `Attempts` is told what happened and says what to d
 share every rule.
 """
 
+import logging
 import random
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -15,6 +16,8 @@ import httpx2
 
 from deepsimbad_client.errors import TransportError, TransportTimeoutError
 from deepsimbad_client.problem import problem_of
+
+logger = logging.getLogger(__name__)
 
 RETRIED_STATUSES = frozenset({408, 429, 502, 503, 504})
 REFUSED_STATUSES = frozenset({408, 429, 503})
@@ -116,12 +119,11 @@ class Attempts:
         hopeless = isinstance(error, httpx2.UnsupportedProtocol | httpx2.LocalProtocolError)
         if safe and not hopeless and self.n_sent < self.policy.attempts:
             self.answer_lost |= not untouched
-            return self.policy.backoff_s(self.n_sent, self.jitter())
+            return self._announced(self.policy.backoff_s(self.n_sent, self.jitter()), _reason(error))
         kind = TransportTimeoutError if isinstance(error, httpx2.TimeoutException) else TransportError
         tries = f"{self.n_sent} tries" if self.n_sent > 1 else "one try"
-        reason = str(error) or type(error).__name__
         there = "; is the service running there?" if untouched else ""
-        raise kind(f"no answer to {self.what} after {tries}: {reason}{there}") from error
+        raise kind(f"no answer to {self.what} after {tries}: {_reason(error)}{there}") from error
 
     def after_answer(self, response: httpx2.Response) -> float | None:
         """Seconds to wait before the next try; None when this answer is the last word."""
@@ -134,10 +136,29 @@ class Attempts:
         }[self.repeat]
         if status not in retried or self.n_sent >= self.policy.attempts:
             return None
-        if problem_of(response).get("code") in LASTING_CODES:
+        code = problem_of(response).get("code")
+        if code in LASTING_CODES:
             return None
-        asked = retry_after_s(response.headers.get("retry-after"), self.now())
-        if asked is None:
+        wait_s = retry_after_s(response.headers.get("retry-after"), self.now())
+        if wait_s is None:
             self.answer_lost |= status not in REFUSED_STATUSES
-            return self.policy.backoff_s(self.n_sent, self.jitter())
-        return asked if asked <= self.policy.max_retry_after_s else None
+            wait_s = self.policy.backoff_s(self.n_sent, self.jitter())
+        elif wait_s > self.policy.max_retry_after_s:
+            return None
+        return self._announced(wait_s, f"{status} {code or ''}".rstrip())
+
+    def _announced(self, wait_s: float, reason: str) -> float:
+        """The wait, told to whoever listens to this module's logger: a client that only waits looks dead."""
+        logger.info(
+            "%s: %s; trying again in %.1f s (try %d of %d)",
+            self.what,
+            reason,
+            wait_s,
+            self.n_sent + 1,
+            self.policy.attempts,
+        )
+        return wait_s
+
+
+def _reason(error: httpx2.TransportError) -> str:
+    return str(error) or type(error).__name__

@@ -106,6 +106,9 @@ class Settings(BaseSettings):
     snapshot_every: Annotated[
         int, Field(description="Observations of a session between two snapshots of its belief.", ge=1)
     ] = 32
+    keep_ended_sessions_s: Annotated[
+        float, Field(description="What a session saw is kept for so long after its end, for its truths.", ge=0)
+    ] = 86_400.0
     session_sweep_s: Annotated[float, Field(description="Expired sessions are looked for this often.", gt=0)] = 30.0
 
     @field_validator("cors_origins")

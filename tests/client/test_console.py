@@ -1,8 +1,14 @@
 """Tables off a terminal: whole names, for a person who pipes and a script that cuts."""
 
-import pytest
+import io
+import logging
+from collections.abc import Iterator
 
-from deepsimbad_client.console import show
+import pytest
+from rich.console import Console
+
+from deepsimbad_client import console
+from deepsimbad_client.console import show, show_waits
 from deepsimbad_client.models import Domain
 from deepsimbad_client.tables import domain_table
 
@@ -21,3 +27,25 @@ def test_columns_are_heeded(capsys: pytest.CaptureFixture[str], monkeypatch: pyt
     monkeypatch.setenv("COLUMNS", "60")
     show(domain_table([Domain(name="a" * 64, evaluator={"kind": "feature_l2"})]))
     assert max(map(len, capsys.readouterr().out.splitlines())) <= 60
+
+
+@pytest.fixture
+def retries() -> Iterator[logging.Logger]:
+    logger = logging.getLogger("deepsimbad_client.retry")
+    before = logger.level, logger.handlers, logger.propagate
+    yield logger
+    logger.setLevel(before[0])
+    logger.handlers, logger.propagate = before[1:]
+
+
+@pytest.mark.parametrize("is_terminal", [True, False])
+def test_waits_are_shown_to_a_person_and_to_no_script(
+    retries: logging.Logger, monkeypatch: pytest.MonkeyPatch, is_terminal: bool
+) -> None:
+    screen = io.StringIO()
+    monkeypatch.setattr(
+        console, "REMARKS", Console(file=screen, force_terminal=is_terminal, markup=False, highlight=False)
+    )
+    show_waits()
+    retries.info("503 [overloaded]; trying again in %.1f s", 2)
+    assert ("503 [overloaded]; trying again in 2.0 s" in screen.getvalue()) == is_terminal

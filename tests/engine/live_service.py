@@ -21,7 +21,7 @@ from deepsimbad.store.sessions import SessionStore
 from .conftest import DIM, N_LANDMARKS
 
 T = TypeVar("T")
-TTL_S = 100.0
+TTL_S, KEEP_ENDED_S = 100.0, 50_000.0
 
 
 class Clock:
@@ -46,7 +46,14 @@ class Live:
             self.store,
             self.maps,
             self.worker,
-            **{"ttl_s": TTL_S, "max_sessions": 20, "snapshot_every": 4, "clock": clock, **options},
+            **{
+                "ttl_s": TTL_S,
+                "max_sessions": 20,
+                "snapshot_every": 4,
+                "keep_ended_s": KEEP_ENDED_S,
+                "clock": clock,
+                **options,
+            },
         )
 
     def close(self) -> None:

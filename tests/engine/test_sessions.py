@@ -32,7 +32,7 @@ from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.map_table import ANY
 
 from .conftest import N_IMAGES, add_domain, add_map
-from .live_service import TTL_S, Clock, Live, encoded, ranked, run, running
+from .live_service import KEEP_ENDED_S, TTL_S, Clock, Live, encoded, ranked, run, running
 
 Masses = NDArray[np.float64]
 
@@ -316,7 +316,7 @@ def test_a_session_expires_when_nothing_happens(mapped: Catalog) -> None:
         assert live.sessions.n_living == 0
         with pytest.raises(EndedSessionError):
             await live.sessions.observe(busy, ranked(1))
-        clock.now += 86_401
+        clock.now += KEEP_ENDED_S + 1
         await live.sessions.sweep()
         for session_id in (idle, busy):
             with pytest.raises(UnknownSessionError):

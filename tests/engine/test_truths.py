@@ -21,7 +21,7 @@ from deepsimbad.errors import InvalidInputError, RetiredMapError, UnknownSession
 from deepsimbad.store.catalog import Catalog
 
 from .conftest import add_domain, add_map
-from .live_service import Clock, Live, encoded, ranked, run
+from .live_service import KEEP_ENDED_S, Clock, Live, encoded, ranked, run
 
 NAN = math.nan
 
@@ -117,7 +117,7 @@ def test_an_ended_session_may_be_told_of_until_it_is_forgotten(mapped: Catalog) 
         found = await truths_of(live).rank(session_id, [3.0, 4.6])
         expected = [slow_share(mass, route, at) for mass, at in zip(masses, (3.0, 4.6), strict=True)]
         np.testing.assert_allclose(found.rank_share, expected)
-        clock.now += 86_401
+        clock.now += KEEP_ENDED_S + 1
         await live.sessions.sweep()
         with pytest.raises(UnknownSessionError):
             await truths_of(live).rank(session_id, [3.0, 4.6])

@@ -211,6 +211,7 @@ def _start(settings: Settings, metrics: Metrics, keys: KeyRing, run_job: RunJob,
         ttl_s=settings.session_ttl_s,
         max_sessions=settings.max_sessions,
         snapshot_every=settings.snapshot_every,
+        keep_ended_s=settings.keep_ended_sessions_s,
         clock=clock,
     )
     parts.callback(live.close)
@@ -258,7 +259,7 @@ def _start(settings: Settings, metrics: Metrics, keys: KeyRing, run_job: RunJob,
     else:
         log.info("asks for keys", extra=exposure)
     log.info(
-        "ready",
+        "opened",
         extra={
             "n_domains": len(catalog.domains()),
             "n_maps": active_maps.n_loaded,

@@ -26,7 +26,7 @@ log = logging.getLogger(__name__)
 
 
 class _Server(uvicorn.Server):
-    """Tells the application that shutdown begins, so that event streams end rather than hold it up."""
+    """Says when it listens, and tells the application of shutdown, so that event streams do not hold it up."""
 
     def __init__(self, config: uvicorn.Config, app: FastAPI) -> None:
         super().__init__(config)
@@ -43,6 +43,12 @@ class _Server(uvicorn.Server):
             self.should_exit = True  # being asked to stop is no failure, so the signal is not raised again
         else:
             super().handle_exit(sig, frame)
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Open the application and listen, and say so when both are done."""
+        await super().startup(sockets)
+        addresses = [listening.getsockname()[:2] for server in self.servers for listening in server.sockets]
+        log.info("ready", extra={"addresses": [f"{host}:{port}" for host, port in addresses]})
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         """End connections and requests, then the application: also where nobody waits, its files are closed."""

@@ -12,7 +12,6 @@ from deepsimbad.errors import DamagedFileError, TooManySessionsError, UnknownSes
 from deepsimbad.store.session_records import SessionRecord
 from deepsimbad.store.sessions import SessionStore
 
-REMEMBERED_S = 86_400.0  # an ended session is known to have been one for so long
 DELETED, EXPIRED = "deleted", "expired"
 _LONGEST_RETRY_S = 60
 
@@ -152,9 +151,9 @@ class SessionRegistry:
             if self.is_due(live) and live.ending is None:  # neither moved on nor ended since the list was made
                 await self.end(live, EXPIRED)
 
-    async def purge(self) -> None:
-        """Forget what ended long ago."""
-        while await asyncio.wrap_future(self._store.purge(self._clock() - REMEMBERED_S)):
+    async def purge(self, kept_s: float) -> None:
+        """Forget what ended longer ago than this."""
+        while await asyncio.wrap_future(self._store.purge(self._clock() - kept_s)):
             pass
 
 

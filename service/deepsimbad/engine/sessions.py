@@ -50,6 +50,7 @@ class Sessions:
         ttl_s: A session ends when nothing happened to it for so long.
         max_sessions: How many may live at once.
         snapshot_every: Rows of a journal between two snapshots: how much is replayed after a start.
+        keep_ended_s: An ended session is known, with what it saw, for so long.
         clock: Seconds since 1970.
     """
 
@@ -62,6 +63,7 @@ class Sessions:
         ttl_s: float,
         max_sessions: int,
         snapshot_every: int,
+        keep_ended_s: float,
         clock: Callable[[], float] = time.time,
     ) -> None:
         self._store = store
@@ -69,6 +71,7 @@ class Sessions:
         self._worker = worker
         self._ttl_s = ttl_s
         self._snapshot_every = snapshot_every
+        self._keep_ended_s = keep_ended_s
         self._clock = clock
         self._summaries = ThreadPoolExecutor(1, "summaries")
         self._registry = SessionRegistry(store, maps, max_sessions, clock)
@@ -154,7 +157,7 @@ class Sessions:
     async def sweep(self) -> None:
         """End what has expired, and forget what ended long ago."""
         await self._finished(self._registry.expire())
-        await self._finished(self._registry.purge())
+        await self._finished(self._registry.purge(self._keep_ended_s))
 
     async def _begun_before(self, session_id: str, config: SessionConfig) -> SessionView:
         live = await self._registry.find(session_id)

@@ -87,7 +87,7 @@ def checked_truths(positions_m: Sequence[float | None], n_observations: int) -> 
 
 
 class Truths:
-    """Replays sessions, living ones and those that ended up to a day ago; used from an event loop.
+    """Replays sessions, living ones and those that ended and are still known; used from an event loop.
 
     A replay takes as long as the session's observations took, but in short pieces behind every live view, and holds a
     few rows of the journal at a time.

@@ -72,6 +72,28 @@ def test_an_idempotent_call_is_sent_again(outcome: Callable[[], Outcome]) -> Non
     assert script.slept == [1.0, 2.0]
 
 
+def test_every_wait_is_told_to_the_log_with_its_reason(caplog: pytest.LogCaptureFixture) -> None:
+    overloaded = {"code": "overloaded", "status": 503}
+    refused = httpx2.Response(
+        503, json=overloaded, headers={"content-type": "application/problem+json", "retry-after": "7"}
+    )
+    caplog.set_level("INFO", "deepsimbad_client.retry")
+    Script(httpx2.ConnectError, refused, answer(200, OK)).client().health()
+    assert caplog.messages == [
+        "GET /healthz at http://service: scripted; trying again in 1.0 s (try 2 of 4)",
+        "GET /healthz at http://service: 503 overloaded; trying again in 7.0 s (try 3 of 4)",
+    ]
+
+
+def test_the_last_failure_is_an_error_and_no_wait(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO", "deepsimbad_client.retry")
+    with pytest.raises(errors.ApiError):
+        Script(answer(503, retry_after="31")).client().health()  # longer than is waited out
+    with pytest.raises(errors.ApiError):
+        Script(answer(404)).client().health()
+    assert caplog.messages == []
+
+
 def test_an_upload_is_sent_again_with_its_body() -> None:
     script = Script(httpx2.ReadError, answer(201, {"index": 3, "n_frames": 1}))
     image = b"\xff\xd8\xff rest"

@@ -33,8 +33,8 @@ router = APIRouter(prefix="/v1/admin/domains", tags=["admin: maps"])
 async def post_experience(domain: DomainName, request: Request, response: Response, running: Running) -> JobAnswer:
     """Let the next map version learn from a session, whose true positions are known by now, as a job.
 
-    The next version is the active one with a better experience database; the session may have ended up to a day ago.
-    What it tells of the live answers counts as it does for `truths`.
+    The next version is the active one with a better experience database; the session may have ended, up to
+    a day ago unless the settings say otherwise. What it tells of the live answers counts as it does for `truths`.
     """
     body = await read_json(request, ExperienceBody)
 

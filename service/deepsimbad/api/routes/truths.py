@@ -18,10 +18,11 @@ router = APIRouter(prefix="/v1", tags=["sessions"])
     openapi_extra=declare_json(TruthsBody),
 )
 async def post_truths(session_id: SessionId, request: Request, running: Running) -> TruthsAnswer:
-    """Rank the truth in the belief as it was after every observation; the session may have ended up to a day ago.
+    """Rank the truth in the belief as it was after every observation.
 
-    The answer's ANR is that of this session; the metric `deepsimbad_live_anr_percent` counts every observation once,
-    whoever tells of it how often. The positions are kept, so that a map can learn from them.
+    The session may have ended, up to a day ago unless the settings say otherwise. The answer's ANR is that of this
+    session; the metric `deepsimbad_live_anr_percent` counts every observation once, whoever tells of it how often. The
+    positions are kept, so that a map can learn from them.
     """
     body = await read_json(request, TruthsBody)
     ranked, before_m = await running.truths.keep(session_id, body.true_positions_m)
