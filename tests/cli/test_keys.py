@@ -59,5 +59,6 @@ def test_mistakes_are_named_and_change_nothing(deepsimbad, tmp_path):
 
 @pytest.mark.parametrize("command", [("list",), ("list", "--json"), ("revoke", "0123456789ab")])
 def test_a_question_makes_no_folder(deepsimbad, tmp_path, command):
-    deepsimbad("keys", *command, "--data-dir", tmp_path / "nowhere")
+    ran = deepsimbad("keys", *command, "--data-dir", tmp_path / "nowhere")
     assert not (tmp_path / "nowhere").exists()
+    assert "name their folder with --data-dir" in ran.err  # a mistyped folder would look like one without keys

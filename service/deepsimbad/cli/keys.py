@@ -55,6 +55,8 @@ def list_(as_json: bool, data_dir: Path | None) -> None:
     if catalog_path(folder).is_file():  # a question must not make the folder it asks about
         with Catalog.open(folder) as catalog:
             records = catalog.keys()
+    else:
+        click.echo(f"nothing was ever kept in {folder}: if keys were, name their folder with --data-dir", err=True)
     if as_json:
         write_json([_described(record) for record in records])
         return
