@@ -11,6 +11,12 @@ from hypothesis import settings
 settings.register_profile("project", deadline=None, derandomize=True, print_blob=True)
 settings.load_profile("project")
 
+# Whoever runs the tests may have settings of their own; these are for the processes that tests start.
+for name in [name for name in os.environ if name.startswith("DEEPSIMBAD_") and name != "DEEPSIMBAD_REAL_DATA"]:
+    del os.environ[name]
+os.environ["DEEPSIMBAD_JOB_PRIORITY"] = (
+    "normal"  # tests keep every core busy: an idle-class job would wait for them all
+)
 os.environ.pop("COLUMNS", None)  # a parallel run sets one, too narrow for the tables that a pipe gets
 
 # A run in the background of a script ignores Ctrl-C, and so would every process that the tests begin and interrupt.

@@ -9,6 +9,7 @@ from pydantic import Field, field_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from deepsimbad.errors import SettingsError
+from deepsimbad.jobs.job_priority import JobPriority
 
 MEBIBYTE = 1024 * 1024
 _ORIGIN = re.compile(r"\*|[a-z][a-z0-9+.-]*://[^/\s*?#@]+")
@@ -98,6 +99,10 @@ class Settings(BaseSettings):
     job_threads: Annotated[
         int, Field(description="Threads that a job computes in; 0: one less than there are cores.", ge=0)
     ] = 0
+    job_priority: Annotated[
+        JobPriority,
+        Field(description="`idle`: jobs run when nothing else on the machine would; `low`, `normal`: beside it."),
+    ] = JobPriority.IDLE
 
     session_ttl_s: Annotated[
         float, Field(description="A session ends when nothing was observed in it for so long.", gt=0, le=31_536_000)

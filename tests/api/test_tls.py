@@ -19,7 +19,6 @@ from deepsimbad.errors import SettingsError
 
 FILES = Path(__file__).parent / "tls"
 CERTIFICATE, KEY = FILES / "certificate.pem", FILES / "key.pem"
-ENVIRONMENT = {name: value for name, value in os.environ.items() if not name.startswith("DEEPSIMBAD_")}
 
 
 def test_neither_is_http() -> None:
@@ -77,7 +76,7 @@ def port(tmp_path: Path) -> Iterator[int]:
     settings = {"TLS_CERTIFICATE": CERTIFICATE, "TLS_KEY": KEY, "HEADER_TIMEOUT_S": 1}
     process = subprocess.Popen(
         [sys.executable, "-m", "deepsimbad", "serve", "--data-dir", str(tmp_path / "data"), "--port", str(found)],
-        env=ENVIRONMENT | {f"DEEPSIMBAD_{name}": str(value) for name, value in settings.items()},
+        env={**os.environ, **{f"DEEPSIMBAD_{name}": str(value) for name, value in settings.items()}},
         stderr=subprocess.DEVNULL,
         cwd=tmp_path,
     )
@@ -128,7 +127,7 @@ def test_the_service_on_https(port: int) -> None:
 def test_serve_says_which_file_it_cannot_use(tmp_path: Path) -> None:
     ran = subprocess.run(
         [sys.executable, "-m", "deepsimbad", "serve", "--data-dir", str(tmp_path / "data"), "--port", "0"],
-        env=ENVIRONMENT | {"DEEPSIMBAD_TLS_CERTIFICATE": str(CERTIFICATE), "DEEPSIMBAD_TLS_KEY": "/nowhere/key.pem"},
+        env={**os.environ, "DEEPSIMBAD_TLS_CERTIFICATE": str(CERTIFICATE), "DEEPSIMBAD_TLS_KEY": "/nowhere/key.pem"},
         cwd=tmp_path,
         capture_output=True,
         text=True,

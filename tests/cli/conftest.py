@@ -13,8 +13,6 @@ import pytest
 
 from deepsimbad.cli import run
 
-ENVIRONMENT = {name: value for name, value in os.environ.items() if not name.startswith("DEEPSIMBAD_")}
-
 
 @dataclass(frozen=True)
 class Ran:
@@ -47,7 +45,7 @@ def process(tmp_path) -> Callable[..., subprocess.Popen[str]]:
         return subprocess.Popen(
             [sys.executable, "-m", "deepsimbad", *map(str, arguments)],
             cwd=tmp_path,
-            env=ENVIRONMENT | environment,
+            env={**os.environ, **environment},
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,

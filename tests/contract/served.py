@@ -18,8 +18,6 @@ import httpx2
 
 from .conftest import NPZ, npz, ready_encodings
 
-ENVIRONMENT = {name: value for name, value in os.environ.items() if not name.startswith("DEEPSIMBAD_")}
-
 
 def free_port() -> int:
     with socket.socket() as probe:
@@ -43,7 +41,7 @@ class Served:
         command = [sys.executable, "-m", "deepsimbad", "serve", "--data-dir", str(data_dir), "--port", str(port)]
         given = {f"DEEPSIMBAD_{name.upper()}": str(value) for name, value in settings.items()}
         with log.open("ab") as stderr:
-            process = subprocess.Popen(command, stderr=stderr, env=ENVIRONMENT | given, cwd=log.parent)
+            process = subprocess.Popen(command, stderr=stderr, env={**os.environ, **given}, cwd=log.parent)
         served = cls(process, port, log)
         try:
             served.wait_until_ready()

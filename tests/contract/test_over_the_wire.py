@@ -2,7 +2,6 @@
 
 import http.client
 import json
-import os
 import signal
 import socket
 import subprocess
@@ -55,11 +54,8 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     folder = tmp_path_factory.mktemp("wire")
     port = free_port()
     log = folder / "log"
-    environment = {name: value for name, value in os.environ.items() if not name.startswith("DEEPSIMBAD_")}
     with log.open("wb") as stderr:
-        process = subprocess.Popen(
-            [sys.executable, "-c", SERVE, str(folder / "data"), str(port)], stderr=stderr, env=environment
-        )
+        process = subprocess.Popen([sys.executable, "-c", SERVE, str(folder / "data"), str(port)], stderr=stderr)
     started = Server(process, port, log)
     try:
         for _ in range(600):

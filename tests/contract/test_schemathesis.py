@@ -126,11 +126,8 @@ def served(data_dir: Path) -> Iterator[str]:
     port = free_port()
     url = f"http://127.0.0.1:{port}"
     log = data_dir.parent / "log"
-    environment = {name: value for name, value in os.environ.items() if not name.startswith("DEEPSIMBAD_")}
     with log.open("wb") as stderr:
-        process = subprocess.Popen(
-            [sys.executable, "-c", SERVE, str(data_dir), str(port)], stderr=stderr, env=environment
-        )
+        process = subprocess.Popen([sys.executable, "-c", SERVE, str(data_dir), str(port)], stderr=stderr)
     try:
         for _ in range(600):
             try:

@@ -21,7 +21,6 @@ import pytest
 pytestmark = pytest.mark.slow
 
 N_LANDMARKS = 30
-ENVIRONMENT = {name: value for name, value in os.environ.items() if not name.startswith("DEEPSIMBAD_")}
 
 
 class Service:
@@ -39,7 +38,9 @@ class Service:
         command = [sys.executable, "-m", "deepsimbad", "serve", "--data-dir", self.data_dir, "--port", str(self.port)]
         given = {f"DEEPSIMBAD_{name.upper()}": str(value) for name, value in settings.items()}
         with self.log.open("ab") as stderr:
-            self.process = subprocess.Popen(command, stderr=stderr, env=ENVIRONMENT | given, cwd=self.data_dir.parent)
+            self.process = subprocess.Popen(
+                command, stderr=stderr, env={**os.environ, **given}, cwd=self.data_dir.parent
+            )
         until(self._is_ready)
 
     def _is_ready(self) -> bool:

@@ -99,7 +99,7 @@ def _run(command, folder, url):
         ["bash", "-c", failing + _here(command, folder, url)],
         cwd=folder,
         env={
-            **{name: value for name, value in os.environ.items() if not name.startswith("DEEPSIMBAD_")},
+            **os.environ,
             "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",
             "DEEPSIMBAD_URL": url,
         },

@@ -45,7 +45,7 @@ class Workplace:
             ["bash", "-c", self._here(command)],
             cwd=self.folder,
             env={
-                **{name: value for name, value in os.environ.items() if not name.startswith("DEEPSIMBAD_")},
+                **os.environ,
                 "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",
                 "DEEPSIMBAD_URL": self.url,
                 **self._key(),

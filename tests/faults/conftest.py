@@ -1,7 +1,6 @@
 """A small mapped data directory, and the service as a process whose disk can be taken away from it."""
 
 import io
-import os
 import shutil
 import socket
 import subprocess
@@ -19,7 +18,6 @@ import httpx2
 import numpy as np
 import pytest
 
-ENVIRONMENT = {name: value for name, value in os.environ.items() if not name.startswith("DEEPSIMBAD_")}
 READY_WITHIN_S = 60.0
 N_PLACES, DIM, N_LANDMARKS = 60, 8, 12
 NPZ = {"Content-Type": "application/octet-stream"}
@@ -44,7 +42,6 @@ def command(*arguments: object) -> Ran:
     """Run `deepsimbad` in a process of its own."""
     done = subprocess.run(
         [sys.executable, "-m", "deepsimbad", *map(str, arguments)],
-        env=ENVIRONMENT,
         capture_output=True,
         text=True,
         check=False,
@@ -75,7 +72,6 @@ class Service:
     def __enter__(self) -> Self:
         self._process = subprocess.Popen(
             [sys.executable, "-m", "deepsimbad", "serve", "--data-dir", str(self._data_dir), "--port", str(self._port)],
-            env=ENVIRONMENT,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.PIPE,
             text=True,

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from .conftest import ENVIRONMENT, Ran, command
+from .conftest import Ran, command
 
 pytestmark = pytest.mark.slow
 # Root may write everywhere, unless it gives that right up before it becomes the command.
@@ -25,7 +25,6 @@ def unprivileged(*arguments: object) -> Ran:
     """Run `deepsimbad` as somebody who may not write everywhere."""
     done = subprocess.run(
         [sys.executable, "-c", UNPRIVILEGED, "-m", "deepsimbad", *map(str, arguments)],
-        env=ENVIRONMENT,
         capture_output=True,
         text=True,
         check=False,

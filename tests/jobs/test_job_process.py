@@ -23,6 +23,7 @@ from deepsimbad.errors import (
     UnavailableError,
 )
 from deepsimbad.jobs.cores import available_cores, job_threads
+from deepsimbad.jobs.job_priority import JobPriority
 from deepsimbad.jobs.job_process import BrokenJobError, InAnotherProcess
 from deepsimbad.jobs.map_config import RemapConfig
 from deepsimbad.jobs.perform import REMAP, InThisProcess
@@ -32,7 +33,7 @@ from deepsimbad.store.map_file import read_map
 DOMAIN = "route"
 WITHIN_S = 30
 CONFIG = RemapConfig("drive", "other", n_landmarks=8, training_episodes=200)
-COMMAND = [sys.executable, "-P", "-m", "deepsimbad.jobs.job_child"]
+COMMAND = [sys.executable, "-P", "-m", "deepsimbad.jobs.job_child", "idle"]
 
 
 def never():
@@ -159,6 +160,16 @@ def test_it_yields_to_everyone_and_computes_in_the_threads_it_is_given(catalog, 
             assert os.sched_getscheduler(int(task.name)) == os.SCHED_IDLE, "every thread of it"
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="the scheduling classes are Linux's")
+@pytest.mark.parametrize(("priority", "kind", "nice"), [("low", "SCHED_BATCH", 19), ("normal", "SCHED_OTHER", 0)])
+def test_or_less(catalog, job, caplog, priority, kind, nice):
+    run_job = InAnotherProcess(catalog.data_dir, 3, JobPriority(priority))
+    with held(catalog, job, caplog, run_job) as doing:
+        doing.until_ready()
+        assert os.sched_getscheduler(doing.pid) == getattr(os, kind)
+        assert os.getpriority(os.PRIO_PROCESS, doing.pid) == nice
+
+
 def test_a_cancel_is_heard(catalog, job, caplog):
     with held(catalog, job, caplog) as doing:
         doing.cancelled.set()
@@ -225,6 +236,7 @@ def test_without_its_parent_it_ends(catalog, job):
 SERVICE = """
 import sys, threading
 from pathlib import Path
+from deepsimbad.jobs.job_priority import JobPriority
 from deepsimbad.jobs.job_process import InAnotherProcess
 from deepsimbad.store.catalog import Catalog
 import logging

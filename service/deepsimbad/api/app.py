@@ -102,7 +102,8 @@ def create_app(settings: Settings, run_job: RunJob | None = None) -> FastAPI:
         settings: All it is told; it reads no environment.
         run_job: Does jobs; None: each in a process of its own (decision 0011).
     """
-    run_job = run_job or InAnotherProcess(settings.data_dir, job_threads(settings.job_threads))
+    n_threads = job_threads(settings.job_threads)
+    run_job = run_job or InAnotherProcess(settings.data_dir, n_threads, settings.job_priority)
     metrics = Metrics()
     keys = KeyRing()
     app = FastAPI(

@@ -1,4 +1,4 @@
-"""The process of one job: `python -m deepsimbad.jobs.job_child`, started by `job_process`.
+"""The process of one job: `python -m deepsimbad.jobs.job_child PRIORITY`, started by `job_process`.
 
 It says everything as JSON lines on its standard output, and takes from its standard input one line that says which job,
 then perhaps one more, which cancels. When its input ends, its parent is dead and it ends at once.
@@ -19,9 +19,10 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, TextIO
 
+from deepsimbad.jobs.job_priority import JobPriority, take_priority
+
 _PR_SET_PDEATHSIG = 1
 _KILL_ME_FIRST = 500  # of 1000: where memory runs out, the kernel shall end the job rather than the service
-_LOWEST_NICE = 19
 _ORPHANED = 3  # exit code
 
 
@@ -87,7 +88,9 @@ def main() -> None:
     """Do the job that standard input names."""
     for signal_number in (signal.SIGINT, signal.SIGTERM):  # meant for the service, which then stops its job itself
         signal.signal(signal_number, signal.SIG_IGN)
-    _yield_to_everyone()
+    take_priority(JobPriority(sys.argv[1]))
+    with suppress(OSError):
+        Path("/proc/self/oom_score_adj").write_text(str(_KILL_ME_FIRST), encoding="ascii")
     faulthandler.enable()
     lines = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)  # whatever a library prints is no message
@@ -120,22 +123,6 @@ def _perform(order: dict[str, Any], parent: _Parent) -> None:
         parent.tell(broken=traceback.format_exc())
     else:
         parent.tell(result=result)
-
-
-def _yield_to_everyone() -> None:
-    """Take the machine only while nobody else wants it; what a system does not have or allow is left out.
-
-    SCHED_IDLE, not SCHED_BATCH: batch work at nice 19 still keeps about a seventieth of a contended core and, worse,
-    is not preempted by a thread that wakes up. An idle-class thread is preempted at once, and the kernel (since 5.4)
-    counts a core that runs nothing else as free when it places a waking thread.
-    """
-    with suppress(OSError):
-        os.nice(_LOWEST_NICE)
-    if hasattr(os, "SCHED_IDLE"):
-        with suppress(OSError):
-            os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
-    with suppress(OSError):
-        Path("/proc/self/oom_score_adj").write_text(str(_KILL_ME_FIRST), encoding="ascii")
 
 
 def _die_with(parent_pid: int) -> None:

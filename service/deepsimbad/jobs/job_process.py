@@ -15,6 +15,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from deepsimbad.errors import CancelledError, DeepSimbadError, JobInterruptedError, UnavailableError
+from deepsimbad.jobs.job_priority import JobPriority
 from deepsimbad.jobs.progress import ProgressState
 from deepsimbad.store.records import JobRecord
 
@@ -31,19 +32,27 @@ class BrokenJobError(Exception):
 
 
 class InAnotherProcess:
-    """Does every job in a child process of the lowest priority that dies with this one.
+    """Does every job in a child process that gives way to this one and dies with it.
 
     Call it from a thread that lives as long as the child may: Linux ties the child to the thread that started it.
 
     Args:
         data_dir: The data directory.
         n_threads: Threads the child computes in.
+        priority: How far the child gives way to everything else.
         stops_within_s: A child that does not stop so soon after a cancel is killed, which harms nothing either.
     """
 
-    def __init__(self, data_dir: Path, n_threads: int, stops_within_s: float = 3.0) -> None:
+    def __init__(
+        self,
+        data_dir: Path,
+        n_threads: int,
+        priority: JobPriority = JobPriority.IDLE,
+        stops_within_s: float = 3.0,
+    ) -> None:
         self._data_dir = data_dir
         self._n_threads = n_threads
+        self._priority = priority
         self._stops_within_s = stops_within_s
 
     def __call__(
@@ -58,7 +67,7 @@ class InAnotherProcess:
             "log_level": logging.getLogger("deepsimbad").getEffectiveLevel(),
         }
         limits = dict.fromkeys(_THREAD_VARIABLES, str(self._n_threads))  # read when the libraries load, not later
-        with _Child(order, limits) as child:
+        with _Child(order, self._priority, limits) as child:
             _log.info("job begins", extra={"job_id": job.job_id, "kind": job.kind, "pid": child.pid})
             result = None
             for message in child.messages(is_cancelled, self._stops_within_s):
@@ -87,13 +96,14 @@ class _Child:
 
     Args:
         order: What it is to do.
+        priority: How far it gives way.
         limits: Environment variables besides the present ones.
     """
 
-    def __init__(self, order: dict[str, Any], limits: dict[str, str]) -> None:
+    def __init__(self, order: dict[str, Any], priority: JobPriority, limits: dict[str, str]) -> None:
         try:
             self._process = subprocess.Popen(  # noqa: S603 - our own interpreter and module
-                [sys.executable, "-P", "-m", _MODULE],
+                [sys.executable, "-P", "-m", _MODULE, priority],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.PIPE,
