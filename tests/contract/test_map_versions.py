@@ -97,6 +97,18 @@ def test_frames_are_appended_to_the_map_that_serves(client: TestClient, domain: 
     assert versions(client, domain)[2]["config"]["appended"][0]["traverse"] == "further"
 
 
+def test_what_the_map_holds_is_refused_before_it_is_appended_again(client: TestClient, domain: str) -> None:
+    """With its old images left in the copy the frames would find themselves, and any gate would open."""
+    asked = {"training_traverse": "drive", "append": True, "gate_margin": 2}
+    problem = refused(client.post(f"/v1/admin/domains/{domain}/remaps", json=asked), 422, "invalid_map_config")
+    assert "map 1, which serves, holds traverse drive already" in problem["detail"]
+    upload(client, domain, "again", ready_encodings(), np.arange(N_READY))
+    job = remap(client, domain, **asked | {"training_traverse": "again"})
+    assert (job["state"], job["error"]["code"]) == ("failed", "invalid_map_config")
+    assert "holds every frame of traverse again already, under another name" in job["error"]["detail"]
+    assert list(versions(client, domain)) == [1]
+
+
 @pytest.mark.parametrize(
     ("wrong", "status", "code"),
     [

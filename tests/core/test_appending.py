@@ -38,7 +38,7 @@ def test_old_images_stay_as_they_are_and_all_lie_in_route_order(relevance, old_m
     n_old, lists = len(old_m), merged.built.index.lists
     assert (np.diff(merged.position_m) >= 0).all()
     assert np.array_equal(np.sort(merged.source), np.arange(n_old + len(new_m)))
-    where = merged.image_of_source
+    where = np.argsort(merged.source)
     assert (np.diff(where[:n_old]) > 0).all()  # old images keep their order
     assert np.array_equal(lists[:, where[:n_old]], built.index.lists)
     assert np.array_equal(merged.position_m[where[:n_old]], route.position_m)
@@ -60,7 +60,7 @@ def test_new_lists_are_the_nearest_landmarks_by_rank(relevance):
     built, route = a_map(relevance)
     found = some(7, 1)
     merged = append_images(built, route, found, np.arange(7) + 0.5)
-    lists = merged.built.index.lists[:, merged.image_of_source[20:]]
+    lists = merged.built.index.lists[:, np.argsort(merged.source)[20:]]
     assert np.array_equal(lists, nearest_landmarks(rank_landmarks(found), H))
 
 
@@ -71,7 +71,7 @@ def test_new_lists_come_from_the_new_drives_own_statistics(relevance):
     found = some(4000, 1)
     found[:, 5] /= 100
     merged = append_images(built, route, found, np.arange(4000) / 10)
-    lists = merged.built.index.lists[:, merged.image_of_source[400:]]
+    lists = merged.built.index.lists[:, np.argsort(merged.source)[400:]]
     own = nearest_landmarks(LandmarkStatistics.of_map(rank_landmarks(found)).standardise(rank_landmarks(found)), H)
     assert (lists == own).mean() > 0.95  # the map's statistics count for a few frames among 4,000
     naive = nearest_landmarks(built.statistics.standardise(rank_landmarks(found)), H)
@@ -84,7 +84,7 @@ def test_one_frame_alone_is_described_too():
     built, route = a_map(Relevance.CALIBRATED, 400)
     found = some(1, 9)
     merged = append_images(built, route, found, np.array([7.25]))
-    image = merged.image_of_source[400]
+    image = np.argsort(merged.source)[400]
     assert merged.position_m[image] == 7.25
     assert merged.built.index.lists[0, image] == np.argmin(found)
     relevance = relevances(merged.built, Query(rank_landmarks(found[0])))
@@ -111,7 +111,7 @@ def test_of_two_images_at_one_position_the_old_comes_first():
 def test_a_position_of_another_turn_lies_within_the_first():
     built, route = a_map(Relevance.RRF, 10, closed=True)  # once around is 10 m
     merged = append_images(built, route, some(3, 1), np.array([12.5, 19.75, 30.0]))
-    assert merged.position_m[merged.image_of_source[10:]].tolist() == [2.5, 9.75, 0.0]
+    assert merged.position_m[np.argsort(merged.source)[10:]].tolist() == [2.5, 9.75, 0.0]
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,8 @@
 """Appending a drive to the active map: what stays, what is new, what is refused."""
 
+import shutil
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,12 +12,15 @@ from deepsimbad.core.relevance import Query, Relevance, relevances
 from deepsimbad.engine.active_maps import load_snapshot
 from deepsimbad.errors import InvalidEncodingError, InvalidMapConfigError
 from deepsimbad.jobs.append import append_frames
+from deepsimbad.jobs.import_map import import_map
+from deepsimbad.jobs.known_frames import UNKNOWN_FRAME, frame_digests
 from deepsimbad.jobs.map_config import RemapConfig
 from deepsimbad.jobs.progress import Progress
 from deepsimbad.jobs.remap import REMAP_STAGES, remap
 from deepsimbad.store.frames import TraverseFrames
 from deepsimbad.store.map_contents import MapContents
 from deepsimbad.store.map_file import read_map
+from deepsimbad.store.records import MapRecord, MapState
 from deepsimbad.store.traverses import Traverse
 
 DOMAIN = "route"
@@ -113,15 +119,16 @@ def test_telling_bits_of_what_is_far_are_the_mean(catalog, evaluator):
         y_m=np.array([2.0, np.nan]),
         encodings=rng.normal(size=(2, 6)).astype(np.float32),
     )
-    made = append_frames(before, 7, RemapConfig("more", append=True), frames, evaluator, lambda _: None)
-    assert made.images.tolist() == [4, 10]
-    bits = made.contents.telling_bits
-    assert bits[made.images] == pytest.approx([before.telling_bits[3], before.telling_bits.mean()])
-    assert np.delete(bits, made.images).tolist() == before.telling_bits.tolist()
-    assert made.contents.timestamp_us.tolist() == [-1, -1, -1, -1, 5, -1, -1, -1, -1, -1, 6]
-    assert made.contents.x_m[4] == 1.0
-    assert np.isnan(np.delete(made.contents.x_m, 4)).all()
-    assert made.contents.off_route_model is before.off_route_model
+    record = MapRecord(7, MapState.ACTIVE, "", None, None, before.config, {}, None, None, None)
+    made = append_frames(before, record, RemapConfig("more", append=True), frames, evaluator, lambda _: None)
+    assert np.flatnonzero(made.frame_digest != UNKNOWN_FRAME).tolist() == [4, 10], "where the new ones are"
+    bits = made.telling_bits
+    assert bits[[4, 10]] == pytest.approx([before.telling_bits[3], before.telling_bits.mean()])
+    assert np.delete(bits, [4, 10]).tolist() == before.telling_bits.tolist()
+    assert made.timestamp_us.tolist() == [-1, -1, -1, -1, 5, -1, -1, -1, -1, -1, 6]
+    assert made.x_m[4] == 1.0
+    assert np.isnan(np.delete(made.x_m, 4)).all()
+    assert made.off_route_model is before.off_route_model
 
 
 def a_map(evaluator, rng):
@@ -184,12 +191,15 @@ def test_held_out_frames_are_those_that_were_appended(first, run):
 
 def test_a_gate_keeps_an_append_back_too(catalog, evaluator, drive, run):
     drive("landmarks", 30, seed=1)
-    drive("drive", 40, seed=2)
+    views = drive("drive", 40, seed=2)
     run("drive", landmark_traverse="landmarks", n_landmarks=12, training_episodes=0)
-    drive("day", 40, seed=2)  # the same views
+    drive("day", 40, seed=2)
+    with Traverse.open(catalog.data_dir, DOMAIN, "day") as day:
+        day.put_frames(replace(day.read(), encodings=views + np.float32(0.01)))  # nearly the same views
     drive("noise", 400, seed=3, position_m=np.arange(400) / 10 + 0.01)
     result = run("noise", append=True, check_traverse="day", gate_margin=0.0)
     assert result["active"] is False
+    assert "more than 0 above" in result["metrics"]["check"]["why"]
     assert catalog.domain(DOMAIN).active_version == 1
 
 
@@ -206,6 +216,68 @@ def test_what_is_appended_must_be_alike(first, run, catalog, wrong, match):
     with pytest.raises(InvalidMapConfigError, match=match):
         run("more", append=True, **wrong)
     assert [record.version for record in catalog.maps(DOMAIN)] == [1]
+
+
+@pytest.mark.parametrize("again", ["drive", "more"])
+def test_no_traverse_is_appended_twice(first, run, catalog, drive, again):
+    """Whatever frames are in it by now: with its old images left in, the new map would find the frames themselves."""
+    first(training_episodes=0)
+    run("more", append=True)
+    Traverse.delete(catalog.data_dir, DOMAIN, again)
+    drive(again, 15, seed=7)
+    with pytest.raises(InvalidMapConfigError, match=f"map 2, which serves, holds traverse {again} already") as refused:
+        run(again, append=True, gate_margin=2.0)
+    assert "Append another drive" in refused.value.message
+    assert refused.value.hints == {"traverse": again, "map_version": 2}
+    assert [record.version for record in catalog.maps(DOMAIN)] == [1, 2]
+    catalog.activate(DOMAIN, 1, 2)
+    assert (again == "drive") or run(again, append=True)["map_version"] == 3, "map 1 is made of the other one alone"
+
+
+def test_the_same_frames_are_not_appended_under_another_name(first, run, catalog, drive):
+    first(training_episodes=0)
+    drive("again", 40, seed=2, position_m=np.arange(40) + 0.1)
+    with pytest.raises(InvalidMapConfigError, match="holds every frame of traverse again already, under another name"):
+        run("again", append=True)
+    drive("longer", 41, seed=2)  # the first 40 are the same; one is new
+    run("longer", append=True)
+    with pytest.raises(InvalidMapConfigError, match="map 2, which serves, holds every frame of traverse again"):
+        run("again", append=True)
+
+
+def test_a_map_knows_the_frames_it_is_made_of(first, run, catalog):
+    old, new = first(training_episodes=0)
+    run("more", append=True)
+    assert contents(catalog, 1).frame_digest.tolist() == frame_digests(old).tolist()
+    after = contents(catalog, 2)
+    is_old = np.isin(after.position_m, np.arange(40.0))
+    assert after.frame_digest[is_old].tolist() == frame_digests(old).tolist()
+    assert after.frame_digest[~is_old].tolist() == frame_digests(new).tolist()
+
+
+def test_digests_stay_as_they_are():
+    """They are compared with those in map files of other releases."""
+    frames = np.array([[1.0, 2.0], [0.0, -1.5]], np.float32)
+    assert frame_digests(frames).tolist() == [
+        7373934272132878346,
+        14435273145991011183,
+    ]
+
+
+def test_an_imported_map_is_appended_to_under_the_names_of_here(first, run, catalog, drive, tmp_path):
+    """Its file names traverses of another server; its frames are known all the same."""
+    first(training_episodes=0)
+    run("more", append=True)
+    shutil.copy(catalog.map_path(DOMAIN, 2), tmp_path / "exported")
+    import_map(catalog, tmp_path / "exported", DOMAIN)
+    with pytest.raises(InvalidMapConfigError, match="map 3, which serves, holds every frame of traverse more already"):
+        run("more", append=True)
+    Traverse.delete(catalog.data_dir, DOMAIN, "more")
+    drive("more", 15, seed=8)
+    assert run("more", append=True)["map_version"] == 4
+    for config in (catalog.map(DOMAIN, 4).config, contents(catalog, 4).config):
+        assert (config["training_traverse"], config["imported"]["version"]) == (None, 2)
+        assert config["appended"] == [{"traverse": "more", "n_frames": 15, "to_version": 3}]
 
 
 def test_there_must_be_a_map_to_append_to(drive, run):

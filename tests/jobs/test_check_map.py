@@ -166,6 +166,67 @@ def test_frames_taken_where_a_held_out_one_stood_are_held_out_with_it(store, mad
     assert check["anr"] > 8
 
 
+def test_frames_do_not_find_what_the_map_has_of_them_under_another_name(store, made):
+    """Neither held-out frames of a drive appended again with a few new ones, nor a check traverse appended before."""
+    store("landmarks", season(0.2, 1))
+    noise = np.random.default_rng(0).normal(size=(310, DIM))
+    store("noise", noise[:300])
+    made(training_traverse="noise", relevance=Relevance.BRUTE_FORCE)
+    store("longer", noise)
+    given = {"landmark_traverse": None, "append": True, "relevance": Relevance.BRUTE_FORCE, "gate_margin": 0.0}
+    check = made(training_traverse="longer", n_landmarks=None, **given)["metrics"]["check"]
+    assert check["frames"] == "held_out"
+    assert check["anr"] > 8, "0 would say that every frame found itself"
+    assert check["anr_active"] > 8
+
+
+def test_a_check_traverse_that_both_maps_have_among_others_is_asked_of_the_others(store, made):
+    store("landmarks", season(0.2, 1))
+    noise = np.random.default_rng(0).normal(size=(100, DIM))
+    store("noise", noise)
+    store("other", np.random.default_rng(1).normal(size=(100, DIM)))
+    store("third", np.random.default_rng(2).normal(size=(100, DIM)))
+    made(training_traverse="other", relevance=Relevance.BRUTE_FORCE)
+    given = {"landmark_traverse": None, "append": True, "n_landmarks": None, "relevance": Relevance.BRUTE_FORCE}
+    made(training_traverse="noise", **given)
+    check = made(training_traverse="third", check_traverse="noise", **given)["metrics"]["check"]
+    assert (check["frames"], check["n_queries"], check["active_version"]) == ("traverse", 100, 2)
+    assert check["anr"] > 4, "of the best of nine neighbours"
+    assert check["anr_active"] > 4
+
+
+def test_a_check_on_the_frames_that_the_new_map_is_made_of_says_so(store, made, seasons):
+    """Of a long drive only some are asked; what is between them was seen a moment before or after."""
+    made(training_traverse="good")
+    drive = np.random.default_rng(0).normal(size=(2500, DIM))
+    store("long", drive)
+    store("long-again", drive, np.arange(2500) + 0.5)
+    result = made(training_traverse="long", check_traverse="long-again", gate_margin=100.0)
+    check = result["metrics"]["check"]
+    assert (check["anr"], check["passed"], result["active"]) == (None, False, False)
+    assert check["why"] == "the new map was made of the frames of traverse long-again itself: check on another drive"
+
+
+def test_a_map_without_digests_is_known_by_the_names_of_its_traverses(made, seasons, monkeypatch):
+    """As maps of before are: the active one has its frames at the same places under the same name."""
+    with monkeypatch.context() as of_before:
+        of_before.setattr("deepsimbad.jobs.remap.frame_digests", lambda encodings: None)
+        made(training_traverse="good")
+    check = made(training_traverse="good", gate_margin=0.0)["metrics"]["check"]
+    assert check["anr"] == pytest.approx(check["anr_active"])
+    check = made(training_traverse="bad", check_traverse="good", gate_margin=0.0)["metrics"]["check"]
+    assert "was made of traverse good itself" in check["why"]
+
+
+def test_a_drive_of_the_same_name_is_another_where_its_frames_are(store, made, seasons, catalog):
+    made(training_traverse="good")
+    Traverse.delete(catalog.data_dir, DOMAIN, "good")
+    store("good", season(0.2, 7))
+    check = made(training_traverse="bad", check_traverse="good")["metrics"]["check"]
+    assert check["anr_active"] < check["anr"]
+    assert check["n_left_out"] == 0
+
+
 def test_only_places_that_both_maps_hold_count(store, made, seasons):
     made(training_traverse="good")
     store("half", season(0.2, 5)[:30])

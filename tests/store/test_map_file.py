@@ -59,6 +59,7 @@ def everything(make_map: MakeMap) -> MapContents:
         closed=True,
         values=generator.random((4, 60), dtype=np.float32),
         encodings=generator.random((60, 8), dtype=np.float32),
+        frame_digest=generator.integers(2**64, size=60, dtype=np.uint64),
         x_m=np.where(np.arange(60) % 7 == 0, np.nan, 1.0),
         landmark_model={
             "prototypes": generator.random((20, 8), dtype=np.float32),

@@ -26,11 +26,6 @@ class AppendedMap:
     position_m: NDArray[np.float64]
     source: NDArray[np.int64]
 
-    @property
-    def image_of_source(self) -> NDArray[np.int64]:
-        """[n + m] int64, the image that every old image and then every new frame became."""
-        return np.argsort(self.source, kind="stable").astype(np.int64)
-
 
 def append_images(
     built: RetrievalMap,

@@ -35,6 +35,7 @@ class MapSnapshot:
         q_values: [n, a] float32, the experience database; None where the map has none.
         bits_ahead: [n, a] float32, how telling the place is where every move leads; None where nobody knows.
         off_route: How a view from off the route is known; None where that was not learnt.
+        frame_digest: [n] uint64, which frame every image was made of; None where nobody noted it.
     """
 
     domain: str
@@ -50,6 +51,7 @@ class MapSnapshot:
     q_values: NDArray[np.float32] | None
     bits_ahead: NDArray[np.float32] | None
     off_route: OffRouteModel | None
+    frame_digest: NDArray[np.uint64] | None
 
     @classmethod
     def from_contents(cls, contents: MapContents, index_bytes: int) -> Self:
@@ -59,7 +61,8 @@ class MapSnapshot:
             InvalidMapConfigError, InvalidRouteError: The contents contradict each other.
             KeyError, ValueError: The configuration names no relevance that exists.
         """
-        for array in (*contents.landmark_model.values(), contents.encodings, contents.timestamp_us):
+        known = (contents.encodings, contents.timestamp_us, contents.frame_digest)
+        for array in (*contents.landmark_model.values(), *known):
             _freeze(array)
         relevance = Relevance(contents.config["relevance"])
         actions_m = np.array(sorted(contents.actions_m))
@@ -82,6 +85,7 @@ class MapSnapshot:
             q_values=contents.q_values,
             bits_ahead=None if contents.telling_bits is None else bits_ahead(route, contents.telling_bits, actions_m),
             off_route=None if contents.off_route_model is None else OffRouteModel(*contents.off_route_model.tolist()),
+            frame_digest=contents.frame_digest,
             landmark_model=contents.landmark_model,
             actions_m=actions_m,
             index_bytes=index_bytes,

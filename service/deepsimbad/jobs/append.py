@@ -6,7 +6,7 @@ robot off the route is known, stay as two seasons taught them.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -20,47 +20,43 @@ from deepsimbad.errors import InvalidMapConfigError
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.jobs.build_map import dissimilarities_to
 from deepsimbad.jobs.encoded_traverse import route_of
+from deepsimbad.jobs.known_frames import (
+    UNKNOWN_FRAME,
+    frame_digests,
+    refuse_known_frames,
+    refuse_known_traverse,
+)
 from deepsimbad.jobs.map_config import DEFAULT_LIST_LENGTH, RemapConfig
 from deepsimbad.store.frames import UNKNOWN_TIMESTAMP, TraverseFrames
 from deepsimbad.store.map_contents import MapContents
-
-
-@dataclass(frozen=True)
-class Appended:
-    """A map with a further drive.
-
-    Attributes:
-        contents: All of it; its version is not known yet.
-        images: [m] int64, the map image that every new frame became.
-    """
-
-    contents: MapContents
-    images: NDArray[np.int64]
+from deepsimbad.store.records import MapRecord
 
 
 def append_frames(
     before: MapContents,
-    from_version: int,
+    record: MapRecord,
     config: RemapConfig,
     frames: TraverseFrames,
     evaluator: Evaluator,
     on_progress: Callable[[float], None],
-) -> Appended:
-    """Append a traverse to a map.
+) -> MapContents:
+    """Append a traverse to a map; the version of what comes out is not known yet.
 
     Args:
         before: The map; it stays as it is.
-        from_version: Its version in the catalog.
+        record: What the catalog knows of it.
         config: What is asked for; its `training_traverse` names the frames.
         frames: The new frames.
         evaluator: The domain's.
         on_progress: Called with the share done; may raise to cancel.
 
     Raises:
-        InvalidMapConfigError: Something is asked for that the map has otherwise.
+        InvalidMapConfigError: Something is asked for that the map has otherwise, or it holds the traverse already.
         InvalidRouteError: The new frames go backwards.
         InvalidEncodingError: They come from another encoder.
     """
+    refuse_known_traverse(record.config, record.version, config.training_traverse)
+    refuse_known_frames(before, record.version, config.training_traverse, frames)
     check_same(before, config)
     known = MapSnapshot.from_contents(before, index_bytes=0)
     driven = route_of(frames, before.closed)
@@ -70,13 +66,14 @@ def append_frames(
     nearest, is_near = nearest_known(known.route, driven.position_m, max(before.actions_m))
     contents = replace(
         before,
-        config=appended_config(before.config, from_version, config, frames.n_frames),
+        config=appended_config(before, record, config, frames.n_frames),
         lists=merged.built.index.lists,
         position_m=merged.position_m,
         values=merged.built.index.values,
         encodings=merged.built.encodings,
         statistics=None if statistics is None else np.stack([statistics.mean, statistics.std]),
         timestamp_us=_merged(before.timestamp_us, _known_times(frames), n_old, source, UNKNOWN_TIMESTAMP),
+        frame_digest=_merged(before.frame_digest, frame_digests(frames.encodings), n_old, source, UNKNOWN_FRAME),
         x_m=_merged(before.x_m, driven.x_m, n_old, source, np.nan),
         y_m=_merged(before.y_m, driven.y_m, n_old, source, np.nan),
     )
@@ -87,7 +84,7 @@ def append_frames(
     if before.telling_bits is not None:
         new_bits = np.where(is_near, before.telling_bits[nearest], before.telling_bits.mean(dtype=np.float32))
         contents = replace(contents, telling_bits=np.concatenate([before.telling_bits, new_bits])[source])
-    return Appended(contents, merged.image_of_source[n_old:])
+    return contents
 
 
 def check_same(before: MapContents, config: RemapConfig) -> None:
@@ -110,14 +107,18 @@ def check_same(before: MapContents, config: RemapConfig) -> None:
             )
 
 
-def appended_config(before: dict[str, Any], from_version: int, config: RemapConfig, n_frames: int) -> dict[str, Any]:
-    """The configuration of a map with an appended drive: the map's own, and what was appended to it, in order."""
+def appended_config(before: MapContents, record: MapRecord, config: RemapConfig, n_frames: int) -> dict[str, Any]:
+    """The configuration of a map with an appended drive: the map's own, and what was appended to it, in order.
+
+    It is the catalog's: the file of an imported map names traverses of another server.
+    """
     asked = config.as_dict()
-    added = {"traverse": config.training_traverse, "n_frames": n_frames, "to_version": from_version}
+    added = {"traverse": config.training_traverse, "n_frames": n_frames, "to_version": record.version}
     return {
-        **before,
+        **record.config,
+        "n_landmarks": before.n_landmarks,
         **{name: asked[name] for name in ("append", "check_traverse", "gate_margin", "activate")},
-        "appended": [*before.get("appended", ()), added],
+        "appended": [*record.config.get("appended", ()), added],
     }
 
 

@@ -6,9 +6,14 @@ the route. Both figures are of the frames whose place both maps hold; the others
 half the route is judged on that half alone.
 
 Best is a drive that no map was made of (`check_traverse`). Without one every tenth frame of the training traverse is
-held out: it is scored against the new map without its own image, and against the active map as it serves (without its
-own image too, where the active map was made of the same traverse). Such a figure is kind to the new map, for what is
-left of it still knows those frames in part:
+held out.
+
+No frame finds itself: neither map is asked with the images that it has of the held-out frames or of the check traverse,
+whichever traverse they came into it with (`deepsimbad.jobs.known_frames`). What then is left of a place is compared; a
+map made of the check traverse alone has nothing left, and no figure.
+
+A check traverse is kind to a map that had its landmarks or its second season from it. Held-out frames are kind to the
+new map, for what is left of it still knows them in part:
 
 - its other images are of the same drive, taken moments before and after in the same light, while the active map
   is asked across seasons;
@@ -19,7 +24,7 @@ So a map that fails it is broken, and a map that passes it is whole; whether it 
 drive of another day can tell.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -34,9 +39,11 @@ from deepsimbad.core.route import Route
 from deepsimbad.core.true_images import true_images_of
 from deepsimbad.core.update_rules import DEFAULT_UPDATE
 from deepsimbad.engine.active_maps import load_snapshot
+from deepsimbad.engine.snapshot import MapSnapshot
 from deepsimbad.errors import DamagedMapError, InvalidEncodingError, RetiredMapError
 from deepsimbad.evaluators.base import Evaluator, LandmarkModel
 from deepsimbad.jobs.encoded_traverse import route_of
+from deepsimbad.jobs.known_frames import UNKNOWN_FRAME, frame_digests, traverses_in
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.frames import TraverseFrames
 
@@ -49,17 +56,27 @@ ON_TRAVERSE, HELD_OUT = "traverse", "held_out"
 
 @dataclass(frozen=True)
 class CheckedMap:
-    """What retrieval needs of a map.
+    """What the check needs of a map.
 
     Attributes:
         built: The index and what the relevance compares besides.
         route: Where its images are.
         model: Its landmarks.
+        frame_digest: [n] uint64, which frame every image was made of; None where nobody noted it.
+        traverses: The traverses they came from.
     """
 
     built: RetrievalMap
     route: Route
     model: LandmarkModel
+    frame_digest: NDArray[np.uint64] | None
+    traverses: frozenset[str]
+
+    @classmethod
+    def of(cls, snapshot: MapSnapshot, config: Mapping[str, Any]) -> Self:
+        """A map as it serves, with its configuration in the catalog: an imported file names another server's drives."""
+        known, names = snapshot.frame_digest, frozenset(traverses_in(config))
+        return cls(snapshot.retrieval, snapshot.route, snapshot.landmark_model, known, names)
 
 
 @dataclass(frozen=True)
@@ -67,39 +84,44 @@ class CheckFrames:
     """The frames a map is checked on.
 
     Attributes:
+        kind: ON_TRAVERSE or HELD_OUT.
         source: The traverse they are of.
         drive: All frames of it.
         route: Their positions.
         chosen: [q] int64, the places in it of those that are asked.
-        own_images: [k] int64, the new map's images made of them, and of frames taken where they stood; None where the
-            new map was made of another drive.
+        withheld: [k] int64, the places in it of those that a map must not have images of.
     """
 
+    kind: str
     source: str
     drive: TraverseFrames
     route: Route
     chosen: NDArray[np.int64]
-    own_images: NDArray[np.int64] | None
+    withheld: NDArray[np.int64]
 
     @classmethod
     def of_traverse(cls, source: str, drive: TraverseFrames, closed: bool) -> Self:
         """A drive of its own, evenly spaced; raises InvalidRouteError where it goes backwards."""
         chosen = np.arange(0, drive.n_frames, max(1, -(-drive.n_frames // MOST_QUERIES)))
-        return cls(source, drive, route_of(drive, closed), chosen, None)
+        return cls(ON_TRAVERSE, source, drive, route_of(drive, closed), chosen, np.arange(drive.n_frames))
 
     @classmethod
-    def held_out(cls, source: str, drive: TraverseFrames, closed: bool, images: NDArray[np.int64]) -> Self:
-        """Every tenth frame of the training traverse, of a long one fewer.
-
-        Args:
-            source: The traverse's name.
-            drive: Its frames.
-            closed: Whether the route is a loop.
-            images: [m] the map image that every frame became.
-        """
+    def held_out(cls, source: str, drive: TraverseFrames, closed: bool) -> Self:
+        """Every tenth frame of the training traverse, of a long one fewer."""
         chosen = np.arange(0, drive.n_frames, max(HELD_OUT_EVERY, -(-drive.n_frames // MOST_QUERIES)))
         is_held_out = np.isin(drive.position_m, drive.position_m[chosen])  # one that stood still shows the same again
-        return cls(source, drive, route_of(drive, closed), chosen, images[is_held_out])
+        return cls(HELD_OUT, source, drive, route_of(drive, closed), chosen, np.flatnonzero(is_held_out))
+
+    def images_in(self, checked: CheckedMap) -> NDArray[np.int64]:
+        """The images that a map has of the withheld frames."""
+        known = checked.frame_digest
+        if known is None:
+            known = np.full(checked.route.n_images, UNKNOWN_FRAME, np.uint64)
+        is_withheld = np.isin(known, frame_digests(self.drive.encodings[self.withheld]))
+        if self.source in checked.traverses:
+            at_their_places = np.isin(checked.route.position_m, self.route.position_m[self.withheld])
+            is_withheld |= (known == UNKNOWN_FRAME) & at_their_places
+        return np.flatnonzero(is_withheld)
 
 
 def check_map(
@@ -130,18 +152,21 @@ def check_map(
         `metrics["check"]` of a map, JSON-ready.
     """
     active_version, active, why = _active_map(catalog, domain)
-    ranks = _normalised_ranks(new, frames, frames.own_images, evaluator, lambda share: on_progress(share / 2))
+    own = frames.images_in(new)
+    ranks = _normalised_ranks(new, frames, own, evaluator, lambda share: on_progress(share / 2))
     theirs = known = None
     if active is not None:
         try:
-            known = _images_of_frames(catalog, domain, active_version, active, frames)
+            known = frames.images_in(active)
             theirs = _normalised_ranks(active, frames, known, evaluator, lambda share: on_progress(0.5 + share / 2))
         except InvalidEncodingError:
             why = f"map {active_version}, which serves, was made of encodings of another length"
     scored = np.isfinite(ranks)
     anr_active = None
-    if not scored.any():
-        without = "" if frames.own_images is None else "without the held-out frames "
+    if not scored.any() and own.size and frames.kind == ON_TRAVERSE:
+        why = f"the new map was made of the frames of traverse {frames.source} itself: check on another drive"
+    elif not scored.any():
+        without = "without the held-out frames " if frames.kind == HELD_OUT else ""
         why = f"{without}the new map holds no place within {TOLERANCE_M:g} m of a frame of traverse {frames.source}"
     elif known is not None and known.size and theirs is not None and not np.isfinite(theirs[scored]).any():
         why = (
@@ -165,8 +190,8 @@ def check_map(
             )
     on_progress(1.0)
     return {
-        "frames": HELD_OUT if frames.own_images is not None else ON_TRAVERSE,
-        "traverse": None if frames.own_images is not None else frames.source,
+        "frames": frames.kind,
+        "traverse": frames.source if frames.kind == ON_TRAVERSE else None,
         "n_queries": int(scored.sum()),
         "n_left_out": int((~scored).sum()),
         "tolerance_m": TOLERANCE_M,
@@ -188,29 +213,13 @@ def _active_map(catalog: Catalog, domain: str) -> tuple[int | None, CheckedMap |
         snapshot = load_snapshot(catalog, domain, version)
     except (DamagedMapError, RetiredMapError):
         return version, None, f"map {version}, which serves, is damaged and cannot be compared"
-    return version, CheckedMap(snapshot.retrieval, snapshot.route, snapshot.landmark_model), None
-
-
-def _images_of_frames(
-    catalog: Catalog, domain: str, version: int | None, active: CheckedMap, frames: CheckFrames
-) -> NDArray[np.int64] | None:
-    """The active map's images that are the asked frames themselves, where it was made of the same traverse.
-
-    A frame that looks for itself finds itself, which would say nothing of the map.
-    """
-    if version is None:
-        return None
-    config = catalog.map(domain, version).config
-    made_of = {config.get("training_traverse"), *(each["traverse"] for each in config.get("appended", ()))}
-    if frames.source not in made_of:
-        return None
-    return np.flatnonzero(np.isin(active.route.position_m, frames.route.position_m[frames.chosen]))
+    return version, CheckedMap.of(snapshot, catalog.map(domain, version).config), None
 
 
 def _normalised_ranks(
     checked: CheckedMap,
     frames: CheckFrames,
-    left_out: NDArray[np.int64] | None,
+    left_out: NDArray[np.int64],
     evaluator: Evaluator,
     on_progress: Callable[[float], None],
 ) -> NDArray[np.float64]:
@@ -226,8 +235,7 @@ def _normalised_ranks(
     encodings = frames.drive.encodings[frames.chosen]
     dissimilarities = evaluator.dissimilarities(encodings, checked.model)
     is_kept = np.ones(checked.route.n_images, np.bool_)
-    if left_out is not None:
-        is_kept[left_out] = False
+    is_kept[left_out] = False
     kept = np.flatnonzero(is_kept)
     ranks = np.full(len(encodings), np.nan)
     for first, relevance in _relevances(checked.built, dissimilarities, encodings):

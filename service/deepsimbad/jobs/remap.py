@@ -5,9 +5,6 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from deepsimbad.core.nnql import NnqlConfig
 from deepsimbad.core.relevance import Relevance
 from deepsimbad.engine.snapshot import MapSnapshot
@@ -16,6 +13,7 @@ from deepsimbad.evaluators.base import Evaluator, LandmarkModel
 from deepsimbad.jobs.append import append_frames
 from deepsimbad.jobs.build_map import Described, choose_landmarks, describe, map_contents
 from deepsimbad.jobs.check_map import CheckedMap, CheckFrames, check_map
+from deepsimbad.jobs.known_frames import frame_digests
 from deepsimbad.jobs.map_config import DEFAULT_N_LANDMARKS, RemapConfig
 from deepsimbad.jobs.progress import Progress
 from deepsimbad.jobs.remap_inputs import RemapInputs, read_inputs
@@ -132,13 +130,11 @@ class _Made:
     Attributes:
         contents: All of it; its version is not known yet.
         config: As the catalog keeps it.
-        images: [m] int64, the map image that every frame of the training traverse became.
         training: How its experience database was learnt; None where it has none.
     """
 
     contents: MapContents
     config: Mapping[str, Any]
-    images: NDArray[np.int64]
     training: Mapping[str, Any] | None
 
 
@@ -152,10 +148,9 @@ def _appended(
 ) -> _Made:
     """A copy of the active map with the training traverse among its images."""
     record = catalog.map(inputs.domain.name, inputs.domain.active_version or 0)
-    append = partial(append_frames, before, record.version, inputs.config, inputs.training, evaluator, progress.update)
-    appended = stages.run("describe", append)
-    contents = appended.contents
-    return _Made(contents, contents.config, appended.images, record.metrics.get("training"))
+    append = partial(append_frames, before, record, inputs.config, inputs.training, evaluator, progress.update)
+    contents = stages.run("describe", append)
+    return _Made(contents, contents.config, record.metrics.get("training"))
 
 
 def _mapped(inputs: RemapInputs, evaluator: Evaluator, stages: Stages, progress: Progress, n_threads: int) -> _Made:
@@ -177,7 +172,7 @@ def _mapped(inputs: RemapInputs, evaluator: Evaluator, stages: Stages, progress:
         experience = stages.run_once("train", train, pack_experience, unpack_experience)
     contents = _contents(inputs, model, found, experience)
     training = None if experience is None else experience.metrics
-    return _Made(contents, config.as_dict(), np.arange(inputs.route.n_images), training)
+    return _Made(contents, config.as_dict(), training)
 
 
 def _checked(
@@ -188,9 +183,8 @@ def _checked(
     if config.check_traverse is not None and inputs.check is not None:
         frames = CheckFrames.of_traverse(config.check_traverse, inputs.check, closed)
     else:
-        frames = CheckFrames.held_out(config.training_traverse, inputs.training, closed, made.images)
-    new = MapSnapshot.from_contents(made.contents, index_bytes=0)
-    checked = CheckedMap(new.retrieval, new.route, new.landmark_model)
+        frames = CheckFrames.held_out(config.training_traverse, inputs.training, closed)
+    checked = CheckedMap.of(MapSnapshot.from_contents(made.contents, index_bytes=0), made.config)
     return check_map(catalog, inputs.domain.name, checked, frames, config.gate_margin, evaluator, progress.update)
 
 
@@ -252,5 +246,6 @@ def _contents(
     return replace(
         contents,
         timestamp_us=times if (times >= 0).any() else None,
+        frame_digest=frame_digests(inputs.training.encodings),
         q_values=None if experience is None else experience.q_values,
     )

@@ -33,6 +33,7 @@ class MapContents:
         telling_bits: [n] float32, by how many bits a view from a place narrows the map down, where that was learnt.
         off_route_model: [2] float64, slope and intercept of the log-odds of being off the route, where learnt.
         timestamp_us: [n] int64.
+        frame_digest: [n] uint64, which frame every image was made of, 0 where that was not noted.
         x_m: East, [n] float64.
         y_m: North, [n] float64.
         q_values: [n, a] float32, the experience database.
@@ -57,6 +58,7 @@ class MapContents:
     telling_bits: NDArray[np.float32] | None = None
     off_route_model: NDArray[np.float64] | None = None
     timestamp_us: NDArray[np.int64] | None = None
+    frame_digest: NDArray[np.uint64] | None = None
     x_m: NDArray[np.float64] | None = None
     y_m: NDArray[np.float64] | None = None
     q_values: NDArray[np.float32] | None = None
@@ -96,6 +98,7 @@ class MapContents:
             ("telling_bits", (n,), np.float32),
             ("off_route_model", (2,), np.float64),
             ("timestamp_us", (n,), np.int64),
+            ("frame_digest", (n,), np.uint64),
             ("x_m", (n,), np.float64),
             ("y_m", (n,), np.float64),
             ("q_values", (n, len(self.actions_m)), np.float32),

@@ -44,7 +44,7 @@ _TABLES: dict[str, tuple[str, ...]] = {
     "listed_dissimilarity": ("values",),
     "map_image_encoding": ("encodings",),
     EXPERIENCE_TABLE: ("q_values",),
-    "route": ("position_m", "timestamp_us", "x_m", "y_m"),
+    "route": ("position_m", "timestamp_us", "x_m", "y_m", "frame_digest"),
 }
 _MODEL_TABLE = "landmark_model"
 

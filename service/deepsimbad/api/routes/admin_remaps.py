@@ -9,6 +9,7 @@ from deepsimbad.api.openapi import problems
 from deepsimbad.api.rendering import render_job
 from deepsimbad.api.schemas import JobAnswer
 from deepsimbad.errors import NoActiveMapError
+from deepsimbad.jobs.known_frames import refuse_known_traverse
 from deepsimbad.store.traverses import Traverse
 
 router = APIRouter(prefix="/v1/admin/domains", tags=["admin: maps"])
@@ -45,6 +46,9 @@ async def post_remap(domain: DomainName, request: Request, response: Response, r
                 else "whose landmarks could stay; give a landmark_traverse"
             )
             raise NoActiveMapError(f"domain {domain} has no active map {wanted}", domain=domain)
+        if config.append and record.active_version is not None:
+            active = running.catalog.map(domain, record.active_version)
+            refuse_known_traverse(active.config, active.version, config.training_traverse)
         return render_job(running.runner.submit(domain, config))
 
     job = await run_sync(submit)
