@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 Model = TypeVar("Model", bound=Answer)
 
+REQUEST_ID = "X-Request-ID"
+
 
 def raise_for_problem(response: httpx2.Response) -> None:
     """Turn an error answer into its named error.
@@ -40,7 +42,7 @@ def raise_for_problem(response: httpx2.Response) -> None:
     problem = problem_of(response)
     code = problem.get("code")
     detail = problem.get("detail") or problem.get("title")
-    request_id = response.headers.get("x-request-id") or problem.get("request_id")
+    request_id = response.headers.get(REQUEST_ID) or problem.get("request_id")
     name = code if isinstance(code, str) else ""
     raise api_error_class(status, name)(
         str(detail or f"the service answered {status} {response.reason_phrase}".rstrip()),
@@ -57,7 +59,7 @@ def model(kind: type[Model]) -> Callable[[httpx2.Response], Model]:
 
     def parse(response: httpx2.Response) -> Model:
         try:
-            return kind.model_validate_json(response.content)
+            return kind.model_validate_json(response.content).answering(response.headers.get(REQUEST_ID))
         except ValidationError as error:
             raise _unexpected(response, error) from error
 
@@ -72,15 +74,16 @@ def models(kind: type[Model], key: str) -> Callable[[httpx2.Response], tuple[Mod
 
 def page(kind: type[Model], key: str) -> Callable[[httpx2.Response], Page[Model]]:
     """A parser of one page of a list of models under `key`; a list that says nothing of a next page is whole."""
-    adapter = TypeAdapter(tuple[kind, ...])  # type: ignore[valid-type]
+    adapter: TypeAdapter[tuple[Model, ...]] = TypeAdapter(tuple[kind, ...])  # type: ignore[valid-type]
 
     def parse(response: httpx2.Response) -> Page[Model]:
+        request_id = response.headers.get(REQUEST_ID)
         try:
             document = json.loads(response.content)
-            if not isinstance(document, dict):
-                return Page(adapter.validate_python(document), None)
-            behind = document.get("next")
-            return Page(adapter.validate_python(document[key]), None if behind is None else str(behind))
+            listed = document[key] if isinstance(document, dict) else document
+            behind = document.get("next") if isinstance(document, dict) else None
+            entries = tuple(entry.answering(request_id) for entry in adapter.validate_python(listed))
+            return Page(entries, None if behind is None else str(behind))
         except (ValueError, KeyError) as error:
             raise _unexpected(response, error) from error
 

@@ -35,11 +35,12 @@ class AsyncClient:
         *,
         timeout: httpx2.Timeout = THIN_LINK_TIMEOUT,
         retry: RetryPolicy | None = None,
+        request_id: Callable[[], str] | None = None,
         transport: httpx2.AsyncBaseTransport | None = None,
         sleep: Callable[[float], Awaitable[None]] = asyncio.sleep,
         jitter: Callable[[], float] = random.random,
     ) -> None:
-        endpoint = Endpoint(url, api_key, timeout, retry or RetryPolicy())
+        endpoint = Endpoint(url, api_key, timeout, retry or RetryPolicy(), request_id)
         self._transport = AsyncTransport(endpoint, transport=transport, sleep=sleep, jitter=jitter)
         self.admin = AsyncAdmin(self._transport)
 

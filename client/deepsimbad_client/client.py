@@ -34,6 +34,8 @@ class Client:
         api_key: Absent: `$DEEPSIMBAD_API_KEY`, else none is sent.
         timeout: Connect, read, write and pool timeouts in seconds.
         retry: How often and how long to try.
+        request_id: Names every request that is sent, each try anew, in the service's log too: 1 to 64 letters, digits,
+            '.', '_' and '-'; absent: the service names them. Answers and errors tell it as their `request_id`.
         transport: Another httpx2 transport (tests, proxies, Unix sockets).
         sleep: Waits between tries.
         jitter: Draws in 0..1 that spread the waits.
@@ -49,11 +51,12 @@ class Client:
         *,
         timeout: httpx2.Timeout = THIN_LINK_TIMEOUT,
         retry: RetryPolicy | None = None,
+        request_id: Callable[[], str] | None = None,
         transport: httpx2.BaseTransport | None = None,
         sleep: Callable[[float], None] = time.sleep,
         jitter: Callable[[], float] = random.random,
     ) -> None:
-        endpoint = Endpoint(url, api_key, timeout, retry or RetryPolicy())
+        endpoint = Endpoint(url, api_key, timeout, retry or RetryPolicy(), request_id)
         self._transport = Transport(endpoint, transport=transport, sleep=sleep, jitter=jitter)
         self.admin = Admin(self._transport)
 

@@ -4,7 +4,7 @@ Fields the contract adds later are kept (`extra="allow"`), states are plain word
 may be unknown are None: a client of this version goes on reading what a newer service says.
 """
 
-from typing import Any
+from typing import Any, Self
 
 from pydantic import BaseModel, ConfigDict
 
@@ -15,6 +15,21 @@ class Answer(BaseModel):
     """Root of the answers."""
 
     model_config = ConfigDict(frozen=True, extra="allow")
+    __slots__ = ("_request_id",)  # beside the fields: it is neither compared nor dumped
+
+    @property
+    def request_id(self) -> str | None:
+        """By which the service's log tells of the request answered by this; None in a stream of events."""
+        try:
+            told: str | None = object.__getattribute__(self, "_request_id")
+        except AttributeError:
+            return None
+        return told
+
+    def answering(self, request_id: str | None) -> Self:
+        """The same answer, which knows its request from now on."""
+        object.__setattr__(self, "_request_id", request_id)
+        return self
 
 
 class Health(Answer):

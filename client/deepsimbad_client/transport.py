@@ -3,21 +3,25 @@
 import asyncio
 import os
 import random
+import re
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from contextlib import asynccontextmanager, contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, TypeVar
 
 import httpx2
 
-from deepsimbad_client.answers import raise_for_problem
+from deepsimbad_client.answers import REQUEST_ID, raise_for_problem
 from deepsimbad_client.call import Call
 from deepsimbad_client.errors import InvalidArgumentError, TransportError, TransportTimeoutError
 from deepsimbad_client.map_download import BEYOND_THE_END, MapDownload
 from deepsimbad_client.retry import Attempts, RetryPolicy
 
 T = TypeVar("T")
+
+_REQUEST_ID = re.compile(r"[A-Za-z0-9._-]{1,64}")
 
 URL_VARIABLE = "DEEPSIMBAD_URL"
 KEY_VARIABLE = "DEEPSIMBAD_API_KEY"
@@ -38,12 +42,14 @@ class Endpoint:
         api_key: Sent as a bearer token; absent: `$DEEPSIMBAD_API_KEY`, else none is sent. It is not shown in repr.
         timeout: httpx2's four timeouts.
         retry: How patient.
+        request_id: Names every request that is sent; None: the service names them.
     """
 
     url: str | None = None
     api_key: str | None = field(default=None, repr=False)
     timeout: httpx2.Timeout = field(default_factory=lambda: THIN_LINK_TIMEOUT)
     retry: RetryPolicy = field(default_factory=RetryPolicy)
+    request_id: Callable[[], str] | None = None
 
     def base_url(self) -> str:
         """The address in use.
@@ -71,11 +77,22 @@ class Endpoint:
         return headers
 
 
-def request_of(call: Call[T], http: httpx2.Client | httpx2.AsyncClient) -> httpx2.Request:
-    """A call as an HTTP request."""
-    return http.build_request(
-        call.method, call.path, params=call.params or None, headers=call.headers, content=call.body
-    )
+def request_of(
+    http: httpx2.Client | httpx2.AsyncClient, request_id: Callable[[], str] | None, call: Call[Any]
+) -> httpx2.Request:
+    """A call as an HTTP request, under an id of the caller's where he gives them.
+
+    Raises:
+        InvalidArgumentError: The service would not take that id.
+    """
+    headers = dict(call.headers)
+    if request_id is not None:
+        headers[REQUEST_ID] = request_id()
+        if _REQUEST_ID.fullmatch(headers[REQUEST_ID]) is None:
+            raise InvalidArgumentError(
+                f"{headers[REQUEST_ID]!r} cannot name a request: use 1 to 64 letters, digits, '.', '_' and '-'"
+            )
+    return http.build_request(call.method, call.path, params=call.params or None, headers=headers, content=call.body)
 
 
 def read(call: Call[T], response: httpx2.Response, attempts: Attempts) -> T:
@@ -112,6 +129,7 @@ class Transport:
             limits=CONNECTIONS,
             transport=transport,
         )
+        self._request_of = partial(request_of, self._http, endpoint.request_id)
 
     def send(self, call: Call[T]) -> T:
         """Send a call until it is answered or hopeless.
@@ -124,7 +142,7 @@ class Transport:
         attempts = self._attempts(call)
         while True:
             try:
-                response = self._http.send(request_of(call, self._http))
+                response = self._http.send(self._request_of(call))
             except httpx2.TransportError as error:
                 wait_s = attempts.after_failure(error)
             else:
@@ -143,7 +161,7 @@ class Transport:
             ApiError: The service refused.
         """
         with _broken_streams(f"{call} at {self.url}"):
-            response = self._http.send(request_of(call, self._http), stream=True)
+            response = self._http.send(self._request_of(call), stream=True)
             try:
                 if not response.is_success:
                     response.read()
@@ -180,7 +198,7 @@ class Transport:
 
     def _received(self, download: MapDownload, attempts: Attempts) -> float | None:
         """Receive what comes; answers how long to wait before asking for more, None where nothing is missing."""
-        response = self._http.send(request_of(download.asking(), self._http), stream=True)
+        response = self._http.send(self._request_of(download.asking()), stream=True)
         try:
             if download.begin(response):
                 for piece in response.iter_bytes():
@@ -226,13 +244,14 @@ class AsyncTransport:
             limits=CONNECTIONS,
             transport=transport,
         )
+        self._request_of = partial(request_of, self._http, endpoint.request_id)
 
     async def send(self, call: Call[T]) -> T:
         """See `Transport.send`."""
         attempts = self._attempts(call)
         while True:
             try:
-                response = await self._http.send(request_of(call, self._http))
+                response = await self._http.send(self._request_of(call))
             except httpx2.TransportError as error:
                 wait_s = attempts.after_failure(error)
             else:
@@ -246,7 +265,7 @@ class AsyncTransport:
     async def stream(self, call: Call[None]) -> AsyncIterator[AsyncIterator[httpx2.ServerSentEvent]]:
         """See `Transport.stream`."""
         with _broken_streams(f"{call} at {self.url}"):
-            response = await self._http.send(request_of(call, self._http), stream=True)
+            response = await self._http.send(self._request_of(call), stream=True)
             try:
                 if not response.is_success:
                     await response.aread()
@@ -274,7 +293,7 @@ class AsyncTransport:
 
     async def _received(self, download: MapDownload, attempts: Attempts) -> float | None:
         """Receive what comes; answers how long to wait before asking for more, None where nothing is missing."""
-        response = await self._http.send(request_of(download.asking(), self._http), stream=True)
+        response = await self._http.send(self._request_of(download.asking()), stream=True)
         try:
             if await asyncio.to_thread(download.begin, response):
                 async for piece in response.aiter_bytes():

@@ -106,6 +106,7 @@ def test_a_503_is_logged_with_its_request_and_with_a_stack_where_something_stand
         error_response(SCOPE, error)
     told, behind = (vars(record) for record in caplog.records)
     assert (told["request_id"], told["exc_info"]) == ("r1", None)
+    assert (told["msg"], told["code"], told["why"]) == ("not answered", "unavailable", "12 MiB are free")
     assert (behind["request_id"], behind["exc_info"][1]) == ("r1", caught.value)
 
 

@@ -35,7 +35,7 @@ def told(line: dict[str, Any], *names: str) -> dict[str, Any]:
     return {name: line[name] for name in names if name in line}
 
 
-ALL = ("request_id", "method", "path", "status", "key_id", "domain", "session_id", "job_id", "code")
+ALL = ("request_id", "peer", "method", "path", "status", "key_id", "domain", "session_id", "job_id", "code")
 
 
 def test_a_line_tells_what_the_request_was_about(client: TestClient, lines: pytest.LogCaptureFixture) -> None:
@@ -44,6 +44,7 @@ def test_a_line_tells_what_the_request_was_about(client: TestClient, lines: pyte
     line = last(lines)
     assert told(line, *ALL) == {
         "request_id": "mine-1",
+        "peer": "testclient",
         "method": "GET",
         "path": "/v1/domains/ready",
         "status": 200,

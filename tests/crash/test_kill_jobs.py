@@ -60,7 +60,8 @@ def training(server: LocalServer, client: Client) -> tuple[Job, int]:
     """A job that is at training its experience database, and the process it is in."""
     job = client.admin.remap("campus", **CONFIG, training_episodes=LONG)
     until(lambda: client.admin.job(job.job_id).stage == "train")
-    (begun,) = [line for line in log_of(server) if line["message"] == "job begins" and line["job_id"] == job.job_id]
+    started = [line for line in log_of(server) if line["message"] == "a job's process started"]
+    (begun,) = [line for line in started if line["job_id"] == job.job_id]
     return job, begun["pid"]
 
 

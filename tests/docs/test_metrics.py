@@ -102,16 +102,3 @@ def test_every_alarm_is_tried(alarms: list[dict[str, object]]) -> None:
     tried = yaml.safe_load((PROJECT / "deploy" / "alerts_test.yml").read_text())["tests"]
     ringing = {each["alertname"] for test in tried for each in test["alert_rule_test"] if "exp_alerts" in each}
     assert ringing == {alarm["alert"] for alarm in alarms}
-
-
-def test_every_log_line_explained_is_written(page: Page) -> None:
-    sources = "\n".join(path.read_text(encoding="utf-8") for path in (PROJECT / "service" / "deepsimbad").rglob("*.py"))
-    table = page.text.split("### Log lines")[1].split("### Metrics")[0]
-    messages = {
-        message
-        for row in re.findall(r"^\| (`[^|]*) \| (?:INFO|WARNING|ERROR) \|", table, re.MULTILINE)
-        for message in re.findall(r"`([^`]+)`", row)
-    }
-    assert len(messages) > 10
-    for message in messages:
-        assert re.search(rf'"{message}\b', sources), f"no line says {message!r}"

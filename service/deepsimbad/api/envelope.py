@@ -106,6 +106,7 @@ class EnvelopeMiddleware:
                     "request",
                     extra={
                         "request_id": request_id,
+                        "peer": (scope.get("client") or ("",))[0],
                         "method": method,
                         "path": scope["path"][:_LONGEST_PATH],
                         "status": status,

@@ -5,6 +5,7 @@ Every metric is explained in `docs/operations.md`, and a test compares.
 
 import threading
 from collections.abc import Iterable, Mapping
+from functools import cache
 
 from prometheus_client import (
     CollectorRegistry,
@@ -52,13 +53,14 @@ class Metrics:
             buckets=_LATENCY_BUCKETS_S,
             registry=self._registry,
         )
-        self._stage_seconds = Histogram(
+        stage_seconds = Histogram(
             "deepsimbad_localization_stage_seconds",
-            "Time of the stages of one localization.",
+            "Time of the stages of one answer to a view, and their total.",
             ["stage"],
             buckets=_LATENCY_BUCKETS_S,
             registry=self._registry,
         )
+        self._seconds_of_stage = cache(stage_seconds.labels)  # a view has a dozen: looked up, they cost twice as much
         self._entropy_bits = Histogram(
             "deepsimbad_belief_entropy_bits",
             "Entropy of the belief after one view: high when the map no longer tells places apart.",
@@ -125,7 +127,7 @@ class Metrics:
     def localized(self, domain: str, timings_ms: Mapping[str, float], entropy_bits: float) -> None:
         """Record one localization."""
         for stage, milliseconds in timings_ms.items():
-            self._stage_seconds.labels(stage).observe(milliseconds / 1000)
+            self._seconds_of_stage(stage).observe(milliseconds / 1000)
         self._domains.add(domain)
         self._entropy_bits.labels(domain).observe(entropy_bits)
 

@@ -134,8 +134,8 @@ def error_response(scope: Scope, error: DeepSimbadError) -> Response:
     if status >= HTTPStatus.INTERNAL_SERVER_ERROR and not isinstance(error, OverloadedError):
         # What stands behind a 503 helps; where nothing does its sentence says all, and a probe repeats it all night.
         is_told = status == HTTPStatus.SERVICE_UNAVAILABLE and error.__cause__ is None
-        about = {"request_id": scope.get("state", {}).get("request_id")}
-        log.warning("%s: %s", error.code, error.message, exc_info=None if is_told else error, extra=about)
+        about = {"request_id": scope.get("state", {}).get("request_id"), "code": error.code, "why": error.message}
+        log.warning("not answered", exc_info=None if is_told else error, extra=about)
     summary = (type(error).__doc__ or "").strip().partition("\n")[0].rstrip(".")
     retry_after_s = error.hints.get("retry_after_s")
     headers = None if retry_after_s is None else {"Retry-After": str(retry_after_s)}

@@ -1,7 +1,6 @@
 """From the engine's arrays to the answers' models."""
 
 import math
-from time import perf_counter
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,24 +22,23 @@ from deepsimbad.core.belief_summary import BeliefSummary
 from deepsimbad.core.planners import Plan
 from deepsimbad.core.route import Route
 from deepsimbad.engine.localizer import Localization
+from deepsimbad.engine.stopwatch import Stopwatch
 from deepsimbad.store.records import JobRecord, MapRecord
 
 
-def render_localization(localization: Localization, began: float) -> LocalizationAnswer:
+def render_localization(localization: Localization, watch: Stopwatch) -> LocalizationAnswer:
     """The answer to one view.
 
     Args:
         localization: What the engine found.
-        began: `perf_counter()` when the request arrived.
+        watch: Runs since the request arrived.
     """
     route = localization.snapshot.route
     retrieval = render_shortlist(route, localization.shortlist, localization.retrieval.relevance)
     belief = render_belief(route, localization.belief)
-    timings_ms = {stage: round(spent, 3) for stage, spent in localization.timings_ms.items()}
-    timings_ms["total"] = round(1000 * (perf_counter() - began), 3)
     return LocalizationAnswer.model_construct(
         map_version=localization.snapshot.version,
-        timings_ms=timings_ms,
+        timings_ms=watch.timings_ms(),
         belief=belief,
         retrieval=retrieval,
         next_best_view=render_plan(localization.plan, localization.snapshot.actions_m),

@@ -5,6 +5,13 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 Next = Annotated[str | None, Field(description="Ask for the list `after` this for its next page; null: it ends here.")]
+Timings = Annotated[
+    dict[str, float],
+    Field(
+        description="Milliseconds by stage: `receive` (the body), `wait` (for its turn and the worker), `decode`, "
+        "`describe`, `retrieve`, ..., `commit` (to the disk); and their `total`, with what is in no stage."
+    ),
+]
 IndexRange = Annotated[tuple[int, int], Field(description="First and last index of a gap, both inside it.")]
 
 
@@ -139,7 +146,7 @@ class LocalizationAnswer(Answer):
     """Where one view places the robot, from a uniform prior."""
 
     map_version: int
-    timings_ms: Annotated[dict[str, float], Field(description="Milliseconds by stage, and their `total`.")]
+    timings_ms: Timings
     belief: BeliefAnswer
     retrieval: Annotated[list[RetrievedAnswer], Field(description="Most relevant map images, best first.")]
     next_best_view: Annotated[NextBestViewAnswer | None, Field(description="null until the map was trained for it.")]

@@ -1,12 +1,12 @@
 """From a session's view to its answers' models."""
 
 from datetime import UTC, datetime
-from time import perf_counter
 from typing import Any
 
 from deepsimbad.api.rendering import render_belief, render_plan, render_shortlist
 from deepsimbad.api.session_schemas import ListedSessionAnswer, ObservationAnswer, SessionAnswer
 from deepsimbad.engine.session_view import SessionView
+from deepsimbad.engine.stopwatch import Stopwatch
 from deepsimbad.store.session_records import ListedSession
 
 
@@ -15,18 +15,16 @@ def render_session(view: SessionView) -> SessionAnswer:
     return SessionAnswer.model_construct(**_members(view))
 
 
-def render_observation(view: SessionView, began: float) -> ObservationAnswer:
+def render_observation(view: SessionView, watch: Stopwatch) -> ObservationAnswer:
     """A session after an observation.
 
     Args:
         view: The session.
-        began: `perf_counter()` when the request arrived.
+        watch: Runs since the request arrived.
     """
     retrieval = [] if view.relevance is None else render_shortlist(view.snapshot.route, view.shortlist, view.relevance)
     members = _members(view)
-    timings_ms = {stage: round(spent, 3) for stage, spent in view.timings_ms.items()}
-    timings_ms["total"] = round(1000 * (perf_counter() - began), 3)
-    return ObservationAnswer.model_construct(**members, retrieval=retrieval, timings_ms=timings_ms)
+    return ObservationAnswer.model_construct(**members, retrieval=retrieval, timings_ms=watch.timings_ms())
 
 
 def render_listed(listed: ListedSession) -> ListedSessionAnswer:

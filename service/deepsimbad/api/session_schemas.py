@@ -4,7 +4,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from deepsimbad.api.schemas import Answer, BeliefAnswer, Next, NextBestViewAnswer, RetrievedAnswer
+from deepsimbad.api.schemas import Answer, BeliefAnswer, Next, NextBestViewAnswer, RetrievedAnswer, Timings
 
 
 class SessionAnswer(Answer):
@@ -22,7 +22,7 @@ class SessionAnswer(Answer):
 class ObservationAnswer(SessionAnswer):
     """A session after one more observation."""
 
-    timings_ms: Annotated[dict[str, float], Field(description="Milliseconds by stage, and their `total`.")]
+    timings_ms: Timings
     retrieval: Annotated[list[RetrievedAnswer], Field(description="Map images most relevant to this view, best first.")]
 
 

@@ -1,7 +1,6 @@
 """`deepsimbad map`, `localize` and `info`: the same data directory as the server's, without a server."""
 
 from pathlib import Path
-from time import perf_counter
 
 import click
 from rich.table import Table
@@ -21,6 +20,7 @@ from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Relevance
 from deepsimbad.engine.active_maps import ActiveMaps
 from deepsimbad.engine.evaluator_pool import EvaluatorPool
 from deepsimbad.engine.localizer import localize as localize_view
+from deepsimbad.engine.stopwatch import Stopwatch
 from deepsimbad.errors import (
     ImageTooLargeError,
     InvalidImageError,
@@ -123,9 +123,9 @@ def localize(domain: str, images: tuple[Path, ...], as_json: bool, data_dir: Pat
     with Catalog.open(existing_data_dir(settings.data_dir)) as catalog:
         active = ActiveMaps(catalog).active(domain)
         judge = EvaluatorPool().evaluator(active.record.evaluator)
-        found = []
+        answers = []
         for path in images:
-            began = perf_counter()
+            watch = Stopwatch()
             try:
                 body = path.read_bytes()
             except OSError as error:
@@ -134,8 +134,10 @@ def localize(domain: str, images: tuple[Path, ...], as_json: bool, data_dir: Pat
                 view = decode_image(body, settings.max_pixels)
             except (InvalidImageError, ImageTooLargeError) as error:
                 raise type(error)(f"{path}: {error.message}", **error.hints) from error
-            found.append((localize_view(active.snapshot, judge, view), began))
-    answers = [render_localization(each, began) for each, began in found]
+            watch.lap("decode")
+            found = localize_view(active.snapshot, judge, view)
+            watch.take(found.timings_ms)
+            answers.append(render_localization(found, watch))
     if as_json:
         write_json([{"image": str(path), **answer.model_dump()} for path, answer in zip(images, answers, strict=True)])
         return

@@ -164,8 +164,10 @@ class ActiveMaps:
         """Say in the log that another version serves than before, whoever switched it."""
         before = self._announced.get(domain)
         if before != version:
-            what = "map activated" if before is None or version > before else "map rolled back"
-            log.info(what, extra={"domain": domain, "map_version": version, "before": before})
+            log.info(
+                "map activated" if before is None or version > before else "map rolled back",
+                extra={"domain": domain, "map_version": version, "before": before},
+            )
             self._announced[domain] = version
 
 

@@ -1,8 +1,6 @@
 """What a session answers with."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from time import perf_counter
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +26,6 @@ class SessionView:
         plan: The move to make next; None where the map can name none.
         relevance: [n] float32 of the last view; None before any.
         shortlist: Ids of the map images most relevant to the last view, best first.
-        timings_ms: Milliseconds by stage.
         is_repeated: Whether the observation had been counted before.
     """
 
@@ -40,7 +37,6 @@ class SessionView:
     plan: Plan | None
     relevance: NDArray[np.float32] | None
     shortlist: NDArray[np.int64]
-    timings_ms: Mapping[str, float] = field(default_factory=dict)
     is_repeated: bool = False
 
 
@@ -56,13 +52,10 @@ def view_of(
         state: Of the session.
         n_shortlist: Length of the shortlist and of the belief's top; None: the usual one.
     """
-    began = perf_counter()
     length = shortlist_length(engine.snapshot, n_shortlist)
     known, step = state.belief, state.step
     summary = summarise(engine.snapshot.route, known.belief.mass, length, known.off_route)
     best = np.empty(0, np.int64) if known.relevance is None else shortlist(known.relevance, length)
-    timings_ms = {} if step is None else dict(step.timings_ms)
-    timings_ms["summarise"] = 1000 * (perf_counter() - began)
     return SessionView(
         session_id=session_id,
         expires_at=expires_at,
@@ -72,5 +65,4 @@ def view_of(
         plan=engine.localizer.plan(known) if step is None else step.plan,
         relevance=known.relevance,
         shortlist=best,
-        timings_ms=timings_ms,
     )

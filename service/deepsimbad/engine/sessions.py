@@ -21,6 +21,7 @@ from deepsimbad.engine.session_config import SessionConfig, check_move, check_pr
 from deepsimbad.engine.session_registry import DELETED, SessionRegistry
 from deepsimbad.engine.session_state import SessionEngine
 from deepsimbad.engine.session_view import SessionView, view_of
+from deepsimbad.engine.stopwatch import Stopwatch
 from deepsimbad.engine.worker import InferenceWorker
 from deepsimbad.errors import IdempotencyKeyReusedError, InvalidInputError, UnavailableError
 from deepsimbad.store.list_page import ListPage
@@ -106,8 +107,13 @@ class Sessions:
         check_start(active.snapshot.route, config)
         return await self._finished(self._begin(active, config, session_id or secrets.token_hex(16)))
 
-    async def observe(self, session_id: str, observation: Observation) -> SessionView:
+    async def observe(self, session_id: str, observation: Observation, watch: Stopwatch | None = None) -> SessionView:
         """Move a session on by a move and the view after it.
+
+        Args:
+            session_id: Which session.
+            observation: What its robot reports.
+            watch: Told of every stage. `wait` is for its turn: behind what came before it, and then for the worker.
 
         Raises:
             UnknownSessionError, EndedSessionError, RetiredMapError: There is no such session, or no more.
@@ -115,7 +121,7 @@ class Sessions:
             IdempotencyKeyReusedError: The key named another observation.
         """
         live = await self._registry.find(session_id)
-        return await self._finished(self._observe(live, observation))
+        return await self._finished(self._observe(live, observation, watch or Stopwatch()))
 
     async def set_prior(self, session_id: str, position_m: float, std_m: float) -> SessionView:
         """Replace a session's belief by one around a position; raises InvalidPriorError."""
@@ -194,35 +200,52 @@ class Sessions:
         # Else the same request was on its way twice, and the other one was quicker.
         return answer if begun is not None else await self._begun_before(session_id, config)
 
-    async def _observe(self, live: LiveSession, observation: Observation) -> SessionView:
+    async def _observe(self, live: LiveSession, observation: Observation, watch: Stopwatch) -> SessionView:
         """Everything in order under the session's lock: describe, compute, write, publish."""
         async with live.lock:
             loaded = await self._registry.loaded(live)
             shortlist_length(loaded.engine.snapshot, observation.n_shortlist)  # a bad one should not move the session
             check_move(loaded.engine.snapshot, observation.action_m, observation.action_std_m)
+            watch.lap("wait")
             view = await observation.view()
+            watch.lap("decode")
             expires_at = self._clock() + self._ttl_s
-            stepped = await self._compute(lambda: self._step(live, loaded, observation, view, expires_at))
+            stepped = await self._compute(lambda: self._step(live, loaded, observation, view, expires_at, watch))
             if isinstance(stepped, int):
-                return await self._repeated(live, loaded, stepped, observation.n_shortlist)
+                answer = await self._repeated(live, loaded, stepped, observation.n_shortlist)
+                watch.lap("summarise")
+                return answer
             row, moved_on = stepped
             told = self._summarised(live.session_id, expires_at, moved_on, observation.n_shortlist)
             await self._commit(live, loaded, row, moved_on)  # the disk and the summary take their time together
-            return await told
+            watch.lap("commit")
+            answer = await told
+            watch.lap("summarise")  # what it took beyond the disk
+            return answer
 
     def _step(
-        self, live: LiveSession, loaded: Loaded, observation: Observation, view: View, expires_at: float
+        self,
+        live: LiveSession,
+        loaded: Loaded,
+        observation: Observation,
+        view: View,
+        expires_at: float,
+        watch: Stopwatch,
     ) -> tuple[ObservedRow, Loaded] | int:
         """The next row and what it leads to; or the row's number, if the observation was counted before."""
+        watch.lap("wait")
         named = observation.idempotency
         if named is not None and (earlier := self._counted_before(live, named)) is not None:
             return earlier
         engine = loaded.engine
         query = describe(engine.snapshot, engine.evaluator, view)
+        watch.lap("describe")
         row = engine.row_of(
             query, loaded.state.sequence + 1, expires_at, observation.action_m, observation.action_std_m, named
         )
         state = engine.applied(loaded.state, row)
+        if state.step is not None:
+            watch.take(state.step.timings_ms)
         return row, Loaded(engine, state)
 
     def _counted_before(self, live: LiveSession, named: IdempotencyKey) -> int | None:

@@ -68,7 +68,7 @@ class InAnotherProcess:
         }
         limits = dict.fromkeys(_THREAD_VARIABLES, str(self._n_threads))  # read when the libraries load, not later
         with _Child(order, self._priority, limits) as child:
-            _log.info("job begins", extra={"job_id": job.job_id, "kind": job.kind, "pid": child.pid})
+            _log.info("a job's process started", extra={"job_id": job.job_id, "pid": child.pid})
             result = None
             for message in child.messages(is_cancelled, self._stops_within_s):
                 match message:

@@ -1,7 +1,6 @@
 """Where a single view places the robot: stateless, from a uniform prior."""
 
 from io import BytesIO
-from time import perf_counter
 from typing import Annotated
 
 import numpy as np
@@ -24,8 +23,9 @@ from deepsimbad.api.dependencies import DomainName, Running, Services
 from deepsimbad.api.openapi import binary, problems
 from deepsimbad.api.rendering import render_localization
 from deepsimbad.api.schemas import LocalizationAnswer
-from deepsimbad.engine.localizer import localize, retrieve, shortlist_length
+from deepsimbad.engine.localizer import Localization, localize, retrieve, shortlist_length
 from deepsimbad.engine.observation import View
+from deepsimbad.engine.stopwatch import Stopwatch
 from deepsimbad.evaluators.image import MEDIA_TYPES
 
 router = APIRouter(prefix="/v1/domains", tags=["localization"])
@@ -61,24 +61,28 @@ async def post_localization(
     from its bytes, whichever of the image types the header names. With `Accept: application/octet-stream` the answer
     is the relevance of every map image.
     """
-    began = perf_counter()
+    watch = Stopwatch()
     active = await running.active(domain)
     media_type = media_type_of(request, OBSERVATION_TYPES)
     shortlist_length(active.snapshot, shortlist)  # a bad query should not cost an upload
-    view = await read_view(request, running, media_type)
+    body = await read_bytes(request)
+    watch.lap("receive")
+    view = await view_in(body, running, media_type)
+    watch.lap("decode")
     evaluator = running.evaluators.evaluator(active.record.evaluator)
     if prefers_binary(request):
         retrieval = await running.infer(lambda: retrieve(active.snapshot, evaluator, view))
         return npy_response(retrieval.relevance)
-    localization = await running.infer(lambda: localize(active.snapshot, evaluator, view, shortlist))
-    answer = render_localization(localization, began)
+
+    def look() -> Localization:
+        watch.lap("wait")
+        found = localize(active.snapshot, evaluator, view, shortlist)
+        watch.take(found.timings_ms)
+        return found
+
+    answer = render_localization(await running.infer(look), watch)
     running.metrics.localized(domain, answer.timings_ms, answer.belief.entropy_bits)
     return Response(answer.model_dump_json(), media_type=JSON)
-
-
-async def read_view(request: Request, running: Services, media_type: str) -> View:
-    """The observation in a request's body."""
-    return await view_in(await read_bytes(request), running, media_type)
 
 
 async def view_in(body: bytes, running: Services, media_type: str) -> View:

@@ -1,7 +1,6 @@
 """A robot's live belief: begun, moved on by observations, asked, ended."""
 
 import hashlib
-from time import perf_counter
 from typing import Annotated
 
 from fastapi import APIRouter, Header, Query, Request, Response
@@ -27,6 +26,7 @@ from deepsimbad.api.session_bodies import PriorBody, SessionBody
 from deepsimbad.api.session_rendering import render_observation, render_session
 from deepsimbad.api.session_schemas import ObservationAnswer, SessionAnswer
 from deepsimbad.engine.live_session import Observation
+from deepsimbad.engine.stopwatch import Stopwatch
 from deepsimbad.errors import DeepSimbadError
 from deepsimbad.evaluators.image import MEDIA_TYPES
 from deepsimbad.store.session_records import IdempotencyKey
@@ -113,20 +113,21 @@ async def post_observation(
     When this has answered, the observation survives whatever happens to the service. Two at once are both answered, in
     order of arrival. The body is what `localizations` takes.
     """
-    began = perf_counter()
+    watch = Stopwatch()
     try:
         media_type = media_type_of(request, OBSERVATION_TYPES)
         body = await read_bytes(request)
+        watch.lap("receive")
         named = None
         if idempotency_key is not None:
             told = f"{media_type}\n{action_m!r}\n{action_std_m!r}\n".encode()
             named = IdempotencyKey(idempotency_key, hashlib.sha256(told + body).digest())
         observation = Observation(lambda: view_in(body, running, media_type), action_m, action_std_m, shortlist, named)
-        view = await running.sessions.observe(session_id, observation)
+        view = await running.sessions.observe(session_id, observation, watch)
     except DeepSimbadError as error:
         running.metrics.observed(error.code)
         raise
-    answer = render_observation(view, began)
+    answer = render_observation(view, watch)
     request.state.domain = answer.domain
     running.metrics.observed("repeated" if view.is_repeated else "accepted")
     running.metrics.localized(answer.domain, answer.timings_ms, answer.belief.entropy_bits)

@@ -1,0 +1,129 @@
+"""Where an observation's time went: what waits, and what is held, shows in the stage of that name."""
+
+import asyncio
+import threading
+from dataclasses import replace
+from time import perf_counter
+from typing import Any
+
+import pytest
+
+from deepsimbad.engine.session_config import SessionConfig
+from deepsimbad.engine.stopwatch import Stopwatch
+from deepsimbad.store.catalog import Catalog
+from deepsimbad.store.map_table import ANY
+
+from .conftest import add_domain, add_map
+from .live_service import Live, ranked, run
+
+HELD_S = 0.05  # long beside nothing; only "at least so long" is asked of it
+STAGES = ["wait", "decode", "describe", "retrieve", "predict", "update", "plan", "commit", "summarise", "total"]
+
+
+@pytest.fixture
+def mapped(catalog: Catalog) -> Catalog:
+    add_domain(catalog, "d")
+    catalog.activate("d", add_map(catalog, "d"), ANY)
+    return catalog
+
+
+async def begun(live: Live) -> str:
+    return (await live.sessions.begin(live.active_maps.active("d"), SessionConfig())).session_id
+
+
+async def held(let_go: threading.Event | asyncio.Event) -> float:
+    """Hold a little longer, and tell how long at least, in milliseconds."""
+    began = perf_counter()
+    await asyncio.sleep(HELD_S)
+    held_ms = 1000 * (perf_counter() - began)
+    let_go.set()
+    return held_ms
+
+
+async def until(look: Any) -> None:
+    while not look():
+        await asyncio.sleep(0.001)
+
+
+def test_stages_are_told_in_order_and_make_up_the_total(mapped: Catalog) -> None:
+    async def body(live: Live) -> dict[str, float]:
+        watch = Stopwatch()
+        await live.sessions.observe(await begun(live), ranked(1), watch)
+        return watch.timings_ms()
+
+    timings_ms = run(mapped, body)
+    assert list(timings_ms) == STAGES
+    assert min(timings_ms.values()) >= 0
+    total = timings_ms.pop("total")
+    assert 0 < sum(timings_ms.values()) <= total + 0.001 * len(STAGES)  # each is rounded
+
+
+def test_a_busy_worker_shows_as_waiting(mapped: Catalog) -> None:
+    async def body(live: Live) -> tuple[dict[str, float], float]:
+        session_id, watch, begins, let_go = await begun(live), Stopwatch(), threading.Event(), threading.Event()
+        live.worker.submit(lambda: (begins.set(), let_go.wait(60)))
+        await until(begins.is_set)
+        posted = asyncio.create_task(live.sessions.observe(session_id, ranked(1), watch))
+        await until(lambda: live.worker.n_waiting)
+        held_ms = await held(let_go)
+        await posted
+        return watch.timings_ms(), held_ms
+
+    timings_ms, held_ms = run(mapped, body)
+    assert timings_ms["wait"] >= held_ms - 0.001
+
+
+def test_a_view_before_this_one_shows_as_waiting_and_a_slow_image_as_decoding(mapped: Catalog) -> None:
+    async def body(live: Live) -> tuple[dict[str, float], dict[str, float], float]:
+        session_id, before, behind = await begun(live), Stopwatch(), Stopwatch()
+        begins, let_go, slow = asyncio.Event(), asyncio.Event(), ranked(1)
+
+        async def late() -> Any:
+            begins.set()
+            await let_go.wait()
+            return await slow.view()
+
+        first = asyncio.create_task(live.sessions.observe(session_id, replace(slow, view=late), before))
+        await begins.wait()
+        second = asyncio.create_task(live.sessions.observe(session_id, ranked(2), behind))
+        await asyncio.sleep(0)
+        held_ms = await held(let_go)
+        await asyncio.gather(first, second)
+        return before.timings_ms(), behind.timings_ms(), held_ms
+
+    before, behind, held_ms = run(mapped, body)
+    assert before["decode"] >= held_ms - 0.001
+    assert behind["wait"] >= held_ms - 0.001
+
+
+def test_a_slow_disk_shows_as_committing(mapped: Catalog) -> None:
+    async def body(live: Live) -> tuple[dict[str, float], float]:
+        session_id, watch, let_go = await begun(live), Stopwatch(), threading.Event()
+        live.store._commits.submit(lambda db: let_go.wait(60))
+        posted = asyncio.create_task(live.sessions.observe(session_id, ranked(1), watch))
+        await until(lambda: "plan" in watch.timings_ms())
+        held_ms = await held(let_go)
+        await posted
+        return watch.timings_ms(), held_ms
+
+    timings_ms, held_ms = run(mapped, body)
+    assert timings_ms["commit"] >= held_ms - 0.001
+
+
+def test_a_repetition_tells_only_what_it_took_itself(mapped: Catalog) -> None:
+    async def body(live: Live) -> dict[str, float]:
+        session_id, watch = await begun(live), Stopwatch()
+        await live.sessions.observe(session_id, ranked(1, key="k"))
+        assert (await live.sessions.observe(session_id, ranked(1, key="k"), watch)).is_repeated
+        return watch.timings_ms()
+
+    assert list(run(mapped, body)) == ["wait", "decode", "summarise", "total"]
+
+
+@pytest.mark.parametrize("stages", [(), ("a",), ("a", "b", "a")])
+def test_laps_are_added_up(stages: tuple[str, ...]) -> None:
+    watch = Stopwatch()
+    for stage in stages:
+        watch.lap(stage)
+    watch.take({"c": 0.0})
+    assert list(watch.timings_ms()) == [*dict.fromkeys(stages), "c", "total"]
