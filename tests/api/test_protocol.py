@@ -568,6 +568,24 @@ def test_one_connection_more_closes_the_longest_silent(service: Service, silent:
     until(lambda: _answers(service))
 
 
+def test_announcing_a_body_that_never_comes_holds_no_place(service: Service) -> None:
+    """Strangers who are answered 401 at once could else keep all robots out until their bodies stall."""
+    held = []
+    try:
+        for _ in range(MAX_CONNECTIONS):
+            connection = service.connect()
+            held.append(connection)
+            connection.sendall(b"POST /forgetful HTTP/1.1\r\nHost: x\r\nContent-Length: 1000\r\n\r\n")
+            assert read_one(connection).endswith(b"early")
+        with service.connect() as robot:
+            robot.sendall(GET)
+            assert read_one(robot).endswith(b"GET / 0")
+    finally:
+        for connection in held:
+            connection.close()
+    until(lambda: _answers(service))
+
+
 def _answers(service: Service) -> bool:
     try:
         with service.connect() as connection:

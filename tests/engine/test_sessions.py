@@ -2,6 +2,8 @@
 
 import asyncio
 import threading
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,6 +16,7 @@ from deepsimbad.core.filters import FilterKind
 from deepsimbad.core.relevance import Relevance
 from deepsimbad.engine.active_localizer import ActiveLocalizer, LocalizerConfig
 from deepsimbad.engine.localizer import describe
+from deepsimbad.engine.observation import View
 from deepsimbad.engine.session_config import SessionConfig
 from deepsimbad.errors import (
     EndedSessionError,
@@ -57,7 +60,8 @@ def test_a_session_is_the_localizer_step_by_step(mapped: Catalog) -> None:
         for seed in range(6):
             observation = ranked(seed)
             view = await live.sessions.observe(session_id, observation)
-            query = describe(snapshot, FeatureL2("none"), await observation.view())
+            async with observation.view() as seen:
+                query = describe(snapshot, FeatureL2("none"), seen)
             state = localizer.step(state, query, observation.action_m).state
             np.testing.assert_array_equal(await live.sessions.mass(session_id), state.belief.mass)
             assert view.n_observations == seed + 1
@@ -112,9 +116,11 @@ def test_two_at_once_are_answered_in_order_of_arrival(mapped: Catalog) -> None:
         gate = asyncio.Event()
         slow = ranked(0)
 
-        async def late() -> Any:
+        @asynccontextmanager
+        async def late() -> AsyncIterator[View]:
             await gate.wait()  # its image takes long to decode; it arrived first all the same
-            return await slow.view()
+            async with slow.view() as view:
+                yield view
 
         first = asyncio.create_task(live.sessions.observe(at_once, replace(slow, view=late)))
         others = [asyncio.create_task(live.sessions.observe(at_once, ranked(seed))) for seed in range(1, 12)]
@@ -251,6 +257,29 @@ def test_a_session_that_another_process_moved_on_does_not_expire(mapped: Catalog
                 await ours.sessions.view(session_id)
 
         asyncio.run(body())
+
+
+def test_the_sessions_of_a_deleted_domain_end_though_robots_end_some_meanwhile(mapped: Catalog) -> None:
+    async def body(live: Live) -> None:
+        sessions = [await begun(live) for _ in range(6)]
+        await asyncio.gather(*(live.sessions.end(one) for one in sessions[::2]), live.sessions.end_domain("d"))
+        for session_id in sessions:
+            with pytest.raises(EndedSessionError):
+                await live.sessions.observe(session_id, ranked(1))
+
+    run(mapped, body)
+
+
+def test_sessions_of_a_domain_that_a_command_deleted_end(mapped: Catalog) -> None:
+    async def body(live: Live) -> None:
+        session_id = await begun(live)
+        await live.sessions.end_strangers({"d"})
+        await live.sessions.observe(session_id, ranked(1))
+        await live.sessions.end_strangers({"another"})
+        with pytest.raises(EndedSessionError):
+            await live.sessions.observe(session_id, ranked(1))
+
+    run(mapped, body)
 
 
 def test_a_repeated_observation_counts_once_and_has_its_own_answer(mapped: Catalog) -> None:

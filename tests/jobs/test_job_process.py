@@ -3,12 +3,13 @@
 import json
 import logging
 import os
+import resource
 import signal
 import subprocess
 import sys
 import threading
 import time
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -171,7 +172,7 @@ def test_or_less(catalog, job, caplog, priority, kind, nice):
 
 
 def test_a_cancel_is_heard(catalog, job, caplog):
-    with held(catalog, job, caplog) as doing:
+    with held(catalog, job, caplog, InAnotherProcess(catalog.data_dir, 3, stops_within_s=WITHIN_S)) as doing:
         doing.cancelled.set()
         error = doing.ended()
     assert isinstance(error, CancelledError)
@@ -271,6 +272,22 @@ def is_running(pid):
 def test_threads_of_jobs():
     assert job_threads(5) == 5
     assert 1 <= job_threads(0) <= max(1, available_cores() - 1)
+
+
+def test_a_service_that_holds_many_connections_does_jobs_too(catalog, job, caplog):
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if hard != resource.RLIM_INFINITY and hard < 2000:
+        pytest.skip("so many files may not be open here")
+    resource.setrlimit(resource.RLIMIT_NOFILE, (max(soft, 2000), hard))
+    with ExitStack() as files:
+        try:
+            for _ in range(1100):
+                files.enter_context(Path(os.devnull).open("rb"))
+            with held(catalog, job, caplog) as doing:
+                doing.cancelled.set()
+                assert isinstance(doing.ended(), CancelledError)
+        finally:
+            resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
 
 
 def test_where_no_process_can_be_started_the_job_fails_by_name(catalog, job, monkeypatch):

@@ -1,6 +1,8 @@
+import shutil
 import sqlite3
 import threading
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -18,6 +20,7 @@ from deepsimbad.errors import (
     UnknownJobError,
     UnknownMapVersionError,
 )
+from deepsimbad.store import durable
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.map_table import ANY
 from deepsimbad.store.records import JobState, MapState
@@ -282,3 +285,64 @@ def test_the_catalog_is_plain_sqlite_with_its_rules_inside(campus: Catalog) -> N
             with pytest.raises(sqlite3.IntegrityError):
                 connection.execute(statement)
     connection.close()
+
+
+def test_who_reads_does_not_wait_for_who_writes(campus: Catalog) -> None:
+    writing, done = threading.Event(), threading.Event()
+
+    def write() -> None:
+        with campus._writing() as db:
+            db.execute("UPDATE domain SET closed = 1")
+            writing.set()
+            done.wait(60)
+
+    thread = threading.Thread(target=write)
+    thread.start()
+    try:
+        assert writing.wait(60)
+        assert [record.closed for record in campus.domains()] == [False]
+        assert campus.keys() == []
+    finally:
+        done.set()
+        thread.join()
+    assert campus.domain("campus").closed
+
+
+def test_others_write_while_the_files_of_a_deleted_domain_go(campus: Catalog, monkeypatch: pytest.MonkeyPatch) -> None:
+    remove = shutil.rmtree
+
+    def slowly(path: Path, **how: Any) -> None:
+        monkeypatch.setattr(durable.shutil, "rmtree", remove)
+        with Catalog.open(campus.data_dir) as other:
+            other.create_domain("meanwhile", EVALUATOR, False, [1])
+            other.create_domain("campus", EVALUATOR, True, [1])
+        remove(path, **how)
+
+    monkeypatch.setattr(durable.shutil, "rmtree", slowly)
+    campus.delete_domain("campus")
+    assert {record.name for record in campus.domains()} == {"campus", "meanwhile"}
+    assert not list(campus.data_dir.glob("domains/.removing-*"))
+
+
+def test_a_settled_map_waits_for_a_removal_under_way(campus: Catalog) -> None:
+    """Who pins a version and then finds it here keeps it: so it must not look while it is being removed."""
+    sealed(campus)
+    campus.activate("campus", sealed(campus), ANY)
+    asked, go_on = threading.Event(), threading.Event()
+    found: list[bool] = []
+
+    def is_pinned() -> bool:
+        asked.set()
+        assert go_on.wait(60)
+        return False
+
+    removing = threading.Thread(target=lambda: campus.remove_map("campus", 1, is_pinned))
+    removing.start()
+    assert asked.wait(60)
+    looking = threading.Thread(target=lambda: found.append(campus.settled_map("campus", 1).removed_at is not None))
+    looking.start()
+    assert campus.map("campus", 1).removed_at is None  # a plain look does not wait
+    go_on.set()
+    removing.join()
+    looking.join()
+    assert found == [True]

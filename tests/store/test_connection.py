@@ -2,6 +2,7 @@ import errno
 import sqlite3
 import threading
 from pathlib import Path
+from typing import Any, cast
 
 import pytest
 
@@ -62,6 +63,41 @@ def test_a_write_transaction_is_undone_on_any_error(tmp_path: Path) -> None:
         with write_transaction(db):
             db.execute("INSERT INTO a VALUES (1)")
         assert db.execute("SELECT count(*) FROM a").fetchone() == (1,)
+
+
+class FailingCommits:
+    """A connection whose next COMMIT fails, as one does whose sync the disk refused."""
+
+    def __init__(self, connection: sqlite3.Connection) -> None:
+        self._connection = connection
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._connection, name)
+
+    def execute(self, statement: str, *values: Any) -> sqlite3.Cursor:
+        if statement == "COMMIT":
+            raise sqlite3.OperationalError("disk I/O error")
+        return self._connection.execute(statement, *values)
+
+
+def test_after_a_commit_that_failed_the_log_begins_anew(tmp_path: Path) -> None:
+    """What the failed one may have left in it would look like lost commits behind a shorter one."""
+    path = tmp_path / "a.sqlite"
+    log = path.with_name("a.sqlite-wal")
+    with open_database(path, create=True) as db:
+        use_write_ahead_log(db)
+        with write_transaction(db):
+            db.execute("CREATE TABLE t (x)")
+        salts = log.read_bytes()[16:24]
+        connection = db.conn
+        db.conn = cast("sqlite3.Connection", FailingCommits(connection))
+        with pytest.raises(sqlite3.OperationalError), write_transaction(db):
+            db.execute("INSERT INTO t VALUES (1)")
+        db.conn = connection
+        with write_transaction(db):
+            db.execute("INSERT INTO t VALUES (2)")
+        assert log.read_bytes()[16:24] != salts
+        assert db.execute("SELECT x FROM t").fetchall() == [(2,)]
 
 
 def test_a_locked_file_is_busy_by_name(tmp_path: Path) -> None:

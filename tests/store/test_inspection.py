@@ -151,7 +151,7 @@ def test_what_a_crash_leaves_is_no_damage(furnished: Path) -> None:
     with Catalog.open(furnished) as catalog:
         catalog.discard_unfinished()
     still = {finding.file for finding in inspected(furnished).left_over}
-    assert still == {"domains/.removing-old", "domains/campus/notes.txt", "domains/stranger", "what.is.this"}
+    assert still == {"domains/campus/notes.txt", "domains/stranger", "what.is.this"}
 
 
 def test_a_removed_version_needs_no_file_and_a_building_one_may_have_some(furnished: Path) -> None:

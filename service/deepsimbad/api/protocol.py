@@ -236,8 +236,12 @@ class LimitedProtocol(HttpToolsProtocol):
 
     @property
     def _is_silent(self) -> bool:
-        """Whether no request of this connection is read or answered."""
-        return self._place != _BODY and not self._is_under_way and not self.pipeline
+        """Whether no request of this connection is read or answered.
+
+        The rest of a body whose answer has gone is nobody's request: announcing one must not hold a place.
+        """
+        is_read = self._place == _BODY and not (self.cycle is not None and self.cycle.response_complete)
+        return not is_read and not self._is_under_way and not self.pipeline
 
     # Time
 

@@ -74,7 +74,7 @@ class PinnedMaps:
             UnavailableError: Another map serves by now, and this one was removed: ask for the active map again.
         """
         snapshot = active.snapshot
-        known = self._catalog.map(snapshot.domain, snapshot.version)
+        known = self._catalog.settled_map(snapshot.domain, snapshot.version)
         if known.removed_at is not None:
             raise UnavailableError(f"domain {snapshot.domain} was given another map this moment: try again")
         digest = known.sha256 or ""
@@ -94,11 +94,11 @@ class PinnedMaps:
                 record = self._catalog.domain(domain)
                 known = self._catalog.map(domain, version)
             except (UnknownDomainError, UnknownMapVersionError) as error:
-                raise _retired(domain, version) from error
+                raise retired(domain, version) from error
             is_removed = known.state is not MapState.ACTIVE and not self._catalog.map_path(domain, version).exists()
             snapshot = self._held.get((domain, version, digest))
             if known.sha256 != digest or (is_removed and snapshot is None):
-                raise _retired(domain, version)
+                raise retired(domain, version)
             if snapshot is None:
                 snapshot = self._load(record, version)
                 self._held[domain, version, digest] = snapshot
@@ -115,7 +115,8 @@ class PinnedMaps:
         return load_snapshot(self._catalog, record.name, version)
 
 
-def _retired(domain: str, version: int) -> RetiredMapError:
+def retired(domain: str, version: int) -> RetiredMapError:
+    """What is said to a session whose map is no more."""
     return RetiredMapError(
         f"map {version} of domain {domain}, which the session was begun on, is no more: begin a new session",
         domain=domain,

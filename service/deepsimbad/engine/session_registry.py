@@ -40,6 +40,10 @@ class SessionRegistry:
         """How many sessions have not ended, as far as is known without looking."""
         return len(self._living)
 
+    def domains(self) -> set[str]:
+        """The domains that living sessions are of."""
+        return {live.record.domain for live in self._living.values()}
+
     def of_domain(self, domain: str) -> list[LiveSession]:
         """The living sessions of a domain."""
         return [live for live in self._living.values() if live.record.domain == domain]

@@ -3,8 +3,9 @@
 import asyncio
 import secrets
 import time
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Container, Coroutine
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any, TypeVar
 
@@ -23,7 +24,7 @@ from deepsimbad.engine.session_state import SessionEngine
 from deepsimbad.engine.session_view import SessionView, view_of
 from deepsimbad.engine.stopwatch import Stopwatch
 from deepsimbad.engine.worker import InferenceWorker
-from deepsimbad.errors import IdempotencyKeyReusedError, InvalidInputError, UnavailableError
+from deepsimbad.errors import EndedSessionError, IdempotencyKeyReusedError, InvalidInputError, UnavailableError
 from deepsimbad.store.list_page import ListPage
 from deepsimbad.store.session_records import (
     IdempotencyKey,
@@ -158,7 +159,14 @@ class Sessions:
         """End the sessions of a domain that was deleted."""
         for live in self._registry.of_domain(domain):
             if live.ending is None:
-                await self._finished(self._registry.end(live, DELETED))
+                with suppress(EndedSessionError):  # its robot was quicker
+                    await self._finished(self._registry.end(live, DELETED))
+
+    async def end_strangers(self, domains: Container[str]) -> None:
+        """End the sessions of no domain there is: a command beside the service may have deleted theirs."""
+        for domain in self._registry.domains():
+            if domain not in domains:
+                await self.end_domain(domain)
 
     async def sweep(self) -> None:
         """End what has expired, and forget what ended long ago."""
@@ -207,21 +215,27 @@ class Sessions:
             shortlist_length(loaded.engine.snapshot, observation.n_shortlist)  # a bad one should not move the session
             check_move(loaded.engine.snapshot, observation.action_m, observation.action_std_m)
             watch.lap("wait")
-            view = await observation.view()
-            watch.lap("decode")
-            expires_at = self._clock() + self._ttl_s
-            stepped = await self._compute(lambda: self._step(live, loaded, observation, view, expires_at, watch))
+            stepped = await self._looked(live, loaded, observation, watch)
             if isinstance(stepped, int):
                 answer = await self._repeated(live, loaded, stepped, observation.n_shortlist)
                 watch.lap("summarise")
                 return answer
             row, moved_on = stepped
-            told = self._summarised(live.session_id, expires_at, moved_on, observation.n_shortlist)
+            told = self._summarised(live.session_id, row.expires_at, moved_on, observation.n_shortlist)
             await self._commit(live, loaded, row, moved_on)  # the disk and the summary take their time together
             watch.lap("commit")
             answer = await told
             watch.lap("summarise")  # what it took beyond the disk
             return answer
+
+    async def _looked(
+        self, live: LiveSession, loaded: Loaded, observation: Observation, watch: Stopwatch
+    ) -> tuple[ObservedRow, Loaded] | int:
+        """As `_step`; a view's pixels are gone when this returns."""
+        async with observation.view() as view:
+            watch.lap("decode")
+            expires_at = self._clock() + self._ttl_s
+            return await self._compute(lambda: self._step(live, loaded, observation, view, expires_at, watch))
 
     def _step(
         self,

@@ -148,8 +148,10 @@ class _Child:
         messages = process.stdout.fileno()
         kill_at: float | None = None
         while rests:
-            ready, _, _ = select.select(list(rests), [], [], _LOOK_AGAIN_S)
-            for descriptor in ready:
+            poll = select.poll()  # select knows no descriptor above 1023, and robots hold many
+            for descriptor in rests:
+                poll.register(descriptor, select.POLLIN)
+            for descriptor, _ in poll.poll(1000 * _LOOK_AGAIN_S):
                 read = os.read(descriptor, _READ_AT_ONCE)
                 *lines, rest = (rests[descriptor] + read).split(b"\n")
                 rests[descriptor] = rest

@@ -11,12 +11,13 @@ from deepsimbad.store.census import Census
 from deepsimbad.store.census import take as take_census
 from deepsimbad.store.checkpoints import sweep_checkpoints
 from deepsimbad.store.documents import from_json, to_json
-from deepsimbad.store.durable import remove_folder, sync_folder
+from deepsimbad.store.durable import bury, empty_graves, sync_folder
 from deepsimbad.store.job_catalog import JobCatalog
 from deepsimbad.store.key_catalog import KeyCatalog
 from deepsimbad.store.map_catalog import MapCatalog
 from deepsimbad.store.ownership import is_alive
 from deepsimbad.store.records import DomainRecord
+from deepsimbad.store.traverses import Traverse
 
 
 class Catalog(MapCatalog, JobCatalog, KeyCatalog):
@@ -75,6 +76,7 @@ class Catalog(MapCatalog, JobCatalog, KeyCatalog):
                 layout.maps_folder(self.data_dir, name).mkdir(parents=True, exist_ok=True)
                 for made in (folder, folder.parent, self.data_dir):
                     sync_folder(made)
+        empty_graves(folder.parent)
         return record, created
 
     def domain(self, name: str) -> DomainRecord:
@@ -87,8 +89,12 @@ class Catalog(MapCatalog, JobCatalog, KeyCatalog):
         with self._reading() as db:
             return domain_table.all_domains(db)
 
-    def delete_domain(self, name: str) -> None:
+    def delete_domain(self, name: str, *, only_empty: bool = False) -> None:
         """Delete a domain with its jobs, maps and traverses.
+
+        Args:
+            name: The domain.
+            only_empty: Leave it where it has a map or a traverse.
 
         Raises:
             UnknownDomainError: There is no such domain.
@@ -96,6 +102,8 @@ class Catalog(MapCatalog, JobCatalog, KeyCatalog):
         """
         with self._writing() as db:
             domain_table.get(db, name)
+            if only_empty and (map_table.of_domain(db, name) or Traverse.list(self.data_dir, name)):
+                return
             builders = {owner for domain, _, owner in map_table.building(db) if domain == name}
             # A job whose process died counts as well: the next service goes on with it.
             if job_table.unfinished(db, name) or any(is_alive(self._owners, owner) for owner in builders):
@@ -103,10 +111,11 @@ class Catalog(MapCatalog, JobCatalog, KeyCatalog):
             domain_table.doom(db, name)
         with self._writing() as db:  # from here on a crash is finished at the next start
             self._finish_deletion(db, name)
+        empty_graves(layout.domains_folder(self.data_dir))  # gigabytes take seconds, in which others may write
 
     def _finish_deletion(self, db: Database, name: str) -> None:
         if name in domain_table.doomed(db):
-            remove_folder(layout.domain_folder(self.data_dir, name))
+            bury(layout.domain_folder(self.data_dir, name))
             domain_table.forget_doomed(db, name)
 
     # Recovery
@@ -134,6 +143,7 @@ class Catalog(MapCatalog, JobCatalog, KeyCatalog):
             for name in domain_table.doomed(db):
                 self._finish_deletion(db, name)
                 lines.append(f"removed the folder of the deleted domain {name}")
+        lines += [f"removed {name}" for name in empty_graves(layout.domains_folder(self.data_dir))]
         return lines
 
     def discard_abandoned_maps(self) -> list[str]:

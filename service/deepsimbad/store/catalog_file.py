@@ -1,5 +1,6 @@
 """The catalog's file: how it is opened, checked, read and written."""
 
+import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -35,6 +36,9 @@ class CatalogFile(OpenFile):
         super().__init__(layout.catalog_path(data_dir), db)
         self.data_dir = data_dir
         self._checksums = checksums
+        # Readers do not wait for who writes, nor for who waits to: a robot's answer needs the catalog.
+        self._reader = open_database(self._path)
+        self._reader_lock = threading.RLock()
         self._owners = layout.owners_folder(data_dir)
         self._owner = Owner(self._owners)
 
@@ -69,7 +73,15 @@ class CatalogFile(OpenFile):
         """Close the file. Unfinished work begun through this object counts as abandoned from here on."""
         with self._lock:
             self._owner.release()
+            with self._reader_lock:
+                self._reader.close()
             super().close()
+
+    @contextmanager
+    def _reading(self) -> Iterator[Database]:
+        """What was committed before; inside a block of `_writing` too."""
+        with self._reader_lock, storage_faults(self._path), self._reader.atomic() as db:
+            yield db
 
     @contextmanager
     def _writing(self) -> Iterator[Database]:

@@ -2,7 +2,7 @@
 
 import sqlite3
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TypeVar
 
@@ -101,9 +101,21 @@ def write_transaction(db: Database) -> Iterator[Database]:
     db.conn.execute("BEGIN IMMEDIATE")
     try:
         yield db
-        db.conn.execute("COMMIT")
+        _commit(db)
     except BaseException:
         db.rollback()
+        raise
+
+
+def _commit(db: Database) -> None:
+    try:
+        db.conn.execute("COMMIT")
+    except sqlite3.Error:
+        # Where the sync failed, the log holds a transaction that we call failed, with its end. The next one, if
+        # shorter, would leave that end behind it, which looks like lost commits: a log begun anew has other salts.
+        db.rollback()
+        with suppress(sqlite3.Error):
+            db.conn.execute("PRAGMA wal_checkpoint(RESTART)")
         raise
 
 

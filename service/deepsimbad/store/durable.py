@@ -3,12 +3,14 @@
 import errno
 import hashlib
 import os
+import secrets
 import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+_GRAVE_PREFIX = ".removing-"
 _NO_HARD_LINKS = {errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK, errno.EACCES}
 
 
@@ -73,12 +75,16 @@ def remove_database(path: Path) -> bool:
     return existed
 
 
-def remove_folder(folder: Path) -> None:
-    """Remove a folder whole: first out of sight by one rename, then its content."""
-    grave = folder.with_name(f".removing-{folder.name}")
-    if grave.exists():
-        shutil.rmtree(grave)
+def bury(folder: Path) -> None:
+    """Take a folder out of sight by one rename; `empty_graves` removes its content, which may take long."""
     if folder.exists():
-        folder.rename(grave)
+        folder.rename(folder.with_name(f"{_GRAVE_PREFIX}{secrets.token_hex(8)}"))
         sync_folder(folder.parent)
-        shutil.rmtree(grave)
+
+
+def empty_graves(parent: Path) -> list[str]:
+    """Remove what was buried in a folder, also by others who may be at it now; returns names."""
+    graves = sorted(parent.glob(f"{_GRAVE_PREFIX}*"))
+    for grave in graves:
+        shutil.rmtree(grave, ignore_errors=True)
+    return [grave.name for grave in graves]

@@ -101,6 +101,11 @@ class MapCatalog(CatalogFile):
             domain_table.get(db, domain)
             return map_table.get(db, domain, version)
 
+    def settled_map(self, domain: str, version: int) -> MapRecord:
+        """As `map`, behind every change that this process is about to make: a removal is done, or has not begun."""
+        with self._lock:
+            return self.map(domain, version)
+
     def map_of_job(self, domain: str, job_id: str) -> MapRecord | None:
         """The version that a job has sealed, whatever became of it since; raises UnknownDomainError."""
         made = [record for record in self.maps(domain) if record.metrics.get("job_id") == job_id]
