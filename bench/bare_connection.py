@@ -4,9 +4,11 @@ import asyncio
 from typing import Self
 from urllib.parse import urlsplit
 
+JSON = "application/json"
+
 
 class BareConnection:
-    """HTTP/1.1 as far as a benchmark needs it: one request at a time, JSON both ways.
+    """HTTP/1.1 as far as a benchmark needs it: one request at a time, JSON back.
 
     Args:
         reader: What comes back.
@@ -22,21 +24,24 @@ class BareConnection:
         where = urlsplit(url)
         return cls(*await asyncio.open_connection(where.hostname, where.port))
 
-    async def request(self, method: str, path: str, body: bytes = b"", key: str = "") -> tuple[int, bytes]:
+    async def request(
+        self, method: str, path: str, body: bytes = b"", key: str = "", media_type: str = JSON
+    ) -> tuple[int, bytes]:
         """Send a request.
 
         Args:
             method: GET, POST, ...
             path: With its query.
-            body: JSON.
+            body: What is sent.
             key: The idempotency key; empty: none.
+            media_type: Of the body.
 
         Returns:
             Status and body of the answer.
         """
         named = f"Idempotency-Key: {key}\r\n" if key else ""
         head = (
-            f"{method} {path} HTTP/1.1\r\nHost: bench\r\nContent-Type: application/json\r\n"
+            f"{method} {path} HTTP/1.1\r\nHost: bench\r\nContent-Type: {media_type}\r\n"
             f"{named}Content-Length: {len(body)}\r\n\r\n"
         )
         self._writer.write(head.encode() + body)

@@ -1,88 +1,53 @@
-"""A remap of a long domain: its seconds, and what live queries notice of it."""
+"""A remap of a long domain: its seconds, and what live queries notice of it.
 
+`python -m bench.remap` prints this table alone, and ends with 1 where a limit is not kept.
+"""
+
+import argparse
 import asyncio
 import json
+import sys
 import tempfile
 import time
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bench.bare_connection import BareConnection
+from bench.camera import jpegs
 from bench.landmarks import N_CANDIDATES
-from bench.timing import duration
+from bench.limits import Limit, breaches, limit_table
+from bench.live_robots import PAUSE_S, LiveRobot, Waits, drive
+from bench.seasons import SPACING_M, write_seasons
 from bench.worlds import ENCODING_DIM, N_LANDMARKS, NCLT_IMAGES
-from deepsimbad.store.frames import UNKNOWN_TIMESTAMP, TraverseFrames
-from deepsimbad.store.traverses import Traverse
 from deepsimbad_client import Client
 from deepsimbad_client.local_server import LocalServer
 
-EPISODES = 10_000
 MOST_SECONDS, MOST_SECONDS_UNDER_LOAD, MOST_MEDIAN_RATIO, MOST_P99_RATIO = 60.0, 120.0, 1.5, 3.0
-_IDLE_S = 30.0
-_PAUSE_S = 0.02  # between an answer and the next request of the same robot
-_SESSION_LENGTH = 500  # moves of 1 m, then another: the route has an end
-_SPACING_M = 0.2
-_BLOCK = 1024
-_DOMAIN = "bench"
+_SESSION_LENGTH = 500
+_N_PICTURES = 20
+_DOMAIN, _CAMERA_DOMAIN = "bench", "camera"
 _STAGES = ("read_frames", "select_landmarks", "describe", "train", "check")
-_CONFIG = {
-    "training_traverse": "training",
-    "landmark_traverse": "landmarks",
-    "n_landmarks": N_LANDMARKS,
-    "training_episodes": EPISODES,
-}
 
 
-def remap_table() -> Iterator[str]:
-    """Markdown lines."""
-    yield (
-        f"## Remap: {NCLT_IMAGES:,} frames of {ENCODING_DIM:,} numbers, {N_LANDMARKS} of {N_CANDIDATES:,} landmarks, "
-        f"{EPISODES:,} episodes"
-    )
-    yield ""
-    with tempfile.TemporaryDirectory() as folder, LocalServer(Path(folder) / "data") as server:
-        with Client(server.url) as client:
-            client.admin.put_domain(_DOMAIN, {"kind": "feature_l2", "extractor": "none"})
-        write_seasons(Path(folder) / "data")
-        alone = asyncio.run(_remapped(server.url))
-        yield "| stage | seconds |"
-        yield "|---|---|"
-        for stage in _STAGES:
-            yield f"| {stage.replace('_', ' ')} | {alone.stages[stage]:.1f} |"
-        rest = alone.seconds - sum(alone.stages[stage] for stage in _STAGES)
-        yield f"| its process, digest of the frames, seal, activate | {rest:.1f} |"
-        yield f"| from the request to the end of the job (at most {MOST_SECONDS:.0f}) | {alone.seconds:.1f} |"
-        yield ""
-        idle, during, remap = asyncio.run(_driven(server.url))
-    yield (
-        "Two robots meanwhile, one observing in a session and one localizing, each with "
-        f"{1000 * _PAUSE_S:.0f} ms between an answer and the next request, on the map of before:"
-    )
-    yield ""
-    yield (
-        "| call | idle: median, p99 | during the next remap: median, p99 "
-        f"| median ratio (at most {MOST_MEDIAN_RATIO:g}) | p99 ratio (at most {MOST_P99_RATIO:g}) "
-        "| failures | map versions |"
-    )
-    yield "|---|---|---|---|---|---|---|"
-    for before, after in zip(idle, during, strict=True):
-        yield (
-            f"| `POST {before.what}` | {before} | {after} | {after.median_s / before.median_s:.2f} "
-            f"| {after.p99_s / before.p99_s:.2f} | {_counted(before.failures + after.failures)} "
-            f"of {after.n_all + before.n_all} | {after.versions} |"
-        )
-    yield ""
-    yield f"That remap took {remap.seconds:.1f} s (at most {MOST_SECONDS_UNDER_LOAD:.0f})."
+@dataclass(frozen=True)
+class RemapSize:
+    """How much there is to do.
 
+    Attributes:
+        n_frames: Of the drive that becomes the map.
+        n_candidates: Frames of it that another season shows, among which landmarks are selected.
+        episodes: Of training.
+        idle_s: How long the robots are measured without a remap.
+    """
 
-def _counted(failures: list[str]) -> str:
-    """How many, and which."""
-    return f"{len(failures)} ({', '.join(sorted(set(failures)))})" if failures else "0"
+    n_frames: int = NCLT_IMAGES
+    n_candidates: int = N_CANDIDATES
+    episodes: int = 10_000
+    idle_s: float = 30.0
 
 
 @dataclass(frozen=True)
@@ -98,52 +63,135 @@ class Remapped:
     stages: dict[str, float]
 
 
-@dataclass
-class Waits:
-    """What one robot met with.
+@dataclass(frozen=True)
+class RemapFigures:
+    """What was measured.
 
     Attributes:
-        what: The call.
-        seconds: Of every answer.
-        failures: Status and code of answers that were no belief.
-        map_versions: Of the answers, as they came, changes alone.
+        size: Of what.
+        alone: A remap that nobody asks beside.
+        beside: One beside the robots.
+        robots: They.
+        idle: What each met with before that remap.
+        during: And while it went on.
     """
 
-    what: str
-    seconds: list[float] = field(default_factory=list)
-    failures: list[str] = field(default_factory=list)
-    map_versions: list[int] = field(default_factory=list)
+    size: RemapSize
+    alone: Remapped
+    beside: Remapped
+    robots: Sequence[LiveRobot]
+    idle: Sequence[Waits]
+    during: Sequence[Waits]
 
-    @property
-    def n_all(self) -> int:
-        """Answers in all."""
-        return len(self.seconds)
-
-    @property
-    def median_s(self) -> float:
-        """Seconds."""
-        return float(np.median(self.seconds))
-
-    @property
-    def p99_s(self) -> float:
-        """Seconds."""
-        return float(np.quantile(self.seconds, 0.99))
-
-    @property
-    def versions(self) -> str:
-        """In the order they came."""
-        return " then ".join(map(str, self.map_versions))
-
-    def __str__(self) -> str:
-        return f"{duration(self.median_s)}, {duration(self.p99_s)} ({self.n_all})"
+    def limits(self) -> list[Limit]:
+        """What must be kept."""
+        limits = [
+            Limit("remap, seconds", self.alone.seconds, MOST_SECONDS),
+            Limit("remap beside the robots, seconds", self.beside.seconds, MOST_SECONDS_UNDER_LOAD),
+        ]
+        for robot, before, after in zip(self.robots, self.idle, self.during, strict=True):
+            limits += [
+                Limit(f"{robot.name}: median ratio", after.median_s / before.median_s, MOST_MEDIAN_RATIO),
+                Limit(f"{robot.name}: p99 ratio", after.p99_s / before.p99_s, MOST_P99_RATIO),
+                Limit(f"{robot.name}: failures", len(before.failures) + len(after.failures), 0),
+            ]
+        return limits
 
 
-async def _remapped(url: str) -> Remapped:
+def measured(size: RemapSize) -> RemapFigures:
+    """Measure a service of its own."""
+    with tempfile.TemporaryDirectory() as folder, LocalServer(Path(folder) / "data") as server:
+        with Client(server.url) as client:
+            client.admin.put_domain(_DOMAIN, {"kind": "feature_l2", "extractor": "none"})
+            client.admin.put_domain(_CAMERA_DOMAIN, {"kind": "feature_l2"})
+            encoding_dim = client.domain(_CAMERA_DOMAIN).encoding_dim
+        write_seasons(Path(folder) / "data", _DOMAIN, size.n_frames, size.n_candidates, ENCODING_DIM)
+        few = RemapSize(size.n_frames, N_LANDMARKS, episodes=0)
+        write_seasons(Path(folder) / "data", _CAMERA_DOMAIN, few.n_frames, few.n_candidates, encoding_dim)
+        asyncio.run(_remapped(server.url, _CAMERA_DOMAIN, few))
+        alone = asyncio.run(_remapped(server.url, _DOMAIN, size))
+        robots = _robots(size)
+        idle, during, beside = asyncio.run(_driven(server.url, robots, size))
+    return RemapFigures(size, alone, beside, robots, idle, during)
+
+
+def report(figures: RemapFigures) -> Iterator[str]:
+    """Markdown lines."""
+    size, alone = figures.size, figures.alone
+    yield (
+        f"## Remap: {size.n_frames:,} frames of {ENCODING_DIM:,} numbers, {N_LANDMARKS} of {size.n_candidates:,} "
+        f"landmarks, {size.episodes:,} episodes"
+    )
+    yield ""
+    yield "| stage | seconds |"
+    yield "|---|---|"
+    for stage in _STAGES:
+        yield f"| {stage.replace('_', ' ')} | {alone.stages[stage]:.1f} |"
+    rest = alone.seconds - sum(alone.stages[stage] for stage in _STAGES)
+    yield f"| its process, digest of the frames, seal, activate | {rest:.1f} |"
+    yield f"| from the request to the end of the job | {alone.seconds:.1f} |"
+    yield ""
+    yield (
+        f"{len(figures.robots)} robots meanwhile, each with {1000 * PAUSE_S:.0f} ms between an answer and the next "
+        f"request, on the map of before; the pictures on a domain of its own with {size.n_frames:,} map images. "
+        f"The remap took {figures.beside.seconds:.1f} s beside them."
+    )
+    yield ""
+    yield "| robot | idle: median, p99 | during the next remap: median, p99 | failures | map versions |"
+    yield "|---|---|---|---|---|"
+    for robot, before, after in zip(figures.robots, figures.idle, figures.during, strict=True):
+        yield (
+            f"| {robot.name} | {before} | {after} | {_counted(before.failures + after.failures)} "
+            f"of {before.n_all + after.n_all} | {after.versions} |"
+        )
+    yield ""
+    yield from limit_table(figures.limits())
+
+
+def remap_table() -> Iterator[str]:
+    """Markdown lines."""
+    yield from report(measured(RemapSize()))
+
+
+def _counted(failures: list[str]) -> str:
+    """How many, and which."""
+    return f"{len(failures)} ({', '.join(sorted(set(failures)))})" if failures else "0"
+
+
+def _robots(size: RemapSize) -> list[LiveRobot]:
+    rng = np.random.default_rng(2)
+    ranks = [json.dumps({"ranked_landmarks": rng.permutation(N_LANDMARKS).tolist()}).encode() for _ in range(50)]
+    pictures = jpegs(_N_PICTURES)
+    kilobytes = sum(map(len, pictures)) / len(pictures) / 1e3
+    session_length = min(_SESSION_LENGTH, int(size.n_frames * SPACING_M))
+    return [
+        LiveRobot("`POST localizations`, ranks", _DOMAIN, ranks),
+        LiveRobot("`POST observations`, ranks", _DOMAIN, ranks, session_length=session_length),
+        LiveRobot(
+            f"`POST localizations`, JPEG of 1232 x 1616, {kilobytes:.0f} kB", _CAMERA_DOMAIN, pictures, "image/jpeg"
+        ),
+    ]
+
+
+async def _driven(url: str, robots: Sequence[LiveRobot], size: RemapSize) -> tuple[list[Waits], list[Waits], Remapped]:
+    """The robots, first alone, then beside a remap."""
+    await drive(url, robots, asyncio.create_task(asyncio.sleep(1.0)))
+    idle = await drive(url, robots, asyncio.create_task(asyncio.sleep(size.idle_s)))
+    remap = asyncio.create_task(_remapped(url, _DOMAIN, size))
+    during = await drive(url, robots, remap)
+    return idle, during, await remap
+
+
+async def _remapped(url: str, domain: str, size: RemapSize) -> Remapped:
+    config = {
+        "training_traverse": "training",
+        "landmark_traverse": "landmarks",
+        "n_landmarks": N_LANDMARKS,
+        "training_episodes": size.episodes,
+    }
     connection = await BareConnection.to(url)
     began = time.perf_counter()
-    status, answer = await connection.request(
-        "POST", f"/v1/admin/domains/{_DOMAIN}/remaps", json.dumps(_CONFIG).encode()
-    )
+    status, answer = await connection.request("POST", f"/v1/admin/domains/{domain}/remaps", json.dumps(config).encode())
     job: dict[str, Any] = json.loads(answer)
     if status != 202:
         raise RuntimeError(f"no remap: {job}")
@@ -157,83 +205,19 @@ async def _remapped(url: str) -> Remapped:
     return Remapped(seconds, job["result"]["metrics"]["seconds"])
 
 
-async def _driven(url: str) -> tuple[list[Waits], list[Waits], Remapped]:
-    """Two robots, first alone, then beside a remap."""
-    paths = ["localizations", "observations"]
-    await _drive(url, [Waits(path) for path in paths], asyncio.create_task(asyncio.sleep(1.0)))
-    idle, during = ([Waits(path) for path in paths] for _ in range(2))
-    await _drive(url, idle, asyncio.create_task(asyncio.sleep(_IDLE_S)))
-    remap = asyncio.create_task(_remapped(url))
-    await _drive(url, during, remap)
-    return idle, during, await remap
-
-
-async def _drive(url: str, robots: list[Waits], until: "asyncio.Task[Any]") -> None:
-    """Let every robot ask until something is done, and once more."""
-    await asyncio.gather(*(_ask(url, waits, until) for waits in robots))
-
-
-async def _ask(url: str, waits: Waits, until: "asyncio.Task[Any]") -> None:
-    rng = np.random.default_rng(2)
-    bodies = [json.dumps({"ranked_landmarks": rng.permutation(N_LANDMARKS).tolist()}).encode() for _ in range(50)]
-    connection = await BareConnection.to(url)
-    path = f"/v1/domains/{_DOMAIN}/localizations"
-    n_asked, is_last = 0, False
-    while not is_last:
-        is_last = until.done()
-        if waits.what == "observations" and n_asked % _SESSION_LENGTH == 0:
-            path = f"/v1/sessions/{await _session(connection)}/observations?action_m=1"
-        began = time.perf_counter()
-        status, answer = await connection.request("POST", path, bodies[n_asked % len(bodies)])
-        waits.seconds.append(time.perf_counter() - began)
-        said = json.loads(answer)
-        if status != 200:
-            waits.failures.append(f"{status} {said['code']}")
-        elif waits.map_versions[-1:] != [said["map_version"]]:
-            waits.map_versions.append(said["map_version"])
-        n_asked += 1
-        await asyncio.sleep(_PAUSE_S)
-    connection.close()
-
-
-async def _session(connection: BareConnection) -> str:
-    status, answer = await connection.request("POST", f"/v1/domains/{_DOMAIN}/sessions", b"{}")
-    if status != 201:
-        raise RuntimeError(f"no session: {answer!r}")
-    return str(json.loads(answer)["session_id"])
-
-
-def write_seasons(data_dir: Path) -> None:
-    """Two drives of one wandering route, straight into their files: an upload is not what is measured here."""
-    frames_of = np.linspace(0, NCLT_IMAGES - 1, N_CANDIDATES).round().astype(np.int64)
-    with (
-        Traverse.create(data_dir, _DOMAIN, "training") as training,
-        Traverse.create(data_dir, _DOMAIN, "landmarks") as landmarks,
-    ):
-        rng = np.random.default_rng(0)
-        level = rng.standard_normal(ENCODING_DIM, dtype=np.float32)
-        for start in range(0, NCLT_IMAGES, _BLOCK):
-            places = np.empty((min(_BLOCK, NCLT_IMAGES - start), ENCODING_DIM), np.float32)
-            for place in places:
-                level = np.float32(0.98) * level + np.float32(0.2) * rng.standard_normal(ENCODING_DIM, np.float32)
-                place[:] = level
-            index = np.arange(start, start + len(places))
-            training.put_frames(_season(places, index, index, rng))
-            chosen = np.flatnonzero((frames_of >= start) & (frames_of < start + len(places)))
-            landmarks.put_frames(_season(places[frames_of[chosen] - start], chosen, frames_of[chosen], rng))
-
-
-def _season(
-    places: NDArray[np.float32], index: NDArray[np.int64], frame: NDArray[np.int64], rng: np.random.Generator
-) -> TraverseFrames:
-    """The places as one season shows them: unit vectors, as NetVLAD's are."""
-    seen = places + np.float32(0.7) * rng.standard_normal(places.shape, np.float32)
-    seen = (seen / np.linalg.norm(seen, axis=1, keepdims=True)).astype(np.float32)
-    unknown = np.full(index.size, np.nan)
-    times = np.full(index.size, UNKNOWN_TIMESTAMP)
-    return TraverseFrames(index, (frame * _SPACING_M).astype(np.float64), times, unknown, unknown, seen)
+def main() -> None:
+    """Print the table; ends with 1 where a limit is not kept."""
+    usual = RemapSize()
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--frames", type=int, default=usual.n_frames)
+    parser.add_argument("--candidates", type=int, default=usual.n_candidates)
+    parser.add_argument("--episodes", type=int, default=usual.episodes)
+    parser.add_argument("--idle", type=float, default=usual.idle_s, metavar="SECONDS")
+    given = parser.parse_args()
+    figures = measured(RemapSize(given.frames, given.candidates, given.episodes, given.idle))
+    print("\n".join(report(figures)), flush=True)
+    sys.exit(breaches(figures.limits()))
 
 
 if __name__ == "__main__":
-    for line in remap_table():
-        print(line, flush=True)
+    main()

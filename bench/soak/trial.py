@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from collections import Counter
@@ -35,6 +36,8 @@ class Soak:
     Attributes:
         n_kills: How often the service was killed.
         ready_s: Seconds from each start after a kill to the first `/readyz` that answers 200.
+        empty_ready_s: The same of a service on an empty data directory, right before each of them: what the machine
+            itself was up to at that moment.
         n_acknowledged: Writes that were answered, by who asked; none was lost, or the soak would have ended.
         doing: What was going on at the moments of the kills; robots observe at all of them.
         n_remaps: Remaps that succeeded, many of them across kills.
@@ -43,6 +46,7 @@ class Soak:
 
     n_kills: int = 0
     ready_s: list[float] = field(default_factory=list)
+    empty_ready_s: list[float] = field(default_factory=list)
     n_acknowledged: Counter[str] = field(default_factory=Counter)
     doing: Counter[str] = field(default_factory=Counter)
     n_remaps: int = 0
@@ -73,9 +77,8 @@ def soak(data_dir: Path, n_kills: int, seed: int, on_kill: Callable[[int], None]
         for kill in range(n_kills):
             _live_and_die(server, actors, _AIMS[kill % len(_AIMS)], rng)
             found.doing.update([uploader.doing, mapper.doing])
-            began = time.perf_counter()
-            server.start()
-            found.ready_s.append(time.perf_counter() - began)
+            found.empty_ready_s.append(_ready_on_nothing())
+            found.ready_s.append(_ready(server))
             with Link(server.url) as link:
                 expect(link.ask("GET", "/readyz")["damaged_maps"] == [], "a map is damaged")
                 for actor in actors:
@@ -93,6 +96,21 @@ def soak(data_dir: Path, n_kills: int, seed: int, on_kill: Callable[[int], None]
         found.n_acknowledged[type(actor).__name__] += actor.n_acknowledged
     found.n_remaps, found.n_interrupted = mapper.n_remaps, mapper.n_interrupted
     return found
+
+
+def _ready(server: LocalServer) -> float:
+    began = time.perf_counter()
+    server.start()
+    return time.perf_counter() - began
+
+
+def _ready_on_nothing() -> float:
+    with tempfile.TemporaryDirectory() as folder:
+        server = LocalServer(Path(folder) / "data", environment=ENVIRONMENT)
+        try:
+            return _ready(server)
+        finally:
+            server.kill()
 
 
 def _live_and_die(server: LocalServer, actors: list[Actor], aim: str, rng: np.random.Generator) -> None:

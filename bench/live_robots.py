@@ -1,0 +1,107 @@
+"""Robots that ask again and again, and how long they wait: alone, and beside something."""
+
+import asyncio
+import json
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from bench.bare_connection import JSON, BareConnection
+from bench.timing import duration
+
+PAUSE_S = 0.02  # between an answer and the next request of the same robot
+
+
+@dataclass(frozen=True)
+class LiveRobot:
+    """One robot.
+
+    Attributes:
+        name: What it does, in a table.
+        domain: Where it is.
+        bodies: What it sends, in turn.
+        media_type: Of them.
+        session_length: Moves of 1 m in a session, then another one: the route has an end. 0: it asks without a session.
+    """
+
+    name: str
+    domain: str
+    bodies: Sequence[bytes]
+    media_type: str = JSON
+    session_length: int = 0
+
+
+@dataclass
+class Waits:
+    """What one robot met with.
+
+    Attributes:
+        seconds: Of every answer.
+        failures: Status and code of answers that were no belief.
+        map_versions: Of the answers, as they came, changes alone.
+    """
+
+    seconds: list[float] = field(default_factory=list)
+    failures: list[str] = field(default_factory=list)
+    map_versions: list[int] = field(default_factory=list)
+
+    @property
+    def n_all(self) -> int:
+        """Answers in all."""
+        return len(self.seconds)
+
+    @property
+    def median_s(self) -> float:
+        """Seconds."""
+        return float(np.median(self.seconds))
+
+    @property
+    def p99_s(self) -> float:
+        """Seconds."""
+        return float(np.quantile(self.seconds, 0.99))
+
+    @property
+    def versions(self) -> str:
+        """In the order they came."""
+        return " then ".join(map(str, self.map_versions))
+
+    def __str__(self) -> str:
+        return f"{duration(self.median_s)}, {duration(self.p99_s)} ({self.n_all})"
+
+
+async def drive(url: str, robots: Sequence[LiveRobot], until: "asyncio.Task[Any]") -> list[Waits]:
+    """Let every robot ask until something is done, and once more."""
+    return list(await asyncio.gather(*(_ask(url, robot, until) for robot in robots)))
+
+
+async def _ask(url: str, robot: LiveRobot, until: "asyncio.Task[Any]") -> Waits:
+    waits = Waits()
+    connection = await BareConnection.to(url)
+    path = f"/v1/domains/{robot.domain}/localizations"
+    is_last = False
+    while not is_last:
+        is_last = until.done()
+        if robot.session_length and waits.n_all % robot.session_length == 0:
+            path = f"/v1/sessions/{await _session(connection, robot.domain)}/observations?action_m=1"
+        body = robot.bodies[waits.n_all % len(robot.bodies)]
+        began = time.perf_counter()
+        status, answer = await connection.request("POST", path, body, media_type=robot.media_type)
+        waits.seconds.append(time.perf_counter() - began)
+        said = json.loads(answer)
+        if status != 200:
+            waits.failures.append(f"{status} {said['code']}")
+        elif waits.map_versions[-1:] != [said["map_version"]]:
+            waits.map_versions.append(said["map_version"])
+        await asyncio.sleep(PAUSE_S)
+    connection.close()
+    return waits
+
+
+async def _session(connection: BareConnection, domain: str) -> str:
+    status, answer = await connection.request("POST", f"/v1/domains/{domain}/sessions", b"{}")
+    if status != 201:
+        raise RuntimeError(f"no session: {answer!r}")
+    return str(json.loads(answer)["session_id"])
