@@ -35,7 +35,7 @@ RUN python3 -m venv /opt/deepsimbad \
     && /opt/deepsimbad/bin/python -m pip uninstall --yes --quiet --disable-pip-version-check pip setuptools
 # The hot loops are compiled here rather than in front of the first robot. numba takes them for the same kind of
 # processor alone; on another kind it compiles anew, into the volume.
-RUN install -d /var/lib/deepsimbad/data /var/lib/deepsimbad/cache \
+RUN install -d -m 0700 /var/lib/deepsimbad/data /var/lib/deepsimbad/cache \
     && NUMBA_CACHE_DIR=/var/lib/deepsimbad/cache /opt/deepsimbad/bin/python -c "from deepsimbad.engine.warm_up import warm_up; warm_up()"
 
 # hadolint ignore=DL3006

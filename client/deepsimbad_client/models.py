@@ -43,6 +43,8 @@ class Domain(Answer):
 
     name: str
     map_version: int | None = None
+    map_problem: str | None = None
+    """Code of what keeps the active map from answering; its figures are None then."""
     route_length_m: float | None = None
     n_map_images: int | None = None
     n_landmarks: int | None = None
@@ -211,6 +213,11 @@ class Job(Answer):
     error: str | dict[str, Any] | None = None
     created_at: str | None = None
     finished_at: str | None = None
+
+    @property
+    def stage_name(self) -> str:
+        """What it does, in words; one that has only just begun has told of no stage."""
+        return (self.stage or ("beginning" if self.state == "running" else self.state)).replace("_", " ")
 
     @property
     def ended(self) -> bool:

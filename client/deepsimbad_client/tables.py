@@ -1,6 +1,7 @@
 """The tables that the commands print; times are UTC."""
 
 from collections.abc import Mapping, Sequence
+from datetime import timedelta
 from typing import Any
 
 from rich.table import Table
@@ -21,7 +22,7 @@ def domain_table(domains: Sequence[Domain]) -> Table:
         kind = evaluator.get("kind", "") if isinstance(evaluator, dict) else evaluator
         table.add_row(
             domain.name,
-            _shown(domain.map_version),
+            _shown(domain.map_version) + (f" {domain.map_problem}" if domain.map_problem else ""),
             _shown(domain.n_map_images),
             _shown(domain.route_length_m, ".0f"),
             _shown(domain.n_landmarks),
@@ -40,23 +41,32 @@ def job_table(jobs: Sequence[Job]) -> Table:
     table.add_column("state", no_wrap=True)
     table.add_column("asked for", no_wrap=True)
     table.add_column("ended", no_wrap=True)
+    table.add_column("time left", justify="right", no_wrap=True)
     table.add_column("outcome", overflow="fold")
     for job in jobs:
         times = (_minute(job.created_at), _minute(job.finished_at))
-        table.add_row(job.job_id, job.domain, job.state, *times, _outcome(job))
+        left = "-" if job.ended else lasting(job.eta_s)
+        table.add_row(job.job_id, job.domain, job.state, *times, left, _outcome(job))
     return table
 
 
 def _outcome(job: Job) -> str:
     if not job.ended:
-        return f"{(job.stage or 'waiting').replace('_', ' ')}, {100 * job.progress:.0f} %"
+        return "waiting for its turn" if job.state == "queued" else f"{job.stage_name}, {100 * job.progress:.0f} %"
     if job.error_text or not job.result:
         return job.error_text
-    made = f"map {job.result.get('map_version')}"
+    made = f"map {job.result.get('map_version')}{_compared(job.check)}"
     if job.result.get("active", True):
         return made
-    has_lost = (job.result.get("metrics", {}).get("check") or {}).get("passed") is False
-    return f"{made}, sealed but not activated{': its gate was lost' if has_lost else ''}"
+    return f"{made}, sealed but not activated{': its gate was lost' if job.check.get('passed') is False else ''}"
+
+
+def _compared(check: Mapping[str, Any]) -> str:
+    """Both figures of a check, and on what they were taken; "" where there are not two."""
+    if check.get("anr") is None or check.get("anr_active") is None:
+        return ""
+    ours, theirs = _shown(check["anr"], ".2f"), _shown(check["anr_active"], ".2f")
+    return f" (ANR {ours} % on {_checked_on(check)}; map {check.get('active_version')}: {theirs} %)"
 
 
 def map_table(domain: str, maps: Sequence[MapVersion]) -> Table:
@@ -78,7 +88,7 @@ def map_table(domain: str, maps: Sequence[MapVersion]) -> Table:
             version.state or "",
             _shown(check.get("anr"), ".2f"),
             _shown(check.get("anr_active"), ".2f"),
-            "-" if not check else check.get("traverse") or "held-out frames",
+            "-" if not check else _checked_on(check),
             _gate(check),
             "removed" if version.removed_at else _size(version.file_bytes),
             _minute(version.created_at),
@@ -91,6 +101,10 @@ def map_table(domain: str, maps: Sequence[MapVersion]) -> Table:
 def gate_verdict(check: Mapping[str, Any]) -> str:
     """Why a gate was lost, or could not be held, in one sentence; "" where there was none or nothing to say."""
     return str(check.get("why") or "") if check.get("gate_margin") is not None else ""
+
+
+def _checked_on(check: Mapping[str, Any]) -> str:
+    return str(check.get("traverse") or "held-out frames")
 
 
 def _gate(check: Mapping[str, Any]) -> str:
@@ -150,6 +164,11 @@ def place_table(answers: Sequence[tuple[str, Localization]]) -> Table:
 
 def _shown(value: float | None, form: str = "") -> str:
     return "-" if value is None else format(value, form)
+
+
+def lasting(seconds: float | None) -> str:
+    """A duration as H:MM:SS; "-" where it is not known."""
+    return "-" if seconds is None else str(timedelta(seconds=round(seconds)))
 
 
 def _size(n_bytes: int | None) -> str:

@@ -45,6 +45,17 @@ def test_a_revoked_key_is_listed_as_such(deepsimbad):
     assert first[0] not in table
 
 
+def test_a_script_is_told_what_was_revoked(deepsimbad):
+    key = KEY.fullmatch(deepsimbad("keys", "create", "--scope", "admin", "--name", "old").out.strip())
+    ran = deepsimbad("keys", "revoke", key[1], "--json")
+    assert ran.code == 0
+    told = json.loads(ran.out)
+    assert (told["key_id"], told["name"], told["state"]) == (key[1], "old", "revoked")
+    assert told["revoked_at"]
+    assert [told] == json.loads(deepsimbad("keys", "list", "--json").out)
+    assert "stays closed" in ran.err
+
+
 def test_mistakes_are_named_and_change_nothing(deepsimbad, tmp_path):
     assert deepsimbad("keys", "create").code == 2
     assert deepsimbad("keys", "create", "--scope", "root").code == 2

@@ -1,6 +1,7 @@
 """`deepsimbad map`, `info` and `localize`: a route mapped and asked without a server."""
 
 import json
+import re
 import signal
 import time
 
@@ -51,6 +52,14 @@ def test_a_map_is_made_and_described(deepsimbad, drives, tmp_path):
     assert document["route_length_m"] == 79.0
     assert document["actions_m"] == list(range(1, 11))
     assert document["relevance"] == "calibrated"
+
+
+def test_a_script_is_told_which_map_was_made(deepsimbad, drives):
+    ran = deepsimbad("map", "route", *sources(drives), *READY, "--n-landmarks", 20, "--json")
+    assert (ran.code, ran.err) == (0, "")
+    told = json.loads(ran.out)
+    assert (told["domain"], told["map_version"], told["active"]) == ("route", 1, True)
+    assert told["metrics"]["n_map_images"] == 80
 
 
 def test_every_option_of_a_map_is_heeded(deepsimbad, drives, tmp_path):
@@ -130,7 +139,7 @@ def named_error(ran, *words):
     assert ran.code == 1
     assert ran.out == ""
     assert len(ran.err.splitlines()) == 1, ran.err
-    assert ran.err.startswith("deepsimbad: ")
+    assert re.match(r"deepsimbad: [a-z_]+: ", ran.err)
     for word in words:
         assert word in ran.err
 
@@ -188,7 +197,7 @@ def test_a_damaged_map_is_named_in_one_line(deepsimbad, process, pictures, tmp_p
     damaged(tmp_path / "deepsimbad-data")
     out, err = process("localize", "route", pictures / "1.png").communicate(timeout=60)
     assert out == ""
-    assert err.startswith("deepsimbad: map 1 of domain route is damaged")
+    assert err.startswith("deepsimbad: damaged_map: map 1 of domain route is damaged")
     assert len(err.splitlines()) == 1, err
     described = process("info", "route", "--json")
     out, err = described.communicate(timeout=60)

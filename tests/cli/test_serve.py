@@ -1,7 +1,9 @@
 """`deepsimbad serve`: ready, stopped, refused."""
 
+import json
 import signal
 import socket
+import stat
 import time
 import urllib.error
 import urllib.request
@@ -30,6 +32,15 @@ def wait_until_ready(port, running):
     raise AssertionError("the service did not become ready")
 
 
+def assert_it_cannot_start(err, code, why):
+    """One record for what reads the log, then the line that every named error is."""
+    *_, record, line = err.splitlines()
+    logged = json.loads(record)
+    assert (logged["level"], logged["message"], logged["code"]) == ("ERROR", "cannot start", code)
+    assert why in logged["why"]
+    assert line == f"deepsimbad: {code}: {' '.join(logged['why'].split())}"
+
+
 @pytest.mark.parametrize(("by", "code"), [(signal.SIGTERM, 0), (signal.SIGINT, 130)])
 def test_it_serves_until_it_is_stopped(process, tmp_path, by, code):
     port = free_port()
@@ -40,6 +51,7 @@ def test_it_serves_until_it_is_stopped(process, tmp_path, by, code):
     assert running.returncode == code, err
     assert out == "", "logs go to standard error"
     assert (tmp_path / "here" / "catalog.sqlite").exists()
+    assert stat.S_IMODE((tmp_path / "here").stat().st_mode) == 0o700
 
 
 def test_host_and_port_come_from_the_environment_too(process, tmp_path):
@@ -55,8 +67,17 @@ def test_other_machines_are_refused_while_there_are_no_keys(process):
     running = process("serve", "--host", "0.0.0.0", "--port", free_port())
     out, err = running.communicate(timeout=60)
     assert (running.returncode, out) == (1, "")
-    assert len(err.splitlines()) == 1
-    assert "DEEPSIMBAD_ALLOW_OPEN" in err
+    assert_it_cannot_start(err, "invalid_settings", "DEEPSIMBAD_ALLOW_OPEN")
+    assert len(err.splitlines()) == 2
+
+
+def test_settings_that_cannot_be_used_are_logged_too(process, tmp_path):
+    (tmp_path / "bad.toml").write_text("data_dri = 'there'")
+    running = process("serve", "--config", "bad.toml")
+    out, err = running.communicate(timeout=60)
+    assert (running.returncode, out) == (1, "")
+    assert_it_cannot_start(err, "invalid_settings", "there is no setting 'data_dri'")
+    assert [path.name for path in tmp_path.iterdir()] == ["bad.toml"]
 
 
 def test_with_a_key_other_machines_may_reach_it(deepsimbad, process, tmp_path):
@@ -82,3 +103,4 @@ def test_a_port_that_is_taken_is_an_error(process):
         _, err = running.communicate(timeout=60)
     assert running.returncode == 1
     assert "address already in use" in err.lower()
+    assert_it_cannot_start(err, "unavailable", "cannot listen on")

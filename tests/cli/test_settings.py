@@ -34,13 +34,14 @@ def test_for_people_too_and_what_is_no_setting_is_remarked(deepsimbad, tmp_path,
     assert ran.err == "deepsimbad: DEEPSIMBAD_PROT is set in the environment and is no setting\n"
 
 
-@pytest.mark.parametrize("command", [("settings",), ("info", "route"), ("localize", "route", "view.jpg"), ("serve",)])
+@pytest.mark.parametrize("command", [("settings",), ("info", "route"), ("localize", "route", "view.jpg")])
 def test_every_command_that_takes_settings_heeds_the_file(deepsimbad, tmp_path, command):
     (tmp_path / "bad.toml").write_text("data_dri = 'there'")
     ran = deepsimbad(*command, "--config", "bad.toml")
     assert (ran.code, ran.out) == (1, "")
     assert ran.err.splitlines() == [
-        "deepsimbad: there is no setting 'data_dri', which stands in bad.toml: did you mean 'data_dir'?"
+        "deepsimbad: invalid_settings: there is no setting 'data_dri', which stands in bad.toml: "
+        "did you mean 'data_dir'?"
     ]
     assert [path.name for path in tmp_path.iterdir()] == ["bad.toml"]
 

@@ -99,7 +99,7 @@ def test_keys_are_asked_from_the_first_on(workplace: Workplace) -> None:
     with Client(workplace.url, api_key="") as nobody, pytest.raises(Exception, match="key"):
         nobody.domains()
     keys = json.loads(workplace.run("deepsimbad keys list --json --data-dir /var/lib/deepsimbad"))
-    assert [(key["name"], key["scope"]) for key in keys] == [("operator", "admin"), ("robots", "localize")]
+    assert [(key["name"], key["scope"]) for key in keys] == [("operator", "admin"), ("robot-1", "localize")]
 
 
 def test_the_seasons_passed_as_the_page_says(workplace: Workplace) -> None:

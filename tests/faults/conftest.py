@@ -1,6 +1,7 @@
 """A small mapped data directory, and the service as a process whose disk can be taken away from it."""
 
 import io
+import re
 import shutil
 import socket
 import subprocess
@@ -34,7 +35,7 @@ class Ran:
         """The one line on standard error that a named error is."""
         assert (self.code, self.out) == (1, ""), self
         (line,) = self.err.splitlines()
-        assert line.startswith("deepsimbad: ")
+        assert re.match(r"deepsimbad: [a-z_]+: ", line)
         return line
 
 

@@ -51,7 +51,7 @@ def test_the_service_does_not_start(read_only: Path) -> None:
     ran = unprivileged("serve", "--port", 0, "--data-dir", read_only)
     assert (ran.code, ran.out) == (1, "")
     last = ran.err.splitlines()[-1]
-    assert last.startswith(f"deepsimbad: the data directory {read_only} cannot be used: "), ran
+    assert last.startswith(f"deepsimbad: unavailable: the data directory {read_only} cannot be used: "), ran
     assert "Permission denied" in last
 
 

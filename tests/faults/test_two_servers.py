@@ -15,7 +15,9 @@ def test_the_second_refuses_before_it_listens(data_dir: Path, tmp_path: Path) ->
         ran = command("serve", "--port", 0, "--data-dir", data_dir)
         assert (ran.code, ran.out) == (1, "")
         last = ran.err.splitlines()[-1]
-        assert last.startswith(f"deepsimbad: another service (process {service.pid}, listening on 127.0.0.1:")
+        assert last.startswith(
+            f"deepsimbad: data_dir_in_use: another service (process {service.pid}, listening on 127.0.0.1:"
+        )
         assert "Uvicorn running" not in ran.err
         assert service.told("POST", **service.observe(session_id, 3))["n_observations"] == 4
         assert command("backup", tmp_path / "b.tar", "--data-dir", data_dir).code == 0

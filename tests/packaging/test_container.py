@@ -10,6 +10,7 @@ import re
 import shutil
 import signal
 import socket
+import stat
 import subprocess
 import sys
 import tempfile
@@ -122,15 +123,22 @@ def test_compose_agrees_with_the_image(compose: dict[str, Any], final: Stage, do
     assert grace_s > 2 * 10, "the service's own grace, and a job's end"
 
 
-def test_prometheus_finds_the_service_and_its_rules(compose: dict[str, Any], final: Stage) -> None:
-    mounted = [volume.split(":")[:2] for volume in compose["services"]["prometheus"]["volumes"]]
+def mounted_files(service: dict[str, Any]) -> dict[str, Path]:
+    """The project's files that a service of compose.yaml sees, by their paths inside."""
+    mounted = [volume.split(":")[:2] for volume in service["volumes"]]
     inside = {target: PROJECT / source for source, target in mounted if source.startswith("./")}
     assert all(path.is_file() for path in inside.values())
-    (config_path,) = [
-        word.partition("=")[2]
-        for word in compose["services"]["prometheus"]["command"]
-        if word.startswith("--config.file=")
-    ]
+    return inside
+
+
+def option_of(service: dict[str, Any], option: str) -> str:
+    (value,) = [word.partition("=")[2] for word in service["command"] if word.startswith(f"{option}=")]
+    return str(value)
+
+
+def test_prometheus_finds_the_service_and_its_rules(compose: dict[str, Any], final: Stage) -> None:
+    inside = mounted_files(compose["services"]["prometheus"])
+    config_path = option_of(compose["services"]["prometheus"], "--config.file")
     config = yaml.safe_load(inside[config_path].read_text())
     for rules in config["rule_files"]:
         assert str(Path(config_path).parent / rules) in inside
@@ -139,6 +147,37 @@ def test_prometheus_finds_the_service_and_its_rules(compose: dict[str, Any], fin
     assert "metrics_path" not in job
     alarms = (PROJECT / "deploy" / "alerts.yml").read_text()
     assert f'up{{job="{job["job_name"]}"}}' in alarms
+
+
+def test_every_alarm_reaches_a_receiver(compose: dict[str, Any]) -> None:
+    prometheus = yaml.safe_load((PROJECT / "deploy" / "prometheus.yml").read_text())
+    (told,) = prometheus["alerting"]["alertmanagers"]
+    ((target,),) = [each["targets"] for each in told["static_configs"]]
+    name, port = target.split(":")
+    service = compose["services"][name]
+    assert [each.split(":")[2] for each in service["ports"]] == [port]
+    assert re.search(r":v\d+\.\d+\.\d+$", service["image"]), "pinned, as Prometheus is"
+    assert name in compose["services"]["prometheus"]["depends_on"]
+    assert option_of(service, "--storage.path") in [volume.split(":")[1] for volume in service["volumes"]]
+    config = yaml.safe_load(mounted_files(service)[option_of(service, "--config.file")].read_text())
+    rules = yaml.safe_load((PROJECT / "deploy" / "alerts.yml").read_text())
+    severities = {rule["labels"]["severity"] for group in rules["groups"] for rule in group["rules"]}
+    routed = {route["receiver"]: route["matchers"] for route in config["route"]["routes"]}
+    assert routed == {severity: [f'severity = "{severity}"'] for severity in severities}
+    assert config["route"]["group_by"] == ["alertname"]
+    receivers = {each["name"]: each["webhook_configs"] for each in config["receivers"]}
+    assert set(receivers) == {config["route"]["receiver"], *routed}
+    for name, hooks in receivers.items():
+        assert [hook["url"] for hook in hooks] == [f"https://fill-in.invalid/{name}"], "nobody's address, and no secret"
+
+
+def test_the_receivers_are_as_alertmanager_wants_them() -> None:
+    amtool = shutil.which("amtool")
+    if amtool is None:
+        pytest.skip("amtool is not installed")
+    checked = [amtool, "check-config", "alertmanager.yml"]
+    done = subprocess.run(checked, cwd=PROJECT / "deploy", capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
 
 
 def test_alarms_ring_when_they_should() -> None:
@@ -228,6 +267,7 @@ def test_the_image_serves(image: Build, final: Stage) -> None:
         check=False,
     )
     assert made.returncode == 0, made.stderr
+    assert stat.S_IMODE((image.root / "var/lib/deepsimbad/data").stat().st_mode) == 0o700
     key = made.stdout.strip()
     assert is_healthy(image, health, port) is False, "nothing listens yet"
     serving = subprocess.Popen(

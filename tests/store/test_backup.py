@@ -300,6 +300,34 @@ def test_a_link_to_a_folder_is_followed(archive: Path, tmp_path: Path) -> None:
     assert (tmp_path / "real" / "catalog.sqlite").exists()
 
 
+def rights(folder: Path) -> int:
+    return stat.S_IMODE(folder.stat().st_mode)
+
+
+def test_a_folder_that_is_made_is_its_owners_alone(archive: Path, furnished: Catalog, tmp_path: Path) -> None:
+    restore(archive, tmp_path / "above" / "there", silent)
+    assert rights(tmp_path / "above" / "there") == 0o700
+    assert rights(tmp_path / "above") != 0o700, "who may enter the folders above it is not ours to say"
+    assert rights(furnished.data_dir) == 0o700
+
+
+def test_a_folder_that_was_there_keeps_its_rights(archive: Path, tmp_path: Path) -> None:
+    (tmp_path / "there").mkdir()
+    (tmp_path / "there").chmod(0o750)
+    restore(archive, tmp_path / "there", silent)
+    Catalog.open(tmp_path / "there").close()
+    assert rights(tmp_path / "there") == 0o750
+
+
+def test_what_a_killed_restore_left_open_is_closed(archive: Path, tmp_path: Path) -> None:
+    killed = tmp_path / "there.restoring"
+    killed.mkdir()
+    (killed / ".restoring").touch()
+    killed.chmod(0o755)
+    restore(archive, tmp_path / "there", silent)
+    assert rights(tmp_path / "there") == 0o700
+
+
 def test_a_map_that_is_removed_meanwhile_is_in_neither_copy(furnished: Catalog, tmp_path: Path) -> None:
     n_pieces = 0
 

@@ -1,6 +1,6 @@
 """The `deepsimbad` command (design section 7).
 
-Exit codes: 0 done, 1 a named error (one line on standard error), 2 usage, 130 cancelled.
+Exit codes: 0 done, 1 a named error (one line on standard error, `deepsimbad: CODE: MESSAGE`), 2 usage, 130 cancelled.
 """
 
 import logging
@@ -16,7 +16,7 @@ from deepsimbad.cli.local import delete, info, localize, map_
 from deepsimbad.cli.serve import serve
 from deepsimbad.cli.settings import settings
 from deepsimbad.cli.transfer import export, import_
-from deepsimbad.errors import CancelledError, DeepSimbadError
+from deepsimbad.errors import CancelledError, DeepSimbadError, UnavailableError
 from deepsimbad_client.errors import DeepSimbadClientError
 
 _FAILED, _CANCELLED = 1, 130
@@ -47,7 +47,13 @@ def run(arguments: Sequence[str] | None = None) -> int:
     except click.ClickException as error:
         error.show()
         return error.exit_code
-    except (DeepSimbadError, DeepSimbadClientError, OSError) as error:
-        click.echo(f"deepsimbad: {' '.join(str(error).split())}", err=True)
-        return _FAILED
+    except (DeepSimbadError, DeepSimbadClientError) as error:
+        return _failed(error.code, error)
+    except OSError as error:
+        return _failed(UnavailableError.code, error)
     return code if isinstance(code, int) else 0  # what a command exits with, where it says so
+
+
+def _failed(code: str, error: Exception) -> int:
+    click.echo(f"deepsimbad: {code}: {' '.join(str(error).split())}", err=True)
+    return _FAILED

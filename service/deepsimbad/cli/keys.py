@@ -68,8 +68,9 @@ def list_(as_json: bool, data_dir: Path | None) -> None:
 
 @keys.command()
 @click.argument("key_id")
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON document.")
 @data_dir_option
-def revoke(key_id: str, data_dir: Path | None) -> None:
+def revoke(key_id: str, as_json: bool, data_dir: Path | None) -> None:
     """Let a key open nothing any more. KEY_ID is what `keys list` shows; a whole key, a leaked one say, does too."""
     whole = ApiKey.parse(key_id)
     folder = given_settings(data_dir=data_dir).data_dir
@@ -78,7 +79,10 @@ def revoke(key_id: str, data_dir: Path | None) -> None:
     with Catalog.open(folder) as catalog:
         record = catalog.revoke_key(key_id if whole is None else whole.key_id)
         known = catalog.keys()
-    click.echo(f"key {record.key_id} is revoked", err=True)
+    if as_json:
+        write_json(_described(record))
+    else:
+        click.echo(f"key {record.key_id} is revoked", err=True)
     if not any(other.is_usable(now()) for other in known):
         click.echo("no usable key is left: the service stays closed until one is created", err=True)
 

@@ -59,6 +59,7 @@ _ACTIONS_M = tuple(float(metres) for metres in range(1, 11))
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
 @click.option("--closed", is_flag=True, help="The end of the route joins its start.")
 @spacing_option
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON document.")
 @data_dir_option
 def map_(
     domain: str,
@@ -72,6 +73,7 @@ def map_(
     seed: int,
     closed: bool,
     spacing_m: float,
+    as_json: bool,
     data_dir: Path | None,
 ) -> None:
     """Map a route from two recordings: one gives the landmarks, the other becomes the map.
@@ -109,7 +111,10 @@ def map_(
                 encoded = encode_recording(recording, judge, settings.max_pixels, progress.update)
                 _store(catalog, domain, role, encoded.frames)
             result = remap(catalog, domain, config, judge, progress, n_threads=available_cores())
-        click.echo(f"map {result['map_version']} of {domain} is active: {result['metrics']['n_map_images']} images")
+    if as_json:
+        write_json({"domain": domain, **result})
+        return
+    click.echo(f"map {result['map_version']} of {domain} is active: {result['metrics']['n_map_images']} images")
 
 
 @click.command()

@@ -3,6 +3,7 @@
 import fcntl
 import os
 import shutil
+import stat
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -15,7 +16,7 @@ from deepsimbad.store import domain_table, layout
 from deepsimbad.store.archive import ArchiveReader, opened_archive
 from deepsimbad.store.backup import BACKUP_FORMAT, CATALOG, SESSIONS, is_member
 from deepsimbad.store.connection import check_integrity, in_todays_schema, look_at
-from deepsimbad.store.data_dir import make_data_dir
+from deepsimbad.store.data_dir import PRIVATE, make_data_dir
 from deepsimbad.store.durable import sync_file, sync_folder
 from deepsimbad.store.faults import storage_faults
 from deepsimbad.store.service_lock import ServiceLock
@@ -80,7 +81,7 @@ def _check_empty(data_dir: Path, parts: ExitStack) -> None:
     """Refuse what holds anything; keep services away from what is there and empty."""
     lock = layout.service_lock_path(data_dir)
     if not data_dir.exists():
-        make_data_dir(data_dir.parent)
+        make_data_dir(data_dir.parent, 0o777)
         return
     if not data_dir.is_dir():
         raise ConflictError(f"{data_dir} is no folder")
@@ -103,7 +104,7 @@ def _staging(data_dir: Path) -> Iterator[Path]:
     """A folder to unpack into, on the same file system; it is gone afterwards, unless it became the data directory."""
     inside = data_dir.is_mount()  # a mounted folder cannot be replaced by another, and beside it is another disk
     staging = data_dir / _MARK if inside else data_dir.with_name(f"{data_dir.name}{_MARK}")
-    staging.mkdir(exist_ok=True)
+    staging.mkdir(PRIVATE, exist_ok=True)
     descriptor = os.open(staging, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         try:
@@ -113,6 +114,7 @@ def _staging(data_dir: Path) -> Iterator[Path]:
         if any(staging.iterdir()) and not (staging / _MARK).exists():
             raise ConflictError(f"{staging} is in the way: move it away first")
         try:
+            staging.chmod(PRIVATE)  # one that a killed restore left may be open to others
             (staging / _MARK).touch()
             for left in staging.iterdir():
                 if left.is_dir():
@@ -163,6 +165,7 @@ def _publish(staging: Path, data_dir: Path) -> None:
     (staging / _MARK).unlink()
     try:
         if data_dir.exists():
+            staging.chmod(stat.S_IMODE(data_dir.stat().st_mode))  # whoever made the folder chose who may enter it
             layout.service_lock_path(data_dir).unlink(missing_ok=True)
         staging.rename(data_dir)  # onto an empty folder at most
     except OSError as error:

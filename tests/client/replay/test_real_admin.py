@@ -114,7 +114,8 @@ def test_a_map_is_fetched_and_deleted(service: str, domain: str, tmp_path: Path,
 
     assert run(["delete-map", domain, "1", "--yes"]) == 1  # it serves
     assert "map_in_use" in capsys.readouterr().err
-    out("delete-map", domain, "2", "--yes")
+    told = json.loads(out("delete-map", domain, "2", "--yes", "--json"))
+    assert told == {"domain": domain, "version": 2, "deleted": True}
     assert run(["download", domain, "2", str(tmp_path / "gone")]) == 1
     assert "retired_map" in capsys.readouterr().err
     assert "removed" in out("maps", domain)
@@ -155,7 +156,8 @@ def test_sessions_and_traverses_are_listed_and_ended(service: str, domain: str, 
     assert session.session_id in shown
     (listed,) = json.loads(out("sessions", "--domain", domain, "--json"))
     assert (listed["session_id"], listed["n_observations"]) == (session.session_id, 1)
-    out("delete-session", session.session_id, "--yes")
+    told = json.loads(out("delete-session", session.session_id, "--yes", "--json"))
+    assert told == {"session_id": session.session_id, "deleted": True}
     assert json.loads(out("sessions", "--domain", domain, "--json")) == []
 
     with Client(service) as client:
@@ -165,7 +167,8 @@ def test_sessions_and_traverses_are_listed_and_ended(service: str, domain: str, 
     assert "1-2" in out("traverses", domain)
     names = [traverse["name"] for traverse in json.loads(out("traverses", domain, "--json"))]
     assert names == ["gaps", "landmarks", "noise", "summer", "winter"]
-    out("delete-traverse", domain, "gaps", "--yes")
+    told = json.loads(out("delete-traverse", domain, "gaps", "--yes", "--json"))
+    assert told == {"domain": domain, "traverse": "gaps", "deleted": True}
     with Client(service) as client, pytest.raises(errors.UnknownTraverseError):
         client.admin.traverse(domain, "gaps")
 
@@ -177,7 +180,9 @@ def test_nothing_is_deleted_where_nobody_can_be_asked(service: str, domain: str,
     with Client(service) as client:
         assert client.admin.traverse(domain, "winter").n_frames == 120
         client.admin.put_domain("brief", ENCODINGS)
-        out("delete-domain", "brief", "--yes")
+        assert json.loads(out("delete-domain", "brief", "--yes", "--json")) == {"domain": "brief", "deleted": True}
+        client.admin.put_domain("brief", ENCODINGS)
+        assert out("delete-domain", "brief", "--yes") == ""
         with pytest.raises(errors.UnknownDomainError):
             client.domain("brief")
 
