@@ -13,9 +13,12 @@ import threading
 import time
 import zipfile
 import zlib
+from collections import Counter
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from bench.load.trial import Sample
@@ -25,6 +28,7 @@ from bench.soak.world import BASE, DOMAIN, N_LANDMARKS, make_domain
 from deepsimbad_client.local_server import LocalServer
 
 _SILENT = 900
+_LARGE, _LARGE_SENDERS = (5_000, 10_000), 24  # pixels just under the limit
 _LOCALIZE = f"/v1/domains/{DOMAIN}/localizations"
 _FRAMES = f"{BASE}/traverses/spring/frames"
 
@@ -177,6 +181,43 @@ def silent_crowd(port: int, measure: Callable[[], tuple[float, float]]) -> tuple
         return measure()
 
 
+def large_images() -> list[bytes]:
+    """A WebP and a PNG of few bytes, of as many pixels as are taken."""
+    picture = np.full((*_LARGE, 3), 90, np.uint8)
+    kinds = (("webp", [cv2.IMWRITE_WEBP_QUALITY, 101]), ("png", []))
+    return [
+        request("POST", _LOCALIZE, cv2.imencode(f".{kind}", picture, asked)[1].tobytes(), Content_Type=f"image/{kind}")
+        for kind, asked in kinds
+    ]
+
+
+def large_crowd(
+    port: int, pid: int, measure: Callable[[], tuple[float, float]]
+) -> tuple[tuple[float, float], Counter[str], float]:
+    """Measure while many send images just under the limit; also what those were told, and the peak of memory in MB."""
+    bodies, told_each = large_images(), Counter[str]()
+    ended = threading.Event()
+
+    def send(number: int) -> None:
+        while not ended.is_set():
+            said = told(port, bodies[number % 2])[1]
+            told_each[said] += 1
+            if said.startswith("503"):
+                ended.wait(1.0)  # as `Retry-After` says
+
+    Path(f"/proc/{pid}/clear_refs").write_text("5")  # the peak from now on
+    with ThreadPoolExecutor(_LARGE_SENDERS) as senders:
+        sending = [senders.submit(send, number) for number in range(_LARGE_SENDERS)]
+        try:
+            measured = measure()
+        finally:
+            ended.set()
+        for each in sending:
+            each.result()
+    status = Path(f"/proc/{pid}/status").read_text()
+    return measured, told_each, int(status.partition("VmHWM:")[2].split()[0]) / 1024
+
+
 def hostile_table() -> Iterator[str]:
     """Markdown lines."""
     with tempfile.TemporaryDirectory() as folder, LocalServer(Path(folder) / "data") as server:
@@ -193,12 +234,17 @@ def hostile_table() -> Iterator[str]:
         crowd = silent_crowd(port, lambda: robot_ms(server.url))
         for name, (seconds, said) in slow_senders(port).items():
             yield f"| {name} | {said} | {seconds:.1f} s |"
+        large, large_told, peak_mb = large_crowd(port, server.pid, lambda: robot_ms(server.url))
         after = Sample.of(server.pid, 0.0)
     yield ""
     yield "| a robot's localization | median | p99 |"
     yield "|---|---|---|"
     yield f"| alone | {idle[0]:.2f} ms | {idle[1]:.2f} ms |"
     yield f"| beside {_SILENT} connections with half a header | {crowd[0]:.2f} ms | {crowd[1]:.2f} ms |"
+    yield f"| beside {_LARGE_SENDERS} senders of images just under the limit | {large[0]:.2f} ms | {large[1]:.2f} ms |"
+    yield ""
+    answers = ", ".join(f"{n} times {said}" for said, n in large_told.most_common())
+    yield f"Images just under the limit were answered {answers}; the service's memory was {peak_mb:.0f} MB at its peak."
     yield ""
     yield (
         f"The service's memory before and after all of it: {before.rss_mb:.0f} and {after.rss_mb:.0f} MB; "

@@ -1,8 +1,8 @@
 """What the tests of sessions stand on: a data directory with one mapped domain, and a service that can be restarted."""
 
 import asyncio
-from collections.abc import Awaitable, Callable, Coroutine, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Coroutine, Iterator
+from contextlib import AbstractAsyncContextManager, contextmanager, nullcontext
 from typing import Any, TypeVar
 
 import numpy as np
@@ -79,11 +79,8 @@ def run(
         return asyncio.run(body(live))
 
 
-def viewed(view: View) -> Callable[[], Awaitable[View]]:
-    async def give() -> View:
-        return view
-
-    return give
+def viewed(view: View) -> Callable[[], AbstractAsyncContextManager[View]]:
+    return lambda: nullcontext(view)
 
 
 def ranked(seed: int, action_m: float = 1.5, key: str | None = None, digest: bytes = b"d", **more: Any) -> Observation:

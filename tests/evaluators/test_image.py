@@ -11,7 +11,8 @@ import pytest
 from PIL import Image as Pillow
 
 from deepsimbad.errors import EmptyBodyError, ImageTooLargeError, InvalidImageError, TruncatedImageError
-from deepsimbad.evaluators.image import MEDIA_TYPES, decode_image
+from deepsimbad.evaluators.feature_l2 import FeatureL2
+from deepsimbad.evaluators.image import KEPT_PIXELS, MEDIA_TYPES, decode_image, is_blank
 
 LIMIT = 1_000_000
 
@@ -228,3 +229,46 @@ def test_passes_over_a_large_picture_are_counted():
     last_pass = body[body.rindex(b"\xff\xda") : -2]
     with pytest.raises(InvalidImageError, match="scans"):
         decode_image(body[:-2] + last_pass * 40 + b"\xff\xd9", 49_000_000)
+
+
+def test_what_a_png_says_beside_its_picture_is_not_read(the_picture, capfd):
+    body = cv2.imencode(".png", the_picture)[1].tobytes()
+    remarks = [(b"zTXt", b"a"), (b"iCCP", b"a\0\0" + b"x" * 20), (b"tEXt", b""), (b"gAMA", bytes(4)), (b"sRGB", b"")]
+    odd = _png(48, 32, *remarks * 50)[33:]
+    image = decode_image(body[:33] + odd + body[33:], LIMIT)
+    np.testing.assert_array_equal(image, the_picture)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_more_pixels_than_are_kept_are_averaged_by_a_whole_factor():
+    small = cv2.resize(np.random.default_rng(2).integers(0, 255, (9, 16, 3), np.uint8), (2000, 1100))
+    large = np.repeat(np.repeat(small, 3, axis=0), 3, axis=1)
+    body = cv2.imencode(".png", large)[1].tobytes()
+    kept = decode_image(body, 50_000_000)
+    side = 2 if large.shape[0] * large.shape[1] <= 4 * KEPT_PIXELS else 3
+    assert kept.shape == (3300 // side, 6000 // side, 3)
+    assert kept.shape[0] * kept.shape[1] <= KEPT_PIXELS < large.shape[0] * large.shape[1]
+    before, after = FeatureL2().encode([large, kept])
+    assert np.square(before - after).sum() < 1e-4  # two unlike pictures are about 1 apart
+
+
+@pytest.mark.parametrize("shape", [(2160, 3840), (3840, 2160), (8, 1_000_000)])
+def test_as_many_pixels_as_are_kept_stay_as_they_are(shape):
+    image = np.random.default_rng(3).integers(0, 2, (*shape, 1), np.uint8).repeat(3, axis=2) * 200
+    np.testing.assert_array_equal(decode_image(cv2.imencode(".png", image)[1].tobytes(), 50_000_000), image)
+
+
+def test_the_thinnest_image_keeps_a_row():
+    thin = np.full((1, 1_000_000, 3), 90, np.uint8)
+    body = cv2.imencode(".png", np.repeat(thin, 20, axis=0))[1].tobytes()
+    assert decode_image(body, 50_000_000).shape == (10, 500_000, 3)
+
+
+def test_blank_is_what_the_deviation_of_all_grey_levels_says():
+    random = np.random.default_rng(4)
+    decided = []
+    for sigma in np.linspace(0.2, 2.5, 60):
+        noisy = np.clip(random.normal(100, sigma, (37, 53, 3)).round(), 0, 255).astype(np.uint8)
+        decided.append(is_blank(noisy))
+        assert decided[-1] == (cv2.cvtColor(noisy, cv2.COLOR_BGR2GRAY).std() < 1.0)
+    assert 10 < sum(decided) < 50

@@ -14,6 +14,7 @@ from starlette.types import Scope
 
 from deepsimbad.api.admission import AdmissionLimits, AdmissionMiddleware
 from deepsimbad.api.auth import AuthMiddleware, KeyRing
+from deepsimbad.api.decoders import Decoders
 from deepsimbad.api.dependencies import Services
 from deepsimbad.api.envelope import EnvelopeMiddleware
 from deepsimbad.api.job_watch import watched
@@ -281,6 +282,7 @@ def _start(settings: Settings, metrics: Metrics, keys: KeyRing, run_job: RunJob,
         truths=Truths(store, pinned_maps, worker, clock),
         clock=clock,
         worker=worker,
+        decoders=Decoders(settings.max_pixels),
         runner=runner,
         keys=keys,
         readiness=readiness,

@@ -4,6 +4,7 @@ import asyncio
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future
+from contextlib import AbstractAsyncContextManager
 from dataclasses import dataclass, field
 from typing import Annotated, TypeVar, cast
 
@@ -13,6 +14,7 @@ from fastapi import Depends, Path, Request
 
 from deepsimbad.api.auth import KeyRing
 from deepsimbad.api.bodies import GREATEST_ID, NAME_PATTERN
+from deepsimbad.api.decoders import Decoders
 from deepsimbad.api.metrics import Metrics
 from deepsimbad.api.readiness import ReadinessCheck
 from deepsimbad.engine.active_maps import ActiveDomain, ActiveMaps
@@ -24,7 +26,6 @@ from deepsimbad.engine.steady_clock import SteadyClock
 from deepsimbad.engine.truths import Truths
 from deepsimbad.engine.worker import InferenceWorker, Priority
 from deepsimbad.evaluators.base import Image
-from deepsimbad.evaluators.image import decode_image
 from deepsimbad.jobs.runner import JobRunner
 from deepsimbad.settings import Settings
 from deepsimbad.store.catalog import Catalog
@@ -32,7 +33,6 @@ from deepsimbad.store.sessions import SessionStore
 
 T = TypeVar("T")
 
-DECODERS = 4  # images decoded at once: each may need max_pixels times 3 bytes
 BATCHES = 1  # batches read into memory at once
 HEALTH = 2  # threads that nothing but questions about health may take
 
@@ -54,11 +54,11 @@ class Services:
         truths: What their beliefs were worth.
         clock: What they live by.
         worker: Where encoding and scoring run.
+        decoders: Where images are decoded.
         runner: Where jobs run.
         keys: Who may ask.
         readiness: Whether all of it works.
         stopping: Set when shutdown begins; streams end on it.
-        decoders: Bounds the images being decoded.
         batches: Bounds the batches being read.
         health: Threads of their own for questions about health, which should not wait behind what they ask about.
     """
@@ -75,11 +75,11 @@ class Services:
     truths: Truths
     clock: SteadyClock
     worker: InferenceWorker
+    decoders: Decoders
     runner: JobRunner
     keys: KeyRing
     readiness: ReadinessCheck
     stopping: threading.Event = field(default_factory=threading.Event)
-    decoders: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(DECODERS))
     batches: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(BATCHES))
     health: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(HEALTH))
 
@@ -88,9 +88,9 @@ class Services:
         known = self.active_maps.peek(domain)
         return known if known is not None else await run_sync(self.active_maps.active, domain)
 
-    async def decode(self, body: bytes) -> Image:
-        """Decode an image in a thread."""
-        return await run_sync(decode_image, body, self.settings.max_pixels, limiter=self.decoders)
+    def decoded(self, body: bytes, priority: Priority = Priority.LIVE) -> AbstractAsyncContextManager[Image]:
+        """The image in a body, decoded in a thread, for a block that waits for nothing but the inference worker."""
+        return self.decoders.decoded(body, priority)
 
     async def infer(self, run: Callable[[], T], priority: Priority = Priority.LIVE) -> T:
         """Run on the inference worker."""

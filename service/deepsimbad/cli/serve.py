@@ -17,10 +17,12 @@ log = logging.getLogger(__name__)
 def serve(data_dir: Path | None, host: str | None, port: int | None) -> None:
     """Serve the domains over HTTP until interrupted. Ready when /readyz answers 200."""
     from deepsimbad.api.logs import configure_logging  # noqa: PLC0415 - other commands need no server
+    from deepsimbad.api.native_lines import native_lines_in_the_log  # noqa: PLC0415
     from deepsimbad.api.server import serve as serve_until_stopped  # noqa: PLC0415
 
-    settings = given_settings(data_dir=data_dir, host=host, port=port)
-    configure_logging(settings.log_level)
-    for variable in unknown_variables():
-        log.warning("set in the environment, and no setting", extra={"variable": variable})
-    serve_until_stopped(settings)
+    with native_lines_in_the_log():
+        settings = given_settings(data_dir=data_dir, host=host, port=port)
+        configure_logging(settings.log_level)
+        for variable in unknown_variables():
+            log.warning("set in the environment, and no setting", extra={"variable": variable})
+        serve_until_stopped(settings)

@@ -1,7 +1,8 @@
 """A session in memory, and what may be asked of it."""
 
 import asyncio
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable
+from contextlib import AbstractAsyncContextManager
 from dataclasses import dataclass, field
 
 from deepsimbad.engine.observation import View
@@ -47,14 +48,15 @@ class Observation:
     """A move and the view after it, as a robot reports them.
 
     Attributes:
-        view: Gives the view; awaited when the session's turn has come, so that order is that of arrival.
+        view: Gives the view, entered when the session's turn has come, so that order is that of arrival; left when the
+            view has been looked at.
         action_m: Metres moved since the last view; ignored for the first one.
         action_std_m: Their standard deviation; None: the usual one.
         n_shortlist: Length of the answer's lists; None: the usual one.
         idempotency: How a repetition is known; None: it is not.
     """
 
-    view: Callable[[], Awaitable[View]]
+    view: Callable[[], AbstractAsyncContextManager[View]]
     action_m: float = 0.0
     action_std_m: float | None = None
     n_shortlist: int | None = None

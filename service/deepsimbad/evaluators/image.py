@@ -2,17 +2,22 @@
 
 EXIF (and TIFF) orientation is applied; grey becomes three equal channels; of 16 bits a channel the upper 8 are
 kept; alpha is dropped (PNG and WebP give their colours as stored, TIFF's come composited on black); of several
-pages or animation frames the first is taken and no other decoded.
+pages or animation frames the first is taken and no other decoded. An image of more than `KEPT_PIXELS` is reduced by a
+whole factor, whoever decodes it: no extractor needs so many, and looking at them would keep live views waiting.
 """
+
+import math
 
 import cv2
 import numpy as np
 
 from deepsimbad.errors import EmptyBodyError, ImageTooLargeError, InvalidImageError
 from deepsimbad.evaluators.base import Image
-from deepsimbad.evaluators.image_header import MEDIA_TYPES, check_whole, media_type, read_size
+from deepsimbad.evaluators.image_header import MEDIA_TYPES, check_whole, media_type, picture_alone, read_size
 
-__all__ = ["MEDIA_TYPES", "decode_image"]
+__all__ = ["KEPT_PIXELS", "MEDIA_TYPES", "claimed_pixels", "decode_image"]
+
+KEPT_PIXELS = 3840 * 2160
 
 # Bad input is answered by a named error; OpenCV's own words about it would only fill the server's log.
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
@@ -20,21 +25,18 @@ cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
 _BLANK_BELOW_STD = 1.0  # grey levels of 256
 
 
-def decode_image(body: bytes, max_pixels: int) -> Image:
-    """Decode one image.
+def claimed_pixels(body: bytes, max_pixels: int) -> int:
+    """How many pixels an image's header claims.
 
     Args:
         body: The file's bytes; its real format is read from them.
-        max_pixels: Greatest width x height accepted, judged by the header before anything is decoded.
-
-    Returns:
-        [height, width, 3] uint8 BGR.
+        max_pixels: Greatest width x height accepted.
 
     Raises:
         EmptyBodyError: No bytes.
         ImageTooLargeError: The header claims more pixels.
-        TruncatedImageError: The end of the file is missing.
-        InvalidImageError: Not one of `MEDIA_TYPES`, or damaged.
+        TruncatedImageError: The end of the header is missing.
+        InvalidImageError: Not one of `MEDIA_TYPES`, or a header that contradicts itself.
     """
     if not body:
         raise EmptyBodyError("the body is empty: send the image's bytes")
@@ -46,18 +48,49 @@ def decode_image(body: bytes, max_pixels: int) -> Image:
             height=height,
             max_pixels=max_pixels,
         )
+    return width * height
+
+
+def decode_image(body: bytes, max_pixels: int) -> Image:
+    """Decode one image.
+
+    Args:
+        body: The file's bytes; its real format is read from them.
+        max_pixels: Greatest width x height accepted, judged by the header before anything is decoded.
+
+    Returns:
+        [height, width, 3] uint8 BGR; height x width is at most `KEPT_PIXELS`.
+
+    Raises:
+        EmptyBodyError: No bytes.
+        ImageTooLargeError: The header claims more pixels.
+        TruncatedImageError: The end of the file is missing.
+        InvalidImageError: Not one of `MEDIA_TYPES`, or damaged.
+    """
+    claimed_pixels(body, max_pixels)
     check_whole(body)
     try:
-        image = cv2.imdecode(np.frombuffer(body, np.uint8), cv2.IMREAD_COLOR_BGR)
+        image = cv2.imdecode(np.frombuffer(picture_alone(body), np.uint8), cv2.IMREAD_COLOR_BGR)
     except cv2.error as error:
         raise InvalidImageError(f"the {media_type(body)} image cannot be decoded") from error
     if image is None or image.size == 0:
         raise InvalidImageError(f"the {media_type(body)} image cannot be decoded")
     if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
         raise InvalidImageError(f"the image decodes to {list(image.shape)} {image.dtype}, not to 8-bit colour")
-    return np.ascontiguousarray(image)
+    return _reduced(np.ascontiguousarray(image, np.uint8))
 
 
 def is_blank(image: Image) -> bool:
     """Whether an image shows nothing: grey levels that differ by no more than a sensor's noise does in the dark."""
-    return float(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY).std()) < _BLANK_BELOW_STD
+    _, deviation = cv2.meanStdDev(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
+    return float(deviation[0, 0]) < _BLANK_BELOW_STD
+
+
+def _reduced(image: Image) -> Image:
+    """Means of squares, of the least whole side that leaves no more than may be kept; usual images as they are."""
+    height, width = image.shape[:2]
+    side = math.ceil(math.sqrt(height * width / KEPT_PIXELS))
+    if side == 1:
+        return image
+    size = (max(1, width // side), max(1, height // side))
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)

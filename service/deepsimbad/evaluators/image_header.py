@@ -1,7 +1,8 @@
 """What an image file's header claims, and whether the file is all there, before a decoder sees it.
 
 Decoders allocate what a header asks for, and some half decode a truncated file without a word, so both questions
-are answered here from the bytes alone: `read_size` looks at the header, `check_whole` walks the containers.
+are answered here from the bytes alone: `read_size` looks at the header, `check_whole` walks the containers, and
+`picture_alone` leaves away what a decoder needs not see.
 """
 
 import re
@@ -23,6 +24,7 @@ _JPEG_MARKER = re.compile(rb"[^\xff]", re.DOTALL)
 _JPEG_MAX_SCANS = 200  # a progressive file uses about ten; thousands of empty ones are an attack on the decoder
 _JPEG_MAX_SCANNED = 2_000_000_000  # pixels of all scans together: each costs the decoder a pass over the picture
 _PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # by colour type
+_PNG_PICTURE = frozenset({b"IHDR", b"PLTE", b"tRNS", b"eXIf", b"IDAT", b"IEND"})
 _PNG_UNPACKED = 1 << 18  # bytes of picture data: what is packed in less keeps a decoder for a quarter of a second
 _MAX_PARTS = 100_000  # chunks, segments, strips: a real file has far fewer, walking millions costs seconds
 _TIFF_FIELD_BYTES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4}
@@ -74,6 +76,21 @@ def check_whole(body: bytes) -> None:
     _READERS[media_type(body)][1](body)
 
 
+def picture_alone(body: bytes) -> bytes:
+    """A file without what tells nothing of its picture.
+
+    Of a PNG file, texts, colour profiles and further frames: its decoder unpacks them, and complains of damaged ones
+    on standard error. Other files are given back as they are.
+
+    Args:
+        body: A file that `check_whole` has passed.
+    """
+    if media_type(body) != "image/png":
+        return body
+    chunks = [body[start:end] for name, start, end in _png_chunks(body) if name in _PNG_PICTURE]
+    return b"".join([_PNG_SIGNATURE, *chunks])
+
+
 def _truncated(kind: str) -> NoReturn:
     raise TruncatedImageError(f"the {kind} file ends too early: its end is missing")
 
@@ -96,21 +113,28 @@ def _png_size(body: bytes) -> tuple[int, int]:
     return width, height
 
 
-def _png_whole(body: bytes) -> None:
-    at, packed = len(_PNG_SIGNATURE), []
+def _png_chunks(body: bytes) -> Iterator[tuple[bytes, int, int]]:
+    """(name, start, end) of the chunks up to IEND; length and checksum are in between."""
+    at = len(_PNG_SIGNATURE)
     for _ in range(_MAX_PARTS):
         (length,) = _unpack(">I", body, at, "PNG")
-        name, end = body[at + 4 : at + 8], at + 8 + length
-        (checksum,) = _unpack(">I", body, end, "PNG")
-        if zlib.crc32(memoryview(body)[at + 4 : end]) != checksum:
+        name, end = body[at + 4 : at + 8], at + 12 + length
+        yield name, at, end
+        if name == b"IEND":
+            return
+        at = end
+    _too_many_parts("PNG")
+
+
+def _png_whole(body: bytes) -> None:
+    packed = []
+    for name, start, end in _png_chunks(body):
+        (checksum,) = _unpack(">I", body, end - 4, "PNG")
+        if zlib.crc32(memoryview(body)[start + 4 : end - 4]) != checksum:
             raise InvalidImageError("the PNG file is damaged: a checksum does not fit")
         if name == b"IDAT":
-            packed.append(memoryview(body)[at + 8 : end])
-        elif name == b"IEND":
-            _check_png_unpacks(body, packed)
-            return
-        at = end + 4
-    _too_many_parts("PNG")
+            packed.append(memoryview(body)[start + 8 : end - 4])
+    _check_png_unpacks(body, packed)
 
 
 def _check_png_unpacks(body: bytes, packed: list[memoryview]) -> None:

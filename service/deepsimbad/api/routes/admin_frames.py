@@ -4,8 +4,10 @@ import tempfile
 from dataclasses import replace
 from typing import IO, Annotated
 
+import numpy as np
 from anyio.to_thread import run_sync
 from fastapi import APIRouter, Path, Query, Request, Response
+from numpy.typing import NDArray
 
 from deepsimbad.api.bodies import (
     BINARY,
@@ -24,10 +26,9 @@ from deepsimbad.api.frame_batch import read_batch
 from deepsimbad.api.openapi import problems
 from deepsimbad.api.schemas import BatchAnswer, FrameAnswer
 from deepsimbad.engine.encoding import encode_view, ready_encodings
-from deepsimbad.engine.observation import ReadyEncoding
 from deepsimbad.engine.worker import Priority
 from deepsimbad.errors import EmptyBodyError
-from deepsimbad.evaluators.base import Image
+from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.image import MEDIA_TYPES
 from deepsimbad.store.faults import storage_faults
 
@@ -69,13 +70,7 @@ async def put_frame(
     await run_sync(_check_traverse, running, domain, name)
     media_type = media_type_of(request, FRAME_TYPES)
     body = await read_bytes(request)
-    view: Image | ReadyEncoding
-    if media_type == JSON:
-        view = parse_json(body, EncodingBody).view()
-    else:
-        view = await running.decode(body)
-    evaluator = running.evaluators.evaluator(evaluator_config)
-    encoding = await running.infer(lambda: encode_view(evaluator, view), Priority.BATCH)
+    encoding = await _encoded(body, running, media_type, running.evaluators.evaluator(evaluator_config))
 
     def store() -> tuple[bool, int]:
         with running.open_traverses.lend(domain, name) as traverse:
@@ -85,6 +80,15 @@ async def put_frame(
     created, n_frames = await run_sync(store)
     response.status_code = 201 if created else 200
     return FrameAnswer(index=index, n_frames=n_frames)
+
+
+async def _encoded(body: bytes, running: Services, media_type: str, evaluator: Evaluator) -> NDArray[np.float32]:
+    """The encoding of the frame in a body; its pixels are gone when this returns."""
+    if media_type == JSON:
+        ready = parse_json(body, EncodingBody).view()
+        return await running.infer(lambda: encode_view(evaluator, ready), Priority.BATCH)
+    async with running.decoded(body, Priority.BATCH) as image:
+        return await running.infer(lambda: encode_view(evaluator, image), Priority.BATCH)
 
 
 @router.post(

@@ -1,5 +1,7 @@
 """Where a single view places the robot: stateless, from a uniform prior."""
 
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 from io import BytesIO
 from typing import Annotated
 
@@ -67,11 +69,10 @@ async def post_localization(
     shortlist_length(active.snapshot, shortlist)  # a bad query should not cost an upload
     body = await read_bytes(request)
     watch.lap("receive")
-    view = await view_in(body, running, media_type)
-    watch.lap("decode")
     evaluator = running.evaluators.evaluator(active.record.evaluator)
     if prefers_binary(request):
-        retrieval = await running.infer(lambda: retrieve(active.snapshot, evaluator, view))
+        async with view_in(body, running, media_type) as view:
+            retrieval = await running.infer(lambda: retrieve(active.snapshot, evaluator, view))
         return npy_response(retrieval.relevance)
 
     def look() -> Localization:
@@ -80,16 +81,22 @@ async def post_localization(
         watch.take(found.timings_ms)
         return found
 
-    answer = render_localization(await running.infer(look), watch)
+    async with view_in(body, running, media_type) as view:
+        watch.lap("decode")
+        localization = await running.infer(look)
+    answer = render_localization(localization, watch)
     running.metrics.localized(domain, answer.timings_ms, answer.belief.entropy_bits)
     return Response(answer.model_dump_json(), media_type=JSON)
 
 
-async def view_in(body: bytes, running: Services, media_type: str) -> View:
-    """The observation in a body that has been read."""
+@asynccontextmanager
+async def view_in(body: bytes, running: Services, media_type: str) -> AsyncIterator[View]:
+    """The observation in a body that has been read; an image, as `Services.decoded` gives it."""
     if media_type == JSON:
-        return parse_json(body, ObservationBody).view()
-    return await running.decode(body)
+        yield parse_json(body, ObservationBody).view()
+        return
+    async with running.decoded(body) as image:
+        yield image
 
 
 def prefers_binary(request: Request) -> bool:
