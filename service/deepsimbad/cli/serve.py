@@ -6,6 +6,7 @@ from pathlib import Path
 import click
 
 from deepsimbad.cli.options import address_options, data_dir_option, given_settings
+from deepsimbad.errors import DeepSimbadError
 from deepsimbad.settings_sources import unknown_variables
 
 log = logging.getLogger(__name__)
@@ -21,8 +22,13 @@ def serve(data_dir: Path | None, host: str | None, port: int | None) -> None:
     from deepsimbad.api.server import serve as serve_until_stopped  # noqa: PLC0415
 
     with native_lines_in_the_log():
-        settings = given_settings(data_dir=data_dir, host=host, port=port)
-        configure_logging(settings.log_level)
-        for variable in unknown_variables():
-            log.warning("set in the environment, and no setting", extra={"variable": variable})
-        serve_until_stopped(settings)
+        try:
+            settings = given_settings(data_dir=data_dir, host=host, port=port)
+            configure_logging(settings.log_level)
+            for variable in unknown_variables():
+                log.warning("set in the environment, and no setting", extra={"variable": variable})
+            serve_until_stopped(settings)
+        except DeepSimbadError as error:
+            configure_logging("ERROR")  # the settings themselves may be what is wrong
+            log.error("cannot start", extra={"code": error.code, "why": error.message})
+            raise
