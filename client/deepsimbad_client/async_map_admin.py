@@ -22,13 +22,17 @@ class AsyncMapAdmin:
     def __init__(self, transport: AsyncTransport) -> None:
         self._transport = transport
 
-    async def remap(self, domain: str, **config: Any) -> Job:
+    async def remap(self, domain: str, *, idempotency_key: str | None = None, **config: Any) -> Job:
         """Submit a remap and return its job at once."""
-        return await self._transport.send(map_calls.remap(domain, config))
+        return await self._transport.send(map_calls.remap(domain, config, idempotency_key))
 
-    async def feed_experience(self, domain: str, session_id: str, true_positions_m: Numbers) -> Job:
+    async def feed_experience(
+        self, domain: str, session_id: str, true_positions_m: Numbers, *, idempotency_key: str | None = None
+    ) -> Job:
         """Teach the next map where a session's robot truly was at each of its observations."""
-        return await self._transport.send(map_calls.feed_experience(domain, session_id, true_positions_m))
+        return await self._transport.send(
+            map_calls.feed_experience(domain, session_id, true_positions_m, idempotency_key)
+        )
 
     async def jobs(self, domain: str | None = None) -> tuple[Job, ...]:
         """Jobs, newest first, of one domain or all."""

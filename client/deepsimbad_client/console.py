@@ -11,6 +11,7 @@ from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
     Progress,
+    ProgressColumn,
     SpinnerColumn,
     TaskID,
     TextColumn,
@@ -22,6 +23,7 @@ from rich.table import Table
 from deepsimbad_client.episode_log import Episode
 from deepsimbad_client.models import Job
 from deepsimbad_client.step_log import Step
+from deepsimbad_client.tables import lasting
 from deepsimbad_client.upload import UploadProgress
 
 REMARKS = Console(stderr=True, highlight=False, markup=False)
@@ -62,7 +64,9 @@ def as_json(document: Any) -> str:
 class Bar:
     """A progress bar on standard error; off a terminal it stays silent."""
 
-    def __init__(self, label: str, total: float | None, *, counted: bool = True) -> None:
+    def __init__(
+        self, label: str, total: float | None, *, counted: bool = True, left: ProgressColumn | None = None
+    ) -> None:
         middle = [MofNCompleteColumn()] if counted else [TextColumn("{task.percentage:>3.0f} %")]
         self._progress = Progress(
             SpinnerColumn(finished_text="[green]✓"),
@@ -70,12 +74,12 @@ class Bar:
             BarColumn(bar_width=32),
             *middle,
             TimeElapsedColumn(),
-            TimeRemainingColumn(),
+            left or TimeRemainingColumn(),
             TextColumn("{task.fields[note]}", markup=False),
             console=REMARKS,
             disable=not REMARKS.is_terminal,
         )
-        self._task: TaskID = self._progress.add_task(label, total=total, note="")
+        self._task: TaskID = self._progress.add_task(label, total=total, note="", left="")
 
     def __enter__(self) -> Self:
         self._progress.start()
@@ -108,15 +112,15 @@ class UploadBar(Bar):
 
 
 class JobBar(Bar):
-    """A job's stages."""
+    """A job's stages, and the time left as the service knows it: it knows what is still to come."""
 
     def __init__(self, label: str) -> None:
-        super().__init__(label, 1.0, counted=False)
+        super().__init__(label, 1.0, counted=False, left=TextColumn("{task.fields[left]}", style="progress.remaining"))
 
     def __call__(self, job: Job) -> None:
         """Show how far a job is; one whose service was restarted waits in the queue again."""
-        stage = "waiting for its turn" if job.state == "queued" else (job.stage or job.state).replace("_", " ")
-        self._progress.update(self._task, completed=job.progress, note=stage)
+        stage = "waiting for its turn" if job.state == "queued" else job.stage_name
+        self._progress.update(self._task, completed=job.progress, note=stage, left=lasting(job.eta_s))
 
     def silent(self, seconds: float) -> None:
         """Show that nothing has been heard for a while."""

@@ -293,6 +293,10 @@ class TooManySessionsError(RateLimitedError):
     """The service holds as many live sessions as it may."""
 
 
+class TooManyJobsError(RateLimitedError):
+    """As many jobs wait for their turn as may."""
+
+
 class ServerError(ApiError):
     """5xx: the service failed."""
 
@@ -330,6 +334,7 @@ BY_CODE: Mapping[str, type[ApiError]] = {
     "invalid_prior": InvalidPriorError,
     "idempotency_key_reused": IdempotencyKeyReusedError,
     "too_many_sessions": TooManySessionsError,
+    "too_many_jobs": TooManyJobsError,
     "no_active_map": NoActiveMapError,
     "domain_differs": DomainDiffersError,
     "traverse_in_use": TraverseInUseError,

@@ -2,6 +2,7 @@
 
 import sys
 from itertools import islice
+from typing import Any
 
 import click
 
@@ -76,7 +77,7 @@ def remap(
     """
     if append and landmarks is not None:
         raise click.UsageError("--append keeps the active map's landmarks: leave --landmarks out")
-    config = {
+    config: dict[str, Any] = {
         "landmark_traverse": landmarks,
         "n_landmarks": n_landmarks,
         "list_length": list_length,
@@ -128,6 +129,8 @@ def jobs(
         if cancel:
             client.admin.cancel_job(job_id)
         job = client.admin.job(job_id)
+        if cancel:
+            REMARKS.print(_cancel_told(job), soft_wrap=True)
         if follow and not job.ended:
             job = _follow(client, job)
     _show_job(job, json_output)
@@ -150,6 +153,15 @@ def _follow(client: Client, job: Job) -> Job:
                 soft_wrap=True,
             )
         raise
+
+
+def _cancel_told(job: Job) -> str:
+    """What a cancel has come to by now."""
+    if job.state == "cancelled":
+        return f"job {job.job_id} is cancelled"
+    if job.ended:
+        return f"job {job.job_id} had ended before it could be cancelled"
+    return f"job {job.job_id} is being cancelled; see how it ends with: deepsimbad-client jobs {job.job_id} --follow"
 
 
 def _answer(question: str) -> bool:

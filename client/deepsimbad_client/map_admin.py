@@ -25,29 +25,41 @@ class MapAdmin:
     def __init__(self, transport: Transport) -> None:
         self._transport = transport
 
-    def remap(self, domain: str, **config: Any) -> Job:
+    def remap(self, domain: str, *, idempotency_key: str | None = None, **config: Any) -> Job:
         """Submit a remap and return its job at once; `deepsimbad_client.remap.remap` also follows it.
+
+        A lost answer is asked for again and makes no second job.
 
         Args:
             domain: The domain to map anew.
+            idempotency_key: Names this request, so that it can be repeated after a `TransportError`; absent: a new one.
             **config: `training_traverse` and, where they should differ from the service's defaults,
                 `landmark_traverse`, `n_landmarks`, `list_length`, `relevance`, `training_episodes`, `seed`, `activate`,
                 `check_traverse`, `gate_margin`, `append`.
-        """
-        return self._transport.send(map_calls.remap(domain, config))
 
-    def feed_experience(self, domain: str, session_id: str, true_positions_m: Numbers) -> Job:
+        Raises:
+            TooManyJobsError: As many jobs wait as may.
+        """
+        return self._transport.send(map_calls.remap(domain, config, idempotency_key))
+
+    def feed_experience(
+        self, domain: str, session_id: str, true_positions_m: Numbers, *, idempotency_key: str | None = None
+    ) -> Job:
         """Teach the next map: where a session's robot truly was at each of its observations, known only afterwards.
 
         Args:
             domain: The session's domain.
             session_id: The session; it may have ended a while ago.
             true_positions_m: A position along the map's route for each observation, in order; None where unknown.
+            idempotency_key: As of `remap`.
 
         Returns:
             The job that makes the next map version.
+
+        Raises:
+            TooManyJobsError: As many jobs wait as may.
         """
-        return self._transport.send(map_calls.feed_experience(domain, session_id, true_positions_m))
+        return self._transport.send(map_calls.feed_experience(domain, session_id, true_positions_m, idempotency_key))
 
     def jobs(self, domain: str | None = None) -> tuple[Job, ...]:
         """Jobs, newest first, of one domain or all."""

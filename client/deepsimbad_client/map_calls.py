@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from typing import Any
+from uuid import uuid4
 
 from deepsimbad_client.admin_calls import domain_path
 from deepsimbad_client.answers import model, nothing, page
@@ -10,39 +11,28 @@ from deepsimbad_client.models import Job, MapVersion
 from deepsimbad_client.observation import Numbers
 from deepsimbad_client.page import PAGE_LENGTH, Page
 from deepsimbad_client.retry import Repeat
-from deepsimbad_client.session_calls import known_positions
+from deepsimbad_client.session_calls import KEY_HEADER, known_positions
 
 JOBS = "/v1/admin/jobs"
 EVENT_STREAM = "text/event-stream"
 MAP_FILE = "application/vnd.sqlite3"
 
 
-def remap(domain: str, config: Mapping[str, Any]) -> Call[Job]:
-    """Ask for a new map; a second request would be a second job, so it is sent again only when surely unseen."""
-    return Call(
-        "POST",
-        f"{domain_path(domain)}/remaps",
-        model(Job),
-        headers=JSON,
-        body=json_body(config),
-        repeat=Repeat.IF_UNTOUCHED,
-    )
+def remap(domain: str, config: Mapping[str, Any], idempotency_key: str | None = None) -> Call[Job]:
+    """Ask for a new map; its key makes it one job however often it is sent."""
+    return _making_a_job(f"{domain_path(domain)}/remaps", config, idempotency_key)
 
 
-def feed_experience(domain: str, session_id: str, true_positions_m: Numbers) -> Call[Job]:
-    """Feed back where a session's robot truly was, None or NaN where unknown; a second request would be a second job.
+def feed_experience(
+    domain: str, session_id: str, true_positions_m: Numbers, idempotency_key: str | None = None
+) -> Call[Job]:
+    """Feed back where a session's robot truly was, None or NaN where unknown; its key makes it one job.
 
     Raises:
         InvalidArgumentError: A position is infinite or no number.
     """
-    return Call(
-        "POST",
-        f"{domain_path(domain)}/experience",
-        model(Job),
-        headers=JSON,
-        body=json_body({"session_id": session_id, "true_positions_m": known_positions(true_positions_m)}),
-        repeat=Repeat.IF_UNTOUCHED,
-    )
+    told = {"session_id": session_id, "true_positions_m": known_positions(true_positions_m)}
+    return _making_a_job(f"{domain_path(domain)}/experience", told, idempotency_key)
 
 
 def jobs(domain: str | None, after: str | None) -> Call[Page[Job]]:
@@ -103,6 +93,11 @@ def map_file(domain: str, version: int) -> Call[None]:
         nothing,
         headers={"Accept": f"{MAP_FILE}, application/octet-stream", "Accept-Encoding": "identity"},
     )
+
+
+def _making_a_job(path: str, document: Mapping[str, Any], idempotency_key: str | None) -> Call[Job]:
+    headers = {**JSON, KEY_HEADER: idempotency_key or uuid4().hex}
+    return Call("POST", path, model(Job), headers=headers, body=json_body(document))
 
 
 def _job(job_id: str) -> str:

@@ -198,6 +198,12 @@ class TooManySessionsError(BusyError):
     code = "too_many_sessions"
 
 
+class TooManyJobsError(BusyError):
+    """The limit on waiting jobs is reached."""
+
+    code = "too_many_jobs"
+
+
 class RateLimitedError(BusyError):
     """More requests in a row than one key may send."""
 

@@ -96,6 +96,7 @@ class Settings(BaseSettings):
     keep_maps: Annotated[
         int, Field(description="Retired map versions kept a domain, to roll back to; older files are removed.", ge=1)
     ] = 5
+    max_jobs: Annotated[int, Field(description="Jobs that may wait their turn; one more is answered 429.", ge=1)] = 100
     job_threads: Annotated[
         int, Field(description="Threads that a job computes in; 0: one less than there are cores.", ge=0)
     ] = 0

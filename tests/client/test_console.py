@@ -9,8 +9,8 @@ from rich.console import Console
 
 from deepsimbad_client import console
 from deepsimbad_client.console import show, show_waits
-from deepsimbad_client.models import Domain
-from deepsimbad_client.tables import domain_table
+from deepsimbad_client.models import Domain, Job
+from deepsimbad_client.tables import domain_table, job_table
 
 
 def test_a_table_in_a_pipe_cuts_no_name(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -27,6 +27,25 @@ def test_columns_are_heeded(capsys: pytest.CaptureFixture[str], monkeypatch: pyt
     monkeypatch.setenv("COLUMNS", "60")
     show(domain_table([Domain(name="a" * 64, evaluator={"kind": "feature_l2"})]))
     assert max(map(len, capsys.readouterr().out.splitlines())) <= 60
+
+
+def test_jobs_are_shown_with_what_they_do_and_the_time_left(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("COLUMNS", raising=False)
+    named = {
+        "waits": {"state": "queued"},
+        "began": {"state": "running"},
+        "works": {"state": "running", "stage": "select landmarks", "progress": 0.25, "eta_s": 524.4},
+        "ended": {"state": "failed", "error": {"code": "damaged_file", "detail": "traverse drive: damaged"}},
+    }
+    show(job_table([Job(job_id=name, domain="d", **told) for name, told in named.items()]))
+    rows = {line.split()[1]: line for line in capsys.readouterr().out.splitlines() if "│" in line}
+    assert "waiting for its turn" in rows["waits"]
+    assert "beginning, 0 %" in rows["began"]
+    assert "0:08:44" in rows["works"]
+    assert "select landmarks, 25 %" in rows["works"]
+    assert "traverse drive: damaged" in rows["ended"]
 
 
 @pytest.fixture

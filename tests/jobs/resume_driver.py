@@ -38,7 +38,7 @@ READY = {"kind": "feature_l2", "extractor": "none"}
 N_FRAMES = 50
 CONFIGS = {
     "remap": RemapConfig("drive", "other", n_landmarks=8, training_episodes=60),
-    "experience": ExperienceConfig(SESSION),
+    "experience": ExperienceConfig.of(SESSION, np.arange(0, 20, 2.0).tolist()),
 }
 FILE_STEPS = {"rename", "unlink", "rmtree", "fsync", "mkdir", "rmdir", "chmod", "flock", "open", "close"}
 SQL_STEPS = {"execute", "executemany"}

@@ -6,7 +6,14 @@ from contextlib import contextmanager
 
 import pytest
 
-from deepsimbad.errors import ConflictError, JobInterruptedError, UnknownDomainError, UnknownJobError
+from deepsimbad.errors import (
+    IdempotencyKeyReusedError,
+    JobInterruptedError,
+    TooManyJobsError,
+    UnavailableError,
+    UnknownDomainError,
+    UnknownJobError,
+)
 from deepsimbad.jobs.map_config import RemapConfig
 from deepsimbad.jobs.perform import InThisProcess
 from deepsimbad.jobs.runner import JobRunner
@@ -88,6 +95,70 @@ def test_jobs_run_in_the_order_they_came(catalog, drives):
         gate.open.set()
         results = [ended(catalog, job.job_id).result["map_version"] for job in jobs]
     assert results == [1, 2, 3]
+
+
+def test_only_so_many_jobs_wait_and_a_cancelled_one_makes_room(catalog, drives):
+    gate = Gate(catalog.data_dir)
+    runner = JobRunner(catalog, gate, lambda domain: None, max_waiting=2)
+    try:
+        runner.submit(DOMAIN, CONFIG)
+        assert gate.entered.wait(WITHIN_S)
+        waiting = [runner.submit(DOMAIN, CONFIG) for _ in range(2)]
+        with pytest.raises(TooManyJobsError, match="2 jobs wait already") as refused:
+            runner.submit(DOMAIN, CONFIG)
+        assert (refused.value.hints["limit"], refused.value.hints["max_jobs"]) == ("max_jobs", 2)
+        assert len(catalog.jobs()) == 3
+        runner.cancel(waiting[0].job_id)
+        last = runner.submit(DOMAIN, CONFIG)
+        gate.open.set()
+        assert ended(catalog, last.job_id).state is JobState.SUCCEEDED
+    finally:
+        gate.open.set()
+        runner.close()
+
+
+def test_a_job_of_one_id_is_made_once_whoever_asks_and_whenever(catalog, drives):
+    gate = Gate(catalog.data_dir)
+    job_id, made = "a" * 32, []
+    runner = JobRunner(catalog, gate, lambda domain: None, max_waiting=1)
+    try:
+        first = runner.submit(DOMAIN, CONFIG, job_id)
+        assert gate.entered.wait(WITHIN_S)
+        other = threading.Barrier(8)
+
+        def ask():
+            other.wait(WITHIN_S)
+            made.append(runner.submit(DOMAIN, CONFIG, "b" * 32).job_id)
+
+        asking = [threading.Thread(target=ask) for _ in range(8)]
+        for thread in asking:
+            thread.start()
+        for thread in asking:
+            thread.join(WITHIN_S)
+        assert made == ["b" * 32] * 8, "one alone finds room to wait; the others find that one"
+        with pytest.raises(IdempotencyKeyReusedError):
+            runner.submit(DOMAIN, RemapConfig("drive", "other", n_landmarks=7), job_id)
+        gate.open.set()
+        ended(catalog, "b" * 32)
+    finally:
+        gate.open.set()
+        runner.close()
+    assert runner.submit(DOMAIN, CONFIG, job_id).state is JobState.SUCCEEDED, "nothing new is asked of it"
+    with running(catalog) as again:
+        found = again.submit(DOMAIN, CONFIG, job_id)
+        assert (found.job_id, found.created_at, found.result["map_version"]) == (job_id, first.created_at, 1)
+        with pytest.raises(IdempotencyKeyReusedError):
+            again.submit(DOMAIN, RemapConfig("drive", "other", n_landmarks=7), job_id)
+    assert [record.version for record in catalog.maps(DOMAIN)] == [1, 2]
+
+
+def test_a_job_that_meets_damage_says_in_which_traverse(catalog, drives):
+    path = catalog.data_dir / "domains" / DOMAIN / "traverses" / "other.sqlite"
+    path.write_bytes(b"no database" * 1000)
+    with running(catalog) as runner:
+        job = ended(catalog, runner.submit(DOMAIN, CONFIG).job_id)
+    assert (job.state, job.error["code"], job.error["traverse"]) == (JobState.FAILED, "damaged_file", "other")
+    assert job.error["message"].startswith("traverse other: other.sqlite is damaged")
 
 
 def test_a_queued_job_is_cancelled_at_once_and_never_runs(catalog, drives):
@@ -176,7 +247,7 @@ def test_closing_leaves_what_runs_and_what_waits_to_the_next_service(catalog, dr
     assert (stopped.state, stopped.n_starts, stopped.stage) == (JobState.QUEUED, 0, None)
     assert catalog.job(second.job_id).state is JobState.QUEUED
     assert catalog.maps(DOMAIN) == []
-    with pytest.raises(ConflictError, match="shutting down"):
+    with pytest.raises(UnavailableError, match="shutting down"):
         runner.submit(DOMAIN, CONFIG)
     data_dir = catalog.data_dir
     catalog.close()

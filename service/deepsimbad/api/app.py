@@ -233,7 +233,7 @@ def _start(settings: Settings, metrics: Metrics, keys: KeyRing, run_job: RunJob,
     def goes_on(job_id: str) -> bool:
         return runner.gives_back(job_id)
 
-    runner = JobRunner(catalog, watched(run_job, metrics, goes_on), switched)
+    runner = JobRunner(catalog, watched(run_job, metrics, goes_on), switched, settings.max_jobs)
     parts.callback(runner.close)
     readiness = ReadinessCheck(
         catalog,

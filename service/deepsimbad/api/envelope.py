@@ -34,6 +34,7 @@ REFUSALS = frozenset(
         "rate_limited",
         "overloaded",
         "too_many_sessions",
+        "too_many_jobs",
         "too_many_domains",
         "body_too_large",
         "image_too_large",

@@ -10,6 +10,7 @@ from deepsimbad.jobs.learn_online import LEARN_STAGES, learn_online, serve_learn
 from deepsimbad.jobs.map_config import RemapConfig
 from deepsimbad.jobs.progress import Progress, ProgressState
 from deepsimbad.jobs.remap import REMAP_STAGES, remap
+from deepsimbad.jobs.remap_stages import RemapSize, remap_stages
 from deepsimbad.jobs.session_walks import EXPERIENCE, walks_of
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.checkpoints import Checkpoints
@@ -17,7 +18,7 @@ from deepsimbad.store.records import JobRecord
 from deepsimbad.store.sessions import SessionStore
 
 REMAP = "remap"  # the kind of job
-_STAGES = {REMAP: REMAP_STAGES, EXPERIENCE: LEARN_STAGES}
+_KINDS = (REMAP, EXPERIENCE)
 
 
 class RunJob(Protocol):
@@ -84,9 +85,9 @@ def perform(
     Raises:
         DeepSimbadError: As `RunJob`.
     """
-    if job.kind not in _STAGES:
-        raise InvalidInputError(f"this release does no job of the kind {job.kind!a}", known=list(_STAGES))
-    progress = Progress(_STAGES[job.kind], on_progress, is_cancelled)
+    if job.kind not in _KINDS:
+        raise InvalidInputError(f"this release does no job of the kind {job.kind!a}", known=_KINDS)
+    progress = Progress(_stages(data_dir, job), on_progress, is_cancelled)
     with (
         Catalog.open(data_dir) as catalog,
         Checkpoints.open(data_dir, job.job_id, progress.check) as checkpoints,
@@ -97,6 +98,17 @@ def perform(
         evaluator = make_evaluator(evaluator_config(catalog.domain(job.domain).evaluator))
         config = RemapConfig.from_dict(job.config)
         return remap(catalog, job.domain, config, evaluator, progress, checkpoints, n_threads)
+
+
+def _stages(data_dir: Path, job: JobRecord) -> dict[str, float]:
+    if job.kind == EXPERIENCE:
+        return LEARN_STAGES
+    config = RemapConfig.from_dict(job.config)
+    try:
+        size = RemapSize.of(data_dir, job.domain, config)
+    except DeepSimbadError:  # the stage that needs the traverse will say so; one that was done needs it no more
+        return REMAP_STAGES
+    return remap_stages(config, size)
 
 
 def _learn(data_dir: Path, catalog: Catalog, job: JobRecord, progress: Progress) -> dict[str, Any]:

@@ -17,6 +17,7 @@ from deepsimbad.jobs.known_frames import frame_digests
 from deepsimbad.jobs.map_config import DEFAULT_N_LANDMARKS, RemapConfig
 from deepsimbad.jobs.progress import Progress
 from deepsimbad.jobs.remap_inputs import RemapInputs, read_inputs
+from deepsimbad.jobs.remap_stages import RemapSize, remap_stages
 from deepsimbad.jobs.seal_version import activate_once, seal_version
 from deepsimbad.jobs.stage_results import (
     pack_described,
@@ -34,15 +35,8 @@ from deepsimbad.store.map_contents import MapContents
 from deepsimbad.store.map_table import ANY
 from deepsimbad.store.records import MapRecord
 
-REMAP_STAGES = {
-    "read frames": 1.0,
-    "select landmarks": 4.0,
-    "describe": 2.0,
-    "train": 3.0,
-    "check": 0.5,
-    "seal": 1.0,
-    "activate": 0.1,
-}
+# Of a remap whose size is not known beforehand.
+REMAP_STAGES = remap_stages(RemapConfig("drive", "another"), RemapSize(5_000, 5_000, 1_000))
 
 
 def remap(

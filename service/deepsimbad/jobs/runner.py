@@ -8,10 +8,11 @@ from typing import Any, TypeVar
 
 from deepsimbad.errors import (
     CancelledError,
-    ConflictError,
     DamagedFileError,
     DeepSimbadError,
+    IdempotencyKeyReusedError,
     JobInterruptedError,
+    TooManyJobsError,
     UnavailableError,
     UnknownJobError,
 )
@@ -24,7 +25,8 @@ from deepsimbad.store.checkpoints import remove_checkpoints
 from deepsimbad.store.records import JobRecord, JobState
 
 _log = logging.getLogger(__name__)
-_MAX_QUEUED = 100
+_MAX_WAITING = 100
+_RETRY_AFTER_S = 30  # a place is free when a job has ended, which takes longer than a query
 _WRITTEN_AGAIN_S = 1.0
 
 _Written = TypeVar("_Written")
@@ -37,12 +39,21 @@ class JobRunner:
         catalog: Where jobs are recorded; `Catalog.discard_unfinished` has been called.
         run_job: Does a job; called in one thread that lives until `close`.
         on_activated: Called with the domain's name after a job activated a map.
+        max_waiting: Jobs that may wait their turn.
     """
 
-    def __init__(self, catalog: Catalog, run_job: RunJob, on_activated: Callable[[str], None]) -> None:
+    def __init__(
+        self,
+        catalog: Catalog,
+        run_job: RunJob,
+        on_activated: Callable[[str], None],
+        max_waiting: int = _MAX_WAITING,
+    ) -> None:
         self._catalog = catalog
         self._run_job = run_job
         self._on_activated = on_activated
+        self._max_waiting = max_waiting
+        self._submitting = threading.Lock()
         self._waiting: queue.Queue[str | None] = queue.Queue()
         self._cancelled: dict[str, threading.Event] = {}
         self._closing = threading.Event()
@@ -56,20 +67,53 @@ class JobRunner:
         """Whether the thread is there to take up jobs."""
         return self._thread.is_alive()
 
-    def submit(self, domain: str, config: RemapConfig | ExperienceConfig) -> JobRecord:
+    def submit(self, domain: str, config: RemapConfig | ExperienceConfig, job_id: str | None = None) -> JobRecord:
         """Queue a remap, or the learning of what a session taught.
+
+        Args:
+            domain: Whose next map it makes.
+            config: What is asked for.
+            job_id: Its id, where a repetition of the request would have the same: the job that was made by the first
+                one is returned then, as it stands. None: a new one.
 
         Raises:
             UnknownDomainError: No such domain.
-            ConflictError: Too many jobs wait, or the service is shutting down.
+            IdempotencyKeyReusedError: The job of that id was asked for something else.
+            TooManyJobsError: As many jobs wait as may.
+            UnavailableError: The service is shutting down.
         """
-        if self._closing.is_set():
-            raise ConflictError("the service is shutting down and takes no new job")
-        if self._waiting.qsize() >= _MAX_QUEUED:
-            raise ConflictError(f"{_MAX_QUEUED} jobs wait already; try again later", limit=_MAX_QUEUED)
-        kind = REMAP if isinstance(config, RemapConfig) else EXPERIENCE
-        job = self._catalog.create_job(domain, kind, config.as_dict())
-        self._queue(job.job_id)
+        with self._submitting:
+            made = self.made_before(job_id, config)
+            if made is not None:
+                return made
+            if self._closing.is_set():
+                raise UnavailableError("the service is shutting down and takes no new job")
+            if len(self._catalog.waiting_jobs()) >= self._max_waiting:
+                raise TooManyJobsError(
+                    f"{self._max_waiting} jobs wait already, and no more may: cancel one, or wait",
+                    limit="max_jobs",
+                    max_jobs=self._max_waiting,
+                    retry_after_s=_RETRY_AFTER_S,
+                )
+            kind = REMAP if isinstance(config, RemapConfig) else EXPERIENCE
+            job = self._catalog.create_job(domain, kind, config.as_dict(), job_id)
+            self._queue(job.job_id)
+            return job
+
+    def made_before(self, job_id: str | None, config: RemapConfig | ExperienceConfig) -> JobRecord | None:
+        """The job of that id, which an earlier request made; None: there is none.
+
+        Raises:
+            IdempotencyKeyReusedError: It was asked for something else.
+        """
+        if job_id is None:
+            return None
+        try:
+            job = self._catalog.job(job_id)
+        except UnknownJobError:
+            return None
+        if job.config != config.as_dict():
+            raise IdempotencyKeyReusedError("this idempotency key came before with another body: choose a new one")
         return job
 
     def cancel(self, job_id: str) -> JobRecord:

@@ -1,8 +1,10 @@
 """A session's journal and the true positions fed back, as walks that the experience database can learn from."""
 
+import hashlib
+import json
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import asdict, dataclass
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,13 +23,26 @@ EXPERIENCE = "experience"  # the kind of job
 
 @dataclass(frozen=True)
 class ExperienceConfig:
-    """What is to be learnt from: a session whose true positions have been kept."""
+    """What is to be learnt from: a session whose true positions have been kept.
+
+    Attributes:
+        session_id: The session.
+        positions_sha256: Digest of the true positions that came with the request, hexadecimal; they themselves are kept
+            with the session.
+    """
 
     session_id: str
+    positions_sha256: str
+
+    @classmethod
+    def of(cls, session_id: str, positions_m: Sequence[float | None]) -> Self:
+        """Of a request that tells of true positions."""
+        told = json.dumps(list(positions_m)).encode()  # NaN, which is refused later, has a form as well
+        return cls(session_id, hashlib.sha256(told).hexdigest())
 
     def as_dict(self) -> dict[str, Any]:
         """JSON-ready."""
-        return {"session_id": self.session_id}
+        return asdict(self)
 
 
 def keep_true_positions(

@@ -166,4 +166,4 @@ def _checksum(place: _Place, body: bytes) -> int:
 
 
 def _damaged(why: str) -> DamagedFileError:
-    return DamagedFileError(f"the traverse is damaged: {why}; delete it and upload it again")
+    return DamagedFileError(f"it is damaged: {why}; delete it and upload it again")

@@ -11,11 +11,11 @@ from deepsimbad.store.records import JobRecord
 class JobCatalog(CatalogFile):
     """The jobs of all domains."""
 
-    def create_job(self, domain: str, kind: str, config: dict[str, Any]) -> JobRecord:
-        """Note a queued job of this process; raises UnknownDomainError."""
+    def create_job(self, domain: str, kind: str, config: dict[str, Any], job_id: str | None = None) -> JobRecord:
+        """Note a queued job of this process, under an id that no job has or a new one; raises UnknownDomainError."""
         with self._writing() as db:
             domain_table.get(db, domain)
-            return job_table.insert(db, domain, kind, config, self._owner.token())
+            return job_table.insert(db, domain, kind, config, self._owner.token(), job_id)
 
     def update_job(self, job_id: str, **fields: Any) -> JobRecord:
         """Change state, stage, progress, eta_s, result or error of a job; one that has ended stays as it is.

@@ -42,9 +42,11 @@ def _record(row: tuple[Any, ...]) -> JobRecord:
     )
 
 
-def insert(db: Database, domain: str, kind: str, config: dict[str, Any], owner: str) -> JobRecord:
-    """Insert a queued job."""
-    job_id = secrets.token_hex(16)
+def insert(
+    db: Database, domain: str, kind: str, config: dict[str, Any], owner: str, job_id: str | None = None
+) -> JobRecord:
+    """Insert a queued job under an id that no job has; None: a new one."""
+    job_id = job_id or secrets.token_hex(16)
     db.execute(
         """
         INSERT INTO job (job_id, domain, kind, config, state, owner, created_at)

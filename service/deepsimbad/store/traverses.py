@@ -83,8 +83,8 @@ class Traverse(OpenFile):
         path = layout.traverse_path(data_dir, domain, name)
         if not path.is_file():
             raise UnknownTraverseError(f"domain {domain} has no traverse {name}", known=cls.list(data_dir, domain)[:20])
-        check_log(path)
-        with storage_faults(path), ExitStack() as on_error:
+        with _named(name), storage_faults(path), ExitStack() as on_error:
+            check_log(path)
             db = open_database(path)
             on_error.callback(db.close)
             if not db.table_names():
@@ -124,8 +124,13 @@ class Traverse(OpenFile):
             return sorted(path.stem for path in folder.iterdir() if path.suffix == ".sqlite")
 
     @contextmanager
+    def _reading(self) -> Iterator[Database]:
+        with _named(self.name), super()._reading() as db:
+            yield db
+
+    @contextmanager
     def _writing(self) -> Iterator[Database]:
-        with self._lock, storage_faults(self._path), write_transaction(self._db) as db:
+        with _named(self.name), self._lock, storage_faults(self._path), write_transaction(self._db) as db:
             # Deletion holds the same write lock: a frame is never acknowledged into a file that is gone.
             if not self._path.exists() or self._path.stat().st_ino != self._inode:
                 raise UnknownTraverseError(f"traverse {self.name} was deleted")
@@ -224,6 +229,15 @@ def remove_leftovers(data_dir: Path, domain: str) -> list[str]:
                 path.unlink(missing_ok=True)
                 removed.append(path.name)
     return removed
+
+
+@contextmanager
+def _named(name: str) -> Iterator[None]:
+    """Say of damage which traverse it is in: whoever learns of it, in a job's row perhaps, knows no file's name."""
+    try:
+        yield
+    except DamagedFileError as error:
+        raise DamagedFileError(f"traverse {name}: {error.message}", **{**error.hints, "traverse": name}) from error
 
 
 @contextmanager

@@ -4,6 +4,7 @@ import asyncio
 from collections.abc import Callable, Sequence
 from datetime import UTC, datetime, timedelta
 from email.utils import format_datetime
+from typing import Any
 
 import httpx2
 import pytest
@@ -113,27 +114,56 @@ def test_other_answers_are_the_last_word(outcome: int) -> None:
 
 
 @pytest.mark.parametrize("failure", [httpx2.ReadTimeout, httpx2.ReadError, httpx2.RemoteProtocolError])
-def test_a_remap_that_may_have_been_taken_is_not_sent_again(failure: type[httpx2.TransportError]) -> None:
+def test_a_switch_that_may_have_been_made_is_not_sent_again(failure: type[httpx2.TransportError]) -> None:
     script = Script(failure)
     with pytest.raises(errors.TransportError):
-        script.client().admin.remap("d", training_traverse="t")
+        script.client().admin.activate("d", 2, expected=1)
     assert len(script.requests) == 1
 
 
 @pytest.mark.parametrize("status", [502, 504])
-def test_a_remap_behind_a_failing_proxy_is_not_sent_again(status: int) -> None:
+def test_a_switch_behind_a_failing_proxy_is_not_sent_again(status: int) -> None:
     script = Script(answer(status))
     with pytest.raises(errors.ServerError):
-        script.client().admin.remap("d", training_traverse="t")
+        script.client().admin.activate("d", 2, expected=1)
     assert len(script.requests) == 1
 
 
 @pytest.mark.parametrize(
     "refusal", [lambda: httpx2.ConnectError, lambda: answer(503), lambda: answer(429), lambda: answer(408)]
 )
-def test_a_remap_that_was_surely_not_taken_is_sent_again(refusal: Callable[[], Outcome]) -> None:
-    script = Script(refusal(), answer(202, JOB))
-    assert script.client().admin.remap("d", training_traverse="t").job_id == "1"
+def test_a_switch_that_was_surely_not_made_is_sent_again(refusal: Callable[[], Outcome]) -> None:
+    script = Script(refusal(), answer(200, {"version": 2}))
+    assert script.client().admin.activate("d", 2, expected=1).version == 2
+
+
+@pytest.mark.parametrize(
+    "ask",
+    [
+        lambda client: client.admin.remap("d", training_traverse="t"),
+        lambda client: client.admin.feed_experience("d", "s", [1.0, None]),
+    ],
+    ids=["remap", "experience"],
+)
+@pytest.mark.parametrize("outcome", RETRIED)
+def test_a_job_is_asked_for_until_it_is_known_under_one_key(
+    ask: Callable[[Client], Any], outcome: Callable[[], Outcome]
+) -> None:
+    script = Script(outcome(), outcome(), answer(202, JOB), answer(202, JOB))
+    client = script.client()
+    assert ask(client).job_id == ask(client).job_id == "1"
+    keys = [request.headers["idempotency-key"] for request in script.requests]
+    assert keys[:2] == keys[1:3]
+    assert keys[2] != keys[3], "another call is another job"
+    assert len({request.content for request in script.requests}) == 1
+
+
+def test_a_job_may_be_named_by_who_asks_for_it() -> None:
+    script = Script(answer(202, JOB), answer(202, JOB))
+    script.client().admin.remap("d", idempotency_key="mine", training_traverse="t")
+    script.client().admin.feed_experience("d", "s", [1.0], idempotency_key="mine too")
+    assert [request.headers["idempotency-key"] for request in script.requests] == ["mine", "mine too"]
+    assert b"mine" not in script.requests[0].content
 
 
 def test_the_last_failure_is_raised_after_the_last_try() -> None:

@@ -199,15 +199,56 @@ def test_the_bar_shows_what_happens(monkeypatch: pytest.MonkeyPatch) -> None:
     shown = Console(file=io.StringIO(), force_terminal=True, width=100)
     monkeypatch.setattr(console, "REMARKS", shown)
     with console.JobBar("mapping d") as bar:
-        for state in (job("running", 0.7, stage="train_planner"), job("queued"), job("running", 0.4, stage="rank")):
+        for state in (
+            job("running"),
+            job("running", 0.7, stage="train_planner", eta_s=3723.4),
+            job("queued"),
+            job("running", 0.4, stage="rank"),
+        ):
             bar(Job.model_validate(state))
             bar._progress.refresh()
         bar.silent(12.4)
         bar._progress.refresh()
     printed = shown.file.getvalue()  # type: ignore[attr-defined]
-    for words in ("train planner", "70 %", "waiting for its turn", "rank", "40 %", "no answer for 12 s, still trying"):
+    for words in (
+        "beginning",
+        "train planner",
+        "70 %",
+        "1:02:03",
+        "waiting for its turn",
+        "rank",
+        "40 %",
+        "no answer for 12 s, still trying",
+    ):
         assert words in printed
 
 
 def test_without_a_terminal_nobody_is_asked() -> None:
     assert job_commands._answer("?") is False
+
+
+@pytest.mark.parametrize(
+    ("state", "told"),
+    [
+        ("running", "job 7 is being cancelled; see how it ends with: deepsimbad-client jobs 7 --follow"),
+        ("cancelled", "job 7 is cancelled"),
+        ("succeeded", "job 7 had ended before it could be cancelled"),
+    ],
+)
+def test_a_cancel_says_what_came_of_it(
+    state: str, told: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked: list[str] = []
+
+    def respond(request: httpx2.Request) -> httpx2.Response:
+        asked.append(request.method)
+        return httpx2.Response(204) if request.method == "DELETE" else httpx2.Response(200, json=job(state))
+
+    monkeypatch.setattr(
+        job_commands, "Client", lambda url, key: Client(url, key, transport=httpx2.MockTransport(respond))
+    )
+    assert run(["jobs", "7", "--cancel", "--json", "--server", "http://service"]) == 0
+    shown = capsys.readouterr()
+    assert asked == ["DELETE", "GET"]
+    assert shown.err == f"{told}\n"
+    assert json.loads(shown.out)["state"] == state

@@ -5,11 +5,13 @@ from fastapi import APIRouter, Request, Response
 
 from deepsimbad.api.bodies import RemapBody, declare_json, read_json
 from deepsimbad.api.dependencies import DomainName, Running
+from deepsimbad.api.idempotency import KeyOfJob, id_under_key
 from deepsimbad.api.openapi import problems
 from deepsimbad.api.rendering import render_job
 from deepsimbad.api.schemas import JobAnswer
 from deepsimbad.errors import NoActiveMapError
 from deepsimbad.jobs.known_frames import refuse_known_traverse
+from deepsimbad.jobs.perform import REMAP
 from deepsimbad.store.traverses import Traverse
 
 router = APIRouter(prefix="/v1/admin/domains", tags=["admin: maps"])
@@ -20,11 +22,13 @@ router = APIRouter(prefix="/v1/admin/domains", tags=["admin: maps"])
     status_code=202,
     responses={
         202: {"headers": {"Location": {"description": "The job.", "schema": {"type": "string"}}}},
-        **problems(404, 409, 413, 415, 422),
+        **problems(404, 409, 413, 415, 422, 429),
     },
     openapi_extra=declare_json(RemapBody),
 )
-async def post_remap(domain: DomainName, request: Request, response: Response, running: Running) -> JobAnswer:
+async def post_remap(
+    domain: DomainName, request: Request, response: Response, running: Running, idempotency_key: KeyOfJob = None
+) -> JobAnswer:
     """Build the next map of a domain as a job; what serves stays until the new map is sealed.
 
     Without `landmark_traverse` the active map's landmarks stay, which is the cheap way to retrain; with `append` its
@@ -33,8 +37,12 @@ async def post_remap(domain: DomainName, request: Request, response: Response, r
     """
     body = await read_json(request, RemapBody)
     config = body.config()
+    job_id = id_under_key(request, REMAP, domain, idempotency_key)
 
     def submit() -> JobAnswer:
+        made = running.runner.made_before(job_id, config)
+        if made is not None:
+            return render_job(made)
         record = running.catalog.domain(domain)
         for name in (config.training_traverse, config.landmark_traverse, config.check_traverse):
             if name is not None:
@@ -49,7 +57,7 @@ async def post_remap(domain: DomainName, request: Request, response: Response, r
         if config.append and record.active_version is not None:
             active = running.catalog.map(domain, record.active_version)
             refuse_known_traverse(active.config, active.version, config.training_traverse)
-        return render_job(running.runner.submit(domain, config))
+        return render_job(running.runner.submit(domain, config, job_id))
 
     job = await run_sync(submit)
     response.headers["Location"] = f"/v1/admin/jobs/{job.job_id}"

@@ -4,7 +4,6 @@ import hashlib
 from typing import Annotated
 
 from fastapi import APIRouter, Header, Query, Request, Response
-from pydantic import Field
 
 from deepsimbad.api.bodies import (
     GREATEST_ID,
@@ -18,6 +17,7 @@ from deepsimbad.api.bodies import (
     read_json,
 )
 from deepsimbad.api.dependencies import DomainName, Running, SessionId
+from deepsimbad.api.idempotency import KEY_HEADER, KeyWord, id_under_key
 from deepsimbad.api.openapi import binary, problems
 from deepsimbad.api.rendering import render_belief, render_plan
 from deepsimbad.api.routes.localizations import OBSERVATION_TYPES, npy_response, prefers_binary, view_in
@@ -41,20 +41,17 @@ Shortlist = Annotated[
         description="Length of `retrieval` and `top`, up to the number of map images; absent: 10 or all.",
     ),
 ]
-_KEY_PATTERN = r"^[\x21-\x7e]{1,255}$"
 Key = Annotated[
-    Annotated[str, Field(pattern=_KEY_PATTERN)] | None,
+    KeyWord | None,
     Header(
-        alias="Idempotency-Key",
+        alias=KEY_HEADER,
         description="The same key with the same observation again counts once, and has the same answer.",
     ),
 ]
-
-
 KeyOfSession = Annotated[
-    Annotated[str, Field(pattern=_KEY_PATTERN)] | None,
+    KeyWord | None,
     Header(
-        alias="Idempotency-Key",
+        alias=KEY_HEADER,
         description="The same key with the same body again begins no second session: the first one is answered, as it "
         "stands. Choose one that nobody else will, such as a UUID.",
     ),
@@ -77,12 +74,7 @@ async def post_session(
     """Begin a session on the domain's active map, which it keeps whatever is activated later."""
     active = await running.active(domain)
     config = (await read_json(request, SessionBody)).config()
-    session_id = None
-    if idempotency_key is not None:
-        # The id follows from the key, so that a repetition finds the session after a restart too. Whoever holds another
-        # API key has other sessions, though the words they choose be the same.
-        asker = getattr(request.state, "key_id", "")
-        session_id = hashlib.sha256(f"session\n{asker}\n{domain}\n{idempotency_key}".encode()).hexdigest()[:32]
+    session_id = id_under_key(request, "session", domain, idempotency_key)
     view = await running.sessions.begin(active, config, session_id)
     body = render_session(view).model_dump_json()
     return Response(body, 201, {"Location": f"/v1/sessions/{view.session_id}"}, JSON)
