@@ -2,12 +2,15 @@
 
 import asyncio
 import threading
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
 from dataclasses import replace
 from time import perf_counter
 from typing import Any
 
 import pytest
 
+from deepsimbad.engine.observation import View
 from deepsimbad.engine.session_config import SessionConfig
 from deepsimbad.engine.stopwatch import Stopwatch
 from deepsimbad.store.catalog import Catalog
@@ -40,8 +43,10 @@ async def held(let_go: threading.Event | asyncio.Event) -> float:
     return held_ms
 
 
-async def until(look: Any) -> None:
+async def until(look: Callable[[], Any], posted: asyncio.Task[Any] | None = None) -> None:
+    """Wait for something that happens while an observation is on its way."""
     while not look():
+        assert posted is None or not posted.done(), posted
         await asyncio.sleep(0.001)
 
 
@@ -64,7 +69,7 @@ def test_a_busy_worker_shows_as_waiting(mapped: Catalog) -> None:
         live.worker.submit(lambda: (begins.set(), let_go.wait(60)))
         await until(begins.is_set)
         posted = asyncio.create_task(live.sessions.observe(session_id, ranked(1), watch))
-        await until(lambda: live.worker.n_waiting)
+        await until(lambda: live.worker.n_waiting, posted)
         held_ms = await held(let_go)
         await posted
         return watch.timings_ms(), held_ms
@@ -78,13 +83,15 @@ def test_a_view_before_this_one_shows_as_waiting_and_a_slow_image_as_decoding(ma
         session_id, before, behind = await begun(live), Stopwatch(), Stopwatch()
         begins, let_go, slow = asyncio.Event(), asyncio.Event(), ranked(1)
 
-        async def late() -> Any:
+        @asynccontextmanager
+        async def late() -> AsyncIterator[View]:
             begins.set()
             await let_go.wait()
-            return await slow.view()
+            async with slow.view() as view:
+                yield view
 
         first = asyncio.create_task(live.sessions.observe(session_id, replace(slow, view=late), before))
-        await begins.wait()
+        await until(begins.is_set, first)
         second = asyncio.create_task(live.sessions.observe(session_id, ranked(2), behind))
         await asyncio.sleep(0)
         held_ms = await held(let_go)
@@ -101,7 +108,7 @@ def test_a_slow_disk_shows_as_committing(mapped: Catalog) -> None:
         session_id, watch, let_go = await begun(live), Stopwatch(), threading.Event()
         live.store._commits.submit(lambda db: let_go.wait(60))
         posted = asyncio.create_task(live.sessions.observe(session_id, ranked(1), watch))
-        await until(lambda: "plan" in watch.timings_ms())
+        await until(lambda: "plan" in watch.timings_ms(), posted)
         held_ms = await held(let_go)
         await posted
         return watch.timings_ms(), held_ms
