@@ -74,6 +74,30 @@ def test_a_prior_in_between_begins_another_walk(service: TestClient) -> None:
     assert metrics["experience"]["n_walks"] == 2
 
 
+def test_a_session_whose_map_was_removed(service: TestClient) -> None:
+    session_id, positions_m = walked(service, 3)
+    service.delete(f"/v1/sessions/{session_id}")
+    remap(service, "ready", training_traverse="drive", landmark_traverse="drive", n_landmarks=N_LANDMARKS)
+    assert service.delete("/v1/admin/domains/ready/maps/1").status_code == 204
+    refused(service, 410, "retired_map", session_id=session_id, true_positions_m=positions_m)
+
+
+def test_a_session_of_a_domain_that_was_deleted_and_made_anew(service: TestClient) -> None:
+    session_id, positions_m = walked(service, 3)
+    assert service.delete("/v1/admin/domains/ready").status_code == 204
+    make_ready_domain(service, "ready", actions_m=[4.0])
+    refused(service, 410, "retired_map", session_id=session_id, true_positions_m=positions_m)
+
+
+def test_a_map_that_cannot_be_read_is_named_by_its_number(service: TestClient, tmp_path: Path) -> None:
+    session_id, positions_m = walked(service, 3)
+    remap(service, "ready", training_traverse="drive", landmark_traverse="drive", n_landmarks=N_LANDMARKS)
+    (tmp_path / "domains/ready/maps/000001.sqlite").unlink()
+    answer = service.post(PATH, json={"session_id": session_id, "true_positions_m": positions_m})
+    assert (answer.status_code, answer.json()["code"]) == (503, "damaged_map")
+    assert ".sqlite" not in answer.text
+
+
 def test_what_cannot_be_learnt_from(service: TestClient) -> None:
     session_id, positions_m = walked(service, 3)
     refused(service, 404, "unknown_session", session_id="0" * 32, true_positions_m=positions_m)

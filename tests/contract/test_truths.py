@@ -10,6 +10,7 @@ import pytest
 from starlette.testclient import TestClient
 
 from deepsimbad.api.app import create_app
+from deepsimbad.errors import UnavailableError
 from deepsimbad.jobs.perform import InThisProcess
 
 from .conftest import N_READY, make_ready_domain, ready_encodings, remap, small_settings, wait_for
@@ -91,6 +92,14 @@ def test_an_observation_is_counted_once(service: TestClient) -> None:
     assert service.get(f"/v1/sessions/{session_id}").json()["n_observations"] == 6, "telling moves nothing"
 
 
+def test_a_truth_that_is_unknown_for_once_stays_told(service: TestClient) -> None:
+    session_id, positions_m, _ = walked(service)
+    told(service, session_id, positions_m)
+    told(service, session_id, [None] * 5)
+    told(service, session_id, positions_m)
+    assert counted(service)[0] == 5
+
+
 def test_experience_counts_as_well_and_the_same_positions_only_once(service: TestClient) -> None:
     session_id, positions_m, shares = walked(service)
     service.delete(f"/v1/sessions/{session_id}")
@@ -99,6 +108,22 @@ def test_experience_counts_as_well_and_the_same_positions_only_once(service: Tes
     assert counted(service) == (5, pytest.approx(100 * sum(shares)))
     told(service, session_id, positions_m)
     service.post("/v1/admin/domains/ready/experience", json=body)
+    assert counted(service)[0] == 5
+    assert wait_for(service, job["job_id"])["state"] == "succeeded"
+
+
+def test_experience_that_is_refused_counts_once_as_well(service: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
+    session_id, positions_m, _ = walked(service)
+    body = {"session_id": session_id, "true_positions_m": positions_m}
+
+    def refuse(*_: object) -> None:
+        raise UnavailableError("no job is taken now")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(service.app.state.services.runner, "submit", refuse)  # type: ignore[attr-defined]
+        answer = service.post("/v1/admin/domains/ready/experience", json=body)
+    assert (answer.status_code, answer.json()["code"]) == (503, "unavailable")
+    job = service.post("/v1/admin/domains/ready/experience", json=body).json()
     assert counted(service)[0] == 5
     assert wait_for(service, job["job_id"])["state"] == "succeeded"
 

@@ -24,6 +24,11 @@ def test_a_route_of_no_length_has_equal_cells():
     assert Route(np.array([4.0])).length_m == 0.0
 
 
+def test_a_closed_route_that_only_its_gap_makes_too_short_is_refused():
+    with pytest.raises(InvalidRouteError, match="m long"):
+        Route(np.zeros(2), closed=True, x_m=np.array([0.0, 1e-310]), y_m=np.zeros(2))
+
+
 def test_closing_gap_is_taken_from_the_plane():
     square = np.array([[0, 0], [10, 0], [10, 10], [0, 10]], float)
     route = Route(np.array([0.0, 10, 20, 30]), closed=True, x_m=square[:, 0], y_m=square[:, 1])
@@ -44,6 +49,7 @@ def test_offsets_take_the_short_way_round():
         ([0.0, np.nan], "frame 1 is NaN"),
         ([np.inf], "frame 0"),
         ([], "at least one"),
+        ([0.0, 1e-310], "1e-310 m long"),
     ],
 )
 def test_bad_positions_are_named(positions, says):

@@ -66,6 +66,19 @@ def test_deleted_and_made_anew(lending: OpenTraverses, catalog: Catalog) -> None
     lending.close()
 
 
+def test_made_anew_by_another_process_between_two_loans(lending: OpenTraverses, catalog: Catalog) -> None:
+    with lending.lend("d", "t0") as old:
+        old.put_frame(0, ENCODING, 0.0)
+        Traverse.delete(catalog.data_dir, "d", "t0")
+        Traverse.create(catalog.data_dir, "d", "t0").close()
+        with lending.lend("d", "t0") as traverse:
+            assert traverse is not old
+            traverse.put_frame(1, ENCODING, 0.0)
+            assert traverse.n_frames == 1
+    assert [each.traverse for each in lending._open.values()] == [traverse], "the old one is closed"
+    lending.close()
+
+
 def test_many_threads(lending: OpenTraverses) -> None:
     failures = []
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from deepsimbad.core.filters import FilterKind
 from deepsimbad.core.route import Route
-from deepsimbad.engine import truths as truths_module
+from deepsimbad.engine import replay as replay_module
 from deepsimbad.engine.evaluator_pool import EvaluatorPool
 from deepsimbad.engine.live_session import Observation
 from deepsimbad.engine.pinned_maps import PinnedMaps
@@ -103,6 +103,9 @@ def test_truths_are_kept_and_what_was_told_before_is_answered(mapped: Catalog) -
         np.testing.assert_array_equal(kept, [1.0, 1.5, 2.0, NAN, 3.0])
         none, _ = await truths.keep(session_id, [None] * 5)
         assert (none.n_scored, none.n_left_out, none.anr) == (0, 5, None)
+        await truths.keep(session_id, [None, 1.25, None, None, None])
+        kept = live.store.true_positions(live.store.find(session_id).number)
+        np.testing.assert_array_equal(kept, [1.0, 1.25, 2.0, NAN, 3.0])
 
     run(mapped, body)
 
@@ -156,7 +159,7 @@ def test_a_session_whose_map_is_no_more_cannot_be_replayed(mapped: Catalog) -> N
 
 def test_a_live_view_goes_before_the_rest_of_a_replay(mapped: Catalog, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whoever comes while a session is replayed waits for a piece of it, not for all."""
-    monkeypatch.setattr(truths_module, "_PIECE_S", 0.0)
+    monkeypatch.setattr(replay_module, "_PIECE_S", 0.0)
 
     async def body(live: Live) -> None:
         session_id, _ = await driven(live, [ranked(seed, 0.1) for seed in range(9)])

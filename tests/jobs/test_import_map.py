@@ -23,6 +23,7 @@ from deepsimbad.errors import (
     InvalidInputError,
     NoActiveMapError,
     RetiredMapError,
+    UnavailableError,
     UnknownMapVersionError,
 )
 from deepsimbad.jobs.import_map import import_map
@@ -33,6 +34,7 @@ from deepsimbad.store.map_file import write_map
 from deepsimbad.store.map_table import ANY
 from deepsimbad.store.records import MapState
 from deepsimbad.store.sealing import seal
+from deepsimbad.store.traverses import Traverse
 
 EVALUATOR = {"kind": "feature_l2", "extractor": "none"}
 ACTIONS_M = (1.0, 2.0)
@@ -191,6 +193,22 @@ def test_a_map_of_an_evaluator_that_is_not_here_is_refused(there: Catalog, here:
     with pytest.raises(InvalidInputError, match="a domain is named by"):
         import_map(here, tmp_path / "campus.map", "../elsewhere")
     assert here.domains() == []
+
+
+@pytest.mark.parametrize("is_used", [False, True])
+def test_an_import_that_fails_leaves_what_others_began_in_its_domain(
+    exported: Path, here: Catalog, monkeypatch: pytest.MonkeyPatch, is_used: bool
+) -> None:
+    def fail(*_: object) -> int:
+        if is_used:
+            Traverse.create(here.data_dir, "campus", "mine").close()
+        raise UnavailableError("no space is left")
+
+    monkeypatch.setattr("deepsimbad.jobs.import_map.adopt", fail)
+    with pytest.raises(UnavailableError):
+        import_map(here, exported)
+    assert [record.name for record in here.domains()] == (["campus"] if is_used else [])
+    assert Traverse.list(here.data_dir, "campus") == (["mine"] if is_used else [])
 
 
 KILLED = """

@@ -6,6 +6,7 @@ from typing import Any
 import pytest
 
 from deepsimbad.errors import DamagedFileError
+from deepsimbad.store import job_table
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.records import JobState
 
@@ -61,6 +62,25 @@ def test_the_last_remap_of_a_domain(catalog: Catalog, state: JobState, told: Any
     (found,) = catalog.census().remaps
     assert (found.domain, found.outcome) == ("a", outcome)
     assert found.finished_at > 1.7e9
+
+
+def test_the_last_remap_with_the_clock_set_back(catalog: Catalog, monkeypatch: pytest.MonkeyPatch) -> None:
+    add_job(catalog, "a", JobState.SUCCEEDED, result=result(passed=True, active=True))
+    monkeypatch.setattr(job_table, "now", lambda: "2020-01-01T00:00:00.000Z")
+    add_job(catalog, "a", JobState.FAILED)
+    (found,) = catalog.census().remaps
+    assert found.outcome == "failed"
+
+
+def test_what_was_cancelled_while_it_waited_is_no_last_remap(catalog: Catalog) -> None:
+    running, waiting = (catalog.create_job("a", "remap", {}).job_id for _ in range(2))
+    catalog.start_job(running)
+    catalog.cancel_queued_job(waiting)
+    (found,) = catalog.census().remaps
+    assert found.outcome == "cancelled", "there is no other"
+    catalog.update_job(running, state=JobState.FAILED)
+    (found,) = catalog.census().remaps
+    assert found.outcome == "failed"
 
 
 def test_a_row_that_cannot_be_read_is_damage(catalog: Catalog) -> None:

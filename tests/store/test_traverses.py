@@ -22,7 +22,7 @@ from deepsimbad.errors import (
     UnknownTraverseError,
 )
 from deepsimbad.store.catalog import Catalog
-from deepsimbad.store.frames import TraverseFrames
+from deepsimbad.store.frames import MAX_POSITION_M, TraverseFrames
 from deepsimbad.store.traverses import Traverse
 
 MakeFrames = Callable[..., TraverseFrames]
@@ -73,7 +73,7 @@ def test_frames_come_back_exactly_and_in_index_order(
     frames = replace(
         frames,
         timestamp_us=np.array([1, -1, 2**60, 0]),
-        x_m=np.array([np.nan, -0.0, 1e-300, 1e300]),
+        x_m=np.array([np.nan, -0.0, 1e-300, -MAX_POSITION_M]),
         position_m=np.array([-0.0, -3.25, 1e-9, 1 / 3]),
     )
     assert summer.put_frames(frames) == (4, 0)

@@ -54,7 +54,8 @@ class TruthsBody(JsonBody):
         Field(
             min_length=1,
             max_length=MAX_OBSERVATIONS_FED_BACK,
-            description="One route position for every observation of the session; null where it is unknown.",
+            description="One route position for every observation of the session; null where it is unknown, which "
+            "takes back nothing told before.",
         ),
         FailFast(),
     ]

@@ -8,6 +8,8 @@ from numpy.typing import NDArray
 
 from deepsimbad.errors import InvalidRouteError
 
+_LEAST_LENGTH_M = 1e-9  # counted in steps that are far shorter, moves would overflow
+
 
 @dataclass(frozen=True)
 class Places:
@@ -52,6 +54,10 @@ class Route:
                 f"route position goes backwards at frame {first}: {self.position_m[first - 1]:.3f} m then "
                 f"{self.position_m[first]:.3f} m",
                 frame=first,
+            )
+        if 0 < self.length_m < _LEAST_LENGTH_M:
+            raise InvalidRouteError(
+                f"the route is {self.length_m:g} m long: {_LEAST_LENGTH_M:g} m is the least above 0"
             )
         for array in (self.position_m, self.x_m, self.y_m):
             if array is not None:

@@ -64,6 +64,9 @@ class OpenTraverses:
     def _take(self, domain: str, name: str) -> _Open:
         key = (domain, name)
         with self._lock:
+            known = self._open.get(key)
+            if known is not None and known.traverse.is_deleted:  # by another process, which may have made it anew
+                self._let_go(key, known)
             if key not in self._open:
                 self._open[key] = _Open(Traverse.open(self._data_dir, domain, name))
             self._open.move_to_end(key)
@@ -82,9 +85,12 @@ class OpenTraverses:
 
     def _doom(self, key: tuple[str, str], lent: _Open) -> None:
         with self._lock:
-            if self._open.get(key) is lent:
-                del self._open[key]
-            if not lent.is_doomed:
-                lent.is_doomed = True
-                if lent.n_users == 0:
-                    lent.traverse.close()
+            self._let_go(key, lent)
+
+    def _let_go(self, key: tuple[str, str], lent: _Open) -> None:
+        if self._open.get(key) is lent:
+            del self._open[key]
+        if not lent.is_doomed:
+            lent.is_doomed = True
+            if lent.n_users == 0:
+                lent.traverse.close()

@@ -61,7 +61,7 @@ def import_map(
     except BaseException:
         if is_new:
             with suppress(DeepSimbadError):  # the first error is the one to tell
-                catalog.delete_domain(name)
+                catalog.delete_domain(name, only_empty=True)  # somebody may have begun to use it meanwhile
         raise
     if activate:
         record = catalog.activate(name, record.version, ANY)

@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Self
 
@@ -11,8 +11,17 @@ from numpy.typing import NDArray
 
 from deepsimbad.core.known_walk import KnownWalk
 from deepsimbad.core.relevance import Query
+from deepsimbad.engine.active_maps import unreadable
+from deepsimbad.engine.pinned_maps import retired
 from deepsimbad.engine.truths import checked_truths
-from deepsimbad.errors import ConflictError, InvalidInputError, NoActiveMapError, UnknownSessionError
+from deepsimbad.errors import (
+    ConflictError,
+    DamagedMapError,
+    InvalidInputError,
+    NoActiveMapError,
+    UnknownMapVersionError,
+    UnknownSessionError,
+)
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.map_file import read_map
 from deepsimbad.store.session_records import ObservedRow, SessionRecord
@@ -71,6 +80,7 @@ def keep_true_positions(
         NoActiveMapError: There is no map that could learn.
         InvalidInputError: As many positions as observations there are not, or one is not finite.
         ConflictError: The session was begun on a map of other landmarks than the one that serves.
+        RetiredMapError, DamagedMapError: Its map is no more, or cannot be read.
     """
     active = catalog.domain(domain).active_version
     record = _session_of(store, domain, session_id)
@@ -88,6 +98,7 @@ def walks_of(store: SessionStore, catalog: Catalog, domain: str, session_id: str
         UnknownDomainError, UnknownSessionError: There is none such, or the session ended long ago.
         InvalidInputError: Its true positions were never fed back.
         ConflictError: It was begun on a map of other landmarks than the one that serves.
+        RetiredMapError, DamagedMapError: Its map is no more, or cannot be read.
     """
     record = _session_of(store, domain, session_id)
     known = store.true_positions(record.number)
@@ -121,14 +132,25 @@ def _session_of(store: SessionStore, domain: str, session_id: str) -> SessionRec
 
 def _check_landmarks(catalog: Catalog, record: SessionRecord, active: int | None) -> None:
     """What a session kept are ranks of its own map's landmarks; another map's cannot be compared with them."""
+    try:
+        digest = catalog.map(record.domain, record.map_version).sha256
+    except UnknownMapVersionError as error:
+        raise retired(record.domain, record.map_version) from error
+    if digest != record.map_sha256:  # the domain was deleted since and made anew
+        raise retired(record.domain, record.map_version)
     if active is None or record.map_version == active:
         return
-    ours, theirs = (
-        read_map(catalog.map_path(record.domain, version)).landmark_model for version in (record.map_version, active)
-    )
+    ours, theirs = (_landmarks(catalog, record.domain, version) for version in (record.map_version, active))
     if ours.keys() != theirs.keys() or not all(np.array_equal(ours[name], theirs[name]) for name in ours):
         raise ConflictError(
             f"session {record.session_id} was begun on map {record.map_version}; map {active}, which serves, has other "
             "landmarks and cannot learn from it",
             map_version=active,
         )
+
+
+def _landmarks(catalog: Catalog, domain: str, version: int) -> Mapping[str, NDArray[Any]]:
+    try:
+        return read_map(catalog.map_path(domain, version)).landmark_model
+    except DamagedMapError as error:  # perhaps because its file was removed
+        raise unreadable(catalog, domain, version) from error

@@ -59,13 +59,15 @@ def take(db: Database) -> Census:
 def _take(db: Database) -> Census:
     counted = dict(db.execute("SELECT state, count(*) FROM job GROUP BY state"))
     serving = db.execute("SELECT domain, version, created_at FROM map WHERE state = 'active' ORDER BY domain")
-    # Of a query with one max(), SQLite takes the other columns from the row that has it.
+    # Of a query with one max(), SQLite takes the other columns from the row that has it. Remaps are done one after the
+    # other as they came, so the last row ended last, whatever the clock was set to; one that was cancelled while it
+    # waited, out of that order, tells of nothing that was done and counts only beside others such.
     remaps = db.execute(
         """
         SELECT domain,
                CASE WHEN state = 'succeeded' AND json_extract(result, '$.metrics.check.passed') = 0
                     THEN ? ELSE state END,
-               finished_at, max(finished_at || printf('#%016d', rowid))
+               finished_at, max(((n_starts > 0) << 62) | rowid)
         FROM job WHERE kind = 'remap' AND finished_at IS NOT NULL GROUP BY domain ORDER BY domain
         """,
         [GATE_LOST],

@@ -9,6 +9,7 @@ from deepsimbad.errors import InvalidEncodingError, InvalidInputError, InvalidRo
 
 UNKNOWN_TIMESTAMP = -1
 MAX_FRAME_INDEX = 2**53
+MAX_POSITION_M = 1e9  # either way; 25 times round the earth, and squares and spans are far from overflow
 _ROWS_AT_ONCE = 1024
 
 
@@ -18,10 +19,10 @@ class TraverseFrames:
 
     Attributes:
         index: Place in the whole recording, [n] int64, distinct, from 0.
-        position_m: Route position, [n] float64, finite; need not increase here.
+        position_m: Route position, [n] float64, at most MAX_POSITION_M either way; need not increase here.
         timestamp_us: [n] int64, microseconds, -1 where unknown.
-        x_m: East, [n] float64, NaN where unknown.
-        y_m: North, [n] float64, NaN where unknown.
+        x_m: East, [n] float64, at most MAX_POSITION_M either way, NaN where unknown.
+        y_m: North, likewise.
         encodings: [n, d] float32, finite.
     """
 
@@ -41,8 +42,8 @@ class TraverseFrames:
         """The same frames with exact dtypes, fit to be stored.
 
         Raises:
-            InvalidInputError: Shapes differ, an index is out of range or there twice, a place is infinite.
-            InvalidRouteError: A position is NaN or infinite.
+            InvalidInputError: Shapes differ, an index is out of range or there twice, a place is too far away.
+            InvalidRouteError: A position is NaN or too far away.
             InvalidEncodingError: An encoding is empty or not finite.
         """
         encodings = np.asarray(self.encodings, np.float32)
@@ -74,16 +75,26 @@ class TraverseFrames:
         bad = ~np.isfinite(self.position_m)
         if bad.any():
             raise InvalidRouteError(f"position_m of frame {self.index[bad][0]} is not a finite number")
+        _check_near("position_m", self.position_m, self.index, InvalidRouteError)
         if (self.timestamp_us < UNKNOWN_TIMESTAMP).any():
             raise InvalidInputError("timestamp_us counts from 0; -1 stands for unknown")
         for name, values_m in (("x_m", self.x_m), ("y_m", self.y_m)):
             if np.isinf(values_m).any():
                 raise InvalidInputError(f"{name} is infinite; NaN stands for unknown")
+            _check_near(name, values_m, self.index, InvalidInputError)
         for start in range(0, self.n_frames, _ROWS_AT_ONCE):  # no mask as large as the batch
             finite = np.isfinite(self.encodings[start : start + _ROWS_AT_ONCE]).all(axis=1)
             if not finite.all():
                 frame = self.index[start + int(np.argmin(finite))]
                 raise InvalidEncodingError(f"the encoding of frame {frame} holds NaN or infinity")
+
+
+def _check_near(
+    name: str, values_m: NDArray[np.float64], index: NDArray[np.int64], error: type[InvalidInputError]
+) -> None:
+    far = np.abs(values_m) > MAX_POSITION_M  # not NaN
+    if far.any():
+        raise error(f"{name} of frame {index[far][0]} is {values_m[far][0]:g} m: {MAX_POSITION_M:g} m is the most")
 
 
 def _integers(values: NDArray[np.int64], name: str) -> NDArray[np.int64]:

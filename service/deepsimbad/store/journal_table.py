@@ -111,12 +111,24 @@ def _snapshot(rows: tuple[Any, ...]) -> StateSnapshot:
     return StateSnapshot(rows[0][1], arrays)
 
 
-def save_true_positions(db: Database, session: int, position_m: NDArray[np.float64], received_at: float) -> None:
-    """Keep where the robot truly was at every observation of a session; the same again replaces it."""
+def save_true_positions(
+    db: Database, session: int, position_m: NDArray[np.float64], received_at: float
+) -> NDArray[np.float64] | None:
+    """Keep where the robot truly was at every observation of a session; returns what was kept before, if anything.
+
+    A position replaces an earlier one of its observation; NaN, unknown now, leaves what was told.
+    """
+    before = true_positions(db, session)
+    kept = position_m
+    if before is not None:
+        kept = position_m.copy()
+        told = kept[: before.size]
+        np.copyto(told, before[: told.size], where=np.isnan(told))
     db.execute(
         "INSERT OR REPLACE INTO true_positions (session, received_at, position_m) VALUES (?, ?, ?)",
-        [session, received_at, np.ascontiguousarray(position_m, "<f8").tobytes()],
+        [session, received_at, np.ascontiguousarray(kept, "<f8").tobytes()],
     )
+    return before
 
 
 def true_positions(db: Database, session: int) -> NDArray[np.float64] | None:

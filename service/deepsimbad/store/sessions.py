@@ -166,10 +166,13 @@ class SessionStore(OpenFile):
     def history(self, number: int, until: int) -> tuple[StateSnapshot | None, list[JournalRow]]:
         """What makes up the state after a row: the snapshot, if it is from before that row, and the rows since."""
         with self._reading() as db:
-            snapshot = journal_table.read_snapshot(db, number)
-            if snapshot is not None and snapshot.sequence >= until:
-                snapshot = None
+            snapshot = _snapshot_before(db, number, until)
             return snapshot, journal_table.read(db, number, snapshot.sequence if snapshot else 0, until)
+
+    def snapshot_before(self, number: int, until: int) -> StateSnapshot | None:
+        """A session's snapshot, if it is from before a row."""
+        with self._reading() as db:
+            return _snapshot_before(db, number, until)
 
     def journal(self, number: int) -> list[JournalRow]:
         """All that happened to a session, in order."""
@@ -196,16 +199,18 @@ class SessionStore(OpenFile):
     def save_true_positions(
         self, number: int, position_m: NDArray[np.float64], received_at: float
     ) -> Future[NDArray[np.float64] | None]:
-        """Keep where the robot truly was at every observation of a session; answers with what was kept before."""
+        """Keep where the robot truly was at every observation of a session, as far as it is known.
 
-        def write(db: Database) -> NDArray[np.float64] | None:
-            before = journal_table.true_positions(db, number)
-            journal_table.save_true_positions(db, number, position_m, received_at)
-            return before
-
-        return self._commits.submit(write)
+        Answers with what was kept before; NaN, unknown now, leaves it.
+        """
+        return self._commits.submit(lambda db: journal_table.save_true_positions(db, number, position_m, received_at))
 
     def true_positions(self, number: int) -> NDArray[np.float64] | None:
         """What was fed back of a session, one position for every observation."""
         with self._reading() as db:
             return journal_table.true_positions(db, number)
+
+
+def _snapshot_before(db: Database, number: int, until: int) -> StateSnapshot | None:
+    snapshot = journal_table.read_snapshot(db, number)
+    return snapshot if snapshot is not None and snapshot.sequence < until else None

@@ -123,6 +123,15 @@ class Traverse(OpenFile):
                 return []
             return sorted(path.stem for path in folder.iterdir() if path.suffix == ".sqlite")
 
+    @property
+    def is_deleted(self) -> bool:
+        """Whether its file is gone, or another lies in its place."""
+        with storage_faults(self._path):
+            try:
+                return self._path.stat().st_ino != self._inode
+            except FileNotFoundError:
+                return True
+
     @contextmanager
     def _reading(self) -> Iterator[Database]:
         with _named(self.name), super()._reading() as db:
@@ -132,7 +141,7 @@ class Traverse(OpenFile):
     def _writing(self) -> Iterator[Database]:
         with _named(self.name), self._lock, storage_faults(self._path), write_transaction(self._db) as db:
             # Deletion holds the same write lock: a frame is never acknowledged into a file that is gone.
-            if not self._path.exists() or self._path.stat().st_ino != self._inode:
+            if self.is_deleted:
                 raise UnknownTraverseError(f"traverse {self.name} was deleted")
             yield db
 

@@ -31,6 +31,7 @@ from deepsimbad.errors import EmptyBodyError
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.image import MEDIA_TYPES
 from deepsimbad.store.faults import storage_faults
+from deepsimbad.store.frames import MAX_POSITION_M
 
 router = APIRouter(prefix="/v1/admin/domains/{domain}/traverses/{name}/frames", tags=["admin: traverses"])
 
@@ -51,15 +52,23 @@ async def put_frame(
     domain: DomainName,
     name: TraverseName,
     index: Annotated[int, Path(ge=0, le=GREATEST_EXACT_INTEGER, description="Place in the recording, from 0.")],
-    position_m: Annotated[float, Query(allow_inf_nan=False, description="Metres along the route; finite.")],
+    position_m: Annotated[
+        float, Query(ge=-MAX_POSITION_M, le=MAX_POSITION_M, allow_inf_nan=False, description="Metres along the route.")
+    ],
     request: Request,
     response: Response,
     running: Running,
     timestamp_us: Annotated[
         int | None, Query(ge=0, le=GREATEST_EXACT_INTEGER, description="Microseconds since 1970.")
     ] = None,
-    x_m: Annotated[float | None, Query(allow_inf_nan=False, description="East, in metres; finite.")] = None,
-    y_m: Annotated[float | None, Query(allow_inf_nan=False, description="North, in metres; finite.")] = None,
+    x_m: Annotated[
+        float | None,
+        Query(ge=-MAX_POSITION_M, le=MAX_POSITION_M, allow_inf_nan=False, description="East, in metres."),
+    ] = None,
+    y_m: Annotated[
+        float | None,
+        Query(ge=-MAX_POSITION_M, le=MAX_POSITION_M, allow_inf_nan=False, description="North, in metres."),
+    ] = None,
 ) -> FrameAnswer:
     """Store one frame, in any order; the same index again replaces it.
 
@@ -85,7 +94,7 @@ async def put_frame(
 async def _encoded(body: bytes, running: Services, media_type: str, evaluator: Evaluator) -> NDArray[np.float32]:
     """The encoding of the frame in a body; its pixels are gone when this returns."""
     if media_type == JSON:
-        ready = parse_json(body, EncodingBody).view()
+        ready = (await parse_json(body, EncodingBody)).view()
         return await running.infer(lambda: encode_view(evaluator, ready), Priority.BATCH)
     async with running.decoded(body, Priority.BATCH) as image:
         return await running.infer(lambda: encode_view(evaluator, image), Priority.BATCH)
@@ -100,7 +109,8 @@ async def _encoded(body: bytes, running: Services, media_type: str, evaluator: E
                 "type": "string",
                 "format": "binary",
                 "description": "npz (numpy.savez) of `encodings` [n, d] float, `index` [n] integer, `position_m` [n], "
-                "and where known `timestamp_us` [n] integer (-1: unknown), `x_m` and `y_m` [n] (NaN: unknown).",
+                "and where known `timestamp_us` [n] integer (-1: unknown), `x_m` and `y_m` [n] (NaN: unknown). Metres, "
+                "at most 1e9 either way.",
             }
         }
     ),
