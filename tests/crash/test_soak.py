@@ -10,6 +10,7 @@ from bench.soak.actor import LostError, expect
 from bench.soak.trial import Soak, soak
 
 
+@pytest.mark.slow
 def test_a_few_kills(tmp_path: Path) -> None:
     found = soak(tmp_path / "data", n_kills=3, seed=1)
     assert found.n_kills == len(found.ready_s) == len(found.empty_ready_s) == 3, "it was ready again every time"
