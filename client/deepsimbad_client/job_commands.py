@@ -45,7 +45,8 @@ from deepsimbad_client.tables import gate_verdict, job_table
     type=click.FloatRange(min=0),
     metavar="MARGIN",
     help="Serve the new map only if its ANR is worse than the active one's by no more than so many percentage points; "
-    "else it is sealed, the command says why and still ends with 0 (--json: result.active is false).",
+    "else it is sealed, the command says why and still ends with 0 (--json: result.active is false). "
+    "Give --check a drive of another day with it: frames held out of the map's own drive are kind to the new map.",
 )
 @click.option("--append", is_flag=True, help="Add the drive to a copy of the active map, whose landmarks stay.")
 @click.option("--wait/--no-wait", default=True, show_default=True, help="Follow the job to its end.")
