@@ -1,11 +1,15 @@
 """The admin calls that make, fill, map and switch a domain."""
 
+import errno
 import json
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from starlette.testclient import TestClient
+
+from deepsimbad.store import catalog
 
 from .conftest import DIM, N_READY, NPZ, encoded, make_ready_domain, npz, picture, ready_encodings, remap
 
@@ -34,6 +38,24 @@ def test_a_deleted_domain_is_gone_and_its_name_free(client: TestClient) -> None:
     assert client.post("/v1/domains/brief/localizations", json={"ranked_landmarks": [0]}).status_code == 404
     make_ready_domain(client, "brief", closed=True)
     assert client.get("/v1/domains/brief").json()["closed"] is True
+
+
+def test_a_domain_whose_folder_cannot_be_removed_is_gone_with_its_sessions(
+    client: TestClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(folder: Path) -> None:
+        raise OSError(errno.EIO, "Input/output error", str(folder))
+
+    make_ready_domain(client, "stuck")
+    session = client.post("/v1/domains/stuck/sessions", json={}).json()["session_id"]
+    with monkeypatch.context() as patched:
+        patched.setattr(catalog, "bury", fail)
+        assert client.delete("/v1/admin/domains/stuck").status_code == 503
+    assert client.get("/v1/domains/stuck").status_code == 404
+    view = client.post(f"/v1/sessions/{session}/observations", json={"ranked_landmarks": [0]})
+    assert (view.status_code, view.json()["code"]) == (410, "ended_session")
+    assert client.post("/v1/domains/stuck/localizations", json={"ranked_landmarks": [0]}).status_code == 404
+    assert 'domain="stuck"' not in client.get("/metrics").text
 
 
 def test_traverses_are_listed_and_deleted(client: TestClient) -> None:

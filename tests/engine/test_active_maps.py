@@ -1,11 +1,14 @@
 """Active maps: loaded when needed, switched at once, never half."""
 
+import errno
 from dataclasses import dataclass
+from pathlib import Path
 
 import pytest
 
+from deepsimbad.engine import active_maps
 from deepsimbad.engine.active_maps import ActiveMaps
-from deepsimbad.errors import DamagedMapError, NoActiveMapError, UnknownDomainError
+from deepsimbad.errors import DamagedMapError, NoActiveMapError, UnavailableError, UnknownDomainError
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.map_file import write_map
 from deepsimbad.store.map_table import ANY
@@ -115,6 +118,45 @@ def test_a_damaged_map_does_not_keep_others_from_loading(catalog: Catalog, maps:
     assert maps.snapshot("e").domain == "e"
     maps.forget("e")
     assert maps.n_loaded == 0
+
+
+def test_a_map_that_cannot_be_read_now_is_not_called_damaged(
+    catalog: Catalog, maps: ActiveMaps, clock: Clock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for domain in ("d", "e"):
+        if domain == "e":
+            add_domain(catalog, "e")
+        catalog.activate(domain, add_map(catalog, domain), ANY)
+    verify = active_maps.verify
+
+    def failing(path: Path, digest: str) -> None:
+        if path == catalog.map_path("d", 1):
+            raise OSError(errno.EIO, "Input/output error")
+        verify(path, digest)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(active_maps, "verify", failing)
+        assert maps.load_all() == {}
+        assert maps.peek("e") is not None, "another domain's map is loaded all the same"
+        with pytest.raises(UnavailableError) as caught:
+            maps.snapshot("d")
+        assert (caught.value.code, caught.value.hints["reason"]) == ("unavailable", "io_error")
+        assert maps.damaged() == {}
+    assert maps.snapshot("d").version == 1, "and it is not remembered"
+
+
+def test_a_damaged_map_stays_damaged_while_it_cannot_be_read(
+    catalog: Catalog, maps: ActiveMaps, clock: Clock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def failing(path: Path, digest: str) -> None:
+        raise OSError(errno.EIO, "Input/output error")
+
+    catalog.activate("d", add_map(catalog, "d"), ANY)
+    catalog.map_path("d", 1).unlink()
+    assert list(maps.load_all()) == ["d"]
+    clock.now += 10
+    monkeypatch.setattr(active_maps, "verify", failing)
+    assert maps.damaged() == {"d": 1}
 
 
 def test_domain_and_version_are_the_catalogs_and_not_the_files(catalog: Catalog, maps: ActiveMaps) -> None:

@@ -1,16 +1,26 @@
 """The check of a new map against the active one, and the gate that it keeps."""
 
+import errno
+
 import numpy as np
 import pytest
 
 from deepsimbad.core.descriptor import rank_landmarks
 from deepsimbad.core.metrics import rank_of_truth
 from deepsimbad.core.relevance import Query, Relevance, relevances
+from deepsimbad.engine import active_maps
 from deepsimbad.engine.active_maps import load_snapshot
-from deepsimbad.errors import InvalidEncodingError, InvalidMapConfigError, InvalidRouteError, UnknownTraverseError
+from deepsimbad.errors import (
+    InvalidEncodingError,
+    InvalidMapConfigError,
+    InvalidRouteError,
+    UnavailableError,
+    UnknownTraverseError,
+)
 from deepsimbad.jobs.map_config import RemapConfig
 from deepsimbad.jobs.progress import Progress
 from deepsimbad.jobs.remap import REMAP_STAGES, remap
+from deepsimbad.store import map_file
 from deepsimbad.store.frames import UNKNOWN_TIMESTAMP, TraverseFrames
 from deepsimbad.store.map_table import ANY
 from deepsimbad.store.records import MapState
@@ -295,6 +305,28 @@ def test_a_damaged_active_map_does_not_keep_its_remedy_away(made, seasons, catal
     result = made(training_traverse="good", gate_margin=0.0)
     assert result["active"] is True
     assert "damaged" in result["metrics"]["check"]["why"]
+
+
+@pytest.mark.parametrize(
+    ("module", "name", "error", "reason"),
+    [
+        (active_maps, "verify", OSError(errno.EIO, "Input/output error"), "io_error"),
+        (map_file, "unpack_index", MemoryError(), "out_of_memory"),
+    ],
+)
+def test_no_gate_opens_because_a_sound_map_could_not_be_read(
+    made, seasons, catalog, monkeypatch, module, name, error, reason
+):
+    def fail(*_):
+        raise error
+
+    made(training_traverse="good")
+    monkeypatch.setattr(module, name, fail)
+    with pytest.raises(UnavailableError, match="map 1 of domain route could not be read") as caught:
+        made(training_traverse="bad", check_traverse="day", gate_margin=1.0)
+    assert (caught.value.code, caught.value.hints["reason"]) == ("unavailable", reason)
+    assert [record.version for record in catalog.maps(DOMAIN)] == [1]
+    assert catalog.domain(DOMAIN).active_version == 1
 
 
 def test_a_map_of_one_image_has_nothing_to_hold_out(store, made):

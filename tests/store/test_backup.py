@@ -279,6 +279,61 @@ def test_only_an_empty_folder_is_restored_into(archive: Path, furnished: Catalog
         restore(archive, tmp_path / "file", silent)
 
 
+def at_half(act: Callable[[], None]) -> Callable[[float], None]:
+    """Does something once, in the middle of a restore."""
+    acts = [act]
+
+    def progress(share: float) -> None:
+        if share > 0.5 and acts:
+            acts.pop()()
+
+    return progress
+
+
+@pytest.mark.parametrize("is_mount", [True, False])
+def test_no_service_starts_in_an_empty_folder_that_is_restored_into(
+    archive: Path, tmp_path: Path, is_mount: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    there = tmp_path / "there"
+    there.mkdir()
+    monkeypatch.setattr(Path, "is_mount", lambda path: is_mount and path == there)
+    refused = []
+
+    def start() -> None:
+        with pytest.raises(DataDirInUseError):
+            ServiceLock.take(there, "127.0.0.1:8000")
+        refused.append(True)
+
+    restore(archive, there, at_half(start))
+    assert refused
+    with Catalog.open(there) as catalog:
+        assert len(catalog.domains()) == 2
+    ServiceLock.take(there, "127.0.0.1:8000").release()
+
+
+def test_a_mounted_folder_that_a_command_began_to_use_meanwhile_is_left_alone(
+    archive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    there = tmp_path / "there"
+    there.mkdir()
+    monkeypatch.setattr(Path, "is_mount", lambda path: path == there)
+    with pytest.raises(ConflictError, match="not empty any more"):
+        restore(archive, there, at_half(lambda: Catalog.open(there).close()))
+    assert not (there / "domains").exists(), "nothing is published by half"
+    assert not (there / "sessions.sqlite").exists()
+    with Catalog.open(there) as catalog:
+        assert catalog.domains() == []
+
+
+def test_a_service_that_makes_the_folder_meanwhile_keeps_its_lock(archive: Path, tmp_path: Path) -> None:
+    there, started = tmp_path / "there", []
+    with pytest.raises(ConflictError, match="not empty any more"):
+        restore(archive, there, at_half(lambda: started.append(ServiceLock.take(there, "127.0.0.1:8000"))))
+    with pytest.raises(DataDirInUseError):
+        ServiceLock.take(there, "127.0.0.1:8001")
+    started[0].release()
+
+
 def test_a_restore_that_was_killed_is_begun_anew(archive: Path, tmp_path: Path) -> None:
     killed = tmp_path / "there.restoring"
     (killed / "domains").mkdir(parents=True)

@@ -4,7 +4,7 @@ from deepsimbad.api.schemas import DomainAnswer
 from deepsimbad.engine.active_maps import ActiveMaps
 from deepsimbad.engine.evaluator_pool import EvaluatorPool
 from deepsimbad.engine.snapshot import MapSnapshot
-from deepsimbad.errors import DamagedMapError, NoActiveMapError
+from deepsimbad.errors import NoActiveMapError, UnavailableError
 from deepsimbad.store.records import DomainRecord
 
 
@@ -41,5 +41,5 @@ def _active_map(active_maps: ActiveMaps, record: DomainRecord) -> tuple[MapSnaps
         return active_maps.snapshot(record.name), None
     except NoActiveMapError:
         return None, None
-    except DamagedMapError as error:
+    except UnavailableError as error:  # damaged, or not to be read at this moment
         return None, error.code

@@ -7,8 +7,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from deepsimbad.engine.snapshot import MapSnapshot
-from deepsimbad.errors import DamagedMapError, DeepSimbadError, NoActiveMapError
+from deepsimbad.errors import DamagedMapError, DeepSimbadError, NoActiveMapError, UnavailableError
 from deepsimbad.store.catalog import Catalog
+from deepsimbad.store.faults import storage_faults
 from deepsimbad.store.map_file import index_bytes, read_map
 from deepsimbad.store.map_table import removed
 from deepsimbad.store.records import DomainRecord
@@ -66,11 +67,11 @@ class ActiveMaps:
     def damaged(self) -> dict[str, int]:
         """The active versions that cannot be loaded, by domain; each is tried again, which reads its file."""
         still = {}
-        for domain in sorted(self._damaged.copy()):
+        for domain, known in sorted(self._damaged.copy().items()):
             try:
                 self.refresh(domain)
-            except DamagedMapError as error:
-                still[domain] = int(error.hints["map_version"])
+            except UnavailableError as error:  # a disk that fails to read it now has not made it whole
+                still[domain] = int(error.hints.get("map_version", known.version))
             except DeepSimbadError:  # deleted, or has no active map any more
                 self._damaged.pop(domain, None)
         return still
@@ -87,7 +88,8 @@ class ActiveMaps:
         Raises:
             UnknownDomainError: No such domain.
             NoActiveMapError: It has no map yet.
-            DamagedMapError: The map's file is missing, fails its digest or cannot be read.
+            DamagedMapError: The map's file is missing, fails its digest or contradicts itself.
+            UnavailableError: The disk failed, no memory is left, ...: another try may read it.
         """
         known = self.peek(domain)
         if known is not None:
@@ -124,7 +126,8 @@ class ActiveMaps:
         """Load the active maps of all domains.
 
         Returns:
-            What is damaged, by domain; each is logged, none keeps the service from starting.
+            What is damaged, by domain; each is logged, and so is what could not be read; neither keeps the service
+            from starting.
         """
         damaged = {}
         for record in self._catalog.domains():
@@ -135,6 +138,8 @@ class ActiveMaps:
                 self.refresh(record.name)
             except DamagedMapError as error:
                 damaged[record.name] = error
+            except UnavailableError as error:
+                log.warning("an active map could not be read", extra={"domain": record.name, "why": error.message})
         return damaged
 
     def _forget(self, domain: str) -> None:
@@ -178,18 +183,31 @@ def load_snapshot(catalog: Catalog, domain: str, version: int) -> MapSnapshot:
         UnknownMapVersionError: No such version.
         RetiredMapError: Its file was removed.
         DamagedMapError: The file is missing, fails its digest or contradicts itself.
+        UnavailableError: The disk failed, no memory is left, ...: the file may be whole.
     """
     record = catalog.map(domain, version)
     if record.removed_at is not None:
         raise removed(domain, version)
     path = catalog.map_path(domain, version)
     try:
-        if record.sha256 is not None:
-            verify(path, record.sha256)
-        # A map moved here from another server says in its file what it was called there.
-        contents = replace(read_map(path), domain=domain, version=version)
-        return MapSnapshot.from_contents(contents, index_bytes(path))
-    except (DeepSimbadError, OSError, KeyError, TypeError, ValueError) as error:
+        with storage_faults(path, DamagedMapError):
+            if record.sha256 is not None:
+                verify(path, record.sha256)
+            # A map moved here from another server says in its file what it was called there.
+            contents = replace(read_map(path), domain=domain, version=version)
+            return MapSnapshot.from_contents(contents, index_bytes(path))
+    except DamagedMapError as error:
+        raise unreadable(catalog, domain, version) from error
+    except UnavailableError as error:
+        if catalog.map(domain, version).removed_at is not None:  # just now
+            raise removed(domain, version) from error
+        raise UnavailableError(
+            f"map {version} of domain {domain} could not be read ({error.hints.get('reason')}): try again",
+            reason=error.hints.get("reason"),
+            domain=domain,
+            map_version=version,
+        ) from error
+    except (DeepSimbadError, KeyError, TypeError, ValueError) as error:
         raise unreadable(catalog, domain, version) from error
 
 

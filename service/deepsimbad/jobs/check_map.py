@@ -205,7 +205,11 @@ def check_map(
 
 
 def _active_map(catalog: Catalog, domain: str) -> tuple[int | None, CheckedMap | None, str | None]:
-    """The version that serves, the map itself, and why it cannot be compared."""
+    """The version that serves, the map itself, and why it cannot be compared.
+
+    Raises:
+        UnavailableError: It may be whole, but could not be read: a gate that did not compare it must not open.
+    """
     version = catalog.domain(domain).active_version
     if version is None:
         return None, None, "no map serves yet that the new one could be compared with"

@@ -69,6 +69,9 @@ def load_arrays(db: Database, table: str, checksum: Checksum) -> dict[str, NDArr
             n_filled[name] = len(body)
             continue
         if name not in arrays:
+            stored = next(db.table(table).rows_where("name = ?", [name], select="sum(length(body)) AS n_bytes"))
+            if math.prod(dimensions) * dtype.itemsize != stored["n_bytes"]:  # room for it may be all there is
+                raise ValueError(f"array {name} of {table} is not whole")
             arrays[name], n_filled[name] = np.empty(dimensions, dtype), 0
         octets = arrays[name].reshape(-1).view(np.uint8)
         octets[n_filled[name] : n_filled[name] + len(body)] = np.frombuffer(body, np.uint8)

@@ -73,6 +73,8 @@ def storage_faults(path: Path, damaged: type[DamagedFileError | DamagedMapError]
         raise _from_sqlite(error, path, damaged) from error
     except UnicodeDecodeError as error:  # of a message in which SQLite quotes what is in the file
         raise damaged(f"{path.name} is damaged: it holds text that is none", file=path.name) from error
+    except MemoryError as error:  # SQLite's is raised as this one too
+        raise _unavailable(path, "out_of_memory") from error
     except OSError as error:
         raise _unavailable(path, reason_of(error)) from error
 

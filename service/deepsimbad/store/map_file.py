@@ -126,12 +126,12 @@ def read_map(path: Path) -> MapContents:
 
     Raises:
         DamagedMapError: The file is missing, damaged, of another kind or from a newer release; the cause is chained.
-        UnavailableError: The disk failed, too many files are open, ...
+        UnavailableError: The disk failed, no memory is left, ...: the file may be whole.
     """
     try:
         with _opened(path) as db:
             return _read(db, path)
-    except (KeyError, TypeError, ValueError, IndexError, OverflowError, RecursionError, MemoryError) as error:
+    except (KeyError, TypeError, ValueError, IndexError, OverflowError, RecursionError) as error:
         raise DamagedMapError(f"{path.name} is damaged: {error}", file=path.name) from error
     except InvalidMapConfigError as error:
         raise DamagedMapError(f"{path.name} is damaged: {error.message}", file=path.name) from error

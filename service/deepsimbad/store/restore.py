@@ -42,7 +42,8 @@ def restore(file: Path, data_dir: Path, on_progress: Callable[[float], None]) ->
     Args:
         file: The backup.
         data_dir: Where; absent or empty.
-        on_progress: Called with 0..1; what it raises (a cancel) ends the restore and leaves nothing.
+        on_progress: Called with 0..1; what it raises (a cancel) ends the restore and leaves nothing, but a service's
+            lock, held by nobody, in a folder that was there.
 
     Raises:
         InvalidArchiveError: It is not a backup, was cut short or changed, or would write elsewhere.
@@ -61,12 +62,12 @@ def restore(file: Path, data_dir: Path, on_progress: Callable[[float], None]) ->
         on_progress(min(1.0, n_done / n_expected))
 
     with storage_faults(data_dir), ExitStack() as parts:
-        _check_empty(data_dir, parts)
+        was_there = _check_empty(data_dir, parts)
         archive = parts.enter_context(opened_archive(file, is_member, done))
         _check_kind(file, archive)
         staging = parts.enter_context(_staging(data_dir))
         _unpack(archive, staging)
-        _publish(staging, data_dir)
+        _publish(staging, data_dir, was_there)
     on_progress(1.0)
     return RestoreReport(
         str(data_dir),
@@ -77,19 +78,23 @@ def restore(file: Path, data_dir: Path, on_progress: Callable[[float], None]) ->
     )
 
 
-def _check_empty(data_dir: Path, parts: ExitStack) -> None:
-    """Refuse what holds anything; keep services away from what is there and empty."""
+def _check_empty(data_dir: Path, parts: ExitStack) -> bool:
+    """Refuse what holds anything; keep services away from what is there and empty. Returns whether it is there."""
     lock = layout.service_lock_path(data_dir)
     if not data_dir.exists():
         make_data_dir(data_dir.parent, 0o777)
-        return
+        return False
     if not data_dir.is_dir():
         raise ConflictError(f"{data_dir} is no folder")
-    if lock.exists():
+    is_used = lock.exists()
+    if is_used:
         parts.enter_context(ServiceLock.take(data_dir, "restoring a backup"))
     left = {path.name for path in data_dir.iterdir()} - {lock.name, _MARK}
     if left:
         raise ConflictError(f"{data_dir} is not empty: restore into a new folder, and move it into place afterwards")
+    if not is_used:  # only now: a folder that is none of ours gets no file of ours
+        parts.enter_context(ServiceLock.take(data_dir, "restoring a backup"))
+    return True
 
 
 def _check_kind(file: Path, archive: ArchiveReader) -> None:
@@ -152,19 +157,20 @@ def _domains(db: Database, path: Path) -> list[str]:
         return [record.name for record in domain_table.all_domains(current)]
 
 
-def _publish(staging: Path, data_dir: Path) -> None:
+def _publish(staging: Path, data_dir: Path, was_there: bool) -> None:
     """Let the unpacked files take their names: by one rename, or the catalog last."""
     if staging.parent == data_dir:
-        for name in (layout.domains_folder(data_dir).name, SESSIONS, CATALOG):
-            if (data_dir / name).exists():
-                raise ConflictError(f"{data_dir} is not empty any more: somebody else has begun to use it")
+        names = (layout.domains_folder(data_dir).name, SESSIONS, CATALOG)
+        if any((data_dir / name).exists() for name in names):  # a command takes no lock
+            raise ConflictError(f"{data_dir} is not empty any more: somebody else has begun to use it")
+        for name in names:
             if (staging / name).exists():
                 (staging / name).rename(data_dir / name)
         sync_folder(data_dir)
         return
     (staging / _MARK).unlink()
     try:
-        if data_dir.exists():
+        if was_there:  # else the lock that lies in it is not ours
             staging.chmod(stat.S_IMODE(data_dir.stat().st_mode))  # whoever made the folder chose who may enter it
             layout.service_lock_path(data_dir).unlink(missing_ok=True)
         staging.rename(data_dir)  # onto an empty folder at most

@@ -10,6 +10,7 @@ from deepsimbad.api.dependencies import DomainName, Running
 from deepsimbad.api.domain_answers import describe_domain
 from deepsimbad.api.openapi import problems
 from deepsimbad.api.schemas import DomainAnswer
+from deepsimbad.errors import UnknownDomainError
 from deepsimbad.evaluators.registry import evaluator_config
 
 router = APIRouter(prefix="/v1/admin/domains", tags=["admin: domains"])
@@ -45,8 +46,21 @@ async def put_domain(domain: DomainName, request: Request, response: Response, r
 async def delete_domain(domain: DomainName, running: Running) -> None:
     """Remove a domain with its traverses and maps, and end its sessions; a job that still works on it is a 409."""
     await run_sync(running.open_traverses.forget, domain)
-    await run_sync(running.catalog.delete_domain, domain)
-    running.active_maps.forget(domain)
-    await running.sessions.end_domain(domain)
-    running.metrics.forget_domain(domain)
+    deleted = False
+    try:
+        await run_sync(running.catalog.delete_domain, domain)
+        deleted = True
+    finally:  # where only its folder could not be removed, the domain is gone all the same
+        if deleted or await run_sync(_is_gone, running, domain):
+            running.active_maps.forget(domain)
+            await running.sessions.end_domain(domain)
+            running.metrics.forget_domain(domain)
     log.info("domain deleted", extra={"domain": domain})
+
+
+def _is_gone(running: Running, domain: str) -> bool:
+    try:
+        running.catalog.domain(domain)
+    except UnknownDomainError:
+        return True
+    return False
