@@ -4,6 +4,8 @@ import threading
 from pathlib import Path
 from typing import Any
 
+import pytest
+from starlette.responses import JSONResponse
 from starlette.testclient import TestClient
 
 from deepsimbad.api.app import create_app
@@ -16,6 +18,23 @@ def test_health_readiness_and_documents(client: TestClient) -> None:
     assert client.get("/readyz").json() == {"status": "ready", "damaged_maps": []}
     assert client.get("/docs").status_code == 200
     assert client.get("/openapi.json").json()["openapi"].startswith("3.1")
+
+
+def test_the_openapi_document_is_written_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    n_written = 0
+    render = JSONResponse.render
+
+    def counting(self: JSONResponse, content: Any) -> bytes:
+        nonlocal n_written
+        n_written += 1
+        return render(self, content)
+
+    monkeypatch.setattr(JSONResponse, "render", counting)
+    with TestClient(create_app(small_settings(tmp_path))) as client:
+        first = client.get("/openapi.json")
+        assert (first.status_code, first.headers["content-type"]) == (200, "application/json")
+        assert client.get("/openapi.json").content == first.content
+    assert n_written == 1
 
 
 def test_metrics_count_by_route_and_not_by_path(client: TestClient) -> None:

@@ -3,6 +3,7 @@
 import asyncio
 import io
 import math
+from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 from starlette.testclient import TestClient
 
+from deepsimbad.api import long_work
 from deepsimbad.api.app import create_app
 from deepsimbad.jobs.perform import InThisProcess
 
@@ -39,6 +41,35 @@ def refused(answer: httpx2.Response, status: int, code: str) -> dict[str, Any]:
     assert answer.headers["content-type"] == "application/problem+json"
     problem: dict[str, Any] = answer.json()
     return problem
+
+
+def test_long_answers_of_every_route_are_written_beside_the_loop(
+    client: TestClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    n_beside = 0
+    off_the_loop = long_work.off_the_loop
+
+    async def counting(run: Callable[[], Any]) -> Any:
+        nonlocal n_beside
+        n_beside += 1
+        return await off_the_loop(run)
+
+    monkeypatch.setattr(long_work, "off_the_loop", counting)
+    monkeypatch.setattr(long_work, "LONG_LIST", 20)
+    path = path_of(begin(client))
+    asked = [
+        ("POST", "/v1/domains/ready/localizations", RANKS),
+        ("POST", f"{path}/observations", RANKS),
+        ("GET", path, None),
+        ("GET", f"{path}/belief", None),
+    ]
+    for shortlist, n_expected in ((20, 0), (21, len(asked))):
+        for method, url, body in asked:
+            answer = client.request(method, url, params={"shortlist": shortlist}, json=body)
+            assert answer.status_code == 200, answer.text
+            belief = answer.json() if url.endswith("/belief") else answer.json()["belief"]
+            assert len(belief["top"]) == shortlist
+        assert n_beside == n_expected
 
 
 def test_a_session_from_beginning_to_end(client: TestClient) -> None:

@@ -2,7 +2,8 @@
 
 import asyncio
 import threading
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
+from concurrent.futures import Future
 from contextlib import asynccontextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -14,10 +15,12 @@ from numpy.typing import NDArray
 
 from deepsimbad.core.filters import FilterKind
 from deepsimbad.core.relevance import Relevance
+from deepsimbad.engine import replay as replay_module
 from deepsimbad.engine.active_localizer import ActiveLocalizer, LocalizerConfig
 from deepsimbad.engine.localizer import describe
 from deepsimbad.engine.observation import View
 from deepsimbad.engine.session_config import SessionConfig
+from deepsimbad.engine.worker import Priority
 from deepsimbad.errors import (
     EndedSessionError,
     IdempotencyKeyReusedError,
@@ -315,6 +318,44 @@ def test_a_repeated_observation_counts_once_and_has_its_own_answer(mapped: Catal
     assert [one.is_repeated for one in found] == [False, True, True, True, True]
     assert {one.n_observations for one in found} == {8}
     assert len({one.belief.mean_m for one in found}) == 1
+
+
+def test_a_live_view_goes_before_the_replay_of_an_old_observation(
+    mapped: Catalog, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Old observations are repeated one at a time, in pieces on the worker; the last one as it stands."""
+    monkeypatch.setattr(replay_module, "_PIECE_S", 0.0)
+
+    async def body(live: Live) -> None:
+        sessions = [await begun(live) for _ in range(2)]
+        for session_id in sessions:
+            for seed in range(3):
+                await live.sessions.observe(session_id, ranked(seed, key=f"k{seed}"))
+        order: list[str] = []
+        submit = live.worker.submit
+
+        def noting(run: Callable[[], object], priority: Priority = Priority.LIVE) -> Future[object]:
+            order.append(priority.name)
+            if priority is Priority.BATCH:
+                assert not one_replays.locked()
+                one_replays.acquire()
+
+            def noted() -> object:
+                if priority is Priority.BATCH:
+                    one_replays.release()
+                return run()
+
+            return submit(noted, priority)
+
+        one_replays = threading.Lock()
+        live.worker.submit = noting  # type: ignore[method-assign,assignment]
+        await live.sessions.observe(sessions[0], ranked(2, key="k2"))
+        assert order == ["LIVE"]
+        await asyncio.gather(*(live.sessions.observe(one, ranked(1, key="k1")) for one in sessions))
+        # Each is looked up; then its start and its two rows are a piece each.
+        assert sorted(order[1:]) == ["BATCH"] * 6 + ["LIVE"] * 2
+
+    run(mapped, body)
 
 
 def test_a_session_expires_when_nothing_happens(mapped: Catalog) -> None:

@@ -113,6 +113,7 @@ def create_app(settings: Settings, run_job: RunJob | None = None) -> FastAPI:
         description=_DESCRIPTION,
         lifespan=_lifespan(settings, metrics, keys, run_job),
         redirect_slashes=False,
+        openapi_url=None,  # `install_openapi` answers it
         docs_url=None,  # the framework's page loads its script from another host
         redoc_url=None,
     )

@@ -10,6 +10,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, FailFast, Field, StrictFloat, StrictInt, ValidationError, model_validator
 from starlette.requests import Request
 
+from deepsimbad.api.long_work import off_the_loop
 from deepsimbad.api.problems import InvalidRequestError, invalid_request
 from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Relevance
 from deepsimbad.engine.observation import Dissimilarities, RankedLandmarks, ReadyEncoding
@@ -23,6 +24,8 @@ NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$"
 MAX_LANDMARKS = 0xFFFF
 GREATEST_EXACT_INTEGER = 2**53 - 1
 GREATEST_ID = 2**31 - 1
+MAX_NUMBERS = 2**17  # in one body; about 20 ms to parse
+_LONG_BYTES = 1 << 16
 _MAX_PARTS = 1000  # members, texts, lists: far more than any body here has
 
 Body = TypeVar("Body", bound="JsonBody")
@@ -212,16 +215,26 @@ async def read_json(request: Request, kind: type[Body]) -> Body:
         InvalidInputError: It is empty, not JSON, or not such a body.
     """
     media_type_of(request, (JSON,))
-    return parse_json(await read_bytes(request), kind)
+    return await parse_json(await read_bytes(request), kind)
 
 
-def parse_json(body: bytes, kind: type[Body]) -> Body:
-    """Check the bytes of a JSON body; raises InvalidRequestError."""
+async def parse_json(body: bytes, kind: type[Body]) -> Body:
+    """Check the bytes of a JSON body, those of a long one in a thread; raises InvalidRequestError."""
+    if len(body) > _LONG_BYTES:
+        return await off_the_loop(lambda: _parsed(body, kind))
+    return _parsed(body, kind)
+
+
+def _parsed(body: bytes, kind: type[Body]) -> Body:
     # All but numbers costs the parser a hundred times its bytes, and an error of its own where it is wrong: megabytes
     # of it would take seconds and gigabytes.
     if len(body) > _MAX_PARTS and any(body.count(mark) > _MAX_PARTS for mark in (b":", b'"', b"{", b"[")):
         what = f"more than {_MAX_PARTS} members, texts or lists, which no body here has"
         raise InvalidRequestError(f"body: {what}", errors=[{"loc": ["body"], "msg": what, "type": "too_many_parts"}])
+    # The parser lets no other thread run until it has read all: millions of numbers would hold the event loop up.
+    if body.count(b",") >= MAX_NUMBERS:
+        what = f"more than {MAX_NUMBERS} numbers"
+        raise InvalidRequestError(f"body: {what}", errors=[{"loc": ["body"], "msg": what, "type": "too_many_numbers"}])
     try:
         return kind.model_validate_json(body)
     except ValidationError as error:
@@ -246,7 +259,13 @@ def declare(content: dict[str, Any]) -> dict[str, Any]:
 
 
 def _only(name: str, items: dict[str, Any], description: str) -> dict[str, Any]:
-    values = {"type": "array", "items": items, "minItems": 1, "description": description}
+    values = {
+        "type": "array",
+        "items": items,
+        "minItems": 1,
+        "maxItems": MAX_NUMBERS,
+        "description": description,
+    }
     return {"type": "object", "required": [name], "properties": {name: values}, "additionalProperties": False}
 
 

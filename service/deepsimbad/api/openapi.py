@@ -7,6 +7,8 @@ from typing import Any
 from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
 from pydantic import BaseModel
+from starlette.requests import Request
+from starlette.responses import JSONResponse, Response
 
 from deepsimbad.api.auth import needed_scope
 from deepsimbad.api.bodies import DECLARED_BODIES
@@ -112,6 +114,14 @@ def install_openapi(app: FastAPI) -> None:
         return app.openapi_schema
 
     app.openapi = document  # type: ignore[method-assign]
+    kept = b""
+
+    async def answer(_: Request) -> Response:
+        nonlocal kept
+        kept = kept or bytes(JSONResponse(document()).body)  # written once: anybody may ask, without a key
+        return Response(kept, media_type="application/json")
+
+    app.add_route("/openapi.json", answer, include_in_schema=False)
 
 
 def _declare_what_comes_first(operation: dict[str, Any], needed: KeyScope | None) -> None:

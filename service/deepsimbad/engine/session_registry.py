@@ -112,18 +112,13 @@ class SessionRegistry:
         if live.ending is not None:
             raise ended(live.session_id, live.ending)
         if live.loaded is None:
-            live.loaded = await asyncio.to_thread(self.restored, live.record)
+            live.loaded = await asyncio.to_thread(self._restored, live.record)
         return live.loaded
 
-    def restored(self, record: SessionRecord, until: int | None = None) -> Loaded:
-        """A session as its journal tells; reads files.
-
-        Args:
-            record: The session.
-            until: The last row that counts; None: all of them.
-        """
+    def _restored(self, record: SessionRecord) -> Loaded:
+        """A session as its journal tells; reads files."""
         engine = engine_of(record, self._maps)
-        last = self._store.find(record.session_id).n_events if until is None else until
+        last = self._store.find(record.session_id).n_events
         return Loaded(engine, engine.replayed(*self._store.history(record.number, last)))
 
     def is_due(self, live: LiveSession) -> bool:

@@ -18,6 +18,7 @@ from deepsimbad.engine.live_session import LiveSession, Loaded, Observation
 from deepsimbad.engine.localizer import describe, shortlist_length
 from deepsimbad.engine.observation import View
 from deepsimbad.engine.pinned_maps import PinnedMaps
+from deepsimbad.engine.replay import Replay
 from deepsimbad.engine.session_config import SessionConfig, check_move, check_prior, check_start
 from deepsimbad.engine.session_registry import DELETED, SessionRegistry
 from deepsimbad.engine.session_state import SessionEngine
@@ -75,6 +76,8 @@ class Sessions:
         self._snapshot_every = snapshot_every
         self._keep_ended_s = keep_ended_s
         self._clock = clock
+        self._replay = Replay(store, worker)
+        self._repeating = asyncio.Lock()
         self._summaries = ThreadPoolExecutor(1, "summaries")
         self._registry = SessionRegistry(store, maps, max_sessions, clock)
         self._under_way: set[asyncio.Task[Any]] = set()
@@ -276,7 +279,12 @@ class Sessions:
     async def _repeated(self, live: LiveSession, loaded: Loaded, sequence: int, n_shortlist: int | None) -> SessionView:
         """The answer that an observation had; computed again, since the same journal leads to the same belief."""
         if loaded.state.sequence != sequence:
-            loaded = await asyncio.to_thread(self._registry.restored, live.record, sequence)
+            async with self._repeating:  # a replay is long: many of them take turns
+                snapshot = await asyncio.to_thread(self._store.snapshot_before, live.record.number, sequence)
+                state = await self._replay.until(
+                    live.record, loaded.engine, lambda row, _: row.sequence == sequence, snapshot
+                )
+            loaded = Loaded(loaded.engine, state)
         answer = await self._summarised(live.session_id, live.expires_at, loaded, n_shortlist)
         return replace(answer, is_repeated=True)
 

@@ -4,8 +4,6 @@ import asyncio
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from time import perf_counter
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,18 +11,15 @@ from numpy.typing import NDArray
 from deepsimbad.core.metrics import rank_of_truth
 from deepsimbad.core.route import Route
 from deepsimbad.engine.pinned_maps import PinnedMaps
+from deepsimbad.engine.replay import Replay
 from deepsimbad.engine.session_registry import engine_of
 from deepsimbad.engine.session_state import SessionEngine, SessionState
-from deepsimbad.engine.worker import InferenceWorker, Priority
-from deepsimbad.errors import InvalidInputError, UnknownSessionError
+from deepsimbad.engine.worker import InferenceWorker
+from deepsimbad.errors import InvalidInputError
 from deepsimbad.store.session_records import JournalRow, ObservedRow, SessionRecord
 from deepsimbad.store.sessions import SessionStore
 
-T = TypeVar("T")
-
-_ROWS_AT_ONCE = 64  # of a journal in memory: 130 kB with 500 landmarks
 _FARTHEST_M = 10.0  # a truth farther from every map image is of no place of the map: another road, another frame
-_PIECE_S = 0.01  # a live view waits no longer for a replay than this and one step
 
 
 @dataclass(frozen=True)
@@ -89,9 +84,6 @@ def checked_truths(positions_m: Sequence[float | None], n_observations: int) -> 
 class Truths:
     """Replays sessions, living ones and those that ended and are still known; used from an event loop.
 
-    A replay takes as long as the session's observations took, but in short pieces behind every live view, and holds a
-    few rows of the journal at a time.
-
     Args:
         store: The sessions.
         maps: What they are pinned to.
@@ -104,7 +96,7 @@ class Truths:
     ) -> None:
         self._store = store
         self._maps = maps
-        self._worker = worker
+        self._replays = Replay(store, worker)
         self._clock = clock
 
     async def rank(self, session_id: str, positions_m: Sequence[float | None]) -> RankedTruths:
@@ -158,22 +150,18 @@ class Truths:
         self, record: SessionRecord, engine: SessionEngine, truth: NDArray[np.int64], share: NDArray[np.float64]
     ) -> None:
         """Fill `share` with the rank of every observation's true image."""
-        state = await self._compute(engine.start)
         n_seen = 0
-        while n_seen < truth.size:
-            after = state.sequence
-            rows = await asyncio.to_thread(self._store.journal_part, record.number, after, after + _ROWS_AT_ONCE)
-            if not rows:  # purged since
-                raise UnknownSessionError(f"there is no session {record.session_id!a}")
-            at = 0
-            while at < len(rows) and n_seen < truth.size:
-                piece = _Piece(engine, state, rows[at:], truth[n_seen:], share[n_seen:])
-                state, n_rows, n_observed = await self._compute(piece.run)
-                at += n_rows
-                n_seen += n_observed
 
-    async def _compute(self, run: Callable[[], T]) -> T:
-        return await asyncio.wrap_future(self._worker.submit(run, Priority.BATCH))
+        def rank(row: JournalRow, state: SessionState) -> bool:
+            nonlocal n_seen
+            if isinstance(row, ObservedRow):
+                mass = state.belief.belief.mass
+                share[n_seen] = rank_of_truth(mass, truth[n_seen : n_seen + 1]) / mass.size
+                n_seen += 1
+            return n_seen == truth.size
+
+        if truth.size:
+            await self._replays.until(record, engine, rank)
 
 
 def true_images(route: Route, position_m: NDArray[np.float64]) -> NDArray[np.int64]:
@@ -187,29 +175,3 @@ def true_images(route: Route, position_m: NDArray[np.float64]) -> NDArray[np.int
     if route.closed and route.length_m > 0:
         known = route.start_m + (known - route.start_m) % route.length_m
     return route.nearest_image(known).astype(np.int64)
-
-
-@dataclass(frozen=True)
-class _Piece:
-    """As many rows of a replay as fit into one turn of the worker; each is computed exactly as it was live."""
-
-    engine: SessionEngine
-    state: SessionState
-    rows: Sequence[JournalRow]
-    truth: NDArray[np.int64]
-    share: NDArray[np.float64]
-
-    def run(self) -> tuple[SessionState, int, int]:
-        """The state after the last row done, how many rows were, and how many of them observations."""
-        began = perf_counter()
-        state, n_rows, n_observed = self.state, 0, 0
-        for row in self.rows:
-            state = self.engine.followed(state, row)
-            n_rows += 1
-            if isinstance(row, ObservedRow):
-                mass = state.belief.belief.mass
-                self.share[n_observed] = rank_of_truth(mass, self.truth[n_observed : n_observed + 1]) / mass.size
-                n_observed += 1
-            if n_observed == self.truth.size or perf_counter() - began > _PIECE_S:
-                break
-        return state, n_rows, n_observed

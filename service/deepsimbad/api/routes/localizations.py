@@ -22,6 +22,7 @@ from deepsimbad.api.bodies import (
     read_bytes,
 )
 from deepsimbad.api.dependencies import DomainName, Running, Services
+from deepsimbad.api.long_work import written
 from deepsimbad.api.openapi import binary, problems
 from deepsimbad.api.rendering import render_localization
 from deepsimbad.api.schemas import LocalizationAnswer
@@ -84,16 +85,16 @@ async def post_localization(
     async with view_in(body, running, media_type) as view:
         watch.lap("decode")
         localization = await running.infer(look)
-    answer = render_localization(localization, watch)
+    answer, text = await written(localization.belief.top.size, lambda: render_localization(localization, watch))
     running.metrics.localized(domain, answer.timings_ms, answer.belief.entropy_bits)
-    return Response(answer.model_dump_json(), media_type=JSON)
+    return Response(text, media_type=JSON)
 
 
 @asynccontextmanager
 async def view_in(body: bytes, running: Services, media_type: str) -> AsyncIterator[View]:
     """The observation in a body that has been read; an image, as `Services.decoded` gives it."""
     if media_type == JSON:
-        yield parse_json(body, ObservationBody).view()
+        yield (await parse_json(body, ObservationBody)).view()
         return
     async with running.decoded(body) as image:
         yield image

@@ -18,6 +18,7 @@ from deepsimbad.api.bodies import (
 )
 from deepsimbad.api.dependencies import DomainName, Running, SessionId
 from deepsimbad.api.idempotency import KEY_HEADER, KeyWord, id_under_key
+from deepsimbad.api.long_work import written
 from deepsimbad.api.openapi import binary, problems
 from deepsimbad.api.rendering import render_belief, render_plan
 from deepsimbad.api.routes.localizations import OBSERVATION_TYPES, npy_response, prefers_binary, view_in
@@ -76,8 +77,8 @@ async def post_session(
     config = (await read_json(request, SessionBody)).config()
     session_id = id_under_key(request, "session", domain, idempotency_key)
     view = await running.sessions.begin(active, config, session_id)
-    body = render_session(view).model_dump_json()
-    return Response(body, 201, {"Location": f"/v1/sessions/{view.session_id}"}, JSON)
+    _, text = await written(view.belief.top.size, lambda: render_session(view))
+    return Response(text, 201, {"Location": f"/v1/sessions/{view.session_id}"}, JSON)
 
 
 @router.post(
@@ -119,18 +120,19 @@ async def post_observation(
     except DeepSimbadError as error:
         running.metrics.observed(error.code)
         raise
-    answer = render_observation(view, watch)
+    answer, text = await written(view.belief.top.size, lambda: render_observation(view, watch))
     request.state.domain = answer.domain
     running.metrics.observed("repeated" if view.is_repeated else "accepted")
     running.metrics.localized(answer.domain, answer.timings_ms, answer.belief.entropy_bits)
-    return Response(answer.model_dump_json(), media_type=JSON)
+    return Response(text, media_type=JSON)
 
 
 @router.get("/sessions/{session_id}", response_model=SessionAnswer, responses=problems(404, 410, 422))
 async def get_session(session_id: SessionId, running: Running, shortlist: Shortlist = None) -> Response:
     """A session as it stands; asking does not keep it from expiring."""
     view = await running.sessions.view(session_id, shortlist)
-    return Response(render_session(view).model_dump_json(), media_type=JSON)
+    _, text = await written(view.belief.top.size, lambda: render_session(view))
+    return Response(text, media_type=JSON)
 
 
 @router.get(
@@ -148,7 +150,8 @@ async def get_belief(
     if prefers_binary(request):
         return npy_response((await running.sessions.mass(session_id)).astype("<f4"))
     view = await running.sessions.view(session_id, shortlist)
-    return Response(render_belief(view.snapshot.route, view.belief).model_dump_json(), media_type=JSON)
+    _, text = await written(view.belief.top.size, lambda: render_belief(view.snapshot.route, view.belief))
+    return Response(text, media_type=JSON)
 
 
 @router.get("/sessions/{session_id}/next-best-view", responses=problems(404, 410, 422))
@@ -168,7 +171,8 @@ async def put_prior(session_id: SessionId, request: Request, running: Running) -
     """Replace the belief by one around a position: the robot was carried, or got a fix."""
     body = await read_json(request, PriorBody)
     view = await running.sessions.set_prior(session_id, body.position_m, body.std_m)
-    return Response(render_session(view).model_dump_json(), media_type=JSON)
+    _, text = await written(view.belief.top.size, lambda: render_session(view))
+    return Response(text, media_type=JSON)
 
 
 @router.delete("/sessions/{session_id}", status_code=204, responses=problems(404, 410, 422))
