@@ -89,7 +89,7 @@ def fill_disk(client: TestClient) -> None:
 
 
 def close_catalog(client: TestClient) -> None:
-    services_of(client).catalog._db.close()
+    services_of(client).catalog._reader.close()
 
 
 @pytest.mark.parametrize(

@@ -180,6 +180,8 @@ async def _sweep(services: Services, every_s: float) -> None:
         await asyncio.sleep(every_s)
         try:
             await services.sessions.sweep()
+            domains = await run_sync(services.catalog.domains)
+            await services.sessions.end_strangers({record.name for record in domains})
             await run_sync(services.retention.prune)
             if services.sessions.n_living:
                 await asyncio.wrap_future(services.session_store.note_clock(services.clock.record()))

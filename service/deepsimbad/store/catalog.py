@@ -131,8 +131,11 @@ class Catalog(MapCatalog, JobCatalog, KeyCatalog):
         Returns:
             One line for each thing done, for the log.
         """
+        domains = layout.domains_folder(self.data_dir)
+        buried = empty_graves(domains)
         with self._writing() as db:
             lines = [
+                *(f"removed {name}" for name in buried),
                 *unfinished.take_over_abandoned_jobs(db, self._owners, self._owner.token),
                 *unfinished.discard_abandoned_maps(db, self.data_dir, self._owners),
                 *unfinished.remove_orphans(db, self.data_dir),
@@ -143,7 +146,7 @@ class Catalog(MapCatalog, JobCatalog, KeyCatalog):
             for name in domain_table.doomed(db):
                 self._finish_deletion(db, name)
                 lines.append(f"removed the folder of the deleted domain {name}")
-        lines += [f"removed {name}" for name in empty_graves(layout.domains_folder(self.data_dir))]
+        empty_graves(domains)
         return lines
 
     def discard_abandoned_maps(self) -> list[str]:
