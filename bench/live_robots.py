@@ -12,8 +12,6 @@ import numpy as np
 from bench.bare_connection import JSON, BareConnection
 from bench.timing import duration
 
-PAUSE_S = 0.02  # between an answer and the next request of the same robot
-
 
 @dataclass(frozen=True)
 class LiveRobot:
@@ -25,6 +23,7 @@ class LiveRobot:
         bodies: What it sends, in turn.
         media_type: Of them.
         session_length: Moves of 1 m in a session, then another one: the route has an end. 0: it asks without a session.
+        pause_s: Seconds between an answer and its next request.
     """
 
     name: str
@@ -32,6 +31,7 @@ class LiveRobot:
     bodies: Sequence[bytes]
     media_type: str = JSON
     session_length: int = 0
+    pause_s: float = 0.02
 
 
 @dataclass
@@ -95,7 +95,7 @@ async def _ask(url: str, robot: LiveRobot, until: "asyncio.Task[Any]") -> Waits:
             waits.failures.append(f"{status} {said['code']}")
         elif waits.map_versions[-1:] != [said["map_version"]]:
             waits.map_versions.append(said["map_version"])
-        await asyncio.sleep(PAUSE_S)
+        await asyncio.sleep(robot.pause_s)
     connection.close()
     return waits
 

@@ -20,7 +20,7 @@ from bench.bare_connection import BareConnection
 from bench.camera import jpegs
 from bench.landmarks import N_CANDIDATES
 from bench.limits import Limit, breaches, limit_table
-from bench.live_robots import PAUSE_S, LiveRobot, Waits, drive
+from bench.live_robots import LiveRobot, Waits, drive
 from bench.seasons import SPACING_M, write_seasons
 from bench.worlds import ENCODING_DIM, N_LANDMARKS, NCLT_IMAGES
 from deepsimbad_client import Client
@@ -29,6 +29,7 @@ from deepsimbad_client.local_server import LocalServer
 MOST_SECONDS, MOST_SECONDS_UNDER_LOAD, MOST_MEDIAN_RATIO, MOST_P99_RATIO = 60.0, 120.0, 1.5, 3.0
 _SESSION_LENGTH = 500
 _N_PICTURES = 20
+_CAMERA_PERIOD_S = 0.2  # NCLT's camera takes five pictures a second
 _DOMAIN, _CAMERA_DOMAIN = "bench", "camera"
 _STAGES = ("read_frames", "select_landmarks", "describe", "train", "check")
 
@@ -131,9 +132,10 @@ def report(figures: RemapFigures) -> Iterator[str]:
     yield f"| its process, digest of the frames, seal, activate | {rest:.1f} |"
     yield f"| from the request to the end of the job | {alone.seconds:.1f} |"
     yield ""
+    pauses = ", ".join(f"{1000 * robot.pause_s:.0f}" for robot in figures.robots)
     yield (
-        f"{len(figures.robots)} robots meanwhile, each with {1000 * PAUSE_S:.0f} ms between an answer and the next "
-        f"request, on the map of before; the pictures on a domain of its own with {size.n_frames:,} map images. "
+        f"{len(figures.robots)} robots meanwhile, with {pauses} ms between an answer and the next request, on the map "
+        f"of before; the pictures on a domain of its own with {size.n_frames:,} map images. "
         f"The remap took {figures.beside.seconds:.1f} s beside them."
     )
     yield ""
@@ -168,7 +170,11 @@ def _robots(size: RemapSize) -> list[LiveRobot]:
         LiveRobot("`POST localizations`, ranks", _DOMAIN, ranks),
         LiveRobot("`POST observations`, ranks", _DOMAIN, ranks, session_length=session_length),
         LiveRobot(
-            f"`POST localizations`, JPEG of 1232 x 1616, {kilobytes:.0f} kB", _CAMERA_DOMAIN, pictures, "image/jpeg"
+            f"`POST localizations`, JPEG of 1232 x 1616, {kilobytes:.0f} kB",
+            _CAMERA_DOMAIN,
+            pictures,
+            "image/jpeg",
+            pause_s=_CAMERA_PERIOD_S,
         ),
     ]
 
