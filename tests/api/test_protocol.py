@@ -540,17 +540,27 @@ def test_an_upgrade_is_not_taken_up(service: Service) -> None:
 # Many connections
 
 
+@contextlib.contextmanager
+def held_open(service: Service) -> Iterator[list[socket.socket]]:
+    """Room for connections, which are closed and gone from the service behind the block."""
+    held: list[socket.socket] = []
+    try:
+        yield held
+    finally:
+        for connection in held:
+            connection.close()
+    until(lambda: _answers(service))
+
+
 @pytest.mark.parametrize("silent", [0, MAX_CONNECTIONS - 1], ids=["all-have-asked", "one-never-asked"])
 def test_one_connection_more_closes_the_longest_silent(service: Service, silent: int) -> None:
     """Where all have asked, the first; where one never asked, that one, though it came last."""
-    held = []
-    try:
+    with held_open(service) as held:
         for place in range(MAX_CONNECTIONS):
-            connection = service.connect()
-            held.append(connection)
+            held.append(service.connect())
             if silent == 0 or place != silent:
-                connection.sendall(GET)
-                assert read_one(connection).endswith(b"GET / 0")
+                held[-1].sendall(GET)
+                assert read_one(held[-1]).endswith(b"GET / 0")
             time.sleep(LOOP_TICK_S)
         n_refused = service.refused["max_connections"]
         with service.connect() as one_more:
@@ -562,28 +572,18 @@ def test_one_connection_more_closes_the_longest_silent(service: Service, silent:
         for connection in held[:silent] + held[silent + 1 :]:
             connection.sendall(GET)
             assert read_one(connection).endswith(b"GET / 0")
-    finally:
-        for connection in held:
-            connection.close()
-    until(lambda: _answers(service))
 
 
 def test_announcing_a_body_that_never_comes_holds_no_place(service: Service) -> None:
     """Strangers who are answered 401 at once could else keep all robots out until their bodies stall."""
-    held = []
-    try:
+    with held_open(service) as held:
         for _ in range(MAX_CONNECTIONS):
-            connection = service.connect()
-            held.append(connection)
-            connection.sendall(b"POST /forgetful HTTP/1.1\r\nHost: x\r\nContent-Length: 1000\r\n\r\n")
-            assert read_one(connection).endswith(b"early")
+            held.append(service.connect())
+            held[-1].sendall(b"POST /forgetful HTTP/1.1\r\nHost: x\r\nContent-Length: 1000\r\n\r\n")
+            assert read_one(held[-1]).endswith(b"early")
         with service.connect() as robot:
             robot.sendall(GET)
             assert read_one(robot).endswith(b"GET / 0")
-    finally:
-        for connection in held:
-            connection.close()
-    until(lambda: _answers(service))
 
 
 def _answers(service: Service) -> bool:
