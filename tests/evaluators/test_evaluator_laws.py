@@ -4,18 +4,17 @@ import numpy as np
 import pytest
 
 from deepsimbad.errors import InvalidEncodingError, InvalidImageError, UnsupportedMediaTypeError
-from deepsimbad.evaluators.registry import EvaluatorKind, ExtractorName, evaluator_config, make_evaluator
+from deepsimbad.evaluators.compute import Compute
+from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
 
-CONFIGS = [
-    evaluator_config({"kind": kind, "extractor": extractor}).as_dict()
-    for kind in EvaluatorKind
-    for extractor in ExtractorName
-]
+EXTRACTORS = ("efficientnet_lite0", "gradient_grid", "none")
 
 
-@pytest.fixture(params=CONFIGS, ids=lambda raw: "-".join(raw.values()))
+@pytest.fixture(params=EXTRACTORS, scope="module")
 def evaluator(request):
-    return make_evaluator(evaluator_config(request.param))
+    """One a module: loading a network takes longer than all the laws."""
+    compute = Compute()
+    return make_evaluator(evaluator_config({"kind": "feature_l2", "extractor": request.param}), compute)
 
 
 def _images(n, seed=0):
@@ -25,14 +24,14 @@ def _images(n, seed=0):
 
 
 def _encodings(evaluator, n, seed=0):
-    if evaluator.input_size is not None:
+    if evaluator.takes_images:
         return evaluator.encode(_images(n, seed))
     return np.random.default_rng(seed).normal(size=(n, 24)).astype(np.float32)
 
 
 def test_encodings_have_the_stated_shape(evaluator):
-    if evaluator.input_size is None:
-        assert evaluator.encoding_dim is None
+    if not evaluator.takes_images:
+        assert evaluator.encoding_dim is evaluator.input_size is evaluator.weights_sha256 is None
         with pytest.raises(UnsupportedMediaTypeError):
             evaluator.encode(_images(1))
         return
@@ -41,20 +40,30 @@ def test_encodings_have_the_stated_shape(evaluator):
     assert encodings.dtype == np.float32
     assert np.isfinite(encodings).all()
     assert evaluator.encode([]).shape == (0, evaluator.encoding_dim)
-    assert min(evaluator.input_size) >= 1
+    assert evaluator.input_size is None or min(evaluator.input_size) >= 1
+    assert evaluator.largest_batch >= 1
+    np.testing.assert_allclose(np.linalg.norm(encodings, axis=1), 1, atol=1e-4)
 
 
 def test_an_image_is_encoded_the_same_alone_again_and_in_company(evaluator):
-    if evaluator.input_size is None:
+    if not evaluator.takes_images:
         pytest.skip("takes no images")
     images = _images(5)
     together = evaluator.encode(images)
     for row, image in zip(together, images, strict=True):
         np.testing.assert_array_equal(evaluator.encode([image.copy()])[0], row)
+        np.testing.assert_array_equal(evaluator.encode([evaluator.prepare(image)])[0], row)
+
+
+def test_encodings_are_kept_in_half_the_bytes_without_loss(evaluator):
+    if not evaluator.takes_images or evaluator.weights_sha256 is None:
+        pytest.skip("has no network")
+    encodings = evaluator.encode(_images(2))
+    np.testing.assert_array_equal(encodings, encodings.astype(np.float16))
 
 
 def test_encoding_leaves_the_image_alone(evaluator):
-    if evaluator.input_size is None:
+    if not evaluator.takes_images:
         pytest.skip("takes no images")
     image = _images(3)[2]
     before = image.copy()
@@ -91,7 +100,7 @@ def test_a_landmark_is_nearest_to_itself(evaluator):
 
 def test_a_scene_is_compared_the_same_alone_and_in_company(evaluator):
     model = evaluator.fit_landmarks(_encodings(evaluator, 50, 1))
-    scenes = _encodings(evaluator, 2100, 2) if evaluator.input_size is None else _encodings(evaluator, 40, 2)
+    scenes = _encodings(evaluator, 2100, 2) if not evaluator.takes_images else _encodings(evaluator, 40, 2)
     together = evaluator.dissimilarities(scenes, model)
     for k in range(0, len(scenes), 13):
         alone = evaluator.dissimilarities(scenes[k : k + 1], model)[0]

@@ -248,7 +248,7 @@ def test_more_pixels_than_are_kept_are_averaged_by_a_whole_factor():
     side = 2 if large.shape[0] * large.shape[1] <= 4 * KEPT_PIXELS else 3
     assert kept.shape == (3300 // side, 6000 // side, 3)
     assert kept.shape[0] * kept.shape[1] <= KEPT_PIXELS < large.shape[0] * large.shape[1]
-    before, after = FeatureL2().encode([large, kept])
+    before, after = FeatureL2("gradient_grid").encode([large, kept])
     assert np.square(before - after).sum() < 1e-4  # two unlike pictures are about 1 apart
 
 

@@ -28,15 +28,43 @@ class Evaluator(Protocol):
     """
 
     @property
+    def takes_images(self) -> bool:
+        """Whether it encodes images; else it takes ready encodings alone."""
+
+    @property
     def input_size(self) -> tuple[int, int] | None:
-        """(width, height) in pixels a client should resize to; None where no images are taken."""
+        """(width, height) in pixels a client should resize to; None: images are taken as they are, or not at all."""
 
     @property
     def encoding_dim(self) -> int | None:
         """Length d of what `encode` gives; None where no images are taken. Ready encodings may have any one length."""
 
+    @property
+    def weights_sha256(self) -> str | None:
+        """SHA-256 in hex of the file that encoding depends on; None where it depends on none."""
+
+    @property
+    def largest_batch(self) -> int:
+        """How many observations are best encoded at once."""
+
+    def load(self) -> None:
+        """Load what encoding needs, now rather than at first need.
+
+        Raises:
+            MissingPackageError, MissingWeightsError, InvalidWeightsError: It cannot be loaded.
+            OutOfMemoryError: There is too little memory for it.
+        """
+
+    def prepare(self, observation: Observation) -> Observation:
+        """Bring an observation to the size it is encoded at; `encode` does so itself with one that was not.
+
+        Raises:
+            InvalidImageError: An array that is not such an image.
+            UnsupportedMediaTypeError: The evaluator takes ready encodings alone.
+        """
+
     def encode(self, observations: Sequence[Observation]) -> NDArray[np.float32]:
-        """Encode observations, each by itself: no answer depends on its neighbours in the call.
+        """Encode observations, each by itself: no answer depends on its neighbours in the call, beyond rounding.
 
         Args:
             observations: n images, each [height, width, 3] uint8 BGR of any size.
@@ -47,6 +75,7 @@ class Evaluator(Protocol):
         Raises:
             InvalidImageError: An array that is not such an image.
             UnsupportedMediaTypeError: The evaluator takes ready encodings alone.
+            OutOfMemoryError: There is too little memory for it.
         """
 
     def fit_landmarks(self, encodings: NDArray[np.float32]) -> LandmarkModel:

@@ -11,7 +11,7 @@ import math
 import cv2
 import numpy as np
 
-from deepsimbad.errors import EmptyBodyError, ImageTooLargeError, InvalidImageError
+from deepsimbad.errors import EmptyBodyError, ImageTooLargeError, InvalidImageError, OutOfMemoryError
 from deepsimbad.evaluators.base import Image
 from deepsimbad.evaluators.image_header import MEDIA_TYPES, check_whole, media_type, picture_alone, read_size
 
@@ -22,6 +22,7 @@ KEPT_PIXELS = 3840 * 2160
 # Bad input is answered by a named error; OpenCV's own words about it would only fill the server's log.
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
 
+_NO_MEMORY = "there is too little memory to decode an image now: try again, or give the service more"
 _BLANK_BELOW_STD = 1.0  # grey levels of 256
 
 
@@ -66,12 +67,17 @@ def decode_image(body: bytes, max_pixels: int) -> Image:
         ImageTooLargeError: The header claims more pixels.
         TruncatedImageError: The end of the file is missing.
         InvalidImageError: Not one of `MEDIA_TYPES`, or damaged.
+        OutOfMemoryError: There is too little memory for it.
     """
     claimed_pixels(body, max_pixels)
     check_whole(body)
     try:
         image = cv2.imdecode(np.frombuffer(picture_alone(body), np.uint8), cv2.IMREAD_COLOR_BGR)
+    except MemoryError as error:
+        raise OutOfMemoryError(_NO_MEMORY) from error
     except cv2.error as error:
+        if error.code == cv2.Error.StsNoMem:  # no fault of the picture's
+            raise OutOfMemoryError(_NO_MEMORY) from error
         raise InvalidImageError(f"the {media_type(body)} image cannot be decoded") from error
     if image is None or image.size == 0:
         raise InvalidImageError(f"the {media_type(body)} image cannot be decoded")

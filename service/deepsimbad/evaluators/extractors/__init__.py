@@ -1,1 +1,1 @@
-"""Embedded extractors: image -> unit-length encoding, with no download and no training; one file each."""
+"""Extractors: images -> encodings of unit length; one file each, made by name in `evaluators.registry`."""

@@ -1,6 +1,7 @@
-"""The contract of an embedded extractor."""
+"""The contract of an extractor."""
 
-from typing import ClassVar, Protocol
+from collections.abc import Sequence
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,24 +10,37 @@ from deepsimbad.evaluators.base import Image
 
 
 class Extractor(Protocol):
-    """A pure function of one image.
+    """A pure function from images to unit-length encodings. Loaded when it is made; usable from several threads."""
 
-    Attributes:
-        name: The word that selects it in a configuration.
-        input_size: (width, height) in pixels it works at; any other size is resized, aspect not kept.
-        encoding_dim: Length d of its encodings.
-    """
+    @property
+    def input_size(self) -> tuple[int, int] | None:
+        """(width, height) in pixels it works at, aspect not kept; None: it takes images as they are."""
 
-    name: ClassVar[str]
-    input_size: ClassVar[tuple[int, int]]
-    encoding_dim: ClassVar[int]
+    @property
+    def encoding_dim(self) -> int:
+        """Length d of its encodings."""
 
-    def __call__(self, image: Image) -> NDArray[np.float32]:
-        """Encode one image.
+    @property
+    def weights_sha256(self) -> str | None:
+        """SHA-256 in hex of the file its weights come from; None where it has none."""
+
+    @property
+    def largest_batch(self) -> int:
+        """How many images are best encoded at once here; more only take more memory."""
+
+    def prepare(self, image: Image) -> Image:
+        """Bring an image to the size it is encoded at; one that is there already comes back as it is."""
+
+    def encode(self, images: Sequence[Image]) -> NDArray[np.float32]:
+        """Encode images.
 
         Args:
-            image: [height, width, 3] uint8 BGR, of any size.
+            images: n of [height, width, 3] uint8 BGR, of any size.
 
         Returns:
-            [d] float32 of unit length, also for a uniform image; the same bits for the same pixels.
+            [n, d] float32, rows of unit length, also for a uniform image. An image's encoding does not depend on the
+            others in the call beyond the last bits of a float32.
+
+        Raises:
+            UnavailableError: There is no memory left for it.
         """

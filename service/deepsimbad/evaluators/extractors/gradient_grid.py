@@ -8,13 +8,14 @@ differs from HOG in three ways that matter across seasons and drives:
 - directions enter twice: signed (dark below bright) and unsigned (any edge), because a season may reverse a contrast.
 """
 
-from typing import ClassVar
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from deepsimbad.evaluators.base import Image
+from deepsimbad.evaluators.compute import Compute
 
 _SIDE = 128  # pixels
 _POOL = 4  # pixels averaged before blurring: nothing finer survives the blur anyway
@@ -33,29 +34,46 @@ _TOWARDS = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)]).astype(np.float32)  # [2
 
 
 class GradientGrid:
-    """The default extractor: no download, no training, about a millisecond an image."""
+    """An extractor of no weights: no download, no training, about a millisecond an image."""
 
-    name: ClassVar[str] = "gradient_grid"
-    input_size: ClassVar[tuple[int, int]] = (_SIDE, _SIDE)
-    encoding_dim: ClassVar[int] = _ROWS * _COLUMNS * (_DIRECTIONS + _DIRECTIONS // 2)
+    input_size = (_SIDE, _SIDE)
+    encoding_dim = _ROWS * _COLUMNS * (_DIRECTIONS + _DIRECTIONS // 2)
+    weights_sha256 = None
+    largest_batch = 1
 
-    def __call__(self, image: Image) -> NDArray[np.float32]:
-        """See `Extractor`."""
-        energy = _cells(_directional_energy(_normalised_grey(image)))
-        folded = energy[..., : _DIRECTIONS // 2] + energy[..., _DIRECTIONS // 2 :]
-        strength = np.sqrt(np.square(folded).sum(axis=2))
-        around = cv2.GaussianBlur(strength, (0, 0), sigmaX=_NEIGHBOURHOOD[0], sigmaY=_NEIGHBOURHOOD[1])
-        shares = 1.0 / (around[..., None] + _FLOOR)
-        signed, unsigned = _unit((energy * shares) ** _POWER), _unit((folded * shares) ** _POWER)
-        return _unit(np.concatenate([signed, unsigned]))
+    def prepare(self, image: Image) -> Image:
+        """See `Extractor`; colours go, of which it sees nothing."""
+        grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+        if grey.shape != (_SIDE, _SIDE):
+            shrinks = grey.shape[0] >= _SIDE and grey.shape[1] >= _SIDE
+            grey = cv2.resize(grey, self.input_size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
+        return np.asarray(cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR), np.uint8)
+
+    def encode(self, images: Sequence[Image]) -> NDArray[np.float32]:
+        """See `Extractor`; the same bits for the same pixels."""
+        encodings = np.empty((len(images), self.encoding_dim), np.float32)
+        for row, image in zip(encodings, images, strict=True):
+            row[:] = _encoding(np.asarray(cv2.cvtColor(self.prepare(image), cv2.COLOR_BGR2GRAY), np.uint8))
+        return encodings
 
 
-def _normalised_grey(image: Image) -> NDArray[np.float32]:
+def gradient_grid(_argument: str, _compute: Compute) -> GradientGrid:
+    """As the registry makes it."""
+    return GradientGrid()
+
+
+def _encoding(grey: NDArray[np.uint8]) -> NDArray[np.float32]:
+    energy = _cells(_directional_energy(_normalised(grey)))
+    folded = energy[..., : _DIRECTIONS // 2] + energy[..., _DIRECTIONS // 2 :]
+    strength = np.sqrt(np.square(folded).sum(axis=2))
+    around = cv2.GaussianBlur(strength, (0, 0), sigmaX=_NEIGHBOURHOOD[0], sigmaY=_NEIGHBOURHOOD[1])
+    shares = 1.0 / (around[..., None] + _FLOOR)
+    signed, unsigned = _unit((energy * shares) ** _POWER), _unit((folded * shares) ** _POWER)
+    return _unit(np.concatenate([signed, unsigned]))
+
+
+def _normalised(grey: NDArray[np.uint8]) -> NDArray[np.float32]:
     """[side, side] grey levels of fixed contrast."""
-    grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
-    if grey.shape != (_SIDE, _SIDE):
-        shrinks = grey.shape[0] >= _SIDE and grey.shape[1] >= _SIDE
-        grey = cv2.resize(grey, (_SIDE, _SIDE), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
     levels = grey.astype(np.float32)
     _, deviation = cv2.meanStdDev(levels)
     return np.asarray(levels * (_CONTRAST / (float(deviation[0, 0]) + _LEAST_CONTRAST)), np.float32)

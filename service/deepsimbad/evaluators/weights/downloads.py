@@ -1,0 +1,392 @@
+"""Bringing files of weights and archives of repositories here: resumed after a break, checked, never half there."""
+
+import hashlib
+import os
+import re
+import shutil
+import stat
+import tempfile
+import zipfile
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
+
+import httpx2
+
+from deepsimbad.errors import InvalidWeightsError, MissingWeightsError
+from deepsimbad.evaluators.weights.files import file_sha256
+from deepsimbad.evaluators.weights.library import HUB, KNOWN, Argument, known
+from deepsimbad.evaluators.weights.lock import (
+    CHECKPOINTS,
+    HUB_FOLDER,
+    FileRecord,
+    Finding,
+    HubRecord,
+    Lock,
+    found_sha256,
+    hub_tree,
+    tree_sha256,
+)
+
+GITHUB = "https://github.com"
+GITHUB_API = "https://api.github.com"
+
+Tell = Callable[[str, int, int | None], None]
+"""Told of a download: the file's name, the bytes there, the bytes in all (None: not known)."""
+
+HUB_INPUT_SIZE = (322, 322)  # pixels; a multiple of the 14 that DINOv2 asks for
+_MOST_BYTES = 4 << 30
+_MOST_UNPACKED = 512 << 20  # of a repository
+_MOST_MEMBERS = 20_000
+_MOST_RATIO = 100  # source texts reach ten
+_TRIES = 4  # in a row without a single byte; a download that moves is never given up
+_WHOLE, _PART, _BEYOND_THE_END = 200, 206, 416
+_PATIENCE = httpx2.Timeout(connect=10.0, read=60.0, write=60.0, pool=60.0)
+_CONTENT_RANGE = re.compile(r"bytes (?:(\d+)-\d+|\*)/(\d+|\*)")
+_COMMIT = re.compile(r"[0-9a-f]{40}")
+
+
+def pull_file(
+    folder: Path, extractor: str, tell: Tell, url: str | None = None, sha256: str | None = None
+) -> FileRecord:
+    """Bring a file of weights into the folder and record it; one that lies there already is only recorded.
+
+    Args:
+        folder: Of the weights.
+        extractor: NAME:FILE, which names the file.
+        tell: Told of what has come.
+        url: Where it is; None: where the library knows it to be.
+        sha256: Its digest, in hex; None: as recorded, else as the library knows it, else whatever comes the first time.
+
+    Raises:
+        MissingWeightsError: It cannot be fetched; the message says where to put it.
+        InvalidWeightsError: It has another digest.
+    """
+    name = extractor.partition(":")[2]
+    lock, to = Lock.read(folder), folder / name
+    listed = next((each for each in KNOWN if each.file == name), None)
+    recorded = lock.files.get(name)
+    wanted = sha256 or (recorded.sha256 if recorded else None) or (listed.sha256 if listed else None)
+    came_from = recorded.url if recorded else None
+    if to.is_file():
+        found = found_sha256(to) or ""
+        check_digest(name, found, wanted, f"remove {to}, and pull it again")
+    else:
+        came_from = url or came_from or (listed.url if listed else None)
+        if came_from is None:
+            page = listed.page if listed else None
+            where = f"get it from {page} and " if page else "say where it is with --url, or "
+            raise MissingWeightsError(f"{name} is not known to be at any address: {where}put it at {to}", file=name)
+        found = fetch(came_from, to, tell, wanted)
+    record = FileRecord(found, to.stat().st_size, extractor, came_from)
+    lock.with_file(name, record).write()
+    return record
+
+
+@dataclass(frozen=True)
+class HubWish:
+    """What somebody wants of a torch hub repository; what is None is as recorded, as the library knows it, or else.
+
+    Attributes:
+        extractor: torchhub:OWNER/REPO:ENTRY.
+        commit: Of the repository; else the one its default branch is at now.
+        sha256: Of the repository's archive; else any.
+        arguments: For the entry, added to those that the library knows.
+        input_size: (width, height) in pixels; else `HUB_INPUT_SIZE`.
+    """
+
+    extractor: str
+    commit: str | None = None
+    sha256: str | None = None
+    arguments: Mapping[str, Argument] = field(default_factory=dict)
+    input_size: tuple[int, int] | None = None
+
+
+def pull_hub(folder: Path, wish: HubWish, tell: Tell) -> HubRecord:
+    """Bring a repository here, run its entry once so that its own downloads come too, and record all of it.
+
+    Args:
+        folder: Of the weights.
+        wish: What is wanted. The same again as recorded must come to the same digests.
+        tell: Told of what has come.
+
+    Raises:
+        MissingWeightsError: Something cannot be fetched; the message says where to put it.
+        InvalidWeightsError: It is another than was recorded, or gives no encodings.
+        MissingPackageError: Its code needs a package that is not installed.
+    """
+    from deepsimbad.evaluators.extractors.torchhub import HubEntry, load_recorded, parameters_sha256  # brings torch
+
+    lock, listed = Lock.read(folder), known(wish.extractor)
+    old = lock.hub_record(wish.extractor)
+    repository = (listed.extractor if listed else wish.extractor).removeprefix(HUB).partition(":")[0]
+    arguments = {**(old.arguments if old else listed.arguments if listed else {}), **wish.arguments}
+    size = wish.input_size or (old.input_size if old else listed.input_size if listed else None) or HUB_INPUT_SIZE
+    commit = wish.commit or (old.commit if old else listed.commit if listed else None)
+    if commit is None:
+        commit = resolve_commit(repository, f"say which one you want with --commit; see {archive_url(repository, '')}")
+    hub = folder.absolute() / HUB_FOLDER
+    tree, archive = hub / hub_tree(repository, commit), hub / f"{hub_tree(repository, commit)}.zip"
+    if old is not None and old.commit == commit and found_sha256(tree) == old.tree_sha256:
+        archive_sha256 = old.archive_sha256
+    else:
+        if not archive.is_file():
+            fetch(archive_url(repository, commit), archive, tell, wish.sha256)
+        archive_sha256 = file_sha256(archive)
+        unpack(archive, tree)
+    check_digest(archive.name, archive_sha256, wish.sha256, f"remove {archive}, and pull again")
+    is_again = old is not None and (old.commit, dict(old.arguments)) == (commit, arguments)
+    if old is not None and is_again:
+        Finding(tree, old.tree_sha256, found_sha256(tree)).check()  # before any of it is run
+
+    def download(url: str, to: Path) -> None:
+        fetch(url, to, tell, old.beside.get(f"{CHECKPOINTS}/{to.name}") if old and is_again else None)
+
+    dim = listed.encoding_dim if listed is not None and arguments == dict(listed.arguments) else None
+    loaded = HubEntry(wish.extractor, hub, tree, arguments, size, dim).load(download)
+    beside = {name: found_sha256(hub / name) or "" for name in loaded.read_beside}
+    record = HubRecord(
+        repository, commit, archive_sha256, tree_sha256(tree), arguments, size, loaded.encoding_dim,
+        parameters_sha256(loaded.trunk), beside,
+    )  # fmt: skip
+    if old is not None and is_again:
+        for name in {**old.beside, **beside}:
+            now, before = beside.get(name, "none"), old.beside.get(name, "none")
+            check_digest(f"{HUB_FOLDER}/{name}", now, before, "remove it, and pull again")
+        check_digest(f"{wish.extractor}'s parameters", record.parameters_sha256, old.parameters_sha256, "they changed")
+    lock = lock.with_hub(wish.extractor, record)
+    load_recorded(lock, wish.extractor, record)  # as every later load: from here alone
+    lock.write()
+    archive.unlink(missing_ok=True)
+    if old is not None and old.folder not in {each.folder for each in lock.hub.values()}:
+        shutil.rmtree(hub / old.folder, ignore_errors=True)
+    return record
+
+
+def fetch(url: str, to: Path, tell: Tell, sha256: str | None = None, advice: str = "") -> str:
+    """Download a file.
+
+    What has come waits in `NAME.part`, and beside it which version of the file it is the beginning of, so that a later
+    try goes on where this one stopped.
+
+    Args:
+        url: Of the file.
+        to: Where it shall lie; what lies there is replaced.
+        tell: Told of what has come.
+        sha256: Its digest in hex, or the first digits of it; None: not known.
+        advice: What to do where it cannot be fetched; empty: to put the file where it shall lie.
+
+    Returns:
+        Its SHA-256, in hex.
+
+    Raises:
+        MissingWeightsError: It cannot be fetched; the message says where to put it.
+        InvalidWeightsError: It has another digest, or is larger than any file of weights.
+    """
+    to.parent.mkdir(parents=True, exist_ok=True)
+    return _Download(url, to, tell, sha256, advice).run()
+
+
+def resolve_commit(repository: str, advice: str) -> str:
+    """The commit that a repository's default branch is at now.
+
+    Raises:
+        MissingWeightsError: GitHub cannot be asked.
+    """
+    url = f"{GITHUB_API}/repos/{repository}/commits/HEAD"
+    try:
+        answer = httpx2.get(
+            url, headers={"Accept": "application/vnd.github.sha"}, timeout=_PATIENCE, follow_redirects=True
+        )
+    except httpx2.TransportError as error:
+        raise _missing(url, f"cannot be reached ({_reason(error)})", advice) from error
+    if answer.status_code != _WHOLE or _COMMIT.fullmatch(answer.text.strip()) is None:
+        raise _missing(url, f"answered {answer.status_code}, and no commit", advice)
+    return answer.text.strip()
+
+
+def archive_url(repository: str, commit: str) -> str:
+    """Where GitHub gives a repository's tree at a commit."""
+    return f"{GITHUB}/{repository}/archive/{commit}.zip"
+
+
+def unpack(archive: Path, to: Path) -> None:
+    """Unpack a repository's archive: its one folder becomes the folder `to`, and replaces what was there.
+
+    Raises:
+        InvalidWeightsError: It is no such archive, would write outside, or unpacks to more than a repository holds.
+    """
+    with tempfile.TemporaryDirectory(dir=to.parent, prefix=".unpacking-") as beside:
+        try:
+            with zipfile.ZipFile(archive) as opened:
+                root = _root(opened, archive)
+                opened.extractall(beside)
+        except (zipfile.BadZipFile, ValueError, EOFError, NotImplementedError, RuntimeError) as error:
+            raise InvalidWeightsError(f"{archive.name} is no whole archive", file=archive.name) from error
+        if not (Path(beside) / root / "hubconf.py").is_file():
+            raise InvalidWeightsError(
+                f"{archive.name} has no hubconf.py: it is no torch hub repository", file=archive.name
+            )
+        shutil.rmtree(to, ignore_errors=True)
+        (Path(beside) / root).replace(to)
+
+
+def matches(sha256: str, wanted: str | None) -> bool:
+    """Whether a digest is the one wanted, of which perhaps only the first digits are known."""
+    return wanted is None or sha256.startswith(wanted.lower())
+
+
+def check_digest(name: str, sha256: str, wanted: str | None, then: str) -> None:
+    """Refuse another digest than the one wanted.
+
+    Raises:
+        InvalidWeightsError: It is another.
+    """
+    if not matches(sha256, wanted):
+        raise InvalidWeightsError(
+            f"{name} has sha256 {sha256} and should have {wanted}: {then}", file=name, found=sha256, wanted=wanted
+        )
+
+
+class _Download:
+    """One file on its way."""
+
+    def __init__(self, url: str, to: Path, tell: Tell, sha256: str | None, advice: str) -> None:
+        self._url, self._to, self._tell, self._sha256 = url, to, tell, sha256
+        self._advice = advice or f"fetch it where there is a network, put it at {to} and pull again"
+        self._part = to.with_name(f"{to.name}.part")
+        self._version = to.with_name(f"{to.name}.part.etag")
+        self._n_received = 0
+
+    def run(self) -> str:
+        """Ask until all of it is there; given up only where nothing comes several times in a row."""
+        tries = 0
+        with httpx2.Client(follow_redirects=True, timeout=_PATIENCE) as http:
+            while True:
+                before, why = self._n_received, ""
+                try:
+                    why = self._receive(http)
+                    if not why:
+                        return self._finish()
+                except (httpx2.ConnectError, httpx2.UnsupportedProtocol, httpx2.InvalidURL) as error:
+                    raise self._missing(f"cannot be reached ({_reason(error)})") from error
+                except httpx2.HTTPError as error:
+                    why = f"broke off ({_reason(error)})"
+                tries = 1 if self._n_received > before else tries + 1
+                if tries >= _TRIES:
+                    raise self._missing(why)
+
+    def _receive(self, http: httpx2.Client) -> str:
+        """Ask for what is still to come and keep it; answers why to ask again, nothing where all is there."""
+        n_there, headers = self._part.stat().st_size if self._part.exists() else 0, {"Accept-Encoding": "identity"}
+        version = self._version.read_text() if self._version.exists() else ""
+        if n_there and not version and len(self._sha256 or "") < hashlib.sha256().digest_size * 2:
+            n_there = 0  # nothing would tell that the file has changed since
+        if n_there:
+            headers["Range"] = f"bytes={n_there}-"
+            if version:
+                headers["If-Range"] = version
+        with http.stream("GET", self._url, headers=headers) as answer:
+            if answer.status_code == _BEYOND_THE_END and n_there:
+                return self._beyond_the_end(answer, n_there)
+            if answer.status_code >= 500:
+                return f"answered {answer.status_code}"
+            if answer.status_code not in {_WHOLE, _PART}:
+                raise self._missing(f"answered {answer.status_code}")
+            if "text/html" in answer.headers.get("content-type", ""):
+                raise self._missing("answered a page, not a file")
+            return self._keep(answer, n_there)
+
+    def _beyond_the_end(self, answer: httpx2.Response, n_there: int) -> str:
+        """Nothing is missing, where the file is as long as what is there; else what is there is of another file."""
+        found = _CONTENT_RANGE.fullmatch(answer.headers.get("content-range", ""))
+        if found is not None and found[2] == str(n_there):
+            return ""
+        self._forget()
+        return "has become another file"
+
+    def _keep(self, answer: httpx2.Response, n_there: int) -> str:
+        n_in_all = _content_length(answer)
+        if answer.status_code == _PART:
+            found = _CONTENT_RANGE.fullmatch(answer.headers.get("content-range", ""))
+            if found is None or found[1] != str(n_there):
+                self._forget()
+                return "answered another part than was asked for"
+            n_in_all = None if found[2] == "*" else int(found[2])
+        else:
+            n_there = 0
+        self._check_size(n_in_all or 0)
+        etag = answer.headers.get("etag", "")
+        with self._part.open("ab" if n_there else "wb") as part:
+            if etag and not etag.startswith("W/"):
+                self._version.write_text(etag)
+            else:
+                self._version.unlink(missing_ok=True)
+            for piece in answer.iter_raw():  # as it comes: what a break would lose is never gathered
+                part.write(piece)
+                n_there += len(piece)
+                self._n_received += len(piece)
+                self._check_size(n_there)
+                self._tell(self._to.name, n_there, n_in_all)
+            part.flush()
+            os.fsync(part.fileno())
+        return ""
+
+    def _check_size(self, n_bytes: int) -> None:
+        if n_bytes > _MOST_BYTES:
+            self._forget()
+            raise InvalidWeightsError(
+                f"{self._url} is larger than any file of weights: {n_bytes} bytes", limit=_MOST_BYTES
+            )
+
+    def _finish(self) -> str:
+        with self._part.open("rb") as stream:
+            sha256 = hashlib.file_digest(stream, "sha256").hexdigest()
+        if not matches(sha256, self._sha256):
+            self._forget()
+        check_digest(self._to.name, sha256, self._sha256, f"what {self._url} sent was not kept")
+        self._part.replace(self._to)
+        self._version.unlink(missing_ok=True)
+        return sha256
+
+    def _missing(self, why: str) -> MissingWeightsError:
+        kept = "" if not self._part.exists() else f"; the {self._part.stat().st_size} bytes that came are kept"
+        return _missing(self._url, why + kept, self._advice)
+
+    def _forget(self) -> None:
+        self._part.unlink(missing_ok=True)
+        self._version.unlink(missing_ok=True)
+
+
+def _root(opened: zipfile.ZipFile, archive: Path) -> str:
+    """The one folder that holds all members, after looking at every one of them."""
+    members = opened.infolist()
+    packed, unpacked = archive.stat().st_size, sum(member.file_size for member in members)
+    if len(members) > _MOST_MEMBERS or unpacked > min(_MOST_UNPACKED, _MOST_RATIO * packed):
+        raise InvalidWeightsError(
+            f"{archive.name} unpacks to {len(members)} files of {unpacked} bytes: more than a repository holds",
+            file=archive.name,
+        )
+    roots = set()
+    for member in members:
+        path = PurePosixPath(member.orig_filename)
+        leads_out = path.is_absolute() or not path.parts or {".."} & {*path.parts} or set("\\:") & {*str(path)}
+        if leads_out or stat.S_ISLNK(member.external_attr >> 16):
+            raise InvalidWeightsError(f"{archive.name} would write outside its folder: {path}", file=archive.name)
+        roots.add(path.parts[0])
+    if len(roots) != 1:
+        raise InvalidWeightsError(f"{archive.name} holds no single folder, as GitHub's archives do", file=archive.name)
+    return roots.pop()
+
+
+def _missing(url: str, why: str, advice: str) -> MissingWeightsError:
+    return MissingWeightsError(f"{url} {why}: {advice}", url=url)
+
+
+def _reason(error: Exception) -> str:
+    return str(error) or type(error).__name__
+
+
+def _content_length(answer: httpx2.Response) -> int | None:
+    length = answer.headers.get("content-length", "")
+    return int(length) if length.isdecimal() else None

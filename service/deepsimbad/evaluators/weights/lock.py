@@ -1,0 +1,239 @@
+"""What was pulled, with its digests: a file in the weights' folder that every later load is held to."""
+
+import hashlib
+import os
+import tempfile
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import Field, TypeAdapter, ValidationError
+
+from deepsimbad.errors import InvalidWeightsError, MissingWeightsError
+from deepsimbad.evaluators.weights.files import file_sha256
+from deepsimbad.evaluators.weights.library import KNOWN, Argument, canonical
+
+LOCK = "weights.lock"
+HUB_FOLDER = "hub"
+CHECKPOINTS = "checkpoints"
+_NOT_CONTENT = "__pycache__"  # Python writes it when it pleases
+
+_Sha256 = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
+_Commit = Annotated[str, Field(pattern="^[0-9a-f]{40}$")]
+_Side = Annotated[int, Field(ge=1, le=8192)]
+
+
+@dataclass(frozen=True)
+class FileRecord:
+    """A file of weights.
+
+    Attributes:
+        sha256: Its digest.
+        n_bytes: Its size.
+        extractor: How a configuration names it.
+        url: Where it was downloaded; None: it was put there by hand.
+    """
+
+    sha256: _Sha256
+    n_bytes: int
+    extractor: str
+    url: str | None = None
+
+
+@dataclass(frozen=True)
+class HubRecord:
+    """An entry of a torch hub repository, as it was pulled.
+
+    Attributes:
+        repository: OWNER/REPO, as it was asked for.
+        commit: Of it.
+        archive_sha256: Of the archive that held it.
+        tree_sha256: Of what was unpacked; see `tree_sha256`.
+        arguments: What the entry is given.
+        input_size: (width, height) images are brought to.
+        encoding_dim: d of what it gives.
+        parameters_sha256: Of the parameters it was loaded with, whatever file they come from.
+        beside: Digests of what else in the hub's folder loading it reads: checkpoints, and other repositories' trees.
+    """
+
+    repository: str
+    commit: _Commit
+    archive_sha256: _Sha256
+    tree_sha256: _Sha256
+    arguments: Mapping[str, Argument]
+    input_size: tuple[_Side, _Side]
+    encoding_dim: Annotated[int, Field(ge=1)]
+    parameters_sha256: _Sha256
+    beside: Mapping[str, _Sha256]
+
+    @property
+    def folder(self) -> str:
+        """Of its tree, in the hub's folder."""
+        return hub_tree(self.repository, self.commit)
+
+    @property
+    def weights_sha256(self) -> str:
+        """Stands for all that its encodings depend on."""
+        parts = [self.tree_sha256, self.parameters_sha256, repr(sorted(self.arguments.items()))]
+        parts += [f"{name} {sha256}" for name, sha256 in sorted(self.beside.items())]
+        return hashlib.sha256("\n".join([*parts, f"{self.input_size}"]).encode()).hexdigest()
+
+
+@dataclass(frozen=True)
+class _Document:
+    version: Literal[1] = 1
+    files: Mapping[str, FileRecord] = field(default_factory=dict)
+    hub: Mapping[str, HubRecord] = field(default_factory=dict)
+
+
+_DOCUMENT: TypeAdapter[_Document] = TypeAdapter(_Document)
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A file or tree that was looked at.
+
+    Attributes:
+        path: Where.
+        recorded: Its digest in the lock.
+        found: Its digest now; None: it is not there.
+    """
+
+    path: Path
+    recorded: str
+    found: str | None
+
+    @property
+    def is_good(self) -> bool:
+        """Whether it is what was recorded."""
+        return self.found == self.recorded
+
+    def check(self) -> None:
+        """Refuse what is not as recorded.
+
+        Raises:
+            MissingWeightsError: It is not there.
+            InvalidWeightsError: It is another.
+        """
+        if self.found is None:
+            raise MissingWeightsError(f"{self.path} is missing: pull it again", file=self.path.name)
+        if not self.is_good:
+            raise InvalidWeightsError(
+                f"{self.path} has sha256 {self.found} and was recorded with {self.recorded}: it was changed; remove it "
+                "and pull it again",
+                file=self.path.name, recorded=self.recorded, found=self.found,
+            )  # fmt: skip
+
+
+_KIND_OF_FILE = {"*.onnx": "onnx", "*.mat": "netvlad", "*.pth.tar": "netvlad", "*.npz": "squeezenet"}
+
+
+@dataclass(frozen=True)
+class Lock:
+    """The records of one weights' folder.
+
+    Attributes:
+        folder: The folder.
+        files: By the name in the folder.
+        hub: By the extractor's canonical name.
+    """
+
+    folder: Path
+    files: Mapping[str, FileRecord]
+    hub: Mapping[str, HubRecord]
+
+    @classmethod
+    def read(cls, folder: Path) -> "Lock":
+        """The folder's records; none where it has no lock yet.
+
+        Raises:
+            InvalidWeightsError: The lock cannot be read.
+        """
+        try:
+            document = _DOCUMENT.validate_json((folder / LOCK).read_bytes())
+        except FileNotFoundError:
+            document = _Document()
+        except (OSError, ValidationError) as error:
+            raise InvalidWeightsError(
+                f"{folder / LOCK} is no lock of weights: remove it to record everything anew", file=LOCK
+            ) from error
+        return cls(folder, document.files, document.hub)
+
+    def extractors(self) -> list[str]:
+        """The extractors whose weights lie in the folder, as configurations name them."""
+        here = {each.extractor for each in KNOWN if each.file is not None and (self.folder / each.file).is_file()}
+        for pattern, kind in _KIND_OF_FILE.items():
+            here |= {f"{kind}:{path.name}" for path in self.folder.glob(pattern)}
+        return sorted(here) + sorted(self.hub)
+
+    def hub_record(self, extractor: str) -> HubRecord | None:
+        """What is recorded of an entry, by its extractor's name."""
+        return self.hub.get(canonical(extractor))
+
+    def with_file(self, name: str, record: FileRecord) -> "Lock":
+        """With a file recorded, or recorded anew."""
+        return replace(self, files={**self.files, name: record})
+
+    def with_hub(self, extractor: str, record: HubRecord) -> "Lock":
+        """With an entry recorded, or recorded anew."""
+        return replace(self, hub={**self.hub, canonical(extractor): record})
+
+    def write(self) -> None:
+        """Replace the folder's lock, whole or not at all."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        text = _DOCUMENT.dump_json(_Document(files=self.files, hub=self.hub), indent=2)
+        with tempfile.NamedTemporaryFile(dir=self.folder, prefix=f".{LOCK}.", delete=False) as new:
+            new.write(text + b"\n")
+            new.flush()
+            os.fsync(new.fileno())
+        Path(new.name).chmod(0o644)  # a folder of weights may be shared
+        Path(new.name).replace(self.folder / LOCK)
+
+    def check_file(self, name: str, sha256: str) -> None:
+        """Hold a file to its record, where it has one.
+
+        Args:
+            name: In the folder.
+            sha256: What it has now.
+
+        Raises:
+            InvalidWeightsError: It was recorded with another.
+        """
+        if name in self.files:
+            Finding(self.folder / name, self.files[name].sha256, sha256).check()
+
+    def findings(self, name: str) -> Iterator[Finding]:
+        """Everything that belongs to a record, looked at one after another.
+
+        Args:
+            name: Of a file, or of an extractor.
+        """
+        if name in self.files:
+            yield Finding(self.folder / name, self.files[name].sha256, found_sha256(self.folder / name))
+            return
+        record, hub = self.hub[canonical(name)], self.folder / HUB_FOLDER
+        for part, sha256 in {record.folder: record.tree_sha256, **record.beside}.items():
+            yield Finding(hub / part, sha256, found_sha256(hub / part))
+
+
+def hub_tree(repository: str, commit: str) -> str:
+    """Name of the folder that a repository's tree at a commit has in the hub's folder."""
+    return f"{repository.replace('/', '_')}_{commit}"
+
+
+def found_sha256(path: Path) -> str | None:
+    """Digest of a file or of a tree; None: there is neither."""
+    if path.is_dir():
+        return tree_sha256(path)
+    return file_sha256(path) if path.is_file() else None
+
+
+def tree_sha256(folder: Path) -> str:
+    """One digest of all files in a folder: their paths and contents, in the order of their paths."""
+    tree = hashlib.sha256()
+    for path in sorted(folder.rglob("*"), key=lambda each: each.relative_to(folder).as_posix()):
+        inside = path.relative_to(folder)
+        if path.is_file() and _NOT_CONTENT not in inside.parts:
+            tree.update(f"{file_sha256(path)}  {inside.as_posix()}\n".encode())
+    return tree.hexdigest()

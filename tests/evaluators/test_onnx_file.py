@@ -1,0 +1,212 @@
+"""ONNX files of anybody's making, written here with onnx.helper."""
+
+import hashlib
+import json
+
+import numpy as np
+import onnx
+import pytest
+from onnx import TensorProto, helper, numpy_helper
+
+from deepsimbad.errors import InvalidWeightsError, MissingPackageError, MissingWeightsError
+from deepsimbad.evaluators.compute import Compute
+from deepsimbad.evaluators.extractors import onnx_file as module
+from deepsimbad.evaluators.extractors.onnx_file import onnx_file
+from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
+from deepsimbad.evaluators.weights.lock import FileRecord, Lock
+
+D = 6
+WEIGHTS = np.random.default_rng(3).normal(size=(3, D)).astype(np.float32)
+
+
+def model(
+    shape=("n", 3, 20, 30), *, nodes=None, output=("n", D), kind=TensorProto.FLOAT, metadata=None, opsets=(("", 17),),
+    axes=(2, 3),
+):  # fmt: skip
+    """Means over rows and columns, times a matrix: [n, 3, h, w] to [n, 6]."""
+    nodes = nodes or [
+        helper.make_node("ReduceMean", ["x"], ["means"], axes=list(axes), keepdims=0),
+        helper.make_node("MatMul", ["means", "weights"], ["y"]),
+    ]
+    graph = helper.make_graph(
+        nodes, "g", [helper.make_tensor_value_info("x", kind, shape)],
+        [helper.make_tensor_value_info("y", TensorProto.FLOAT, output)],
+        [numpy_helper.from_array(WEIGHTS, "weights")],
+    )  # fmt: skip
+    made = helper.make_model(graph, opset_imports=[helper.make_opsetid(*each) for each in opsets], ir_version=9)
+    helper.set_model_props(made, {f"deepsimbad.{name}": text for name, text in (metadata or {}).items()})
+    return made
+
+
+def load(folder, made, **compute):
+    (folder / "places.onnx").write_bytes(made if isinstance(made, bytes) else made.SerializeToString())
+    return onnx_file("places.onnx", Compute(weights_dir=folder, **compute))
+
+
+def images(n=3, size=(20, 30)):
+    return list(np.random.default_rng(1).integers(0, 256, (n, *size, 3), np.uint8))
+
+
+def by_hand(images, scale=1 / 255, mean=(0.485, 0.456, 0.406), std=(0.229, 0.224, 0.225), bgr=False):
+    means = np.stack([image.astype(np.float64).mean(axis=(0, 1)) for image in images])
+    means = means if bgr else means[:, ::-1]
+    given = ((means * scale - mean) / std) @ WEIGHTS
+    return given / np.linalg.norm(given, axis=1, keepdims=True)
+
+
+def test_a_file_encodes_as_its_graph_says(tmp_path):
+    extractor = load(tmp_path, model())
+    assert (extractor.input_size, extractor.encoding_dim, extractor.largest_batch) == ((30, 20), D, 1)
+    given = extractor.encode(images())
+    assert given.dtype == np.float32
+    np.testing.assert_allclose(given, by_hand(images()), atol=1e-3)
+    assert extractor.weights_sha256 == hashlib.sha256((tmp_path / "places.onnx").read_bytes()).hexdigest()
+
+
+def test_it_is_made_by_name(tmp_path):
+    load(tmp_path, model())
+    config = evaluator_config({"kind": "feature_l2", "extractor": "onnx:places.onnx"})
+    assert make_evaluator(config, Compute(weights_dir=tmp_path)).encode(images()).shape == (3, D)
+
+
+@pytest.mark.parametrize(
+    ("shape", "size"),
+    [
+        (("n", 3, "h", "w"), (224, 224)),
+        ((None, 3, None, None), (224, 224)),
+        (("n", 3, "h", 100), (100, 224)),
+        ((1, 3, 20, 30), (30, 20)),
+    ],
+)
+def test_sides_that_are_open_and_batches_that_are_not(tmp_path, shape, size):
+    extractor = load(tmp_path, model(shape, output=(shape[0], D)), largest_batch=4)
+    assert extractor.input_size == size
+    assert extractor.largest_batch == (1 if shape[0] == 1 else 4)
+    same = images(size=size[::-1])
+    np.testing.assert_allclose(extractor.encode(same), by_hand(same), atol=1e-3)
+
+
+def test_how_images_are_shown_is_told_by_the_file(tmp_path):
+    told = {"mean": "[0.5, 0.4, 0.3]", "std": "[1, 2, 3]", "scale": "0.01", "channels": "BGR"}
+    extractor = load(tmp_path, model(metadata=told))
+    wanted = by_hand(images(), 0.01, (0.5, 0.4, 0.3), (1, 2, 3), bgr=True)
+    np.testing.assert_allclose(extractor.encode(images()), wanted, atol=1e-3)
+    told = {"mean": "[123, 117, 104]", "std": "[1, 1, 1]", "scale": "[1, 1, 1]", "layout": "NHWC"}
+    extractor = load(tmp_path, model(("n", 20, 30, 3), metadata=told, axes=(1, 2)))
+    np.testing.assert_allclose(extractor.encode(images()), by_hand(images(), 1, (123, 117, 104), (1, 1, 1)), atol=1e-3)
+    extractor = load(tmp_path, model(metadata={"channels": "BGR"}))
+    wanted = by_hand(images(), mean=(0.406, 0.456, 0.485), std=(0.225, 0.224, 0.229), bgr=True)
+    np.testing.assert_allclose(extractor.encode(images()), wanted, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    "told",
+    [
+        {"means": "[1, 2, 3]"},
+        {"mean": "[1, 2]"},
+        {"mean": "[1, 2, NaN]"},
+        {"mean": "red"},
+        {"mean": "[1, 2, true]"},
+        {"mean": "[1, 2, 1e300]"},
+        {"std": "[1, 0, 1]"},
+        {"scale": "[]"},
+        {"scale": json.dumps([[1]])},
+        {"channels": "GBR"},
+        {"layout": "nchw"},
+    ],
+    ids=str,
+)
+def test_metadata_that_means_nothing_is_refused(tmp_path, told):
+    with pytest.raises(InvalidWeightsError, match=f"deepsimbad.{next(iter(told))}"):
+        load(tmp_path, model(metadata=told))
+
+
+def test_maps_of_one_cell_are_encodings(tmp_path):
+    nodes = [helper.make_node("GlobalAveragePool", ["x"], ["y"])]
+    extractor = load(tmp_path, model(nodes=nodes, output=("n", 3, 1, 1)))
+    assert extractor.encode(images()).shape == (3, 3)
+
+
+def test_an_image_in_which_nothing_is_seen_has_a_neutral_encoding(tmp_path):
+    nodes = [
+        helper.make_node("ReduceMean", ["x"], ["means"], axes=[2, 3], keepdims=0),
+        helper.make_node("Sub", ["means", "means"], ["y"]),
+    ]
+    given = load(tmp_path, model(nodes=nodes, output=("n", 3))).encode(images())
+    np.testing.assert_allclose(given, 3**-0.5, atol=1e-3)
+
+
+def _node(name, *inputs, **attributes):
+    return [helper.make_node(name, list(inputs), ["y"], **attributes)]
+
+
+@pytest.mark.parametrize(
+    ("made", "told"),
+    [
+        (lambda: model(("n", 1, 20, 30), nodes=_node("Identity", "x"), output=("n", 1, 20, 30)), "takes tensor"),
+        (lambda: model(("n", 20, 30, 3), axes=(1, 2)), "takes tensor"),
+        (lambda: model((4, 3, 20, 30), output=(4, D)), "with n open or 1"),
+        (lambda: model(("n", 3, 20, 100_000)), "takes tensor"),
+        (lambda: model(("n", 3, 20), nodes=_node("Identity", "x"), output=("n", 3, 20)), "takes tensor"),
+        (lambda: model(kind=TensorProto.DOUBLE), "."),
+        (lambda: model(nodes=_node("Identity", "x"), output=("n", 3, 20, 30)), r"gives \[1, 3, 20, 30\] for 1 images"),
+        (lambda: model(nodes=_node("Shape", "x"), output=(4,)), "."),
+        (lambda: model(nodes=_node("MatMul", "x", "weights")), "."),
+        (lambda: model(nodes=_node("Sight", "x", domain="others"), opsets=(("", 17), ("others", 1))), "can run"),
+        (lambda: model().SerializeToString()[:-40], "."),
+        (lambda: model().SerializeToString()[:50], "."),
+        (lambda: b"", "no whole ONNX file"),
+        (lambda: b"no model at all", "no whole ONNX file"),
+        (lambda: b"\x00" * 1000, "no whole ONNX file"),
+    ],
+)  # fmt: skip
+def test_what_gives_no_encodings_is_refused(tmp_path, capfd, made, told):
+    with pytest.raises(InvalidWeightsError, match=told) as refused:
+        load(tmp_path, made())
+    assert "places.onnx" in refused.value.message
+    assert capfd.readouterr() == ("", "")
+
+
+def test_numbers_that_are_none_are_refused(tmp_path):
+    nodes = [
+        helper.make_node("ReduceMean", ["x"], ["means"], axes=[2, 3], keepdims=0),
+        helper.make_node("Sub", ["means", "means"], ["none"]),
+        helper.make_node("Div", ["means", "none"], ["y"]),
+    ]
+    with pytest.raises(InvalidWeightsError, match="NaN, infinity"):
+        load(tmp_path, model(nodes=nodes, output=("n", 3)))
+
+
+@pytest.mark.parametrize("where", ["initializer", "constant", "branch"])
+def test_data_in_another_file_is_refused(tmp_path, where):
+    made = model()
+    outside = onnx.TensorProto(name="weights", data_type=TensorProto.FLOAT, dims=[3, D])
+    outside.data_location = TensorProto.EXTERNAL
+    outside.external_data.add(key="location", value="../secret")
+    if where == "initializer":
+        made.graph.initializer[0].CopyFrom(outside)
+    else:
+        constant = helper.make_node("Constant", [], ["c"], value=outside)
+        if where == "branch":
+            branch = helper.make_graph(
+                [constant], "b", [], [helper.make_tensor_value_info("c", TensorProto.FLOAT, (3, D))]
+            )
+            constant = helper.make_node("If", ["when"], ["c"], then_branch=branch, else_branch=branch)
+        made.graph.node.append(constant)
+    with pytest.raises(InvalidWeightsError, match="keeps its numbers in another file"):
+        load(tmp_path, made)
+
+
+def test_a_file_is_held_to_what_was_recorded(tmp_path):
+    load(tmp_path, model())
+    Lock.read(tmp_path).with_file("places.onnx", FileRecord("0" * 64, 5, "onnx:places.onnx")).write()
+    with pytest.raises(InvalidWeightsError, match="was changed"):
+        load(tmp_path, model())
+
+
+def test_what_is_missing_is_named(tmp_path, monkeypatch):
+    with pytest.raises(MissingWeightsError, match=r"put it at .*places\.onnx"):
+        onnx_file("places.onnx", Compute(weights_dir=tmp_path))
+    monkeypatch.setattr(module, "has_onnxruntime", lambda: False)
+    with pytest.raises(MissingPackageError, match=r"deep-simbad\[fast\]"):
+        onnx_file("places.onnx", Compute(weights_dir=tmp_path))

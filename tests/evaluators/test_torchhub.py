@@ -1,0 +1,398 @@
+"""Torch hub repositories: pulled from an archive that lies here, then loaded as any domain would."""
+
+import contextlib
+import json
+import sys
+import zipfile
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from deepsimbad.errors import InvalidWeightsError, MissingPackageError, MissingWeightsError, OutOfMemoryError
+from deepsimbad.evaluators.compute import Compute, Device, Runtime
+from deepsimbad.evaluators.extractors.torchhub import torchhub
+from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
+from deepsimbad.evaluators.weights import downloads
+from deepsimbad.evaluators.weights.downloads import HubWish, pull_hub
+from deepsimbad.evaluators.weights.lock import LOCK, Lock
+
+COMMIT = "0123456789abcdef0123456789abcdef01234567"
+REPOSITORY = "someone/Places"
+SIZE = (28, 42)
+
+MODEL = """
+import torch
+
+class Means(torch.nn.Module):
+    def __init__(self, dim, form="tensor"):
+        super().__init__()
+        self.form = form
+        self.project = torch.nn.Linear(12, dim, bias=False)
+        torch.nn.init.constant_(self.project.weight, 0.1)
+        with torch.no_grad():
+            self.project.weight[:, ::2] += torch.arange(dim)[:, None] / dim
+
+    def forward(self, x):
+        means = torch.nn.functional.adaptive_avg_pool2d(x, 2).flatten(1)
+        y = self.project(means)
+        return {
+            "tensor": y, "pair": (torch.zeros(3), x, y, y + 1), "dict": {"y": y}, "map": x, "one": y[:1],
+            "nan": y / 0, "whole": y.long(), "flat": y[0], "zero": y * 0,
+        }[self.form]
+"""
+HUBCONF = """
+dependencies = ["torch"]
+import torch
+from places_model import Means
+
+def entry(dim=8, form="tensor"):
+    print("noise on standard output")
+    return Means(dim, form)
+
+def wrapped():
+    return torch.nn.DataParallel(Means(8))
+
+def broken():
+    raise ValueError("there is nothing to see")
+
+def ending():
+    raise SystemExit(3)
+
+def text():
+    return "no model"
+
+def random():
+    model = Means(8)
+    torch.nn.init.normal_(model.project.weight)
+    return model
+
+def needing():
+    import a_package_nobody_has
+
+def checkpoint(name="places.pth"):
+    model = Means(8)
+    model.load_state_dict(torch.hub.load_state_dict_from_url("http://127.0.0.1:9/" + name, map_location="cpu"))
+    return model
+
+def secret():
+    import urllib.request
+    try:
+        urllib.request.urlopen("http://127.0.0.1:9/secret")
+    except OSError:
+        pass
+    import socket
+    socket.create_connection(("127.0.0.1", 9))
+
+def nested():
+    inner = torch.hub.load("elsewhere/backbone", "backbone")
+    model = Means(8)
+    model.backbone = inner
+    return model
+"""
+
+
+def leave_archive(folder, files, repository=REPOSITORY, commit=COMMIT):
+    """As somebody without a network would: the archive where a pull looks for it."""
+    hub = folder / "hub"
+    hub.mkdir(parents=True, exist_ok=True)
+    path = hub / f"{repository.replace('/', '_')}_{commit}.zip"
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, text in files.items():
+            archive.writestr(zipfile.ZipInfo(f"Places-{commit}/{name}"), text)
+    return path
+
+
+def pulled(folder, entry="entry", files=None, **wish):
+    leave_archive(folder, files or {"hubconf.py": HUBCONF, "places_model.py": MODEL})
+    wish = {"commit": COMMIT, "input_size": SIZE, **wish}
+    return pull_hub(folder, HubWish(f"torchhub:{REPOSITORY}:{entry}", **wish), lambda *_: None)
+
+
+def loaded(folder, entry="entry", **compute):
+    return torchhub(f"{REPOSITORY}:{entry}", Compute(weights_dir=folder, device=Device.CPU, **compute))
+
+
+@pytest.fixture(autouse=True)
+def _the_process_stays_as_it_was():
+    before = (set(sys.modules), list(sys.path), torch.hub.get_dir(), torch.hub.download_url_to_file, sys.stdout)
+    yield
+    assert "places_model" not in sys.modules
+    assert (list(sys.path), torch.hub.get_dir(), torch.hub.download_url_to_file, sys.stdout) == before[1:]
+
+
+def scenes(n=3):
+    return list(np.random.default_rng(5).integers(0, 255, (n, 30, 40, 3), np.uint8))
+
+
+def by_hand(image, dim=8):
+    """The same in plain numpy, but for resizing."""
+    rgb = image[..., ::-1].astype(np.float64) / 255
+    normalised = (rgb - [0.485, 0.456, 0.406]) / [0.229, 0.224, 0.225]
+    height, width = image.shape[:2]
+    cells = [
+        [normalised[y : y + height // 2, x : x + width // 2].mean(axis=(0, 1)) for x in (0, width // 2)]
+        for y in (0, height // 2)
+    ]
+    means = np.array(cells).transpose(2, 0, 1).ravel()
+    weights = np.full((dim, 12), 0.1)
+    weights[:, ::2] += np.arange(dim)[:, None] / dim
+    return weights @ means / np.linalg.norm(weights @ means)
+
+
+def test_an_entry_encodes_as_its_model_says(tmp_path, capfd):
+    record = pulled(tmp_path)
+    assert (record.encoding_dim, record.input_size, record.beside) == (8, SIZE, {})
+    capfd.readouterr()
+    extractor = loaded(tmp_path)
+    assert capfd.readouterr() == ("", "")
+    images = [np.ascontiguousarray(np.random.default_rng(i).integers(0, 255, (42, 28, 3), np.uint8)) for i in range(3)]
+    given = extractor.encode(images)
+    assert given.dtype == np.float32
+    np.testing.assert_allclose(given, [by_hand(image) for image in images], atol=3e-4)
+    assert (extractor.encoding_dim, extractor.input_size) == (8, SIZE)
+    assert extractor.weights_sha256 == record.weights_sha256
+
+
+@pytest.mark.parametrize("form", ["tensor", "pair", "zero"])
+def test_encodings_have_unit_length_and_stand_for_themselves(tmp_path, form):
+    pulled(tmp_path, arguments={"form": form})
+    extractor = loaded(tmp_path, largest_batch=2)
+    given = extractor.encode(scenes())
+    np.testing.assert_allclose(np.linalg.norm(given, axis=1), 1, rtol=1e-3)
+    np.testing.assert_allclose(given, [extractor.encode([image])[0] for image in scenes()], atol=3e-4)
+
+
+def test_it_is_made_by_name(tmp_path):
+    record = pulled(tmp_path)
+    config = evaluator_config({"kind": "feature_l2", "extractor": f"torchhub:{REPOSITORY}:entry"})
+    evaluator = make_evaluator(config, Compute(weights_dir=tmp_path, device=Device.CPU))
+    assert evaluator.encode(scenes()).shape == (3, 8)
+    assert evaluator.weights_sha256 == record.weights_sha256
+
+
+def test_arguments_are_recorded_and_given_at_every_load(tmp_path):
+    first = pulled(tmp_path)
+    record = pulled(tmp_path, arguments={"dim": 5})
+    assert json.loads((tmp_path / LOCK).read_text())["hub"][f"torchhub:{REPOSITORY.lower()}:entry"]["arguments"] == {
+        "dim": 5
+    }
+    assert loaded(tmp_path).encode(scenes()).shape == (3, 5)
+    assert record.weights_sha256 != first.weights_sha256
+
+
+def test_the_repositorys_name_may_be_in_capitals(tmp_path):
+    pulled(tmp_path)
+    assert torchhub("SOMEONE/places:entry", Compute(weights_dir=tmp_path, device=Device.CPU)).encoding_dim == 8
+
+
+def test_a_model_of_several_devices_is_taken_out_of_its_wrapper(tmp_path):
+    pulled(tmp_path, "wrapped")
+    np.testing.assert_allclose(np.linalg.norm(loaded(tmp_path, "wrapped").encode(scenes()), axis=1), 1, rtol=1e-3)
+
+
+def test_by_itself_it_is_computed_in_float32(tmp_path):
+    pulled(tmp_path)
+    by_itself, asked = loaded(tmp_path).encode(scenes()), loaded(tmp_path, runtime=Runtime.TORCH).encode(scenes())
+    np.testing.assert_array_equal(by_itself, asked)
+    with contextlib.suppress(InvalidWeightsError):  # a model may be unable to; this one is not
+        np.testing.assert_allclose(loaded(tmp_path, runtime=Runtime.TORCH_BF16).encode(scenes()), asked, atol=0.05)
+
+
+@pytest.mark.parametrize(
+    ("entry", "arguments", "told"),
+    [
+        ("entry", {"form": "dict"}, "gives dict for 2 images"),
+        ("entry", {"form": "map"}, r"gives \[2, 3, 42, 28\] for 2 images"),
+        ("entry", {"form": "one"}, r"gives \[1, 8\] for 2 images"),
+        ("entry", {"form": "flat"}, r"gives \[8\] for 2 images"),
+        ("entry", {"form": "whole"}, r"gives \[2, 8\] for 2 images"),
+        ("entry", {"form": "nan"}, "NaN or infinity"),
+        ("entry", {"form": "other"}, "does not take images of 28 x 42: KeyError"),
+        ("entry", {"colour": "red"}, "cannot be made: TypeError"),
+        ("broken", {}, "cannot be made: ValueError: there is nothing to see"),
+        ("ending", {}, "cannot be made: SystemExit"),
+        ("entry", {"dim": -1}, "cannot be made: RuntimeError"),
+        ("text", {}, "gives a str, no model"),
+        ("absent", {}, "Cannot find callable absent"),
+        ("random", {}, "not the same each time"),
+    ],
+)
+def test_what_gives_no_encodings_is_not_recorded(tmp_path, entry, arguments, told):
+    with pytest.raises(InvalidWeightsError, match=told):
+        pulled(tmp_path, entry, arguments=arguments)
+    assert not (tmp_path / LOCK).exists()
+    with pytest.raises(MissingWeightsError, match=f"weights pull torchhub:{REPOSITORY}:{entry}"):
+        loaded(tmp_path, entry)
+
+
+@pytest.mark.parametrize("dim", [10**12, 10**15])
+def test_a_model_that_does_not_fit_the_memory_is_no_invalid_one(tmp_path, dim):
+    with pytest.raises(OutOfMemoryError):
+        pulled(tmp_path, arguments={"dim": dim})
+
+
+@pytest.mark.parametrize("listed", [True, False])
+def test_a_package_that_it_needs_is_named(tmp_path, listed):
+    text = HUBCONF.replace('["torch"]', '["torch", "a_package_nobody_has"]') if listed else HUBCONF
+    with pytest.raises(MissingPackageError, match="needs a_package_nobody_has"):
+        pulled(tmp_path, "entry" if listed else "needing", {"hubconf.py": text, "places_model.py": MODEL})
+
+
+def test_a_module_that_the_repository_lacks_itself_is_no_package(tmp_path):
+    model = MODEL.replace("import torch", "import torch\nfrom places_model.other import x", 1)
+    with pytest.raises(InvalidWeightsError, match="cannot be made: ModuleNotFoundError"):
+        pulled(tmp_path, files={"hubconf.py": HUBCONF, "places_model.py": model})
+
+
+def test_checkpoints_are_brought_by_a_pull_alone_and_recorded(tmp_path, monkeypatch):
+    asked = []
+
+    def fetch(url, to, tell, sha256=None, advice=""):
+        asked.append((url, sha256))
+        to.parent.mkdir(exist_ok=True)
+        torch.save({"project.weight": torch.ones(8, 12)}, to)
+
+    monkeypatch.setattr(downloads, "fetch", fetch)
+    record = pulled(tmp_path, "checkpoint")
+    assert asked == [("http://127.0.0.1:9/places.pth", None)]
+    checkpoint = tmp_path / "hub" / "checkpoints" / "places.pth"
+    assert list(record.beside) == ["checkpoints/places.pth"]
+    np.testing.assert_allclose(np.abs(loaded(tmp_path, "checkpoint").encode(scenes())), 8**-0.5, rtol=1e-3)
+    checkpoint.unlink()
+    with pytest.raises(MissingWeightsError, match=r"places\.pth is missing"):
+        loaded(tmp_path, "checkpoint")
+    torch.save({"project.weight": torch.zeros(8, 12)}, checkpoint)
+    with pytest.raises(InvalidWeightsError, match=f"recorded with {record.beside['checkpoints/places.pth']}"):
+        loaded(tmp_path, "checkpoint")
+    with pytest.raises(InvalidWeightsError, match="remove it"):
+        pulled(tmp_path, "checkpoint")
+    checkpoint.unlink()
+    again = pulled(tmp_path, "checkpoint")
+    assert again == record
+    assert asked[1:] == [("http://127.0.0.1:9/places.pth", record.beside["checkpoints/places.pth"])]
+
+
+def test_a_pull_without_a_network_says_what_to_put_where(tmp_path):
+    place = tmp_path / "hub" / "checkpoints" / "places.pth"
+    with pytest.raises(MissingWeightsError, match=r"127\.0\.0\.1:9/places\.pth cannot be reached") as told:
+        pulled(tmp_path, "checkpoint")
+    assert str(place) in told.value.message
+    torch.save({"project.weight": torch.ones(8, 12)}, place)
+    assert list(pulled(tmp_path, "checkpoint").beside) == ["checkpoints/places.pth"]
+
+
+def test_loading_asks_nothing_of_a_network(tmp_path):
+    """An entry that swallows the first refusal, and one whose record knows nothing of its download."""
+    with pytest.raises(InvalidWeightsError, match="ConnectionRefusedError"):
+        pulled(tmp_path, "secret")
+    record = pulled(tmp_path)
+    for entry, address in (("secret", "127.0.0.1"), ("checkpoint", "http://127.0.0.1:9/places.pth for ")):
+        lock = Lock.read(tmp_path)
+        lock.with_hub(f"torchhub:{REPOSITORY}:{entry}", replace(record, arguments={})).write()
+        with pytest.raises(MissingWeightsError, match="nothing is downloaded while it is loaded") as told:
+            loaded(tmp_path, entry)
+        assert address in told.value.message
+
+
+def test_other_repositories_that_it_loads_are_recorded_too(tmp_path, monkeypatch):
+    """One that torch hub has put there; offline it is found by its folder's name."""
+    inner = tmp_path / "hub" / "elsewhere_backbone_main"
+    inner.mkdir(parents=True)
+    (inner / "hubconf.py").write_text("from inner_model import Inner\n\ndef backbone():\n    return Inner()\n")
+    (inner / "inner_model.py").write_text("from torch.nn import Identity as Inner\n")
+    monkeypatch.setattr("torch.hub._parse_repo_info", lambda github: (*github.split("/"), "main"))
+    record = pulled(tmp_path, "nested")
+    assert list(record.beside) == ["elsewhere_backbone_main"]
+    assert loaded(tmp_path, "nested").encoding_dim == 8
+    (inner / "README").write_text("changed")
+    with pytest.raises(InvalidWeightsError, match="elsewhere_backbone_main has sha256"):
+        loaded(tmp_path, "nested")
+
+
+def test_repositories_may_have_modules_of_one_name(tmp_path):
+    pulled(tmp_path)
+    files = {"hubconf.py": HUBCONF, "places_model.py": MODEL.replace("means)", "-means)")}
+    leave_archive(tmp_path, files, "another/Places")
+    pull_hub(tmp_path, HubWish("torchhub:another/Places:entry", COMMIT, input_size=SIZE), lambda *_: None)
+    another = torchhub("another/Places:entry", Compute(weights_dir=tmp_path, device=Device.CPU))
+    np.testing.assert_allclose(another.encode(scenes()), -loaded(tmp_path).encode(scenes()), atol=3e-4)
+
+
+@pytest.mark.parametrize("change", ["changed", "added", "removed", "gone"])
+def test_a_tree_that_was_changed_is_not_run(tmp_path, change):
+    record = pulled(tmp_path)
+    tree = tmp_path / "hub" / record.folder
+    mark = tmp_path / "was-run"
+    evil = f"open({str(mark)!r}, 'w')\n"
+    if change == "changed":
+        (tree / "hubconf.py").write_text(evil + HUBCONF)
+    elif change == "added":
+        (tree / "torch.py").write_text(evil)
+    elif change == "removed":
+        (tree / "places_model.py").unlink()
+    else:
+        tree.rename(tmp_path / "elsewhere")
+    error = MissingWeightsError if change == "gone" else InvalidWeightsError
+    with pytest.raises(error) as told:
+        loaded(tmp_path)
+    assert not mark.exists()
+    assert record.folder in told.value.message
+    if change != "gone":
+        assert record.tree_sha256 in told.value.message
+    assert pulled(tmp_path) == record, "a pull mends it"
+    assert loaded(tmp_path).encoding_dim == 8
+
+
+def test_an_archive_of_the_same_commit_must_be_the_same(tmp_path):
+    record = pulled(tmp_path)
+    (tmp_path / "hub" / record.folder / "hubconf.py").write_text("")
+    mark = tmp_path / "was-run"
+    files = {"hubconf.py": f"open({str(mark)!r}, 'w')\n{HUBCONF}", "places_model.py": MODEL}
+    with pytest.raises(InvalidWeightsError, match=record.tree_sha256):
+        pulled(tmp_path, files=files)
+    assert not mark.exists()
+    with pytest.raises(InvalidWeightsError, match="should have 00000000"):
+        pulled(tmp_path, sha256="00000000")
+    assert pulled(tmp_path) == record
+
+
+def test_what_is_here_as_recorded_is_not_fetched_again(tmp_path, monkeypatch):
+    record = pulled(tmp_path)
+    (tmp_path / "hub" / f"{record.folder}.zip").unlink(missing_ok=True)
+    monkeypatch.setattr(downloads, "GITHUB", "http://127.0.0.1:9")
+    assert pull_hub(tmp_path, HubWish(f"torchhub:{REPOSITORY}:entry"), lambda *_: None) == record
+
+
+def test_another_commit_takes_the_place_of_the_first(tmp_path):
+    first = pulled(tmp_path)
+    leave_archive(tmp_path, {"hubconf.py": HUBCONF, "places_model.py": MODEL}, commit="a" * 40)
+    wish = HubWish(f"torchhub:{REPOSITORY}:entry", commit="a" * 40)
+    second = pull_hub(tmp_path, wish, lambda *_: None)
+    assert (second.commit, second.input_size, second.tree_sha256) == ("a" * 40, SIZE, first.tree_sha256)
+    assert [path.name for path in (tmp_path / "hub").iterdir()] == [second.folder]
+
+
+def test_what_python_keeps_of_a_tree_is_neither_read_nor_counted(tmp_path):
+    record = pulled(tmp_path)
+    tree = tmp_path / "hub" / record.folder
+    assert not (tree / "__pycache__").exists()
+    (tree / "__pycache__").mkdir()
+    (tree / "__pycache__" / f"places_model.{sys.implementation.cache_tag}.pyc").write_bytes(b"no code at all")
+    assert loaded(tmp_path).encoding_dim == 8
+
+
+def test_the_dimension_that_is_known_must_come(tmp_path):
+    pulled(tmp_path)
+    text = (tmp_path / LOCK).read_text()
+    (tmp_path / LOCK).write_text(text.replace('"encoding_dim": 8', '"encoding_dim": 9'))
+    with pytest.raises(InvalidWeightsError, match="encodings of 8 numbers, not 9"):
+        loaded(tmp_path)
+
+
+@pytest.mark.parametrize("text", ["", "{", '{"version": 2}', '{"hub": {"x": {}}}', '{"files": {"x": {"sha256": "1"}}}'])
+def test_a_damaged_lock_is_named(tmp_path, text):
+    (tmp_path / LOCK).write_text(text)
+    with pytest.raises(InvalidWeightsError, match=r"weights\.lock is no lock"):
+        loaded(tmp_path)
