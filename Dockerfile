@@ -7,10 +7,13 @@
 # It listens on every address of its network, so it refuses to start until the first key was created. Any command of
 # `deepsimbad` can stand in the place of `keys create ...`.
 #
-# VARIANT=cuda builds on NVIDIA's CUDA runtime instead of plain Debian. Nothing in this release computes on a GPU
-# (docs/decisions/0002-no-torch-yet.md), so it makes nothing faster: it is the base for images that add an evaluator of
-# their own, which then finds driver libraries and a Python of the same make. EXTRAS and PIP_EXTRA_INDEX_URL say what is
-# installed besides, and from where.
+# It computes on the processor: PyTorch comes from PyTorch's own index of CPU builds, about 1.5 GB of image in all, and
+# ONNX Runtime runs the default extractor. With a GPU,
+#
+#   docker build --build-arg VARIANT=cuda --build-arg PIP_EXTRA_INDEX_URL= --tag deep-simbad:cuda .
+#
+# builds on NVIDIA's CUDA base with PyPI's PyTorch, which brings CUDA's libraries, about 8 GB. EXTRAS says what is
+# installed.
 ARG VARIANT=cpu
 
 FROM python:3.11-slim-bookworm AS base-cpu
@@ -23,8 +26,8 @@ RUN apt-get update \
 
 # hadolint ignore=DL3006
 FROM base-${VARIANT} AS build
-ARG EXTRAS=service
-ARG PIP_EXTRA_INDEX_URL=
+ARG EXTRAS=service,fast
+ARG PIP_EXTRA_INDEX_URL=https://download.pytorch.org/whl/cpu
 WORKDIR /src
 COPY pyproject.toml constraints.txt README.md CHANGELOG.md LICENSE ./
 COPY service service
@@ -33,10 +36,11 @@ COPY migrations migrations
 RUN python3 -m venv /opt/deepsimbad \
     && /opt/deepsimbad/bin/python -m pip install --no-cache-dir --disable-pip-version-check --constraint constraints.txt ".[${EXTRAS}]" \
     && /opt/deepsimbad/bin/python -m pip uninstall --yes --quiet --disable-pip-version-check pip setuptools
-# The hot loops are compiled here rather than in front of the first robot. numba takes them for the same kind of
-# processor alone; on another kind it compiles anew, into the volume.
-RUN install -d -m 0700 /var/lib/deepsimbad/data /var/lib/deepsimbad/cache \
-    && NUMBA_CACHE_DIR=/var/lib/deepsimbad/cache /opt/deepsimbad/bin/python -c "from deepsimbad.engine.warm_up import warm_up; warm_up()"
+# The hot loops are compiled, and the default network is made ready, here rather than in front of the first robot. numba
+# takes its loops for the same kind of processor alone; on another kind it compiles anew, into the volume.
+RUN install -d -m 0700 /var/lib/deepsimbad/data /var/lib/deepsimbad/cache /var/lib/deepsimbad/weights \
+    && NUMBA_CACHE_DIR=/var/lib/deepsimbad/cache DEEPSIMBAD_WEIGHTS_DIR=/var/lib/deepsimbad/weights \
+       /opt/deepsimbad/bin/python -c "from deepsimbad.engine.warm_up import warm_up; from deepsimbad.settings import Settings; from deepsimbad.engine.evaluator_pool import EvaluatorPool; warm_up(); EvaluatorPool(Settings().compute()).evaluator({'kind': 'feature_l2'})"
 
 # hadolint ignore=DL3006
 FROM base-${VARIANT} AS service
@@ -54,6 +58,7 @@ ENV PATH=/opt/deepsimbad/bin:$PATH \
     PYTHONDONTWRITEBYTECODE=1 \
     NUMBA_CACHE_DIR=/var/lib/deepsimbad/cache \
     DEEPSIMBAD_DATA_DIR=/var/lib/deepsimbad/data \
+    DEEPSIMBAD_WEIGHTS_DIR=/var/lib/deepsimbad/weights \
     DEEPSIMBAD_HOST=0.0.0.0 \
     DEEPSIMBAD_PORT=8000
 USER 10001:10001

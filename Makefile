@@ -1,6 +1,10 @@
 # The two commands a newcomer needs: `make demo` and `make test`. Both set everything up first.
 # A Python of 3.11 or newer and make are all that must be there; PYTHON=... picks another interpreter.
 
+# What pip may look at besides PyPI. On Linux PyPI's PyTorch is the CUDA build, gigabytes of it; the CPU build comes with
+#   make install TORCH_INDEX=https://download.pytorch.org/whl/cpu
+TORCH_INDEX ?=
+PIP_INSTALL = $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX))
 PYTHON ?= $(shell for p in python3.11 python3.12 python3.13 python3 python; do \
   $$p -c 'import sys, venv, ensurepip; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && { echo $$p; break; }; done)
 BIN := .venv/bin
@@ -15,7 +19,9 @@ install: .venv/.installed ## .venv with the service, the client and the tools fr
 .venv/.installed: pyproject.toml constraints.txt
 	@test -n "$(PYTHON)" || { echo "No Python 3.11 or newer with venv found; install one, or name it: make PYTHON=/path/to/python $(MAKECMDGOALS)" >&2; exit 1; }
 	$(PYTHON) -m venv --clear .venv
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
+	@echo "Installing into .venv: about 0.6 GB to download and 1.8 GB on the disk with PyTorch's CPU build, 4 and 8 GB with CUDA's," >&2
+	@echo "which is what pip takes on Linux unless told: make $(or $(MAKECMDGOALS),install) TORCH_INDEX=https://download.pytorch.org/whl/cpu" >&2
+	$(PIP_INSTALL) --editable '.[dev]'
 	@touch $@
 
 demo: install ## renders a campus, maps it, localizes a drive of another season against a live server
@@ -34,7 +40,7 @@ test: lint ## every check
 	$(BIN)/pytest -n auto --dist loadfile
 
 bench: install ## the benchmark tables under docs/results/
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[bench]'
+	$(PIP_INSTALL) --editable '.[bench]'
 	$(BIN)/python -m bench
 
 soak: install ## kills the service 200 times under load and looks for what it acknowledged: docs/results/soak.md

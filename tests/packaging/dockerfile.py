@@ -119,16 +119,24 @@ class Build:
         folder: Where.
         moved: Absolute paths of the image that are moved below the folder.
         environment: What every command sees besides the stage's own.
+        given: Build arguments, in the place of their defaults.
     """
 
     def __init__(
-        self, dockerfile: Dockerfile, context: Path, folder: Path, moved: list[str], environment: dict[str, str]
+        self,
+        dockerfile: Dockerfile,
+        context: Path,
+        folder: Path,
+        moved: list[str],
+        environment: dict[str, str],
+        given: Mapping[str, str],
     ) -> None:
         self.dockerfile = dockerfile
         self.context = context
         self.folder = folder
         self.root = folder / "root"
         self.environment = environment
+        self.given = given
         self._moved = re.compile(rf"(?<![\w.-])(?=(?:{'|'.join(map(re.escape, moved))})(?![\w-]))")
         self.env: dict[str, str] = {}
 
@@ -147,7 +155,7 @@ class Build:
         workdir = PurePosixPath("/")
         for each in stage.instructions:
             if each.word == "ARG":
-                self.env.update(_pairs(each.rest))
+                self.env.update({name: self.given.get(name, value) for name, value in _pairs(each.rest).items()})
             elif each.word == "ENV":
                 self.env.update(_pairs(self.here(each.rest)))
             elif each.word == "WORKDIR":

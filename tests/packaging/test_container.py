@@ -230,7 +230,9 @@ def image(dockerfile: Dockerfile, interpreter: str) -> Iterator[Build]:
             **{name: value for name, value in os.environ.items() if name.startswith("PIP_")},
         }
         context = context_of(PROJECT, folder / "context")
-        build = Build(dockerfile, context, folder, MOVED, environment)
+        # Where this machine installs from is in its environment.
+        given = {"PIP_EXTRA_INDEX_URL": environment.pop("PIP_EXTRA_INDEX_URL", "")}
+        build = Build(dockerfile, context, folder, MOVED, environment, given)
         build.do("build")
         build.do("service")
         yield build

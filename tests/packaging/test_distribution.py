@@ -125,6 +125,17 @@ server.shutdown()
     assert python(bare, code) == "ok\n"
 
 
+def test_the_bare_client_says_what_encoding_on_board_takes(bare):
+    code = """
+from deepsimbad_client import Client, errors
+try:
+    Client("http://127.0.0.1:9").on_board("campus")
+except errors.MissingExtraError as error:
+    print(error)
+"""
+    assert "pip install 'deep-simbad[edge]'" in python(bare, code)
+
+
 def test_the_command_of_the_bare_client_says_what_it_lacks_in_one_line(bare):
     done = subprocess.run([str(bare / "deepsimbad-client"), "domains"], capture_output=True, text=True, check=False)
     assert done.returncode == 1
