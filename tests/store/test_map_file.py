@@ -318,7 +318,7 @@ def test_the_index_of_a_campus_fits_the_papers_size(
     path = tmp_path / "map.sqlite"
     write_map(
         tmp_path / "map",
-        make_map(n=n, r=r, lists=np.ascontiguousarray(lists), landmark_model={"p": np.zeros((r, 4096), "f4")}),
+        make_map(n=n, r=r, lists=np.ascontiguousarray(lists), landmark_model={"p": np.full((r, 4096), 0.1, "f4")}),
     )
     seal(tmp_path / "map", path)
     bits = index_bytes(path) * 8 / n

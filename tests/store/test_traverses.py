@@ -4,7 +4,7 @@ import threading
 import time
 import tracemalloc
 from collections.abc import Callable, Iterator
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +20,7 @@ from deepsimbad.errors import (
     UnavailableError,
     UnknownDomainError,
     UnknownTraverseError,
+    WeightsDifferError,
 )
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.frames import MAX_POSITION_M, TraverseFrames
@@ -35,10 +36,10 @@ def summer(campus: Catalog) -> Iterator[Traverse]:
 
 
 def same(left: TraverseFrames, right: TraverseFrames) -> bool:
-    return all(
-        getattr(left, each.name).dtype == getattr(right, each.name).dtype
-        and np.array_equal(getattr(left, each.name), getattr(right, each.name), equal_nan=True)
-        for each in fields(TraverseFrames)
+    ours, theirs = left.arrays(), right.arrays()
+    return left.weights_sha256 == right.weights_sha256 and all(
+        ours[name].dtype == theirs[name].dtype and np.array_equal(ours[name], theirs[name], equal_nan=True)
+        for name in ours
     )
 
 
@@ -78,7 +79,7 @@ def test_frames_come_back_exactly_and_in_index_order(
     )
     assert summer.put_frames(frames) == (4, 0)
     order = np.argsort(frames.index)
-    expected = TraverseFrames(*(getattr(frames, each.name)[order] for each in fields(TraverseFrames)))
+    expected = TraverseFrames(**{name: array[order] for name, array in frames.arrays().items()})
     assert same(summer.read(), expected)
     assert (summer.n_frames, summer.encoding_dim) == (4, 8)
     assert summer.missing == [(1, 1), (3, 4), (6, 6)]
@@ -320,3 +321,25 @@ def test_a_whole_campus_uploads_and_reads_at_a_decent_speed(summer: Traverse) ->
     print(f"written in {written - started:.1f} s, read in {read - written:.2f} s")
     assert written - started < 60
     assert read - written < 15
+
+
+def test_the_weights_of_the_first_image_hold_for_all(summer: Traverse, make_frames: MakeFrames) -> None:
+    summer.put_frames(make_frames(range(2)))  # ready encodings: nobody knows whose
+    assert summer.read().weights_sha256 is None
+    summer.put_frames(replace(make_frames(range(2, 4)), weights_sha256="a" * 64))
+    with pytest.raises(WeightsDifferError) as caught:
+        summer.put_frames(replace(make_frames(range(4, 6)), weights_sha256="b" * 64))
+    assert caught.value.hints == {"known_weights_sha256": "a" * 64, "given_weights_sha256": "b" * 64}
+    summer.put_frames(make_frames(range(4, 5)))
+    kept = summer.read()
+    assert (kept.n_frames, kept.weights_sha256) == (5, "a" * 64)
+
+
+def test_encodings_take_half_the_bytes_where_nothing_is_lost(summer: Traverse, make_frames: MakeFrames) -> None:
+    frames = make_frames(range(3))
+    rounded = frames.encodings.astype(np.float16).astype(np.float32)
+    rounded[2, 0] = 1e6  # beyond float16
+    summer.put_frames(replace(frames, encodings=rounded))
+    np.testing.assert_array_equal(summer.read().encodings, rounded)
+    sizes = [row["n"] for row in summer._db.query("SELECT length(body) AS n FROM encoding ORDER BY frame_index")]
+    assert sizes == [2 * rounded.shape[1]] * 2 + [4 * rounded.shape[1]]

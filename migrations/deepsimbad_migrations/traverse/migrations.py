@@ -33,3 +33,9 @@ def m001_frames(db: Database) -> None:
         );
         """
     )
+
+
+@migrations()
+def m002_weights(db: Database) -> None:
+    """By which weights the images of the traverse were encoded. From here on a body may hold float16 too."""
+    db.execute("ALTER TABLE traverse ADD COLUMN weights_sha256 TEXT")

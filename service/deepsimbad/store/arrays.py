@@ -39,6 +39,7 @@ def save_arrays(db: Database, table: str, arrays: Mapping[str, NDArray[Any]], ch
         array = np.asarray(arrays[name])
         if array.dtype.kind not in _KINDS:
             raise InvalidInputError(f"array {name} of {table} holds {array.dtype}, not numbers")
+        array = halved(array) if array.dtype == np.float32 else array
         shape = to_json(list(array.shape))
         numbers = np.ascontiguousarray(array, array.dtype.newbyteorder("<")).reshape(-1)
         octets = numbers.view(np.uint8)
@@ -51,7 +52,7 @@ def save_arrays(db: Database, table: str, arrays: Mapping[str, NDArray[Any]], ch
 
 
 def load_arrays(db: Database, table: str, checksum: Checksum) -> dict[str, NDArray[Any]]:
-    """Read the named arrays of an array table, frozen; an array of one part is not copied.
+    """Read the named arrays of an array table, frozen; float16 comes back as float32.
 
     Raises:
         ValueError: The rows do not make up arrays.
@@ -79,5 +80,14 @@ def load_arrays(db: Database, table: str, checksum: Checksum) -> dict[str, NDArr
     for name, array in arrays.items():
         if n_filled[name] != array.nbytes:
             raise ValueError(f"array {name} of {table} is not whole")
-        array.setflags(write=False)
+        if array.dtype == np.float16:
+            arrays[name] = array.astype(np.float32)
+        arrays[name].setflags(write=False)
     return arrays
+
+
+def halved(numbers: NDArray[np.float32]) -> NDArray[np.float16] | NDArray[np.float32]:
+    """Numbers as float16 where nothing is lost by it: our networks' encodings are rounded to that."""
+    with np.errstate(over="ignore"):
+        half = numbers.astype(np.float16)
+    return half if np.array_equal(half, numbers) else numbers

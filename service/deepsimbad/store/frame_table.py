@@ -7,11 +7,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from sqlite_utils import Database
 
-from deepsimbad.errors import DamagedFileError, InvalidEncodingError
+from deepsimbad.errors import DamagedFileError, InvalidEncodingError, WeightsDifferError
+from deepsimbad.store.arrays import halved
 from deepsimbad.store.frames import UNKNOWN_TIMESTAMP, TraverseFrames
 
+_DTYPE_OF_BYTES = {2.0: "<f2", 4.0: "<f4"}  # by the bytes of one number
 _Place = tuple[float, int | None, float | None, float | None]  # position_m, timestamp_us, x_m, y_m
 
 
@@ -27,6 +30,12 @@ def encoding_dim(db: Database) -> int | None:
     if row is None:
         raise _damaged("it does not describe itself")
     return None if row[0] is None else int(row[0])
+
+
+def weights_sha256(db: Database) -> str | None:
+    """By which weights images were encoded; None where none were, or nobody knows."""
+    row = db.execute("SELECT weights_sha256 FROM traverse").fetchone()
+    return None if row is None else row[0]
 
 
 def missing(db: Database) -> list[tuple[int, int]]:
@@ -46,6 +55,7 @@ def upsert(db: Database, frames: TraverseFrames) -> None:
 
     Raises:
         InvalidEncodingError: The encodings have another length than those of the traverse.
+        WeightsDifferError: They were made by other weights.
     """
     dim = frames.encodings.shape[1]
     db.execute("UPDATE traverse SET encoding_dim = ? WHERE encoding_dim IS NULL", [dim])
@@ -54,6 +64,7 @@ def upsert(db: Database, frames: TraverseFrames) -> None:
         raise InvalidEncodingError(
             f"encodings of this traverse hold {present_dim} numbers, these {dim}", encoding_dim=present_dim
         )
+    _check_weights(db, frames.weights_sha256)
     db.conn.executemany(
         """
         INSERT INTO frame (frame_index, position_m, timestamp_us, x_m, y_m) VALUES (?, ?, ?, ?, ?)
@@ -85,6 +96,7 @@ def read(db: Database) -> TraverseFrames:
         x_m=np.empty(n, np.float64),
         y_m=np.empty(n, np.float64),
         encodings=np.empty((n, dim), np.float32),
+        weights_sha256=weights_sha256(db),
     )
     n_read = 0
     for index, position_m, timestamp_us, x_m, y_m, encoding in _checked_rows(db, dim):
@@ -127,9 +139,10 @@ def _checked_rows(db: Database, dim: int) -> Iterator[tuple[Any, ...]]:
         try:
             if _checksum((position_m, timestamp_us, x_m, y_m), body) != checksum:
                 raise ValueError("the checksum differs")
-            if len(body) != 4 * dim:  # a single number would be broadcast
+            dtype = _DTYPE_OF_BYTES.get(len(body) / dim)  # a single number would be broadcast
+            if dtype is None:
                 raise ValueError("the encoding has another length")
-            encoding = np.frombuffer(body, "<f4")
+            encoding = np.frombuffer(body, dtype)
         except (TypeError, ValueError, struct.error) as error:
             raise _damaged(f"frame {index} is not what was stored") from error
         yield index, position_m, timestamp_us, x_m, y_m, encoding
@@ -148,8 +161,19 @@ def _place(frames: TraverseFrames, row: int) -> _Place:
 
 def _bodies(frames: TraverseFrames) -> Iterator[tuple[int, int, bytes]]:
     for row, index in enumerate(frames.index):
-        body = np.ascontiguousarray(frames.encodings[row], "<f4").tobytes()
+        body = _body(frames.encodings[row])
         yield int(index), _checksum(_place(frames, row), body), body
+
+
+def _body(encoding: NDArray[np.float32]) -> bytes:
+    kept = halved(encoding)
+    return kept.astype(kept.dtype.newbyteorder("<")).tobytes()
+
+
+def _check_weights(db: Database, given: str | None) -> None:
+    WeightsDifferError.check("the traverse", weights_sha256(db), "a frame", given)
+    if given is not None:
+        db.execute("UPDATE traverse SET weights_sha256 = ?", [given])
 
 
 def _checksum(place: _Place, body: bytes) -> int:

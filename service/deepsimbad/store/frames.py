@@ -1,6 +1,7 @@
 """The frames of a traverse as arrays, and what is checked before they are stored."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,7 @@ class TraverseFrames:
         x_m: East, [n] float64, at most MAX_POSITION_M either way, NaN where unknown.
         y_m: North, likewise.
         encodings: [n, d] float32, finite.
+        weights_sha256: Of the network that encoded images among them; None where none did, or nobody knows.
     """
 
     index: NDArray[np.int64]
@@ -32,6 +34,11 @@ class TraverseFrames:
     x_m: NDArray[np.float64]
     y_m: NDArray[np.float64]
     encodings: NDArray[np.float32]
+    weights_sha256: str | None = None
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """All arrays by name."""
+        return {name: value for name, value in self.__dict__.items() if isinstance(value, np.ndarray)}
 
     @property
     def n_frames(self) -> int:
@@ -56,6 +63,7 @@ class TraverseFrames:
             x_m=_reals(self.x_m, "x_m"),
             y_m=_reals(self.y_m, "y_m"),
             encodings=encodings,
+            weights_sha256=self.weights_sha256,
         )
         n = encodings.shape[0]
         for name in ("index", "position_m", "timestamp_us", "x_m", "y_m"):

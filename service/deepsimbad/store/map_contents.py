@@ -9,6 +9,19 @@ from numpy.typing import NDArray
 
 from deepsimbad.errors import InvalidMapConfigError
 
+_WEIGHTS = "weights_sha256"
+
+
+def weights_of(config: Mapping[str, Any]) -> str | None:
+    """SHA-256 of the weights that the images of a map were encoded by, from its configuration; None where unknown."""
+    known = config.get(_WEIGHTS)
+    return known if isinstance(known, str) else None
+
+
+def with_weights(config: Mapping[str, Any], weights_sha256: str | None) -> dict[str, Any]:
+    """A map's configuration that says by which weights its images were encoded."""
+    return {**config, **({} if weights_sha256 is None else {_WEIGHTS: weights_sha256})}
+
 
 @dataclass(frozen=True)
 class MapContents:
@@ -28,6 +41,7 @@ class MapContents:
         values: [h, n] float32, the listed dissimilarities (`simbad` alone).
         encodings: [n, d] float32 (`brute_force` alone).
         statistics: [2, r] float64, mean and std of the normal scores (`standardised` and `calibrated`).
+        loadings: [r, q] float32 on common factors, how landmarks go together (of the same, where the drive tells).
         correlation: [r] float64, how far each landmark can be trusted across seasons (`calibrated` alone).
         listed_score: [h, r] float64, mean score of a landmark where it is listed at a rank (`calibrated` alone).
         telling_bits: [n] float32, by how many bits a view from a place narrows the map down, where that was learnt.
@@ -53,6 +67,7 @@ class MapContents:
     values: NDArray[np.float32] | None = None
     encodings: NDArray[np.float32] | None = None
     statistics: NDArray[np.float64] | None = None
+    loadings: NDArray[np.float32] | None = None
     correlation: NDArray[np.float64] | None = None
     listed_score: NDArray[np.float64] | None = None
     telling_bits: NDArray[np.float32] | None = None
@@ -93,6 +108,7 @@ class MapContents:
             ("values", (h, n), np.float32),
             ("encodings", (n, None), np.float32),
             ("statistics", (2, r), np.float64),
+            ("loadings", (r, None), np.float32),
             ("correlation", (r,), np.float64),
             ("listed_score", (h, r), np.float64),
             ("telling_bits", (n,), np.float32),

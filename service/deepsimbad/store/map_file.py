@@ -40,7 +40,7 @@ _WAL_HEADER = bytes([2, 2])  # read and write version at offset 18 of a file tha
 # Which array table holds which attributes; None: the landmark model's own names.
 _TABLES: dict[str, tuple[str, ...]] = {
     "calibration": ("correlation", "listed_score", "telling_bits", "off_route_model"),
-    "landmark_statistics": ("statistics",),
+    "landmark_statistics": ("statistics", "loadings"),
     "listed_dissimilarity": ("values",),
     "map_image_encoding": ("encodings",),
     EXPERIENCE_TABLE: ("q_values",),

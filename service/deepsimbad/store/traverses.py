@@ -153,6 +153,7 @@ class Traverse(OpenFile):
         timestamp_us: int | None = None,
         x_m: float | None = None,
         y_m: float | None = None,
+        weights_sha256: str | None = None,
     ) -> bool:
         """Store one frame, replacing one of the same index.
 
@@ -163,6 +164,7 @@ class Traverse(OpenFile):
             timestamp_us: Microseconds, None where unknown.
             x_m: East, None where unknown.
             y_m: North, None where unknown.
+            weights_sha256: Of the network that encoded it; None where none did.
 
         Returns:
             Whether the frame is new.
@@ -177,6 +179,7 @@ class Traverse(OpenFile):
             x_m=np.array([np.nan if x_m is None else x_m], np.float64),
             y_m=np.array([np.nan if y_m is None else y_m], np.float64),
             encodings=np.asarray(encoding, np.float32)[np.newaxis],
+            weights_sha256=weights_sha256,
         )
         return self.put_frames(frames)[0] == 1
 
@@ -190,6 +193,7 @@ class Traverse(OpenFile):
             InvalidInputError: Shapes differ, an index is out of range or there twice.
             InvalidRouteError: A position is NaN or infinite.
             InvalidEncodingError: An encoding is not finite, or of another length than those of the traverse.
+            WeightsDifferError: The traverse holds frames that other weights encoded.
             UnknownTraverseError: The traverse was deleted meanwhile.
         """
         frames = frames.checked()
