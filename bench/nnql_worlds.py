@@ -75,7 +75,7 @@ class Triplet:
         model = choose_landmarks(drives[0].encodings, N_LANDMARKS, evaluator, lambda _: None)
         route = Route(drives[1].position_m)
         found = describe(
-            drives[1], route, evaluator, model, self.setup.relevance, LIST_LENGTH, drives[0], lambda _: None
+            drives[1], route, evaluator, model, self.setup.relevance, LIST_LENGTH, drives[0], True, lambda _: None
         )
         seen = [DescribedDrive.of(drive, False, evaluator, model) for drive in drives]
         return found.built, found.rehearsal or found.built, seen

@@ -22,6 +22,7 @@ from deepsimbad_client.models import (
     Traverse,
     TruthScore,
 )
+from deepsimbad_client.observation import Observation
 from deepsimbad_client.retry import RetryPolicy
 from deepsimbad_client.session import Session
 
@@ -38,6 +39,7 @@ __all__ = [
     "Localization",
     "MapFile",
     "MapVersion",
+    "Observation",
     "RetryPolicy",
     "Session",
     "SessionAnswer",

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from deepsimbad_client.on_board import OnBoardEncoder
+
 Model = TypeVar("Model", bound=Answer)
 
 REQUEST_ID = "X-Request-ID"
@@ -93,6 +95,17 @@ def page(kind: type[Model], key: str) -> Callable[[httpx2.Response], Page[Model]
 def text(response: httpx2.Response) -> str:
     """A parser of plain text."""
     return response.text
+
+
+def on_board_encoder() -> "Callable[[httpx2.Response], OnBoardEncoder]":
+    """A parser of a landmark model.
+
+    Raises:
+        MissingExtraError: The packages that it takes are not installed.
+    """
+    from deepsimbad_client.on_board import OnBoardEncoder  # noqa: PLC0415 - the client alone must work without it
+
+    return lambda response: OnBoardEncoder(response.content)
 
 
 def nothing(response: httpx2.Response) -> None:

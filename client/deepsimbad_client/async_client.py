@@ -12,13 +12,15 @@ from deepsimbad_client import calls, session_calls
 from deepsimbad_client.async_admin import AsyncAdmin
 from deepsimbad_client.async_session import AsyncSession
 from deepsimbad_client.models import Domain, Health, Localization, TruthScore
-from deepsimbad_client.observation import Image, Numbers, observation
+from deepsimbad_client.observation import Image, Numbers, Observation, observation
 from deepsimbad_client.retry import RetryPolicy
 from deepsimbad_client.transport import THIN_LINK_TIMEOUT, AsyncTransport, Endpoint
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
+
+    from deepsimbad_client.on_board import OnBoardEncoder
 
 
 class AsyncClient:
@@ -69,6 +71,10 @@ class AsyncClient:
         """One domain and its active map."""
         return await self._transport.send(calls.domain(name))
 
+    async def on_board(self, domain: str, *, map_version: int | None = None) -> "OnBoardEncoder":
+        """Fetch a map's landmarks once, to rank them here and send a few bytes a view (needs `deep-simbad[edge]`)."""
+        return await self._transport.send(calls.landmark_model(domain, map_version))
+
     async def localize(
         self,
         domain: str,
@@ -78,6 +84,7 @@ class AsyncClient:
         ranked_landmarks: Numbers | None = None,
         dissimilarities: Numbers | None = None,
         encoding: Numbers | None = None,
+        ranked: Observation | None = None,
         shortlist: int | None = None,
     ) -> Localization:
         """Where one view probably is; give exactly one form of it."""
@@ -87,6 +94,7 @@ class AsyncClient:
             ranked_landmarks=ranked_landmarks,
             dissimilarities=dissimilarities,
             encoding=encoding,
+            ranked=ranked,
         )
         return await self._transport.send(calls.localize(domain, seen, shortlist=shortlist))
 
@@ -99,6 +107,7 @@ class AsyncClient:
         ranked_landmarks: Numbers | None = None,
         dissimilarities: Numbers | None = None,
         encoding: Numbers | None = None,
+        ranked: Observation | None = None,
     ) -> "NDArray[np.float32]":
         """How well every map image answers one view: [n] float32, larger is better (needs numpy)."""
         seen = observation(
@@ -107,6 +116,7 @@ class AsyncClient:
             ranked_landmarks=ranked_landmarks,
             dissimilarities=dissimilarities,
             encoding=encoding,
+            ranked=ranked,
         )
         return await self._transport.send(calls.relevances(domain, seen))
 

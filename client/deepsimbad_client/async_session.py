@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Self
 from deepsimbad_client import session_calls
 from deepsimbad_client.errors import DeepSimbadClientError, GoneError
 from deepsimbad_client.models import NextBestView, SessionAnswer, SessionState, TruthScore
-from deepsimbad_client.observation import Image, Numbers, observation
+from deepsimbad_client.observation import Image, Numbers, Observation, observation
 from deepsimbad_client.transport import AsyncTransport
 
 if TYPE_CHECKING:
@@ -48,6 +48,7 @@ class AsyncSession:
         ranked_landmarks: Numbers | None = None,
         dissimilarities: Numbers | None = None,
         encoding: Numbers | None = None,
+        ranked: Observation | None = None,
         shortlist: int | None = None,
         idempotency_key: str | None = None,
     ) -> SessionAnswer:
@@ -58,6 +59,7 @@ class AsyncSession:
             ranked_landmarks=ranked_landmarks,
             dissimilarities=dissimilarities,
             encoding=encoding,
+            ranked=ranked,
         )
         call = session_calls.observe(
             self.session_id,

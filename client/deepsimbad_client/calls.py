@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from deepsimbad_client.answers import float_array, model, models, text
+from deepsimbad_client.answers import float_array, model, models, on_board_encoder, text
 from deepsimbad_client.call import Call, name_in_path, query
 from deepsimbad_client.models import Domain, Health, Localization
 from deepsimbad_client.observation import Observation
@@ -11,6 +11,8 @@ from deepsimbad_client.retry import Repeat
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
+
+    from deepsimbad_client.on_board import OnBoardEncoder
 
 
 def health() -> Call[Health]:
@@ -38,6 +40,17 @@ def domain(name: str) -> Call[Domain]:
     return Call("GET", f"/v1/domains/{name_in_path('domain', name)}", model(Domain))
 
 
+def landmark_model(domain: str, map_version: int | None) -> "Call[OnBoardEncoder]":
+    """The landmarks of a map, ready to rank by; raises MissingExtraError before anything is sent."""
+    return Call(
+        "GET",
+        f"/v1/domains/{name_in_path('domain', domain)}/landmark-model",
+        on_board_encoder(),
+        params=query(map_version=map_version),
+        headers={"Accept": "application/octet-stream"},
+    )
+
+
 def localize(domain: str, seen: Observation, *, shortlist: int | None) -> Call[Localization]:
     """Where one view probably is; stateless, so it may be asked again."""
     return Call(
@@ -45,7 +58,7 @@ def localize(domain: str, seen: Observation, *, shortlist: int | None) -> Call[L
         f"/v1/domains/{name_in_path('domain', domain)}/localizations",
         model(Localization),
         params=query(shortlist=shortlist),
-        headers={"Content-Type": seen.content_type, "Accept": "application/json"},
+        headers={**seen.headers, "Accept": "application/json"},
         body=seen.body,
     )
 
@@ -56,6 +69,6 @@ def relevances(domain: str, seen: Observation) -> "Call[NDArray[np.float32]]":
         "POST",
         f"/v1/domains/{name_in_path('domain', domain)}/localizations",
         float_array,
-        headers={"Content-Type": seen.content_type, "Accept": "application/octet-stream"},
+        headers={**seen.headers, "Accept": "application/octet-stream"},
         body=seen.body,
     )

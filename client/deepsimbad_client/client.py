@@ -11,7 +11,7 @@ import httpx2
 from deepsimbad_client import calls, session_calls
 from deepsimbad_client.admin import Admin
 from deepsimbad_client.models import Domain, Health, Localization, TruthScore
-from deepsimbad_client.observation import Image, Numbers, observation
+from deepsimbad_client.observation import Image, Numbers, Observation, observation
 from deepsimbad_client.retry import RetryPolicy
 from deepsimbad_client.session import Session
 from deepsimbad_client.transport import THIN_LINK_TIMEOUT, Endpoint, Transport
@@ -19,6 +19,8 @@ from deepsimbad_client.transport import THIN_LINK_TIMEOUT, Endpoint, Transport
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
+
+    from deepsimbad_client.on_board import OnBoardEncoder
 
 
 class Client:
@@ -93,6 +95,21 @@ class Client:
         """
         return self._transport.send(calls.domain(name))
 
+    def on_board(self, domain: str, *, map_version: int | None = None) -> "OnBoardEncoder":
+        """Fetch a map's landmarks once, to rank them here and send a few bytes a view (needs `deep-simbad[edge]`).
+
+        Args:
+            domain: Where the robot is.
+            map_version: A version that a session keeps; absent: the active map.
+
+        Raises:
+            UnknownDomainError, UnknownMapVersionError: There is none.
+            NoActiveMapError: The domain has no map yet.
+            RetiredMapError: That version was removed.
+            MissingExtraError: The packages of `deep-simbad[edge]` are not installed.
+        """
+        return self._transport.send(calls.landmark_model(domain, map_version))
+
     def localize(
         self,
         domain: str,
@@ -102,6 +119,7 @@ class Client:
         ranked_landmarks: Numbers | None = None,
         dissimilarities: Numbers | None = None,
         encoding: Numbers | None = None,
+        ranked: Observation | None = None,
         shortlist: int | None = None,
     ) -> Localization:
         """Where one view probably is; give exactly one form of it.
@@ -113,11 +131,13 @@ class Client:
             ranked_landmarks: Landmark ids, nearest first, 1..r of them.
             dissimilarities: r finite numbers in landmark order, smaller is nearer.
             encoding: A ready encoding, where the domain takes them.
+            ranked: What an `OnBoardEncoder` made of an image, a few bytes.
             shortlist: Length of `retrieval` and `belief.top`; absent: the service's default.
 
         Raises:
             UnknownDomainError: No such domain.
             NoActiveMapError: The domain has no map yet.
+            LandmarkModelDiffersError: `ranked` was made with other landmarks than the map's; fetch them by `on_board`.
             InvalidInputError: The service cannot use the view; its detail says why.
         """
         seen = observation(
@@ -126,6 +146,7 @@ class Client:
             ranked_landmarks=ranked_landmarks,
             dissimilarities=dissimilarities,
             encoding=encoding,
+            ranked=ranked,
         )
         return self._transport.send(calls.localize(domain, seen, shortlist=shortlist))
 
@@ -138,6 +159,7 @@ class Client:
         ranked_landmarks: Numbers | None = None,
         dissimilarities: Numbers | None = None,
         encoding: Numbers | None = None,
+        ranked: Observation | None = None,
     ) -> "NDArray[np.float32]":
         """How well every map image answers one view: [n] float32, larger is better (needs numpy).
 
@@ -149,6 +171,7 @@ class Client:
             ranked_landmarks=ranked_landmarks,
             dissimilarities=dissimilarities,
             encoding=encoding,
+            ranked=ranked,
         )
         return self._transport.send(calls.relevances(domain, seen))
 

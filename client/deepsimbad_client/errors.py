@@ -31,6 +31,18 @@ class InvalidArgumentError(DeepSimbadClientError, ValueError):
     code = "invalid_argument"
 
 
+class OtherWeightsError(DeepSimbadClientError):
+    """The weights here are not those that the map's images were encoded by: ranks of both cannot be compared."""
+
+    code = "other_weights"
+
+
+class InvalidLandmarkModelError(DeepSimbadClientError):
+    """A file or answer that is no landmark model, or one that this version cannot rank by."""
+
+    code = "invalid_landmark_model"
+
+
 class SourceError(DeepSimbadClientError):
     """A recording that cannot be read as a whole: missing, empty or inconsistent."""
 
@@ -225,6 +237,18 @@ class DomainDiffersError(ConflictError):
     """A domain of that name exists with another configuration."""
 
 
+class LandmarkModelDiffersError(ConflictError):
+    """The view was ranked by another landmark model than that of the map that should answer: fetch that one.
+
+    `problem` holds both digests, and the `map_version` to ask for.
+    """
+
+    @property
+    def advice(self) -> str:
+        """How to come by the right one."""
+        return f"`client.on_board(domain, map_version={self.problem.get('map_version')})` fetches it"
+
+
 class TraverseInUseError(ConflictError):
     """A running job still reads the traverse or domain."""
 
@@ -337,6 +361,7 @@ BY_CODE: Mapping[str, type[ApiError]] = {
     "too_many_jobs": TooManyJobsError,
     "no_active_map": NoActiveMapError,
     "domain_differs": DomainDiffersError,
+    "landmark_model_differs": LandmarkModelDiffersError,
     "traverse_in_use": TraverseInUseError,
     "lost_activation": LostActivationError,
     "damaged_map": DamagedMapError,

@@ -49,6 +49,12 @@ from deepsimbad_client.tables import gate_verdict, job_table
     "Give --check a drive of another day with it: frames held out of the map's own drive are kind to the new map.",
 )
 @click.option("--append", is_flag=True, help="Add the drive to a copy of the active map, whose landmarks stay.")
+@click.option(
+    "--same-route/--no-same-route",
+    default=None,
+    help="Whether both drives count their positions along one route, so that the map may learn from two seasons of it; "
+    "absent: only where both know x, y.",
+)
 @click.option("--wait/--no-wait", default=True, show_default=True, help="Follow the job to its end.")
 @json_flag
 @serving
@@ -65,6 +71,7 @@ def remap(
     check: str | None,
     gate: float | None,
     append: bool,
+    same_route: bool | None,
     wait: bool,
     json_output: bool,
     server: str,
@@ -89,6 +96,7 @@ def remap(
         "check_traverse": check,
         "gate_margin": gate,
         "append": True if append else None,
+        "same_route": same_route,
     }
     given = {key: value for key, value in config.items() if value is not None}
     with Client(server, api_key) as client:
@@ -190,3 +198,6 @@ def _show_job(job: Job, json_output: bool) -> None:
         click.echo(f"to serve it all the same: deepsimbad-client activate {job.domain} {made}")
     elif why:
         click.echo(f"map {made}: {why}")
+    season = job.second_season
+    if season.get("significance") is not None and not season.get("accepted"):  # compared, and found to differ
+        REMARKS.print(f"map {made} learnt nothing of a second season: {season.get('why')}", soft_wrap=True)

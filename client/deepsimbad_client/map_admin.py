@@ -35,7 +35,7 @@ class MapAdmin:
             idempotency_key: Names this request, so that it can be repeated after a `TransportError`; absent: a new one.
             **config: `training_traverse` and, where they should differ from the service's defaults,
                 `landmark_traverse`, `n_landmarks`, `list_length`, `relevance`, `training_episodes`, `seed`, `activate`,
-                `check_traverse`, `gate_margin`, `append`.
+                `check_traverse`, `gate_margin`, `append`, `same_route`.
 
         Raises:
             TooManyJobsError: As many jobs wait as may.

@@ -56,6 +56,8 @@ class Domain(Answer):
     """Length of an image's encoding; None: no images are taken. Ready ones may have any one length."""
     relevance: str | None = None
     index_bits_per_map_image: float | None = None
+    landmark_model_digest: str | None = None
+    """SHA-256 of the landmarks that `Client.on_board` fetches."""
     actions_m: tuple[float, ...] = ()
     closed: bool = False
 
@@ -227,7 +229,12 @@ class Job(Answer):
     @property
     def check(self) -> dict[str, Any]:
         """How its map compares with the one active before; empty where that was not looked at."""
-        return _check_in((self.result or {}).get("metrics"))
+        return _in_metrics((self.result or {}).get("metrics"), "check")
+
+    @property
+    def second_season(self) -> dict[str, Any]:
+        """Whether its map learnt from a second drive of the route, and why not; empty where there was none."""
+        return _in_metrics((self.result or {}).get("metrics"), "second_season")
 
     @property
     def error_text(self) -> str:
@@ -261,9 +268,9 @@ class MapVersion(Answer):
     @property
     def check(self) -> dict[str, Any]:
         """How it compares with the map that was active when it was made; empty where that was not looked at."""
-        return _check_in(self.metrics)
+        return _in_metrics(self.metrics, "check")
 
 
-def _check_in(metrics: Any) -> dict[str, Any]:
-    check = metrics.get("check") if isinstance(metrics, dict) else None
-    return check if isinstance(check, dict) else {}
+def _in_metrics(metrics: Any, name: str) -> dict[str, Any]:
+    found = metrics.get(name) if isinstance(metrics, dict) else None
+    return found if isinstance(found, dict) else {}

@@ -27,10 +27,23 @@ Numbers = Iterable[Any]
 
 @dataclass(frozen=True)
 class Observation:
-    """A body ready to post."""
+    """A body ready to post.
+
+    Attributes:
+        body: Its bytes.
+        content_type: Their media type.
+        landmark_model: Digest of the landmarks that it was ranked by, which the answering map must have; None: unsaid.
+    """
 
     body: bytes
     content_type: str
+    landmark_model: str | None = None
+
+    @property
+    def headers(self) -> dict[str, str]:
+        """What a request says of it."""
+        matching = {} if self.landmark_model is None else {"If-Match": f'"{self.landmark_model}"'}
+        return {"Content-Type": self.content_type, **matching}
 
 
 def media_type_of(body: bytes) -> str | None:
@@ -48,6 +61,7 @@ def observation(
     ranked_landmarks: Numbers | None = None,
     dissimilarities: Numbers | None = None,
     encoding: Numbers | None = None,
+    ranked: Observation | None = None,
 ) -> Observation:
     """Make the body of one observation from exactly one of its forms.
 
@@ -57,6 +71,7 @@ def observation(
         ranked_landmarks: Landmark ids, nearest first.
         dissimilarities: r finite numbers in landmark order, smaller is nearer.
         encoding: A ready encoding.
+        ranked: What an `OnBoardEncoder` made of an image; sent as it is.
 
     Raises:
         InvalidArgumentError: None or several given, not an image, or NaN among the numbers.
@@ -64,12 +79,14 @@ def observation(
     """
     forms = {"ranked_landmarks": ranked_landmarks, "dissimilarities": dissimilarities, "encoding": encoding}
     given = {name: values for name, values in forms.items() if values is not None}
-    if len(given) + (image is not None) != 1:
-        raise InvalidArgumentError("give exactly one of image, ranked_landmarks, dissimilarities and encoding")
+    if len(given) + (image is not None) + (ranked is not None) != 1:
+        raise InvalidArgumentError("give exactly one of image, ranked, ranked_landmarks, dissimilarities and encoding")
+    if ranked is not None:
+        return ranked
     if image is None:
         ((name, values),) = given.items()
         return _json_observation(name, values)
-    body = _image_bytes(image)
+    body = image_bytes(image)
     found = content_type or media_type_of(body)
     if found is None:
         what = "the file" if isinstance(image, str | PathLike) else "the bytes"
@@ -77,7 +94,8 @@ def observation(
     return Observation(body, found)
 
 
-def _image_bytes(image: Image) -> bytes:
+def image_bytes(image: Image) -> bytes:
+    """The bytes of an encoded image, or of the file at a path; raises BrokenFrameError."""
     if not isinstance(image, str | PathLike):
         return bytes(image)
     try:

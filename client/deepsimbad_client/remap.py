@@ -23,6 +23,7 @@ def remap(
     check_traverse: str | None = None,
     gate_margin: float | None = None,
     append: bool | None = None,
+    same_route: bool | None = None,
     on_progress: Callable[[Job], None] | None = None,
     patience_s: float = PATIENCE_S,
 ) -> Job:
@@ -42,6 +43,8 @@ def remap(
         check_traverse: The drive that the new map and the active one are compared on.
         gate_margin: By how many percentage points of ANR the new map may be worse and still be activated.
         append: Whether the traverse is added to a copy of the active map.
+        same_route: Whether the training and the landmark traverse count their positions along one route; None: only
+            where both know x, y. `metrics["second_season"]` of the result says whether the map learnt from both.
         on_progress: Told of the job each time something is heard of it; first when it is submitted.
         patience_s: Longest silence of the service that is waited out.
 
@@ -68,6 +71,7 @@ def remap(
             check_traverse=check_traverse,
             gate_margin=gate_margin,
             append=append,
+            same_route=same_route,
         ),
     )
     if on_progress is not None:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Self
 from deepsimbad_client import session_calls
 from deepsimbad_client.errors import DeepSimbadClientError, GoneError
 from deepsimbad_client.models import NextBestView, SessionAnswer, SessionState, TruthScore
-from deepsimbad_client.observation import Image, Numbers, observation
+from deepsimbad_client.observation import Image, Numbers, Observation, observation
 from deepsimbad_client.transport import Transport
 
 if TYPE_CHECKING:
@@ -60,6 +60,7 @@ class Session:
         ranked_landmarks: Numbers | None = None,
         dissimilarities: Numbers | None = None,
         encoding: Numbers | None = None,
+        ranked: Observation | None = None,
         shortlist: int | None = None,
         idempotency_key: str | None = None,
     ) -> SessionAnswer:
@@ -76,11 +77,13 @@ class Session:
             ranked_landmarks: Landmark ids, nearest first, 1..r of them.
             dissimilarities: r finite numbers in landmark order, smaller is nearer.
             encoding: A ready encoding, where the domain takes them.
+            ranked: What an `OnBoardEncoder` made of an image, a few bytes.
             shortlist: Length of `retrieval` and `belief.top`; absent: the service's default.
             idempotency_key: Names this observation; absent: a new one.
 
         Raises:
             InvalidMoveError: The move is negative or too long; `PastTheEndError`: past the end of the route.
+            LandmarkModelDiffersError: `ranked` was made with other landmarks than those of the session's map.
             InvalidInputError: The service cannot use the view; its detail says why.
             GoneError: The session has ended, or its map was removed.
         """
@@ -90,6 +93,7 @@ class Session:
             ranked_landmarks=ranked_landmarks,
             dissimilarities=dissimilarities,
             encoding=encoding,
+            ranked=ranked,
         )
         call = session_calls.observe(
             self.session_id,

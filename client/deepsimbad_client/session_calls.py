@@ -84,7 +84,7 @@ def observe(
             shortlist=shortlist,
         ),
         headers={
-            "Content-Type": seen.content_type,
+            **seen.headers,
             "Accept": "application/json",
             KEY_HEADER: idempotency_key or uuid4().hex,
         },

@@ -114,6 +114,24 @@ class InvalidSourceError(InvalidInputError):
     code = "invalid_source"
 
 
+class InvalidWeightsError(InvalidInputError):
+    """A file of weights that is truncated, of another family, of other shapes, unsafe, or fails its digest."""
+
+    code = "invalid_weights"
+
+
+class MissingWeightsError(InvalidInputError):
+    """A file of weights that is not there; the message says where to put it."""
+
+    code = "missing_weights"
+
+
+class MissingPackageError(InvalidInputError):
+    """A package that an extractor needs and that is not installed; the message says how to install it."""
+
+    code = "missing_package"
+
+
 class SettingsError(InvalidInputError):
     """A setting that cannot be used."""
 
@@ -228,6 +246,36 @@ class DomainDiffersError(ConflictError):
     code = "domain_differs"
 
 
+class WeightsDifferError(ConflictError):
+    """A view, frame or traverse encoded by other weights than the map or traverse it should join."""
+
+    code = "weights_differ"
+
+    @classmethod
+    def check(cls, what: str, known: str | None, given_to: str, given: str | None) -> None:
+        """Refuse to bring together encodings of two networks; what nobody knows is believed.
+
+        Args:
+            what: Whose weights are known, as a sentence would name it.
+            known: Their SHA-256; None: unknown, or there are none.
+            given_to: What should join it.
+            given: The SHA-256 of its weights.
+        """
+        if known is not None and given is not None and known != given:
+            raise cls(
+                f"{given_to} comes from other weights ({given[:12]}...) than {what} ({known[:12]}...): their encodings "
+                "cannot be compared. Bring the old weights back, or upload and map anew",
+                known_weights_sha256=known,
+                given_weights_sha256=given,
+            )
+
+
+class LandmarkModelDiffersError(ConflictError):
+    """A view ranked by another landmark model than that of the map that should answer."""
+
+    code = "landmark_model_differs"
+
+
 class TraverseInUseError(ConflictError):
     """A running job still reads the traverse or domain."""
 
@@ -328,6 +376,18 @@ class OverloadedError(UnavailableError):
     """More requests at once than the service answers in good time."""
 
     code = "overloaded"
+
+
+class OutOfMemoryError(UnavailableError):
+    """Too little memory is left for a network; the view is not at fault."""
+
+    code = "out_of_memory"
+
+
+class EvaluatorUnavailableError(UnavailableError):
+    """A domain's extractor that cannot be loaded: its weights or a package are missing, or memory is short."""
+
+    code = "evaluator_unavailable"
 
 
 class DamagedMapError(UnavailableError):

@@ -9,6 +9,7 @@ from pydantic import Field, field_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from deepsimbad.errors import SettingsError
+from deepsimbad.evaluators.compute import DEFAULT_WEIGHTS_DIR, Compute, Device, Runtime
 from deepsimbad.jobs.job_priority import JobPriority
 
 MEBIBYTE = 1024 * 1024
@@ -105,6 +106,29 @@ class Settings(BaseSettings):
         Field(description="`idle`: jobs run when nothing else on the machine would; `low`, `normal`: beside it."),
     ] = JobPriority.IDLE
 
+    weights_dir: Annotated[
+        Path,
+        Field(description="Folder of networks' weights, and of what is prepared from them.", validate_default=True),
+    ] = DEFAULT_WEIGHTS_DIR
+    network_runtime: Annotated[
+        Runtime,
+        Field(
+            description="What runs networks: `torch`, `torch_bf16`, `onnxruntime`; `auto`: the fastest that is there."
+        ),
+    ] = Runtime.AUTO
+    network_device: Annotated[
+        Device, Field(description="Where: `cpu`, `cuda`; `auto`: CUDA where there is one that works.")
+    ] = Device.AUTO
+    network_threads: Annotated[
+        int, Field(description="Processor threads of a network; 0: as many as there are cores.", ge=0)
+    ] = 0
+    encode_batch: Annotated[
+        int, Field(description="Most images encoded at once; 0: 1 on the processor, 32 on CUDA.", ge=0, le=1024)
+    ] = 0
+    encode_wait_ms: Annotated[
+        float, Field(description="How long an image waits for others to fill a batch larger than 1.", ge=0, le=1000)
+    ] = 2.0
+
     session_ttl_s: Annotated[
         float, Field(description="A session ends when nothing was observed in it for so long.", gt=0, le=31_536_000)
     ] = 3600.0
@@ -117,6 +141,11 @@ class Settings(BaseSettings):
     ] = 86_400.0
     session_sweep_s: Annotated[float, Field(description="Expired sessions are looked for this often.", gt=0)] = 30.0
 
+    @field_validator("weights_dir")
+    @classmethod
+    def _at_home(cls, folder: Path) -> Path:
+        return folder.expanduser()
+
     @field_validator("cors_origins")
     @classmethod
     def _origins(cls, origins: tuple[str, ...]) -> tuple[str, ...]:
@@ -124,6 +153,12 @@ class Settings(BaseSettings):
             if _ORIGIN.fullmatch(origin) is None:  # any other text would silently match nobody
                 raise ValueError(f'{origin!r} is no origin: write it as "https://host" or "https://host:port", or "*"')
         return origins
+
+    def compute(self) -> Compute:
+        """How networks are computed."""
+        return Compute(
+            self.network_runtime, self.network_device, self.network_threads, self.encode_batch, self.weights_dir
+        )
 
     @property
     def is_loopback(self) -> bool:

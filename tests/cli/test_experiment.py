@@ -15,8 +15,12 @@ KEYS = {
     "n_queries",
     "n_left_out",
     "index_bits_per_map_image",
+    "second_season",
     "config",
     "seconds",
+    "encoding_dim",
+    "bytes_per_encoding",
+    "encode_ms",
 }
 SIX = {"calibrated", "standardised", "rrf", "bag_of_landmarks", "simbad", "brute_force"}
 
@@ -89,6 +93,24 @@ def test_ground_truth_replaces_the_tolerance(deepsimbad, triplet, tmp_path):
     assert (document["n_queries"], document["n_left_out"]) == (79, 1)
     assert document["anr"]["brute_force"] > 30, "half a route away is about chance"
     assert document["config"]["ground_truth"] == str(tmp_path / "truth.npy")
+
+
+def test_landmarks_of_another_season_are_told_from_those_of_elsewhere(deepsimbad, drives, tmp_path):
+    """Positions count as comparable unless something else is said, or other truths are given."""
+    np.save(tmp_path / "truth.npy", np.arange(80)[:, np.newaxis])
+    truth = ("--ground-truth", tmp_path / "truth.npy")
+
+    def season(landmarks, *said):
+        roles = {"--landmarks": landmarks, "--training": "summer", "--test": "summer"}
+        triplet = [part for role, name in roles.items() for part in (role, drives / f"{name}.npy")]
+        ran = deepsimbad("experiment", "vpr", *triplet, *READY, "--relevance", "calibrated", *said, "--json")
+        return json.loads(ran.out)["second_season"]
+
+    assert season("winter")["accepted"]
+    assert not season("landmarks")["accepted"]
+    assert "are said not to share" in season("winter", "--no-same-route")["why"]
+    assert "without x, y" in season("winter", *truth)["why"]
+    assert season("winter", *truth, "--same-route")["accepted"]
 
 
 def test_frames_left_out_are_told(deepsimbad, pictures, tmp_path):

@@ -86,6 +86,24 @@ def test_every_option_of_a_map_is_heeded(deepsimbad, drives, tmp_path):
     assert kept == {"n_landmarks": 12, "list_length": 3, "relevance": "rrf", "training_episodes": 7, "seed": 5}
 
 
+def test_two_seasons_are_learnt_from_where_the_route_is_said_to_be_one(deepsimbad, drives):
+    """Of drives without x, y; and where their views differ, people are told."""
+
+    def made(landmarks, *said):
+        pair = ("--landmarks", drives / f"{landmarks}.npy", "--training", drives / "summer.npy")
+        ran = deepsimbad("map", landmarks, *pair, *READY, "--n-landmarks", 40, "--training-episodes", 0, *said)
+        assert ran.code == 0, ran.err
+        return ran
+
+    same = [
+        json.loads(made("winter", *said, "--json").out)["metrics"]["second_season"]
+        for said in ((), ("--same-route",), ("--no-same-route",))
+    ]
+    assert [season["accepted"] for season in same] == [False, True, False]
+    assert made("winter", "--same-route").err == made("landmarks").err == ""
+    assert "it learnt nothing of a second season: at equal positions" in made("landmarks", "--same-route").err
+
+
 def test_a_second_map_is_the_next_version(deepsimbad, drives, tmp_path):
     for part in ("", "#10:40:2"):
         ran = deepsimbad("map", "route", *sources(drives, part=part), *READY, "--n-landmarks", 20, "--data-dir", "here")

@@ -33,6 +33,13 @@ def _batch(n: int) -> bytes:
 for _type, _extension in (("jpeg", ".jpg"), ("png", ".png"), ("tiff", ".tiff"), ("webp", ".webp")):
     schemathesis.openapi.media_type(f"image/{_type}", _images(_extension))
 schemathesis.openapi.media_type("application/octet-stream", st.one_of(st.integers(0, 5).map(_batch), st.binary()))
+schemathesis.openapi.media_type(
+    "application/vnd.deepsimbad.ranks",
+    st.one_of(
+        st.integers(1, 3).map(lambda m: m.to_bytes(2, "big") + bytes([0b0000_0001, 0b0010_0000])[: (m + 1) // 2]),
+        st.binary(max_size=8),
+    ),
+)
 
 
 @schemathesis.hook

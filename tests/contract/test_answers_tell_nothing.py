@@ -41,7 +41,7 @@ QUERIES = (
 )
 
 
-INSIDE = ("Traceback", 'File "', "sqlite3.", "OperationalError", "site-packages", "deepsimbad.", "<class", "0x7f")
+INSIDE = ("Traceback", 'File "', "sqlite3.", "OperationalError", "site-packages", " deepsimbad.", "<class", "0x7f")
 
 
 class Telling:

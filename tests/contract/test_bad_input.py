@@ -91,7 +91,8 @@ def test_wrong_content_type(client: TestClient, content_type: str) -> None:
     problem = check(
         client.post(SEEN, content=b"x", headers={"Content-Type": content_type}), 415, "unsupported_media_type"
     )
-    assert problem["allowed"] == ["image/jpeg", "image/png", "image/tiff", "image/webp", "application/json"]
+    images = ["image/jpeg", "image/png", "image/tiff", "image/webp"]
+    assert problem["allowed"] == [*images, "application/json", "application/vnd.deepsimbad.ranks"]
 
 
 def test_missing_content_type(client: TestClient) -> None:

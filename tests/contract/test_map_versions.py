@@ -17,6 +17,7 @@ from .conftest import DIM, N_READY, NPZ, make_ready_domain, npz, ready_encodings
 
 RANKS = {"ranked_landmarks": [3, 1, 2]}
 FILE = "application/vnd.sqlite3"
+SAME = {"same_route": True}
 
 
 def upload(client: TestClient, domain: str, name: str, encodings: Any, position_m: Any) -> None:
@@ -305,3 +306,28 @@ def test_versions_beyond_those_kept_lose_their_files(tmp_path: Path) -> None:
         assert files() == [3, 4]
         assert versions(client, "route")[2]["removed_at"] == removed
         assert len(versions(client, "route")) == 4
+
+
+def test_a_second_season_is_learnt_from_where_the_route_is_said_to_be_one(client: TestClient, domain: str) -> None:
+    """The drive knows x, y of its own; the other one does not."""
+    again = ready_encodings() + 0.1 * np.random.default_rng(1).normal(size=(N_READY, DIM)).astype(np.float32)
+    upload(client, domain, "again", again, 2.0 * np.arange(N_READY))
+    upload(client, domain, "noise", np.random.default_rng(2).normal(size=(N_READY, DIM)), 2.0 * np.arange(N_READY))
+    asked = {"training_traverse": "drive", "landmark_traverse": "again", "training_episodes": 0}
+    told = [remap(client, domain, **asked, **said)["result"]["metrics"]["second_season"] for said in ({}, SAME)]
+    assert [season["accepted"] for season in told] == [False, True]
+    assert "say same_route" in told[0]["why"]
+    assert (told[1]["why"], told[1]["n_pairs"]) == (None, N_READY)
+    assert 0 <= told[1]["significance"] < 0.001 < told[1]["statistic"]
+    noise = remap(client, domain, **asked | SAME | {"landmark_traverse": "noise"})
+    season = noise["result"]["metrics"]["second_season"]
+    assert (season["accepted"], noise["config"]["same_route"]) == (False, True)
+    assert "agree no better" in season["why"]
+    newest = max(versions(client, domain).items())[1]
+    assert newest["metrics"]["second_season"] == season
+
+
+@pytest.mark.parametrize("said", ["yes", 1, []])
+def test_same_route_is_true_false_or_null(client: TestClient, said: Any) -> None:
+    body = {"training_traverse": "drive", "same_route": said}
+    refused(client.post("/v1/admin/domains/ready/remaps", json=body), 422, "invalid_request")

@@ -17,6 +17,7 @@ GET /readyz
 GET /metrics
 GET /v1/domains
 GET /v1/domains/{domain}
+GET /v1/domains/{domain}/landmark-model
 POST /v1/domains/{domain}/localizations
 POST /v1/domains/{domain}/sessions
 POST /v1/sessions/{session_id}/observations
@@ -96,7 +97,12 @@ def test_whatever_takes_parameters_or_a_body_may_refuse_them(operations: dict[st
 def test_bodies_and_answers_by_media_type(operations: dict[str, Any]) -> None:
     images = {"image/jpeg", "image/png", "image/tiff", "image/webp"}
     localize = operations["POST /v1/domains/{domain}/localizations"]
-    assert set(localize["requestBody"]["content"]) == images | {"application/json"}
+    seen = images | {"application/json", "application/vnd.deepsimbad.ranks"}
+    for name in ("domains/{domain}/localizations", "sessions/{session_id}/observations"):
+        assert set(operations[f"POST /v1/{name}"]["requestBody"]["content"]) == seen
+    assert set(operations["GET /v1/domains/{domain}/landmark-model"]["responses"]["200"]["content"]) == {
+        "application/octet-stream"
+    }
     assert set(localize["responses"]["200"]["content"]) == {"application/json", "application/octet-stream"}
     base = "/v1/admin/domains/{domain}/traverses/{name}/frames"
     assert set(operations[f"PUT {base}/{{index}}"]["requestBody"]["content"]) == images | {"application/json"}

@@ -16,7 +16,7 @@ from .conftest import N_LANDMARKS, encoded, picture
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "operations.md"
 JPEG = {"Content-Type": "image/jpeg"}
-COMMON = {"receive", "wait", "decode", "describe", "retrieve", "plan", "total"}
+COMMON = {"receive", "wait", "decode", "encode", "describe", "retrieve", "plan", "total"}
 SINGLE = COMMON | {"shortlist", "belief"}
 IN_SESSION = COMMON | {"predict", "update", "commit", "summarise"}
 

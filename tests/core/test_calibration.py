@@ -10,6 +10,7 @@ from deepsimbad.core.descriptor import rank_landmarks
 from deepsimbad.core.relevance import Query, Relevance, relevances
 from deepsimbad.core.retrieval import SecondSeason, build_retrieval_map
 from deepsimbad.core.route import Route
+from deepsimbad.core.same_route import second_season
 from deepsimbad.core.statistics import LandmarkStatistics
 from deepsimbad.core.true_images import same_places
 
@@ -156,13 +157,15 @@ def test_log_ratios_are_those_of_two_normal_distributions():
 def test_without_two_seasons_of_one_route_it_falls_back(second, seasons):
     first = seasons[0]
     unrelated = np.random.default_rng(9).normal(size=first.shape).astype(np.float32)
-    pairs = np.stack([np.arange(N_IMAGES), np.arange(N_IMAGES)], axis=1)
-    given = {
-        "none": None,
-        "elsewhere": SecondSeason(seasons[1], np.empty((0, 2), np.int64)),
-        "unrelated": SecondSeason(unrelated, pairs),
-        "too few": SecondSeason(seasons[1], pairs[:29]),
+    route = Route(np.arange(N_IMAGES, dtype=float))
+    drive, driven = {
+        "none": (seasons[1], route),
+        "elsewhere": (seasons[1], Route(1000 + route.position_m)),
+        "unrelated": (unrelated, route),
+        "too few": (seasons[1][:29], Route(route.position_m[:29])),
     }[second]
+    said = None if second == "none" else True
+    given, _ = second_season(first, lambda: drive, route, driven, said)
     built = build_retrieval_map(Relevance.CALIBRATED, first, LIST_LENGTH, second_season=given)
     assert not built.calibration.is_of_two_seasons
     assert DEFAULT_CORRELATION == 0.6
@@ -175,8 +178,8 @@ def test_without_two_seasons_of_one_route_it_falls_back(second, seasons):
 
 
 def test_pairs_enough_are_learnt_from(seasons):
-    pairs = np.stack([np.arange(30), np.arange(30)], axis=1)
-    given = SecondSeason(seasons[1], pairs)
+    route = Route(np.arange(N_IMAGES, dtype=float))
+    given, _ = second_season(seasons[0], lambda: seasons[1][:30], route, Route(route.position_m[:30]), True)
     assert build_retrieval_map(
         Relevance.CALIBRATED, seasons[0], LIST_LENGTH, second_season=given
     ).calibration.is_of_two_seasons

@@ -106,7 +106,7 @@ def test_every_command_named_exists_and_has_the_options_shown(pages):
             words = shlex.split(text) if re.match(r"deepsimbad(-client)? [a-z]", text) else []
             if not words:
                 continue
-            depth = 3 if words[1] in {"experiment", "keys"} else 2
+            depth = 3 if words[1] in {"experiment", "keys", "weights"} else 2
             shown = help_of(words[0], *words[1:depth])
             for option in (word for word in words if word.startswith("--")):
                 assert re.search(rf"{option}\b", shown), f"{page.path.name}: {text}: no option {option}"

@@ -1,8 +1,8 @@
 """What the tests of sessions stand on: a data directory with one mapped domain, and a service that can be restarted."""
 
 import asyncio
-from collections.abc import Callable, Coroutine, Iterator
-from contextlib import AbstractAsyncContextManager, contextmanager, nullcontext
+from collections.abc import Awaitable, Callable, Coroutine, Iterator
+from contextlib import contextmanager
 from typing import Any, TypeVar
 
 import numpy as np
@@ -14,6 +14,7 @@ from deepsimbad.engine.observation import RankedLandmarks, ReadyEncoding, View
 from deepsimbad.engine.pinned_maps import PinnedMaps
 from deepsimbad.engine.sessions import Sessions
 from deepsimbad.engine.worker import InferenceWorker
+from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.session_records import IdempotencyKey
 from deepsimbad.store.sessions import SessionStore
@@ -79,8 +80,11 @@ def run(
         return asyncio.run(body(live))
 
 
-def viewed(view: View) -> Callable[[], AbstractAsyncContextManager[View]]:
-    return lambda: nullcontext(view)
+def viewed(view: View) -> Callable[[Evaluator], Awaitable[View]]:
+    async def give(_evaluator: Evaluator) -> View:
+        return view
+
+    return give
 
 
 def ranked(seed: int, action_m: float = 1.5, key: str | None = None, digest: bytes = b"d", **more: Any) -> Observation:

@@ -2,9 +2,8 @@
 
 import asyncio
 import threading
-from collections.abc import AsyncIterator, Callable
+from collections.abc import Callable
 from concurrent.futures import Future
-from contextlib import asynccontextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -33,6 +32,7 @@ from deepsimbad.errors import (
     UnavailableError,
     UnknownSessionError,
 )
+from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.feature_l2 import FeatureL2
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.map_table import ANY
@@ -63,8 +63,8 @@ def test_a_session_is_the_localizer_step_by_step(mapped: Catalog) -> None:
         for seed in range(6):
             observation = ranked(seed)
             view = await live.sessions.observe(session_id, observation)
-            async with observation.view() as seen:
-                query = describe(snapshot, FeatureL2("none"), seen)
+            evaluator = FeatureL2("none")
+            query = describe(snapshot, evaluator, await observation.view(evaluator))
             state = localizer.step(state, query, observation.action_m).state
             np.testing.assert_array_equal(await live.sessions.mass(session_id), state.belief.mass)
             assert view.n_observations == seed + 1
@@ -119,11 +119,9 @@ def test_two_at_once_are_answered_in_order_of_arrival(mapped: Catalog) -> None:
         gate = asyncio.Event()
         slow = ranked(0)
 
-        @asynccontextmanager
-        async def late() -> AsyncIterator[View]:
+        async def late(evaluator: Evaluator) -> View:
             await gate.wait()  # its image takes long to decode; it arrived first all the same
-            async with slow.view() as view:
-                yield view
+            return await slow.view(evaluator)
 
         first = asyncio.create_task(live.sessions.observe(at_once, replace(slow, view=late)))
         others = [asyncio.create_task(live.sessions.observe(at_once, ranked(seed))) for seed in range(1, 12)]
@@ -332,7 +330,11 @@ def test_a_live_view_goes_before_the_replay_of_an_old_observation(
             for seed in range(3):
                 await live.sessions.observe(session_id, ranked(seed, key=f"k{seed}"))
         order: list[str] = []
-        submit = live.worker.submit
+        submit, look = live.worker.submit, live.worker.look
+
+        def looking(*given: Any) -> Future[Any]:
+            order.append(Priority.LIVE.name)
+            return look(*given)
 
         def noting(run: Callable[[], object], priority: Priority = Priority.LIVE) -> Future[object]:
             order.append(priority.name)
@@ -349,6 +351,7 @@ def test_a_live_view_goes_before_the_replay_of_an_old_observation(
 
         one_replays = threading.Lock()
         live.worker.submit = noting  # type: ignore[method-assign,assignment]
+        live.worker.look = looking  # type: ignore[method-assign,assignment]
         await live.sessions.observe(sessions[0], ranked(2, key="k2"))
         assert order == ["LIVE"]
         await asyncio.gather(*(live.sessions.observe(one, ranked(1, key="k1")) for one in sessions))

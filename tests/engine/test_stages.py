@@ -2,8 +2,7 @@
 
 import asyncio
 import threading
-from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager
+from collections.abc import Callable
 from dataclasses import replace
 from time import perf_counter
 from typing import Any
@@ -13,6 +12,7 @@ import pytest
 from deepsimbad.engine.observation import View
 from deepsimbad.engine.session_config import SessionConfig
 from deepsimbad.engine.stopwatch import Stopwatch
+from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.map_table import ANY
 
@@ -83,12 +83,10 @@ def test_a_view_before_this_one_shows_as_waiting_and_a_slow_image_as_decoding(ma
         session_id, before, behind = await begun(live), Stopwatch(), Stopwatch()
         begins, let_go, slow = asyncio.Event(), asyncio.Event(), ranked(1)
 
-        @asynccontextmanager
-        async def late() -> AsyncIterator[View]:
+        async def late(evaluator: Evaluator) -> View:
             begins.set()
             await let_go.wait()
-            async with slow.view() as view:
-                yield view
+            return await slow.view(evaluator)
 
         first = asyncio.create_task(live.sessions.observe(session_id, replace(slow, view=late), before))
         await until(begins.is_set, first)

@@ -3,10 +3,12 @@
 import threading
 from collections.abc import Iterator
 
+import numpy as np
 import pytest
 
+from deepsimbad.engine.observation import EncodedImage, NothingSeen
 from deepsimbad.engine.worker import InferenceWorker, Priority
-from deepsimbad.errors import InvalidInputError, OverloadedError, UnavailableError
+from deepsimbad.errors import InvalidImageError, InvalidInputError, OverloadedError, UnavailableError
 
 
 @pytest.fixture
@@ -85,3 +87,106 @@ def test_no_more_of_one_priority_wait_than_may() -> None:
     finally:
         gate.set()
         worker.close()
+
+
+class Eyes:
+    """An evaluator that encodes an image to its first pixel and notes the sizes of its batches."""
+
+    weights_sha256 = "f" * 64
+
+    def __init__(self, largest_batch: int) -> None:
+        self.largest_batch = largest_batch
+        self.batches: list[int] = []
+
+    def encode(self, images):
+        self.batches.append(len(images))
+        if any(image[0, 0, 0] == 255 for image in images):
+            raise InvalidImageError("no picture")
+        return np.array([[image[0, 0, 0]] for image in images], np.float32)
+
+
+def grey(level: int) -> np.ndarray:
+    return np.full((4, 4, 3), level, np.uint8)
+
+
+def looked(worker, eyes, levels, priority=Priority.LIVE):
+    """Answers to come of images that all wait before the worker gets to the first."""
+    gate = threading.Event()
+    worker.submit(gate.wait)
+    answers = [worker.look(eyes, grey(level), lambda seen: seen, priority) for level in levels]
+    return gate, answers
+
+
+def test_images_that_wait_are_encoded_together_as_many_as_pay(worker: InferenceWorker) -> None:
+    eyes = Eyes(largest_batch=4)
+    gate, answers = looked(worker, eyes, range(10))
+    gate.set()
+    seen = [answer.result(5) for answer in answers]
+    assert all(isinstance(one, EncodedImage) and one.weights_sha256 == eyes.weights_sha256 for one in seen)
+    assert [one.values.tolist() for one in seen] == [[level] for level in range(10)]
+    assert eyes.batches == [4, 4, 2]
+    assert worker.n_waiting == 0
+    assert not worker.is_full()
+
+
+def test_where_batches_do_not_pay_nobody_waits_for_company() -> None:
+    worker, eyes = InferenceWorker(longest_wait_s=3600), Eyes(largest_batch=1)
+    try:
+        gate, answers = looked(worker, eyes, range(3))
+        gate.set()
+        assert [answer.result(5).values[0] for answer in answers] == [0, 1, 2]
+        assert eyes.batches == [1, 1, 1]
+    finally:
+        worker.close()
+
+
+def test_an_image_waits_for_company_no_longer_than_it_may() -> None:
+    worker, eyes = InferenceWorker(longest_wait_s=0.02), Eyes(largest_batch=64)
+    try:
+        assert worker.look(eyes, grey(7), lambda seen: seen.values[0]).result(60) == 7
+        assert eyes.batches == [1]
+    finally:
+        worker.close()
+
+
+def test_a_batch_takes_live_views_first_and_is_of_one_evaluator(worker: InferenceWorker) -> None:
+    eyes, others, order = Eyes(3), Eyes(3), []
+    gate = threading.Event()
+    worker.submit(gate.wait)
+
+    def look(at, level, priority):
+        return worker.look(at, grey(level), lambda seen: order.append((priority.name, int(seen.values[0]))), priority)
+
+    frames = [look(eyes, level, Priority.BATCH) for level in (1, 2)]
+    live = [look(eyes, 3, Priority.LIVE), look(others, 4, Priority.LIVE), look(eyes, 5, Priority.LIVE)]
+    gate.set()
+    for answer in (*frames, *live):
+        answer.result(5)
+    assert order == [("LIVE", 3), ("LIVE", 4), ("LIVE", 5), ("BATCH", 1), ("BATCH", 2)]
+    assert eyes.batches == [1, 3]  # the other evaluator's view came in between, and keeps its place
+    assert others.batches == [1]
+
+
+def test_one_bad_image_fails_alone(worker: InferenceWorker) -> None:
+    eyes = Eyes(largest_batch=4)
+    gate, answers = looked(worker, eyes, [1, 255, 3])
+    gate.set()
+    assert answers[0].result(5).values[0] == 1
+    assert answers[2].result(5).values[0] == 3
+    with pytest.raises(InvalidImageError):
+        answers[1].result(5)
+
+
+def test_what_needs_no_encoding_is_passed_on_as_it_is(worker: InferenceWorker) -> None:
+    eyes, nothing = Eyes(4), NothingSeen()
+    assert worker.look(eyes, nothing, lambda seen: seen).result(5) is nothing
+    assert eyes.batches == []
+
+
+def test_a_cancelled_image_is_not_encoded(worker: InferenceWorker) -> None:
+    eyes = Eyes(largest_batch=4)
+    gate, answers = looked(worker, eyes, [1, 2, 3])
+    assert answers[1].cancel()
+    gate.set()
+    assert [answers[k].result(5).values[0] for k in (0, 2)] == [1, 3]
+    assert eyes.batches == [2]

@@ -55,7 +55,7 @@ def slow_second_season(map_scores, other_scores):
     own, other = ((scores - scores.mean(axis=0)) / scores.std(axis=0) for scores in (map_scores, other_scores))
     pairs = [(min(f, len(own) - 1), f) for f in range(len(other)) if f - (len(own) - 1) <= 2]
     rho = np.mean([own[m] * other[f] for m, f in pairs], axis=0)
-    if rho.mean() < 0.15:
+    if rho.mean() < 0.15:  # far from the drives of one route here; `deepsimbad.core.same_route` has tests of its own
         return None
     rho = np.clip(rho, 0.05, 0.95)
     both = own.copy()

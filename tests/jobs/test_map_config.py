@@ -31,5 +31,5 @@ def test_the_greatest_numbers_that_fit_are_taken():
 
 
 def test_it_survives_its_json_form():
-    config = RemapConfig("drive", "other", 40, 3, Relevance.RRF, 5, 6, activate=False)
+    config = RemapConfig("drive", "other", 40, 3, Relevance.RRF, 5, 6, activate=False, same_route=True)
     assert RemapConfig.from_dict(json.loads(json.dumps(config.as_dict()))) == config

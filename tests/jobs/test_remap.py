@@ -1,5 +1,7 @@
 """Remapping: what the map file holds, what stays when it fails."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -16,9 +18,12 @@ from deepsimbad.errors import (
 from deepsimbad.jobs.map_config import RemapConfig
 from deepsimbad.jobs.progress import Progress
 from deepsimbad.jobs.remap import REMAP_STAGES, remap
+from deepsimbad.jobs.remap_inputs import read_inputs
+from deepsimbad.store.frames import UNKNOWN_TIMESTAMP, TraverseFrames
 from deepsimbad.store.map_file import read_map
 from deepsimbad.store.records import MapState
 from deepsimbad.store.sealing import verify
+from deepsimbad.store.traverses import Traverse
 
 DOMAIN = "route"
 
@@ -217,3 +222,87 @@ def before(stage):
 
 def cancelled():
     return Progress(REMAP_STAGES, None, lambda: True)
+
+
+# --- whether a second drive is learnt from -------------------------------------------------------------------------
+
+PLACES = 120
+
+
+@pytest.fixture
+def route(catalog):
+    """Stores drives of 120 places: `drive` and `other` of the same ones, `strange` of others, x and y where asked."""
+
+    def store(plane=False):
+        rng = np.random.default_rng(3)
+        places = rng.normal(size=(PLACES, 16))
+        known = np.arange(PLACES, dtype=float) if plane else np.full(PLACES, np.nan)
+        for name, seen in (("drive", places), ("other", places), ("strange", rng.normal(size=places.shape))):
+            frames = TraverseFrames(
+                index=np.arange(PLACES),
+                position_m=np.arange(PLACES, dtype=float),
+                timestamp_us=np.full(PLACES, UNKNOWN_TIMESTAMP),
+                x_m=known,
+                y_m=0 * known,
+                encodings=(seen + 0.3 * rng.normal(size=seen.shape)).astype(np.float32),
+            )
+            with Traverse.create(catalog.data_dir, DOMAIN, name) as traverse:
+                traverse.put_frames(frames)
+
+    return store
+
+
+@pytest.mark.parametrize(
+    ("plane", "asked", "accepted", "why"),
+    [
+        (False, {}, False, "without x, y of both drives nothing says"),
+        (False, {"same_route": True}, True, None),
+        (True, {}, True, None),
+        (True, {"same_route": False}, False, "are said not to share their positions"),
+        (False, {"same_route": True, "landmark_traverse": "strange"}, False, "agree no better"),
+        (True, {"landmark_traverse": "strange"}, False, "agree no better"),
+    ],
+)
+@pytest.mark.parametrize("relevance", [Relevance.CALIBRATED, Relevance.RRF])
+def test_a_second_drive_is_learnt_from_only_on_the_same_route(
+    catalog, route, evaluator, plane, asked, accepted, why, relevance
+):
+    """One verdict holds for trust, for telling places and off the route, and for the live images of training."""
+    route(plane)
+    asked = config(n_landmarks=60, training_episodes=20, relevance=relevance, **asked)
+    metrics = remap(catalog, DOMAIN, asked, evaluator, Progress(REMAP_STAGES))["metrics"]
+    season = metrics["second_season"]
+    assert season["accepted"] is accepted
+    assert season["why"] is None if why is None else why in season["why"]
+    assert (season["significance"] is None) == (season["n_pairs"] == 0) == (why is not None and "agree" not in why)
+    assert metrics["training"]["live_images"] == ("landmark_traverse" if accepted else "held_out_frames")
+    assert catalog.map(DOMAIN, 1).metrics["second_season"] == season
+    contents = read_map(catalog.map_path(DOMAIN, 1))
+    learnt = accepted and relevance is Relevance.CALIBRATED
+    assert (contents.telling_bits is not None) == (contents.off_route_model is not None) == learnt
+    if relevance is Relevance.CALIBRATED:
+        assert (set(contents.correlation.tolist()) != {0.6}) == accepted
+
+
+def test_without_a_second_drive_there_is_no_verdict(catalog, drive, evaluator, quiet):
+    drive("drive", 12)
+    result = remap(catalog, DOMAIN, config(landmark_traverse="drive"), evaluator, quiet)
+    assert result["metrics"]["second_season"] is None
+
+
+def test_where_landmarks_stay_the_active_maps_drive_is_judged(catalog, route, evaluator):
+    route()
+    remap(catalog, DOMAIN, config(training_episodes=0), evaluator, Progress(REMAP_STAGES))
+    later = config(training_traverse="strange", landmark_traverse=None, n_landmarks=None, training_episodes=0)
+    told = remap(catalog, DOMAIN, replace(later, same_route=True), evaluator, Progress(REMAP_STAGES))
+    assert told["metrics"]["second_season"]["accepted"] is False
+    again = remap(catalog, DOMAIN, config(training_episodes=0), evaluator, Progress(REMAP_STAGES))
+    back = config(training_traverse="other", landmark_traverse=None, n_landmarks=None, same_route=True)
+    assert again["map_version"] == 3
+    assert remap(catalog, DOMAIN, back, evaluator, Progress(REMAP_STAGES))["metrics"]["second_season"]["accepted"]
+
+
+def test_what_is_said_of_the_positions_is_an_input(catalog, route, evaluator):
+    route()
+    digests = {read_inputs(catalog, DOMAIN, config(same_route=said)).digest() for said in (None, False, True)}
+    assert len(digests) == 3

@@ -52,7 +52,7 @@ from deepsimbad.engine.truths import Truths
 from deepsimbad.engine.warm_up import warm_up
 from deepsimbad.engine.worker import InferenceWorker, Priority
 from deepsimbad.errors import DeepSimbadError
-from deepsimbad.evaluators.registry import EvaluatorKind
+from deepsimbad.evaluators.registry import fallback
 from deepsimbad.jobs.cores import job_threads
 from deepsimbad.jobs.job_process import InAnotherProcess
 from deepsimbad.jobs.perform import RunJob
@@ -197,13 +197,13 @@ def _start(settings: Settings, metrics: Metrics, keys: KeyRing, run_job: RunJob,
     settings.check_exposure(keys.n_created)
     for line in catalog.discard_unfinished():
         log.warning("discarded at start", extra={"what": line})
-    evaluators = EvaluatorPool()
-    evaluators.evaluator({"kind": EvaluatorKind.FEATURE_L2.value})
-    for record in catalog.domains():
-        evaluators.evaluator(record.evaluator)
+    if (told := fallback()) is not None:
+        log.warning("the default network is not installed", extra={"why": told})
+    evaluators = EvaluatorPool(settings.compute())
+    evaluators.load_all({record.name: record.evaluator for record in catalog.domains()})
     active_maps = ActiveMaps(catalog)
     damaged = active_maps.load_all()
-    worker = InferenceWorker(max_waiting=settings.max_queue)
+    worker = InferenceWorker(max_waiting=settings.max_queue, longest_wait_s=settings.encode_wait_ms / 1000)
     parts.callback(worker.close)
     worker.submit(warm_up).result()
     store = parts.enter_context(SessionStore.open(settings.data_dir, metrics.committed))
@@ -283,6 +283,7 @@ def _start(settings: Settings, metrics: Metrics, keys: KeyRing, run_job: RunJob,
         session_store=store,
         retention=retention,
         truths=Truths(store, pinned_maps, worker, clock),
+        pinned_maps=pinned_maps,
         clock=clock,
         worker=worker,
         decoders=Decoders(settings.max_pixels),

@@ -15,11 +15,12 @@ from deepsimbad.api.problems import InvalidRequestError, invalid_request
 from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Relevance
 from deepsimbad.engine.observation import Dissimilarities, RankedLandmarks, ReadyEncoding
 from deepsimbad.errors import EmptyBodyError, UnsupportedMediaTypeError
-from deepsimbad.evaluators.registry import EvaluatorKind, ExtractorName
+from deepsimbad.evaluators.registry import EXTRACTOR_PATTERN, EvaluatorKind
 from deepsimbad.jobs.map_config import DEFAULT_LIST_LENGTH, DEFAULT_TRAINING_EPISODES, RemapConfig
 
 JSON = "application/json"
 BINARY = "application/octet-stream"
+RANKS = "application/vnd.deepsimbad.ranks"
 NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$"
 MAX_LANDMARKS = 0xFFFF
 GREATEST_EXACT_INTEGER = 2**53 - 1
@@ -80,7 +81,7 @@ _EVALUATOR_SCHEMA = {
     "required": ["kind"],
     "properties": {
         "kind": {"enum": [kind.value for kind in EvaluatorKind]},
-        "extractor": {"enum": [name.value for name in ExtractorName]},
+        "extractor": {"type": "string", "pattern": EXTRACTOR_PATTERN},
     },
     "additionalProperties": False,
 }
@@ -156,6 +157,14 @@ class RemapBody(JsonBody):
             "landmark_traverse must be null.",
         ),
     ] = False
+    same_route: Annotated[
+        Annotated[bool, Field(strict=True)] | None,
+        Field(
+            description="Whether the training traverse and the one that the map would learn a second season from (the "
+            "landmark traverse, else what the active map was made of) count positions along one route; null: only "
+            "where both know x, y. Where their views disagree nothing is learnt, and metrics.second_season says why."
+        ),
+    ] = None
 
     def config(self) -> RemapConfig:
         """The job's form; raises InvalidMapConfigError."""
@@ -274,7 +283,8 @@ OBSERVATION_SCHEMA = {
         _only(
             "ranked_landmarks",
             {"type": "integer", "minimum": 0, "maximum": MAX_LANDMARKS - 1},
-            "Distinct landmark ids from 0, nearest first, 1..r of them; the rest share the mean of the ranks left.",
+            "Distinct landmark ids from 0, nearest first, 1..r of them; of the rest no more is known than that they "
+            "are farther, and that landmarks go together as they did along the map's own drive.",
         ),
         _only("dissimilarities", {"type": "number"}, "r finite numbers in landmark order, smaller is nearer."),
         _only("encoding", {"type": "number"}, "A ready encoding, as long as those the map was made of."),
@@ -282,4 +292,10 @@ OBSERVATION_SCHEMA = {
 }
 ENCODING_SCHEMA = _only("encoding", {"type": "number"}, "A ready encoding, as long as the others of the traverse.")
 IMAGE_SCHEMA: dict[str, Any] = {"type": "string", "format": "binary"}
+RANKS_SCHEMA: dict[str, Any] = {
+    "type": "string",
+    "format": "binary",
+    "description": "The same in fewest bytes: their number m in two, big-endian, then m landmark ids, nearest first, "
+    "of ceil(log2 r) bits each, most significant bit first; zero bits fill the last byte.",
+}
 DECLARED_BODIES: tuple[type[JsonBody], ...] = (DomainBody, TraverseBody, RemapBody, ActiveMapBody)

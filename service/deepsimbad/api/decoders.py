@@ -1,22 +1,35 @@
-"""Images on their way from a body to the inference worker: few at once, whatever is sent."""
+"""Images on their way from a body to the inference worker: few are decoded at once, whatever is sent."""
 
-from collections.abc import AsyncIterator
-from contextlib import AsyncExitStack, asynccontextmanager
+from contextlib import AsyncExitStack
+from dataclasses import dataclass
 
 from anyio import CapacityLimiter
 from anyio.to_thread import run_sync
 
 from deepsimbad.engine.worker import Priority
 from deepsimbad.errors import OverloadedError
-from deepsimbad.evaluators.base import Image
-from deepsimbad.evaluators.image import KEPT_PIXELS, claimed_pixels, decode_image
+from deepsimbad.evaluators.base import Evaluator, Image
+from deepsimbad.evaluators.image import KEPT_PIXELS, claimed_pixels, decode_image, is_blank
 
-SLOTS = {Priority.LIVE: 4, Priority.BATCH: 2}  # images decoded and not yet looked at, each of up to KEPT_PIXELS
+SLOTS = {Priority.LIVE: 4, Priority.BATCH: 2}  # images decoded and not yet reduced, each of up to KEPT_PIXELS
 LARGE_WAITING = 8  # larger images that may wait for the one that is being decoded
 
 
+@dataclass(frozen=True)
+class Decoded:
+    """An image at the size that its evaluator encodes.
+
+    Attributes:
+        image: [height, width, 3] uint8 BGR.
+        is_blank: Whether it shows nothing.
+    """
+
+    image: Image
+    is_blank: bool
+
+
 class Decoders:
-    """Decodes images in threads, and lets the next one begin when nobody needs the last one's pixels any more.
+    """Decodes images in threads and brings them to their evaluator's size there, so that little of each is held.
 
     An image of more than `KEPT_PIXELS` takes most of a second and memory for all its pixels until it is reduced. So
     there is one of those at a time, and usual images never wait for one; when too many wait, more are refused.
@@ -27,28 +40,28 @@ class Decoders:
 
     def __init__(self, max_pixels: int) -> None:
         self._max_pixels = max_pixels
-        # Live views have slots of their own: frames of a traverse hold theirs until no live view waits.
+        # Live views have slots of their own: frames of a traverse must not keep them waiting.
         self._slots = {priority: CapacityLimiter(n_slots) for priority, n_slots in SLOTS.items()}
         self._large = CapacityLimiter(1)
-        self._threads = CapacityLimiter(sum(SLOTS.values()))
 
-    @asynccontextmanager
-    async def decoded(self, body: bytes, priority: Priority) -> AsyncIterator[Image]:
-        """The image in a body, for as long as the block lasts; behind it nobody should hold it for long.
+    async def decoded(self, body: bytes, evaluator: Evaluator, priority: Priority) -> Decoded:
+        """The image in a body.
 
         Raises:
             InvalidImageError, ImageTooLargeError, EmptyBodyError: As `decode_image`.
+            UnsupportedMediaTypeError: The evaluator takes ready encodings alone.
             OverloadedError: The image is large, and as many large ones wait as may.
         """
         n_pixels = await run_sync(claimed_pixels, body, self._max_pixels)
-        async with AsyncExitStack() as until_decoded, AsyncExitStack() as until_seen:
+        async with AsyncExitStack() as until_decoded:
             if n_pixels > KEPT_PIXELS:
                 self._check_large()
                 await until_decoded.enter_async_context(self._large)
-            await until_seen.enter_async_context(self._slots[priority])
-            image = await run_sync(decode_image, body, self._max_pixels, limiter=self._threads)
-            await until_decoded.aclose()
-            yield image
+            return await run_sync(self._decode, body, evaluator, limiter=self._slots[priority])
+
+    def _decode(self, body: bytes, evaluator: Evaluator) -> Decoded:
+        image = decode_image(body, self._max_pixels)
+        return Decoded(evaluator.prepare(image), is_blank(image))
 
     def _check_large(self) -> None:
         if self._large.statistics().tasks_waiting >= LARGE_WAITING:

@@ -3,8 +3,6 @@
 import asyncio
 import threading
 from collections.abc import Callable
-from concurrent.futures import Future
-from contextlib import AbstractAsyncContextManager
 from dataclasses import dataclass, field
 from typing import Annotated, TypeVar, cast
 
@@ -19,13 +17,15 @@ from deepsimbad.api.metrics import Metrics
 from deepsimbad.api.readiness import ReadinessCheck
 from deepsimbad.engine.active_maps import ActiveDomain, ActiveMaps
 from deepsimbad.engine.evaluator_pool import EvaluatorPool
+from deepsimbad.engine.observation import View
 from deepsimbad.engine.open_traverses import OpenTraverses
+from deepsimbad.engine.pinned_maps import PinnedMaps
 from deepsimbad.engine.retention import Retention
 from deepsimbad.engine.sessions import Sessions
 from deepsimbad.engine.steady_clock import SteadyClock
 from deepsimbad.engine.truths import Truths
 from deepsimbad.engine.worker import InferenceWorker, Priority
-from deepsimbad.evaluators.base import Image
+from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.jobs.runner import JobRunner
 from deepsimbad.settings import Settings
 from deepsimbad.store.catalog import Catalog
@@ -52,6 +52,7 @@ class Services:
         session_store: Their file.
         retention: Which old maps keep their files.
         truths: What their beliefs were worth.
+        pinned_maps: The map versions that they keep.
         clock: What they live by.
         worker: Where encoding and scoring run.
         decoders: Where images are decoded.
@@ -73,6 +74,7 @@ class Services:
     session_store: SessionStore
     retention: Retention
     truths: Truths
+    pinned_maps: PinnedMaps
     clock: SteadyClock
     worker: InferenceWorker
     decoders: Decoders
@@ -88,14 +90,15 @@ class Services:
         known = self.active_maps.peek(domain)
         return known if known is not None else await run_sync(self.active_maps.active, domain)
 
-    def decoded(self, body: bytes, priority: Priority = Priority.LIVE) -> AbstractAsyncContextManager[Image]:
-        """The image in a body, decoded in a thread, for a block that waits for nothing but the inference worker."""
-        return self.decoders.decoded(body, priority)
-
     async def infer(self, run: Callable[[], T], priority: Priority = Priority.LIVE) -> T:
         """Run on the inference worker."""
-        answer: Future[T] = self.worker.submit(run, priority)
-        return await asyncio.wrap_future(answer)
+        return await asyncio.wrap_future(self.worker.submit(run, priority))
+
+    async def look(
+        self, evaluator: Evaluator, view: View, run: Callable[[View], T], priority: Priority = Priority.LIVE
+    ) -> T:
+        """Run a function of a view on the inference worker, which encodes an image before."""
+        return await asyncio.wrap_future(self.worker.look(evaluator, view, run, priority))
 
 
 async def services_of(request: Request) -> Services:

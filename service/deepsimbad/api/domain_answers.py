@@ -5,6 +5,7 @@ from deepsimbad.engine.active_maps import ActiveMaps
 from deepsimbad.engine.evaluator_pool import EvaluatorPool
 from deepsimbad.engine.snapshot import MapSnapshot
 from deepsimbad.errors import NoActiveMapError, UnavailableError
+from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.store.records import DomainRecord
 
 
@@ -14,13 +15,15 @@ def describe_domain(record: DomainRecord, evaluators: EvaluatorPool, active_maps
     Raises:
         UnknownDomainError: It was deleted meanwhile.
     """
-    evaluator = evaluators.evaluator(record.evaluator)
+    evaluator, evaluator_problem = _evaluator(evaluators, record)
     snapshot, problem = _active_map(active_maps, record)
     return DomainAnswer(
         name=record.name,
         evaluator=record.evaluator,
-        input_size=evaluator.input_size,
-        encoding_dim=evaluator.encoding_dim,
+        evaluator_problem=evaluator_problem,
+        input_size=evaluator and evaluator.input_size,
+        encoding_dim=evaluator and evaluator.encoding_dim,
+        weights_sha256=evaluator and evaluator.weights_sha256,
         closed=record.closed,
         actions_m=list(record.actions_m),
         created_at=record.created_at,
@@ -32,7 +35,16 @@ def describe_domain(record: DomainRecord, evaluators: EvaluatorPool, active_maps
         n_landmarks=snapshot and snapshot.n_landmarks,
         list_length=snapshot and snapshot.list_length,
         index_bits_per_map_image=snapshot and snapshot.index_bits_per_map_image,
+        landmark_model_digest=snapshot and snapshot.landmark_model_digest,
     )
+
+
+def _evaluator(evaluators: EvaluatorPool, record: DomainRecord) -> tuple[Evaluator | None, str | None]:
+    """The evaluator, or the code of what keeps it from being loaded."""
+    try:
+        return evaluators.serving(record.evaluator), None
+    except UnavailableError as error:
+        return None, error.hints.get("reason", error.code)
 
 
 def _active_map(active_maps: ActiveMaps, record: DomainRecord) -> tuple[MapSnapshot | None, str | None]:

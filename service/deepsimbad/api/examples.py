@@ -29,6 +29,8 @@ PARAMETERS: Mapping[str, Any] = {
     "shortlist": 10,
     "limit": 100,
     "Idempotency-Key": "robot-7/421",
+    "If-Match": "*",
+    "map_version": 1,
 }
 ENCODED_ON_BOARD = {"ranked_landmarks": [7, 2, 9, 0]}
 

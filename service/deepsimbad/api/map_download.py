@@ -15,6 +15,7 @@ from starlette.exceptions import HTTPException
 from starlette.responses import Response, StreamingResponse
 from starlette.types import Receive, Scope, Send
 
+from deepsimbad.api.entity_tags import KEPT, names
 from deepsimbad.errors import DamagedMapError
 from deepsimbad.store.faults import storage_faults
 
@@ -99,10 +100,6 @@ class _MapResponse(StreamingResponse):
                 await run_sync(self._file.close)
 
 
-# It may be kept by who asked, and asked for again: a domain made anew counts its versions from 1 again.
-_KEPT = {"Cache-Control": "private, no-cache"}
-
-
 def map_response(file: MapFile, filename: str, headers: Headers) -> Response:
     """The answer to a request for a map file, which it closes.
 
@@ -116,14 +113,14 @@ def map_response(file: MapFile, filename: str, headers: Headers) -> Response:
     """
     told = {
         "Accept-Ranges": "bytes",
-        **_KEPT,
+        **KEPT,
         "ETag": file.etag,
         "Repr-Digest": file.digest,
         "Content-Disposition": f'attachment; filename="{filename}"',
     }
-    if _names(headers.get("if-none-match"), file.etag):
+    if names(headers.get("if-none-match"), file.etag):
         file.close()
-        return Response(status_code=HTTPStatus.NOT_MODIFIED, headers={**_KEPT, "ETag": file.etag})
+        return Response(status_code=HTTPStatus.NOT_MODIFIED, headers={**KEPT, "ETag": file.etag})
     part = None
     if headers.get("if-range") in {None, file.etag}:
         part = _part(headers.get("range"), file.n_bytes)
@@ -140,11 +137,6 @@ def map_response(file: MapFile, filename: str, headers: Headers) -> Response:
         )
     told |= {"Content-Range": f"bytes {start}-{stop - 1}/{file.n_bytes}", "Content-Length": str(stop - start)}
     return _MapResponse(file, start, stop, HTTPStatus.PARTIAL_CONTENT, told)
-
-
-def _names(wanted: str | None, etag: str) -> bool:
-    """Whether an If-None-Match names this."""
-    return wanted is not None and any(one.strip().removeprefix("W/") in {etag, "*"} for one in wanted.split(","))
 
 
 def _part(wanted: str | None, n_bytes: int) -> tuple[int, int] | None:

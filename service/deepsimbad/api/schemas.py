@@ -55,15 +55,24 @@ class DomainAnswer(Answer):
 
     name: str
     evaluator: Annotated[dict[str, Any], Field(description="Its `kind` and options, defaults filled in.")]
+    evaluator_problem: Annotated[
+        str | None, Field(description="Code of what keeps the extractor from being loaded; images are then a 503.")
+    ]
     input_size: Annotated[
         tuple[int, int] | None,
-        Field(description="[width, height] in pixels to resize an image to; null: no images are taken."),
+        Field(
+            description="[width, height] in pixels to resize an image to; null: images are taken as they are, or not "
+            "at all where `encoding_dim` is null too."
+        ),
     ]
     encoding_dim: Annotated[
         int | None,
         Field(
             description="Length of an image's encoding; null: no images are taken. Ready ones may have any one length."
         ),
+    ]
+    weights_sha256: Annotated[
+        str | None, Field(description="SHA-256 of the file of weights that images are encoded by; null: of none.")
     ]
     closed: Annotated[bool, Field(description="Whether the end of the route joins its start.")]
     actions_m: Annotated[list[float], Field(description="The moves a planner may choose, in metres.")]
@@ -76,6 +85,9 @@ class DomainAnswer(Answer):
     n_landmarks: int | None
     list_length: int | None
     index_bits_per_map_image: float | None
+    landmark_model_digest: Annotated[
+        str | None, Field(description="SHA-256 of the landmarks that a robot may rank itself: see `landmark-model`.")
+    ]
 
 
 class DomainList(Answer):

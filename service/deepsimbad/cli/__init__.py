@@ -16,6 +16,7 @@ from deepsimbad.cli.local import delete, info, localize, map_
 from deepsimbad.cli.serve import serve
 from deepsimbad.cli.settings import settings
 from deepsimbad.cli.transfer import export, import_
+from deepsimbad.cli.weights import weights
 from deepsimbad.errors import CancelledError, DeepSimbadError, UnavailableError
 from deepsimbad_client.errors import DeepSimbadClientError
 
@@ -30,7 +31,7 @@ def deepsimbad() -> None:
 
 for command in (
     *(serve, map_, localize, info, delete, experiment, keys, settings),
-    *(backup, restore, export, import_, check),
+    *(backup, restore, export, import_, check, weights),
 ):
     deepsimbad.add_command(command)
 

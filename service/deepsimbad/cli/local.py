@@ -57,6 +57,12 @@ _ACTIONS_M = tuple(float(metres) for metres in range(1, 11))
 @click.option("--relevance", type=RELEVANCES, default=DEFAULT_RELEVANCE.value, show_default=True)
 @click.option("--training-episodes", type=click.IntRange(min=0), default=DEFAULT_TRAINING_EPISODES, show_default=True)
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
+@click.option(
+    "--same-route/--no-same-route",
+    default=None,
+    help="Whether both recordings count their positions along one route, so that the map may learn from two seasons of "
+    "it.  [default: where both know x, y]",
+)
 @click.option("--closed", is_flag=True, help="The end of the route joins its start.")
 @spacing_option
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON document.")
@@ -71,6 +77,7 @@ def map_(
     relevance: str,
     training_episodes: int,
     seed: int,
+    same_route: bool | None,
     closed: bool,
     spacing_m: float,
     as_json: bool,
@@ -89,10 +96,11 @@ def map_(
         relevance=Relevance(relevance),
         training_episodes=training_episodes,
         seed=seed,
+        same_route=same_route,
     )
     checked_name(domain, "domain")
-    judge = make_evaluator(evaluator)
     settings = given_settings(data_dir=data_dir)
+    judge = make_evaluator(evaluator, settings.compute())
     # A mistake in what was typed should cost no minutes of encoding, and leave no domain behind.
     recordings = {
         role: open_source(source, spacing_m=spacing_m)
@@ -115,6 +123,9 @@ def map_(
         write_json({"domain": domain, **result})
         return
     click.echo(f"map {result['map_version']} of {domain} is active: {result['metrics']['n_map_images']} images")
+    season = result["metrics"]["second_season"]
+    if season["significance"] is not None and not season["accepted"]:
+        click.echo(f"it learnt nothing of a second season: {season['why']}", err=True)
 
 
 @click.command()
@@ -127,7 +138,7 @@ def localize(domain: str, images: tuple[Path, ...], as_json: bool, data_dir: Pat
     settings = given_settings(data_dir=data_dir)
     with Catalog.open(existing_data_dir(settings.data_dir)) as catalog:
         active = ActiveMaps(catalog).active(domain)
-        judge = EvaluatorPool().evaluator(active.record.evaluator)
+        judge = EvaluatorPool(settings.compute()).serving(active.record.evaluator)
         answers = []
         for path in images:
             watch = Stopwatch()
@@ -177,8 +188,9 @@ def delete(domain: str, data_dir: Path | None) -> None:
 @data_dir_option
 def info(domain: str, as_json: bool, data_dir: Path | None) -> None:
     """Describe a domain and its active map."""
-    with Catalog.open(existing_data_dir(given_settings(data_dir=data_dir).data_dir)) as catalog:
-        answer = describe_domain(catalog.domain(domain), EvaluatorPool(), ActiveMaps(catalog))
+    settings = given_settings(data_dir=data_dir)
+    with Catalog.open(existing_data_dir(settings.data_dir)) as catalog:
+        answer = describe_domain(catalog.domain(domain), EvaluatorPool(settings.compute()), ActiveMaps(catalog))
     if as_json:
         write_json(answer.model_dump())
         return

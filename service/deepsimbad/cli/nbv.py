@@ -5,7 +5,7 @@ from pathlib import Path
 import click
 from rich.table import Table
 
-from deepsimbad.cli.options import RELEVANCES
+from deepsimbad.cli.options import RELEVANCES, evaluator_option
 from deepsimbad.cli.terminal import console, progress_bar
 from deepsimbad.cli.triplet import READING_STAGES, read_triplet, triplet_options, written
 from deepsimbad.core.planners import DEFAULT_PLANNER
@@ -18,6 +18,7 @@ from deepsimbad.jobs.map_config import DEFAULT_TRAINING_EPISODES
 
 @click.command()
 @triplet_options
+@evaluator_option
 @click.option("--relevance", type=RELEVANCES, help=f"Of our set-up.  [default: {DEFAULT_RELEVANCE.value}]")
 @click.option(
     "--update",
@@ -37,6 +38,7 @@ def nbv(
     spacing_m: float,
     n_landmarks: int,
     list_length: int,
+    same_route: bool | None,
     json_file: Path | None,
     relevance: str | None,
     update: str | None,
@@ -57,6 +59,7 @@ def nbv(
         training_episodes=training_episodes,
         episodes=episodes,
         seed=seed,
+        same_route=same_route is not False,
     )
     with progress_bar(READING_STAGES | nbv_stages(config), "experiment") as progress:
         triplet = read_triplet(landmarks, training, test, evaluator, spacing_m, progress)
@@ -84,6 +87,8 @@ def _print_table(report: NbvReport) -> None:
     output.print(table)
     for pair, (low, high) in document["difference_95"].items():
         output.print(f"{pair}: {low:+.3f} .. {high:+.3f} % (paired, 95 %)")
+    if report.same_route is not None and report.same_route.why is not None:
+        output.print(f"no second season was learnt from: {report.same_route.why}")
 
 
 def _distances(document: dict[str, dict[str, dict[str, float]]]) -> list[str]:

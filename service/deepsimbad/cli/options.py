@@ -8,7 +8,16 @@ import click
 
 from deepsimbad.core.relevance import Relevance
 from deepsimbad.errors import UnknownDomainError
-from deepsimbad.evaluators.registry import EvaluatorConfig, EvaluatorKind, ExtractorName, evaluator_config
+from deepsimbad.evaluators.registry import (
+    EXTRACTOR_FORMS,
+    EvaluatorConfig,
+    EvaluatorKind,
+    ExtractorName,
+    default_extractor,
+    evaluator_config,
+    fallback,
+)
+from deepsimbad.evaluators.weights.lock import Lock
 from deepsimbad.settings import Settings
 from deepsimbad.settings_sources import TracedSettings, trace_settings
 from deepsimbad.store.layout import catalog_path
@@ -68,13 +77,25 @@ def traced_settings(**flags: object) -> TracedSettings:
 
 def evaluator_option(command: _Command) -> _Command:
     """`--evaluator KIND[:EXTRACTOR]`, given on as an EvaluatorConfig."""
-    names = ", ".join(f"{EvaluatorKind.FEATURE_L2}:{extractor}" for extractor in ExtractorName)
+    names = ", ".join(f"{EvaluatorKind.FEATURE_L2}:{extractor}" for extractor in EXTRACTOR_FORMS)
     return click.option(
         "--evaluator",
         default=EvaluatorKind.FEATURE_L2.value,
         show_default=True,
         callback=_evaluator,
         help=f"How images are compared with landmarks: a kind, or one of {names}.",
+    )(command)
+
+
+def evaluators_option(command: _Command) -> _Command:
+    """As `evaluator_option`, or `all`, given on as EvaluatorConfigs."""
+    return click.option(
+        "--evaluator",
+        "evaluators",
+        default=EvaluatorKind.FEATURE_L2.value,
+        show_default=True,
+        callback=_evaluators,
+        help="How images are compared with landmarks: as KIND or KIND:EXTRACTOR; all: by every extractor that is here.",
     )(command)
 
 
@@ -106,6 +127,19 @@ def _remember_config(context: click.Context, _parameter: click.Parameter, value:
     context.meta[_CONFIG] = value
 
 
+def _evaluators(context: click.Context, parameter: click.Parameter, value: str) -> tuple[EvaluatorConfig, ...]:
+    if value != "all":
+        return (_evaluator(context, parameter, value),)
+    default, plain = default_extractor().value, ExtractorName.GRADIENT_GRID.value
+    pulled = Lock.read(given_settings().weights_dir).extractors()
+    return tuple(
+        evaluator_config({"kind": EvaluatorKind.FEATURE_L2.value, "extractor": extractor})
+        for extractor in dict.fromkeys([default, plain, *pulled])
+    )
+
+
 def _evaluator(_context: click.Context, _parameter: click.Parameter, value: str) -> EvaluatorConfig:
     kind, _, extractor = value.partition(":")
+    if not extractor and (told := fallback()) is not None:
+        click.echo(told, err=True)
     return evaluator_config({"kind": kind, **({"extractor": extractor} if extractor else {})})

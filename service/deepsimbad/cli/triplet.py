@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 import click
 
-from deepsimbad.cli.options import config_option, evaluator_option, given_settings, spacing_option
+from deepsimbad.cli.options import config_option, given_settings, spacing_option
 from deepsimbad.cli.terminal import write_json
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.registry import EvaluatorConfig, make_evaluator
@@ -45,10 +45,15 @@ def triplet_options(command: _Command) -> _Command:
         click.option("--landmarks", required=True, help="SOURCE landmarks are selected from."),
         click.option("--training", required=True, help="SOURCE that becomes the map."),
         click.option("--test", required=True, help="SOURCE of the live views, in the order they were driven."),
-        evaluator_option,
         spacing_option,
         click.option("--n-landmarks", type=click.IntRange(min=1), default=300, show_default=True),
         click.option("--list-length", type=click.IntRange(min=1), default=4, show_default=True),
+        click.option(
+            "--same-route/--no-same-route",
+            default=None,
+            help="Whether landmarks and training count their positions along one route, as test and training do.  "
+            "[default: they do]",
+        ),
         click.option(
             "--json",
             "json_file",
@@ -72,13 +77,13 @@ def read_triplet(
     landmarks: str, training: str, test: str, evaluator: EvaluatorConfig, spacing_m: float, progress: Progress
 ) -> Triplet:
     """Read and encode the three recordings; reports READING_STAGES."""
-    judge = make_evaluator(evaluator)
-    max_pixels = given_settings().max_pixels
+    settings = given_settings()
+    judge = make_evaluator(evaluator, settings.compute())
     traverses = []
     for stage, source in zip(READING_STAGES, (landmarks, training, test), strict=True):
         progress.stage(stage)
         recording = open_source(source, spacing_m=spacing_m)
-        traverses.append(encode_recording(recording, judge, max_pixels, progress.update))
+        traverses.append(encode_recording(recording, judge, settings.max_pixels, progress.update))
     roles = ("landmarks", "training", "test")
     sources = {
         **dict(zip(roles, (landmarks, training, test), strict=True)),

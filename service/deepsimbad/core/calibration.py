@@ -25,8 +25,6 @@ CALIBRATED_PRIOR_WEIGHT_FRAMES = 20.0
 # Without two seasons of one place nothing can be learnt; this is what the development recordings show on average.
 DEFAULT_CORRELATION = 0.6
 SECOND_SEASON_WEIGHT = 0.6  # of its score against the map's own, in choosing what an image lists
-_LEAST_MEAN_CORRELATION = 0.15  # below, the two traverses did not see the same places, whatever their positions say
-_LEAST_PAIRS = 30
 _BOUNDS = (0.05, 0.95)
 _PSEUDO_IMAGES = 3.0  # weight of the rank's mean in a landmark's mean score at that rank
 
@@ -45,10 +43,17 @@ class Calibration:
     listed_score: NDArray[np.float64]
     is_of_two_seasons: bool = False
 
-    def log_ratios(self, scores: NDArray[np.float64]) -> NDArray[np.float64]:
-        """What every landmark is worth at every rank of a list, [h, r], for a query's standardised scores [r]."""
+    def log_ratios(self, scores: NDArray[np.float64], known: NDArray[np.float64] | float = 1.0) -> NDArray[np.float64]:
+        """What every landmark is worth at every rank of a list, [h, r], for a query's standardised scores [r].
+
+        Args:
+            scores: z; expected ones where they are not known.
+            known: How much of each is known, [r]. A landmark that was not sent, of which z is known but for a variance
+                v, tells as much less: to second order in rho * z_m its ratio is rho * z_m * E[z_q] less (1 - v) of the
+                square.
+        """
         expected = self.correlation * self.listed_score
-        return expected * scores - np.square(expected) / 2
+        return expected * scores - known * np.square(expected) / 2
 
 
 @dataclass(frozen=True)
@@ -77,15 +82,13 @@ class SeasonsOfRoute:
         Args:
             own: [n, r] scores of the map images by the map's own statistics.
             second: [m, r] scores of the landmark traverse's frames by theirs.
-            places: [k, 2] (map image, frame) of the same place.
+            places: [k, 2] (map image, frame) of the same place, k at least 1; given with `second`.
         """
         single = cls(own, np.full(own.shape[1], DEFAULT_CORRELATION), are_two=False)
-        if second is None or places is None or len(places) < _LEAST_PAIRS:
+        if second is None or places is None:
             return single
         of_map, of_second = places.T
         between = np.einsum("kr,kr->r", own[of_map], second[of_second]) / len(places)
-        if between.mean() < _LEAST_MEAN_CORRELATION:
-            return single
         between = np.clip(between, *_BOUNDS)
         weight = SECOND_SEASON_WEIGHT
         spread = np.sqrt(1 + weight**2 + 2 * weight * between)
@@ -107,9 +110,13 @@ class SeasonsOfRoute:
 
 
 def live_prior(seasons: Sequence[LandmarkStatistics]) -> LandmarkStatistics:
-    """What is usual over all seasons that the map knows, taken alike: the best guess about another one."""
+    """What is usual over all seasons that the map knows, taken alike: the best guess about another one.
+
+    How landmarks go together is a matter of places more than of seasons: it stays the first one's.
+    """
     return LandmarkStatistics(
         CALIBRATED_PRIOR_WEIGHT_FRAMES,
         np.mean([season.mean for season in seasons], axis=0),
         np.mean([season.square for season in seasons], axis=0),
+        seasons[0].loadings,
     )

@@ -47,16 +47,95 @@ def ranks_from_ranked_landmarks(landmark_ids: Sequence[int], n_landmarks: int) -
         n_landmarks: r.
 
     Returns:
-        [r] float32. Landmarks that were not sent share the mean of the ranks left.
+        [r] float32. Landmarks that were not sent share the mean of the ranks left; `n_ranked` tells them.
 
     Raises:
         InvalidRankedLandmarksError: None, too many, out of range or listed twice.
     """
+    ids = _checked(landmark_ids, n_landmarks)
+    n_sent = ids.size
+    ranks = np.full(n_landmarks, (n_sent + 1 + n_landmarks) / 2, np.float32)
+    ranks[ids] = np.arange(1, n_sent + 1, dtype=np.float32)
+    return ranks
+
+
+def n_ranked(ranks: NDArray[np.float32]) -> int:
+    """How many landmarks a view has a rank of its own for: the nearest m, while all others share the mean rank left.
+
+    Args:
+        ranks: [r], of dissimilarities or of ranked landmarks.
+
+    Returns:
+        m; r where all ranks are known, 0 for a view that shows nothing.
+    """
+    last = float(ranks.max())
+    return ranks.size if last == ranks.size else round(2 * last) - 1 - ranks.size
+
+
+def pack_ranked_landmarks(landmark_ids: Sequence[int], n_landmarks: int) -> bytes:
+    """The nearest landmarks in the fewest bytes: m in two, big-endian, then m ids, nearest first.
+
+    An id takes ceil(log2 r) bits, most significant first; the last byte is filled up with zeros.
+
+    Args:
+        landmark_ids: Distinct ids from 0, nearest first, 1..r of them.
+        n_landmarks: r, at most 65,535.
+
+    Raises:
+        InvalidRankedLandmarksError: None, too many, out of range or listed twice.
+    """
+    ids = _checked(landmark_ids, n_landmarks)
+    n_bits = _bits_per_id(n_landmarks)
+    bits = (ids[:, np.newaxis] >> np.arange(n_bits - 1, -1, -1)) & 1  # [m, bits]
+    return len(ids).to_bytes(2, "big") + np.packbits(bits.astype(np.uint8).reshape(-1)).tobytes()
+
+
+def unpack_ranked_landmarks(body: bytes, n_landmarks: int) -> tuple[int, ...]:
+    """Back from `pack_ranked_landmarks`.
+
+    Args:
+        body: What was packed.
+        n_landmarks: r.
+
+    Raises:
+        InvalidRankedLandmarksError: The body is not what packing 1..r distinct ids below r gives.
+    """
+    if len(body) < 2:
+        raise InvalidRankedLandmarksError("packed ranked landmarks begin with their number, in two bytes")
+    n_sent, n_bits = int.from_bytes(body[:2], "big"), _bits_per_id(n_landmarks)
+    if not 1 <= n_sent <= n_landmarks:
+        raise _wrong_number(n_sent, n_landmarks)
+    n_bytes = 2 + -(-n_sent * n_bits // 8)
+    if len(body) != n_bytes:
+        raise InvalidRankedLandmarksError(
+            f"{n_sent} ids of {n_bits} bits are packed into {n_bytes} bytes, not {len(body)}: "
+            "is it the landmark model of another map?",
+            n_landmarks=n_landmarks,
+            bits_per_id=n_bits,
+        )
+    bits = np.unpackbits(np.frombuffer(body, np.uint8, offset=2))
+    if bits[n_sent * n_bits :].any():
+        raise InvalidRankedLandmarksError("the bits behind the last id must be zero")
+    places = np.left_shift(1, np.arange(n_bits - 1, -1, -1))
+    ids = bits[: n_sent * n_bits].reshape(n_sent, n_bits) @ places
+    return tuple(_checked(ids.tolist(), n_landmarks).tolist())
+
+
+def ranked_landmarks_within(n_bytes: int, n_landmarks: int) -> int:
+    """How many ranked landmarks, r at most, `pack_ranked_landmarks` brings into so many bytes."""
+    n_bits = _bits_per_id(n_landmarks)
+    return n_landmarks if n_bits == 0 else min(n_landmarks, 8 * (n_bytes - 2) // n_bits)
+
+
+def _bits_per_id(n_landmarks: int) -> int:
+    return (n_landmarks - 1).bit_length()
+
+
+def _checked(landmark_ids: Sequence[int], n_landmarks: int) -> NDArray[np.int64]:
+    """[m] ids that are a ranking's beginning; raises InvalidRankedLandmarksError."""
     n_sent = len(landmark_ids)
     if not 1 <= n_sent <= n_landmarks:
-        raise InvalidRankedLandmarksError(
-            f"{n_sent} ranked landmarks sent; send 1 to {n_landmarks}, nearest first", n_landmarks=n_landmarks
-        )
+        raise _wrong_number(n_sent, n_landmarks)
     try:
         ids = np.asarray(landmark_ids, dtype=np.int64)
     except (OverflowError, TypeError, ValueError) as error:
@@ -65,13 +144,15 @@ def ranks_from_ranked_landmarks(landmark_ids: Sequence[int], n_landmarks: int) -
         raise InvalidRankedLandmarksError(
             f"a landmark id is out of range; ids run from 0 to {n_landmarks - 1}", n_landmarks=n_landmarks
         )
-    is_sent = np.zeros(n_landmarks, np.bool_)
-    is_sent[ids] = True
-    if np.count_nonzero(is_sent) != n_sent:
+    if np.unique(ids).size != n_sent:
         raise InvalidRankedLandmarksError("a landmark id is listed twice; ids must be distinct")
-    ranks = np.full(n_landmarks, (n_sent + 1 + n_landmarks) / 2, np.float32)
-    ranks[ids] = np.arange(1, n_sent + 1, dtype=np.float32)
-    return ranks
+    return ids
+
+
+def _wrong_number(n_sent: int, n_landmarks: int) -> InvalidRankedLandmarksError:
+    return InvalidRankedLandmarksError(
+        f"{n_sent} ranked landmarks sent; send 1 to {n_landmarks}, nearest first", n_landmarks=n_landmarks
+    )
 
 
 def nearest_landmarks(values: ArrayLike, list_length: int) -> NDArray[np.uint16]:

@@ -108,7 +108,7 @@ def _standardised(built: RetrievalMap, query: Query, live: LandmarkStatistics | 
     statistics = live or built.statistics
     if statistics is None:
         raise InvalidMapConfigError("a standardised map needs landmark statistics")
-    worth = -statistics.standardise(query.ranks)
+    worth = -statistics.view(query.ranks).z
     return built.index.sum_listed(_same_at_every_rank(worth, built.index))
 
 
@@ -117,7 +117,8 @@ def _calibrated(built: RetrievalMap, query: Query, live: LandmarkStatistics | No
     statistics = live or built.statistics
     if statistics is None or built.calibration is None:
         raise InvalidMapConfigError("a calibrated map needs landmark statistics and a calibration")
-    return built.index.sum_listed(built.calibration.log_ratios(statistics.standardise(query.ranks)))
+    seen = statistics.view(query.ranks)
+    return built.index.sum_listed(built.calibration.log_ratios(seen.z, seen.known))
 
 
 def _rrf(built: RetrievalMap, query: Query, _: LandmarkStatistics | None) -> NDArray[np.float32]:

@@ -1,6 +1,6 @@
 """Building what retrieval reads from a traverse's dissimilarities, and the shortlist of an answer (II-C)."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numba import njit
@@ -10,7 +10,7 @@ from deepsimbad.core.calibration import SeasonsOfRoute, live_prior
 from deepsimbad.core.descriptor import nearest_landmarks, rank_landmarks
 from deepsimbad.core.inverted_index import InvertedIndex
 from deepsimbad.core.relevance import Relevance, RetrievalMap
-from deepsimbad.core.statistics import LandmarkStatistics
+from deepsimbad.core.statistics import LandmarkStatistics, common_factors
 from deepsimbad.errors import InvalidMapConfigError
 
 _SCAN_UP_TO = 64  # a longer shortlist is sorted whole
@@ -19,11 +19,11 @@ _BLOCK = 256  # values that are looked at in one vectorised sweep
 
 @dataclass(frozen=True)
 class SecondSeason:
-    """What the landmark traverse tells of the route, for `calibrated`.
+    """What another drive of the mapped route tells of it; `deepsimbad.core.same_route` says whether one is.
 
     Attributes:
         dissimilarities: [m, r] of its frames to the landmarks.
-        places: [k, 2] int64, (map image, its frame) where both saw the same place; none where they share no route.
+        places: [k, 2] int64, (map image, its frame) where both saw the same place; some.
     """
 
     dissimilarities: NDArray[np.float32]
@@ -75,16 +75,16 @@ def _standardised_map(
 ) -> RetrievalMap:
     own = LandmarkStatistics.of_map(ranks)
     scores = own.standardise(ranks)
+    own = replace(own, loadings=common_factors(scores))
     if relevance is Relevance.STANDARDISED:
         return RetrievalMap(relevance, InvertedIndex(nearest_landmarks(scores, list_length), ranks.shape[1]), own)
     known = [own]
     seasons = SeasonsOfRoute.learn(scores)
-    if second is not None and len(second.places):
+    if second is not None:
         other_ranks = rank_landmarks(second.dissimilarities)
         other = LandmarkStatistics.of_map(other_ranks)
         seasons = SeasonsOfRoute.learn(scores, other.standardise(other_ranks), second.places)
-        if seasons.are_two:
-            known.append(other)
+        known.append(other)
     lists = nearest_landmarks(seasons.scores, list_length)
     index = InvertedIndex(lists, ranks.shape[1])
     return RetrievalMap(relevance, index, live_prior(known), seasons.calibration(lists))

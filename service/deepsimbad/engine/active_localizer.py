@@ -191,9 +191,10 @@ class ActiveLocalizer:
             belief = GridFilter.from_arrays(self._map.route, held)
         else:
             belief = ParticleFilter.from_arrays(self._map.route, held, self._config.seed)
-        live = None
-        if "live" in arrays:
-            live = LandmarkStatistics(_floats(arrays["live_weight"])[0].item(), *_floats(arrays["live"]))
+        live, of_map = None, self._map.retrieval.statistics
+        if "live" in arrays and of_map is not None:
+            mean, square = _floats(arrays["live"])
+            live = replace(of_map, weight=_floats(arrays["live_weight"])[0].item(), mean=mean, square=square)
         relevance = np.asarray(arrays["relevance"], np.float32) if "relevance" in arrays else None
         off_route = _floats(arrays["off_route"])[0].item() if "off_route" in arrays else None
         return LocalizerState(belief, live, relevance, off_route, int(_floats(arrays["n_observations"])[0]))

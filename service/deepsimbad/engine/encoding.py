@@ -1,30 +1,28 @@
-"""From a view to its encoding, with every rule that a ready encoding must keep."""
+"""From images to encodings, and the rules that a ready encoding must keep."""
 
+from collections.abc import Sequence
+from time import perf_counter
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from deepsimbad.engine.observation import ReadyEncoding
+from deepsimbad.engine.observation import EncodedImage
 from deepsimbad.errors import InvalidEncodingError
 from deepsimbad.evaluators.base import Evaluator, Image
 
 
-def encode_view(evaluator: Evaluator, view: Image | ReadyEncoding) -> NDArray[np.float32]:
-    """Encode an image, or check and take a ready encoding.
-
-    Returns:
-        [d] float32, finite.
+def encode_images(evaluator: Evaluator, images: Sequence[Image]) -> list[EncodedImage]:
+    """Encode images at once.
 
     Raises:
-        InvalidEncodingError: A ready encoding that is empty, or with NaN or infinity.
-        UnsupportedMediaTypeError: An image, where the evaluator takes ready encodings alone.
+        UnsupportedMediaTypeError: The evaluator takes ready encodings alone.
+        OutOfMemoryError: There is too little memory for it.
     """
-    if isinstance(view, ReadyEncoding):
-        encodings = ready_encodings(view.values[np.newaxis])
-    else:
-        encodings = evaluator.encode([view])
-    return encodings.reshape(-1)
+    began = perf_counter()
+    encodings = evaluator.encode(images)
+    encode_ms = 1000 * (perf_counter() - began)
+    return [EncodedImage(encoding, evaluator.weights_sha256, encode_ms) for encoding in encodings]
 
 
 def ready_encodings(values: NDArray[Any]) -> NDArray[np.float32]:

@@ -1,30 +1,68 @@
 """Evaluators made once and shared by all domains that are configured alike."""
 
 import json
+import logging
 import threading
 from collections.abc import Mapping
 from typing import Any
 
+from deepsimbad.errors import DeepSimbadError, EvaluatorUnavailableError, InvalidInputError
 from deepsimbad.evaluators.base import Evaluator
+from deepsimbad.evaluators.compute import Compute
 from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
+
+log = logging.getLogger(__name__)
 
 
 class EvaluatorPool:
-    """Evaluators by configuration, made at first need."""
+    """Evaluators by configuration, made and loaded at first need: one copy of a network, whoever uses it.
 
-    def __init__(self) -> None:
+    Args:
+        compute: How networks are computed; None: by the defaults.
+    """
+
+    def __init__(self, compute: Compute | None = None) -> None:
+        self._compute = compute or Compute()
         self._made: dict[str, Evaluator] = {}
         self._lock = threading.Lock()
 
     def evaluator(self, raw_config: Mapping[str, Any]) -> Evaluator:
-        """The evaluator of a configuration.
+        """The loaded evaluator of a configuration.
 
         Raises:
-            InvalidInputError: There is none of that kind, or an option cannot be used.
+            InvalidInputError: There is none of that kind, or an option cannot be used: weights or a package are
+                missing, or the file is no such weights.
+            OutOfMemoryError: There is too little memory for it.
         """
         config = evaluator_config(raw_config)
         key = json.dumps(config.as_dict(), sort_keys=True)
+        made = self._made.get(key)
+        if made is not None:
+            return made
         with self._lock:
             if key not in self._made:
-                self._made[key] = make_evaluator(config)
+                evaluator = make_evaluator(config, self._compute)
+                evaluator.load()
+                self._made[key] = evaluator
             return self._made[key]
+
+    def serving(self, raw_config: Mapping[str, Any]) -> Evaluator:
+        """As `evaluator`, of a domain that exists.
+
+        Raises:
+            EvaluatorUnavailableError: It cannot be loaded any more; what the robot sent is not at fault.
+        """
+        try:
+            return self.evaluator(raw_config)
+        except InvalidInputError as error:
+            raise EvaluatorUnavailableError(
+                f"the domain's extractor cannot be loaded: {error.message}", reason=error.code, **error.hints
+            ) from error
+
+    def load_all(self, configs: Mapping[str, Mapping[str, Any]]) -> None:
+        """Load the evaluators of all domains, by their names; one that cannot be keeps no other from serving."""
+        for domain, raw_config in configs.items():
+            try:
+                self.evaluator(raw_config)
+            except DeepSimbadError as error:
+                log.error("an extractor cannot be loaded", extra={"domain": domain, "why": error.message})

@@ -1,13 +1,13 @@
 """A session in memory, and what may be asked of it."""
 
 import asyncio
-from collections.abc import Callable
-from contextlib import AbstractAsyncContextManager
+from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
 
 from deepsimbad.engine.observation import View
 from deepsimbad.engine.session_state import SessionEngine, SessionState
 from deepsimbad.errors import EndedSessionError
+from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.store.session_records import IdempotencyKey, SessionRecord
 
 
@@ -48,19 +48,21 @@ class Observation:
     """A move and the view after it, as a robot reports them.
 
     Attributes:
-        view: Gives the view, entered when the session's turn has come, so that order is that of arrival; left when the
-            view has been looked at.
+        view: Gives the view, at the size of the evaluator it is given; called when the session's turn has come, so that
+            order is that of arrival.
         action_m: Metres moved since the last view; ignored for the first one.
         action_std_m: Their standard deviation; None: the usual one.
         n_shortlist: Length of the answer's lists; None: the usual one.
         idempotency: How a repetition is known; None: it is not.
+        landmark_models: Digests of landmark models, by one of which the view was ranked; None: nobody said.
     """
 
-    view: Callable[[], AbstractAsyncContextManager[View]]
+    view: Callable[[Evaluator], Awaitable[View]]
     action_m: float = 0.0
     action_std_m: float | None = None
     n_shortlist: int | None = None
     idempotency: IdempotencyKey | None = None
+    landmark_models: frozenset[str] | None = None
 
 
 def ended(session_id: str, ending: str) -> EndedSessionError:

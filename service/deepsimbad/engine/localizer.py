@@ -8,17 +8,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepsimbad.core.belief_summary import BeliefSummary, summarise
-from deepsimbad.core.descriptor import rank_landmarks, ranks_from_ranked_landmarks
+from deepsimbad.core.descriptor import rank_landmarks, ranks_from_ranked_landmarks, unpack_ranked_landmarks
 from deepsimbad.core.grid_filter import GridFilter
 from deepsimbad.core.off_route import OFF_ROUTE_AT_START
 from deepsimbad.core.planners import Plan
 from deepsimbad.core.relevance import Query, relevances
 from deepsimbad.core.retrieval import shortlist
 from deepsimbad.engine.active_localizer import ActiveLocalizer, LocalizerConfig, LocalizerState
-from deepsimbad.engine.encoding import encode_view
-from deepsimbad.engine.observation import Dissimilarities, RankedLandmarks, View
+from deepsimbad.engine.encoding import encode_images, ready_encodings
+from deepsimbad.engine.observation import (
+    Dissimilarities,
+    EncodedImage,
+    NothingSeen,
+    PackedRanks,
+    RankedLandmarks,
+    View,
+)
 from deepsimbad.engine.snapshot import MapSnapshot
-from deepsimbad.errors import InvalidDissimilaritiesError, InvalidInputError
+from deepsimbad.errors import InvalidDissimilaritiesError, InvalidInputError, WeightsDifferError
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.image import is_blank
 
@@ -112,9 +119,17 @@ def retrieve(snapshot: MapSnapshot, evaluator: Evaluator, view: View) -> Retriev
 
 
 def describe(snapshot: MapSnapshot, evaluator: Evaluator, view: View) -> Query:
-    """Rank the landmarks for a view (II-A, II-C); one that shows nothing comes out as uninformative."""
+    """Rank the landmarks for a view (II-A, II-C); one that shows nothing comes out as uninformative.
+
+    Raises:
+        InvalidInputError: The view is not of this map.
+        WeightsDifferError: The map's images were encoded by other weights than the view.
+    """
     if isinstance(view, RankedLandmarks):
         return Query(ranks_from_ranked_landmarks(view.landmark_ids, snapshot.n_landmarks))
+    if isinstance(view, PackedRanks):
+        landmark_ids = unpack_ranked_landmarks(view.body, snapshot.n_landmarks)
+        return Query(ranks_from_ranked_landmarks(landmark_ids, snapshot.n_landmarks))
     if isinstance(view, Dissimilarities):
         if view.values.shape != (snapshot.n_landmarks,):
             raise InvalidDissimilaritiesError(
@@ -124,9 +139,15 @@ def describe(snapshot: MapSnapshot, evaluator: Evaluator, view: View) -> Query:
         if np.ptp(view.values) == 0:
             return Query.uninformative(snapshot.n_landmarks)
         return Query(rank_landmarks(view.values), _as_float32(view.values))
-    if isinstance(view, np.ndarray) and is_blank(view):
+    if isinstance(view, np.ndarray):
+        view = NothingSeen() if is_blank(view) else encode_images(evaluator, [view])[0]
+    if isinstance(view, NothingSeen):
         return Query.uninformative(snapshot.n_landmarks)
-    encoding = encode_view(evaluator, view)
+    if isinstance(view, EncodedImage):
+        WeightsDifferError.check("the map", snapshot.weights_sha256, "the view", view.weights_sha256)
+        encoding = view.values
+    else:
+        encoding = ready_encodings(view.values[np.newaxis])[0]
     dissimilarities = evaluator.dissimilarities(encoding[None, :], snapshot.landmark_model)[0]
     return Query(rank_landmarks(dissimilarities), dissimilarities, encoding)
 

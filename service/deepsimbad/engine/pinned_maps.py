@@ -18,6 +18,7 @@ from deepsimbad.errors import (
 )
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.store.catalog import Catalog
+from deepsimbad.store.map_table import removed
 from deepsimbad.store.records import DomainRecord, MapState
 
 _Key = tuple[str, int, str]  # domain, version, digest: a domain that was deleted and made anew has other maps
@@ -80,7 +81,7 @@ class PinnedMaps:
         digest = known.sha256 or ""
         with self._lock:
             self._held[snapshot.domain, snapshot.version, digest] = snapshot
-        return digest, self._evaluators.evaluator(active.record.evaluator)
+        return digest, self._evaluators.serving(active.record.evaluator)
 
     def take(self, domain: str, version: int, digest: str) -> tuple[MapSnapshot, Evaluator]:
         """A map version and its domain's evaluator; may read files.
@@ -89,6 +90,25 @@ class PinnedMaps:
             RetiredMapError: The version is no more.
             DamagedMapError: Its file is damaged, or missing though the version serves.
         """
+        record, snapshot = self._taken(domain, version, digest)
+        return snapshot, self._evaluators.serving(record.evaluator)
+
+    def snapshot(self, domain: str, version: int) -> MapSnapshot:
+        """A sealed map version that need not serve, as a session may be pinned to one; may read files.
+
+        Raises:
+            UnknownDomainError, UnknownMapVersionError: There is none, or it is still being built.
+            RetiredMapError: It was removed.
+            DamagedMapError: Its file is damaged, or missing though the version serves.
+        """
+        known = self._catalog.settled_map(domain, version)
+        if known.removed_at is not None:
+            raise removed(domain, version)
+        if known.sha256 is None:
+            raise UnknownMapVersionError(f"map {version} of domain {domain} is still being built", version=version)
+        return self._taken(domain, version, known.sha256)[1]
+
+    def _taken(self, domain: str, version: int, digest: str) -> tuple[DomainRecord, MapSnapshot]:
         with self._lock:
             try:
                 record = self._catalog.domain(domain)
@@ -102,7 +122,7 @@ class PinnedMaps:
             if snapshot is None:
                 snapshot = self._load(record, version)
                 self._held[domain, version, digest] = snapshot
-        return snapshot, self._evaluators.evaluator(record.evaluator)
+        return record, snapshot
 
     def _load(self, record: DomainRecord, version: int) -> MapSnapshot:
         if record.active_version == version:

@@ -16,7 +16,7 @@ from deepsimbad.core.planners import Plan
 from deepsimbad.engine.active_maps import ActiveDomain
 from deepsimbad.engine.live_session import LiveSession, Loaded, Observation
 from deepsimbad.engine.localizer import describe, shortlist_length
-from deepsimbad.engine.observation import View
+from deepsimbad.engine.observation import View, encoding_ms
 from deepsimbad.engine.pinned_maps import PinnedMaps
 from deepsimbad.engine.replay import Replay
 from deepsimbad.engine.session_config import SessionConfig, check_move, check_prior, check_start
@@ -122,6 +122,7 @@ class Sessions:
         Raises:
             UnknownSessionError, EndedSessionError, RetiredMapError: There is no such session, or no more.
             InvalidInputError: The move, the view or the shortlist cannot be.
+            LandmarkModelDiffersError: The view was ranked by another landmark model than that of the session's map.
             IdempotencyKeyReusedError: The key named another observation.
         """
         live = await self._registry.find(session_id)
@@ -234,11 +235,16 @@ class Sessions:
     async def _looked(
         self, live: LiveSession, loaded: Loaded, observation: Observation, watch: Stopwatch
     ) -> tuple[ObservedRow, Loaded] | int:
-        """As `_step`; a view's pixels are gone when this returns."""
-        async with observation.view() as view:
-            watch.lap("decode")
-            expires_at = self._clock() + self._ttl_s
-            return await self._compute(lambda: self._step(live, loaded, observation, view, expires_at, watch))
+        """As `_step`, of a view that is still to be decoded and encoded."""
+        evaluator = loaded.engine.evaluator
+        view = await observation.view(evaluator)
+        watch.lap("decode")
+        expires_at = self._clock() + self._ttl_s
+
+        def step(seen: View) -> tuple[ObservedRow, Loaded] | int:
+            return self._step(live, loaded, observation, seen, expires_at, watch)
+
+        return await asyncio.wrap_future(self._worker.look(evaluator, view, step))
 
     def _step(
         self,
@@ -250,11 +256,12 @@ class Sessions:
         watch: Stopwatch,
     ) -> tuple[ObservedRow, Loaded] | int:
         """The next row and what it leads to; or the row's number, if the observation was counted before."""
-        watch.lap("wait")
+        watch.lap("wait", **encoding_ms(view))
         named = observation.idempotency
         if named is not None and (earlier := self._counted_before(live, named)) is not None:
             return earlier
         engine = loaded.engine
+        engine.snapshot.check_landmark_model(observation.landmark_models)
         query = describe(engine.snapshot, engine.evaluator, view)
         watch.lap("describe")
         row = engine.row_of(

@@ -1,7 +1,8 @@
 """One map version as serving needs it: frozen arrays in memory."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
@@ -9,14 +10,16 @@ from numpy.typing import NDArray
 
 from deepsimbad.core.calibration import CALIBRATED_PRIOR_WEIGHT_FRAMES, Calibration
 from deepsimbad.core.inverted_index import InvertedIndex
+from deepsimbad.core.landmark_model import PortableLandmarks, landmark_model_digest, pack_landmarks
 from deepsimbad.core.off_route import OffRouteModel
 from deepsimbad.core.relevance import Relevance, RetrievalMap
 from deepsimbad.core.route import Route
-from deepsimbad.core.statistics import LandmarkStatistics
+from deepsimbad.core.statistics import PRIOR_WEIGHT_FRAMES, LandmarkStatistics
 from deepsimbad.core.telling import bits_ahead
 from deepsimbad.core.update_rules import DEFAULT_UPDATE, UpdateRule
+from deepsimbad.errors import LandmarkModelDiffersError
 from deepsimbad.evaluators.base import LandmarkModel
-from deepsimbad.store.map_file import MapContents
+from deepsimbad.store.map_contents import MapContents, weights_of
 
 
 @dataclass(frozen=True)
@@ -29,7 +32,8 @@ class MapSnapshot:
         metrics: What was measured when it was built.
         route: Where the map images are.
         retrieval: The index and what the map's relevance compares besides.
-        landmark_model: For the domain's evaluator.
+        evaluator: The evaluator's configuration.
+        landmark_model: For that evaluator.
         actions_m: [a] the moves of the domain in metres, ascending.
         index_bytes: Size of the posting tables in the map file.
         q_values: [n, a] float32, the experience database; None where the map has none.
@@ -45,6 +49,7 @@ class MapSnapshot:
     metrics: Mapping[str, Any]
     route: Route
     retrieval: RetrievalMap
+    evaluator: Mapping[str, Any]
     landmark_model: LandmarkModel
     actions_m: NDArray[np.float64]
     index_bytes: int
@@ -86,9 +91,48 @@ class MapSnapshot:
             bits_ahead=None if contents.telling_bits is None else bits_ahead(route, contents.telling_bits, actions_m),
             off_route=None if contents.off_route_model is None else OffRouteModel(*contents.off_route_model.tolist()),
             frame_digest=contents.frame_digest,
+            evaluator=contents.evaluator,
             landmark_model=contents.landmark_model,
             actions_m=actions_m,
             index_bytes=index_bytes,
+        )
+
+    @property
+    def weights_sha256(self) -> str | None:
+        """Of the network that its images were encoded by; None where none did, or nobody knows."""
+        return weights_of(self.config)
+
+    @cached_property
+    def landmark_model_digest(self) -> str:
+        """SHA-256 in hex of the landmark model; worked out at first need, in about a second a gigabyte."""
+        return landmark_model_digest(self.landmark_model)
+
+    @cached_property
+    def portable_landmarks(self) -> bytes:
+        """The landmark model as it travels to robots; made at first need and kept."""
+        return pack_landmarks(
+            PortableLandmarks(
+                self.landmark_model, self.n_landmarks, self.version, self.evaluator, self.weights_sha256 or ""
+            )
+        )
+
+    def check_landmark_model(self, digests: Collection[str] | None) -> None:
+        """Check that a view was ranked by this map's landmarks.
+
+        Args:
+            digests: Of landmark models, one of which must be this map's; None: nobody said by which.
+
+        Raises:
+            LandmarkModelDiffersError: None of them is.
+        """
+        if digests is None or self.landmark_model_digest in digests:
+            return
+        raise LandmarkModelDiffersError(
+            f"the view was ranked by another landmark model than that of map {self.version}: fetch it from "
+            f"/v1/domains/{self.domain}/landmark-model?map_version={self.version}",
+            landmark_model_digest=self.landmark_model_digest,
+            given_landmark_models=sorted(digests),
+            map_version=self.version,
         )
 
     @property
@@ -121,9 +165,8 @@ def _statistics(contents: MapContents, relevance: Relevance) -> LandmarkStatisti
     if contents.statistics is None:
         return None
     mean, std = contents.statistics
-    if relevance is Relevance.CALIBRATED:
-        return LandmarkStatistics.from_mean_std(mean, std, CALIBRATED_PRIOR_WEIGHT_FRAMES)
-    return LandmarkStatistics.from_mean_std(mean, std)
+    weight = CALIBRATED_PRIOR_WEIGHT_FRAMES if relevance is Relevance.CALIBRATED else PRIOR_WEIGHT_FRAMES
+    return LandmarkStatistics.from_mean_std(mean, std, weight, contents.loadings)
 
 
 def _calibration(contents: MapContents) -> Calibration | None:

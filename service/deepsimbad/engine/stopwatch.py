@@ -14,10 +14,12 @@ class Stopwatch:
         self._began = self._since = perf_counter()
         self._spent_ms: dict[str, float] = {}
 
-    def lap(self, stage: str) -> None:
-        """Count the time since the last lap to a stage."""
+    def lap(self, stage: str, **within_ms: float) -> None:
+        """Count the time since the last lap to a stage, less what was spent within it on stages of their own."""
         now = perf_counter()
-        self._spent_ms[stage] = self._spent_ms.get(stage, 0.0) + 1000 * (now - self._since)
+        spent_ms = max(0.0, 1000 * (now - self._since) - sum(within_ms.values()))
+        for name, spent in {stage: spent_ms, **within_ms}.items():
+            self._spent_ms[name] = self._spent_ms.get(name, 0.0) + spent
         self._since = now
 
     def take(self, timings_ms: Mapping[str, float]) -> None:

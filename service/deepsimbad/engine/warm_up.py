@@ -9,6 +9,7 @@ from deepsimbad.core.relevance import Query, Relevance, RetrievalMap, relevances
 from deepsimbad.core.retrieval import shortlist
 from deepsimbad.core.route import Route
 from deepsimbad.core.update_rules import UpdateRule
+from deepsimbad.evaluators.feature_l2 import squared_distances
 
 
 def warm_up() -> None:
@@ -19,3 +20,4 @@ def warm_up() -> None:
     shortlist(relevance, 1)
     belief = GridFilter.uniform(Route(np.array([0.0, 1.0]))).updated(relevance, UpdateRule.ADDITIVE_RELEVANCE, step=0)
     summarise(belief.route, belief.predicted(0.5, 0.1, step=1).mass, 1)
+    squared_distances(np.zeros((1, 2), np.float32), np.zeros((2, 2), np.float32))

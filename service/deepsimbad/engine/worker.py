@@ -1,4 +1,7 @@
-"""The one thread in which encoding and scoring run: a robot's live view goes before whatever waits in bulk."""
+"""The one thread in which encoding and scoring run: a robot's live view goes before whatever waits in bulk.
+
+Images of several robots are encoded in one batch where the machine gains by it.
+"""
 
 import itertools
 import threading
@@ -6,10 +9,16 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 from enum import IntEnum
-from queue import PriorityQueue
+from queue import Empty, PriorityQueue
+from time import monotonic
 from typing import Any, TypeVar
 
+import numpy as np
+
+from deepsimbad.engine.encoding import encode_images
+from deepsimbad.engine.observation import View
 from deepsimbad.errors import OverloadedError, UnavailableError
+from deepsimbad.evaluators.base import Evaluator, Image
 
 T = TypeVar("T")
 
@@ -26,8 +35,14 @@ class Priority(IntEnum):
 class _Work:
     priority: Priority
     arrival: int
-    run: Callable[[], Any] = field(compare=False)
+    run: Callable[[Any], Any] = field(compare=False)
     answer: Future[Any] = field(compare=False)
+    seen: Any = field(default=None, compare=False)
+    evaluator: Evaluator | None = field(default=None, compare=False)
+
+    def goes_with(self, other: "_Work") -> bool:
+        """Whether both are images for one evaluator."""
+        return self.evaluator is not None and self.evaluator is other.evaluator
 
 
 class InferenceWorker:
@@ -39,10 +54,12 @@ class InferenceWorker:
     Args:
         name: Of the thread.
         max_waiting: How many functions of one priority may wait; None: any number.
+        longest_wait_s: How long an image may wait for others to fill a batch, where one larger than 1 gains anything.
     """
 
-    def __init__(self, name: str = "inference", max_waiting: int | None = None) -> None:
+    def __init__(self, name: str = "inference", max_waiting: int | None = None, longest_wait_s: float = 0.002) -> None:
         self._max_waiting = max_waiting
+        self._longest_wait_s = longest_wait_s
         self._n_waiting = dict.fromkeys(Priority, 0)
         self._queue: PriorityQueue[_Work] = PriorityQueue()
         self._arrivals = itertools.count()
@@ -75,15 +92,34 @@ class InferenceWorker:
             UnavailableError: The worker has been closed.
             OverloadedError: As many wait as may.
         """
-        answer: Future[T] = Future()
+        return self._put(_Work(priority, next(self._arrivals), lambda _: run(), Future()))
+
+    def look(
+        self, evaluator: Evaluator, view: View, run: Callable[[View], T], priority: Priority = Priority.LIVE
+    ) -> Future[T]:
+        """Queue a function of a view; an image is encoded before, maybe in one batch with others.
+
+        Args:
+            evaluator: Encodes an image.
+            view: An image, or what needs no encoding.
+            run: Given an `EncodedImage` in the place of an image, other views as they are.
+            priority: Who goes first.
+
+        Returns:
+            Its result or error to come, as `submit`; raises as `submit`.
+        """
+        encoder = evaluator if isinstance(view, np.ndarray) else None
+        return self._put(_Work(priority, next(self._arrivals), run, Future(), view, encoder))
+
+    def _put(self, work: _Work) -> Future[Any]:
         with self._lock:
             if not self._open:
                 raise UnavailableError("the service is shutting down")
-            if self.is_full(priority):
+            if self.is_full(work.priority):
                 raise queue_is_full()
-            self._n_waiting[priority] += 1
-            self._queue.put(_Work(priority, next(self._arrivals), run, answer))
-        return answer
+            self._n_waiting[work.priority] += 1
+            self._queue.put(work)
+        return work.answer
 
     def close(self) -> None:
         """Finish what is queued, then end the thread."""
@@ -91,22 +127,64 @@ class InferenceWorker:
             if not self._open:
                 return
             self._open = False
-            self._queue.put(_Work(Priority._CLOSE, next(self._arrivals), lambda: None, Future()))
+            self._n_waiting[Priority._CLOSE] += 1
+            self._queue.put(_Work(Priority._CLOSE, next(self._arrivals), lambda _: None, Future()))
         self._thread.join()
 
     def _work(self) -> None:
-        while (work := self._queue.get()).priority is not Priority._CLOSE:
-            with self._lock:
-                self._n_waiting[work.priority] -= 1
-            if not work.answer.set_running_or_notify_cancel():
-                continue
+        while (first := self._queue.get()).priority is not Priority._CLOSE:
+            batch = [work for work in self._with_company(first) if work.answer.set_running_or_notify_cancel()]
+            del first
+            _encode(batch)
+            while batch:
+                _finish(batch.pop(0))  # or the last answer's arrays live until the next query
+
+    def _with_company(self, first: _Work) -> list[_Work]:
+        """A piece of work with the images that are encoded together with it, taken off the queue."""
+        batch = [first]
+        largest = 1 if first.evaluator is None else first.evaluator.largest_batch
+        until = monotonic() + self._longest_wait_s
+        while len(batch) < largest:
             try:
-                result = work.run()
-            except BaseException as error:
-                work.answer.set_exception(error)
-            else:
-                work.answer.set_result(result)
-            del work  # or the last answer's arrays live until the next query
+                following = self._queue.get(timeout=max(0.0, until - monotonic()))
+            except Empty:
+                break
+            if not following.goes_with(first):
+                self._queue.put(following)  # in its old place: the order is by priority and arrival
+                break
+            batch.append(following)
+        with self._lock:
+            for work in batch:
+                self._n_waiting[work.priority] -= 1
+        return batch
+
+
+def _encode(batch: list[_Work]) -> None:
+    """Put encodings in the place of the images of a batch; those of an image that cannot be encoded fail alone."""
+    evaluator = batch[0].evaluator if batch else None
+    if evaluator is None:
+        return
+    images: list[Image] = [work.seen for work in batch]
+    try:
+        for work, encoded in zip(batch, encode_images(evaluator, images), strict=True):
+            work.seen = encoded
+    except BaseException as error:
+        if len(batch) == 1:
+            batch.pop().answer.set_exception(error)
+            return
+        alone = [[work] for work in batch]
+        for single in alone:
+            _encode(single)
+        batch[:] = [work for single in alone for work in single]
+
+
+def _finish(work: _Work) -> None:
+    try:
+        result = work.run(work.seen)
+    except BaseException as error:
+        work.answer.set_exception(error)
+    else:
+        work.answer.set_result(result)
 
 
 def queue_is_full() -> OverloadedError:

@@ -28,7 +28,7 @@ from deepsimbad.jobs.known_frames import (
 )
 from deepsimbad.jobs.map_config import DEFAULT_LIST_LENGTH, RemapConfig
 from deepsimbad.store.frames import UNKNOWN_TIMESTAMP, TraverseFrames
-from deepsimbad.store.map_contents import MapContents
+from deepsimbad.store.map_contents import MapContents, weights_of, with_weights
 from deepsimbad.store.records import MapRecord
 
 
@@ -66,7 +66,7 @@ def append_frames(
     nearest, is_near = nearest_known(known.route, driven.position_m, max(before.actions_m))
     contents = replace(
         before,
-        config=appended_config(before, record, config, frames.n_frames),
+        config=appended_config(before, record, config, frames),
         lists=merged.built.index.lists,
         position_m=merged.position_m,
         values=merged.built.index.values,
@@ -107,15 +107,17 @@ def check_same(before: MapContents, config: RemapConfig) -> None:
             )
 
 
-def appended_config(before: MapContents, record: MapRecord, config: RemapConfig, n_frames: int) -> dict[str, Any]:
+def appended_config(
+    before: MapContents, record: MapRecord, config: RemapConfig, frames: TraverseFrames
+) -> dict[str, Any]:
     """The configuration of a map with an appended drive: the map's own, and what was appended to it, in order.
 
     It is the catalog's: the file of an imported map names traverses of another server.
     """
     asked = config.as_dict()
-    added = {"traverse": config.training_traverse, "n_frames": n_frames, "to_version": record.version}
+    added = {"traverse": config.training_traverse, "n_frames": frames.n_frames, "to_version": record.version}
     return {
-        **record.config,
+        **with_weights(record.config, frames.weights_sha256 or weights_of(before.config)),
         "n_landmarks": before.n_landmarks,
         **{name: asked[name] for name in ("append", "check_traverse", "gate_margin", "activate")},
         "appended": [*record.config.get("appended", ()), added],

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,10 +13,10 @@ from deepsimbad.core.calibration import Calibration
 from deepsimbad.core.landmark_selection import select_landmarks
 from deepsimbad.core.off_route import OffRouteModel
 from deepsimbad.core.relevance import Relevance, RetrievalMap
-from deepsimbad.core.retrieval import SecondSeason, build_retrieval_map
+from deepsimbad.core.retrieval import build_retrieval_map
 from deepsimbad.core.route import Route
+from deepsimbad.core.same_route import SameRoute, second_season
 from deepsimbad.core.telling import telling_bits
-from deepsimbad.core.true_images import same_places
 from deepsimbad.errors import InvalidMapConfigError
 from deepsimbad.evaluators.base import Evaluator, LandmarkModel
 from deepsimbad.jobs.encoded_traverse import route_of
@@ -50,6 +51,7 @@ class Described:
             None: as `built`.
         telling_bits: [n] float32, how telling every place is; None where no second season is known.
         off_route: How a robot off the route is known; None as well.
+        same_route: Whether the second drive is of the same route; None where there is no second drive.
         second_dissimilarities: [m, r] float32 of the second drive, where they were computed: training wants them too.
     """
 
@@ -57,7 +59,13 @@ class Described:
     rehearsal: RetrievalMap | None = None
     telling_bits: NDArray[np.float32] | None = None
     off_route: OffRouteModel | None = None
+    same_route: SameRoute | None = None
     second_dissimilarities: NDArray[np.float32] | None = None
+
+    @property
+    def is_of_two_drives(self) -> bool:
+        """Whether the second drive is of the same route, so that a map may learn from it."""
+        return self.same_route is not None and self.same_route.accepted
 
 
 def describe(
@@ -68,6 +76,7 @@ def describe(
     relevance: Relevance,
     list_length: int,
     second: TraverseFrames | None,
+    same_route: bool | None,
     on_progress: Callable[[float], None],
 ) -> Described:
     """Describe every training frame by its landmarks, and learn from a second season where there is one.
@@ -80,26 +89,28 @@ def describe(
         relevance: What the map is built for; only `calibrated` learns from a second season.
         list_length: h.
         second: Another drive, of the same route or not.
+        same_route: Whether its positions are said to be comparable; None: where both drives know x, y.
         on_progress: Called with the share done; may raise to cancel.
     """
-    two = relevance is Relevance.CALIBRATED and second is not None
     own = dissimilarities_to(
-        training.encodings, evaluator, model, lambda share: on_progress(share / 2 if two else share)
+        training.encodings, evaluator, model, lambda share: on_progress(share if second is None else share / 2)
     )
-    season = other = None
-    if two and second is not None:
-        other = dissimilarities_to(second.encodings, evaluator, model, lambda share: on_progress(0.5 + share / 4))
-        season = SecondSeason(other, same_places(route_of(second), route))
+    season = found = None
+    if second is not None:
+        to_second = partial(dissimilarities_to, second.encodings, evaluator, model)
+        described = partial(to_second, lambda share: on_progress(0.5 + share / 4))
+        season, found = second_season(own, described, route, route_of(second), same_route)
+    other = None if season is None else season.dissimilarities
     built = build_retrieval_map(relevance, own, list_length, training.encodings, season)
-    if season is None or built.calibration is None or not built.calibration.is_of_two_seasons:
+    if season is None or relevance is not Relevance.CALIBRATED:
         on_progress(1.0)
-        return Described(built, second_dissimilarities=other)
+        return Described(built, same_route=found, second_dissimilarities=other)
     # Judged by lists that do not know the second season, as no list knows the season to come.
     unaware = build_retrieval_map(relevance, own, list_length)
     rehearsal = replace(unaware, calibration=_unaware(built, unaware))
     bits = telling_bits(rehearsal, season, route)
     on_progress(0.9)
-    return Described(built, rehearsal, bits, OffRouteModel.learn(rehearsal, season, route), other)
+    return Described(built, rehearsal, bits, OffRouteModel.learn(rehearsal, season, route), found, other)
 
 
 def _unaware(built: RetrievalMap, unaware: RetrievalMap) -> Calibration:
@@ -161,6 +172,7 @@ def map_contents(
         values=built.index.values,
         encodings=built.encodings,
         statistics=None if statistics is None else np.stack([statistics.mean, statistics.std]),
+        loadings=None if statistics is None else statistics.loadings,
         correlation=None if calibration is None else calibration.correlation,
         listed_score=None if calibration is None else calibration.listed_score,
         telling_bits=described.telling_bits,

@@ -40,12 +40,13 @@ from deepsimbad.core.true_images import true_images_of
 from deepsimbad.core.update_rules import DEFAULT_UPDATE
 from deepsimbad.engine.active_maps import load_snapshot
 from deepsimbad.engine.snapshot import MapSnapshot
-from deepsimbad.errors import DamagedMapError, InvalidEncodingError, RetiredMapError
+from deepsimbad.errors import DamagedMapError, InvalidEncodingError, RetiredMapError, WeightsDifferError
 from deepsimbad.evaluators.base import Evaluator, LandmarkModel
 from deepsimbad.jobs.encoded_traverse import route_of
 from deepsimbad.jobs.known_frames import UNKNOWN_FRAME, frame_digests, traverses_in
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.frames import TraverseFrames
+from deepsimbad.store.map_contents import weights_of
 
 TOLERANCE_M = 2.0
 HELD_OUT_EVERY = 10
@@ -64,6 +65,7 @@ class CheckedMap:
         model: Its landmarks.
         frame_digest: [n] uint64, which frame every image was made of; None where nobody noted it.
         traverses: The traverses they came from.
+        weights_sha256: By which weights they were encoded; None where by none, or nobody knows.
     """
 
     built: RetrievalMap
@@ -71,12 +73,13 @@ class CheckedMap:
     model: LandmarkModel
     frame_digest: NDArray[np.uint64] | None
     traverses: frozenset[str]
+    weights_sha256: str | None = None
 
     @classmethod
     def of(cls, snapshot: MapSnapshot, config: Mapping[str, Any]) -> Self:
         """A map as it serves, with its configuration in the catalog: an imported file names another server's drives."""
         known, names = snapshot.frame_digest, frozenset(traverses_in(config))
-        return cls(snapshot.retrieval, snapshot.route, snapshot.landmark_model, known, names)
+        return cls(snapshot.retrieval, snapshot.route, snapshot.landmark_model, known, names, weights_of(config))
 
 
 @dataclass(frozen=True)
@@ -157,10 +160,13 @@ def check_map(
     theirs = known = None
     if active is not None:
         try:
+            WeightsDifferError.check("a map", active.weights_sha256, "a frame", frames.drive.weights_sha256)
             known = frames.images_in(active)
             theirs = _normalised_ranks(active, frames, known, evaluator, lambda share: on_progress(0.5 + share / 2))
         except InvalidEncodingError:
             why = f"map {active_version}, which serves, was made of encodings of another length"
+        except WeightsDifferError:
+            why = f"map {active_version}, which serves, was made of images that other weights encoded"
     scored = np.isfinite(ranks)
     anr_active = None
     if not scored.any() and own.size and frames.kind == ON_TRAVERSE:

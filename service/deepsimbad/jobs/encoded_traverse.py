@@ -6,6 +6,8 @@ uploaded or read here, because the same reader prepared it.
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from statistics import median
+from time import perf_counter
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,11 +29,13 @@ class EncodedTraverse:
         frames: Encodings and places, n of them, in the order they were driven.
         route: The frames' positions.
         left_out: Reason -> number of frames that could not be used.
+        encode_ms: Median from an image's bytes to its encoding; None where encodings came ready.
     """
 
     frames: TraverseFrames
     route: Route
     left_out: dict[str, int] = field(default_factory=dict)
+    encode_ms: float | None = None
 
     @property
     def encodings(self) -> NDArray[np.float32]:
@@ -56,9 +60,9 @@ def encode_recording(
     """
     left_out = dict(recording.left_out)
     if recording.encodings is not None:
-        kept, encodings = list(range(len(recording.frames))), recording.encodings
+        kept, encodings, encode_ms = list(range(len(recording.frames))), recording.encodings, None
     else:
-        kept, encodings = _encode_images(recording, evaluator, max_pixels, left_out, on_progress)
+        kept, encodings, encode_ms = _encode_images(recording, evaluator, max_pixels, left_out, on_progress)
     if not kept:
         raise InvalidSourceError(f"{recording.name} has no frame that can be used: {left_out}")
     used = [recording.frames[place] for place in kept]
@@ -71,8 +75,9 @@ def encode_recording(
         x_m=np.array([np.nan if frame.x_m is None else frame.x_m for frame in used], np.float64),
         y_m=np.array([np.nan if frame.y_m is None else frame.y_m for frame in used], np.float64),
         encodings=encodings,
+        weights_sha256=None if recording.encodings is not None else evaluator.weights_sha256,
     )
-    return EncodedTraverse(frames, route_of(frames), left_out)
+    return EncodedTraverse(frames, route_of(frames), left_out, encode_ms)
 
 
 def route_of(frames: TraverseFrames, closed: bool = False) -> Route:
@@ -91,19 +96,25 @@ def _encode_images(
     max_pixels: int,
     left_out: dict[str, int],
     on_progress: Callable[[float], None],
-) -> tuple[list[int], NDArray[np.float32]]:
-    """Places of the frames that could be read, and their encodings; broken ones are counted under their reason."""
-    if evaluator.encoding_dim is None:
+) -> tuple[list[int], NDArray[np.float32], float | None]:
+    """Places of the frames that could be read, their encodings, and the median of milliseconds that each took.
+
+    Broken ones are counted under their reason.
+    """
+    if not evaluator.takes_images or evaluator.encoding_dim is None:
         raise InvalidSourceError("this evaluator takes ready encodings alone; give a .npy or .csv file")
     encodings = np.empty((len(recording.frames), evaluator.encoding_dim), np.float32)
     kept: list[int] = []
+    took_ms: list[float] = []
     for place, frame in enumerate(recording.frames):
         try:
             body = recording.image(frame, evaluator.input_size).body
         except BrokenFrameError as error:
             left_out[error.reason] = left_out.get(error.reason, 0) + 1
         else:
+            began = perf_counter()
             encodings[len(kept)] = evaluator.encode([decode_image(body, max_pixels)])[0]
+            took_ms.append(1000 * (perf_counter() - began))
             kept.append(place)
         on_progress((place + 1) / len(recording.frames))
-    return kept, encodings[: len(kept)]
+    return kept, encodings[: len(kept)], median(took_ms) if took_ms else None

@@ -12,6 +12,7 @@ from deepsimbad.core.descriptor import rank_landmarks
 from deepsimbad.core.nnql import NnqlConfig
 from deepsimbad.core.planners import CONSTANT, DEFAULT_PLANNER, NNQL, RANDOM
 from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Query, Relevance
+from deepsimbad.core.same_route import SameRoute
 from deepsimbad.core.true_images import same_places
 from deepsimbad.core.update_rules import DEFAULT_UPDATE, UpdateRule
 from deepsimbad.engine.active_localizer import ActiveLocalizer, LocalizerConfig
@@ -54,6 +55,7 @@ class NbvConfig:
         training_episodes: Of NNQL.
         episodes: Test episodes of every planner.
         seed: Of starts, random moves and training.
+        same_route: Whether positions of landmark and training traverse are comparable; None: where both know x, y.
     """
 
     n_landmarks: int = 300
@@ -65,6 +67,7 @@ class NbvConfig:
     training_episodes: int = 10_000
     episodes: int = 2000
     seed: int = 0
+    same_route: bool | None = True
 
 
 @dataclass(frozen=True)
@@ -83,12 +86,14 @@ class NbvReport:
         config: What was compared.
         ours, paper: Rank shares [episodes, steps] by planner, under our set-up and the paper's.
         travelled_m: Metres [episodes, steps] by planner, under our set-up.
+        same_route: Whether the landmark traverse drove the mapped route; None: nobody looked.
     """
 
     config: NbvConfig
     ours: dict[str, NDArray[np.float64]]
     paper: dict[str, NDArray[np.float64]]
     travelled_m: dict[str, NDArray[np.float64]]
+    same_route: SameRoute | None = None
 
     @property
     def best_constant(self) -> str:
@@ -124,6 +129,7 @@ class NbvReport:
                 name: _at_distances(shares, self.travelled_m[name]) for name, shares in self.ours.items()
             },
             "n_episodes": self.config.episodes,
+            "second_season": None if self.same_route is None else self.same_route.as_dict(),
             "config": {**asdict(self.config), **sources},
         }
 
@@ -163,12 +169,13 @@ def run_nbv(
         raise InvalidMapConfigError(f"the test traverse is shorter than an episode of {travel_m:g} m")
 
     results: dict[str, dict[str, list[Episode]]] = {}
+    same_route = None
     setups = (
         _Setup("ours", config.relevance, config.update, None),
         _Setup("paper", *PAPER, PAPER_ACTION_STD_M),
     )
     for setup in setups:
-        snapshot = _mapped(config, setup, evaluator, model, landmarks, training, progress)
+        snapshot, same_route = _mapped(config, setup, evaluator, model, landmarks, training, progress)
         results[setup.name] = {}
         for name in _names(config):
             progress.stage(f"{name} ({setup.name})")
@@ -182,6 +189,7 @@ def run_nbv(
         {name: _stack(episodes) for name, episodes in ours.items()},
         {name: _stack(episodes) for name, episodes in results["paper"].items()},
         {name: np.stack([episode.travelled_m for episode in episodes]) for name, episodes in ours.items()},
+        same_route,
     )
 
 
@@ -193,8 +201,8 @@ def _mapped(
     landmarks: EncodedTraverse,
     training: EncodedTraverse,
     progress: Progress,
-) -> MapSnapshot:
-    """The map with its experience database, as a remap makes it."""
+) -> tuple[MapSnapshot, SameRoute | None]:
+    """The map with its experience database, as a remap makes it, and whether it learnt from the landmark traverse."""
     progress.stage(f"map ({setup.name})")
     route = training.route
     found = describe(
@@ -205,6 +213,7 @@ def _mapped(
         setup.relevance,
         config.list_length,
         landmarks.frames,
+        config.same_route,
         progress.update,
     )
     domain = DomainRecord("experiment", {}, False, config.actions_m, None, "")
@@ -215,7 +224,7 @@ def _mapped(
         route,
         config.actions_m,
         partial(DescribedDrive.of, training.frames, False, evaluator, model),
-        DescribedDrive.of(landmarks.frames, False, evaluator, model),
+        DescribedDrive.of(landmarks.frames, False, evaluator, model) if found.is_of_two_drives else None,
         NnqlConfig(
             config.training_episodes,
             config.n_steps,
@@ -226,7 +235,8 @@ def _mapped(
         progress.update,
         available_cores(),
     )
-    return MapSnapshot.from_contents(replace(contents, q_values=experience.q_values), index_bytes=0)
+    snapshot = MapSnapshot.from_contents(replace(contents, q_values=experience.q_values), index_bytes=0)
+    return snapshot, found.same_route
 
 
 def _names(config: NbvConfig) -> list[str]:

@@ -21,13 +21,14 @@ from deepsimbad.core.relevance import (
     brute_force_relevances,
     relevances,
 )
-from deepsimbad.core.retrieval import SecondSeason, build_retrieval_map
+from deepsimbad.core.retrieval import build_retrieval_map
 from deepsimbad.core.route import Route
-from deepsimbad.core.true_images import same_places
+from deepsimbad.core.same_route import SameRoute, second_season
 from deepsimbad.evaluators.base import Evaluator, LandmarkModel
 from deepsimbad.jobs.build_map import Described, map_contents
 from deepsimbad.jobs.encoded_traverse import EncodedTraverse
 from deepsimbad.jobs.progress import Progress
+from deepsimbad.store.arrays import halved
 from deepsimbad.store.map_file import index_bytes, write_map
 from deepsimbad.store.records import DomainRecord
 from deepsimbad.store.sealing import seal
@@ -45,6 +46,7 @@ class VprConfig:
         tolerance_m: How far from the query a map image may be and still be true.
         relevances: Which to compare, in the order of the report.
         seed: Kept with the result; nothing here is random.
+        same_route: Whether positions of landmark and training traverse are comparable; None: where both know x, y.
     """
 
     n_landmarks: int = 300
@@ -52,6 +54,7 @@ class VprConfig:
     tolerance_m: float = 2.0
     relevances: tuple[Relevance, ...] = tuple(Relevance)
     seed: int = 0
+    same_route: bool | None = True
 
 
 @dataclass(frozen=True)
@@ -63,12 +66,20 @@ class VprReport:
         index_bits_per_map_image: Size on disk of the posting tables, of the map for the relevance that ships (or
             of the first asked for).
         seconds: Seconds by stage.
+        same_route: Whether the landmark traverse drove the mapped route.
+        encoding_dim: d.
+        bytes_per_encoding: Of one frame in a traverse's file, places apart.
+        encode_ms: Median from an image's bytes to its encoding; None where encodings came ready.
     """
 
     config: VprConfig
     scores: dict[Relevance, RetrievalScores]
     index_bits_per_map_image: float
     seconds: dict[str, float]
+    same_route: SameRoute
+    encoding_dim: int
+    bytes_per_encoding: int
+    encode_ms: float | None
 
     def as_dict(self, sources: dict[str, Any]) -> dict[str, Any]:
         """The stable flat JSON document of design section 7."""
@@ -81,6 +92,10 @@ class VprReport:
             "n_queries": first.n_queries,
             "n_left_out": first.n_left_out,
             "index_bits_per_map_image": self.index_bits_per_map_image,
+            "second_season": self.same_route.as_dict(),
+            "encoding_dim": self.encoding_dim,
+            "bytes_per_encoding": self.bytes_per_encoding,
+            "encode_ms": self.encode_ms,
             "config": {**asdict(self.config), **sources},
             "seconds": self.seconds,
         }
@@ -132,8 +147,12 @@ def run_vpr(
     progress.update(0.3)
     test_dissimilarities = evaluator.dissimilarities(test.encodings, model)
     progress.update(0.6)
-    second = SecondSeason(
-        evaluator.dissimilarities(landmarks.encodings, model), same_places(landmarks.route, training.route)
+    second, same_route = second_season(
+        map_dissimilarities,
+        lambda: evaluator.dissimilarities(landmarks.encodings, model),
+        training.route,
+        landmarks.route,
+        config.same_route,
     )
     queries = [
         Query(ranks, dissimilarities, encoding)
@@ -151,7 +170,16 @@ def run_vpr(
         scores[name] = _score(maps[name], queries, true_images, progress.update)
         lap(f"query by {name.value}")
     sized = maps.get(DEFAULT_RELEVANCE, maps[config.relevances[0]])
-    return VprReport(config, scores, _bits_per_map_image(sized, model, training.route), seconds)
+    return VprReport(
+        config,
+        scores,
+        _bits_per_map_image(sized, model, training.route),
+        seconds,
+        same_route,
+        encoding_dim=int(test.encodings.shape[1]),
+        bytes_per_encoding=halved(test.encodings).nbytes // len(test.encodings),
+        encode_ms=test.encode_ms,
+    )
 
 
 def _bits_per_map_image(built: RetrievalMap, model: LandmarkModel, route: Route) -> float:

@@ -33,6 +33,8 @@ class RemapConfig:
             traverse that are held out.
         gate_margin: By how many percentage points of ANR the new map may be worse than the active one and still take
             over; None: whatever it is.
+        same_route: Whether positions of the training traverse and of the second drive (the landmark traverse, else what
+            the active map was made of) are comparable; None: only where both know x, y.
         append: Add the training traverse to a copy of the active map, whose images, landmarks, lists and experience
             stay; n_landmarks, list_length and relevance are the active map's.
     """
@@ -48,6 +50,7 @@ class RemapConfig:
     check_traverse: str | None = None
     gate_margin: float | None = None
     append: bool = False
+    same_route: bool | None = None
 
     def __post_init__(self) -> None:
         n_landmarks = self.n_landmarks

@@ -31,7 +31,7 @@ from deepsimbad.jobs.stages import Stages
 from deepsimbad.jobs.train_nnql import DescribedDrive, Experience, train_nnql
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.checkpoints import Checkpoints
-from deepsimbad.store.map_contents import MapContents
+from deepsimbad.store.map_contents import MapContents, with_weights
 from deepsimbad.store.map_table import ANY
 from deepsimbad.store.records import MapRecord
 
@@ -111,6 +111,7 @@ def _built(
         "n_map_images": made.contents.n_map_images,
         "seconds": stages.seconds,
         "training": made.training,
+        "second_season": made.second_season,
         "check": check,
     }
     job_id = None if checkpoints is None else checkpoints.job_id
@@ -125,11 +126,13 @@ class _Made:
         contents: All of it; its version is not known yet.
         config: As the catalog keeps it.
         training: How its experience database was learnt; None where it has none.
+        second_season: Whether it learnt from a second drive, and why not; None where there was none.
     """
 
     contents: MapContents
     config: Mapping[str, Any]
     training: Mapping[str, Any] | None
+    second_season: Mapping[str, Any] | None
 
 
 def _appended(
@@ -144,7 +147,8 @@ def _appended(
     record = catalog.map(inputs.domain.name, inputs.domain.active_version or 0)
     append = partial(append_frames, before, record, inputs.config, inputs.training, evaluator, progress.update)
     contents = stages.run("describe", append)
-    return _Made(contents, contents.config, record.metrics.get("training"))
+    known = record.metrics
+    return _Made(contents, contents.config, known.get("training"), known.get("second_season"))
 
 
 def _mapped(inputs: RemapInputs, evaluator: Evaluator, stages: Stages, progress: Progress, n_threads: int) -> _Made:
@@ -166,7 +170,8 @@ def _mapped(inputs: RemapInputs, evaluator: Evaluator, stages: Stages, progress:
         experience = stages.run_once("train", train, pack_experience, unpack_experience)
     contents = _contents(inputs, model, found, experience)
     training = None if experience is None else experience.metrics
-    return _Made(contents, config.as_dict(), training)
+    second_season = None if found.same_route is None else found.same_route.as_dict()
+    return _Made(contents, with_weights(config.as_dict(), inputs.weights_sha256), training, second_season)
 
 
 def _checked(
@@ -202,6 +207,7 @@ def _described(inputs: RemapInputs, evaluator: Evaluator, model: LandmarkModel, 
         config.relevance,
         config.list_length,
         inputs.second,
+        config.same_route,
         progress.update,
     )
 
@@ -217,7 +223,7 @@ def _trained(
     """The experience database."""
     config, closed = inputs.config, inputs.domain.closed
     second = None
-    if inputs.second is not None:
+    if inputs.second is not None and found.is_of_two_drives:
         second = DescribedDrive.of(inputs.second, closed, evaluator, model, found.second_dissimilarities)
     return train_nnql(
         found.rehearsal or found.built,
@@ -235,7 +241,8 @@ def _contents(
     inputs: RemapInputs, model: LandmarkModel, found: Described, experience: Experience | None
 ) -> MapContents:
     """Everything the map file holds; its version is not known yet."""
-    contents = map_contents(inputs.domain, 0, inputs.config.as_dict(), model, found, inputs.route)
+    config = with_weights(inputs.config.as_dict(), inputs.weights_sha256)
+    contents = map_contents(inputs.domain, 0, config, model, found, inputs.route)
     times = inputs.training.timestamp_us
     return replace(
         contents,

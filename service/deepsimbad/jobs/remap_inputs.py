@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepsimbad.core.route import Route
-from deepsimbad.errors import InvalidEncodingError, InvalidMapConfigError
+from deepsimbad.errors import InvalidEncodingError, InvalidMapConfigError, WeightsDifferError
 from deepsimbad.jobs.encoded_traverse import route_of
 from deepsimbad.jobs.map_config import RemapConfig
 from deepsimbad.release import release
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.frames import TraverseFrames
-from deepsimbad.store.map_contents import MapContents
+from deepsimbad.store.map_contents import MapContents, weights_of
 from deepsimbad.store.map_file import read_map
 from deepsimbad.store.records import DomainRecord
 from deepsimbad.store.traverses import Traverse
@@ -47,6 +47,13 @@ class RemapInputs:
     second: TraverseFrames | None
     check: TraverseFrames | None = None
 
+    @property
+    def weights_sha256(self) -> str | None:
+        """Of the network that encoded the images; None where none did, or nobody knows."""
+        if self.training.weights_sha256 is not None or self.kept is None:
+            return self.training.weights_sha256
+        return weights_of(self.kept.config)
+
     def digest(self) -> str:
         """SHA-256 over all of it, in hex: equal digests, equal map. Another release counts as another input."""
         sha256 = hashlib.sha256()
@@ -57,11 +64,12 @@ class RemapInputs:
             "closed": self.domain.closed,
             "actions_m": list(self.domain.actions_m),
             "kept": None if self.kept is None else self.kept.config,
+            "weights": self.weights_sha256,
         }
         sha256.update(json.dumps(said, sort_keys=True).encode())
         digests: dict[int, bytes] = {}  # one traverse may stand in two places
         for frames in (self.training, self.candidates, self.second):
-            digest = b"" if frames is None else digests.get(id(frames)) or _digest(frames.__dict__)
+            digest = b"" if frames is None else digests.get(id(frames)) or _digest(frames.arrays())
             digests[id(frames)] = digest
             sha256.update(digest or b"none")
         sha256.update(b"none" if self.kept is None else _digest(self.kept.landmark_model))
@@ -85,6 +93,7 @@ def read_inputs(catalog: Catalog, domain: str, config: RemapConfig) -> RemapInpu
         InvalidMapConfigError: A traverse is empty, or no landmarks could stay.
         InvalidRouteError: The training or the check traverse goes backwards.
         InvalidEncodingError: The traverses come from two encoders.
+        WeightsDifferError: Their images were encoded by other weights.
     """
     record = catalog.domain(domain)
     training = _frames(catalog, domain, config.training_traverse)
@@ -93,6 +102,8 @@ def read_inputs(catalog: Catalog, domain: str, config: RemapConfig) -> RemapInpu
     candidates = kept = None
     if config.landmark_traverse is None:
         kept = _active_map(catalog, record, config)
+        joining = f"traverse {config.training_traverse}"
+        WeightsDifferError.check("the active map", weights_of(kept.config), joining, training.weights_sha256)
     else:
         if config.landmark_traverse not in read:
             read[config.landmark_traverse] = _frames(catalog, domain, config.landmark_traverse)
@@ -127,6 +138,9 @@ def _check_length(name: str, frames: TraverseFrames, training_name: str, trainin
             f"traverse {name} holds encodings of {_length(frames)} numbers, traverse "
             f"{training_name} of {_length(training)}; both must come from the same encoder"
         )
+    WeightsDifferError.check(
+        f"traverse {training_name}", training.weights_sha256, f"traverse {name}", frames.weights_sha256
+    )
 
 
 def _second_season(
@@ -140,7 +154,9 @@ def _second_season(
     for name in names:
         if name is not None and name != config.training_traverse and name in known:
             second = read[name] if name in read else _frames(catalog, record.name, name)
-            if _length(second) == _length(read[config.training_traverse]):  # else another encoder made it anew
+            training = read[config.training_traverse]
+            weights = {second.weights_sha256, training.weights_sha256} - {None}
+            if _length(second) == _length(training) and len(weights) <= 1:  # else another encoder made it anew
                 return second
     return None
 

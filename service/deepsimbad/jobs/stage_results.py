@@ -10,6 +10,7 @@ from deepsimbad.core.calibration import Calibration
 from deepsimbad.core.inverted_index import InvertedIndex
 from deepsimbad.core.off_route import OffRouteModel
 from deepsimbad.core.relevance import Relevance, RetrievalMap
+from deepsimbad.core.same_route import SameRoute
 from deepsimbad.core.statistics import LandmarkStatistics
 from deepsimbad.evaluators.base import LandmarkModel
 from deepsimbad.jobs.build_map import Described
@@ -50,6 +51,7 @@ def pack_described(found: Described) -> Checkpoint:
         arrays["telling_bits"] = found.telling_bits
     if found.off_route is not None:
         arrays["off_route"] = np.array([found.off_route.slope, found.off_route.intercept])
+    document["same_route"] = None if found.same_route is None else found.same_route.as_dict()
     return Checkpoint(arrays, document)
 
 
@@ -60,12 +62,13 @@ def unpack_described(kept: Checkpoint, encodings: NDArray[np.float32]) -> Descri
         kept: What was packed.
         encodings: [n, d] of the described traverse.
     """
-    off_route = kept.arrays.get("off_route")
+    off_route, same_route = kept.arrays.get("off_route"), kept.document["same_route"]
     return Described(
         _unpack_map(kept, _BUILT, encodings),
         _unpack_map(kept, _REHEARSAL, encodings) if _REHEARSAL in kept.document else None,
         kept.arrays.get("telling_bits"),
         None if off_route is None else OffRouteModel(*off_route.tolist()),
+        None if same_route is None else SameRoute(**same_route),
     )
 
 
@@ -76,6 +79,7 @@ def _pack_map(built: RetrievalMap, name: str, arrays: dict[str, NDArray[Any]]) -
         "values": index.values,
         "mean": None if statistics is None else statistics.mean,
         "square": None if statistics is None else statistics.square,
+        "loadings": None if statistics is None else statistics.loadings,
         "correlation": None if calibration is None else calibration.correlation,
         "listed_score": None if calibration is None else calibration.listed_score,
     }
@@ -94,7 +98,7 @@ def _unpack_map(kept: Checkpoint, name: str, encodings: NDArray[np.float32]) -> 
     parts = {key.removeprefix(f"{name}."): array for key, array in kept.arrays.items() if key.startswith(f"{name}.")}
     statistics = calibration = None
     if said["weight"] is not None:
-        statistics = LandmarkStatistics(said["weight"], parts["mean"], parts["square"])
+        statistics = LandmarkStatistics(said["weight"], parts["mean"], parts["square"], parts.get("loadings"))
     if said["is_of_two_seasons"] is not None:
         calibration = Calibration(parts["correlation"], parts["listed_score"], said["is_of_two_seasons"])
     return RetrievalMap(

@@ -1,7 +1,8 @@
 """Training the experience database of a map (II-D), on live images that are never the map's own.
 
 A map image that looks for itself finds itself at once: every view would seem perfect, and nothing be learnt. So the
-live images are those of a second drive along the route, the landmark traverse, where there is one. Else the training
+live images are those of a second drive along the route, the landmark traverse, where there is one
+(`deepsimbad.core.same_route`). Else the training
 traverse is halved: its odd frames are driven through a map of the even ones, which teaches the even ones' Q-values, and
 then the other way round.
 """
@@ -20,7 +21,6 @@ from numpy.typing import NDArray
 from deepsimbad.core.descriptor import rank_landmarks
 from deepsimbad.core.inverted_index import InvertedIndex
 from deepsimbad.core.live_views import LiveViews
-from deepsimbad.core.metrics import rank_of_truth
 from deepsimbad.core.nnql import NnqlConfig, initial_q_values
 from deepsimbad.core.nnql_training import LearningCurve, train
 from deepsimbad.core.relevance import RetrievalMap
@@ -34,9 +34,6 @@ from deepsimbad.store.frames import TraverseFrames
 
 EPISODES_A_MAP_IMAGE = 25  # more would visit every entry of a small map again and again
 _FRAMES_A_BLOCK = 1024
-_LEAST_PLACES = 30  # that a second drive must share with the map to be driven through it
-_CHECKED_PLACES = 200
-_MOST_RANK_SHARE = 0.35  # above, the two did not see the same places, whatever their positions say; chance is a half
 SECOND_DRIVE, HELD_OUT = "landmark_traverse", "held_out_frames"
 
 
@@ -113,7 +110,7 @@ def train_nnql(
         route: Where its images are.
         actions_m: The moves.
         own: Gives the map's own traverse as live views; asked only where there is no second drive.
-        second: Another drive, of the same route or not.
+        second: Another drive of the same route; None where there is none, or none was found to be.
         config: The hyperparameters; small maps take fewer episodes than it says.
         on_progress: Called with the share done; may raise to cancel.
         n_threads: Threads to compute in.
@@ -121,13 +118,12 @@ def train_nnql(
     started = time.perf_counter()
     ascending = tuple(sorted(actions_m))
     n_episodes = min(config.n_episodes, EPISODES_A_MAP_IMAGE * route.n_images)
-    true_image = None if second is None else _true_images(built, route, second)
     q_values = initial_q_values(route.n_images, len(ascending), config)
     curves: list[LearningCurve] = []
     with ThreadPoolExecutor(n_threads) if n_threads > 1 else nullcontext() as pool:
-        if second is not None and true_image is not None:
+        if second is not None:
             used = replace(config, n_episodes=n_episodes)
-            world = _world(built, route, second, true_image, ascending, used)
+            world = _world(built, route, second, _true_images(route, second), ascending, used)
             q_values, curve = train(world, used, on_progress, pool)
             curves.append(curve)
         elif n_episodes:
@@ -138,7 +134,7 @@ def train_nnql(
                 q_values[images], curve = train(world, used, report, pool)
                 curves.append(curve)
     metrics = {
-        "live_images": HELD_OUT if true_image is None else SECOND_DRIVE,
+        "live_images": HELD_OUT if second is None else SECOND_DRIVE,
         "n_episodes": n_episodes,
         "curves": [curve.as_dict() for curve in curves],
         "hyperparameters": asdict(config),
@@ -165,25 +161,9 @@ def _world(
     return TrainingWorld.on(route, views, live.route, true_image, actions_m, config)
 
 
-def _true_images(built: RetrievalMap, route: Route, second: DescribedDrive) -> NDArray[np.int64] | None:
-    """The map image of every frame's place, -1 where the map has none; None where the drive is of another route."""
+def _true_images(route: Route, second: DescribedDrive) -> NDArray[np.int64]:
+    """The map image of every frame's place, -1 where the map has none."""
     places = same_places(second.route, route)
-    if len(places) < _LEAST_PLACES:
-        return None
-    checked = places[:: -(-len(places) // _CHECKED_PLACES)]
-    ranks = rank_landmarks(second.dissimilarities[checked[:, 1]])
-    views = LiveViews(
-        built,
-        DEFAULT_UPDATE[built.relevance],
-        1,
-        ranks,
-        second.dissimilarities[checked[:, 1]],
-        second.encodings[checked[:, 1]],
-    )
-    relevance = views.relevance(np.arange(len(checked)), None)
-    found = [rank_of_truth(row, image) for row, image in zip(relevance, checked[:, :1], strict=True)]
-    if np.mean(found) > _MOST_RANK_SHARE * route.n_images:
-        return None
     true_image = np.full(second.route.n_images, -1, np.int64)
     true_image[places[:, 1]] = places[:, 0]
     return true_image

@@ -51,6 +51,7 @@ ASKED: dict[str, Ask] = {
     "GET /metrics": lambda c, s, f: c.metrics(),
     "GET /v1/domains": lambda c, s, f: c.domains(),
     "GET /v1/domains/{domain}": lambda c, s, f: c.domain("d"),
+    "GET /v1/domains/{domain}/landmark-model": lambda c, s, f: c.on_board("d"),
     "POST /v1/domains/{domain}/localizations": lambda c, s, f: c.localize("d", ranked_landmarks=[0]),
     "POST /v1/domains/{domain}/sessions": lambda c, s, f: c.session("d"),
     "POST /v1/sessions/{session_id}/observations": lambda c, s, f: s.observe(ranked_landmarks=[0]),

@@ -198,3 +198,18 @@ def test_nothing_to_roll_back_to(service: str, capsys: Any, out: Any) -> None:
         client.admin.put_domain("fresh", ENCODINGS)
     assert run(["rollback", "fresh"]) == 1
     assert "no_earlier_map" in capsys.readouterr().err
+
+
+def test_a_second_season_is_asked_for(service: str, domain: str, out: Any) -> None:
+    command = ["remap", "--domain", domain, "--training", "summer", "--landmarks", "winter", "--no-activate", "--json"]
+    quick = ["--n-landmarks", "50", "--training-episodes", "0"]
+    said = {"": False, "--same-route": True, "--no-same-route": False}
+    for flag, accepted in said.items():
+        job = json.loads(out(*command, *quick, *filter(None, [flag])))
+        assert job["result"]["metrics"]["second_season"]["accepted"] is accepted
+    with Client(service) as client:
+        job = remap(
+            *(client, domain, "summer"), landmark_traverse="noise", n_landmarks=50, training_episodes=0, same_route=True
+        )
+    assert "agree no better" in job.second_season["why"]
+    assert job.second_season["accepted"] is False

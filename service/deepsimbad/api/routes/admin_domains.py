@@ -1,17 +1,18 @@
 """Making and removing domains."""
 
 import logging
+from typing import Any
 
 from anyio.to_thread import run_sync
 from fastapi import APIRouter, Request, Response
 
 from deepsimbad.api.bodies import DomainBody, declare_json, read_json
-from deepsimbad.api.dependencies import DomainName, Running
+from deepsimbad.api.dependencies import DomainName, Running, Services
 from deepsimbad.api.domain_answers import describe_domain
 from deepsimbad.api.openapi import problems
 from deepsimbad.api.schemas import DomainAnswer
 from deepsimbad.errors import UnknownDomainError
-from deepsimbad.evaluators.registry import evaluator_config
+from deepsimbad.evaluators.registry import EvaluatorConfig, evaluator_config
 
 router = APIRouter(prefix="/v1/admin/domains", tags=["admin: domains"])
 log = logging.getLogger(__name__)
@@ -26,9 +27,10 @@ log = logging.getLogger(__name__)
 async def put_domain(domain: DomainName, request: Request, response: Response, running: Running) -> DomainAnswer:
     """Make a domain; the same again changes nothing, a different one is a 409."""
     body = await read_json(request, DomainBody)
-    evaluator = evaluator_config(body.evaluator)
+    evaluator_config(body.evaluator)
 
     def make() -> tuple[DomainAnswer, bool]:
+        evaluator = _completed(body.evaluator, running, domain)
         running.evaluators.evaluator(evaluator.as_dict())  # one that cannot be loaded should not be stored
         record, created = running.catalog.create_domain(
             domain, dict(evaluator.as_dict()), body.closed, body.actions_m, running.settings.max_domains
@@ -56,6 +58,15 @@ async def delete_domain(domain: DomainName, running: Running) -> None:
             await running.sessions.end_domain(domain)
             running.metrics.forget_domain(domain)
     log.info("domain deleted", extra={"domain": domain})
+
+
+def _completed(given: dict[str, Any], running: Services, domain: str) -> EvaluatorConfig:
+    """What was left out is as the domain has it, where it exists: the default may have changed since it was made."""
+    try:
+        present = running.catalog.domain(domain).evaluator
+    except UnknownDomainError:
+        return evaluator_config(given)
+    return evaluator_config({**present, **given} if present.get("kind") == given["kind"] else given)
 
 
 def _is_gone(running: Running, domain: str) -> bool:

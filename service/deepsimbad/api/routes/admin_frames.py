@@ -2,7 +2,7 @@
 
 import tempfile
 from dataclasses import replace
-from typing import IO, Annotated
+from typing import IO, Annotated, cast
 
 import numpy as np
 from anyio.to_thread import run_sync
@@ -25,7 +25,8 @@ from deepsimbad.api.dependencies import DomainName, Running, Services, TraverseN
 from deepsimbad.api.frame_batch import read_batch
 from deepsimbad.api.openapi import problems
 from deepsimbad.api.schemas import BatchAnswer, FrameAnswer
-from deepsimbad.engine.encoding import encode_view, ready_encodings
+from deepsimbad.engine.encoding import ready_encodings
+from deepsimbad.engine.observation import EncodedImage, View
 from deepsimbad.engine.worker import Priority
 from deepsimbad.errors import EmptyBodyError
 from deepsimbad.evaluators.base import Evaluator
@@ -79,11 +80,12 @@ async def put_frame(
     await run_sync(_check_traverse, running, domain, name)
     media_type = media_type_of(request, FRAME_TYPES)
     body = await read_bytes(request)
-    encoding = await _encoded(body, running, media_type, running.evaluators.evaluator(evaluator_config))
+    evaluator = await run_sync(running.evaluators.serving, evaluator_config)
+    encoding, weights_sha256 = await _encoded(body, running, media_type, evaluator)
 
     def store() -> tuple[bool, int]:
         with running.open_traverses.lend(domain, name) as traverse:
-            created = traverse.put_frame(index, encoding, position_m, timestamp_us, x_m, y_m)
+            created = traverse.put_frame(index, encoding, position_m, timestamp_us, x_m, y_m, weights_sha256)
             return created, traverse.n_frames
 
     created, n_frames = await run_sync(store)
@@ -91,13 +93,21 @@ async def put_frame(
     return FrameAnswer(index=index, n_frames=n_frames)
 
 
-async def _encoded(body: bytes, running: Services, media_type: str, evaluator: Evaluator) -> NDArray[np.float32]:
-    """The encoding of the frame in a body; its pixels are gone when this returns."""
+async def _encoded(
+    body: bytes, running: Services, media_type: str, evaluator: Evaluator
+) -> tuple[NDArray[np.float32], str | None]:
+    """The encoding of the frame in a body, and by which weights it was made."""
     if media_type == JSON:
         ready = (await parse_json(body, EncodingBody)).view()
-        return await running.infer(lambda: encode_view(evaluator, ready), Priority.BATCH)
-    async with running.decoded(body, Priority.BATCH) as image:
-        return await running.infer(lambda: encode_view(evaluator, image), Priority.BATCH)
+        return (await run_sync(ready_encodings, ready.values[np.newaxis]))[0], None
+    decoded = await running.decoders.decoded(body, evaluator, Priority.BATCH)
+    seen = await running.look(evaluator, decoded.image, _as_encoded, Priority.BATCH)
+    return seen.values, seen.weights_sha256
+
+
+def _as_encoded(seen: View) -> EncodedImage:
+    """What the inference worker makes of an image."""
+    return cast("EncodedImage", seen)
 
 
 @router.post(

@@ -1,11 +1,10 @@
 """Where a single view places the robot: stateless, from a uniform prior."""
 
-from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
 from io import BytesIO
 from typing import Annotated
 
 import numpy as np
+from anyio.to_thread import run_sync
 from fastapi import APIRouter, Query, Request, Response
 from numpy.typing import NDArray
 
@@ -15,6 +14,8 @@ from deepsimbad.api.bodies import (
     IMAGE_SCHEMA,
     JSON,
     OBSERVATION_SCHEMA,
+    RANKS,
+    RANKS_SCHEMA,
     ObservationBody,
     declare,
     media_type_of,
@@ -22,18 +23,22 @@ from deepsimbad.api.bodies import (
     read_bytes,
 )
 from deepsimbad.api.dependencies import DomainName, Running, Services
+from deepsimbad.api.entity_tags import LandmarkModelTag, insisted_on
 from deepsimbad.api.long_work import written
 from deepsimbad.api.openapi import binary, problems
 from deepsimbad.api.rendering import render_localization
 from deepsimbad.api.schemas import LocalizationAnswer
-from deepsimbad.engine.localizer import Localization, localize, retrieve, shortlist_length
-from deepsimbad.engine.observation import View
+from deepsimbad.engine.localizer import Localization, Retrieval, localize, retrieve, shortlist_length
+from deepsimbad.engine.observation import NothingSeen, PackedRanks, View, encoding_ms
 from deepsimbad.engine.stopwatch import Stopwatch
+from deepsimbad.engine.worker import Priority
+from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.image import MEDIA_TYPES
 
 router = APIRouter(prefix="/v1/domains", tags=["localization"])
 
-OBSERVATION_TYPES = (*MEDIA_TYPES, JSON)
+OBSERVATION_TYPES = (*MEDIA_TYPES, JSON, RANKS)
+OBSERVATION_BODY = declare({**dict.fromkeys(MEDIA_TYPES, IMAGE_SCHEMA), JSON: OBSERVATION_SCHEMA, RANKS: RANKS_SCHEMA})
 
 
 @router.post(
@@ -43,7 +48,7 @@ OBSERVATION_TYPES = (*MEDIA_TYPES, JSON)
         200: {"content": dict(binary("float32 npy [n]: the relevance of every map image, in route order"))},
         **problems(404, 409, 413, 415, 422),
     },
-    openapi_extra=declare({**dict.fromkeys(MEDIA_TYPES, IMAGE_SCHEMA), JSON: OBSERVATION_SCHEMA}),
+    openapi_extra=OBSERVATION_BODY,
 )
 async def post_localization(
     domain: DomainName,
@@ -57,6 +62,7 @@ async def post_localization(
             description="Length of `retrieval` and `top`, up to the number of map images; absent: 10 or all.",
         ),
     ] = None,
+    if_match: LandmarkModelTag = None,
 ) -> Response:
     """Localize one view.
 
@@ -68,36 +74,41 @@ async def post_localization(
     active = await running.active(domain)
     media_type = media_type_of(request, OBSERVATION_TYPES)
     shortlist_length(active.snapshot, shortlist)  # a bad query should not cost an upload
+    landmark_models = insisted_on(if_match)
     body = await read_bytes(request)
     watch.lap("receive")
-    evaluator = running.evaluators.evaluator(active.record.evaluator)
+    evaluator = await run_sync(running.evaluators.serving, active.record.evaluator)
+    view = await view_in(body, running, media_type, evaluator)
     if prefers_binary(request):
-        async with view_in(body, running, media_type) as view:
-            retrieval = await running.infer(lambda: retrieve(active.snapshot, evaluator, view))
-        return npy_response(retrieval.relevance)
 
-    def look() -> Localization:
-        watch.lap("wait")
-        found = localize(active.snapshot, evaluator, view, shortlist)
+        def compare(seen: View) -> Retrieval:
+            active.snapshot.check_landmark_model(landmark_models)
+            return retrieve(active.snapshot, evaluator, seen)
+
+        return npy_response((await running.look(evaluator, view, compare)).relevance)
+    watch.lap("decode")
+
+    def look(seen: View) -> Localization:
+        watch.lap("wait", **encoding_ms(seen))
+        active.snapshot.check_landmark_model(landmark_models)
+        found = localize(active.snapshot, evaluator, seen, shortlist)
         watch.take(found.timings_ms)
         return found
 
-    async with view_in(body, running, media_type) as view:
-        watch.lap("decode")
-        localization = await running.infer(look)
+    localization = await running.look(evaluator, view, look)
     answer, text = await written(localization.belief.top.size, lambda: render_localization(localization, watch))
     running.metrics.localized(domain, answer.timings_ms, answer.belief.entropy_bits)
     return Response(text, media_type=JSON)
 
 
-@asynccontextmanager
-async def view_in(body: bytes, running: Services, media_type: str) -> AsyncIterator[View]:
-    """The observation in a body that has been read; an image, as `Services.decoded` gives it."""
+async def view_in(body: bytes, running: Services, media_type: str, evaluator: Evaluator) -> View:
+    """The observation in a body that has been read; an image at its evaluator's size."""
     if media_type == JSON:
-        yield (await parse_json(body, ObservationBody)).view()
-        return
-    async with running.decoded(body) as image:
-        yield image
+        return (await parse_json(body, ObservationBody)).view()
+    if media_type == RANKS:
+        return PackedRanks(body)
+    decoded = await running.decoders.decoded(body, evaluator, Priority.LIVE)
+    return NothingSeen() if decoded.is_blank else decoded.image
 
 
 def prefers_binary(request: Request) -> bool:

@@ -1,27 +1,32 @@
 """A robot's live belief: begun, moved on by observations, asked, ended."""
 
 import hashlib
+from functools import partial
 from typing import Annotated
 
 from fastapi import APIRouter, Header, Query, Request, Response
 
 from deepsimbad.api.bodies import (
     GREATEST_ID,
-    IMAGE_SCHEMA,
     JSON,
-    OBSERVATION_SCHEMA,
-    declare,
     declare_json,
     media_type_of,
     read_bytes,
     read_json,
 )
 from deepsimbad.api.dependencies import DomainName, Running, SessionId
+from deepsimbad.api.entity_tags import LandmarkModelTag, insisted_on
 from deepsimbad.api.idempotency import KEY_HEADER, KeyWord, id_under_key
 from deepsimbad.api.long_work import written
 from deepsimbad.api.openapi import binary, problems
 from deepsimbad.api.rendering import render_belief, render_plan
-from deepsimbad.api.routes.localizations import OBSERVATION_TYPES, npy_response, prefers_binary, view_in
+from deepsimbad.api.routes.localizations import (
+    OBSERVATION_BODY,
+    OBSERVATION_TYPES,
+    npy_response,
+    prefers_binary,
+    view_in,
+)
 from deepsimbad.api.schemas import BeliefAnswer, NextBestViewAnswer
 from deepsimbad.api.session_bodies import PriorBody, SessionBody
 from deepsimbad.api.session_rendering import render_observation, render_session
@@ -29,7 +34,6 @@ from deepsimbad.api.session_schemas import ObservationAnswer, SessionAnswer
 from deepsimbad.engine.live_session import Observation
 from deepsimbad.engine.stopwatch import Stopwatch
 from deepsimbad.errors import DeepSimbadError
-from deepsimbad.evaluators.image import MEDIA_TYPES
 from deepsimbad.store.session_records import IdempotencyKey
 
 router = APIRouter(prefix="/v1", tags=["sessions"])
@@ -84,8 +88,8 @@ async def post_session(
 @router.post(
     "/sessions/{session_id}/observations",
     response_model=ObservationAnswer,
-    responses=problems(404, 410, 413, 415, 422),
-    openapi_extra=declare({**dict.fromkeys(MEDIA_TYPES, IMAGE_SCHEMA), JSON: OBSERVATION_SCHEMA}),
+    responses=problems(404, 409, 410, 413, 415, 422),
+    openapi_extra=OBSERVATION_BODY,
 )
 async def post_observation(
     session_id: SessionId,
@@ -100,6 +104,7 @@ async def post_observation(
     ] = None,
     shortlist: Shortlist = None,
     idempotency_key: Key = None,
+    if_match: LandmarkModelTag = None,
 ) -> Response:
     """Move the belief on by a move and the view after it.
 
@@ -115,7 +120,14 @@ async def post_observation(
         if idempotency_key is not None:
             told = f"{media_type}\n{action_m!r}\n{action_std_m!r}\n".encode()
             named = IdempotencyKey(idempotency_key, hashlib.sha256(told + body).digest())
-        observation = Observation(lambda: view_in(body, running, media_type), action_m, action_std_m, shortlist, named)
+        observation = Observation(
+            partial(view_in, body, running, media_type),
+            action_m,
+            action_std_m,
+            shortlist,
+            named,
+            insisted_on(if_match),
+        )
         view = await running.sessions.observe(session_id, observation, watch)
     except DeepSimbadError as error:
         running.metrics.observed(error.code)

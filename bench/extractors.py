@@ -1,0 +1,171 @@
+"""Which extractor: the default one, the gradient grid and SqueezeNet on real recordings and the rendered campus.
+
+    python -m bench.extractors
+
+Every row comes of `deepsimbad experiment vpr --evaluator all`, which takes whatever weights lie in its folder:
+SqueezeNet's, where they are beside the real recordings. Writes docs/results/extractors.md.
+"""
+
+import itertools
+import json
+import os
+import sys
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bench import machine
+from bench.nordland import kept_frames, season_folder
+from bench.recordings import RESULTS, real_recordings
+from deepsimbad.cli import run
+from deepsimbad_client.campus.writer import write_campus
+
+N_LANDMARKS, N_CAMPUS_LANDMARKS = 300, 290  # a campus of 300 frames has a few without ground truth
+CAMPUS_SEASONS = ("winter", "summer", "autumn")
+CAMPUS_TOLERANCE_M = 3.5  # two of its frames
+
+
+@dataclass(frozen=True)
+class Split:
+    """One landmark-training-test triplet.
+
+    Attributes:
+        group: Row of the table; splits of one group are averaged.
+        landmarks, training, test: SOURCEs.
+        n_landmarks: r.
+        more: Further options.
+    """
+
+    group: str
+    landmarks: str
+    training: str
+    test: str
+    n_landmarks: int
+    more: tuple[str, ...] = ()
+
+
+def railway(data: Path, work: Path) -> Iterator[Split]:
+    """The railway in two seasons; frames that show nothing in either are left out. Landmarks come from elsewhere."""
+    summer, winter = data / "nordland" / "summer", data / "nordland" / "winter"
+    drives = {}
+    for half, numbers in (("first", range(1000)), ("second", range(1000, 2000))):
+        kept = kept_frames((summer, winter), numbers)
+        for season in (summer, winter):
+            drives[season.name, half] = str(season_folder(work / f"{season.name}-{half}", season, kept, numbers.start))
+    for group, mapped, live, half, other in (
+        ("railway, map summer 0..999, live winter", "summer", "winter", "first", "second"),
+        ("railway, map summer 1000..1999, live winter", "summer", "winter", "second", "first"),
+        ("railway, map winter 0..999, live summer", "winter", "summer", "first", "second"),
+    ):
+        yield Split(
+            group, drives[mapped, other], drives[mapped, half], drives[live, half], N_LANDMARKS, ("--no-same-route",)
+        )
+
+
+def corridor(data: Path) -> Iterator[Split]:
+    """The corridor walked twice: the map is one half of the first walk, the landmarks are the other half."""
+    ref, query, accepted = (
+        data / "corridor" / "ref",
+        data / "corridor" / "query",
+        data / "corridor" / "ground_truth_new.npy",
+    )
+    for mapped, other in (("0:56", "56:111"), ("56:111", "0:56")):
+        n_landmarks = 55 if other == "56:111" else 56
+        more = ("--ground-truth", str(accepted))
+        yield Split("corridor halves", f"{ref}#{other}", f"{ref}#{mapped}", str(query), n_landmarks, more)
+
+
+def campus(work: Path) -> Iterator[Split]:
+    """The client's rendered campus in three seasons, all six triplets; the landmark drive is of the same route."""
+    drives = [f"nclt:{work}/{drive.date}" for drive in write_campus(work, CAMPUS_SEASONS, 300, 0)]
+    for landmarks, training, test in itertools.permutations(drives):
+        more = ("--tolerance", str(CAMPUS_TOLERANCE_M))
+        yield Split("campus, six triplets", landmarks, training, test, N_CAMPUS_LANDMARKS, more)
+
+
+def documents(split: Split, work: Path) -> dict[str, Any]:
+    """The result of every extractor."""
+    into = work / "vpr.json"
+    sources = ("--landmarks", split.landmarks, "--training", split.training, "--test", split.test)
+    relevances = ("--relevance", "calibrated", "--relevance", "rrf", "--relevance", "brute_force")
+    counted = ("--n-landmarks", str(split.n_landmarks), "--json", str(into))
+    if code := run(["experiment", "vpr", *sources, *relevances, *counted, "--evaluator", "all", *split.more]):
+        raise RuntimeError(f"the experiment on {split.group} ended with exit code {code}")
+    return dict(json.loads(into.read_text(encoding="utf-8"))["extractors"])
+
+
+def report(splits: list[Split], work: Path) -> Iterator[str]:
+    """The lines of the page."""
+    grouped: dict[str, list[dict[str, Any]]] = {}
+    for split in splits:
+        grouped.setdefault(split.group, []).append(documents(split, work))
+    extractors = list(next(iter(grouped.values()))[0])
+    yield from (
+        "# Extractors",
+        "",
+        "Made by `DEEPSIMBAD_REAL_DATA=... python -m bench.extractors`, which runs `deepsimbad experiment vpr "
+        "--evaluator all` on every split.",
+        "",
+        f"Machine: {machine.describe()}",
+        "",
+        "ANR in percent of `calibrated` / `rrf` / `brute_force`, and R@1 of `brute_force` in percent behind them. One "
+        f"session over the test drive, h = 4, r = {N_LANDMARKS} or all candidates, tolerance two frames.",
+        "",
+        "| split | " + " | ".join(extractors) + " |",
+        "|---|" + "---|" * len(extractors),
+    )
+    ratios: dict[str, list[float]] = {extractor: [] for extractor in extractors}
+    for group, found in grouped.items():
+        cells = []
+        for extractor in extractors:
+            anr = [_mean(found, extractor, "anr", name) for name in ("calibrated", "rrf", "brute_force")]
+            recall = _mean(found, extractor, "recall_at_1", "brute_force")
+            cells.append(" / ".join(f"{value:.2f}" for value in anr) + f" ({recall:.0f})")
+            ratios[extractor].append(anr[0] / _mean(found, "gradient_grid", "anr", "calibrated"))
+        yield f"| {group} | " + " | ".join(cells) + " |"
+    means = [f"{np.exp(np.mean(np.log(ratios[extractor]))):.2f}" for extractor in extractors]
+    yield "| geometric mean of `calibrated` against the gradient grid | " + " | ".join(means) + " |"
+    yield from ("", "| extractor | numbers | bytes a frame | ms an image, bytes to encoding |", "|---|---|---|---|")
+    for extractor in extractors:
+        one = [document[extractor] for document in grouped["corridor halves"]]
+        took = float(np.median([each["encode_ms"] for each in one]))
+        yield f"| {extractor} | {one[0]['encoding_dim']} | {one[0]['bytes_per_encoding']} | {took:.1f} |"
+    yield from (
+        "",
+        "Times are of the corridor's JPEGs, 160 x 120, on a machine that may have had other work; "
+        "[encode.md](encode.md) has those of larger pictures and of every runtime.",
+        "",
+        "The railway's frames are 64 x 32 pixels and grey, one metre stands for a frame; frames that show nothing "
+        "(grey levels' standard deviation at most 8) in either season are left out. Parameters of the default extractor "
+        "were chosen on these very splits ([0014](../decisions/0014-default-extractor.md)).",
+    )
+
+
+def _mean(found: list[dict[str, Any]], extractor: str, figure: str, name: str) -> float:
+    return float(np.mean([document[extractor][figure][name] for document in found]))
+
+
+def main() -> None:
+    """Measure, print, write docs/results/extractors.md."""
+    data = real_recordings()
+    with tempfile.TemporaryDirectory() as folder:
+        work = Path(folder)
+        weights = work / "weights"
+        weights.mkdir()
+        squeezenet = data.parent / "weights" / "squeezenet1_0" / "squeezenet1_0_caffe.npz"
+        if squeezenet.is_file():
+            (weights / squeezenet.name).symlink_to(squeezenet)
+        os.environ["DEEPSIMBAD_WEIGHTS_DIR"] = str(weights)
+        splits = [*railway(data, work), *corridor(data), *campus(work / "campus")]
+        lines = list(report(splits, work))
+    print("\n".join(lines))
+    (RESULTS / "extractors.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    print(f"written to {RESULTS / 'extractors.md'}", file=sys.stderr)
+
+
+if __name__ == "__main__":
+    main()

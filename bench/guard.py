@@ -1,0 +1,431 @@
+"""How often the guard of the second season takes drives of two places for one route, and one route for two.
+
+    python -m bench.guard [FOLDER]
+
+FOLDER keeps the encodings for the next run; rendering and encoding take most of the time. Half of the places were used
+to choose the numbers of `deepsimbad.core.same_route`, and are reported apart from the half that was not.
+"""
+
+import math
+import sys
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bench import machine
+from bench.recordings import RESULTS, real_recordings
+from deepsimbad.core.descriptor import rank_landmarks
+from deepsimbad.core.landmark_selection import select_landmarks
+from deepsimbad.core.route import Route
+from deepsimbad.core.same_route import LEAST_PLACES, SIGNIFICANCE, judge
+from deepsimbad.core.statistics import LandmarkStatistics
+from deepsimbad.core.true_images import same_places
+from deepsimbad.evaluators.base import Evaluator, Image
+from deepsimbad.evaluators.feature_l2 import FeatureL2
+from deepsimbad.evaluators.image import decode_image
+from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
+from deepsimbad_client.campus.writer import write_campus
+from deepsimbad_client.sources import open_source
+
+EXTRACTORS = ("gradient_grid", "efficientnet_lite0")
+NETVLAD = ("nr", "nq", "nq2")
+SEASONS = ("summer", "winter")
+N_LANDMARKS = 300
+PAIRS = 300  # of every kind
+SHORTEST, LONGEST = 60, 300  # frames of a slice
+OLD_LEAST_CORRELATION = 0.15  # of the rule that this one replaced
+MAX_PIXELS = 50_000_000
+CHOSEN_ON, REPORTED = "chosen on", "reported only"
+CAMPUS_FRAMES = dict.fromkeys(range(8), 160) | dict.fromkeys(range(8, 24), 100)  # by seed
+CAMPUSES = {CHOSEN_ON: (*range(4), *range(8, 16)), REPORTED: (*range(4, 8), *range(16, 24))}
+SLICED_CAMPUSES = {CHOSEN_ON: range(4), REPORTED: range(4, 8)}  # long enough for two slices
+ROWS = {CHOSEN_ON: (0.0, 0.5), REPORTED: (0.5, 1.0)}  # share of a railway drive
+
+
+@dataclass(frozen=True)
+class Drive:
+    """Frames of a recording, as one drive.
+
+    Attributes:
+        frames: [n] their places in all frames of the world.
+        position_m: [n] as the drive's own recorder would say.
+        x_m, y_m: [n] where known.
+    """
+
+    frames: NDArray[np.int64]
+    position_m: NDArray[np.float64]
+    x_m: NDArray[np.float64] | None = None
+    y_m: NDArray[np.float64] | None = None
+
+    def part(self, first: int, stop: int) -> "Drive":
+        """Some of its frames, which keep their positions."""
+        chosen = slice(first, stop)
+        plane = [None if axis is None else axis[chosen] for axis in (self.x_m, self.y_m)]
+        return Drive(self.frames[chosen], self.position_m[chosen], *plane)
+
+    def restarted(self) -> "Drive":
+        """The same frames as a recording that begins with them: positions from 0, and no plane."""
+        return Drive(self.frames, self.position_m - self.position_m[0])
+
+    def moved(self, error_m: NDArray[np.float64]) -> "Drive":
+        """With errors in its positions, of the plane along x; never backwards along the route."""
+        x_m = None if self.x_m is None else self.x_m + error_m
+        return Drive(self.frames, np.maximum.accumulate(self.position_m + error_m), x_m, self.y_m)
+
+    def backwards(self) -> "Drive":
+        """The places in the opposite order."""
+        return Drive(self.frames[::-1], self.position_m[-1] - self.position_m[::-1])
+
+    @property
+    def n_frames(self) -> int:
+        """n."""
+        return int(self.frames.size)
+
+    @property
+    def route(self) -> Route:
+        """Its positions."""
+        return Route(self.position_m, x_m=self.x_m, y_m=self.y_m)
+
+
+class World:
+    """Recordings under one encoder, every frame compared with every other once."""
+
+    def __init__(self, encodings: dict[str, NDArray[np.float32]], plane: dict[str, NDArray[np.float64]]) -> None:
+        self.encodings = np.concatenate(list(encodings.values())).astype(np.float32)
+        everything = FeatureL2("none")
+        self._dissimilarities = everything.dissimilarities(self.encodings, everything.fit_landmarks(self.encodings))
+        self._drives: dict[str, Drive] = {}
+        first = 0
+        for name, rows in encodings.items():
+            frames = np.arange(first, first + len(rows))
+            known = plane.get(name)
+            self._drives[name] = (
+                Drive(frames, np.arange(len(rows), dtype=np.float64)) if known is None else Drive(frames, *known)
+            )
+            first += len(rows)
+
+    def drive(self, name: str) -> Drive:
+        """A whole recording."""
+        return self._drives[name]
+
+    def verdicts(self, mapped: Drive, other: Drive) -> tuple[bool, bool]:
+        """Whether the old and the new rule take both for drives of one route; landmarks are of the other drive."""
+        encodings = self.encodings[other.frames]
+        landmarks = other.frames[select_landmarks(encodings, min(N_LANDMARKS, other.n_frames))]
+        own, second = (self._dissimilarities[np.ix_(drive.frames, landmarks)] for drive in (mapped, other))
+        places = same_places(other.route, mapped.route)
+        return _old_rule(own, second, places), judge(own, second, places, mapped.position_m).accepted
+
+
+def _old_rule(own: NDArray[np.float32], second: NDArray[np.float32], places: NDArray[np.int64]) -> bool:
+    if len(places) < LEAST_PLACES:
+        return False
+    z = []
+    for dissimilarities in (own, second):
+        ranks = rank_landmarks(dissimilarities)
+        z.append(LandmarkStatistics.of_map(ranks).standardise(ranks))
+    return float((z[0][places[:, 0]] * z[1][places[:, 1]]).mean()) >= OLD_LEAST_CORRELATION
+
+
+# --- pairs of drives -----------------------------------------------------------------------------------------------
+
+Draw = Callable[[np.random.Generator], tuple[Drive, Drive]]
+
+
+def railway_pairs(world: World, names: Sequence[str], part: str) -> Iterator[tuple[str, bool, Draw]]:
+    """(kind, whether it is one route, how to draw a pair) of slices of the railway; one frame counts as a metre."""
+    n = world.drive(names[0]).n_frames
+    low, high = (round(share * n) for share in ROWS[part])
+
+    def length(rng: np.random.Generator, most: int) -> int:
+        return int(rng.integers(SHORTEST, min(LONGEST, most) + 1))
+
+    def apart(rng: np.random.Generator, first: str, second: str) -> tuple[Drive, Drive]:
+        n_frames = length(rng, (high - low) // 2)
+        gap = int(rng.integers(n_frames, high - low - n_frames + 1))
+        start = int(rng.integers(low, high - n_frames - gap + 1))
+        starts = (start, start + gap) if rng.integers(2) else (start + gap, start)
+        drives = [
+            world.drive(name).part(at, at + n_frames).restarted()
+            for name, at in zip((first, second), starts, strict=True)
+        ]
+        return drives[0], drives[1]
+
+    def of_two(rng: np.random.Generator) -> tuple[str, str]:
+        first, second = rng.choice(len(names), 2, replace=False)
+        return names[first], names[second]
+
+    def one_season(rng: np.random.Generator) -> tuple[Drive, Drive]:
+        return apart(rng, *(of_two(rng)[0],) * 2)
+
+    def two_seasons(rng: np.random.Generator) -> tuple[Drive, Drive]:
+        return apart(rng, *of_two(rng))
+
+    def same(rng: np.random.Generator) -> tuple[Drive, Drive]:
+        n_frames = length(rng, high - low)
+        start = int(rng.integers(low, high - n_frames + 1))
+        first, second = (world.drive(name).part(start, start + n_frames) for name in of_two(rng))
+        return first, second
+
+    def inexact(rng: np.random.Generator) -> tuple[Drive, Drive]:
+        first, second = same(rng)
+        return first, second.moved(rng.integers(-1, 2, second.n_frames).astype(np.float64))
+
+    def in_part(rng: np.random.Generator) -> tuple[Drive, Drive]:
+        return overlapping(rng, *same(rng))
+
+    def reversed_drive(rng: np.random.Generator) -> tuple[Drive, Drive]:
+        first, second = same(rng)
+        return first.restarted(), second.backwards()
+
+    yield "two places of the railway, one season", False, one_season
+    yield "two places of the railway, two seasons", False, two_seasons
+    yield "one stretch of the railway, driven backwards", False, reversed_drive
+    yield "one stretch of the railway", True, same
+    yield "one stretch of the railway, positions wrong by up to a frame", True, inexact
+    yield "one stretch of the railway, overlap in part", True, in_part
+
+
+def overlapping(rng: np.random.Generator, mapped: Drive, other: Drive) -> tuple[Drive, Drive]:
+    """The other drive reduced to half or more of its frames, 45 at least."""
+    n_frames = int(rng.integers(min(max(45, other.n_frames // 2), other.n_frames), other.n_frames + 1))
+    first = int(rng.integers(0, other.n_frames - n_frames + 1))
+    return mapped, other.part(first, first + n_frames)
+
+
+def corridor_pairs(world: World, part: str) -> Iterator[tuple[str, bool, Draw]]:
+    """The corridor beside the railway."""
+    low, high = (round(share * world.drive("nordland_summer").n_frames) for share in ROWS[part])
+
+    def elsewhere(rng: np.random.Generator) -> tuple[Drive, Drive]:
+        corridor = world.drive(("corridor_ref", "corridor_query")[rng.integers(2)])
+        n_frames = int(rng.integers(SHORTEST, corridor.n_frames + 1))
+        first = int(rng.integers(0, corridor.n_frames - n_frames + 1))
+        start = int(rng.integers(low, high - n_frames + 1))
+        railway = world.drive(f"nordland_{SEASONS[rng.integers(2)]}").part(start, start + n_frames)
+        drives = corridor.part(first, first + n_frames).restarted(), railway.restarted()
+        return drives if rng.integers(2) else drives[::-1]
+
+    yield "corridor and railway", False, elsewhere
+
+
+def campus_pairs(world: World, part: str) -> Iterator[tuple[str, bool, Draw]]:
+    """Rendered campuses; one seed and season is one drive."""
+    seeds, sliced = CAMPUSES[part], SLICED_CAMPUSES[part]
+
+    def drive(rng: np.random.Generator, seed: int, season: int | None = None) -> Drive:
+        chosen = int(rng.integers(2)) if season is None else season
+        return world.drive(f"campus{seed}_{SEASONS[chosen]}")
+
+    def two_campuses(rng: np.random.Generator) -> tuple[Drive, Drive]:
+        first, second = (drive(rng, int(seed)) for seed in rng.choice(seeds, 2, replace=False))
+        n_frames = int(rng.integers(SHORTEST, min(first.n_frames, second.n_frames) + 1))
+        return first.part(0, n_frames).restarted(), second.part(0, n_frames).restarted()
+
+    def two_slices(rng: np.random.Generator) -> tuple[Drive, Drive]:
+        seed = int(rng.choice(sliced))
+        first, second = drive(rng, seed), drive(rng, seed)
+        n_frames = int(rng.integers(SHORTEST, min(first.n_frames, second.n_frames) // 2 + 1))
+        start = int(rng.integers(0, min(first.n_frames, second.n_frames) - 2 * n_frames + 1))
+        gap = int(rng.integers(n_frames, min(first.n_frames, second.n_frames) - start - n_frames + 1))
+        drives = first.part(start, start + n_frames), second.part(start + gap, start + gap + n_frames)
+        ordered = drives if rng.integers(2) else drives[::-1]
+        return ordered[0].restarted(), ordered[1].restarted()
+
+    def same(rng: np.random.Generator) -> tuple[Drive, Drive]:
+        seed, season = int(rng.choice(seeds)), int(rng.integers(2))
+        first, second = drive(rng, seed, season), drive(rng, seed, 1 - season)
+        n_frames = int(rng.integers(SHORTEST, first.n_frames + 1))
+        start = int(rng.integers(0, first.n_frames - n_frames + 1))
+        return first.part(start, start + n_frames), second
+
+    def inexact(rng: np.random.Generator) -> tuple[Drive, Drive]:
+        first, second = same(rng)
+        return first, second.moved(rng.normal(0, 1.5, second.n_frames))
+
+    def adrift(rng: np.random.Generator) -> tuple[Drive, Drive]:
+        first, second = same(rng)
+        walk = np.cumsum(rng.normal(0, 0.3, second.n_frames))
+        return first, second.moved(np.clip(walk - walk.mean(), -3, 3))
+
+    def in_part(rng: np.random.Generator) -> tuple[Drive, Drive]:
+        mapped, other = same(rng)
+        first, stop = np.searchsorted(other.position_m, mapped.position_m[[0, -1]])
+        return overlapping(rng, mapped, other.part(int(first), int(stop)))
+
+    yield "two rendered campuses", False, two_campuses
+    yield "two places of one rendered campus", False, two_slices
+    yield "one stretch of a rendered campus", True, same
+    yield "one stretch of a rendered campus, positions wrong by 1.5 m", True, inexact
+    yield "one stretch of a rendered campus, positions adrift by up to 3 m", True, adrift
+    yield "one stretch of a rendered campus, overlap in part", True, in_part
+
+
+# --- what is compared ----------------------------------------------------------------------------------------------
+
+
+def netvlad_world(data: Path) -> World:
+    """The railway in three seasons as ready NetVLAD encodings."""
+    return World({name: np.load(data / "nordland_netvlad64" / f"{name}.npy") for name in NETVLAD}, {})
+
+
+def image_world(folder: Path, extractor: str) -> World:
+    """All images under one extractor, from a folder that `encode` filled."""
+    kept = {path.name.split(".")[0]: np.load(path) for path in sorted(folder.glob(f"*.{extractor}.npz"))}
+    plane = {name: np.stack([each["p"], each["x"], each["y"]]) for name, each in kept.items() if "p" in each.files}
+    return World({name: each["e"] for name, each in kept.items()}, plane)
+
+
+def encode(folder: Path, data: Path) -> None:
+    """Encode every recording that the folder lacks."""
+    evaluators = {
+        name: make_evaluator(evaluator_config({"kind": "feature_l2", "extractor": name})) for name in EXTRACTORS
+    }
+    for season in SEASONS:
+        _encode_folder(folder, f"nordland_{season}", data / "nordland" / season, evaluators)
+    for walk in ("ref", "query"):
+        _encode_folder(folder, f"corridor_{walk}", data / "corridor" / walk, evaluators)
+    for seed, n_frames in CAMPUS_FRAMES.items():
+        names = [f"campus{seed}_{season}" for season in SEASONS]
+        if all((folder / f"{name}.{extractor}.npz").exists() for name in names for extractor in EXTRACTORS):
+            continue
+        with tempfile.TemporaryDirectory() as root:
+            for name, written in zip(names, write_campus(Path(root), SEASONS, n_frames, seed), strict=True):
+                recording = open_source(f"nclt:{root}/{written.date}")
+                images = [
+                    decode_image(recording.image(frame, (224, 224)).body, MAX_PIXELS) for frame in recording.frames
+                ]
+                places = [(frame.position_m, frame.x_m, frame.y_m) for frame in recording.frames]
+                _encode(folder, name, images, evaluators, np.array(places, np.float64).T)
+
+
+def _encode_folder(folder: Path, name: str, pictures: Path, evaluators: dict[str, Evaluator]) -> None:
+    if not all((folder / f"{name}.{extractor}.npz").exists() for extractor in evaluators):
+        paths = sorted(path for path in pictures.iterdir() if path.suffix in {".png", ".jpg"})
+        _encode(folder, name, [decode_image(path.read_bytes(), MAX_PIXELS) for path in paths], evaluators)
+
+
+def _encode(
+    folder: Path,
+    name: str,
+    images: list[Image],
+    evaluators: dict[str, Evaluator],
+    plane: NDArray[np.float64] | None = None,
+) -> None:
+    for extractor, evaluator in evaluators.items():
+        rows = np.concatenate([evaluator.encode(images[first : first + 64]) for first in range(0, len(images), 64)])
+        known = {} if plane is None else dict(zip("pxy", plane, strict=True))
+        np.savez(folder / f"{name}.{extractor}.npz", e=rows, **known)
+
+
+# --- the report ----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Row:
+    """Pairs of one kind: how many, and how many either rule took for one route."""
+
+    kind: str
+    encoder: str
+    is_one_route: bool
+    part: str
+    n_pairs: int
+    n_old: int
+    n_new: int
+
+
+def measure(world: World, encoder: str, part: str) -> Iterator[Row]:
+    """Every kind's row."""
+    kinds = (
+        list(railway_pairs(world, NETVLAD, part))
+        if encoder == "netvlad"
+        else [
+            *railway_pairs(world, [f"nordland_{season}" for season in SEASONS], part),
+            *corridor_pairs(world, part),
+            *campus_pairs(world, part),
+        ]
+    )
+    for number, (kind, is_one_route, draw) in enumerate(kinds):
+        rng = np.random.default_rng([number, list(ROWS).index(part)])
+        verdicts = np.array([world.verdicts(*draw(rng)) for _ in range(PAIRS)])
+        row = Row(kind, encoder, is_one_route, part, PAIRS, *verdicts.sum(axis=0).tolist())
+        print(row, file=sys.stderr)
+        yield row
+
+
+def interval(n_found: int, n: int) -> tuple[float, float]:
+    """Wilson's 95 % interval of a share."""
+    z, share = 1.96, n_found / n
+    centre = (share + z * z / (2 * n)) / (1 + z * z / n)
+    reach = z / (1 + z * z / n) * math.sqrt(share * (1 - share) / n + z * z / (4 * n * n))
+    return max(0.0, centre - reach), min(1.0, centre + reach)
+
+
+def shown(n_found: int, n: int) -> str:
+    """A share and its interval, in percent."""
+    low, high = interval(n_found, n)
+    return f"{100 * n_found / n:.1f} ({100 * low:.1f} .. {100 * high:.1f})"
+
+
+def table(rows: Sequence[Row]) -> list[str]:
+    """Markdown lines, with all kinds together last."""
+    lines = ["| pairs | encoder | n | old rule accepts, % | accepts, % |", "|---|---|---|---|---|"]
+    for row in rows:
+        old, new = shown(row.n_old, row.n_pairs), shown(row.n_new, row.n_pairs)
+        lines.append(f"| {row.kind} | {row.encoder} | {row.n_pairs} | {old} | {new} |")
+    n, old, new = (sum(each) for each in zip(*((row.n_pairs, row.n_old, row.n_new) for row in rows), strict=True))
+    return [*lines, f"| **all** | | {n} | {shown(old, n)} | **{shown(new, n)}** |"]
+
+
+def report(rows: Sequence[Row]) -> list[str]:
+    """The whole document."""
+    lines = [
+        "# The guard of the second season",
+        "",
+        "Made by `python -m bench.guard`. A map learns from a second drive only where both saw one route "
+        "([0015](../decisions/0015-same-route.md)). Here the positions of every pair are said to be comparable, so the "
+        f"test alone decides; it asks for a significance of {SIGNIFICANCE:g}. The old rule: a mean correlation of "
+        f"at least {OLD_LEAST_CORRELATION:g}.",
+        "",
+        f"Slices of {SHORTEST} to {LONGEST} frames (of {len(CAMPUS_FRAMES)} campuses up to 155), r at most "
+        f"{N_LANDMARKS}, {PAIRS} pairs of every kind. The 95 % intervals take pairs as independent; slices overlap, so "
+        "the true ones are wider. Positions of the railway count a metre a frame, which is some 20 m of it.",
+        "",
+        f"Machine: {machine.describe()}",
+    ]
+    heads = {
+        REPORTED: "## Places that nothing was chosen on",
+        CHOSEN_ON: "## Places that the numbers of the test were chosen on",
+    }
+    for part, head in heads.items():
+        for is_one_route, title in ((False, "Drives of two places"), (True, "Drives of one route, in two seasons")):
+            chosen = [row for row in rows if row.part == part and row.is_one_route is is_one_route]
+            lines += ["", *([head, ""] if not is_one_route else []), f"{title}:", "", *table(chosen)]
+    return lines
+
+
+def main() -> None:
+    """Measure, print, write `docs/results/guard.md`."""
+    data = real_recordings()
+    rows: list[Row] = []
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(scratch)
+        folder.mkdir(parents=True, exist_ok=True)
+        encode(folder, data)
+        for encoder in ("netvlad", *EXTRACTORS):
+            world = netvlad_world(data) if encoder == "netvlad" else image_world(folder, encoder)
+            for part in ROWS:
+                rows += measure(world, encoder, part)
+    lines = report(rows)
+    print("\n".join(lines))
+    RESULTS.mkdir(parents=True, exist_ok=True)
+    (RESULTS / "guard.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    print(f"\nwritten to {RESULTS / 'guard.md'}", file=sys.stderr)
+
+
+if __name__ == "__main__":
+    main()

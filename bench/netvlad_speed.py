@@ -1,0 +1,181 @@
+"""How fast NetVLAD is here, beside its bare layers: the whole network, 640 x 480, in float32 and bfloat16.
+
+    python -m bench.netvlad_speed
+
+The weights are made up, of the published shapes: no value changes how long a product takes. *Bare* is the same network
+of PyTorch's own modules in their best memory layout (`nn.Conv2d`, `nn.ReLU`, `nn.MaxPool2d`, `nn.Linear`), called
+directly on an image that is already normalised; *ours* is what an extractor calls, from uint8 pixels to encodings.
+"""
+
+import itertools
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from bench import machine
+from bench.recordings import RESULTS
+from bench.timing import Timing, interleaved
+from deepsimbad.evaluators.compute import Compute, Device, Runtime
+from deepsimbad.evaluators.nets.netvlad import NetVlad
+from deepsimbad.evaluators.nets.vgg16 import STAGES
+from deepsimbad.evaluators.runtimes import make_run
+
+CHANNELS = (64, 64, 128, 128, 256, 256, 256, 512, 512, 512, 512, 512, 512)
+N_CLUSTERS, N_WHITENED = 64, 4096
+WIDTH, HEIGHT = 640, 480
+RUNTIMES = {Runtime.TORCH: torch.float32, Runtime.TORCH_BF16: torch.bfloat16}
+REPEATS = {"cpu": 15, "cuda": 30}
+LARGE_BATCH = 32  # on CUDA
+
+
+def made_up() -> NetVlad:
+    """A network of the published shapes."""
+    torch.manual_seed(0)
+    network = NetVlad(CHANNELS, N_CLUSTERS, N_WHITENED, cluster_major=True)
+    with torch.no_grad():
+        network.get_buffer("mean").fill_(120.0)
+        network.get_buffer("deviation").fill_(60.0)
+        for parameter in (network.assignment, network.centres):
+            nn.init.normal_(parameter, std=0.05)
+    return network
+
+
+class Bare(nn.Module):
+    """The same layers and numbers, of PyTorch's own modules."""
+
+    def __init__(self, network: NetVlad) -> None:
+        super().__init__()
+        layers: list[nn.Module] = []
+        convolutions = iter(network.trunk.convolutions)
+        for n_convolutions in STAGES:
+            for convolution in itertools.islice(convolutions, n_convolutions):
+                assert isinstance(convolution, nn.Conv2d)
+                plain = nn.Conv2d(convolution.in_channels, convolution.out_channels, 3, padding=1)
+                plain.load_state_dict(convolution.state_dict())
+                layers += [plain, nn.ReLU(inplace=True)]
+            layers.append(nn.MaxPool2d(2))
+        self.trunk = nn.Sequential(*layers[:-2])  # as NetVLAD cuts it
+        self.assignment, self.centres, self.whitening = network.assignment, network.centres, network.whitening
+
+    def forward(self, images: Tensor) -> Tensor:
+        """Normalised [n, 3, height, width] to [n, d]."""
+        features = self.trunk(images).permute(0, 2, 3, 1).flatten(1, 2).float()
+        features = functional.normalize(features, dim=2)
+        shares = torch.softmax(functional.linear(features, self.assignment), dim=2).transpose(1, 2)
+        residuals = torch.matmul(shares, features) - shares.sum(2, keepdim=True) * self.centres
+        encodings = functional.normalize(functional.normalize(residuals, dim=2).flatten(1), dim=1)
+        assert self.whitening is not None
+        return functional.normalize(self.whitening(encodings), dim=1)
+
+
+@dataclass(frozen=True)
+class Row:
+    """Seconds a call of a batch."""
+
+    runtime: Runtime
+    batch: int
+    ours: Timing
+    bare: Timing
+
+    @property
+    def share(self) -> float:
+        """Our throughput beside the bare network's, paired call by call: a neighbour's load hits both."""
+        pairs = zip(self.bare.seconds, self.ours.seconds, strict=True)
+        return float(np.median([bare / ours for bare, ours in pairs]))
+
+
+def measure(device: Device, batch: int, repeats: int) -> Iterator[Row]:
+    """Ours and bare in both number formats, all four in turn."""
+    calls: list[Callable[[], object]] = []
+    for runtime in RUNTIMES:
+        calls += [ours(runtime, device, batch), bare(runtime, device, batch)]
+    timings = interleaved(calls, repeats, warm_up=2)
+    for runtime, first in zip(RUNTIMES, range(0, len(timings), 2), strict=True):
+        yield Row(runtime, batch, timings[first], timings[first + 1])
+
+
+def ours(runtime: Runtime, device: Device, batch: int) -> Callable[[], object]:
+    run = make_run(made_up, Compute(runtime, device, largest_batch=batch), (WIDTH, HEIGHT))
+    pixels = np.random.default_rng(0).integers(0, 256, (batch, HEIGHT, WIDTH, 3), dtype=np.uint8)
+    return lambda: run(pixels)
+
+
+def bare(runtime: Runtime, device: Device, batch: int) -> Callable[[], object]:
+    network = Bare(made_up()).eval().requires_grad_(False)
+    dtype = RUNTIMES[runtime]
+    network.trunk.to(dtype)
+    network.to(device.value).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    images = torch.randn(batch, 3, HEIGHT, WIDTH, device=device.value).to(dtype)
+    images = images.contiguous(memory_format=torch.channels_last)
+
+    def call() -> object:
+        with torch.inference_mode():
+            encodings = network(images)
+            return encodings.cpu()  # waits for CUDA, as ours does
+
+    return call
+
+
+def table(rows: list[Row]) -> list[str]:
+    """Markdown lines."""
+    lines = [
+        "| network in | batch | ours, a call | bare layers, a call | ours, images/s | ours of bare's throughput |",
+        "|---|---|---|---|---|---|",
+    ]
+    for row in rows:
+        name = {Runtime.TORCH: "float32", Runtime.TORCH_BF16: "bfloat16"}[row.runtime]
+        lines.append(
+            f"| {name} | {row.batch} | {row.ours} | {row.bare} | {row.batch / row.ours.median_s:.3g} | "
+            f"**{row.share:.0%}** |"
+        )
+    return lines
+
+
+def gains(rows: list[Row]) -> list[str]:
+    """What bfloat16 brings, batch by batch, of calls paired in turn."""
+    lines = []
+    for single, half in zip(rows[::2], rows[1::2], strict=True):
+        figures = {
+            "ours against ours": (single.ours, half.ours),
+            "bare against bare": (single.bare, half.bare),
+            "ours against bare layers in float32": (single.bare, half.ours),
+        }
+        told = "; ".join(
+            f"{name} **{np.median([a / b for a, b in zip(slow.seconds, fast.seconds, strict=True)]):.2f}** times"
+            for name, (slow, fast) in figures.items()
+        )
+        lines.append(f"bfloat16 beside float32, batch {single.batch}: {told}.")
+    return lines
+
+
+def main() -> None:
+    """Measure, print, write `docs/results/netvlad-speed.md`."""
+    lines = [
+        "# Speed of NetVLAD",
+        "",
+        f"The whole network at {WIDTH} x {HEIGHT}: VGG16, {N_CLUSTERS} clusters, whitening to {N_WHITENED:,} numbers. "
+        "Made by `python -m bench.netvlad_speed`, which explains what is compared; medians, and in brackets the range, "
+        "of calls taken in turn. Ratios are medians over turns and hold on a shared machine; times are what it had to "
+        "spare.",
+        "",
+        f"Machine: {machine.describe()}, torch {torch.__version__}",
+        "",
+    ]
+    on_cpu = list(measure(Device.CPU, 1, REPEATS["cpu"]))
+    lines += [f"## Processor, {torch.get_num_threads()} threads", "", *table(on_cpu), "", *gains(on_cpu), ""]
+    if torch.cuda.is_available():
+        on_cuda = [row for n in (1, LARGE_BATCH) for row in measure(Device.CUDA, n, REPEATS["cuda"])]
+        lines += [f"## {torch.cuda.get_device_name()}", "", *table(on_cuda), "", *gains(on_cuda), ""]
+    print("\n".join(lines))
+    RESULTS.mkdir(parents=True, exist_ok=True)
+    (RESULTS / "netvlad-speed.md").write_text("\n".join(lines), encoding="utf-8")
+    print(f"written to {RESULTS / 'netvlad-speed.md'}", file=sys.stderr)
+
+
+if __name__ == "__main__":
+    main()

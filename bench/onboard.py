@@ -1,0 +1,206 @@
+"""What an observation of a few bytes costs: ANR of the m nearest landmarks against that of all ranks.
+
+    python -m bench.onboard
+
+A robot that encodes on board sends m landmark ids. Landmarks that it does not send are judged by what is usual for
+them and by how they go together (`deepsimbad.core.statistics`); the table shows beside it what came of giving each the
+mean of the ranks left.
+"""
+
+import itertools
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from bench import machine
+from bench.nordland import LANDMARK_FRAMES, MAP_FRAMES, kept_frames
+from bench.recordings import RESULTS, real_recordings
+from deepsimbad.core.descriptor import normal_scores, pack_ranked_landmarks, rank_landmarks, ranks_from_ranked_landmarks
+from deepsimbad.core.landmark_selection import select_landmarks
+from deepsimbad.core.metrics import RetrievalScorer
+from deepsimbad.core.relevance import Query, Relevance, RetrievalMap, relevances
+from deepsimbad.core.retrieval import SecondSeason, build_retrieval_map
+from deepsimbad.core.statistics import LandmarkStatistics
+from deepsimbad.evaluators.base import Evaluator
+from deepsimbad.evaluators.feature_l2 import FeatureL2
+from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
+
+N_LANDMARKS, N_SENT = (300, 500), (8, 16, 32, 48, 55, 64)
+LIST_LENGTH, TOLERANCE, BUDGET_BYTES = 4, 2, 64
+_DRIVES = ("nr", "nq", "nq2")
+_IMAGES_A_BLOCK = 16
+
+
+@dataclass(frozen=True)
+class Drives:
+    """A landmark, a training and a test drive, encoded.
+
+    Attributes:
+        landmarks, training, test: [n, d] float32 each.
+        position: [n] of the training and of the test frames, one a place.
+        is_of_two_seasons: Whether the landmark drive shares the places of the training drive, row by row.
+    """
+
+    landmarks: NDArray[np.float32]
+    training: NDArray[np.float32]
+    test: NDArray[np.float32]
+    position: NDArray[np.int64]
+    is_of_two_seasons: bool
+
+    def views(self, relevance: Relevance, n_landmarks: int) -> tuple[RetrievalMap, NDArray[np.float32]]:
+        """The map, and the ranks of the test frames, [n, r]."""
+        evaluator = FeatureL2("none")
+        model = evaluator.fit_landmarks(self.landmarks[select_landmarks(self.landmarks, n_landmarks)])
+        seen, other, live = (
+            evaluator.dissimilarities(each, model) for each in (self.training, self.landmarks, self.test)
+        )
+        rows = np.arange(len(self.training))
+        second = SecondSeason(other, np.stack([rows, rows], axis=1)) if self.is_of_two_seasons else None
+        return build_retrieval_map(relevance, seen, LIST_LENGTH, second_season=second), rank_landmarks(live)
+
+
+def anr(drives: Drives, built: RetrievalMap, ranks: NDArray[np.float32], m: int, how: str) -> tuple[float, float]:
+    """ANR in percent over the test drive, and milliseconds a view.
+
+    Args:
+        drives: Where the test frames were taken.
+        built: The map.
+        ranks: [n, r] of the test frames.
+        m: How many landmarks a view sends.
+        how: `session`: with the live statistics of a drive in order; `alone`: every view by the map's; `mean rank`: a
+            session in which landmarks that were not sent take the mean of the ranks left for what they are.
+    """
+    scorer, spent_s = RetrievalScorer(), 0.0
+    live = built.statistics
+    for frame, all_ranks in enumerate(ranks):
+        query = Query(ranks_from_ranked_landmarks(np.argsort(all_ranks)[:m].tolist(), ranks.shape[1]))
+        began = time.perf_counter()
+        if live is not None and how == "mean rank":
+            live, relevance = _by_mean_rank(built, live, query.ranks)
+        else:
+            live = live.observing(query.ranks) if live is not None and how == "session" else live
+            relevance = relevances(built, query, live)
+        spent_s += time.perf_counter() - began
+        scorer.add(relevance, np.flatnonzero(np.abs(drives.position - drives.position[frame]) <= TOLERANCE))
+    return scorer.result().anr, 1000 * spent_s / len(ranks)
+
+
+def _by_mean_rank(
+    built: RetrievalMap, live: LandmarkStatistics, ranks: NDArray[np.float32]
+) -> tuple[LandmarkStatistics, NDArray[np.float32]]:
+    """The statistics after a view, and its relevances, with the shared mean rank read as if it had been measured."""
+    if built.calibration is None:
+        raise ValueError("the map is not a calibrated one")
+    scores, weight = normal_scores(ranks, ranks.size), live.weight + 1
+    mean = live.mean + (scores - live.mean) / weight
+    live = replace(live, weight=weight, mean=mean, square=live.square + (np.square(scores) - live.square) / weight)
+    return live, built.index.sum_listed(built.calibration.log_ratios(live.standardise(ranks)))
+
+
+def netvlad(folder: Path) -> list[Drives]:
+    """The six landmark-training-test permutations of three drives."""
+    encodings = {name: np.load(folder / f"{name}.npy").astype(np.float32) for name in _DRIVES}
+    return [
+        Drives(encodings[landmarks], encodings[training], encodings[test], np.arange(len(encodings[test])), True)
+        for landmarks, training, test in itertools.permutations(_DRIVES)
+    ]
+
+
+def nordland(folder: Path) -> list[Drives]:
+    """Landmarks from summer frames 1000..1999, the map from summer 0..999, live images from winter 0..999."""
+    summer, winter = folder / "summer", folder / "winter"
+    kept, candidates = kept_frames((summer, winter), MAP_FRAMES), kept_frames((summer,), LANDMARK_FRAMES)
+    evaluator = make_evaluator(evaluator_config({"kind": "feature_l2", "extractor": "efficientnet_lite0"}))
+    landmarks, training, test = (
+        _encoded(evaluator, season, numbers)
+        for season, numbers in ((summer, candidates), (summer, kept), (winter, kept))
+    )
+    return [Drives(landmarks, training, test, np.array(kept), False)]
+
+
+def _encoded(evaluator: Evaluator, season: Path, numbers: Sequence[int]) -> NDArray[np.float32]:
+    images = [np.asarray(cv2.imread(str(season / f"{number:05}.png")), np.uint8) for number in numbers]
+    blocks = (images[first : first + _IMAGES_A_BLOCK] for first in range(0, len(images), _IMAGES_A_BLOCK))
+    return np.concatenate([evaluator.encode(block) for block in blocks])
+
+
+def rows(triplets: Sequence[Drives], n_landmarks: int) -> Iterator[str]:
+    """A Markdown line for every m, each figure the mean over the triplets."""
+    calibrated = [(drives, *drives.views(Relevance.CALIBRATED, n_landmarks)) for drives in triplets]
+    rrf = [(drives, *drives.views(Relevance.RRF, n_landmarks)) for drives in triplets]
+    columns = ((calibrated, "mean rank"), (calibrated, "session"), (calibrated, "alone"), (rrf, "session"))
+    found = {}
+    for m in (n_landmarks, *N_SENT):
+        measured = [[anr(*each, m, how) for each in maps] for maps, how in columns]
+        found[m] = [np.mean([figure for figure, _ in one]) for one in measured]
+        n_bytes = len(pack_ranked_landmarks(range(m), n_landmarks))
+        ms = np.mean([ms for _, ms in measured[1]])
+        within = " **(64 bytes)**" if n_bytes == BUDGET_BYTES else ""
+        costs = " | ".join(
+            f"{value:.2f}" + ("" if m == n_landmarks else f" ({100 * (value / whole - 1):+.0f} %)")
+            for value, whole in zip(found[m], found[n_landmarks], strict=True)
+        )
+        yield f"| {n_landmarks} | {'all' if m == n_landmarks else m}{within} | {n_bytes} | {costs} | {ms:.1f} |"
+
+
+def table(triplets: Sequence[Drives]) -> list[str]:
+    """Markdown lines for every r and m."""
+    lines = [
+        "| r | m | bytes | calibrated, by mean rank | **calibrated** | calibrated, views alone | rrf | ms a view |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for n_landmarks in N_LANDMARKS:
+        for line in rows(triplets, n_landmarks):
+            print(line, flush=True)
+            lines.append(line)
+    return lines
+
+
+def main() -> None:
+    """Measure, print, write `docs/results/onboard.md`."""
+    recordings = real_recordings()
+    lines = [
+        "# Encoding on board: what an observation of a few bytes costs",
+        "",
+        "A robot that encodes on board sends its m nearest landmarks as `application/vnd.deepsimbad.ranks`: two bytes "
+        "and ceil(log2 r) bits a landmark. ANR in percent (0 is perfect, 50 chance) and, in brackets, how much worse "
+        f"that is than sending all ranks. h = {LIST_LENGTH}, tolerance {TOLERANCE} frames; one session over the test "
+        "drive in order, but for `views alone` (each by the map's statistics, as single localizations are answered).",
+        "",
+        "`calibrated` is the default: of a landmark that was not sent the score is the expected one, given the "
+        "landmarks that were, how landmarks went together over the map's drive, and that it is farther than the last "
+        "that was sent; its evidence counts by how much of it is known. `by mean rank` gives it the mean of the ranks "
+        "left instead, as if that had been measured. `rrf` has no statistics and takes that mean. Times are those of "
+        "`calibrated` in a session, statistics and relevance, on a machine shared with other work.",
+        "",
+        "Made by `python -m bench.onboard`.",
+        "",
+        f"Machine: {machine.describe()}",
+        "",
+        "## NetVLAD encodings of Nordland",
+        "",
+        "Mean over the six landmark-training-test permutations of three drives, 600 places, 64 numbers each.",
+        "",
+        *table(netvlad(recordings / "nordland_netvlad64")),
+        "",
+        "## Images of Nordland, winter on a summer map",
+        "",
+        "Extractor efficientnet_lite0; landmarks come from another part of the route (summer 1000..1999), so no second "
+        "season is known. Frames that show nothing are left out, as in [nordland-http.md](nordland-http.md).",
+        "",
+        *table(nordland(recordings / "nordland")),
+    ]
+    print("\n".join(lines))
+    RESULTS.mkdir(parents=True, exist_ok=True)
+    (RESULTS / "onboard.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    print(f"\nwritten to {RESULTS / 'onboard.md'}", file=sys.stderr)
+
+
+if __name__ == "__main__":
+    main()

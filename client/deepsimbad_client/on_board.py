@@ -1,0 +1,198 @@
+"""Encoding on board: a robot ranks a map's landmarks itself and sends a few bytes instead of an image.
+
+The landmarks are fetched once, or read from a file that was kept. Images are decoded, encoded and compared by the very
+code that the service runs, so a view has the same ranks here as there. Needs `pip install 'deep-simbad[edge]'`, and
+says so where that is missing.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import cached_property
+from os import PathLike
+from pathlib import Path
+
+from deepsimbad_client.errors import (
+    BrokenFrameError,
+    InvalidArgumentError,
+    InvalidLandmarkModelError,
+    MissingExtraError,
+    NotSavedError,
+    OtherWeightsError,
+    SourceError,
+)
+from deepsimbad_client.observation import Image, Numbers, Observation, image_bytes, observation
+
+INSTALL = "pip install 'deep-simbad[edge]'"
+
+try:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from deepsimbad.core.descriptor import pack_ranked_landmarks, rank_landmarks, ranked_landmarks_within
+    from deepsimbad.core.landmark_model import PortableLandmarks, landmark_model_digest, unpack_landmarks
+    from deepsimbad.errors import DeepSimbadError, InvalidImageError, InvalidInputError, MissingPackageError
+    from deepsimbad.evaluators.base import Evaluator
+    from deepsimbad.evaluators.compute import Compute
+    from deepsimbad.evaluators.image import decode_image, is_blank
+    from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
+except ImportError as missing:
+    raise MissingExtraError(f"encoding on board needs further packages: {INSTALL}") from missing
+
+MEDIA_TYPE = "application/vnd.deepsimbad.ranks"
+DEFAULT_BODY_BYTES = 64
+"""What an observation takes unless told otherwise; what that costs in accuracy: docs/results/onboard.md."""
+_MAX_PIXELS = 1 << 30  # the picture is the robot's own
+
+
+class OnBoardEncoder:
+    """Makes observations of a few bytes out of images, by a map's own landmarks.
+
+    Given by `Client.on_board`, or loaded from a file that `save` wrote, without a network. It is made in milliseconds;
+    the extractor is loaded with the first image, or by `load_extractor`. Usable from several threads.
+
+    Args:
+        content: The landmark model, as the service sends it.
+        compute: On what a network runs; absent: the fastest that is installed, on a GPU if there is one.
+
+    Attributes:
+        landmarks: The landmark model, the map's version and the evaluator's configuration.
+        digest: SHA-256 that names the landmarks; sent with every observation, so that no other map answers it.
+
+    Raises:
+        InvalidLandmarkModelError: It is none, or of an evaluator that this version does not know.
+    """
+
+    def __init__(self, content: bytes, compute: Compute | None = None) -> None:
+        self._content = content
+        with _named_errors("this landmark model cannot be used here"):
+            self.landmarks: PortableLandmarks = unpack_landmarks(content)
+            self._evaluator = make_evaluator(evaluator_config(self.landmarks.evaluator), compute)
+            self._evaluator.check_model(self.landmarks.model, self.landmarks.n_landmarks)
+        self.digest = landmark_model_digest(self.landmarks.model)
+
+    @classmethod
+    def load(cls, path: str | PathLike[str], compute: Compute | None = None) -> "OnBoardEncoder":
+        """From a file that `save` wrote.
+
+        Raises:
+            SourceError: It cannot be read.
+            InvalidLandmarkModelError: It is no landmark model.
+        """
+        try:
+            content = Path(path).read_bytes()
+        except OSError as error:
+            raise SourceError(f"cannot read {path}: {error.strerror or error}") from error
+        return cls(content, compute)
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Keep the landmarks in a file (a numpy npz) for `load`; raises NotSavedError."""
+        try:
+            Path(path).write_bytes(self._content)
+        except OSError as error:
+            raise NotSavedError(f"{path} cannot be written: {error.strerror or error}") from error
+
+    @property
+    def map_version(self) -> int:
+        """The map that the landmarks come from."""
+        return self.landmarks.map_version
+
+    @property
+    def n_landmarks(self) -> int:
+        """r."""
+        return self.landmarks.n_landmarks
+
+    def load_extractor(self) -> None:
+        """Load what encodes images now, and not with the first one.
+
+        Raises:
+            MissingExtraError: A package is missing; the message says how to install it.
+            OtherWeightsError: The weights here are not those that the map's images were encoded by.
+            InvalidLandmarkModelError: The extractor cannot be loaded.
+        """
+        _ = self._loaded
+
+    @cached_property
+    def _loaded(self) -> Evaluator:
+        """The evaluator with its extractor, whose weights are the map's."""
+        with _named_errors("the map's extractor cannot be loaded here"):
+            self._evaluator.load()
+            here, there = self._evaluator.weights_sha256 or "", self.landmarks.weights_sha256
+        if there and here != there:
+            raise OtherWeightsError(
+                f"the weights here (sha256 {here or 'none'}) are not those that the images of map {self.map_version} "
+                f"were encoded by (sha256 {there}): install the service's release of them"
+            )
+        return self._evaluator
+
+    def ranks(
+        self, image: "Image | NDArray[np.uint8] | None" = None, *, encoding: Numbers | None = None, m: int | None = None
+    ) -> Observation:
+        """What `Client.localize` and `Session.observe` take as `ranked`; give exactly one form of the view.
+
+        A picture that shows nothing (the dark, a wall) has no nearest landmarks: it travels as JSON that says so.
+
+        Args:
+            image: An encoded image (JPEG, PNG, TIFF, WebP), its path, or [height, width, 3] uint8 BGR.
+            encoding: A ready encoding, where the domain takes them.
+            m: How many landmarks to send, 1..r; absent: what 64 bytes hold. r sends all that the service would see.
+
+        Raises:
+            InvalidArgumentError: None or both given, or an `m`, image or encoding that cannot be.
+            BrokenFrameError: The image cannot be read or decoded.
+            MissingExtraError, OtherWeightsError, InvalidLandmarkModelError: As `load_extractor`.
+        """
+        n_sent = ranked_landmarks_within(DEFAULT_BODY_BYTES, self.n_landmarks) if m is None else m
+        if not 1 <= n_sent <= self.n_landmarks:
+            raise InvalidArgumentError(f"m is {n_sent}: send 1 to {self.n_landmarks} landmarks")
+        if (image is None) == (encoding is None):
+            raise InvalidArgumentError("give exactly one of image and encoding")
+        dissimilarities = self._of_image(image) if image is not None else self._of_encoding(encoding)
+        if dissimilarities is None:
+            return observation(dissimilarities=[0] * self.n_landmarks)
+        nearest_first = np.argsort(rank_landmarks(dissimilarities))
+        body = pack_ranked_landmarks(nearest_first[:n_sent].tolist(), self.n_landmarks)
+        return Observation(body, MEDIA_TYPE, self.digest)
+
+    def _of_image(self, image: "Image | NDArray[np.uint8]") -> NDArray[np.float32] | None:
+        """[r] dissimilarities; None for an image that shows nothing."""
+        if not self._evaluator.takes_images:
+            raise InvalidArgumentError("the domain has no extractor and takes ready encodings alone: give encoding")
+        if isinstance(image, np.ndarray):
+            pixels, what = image, "the array given as image"
+        else:
+            what = str(image) if isinstance(image, str | PathLike) else "the bytes given as image"
+            try:
+                pixels = decode_image(image_bytes(image), _MAX_PIXELS)
+            except DeepSimbadError as error:
+                raise BrokenFrameError(f"{what}: {error.message}") from error
+        evaluator = self._loaded
+        if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] != 3 or pixels.size == 0:
+            raise InvalidArgumentError(f"{what} is {list(pixels.shape)} {pixels.dtype}, not [height, width, 3] uint8")
+        if is_blank(pixels):
+            return None
+        with _named_errors("the image cannot be encoded"):
+            return self._compared(evaluator.encode([pixels]))
+
+    def _of_encoding(self, encoding: Numbers | None) -> NDArray[np.float32]:
+        values = np.asarray(encoding, np.float32).reshape(1, -1)
+        try:
+            return self._compared(values)
+        except InvalidInputError as error:
+            raise InvalidArgumentError(error.message) from error
+
+    def _compared(self, encodings: NDArray[np.float32]) -> NDArray[np.float32]:
+        """[r] dissimilarities of one encoding, [1, d]."""
+        return np.asarray(self._evaluator.dissimilarities(encodings, self.landmarks.model)[0])
+
+
+@contextmanager
+def _named_errors(what: str) -> Iterator[None]:
+    """The library's errors as this client names them."""
+    try:
+        yield
+    except (ImportError, MissingPackageError) as error:
+        raise MissingExtraError(f"{error}; {INSTALL} brings what the default extractor needs") from error
+    except InvalidImageError as error:
+        raise InvalidArgumentError(error.message) from error
+    except DeepSimbadError as error:
+        raise InvalidLandmarkModelError(f"{what}: {error.message}") from error

@@ -1,0 +1,261 @@
+"""`deepsimbad weights`: which weights are known, bringing them here, and whether they are still what came."""
+
+import json
+import re
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, TypeVar
+
+import click
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, DownloadColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+from rich.table import Column, Table
+
+from deepsimbad.cli.options import data_dir_option, given_settings
+from deepsimbad.cli.terminal import console, write_json
+from deepsimbad.errors import InvalidInputError, MissingWeightsError
+from deepsimbad.evaluators.registry import EXTRACTOR_FORMS, EXTRACTOR_PATTERN
+from deepsimbad.evaluators.weights.downloads import HubWish, Tell, pull_file, pull_hub
+from deepsimbad.evaluators.weights.library import HUB, KNOWN, Argument, canonical, known
+from deepsimbad.evaluators.weights.lock import HUB_FOLDER, FileRecord, HubRecord, Lock
+
+DIFFERENCE_FOUND = 1
+
+_Command = TypeVar("_Command", bound=Callable[..., Any])
+_SHA256 = re.compile(r"[0-9a-fA-F]{8,64}")
+_COMMIT = re.compile(r"[0-9a-f]{40}")
+_SIZE = re.compile(r"([1-9]\d{0,3})x([1-9]\d{0,3})")
+
+
+def _folder_options(command: _Command) -> _Command:
+    """`--weights-dir`, beside what every command takes."""
+    return click.option(
+        "--weights-dir",
+        type=click.Path(file_okay=False, path_type=Path),
+        help="Folder of weights.  [default: $DEEPSIMBAD_WEIGHTS_DIR, else ~/.cache/deepsimbad/weights]",
+    )(data_dir_option(command))
+
+
+@click.group()
+def weights() -> None:
+    """Weights of networks. Nothing is downloaded but by `pull`, and what was pulled is held to its digests."""
+
+
+@weights.command("list")
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON list.")
+@_folder_options
+def list_(as_json: bool, data_dir: Path | None, weights_dir: Path | None) -> None:
+    """List the weights that are known, and what else was pulled, with how a configuration names them."""
+    lock = Lock.read(given_settings(data_dir=data_dir, weights_dir=weights_dir).weights_dir)
+    rows = list(_rows(lock))
+    if as_json:
+        write_json(rows)
+        return
+    titles = ("name", "extractor", "dimension", "input", "licence", "size", "here")
+    table = Table(*(Column(title, overflow="fold") for title in titles))  # names are there to be copied
+    for each in rows:
+        size = None if each["size_mb"] is None else f"{each['size_mb']} MB"
+        cells = (each["name"], each["extractor"], each["encoding_dim"], each["input"], each["licence"], size)
+        table.add_row(*("-" if cell is None else escape(str(cell)) for cell in (*cells, each["state"])))
+    console().print(table)
+
+
+@weights.command()
+@click.argument("names", metavar="NAME...", nargs=-1, required=True)
+@click.option("--url", help="Where the file is, if it is not a known one.")
+@click.option("--sha256", help="Digest the file must have, or the repository's archive; its first 8 digits at least.")
+@click.option("--commit", help="Commit of the repository, all 40 digits.  [default: as recorded, as known, the newest]")
+@click.option("--argument", "arguments", multiple=True, metavar="KEY=VALUE", help="For the repository's entry.")
+@click.option("--input-size", help="Pixels images are brought to, as 322x322 (width, height).")
+@click.option("--yes", is_flag=True, help="Run the repository's code without asking.")
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON list of what was recorded.")
+@_folder_options
+def pull(
+    names: tuple[str, ...],
+    url: str | None,
+    sha256: str | None,
+    commit: str | None,
+    arguments: tuple[str, ...],
+    input_size: str | None,
+    yes: bool,
+    as_json: bool,
+    data_dir: Path | None,
+    weights_dir: Path | None,
+) -> None:
+    """Bring weights here and record their digests. NAME is of `weights list`, or an extractor's, as netvlad:FILE.
+
+    A download that broke off goes on where it stopped. Of a torch hub repository the archive at a commit is fetched and
+    its code is run once, so that its own downloads come too: you are asked before.
+    """
+    folder = given_settings(data_dir=data_dir, weights_dir=weights_dir).weights_dir
+    extractors = [_extractor(name) for name in names]
+    if len(names) > 1 and (url or sha256 or commit or arguments or input_size):
+        raise click.UsageError("--url, --sha256, --commit, --argument and --input-size are for one NAME")
+    _check_form("--sha256", sha256, _SHA256)
+    _check_form("--commit", commit, _COMMIT)
+    size = _check_form("--input-size", input_size, _SIZE)
+    is_hub = [extractor.startswith(HUB) for extractor in extractors]
+    if (url and any(is_hub)) or ((commit or arguments or input_size) and not all(is_hub)):
+        raise click.UsageError("--url is for files; --commit, --argument and --input-size are for torch hub")
+    _agree([extractor for extractor in extractors if extractor.startswith(HUB)], yes)
+    pulled = []
+    for extractor in extractors:
+        record: HubRecord | FileRecord
+        with _download_bar() as tell:
+            if extractor.startswith(HUB):
+                given = dict(map(_argument, arguments))
+                sides = (int(size[1]), int(size[2])) if size else None
+                record = pull_hub(folder, HubWish(extractor, commit, sha256, given, sides), tell)
+                digest, where = record.tree_sha256, folder / HUB_FOLDER / record.folder
+            else:
+                record = pull_file(folder, extractor, tell, url, sha256)
+                digest, where = record.sha256, folder / extractor.partition(":")[2]
+        click.echo(f"{extractor} is at {where}, sha256 {digest}", err=True)
+        pulled.append({"extractor": extractor, "path": str(where), "sha256": digest})
+    if as_json:
+        write_json(pulled)
+
+
+@weights.command()
+@click.argument("names", metavar="[NAME...]", nargs=-1)
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON document.")
+@_folder_options
+@click.pass_context
+def verify(
+    context: click.Context, names: tuple[str, ...], as_json: bool, data_dir: Path | None, weights_dir: Path | None
+) -> None:
+    """Compute the digests of what was pulled anew: one line each, exit code 1 if one differs or is missing."""
+    lock = Lock.read(given_settings(data_dir=data_dir, weights_dir=weights_dir).weights_dir)
+    findings = [finding for name in _recorded(lock, names) for finding in lock.findings(name)]
+    if as_json:
+        told = [{"path": str(each.path), "recorded": each.recorded, "found": each.found} for each in findings]
+        write_json({"ok": all(each.is_good for each in findings), "findings": told})
+    for each in [] if as_json else findings:
+        state = "good" if each.is_good else "missing" if each.found is None else "differs"
+        recorded = "" if each.is_good else f" (recorded: {each.recorded})"
+        click.echo(f"{state}: {each.path}: {each.found or 'not there'}{recorded}")
+    if not all(each.is_good for each in findings):
+        context.exit(DIFFERENCE_FOUND)
+
+
+def _extractor(name: str) -> str:
+    """The extractor that a name means, as a configuration would name it."""
+    listed = known(name)
+    extractor = name if listed is None else listed.extractor
+    if listed is not None and listed.package is not None:
+        raise InvalidInputError(f"{name} comes with the package {listed.package}: there is nothing to pull")
+    if ":" not in extractor or re.fullmatch(EXTRACTOR_PATTERN, extractor) is None:
+        forms = ", ".join(form for form in EXTRACTOR_FORMS if ":" in form)
+        raise InvalidInputError(f"{name} is no name of `deepsimbad weights list`, and none of {forms}", name=name)
+    return extractor
+
+
+def _recorded(lock: Lock, names: tuple[str, ...]) -> Iterator[str]:
+    """The names of records in the lock; all of them where none is named."""
+    if not names:
+        yield from (*lock.files, *lock.hub)
+    for name in names:
+        extractor = _extractor(name)
+        record = canonical(extractor) if extractor.startswith(HUB) else extractor.partition(":")[2]
+        if record not in lock.hub and record not in lock.files:
+            raise MissingWeightsError(f"{name} was never pulled to {lock.folder}: nothing is recorded of it", name=name)
+        yield record
+
+
+def _check_form(option: str, value: str | None, form: re.Pattern[str]) -> re.Match[str] | None:
+    if value is None:
+        return None
+    found = form.fullmatch(value)
+    if found is None:
+        raise click.BadParameter(f"{value!r} is none", param_hint=option)
+    return found
+
+
+def _argument(text: str) -> tuple[str, Argument]:
+    """A name and its value: a number, true, false or null, as JSON has them, else a text."""
+    name, _, value = text.partition("=")
+    if not name.isidentifier():
+        raise click.BadParameter(f"{text!r} is not of the form KEY=VALUE", param_hint="--argument")
+    try:
+        read = json.loads(value)
+    except ValueError:
+        return name, value
+    return name, read if isinstance(read, bool | int | float | None) else value
+
+
+def _agree(extractors: list[str], yes: bool) -> None:
+    """Have it confirmed that code of others will be run."""
+    for extractor in extractors:
+        repository = extractor.removeprefix(HUB).partition(":")[0]
+        warning = f"{extractor} runs the code of github.com/{repository} on this machine, now and whenever it is used"
+        click.echo(warning, err=True)
+        if not yes:
+            if not sys.stdin.isatty():
+                raise click.UsageError(f"{warning}: say --yes if you trust it")
+            click.confirm("Do you trust it?", abort=True, err=True)
+
+
+@contextmanager
+def _download_bar() -> Iterator[Tell]:
+    """A progress bar on standard error for every file that comes."""
+    errors = Console(stderr=True)
+    columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=errors, transient=True, disable=not errors.is_terminal) as bars:
+        tasks: dict[str, TaskID] = {}
+
+        def tell(name: str, n_bytes: int, n_in_all: int | None) -> None:
+            if name not in tasks:
+                tasks[name] = bars.add_task(escape(name), total=n_in_all)
+            bars.update(tasks[name], completed=n_bytes, total=n_in_all)
+
+        yield tell
+
+
+def _rows(lock: Lock) -> Iterator[dict[str, Any]]:
+    """What is known, and what else was pulled."""
+    for each in KNOWN:
+        hub, file = lock.hub_record(each.extractor), lock.files.get(each.file or "")
+        row = _row(lock, each.name, each.extractor, hub or file)
+        size = hub.input_size if hub else each.input_size
+        row |= {"input": _shown_size(size), "licence": each.licence, "packages": list(each.packages), "page": each.page}
+        row |= {"encoding_dim": row["encoding_dim"] or each.encoding_dim, "size_mb": row["size_mb"] or each.size_mb}
+        if each.package is not None:
+            is_there = find_spec(each.package.replace("-", "_")) is not None
+            row["state"] = "with its package" if is_there else "no package"
+        yield row
+    known_files, known_hub = {each.file for each in KNOWN}, {canonical(each.extractor) for each in KNOWN}
+    for name, file in lock.files.items():
+        if name not in known_files:
+            yield _row(lock, name, file.extractor, file)
+    for extractor, hub in lock.hub.items():
+        if extractor not in known_hub:
+            yield {**_row(lock, hub.repository, extractor, hub), "input": _shown_size(hub.input_size)}
+
+
+def _row(lock: Lock, name: str, extractor: str, record: HubRecord | FileRecord | None) -> dict[str, Any]:
+    """What the lock and the folder tell; whether it is still what came is for `verify`."""
+    hub = record if isinstance(record, HubRecord) else None
+    file = record if isinstance(record, FileRecord) else None
+    is_there = (lock.folder / HUB_FOLDER / hub.folder).exists() if hub else False
+    if not extractor.startswith(HUB):
+        is_there = (lock.folder / extractor.partition(":")[2]).exists()
+    states = {(True, True): "pulled", (True, False): "missing", (False, True): "not recorded", (False, False): "-"}
+    return {
+        "name": name,
+        "extractor": extractor,
+        "encoding_dim": hub.encoding_dim if hub else None,
+        "input": None,
+        "licence": None,
+        "size_mb": round(file.n_bytes / 1e6, 1) if file else None,
+        "packages": [],
+        "page": file.url if file else None,
+        "state": states[record is not None, is_there],
+    }
+
+
+def _shown_size(size: tuple[int, int] | None) -> str:
+    return "aspect kept" if size is None else f"{size[0]}x{size[1]}"

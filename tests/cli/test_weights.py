@@ -1,0 +1,399 @@
+"""`deepsimbad weights`, against a small server of files on this machine."""
+
+import contextlib
+import hashlib
+import io
+import json
+import threading
+import zipfile
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+
+import pytest
+import torch
+
+from deepsimbad.evaluators.weights import downloads
+
+COMMIT = "0123456789abcdef0123456789abcdef01234567"
+NEWER = "f" * 40
+CONTENT = bytes(range(256)) * 9000
+SHA256 = hashlib.sha256(CONTENT).hexdigest()
+
+HUBCONF = """
+import torch
+
+def places(dim=6):
+    model = torch.nn.Sequential(torch.nn.AdaptiveAvgPool2d(1), torch.nn.Flatten(), torch.nn.Linear(3, dim))
+    model.load_state_dict(torch.hub.load_state_dict_from_url("{url}/checkpoint-{digest}.pth", check_hash=True))
+    return model
+"""
+
+
+@dataclass
+class Files:
+    """What is served, how, and what was asked for.
+
+    Attributes:
+        content: By path.
+        url: Of the server.
+        tear: A path's next answers break off after so many bytes.
+        status: A path is answered with this status alone.
+        headers: Of every answer.
+        asked: Path and Range of every request.
+        has_etag: Whether answers say which version a file has.
+    """
+
+    content: dict[str, bytes] = field(default_factory=dict)
+    url: str = ""
+    tear: dict[str, list[int]] = field(default_factory=dict)
+    status: dict[str, int] = field(default_factory=dict)
+    headers: dict[str, str] = field(default_factory=dict)
+    asked: list[tuple[str, str | None]] = field(default_factory=list)
+    has_etag: bool = True
+
+
+@pytest.fixture
+def files() -> Iterator[Files]:
+    served = Files()
+
+    class Handler(BaseHTTPRequestHandler):
+        def log_message(self, *_):
+            pass
+
+        def do_GET(self):
+            wanted = self.headers["Range"]
+            served.asked.append((self.path, wanted))
+            content = served.content.get(self.path)
+            status = served.status.get(self.path, 200 if content is not None else 404)
+            if status != 200:
+                self.send_response(status)
+                self.send_header("Content-Length", "0")
+                self.end_headers()
+                return
+            etag, first = f'"{hashlib.sha256(content).hexdigest()}"', 0
+            if wanted and self.headers["If-Range"] in {None, etag}:
+                first = int(wanted.removeprefix("bytes=").removesuffix("-"))
+                if first >= len(content):
+                    self.send_response(416)
+                    self.send_header("Content-Range", f"bytes */{len(content)}")
+                    self.send_header("Content-Length", "0")
+                    self.end_headers()
+                    return
+                self.send_response(206)
+                self.send_header("Content-Range", f"bytes {first}-{len(content) - 1}/{len(content)}")
+            else:
+                self.send_response(200)
+            for name, value in (*served.headers.items(), ("Content-Length", len(content) - first)):
+                self.send_header(name, str(value))
+            if served.has_etag:
+                self.send_header("ETag", etag)
+            self.end_headers()
+            torn = served.tear.get(self.path)
+            with contextlib.suppress(OSError):  # who asked may have heard enough
+                self.wfile.write(content[first : first + torn.pop(0)] if torn else content[first:])
+            self.close_connection = True
+
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+    served.url = f"http://127.0.0.1:{server.server_port}"
+    thread = threading.Thread(target=server.serve_forever, args=(0.01,))
+    thread.start()
+    yield served
+    server.shutdown()
+    thread.join()
+    server.server_close()
+
+
+@pytest.fixture
+def repository(files, monkeypatch) -> Files:
+    """someone/Places, as GitHub would give it, and the checkpoint that it downloads."""
+    stream = io.BytesIO()
+    torch.manual_seed(0)
+    torch.save({f"2.{name}": each for name, each in torch.nn.Linear(3, 6).state_dict().items()}, stream)
+    digest = hashlib.sha256(stream.getvalue()).hexdigest()[:8]
+    files.content[f"/checkpoint-{digest}.pth"] = stream.getvalue()
+    for commit in (COMMIT, NEWER):
+        archive = io.BytesIO()
+        with zipfile.ZipFile(archive, "w") as opened:
+            text = HUBCONF.replace("{url}", files.url).replace("{digest}", digest)
+            opened.writestr(f"Places-{commit}/hubconf.py", text + f"# {commit}")
+        files.content[f"/someone/Places/archive/{commit}.zip"] = archive.getvalue()
+    files.content["/repos/someone/Places/commits/HEAD"] = COMMIT.encode()
+    monkeypatch.setattr(downloads, "GITHUB", files.url)
+    monkeypatch.setattr(downloads, "GITHUB_API", files.url)
+    return files
+
+
+HUB = "torchhub:someone/Places:places"
+IN = ("--weights-dir", "w")
+
+
+def test_the_known_ones_are_listed(deepsimbad, tmp_path):
+    ran = deepsimbad("weights", "list", *IN)
+    assert (ran.code, ran.err) == (0, "")
+    for word in ("torchhub:gmberton/MegaLoc:get_trained_model", "8448", "322x322", "GPL-3.0", "529 MB", "netvlad:"):
+        assert word in ran.out
+    assert not (tmp_path / "w").exists()
+    rows = {row["name"]: row for row in json.loads(deepsimbad("weights", "list", "--json", *IN).out)}
+    assert rows["boq"]["extractor"] == "torchhub:amaralibey/Bag-of-Queries:get_trained_boq"
+    assert rows["boq"]["packages"] == ["torchvision"]
+    assert rows["boq"]["state"] == "-"
+    assert rows["efficientnet-lite0"]["state"] == "with its package"
+
+
+def test_what_was_pulled_or_put_there_is_listed(deepsimbad, files, tmp_path):
+    files.content["/m.onnx"] = CONTENT
+    (tmp_path / "w").mkdir()
+    (tmp_path / "w" / "vgg16_netvlad.pth").write_bytes(b"x")
+    assert deepsimbad("weights", "pull", "onnx:m.onnx", "--url", f"{files.url}/m.onnx", *IN).code == 0
+    rows = {row["extractor"]: row for row in json.loads(deepsimbad("weights", "list", "--json", *IN).out)}
+    assert rows["netvlad:vgg16_netvlad.pth"]["state"] == "not recorded"
+    assert (rows["onnx:m.onnx"]["state"], rows["onnx:m.onnx"]["size_mb"]) == ("pulled", 2.3)
+    (tmp_path / "w" / "m.onnx").unlink()
+    rows = {row["extractor"]: row for row in json.loads(deepsimbad("weights", "list", "--json", *IN).out)}
+    assert rows["onnx:m.onnx"]["state"] == "missing"
+    assert "onnx:m.onnx" in deepsimbad("weights", "list", *IN).out
+
+
+def test_a_file_is_pulled_recorded_and_verified(deepsimbad, files, tmp_path):
+    files.content["/m.onnx"] = CONTENT
+    ran = deepsimbad("weights", "pull", "onnx:m.onnx", "--url", f"{files.url}/m.onnx", "--json", *IN)
+    assert ran.code == 0, ran.err
+    assert json.loads(ran.out) == [{"extractor": "onnx:m.onnx", "path": "w/m.onnx", "sha256": SHA256}]
+    assert ran.err.splitlines() == [f"onnx:m.onnx is at w/m.onnx, sha256 {SHA256}"]
+    assert sorted(path.name for path in (tmp_path / "w").iterdir()) == ["m.onnx", "weights.lock"]
+    ran = deepsimbad("weights", "verify", *IN)
+    assert (ran.code, ran.out) == (0, f"good: w/m.onnx: {SHA256}\n")
+    assert deepsimbad("weights", "pull", "onnx:m.onnx", *IN).code == 0, "it is here"
+    assert len(files.asked) == 1
+    (tmp_path / "w" / "m.onnx").write_bytes(b"changed")
+    ran = deepsimbad("weights", "verify", "onnx:m.onnx", *IN)
+    assert ran.code == 1
+    assert ran.out.startswith("differs: w/m.onnx: ")
+    assert SHA256 in ran.out
+    (tmp_path / "w" / "m.onnx").unlink()
+    ran = deepsimbad("weights", "verify", "--json", *IN)
+    assert ran.code == 1
+    assert json.loads(ran.out)["findings"] == [{"path": "w/m.onnx", "recorded": SHA256, "found": None}]
+    files.content["/m.onnx"] = CONTENT[:-1]
+    ran = deepsimbad("weights", "pull", "onnx:m.onnx", *IN)
+    assert (ran.code, ran.err.count("\n")) == (1, 1)
+    assert f"should have {SHA256}" in ran.err, "it is held to what came first"
+    assert not (tmp_path / "w" / "m.onnx").exists()
+
+
+def test_a_download_that_breaks_off_goes_on(deepsimbad, files):
+    files.content["/m.onnx"] = CONTENT
+    files.tear["/m.onnx"] = [1000, 500_000]
+    ran = deepsimbad("weights", "pull", "onnx:m.onnx", "--url", f"{files.url}/m.onnx", "--sha256", SHA256[:8], *IN)
+    assert ran.code == 0, ran.err
+    assert [wanted for _, wanted in files.asked] == [None, "bytes=1000-", "bytes=501000-"]
+
+
+def _broken_off(deepsimbad, files, tmp_path, *options):
+    """A part of the file is here, and a try in which nothing came."""
+    files.content["/m.onnx"] = CONTENT
+    files.tear["/m.onnx"] = [1000, 0, 0, 0, 0]
+    ran = deepsimbad("weights", "pull", "onnx:m.onnx", "--url", f"{files.url}/m.onnx", *options, *IN)
+    assert (ran.code, ran.err.count("\n")) == (1, 1)
+    assert "missing_weights" in ran.err
+    assert "broke off" in ran.err
+    assert (tmp_path / "w" / "m.onnx.part").exists()
+    assert not (tmp_path / "w" / "m.onnx").exists()
+    files.tear.clear()
+    files.asked.clear()
+
+
+@pytest.mark.parametrize("has_etag", [True, False])
+def test_a_later_pull_goes_on_where_the_file_is_the_same(deepsimbad, files, tmp_path, has_etag):
+    files.has_etag = has_etag
+    _broken_off(deepsimbad, files, tmp_path)
+    ran = deepsimbad("weights", "pull", "onnx:m.onnx", "--url", f"{files.url}/m.onnx", *IN)
+    assert ran.code == 0, ran.err
+    assert (tmp_path / "w" / "m.onnx").read_bytes() == CONTENT
+    assert files.asked == [("/m.onnx", "bytes=1000-" if has_etag else None)]
+    assert sorted(path.name for path in (tmp_path / "w").iterdir()) == ["m.onnx", "weights.lock"]
+
+
+def test_a_digest_stands_for_the_version(deepsimbad, files, tmp_path):
+    files.has_etag = False
+    _broken_off(deepsimbad, files, tmp_path, "--sha256", SHA256)
+    ran = deepsimbad("weights", "pull", "onnx:m.onnx", "--url", f"{files.url}/m.onnx", "--sha256", SHA256, *IN)
+    assert ran.code == 0, ran.err
+    assert files.asked == [("/m.onnx", "bytes=1000-")]
+
+
+@pytest.mark.parametrize("now", [CONTENT[::-1], CONTENT[:10], CONTENT[:1000]])
+def test_a_file_that_has_changed_meanwhile_comes_anew(deepsimbad, files, tmp_path, now):
+    _broken_off(deepsimbad, files, tmp_path)
+    files.content["/m.onnx"] = now
+    assert deepsimbad("weights", "pull", "onnx:m.onnx", "--url", f"{files.url}/m.onnx", *IN).code == 0
+    assert (tmp_path / "w" / "m.onnx").read_bytes() == now
+
+
+def test_a_part_that_is_the_whole_file_or_longer(deepsimbad, files, tmp_path):
+    """The server says "beyond the end": either nothing is missing, or it is no part of this file."""
+    files.content["/m.onnx"] = CONTENT
+    files.has_etag = False
+    for there in (CONTENT, CONTENT + b"x"):
+        (tmp_path / "w").mkdir(exist_ok=True)
+        (tmp_path / "w" / "m.onnx").unlink(missing_ok=True)
+        (tmp_path / "w" / "m.onnx.part").write_bytes(there)
+        ran = deepsimbad("weights", "pull", "onnx:m.onnx", "--url", f"{files.url}/m.onnx", "--sha256", SHA256, *IN)
+        assert ran.code == 0, ran.err
+        assert (tmp_path / "w" / "m.onnx").read_bytes() == CONTENT
+    assert [wanted for _, wanted in files.asked] == [f"bytes={len(CONTENT)}-", f"bytes={len(CONTENT) + 1}-", None]
+
+
+@pytest.mark.parametrize(
+    ("status", "headers", "told"),
+    [(404, {}, "answered 404"), (503, {}, "answered 503"), (200, {"Content-Type": "text/html"}, "answered a page")],
+)
+def test_what_is_no_file_is_not_kept(deepsimbad, files, tmp_path, status, headers, told):
+    files.content["/m.onnx"] = CONTENT
+    files.status["/m.onnx"], files.headers = status, headers
+    ran = deepsimbad("weights", "pull", "onnx:m.onnx", "--url", f"{files.url}/m.onnx", *IN)
+    assert (ran.code, ran.out, ran.err.count("\n")) == (1, "", 1)
+    assert told in ran.err
+    assert "put it at w/m.onnx" in ran.err
+    assert list((tmp_path / "w").iterdir()) == []
+
+
+def test_more_than_any_file_of_weights_is_not_kept(deepsimbad, files, tmp_path, monkeypatch):
+    monkeypatch.setattr(downloads, "_MOST_BYTES", len(CONTENT) - 1)
+    files.content["/m.onnx"] = CONTENT
+    ran = deepsimbad("weights", "pull", "onnx:m.onnx", "--url", f"{files.url}/m.onnx", *IN)
+    assert (ran.code, ran.err.count("\n")) == (1, 1)
+    assert "larger than any file of weights" in ran.err
+    assert list((tmp_path / "w").iterdir()) == []
+
+
+@pytest.mark.parametrize("url", ["http://127.0.0.1:9/m.onnx", "ftp://a/m.onnx", "no address"])
+def test_without_a_network_it_says_which_file_to_put_where(deepsimbad, tmp_path, url):
+    ran = deepsimbad("weights", "pull", "onnx:m.onnx", "--url", url, *IN)
+    assert (ran.code, ran.out, ran.err.count("\n")) == (1, "", 1)
+    assert ran.err.startswith(f"deepsimbad: missing_weights: {url} cannot be reached")
+    assert "put it at w/m.onnx and pull again" in ran.err
+    (tmp_path / "w" / "m.onnx").write_bytes(CONTENT)
+    ran = deepsimbad("weights", "pull", "onnx:m.onnx", *IN)
+    assert (ran.code, ran.err) == (0, f"onnx:m.onnx is at w/m.onnx, sha256 {SHA256}\n")
+
+
+def test_a_repository_is_pulled_at_a_commit_and_held_to_it(deepsimbad, repository, tmp_path):
+    ran = deepsimbad("weights", "pull", HUB, "--yes", "--input-size", "28x28", "--json", *IN)
+    assert ran.code == 0, ran.err
+    assert f"{HUB} runs the code of github.com/someone/Places on this machine" in ran.err
+    (pulled,) = json.loads(ran.out)
+    assert pulled["path"] == f"w/hub/someone_Places_{COMMIT}"
+    (record,) = json.loads((tmp_path / "w" / "weights.lock").read_text())["hub"].values()
+    assert (record["commit"], record["encoding_dim"], record["input_size"]) == (COMMIT, 6, [28, 28])
+    (checkpoint,) = record["beside"]
+    assert [path.name for path in (tmp_path / "w" / "hub" / "checkpoints").iterdir()] == [checkpoint.split("/")[1]]
+    assert not list((tmp_path / "w" / "hub").glob("*.zip"))
+    ran = deepsimbad("weights", "verify", HUB, *IN)
+    assert (ran.code, ran.out.count("good: ")) == (0, 2)
+    repository.content["/repos/someone/Places/commits/HEAD"] = NEWER.encode()
+    assert deepsimbad("weights", "pull", HUB, "--yes", *IN).code == 0
+    assert json.loads((tmp_path / "w" / "weights.lock").read_text())["hub"] == {HUB.lower(): record}
+    assert deepsimbad("weights", "pull", HUB, "--yes", "--commit", NEWER, "--argument", "dim=6", *IN).code == 0
+    (changed,) = json.loads((tmp_path / "w" / "weights.lock").read_text())["hub"].values()
+    assert (changed["commit"], changed["arguments"]) == (NEWER, {"dim": 6})
+    (row,) = [row for row in json.loads(deepsimbad("weights", "list", "--json", *IN).out) if row["state"] == "pulled"]
+    assert (row["name"], row["encoding_dim"], row["input"]) == ("someone/Places", 6, "28x28")
+    (tmp_path / "w" / "hub" / f"someone_Places_{NEWER}" / "hubconf.py").write_text("changed")
+    ran = deepsimbad("weights", "verify", *IN)
+    assert ran.code == 1
+    assert f"differs: w/hub/someone_Places_{NEWER}" in ran.out
+
+
+def test_a_checkpoint_that_breaks_off_goes_on_too(deepsimbad, repository):
+    (path,) = (path for path in repository.content if path.startswith("/checkpoint"))
+    repository.tear[path] = [100]
+    ran = deepsimbad("weights", "pull", HUB, "--yes", "--input-size", "28x28", *IN)
+    assert ran.code == 0, ran.err
+    assert (path, "bytes=100-") in repository.asked
+
+
+def test_a_checkpoint_of_another_digest_than_the_repositorys_is_refused(deepsimbad, repository, tmp_path):
+    (path,) = (path for path in repository.content if path.startswith("/checkpoint"))
+    repository.content[path] += b"x"
+    ran = deepsimbad("weights", "pull", HUB, "--yes", "--input-size", "28x28", *IN)
+    assert ran.code == 1
+    assert "invalid_weights" in ran.err
+    assert not (tmp_path / "w" / "weights.lock").exists()
+
+
+def test_nobodys_code_is_run_unasked(deepsimbad, repository, tmp_path):
+    ran = deepsimbad("weights", "pull", HUB, *IN)
+    assert (ran.code, ran.out) == (2, "")
+    assert "say --yes if you trust it" in ran.err
+    assert repository.asked == []
+    assert not (tmp_path / "w").exists()
+
+
+@pytest.mark.parametrize(("answer", "code"), [("y", 0), ("n", 130)])
+def test_a_person_is_asked(deepsimbad, repository, monkeypatch, answer, code):
+    monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
+    monkeypatch.setattr("click.termui.visible_prompt_func", lambda _: answer)
+    ran = deepsimbad("weights", "pull", HUB, "--input-size", "28x28", *IN)
+    assert ran.code == code
+    assert "runs the code of github.com/someone/Places" in ran.err
+    assert bool(repository.asked) == (code == 0)
+
+
+def test_a_repository_without_a_network(deepsimbad, monkeypatch, tmp_path):
+    monkeypatch.setattr(downloads, "GITHUB", "http://127.0.0.1:9")
+    monkeypatch.setattr(downloads, "GITHUB_API", "http://127.0.0.1:9")
+    ran = deepsimbad("weights", "pull", HUB, "--yes", *IN)
+    assert ran.code == 1
+    assert "--commit" in ran.err.splitlines()[-1]
+    ran = deepsimbad("weights", "pull", HUB, "--yes", "--commit", COMMIT, *IN)
+    assert ran.code == 1
+    told = ran.err.splitlines()[-1]
+    assert f"http://127.0.0.1:9/someone/Places/archive/{COMMIT}.zip cannot be reached" in told
+    assert f"put it at {tmp_path}/w/hub/someone_Places_{COMMIT}.zip and pull again" in told
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("pull",),
+        ("pull", "onnx:a.onnx", "onnx:b.onnx", "--url", "http://a"),
+        ("pull", "onnx:a.onnx", "--commit", COMMIT),
+        ("pull", "onnx:a.onnx", "--sha256", "123"),
+        ("pull", HUB, "--yes", "--commit", "main"),
+        ("pull", HUB, "--yes", "--url", "http://a"),
+        ("pull", HUB, "--yes", "--argument", "=3"),
+        ("pull", HUB, "--yes", "--input-size", "28"),
+    ],
+)
+def test_usage(deepsimbad, tmp_path, arguments):
+    assert deepsimbad("weights", *arguments, *IN).code == 2
+    assert not (tmp_path / "w").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (("pull", "nothing"), "is no name of"),
+        (("pull", "onnx:../a.onnx"), "is no name of"),
+        (("pull", "torchhub:someone:entry"), "is no name of"),
+        (("pull", "gradient_grid"), "is no name of"),
+        (("pull", "efficientnet-lite0"), "comes with the package"),
+        (("pull", "onnx:a.onnx"), "say where it is with --url"),
+        (("pull", "pytorch-netvlad"), "put it at w/checkpoint.pth.tar"),
+        (("verify", "megaloc"), "was never pulled to w"),
+    ],
+)
+def test_mistakes_are_named(deepsimbad, arguments, told):
+    ran = deepsimbad("weights", *arguments, *IN)
+    assert (ran.code, ran.out, ran.err.count("\n")) == (1, "", 1)
+    assert told in ran.err
+
+
+def test_nothing_pulled_is_nothing_to_verify(deepsimbad, monkeypatch, tmp_path):
+    monkeypatch.setenv("DEEPSIMBAD_WEIGHTS_DIR", "elsewhere")
+    assert deepsimbad("weights", "verify").out == ""
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "elsewhere" / "weights.lock").write_text("{")
+    assert "elsewhere/weights.lock is no lock of weights" in deepsimbad("weights", "verify").err

@@ -1,0 +1,233 @@
+"""`OnBoardEncoder`: fetched by either client or loaded from a file, and all that can be wrong with it."""
+
+import asyncio
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import httpx2
+import numpy as np
+import pytest
+
+from deepsimbad.core.descriptor import rank_landmarks, unpack_ranked_landmarks
+from deepsimbad.core.landmark_model import PortableLandmarks, landmark_model_digest, pack_landmarks
+from deepsimbad.errors import MissingPackageError
+from deepsimbad.evaluators.image import decode_image
+from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
+from deepsimbad_client import AsyncClient, Client, RetryPolicy, errors
+from deepsimbad_client.on_board import OnBoardEncoder
+
+N_LANDMARKS = 300
+GRADIENTS = {"kind": "feature_l2", "extractor": "gradient_grid"}
+RANKS = "application/vnd.deepsimbad.ranks"
+
+
+def picture(seed: int) -> bytes:
+    coarse = np.random.default_rng(seed).integers(0, 255, (6, 8, 3), np.uint8)
+    return bytes(cv2.imencode(".png", cv2.resize(coarse, (160, 120), interpolation=cv2.INTER_CUBIC))[1].tobytes())
+
+
+@pytest.fixture(scope="module")
+def model() -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(0)
+    dim = make_evaluator(evaluator_config(GRADIENTS)).encoding_dim
+    landmarks = rng.random((N_LANDMARKS, dim)).astype(np.float32)
+    return {"prototypes": landmarks / np.linalg.norm(landmarks, axis=1, keepdims=True)}
+
+
+@pytest.fixture(scope="module")
+def content(model: dict[str, np.ndarray]) -> bytes:
+    return pack_landmarks(PortableLandmarks(model, N_LANDMARKS, 4, GRADIENTS))
+
+
+def slow_order(body: bytes, model: dict[str, np.ndarray]) -> list[int]:
+    evaluator = make_evaluator(evaluator_config(GRADIENTS))
+    encoding = evaluator.encode([decode_image(body, 1 << 20)])[0]
+    apart = np.square(model["prototypes"].astype(float) - encoding).sum(axis=1)
+    return sorted(range(N_LANDMARKS), key=lambda landmark: (apart[landmark], landmark))
+
+
+def test_an_observation_is_64_bytes_of_the_nearest(content: bytes, model: dict[str, np.ndarray]) -> None:
+    encoder = OnBoardEncoder(content)
+    assert (encoder.map_version, encoder.n_landmarks) == (4, N_LANDMARKS)
+    assert encoder.digest == landmark_model_digest(model)
+    order = slow_order(picture(1), model)
+    seen = encoder.ranks(picture(1))
+    assert seen.headers == {"Content-Type": RANKS, "If-Match": f'"{encoder.digest}"'}
+    assert len(seen.body) == 64
+    assert list(unpack_ranked_landmarks(seen.body, N_LANDMARKS)) == order[:55]
+    for m in (1, 8, N_LANDMARKS):
+        assert list(unpack_ranked_landmarks(encoder.ranks(picture(1), m=m).body, N_LANDMARKS)) == order[:m]
+
+
+def test_an_image_may_be_bytes_a_path_or_an_array(content: bytes, tmp_path: Path) -> None:
+    encoder, body = OnBoardEncoder(content), picture(2)
+    path = tmp_path / "view.png"
+    path.write_bytes(body)
+    forms = (body, bytearray(body), path, str(path), decode_image(body, 1 << 20))
+    assert len({encoder.ranks(form).body for form in forms}) == 1
+
+
+def test_a_saved_file_needs_no_network(content: bytes, tmp_path: Path) -> None:
+    fetched = OnBoardEncoder(content)
+    fetched.save(tmp_path / "campus.npz")
+    with np.load(tmp_path / "campus.npz", allow_pickle=False) as arrays:
+        assert "prototypes" in arrays.files
+    loaded = OnBoardEncoder.load(tmp_path / "campus.npz")
+    assert loaded.digest == fetched.digest
+    assert loaded.ranks(picture(3)) == fetched.ranks(picture(3))
+    with pytest.raises(errors.NotSavedError):
+        fetched.save(tmp_path / "nowhere" / "campus.npz")
+    with pytest.raises(errors.SourceError, match="nothing"):
+        OnBoardEncoder.load(tmp_path / "nothing.npz")
+
+
+def test_a_picture_of_nothing_says_so(content: bytes) -> None:
+    dark = OnBoardEncoder(content).ranks(np.zeros((60, 80, 3), np.uint8))
+    assert dark.content_type == "application/json"
+    assert dark.body == b'{"dissimilarities":[' + b",".join([b"0"] * N_LANDMARKS) + b"]}"
+
+
+def test_ready_encodings_are_ranked_too(model: dict[str, np.ndarray]) -> None:
+    ready = {"kind": "feature_l2", "extractor": "none"}
+    encoder = OnBoardEncoder(pack_landmarks(PortableLandmarks(model, N_LANDMARKS, 1, ready)))
+    encoding = model["prototypes"][7]
+    sent = unpack_ranked_landmarks(encoder.ranks(encoding=encoding, m=3).body, N_LANDMARKS)
+    nearest = rank_landmarks(np.square(model["prototypes"] - encoding).sum(axis=1))
+    assert [nearest[landmark] for landmark in sent] == [1, 2, 3]
+    with pytest.raises(errors.InvalidArgumentError, match="takes ready encodings alone"):
+        encoder.ranks(picture(1))
+    with pytest.raises(errors.InvalidArgumentError, match="another encoder"):
+        encoder.ranks(encoding=[1.0, 2.0])
+
+
+def test_arguments_that_cannot_be(content: bytes, tmp_path: Path) -> None:
+    encoder = OnBoardEncoder(content)
+    for m in (0, -1, N_LANDMARKS + 1):
+        with pytest.raises(errors.InvalidArgumentError, match="send 1 to 300"):
+            encoder.ranks(picture(1), m=m)
+    with pytest.raises(errors.InvalidArgumentError, match="exactly one"):
+        encoder.ranks()
+    with pytest.raises(errors.InvalidArgumentError, match="uint8"):
+        encoder.ranks(np.zeros((60, 80), np.uint8))
+    for broken in (b"", b"hello", picture(1)[:-20], tmp_path / "nothing.png"):
+        with pytest.raises(errors.BrokenFrameError):
+            encoder.ranks(broken)
+    with pytest.raises(errors.InvalidArgumentError, match="exactly one"):
+        Client("http://service").localize("campus", picture(1), ranked=encoder.ranks(picture(1)))
+
+
+@pytest.mark.parametrize("content", [b"", b"PK\x03\x04", b"no zip"])
+def test_what_is_no_landmark_model(content: bytes) -> None:
+    with pytest.raises(errors.InvalidLandmarkModelError):
+        OnBoardEncoder(content)
+
+
+def test_models_that_this_version_cannot_rank_by(model: dict[str, np.ndarray]) -> None:
+    for n_landmarks, evaluator in ((N_LANDMARKS, {"kind": "crystal_ball"}), (N_LANDMARKS - 1, GRADIENTS)):
+        with pytest.raises(errors.InvalidLandmarkModelError):
+            OnBoardEncoder(pack_landmarks(PortableLandmarks(model, n_landmarks, 1, evaluator)))
+
+
+def test_other_weights_are_named(model: dict[str, np.ndarray]) -> None:
+    there = "5" * 64
+    encoder = OnBoardEncoder(pack_landmarks(PortableLandmarks(model, N_LANDMARKS, 1, GRADIENTS, there)))
+    for encode in (encoder.load_extractor, lambda: encoder.ranks(picture(1))):
+        with pytest.raises(errors.OtherWeightsError, match=f"none.*{there}"):
+            encode()
+
+
+def test_a_missing_package_is_named(content: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
+    encoder = OnBoardEncoder(content)
+
+    def missing() -> None:
+        raise MissingPackageError("the extractor needs torch")
+
+    monkeypatch.setattr(encoder._evaluator, "load", missing)
+    with pytest.raises(errors.MissingExtraError, match=r"pip install 'deep-simbad\[edge\]'"):
+        encoder.load_extractor()
+
+
+def test_both_clients_fetch_it(content: bytes) -> None:
+    asked = []
+
+    def serve(request: httpx2.Request) -> httpx2.Response:
+        asked.append(str(request.url))
+        return httpx2.Response(200, content=content, headers={"Content-Type": "application/octet-stream"})
+
+    client = Client("http://service", retry=RetryPolicy(attempts=1), transport=httpx2.MockTransport(serve))
+    fetched = client.on_board("campus")
+
+    async def fetch() -> OnBoardEncoder:
+        async with AsyncClient("http://service", transport=httpx2.MockTransport(serve)) as twin:
+            return await twin.on_board("campus", map_version=3)
+
+    assert asyncio.run(fetch()).digest == fetched.digest
+    base = "http://service/v1/domains/campus/landmark-model"
+    assert asked == [base, f"{base}?map_version=3"]
+
+
+def test_both_clients_send_it_as_it_is(content: bytes) -> None:
+    sent = []
+
+    def refuse(request: httpx2.Request) -> httpx2.Response:
+        sent.append((request.headers["content-type"], request.headers["if-match"], request.content))
+        problem = {"code": "landmark_model_differs", "detail": "another", "map_version": 9}
+        return httpx2.Response(409, json=problem, headers={"Content-Type": "application/problem+json"})
+
+    seen = OnBoardEncoder(content).ranks(picture(1))
+    client = Client("http://service", transport=httpx2.MockTransport(refuse))
+    with pytest.raises(errors.LandmarkModelDiffersError, match="map_version=9"):
+        client.localize("campus", ranked=seen)
+
+    async def localize() -> None:
+        async with AsyncClient("http://service", transport=httpx2.MockTransport(refuse)) as twin:
+            await twin.localize("campus", ranked=seen)
+
+    with pytest.raises(errors.LandmarkModelDiffersError):
+        asyncio.run(localize())
+    assert sent == [(RANKS, seen.headers["If-Match"], seen.body)] * 2
+
+
+HIDDEN = """
+import sys
+class Hide:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in {hidden}:
+            raise ModuleNotFoundError("hidden: " + name)
+sys.meta_path.insert(0, Hide())
+"""
+
+
+def run_without(hidden: set[str], code: str) -> str:
+    done = subprocess.run(
+        [sys.executable, "-c", HIDDEN.replace("{hidden}", repr(hidden)) + code],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_the_bare_client_says_what_it_lacks() -> None:
+    code = """
+from deepsimbad_client import Client, errors
+try:
+    Client("http://127.0.0.1:9").on_board("campus")
+except errors.MissingExtraError as error:
+    print(error)
+"""
+    assert "pip install 'deep-simbad[edge]'" in run_without({"numpy", "torch", "cv2", "deepsimbad"}, code)
+
+
+def test_encoding_on_board_needs_nothing_of_the_service_but_core_and_evaluators(tmp_path: Path, content: bytes) -> None:
+    OnBoardEncoder(content).save(tmp_path / "campus.npz")
+    (tmp_path / "view.png").write_bytes(picture(1))
+    code = f"""
+from deepsimbad_client.on_board import OnBoardEncoder
+print(len(OnBoardEncoder.load({str(tmp_path / "campus.npz")!r}).ranks({str(tmp_path / "view.png")!r}).body))
+"""
+    hidden = {"fastapi", "starlette", "uvicorn", "sqlite_utils", "prometheus_client", "pydantic_settings"}
+    assert run_without(hidden, code) == "64\n"
