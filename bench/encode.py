@@ -276,8 +276,8 @@ def starts() -> Iterator[str]:
     yield from (
         "",
         f"Of which importing torch alone takes {imported['torch'] - imported['sys']:.2f} s, ONNX Runtime "
-        f"{imported['onnxruntime'] - imported['sys']:.2f} s. The very first start with ONNX Runtime prepares the network "
-        "besides, some seconds, unless `deepsimbad` did so before on this machine.",
+        f"{imported['onnxruntime'] - imported['sys']:.2f} s. The very first start with ONNX Runtime prepares "
+        "the network besides, some seconds, unless `deepsimbad` did so before on this machine.",
         "",
     )
 

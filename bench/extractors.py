@@ -23,6 +23,7 @@ from bench.nordland import kept_frames, season_folder
 from bench.recordings import RESULTS, real_recordings
 from deepsimbad.cli import run
 from deepsimbad_client.campus.writer import write_campus
+from deepsimbad_client.sources import open_source
 
 N_LANDMARKS, N_CAMPUS_LANDMARKS = 300, 290  # a campus of 300 frames has a few without ground truth
 CAMPUS_SEASONS = ("winter", "summer", "autumn")
@@ -81,10 +82,22 @@ def corridor(data: Path) -> Iterator[Split]:
 
 def campus(work: Path) -> Iterator[Split]:
     """The client's rendered campus in three seasons, all six triplets; the landmark drive is of the same route."""
-    drives = [f"nclt:{work}/{drive.date}" for drive in write_campus(work, CAMPUS_SEASONS, 300, 0)]
+    drives = [_as_sent(work, drive.date) for drive in write_campus(work, CAMPUS_SEASONS, 300, 0)]
     for landmarks, training, test in itertools.permutations(drives):
         more = ("--tolerance", str(CAMPUS_TOLERANCE_M))
         yield Split("campus, six triplets", landmarks, training, test, N_CAMPUS_LANDMARKS, more)
+
+
+def _as_sent(work: Path, date: str) -> str:
+    """A drive's images as a client sends them, in a folder of their own: read once from TIFF, not by every split."""
+    recording, folder = open_source(f"nclt:{work}/{date}"), work / f"sent-{date}"
+    folder.mkdir()
+    lines = ["name,x_m,y_m"]
+    for frame in recording.frames:
+        (folder / f"{frame.index:05}.jpg").write_bytes(recording.image(frame, (224, 224)).body)
+        lines.append(f"{frame.index:05}.jpg,{frame.x_m},{frame.y_m}")
+    (folder / "positions.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return str(folder)
 
 
 def documents(split: Split, work: Path) -> dict[str, Any]:
@@ -102,6 +115,7 @@ def report(splits: list[Split], work: Path) -> Iterator[str]:
     """The lines of the page."""
     grouped: dict[str, list[dict[str, Any]]] = {}
     for split in splits:
+        print(f"{split.group}: {split.training}", file=sys.stderr)
         grouped.setdefault(split.group, []).append(documents(split, work))
     extractors = list(next(iter(grouped.values()))[0])
     yield from (
@@ -140,8 +154,8 @@ def report(splits: list[Split], work: Path) -> Iterator[str]:
         "[encode.md](encode.md) has those of larger pictures and of every runtime.",
         "",
         "The railway's frames are 64 x 32 pixels and grey, one metre stands for a frame; frames that show nothing "
-        "(grey levels' standard deviation at most 8) in either season are left out. Parameters of the default extractor "
-        "were chosen on these very splits ([0014](../decisions/0014-default-extractor.md)).",
+        "(grey levels' standard deviation at most 8) in either season are left out. Parameters of the default "
+        "extractor were chosen on these very splits ([0014](../decisions/0014-default-extractor.md)).",
     )
 
 

@@ -39,6 +39,9 @@ class Slow:
         self.go = threading.Event()
         self._lock = threading.Lock()
 
+    def load(self) -> None:
+        pass
+
     def prepare(self, image: Image) -> Image:
         with self._lock:
             self.held.append(image.shape)

@@ -117,6 +117,12 @@ def test_a_domain_whose_weights_are_gone_says_so_and_the_others_go_on(tmp_path: 
         problem = refused(client.post(VIEW, content=encoded(picture(1)), headers=JPEG), 503, "evaluator_unavailable")
         assert "eyes.onnx" in problem["detail"]
         assert problem["reason"] == "missing_weights"
+        assert client.post(VIEW, json={"ranked_landmarks": [1, 0]}).status_code == 200  # which needs no network
+        session = client.post("/v1/domains/street/sessions", json={}).json()["session_id"]
+        seen = client.post(f"/v1/sessions/{session}/observations", json={"ranked_landmarks": [1, 0]})
+        assert seen.status_code == 200
+        view = client.post(f"/v1/sessions/{session}/observations", content=encoded(picture(1)), headers=JPEG)
+        refused(view, 503, "evaluator_unavailable")
         assert client.get("/v1/domains/street").json()["evaluator_problem"] == "missing_weights"
         assert len(client.get("/v1/domains").json()["domains"]) == 2
         assert client.post("/v1/domains/ready/localizations", json={"ranked_landmarks": [1]}).status_code == 200

@@ -1,4 +1,4 @@
-"""The default extractor: its network against the published equations written out, and its runtimes against each other."""
+"""The default extractor: its network against the published equations written out, its runtimes against each other."""
 
 import cv2
 import numpy as np

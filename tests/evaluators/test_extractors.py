@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
+from deepsimbad.evaluators.compute import Compute
 from deepsimbad.evaluators.feature_l2 import FeatureL2
 from deepsimbad.evaluators.image import decode_image
-from deepsimbad.evaluators.compute import Compute
 from deepsimbad.evaluators.registry import make_extractor
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from anyio import CapacityLimiter
 from anyio.to_thread import run_sync
 
+from deepsimbad.engine.evaluator_pool import ready
 from deepsimbad.engine.worker import Priority
 from deepsimbad.errors import OverloadedError
 from deepsimbad.evaluators.base import Evaluator, Image
@@ -50,6 +51,7 @@ class Decoders:
         Raises:
             InvalidImageError, ImageTooLargeError, EmptyBodyError: As `decode_image`.
             UnsupportedMediaTypeError: The evaluator takes ready encodings alone.
+            EvaluatorUnavailableError: It cannot be loaded any more.
             OverloadedError: The image is large, and as many large ones wait as may.
         """
         n_pixels = await run_sync(claimed_pixels, body, self._max_pixels)
@@ -60,6 +62,7 @@ class Decoders:
             return await run_sync(self._decode, body, evaluator, limiter=self._slots[priority])
 
     def _decode(self, body: bytes, evaluator: Evaluator) -> Decoded:
+        ready(evaluator)  # where it is not, decoding is in vain
         image = decode_image(body, self._max_pixels)
         return Decoded(evaluator.prepare(image), is_blank(image))
 

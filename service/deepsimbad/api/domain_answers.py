@@ -2,7 +2,7 @@
 
 from deepsimbad.api.schemas import DomainAnswer
 from deepsimbad.engine.active_maps import ActiveMaps
-from deepsimbad.engine.evaluator_pool import EvaluatorPool
+from deepsimbad.engine.evaluator_pool import EvaluatorPool, ready
 from deepsimbad.engine.snapshot import MapSnapshot
 from deepsimbad.errors import NoActiveMapError, UnavailableError
 from deepsimbad.evaluators.base import Evaluator
@@ -42,7 +42,7 @@ def describe_domain(record: DomainRecord, evaluators: EvaluatorPool, active_maps
 def _evaluator(evaluators: EvaluatorPool, record: DomainRecord) -> tuple[Evaluator | None, str | None]:
     """The evaluator, or the code of what keeps it from being loaded."""
     try:
-        return evaluators.serving(record.evaluator), None
+        return ready(evaluators.evaluator(record.evaluator)), None
     except UnavailableError as error:
         return None, error.hints.get("reason", error.code)
 

@@ -138,7 +138,7 @@ def localize(domain: str, images: tuple[Path, ...], as_json: bool, data_dir: Pat
     settings = given_settings(data_dir=data_dir)
     with Catalog.open(existing_data_dir(settings.data_dir)) as catalog:
         active = ActiveMaps(catalog).active(domain)
-        judge = EvaluatorPool(settings.compute()).serving(active.record.evaluator)
+        judge = EvaluatorPool(settings.compute()).evaluator(active.record.evaluator)
         answers = []
         for path in images:
             watch = Stopwatch()

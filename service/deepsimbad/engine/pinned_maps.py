@@ -81,7 +81,7 @@ class PinnedMaps:
         digest = known.sha256 or ""
         with self._lock:
             self._held[snapshot.domain, snapshot.version, digest] = snapshot
-        return digest, self._evaluators.serving(active.record.evaluator)
+        return digest, self._evaluators.evaluator(active.record.evaluator)
 
     def take(self, domain: str, version: int, digest: str) -> tuple[MapSnapshot, Evaluator]:
         """A map version and its domain's evaluator; may read files.
@@ -91,7 +91,7 @@ class PinnedMaps:
             DamagedMapError: Its file is damaged, or missing though the version serves.
         """
         record, snapshot = self._taken(domain, version, digest)
-        return snapshot, self._evaluators.serving(record.evaluator)
+        return snapshot, self._evaluators.evaluator(record.evaluator)
 
     def snapshot(self, domain: str, version: int) -> MapSnapshot:
         """A sealed map version that need not serve, as a session may be pinned to one; may read files.

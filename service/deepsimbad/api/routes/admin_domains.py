@@ -31,7 +31,7 @@ async def put_domain(domain: DomainName, request: Request, response: Response, r
 
     def make() -> tuple[DomainAnswer, bool]:
         evaluator = _completed(body.evaluator, running, domain)
-        running.evaluators.evaluator(evaluator.as_dict())  # one that cannot be loaded should not be stored
+        running.evaluators.evaluator(evaluator.as_dict()).load()  # one that cannot be loaded should not be stored
         record, created = running.catalog.create_domain(
             domain, dict(evaluator.as_dict()), body.closed, body.actions_m, running.settings.max_domains
         )

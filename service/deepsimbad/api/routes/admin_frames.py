@@ -80,7 +80,7 @@ async def put_frame(
     await run_sync(_check_traverse, running, domain, name)
     media_type = media_type_of(request, FRAME_TYPES)
     body = await read_bytes(request)
-    evaluator = await run_sync(running.evaluators.serving, evaluator_config)
+    evaluator = running.evaluators.evaluator(evaluator_config)
     encoding, weights_sha256 = await _encoded(body, running, media_type, evaluator)
 
     def store() -> tuple[bool, int]:

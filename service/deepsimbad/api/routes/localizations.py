@@ -4,7 +4,6 @@ from io import BytesIO
 from typing import Annotated
 
 import numpy as np
-from anyio.to_thread import run_sync
 from fastapi import APIRouter, Query, Request, Response
 from numpy.typing import NDArray
 
@@ -77,7 +76,7 @@ async def post_localization(
     landmark_models = insisted_on(if_match)
     body = await read_bytes(request)
     watch.lap("receive")
-    evaluator = await run_sync(running.evaluators.serving, active.record.evaluator)
+    evaluator = running.evaluators.evaluator(active.record.evaluator)
     view = await view_in(body, running, media_type, evaluator)
     if prefers_binary(request):
 

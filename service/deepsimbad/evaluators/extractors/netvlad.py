@@ -4,7 +4,7 @@ from deepsimbad.errors import MissingPackageError
 from deepsimbad.evaluators.compute import Compute
 from deepsimbad.evaluators.extractors.network import NetworkExtractor
 from deepsimbad.evaluators.runtimes import INSTALL_TORCH, has_torch, make_run
-from deepsimbad.evaluators.weights.files import file_sha256, weights_path
+from deepsimbad.evaluators.weights.lock import Lock
 
 _USUAL_SIZE = (640, 480)
 _SHORTEST_SIDE = 16  # pixels: of fewer, nothing is left behind four maxima
@@ -27,8 +27,7 @@ def netvlad(file: str, compute: Compute) -> NetworkExtractor:
         raise MissingPackageError(f"netvlad needs PyTorch: {INSTALL_TORCH}")
     from deepsimbad.evaluators.weights.netvlad_families import read_netvlad
 
-    path = weights_path(compute.weights_dir, file)
-    sha256 = file_sha256(path)
+    path, sha256 = Lock.read(compute.weights_dir).pinned(file)
     weights = read_netvlad(path)
     preset = weights.preset
     run = make_run(weights.module, compute, preset.input_size or _USUAL_SIZE)

@@ -11,7 +11,7 @@ from deepsimbad.errors import MissingPackageError
 from deepsimbad.evaluators.compute import Compute
 from deepsimbad.evaluators.extractors.network import NetworkExtractor
 from deepsimbad.evaluators.runtimes import INSTALL_TORCH, has_torch, make_run
-from deepsimbad.evaluators.weights.files import file_sha256, weights_path
+from deepsimbad.evaluators.weights.lock import Lock
 
 if TYPE_CHECKING:
     from torch import nn
@@ -38,8 +38,8 @@ def squeezenet(file: str, compute: Compute) -> NetworkExtractor:
         raise MissingPackageError(f"squeezenet needs PyTorch: {INSTALL_TORCH}")
     from deepsimbad.evaluators.weights.squeezenet_families import preset_of
 
-    path = weights_path(compute.weights_dir, file)
-    sha256, size = file_sha256(path), (preset_of(path).side,) * 2
+    path, sha256 = Lock.read(compute.weights_dir).pinned(file)
+    size = (preset_of(path).side,) * 2
     run = make_run(lambda: _module(path), compute, size, f"squeezenet-{_RECIPE}-{sha256[:16]}")
     return NetworkExtractor(run, ENCODING_DIM, sha256, size)
 

