@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from deepsimbad.core.route import Route
-from deepsimbad.core.same_route import LEAST_PLACES, SIGNIFICANCE, judge, second_season
+from deepsimbad.core.same_route import LEAST_CORRELATION, LEAST_PLACES, SIGNIFICANCE, judge, second_season
 from deepsimbad.core.true_images import same_places
 
 R = 40
@@ -64,9 +64,10 @@ def test_a_verdict_tells_its_reasons():
     assert (same.accepted, same.why, same.n_pairs) == (True, None, 120)
     assert same.significance <= SIGNIFICANCE < other.significance
     assert same.statistic > 3 > other.statistic
+    assert same.correlation > 0.5 > 0.2 > other.correlation
     assert (other.accepted, other.n_pairs) == (False, 120)
     assert "agree no better than where one is shifted" in other.why
-    assert set(other.as_dict()) == {"accepted", "why", "n_pairs", "statistic", "significance"}
+    assert set(other.as_dict()) == {"accepted", "why", "n_pairs", "correlation", "statistic", "significance"}
 
 
 def test_common_trends_are_no_common_route():
@@ -148,6 +149,15 @@ def test_thirty_places_are_the_least(n, accepted):
     place = rng.normal(size=(90, 12))
     found = verdict(rng, place, place, diagonal(n), noise=0.1)
     assert (found.accepted, found.n_pairs) == (accepted, n)
+
+
+def test_what_agrees_a_little_is_not_worth_learning_from():
+    """Scenery that repeats agrees beyond chance on a long route; its landmarks would be trusted for nothing."""
+    rng = np.random.default_rng(18)
+    found = verdict(rng, *[rng.normal(size=(500, 12))] * 2, noise=2.5)
+    assert (found.accepted, found.significance < SIGNIFICANCE) == (False, True)
+    assert 0 < found.correlation < LEAST_CORRELATION
+    assert "agree too little to learn from" in found.why
 
 
 @pytest.mark.filterwarnings("error")

@@ -27,9 +27,9 @@ from deepsimbad.errors import (
     InvalidSourceError,
     TooFewCandidatesError,
 )
+from deepsimbad.evaluators.compute import available_cores
 from deepsimbad.evaluators.image import decode_image
 from deepsimbad.evaluators.registry import EvaluatorConfig, make_evaluator
-from deepsimbad.jobs.cores import available_cores
 from deepsimbad.jobs.encoded_traverse import encode_recording
 from deepsimbad.jobs.map_config import DEFAULT_LIST_LENGTH, DEFAULT_N_LANDMARKS, DEFAULT_TRAINING_EPISODES, RemapConfig
 from deepsimbad.jobs.remap import REMAP_STAGES, remap

@@ -11,6 +11,9 @@ Shifting one drive turns the phase of every frequency by its own angle: of drive
 equally likely, independently of the others, and at shift 0 of one route all are 0. The agreement at shift 0 is the sum
 of the cosines of these phases, weighted by how strong each frequency is; over all shifts it has mean 0 and a variance
 that the weights give.
+
+The theory takes a route for a stationary process. Real scenery repeats: of two places of one railway some agree better
+than chance allows, a little. So agreement must also be worth learning from.
 """
 
 from collections.abc import Callable
@@ -27,7 +30,10 @@ from deepsimbad.core.route import Route
 from deepsimbad.core.statistics import LandmarkStatistics
 from deepsimbad.core.true_images import same_places
 
-SIGNIFICANCE = 0.001  # of the agreement at shift 0, below which two drives count as of one route
+SIGNIFICANCE = 0.002  # of the agreement at shift 0, up to which it counts as more than chance
+LEAST_CORRELATION = (
+    0.2  # mean, of scores at equal positions; where scenery repeats, chance goes far, but rarely this far
+)
 LEAST_PLACES = 30  # that both saw
 _STATION_M = 1.0  # frames nearer together, as of a robot that stands, say nothing new
 _FEWEST_STATIONS, _MOST_STATIONS = 64, 512  # a short route is cut finer, a long one coarser
@@ -44,14 +50,16 @@ class SameRoute:
         accepted: It did: the map may learn from it.
         why: In a sentence, why it was not accepted; None where it was.
         n_pairs: Frames that have a map image at their position.
-        statistic: Agreement at equal positions, in standard deviations of the agreement over all shifts; None where
-            nothing was compared.
+        correlation: Mean correlation of landmarks' scores at equal positions; None where nothing was compared.
+        statistic: Agreement at equal positions, in standard deviations of the agreement over all shifts; None
+            likewise.
         significance: Chance that drives of two routes agree so well or better; None likewise.
     """
 
     accepted: bool
     why: str | None
     n_pairs: int
+    correlation: float | None = None
     statistic: float | None = None
     significance: float | None = None
 
@@ -103,15 +111,22 @@ def judge(
         why = f"the two drives share {len(stations)} places by their positions, and {LEAST_PLACES} are the least"
         return SameRoute(False, why, len(places))
     images, frames = stations.T
-    statistic = _agreement(_against_surroundings(own[images]), _against_surroundings(other[frames]))
+    scores, others = _scores(own[images]), _scores(other[frames])
+    correlation = float((scores * others).mean())
+    statistic = _agreement(_against_surroundings(scores), _against_surroundings(others))
     significance = NormalDist().cdf(-statistic)
-    if significance <= SIGNIFICANCE:
-        return SameRoute(True, None, len(places), statistic, significance)
-    why = (
-        "at equal positions the two drives agree no better than where one is shifted against the other "
-        f"(significance {significance:.2g}, {SIGNIFICANCE:g} is asked for)"
-    )
-    return SameRoute(False, why, len(places), statistic, significance)
+    why: str | None = None
+    if significance > SIGNIFICANCE:
+        why = (
+            "at equal positions the two drives agree no better than where one is shifted against the other "
+            f"(significance {significance:.2g}, {SIGNIFICANCE:g} is asked for)"
+        )
+    elif correlation < LEAST_CORRELATION:
+        why = (
+            f"at equal positions the two drives agree too little to learn from (mean correlation {correlation:.2f}, "
+            f"{LEAST_CORRELATION:g} is asked for)"
+        )
+    return SameRoute(why is None, why, len(places), correlation, statistic, significance)
 
 
 def _has_plane(route: Route) -> bool:
@@ -130,10 +145,14 @@ def _stations(places: NDArray[np.int64], position_m: NDArray[np.float64]) -> NDA
     return np.asarray(ordered[np.unique(stretch, return_index=True)[1]], np.int64)
 
 
-def _against_surroundings(dissimilarities: NDArray[np.float32]) -> NDArray[np.float64]:
-    """[s, r] standardised scores less their mean over the surroundings."""
+def _scores(dissimilarities: NDArray[np.float32]) -> NDArray[np.float64]:
+    """[s, r] standardised by what is usual over these stations."""
     ranks = rank_landmarks(dissimilarities)
-    scores = LandmarkStatistics.of_map(ranks).standardise(ranks)
+    return LandmarkStatistics.of_map(ranks).standardise(ranks)
+
+
+def _against_surroundings(scores: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[s, r] scores less their mean over the surroundings."""
     before = np.concatenate([np.zeros((1, scores.shape[1])), np.cumsum(scores, axis=0)])
     station = np.arange(len(scores))
     first, stop = np.maximum(station - _SURROUNDINGS, 0), np.minimum(station + _SURROUNDINGS + 1, len(scores))

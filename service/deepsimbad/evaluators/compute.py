@@ -1,5 +1,6 @@
 """On what, and how, networks are computed: chosen by whoever makes an evaluator, the same for all networks."""
 
+import os
 from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
@@ -28,6 +29,13 @@ class Device(StrEnum):
 
 
 DEFAULT_WEIGHTS_DIR = Path("~/.cache/deepsimbad/weights")
+
+
+def available_cores() -> int:
+    """The cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return max(1, len(os.sched_getaffinity(0)))
+    return os.cpu_count() or 1
 
 
 @dataclass(frozen=True)

@@ -14,18 +14,22 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from deepsimbad.errors import MissingPackageError, OutOfMemoryError
-from deepsimbad.evaluators.compute import Compute, Device, Runtime
+from deepsimbad.evaluators.compute import Compute, Device, Runtime, available_cores
 
 if TYPE_CHECKING:
     from torch import nn
 
 log = logging.getLogger(__name__)
+
+# Threads of a network that wait for each other should sleep. OpenMP lets them spin, and where a job or a decoder wants
+# the same core, an image then takes a second instead of ten milliseconds. It is read when torch is loaded.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 INSTALL_TORCH = (
     "install the service with its networks: pip install 'deep-simbad[service]' "
@@ -131,7 +135,7 @@ class _TorchRun:
         import torch
 
         self._torch, self._device = torch, device
-        torch.set_num_threads(compute.n_threads or os.cpu_count() or 1)
+        torch.set_num_threads(compute.n_threads or available_cores())
         module.eval().requires_grad_(False)
         if in_bf16:
             module.trunk.to(torch.bfloat16)
@@ -158,18 +162,25 @@ class _OnnxRun:
     """An exported module on the processor."""
 
     def __init__(self, exported: Path, compute: Compute) -> None:
-        import onnxruntime
-
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = compute.n_threads or os.cpu_count() or 1
-        options.inter_op_num_threads = 1
-        self._session = onnxruntime.InferenceSession(exported, options, providers=["CPUExecutionProvider"])
+        self._session = onnx_session(exported, compute)
         self.largest_batch = compute.largest_batch or _BATCH_ON_CPU
 
     def __call__(self, pixels: NDArray[np.uint8]) -> NDArray[np.float32]:
         """See `Run`."""
         with _named_lack_of_memory():
             return np.asarray(self._session.run(None, {_INPUT: pixels})[0], np.float32)
+
+
+def onnx_session(model: Path | bytes, compute: Compute) -> Any:
+    """ONNX Runtime's session of a model on the processor; raises what ONNX Runtime does of one that it cannot load."""
+    import onnxruntime
+
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = compute.n_threads or available_cores()
+    options.inter_op_num_threads = 1
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # as OMP_WAIT_POLICY above
+    options.log_severity_level = 4  # what is wrong comes as an exception
+    return onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
 
 
 def _onnx_run(

@@ -1,13 +1,6 @@
 """How many cores there are to compute on."""
 
-import os
-
-
-def available_cores() -> int:
-    """The cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return max(1, len(os.sched_getaffinity(0)))
-    return os.cpu_count() or 1
+from deepsimbad.evaluators.compute import available_cores
 
 
 def job_threads(asked: int) -> int:

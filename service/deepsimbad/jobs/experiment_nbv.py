@@ -19,8 +19,8 @@ from deepsimbad.engine.active_localizer import ActiveLocalizer, LocalizerConfig
 from deepsimbad.engine.snapshot import MapSnapshot
 from deepsimbad.errors import InvalidMapConfigError
 from deepsimbad.evaluators.base import Evaluator, LandmarkModel
+from deepsimbad.evaluators.compute import available_cores
 from deepsimbad.jobs.build_map import choose_landmarks, describe, map_contents
-from deepsimbad.jobs.cores import available_cores
 from deepsimbad.jobs.encoded_traverse import EncodedTraverse
 from deepsimbad.jobs.episodes import (
     Chooser,

@@ -7,7 +7,6 @@ entries of its metadata (`metadata_props`). `deepsimbad.scale` is what pixels 0.
 """
 
 import json
-import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -18,7 +17,7 @@ from numpy.typing import NDArray
 from deepsimbad.errors import InvalidWeightsError, MissingPackageError, OutOfMemoryError
 from deepsimbad.evaluators.compute import Compute
 from deepsimbad.evaluators.extractors.network import NetworkExtractor
-from deepsimbad.evaluators.runtimes import INSTALL_FAST, has_onnxruntime
+from deepsimbad.evaluators.runtimes import INSTALL_FAST, has_onnxruntime, onnx_session
 from deepsimbad.evaluators.weights.files import file_sha256, weights_path
 from deepsimbad.evaluators.weights.lock import Lock
 
@@ -120,16 +119,10 @@ class _FileRun:
     """
 
     def __init__(self, file: str, content: bytes, compute: Compute) -> None:
-        import onnxruntime
-
         self._file = file
         _check_content(file, content)
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = compute.n_threads or os.cpu_count() or 1
-        options.inter_op_num_threads = 1
-        options.log_severity_level = 4  # what is wrong comes as an exception
         try:
-            self._session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+            self._session = onnx_session(content, compute)
         except Exception as error:
             raise self._failure(f"is no model that ONNX Runtime can run: {_first_line(error)}", error) from error
         self._shown = _Shown.read(file, self._session.get_modelmeta().custom_metadata_map)
