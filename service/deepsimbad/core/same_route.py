@@ -108,8 +108,8 @@ def judge(
     """
     stations = _stations(places, position_m)
     if len(stations) < LEAST_PLACES:
-        why = f"the two drives share {len(stations)} places by their positions, and {LEAST_PLACES} are the least"
-        return SameRoute(False, why, len(places))
+        few = f"the two drives share {len(stations)} places by their positions, and {LEAST_PLACES} are the least"
+        return SameRoute(False, few, len(places))
     images, frames = stations.T
     scores, others = _scores(own[images]), _scores(other[frames])
     correlation = float((scores * others).mean())
