@@ -143,7 +143,7 @@ def report(splits: list[Split], work: Path) -> Iterator[str]:
         yield f"| {group} | " + " | ".join(cells) + " |"
     means = [f"{np.exp(np.mean(np.log(ratios[extractor]))):.2f}" for extractor in extractors]
     yield "| geometric mean of `calibrated` against the gradient grid | " + " | ".join(means) + " |"
-    yield from ("", "| extractor | numbers | bytes a frame | ms an image, bytes to encoding |", "|---|---|---|---|")
+    yield from ("", "| extractor | numbers | bytes a frame | ms an image, read and encoded |", "|---|---|---|---|")
     for extractor in extractors:
         one = [document[extractor] for document in grouped["corridor halves"]]
         took = float(np.median([each["encode_ms"] for each in one]))

@@ -17,7 +17,7 @@ for name in [name for name in os.environ if name.startswith("DEEPSIMBAD_") and n
 os.environ["DEEPSIMBAD_JOB_PRIORITY"] = (
     "normal"  # tests keep every core busy: an idle-class job would wait for them all
 )
-os.environ["OMP_WAIT_POLICY"] = "PASSIVE"  # every core is busy: threads that spin would keep each other waiting
+os.environ["GOMP_SPINCOUNT"] = "1000"  # every core is busy: threads that spin would keep each other waiting
 os.environ.pop("COLUMNS", None)  # a parallel run sets one, too narrow for the tables that a pipe gets
 
 # A run in the background of a script ignores Ctrl-C, and so would every process that the tests begin and interrupt.

@@ -123,11 +123,16 @@ class Settings(BaseSettings):
         int, Field(description="Processor threads of a network; 0: as many as there are cores.", ge=0)
     ] = 0
     encode_batch: Annotated[
-        int, Field(description="Most images encoded at once; 0: 1 on the processor, 32 on CUDA.", ge=0, le=1024)
+        int,
+        Field(
+            description="Most images encoded at once; 0: what measures best, on CUDA 32, else 1 to all cores.",
+            ge=0,
+            le=1024,
+        ),
     ] = 0
     encode_wait_ms: Annotated[
-        float, Field(description="How long an image waits for others to fill a batch larger than 1.", ge=0, le=1000)
-    ] = 2.0
+        float, Field(description="How long an image waits for others to fill a batch; 0: for none.", ge=0, le=1000)
+    ] = 0.0
 
     session_ttl_s: Annotated[
         float, Field(description="A session ends when nothing was observed in it for so long.", gt=0, le=31_536_000)

@@ -103,7 +103,7 @@ def test_all_runtimes_agree(runtime, tmp_path):
     cosine = np.einsum("nd,nd->n", exact, other)
     assert (cosine > 1 - 1e-3).all()
     if runtime is Runtime.ONNXRUNTIME:
-        assert (cosine > 1 - 1e-5).all()
+        assert np.abs(exact - other).max() < 1e-3
         (exported,) = (tmp_path / "exported").iterdir()
         exported.write_bytes(exported.read_bytes()[:5000])  # a disk that was full
         again = make_extractor("efficientnet_lite0", Compute(runtime=runtime, weights_dir=tmp_path)).encode(images)

@@ -57,7 +57,7 @@ class InferenceWorker:
         longest_wait_s: How long an image may wait for others to fill a batch, where one larger than 1 gains anything.
     """
 
-    def __init__(self, name: str = "inference", max_waiting: int | None = None, longest_wait_s: float = 0.002) -> None:
+    def __init__(self, name: str = "inference", max_waiting: int | None = None, longest_wait_s: float = 0.0) -> None:
         self._max_waiting = max_waiting
         self._longest_wait_s = longest_wait_s
         self._n_waiting = dict.fromkeys(Priority, 0)
@@ -145,8 +145,9 @@ class InferenceWorker:
         largest = 1 if first.evaluator is None else first.evaluator.largest_batch
         until = monotonic() + self._longest_wait_s
         while len(batch) < largest:
+            left_s = until - monotonic()
             try:
-                following = self._queue.get(timeout=max(0.0, until - monotonic()))
+                following = self._queue.get(timeout=left_s) if left_s > 0 else self._queue.get_nowait()
             except Empty:
                 break
             if not following.goes_with(first):

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from deepsimbad.core.route import Route
 from deepsimbad.errors import InvalidSourceError
-from deepsimbad.evaluators.base import Evaluator
+from deepsimbad.evaluators.base import Evaluator, Image
 from deepsimbad.evaluators.image import decode_image
 from deepsimbad.store.frames import UNKNOWN_TIMESTAMP, TraverseFrames
 from deepsimbad_client.errors import BrokenFrameError
@@ -29,7 +29,7 @@ class EncodedTraverse:
         frames: Encodings and places, n of them, in the order they were driven.
         route: The frames' positions.
         left_out: Reason -> number of frames that could not be used.
-        encode_ms: Median from an image's bytes to its encoding; None where encodings came ready.
+        encode_ms: Median from reading an image to its encoding; None where encodings came ready.
     """
 
     frames: TraverseFrames
@@ -105,16 +105,21 @@ def _encode_images(
         raise InvalidSourceError("this evaluator takes ready encodings alone; give a .npy or .csv file")
     encodings = np.empty((len(recording.frames), evaluator.encoding_dim), np.float32)
     kept: list[int] = []
+    waiting: list[Image] = []  # as many as are best encoded at once
     took_ms: list[float] = []
+    began = perf_counter()
     for place, frame in enumerate(recording.frames):
         try:
             body = recording.image(frame, evaluator.input_size).body
         except BrokenFrameError as error:
             left_out[error.reason] = left_out.get(error.reason, 0) + 1
         else:
-            began = perf_counter()
-            encodings[len(kept)] = evaluator.encode([decode_image(body, max_pixels)])[0]
-            took_ms.append(1000 * (perf_counter() - began))
+            began = perf_counter() if not waiting else began
+            waiting.append(evaluator.prepare(decode_image(body, max_pixels)))
             kept.append(place)
+        if waiting and (len(waiting) >= evaluator.largest_batch or place == len(recording.frames) - 1):
+            encodings[len(kept) - len(waiting) : len(kept)] = evaluator.encode(waiting)
+            took_ms += [1000 * (perf_counter() - began) / len(waiting)] * len(waiting)
+            waiting.clear()
         on_progress((place + 1) / len(recording.frames))
     return kept, encodings[: len(kept)], median(took_ms) if took_ms else None

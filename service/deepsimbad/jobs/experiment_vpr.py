@@ -69,7 +69,7 @@ class VprReport:
         same_route: Whether the landmark traverse drove the mapped route.
         encoding_dim: d.
         bytes_per_encoding: Of one frame in a traverse's file, places apart.
-        encode_ms: Median from an image's bytes to its encoding; None where encodings came ready.
+        encode_ms: Median from reading an image to its encoding; None where encodings came ready.
     """
 
     config: VprConfig

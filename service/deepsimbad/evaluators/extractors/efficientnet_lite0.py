@@ -97,4 +97,4 @@ def _module(weights: Path) -> "nn.Module":
 
     trunk = EfficientNetLite(tuple(_TAKEN))
     read_state_dict(weights, trunk)
-    return SpatialGrid(trunk, _CELLS, mean=(127.0,) * 3, std=(128.0,) * 3, is_rgb=True)
+    return SpatialGrid(trunk.eval().folded(), _CELLS, mean=(127.0,) * 3, std=(128.0,) * 3, is_rgb=True)

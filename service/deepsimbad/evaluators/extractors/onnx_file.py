@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepsimbad.errors import InvalidWeightsError, MissingPackageError, OutOfMemoryError
-from deepsimbad.evaluators.compute import Compute
+from deepsimbad.evaluators.compute import Compute, available_cores
 from deepsimbad.evaluators.extractors.network import NetworkExtractor
 from deepsimbad.evaluators.runtimes import INSTALL_FAST, has_onnxruntime, onnx_session
 from deepsimbad.evaluators.weights.files import file_sha256, weights_path
@@ -122,7 +122,7 @@ class _FileRun:
         self._file = file
         _check_content(file, content)
         try:
-            self._session = onnx_session(content, compute)
+            self._session = onnx_session(content, compute.n_threads or available_cores())
         except Exception as error:
             raise self._failure(f"is no model that ONNX Runtime can run: {_first_line(error)}", error) from error
         self._shown = _Shown.read(file, self._session.get_modelmeta().custom_metadata_map)
