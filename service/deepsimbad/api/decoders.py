@@ -1,7 +1,7 @@
 """Images on their way from a body to the inference worker: few are decoded at once, whatever is sent."""
 
-from contextlib import AsyncExitStack
 from dataclasses import dataclass
+from typing import cast
 
 from anyio import CapacityLimiter
 from anyio.to_thread import run_sync
@@ -54,14 +54,18 @@ class Decoders:
             EvaluatorUnavailableError: It cannot be loaded any more.
             OverloadedError: The image is large, and as many large ones wait as may.
         """
-        n_pixels = await run_sync(claimed_pixels, body, self._max_pixels)
-        async with AsyncExitStack() as until_decoded:
-            if n_pixels > KEPT_PIXELS:
-                self._check_large()
-                await until_decoded.enter_async_context(self._large)
-            return await run_sync(self._decode, body, evaluator, limiter=self._slots[priority])
+        slots = self._slots[priority]
+        decoded = await run_sync(self._decode, body, evaluator, KEPT_PIXELS, limiter=slots)
+        if decoded is not None:
+            return decoded
+        self._check_large()
+        async with self._large:
+            return cast("Decoded", await run_sync(self._decode, body, evaluator, self._max_pixels, limiter=slots))
 
-    def _decode(self, body: bytes, evaluator: Evaluator) -> Decoded:
+    def _decode(self, body: bytes, evaluator: Evaluator, most_pixels: int) -> Decoded | None:
+        """None: it has more pixels than these, and was not decoded."""
+        if claimed_pixels(body, self._max_pixels) > most_pixels:
+            return None
         ready(evaluator)  # where it is not, decoding is in vain
         image = decode_image(body, self._max_pixels)
         return Decoded(evaluator.prepare(image), is_blank(image))

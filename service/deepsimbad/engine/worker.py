@@ -6,7 +6,7 @@ Images of several robots are encoded in one batch where the machine gains by it.
 import itertools
 import threading
 from collections.abc import Callable
-from concurrent.futures import Future
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from enum import IntEnum
 from queue import Empty, PriorityQueue
@@ -49,7 +49,8 @@ class InferenceWorker:
     """Runs submitted functions one at a time, live ones first.
 
     One thread, because encoders and scoring already use the cores they need: two at once would only make both late.
-    A batch must be submitted in pieces short enough that a live view can wait for one.
+    A batch must be submitted in pieces short enough that a live view can wait for one. What is made of encoded images
+    runs in a thread beside it, so that the next images are encoded meanwhile.
 
     Args:
         name: Of the thread.
@@ -65,6 +66,7 @@ class InferenceWorker:
         self._arrivals = itertools.count()
         self._open = True
         self._lock = threading.Lock()
+        self._scorer = ThreadPoolExecutor(1, f"{name} of images")
         self._thread = threading.Thread(target=self._work, name=name, daemon=True)
         self._thread.start()
 
@@ -130,14 +132,20 @@ class InferenceWorker:
             self._n_waiting[Priority._CLOSE] += 1
             self._queue.put(_Work(Priority._CLOSE, next(self._arrivals), lambda _: None, Future()))
         self._thread.join()
+        self._scorer.shutdown()
 
     def _work(self) -> None:
         while (first := self._queue.get()).priority is not Priority._CLOSE:
             batch = [work for work in self._with_company(first) if work.answer.set_running_or_notify_cancel()]
             del first
             _encode(batch)
-            while batch:
-                _finish(batch.pop(0))  # or the last answer's arrays live until the next query
+            while batch:  # emptied, or the last answer's arrays live until the next query
+                work = batch.pop(0)
+                if work.evaluator is None:
+                    _finish(work)
+                else:
+                    self._scorer.submit(_finish, work)
+                del work
 
     def _with_company(self, first: _Work) -> list[_Work]:
         """A piece of work with the images that are encoded together with it, taken off the queue."""

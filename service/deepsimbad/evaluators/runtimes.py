@@ -169,7 +169,7 @@ class _OnnxRun:
     def __init__(self, exported: Path, compute: Compute) -> None:
         n_threads = compute.n_threads or available_cores()
         self._session = onnx_session(exported, n_threads=1)
-        self.largest_batch = compute.largest_batch or n_threads
+        self.largest_batch = compute.largest_batch or 4 * n_threads  # so that threads seldom wait for the last image
         self._threads = ThreadPoolExecutor(n_threads, "onnxruntime")
 
     def __call__(self, pixels: NDArray[np.uint8]) -> NDArray[np.float32]:
