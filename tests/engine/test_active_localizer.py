@@ -53,7 +53,7 @@ def snapshots(seasons: list[NDArray[np.float64]]) -> Snapshots:
         mapped = frames(training)
         route = route_of(mapped, closed)
         second = frames(landmarks)
-        found = describe(mapped, route, EVALUATOR, model, relevance, LIST_LENGTH, second, lambda _: None)
+        found = describe(mapped, route, EVALUATOR, model, relevance, LIST_LENGTH, second, True, lambda _: None)
         domain = DomainRecord("d", {}, closed, ACTIONS_M, None, "")
         return MapSnapshot.from_contents(map_contents(domain, 1, {}, model, found, route), 0)
 
