@@ -7,7 +7,7 @@
 # It listens on every address of its network, so it refuses to start until the first key was created. Any command of
 # `deepsimbad` can stand in the place of `keys create ...`.
 #
-# It computes on the processor: PyTorch comes from PyTorch's own index of CPU builds, about 1.5 GB of image in all, and
+# It computes on the processor: PyTorch comes from PyTorch's own index of CPU builds, about 1.8 GB of image in all, and
 # ONNX Runtime runs the default extractor. With a GPU,
 #
 #   docker build --build-arg VARIANT=cuda --build-arg PIP_EXTRA_INDEX_URL= --tag deep-simbad:cuda .

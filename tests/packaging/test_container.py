@@ -305,7 +305,7 @@ def test_the_image_holds_no_more_than_it_needs(image: Build) -> None:
     assert not list((image.root / "opt").rglob("*.nbi")), "compiled code lies in the volume, not beside the sources"
     assert list((image.root / "var/lib/deepsimbad/cache").rglob("*.nbi")), "the hot loops were compiled"
     n_bytes = sum(path.lstat().st_size for path in (image.root / "opt").rglob("*"))
-    assert n_bytes < 800e6, f"{n_bytes / 1e6:.0f} MB"
+    assert n_bytes < 1800e6, f"{n_bytes / 1e6:.0f} MB: nearly half of it is PyTorch"
 
 
 def is_healthy(image: Build, health: list[str], port: str) -> bool:
