@@ -7,6 +7,7 @@ says so where that is missing.
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import cached_property
 from os import PathLike
 from pathlib import Path
@@ -148,7 +149,7 @@ class OnBoardEncoder:
             raise InvalidArgumentError("give exactly one of image and encoding")
         dissimilarities = self._of_image(image) if image is not None else self._of_encoding(encoding)
         if dissimilarities is None:
-            return observation(dissimilarities=[0] * self.n_landmarks)
+            return replace(observation(dissimilarities=[0] * self.n_landmarks), landmark_model=self.digest)
         nearest_first = np.argsort(rank_landmarks(dissimilarities))
         body = pack_ranked_landmarks(nearest_first[:n_sent].tolist(), self.n_landmarks)
         return Observation(body, MEDIA_TYPE, self.digest)

@@ -11,6 +11,7 @@ import pytest
 from starlette.testclient import TestClient
 
 from deepsimbad.api.app import create_app
+from deepsimbad.errors import InvalidWeightsError
 from deepsimbad.jobs.perform import InThisProcess
 
 from .conftest import N_SEEN, encoded, make_ready_domain, picture, remap, small_settings
@@ -165,3 +166,41 @@ def test_what_is_left_out_is_as_the_domain_has_it(tmp_path: Path) -> None:
         assert (again.status_code, again.json()["evaluator"]) == (200, old)
         other = {"kind": "feature_l2", "extractor": "none"}
         refused(client.put("/v1/admin/domains/old", json={"evaluator": other}), 409, "domain_differs")
+
+
+def test_weights_that_cannot_be_read_keep_no_service_from_starting(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    weights = tmp_path / "weights" / "eyes.onnx"
+    write_network(weights, 1)
+    with service(tmp_path) as client:
+        client.put("/v1/admin/domains/street", json={"evaluator": EVALUATOR})
+
+    def refused_by_the_disk(_path: Path) -> bytes:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(Path, "read_bytes", refused_by_the_disk)
+    monkeypatch.setattr("deepsimbad.evaluators.extractors.onnx_file.file_sha256", refused_by_the_disk)
+    with service(tmp_path) as client:
+        assert client.get("/readyz").status_code == 200
+        assert client.get("/v1/domains/street").json()["evaluator_problem"] == "invalid_weights"
+        again = client.put("/v1/admin/domains/street", json={"evaluator": EVALUATOR})
+        assert again.status_code == 200  # the same again changes nothing
+
+
+def test_a_network_that_gives_no_encoding_is_not_the_robots_fault(tmp_path: Path) -> None:
+    write_network(tmp_path / "weights" / "eyes.onnx", 1)
+    with service(tmp_path) as client:
+        client.put("/v1/admin/domains/street", json={"evaluator": EVALUATOR})
+        upload(client, "drive")
+        remap(client, "street", training_traverse="drive", landmark_traverse="drive", n_landmarks=N_SEEN)
+        evaluators = client.app.state.services.evaluators  # type: ignore[attr-defined]
+        extractor = evaluators.evaluator(EVALUATOR)._extractor
+
+        def broken(_pixels: np.ndarray) -> np.ndarray:
+            raise InvalidWeightsError("eyes.onnx gives NaN")
+
+        object.__setattr__(extractor, "run", broken)
+        broken.largest_batch = 1  # type: ignore[attr-defined]
+        answer = client.post(VIEW, content=encoded(picture(1)), headers=JPEG)
+        assert refused(answer, 503, "evaluator_unavailable")["reason"] == "invalid_weights"

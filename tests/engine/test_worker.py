@@ -190,3 +190,18 @@ def test_a_cancelled_image_is_not_encoded(worker: InferenceWorker) -> None:
     gate.set()
     assert [answers[k].result(5).values[0] for k in (0, 2)] == [1, 3]
     assert eyes.batches == [2]
+
+
+def test_slow_answers_fill_the_queue_that_is_counted() -> None:
+    worker, eyes, gate = InferenceWorker(max_waiting=3), Eyes(largest_batch=1), threading.Event()
+    answers = []
+    try:
+        looks = (worker.look(eyes, grey(n), lambda seen: (gate.wait(60), seen)[1]) for n in range(100))
+        with pytest.raises(OverloadedError):
+            answers.extend(looks)
+        assert len(answers) < 30
+        gate.set()
+        assert [answer.result(60).values[0] for answer in answers] == list(range(len(answers)))
+    finally:
+        gate.set()
+        worker.close()

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepsimbad.engine.observation import EncodedImage
-from deepsimbad.errors import InvalidEncodingError
+from deepsimbad.errors import EvaluatorUnavailableError, InvalidEncodingError, InvalidWeightsError
 from deepsimbad.evaluators.base import Evaluator, Image
 
 
@@ -18,9 +18,13 @@ def encode_images(evaluator: Evaluator, images: Sequence[Image]) -> list[Encoded
     Raises:
         UnsupportedMediaTypeError: The evaluator takes ready encodings alone.
         OutOfMemoryError: There is too little memory for it.
+        EvaluatorUnavailableError: Its network gives something else than encodings.
     """
     began = perf_counter()
-    encodings = evaluator.encode(images)
+    try:
+        encodings = evaluator.encode(images)
+    except InvalidWeightsError as error:  # the network is at fault, not what a robot sent
+        raise EvaluatorUnavailableError(error.message, reason=error.code, **error.hints) from error
     encode_ms = 1000 * (perf_counter() - began)
     return [EncodedImage(encoding, evaluator.weights_sha256, encode_ms) for encoding in encodings]
 

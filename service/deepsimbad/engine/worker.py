@@ -23,6 +23,9 @@ from deepsimbad.evaluators.base import Evaluator, Image
 T = TypeVar("T")
 
 
+_MOST_UNSCORED = 8  # encoded images whose answers are not yet made
+
+
 class Priority(IntEnum):
     """Who goes first; within one priority, in order of arrival."""
 
@@ -66,6 +69,7 @@ class InferenceWorker:
         self._arrivals = itertools.count()
         self._open = True
         self._lock = threading.Lock()
+        self._unscored = threading.Semaphore(_MOST_UNSCORED)
         self._scorer = ThreadPoolExecutor(1, f"{name} of images")
         self._thread = threading.Thread(target=self._work, name=name, daemon=True)
         self._thread.start()
@@ -144,8 +148,15 @@ class InferenceWorker:
                 if work.evaluator is None:
                     _finish(work)
                 else:
-                    self._scorer.submit(_finish, work)
+                    self._unscored.acquire()  # where scoring is slower, images wait in the queue, which is counted
+                    self._scorer.submit(self._score, work)
                 del work
+
+    def _score(self, work: _Work) -> None:
+        try:
+            _finish(work)
+        finally:
+            self._unscored.release()
 
     def _with_company(self, first: _Work) -> list[_Work]:
         """A piece of work with the images that are encoded together with it, taken off the queue."""

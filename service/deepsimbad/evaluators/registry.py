@@ -10,7 +10,7 @@ from importlib.util import find_spec
 from types import MappingProxyType
 from typing import Any, cast
 
-from deepsimbad.errors import InvalidInputError
+from deepsimbad.errors import InvalidInputError, InvalidWeightsError, MissingPackageError
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.compute import Compute
 from deepsimbad.evaluators.extractors.base import Extractor
@@ -171,7 +171,12 @@ def make_extractor(text: str, compute: Compute) -> Extractor:
     target = _EXTRACTORS[ExtractorName(name)].target
     if target is None:
         raise InvalidInputError(f"{name} is no extractor")
-    return cast("Extractor", _load(target)(argument, compute))
+    try:
+        return cast("Extractor", _load(target)(argument, compute))
+    except OSError as error:
+        raise InvalidWeightsError(f"the weights of {text} cannot be read: {error}") from error
+    except ImportError as error:
+        raise MissingPackageError(f"a package that {name} needs cannot be imported: {error}") from error
 
 
 def _load(target: str) -> Callable[..., Any]:

@@ -5,9 +5,9 @@ all that happens between, normalising the pixels included, is its own. So the on
 and ONNX Runtime gets an export of it.
 """
 
+import hashlib
 import logging
 import os
-import shutil
 import tempfile
 import warnings
 from collections.abc import Callable, Iterator
@@ -40,6 +40,7 @@ INSTALL_TORCH = (
 INSTALL_FAST = "install ONNX Runtime: pip install 'deep-simbad[fast]'"
 
 _INPUT = "pixels"
+_DIGEST_BYTES = 32
 _NO_MEMORY = "there is too little memory to encode an image now: try again, or give the service more"
 _BATCH_ON_CPU = 1  # a larger one leaves the caches: docs/results/encode.md
 _BATCH_ON_CUDA = 32
@@ -166,7 +167,7 @@ class _OnnxRun:
     That is a third more images a second than all threads on one image, and each has the same bits alone and in company.
     """
 
-    def __init__(self, exported: Path, compute: Compute) -> None:
+    def __init__(self, exported: bytes, compute: Compute) -> None:
         n_threads = compute.n_threads or available_cores()
         self._session = onnx_session(exported, n_threads=1)
         self.largest_batch = compute.largest_batch or 4 * n_threads  # so that threads seldom wait for the last image
@@ -183,7 +184,7 @@ class _OnnxRun:
             return np.asarray(self._session.run(None, {_INPUT: pixels})[0], np.float32)
 
 
-def onnx_session(model: Path | bytes, n_threads: int) -> Any:
+def onnx_session(model: bytes, n_threads: int) -> Any:
     """ONNX Runtime's session of a model on the processor; raises what ONNX Runtime does of one that it cannot load."""
     import onnxruntime
 
@@ -200,30 +201,35 @@ def _onnx_run(
 ) -> _OnnxRun:
     """From the export in the weights' folder; the first time it is made there, which takes some seconds."""
     kept = compute.weights_dir / "exported" / f"{exported_as}.onnx"
-    if kept.is_file():
-        try:
-            return _OnnxRun(kept, compute)
-        except _unreadable():
-            log.warning("an export for ONNX Runtime is damaged and is made anew", extra={"file": str(kept)})
+    content = _whole(kept)
+    if content is not None:
+        return _OnnxRun(content, compute)
     log.info("preparing a network for ONNX Runtime, once", extra={"file": str(kept)})
     with tempfile.TemporaryDirectory() as folder:
         made = Path(folder) / kept.name
         _export(make_module().eval().requires_grad_(False), made, example)
-        try:
-            kept.parent.mkdir(parents=True, exist_ok=True)
-            beside = kept.with_suffix(f".{os.getpid()}")
-            shutil.copyfile(made, beside)
-            beside.replace(kept)  # whole or not at all, whoever exports beside us
-        except OSError as error:
-            log.warning("an export for ONNX Runtime cannot be kept", extra={"file": str(kept), "why": str(error)})
-        return _OnnxRun(made, compute)
+        content = made.read_bytes()
+    try:
+        kept.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=kept.parent, delete=False) as beside:
+            beside.write(content + hashlib.sha256(content).digest())
+        Path(beside.name).replace(kept)  # whole or not at all, whoever exports beside us
+    except OSError as error:
+        log.warning("an export for ONNX Runtime cannot be kept", extra={"file": str(kept), "why": str(error)})
+    return _OnnxRun(content, compute)
 
 
-def _unreadable() -> tuple[type[Exception], ...]:
-    """What ONNX Runtime raises of a file that is no whole model."""
-    from onnxruntime.capi import onnxruntime_pybind11_state as state
-
-    return state.InvalidProtobuf, state.InvalidGraph, state.Fail, state.InvalidArgument
+def _whole(kept: Path) -> bytes | None:
+    """An export as it was made; None: there is none, or it was changed since. Its digest stands at its end."""
+    try:
+        stored = kept.read_bytes()
+    except OSError:
+        return None
+    content, digest = stored[:-_DIGEST_BYTES], stored[-_DIGEST_BYTES:]
+    if hashlib.sha256(content).digest() == digest:
+        return content
+    log.warning("an export for ONNX Runtime is damaged and is made anew", extra={"file": str(kept)})
+    return None
 
 
 def _export(module: "nn.Module", to: Path, example: tuple[int, int]) -> None:

@@ -50,9 +50,10 @@ class RemapInputs:
     @property
     def weights_sha256(self) -> str | None:
         """Of the network that encoded the images; None where none did, or nobody knows."""
-        if self.training.weights_sha256 is not None or self.kept is None:
-            return self.training.weights_sha256
-        return weights_of(self.kept.config)
+        landmarks = self.candidates.weights_sha256 if self.candidates is not None else None
+        if self.kept is not None:
+            landmarks = weights_of(self.kept.config)
+        return self.training.weights_sha256 or landmarks
 
     def digest(self) -> str:
         """SHA-256 over all of it, in hex: equal digests, equal map. Another release counts as another input."""

@@ -143,7 +143,7 @@ def _checked_rows(db: Database, dim: int) -> Iterator[tuple[Any, ...]]:
             if dtype is None:
                 raise ValueError("the encoding has another length")
             encoding = np.frombuffer(body, dtype)
-        except (TypeError, ValueError, struct.error) as error:
+        except (TypeError, ValueError, ZeroDivisionError, struct.error) as error:
             raise _damaged(f"frame {index} is not what was stored") from error
         yield index, position_m, timestamp_us, x_m, y_m, encoding
 

@@ -31,7 +31,6 @@ async def put_domain(domain: DomainName, request: Request, response: Response, r
 
     def make() -> tuple[DomainAnswer, bool]:
         evaluator = _completed(body.evaluator, running, domain)
-        running.evaluators.evaluator(evaluator.as_dict()).load()  # one that cannot be loaded should not be stored
         record, created = running.catalog.create_domain(
             domain, dict(evaluator.as_dict()), body.closed, body.actions_m, running.settings.max_domains
         )
@@ -61,11 +60,16 @@ async def delete_domain(domain: DomainName, running: Running) -> None:
 
 
 def _completed(given: dict[str, Any], running: Services, domain: str) -> EvaluatorConfig:
-    """What was left out is as the domain has it, where it exists: the default may have changed since it was made."""
+    """The configuration of a domain that is made now, loaded once; where it exists, what was left out is as it has it.
+
+    The default may have changed since it was made.
+    """
     try:
         present = running.catalog.domain(domain).evaluator
     except UnknownDomainError:
-        return evaluator_config(given)
+        config = evaluator_config(given)
+        running.evaluators.evaluator(config.as_dict()).load()  # one that cannot be loaded should not be stored
+        return config
     return evaluator_config({**present, **given} if present.get("kind") == given["kind"] else given)
 
 
