@@ -150,7 +150,7 @@ def batches() -> Iterator[str]:
         "",
         "ONNX Runtime works on every image with one thread, on as many as there are cores; PyTorch with all threads on "
         "one. Where `DEEPSIMBAD_ENCODE_BATCH` is not set, it is 1 for PyTorch on the processor, where a batch rounds "
-        "otherwise than one image, all cores for ONNX Runtime, and 32 on CUDA.",
+        "otherwise than one image, four a core for ONNX Runtime, and 32 on CUDA.",
         "",
     )
 

@@ -125,7 +125,7 @@ class Settings(BaseSettings):
     encode_batch: Annotated[
         int,
         Field(
-            description="Most images encoded at once; 0: what measures best, on CUDA 32, else 1 to all cores.",
+            description="Most images encoded at once; 0: what measures best, on CUDA 32, else 1 to four a core.",
             ge=0,
             le=1024,
         ),
