@@ -1,5 +1,6 @@
 """A live session of the async client."""
 
+from collections.abc import Sequence
 from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
@@ -91,9 +92,17 @@ class AsyncSession:
         """
         return await self._transport.send(session_calls.set_prior(self.session_id, position_m, std_m))
 
-    async def truths(self, true_positions_m: Numbers) -> TruthScore:
+    async def truths(
+        self,
+        true_positions_m: Numbers,
+        *,
+        true_map_images: Sequence[Sequence[int]] | None = None,
+        first_observation: int = 0,
+    ) -> TruthScore:
         """Tell where the robot truly was at each of its observations, known only afterwards."""
-        return await self._transport.send(session_calls.truths(self.session_id, true_positions_m))
+        return await self._transport.send(
+            session_calls.truths(self.session_id, true_positions_m, true_map_images, first_observation)
+        )
 
     async def delete(self) -> None:
         """End the session; nothing more can be asked of it."""

@@ -168,6 +168,8 @@ class TruthScore(Answer):
     n_left_out: int
     anr: float | None = None
     """Averaged normalised rank in percent, 0 is perfect, 50 chance; None where no truth is known."""
+    retrieval_ranks: tuple[float | None, ...] | None = None
+    """Of the best of its true map images by each view alone, from 0; None where none was told."""
     map_version: int
 
 

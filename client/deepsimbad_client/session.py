@@ -1,5 +1,6 @@
 """A live session of the blocking client."""
 
+from collections.abc import Sequence
 from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
@@ -125,7 +126,13 @@ class Session:
         """
         return self._transport.send(session_calls.set_prior(self.session_id, position_m, std_m))
 
-    def truths(self, true_positions_m: Numbers) -> TruthScore:
+    def truths(
+        self,
+        true_positions_m: Numbers,
+        *,
+        true_map_images: Sequence[Sequence[int]] | None = None,
+        first_observation: int = 0,
+    ) -> TruthScore:
         """Tell where the robot truly was at each of its observations, known only afterwards: how good were the answers?
 
         The service raises its alarm by this; the map learns nothing from it (`Admin.feed_experience`). The same truths
@@ -133,11 +140,16 @@ class Session:
 
         Args:
             true_positions_m: A position along the map's route for each observation, in order; None where unknown.
+            true_map_images: For each of the same observations the map images that show its place: the answer's
+                `retrieval_ranks` then tell where each view by itself placed the best of them.
+            first_observation: The observation that the first of them belongs to: truths may be told bit by bit.
 
         Raises:
             InvalidInputError: As many positions as observations there are not.
         """
-        return self._transport.send(session_calls.truths(self.session_id, true_positions_m))
+        return self._transport.send(
+            session_calls.truths(self.session_id, true_positions_m, true_map_images, first_observation)
+        )
 
     def delete(self) -> None:
         """End the session; nothing more can be asked of it."""

@@ -1,7 +1,8 @@
 """The calls of a session: one robot's belief, kept by the service."""
 
 import math
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 from uuid import uuid4
 
 from deepsimbad_client.answers import float_array, model, next_best_view_of, nothing, page
@@ -113,13 +114,22 @@ def set_prior(session_id: str, position_m: float, std_m: float) -> Call[SessionS
     return Call("PUT", f"{_session(session_id)}/prior", model(SessionState), headers=JSON, body=json_body(document))
 
 
-def truths(session_id: str, true_positions_m: Numbers) -> Call[TruthScore]:
+def truths(
+    session_id: str,
+    true_positions_m: Numbers,
+    true_map_images: Sequence[Sequence[int]] | None = None,
+    first_observation: int = 0,
+) -> Call[TruthScore]:
     """Tell where the robot truly was, None or NaN where unknown; the same again counts once.
 
     Raises:
         InvalidArgumentError: A position is infinite or no number.
     """
-    document = {"true_positions_m": known_positions(true_positions_m)}
+    document: dict[str, Any] = {"true_positions_m": known_positions(true_positions_m)}
+    if true_map_images is not None:
+        document["true_map_images"] = [[int(image) for image in images] for images in true_map_images]
+    if first_observation:
+        document["first_observation"] = first_observation
     return Call("POST", f"{_session(session_id)}/truths", model(TruthScore), headers=JSON, body=json_body(document))
 
 

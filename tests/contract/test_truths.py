@@ -16,6 +16,7 @@ from deepsimbad.jobs.perform import InThisProcess
 from .conftest import N_READY, make_ready_domain, ready_encodings, remap, small_settings, wait_for
 
 STEP_M = 4.0
+NO_RANKS: dict[str, Any] = {"retrieval_ranks": None, "map_version": 1}
 
 
 @pytest.fixture
@@ -61,19 +62,61 @@ def test_the_answer_is_the_anr_of_the_beliefs_that_were_answered(service: TestCl
     assert len(set(shares)) > 1, "else nothing is shown"
     expected = 100 * float(np.mean(shares))
     answer = told(service, session_id, positions_m)
-    assert answer == {"n_scored": 5, "n_left_out": 0, "anr": pytest.approx(expected), "map_version": 1}
+    assert answer == {"n_scored": 5, "n_left_out": 0, "anr": pytest.approx(expected), **NO_RANKS}
     assert counted(service) == (5, pytest.approx(100 * sum(shares)))
     some = told(service, session_id, [None, *positions_m[1:3], None, None])
-    assert some == {"n_scored": 2, "n_left_out": 3, "anr": pytest.approx(50 * sum(shares[1:3])), "map_version": 1}
+    assert some == {"n_scored": 2, "n_left_out": 3, "anr": pytest.approx(50 * sum(shares[1:3])), **NO_RANKS}
     none = told(service, session_id, [None] * 5)
-    assert none == {"n_scored": 0, "n_left_out": 5, "anr": None, "map_version": 1}
+    assert none == {"n_scored": 0, "n_left_out": 5, "anr": None, **NO_RANKS}
+
+
+def test_each_view_is_ranked_by_the_map_images_told(service: TestClient) -> None:
+    """Bit by bit as at once, by ANR's rule, also after the session went on or ended."""
+    session_id = service.post("/v1/domains/ready/sessions", json={}).json()["session_id"]
+    retrievals = []
+    for view in range(6):
+        body = {"encoding": (ready_encodings()[2 * view] + 0.8).tolist()}
+        path = f"/v1/sessions/{session_id}/observations?action_m={STEP_M}&shortlist={N_READY}"
+        retrieval = service.post(path, json=body).json()["retrieval"]
+        retrievals.append({place["map_image"]: place["relevance"] for place in retrieval})
+    images = [[2 * view, 2 * view + 1] if view != 1 else [] for view in range(6)]
+
+    def rank(view: int) -> float | None:
+        if not images[view]:
+            return None
+        relevance = retrievals[view]
+        best = max(relevance[image] for image in images[view])
+        return sum(one > best for one in relevance.values()) + (list(relevance.values()).count(best) - 1) / 2
+
+    expected = [rank(view) for view in range(6)]
+    assert len(set(expected)) > 2, "else nothing is shown"
+
+    def ranks(first: int, last: int) -> list[float | None]:
+        part = {"true_positions_m": [None] * (last - first), "true_map_images": images[first:last]}
+        answer = service.post(f"/v1/sessions/{session_id}/truths", json={**part, "first_observation": first})
+        assert answer.status_code == 200, answer.text
+        assert answer.json()["n_left_out"] == last - first
+        found: list[float | None] = answer.json()["retrieval_ranks"]
+        return found
+
+    assert ranks(0, 6) == expected
+    assert ranks(3, 6) == expected[3:]
+    service.put(f"/v1/sessions/{session_id}/prior", json={"position_m": 3.0, "std_m": 1.0})
+    body = {"encoding": ready_encodings()[12].tolist()}
+    retrieval = service.post(f"/v1/sessions/{session_id}/observations", json=body).json()["retrieval"]
+    assert retrieval[0]["map_image"] == 12
+    images.append([12])
+    assert ranks(6, 7) == [0]
+    service.delete(f"/v1/sessions/{session_id}")
+    assert ranks(2, 7) == [*expected[2:], 0]
+    assert counted(service)[0] == 0, "the alarm is of positions alone"
 
 
 def test_a_truth_far_from_the_map_says_nothing_of_it(service: TestClient) -> None:
     session_id, positions_m, shares = walked(service, 3)
     last_m = 2.0 * (N_READY - 1)
     answer = told(service, session_id, [positions_m[0], 1e9, last_m + 10.5])
-    assert answer == {"n_scored": 1, "n_left_out": 2, "anr": pytest.approx(100 * shares[0]), "map_version": 1}
+    assert answer == {"n_scored": 1, "n_left_out": 2, "anr": pytest.approx(100 * shares[0]), **NO_RANKS}
     assert counted(service)[0] == 1
     assert told(service, session_id, [None, None, last_m + 9.5])["n_scored"] == 1
 
@@ -160,6 +203,11 @@ def test_a_deleted_domain_takes_its_series_along(service: TestClient) -> None:
         (b'{"true_positions_m": [true, 2]}', "invalid_request"),
         (b'{"true_positions_m": null}', "invalid_request"),
         (b'{"true_positions_m": [1, 2], "more": 1}', "invalid_request"),
+        (b'{"true_positions_m": [null, null], "true_map_images": [[1]]}', "invalid_input"),
+        (b'{"true_positions_m": [null, null], "true_map_images": [[1], [1000]]}', "invalid_input"),
+        (b'{"true_positions_m": [null, null], "true_map_images": [[1], [-1]]}', "invalid_request"),
+        (b'{"true_positions_m": [null, null], "true_map_images": [[1], [99999999999999999999]]}', "invalid_request"),
+        (b'{"true_positions_m": [1, 2], "first_observation": 1000000000000}', "invalid_input"),
         (b'{}', "invalid_request"),
         (b'[1, 2]', "invalid_request"),
         (b'', "empty_body"),

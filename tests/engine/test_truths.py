@@ -194,3 +194,25 @@ def test_shares_told_before_are_told_apart_by_place() -> None:
     assert ranked_truths.new_since(None).tolist() == [0.1, 0.3]
     assert ranked_truths.new_since(np.array([5.0])).tolist() == [0.3]
     assert ranked_truths.new_since(np.array([NAN, 2.0, NAN, 4.0])).tolist() == [0.1, 0.3]
+
+
+def test_truths_told_bit_by_bit_follow_a_session_once(mapped: Catalog, monkeypatch: pytest.MonkeyPatch) -> None:
+    async def body(live: Live) -> None:
+        session_id, _ = await driven(live, [ranked(seed, 0.1) for seed in range(6)])
+        truths = truths_of(live)
+        whole = await truths.rank(session_id, [1.0] * 6)
+        journal_part, begun_after = live.store.journal_part, []
+
+        def noting(number: int, after: int, until: int) -> object:
+            begun_after.append(after)
+            return journal_part(number, after, until)
+
+        monkeypatch.setattr(live.store, "journal_part", noting)
+        again = truths_of(live)
+        await again.rank(session_id, [1.0] * 3 + [None] * 3)
+        part = await again.rank(session_id, [1.0] * 3, first=3)
+        assert begun_after == [0, 3]
+        np.testing.assert_array_equal(part.rank_share[3:], whole.rank_share[3:])
+        assert part.n_left_out == 0
+
+    run(mapped, body)

@@ -2,9 +2,9 @@
 
 from typing import Annotated
 
-from pydantic import FailFast, Field, StrictFloat
+from pydantic import FailFast, Field, StrictFloat, StrictInt
 
-from deepsimbad.api.bodies import GREATEST_EXACT_INTEGER, JsonBody, Name
+from deepsimbad.api.bodies import GREATEST_EXACT_INTEGER, GREATEST_ID, JsonBody, Name
 from deepsimbad.core.filters import FilterKind
 from deepsimbad.core.update_rules import UpdateRule
 from deepsimbad.engine.session_config import DEFAULT_START_STD_M, SessionConfig
@@ -46,7 +46,7 @@ class PriorBody(JsonBody):
     std_m: Annotated[StrictFloat, Field(description="Standard deviation, above 0.")]
 
 
-class TruthsBody(JsonBody):
+class TruePositions(JsonBody):
     """Where the robot truly was, known later."""
 
     true_positions_m: Annotated[
@@ -61,7 +61,25 @@ class TruthsBody(JsonBody):
     ]
 
 
-class ExperienceBody(TruthsBody):
+class TruthsBody(TruePositions):
+    """Where the robot truly was, known later; truths may be told bit by bit."""
+
+    true_map_images: Annotated[
+        list[list[Annotated[StrictInt, Field(ge=0, le=GREATEST_ID)]]] | None,
+        Field(
+            max_length=MAX_OBSERVATIONS_FED_BACK,
+            description="For each of the same observations the map images that show its place: each view's own "
+            "retrieval is then ranked by them. null: it is not.",
+        ),
+        FailFast(),
+    ] = None
+    first_observation: Annotated[
+        int,
+        Field(strict=True, ge=0, description="The observation, from 0, that the first of the lists belongs to."),
+    ] = 0
+
+
+class ExperienceBody(TruePositions):
     """Where the robot of a session truly was."""
 
     session_id: Name

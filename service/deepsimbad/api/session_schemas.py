@@ -58,4 +58,12 @@ class TruthsAnswer(Answer):
             le=100,
         ),
     ]
+    retrieval_ranks: Annotated[
+        list[float | None] | None,
+        Field(
+            description="For each observation told of, how many map images its own view placed before the best of its "
+            "`true_map_images`, others tied with that one counted half; null where there is none, null for all where "
+            "none were told."
+        ),
+    ]
     map_version: Annotated[int, Field(description="The map that the session is pinned to.")]

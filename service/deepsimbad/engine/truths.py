@@ -10,16 +10,18 @@ from numpy.typing import NDArray
 
 from deepsimbad.core.metrics import rank_of_truth
 from deepsimbad.core.route import Route
+from deepsimbad.engine.active_localizer import LocalizerState
 from deepsimbad.engine.pinned_maps import PinnedMaps
 from deepsimbad.engine.replay import Replay
 from deepsimbad.engine.session_registry import engine_of
 from deepsimbad.engine.session_state import SessionEngine, SessionState
 from deepsimbad.engine.worker import InferenceWorker
 from deepsimbad.errors import InvalidInputError
-from deepsimbad.store.session_records import JournalRow, ObservedRow, SessionRecord
+from deepsimbad.store.session_records import JournalRow, ObservedRow, SessionRecord, StateSnapshot
 from deepsimbad.store.sessions import SessionStore
 
 _FARTHEST_M = 10.0  # a truth farther from every map image is of no place of the map: another road, another frame
+_FOLLOWED = 16  # sessions, 0.5 MB each at 26,000 map images
 
 
 @dataclass(frozen=True)
@@ -31,12 +33,17 @@ class RankedTruths:
         position_m: [n_observations] the truth along the route; NaN where unknown.
         rank_share: [n_observations] share of the map images that the belief placed before the true one, 0..1; NaN where
             the truth is unknown, or farther than 10 m from the map.
+        retrieval_rank: [n_observations] rank from 0 of the best-placed true image by each view's own relevance; NaN
+            where no true image was told; None where none was of any view.
+        first: The first observation that was told of.
     """
 
     domain: str
     map_version: int
     position_m: NDArray[np.float64]
     rank_share: NDArray[np.float64]
+    retrieval_rank: NDArray[np.float64] | None = None
+    first: int = 0
 
     @property
     def n_scored(self) -> int:
@@ -45,8 +52,8 @@ class RankedTruths:
 
     @property
     def n_left_out(self) -> int:
-        """Observations whose truth is unknown, or is no place of the map."""
-        return int(self.rank_share.size) - self.n_scored
+        """Observations told of whose truth is unknown, or is no place of the map."""
+        return int(self.rank_share.size) - self.first - self.n_scored
 
     @property
     def anr(self) -> float | None:
@@ -65,20 +72,37 @@ class RankedTruths:
         return self.rank_share[known]
 
 
-def checked_truths(positions_m: Sequence[float | None], n_observations: int) -> NDArray[np.float64]:
-    """[n_observations] true positions along the route, NaN where unknown.
+def checked_truths(positions_m: Sequence[float | None], n_observations: int, first: int = 0) -> NDArray[np.float64]:
+    """[n_observations] true positions along the route, NaN where unknown, as before the first one told of.
 
     Raises:
         InvalidInputError: As many positions as observations there are not, or one is not finite.
     """
     if any(one is not None and not math.isfinite(one) for one in positions_m):
         raise InvalidInputError("a true position is NaN or infinite; give null where it is unknown")
-    if len(positions_m) != n_observations:
+    if first + len(positions_m) != n_observations:
+        from_the_first = f" from observation {first} on" if first else ""
         raise InvalidInputError(
-            f"{len(positions_m)} true positions for {n_observations} observations: give one for each",
+            f"{len(positions_m)} true positions{from_the_first} for {n_observations} observations: give one for each",
             n_observations=n_observations,
         )
-    return np.array([math.nan if one is None else one for one in positions_m], np.float64)
+    return np.array([math.nan] * first + [math.nan if one is None else one for one in positions_m], np.float64)
+
+
+def checked_images(
+    true_map_images: Sequence[Sequence[int]] | None, n_observations: int, first: int, n_images: int
+) -> dict[int, NDArray[np.int64]]:
+    """The map images that show the place of an observation, by its number, of those that have any.
+
+    Raises:
+        InvalidInputError: As many lists as positions there are not, or one holds what is no map image.
+    """
+    if true_map_images is not None and first + len(true_map_images) != n_observations:
+        raise InvalidInputError(f"{len(true_map_images)} lists of true map images: give one for each true position")
+    if any(not 0 <= image < n_images for images in true_map_images or () for image in images):
+        raise InvalidInputError(f"map images are 0 to {n_images - 1}", minimum=0, maximum=n_images - 1)
+    listed = enumerate(true_map_images or (), first)
+    return {number: np.array(images, np.int64) for number, images in listed if images}
 
 
 class Truths:
@@ -98,70 +122,106 @@ class Truths:
         self._maps = maps
         self._replays = Replay(store, worker)
         self._clock = clock
+        self._followed: dict[int, tuple[int, StateSnapshot | None]] = {}  # how far, by session: truths come bit by bit
 
-    async def rank(self, session_id: str, positions_m: Sequence[float | None]) -> RankedTruths:
-        """Rank the truth in the belief as it was after every observation.
+    async def rank(
+        self,
+        session_id: str,
+        positions_m: Sequence[float | None],
+        true_map_images: Sequence[Sequence[int]] | None = None,
+        first: int = 0,
+    ) -> RankedTruths:
+        """Rank the truth in the belief, and where asked in the retrieval, as it was after every observation.
 
-        The true map image is the one nearest to the true position along the route; its rank follows ANR's rule.
+        In the belief the true map image is the one nearest to the true position along the route; ranks follow ANR's
+        rule. Truths told bit by bit, in order, cost no more than told at once.
 
         Args:
             session_id: The session.
             positions_m: One for every observation; None where it is unknown.
+            true_map_images: For every observation the map images that show its place.
+            first: The observation that the first of them belongs to.
 
         Raises:
             UnknownSessionError: There is none such, or it ended long ago.
             RetiredMapError: Its map is no more.
-            InvalidInputError: As many positions as observations there are not, or one is not finite.
+            InvalidInputError: As many as observations there are not, a position is not finite, or no map image is one.
             DamagedMapError, DamagedFileError: The map or the session cannot be read.
         """
-        return (await self._ranked(session_id, positions_m))[1]
+        return (await self._ranked(session_id, positions_m, true_map_images, first))[1]
 
     async def keep(
-        self, session_id: str, positions_m: Sequence[float | None]
+        self,
+        session_id: str,
+        positions_m: Sequence[float | None],
+        true_map_images: Sequence[Sequence[int]] | None = None,
+        first: int = 0,
     ) -> tuple[RankedTruths, NDArray[np.float64] | None]:
-        """Rank the truths, then keep them for experience; raises as `rank` does, and then nothing was kept.
+        """Rank the truths, then keep the positions for experience; raises as `rank` does, and then nothing was kept.
 
         Returns:
             The ranked truths, and the positions that had been kept before, if any.
         """
-        record, ranked = await self._ranked(session_id, positions_m)
+        record, ranked = await self._ranked(session_id, positions_m, true_map_images, first)
         kept = self._store.save_true_positions(record.number, ranked.position_m, self._clock())
         return ranked, await asyncio.wrap_future(kept)
 
-    async def _ranked(self, session_id: str, positions_m: Sequence[float | None]) -> tuple[SessionRecord, RankedTruths]:
-        record, engine, known = await asyncio.to_thread(self._prepared, session_id, positions_m)
-        share = np.full(known.size, np.nan)
-        n_needed = int(np.flatnonzero(~np.isnan(known)).max(initial=-1)) + 1  # what follows need not be replayed
+    async def _ranked(
+        self,
+        session_id: str,
+        positions_m: Sequence[float | None],
+        true_map_images: Sequence[Sequence[int]] | None,
+        first: int,
+    ) -> tuple[SessionRecord, RankedTruths]:
+        record, engine, known = await asyncio.to_thread(self._prepared, session_id, positions_m, first)
         route = engine.snapshot.route
-        truth = true_images(route, known)
-        await self._replay(record, engine, truth[:n_needed], share[:n_needed])
-        apart_m = np.abs(route.offset_m(route.position_m[truth], known))
+        images = checked_images(true_map_images, known.size, first, route.n_images)
+        nearest = true_images(route, known)
+        share, retrieval = np.full((2, known.size), np.nan)
+
+        def rank(number: int, state: LocalizerState) -> None:
+            if not math.isnan(known[number]):
+                mass = state.belief.mass
+                share[number] = rank_of_truth(mass, nearest[number : number + 1]) / mass.size
+            if number in images and state.relevance is not None:
+                retrieval[number] = rank_of_truth(state.relevance, images[number])
+
+        wanted = np.union1d(np.flatnonzero(~np.isnan(known)), list(images)).astype(int)
+        if wanted.size:
+            await self._follow(record, engine, wanted[0], wanted[-1], rank)
+        apart_m = np.abs(route.offset_m(route.position_m[nearest], known))
         share[~(apart_m <= _FARTHEST_M)] = np.nan  # unknown ones too
-        return record, RankedTruths(record.domain, record.map_version, known, share)
+        asked = None if true_map_images is None else retrieval
+        return record, RankedTruths(record.domain, record.map_version, known, share, asked, first)
 
     def _prepared(
-        self, session_id: str, positions_m: Sequence[float | None]
+        self, session_id: str, positions_m: Sequence[float | None], first: int
     ) -> tuple[SessionRecord, SessionEngine, NDArray[np.float64]]:
         record = self._store.find(session_id)
-        known = checked_truths(positions_m, self._store.n_observations(record.number))
+        known = checked_truths(positions_m, self._store.n_observations(record.number), first)
         return record, engine_of(record, self._maps), known
 
-    async def _replay(
-        self, record: SessionRecord, engine: SessionEngine, truth: NDArray[np.int64], share: NDArray[np.float64]
+    async def _follow(
+        self,
+        record: SessionRecord,
+        engine: SessionEngine,
+        first: int,
+        last: int,
+        rank: Callable[[int, LocalizerState], None],
     ) -> None:
-        """Fill `share` with the rank of every observation's true image."""
-        n_seen = 0
+        """Tell `rank` of the state after every observation from one to another."""
+        n_before, snapshot = self._followed.pop(record.number, (0, None))
 
-        def rank(row: JournalRow, state: SessionState) -> bool:
-            nonlocal n_seen
-            if isinstance(row, ObservedRow):
-                mass = state.belief.belief.mass
-                share[n_seen] = rank_of_truth(mass, truth[n_seen : n_seen + 1]) / mass.size
-                n_seen += 1
-            return n_seen == truth.size
+        def is_last(row: JournalRow, state: SessionState) -> bool:
+            number = state.belief.n_observations - 1
+            if isinstance(row, ObservedRow) and number >= first:
+                rank(number, state.belief)
+            return number == last
 
-        if truth.size:
-            await self._replays.until(record, engine, rank)
+        state = await self._replays.until(record, engine, is_last, snapshot if n_before <= first else None)
+        self._followed[record.number] = (state.belief.n_observations, engine.snapshot_of(state))
+        while len(self._followed) > _FOLLOWED:
+            del self._followed[next(iter(self._followed))]
 
 
 def true_images(route: Route, position_m: NDArray[np.float64]) -> NDArray[np.int64]:

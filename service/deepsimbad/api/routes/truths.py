@@ -1,5 +1,7 @@
 """Telling a session where its robot truly was: how good the live answers are."""
 
+import math
+
 from anyio.to_thread import run_sync
 from fastapi import APIRouter, Request
 
@@ -25,8 +27,15 @@ async def post_truths(session_id: SessionId, request: Request, running: Running)
     positions are kept, so that a map can learn from them.
     """
     body = await read_json(request, TruthsBody)
-    ranked, before_m = await running.truths.keep(session_id, body.true_positions_m)
+    ranked, before_m = await running.truths.keep(
+        session_id, body.true_positions_m, body.true_map_images, body.first_observation
+    )
     await run_sync(running.metrics.fed_back, ranked.domain, ranked.new_since(before_m).tolist())
+    ranks = ranked.retrieval_rank
     return TruthsAnswer(
-        n_scored=ranked.n_scored, n_left_out=ranked.n_left_out, anr=ranked.anr, map_version=ranked.map_version
+        n_scored=ranked.n_scored,
+        n_left_out=ranked.n_left_out,
+        anr=ranked.anr,
+        retrieval_ranks=None if ranks is None else [None if math.isnan(one) else one for one in ranks[ranked.first :]],
+        map_version=ranked.map_version,
     )
