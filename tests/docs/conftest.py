@@ -27,6 +27,14 @@ class Page:
     def blocks(self, language: str) -> list[str]:
         return [body for name, body in _FENCE.findall(self.text) if name == language]
 
+    def steps(self) -> Iterator[tuple[str, str]]:
+        """In a reader's order: (language, line) of the shell blocks, (language, whole block) of the Python ones."""
+        for language, body in _FENCE.findall(self.text):
+            if language == "bash":
+                yield from (("bash", line) for line in body.splitlines())
+            elif language == "python":
+                yield "python", body
+
     def commands(self) -> Iterator[str]:
         """Every line of the shell blocks, and what is written as code in the prose."""
         for block in self.blocks("bash"):

@@ -1,7 +1,7 @@
-"""Every command, curl example and Python example of the README is run, as it stands, against a live service.
+"""Every command, curl example and Python example of README and the pages beside it is run against a live service.
 
-What differs from a person's machine is replaced word by word: the address, the folder of NCLT (here a rendered campus
-in its layout) and the number of landmarks, which a small campus cannot give.
+README's are run as printed, one after the other in a folder that holds a person's own images; only the server's address
+is another. In the pages the folder of NCLT is a rendered campus in its layout, and fewer landmarks are asked for.
 """
 
 import hashlib
@@ -11,7 +11,8 @@ import shutil
 import subprocess
 import sys
 import time
-from dataclasses import dataclass
+from contextlib import ExitStack
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -22,10 +23,12 @@ from deepsimbad_client.campus import PAPER_DATES, write_campus
 from deepsimbad_client.local_server import LocalServer
 from deepsimbad_client.sources import open_source
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
+from .conftest import PROJECT, Page
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 SEASONS = ("winter", "spring", "summer")
 N_FRAMES = 36
-NOT_RUN = ("make ", "pip install ", "deepsimbad serve ")  # compared in test_references instead
+NOT_RUN = ("make ", "pip install ")  # compared in test_references instead
 EXPECTED_TO_FAIL = "problem.json"
 
 
@@ -37,39 +40,73 @@ class Ran:
     err: str
 
 
-@dataclass(frozen=True)
+@dataclass
 class Workplace:
+    """A folder, a service of its own, and what was run there.
+
+    Attributes:
+        folder: Where a person works.
+        words: What stands in the pages, and what it is here.
+    """
+
     folder: Path
-    url: str
-    ran: list[Ran]
+    words: dict[str, str] = field(default_factory=dict)
+    ran: list[Ran] = field(default_factory=list)
+
+    def serve(self, data_dir: str, stack: ExitStack) -> None:
+        self.url = stack.enter_context(LocalServer(self.folder / data_dir)).url
+
+    def run(self, page: Page, stack: ExitStack) -> None:
+        """Do all that the page shows."""
+        for language, text in page.steps():
+            if text.startswith("deepsimbad serve"):
+                self.serve(text.split()[-1], stack)
+            elif language == "python":
+                self._keep(text, self._process(sys.executable, "-W", "error", "-c", text))
+            elif not text.startswith(NOT_RUN):
+                failing = "" if EXPECTED_TO_FAIL in text else 'curl() { command curl -sS --fail-with-body "$@"; }\n'
+                self._keep(text, self._process("bash", "-c", failing + text))
+
+    def _keep(self, command: str, done: subprocess.CompletedProcess[str]) -> None:
+        self.ran.append(Ran(command, done.returncode, done.stdout, done.stderr))
 
     def answer_of(self, part: str) -> Ran:
         """The one command that holds these words."""
-        (found,) = [each for each in self.ran if part in each.command]
-        return found
+        (ran,) = [ran for ran in self.ran if part in ran.command]
+        return ran
+
+    def _process(self, *command: str) -> subprocess.CompletedProcess[str]:
+        url = getattr(self, "url", "http://127.0.0.1:1")
+        words = [*command[:-1], command[-1].replace("http://127.0.0.1:8000", url)]
+        for there, here in self.words.items():
+            words[-1] = words[-1].replace(there, here)
+        path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+        environment = {**os.environ, "PATH": path, "DEEPSIMBAD_URL": url}
+        return subprocess.run(
+            words,
+            cwd=self.folder,
+            env=environment,
+            capture_output=True,
+            text=True,
+            errors="replace",
+            timeout=400,
+            check=False,
+        )
 
 
 @pytest.fixture(scope="module")
-def workplace(readme, tmp_path_factory):
-    """A folder with what the examples name, in which all of them were run in their order."""
+def nclt(tmp_path_factory) -> Path:
     if shutil.which("curl") is None or shutil.which("bash") is None:
         pytest.skip("the examples need curl and bash")
-    folder = tmp_path_factory.mktemp("workplace")
-    _furnish(folder)
-    with LocalServer(folder / "data") as server:
-        ran = [
-            _run(line, folder, server.url)
-            for block in readme.blocks("bash")
-            for line in block.splitlines()
-            if not line.startswith(NOT_RUN)
-        ]
-        yield Workplace(folder, server.url, ran)
+    folder = tmp_path_factory.mktemp("nclt")
+    write_campus(folder, SEASONS, N_FRAMES, 3)
+    return folder
 
 
-def _furnish(folder):
-    write_campus(folder / "nclt", SEASONS, N_FRAMES, 3)
+def furnish(folder: Path, nclt: Path) -> None:
+    """What a person has: pictures of three drives, and encodings of their own."""
     for season, name in zip(SEASONS, ("elsewhere", "summer", "winter"), strict=True):
-        drive = open_source(f"nclt:{folder / 'nclt' / PAPER_DATES[season]}")
+        drive = open_source(f"nclt:{nclt / PAPER_DATES[season]}")
         (folder / "drives" / name).mkdir(parents=True)
         for place, frame in enumerate(drive.frames):
             (folder / "drives" / name / f"{place:03}.jpg").write_bytes(drive.image(frame, (320, 320)).body)
@@ -82,40 +119,47 @@ def _furnish(folder):
         np.save(folder / "encodings" / f"{season}.npy", places + 0.3 * rng.normal(size=places.shape))
 
 
-def _here(text, folder, url):
-    for there, here in {
-        "http://127.0.0.1:8000": url,
-        "/data/nclt": str(folder / "nclt"),
-        "--n-landmarks 500": "--n-landmarks 20",
-        "--n-landmarks 300": "--n-landmarks 10",
-    }.items():
-        text = text.replace(there, here)
-    return text
+@pytest.fixture(scope="module")
+def first_hour(readme, nclt, tmp_path_factory):
+    """README, from top to bottom."""
+    place = Workplace(tmp_path_factory.mktemp("first_hour"))
+    furnish(place.folder, nclt)
+    with ExitStack() as stack:
+        place.run(readme, stack)
+        yield place
 
 
-def _run(command, folder, url):
-    failing = "" if EXPECTED_TO_FAIL in command else 'curl() { command curl -sS --fail-with-body "$@"; }\n'
-    done = subprocess.run(
-        ["bash", "-c", failing + _here(command, folder, url)],
-        cwd=folder,
-        env={
-            **os.environ,
-            "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",
-            "DEEPSIMBAD_URL": url,
-        },
-        capture_output=True,
-        text=True,
-        errors="replace",
-        timeout=240,
-        check=False,
-    )
-    return Ran(command, done.returncode, done.stdout, done.stderr)
+@pytest.fixture(scope="module")
+def workplace(nclt, tmp_path_factory):
+    """The pages behind it."""
+    words = {"/data/nclt": str(nclt), "--n-landmarks 500": "--n-landmarks 20", "--n-landmarks 300": "--n-landmarks 10"}
+    place = Workplace(tmp_path_factory.mktemp("workplace"), words)
+    furnish(place.folder, nclt)
+    with ExitStack() as stack:
+        place.serve("data", stack)
+        for name in ("recordings", "methods", "http"):
+            place.run(Page(PROJECT / "docs" / f"{name}.md"), stack)
+        yield place
 
 
-def test_every_command_of_the_readme_succeeds(workplace):
+def all_succeeded(ran: list[Ran]) -> None:
+    failed = [command for command in ran if command.code != 0]
+    assert not failed, "\n".join(f"{command.command}\n{command.out}{command.err}" for command in failed)
+
+
+def test_the_readme_runs_as_printed(first_hour):
+    assert len(first_hour.ran) > 15
+    all_succeeded(first_hour.ran)
+    answer = json.loads(first_hour.answer_of("localizations?shortlist=3").out)
+    assert len(answer["retrieval"]) == len(answer["belief"]["top"]) == 3
+    left = {path.name for path in (first_hour.folder / "replays" / "summer").iterdir()}
+    assert left >= {"steps.jsonl", "summary.json"}
+    assert "standardised" in first_hour.answer_of("experiment vpr").out
+
+
+def test_every_command_of_the_pages_succeeds(workplace):
     assert len(workplace.ran) > 20
-    failed = [each for each in workplace.ran if each.code != 0]
-    assert not failed, "\n".join(f"{each.command}\n{each.out}{each.err}" for each in failed)
+    all_succeeded(workplace.ran)
 
 
 def test_a_posted_image_is_answered_with_a_belief(workplace):
@@ -124,7 +168,7 @@ def test_a_posted_image_is_answered_with_a_belief(workplace):
     assert {"mean_m", "mode_m", "credible_95_m", "entropy_bits", "histogram"} <= set(answer["belief"])
     assert answer["next_best_view"]["planner"] == "telling"
     assert json.loads(workplace.answer_of("ranked_landmarks").out)["map_version"] == 1
-    domain = json.loads(workplace.answer_of("curl http://127.0.0.1:8000/v1/domains/campus").out)
+    domain = json.loads(workplace.answer_of("curl http://127.0.0.1:8000/v1/domains/nclt").out)
     assert np.load(workplace.folder / "relevances.npy").shape == (domain["n_map_images"],)
 
 
@@ -159,10 +203,10 @@ def test_the_replay_leaves_its_files(workplace):
 
 def test_the_map_of_another_season_is_made_rolled_back_and_fetched(workplace):
     assert "active then" in workplace.answer_of("deepsimbad-client maps").out
-    assert workplace.answer_of("deepsimbad-client activate").out == "campus serves map 2\n"
-    assert workplace.answer_of("deepsimbad-client rollback").out == "campus serves map 1\n"
+    assert workplace.answer_of("deepsimbad-client activate").out == "nclt serves map 2\n"
+    assert workplace.answer_of("deepsimbad-client rollback").out == "nclt serves map 1\n"
     with Client(workplace.url) as client:
-        second, first = client.admin.maps("campus")
+        second, first = client.admin.maps("nclt")
     assert (first.state, second.state) == ("active", "retired")
     assert second.check["traverse"] == "winter"
     assert hashlib.sha256((workplace.folder / "spring.sqlite").read_bytes()).hexdigest() == first.sha256
@@ -171,7 +215,7 @@ def test_the_map_of_another_season_is_made_rolled_back_and_fetched(workplace):
 def test_the_experiments_leave_their_figures(workplace):
     assert json.loads((workplace.folder / "vpr.json").read_text())["n_queries"] == 50
     assert "telling" in json.loads((workplace.folder / "nbv.json").read_text())["anr"]
-    assert "standardised" in workplace.answer_of("experiment vpr --landmarks nclt:").out
+    assert "standardised" in workplace.answer_of("experiment vpr --landmarks nclt:/data").out
 
 
 def test_the_map_asked_for_by_curl_is_made(workplace):
@@ -182,19 +226,10 @@ def test_the_map_asked_for_by_curl_is_made(workplace):
             time.sleep(0.05)
         assert [job.state for job in client.admin.jobs("garden")] == ["succeeded"]
         assert client.domain("garden").n_map_images == 1
-        assert client.domain("campus").map_version == 1
+        assert client.domain("nclt").map_version == 1
 
 
-def test_every_python_example_runs(readme, workplace):
-    blocks = readme.blocks("python")
-    assert blocks
-    for block in blocks:
-        done = subprocess.run(
-            [sys.executable, "-W", "error", "-c", _here(block, workplace.folder, workplace.url)],
-            cwd=workplace.folder,
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        assert done.returncode == 0, done.stderr
-        assert "95 % within" in done.stdout
+def test_every_python_example_says_where(first_hour, workplace):
+    said = [ran.out for ran in (*first_hour.ran, *workplace.ran) if "import Client" in ran.command]
+    assert len(said) > 2
+    assert all("95 % within" in text for text in said)
