@@ -10,9 +10,9 @@ from bench.soak.link import Link
 from bench.soak.world import DOMAIN, N_LANDMARKS
 from deepsimbad.core.filters import FilterKind
 from deepsimbad.engine.active_localizer import ActiveLocalizer, LocalizerConfig
-from deepsimbad.engine.active_maps import load_snapshot
 from deepsimbad.engine.localizer import describe
-from deepsimbad.engine.observation import RankedLandmarks
+from deepsimbad.engine.maps import load_snapshot
+from deepsimbad.engine.views import RankedLandmarks
 from deepsimbad.evaluators.feature_l2 import FeatureL2
 from deepsimbad.store.catalog import Catalog
 

@@ -16,6 +16,7 @@ from deepsimbad.api.app import create_app
 from deepsimbad.api.dependencies import Services
 from deepsimbad.settings import Settings
 from deepsimbad.store.layout import catalog_path, sessions_path
+from deepsimbad.store.session_records import ClockRecord
 
 
 @pytest.fixture
@@ -80,7 +81,7 @@ def refuse_writes(client: TestClient) -> None:
 
 def fill_disk(client: TestClient) -> None:
     """As much room as is needed now, and not a page more."""
-    services_of(client).session_store.note_clock(services_of(client).clock.record()).result()
+    services_of(client).session_store.note_clock(ClockRecord(None, 0.0, 0.0)).result()
     writing(client).conn.execute("CREATE TABLE filler (bytes BLOB)")
     writing(client).conn.execute(
         "CREATE TRIGGER fill AFTER INSERT ON clock BEGIN INSERT INTO filler VALUES (zeroblob(100000)); END"

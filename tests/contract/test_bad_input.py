@@ -252,7 +252,7 @@ def _activate_behind_the_services_back(data_dir: Path, domain: str, version: int
 
 def _forget(client: TestClient, domain: str) -> None:
     app: Any = client.app
-    app.state.services.active_maps.forget(domain)
+    app.state.services.maps.forget(domain)
 
 
 # Domains and traverses

@@ -123,8 +123,8 @@ def test_a_map_put_back_is_not_damaged_any_more(tmp_path: Path) -> None:
     ) as client:
         assert client.get("/readyz").json()["damaged_maps"] == ["ready"]
         (tmp_path / "aside").rename(path)
-        active_maps = services_of(client).active_maps
-        active_maps._clock = lambda: 1e9  # damage is remembered for some seconds
+        maps = services_of(client).maps
+        maps._clock = lambda: 1e9  # damage is remembered for some seconds
         assert client.get("/readyz").json()["damaged_maps"] == []
 
 

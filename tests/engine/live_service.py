@@ -7,12 +7,11 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from deepsimbad.engine.active_maps import ActiveMaps
-from deepsimbad.engine.evaluator_pool import EvaluatorPool
-from deepsimbad.engine.live_session import Observation
-from deepsimbad.engine.observation import RankedLandmarks, ReadyEncoding, View
-from deepsimbad.engine.pinned_maps import PinnedMaps
+from deepsimbad.engine.encoders import EvaluatorPool
+from deepsimbad.engine.maps import Maps
+from deepsimbad.engine.session import Observation
 from deepsimbad.engine.sessions import Sessions
+from deepsimbad.engine.views import RankedLandmarks, ReadyEncoding, View
 from deepsimbad.engine.worker import InferenceWorker
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.store.catalog import Catalog
@@ -41,11 +40,11 @@ class Live:
         self.commits: list[int] = []
         self.store = SessionStore.open(catalog.data_dir, self.commits.append)
         self.worker = InferenceWorker()
-        self.active_maps = ActiveMaps(catalog)
-        self.maps = PinnedMaps(catalog, self.active_maps, EvaluatorPool())
+        self.maps = Maps(catalog)
         self.sessions = Sessions(
             self.store,
             self.maps,
+            EvaluatorPool(),
             self.worker,
             **{
                 "ttl_s": TTL_S,

@@ -8,8 +8,8 @@ import pytest
 from deepsimbad.core.relevance import Relevance
 from deepsimbad.core.update_rules import LOG_LIKELIHOOD_WEIGHT
 from deepsimbad.engine.localizer import localize, retrieve
-from deepsimbad.engine.observation import Dissimilarities, RankedLandmarks, ReadyEncoding
 from deepsimbad.engine.snapshot import MapSnapshot
+from deepsimbad.engine.views import Dissimilarities, RankedLandmarks, ReadyEncoding
 from deepsimbad.errors import (
     InvalidDissimilaritiesError,
     InvalidEncodingError,

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from deepsimbad.engine.retention import Retention, beyond_keeping
-from deepsimbad.engine.session_config import SessionConfig
+from deepsimbad.engine.maps import Retention, beyond_keeping
+from deepsimbad.engine.session import SessionConfig
 from deepsimbad.errors import MapInUseError, RetiredMapError, UnavailableError, UnknownMapVersionError
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.layout import catalog_path
@@ -122,7 +122,7 @@ def test_one_domain_alone_can_be_pruned(mapped: Catalog) -> None:
 
 def test_a_session_keeps_its_map_until_it_ends(mapped: Catalog) -> None:
     async def body(live: Live) -> None:
-        session_id = (await live.sessions.begin(live.active_maps.active(DOMAIN), SessionConfig())).session_id
+        session_id = (await live.sessions.begin(live.maps.active(DOMAIN), SessionConfig())).session_id
         for _ in range(3):
             next_map(mapped)
         assert retention_of(live).prune() == 1
@@ -139,7 +139,7 @@ def test_a_session_keeps_its_map_until_it_ends(mapped: Catalog) -> None:
 
 def test_a_session_of_an_earlier_service_keeps_its_map_too(mapped: Catalog) -> None:
     async def begin(live: Live) -> str:
-        return (await live.sessions.begin(live.active_maps.active(DOMAIN), SessionConfig())).session_id
+        return (await live.sessions.begin(live.maps.active(DOMAIN), SessionConfig())).session_id
 
     session_id = run(mapped, begin)
     for _ in range(2):
@@ -174,7 +174,7 @@ def test_removed_by_hand_is_removed_once(mapped: Catalog) -> None:
 def test_a_beginning_session_keeps_its_map_from_the_first_moment(mapped: Catalog) -> None:
     """Begun on what the service last saw serve, though another process has activated another map since."""
     with running(mapped) as live:
-        stale = live.active_maps.active(DOMAIN)
+        stale = live.maps.active(DOMAIN)
         next_map(mapped)
         with live.maps.beginning(stale.snapshot), pytest.raises(MapInUseError):
             retention_of(live).remove(DOMAIN, 1)
@@ -182,7 +182,7 @@ def test_a_beginning_session_keeps_its_map_from_the_first_moment(mapped: Catalog
         with pytest.raises(UnavailableError, match="try again"):
             asyncio.run(live.sessions.begin(stale, SessionConfig()))
         assert live.store.pins() == set()
-        assert asyncio.run(live.sessions.begin(live.active_maps.refresh(DOMAIN), SessionConfig())).snapshot.version == 2
+        assert asyncio.run(live.sessions.begin(live.maps.refresh(DOMAIN), SessionConfig())).snapshot.version == 2
 
 
 def test_sessions_begun_while_maps_are_switched_and_removed(mapped: Catalog) -> None:
@@ -203,12 +203,12 @@ def test_sessions_begun_while_maps_are_switched_and_removed(mapped: Catalog) -> 
         async def beginning() -> int:
             n_begun = 0
             while not done.is_set():
-                stale = live.active_maps.active(DOMAIN)
+                stale = live.maps.active(DOMAIN)
                 try:
                     await live.sessions.begin(stale, SessionConfig())
                     n_begun += 1
                 except UnavailableError:
-                    live.active_maps.refresh(DOMAIN)
+                    live.maps.refresh(DOMAIN)
             return n_begun
 
         thread = threading.Thread(target=switching)

@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 
 from deepsimbad.core.filters import FilterKind
 from deepsimbad.core.relevance import Relevance
-from deepsimbad.engine import replay as replay_module
+from deepsimbad.engine import session as session_module
 from deepsimbad.engine.active_localizer import ActiveLocalizer, LocalizerConfig
 from deepsimbad.engine.localizer import describe
-from deepsimbad.engine.observation import View
-from deepsimbad.engine.session_config import SessionConfig
+from deepsimbad.engine.session import SessionConfig
+from deepsimbad.engine.views import View
 from deepsimbad.engine.worker import Priority
 from deepsimbad.errors import (
     EndedSessionError,
@@ -36,9 +36,10 @@ from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.feature_l2 import FeatureL2
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.map_table import ANY
+from deepsimbad.store.session_records import SessionRecord
 
 from .conftest import N_IMAGES, add_domain, add_map
-from .live_service import KEEP_ENDED_S, TTL_S, Clock, Live, encoded, ranked, run, running
+from .live_service import KEEP_ENDED_S, TTL_S, Clock, Live, encoded, ranked, run
 
 Masses = NDArray[np.float64]
 
@@ -50,14 +51,18 @@ def mapped(catalog: Catalog) -> Catalog:
     return catalog
 
 
+def of_domain(domain: str) -> Callable[[SessionRecord], bool]:
+    return lambda session: session.domain == domain
+
+
 async def begun(live: Live, **config: Any) -> str:
-    return (await live.sessions.begin(live.active_maps.active("d"), SessionConfig(**config))).session_id
+    return (await live.sessions.begin(live.maps.active("d"), SessionConfig(**config))).session_id
 
 
 def test_a_session_is_the_localizer_step_by_step(mapped: Catalog) -> None:
     async def body(live: Live) -> None:
         session_id = await begun(live, seed=3)
-        snapshot = live.active_maps.snapshot("d")
+        snapshot = live.maps.active("d").snapshot
         localizer = ActiveLocalizer(snapshot, LocalizerConfig(seed=3))
         state = localizer.start()
         for seed in range(6):
@@ -227,43 +232,12 @@ def test_what_cannot_be_written_leaves_the_session_as_it_was(mapped: Catalog) ->
     run(mapped, body)
 
 
-def test_another_process_on_the_same_sessions(mapped: Catalog) -> None:
-    with running(mapped) as ours, running(mapped) as theirs:
-
-        async def body() -> None:
-            session_id = await begun(ours)
-            assert (await theirs.sessions.observe(session_id, ranked(1))).n_observations == 1
-            with pytest.raises(UnavailableError, match="another process"):
-                await ours.sessions.observe(session_id, ranked(2))
-            assert (await ours.sessions.observe(session_id, ranked(2))).n_observations == 2
-
-        asyncio.run(body())
-
-
-def test_a_session_that_another_process_moved_on_does_not_expire(mapped: Catalog) -> None:
-    clock = Clock()
-    with running(mapped, clock) as ours, running(mapped, clock) as theirs:
-
-        async def body() -> None:
-            session_id = await begun(ours)
-            clock.now += TTL_S - 1
-            await theirs.sessions.observe(session_id, ranked(1))
-            clock.now += 2
-            await ours.sessions.sweep()
-            assert (await ours.sessions.view(session_id)).n_observations == 1
-            await theirs.sessions.end(session_id)
-            clock.now += TTL_S
-            await ours.sessions.sweep()
-            with pytest.raises(EndedSessionError, match="deleted"):
-                await ours.sessions.view(session_id)
-
-        asyncio.run(body())
-
-
 def test_the_sessions_of_a_deleted_domain_end_though_robots_end_some_meanwhile(mapped: Catalog) -> None:
     async def body(live: Live) -> None:
         sessions = [await begun(live) for _ in range(6)]
-        await asyncio.gather(*(live.sessions.end(one) for one in sessions[::2]), live.sessions.end_domain("d"))
+        await asyncio.gather(
+            *(live.sessions.end(one) for one in sessions[::2]), live.sessions.end_those(of_domain("d"))
+        )
         for session_id in sessions:
             with pytest.raises(EndedSessionError):
                 await live.sessions.observe(session_id, ranked(1))
@@ -274,9 +248,9 @@ def test_the_sessions_of_a_deleted_domain_end_though_robots_end_some_meanwhile(m
 def test_sessions_of_a_domain_that_a_command_deleted_end(mapped: Catalog) -> None:
     async def body(live: Live) -> None:
         session_id = await begun(live)
-        await live.sessions.end_strangers({"d"})
+        await live.sessions.end_those(lambda session: session.domain not in {"d"})
         await live.sessions.observe(session_id, ranked(1))
-        await live.sessions.end_strangers({"another"})
+        await live.sessions.end_those(lambda session: session.domain not in {"another"})
         with pytest.raises(EndedSessionError):
             await live.sessions.observe(session_id, ranked(1))
 
@@ -322,7 +296,7 @@ def test_a_live_view_goes_before_the_replay_of_an_old_observation(
     mapped: Catalog, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Old observations are repeated one at a time, in pieces on the worker; the last one as it stands."""
-    monkeypatch.setattr(replay_module, "_PIECE_S", 0.0)
+    monkeypatch.setattr(session_module, "_PIECE_S", 0.0)
 
     async def body(live: Live) -> None:
         sessions = [await begun(live) for _ in range(2)]
@@ -446,7 +420,7 @@ def test_a_session_keeps_the_map_it_began_on(mapped: Catalog) -> None:
         first = await begun(live)
         await live.sessions.observe(first, ranked(1))
         mapped.activate("d", add_map(mapped, "d"), ANY)
-        live.active_maps.refresh("d")
+        live.maps.refresh("d")
         assert (await live.sessions.observe(first, ranked(2))).snapshot.version == 1
         second = await begun(live)
         assert (await live.sessions.view(second)).snapshot.version == 2
@@ -472,9 +446,9 @@ def test_a_domain_made_anew_has_other_maps(mapped: Catalog) -> None:
 def test_a_deleted_domain_ends_its_sessions(mapped: Catalog) -> None:
     async def body(live: Live) -> None:
         session_id = await begun(live)
-        await live.sessions.end_domain("other")
+        await live.sessions.end_those(of_domain("other"))
         await live.sessions.view(session_id)
-        await live.sessions.end_domain("d")
+        await live.sessions.end_those(of_domain("d"))
         with pytest.raises(EndedSessionError):
             await live.sessions.view(session_id)
 

@@ -9,9 +9,8 @@ from typing import Any
 
 import pytest
 
-from deepsimbad.engine.observation import View
-from deepsimbad.engine.session_config import SessionConfig
-from deepsimbad.engine.stopwatch import Stopwatch
+from deepsimbad.engine.session import SessionConfig
+from deepsimbad.engine.views import Stopwatch, View
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.map_table import ANY
@@ -31,7 +30,7 @@ def mapped(catalog: Catalog) -> Catalog:
 
 
 async def begun(live: Live) -> str:
-    return (await live.sessions.begin(live.active_maps.active("d"), SessionConfig())).session_id
+    return (await live.sessions.begin(live.maps.active("d"), SessionConfig())).session_id
 
 
 async def held(let_go: threading.Event | asyncio.Event) -> float:

@@ -10,11 +10,8 @@ from numpy.typing import NDArray
 
 from deepsimbad.core.filters import FilterKind
 from deepsimbad.core.route import Route
-from deepsimbad.engine import replay as replay_module
-from deepsimbad.engine.evaluator_pool import EvaluatorPool
-from deepsimbad.engine.live_session import Observation
-from deepsimbad.engine.pinned_maps import PinnedMaps
-from deepsimbad.engine.session_config import SessionConfig
+from deepsimbad.engine import session as session_module
+from deepsimbad.engine.session import Observation, SessionConfig
 from deepsimbad.engine.truths import RankedTruths, Truths, true_images
 from deepsimbad.engine.worker import Priority
 from deepsimbad.errors import InvalidInputError, RetiredMapError, UnknownSessionError
@@ -34,15 +31,14 @@ def mapped(request: pytest.FixtureRequest, catalog: Catalog) -> Catalog:
 
 
 def truths_of(live: Live, clock: Clock | None = None) -> Truths:
-    maps = PinnedMaps(live.catalog, live.active_maps, EvaluatorPool())
-    return Truths(live.store, maps, live.worker, clock or Clock())
+    return Truths(live.store, live.worker, live.sessions, clock or Clock())
 
 
 async def driven(
     live: Live, observations: Sequence[Observation], priors: Sequence[int] = (), **config: object
 ) -> tuple[str, list[NDArray[np.float64]]]:
     """A session, and its belief as it was answered after every observation."""
-    active = live.active_maps.active("d")
+    active = live.maps.active("d")
     session_id = (await live.sessions.begin(active, SessionConfig(**config))).session_id  # type: ignore[arg-type]
     masses = []
     for number, observation in enumerate(observations):
@@ -68,7 +64,7 @@ def test_every_truth_is_ranked_in_the_belief_of_its_time(mapped: Catalog, belief
 
     async def body(live: Live) -> None:
         session_id, masses = await driven(live, views, priors=[4], belief=belief)
-        route = live.active_maps.snapshot("d").route
+        route = live.maps.active("d").snapshot.route
         positions_m: list[float | None] = [0.41 + 0.6 * number for number in range(n_views)]
         if n_views > 3:
             positions_m[2] = None
@@ -116,7 +112,7 @@ def test_an_ended_session_may_be_told_of_until_it_is_forgotten(mapped: Catalog) 
     async def body(live: Live) -> None:
         session_id, masses = await driven(live, [ranked(1), ranked(2)])
         await live.sessions.end(session_id)
-        route = live.active_maps.snapshot("d").route
+        route = live.maps.active("d").snapshot.route
         found = await truths_of(live).rank(session_id, [3.0, 4.6])
         expected = [slow_share(mass, route, at) for mass, at in zip(masses, (3.0, 4.6), strict=True)]
         np.testing.assert_allclose(found.rank_share, expected)
@@ -159,7 +155,7 @@ def test_a_session_whose_map_is_no_more_cannot_be_replayed(mapped: Catalog) -> N
 
 def test_a_live_view_goes_before_the_rest_of_a_replay(mapped: Catalog, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whoever comes while a session is replayed waits for a piece of it, not for all."""
-    monkeypatch.setattr(replay_module, "_PIECE_S", 0.0)
+    monkeypatch.setattr(session_module, "_PIECE_S", 0.0)
 
     async def body(live: Live) -> None:
         session_id, _ = await driven(live, [ranked(seed, 0.1) for seed in range(9)])

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from deepsimbad.engine.observation import EncodedImage, NothingSeen
+from deepsimbad.engine.views import EncodedImage, NothingSeen
 from deepsimbad.engine.worker import InferenceWorker, Priority
 from deepsimbad.errors import InvalidImageError, InvalidInputError, OverloadedError, UnavailableError
 

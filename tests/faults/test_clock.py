@@ -1,4 +1,4 @@
-"""The computer's clock goes backwards: no session ends for it, nothing is put in the wrong order."""
+"""The computer's clock goes backwards: nothing is put in the wrong order."""
 
 from datetime import UTC, datetime, timedelta, tzinfo
 from pathlib import Path
@@ -6,13 +6,12 @@ from typing import Self
 
 import pytest
 
-from deepsimbad.engine.retention import beyond_keeping
-from deepsimbad.engine.steady_clock import SteadyClock
+from deepsimbad.engine.maps import beyond_keeping
 from deepsimbad.jobs.map_config import RemapConfig
 from deepsimbad.store import documents
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.records import JobState
-from deepsimbad.store.session_records import PriorRow, SessionRecord
+from deepsimbad.store.session_records import PriorRow
 from deepsimbad.store.sessions import SessionStore
 
 from .conftest import Service, begin, check_is_clean
@@ -62,27 +61,6 @@ def test_the_map_that_served_last_is_kept_to_roll_back_to(tmp_path: Path, backwa
         catalog.activate("campus", 2, 4)
         catalog.activate("campus", 3, 2)
         assert [one.version for one in beyond_keeping(catalog.kept_maps(), 1)] == [4, 1], "2 served last"
-
-
-def test_sessions_outlive_a_clock_that_was_set_back_and_end_in_their_time(tmp_path: Path) -> None:
-    """Started while the clock shows a year ago; before that it showed today."""
-    today, since_boot = 1_790_000_000.0, 500.0
-    with SessionStore.open(tmp_path) as store:
-        clock = SteadyClock(None, None, False, wall=lambda: today, since_boot=lambda: since_boot, boot="a")
-        record = SessionRecord(0, "robot", "campus", 1, "0" * 64, {}, clock(), clock() + TTL_S, 0, None)
-        number = store.create(record).result().number
-        store.append(number, PriorRow(1, clock() + TTL_S, 0.0, 1.0), clock()).result()
-        store.note_clock(clock.record()).result()
-    for boot in ("a", "b"):  # the same run of the computer, and after a reboot
-        with SessionStore.open(tmp_path) as store:
-            past, latest = store.clock()
-            again = SteadyClock(
-                past, latest, True, wall=lambda: today - 365 * 86_400, since_boot=lambda: since_boot + 60, boot=boot
-            )
-            (session,) = store.living()
-            left_s = session.expires_at - again()
-            assert 0 < left_s <= TTL_S
-            assert not store.end(number, "expired", again()).result(), "it has not expired"
 
 
 @pytest.mark.slow

@@ -9,7 +9,7 @@ import pytest
 from deepsimbad.core.descriptor import rank_landmarks
 from deepsimbad.core.nnql import NnqlConfig
 from deepsimbad.core.relevance import Query, Relevance, relevances
-from deepsimbad.engine.active_maps import load_snapshot
+from deepsimbad.engine.maps import load_snapshot
 from deepsimbad.errors import InvalidEncodingError, InvalidMapConfigError
 from deepsimbad.jobs.append import append_frames
 from deepsimbad.jobs.import_map import import_map

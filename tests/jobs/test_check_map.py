@@ -8,8 +8,8 @@ import pytest
 from deepsimbad.core.descriptor import rank_landmarks
 from deepsimbad.core.metrics import rank_of_truth
 from deepsimbad.core.relevance import Query, Relevance, relevances
-from deepsimbad.engine import active_maps
-from deepsimbad.engine.active_maps import load_snapshot
+from deepsimbad.engine import maps as maps_module
+from deepsimbad.engine.maps import load_snapshot
 from deepsimbad.errors import (
     InvalidEncodingError,
     InvalidMapConfigError,
@@ -310,7 +310,7 @@ def test_a_damaged_active_map_does_not_keep_its_remedy_away(made, seasons, catal
 @pytest.mark.parametrize(
     ("module", "name", "error", "reason"),
     [
-        (active_maps, "verify", OSError(errno.EIO, "Input/output error"), "io_error"),
+        (maps_module, "verify", OSError(errno.EIO, "Input/output error"), "io_error"),
         (map_file, "unpack_index", MemoryError(), "out_of_memory"),
     ],
 )

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from deepsimbad.engine.active_maps import ActiveMaps
+from deepsimbad.engine.maps import Maps
 from deepsimbad.errors import (
     ConflictError,
     DamagedMapError,
@@ -100,7 +100,7 @@ def test_the_bytes_travel_unchanged(there: Catalog, here: Catalog, tmp_path: Pat
     assert (record.sha256, record.state, record.metrics["anr"]) == (sent.sha256, MapState.ACTIVE, 4.5)
     assert record.config["imported"] == {"domain": "campus", "version": 1, "sha256": sent.sha256}
     assert record.config["training_traverse"] is None, "a traverse of that name here is another drive"
-    snapshot = ActiveMaps(here).snapshot("garden")
+    snapshot = Maps(here).snapshot("garden")
     assert (snapshot.domain, snapshot.version, snapshot.n_images) == ("garden", 1, 30)
 
 

@@ -41,13 +41,10 @@ from deepsimbad.api.routes import (
     truths,
 )
 from deepsimbad.api.state_metrics import StateCollector, WatchedState
-from deepsimbad.engine.active_maps import ActiveMaps
-from deepsimbad.engine.evaluator_pool import EvaluatorPool
-from deepsimbad.engine.open_traverses import OpenTraverses
-from deepsimbad.engine.pinned_maps import PinnedMaps
-from deepsimbad.engine.retention import Retention
+from deepsimbad.engine.encoders import EvaluatorPool
+from deepsimbad.engine.maps import Maps, Retention
 from deepsimbad.engine.sessions import Sessions
-from deepsimbad.engine.steady_clock import SteadyClock
+from deepsimbad.engine.traverses import OpenTraverses
 from deepsimbad.engine.truths import Truths
 from deepsimbad.engine.warm_up import warm_up
 from deepsimbad.engine.worker import InferenceWorker, Priority
@@ -175,16 +172,15 @@ def _lifespan(
 
 
 async def _sweep(services: Services, every_s: float) -> None:
-    """End sessions as they expire, so that their memory is free though nobody asks; note the time they live by."""
+    """End sessions as they expire, so that their memory is free though nobody asks."""
     while True:
         await asyncio.sleep(every_s)
         try:
             await services.sessions.sweep()
             domains = await run_sync(services.catalog.domains)
-            await services.sessions.end_strangers({record.name for record in domains})
+            names = {record.name for record in domains}  # a command beside the service may have deleted one
+            await services.sessions.end_those(lambda session, names=names: session.domain not in names)
             await run_sync(services.retention.prune)
-            if services.sessions.n_living:
-                await asyncio.wrap_future(services.session_store.note_clock(services.clock.record()))
         except DeepSimbadError:
             log.exception("expired sessions could not be ended")
 
@@ -201,34 +197,32 @@ def _start(settings: Settings, metrics: Metrics, keys: KeyRing, run_job: RunJob,
         log.warning("the default network is not installed", extra={"why": told})
     evaluators = EvaluatorPool(settings.compute())
     evaluators.load_all({record.name: record.evaluator for record in catalog.domains()})
-    active_maps = ActiveMaps(catalog)
-    damaged = active_maps.load_all()
+    maps = Maps(catalog)
+    damaged = maps.load_all()
     worker = InferenceWorker(max_waiting=settings.max_queue, longest_wait_s=settings.encode_wait_ms / 1000)
     parts.callback(worker.close)
     worker.submit(warm_up).result()
     store = parts.enter_context(SessionStore.open(settings.data_dir, metrics.committed))
-    clock = SteadyClock.of(store)
-    pinned_maps = PinnedMaps(catalog, active_maps, evaluators)
     live = Sessions(
         store,
-        pinned_maps,
+        maps,
+        evaluators,
         worker,
         ttl_s=settings.session_ttl_s,
         max_sessions=settings.max_sessions,
         snapshot_every=settings.snapshot_every,
         keep_ended_s=settings.keep_ended_sessions_s,
-        clock=clock,
     )
     parts.callback(live.close)
     open_traverses = OpenTraverses(settings.data_dir)
     parts.callback(open_traverses.close)
 
-    retention = Retention(catalog, store, pinned_maps, settings.keep_maps)
+    retention = Retention(catalog, store, maps, settings.keep_maps)
     retention.prune()
 
     def switched(domain: str) -> None:
         try:
-            active_maps.refresh(domain)
+            maps.refresh(domain)
             retention.prune(domain)
         except DeepSimbadError:
             log.exception("a new map cannot be served", extra={"domain": domain})
@@ -241,7 +235,6 @@ def _start(settings: Settings, metrics: Metrics, keys: KeyRing, run_job: RunJob,
     readiness = ReadinessCheck(
         catalog,
         store,
-        clock,
         [
             ("the inference worker", lambda: worker.is_alive),
             ("the thread that writes sessions", lambda: store.is_committing),
@@ -252,7 +245,7 @@ def _start(settings: Settings, metrics: Metrics, keys: KeyRing, run_job: RunJob,
         version=release(),
         data_dir=settings.data_dir,
         catalog=catalog,
-        active_maps=active_maps,
+        maps=maps,
         faults=readiness.faults,
         queue_length=lambda: worker.n_waiting,
         n_sessions=lambda: live.n_living,
@@ -267,7 +260,7 @@ def _start(settings: Settings, metrics: Metrics, keys: KeyRing, run_job: RunJob,
         "opened",
         extra={
             "n_domains": len(catalog.domains()),
-            "n_maps": active_maps.n_loaded,
+            "n_maps": maps.n_loaded,
             "n_sessions": live.n_living,
             "damaged": list(damaged),
         },
@@ -276,15 +269,13 @@ def _start(settings: Settings, metrics: Metrics, keys: KeyRing, run_job: RunJob,
         settings=settings,
         metrics=metrics,
         catalog=catalog,
-        active_maps=active_maps,
+        maps=maps,
         evaluators=evaluators,
         open_traverses=open_traverses,
         sessions=live,
         session_store=store,
         retention=retention,
-        truths=Truths(store, pinned_maps, worker, clock),
-        pinned_maps=pinned_maps,
-        clock=clock,
+        truths=Truths(store, worker, live),
         worker=worker,
         decoders=Decoders(settings.max_pixels),
         runner=runner,

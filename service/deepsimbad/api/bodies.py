@@ -13,7 +13,7 @@ from starlette.requests import Request
 from deepsimbad.api.long_work import off_the_loop
 from deepsimbad.api.problems import InvalidRequestError, invalid_request
 from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Relevance
-from deepsimbad.engine.observation import Dissimilarities, RankedLandmarks, ReadyEncoding
+from deepsimbad.engine.views import Dissimilarities, RankedLandmarks, ReadyEncoding
 from deepsimbad.errors import EmptyBodyError, UnsupportedMediaTypeError
 from deepsimbad.evaluators.registry import EXTRACTOR_PATTERN, EvaluatorKind
 from deepsimbad.jobs.map_config import DEFAULT_LIST_LENGTH, DEFAULT_TRAINING_EPISODES, RemapConfig

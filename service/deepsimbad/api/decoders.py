@@ -6,7 +6,7 @@ from typing import cast
 from anyio import CapacityLimiter
 from anyio.to_thread import run_sync
 
-from deepsimbad.engine.evaluator_pool import ready
+from deepsimbad.engine.encoders import ready
 from deepsimbad.engine.worker import Priority
 from deepsimbad.errors import OverloadedError
 from deepsimbad.evaluators.base import Evaluator, Image

@@ -15,15 +15,12 @@ from deepsimbad.api.bodies import GREATEST_ID, NAME_PATTERN
 from deepsimbad.api.decoders import Decoders
 from deepsimbad.api.metrics import Metrics
 from deepsimbad.api.readiness import ReadinessCheck
-from deepsimbad.engine.active_maps import ActiveDomain, ActiveMaps
-from deepsimbad.engine.evaluator_pool import EvaluatorPool
-from deepsimbad.engine.observation import View
-from deepsimbad.engine.open_traverses import OpenTraverses
-from deepsimbad.engine.pinned_maps import PinnedMaps
-from deepsimbad.engine.retention import Retention
+from deepsimbad.engine.encoders import EvaluatorPool
+from deepsimbad.engine.maps import MappedDomain, Maps, Retention
 from deepsimbad.engine.sessions import Sessions
-from deepsimbad.engine.steady_clock import SteadyClock
+from deepsimbad.engine.traverses import OpenTraverses
 from deepsimbad.engine.truths import Truths
+from deepsimbad.engine.views import View
 from deepsimbad.engine.worker import InferenceWorker, Priority
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.jobs.runner import JobRunner
@@ -45,15 +42,13 @@ class Services:
         settings: As it was started.
         metrics: Counters.
         catalog: What is true of the data directory.
-        active_maps: Maps in memory.
+        maps: Map versions in memory.
         evaluators: Evaluators in memory.
         open_traverses: Files kept open while frames arrive.
         sessions: Live beliefs.
         session_store: Their file.
         retention: Which old maps keep their files.
         truths: What their beliefs were worth.
-        pinned_maps: The map versions that they keep.
-        clock: What they live by.
         worker: Where encoding and scoring run.
         decoders: Where images are decoded.
         runner: Where jobs run.
@@ -67,15 +62,13 @@ class Services:
     settings: Settings
     metrics: Metrics
     catalog: Catalog
-    active_maps: ActiveMaps
+    maps: Maps
     evaluators: EvaluatorPool
     open_traverses: OpenTraverses
     sessions: Sessions
     session_store: SessionStore
     retention: Retention
     truths: Truths
-    pinned_maps: PinnedMaps
-    clock: SteadyClock
     worker: InferenceWorker
     decoders: Decoders
     runner: JobRunner
@@ -85,10 +78,10 @@ class Services:
     batches: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(BATCHES))
     health: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(HEALTH))
 
-    async def active(self, domain: str) -> ActiveDomain:
+    async def active(self, domain: str) -> MappedDomain:
         """A domain and its active map; files are read in a thread."""
-        known = self.active_maps.peek(domain)
-        return known if known is not None else await run_sync(self.active_maps.active, domain)
+        known = self.maps.peek(domain)
+        return known if known is not None else await run_sync(self.maps.active, domain)
 
     async def infer(self, run: Callable[[], T], priority: Priority = Priority.LIVE) -> T:
         """Run on the inference worker."""

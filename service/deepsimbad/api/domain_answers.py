@@ -1,22 +1,22 @@
 """Describing a domain, whatever state its map is in."""
 
 from deepsimbad.api.schemas import DomainAnswer
-from deepsimbad.engine.active_maps import ActiveMaps
-from deepsimbad.engine.evaluator_pool import EvaluatorPool, ready
+from deepsimbad.engine.encoders import EvaluatorPool, ready
+from deepsimbad.engine.maps import Maps
 from deepsimbad.engine.snapshot import MapSnapshot
 from deepsimbad.errors import NoActiveMapError, UnavailableError
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.store.records import DomainRecord
 
 
-def describe_domain(record: DomainRecord, evaluators: EvaluatorPool, active_maps: ActiveMaps) -> DomainAnswer:
+def describe_domain(record: DomainRecord, evaluators: EvaluatorPool, maps: Maps) -> DomainAnswer:
     """A domain and its active map; may read files, so it belongs in a thread.
 
     Raises:
         UnknownDomainError: It was deleted meanwhile.
     """
     evaluator, evaluator_problem = _evaluator(evaluators, record)
-    snapshot, problem = _active_map(active_maps, record)
+    snapshot, problem = _active_map(maps, record)
     return DomainAnswer(
         name=record.name,
         evaluator=record.evaluator,
@@ -47,10 +47,10 @@ def _evaluator(evaluators: EvaluatorPool, record: DomainRecord) -> tuple[Evaluat
         return None, error.hints.get("reason", error.code)
 
 
-def _active_map(active_maps: ActiveMaps, record: DomainRecord) -> tuple[MapSnapshot | None, str | None]:
+def _active_map(maps: Maps, record: DomainRecord) -> tuple[MapSnapshot | None, str | None]:
     """The active map, or the code of what is wrong with it; neither where there is none yet."""
     try:
-        return active_maps.snapshot(record.name), None
+        return maps.active(record.name).snapshot, None
     except NoActiveMapError:
         return None, None
     except UnavailableError as error:  # damaged, or not to be read at this moment

@@ -8,9 +8,9 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import TimeoutError as TookTooLong
 from pathlib import Path
 
-from deepsimbad.engine.steady_clock import SteadyClock
 from deepsimbad.errors import DeepSimbadError
 from deepsimbad.store.catalog import Catalog
+from deepsimbad.store.session_records import ClockRecord
 from deepsimbad.store.sessions import SessionStore
 
 MEBIBYTE = 1024 * 1024
@@ -24,8 +24,7 @@ class ReadinessCheck:
 
     Args:
         catalog: Read.
-        sessions: Read and written: the moment that their clock shows.
-        clock: Their clock.
+        sessions: Read and written.
         threads: What must be alive, by a name that a person understands.
         monotonic: Seconds that never go back.
     """
@@ -34,13 +33,11 @@ class ReadinessCheck:
         self,
         catalog: Catalog,
         sessions: SessionStore,
-        clock: SteadyClock,
         threads: Sequence[tuple[str, Callable[[], bool]]],
         monotonic: Callable[[], float] = time.monotonic,
     ) -> None:
         self._catalog = catalog
         self._sessions = sessions
-        self._clock = clock
         self._threads = threads
         self._monotonic = monotonic
         self._lock = threading.Lock()
@@ -69,7 +66,7 @@ class ReadinessCheck:
         return list(dict.fromkeys(found))
 
     def _write(self) -> None:
-        self._sessions.note_clock(self._clock.record()).result(_WRITE_TIMEOUT_S)
+        self._sessions.note_clock(ClockRecord(None, 0.0, time.time())).result(_WRITE_TIMEOUT_S)
 
 
 def disk_faults(data_dir: Path) -> list[str]:

@@ -22,7 +22,7 @@ from deepsimbad.core.belief_summary import BeliefSummary
 from deepsimbad.core.planners import Plan
 from deepsimbad.core.route import Route
 from deepsimbad.engine.localizer import Localization
-from deepsimbad.engine.stopwatch import Stopwatch
+from deepsimbad.engine.views import Stopwatch
 from deepsimbad.store.records import JobRecord, MapRecord
 
 

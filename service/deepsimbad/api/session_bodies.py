@@ -7,7 +7,7 @@ from pydantic import FailFast, Field, StrictFloat, StrictInt
 from deepsimbad.api.bodies import GREATEST_EXACT_INTEGER, GREATEST_ID, JsonBody, Name
 from deepsimbad.core.filters import FilterKind
 from deepsimbad.core.update_rules import UpdateRule
-from deepsimbad.engine.session_config import DEFAULT_START_STD_M, SessionConfig
+from deepsimbad.engine.session import DEFAULT_START_STD_M, SessionConfig
 
 MAX_OBSERVATIONS_FED_BACK = 100_000
 

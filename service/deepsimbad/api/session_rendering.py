@@ -5,8 +5,8 @@ from typing import Any
 
 from deepsimbad.api.rendering import render_belief, render_plan, render_shortlist
 from deepsimbad.api.session_schemas import ListedSessionAnswer, ObservationAnswer, SessionAnswer
-from deepsimbad.engine.session_view import SessionView
-from deepsimbad.engine.stopwatch import Stopwatch
+from deepsimbad.engine.session import SessionView
+from deepsimbad.engine.views import Stopwatch
 from deepsimbad.store.session_records import ListedSession
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from prometheus_client.core import GaugeMetricFamily
 from prometheus_client.registry import Collector
 
-from deepsimbad.engine.active_maps import ActiveMaps
+from deepsimbad.engine.maps import Maps
 from deepsimbad.errors import DeepSimbadError
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.census import GATE_LOST, Census
@@ -27,7 +27,7 @@ class WatchedState:
         version: Of the release.
         data_dir: The data directory.
         catalog: Domains, maps and jobs.
-        active_maps: Those in memory.
+        maps: Those in memory.
         faults: What keeps the service from being ready.
         queue_length: Of the inference worker.
         n_sessions: That have not ended.
@@ -36,7 +36,7 @@ class WatchedState:
     version: str
     data_dir: Path
     catalog: Catalog
-    active_maps: ActiveMaps
+    maps: Maps
     faults: Callable[[], Sequence[str]]
     queue_length: Callable[[], int]
     n_sessions: Callable[[], int]
@@ -74,7 +74,7 @@ class StateCollector(Collector):
         )
         yield _plain("deepsimbad_ready", "1 where /readyz answers 200.", 0 if watched.faults() else 1)
         yield _plain("deepsimbad_inference_queue", "Work waiting for the inference worker.", watched.queue_length())
-        yield _plain("deepsimbad_loaded_maps", "Active maps held in memory.", watched.active_maps.n_loaded)
+        yield _plain("deepsimbad_loaded_maps", "Active maps held in memory.", watched.maps.n_loaded)
         yield _plain("deepsimbad_sessions", "Sessions that have not ended.", watched.n_sessions())
         yield from self._disk()
         if self._census is not None:
@@ -91,8 +91,8 @@ class StateCollector(Collector):
     def _of_catalog(self, census: Census) -> Iterator[GaugeMetricFamily]:
         now = self._wall()
         serving = census.serving
-        snapshots = [one.snapshot for one in self._watched.active_maps.loaded()]
-        damaged = self._watched.active_maps.damaged()
+        snapshots = [one.snapshot for one in self._watched.maps.loaded()]
+        damaged = self._watched.maps.damaged()
         yield _labelled(
             "deepsimbad_jobs",
             "Jobs the catalog knows, by state.",

@@ -17,10 +17,10 @@ from deepsimbad.cli.options import (
 )
 from deepsimbad.cli.terminal import console, progress_bar, write_json
 from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Relevance
-from deepsimbad.engine.active_maps import ActiveMaps
-from deepsimbad.engine.evaluator_pool import EvaluatorPool
+from deepsimbad.engine.encoders import EvaluatorPool
 from deepsimbad.engine.localizer import localize as localize_view
-from deepsimbad.engine.stopwatch import Stopwatch
+from deepsimbad.engine.maps import Maps
+from deepsimbad.engine.views import Stopwatch
 from deepsimbad.errors import (
     ImageTooLargeError,
     InvalidImageError,
@@ -137,7 +137,7 @@ def localize(domain: str, images: tuple[Path, ...], as_json: bool, data_dir: Pat
     """Say where on the route each image was probably taken."""
     settings = given_settings(data_dir=data_dir)
     with Catalog.open(existing_data_dir(settings.data_dir)) as catalog:
-        active = ActiveMaps(catalog).active(domain)
+        active = Maps(catalog).active(domain)
         judge = EvaluatorPool(settings.compute()).evaluator(active.record.evaluator)
         answers = []
         for path in images:
@@ -190,7 +190,7 @@ def info(domain: str, as_json: bool, data_dir: Path | None) -> None:
     """Describe a domain and its active map."""
     settings = given_settings(data_dir=data_dir)
     with Catalog.open(existing_data_dir(settings.data_dir)) as catalog:
-        answer = describe_domain(catalog.domain(domain), EvaluatorPool(settings.compute()), ActiveMaps(catalog))
+        answer = describe_domain(catalog.domain(domain), EvaluatorPool(settings.compute()), Maps(catalog))
     if as_json:
         write_json(answer.model_dump())
         return

@@ -15,8 +15,9 @@ from deepsimbad.core.planners import Plan
 from deepsimbad.core.relevance import Query, relevances
 from deepsimbad.core.retrieval import shortlist
 from deepsimbad.engine.active_localizer import ActiveLocalizer, LocalizerConfig, LocalizerState
-from deepsimbad.engine.encoding import encode_images, ready_encodings
-from deepsimbad.engine.observation import (
+from deepsimbad.engine.encoders import encode_images, ready_encodings
+from deepsimbad.engine.snapshot import MapSnapshot
+from deepsimbad.engine.views import (
     Dissimilarities,
     EncodedImage,
     NothingSeen,
@@ -24,7 +25,6 @@ from deepsimbad.engine.observation import (
     RankedLandmarks,
     View,
 )
-from deepsimbad.engine.snapshot import MapSnapshot
 from deepsimbad.errors import InvalidDissimilaritiesError, InvalidInputError, WeightsDifferError
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.image import is_blank

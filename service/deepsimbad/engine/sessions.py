@@ -1,43 +1,55 @@
 """The live sessions: each moves on in order of arrival, and nothing is answered before it is on the disk."""
 
 import asyncio
+import math
 import secrets
 import time
-from collections.abc import Callable, Container, Coroutine
+from collections.abc import Callable, Coroutine
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from deepsimbad.core.planners import Plan
-from deepsimbad.engine.active_maps import ActiveDomain
-from deepsimbad.engine.live_session import LiveSession, Loaded, Observation
+from deepsimbad.core.relevance import Relevance
+from deepsimbad.engine.encoders import EvaluatorPool
 from deepsimbad.engine.localizer import describe, shortlist_length
-from deepsimbad.engine.observation import View, encoding_ms
-from deepsimbad.engine.pinned_maps import PinnedMaps
-from deepsimbad.engine.replay import Replay
-from deepsimbad.engine.session_config import SessionConfig, check_move, check_prior, check_start
-from deepsimbad.engine.session_registry import DELETED, SessionRegistry
-from deepsimbad.engine.session_state import SessionEngine
-from deepsimbad.engine.session_view import SessionView, view_of
-from deepsimbad.engine.stopwatch import Stopwatch
-from deepsimbad.engine.worker import InferenceWorker
-from deepsimbad.errors import EndedSessionError, IdempotencyKeyReusedError, InvalidInputError, UnavailableError
-from deepsimbad.store.list_page import ListPage
-from deepsimbad.store.session_records import (
-    IdempotencyKey,
-    JournalRow,
-    ListedSession,
-    ObservedRow,
-    PriorRow,
-    SessionRecord,
+from deepsimbad.engine.maps import MappedDomain, Maps
+from deepsimbad.engine.session import (
+    LiveSession,
+    Observation,
+    SessionConfig,
+    SessionEngine,
+    SessionState,
+    SessionView,
+    check_move,
+    check_prior,
+    followed,
+    replayed_until,
+    restored,
+    view_of,
 )
+from deepsimbad.engine.views import Stopwatch, View
+from deepsimbad.engine.worker import InferenceWorker
+from deepsimbad.errors import (
+    DamagedFileError,
+    EndedSessionError,
+    IdempotencyKeyReusedError,
+    TooManySessionsError,
+    UnknownSessionError,
+)
+from deepsimbad.store.list_page import ListPage
+from deepsimbad.store.session_records import JournalRow, ListedSession, ObservedRow, PriorRow, SessionRecord
 from deepsimbad.store.sessions import SessionStore
 
 T = TypeVar("T")
+
+DELETED, EXPIRED = "deleted", "expired"
+_LONGEST_RETRY_S = 60
 
 
 class Sessions:
@@ -49,6 +61,7 @@ class Sessions:
     Args:
         store: Where they are kept.
         maps: What they are pinned to.
+        evaluators: Of all domains.
         worker: Where views are described and beliefs computed.
         ttl_s: A session ends when nothing happened to it for so long.
         max_sessions: How many may live at once.
@@ -60,7 +73,8 @@ class Sessions:
     def __init__(
         self,
         store: SessionStore,
-        maps: PinnedMaps,
+        maps: Maps,
+        evaluators: EvaluatorPool,
         worker: InferenceWorker,
         *,
         ttl_s: float,
@@ -71,27 +85,30 @@ class Sessions:
     ) -> None:
         self._store = store
         self._maps = maps
+        self._evaluators = evaluators
         self._worker = worker
         self._ttl_s = ttl_s
+        self._max_sessions = max_sessions
         self._snapshot_every = snapshot_every
         self._keep_ended_s = keep_ended_s
         self._clock = clock
-        self._replay = Replay(store, worker)
+        self._n_beginning = 0
         self._repeating = asyncio.Lock()
         self._summaries = ThreadPoolExecutor(1, "summaries")
-        self._registry = SessionRegistry(store, maps, max_sessions, clock)
         self._under_way: set[asyncio.Task[Any]] = set()
+        # Only who they are; what they believe is read at first touch, so a start takes no longer for many sessions.
+        self._living = {record.session_id: LiveSession(record, record.expires_at) for record in store.living()}
 
     @property
     def n_living(self) -> int:
         """How many sessions have not ended, as far as is known without looking."""
-        return self._registry.n_living
+        return len(self._living)
 
     def close(self) -> None:
         """End the thread of summaries."""
         self._summaries.shutdown()
 
-    async def begin(self, active: ActiveDomain, config: SessionConfig, session_id: str | None = None) -> SessionView:
+    async def begin(self, active: MappedDomain, config: SessionConfig, session_id: str | None = None) -> SessionView:
         """Begin a session on a domain's active map.
 
         Args:
@@ -106,9 +123,10 @@ class Sessions:
             IdempotencyKeyReusedError: A session of that id was begun with another configuration.
             EndedSessionError: The session of that id has ended.
         """
-        if session_id is not None and await self._registry.knows(session_id):
-            return await self._begun_before(session_id, config)
-        check_start(active.snapshot.route, config)
+        if session_id is not None:
+            with suppress(UnknownSessionError):
+                return await self._begun_before(session_id, config)
+        check_prior(active.snapshot.route, config.start_position_m, config.start_std_m)
         return await self._finished(self._begin(active, config, session_id or secrets.token_hex(16)))
 
     async def observe(self, session_id: str, observation: Observation, watch: Stopwatch | None = None) -> SessionView:
@@ -125,28 +143,28 @@ class Sessions:
             LandmarkModelDiffersError: The view was ranked by another landmark model than that of the session's map.
             IdempotencyKeyReusedError: The key named another observation.
         """
-        live = await self._registry.find(session_id)
+        live = await self._find(session_id)
         return await self._finished(self._observe(live, observation, watch or Stopwatch()))
 
     async def set_prior(self, session_id: str, position_m: float, std_m: float) -> SessionView:
         """Replace a session's belief by one around a position; raises InvalidPriorError."""
-        live = await self._registry.find(session_id)
+        live = await self._find(session_id)
         return await self._finished(self._set_prior(live, position_m, std_m))
 
     async def view(self, session_id: str, n_shortlist: int | None = None) -> SessionView:
         """What a session believes now."""
-        live, loaded = await self._read(session_id)
-        return await self._summarised(session_id, live.expires_at, loaded, n_shortlist)
+        live, state = await self._read(session_id)
+        return await self._summarised(session_id, live.expires_at, state, n_shortlist)
 
     async def mass(self, session_id: str) -> NDArray[np.float64]:
         """[n] mass of every map image in a session's belief; sums to 1."""
-        _, loaded = await self._read(session_id)
-        return await self._compute(lambda: loaded.state.belief.belief.mass)
+        _, state = await self._read(session_id)
+        return await self._compute(lambda: state.belief.belief.mass)
 
     async def next_best_view(self, session_id: str) -> tuple[Plan | None, NDArray[np.float64]]:
         """The move to make next, without a new view (None where the map can name none), and the moves there are."""
-        _, loaded = await self._read(session_id)
-        engine, state = loaded.engine, loaded.state
+        _, state = await self._read(session_id)
+        engine = state.engine
         if state.step is not None:
             return state.step.plan, engine.snapshot.actions_m
         return await self._compute(lambda: engine.localizer.plan(state.belief)), engine.snapshot.actions_m
@@ -157,184 +175,264 @@ class Sessions:
 
     async def end(self, session_id: str) -> None:
         """End a session."""
-        await self._finished(self._registry.end(await self._registry.find(session_id), DELETED))
+        await self._finished(self._end(await self._find(session_id), DELETED))
 
-    async def end_domain(self, domain: str) -> None:
-        """End the sessions of a domain that was deleted."""
-        for live in self._registry.of_domain(domain):
-            if live.ending is None:
+    async def end_those(self, is_over: Callable[[SessionRecord], bool]) -> None:
+        """End the living sessions that something is over for: their domain was deleted, say."""
+        for live in list(self._living.values()):
+            if live.ending is None and is_over(live.record):
                 with suppress(EndedSessionError):  # its robot was quicker
-                    await self._finished(self._registry.end(live, DELETED))
-
-    async def end_strangers(self, domains: Container[str]) -> None:
-        """End the sessions of no domain there is: a command beside the service may have deleted theirs."""
-        for domain in self._registry.domains():
-            if domain not in domains:
-                await self.end_domain(domain)
+                    await self._finished(self._end(live, DELETED))
 
     async def sweep(self) -> None:
         """End what has expired, and forget what ended long ago."""
-        await self._finished(self._registry.expire())
-        await self._finished(self._registry.purge(self._keep_ended_s))
+        await self._finished(self._expire())
+        await self._finished(self._purge())
+
+    def engine_of(self, record: SessionRecord) -> SessionEngine:
+        """What moves a session on, whether it lives or has ended; may read files.
+
+        Raises:
+            RetiredMapError: Its map is no more.
+            DamagedMapError, DamagedFileError: The map or the session cannot be read.
+        """
+        mapped = self._maps.pinned(record.domain, record.map_version, record.map_sha256)
+        try:
+            config = SessionConfig.from_dict(record.config)
+        except (KeyError, TypeError, ValueError) as error:
+            raise DamagedFileError(f"session {record.session_id} cannot be read: {error}") from error
+        return SessionEngine.of(config, mapped.snapshot, self._evaluators.evaluator(mapped.record.evaluator))
+
+    # Beginning
 
     async def _begun_before(self, session_id: str, config: SessionConfig) -> SessionView:
-        live = await self._registry.find(session_id)
+        live = await self._find(session_id)
         if live.record.config != config.as_dict():
             raise IdempotencyKeyReusedError(
                 "this idempotency key began a session with another configuration: choose a new one"
             )
         return await self.view(session_id)
 
-    async def _begin(self, active: ActiveDomain, config: SessionConfig, session_id: str) -> SessionView:
-        await self._registry.reserve()
-        begun = None
+    async def _begin(self, active: MappedDomain, config: SessionConfig, session_id: str) -> SessionView:
+        await self._check_room()
+        self._n_beginning += 1
         try:
-            with self._maps.beginning(active.snapshot):
-                digest, evaluator = await asyncio.to_thread(self._maps.pin, active)
-                snapshot, now = active.snapshot, self._clock()
+            snapshot = active.snapshot
+            with self._maps.beginning(snapshot):
+                digest = await asyncio.to_thread(self._maps.digest, snapshot)
+                evaluator = self._evaluators.evaluator(active.record.evaluator)
+                now = self._clock()
                 expires_at = now + self._ttl_s
-
-                def start() -> Loaded:
-                    engine = SessionEngine.of(config, snapshot, evaluator)
-                    return Loaded(engine, engine.start())
-
-                loaded = await self._compute(start)
-                told = self._summarised(session_id, expires_at, loaded)
+                state = await self._compute(lambda: SessionState.start(SessionEngine.of(config, snapshot, evaluator)))
+                answer = self._summarised(session_id, expires_at, state)
                 new = SessionRecord(
                     0, session_id, snapshot.domain, snapshot.version, digest, config.as_dict(), now, expires_at, 0, None
                 )
-                kept = await asyncio.wrap_future(self._store.create(new))
-            if replace(kept, number=0) == new:
-                begun = LiveSession(kept, expires_at, loaded)
-            answer = await told
+                record = await asyncio.wrap_future(self._store.create(new))
+            if replace(record, number=0) != new:  # the same request was on its way twice, and the other was quicker
+                return await self._begun_before(session_id, config)
+            # A repetition may have found it on the disk already.
+            self._living.setdefault(session_id, LiveSession(record, expires_at, state))
+            return await answer
         finally:
-            self._registry.settle(begun)
-        # Else the same request was on its way twice, and the other one was quicker.
-        return answer if begun is not None else await self._begun_before(session_id, config)
+            self._n_beginning -= 1
+
+    async def _check_room(self) -> None:
+        """Raise TooManySessionsError where as many live as may."""
+        if self.n_living + self._n_beginning >= self._max_sessions:
+            await self._expire()
+        if self.n_living + self._n_beginning >= self._max_sessions:
+            soonest_s = min((live.expires_at for live in self._living.values()), default=0.0) - self._clock()
+            raise TooManySessionsError(
+                f"{self._max_sessions} sessions live, and no more may: delete one that is done with, or wait",
+                max_sessions=self._max_sessions,
+                retry_after_s=max(1, min(_LONGEST_RETRY_S, math.ceil(soonest_s))),
+            )
+
+    # Finding
+
+    async def _find(self, session_id: str) -> LiveSession:
+        """A living session.
+
+        Raises:
+            UnknownSessionError: There is none of that id.
+            EndedSessionError: It has been deleted, or has expired.
+        """
+        live = self._living.get(session_id)
+        if live is None:
+            record = await asyncio.to_thread(self._store.find, session_id)
+            if record.ending is not None:
+                raise _ended(session_id, record.ending)
+            live = self._living.setdefault(session_id, LiveSession(record, record.expires_at))  # begun this moment
+        if self._clock() >= live.expires_at and not live.lock.locked():
+            await self._end(live, EXPIRED)
+        if live.ending is not None:
+            raise _ended(session_id, live.ending)
+        return live
+
+    async def _read(self, session_id: str) -> tuple[LiveSession, SessionState]:
+        live = await self._find(session_id)
+        if live.state is not None:
+            return live, live.state
+        async with live.lock:
+            return live, await self._state(live)
+
+    async def _state(self, live: LiveSession) -> SessionState:
+        """What a session answers from, read from the disk where need be; the caller holds the session's lock.
+
+        Raises:
+            EndedSessionError: It ended while the caller waited.
+            RetiredMapError: Its map is no more.
+            DamagedMapError, DamagedFileError: The map or the session cannot be read.
+        """
+        if live.ending is not None:
+            raise _ended(live.record.session_id, live.ending)
+        if live.state is None:
+            live.state = await asyncio.to_thread(self._from_disk, live.record)
+        return live.state
+
+    def _from_disk(self, record: SessionRecord) -> SessionState:
+        engine = self.engine_of(record)
+        snapshot, rows = self._store.history(record.number, self._store.find(record.session_id).n_events)
+        state = restored(engine, snapshot)
+        for row in rows:
+            state = followed(state, row)
+        return state
+
+    # Moving on
 
     async def _observe(self, live: LiveSession, observation: Observation, watch: Stopwatch) -> SessionView:
-        """Everything in order under the session's lock: describe, compute, write, publish."""
+        """Everything in order under the session's lock: decode, describe, compute, write, publish."""
         async with live.lock:
-            loaded = await self._registry.loaded(live)
-            shortlist_length(loaded.engine.snapshot, observation.n_shortlist)  # a bad one should not move the session
-            check_move(loaded.engine.snapshot, observation.action_m, observation.action_std_m)
+            state = await self._state(live)
+            engine = state.engine
+            shortlist_length(engine.snapshot, observation.n_shortlist)  # a bad one should not move the session
+            check_move(engine.snapshot, observation.action_m, observation.action_std_m)
             watch.lap("wait")
-            stepped = await self._looked(live, loaded, observation, watch)
+            view = await observation.view(engine.evaluator)
+            watch.lap("decode")
+            step = partial(self._step, live, state, observation, self._clock() + self._ttl_s, watch)
+            stepped = await asyncio.wrap_future(self._worker.look(engine.evaluator, view, step))
             if isinstance(stepped, int):
-                answer = await self._repeated(live, loaded, stepped, observation.n_shortlist)
+                repeated = await self._repeated(live, state, stepped, observation.n_shortlist)
                 watch.lap("summarise")
-                return answer
+                return repeated
             row, moved_on = stepped
-            told = self._summarised(live.session_id, row.expires_at, moved_on, observation.n_shortlist)
-            await self._commit(live, loaded, row, moved_on)  # the disk and the summary take their time together
+            # The disk and the summary take their time together.
+            answer = self._summarised(live.record.session_id, row.expires_at, moved_on, observation.n_shortlist)
+            await self._commit(live, state, row, moved_on)
             watch.lap("commit")
-            answer = await told
+            view_after = await answer
             watch.lap("summarise")  # what it took beyond the disk
-            return answer
-
-    async def _looked(
-        self, live: LiveSession, loaded: Loaded, observation: Observation, watch: Stopwatch
-    ) -> tuple[ObservedRow, Loaded] | int:
-        """As `_step`, of a view that is still to be decoded and encoded."""
-        evaluator = loaded.engine.evaluator
-        view = await observation.view(evaluator)
-        watch.lap("decode")
-        expires_at = self._clock() + self._ttl_s
-
-        def step(seen: View) -> tuple[ObservedRow, Loaded] | int:
-            return self._step(live, loaded, observation, seen, expires_at, watch)
-
-        return await asyncio.wrap_future(self._worker.look(evaluator, view, step))
+            return view_after
 
     def _step(
         self,
         live: LiveSession,
-        loaded: Loaded,
+        state: SessionState,
         observation: Observation,
-        view: View,
         expires_at: float,
         watch: Stopwatch,
-    ) -> tuple[ObservedRow, Loaded] | int:
-        """The next row and what it leads to; or the row's number, if the observation was counted before."""
-        watch.lap("wait", **encoding_ms(view))
-        named = observation.idempotency
-        if named is not None and (earlier := self._counted_before(live, named)) is not None:
-            return earlier
-        engine = loaded.engine
-        engine.snapshot.check_landmark_model(observation.landmark_models)
-        query = describe(engine.snapshot, engine.evaluator, view)
-        watch.lap("describe")
-        row = engine.row_of(
-            query, loaded.state.sequence + 1, expires_at, observation.action_m, observation.action_std_m, named
-        )
-        state = engine.applied(loaded.state, row)
-        if state.step is not None:
-            watch.take(state.step.timings_ms)
-        return row, Loaded(engine, state)
-
-    def _counted_before(self, live: LiveSession, named: IdempotencyKey) -> int | None:
-        found = self._store.named(live.record.number, named.key)
-        if found is None:
-            return None
-        sequence, digest = found
-        if digest != named.digest:
-            raise IdempotencyKeyReusedError(
-                "this idempotency key came before with another observation: choose a new one"
-            )
-        return sequence
-
-    async def _repeated(self, live: LiveSession, loaded: Loaded, sequence: int, n_shortlist: int | None) -> SessionView:
-        """The answer that an observation had; computed again, since the same journal leads to the same belief."""
-        if loaded.state.sequence != sequence:
-            async with self._repeating:  # a replay is long: many of them take turns
-                snapshot = await asyncio.to_thread(self._store.snapshot_before, live.record.number, sequence)
-                state = await self._replay.until(
-                    live.record, loaded.engine, lambda row, _: row.sequence == sequence, snapshot
+        view: View,
+    ) -> tuple[ObservedRow, SessionState] | int:
+        """On the worker: the next row and what it leads to; or the row's number, if it was counted before."""
+        watch.lap("wait", view)
+        idempotency, snapshot = observation.idempotency, state.engine.snapshot
+        if idempotency is not None:
+            earlier = self._store.named(live.record.number, idempotency.key)
+            if earlier is not None and earlier[1] != idempotency.digest:
+                raise IdempotencyKeyReusedError(
+                    "this idempotency key came before with another observation: choose a new one"
                 )
-            loaded = Loaded(loaded.engine, state)
-        answer = await self._summarised(live.session_id, live.expires_at, loaded, n_shortlist)
+            if earlier is not None:
+                return earlier[0]
+        snapshot.check_landmark_model(observation.landmark_models)
+        query = describe(snapshot, state.engine.evaluator, view)
+        watch.lap("describe")
+        relevance = snapshot.retrieval.relevance
+        row = ObservedRow(  # what the map's relevance compares, and no more
+            sequence=state.sequence + 1,
+            expires_at=expires_at,
+            action_m=observation.action_m,
+            action_std_m=observation.action_std_m,
+            ranks=query.ranks,
+            dissimilarities=query.dissimilarities if relevance is Relevance.SIMBAD else None,
+            encoding=query.encoding if relevance is Relevance.BRUTE_FORCE else None,
+            idempotency=idempotency,
+        )
+        moved_on = state.after(row)
+        if moved_on.step is not None:
+            watch.take(moved_on.step.timings_ms)
+        return row, moved_on
+
+    async def _repeated(
+        self, live: LiveSession, state: SessionState, sequence: int, n_shortlist: int | None
+    ) -> SessionView:
+        """The answer that an observation had; computed again, since the same journal leads to the same belief."""
+        if state.sequence != sequence:
+            async with self._repeating:  # a replay is long: many of them take turns
+                before = await asyncio.to_thread(self._store.snapshot_before, live.record.number, sequence)
+                state = await replayed_until(
+                    self._store,
+                    self._worker,
+                    live.record,
+                    state.engine,
+                    lambda row, _: row.sequence == sequence,
+                    before,
+                )
+        answer = await self._summarised(live.record.session_id, live.expires_at, state, n_shortlist)
         return replace(answer, is_repeated=True)
 
     async def _set_prior(self, live: LiveSession, position_m: float, std_m: float) -> SessionView:
         async with live.lock:
-            loaded = await self._registry.loaded(live)
-            check_prior(loaded.engine.snapshot.route, position_m, std_m)
-            row = PriorRow(loaded.state.sequence + 1, self._clock() + self._ttl_s, position_m, std_m)
-            state = await self._compute(lambda: loaded.engine.applied(loaded.state, row))
-            moved_on = Loaded(loaded.engine, state)
-            told = self._summarised(live.session_id, row.expires_at, moved_on)
-            await self._commit(live, loaded, row, moved_on)
-            return await told
+            state = await self._state(live)
+            check_prior(state.engine.snapshot.route, position_m, std_m)
+            row = PriorRow(state.sequence + 1, self._clock() + self._ttl_s, position_m, std_m)
+            moved_on = await self._compute(lambda: state.after(row))
+            answer = self._summarised(live.record.session_id, row.expires_at, moved_on)
+            await self._commit(live, state, row, moved_on)
+            return await answer
 
-    async def _commit(self, live: LiveSession, before: Loaded, row: JournalRow, after: Loaded) -> None:
+    async def _commit(self, live: LiveSession, before: SessionState, row: JournalRow, after: SessionState) -> None:
         """Write a row, then publish what it leads to."""
         snapshot = None
-        if before.state.sequence > 0 and before.state.sequence % self._snapshot_every == 0:
+        if before.sequence > 0 and before.sequence % self._snapshot_every == 0:
             # Of the state before the row, so that a restart replays at least the last row and has its whole step.
-            snapshot = before.engine.snapshot_of(before.state)
+            snapshot = before.snapshot()
         try:
             await asyncio.wrap_future(self._store.append(live.record.number, row, self._clock(), snapshot))
-        except BaseException as error:
-            live.loaded = None  # what the file holds is the truth: it is read again at the next touch
-            if isinstance(error, InvalidInputError):
-                raise UnavailableError("another process moved this session on: try again") from error
+        except BaseException:
+            live.state = None  # what the file holds is the truth: it is read again at the next touch
             raise
-        live.expires_at, live.loaded = row.expires_at, after
+        live.expires_at, live.state = row.expires_at, after
 
-    async def _read(self, session_id: str) -> tuple[LiveSession, Loaded]:
-        live = await self._registry.find(session_id)
-        if live.loaded is not None:
-            return live, live.loaded
+    # Ending
+
+    async def _end(self, live: LiveSession, ending: str) -> None:
+        """End a session, once what it is doing is done; raises EndedSessionError where it had ended before."""
         async with live.lock:
-            return live, await self._registry.loaded(live)
+            if live.ending is not None:
+                raise _ended(live.record.session_id, live.ending)
+            await asyncio.wrap_future(self._store.end(live.record.number, ending, self._clock()))
+            live.ending, live.state = ending, None
+            self._living.pop(live.record.session_id, None)
+
+    async def _expire(self) -> None:
+        for live in list(self._living.values()):
+            if live.ending is None and self._clock() >= live.expires_at and not live.lock.locked():
+                await self._end(live, EXPIRED)
+
+    async def _purge(self) -> None:
+        while await asyncio.wrap_future(self._store.purge(self._clock() - self._keep_ended_s)):
+            pass
+
+    # Threads and tasks
 
     def _summarised(
-        self, session_id: str, expires_at: float, loaded: Loaded, n_shortlist: int | None = None
+        self, session_id: str, expires_at: float, state: SessionState, n_shortlist: int | None = None
     ) -> asyncio.Future[SessionView]:
         """A summary to come, from a thread of its own: what only reads should not keep a robot's next step waiting."""
-        return asyncio.wrap_future(
-            self._summaries.submit(view_of, session_id, expires_at, loaded.engine, loaded.state, n_shortlist)
-        )
+        return asyncio.wrap_future(self._summaries.submit(view_of, session_id, expires_at, state, n_shortlist))
 
     async def _compute(self, run: Callable[[], T]) -> T:
         return await asyncio.wrap_future(self._worker.submit(run))
@@ -344,3 +442,7 @@ class Sessions:
         self._under_way.add(task)
         task.add_done_callback(self._under_way.discard)
         return await asyncio.shield(task)
+
+
+def _ended(session_id: str, ending: str) -> EndedSessionError:
+    return EndedSessionError(f"session {session_id} has ended ({ending}): begin a new one", ending=ending)

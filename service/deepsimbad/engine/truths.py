@@ -2,6 +2,7 @@
 
 import asyncio
 import math
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -11,10 +12,8 @@ from numpy.typing import NDArray
 from deepsimbad.core.metrics import rank_of_truth
 from deepsimbad.core.route import Route
 from deepsimbad.engine.active_localizer import LocalizerState
-from deepsimbad.engine.pinned_maps import PinnedMaps
-from deepsimbad.engine.replay import Replay
-from deepsimbad.engine.session_registry import engine_of
-from deepsimbad.engine.session_state import SessionEngine, SessionState
+from deepsimbad.engine.session import SessionEngine, SessionState, replayed_until
+from deepsimbad.engine.sessions import Sessions
 from deepsimbad.engine.worker import InferenceWorker
 from deepsimbad.errors import InvalidInputError
 from deepsimbad.store.session_records import JournalRow, ObservedRow, SessionRecord, StateSnapshot
@@ -110,17 +109,21 @@ class Truths:
 
     Args:
         store: The sessions.
-        maps: What they are pinned to.
         worker: Where beliefs are computed.
+        sessions: They know what a session is moved on by.
         clock: Seconds since 1970.
     """
 
     def __init__(
-        self, store: SessionStore, maps: PinnedMaps, worker: InferenceWorker, clock: Callable[[], float]
+        self,
+        store: SessionStore,
+        worker: InferenceWorker,
+        sessions: Sessions,
+        clock: Callable[[], float] = time.time,
     ) -> None:
         self._store = store
-        self._maps = maps
-        self._replays = Replay(store, worker)
+        self._worker = worker
+        self._sessions = sessions
         self._clock = clock
         self._followed: dict[int, tuple[int, StateSnapshot | None]] = {}  # how far, by session: truths come bit by bit
 
@@ -199,7 +202,7 @@ class Truths:
     ) -> tuple[SessionRecord, SessionEngine, NDArray[np.float64]]:
         record = self._store.find(session_id)
         known = checked_truths(positions_m, self._store.n_observations(record.number), first)
-        return record, engine_of(record, self._maps), known
+        return record, self._sessions.engine_of(record), known
 
     async def _follow(
         self,
@@ -218,8 +221,9 @@ class Truths:
                 rank(number, state.belief)
             return number == last
 
-        state = await self._replays.until(record, engine, is_last, snapshot if n_before <= first else None)
-        self._followed[record.number] = (state.belief.n_observations, engine.snapshot_of(state))
+        snapshot = snapshot if n_before <= first else None
+        state = await replayed_until(self._store, self._worker, record, engine, is_last, snapshot)
+        self._followed[record.number] = (state.belief.n_observations, state.snapshot())
         while len(self._followed) > _FOLLOWED:
             del self._followed[next(iter(self._followed))]
 

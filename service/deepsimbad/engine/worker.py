@@ -15,13 +15,12 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from deepsimbad.engine.encoding import encode_images
-from deepsimbad.engine.observation import View
+from deepsimbad.engine.encoders import encode_images
+from deepsimbad.engine.views import View
 from deepsimbad.errors import OverloadedError, UnavailableError
-from deepsimbad.evaluators.base import Evaluator, Image
+from deepsimbad.evaluators.base import Evaluator
 
 T = TypeVar("T")
-
 
 _MOST_UNSCORED = 8  # encoded images whose answers are not yet made
 
@@ -39,13 +38,9 @@ class _Work:
     priority: Priority
     arrival: int
     run: Callable[[Any], Any] = field(compare=False)
-    answer: Future[Any] = field(compare=False)
-    seen: Any = field(default=None, compare=False)
-    evaluator: Evaluator | None = field(default=None, compare=False)
-
-    def goes_with(self, other: "_Work") -> bool:
-        """Whether both are images for one evaluator."""
-        return self.evaluator is not None and self.evaluator is other.evaluator
+    view: Any = field(default=None, compare=False)
+    encoder: Evaluator | None = field(default=None, compare=False)  # of an image
+    answer: Future[Any] = field(default_factory=Future, compare=False)
 
 
 class InferenceWorker:
@@ -98,7 +93,7 @@ class InferenceWorker:
             UnavailableError: The worker has been closed.
             OverloadedError: As many wait as may.
         """
-        return self._put(_Work(priority, next(self._arrivals), lambda _: run(), Future()))
+        return self._put(_Work(priority, next(self._arrivals), lambda _: run()))
 
     def look(
         self, evaluator: Evaluator, view: View, run: Callable[[View], T], priority: Priority = Priority.LIVE
@@ -115,7 +110,7 @@ class InferenceWorker:
             Its result or error to come, as `submit`; raises as `submit`.
         """
         encoder = evaluator if isinstance(view, np.ndarray) else None
-        return self._put(_Work(priority, next(self._arrivals), run, Future(), view, encoder))
+        return self._put(_Work(priority, next(self._arrivals), run, view, encoder))
 
     def _put(self, work: _Work) -> Future[Any]:
         with self._lock:
@@ -133,35 +128,29 @@ class InferenceWorker:
             if not self._open:
                 return
             self._open = False
-            self._n_waiting[Priority._CLOSE] += 1
-            self._queue.put(_Work(Priority._CLOSE, next(self._arrivals), lambda _: None, Future()))
+            self._queue.put(_Work(Priority._CLOSE, next(self._arrivals), lambda _: None))
         self._thread.join()
         self._scorer.shutdown()
 
     def _work(self) -> None:
         while (first := self._queue.get()).priority is not Priority._CLOSE:
-            batch = [work for work in self._with_company(first) if work.answer.set_running_or_notify_cancel()]
+            batch = self._with_company(first)
             del first
-            _encode(batch)
+            if batch and batch[0].encoder is not None:
+                _encode(batch)
             while batch:  # emptied, or the last answer's arrays live until the next query
                 work = batch.pop(0)
-                if work.evaluator is None:
+                if work.encoder is None:
                     _finish(work)
                 else:
                     self._unscored.acquire()  # where scoring is slower, images wait in the queue, which is counted
-                    self._scorer.submit(self._score, work)
+                    self._scorer.submit(_finish, work).add_done_callback(lambda _: self._unscored.release())
                 del work
 
-    def _score(self, work: _Work) -> None:
-        try:
-            _finish(work)
-        finally:
-            self._unscored.release()
-
     def _with_company(self, first: _Work) -> list[_Work]:
-        """A piece of work with the images that are encoded together with it, taken off the queue."""
+        """A piece of work with the images that are encoded together with it, taken off the queue, but the cancelled."""
         batch = [first]
-        largest = 1 if first.evaluator is None else first.evaluator.largest_batch
+        largest = 1 if first.encoder is None else first.encoder.largest_batch
         until = monotonic() + self._longest_wait_s
         while len(batch) < largest:
             left_s = until - monotonic()
@@ -169,25 +158,24 @@ class InferenceWorker:
                 following = self._queue.get(timeout=left_s) if left_s > 0 else self._queue.get_nowait()
             except Empty:
                 break
-            if not following.goes_with(first):
+            if following.encoder is not first.encoder:
                 self._queue.put(following)  # in its old place: the order is by priority and arrival
                 break
             batch.append(following)
         with self._lock:
             for work in batch:
                 self._n_waiting[work.priority] -= 1
-        return batch
+        return [work for work in batch if work.answer.set_running_or_notify_cancel()]
 
 
 def _encode(batch: list[_Work]) -> None:
     """Put encodings in the place of the images of a batch; those of an image that cannot be encoded fail alone."""
-    evaluator = batch[0].evaluator if batch else None
-    if evaluator is None:
+    encoder = batch[0].encoder
+    if encoder is None:
         return
-    images: list[Image] = [work.seen for work in batch]
     try:
-        for work, encoded in zip(batch, encode_images(evaluator, images), strict=True):
-            work.seen = encoded
+        for work, encoded in zip(batch, encode_images(encoder, [work.view for work in batch]), strict=True):
+            work.view = encoded
     except BaseException as error:
         if len(batch) == 1:
             batch.pop().answer.set_exception(error)
@@ -200,7 +188,7 @@ def _encode(batch: list[_Work]) -> None:
 
 def _finish(work: _Work) -> None:
     try:
-        result = work.run(work.seen)
+        result = work.run(work.view)
     except BaseException as error:
         work.answer.set_exception(error)
     else:

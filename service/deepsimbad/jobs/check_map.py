@@ -38,7 +38,7 @@ from deepsimbad.core.relevance import Relevance, RetrievalMap, brute_force_relev
 from deepsimbad.core.route import Route
 from deepsimbad.core.true_images import true_images_of
 from deepsimbad.core.update_rules import DEFAULT_UPDATE
-from deepsimbad.engine.active_maps import load_snapshot
+from deepsimbad.engine.maps import load_snapshot
 from deepsimbad.engine.snapshot import MapSnapshot
 from deepsimbad.errors import DamagedMapError, InvalidEncodingError, RetiredMapError, WeightsDifferError
 from deepsimbad.evaluators.base import Evaluator, LandmarkModel

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from deepsimbad.core.known_walk import KnownWalk
 from deepsimbad.core.relevance import Query
-from deepsimbad.engine.active_maps import unreadable
-from deepsimbad.engine.pinned_maps import retired
+from deepsimbad.engine.maps import retired, unreadable
 from deepsimbad.engine.truths import checked_truths
 from deepsimbad.errors import (
     ConflictError,

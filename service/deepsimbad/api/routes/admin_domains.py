@@ -34,7 +34,7 @@ async def put_domain(domain: DomainName, request: Request, response: Response, r
         record, created = running.catalog.create_domain(
             domain, dict(evaluator.as_dict()), body.closed, body.actions_m, running.settings.max_domains
         )
-        return describe_domain(record, running.evaluators, running.active_maps), created
+        return describe_domain(record, running.evaluators, running.maps), created
 
     answer, created = await run_sync(make)
     response.status_code = 201 if created else 200
@@ -53,8 +53,8 @@ async def delete_domain(domain: DomainName, running: Running) -> None:
         deleted = True
     finally:  # where only its folder could not be removed, the domain is gone all the same
         if deleted or await run_sync(_is_gone, running, domain):
-            running.active_maps.forget(domain)
-            await running.sessions.end_domain(domain)
+            running.maps.forget(domain)
+            await running.sessions.end_those(lambda session: session.domain == domain)
             running.metrics.forget_domain(domain)
     log.info("domain deleted", extra={"domain": domain})
 

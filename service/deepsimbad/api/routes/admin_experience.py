@@ -1,6 +1,7 @@
 """Feeding back where a session's robot truly was."""
 
 import logging
+import time
 
 import numpy as np
 from anyio.to_thread import run_sync
@@ -46,7 +47,7 @@ async def post_experience(
 
     def keep() -> NDArray[np.float64] | None:
         return keep_true_positions(
-            running.session_store, running.catalog, domain, body.session_id, body.true_positions_m, running.clock()
+            running.session_store, running.catalog, domain, body.session_id, body.true_positions_m, time.time()
         )
 
     async def learn() -> JobRecord:

@@ -25,8 +25,8 @@ from deepsimbad.api.dependencies import DomainName, Running, Services, TraverseN
 from deepsimbad.api.frame_batch import read_batch
 from deepsimbad.api.openapi import problems
 from deepsimbad.api.schemas import BatchAnswer, FrameAnswer
-from deepsimbad.engine.encoding import ready_encodings
-from deepsimbad.engine.observation import EncodedImage, View
+from deepsimbad.engine.encoders import ready_encodings
+from deepsimbad.engine.views import EncodedImage, View
 from deepsimbad.engine.worker import Priority
 from deepsimbad.errors import EmptyBodyError
 from deepsimbad.evaluators.base import Evaluator

@@ -13,7 +13,7 @@ from deepsimbad.api.openapi import problems
 from deepsimbad.api.paging import USUALLY_AT_ONCE, AfterMap, Limit, cursor_of, number_of
 from deepsimbad.api.rendering import render_map
 from deepsimbad.api.schemas import MapAnswer, MapList
-from deepsimbad.engine.active_maps import load_snapshot, unreadable
+from deepsimbad.engine.maps import load_snapshot, unreadable
 from deepsimbad.errors import ConflictError, DamagedMapError, UnknownMapVersionError
 from deepsimbad.store.map_table import ANY, removed
 from deepsimbad.store.records import MapState
@@ -57,7 +57,7 @@ async def put_active_map(domain: DomainName, request: Request, running: Running)
             raise ConflictError(f"map {body.version} of domain {domain} is still being built")
         load_snapshot(running.catalog, domain, body.version)
         record = running.catalog.activate(domain, body.version, expected)
-        running.active_maps.refresh(domain)
+        running.maps.refresh(domain)
         running.retention.prune(domain)
         return render_map(record)
 

@@ -32,7 +32,7 @@ async def list_domains(running: Running) -> DomainList:
         answers = []
         for record in running.catalog.domains():
             try:
-                answers.append(describe_domain(record, running.evaluators, running.active_maps))
+                answers.append(describe_domain(record, running.evaluators, running.maps))
             except UnknownDomainError:  # deleted since it was listed
                 continue
         return DomainList(domains=answers)
@@ -43,9 +43,7 @@ async def list_domains(running: Running) -> DomainList:
 @router.get("/{domain}", responses=problems(404, 422))
 async def get_domain(domain: DomainName, running: Running) -> DomainAnswer:
     """One domain and its active map."""
-    return await run_sync(
-        lambda: describe_domain(running.catalog.domain(domain), running.evaluators, running.active_maps)
-    )
+    return await run_sync(lambda: describe_domain(running.catalog.domain(domain), running.evaluators, running.maps))
 
 
 @router.get(
@@ -73,9 +71,9 @@ async def get_landmark_model(
 
     def packed() -> tuple[str, bytes | None]:
         if map_version is None:
-            snapshot = running.active_maps.snapshot(domain)
+            snapshot = running.maps.active(domain).snapshot
         else:
-            snapshot = running.pinned_maps.snapshot(domain, map_version)
+            snapshot = running.maps.snapshot(domain, map_version)
         etag = f'"{snapshot.landmark_model_digest}"'
         is_known = names(request.headers.get("if-none-match"), etag)
         return etag, None if is_known else snapshot.portable_landmarks

@@ -37,9 +37,7 @@ async def readyz(running: Running) -> Readiness:
     faults = await run_sync(running.readiness.faults, limiter=running.health)
     if faults:
         raise UnavailableError("; ".join(faults), faults=list(faults))
-    return Readiness(
-        status="ready", damaged_maps=list(await run_sync(running.active_maps.damaged, limiter=running.health))
-    )
+    return Readiness(status="ready", damaged_maps=list(await run_sync(running.maps.damaged, limiter=running.health)))
 
 
 @router.get("/metrics", response_class=MetricsResponse, responses=problems())

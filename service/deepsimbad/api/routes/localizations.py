@@ -28,8 +28,7 @@ from deepsimbad.api.openapi import binary, problems
 from deepsimbad.api.rendering import render_localization
 from deepsimbad.api.schemas import LocalizationAnswer
 from deepsimbad.engine.localizer import Localization, Retrieval, localize, retrieve, shortlist_length
-from deepsimbad.engine.observation import NothingSeen, PackedRanks, View, encoding_ms
-from deepsimbad.engine.stopwatch import Stopwatch
+from deepsimbad.engine.views import NothingSeen, PackedRanks, Stopwatch, View
 from deepsimbad.engine.worker import Priority
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.image import MEDIA_TYPES
@@ -88,7 +87,7 @@ async def post_localization(
     watch.lap("decode")
 
     def look(seen: View) -> Localization:
-        watch.lap("wait", **encoding_ms(seen))
+        watch.lap("wait", seen)
         active.snapshot.check_landmark_model(landmark_models)
         found = localize(active.snapshot, evaluator, seen, shortlist)
         watch.take(found.timings_ms)

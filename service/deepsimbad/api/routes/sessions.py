@@ -31,8 +31,8 @@ from deepsimbad.api.schemas import BeliefAnswer, NextBestViewAnswer
 from deepsimbad.api.session_bodies import PriorBody, SessionBody
 from deepsimbad.api.session_rendering import render_observation, render_session
 from deepsimbad.api.session_schemas import ObservationAnswer, SessionAnswer
-from deepsimbad.engine.live_session import Observation
-from deepsimbad.engine.stopwatch import Stopwatch
+from deepsimbad.engine.session import Observation
+from deepsimbad.engine.views import Stopwatch
 from deepsimbad.errors import DeepSimbadError
 from deepsimbad.store.session_records import IdempotencyKey
 

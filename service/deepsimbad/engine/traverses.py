@@ -30,7 +30,7 @@ class OpenTraverses:
     def __init__(self, data_dir: Path) -> None:
         self._data_dir = data_dir
         self._open: OrderedDict[tuple[str, str], _Open] = OrderedDict()
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()
 
     @contextmanager
     def lend(self, domain: str, name: str) -> Iterator[Traverse]:
@@ -46,51 +46,45 @@ class OpenTraverses:
             self._doom((domain, name), lent)
             raise
         finally:
-            self._give_back(lent)
+            with self._lock:
+                lent.n_users -= 1
+                if lent.is_doomed and lent.n_users == 0:
+                    lent.traverse.close()
 
     def forget(self, domain: str, name: str | None = None) -> None:
         """Close a traverse, or all of a domain, as soon as nobody uses it."""
         with self._lock:
-            keys = [key for key in self._open if key[0] == domain and name in {None, key[1]}]
-            doomed = [(key, self._open[key]) for key in keys]
-        for key, lent in doomed:
-            self._doom(key, lent)
+            for key, lent in list(self._open.items()):
+                if key[0] == domain and name in {None, key[1]}:
+                    self._doom(key, lent)
 
     def close(self) -> None:
-        """Close all that nobody uses."""
-        for domain in {key[0] for key in list(self._open)}:
-            self.forget(domain)
+        """Close all, those in use after their last use."""
+        with self._lock:
+            for key, lent in list(self._open.items()):
+                self._doom(key, lent)
 
     def _take(self, domain: str, name: str) -> _Open:
         key = (domain, name)
         with self._lock:
-            known = self._open.get(key)
-            if known is not None and known.traverse.is_deleted:  # by another process, which may have made it anew
-                self._let_go(key, known)
+            lent = self._open.get(key)
+            if lent is not None and lent.traverse.is_deleted:  # by another process, which may have made it anew
+                self._doom(key, lent)
             if key not in self._open:
                 self._open[key] = _Open(Traverse.open(self._data_dir, domain, name))
             self._open.move_to_end(key)
             lent = self._open[key]
             lent.n_users += 1
-            idle = [key for key, one in self._open.items() if one.n_users == 0]
+            idle = [key for key, other in self._open.items() if other.n_users == 0]
             for oldest in idle[: max(0, len(self._open) - MAX_IDLE)]:
                 self._open.pop(oldest).traverse.close()
             return lent
 
-    def _give_back(self, lent: _Open) -> None:
-        with self._lock:
-            lent.n_users -= 1
-            if lent.is_doomed and lent.n_users == 0:
-                lent.traverse.close()
-
     def _doom(self, key: tuple[str, str], lent: _Open) -> None:
         with self._lock:
-            self._let_go(key, lent)
-
-    def _let_go(self, key: tuple[str, str], lent: _Open) -> None:
-        if self._open.get(key) is lent:
-            del self._open[key]
-        if not lent.is_doomed:
-            lent.is_doomed = True
-            if lent.n_users == 0:
-                lent.traverse.close()
+            if self._open.get(key) is lent:
+                del self._open[key]
+            if not lent.is_doomed:
+                lent.is_doomed = True
+                if lent.n_users == 0:
+                    lent.traverse.close()

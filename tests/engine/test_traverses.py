@@ -5,7 +5,7 @@ import threading
 import numpy as np
 import pytest
 
-from deepsimbad.engine.open_traverses import MAX_IDLE, OpenTraverses
+from deepsimbad.engine.traverses import MAX_IDLE, OpenTraverses
 from deepsimbad.errors import UnknownTraverseError
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.traverses import Traverse

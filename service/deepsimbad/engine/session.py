@@ -1,0 +1,348 @@
+"""One session: what it is begun with, what it believes, and how every row of its journal moves it on.
+
+Live and after a restart it is moved on by the same function, so a journal leads to the same bits.
+"""
+
+import asyncio
+import math
+from collections.abc import Awaitable, Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from time import perf_counter
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deepsimbad.core.belief_summary import BeliefSummary, summarise
+from deepsimbad.core.filters import FilterKind
+from deepsimbad.core.planners import Plan
+from deepsimbad.core.relevance import Query
+from deepsimbad.core.retrieval import shortlist
+from deepsimbad.core.route import Route
+from deepsimbad.core.update_rules import UpdateRule
+from deepsimbad.engine.active_localizer import ActiveLocalizer, LocalizerConfig, LocalizerState, Step
+from deepsimbad.engine.localizer import shortlist_length
+from deepsimbad.engine.snapshot import MapSnapshot
+from deepsimbad.engine.views import View
+from deepsimbad.engine.worker import InferenceWorker, Priority
+from deepsimbad.errors import (
+    DamagedFileError,
+    DeepSimbadError,
+    InvalidMoveError,
+    InvalidPriorError,
+    UnknownSessionError,
+)
+from deepsimbad.evaluators.base import Evaluator
+from deepsimbad.store.session_records import (
+    IdempotencyKey,
+    JournalRow,
+    PriorRow,
+    SessionRecord,
+    StateSnapshot,
+)
+from deepsimbad.store.sessions import SessionStore
+
+DEFAULT_START_STD_M = 5.0
+LONGEST_MOVE_ACTIONS = 10.0  # a robot may report a move of up to so many of the domain's longest action
+_SLACK_STDS = 3.0  # a prior may lie beyond the route by so many of its deviations
+_LARGEST_STD_M = 1e6
+_ROWS_AT_ONCE = 64  # of a journal in memory: 130 kB with 500 landmarks
+_PIECE_S = 0.01  # a live view waits no longer for a replay than this and one step
+
+
+@dataclass(frozen=True)
+class SessionConfig:
+    """How a session begins and goes on; kept with it.
+
+    Attributes:
+        start_position_m: Where it begins; None: anywhere on the route.
+        start_std_m: How sure that is.
+        seed: Of whatever is random in it.
+        planner: By name; None: the default.
+        belief: The filter.
+        update: How a view counts; None: as the map's relevance wants.
+    """
+
+    start_position_m: float | None = None
+    start_std_m: float = DEFAULT_START_STD_M
+    seed: int = 0
+    planner: str | None = None
+    belief: FilterKind = FilterKind.GRID
+    update: UpdateRule | None = None
+
+    def as_dict(self) -> dict[str, Any]:
+        """JSON-ready."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, stored: dict[str, Any]) -> Self:
+        """What `as_dict` gave."""
+        update = stored["update"]
+        enums = {"belief": FilterKind(stored["belief"]), "update": None if update is None else UpdateRule(update)}
+        return cls(**{**stored, **enums})
+
+
+@dataclass(frozen=True)
+class Observation:
+    """A move and the view after it, as a robot reports them.
+
+    Attributes:
+        view: Gives the view, at the size of the evaluator it is given; called when the session's turn has come, so that
+            order is that of arrival.
+        action_m: Metres moved since the last view; ignored for the first one.
+        action_std_m: Their standard deviation; None: the usual one.
+        n_shortlist: Length of the answer's lists; None: the usual one.
+        idempotency: How a repetition is known; None: it is not.
+        landmark_models: Digests of landmark models, by one of which the view was ranked; None: nobody said.
+    """
+
+    view: Callable[[Evaluator], Awaitable[View]]
+    action_m: float = 0.0
+    action_std_m: float | None = None
+    n_shortlist: int | None = None
+    idempotency: IdempotencyKey | None = None
+    landmark_models: frozenset[str] | None = None
+
+
+@dataclass(frozen=True)
+class SessionEngine:
+    """What moves one session on: its configuration, its map, the domain's evaluator and the algorithm."""
+
+    config: SessionConfig
+    snapshot: MapSnapshot
+    evaluator: Evaluator
+    localizer: ActiveLocalizer
+
+    @classmethod
+    def of(cls, config: SessionConfig, snapshot: MapSnapshot, evaluator: Evaluator) -> Self:
+        """The engine of a session; raises InvalidInputError where the configuration cannot be."""
+        algorithm = LocalizerConfig(
+            filter=config.belief, update=config.update, planner=config.planner, seed=config.seed
+        )
+        return cls(config, snapshot, evaluator, ActiveLocalizer(snapshot, algorithm))
+
+
+@dataclass(frozen=True)
+class SessionState:
+    """What a session believes after a row of its journal. Immutable: published by one assignment, read without a lock.
+
+    Attributes:
+        engine: What moves it on.
+        sequence: That row's number; 0 before any.
+        belief: The algorithm's state.
+        step: The algorithm's step, where that row was an observation.
+    """
+
+    engine: SessionEngine
+    sequence: int
+    belief: LocalizerState
+    step: Step | None = None
+
+    @classmethod
+    def start(cls, engine: SessionEngine) -> Self:
+        """Before anything has happened."""
+        return cls(engine, 0, engine.localizer.start(engine.config.start_position_m, engine.config.start_std_m))
+
+    def after(self, row: JournalRow) -> "SessionState":
+        """The state after one more row.
+
+        Raises:
+            InvalidInputError: The row cannot follow (a move past the end, a view that the map cannot compare).
+        """
+        if isinstance(row, PriorRow):
+            belief = self.engine.localizer.with_prior(self.belief, row.position_m, row.std_m)
+            return SessionState(self.engine, row.sequence, belief)
+        query = Query(row.ranks, row.dissimilarities, row.encoding)
+        step = self.engine.localizer.step(self.belief, query, row.action_m, row.action_std_m)
+        return SessionState(self.engine, row.sequence, step.state, step)
+
+    def snapshot(self) -> StateSnapshot:
+        """In the store's form."""
+        return StateSnapshot(self.sequence, self.engine.localizer.to_arrays(self.belief))
+
+
+@contextmanager
+def _journal_faults() -> Iterator[None]:
+    try:
+        yield
+    except DamagedFileError:
+        raise
+    except (DeepSimbadError, KeyError, TypeError, ValueError, IndexError) as error:
+        raise DamagedFileError(f"a session's journal cannot be followed: {error}") from error
+
+
+def restored(engine: SessionEngine, snapshot: StateSnapshot | None) -> SessionState:
+    """The state that a journal is followed from; raises DamagedFileError where it cannot be of this session.
+
+    Args:
+        engine: The session's.
+        snapshot: That state; None: before anything happened.
+    """
+    with _journal_faults():
+        if snapshot is None:
+            return SessionState.start(engine)
+        return SessionState(engine, snapshot.sequence, engine.localizer.from_arrays(snapshot.arrays))
+
+
+def followed(state: SessionState, row: JournalRow) -> SessionState:
+    """The state after a row of the journal, the same bits as when it was written.
+
+    Raises:
+        DamagedFileError: It is not the next one, or cannot be of this session.
+    """
+    if row.sequence != state.sequence + 1:
+        raise DamagedFileError(f"row {state.sequence + 1} of a session's journal is missing")
+    with _journal_faults():
+        return state.after(row)
+
+
+async def replayed_until(
+    store: SessionStore,
+    worker: InferenceWorker,
+    record: SessionRecord,
+    engine: SessionEngine,
+    is_last: Callable[[JournalRow, SessionState], bool],
+    snapshot: StateSnapshot | None = None,
+) -> SessionState:
+    """A session's state after the first row that is the last one wanted, computed behind every live view.
+
+    That takes as long as its observations took, but in short pieces, a few rows of the journal in memory at a time.
+
+    Args:
+        store: The sessions.
+        worker: Where beliefs are computed.
+        record: The session.
+        engine: What moves it on.
+        is_last: Told on the worker of every row and the state after it; whether that is the last one wanted.
+        snapshot: Where to begin; None: before anything happened.
+
+    Raises:
+        UnknownSessionError: The journal ends before; it was purged meanwhile.
+        DamagedFileError: The journal cannot be of this session.
+    """
+    state = await asyncio.wrap_future(worker.submit(lambda: restored(engine, snapshot), Priority.BATCH))
+    while True:
+        after = state.sequence
+        rows = await asyncio.to_thread(store.journal_part, record.number, after, after + _ROWS_AT_ONCE)
+        if not rows:
+            raise UnknownSessionError(f"there is no session {record.session_id!a}")
+        while rows:
+
+            def piece(state: SessionState = state, rows: list[JournalRow] = rows) -> tuple[SessionState, int, bool]:
+                began, n_rows, is_done = perf_counter(), 0, False
+                for row in rows:
+                    state = followed(state, row)
+                    n_rows += 1
+                    is_done = is_last(row, state)
+                    if is_done or perf_counter() - began > _PIECE_S:
+                        break
+                return state, n_rows, is_done
+
+            state, n_rows, is_done = await asyncio.wrap_future(worker.submit(piece, Priority.BATCH))
+            if is_done:
+                return state
+            rows = rows[n_rows:]
+
+
+@dataclass
+class LiveSession:
+    """A session that has not ended; touched from the event loop alone.
+
+    Attributes:
+        record: As it was begun.
+        expires_at: When it ends unless something happens to it; seconds since 1970.
+        state: What answers, once it is on the disk; None until it is first needed after a start.
+        lock: Held by whoever moves it on; waiting for it is first come, first served.
+        ending: How it ended; whoever waited for the lock meanwhile comes too late.
+    """
+
+    record: SessionRecord
+    expires_at: float
+    state: SessionState | None = None
+    lock: asyncio.Lock = field(default_factory=asyncio.Lock)
+    ending: str | None = None
+
+
+@dataclass(frozen=True)
+class SessionView:
+    """A session as of one row of its journal.
+
+    Attributes:
+        session_id: Which session.
+        expires_at: When it ends unless something happens to it; seconds since 1970.
+        snapshot: The map it is pinned to.
+        n_observations: How many views its belief rests on.
+        belief: The belief in a few numbers.
+        plan: The move to make next; None where the map can name none.
+        relevance: [n] float32 of the last view; None before any.
+        shortlist: Ids of the map images most relevant to the last view, best first.
+        is_repeated: Whether the observation had been counted before.
+    """
+
+    session_id: str
+    expires_at: float
+    snapshot: MapSnapshot
+    n_observations: int
+    belief: BeliefSummary
+    plan: Plan | None
+    relevance: NDArray[np.float32] | None
+    shortlist: NDArray[np.int64]
+    is_repeated: bool = False
+
+
+def view_of(session_id: str, expires_at: float, state: SessionState, n_shortlist: int | None = None) -> SessionView:
+    """Summarise a state, with lists of the usual length or another; milliseconds of work."""
+    snapshot, belief, step = state.engine.snapshot, state.belief, state.step
+    length = shortlist_length(snapshot, n_shortlist)
+    return SessionView(
+        session_id=session_id,
+        expires_at=expires_at,
+        snapshot=snapshot,
+        n_observations=belief.n_observations,
+        belief=summarise(snapshot.route, belief.belief.mass, length, belief.off_route),
+        plan=state.engine.localizer.plan(belief) if step is None else step.plan,
+        relevance=belief.relevance,
+        shortlist=np.empty(0, np.int64) if belief.relevance is None else shortlist(belief.relevance, length),
+    )
+
+
+def check_prior(route: Route, position_m: float | None, std_m: float) -> None:
+    """Refuse a prior that is no belief on the route; no position is anywhere on it.
+
+    Raises:
+        InvalidPriorError: NaN or infinity, a deviation that is not positive, or a position so far beyond the route
+            that the robot would hardly be on it.
+    """
+    if not (math.isfinite(std_m) and 0 < std_m <= _LARGEST_STD_M):
+        raise InvalidPriorError(
+            f"a standard deviation of {std_m} m cannot be one: it must be above 0 and at most {_LARGEST_STD_M:g}"
+        )
+    if position_m is None:
+        return
+    first_m, last_m = route.start_m, float(route.position_m[-1])
+    if route.closed:
+        last_m = route.start_m + route.length_m
+    slack_m = _SLACK_STDS * std_m
+    if not (math.isfinite(position_m) and first_m - slack_m <= position_m <= last_m + slack_m):
+        raise InvalidPriorError(
+            f"position {position_m} m is off the route, which runs from {first_m:g} m to {last_m:g} m",
+            route_start_m=first_m,
+            route_end_m=last_m,
+        )
+
+
+def check_move(snapshot: MapSnapshot, action_m: float, action_std_m: float | None) -> None:
+    """Refuse a move that no robot of the domain makes.
+
+    Raises:
+        InvalidMoveError: Not finite, negative, or longer than ten of the longest action.
+    """
+    longest_m = LONGEST_MOVE_ACTIONS * float(snapshot.actions_m.max())
+    for name, metres in (("action_m", action_m), ("action_std_m", action_std_m)):
+        if metres is not None and not (math.isfinite(metres) and 0 <= metres <= longest_m):
+            raise InvalidMoveError(
+                f"{name} is {metres}: give metres from 0 to {longest_m:g}, ten of the domain's longest action",
+                minimum=0.0,
+                maximum=longest_m,
+            )

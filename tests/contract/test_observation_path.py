@@ -1,0 +1,64 @@
+"""One acknowledged observation passes through few files and functions of the project."""
+
+import sys
+import threading
+from pathlib import Path
+from types import CodeType
+from typing import Any
+
+import httpx2
+from starlette.testclient import TestClient
+
+import deepsimbad
+from deepsimbad.api.app import create_app
+from deepsimbad.jobs.perform import InThisProcess
+
+from .conftest import N_LANDMARKS, make_ready_domain, small_settings
+
+MOST_FILES, MOST_FUNCTIONS = 45, 152
+PROJECT = str(Path(deepsimbad.__file__).parent)
+
+
+class Profile:
+    """Notes the project's functions that are called, in every thread that is started after it was hooked in."""
+
+    def __init__(self) -> None:
+        self.is_on = False
+        self.called: set[CodeType] = set()
+
+    def __call__(self, frame: Any, event: str, _argument: object) -> None:
+        if self.is_on and event == "call" and frame.f_code.co_filename.startswith(PROJECT):
+            self.called.add(frame.f_code)
+
+    async def of_an_observation(self, app: Any) -> None:
+        """Hear a session's fourth observation from its request to its answer."""
+        async with httpx2.AsyncClient(transport=httpx2.ASGITransport(app), base_url="http://robot") as robot:
+            begun = await robot.post("/v1/domains/ready/sessions", json={})
+            path = f"/v1/sessions/{begun.json()['session_id']}/observations?action_m=2"
+            view = {"ranked_landmarks": list(range(N_LANDMARKS))}
+            for _ in range(3):
+                assert (await robot.post(path, json=view)).status_code == 200
+            before, self.is_on = sys.getprofile(), True
+            sys.setprofile(self)
+            try:
+                answer = await robot.post(path, json=view)
+            finally:
+                self.is_on = False
+                sys.setprofile(before)
+            assert (answer.status_code, answer.json()["n_observations"]) == (200, 4)
+
+
+def test_an_observation_passes_through_few_files_and_functions(tmp_path: Path) -> None:
+    profile = Profile()
+    threading.setprofile(profile)
+    try:
+        with TestClient(create_app(small_settings(tmp_path), InThisProcess(tmp_path))) as client:
+            make_ready_domain(client, "ready")
+            assert client.portal is not None
+            client.portal.call(profile.of_an_observation, client.app)
+    finally:
+        threading.setprofile(None)
+    functions = sorted(f"{Path(code.co_filename).relative_to(PROJECT)}: {code.co_qualname}" for code in profile.called)
+    files = sorted({function.partition(":")[0] for function in functions})
+    assert len(files) <= MOST_FILES, f"{len(files)}: {files}"
+    assert len(functions) <= MOST_FUNCTIONS, f"{len(functions)}: {functions}"
