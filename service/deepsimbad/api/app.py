@@ -177,12 +177,16 @@ async def _sweep(services: Services, every_s: float) -> None:
         await asyncio.sleep(every_s)
         try:
             await services.sessions.sweep()
-            domains = await run_sync(services.catalog.domains)
-            names = {record.name for record in domains}  # a command beside the service may have deleted one
-            await services.sessions.end_those(lambda session, names=names: session.domain not in names)
+            await _end_of_no_domain(services)
             await run_sync(services.retention.prune)
         except DeepSimbadError:
             log.exception("expired sessions could not be ended")
+
+
+async def _end_of_no_domain(services: Services) -> None:
+    """A command beside the service may have deleted a domain."""
+    domains = {record.name for record in await run_sync(services.catalog.domains)}
+    await services.sessions.end_those(lambda session: session.domain not in domains)
 
 
 def _start(settings: Settings, metrics: Metrics, keys: KeyRing, run_job: RunJob, parts: ExitStack) -> Services:
