@@ -25,7 +25,7 @@ install: .venv/.installed ## .venv with the service, the client and the tools fr
 	@touch $@
 
 demo: install ## renders a campus, maps it, localizes a drive of another season against a live server
-	@$(BIN)/python -m deepsimbad_client.demo
+	@$(BIN)/python -m deepsimbad_client.commands.demo
 
 lint: install
 	$(BIN)/ruff check .

@@ -31,8 +31,8 @@ from deepsimbad.evaluators.extractors.network import resized
 from deepsimbad.evaluators.image import decode_image
 from deepsimbad.evaluators.registry import evaluator_config, make_evaluator, make_extractor
 from deepsimbad_client import Client
-from deepsimbad_client.local_server import LocalServer
-from deepsimbad_client.remap import remap
+from deepsimbad_client.http.jobs import remap
+from deepsimbad_client.http.local_server import LocalServer
 
 ROUNDS = 60
 N_ROBOTS, N_VIEWS = 16, 60

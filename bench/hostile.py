@@ -25,7 +25,7 @@ from bench.load.trial import Sample
 from bench.machine import describe
 from bench.soak.link import Link
 from bench.soak.world import BASE, DOMAIN, N_LANDMARKS, make_domain
-from deepsimbad_client.local_server import LocalServer
+from deepsimbad_client.http.local_server import LocalServer
 
 _SILENT = 900
 _LARGE, _LARGE_SENDERS = (5_000, 10_000), 24  # pixels just under the limit

@@ -14,7 +14,7 @@ import numpy as np
 from bench.timing import Timing, timed
 from bench.worlds import N_LANDMARKS, NCLT_IMAGES
 from deepsimbad_client import Client
-from deepsimbad_client.local_server import LocalServer
+from deepsimbad_client.http.local_server import LocalServer
 
 _DIM = 64  # short encodings: what is measured never sees them
 

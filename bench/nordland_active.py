@@ -17,10 +17,10 @@ from bench.recordings import RESULTS, real_recordings
 from deepsimbad_client import Client
 from deepsimbad_client.active_replay import active_replay
 from deepsimbad_client.active_report import distance_table, localized_table, planner_table, summarise_active
-from deepsimbad_client.local_server import LocalServer
-from deepsimbad_client.remap import remap
+from deepsimbad_client.http.jobs import remap
+from deepsimbad_client.http.local_server import LocalServer
+from deepsimbad_client.http.upload import upload
 from deepsimbad_client.sources import open_source
-from deepsimbad_client.upload import upload
 
 PLANNERS = ("default", "random", "constant:10", "constant:8", "constant:5", "nnql")
 EPISODES = 150

@@ -13,7 +13,7 @@ from PIL import Image
 
 from bench.recordings import RESULTS
 from deepsimbad_client.campus import PAPER_DATES
-from deepsimbad_client.demo import SEASONS
+from deepsimbad_client.commands.demo import SEASONS
 from deepsimbad_client.nclt import read_nclt
 
 IMAGES = RESULTS.parent / "images"

@@ -24,7 +24,7 @@ from bench.live_robots import LiveRobot, Waits, drive
 from bench.seasons import SPACING_M, write_seasons
 from bench.worlds import ENCODING_DIM, N_LANDMARKS, NCLT_IMAGES
 from deepsimbad_client import Client
-from deepsimbad_client.local_server import LocalServer
+from deepsimbad_client.http.local_server import LocalServer
 
 MOST_SECONDS, MOST_SECONDS_UNDER_LOAD, MOST_MEDIAN_RATIO, MOST_P99_RATIO = 60.0, 120.0, 1.5, 3.0
 _SESSION_LENGTH = 500

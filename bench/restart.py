@@ -11,7 +11,7 @@ from bench.http import make_map
 from bench.timing import Timing
 from bench.worlds import NCLT_IMAGES
 from deepsimbad_client import Client
-from deepsimbad_client.local_server import LocalServer
+from deepsimbad_client.http.local_server import LocalServer
 
 _KILLS = 7
 

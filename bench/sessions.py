@@ -16,7 +16,7 @@ from bench.http import make_map
 from bench.timing import Timing
 from bench.worlds import N_LANDMARKS, NCLT_IMAGES
 from deepsimbad_client import Client
-from deepsimbad_client.local_server import LocalServer
+from deepsimbad_client.http.local_server import LocalServer
 
 ROBOTS = 50
 _ONE_ROBOT_VIEWS, _EACH_ROBOT_VIEWS, _WARM_UP = 300, 40, 20

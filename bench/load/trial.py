@@ -10,7 +10,7 @@ import numpy as np
 
 from bench.load.drivers import LoadRobot, Operator, make_domain
 from bench.soak.link import Link
-from deepsimbad_client.local_server import LocalServer
+from deepsimbad_client.http.local_server import LocalServer
 
 N_ROBOTS = 20
 

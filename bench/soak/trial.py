@@ -20,7 +20,7 @@ from bench.soak.robot import Robot
 from bench.soak.uploader import Uploader
 from bench.soak.world import make_domain
 from deepsimbad.core.filters import FilterKind
-from deepsimbad_client.local_server import LocalServer
+from deepsimbad_client.http.local_server import LocalServer
 
 N_ROBOTS, SHORT_SESSION = 4, 25
 LONGEST_LIFE_S = 4.0

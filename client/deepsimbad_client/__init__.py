@@ -5,12 +5,10 @@
 ...     print(client.localize("campus", "view.jpg").belief.mode_m)
 """
 
-from deepsimbad_client.async_client import AsyncClient
-from deepsimbad_client.async_session import AsyncSession
-from deepsimbad_client.client import Client
 from deepsimbad_client.errors import ApiError, DeepSimbadClientError
-from deepsimbad_client.map_download import MapFile
-from deepsimbad_client.models import (
+from deepsimbad_client.http.client import AsyncClient, AsyncSession, Client, Session
+from deepsimbad_client.http.download import MapFile
+from deepsimbad_client.http.models import (
     Belief,
     Domain,
     Job,
@@ -22,9 +20,8 @@ from deepsimbad_client.models import (
     Traverse,
     TruthScore,
 )
-from deepsimbad_client.observation import Observation
-from deepsimbad_client.retry import RetryPolicy
-from deepsimbad_client.session import Session
+from deepsimbad_client.http.observation import Observation
+from deepsimbad_client.http.retry import RetryPolicy
 
 __all__ = [
     "ApiError",

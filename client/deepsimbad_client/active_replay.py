@@ -7,16 +7,15 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from deepsimbad_client.client import Client
 from deepsimbad_client.episode_log import Episode, EpisodeLog, EpisodeStep, write_steps
-from deepsimbad_client.in_order import in_order
+from deepsimbad_client.http.client import Client
+from deepsimbad_client.http.models import Domain
+from deepsimbad_client.http.upload import CONCURRENCY, in_order
 from deepsimbad_client.judge import TRUTH_WITHIN_M
 from deepsimbad_client.map_route import MapRoute
-from deepsimbad_client.models import Domain
 from deepsimbad_client.recording import Recording
 from deepsimbad_client.replay import changed_map
 from deepsimbad_client.stage import DEFAULT_PLANNER, Stage
-from deepsimbad_client.upload import CONCURRENCY
 
 EPISODES = 20
 STEPS = 10

@@ -21,10 +21,10 @@ from rich.progress import (
 from rich.table import Table
 
 from deepsimbad_client.episode_log import Episode
-from deepsimbad_client.models import Job
+from deepsimbad_client.http.models import Job
+from deepsimbad_client.http.upload import UploadReport
 from deepsimbad_client.step_log import Step
 from deepsimbad_client.tables import lasting
-from deepsimbad_client.upload import UploadProgress
 
 REMARKS = Console(stderr=True, highlight=False, markup=False)
 """Progress and remarks; names may hold brackets, so nothing is read as markup."""
@@ -50,7 +50,7 @@ class Remarks(logging.Handler):
 def show_waits() -> None:
     """Tell a person at a terminal why nothing happens while a call waits to be sent again."""
     if REMARKS.is_terminal:
-        retries = logging.getLogger("deepsimbad_client.retry")
+        retries = logging.getLogger("deepsimbad_client.http.retry")
         retries.setLevel(logging.INFO)
         retries.handlers = [Remarks()]
         retries.propagate = False
@@ -105,7 +105,7 @@ class FrameBar(Bar):
 class UploadBar(Bar):
     """Frames sent."""
 
-    def __call__(self, progress: UploadProgress) -> None:
+    def __call__(self, progress: UploadReport) -> None:
         """Show how far an upload is."""
         note = f"{progress.bytes_sent / 1e6:.1f} MB sent"
         self._progress.update(self._task, completed=progress.n_done, total=progress.n_frames, note=note)

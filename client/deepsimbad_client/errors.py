@@ -14,42 +14,36 @@ class DeepSimbadClientError(Exception):
 
     code: str = "client_error"
 
+    def __init_subclass__(cls, code: str = "") -> None:
+        super().__init_subclass__()
+        cls.code = code or cls.code
+
     def __init__(self, message: str) -> None:
         super().__init__(message)
         self.message = message
 
 
-class MissingExtraError(DeepSimbadClientError):
+class MissingExtraError(DeepSimbadClientError, code="missing_extra"):
     """A part of the client whose optional dependencies are not installed."""
 
-    code = "missing_extra"
 
-
-class InvalidArgumentError(DeepSimbadClientError, ValueError):
+class InvalidArgumentError(DeepSimbadClientError, ValueError, code="invalid_argument"):
     """A value given to the client that can never be sent."""
 
-    code = "invalid_argument"
 
-
-class OtherWeightsError(DeepSimbadClientError):
+class OtherWeightsError(DeepSimbadClientError, code="other_weights"):
     """The weights here are not those that the map's images were encoded by: ranks of both cannot be compared."""
 
-    code = "other_weights"
 
-
-class InvalidLandmarkModelError(DeepSimbadClientError):
+class InvalidLandmarkModelError(DeepSimbadClientError, code="invalid_landmark_model"):
     """A file or answer that is no landmark model, or one that this version cannot rank by."""
 
-    code = "invalid_landmark_model"
 
-
-class SourceError(DeepSimbadClientError):
+class SourceError(DeepSimbadClientError, code="invalid_source"):
     """A recording that cannot be read as a whole: missing, empty or inconsistent."""
 
-    code = "invalid_source"
 
-
-class BrokenFrameError(SourceError):
+class BrokenFrameError(SourceError, code="broken_frame"):
     """One frame of a recording that cannot be read; the rest of the recording is fine.
 
     Args:
@@ -57,74 +51,58 @@ class BrokenFrameError(SourceError):
         reason: The words to count it under, beside a recording's `left_out`.
     """
 
-    code = "broken_frame"
-
     def __init__(self, message: str, reason: str = "undecodable") -> None:
         super().__init__(message)
         self.reason = reason
 
 
-class ReplayError(DeepSimbadClientError):
+class ReplayError(DeepSimbadClientError, code="replay"):
     """A replay that cannot go on or be scored."""
 
-    code = "replay"
 
-
-class TransportError(DeepSimbadClientError):
+class TransportError(DeepSimbadClientError, code="no_answer"):
     """The request was sent as often as allowed and no answer came back."""
 
-    code = "no_answer"
 
-
-class TransportTimeoutError(TransportError):
+class TransportTimeoutError(TransportError, code="timeout"):
     """The service did not answer within the time allowed."""
 
-    code = "timeout"
 
-
-class UnexpectedAnswerError(DeepSimbadClientError):
+class UnexpectedAnswerError(DeepSimbadClientError, code="unexpected_answer"):
     """An answer that is not what the contract says: something else answers at this address."""
 
-    code = "unexpected_answer"
 
-
-class DamagedDownloadError(DeepSimbadClientError):
+class DamagedDownloadError(DeepSimbadClientError, code="damaged_download"):
     """A file that came has another digest than the service named."""
 
-    code = "damaged_download"
 
-
-class NotSavedError(DeepSimbadClientError):
+class NotSavedError(DeepSimbadClientError, code="not_saved"):
     """A file that cannot be written here."""
 
-    code = "not_saved"
 
-
-class NoEarlierMapError(DeepSimbadClientError):
+class NoEarlierMapError(DeepSimbadClientError, code="no_earlier_map"):
     """There is no map to roll back to."""
 
-    code = "no_earlier_map"
 
-
-class JobFailedError(DeepSimbadClientError):
+class JobFailedError(DeepSimbadClientError, code="job_failed"):
     """A job ended without success.
 
     Args:
         message: What the service said of it.
-        job: The job as the service last described it (a `deepsimbad_client.models.Job`).
+        job: The job as the service last described it (a `deepsimbad_client.http.models.Job`).
     """
-
-    code = "job_failed"
 
     def __init__(self, message: str, job: Any) -> None:
         super().__init__(message)
         self.job = job
 
 
-class JobCancelledError(JobFailedError):
+class JobCancelledError(JobFailedError, code="cancelled"):
     """A job was cancelled before it ended."""
 
-    code = "cancelled"
+
+BY_CODE: "dict[str, type[ApiError]]" = {}
+BY_STATUS: "dict[int, type[ApiError]]" = {}
 
 
 class ApiError(DeepSimbadClientError):
@@ -138,6 +116,16 @@ class ApiError(DeepSimbadClientError):
         request_id: The service's id of this request, to quote to its operator.
         retry_after_s: Seconds the service asked to wait before trying again.
     """
+
+    _advice = ""
+
+    def __init_subclass__(cls, code: str = "", status: int = 0, advice: str = "") -> None:
+        super().__init_subclass__(code)
+        cls._advice = advice or cls._advice
+        if code:
+            BY_CODE[code] = cls
+        if status:
+            BY_STATUS[status] = cls
 
     def __init__(
         self,
@@ -159,165 +147,151 @@ class ApiError(DeepSimbadClientError):
     @property
     def advice(self) -> str:
         """What the caller can do about it, where the service may not have said so; "" where there is nothing to add."""
-        return ""
+        return self._advice.format_map({"needed": "admin", "map_version": None, **self.problem})
 
     def __str__(self) -> str:
-        parts = [f"{self.status} {self.code}".strip()]
-        if self.request_id:
-            parts.append(f"request {self.request_id}")
-        told = f"{self.message} ({', '.join(parts)})"
-        return f"{told}; {self.advice}" if self.advice else told
+        request = f", request {self.request_id}" if self.request_id else ""
+        advice = f"; {self.advice}" if self.advice else ""
+        return f"{self.message} ({self.status} {self.code}{request}){advice}"
 
 
-class BadRequestError(ApiError):
+class BadRequestError(ApiError, status=400):
     """400: the request could not be read at all."""
 
 
 _KEY_ADVICE = (
-    "`deepsimbad keys create --scope {scope}` makes one where the service runs; give it in $DEEPSIMBAD_API_KEY or "
-    "--api-key"
+    "`deepsimbad keys create --scope {}` makes one where the service runs; give it in $DEEPSIMBAD_API_KEY or --api-key"
 )
 
 
-class UnauthorizedError(ApiError):
+class UnauthorizedError(ApiError, status=401, code="unauthorized", advice=_KEY_ADVICE.format("localize|admin")):
     """401: no key, or one the service does not know."""
 
-    @property
-    def advice(self) -> str:
-        """How to come by a key."""
-        return _KEY_ADVICE.format(scope="localize|admin")
 
-
-class ForbiddenError(ApiError):
+class ForbiddenError(ApiError, status=403, code="forbidden", advice=_KEY_ADVICE.format("{needed}")):
     """403: the key lacks the scope this call needs."""
 
-    @property
-    def advice(self) -> str:
-        """How to come by the right key."""
-        return _KEY_ADVICE.format(scope=self.problem.get("needed", "admin"))
 
-
-class NotFoundError(ApiError):
+class NotFoundError(ApiError, status=404):
     """404: a name or id that nothing answers to."""
 
 
-class UnknownDomainError(NotFoundError):
+class UnknownDomainError(NotFoundError, code="unknown_domain"):
     """No such domain."""
 
 
-class UnknownTraverseError(NotFoundError):
+class UnknownTraverseError(NotFoundError, code="unknown_traverse"):
     """No such traverse in the domain."""
 
 
-class UnknownJobError(NotFoundError):
+class UnknownJobError(NotFoundError, code="unknown_job"):
     """No such job."""
 
 
-class UnknownMapVersionError(NotFoundError):
+class UnknownMapVersionError(NotFoundError, code="unknown_map_version"):
     """No such map version in the domain."""
 
 
-class UnknownSessionError(NotFoundError):
+class UnknownSessionError(NotFoundError, code="unknown_session"):
     """No such session, or one that ended long ago."""
 
 
-class RequestTimeoutError(ApiError):
+class RequestTimeoutError(ApiError, status=408, code="request_timeout"):
     """408: the request's bytes stopped coming, so the service gave it up."""
 
 
-class ConflictError(ApiError):
+class ConflictError(ApiError, status=409):
     """409: the request is sound but the present state forbids it."""
 
 
-class NoActiveMapError(ConflictError):
+class NoActiveMapError(ConflictError, code="no_active_map"):
     """The domain has no active map yet."""
 
 
-class DomainDiffersError(ConflictError):
+class DomainDiffersError(ConflictError, code="domain_differs"):
     """A domain of that name exists with another configuration."""
 
 
-class LandmarkModelDiffersError(ConflictError):
+class LandmarkModelDiffersError(
+    ConflictError,
+    code="landmark_model_differs",
+    advice="`client.on_board(domain, map_version={map_version})` fetches it",
+):
     """The view was ranked by another landmark model than that of the map that should answer: fetch that one.
 
     `problem` holds both digests, and the `map_version` to ask for.
     """
 
-    @property
-    def advice(self) -> str:
-        """How to come by the right one."""
-        return f"`client.on_board(domain, map_version={self.problem.get('map_version')})` fetches it"
 
-
-class TraverseInUseError(ConflictError):
+class TraverseInUseError(ConflictError, code="traverse_in_use"):
     """A running job still reads the traverse or domain."""
 
 
-class LostActivationError(ConflictError):
+class LostActivationError(ConflictError, code="lost_activation"):
     """The active map was not the expected one when the swap was tried."""
 
 
-class MapInUseError(ConflictError):
+class MapInUseError(ConflictError, code="map_in_use"):
     """The map version serves, is being built, or a living session keeps it."""
 
 
-class TooManyDomainsError(ConflictError):
+class TooManyDomainsError(ConflictError, code="too_many_domains"):
     """The service holds as many domains as it may."""
 
 
-class GoneError(ApiError):
+class GoneError(ApiError, status=410):
     """410: a retired map, or an expired or deleted session."""
 
 
-class EndedSessionError(GoneError):
+class EndedSessionError(GoneError, code="ended_session"):
     """The session expired or was deleted: start another."""
 
 
-class RetiredMapError(GoneError):
+class RetiredMapError(GoneError, code="retired_map"):
     """The map that the session began on is no more: start another session on the present one."""
 
 
-class TooLargeError(ApiError):
+class TooLargeError(ApiError, status=413):
     """413: more bytes or pixels than a limit allows."""
 
 
-class HeadersTooLargeError(TooLargeError):
+class HeadersTooLargeError(TooLargeError, status=431, code="headers_too_large"):
     """431: the request's headers, the key among them, are longer than the service takes."""
 
 
-class UnsupportedMediaTypeError(ApiError):
+class UnsupportedMediaTypeError(ApiError, status=415):
     """415: a missing or unsupported content type."""
 
 
-class InvalidInputError(ApiError):
+class InvalidInputError(ApiError, status=422):
     """422: a value or body that can never be accepted as it stands."""
 
 
-class InvalidMoveError(InvalidInputError):
+class InvalidMoveError(InvalidInputError, code="invalid_move"):
     """A move that is NaN, negative or longer than a robot may report."""
 
 
-class PastTheEndError(InvalidMoveError):
+class PastTheEndError(InvalidMoveError, code="past_the_end"):
     """A move that leads past the end of an open route wherever the robot may be."""
 
 
-class InvalidPriorError(InvalidInputError):
+class InvalidPriorError(InvalidInputError, code="invalid_prior"):
     """A start or prior far off the route, or without a usable deviation."""
 
 
-class IdempotencyKeyReusedError(InvalidInputError):
+class IdempotencyKeyReusedError(InvalidInputError, code="idempotency_key_reused"):
     """The idempotency key came before with another request."""
 
 
-class RateLimitedError(ApiError):
+class RateLimitedError(ApiError, status=429, code="rate_limited"):
     """429: too many requests; `retry_after_s` says how long to wait."""
 
 
-class TooManySessionsError(RateLimitedError):
+class TooManySessionsError(RateLimitedError, code="too_many_sessions"):
     """The service holds as many live sessions as it may."""
 
 
-class TooManyJobsError(RateLimitedError):
+class TooManyJobsError(RateLimitedError, code="too_many_jobs"):
     """As many jobs wait for their turn as may."""
 
 
@@ -325,69 +299,18 @@ class ServerError(ApiError):
     """5xx: the service failed."""
 
 
-class UnavailableError(ServerError):
+class UnavailableError(ServerError, status=503):
     """503: the service cannot answer now; its data is safe."""
 
 
-class OverloadedError(UnavailableError):
+class OverloadedError(UnavailableError, code="overloaded"):
     """More requests at once than the service answers in good time; `retry_after_s` says when to come again."""
 
 
-class DamagedMapError(UnavailableError):
+class DamagedMapError(UnavailableError, code="damaged_map"):
     """A map file on the server fails its digest or cannot be read."""
 
 
-BY_CODE: Mapping[str, type[ApiError]] = {
-    "unauthorized": UnauthorizedError,
-    "forbidden": ForbiddenError,
-    "request_timeout": RequestTimeoutError,
-    "headers_too_large": HeadersTooLargeError,
-    "rate_limited": RateLimitedError,
-    "overloaded": OverloadedError,
-    "map_in_use": MapInUseError,
-    "too_many_domains": TooManyDomainsError,
-    "unknown_domain": UnknownDomainError,
-    "unknown_traverse": UnknownTraverseError,
-    "unknown_job": UnknownJobError,
-    "unknown_map_version": UnknownMapVersionError,
-    "unknown_session": UnknownSessionError,
-    "ended_session": EndedSessionError,
-    "retired_map": RetiredMapError,
-    "invalid_move": InvalidMoveError,
-    "past_the_end": PastTheEndError,
-    "invalid_prior": InvalidPriorError,
-    "idempotency_key_reused": IdempotencyKeyReusedError,
-    "too_many_sessions": TooManySessionsError,
-    "too_many_jobs": TooManyJobsError,
-    "no_active_map": NoActiveMapError,
-    "domain_differs": DomainDiffersError,
-    "landmark_model_differs": LandmarkModelDiffersError,
-    "traverse_in_use": TraverseInUseError,
-    "lost_activation": LostActivationError,
-    "damaged_map": DamagedMapError,
-}
-
-BY_STATUS: Mapping[int, type[ApiError]] = {
-    400: BadRequestError,
-    401: UnauthorizedError,
-    403: ForbiddenError,
-    404: NotFoundError,
-    408: RequestTimeoutError,
-    409: ConflictError,
-    410: GoneError,
-    413: TooLargeError,
-    415: UnsupportedMediaTypeError,
-    422: InvalidInputError,
-    429: RateLimitedError,
-    431: HeadersTooLargeError,
-    503: UnavailableError,
-}
-
-
 def api_error_class(status: int, code: str) -> type[ApiError]:
-    """Choose the class for an answer: by its code word, else by its status, else by its hundred."""
-    if code in BY_CODE:
-        return BY_CODE[code]
-    if status in BY_STATUS:
-        return BY_STATUS[status]
-    return ServerError if status >= 500 else ApiError
+    """The class of an answer: by its code word, else by its status, else by its hundred."""
+    return BY_CODE.get(code) or BY_STATUS.get(status) or (ServerError if status >= 500 else ApiError)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from deepsimbad_client.models import Localization
+from deepsimbad_client.http.models import Localization
 from deepsimbad_client.recording import Frame
 
 HEADING_CHORD_M = 1.0

@@ -10,15 +10,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from deepsimbad_client.client import Client
 from deepsimbad_client.errors import BrokenFrameError, InvalidInputError, ReplayError
 from deepsimbad_client.heat import RelevanceHeat
-from deepsimbad_client.in_order import in_order
+from deepsimbad_client.http.client import Client
+from deepsimbad_client.http.models import Domain
+from deepsimbad_client.http.upload import CONCURRENCY, UNUSABLE_IMAGE_CODES, in_order
 from deepsimbad_client.map_route import MapRoute, Truth, map_route_of, path_of_frames
-from deepsimbad_client.models import Domain
 from deepsimbad_client.recording import Frame, Recording
 from deepsimbad_client.step_log import Step, StepLog
-from deepsimbad_client.upload import CONCURRENCY, UNUSABLE_IMAGE_CODES
 
 TOLERANCE_M = 2.0
 

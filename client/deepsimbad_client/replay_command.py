@@ -6,9 +6,9 @@ import click
 
 from deepsimbad_client.active_replay import EPISODES, STEPS
 from deepsimbad_client.active_replay_command import replay_actively
-from deepsimbad_client.client import Client
+from deepsimbad_client.commands import at_once, domain_option, json_flag, reading, serving
 from deepsimbad_client.console import REMARKS, ReplayBar, as_json, show
-from deepsimbad_client.options import at_once, domain_option, json_flag, reading, serving
+from deepsimbad_client.http.client import Client
 from deepsimbad_client.replay import TOLERANCE_M
 from deepsimbad_client.replay import replay as replay_recording
 from deepsimbad_client.report import summarise, table, write_summary
@@ -47,6 +47,7 @@ from deepsimbad_client.sources import open_source
 @json_flag
 @serving
 def replay(
+    client: Client,
     source: str,
     domain: str,
     out: Path | None,
@@ -61,8 +62,6 @@ def replay(
     spacing_m: float,
     undistortion: Path | None,
     json_output: bool,
-    server: str,
-    api_key: str | None,
 ) -> None:
     """Localize every frame of a recording, score the answers; with --planner, drive along it as an active robot.
 
@@ -78,26 +77,22 @@ def replay(
     recording = open_source(source, spacing_m=spacing_m, undistortion=undistortion)
     folder = out or Path("replays") / f"{domain}-{recording.name}{'-active' if planners else ''}"
     if planners:
-        with Client(server, api_key) as client:
-            replay_actively(
-                client,
-                recording,
-                domain,
-                folder,
-                planners=planners,
-                episodes=EPISODES if episodes is None else episodes,
-                steps=STEPS if steps is None else steps,
-                seed=seed or 0,
-                concurrency=concurrency,
-                restart=restart,
-                plots=plots,
-                json_output=json_output,
-            )
+        replay_actively(
+            client,
+            recording,
+            domain,
+            folder,
+            planners=planners,
+            episodes=EPISODES if episodes is None else episodes,
+            steps=STEPS if steps is None else steps,
+            seed=seed or 0,
+            concurrency=concurrency,
+            restart=restart,
+            plots=plots,
+            json_output=json_output,
+        )
         return
-    with (
-        Client(server, api_key) as client,
-        ReplayBar(f"{recording.name} against {domain}", len(recording.frames)) as bar,
-    ):
+    with ReplayBar(f"{recording.name} against {domain}", len(recording.frames)) as bar:
         done = replay_recording(
             client,
             recording,

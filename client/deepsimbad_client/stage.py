@@ -7,14 +7,13 @@ from typing import Self
 
 import numpy as np
 
-from deepsimbad_client.client import Client
 from deepsimbad_client.episode_log import EpisodeStep
 from deepsimbad_client.errors import ReplayError
+from deepsimbad_client.http.client import Client, Session
+from deepsimbad_client.http.models import Domain
 from deepsimbad_client.judge import Judge
-from deepsimbad_client.models import Domain
 from deepsimbad_client.recording import Recording
 from deepsimbad_client.replay import changed_map, fetch_route
-from deepsimbad_client.session import Session
 from deepsimbad_client.walk import Seen, Walk, drive
 
 DEFAULT_PLANNER = "default"

@@ -8,7 +8,7 @@ from rich.table import Table
 from rich.text import Text
 
 from deepsimbad_client.episode_log import EpisodeStep
-from deepsimbad_client.models import Belief, NextBestView
+from deepsimbad_client.http.models import Belief, NextBestView
 
 BLOCKS = " ▁▂▃▄▅▆▇█"
 _LEAST_SHOWN = 0.004

@@ -6,7 +6,7 @@ from typing import Any
 
 from rich.table import Table
 
-from deepsimbad_client.models import Domain, Job, ListedSession, Localization, MapVersion, Traverse
+from deepsimbad_client.http.models import Domain, Job, ListedSession, Localization, MapVersion, Traverse
 
 _GAPS_SHOWN = 8
 

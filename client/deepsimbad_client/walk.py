@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 
 from deepsimbad_client.errors import BrokenFrameError, InvalidInputError, PastTheEndError, ReplayError
-from deepsimbad_client.models import SessionAnswer
+from deepsimbad_client.http.client import Session
+from deepsimbad_client.http.models import SessionAnswer
+from deepsimbad_client.http.upload import UNUSABLE_IMAGE_CODES
 from deepsimbad_client.recording import Frame, Recording, nearest_frame, positions_m
-from deepsimbad_client.session import Session
-from deepsimbad_client.upload import UNUSABLE_IMAGE_CODES
 
 
 @dataclass(frozen=True)

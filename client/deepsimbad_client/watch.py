@@ -7,10 +7,10 @@ from contextlib import contextmanager
 from rich.console import Console
 from rich.live import Live
 
-from deepsimbad_client.client import Client
 from deepsimbad_client.episode_log import EpisodeStep
 from deepsimbad_client.errors import GoneError
-from deepsimbad_client.models import SessionState
+from deepsimbad_client.http.client import Client
+from deepsimbad_client.http.models import SessionState
 from deepsimbad_client.stage import Stage
 from deepsimbad_client.story import pictured, told
 

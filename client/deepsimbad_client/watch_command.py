@@ -6,8 +6,8 @@ import click
 from rich.console import Console
 
 from deepsimbad_client.active_replay import STEPS
-from deepsimbad_client.client import Client
-from deepsimbad_client.options import reading, serving
+from deepsimbad_client.commands import reading, serving
+from deepsimbad_client.http.client import Client
 from deepsimbad_client.sources import open_source
 from deepsimbad_client.stage import DEFAULT_PLANNER, Stage
 from deepsimbad_client.watch import watch_episode, watch_session
@@ -31,6 +31,7 @@ from deepsimbad_client.watch import watch_episode, watch_session
 @reading
 @serving
 def watch(
+    client: Client,
     source: str | None,
     domain: str | None,
     session_id: str | None,
@@ -40,8 +41,6 @@ def watch(
     pause_s: float,
     spacing_m: float,
     undistortion: Path | None,
-    server: str,
-    api_key: str | None,
 ) -> None:
     """Show one session live: what it believes along the route, its last move and the next.
 
@@ -51,12 +50,10 @@ def watch(
     if session_id is not None:
         if source is not None or domain is not None:
             raise click.UsageError("--session names all there is to watch: leave SOURCE and --domain out")
-        with Client(server, api_key) as client:
-            watch_session(client, session_id, console, every_s=max(pause_s, 0.05))
+        watch_session(client, session_id, console, every_s=max(pause_s, 0.05))
         return
     if source is None or domain is None:
         raise click.UsageError("give SOURCE and --domain, or --session")
     recording = open_source(source, spacing_m=spacing_m, undistortion=undistortion)
-    with Client(server, api_key) as client:
-        stage = Stage.of(client, recording, domain)
-        watch_episode(stage, console, planner=planner, steps=steps, seed=seed, pause_s=pause_s)
+    stage = Stage.of(client, recording, domain)
+    watch_episode(stage, console, planner=planner, steps=steps, seed=seed, pause_s=pause_s)

@@ -6,7 +6,7 @@ import time
 import pytest
 
 from deepsimbad_client import Client
-from deepsimbad_client.local_server import LocalServer
+from deepsimbad_client.http.local_server import LocalServer
 
 READY = ("--evaluator", "feature_l2:none", "--n-landmarks", 20)
 

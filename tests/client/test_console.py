@@ -9,7 +9,7 @@ from rich.console import Console
 
 from deepsimbad_client import console
 from deepsimbad_client.console import show, show_waits
-from deepsimbad_client.models import Domain, Job
+from deepsimbad_client.http.models import Domain, Job
 from deepsimbad_client.tables import domain_table, job_table
 
 
@@ -50,7 +50,7 @@ def test_jobs_are_shown_with_what_they_do_and_the_time_left(
 
 @pytest.fixture
 def retries() -> Iterator[logging.Logger]:
-    logger = logging.getLogger("deepsimbad_client.retry")
+    logger = logging.getLogger("deepsimbad_client.http.retry")
     before = logger.level, logger.handlers, logger.propagate
     yield logger
     logger.setLevel(before[0])

@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 
 from deepsimbad_client.console import show
-from deepsimbad_client.models import Domain, Job
+from deepsimbad_client.http.models import Domain, Job
 from deepsimbad_client.tables import domain_table, job_table
 
 CHECK = {

@@ -16,7 +16,7 @@ from deepsimbad.core.descriptor import pack_ranked_landmarks
 from deepsimbad.jobs.perform import InThisProcess
 from deepsimbad_client import Client, Observation
 from deepsimbad_client.errors import LandmarkModelDiffersError
-from deepsimbad_client.on_board import OnBoardEncoder
+from deepsimbad_client.http.on_board import OnBoardEncoder
 
 from .conftest import N_LANDMARKS, N_READY, N_SEEN, encoded, make_ready_domain, picture, remap, small_settings
 

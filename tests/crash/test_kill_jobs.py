@@ -14,8 +14,8 @@ import pytest
 from deepsimbad.store.catalog import Catalog
 from deepsimbad_client import Client
 from deepsimbad_client.errors import TraverseInUseError
-from deepsimbad_client.local_server import LocalServer
-from deepsimbad_client.models import Job
+from deepsimbad_client.http.local_server import LocalServer
+from deepsimbad_client.http.models import Job
 
 WITHIN_S = 60
 N_FRAMES, DIM = 1500, 64

@@ -15,7 +15,7 @@ import pytest
 
 from deepsimbad_client import Client
 from deepsimbad_client.campus import PAPER_DATES, write_campus
-from deepsimbad_client.local_server import LocalServer
+from deepsimbad_client.http.local_server import LocalServer
 
 from .conftest import Page
 

@@ -15,8 +15,8 @@ from deepsimbad.cli import deepsimbad
 from deepsimbad.cli.settings import shown as shown_setting
 from deepsimbad.settings import Settings
 from deepsimbad.settings_sources import CONFIG_VARIABLE, load_settings, variable_of
-from deepsimbad_client.commands import cli as deepsimbad_client
-from deepsimbad_client.transport import KEY_VARIABLE, URL_VARIABLE
+from deepsimbad_client.commands.group import cli as deepsimbad_client
+from deepsimbad_client.http.wire import KEY_VARIABLE, URL_VARIABLE
 
 PROJECT = Path(__file__).resolve().parents[2]
 METHODS = "GET|POST|PUT|DELETE"

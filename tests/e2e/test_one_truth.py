@@ -15,12 +15,12 @@ from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.map_file import read_map
 from deepsimbad_client import Client
 from deepsimbad_client.campus import PAPER_DATES, write_campus
-from deepsimbad_client.local_server import LocalServer
-from deepsimbad_client.remap import remap
+from deepsimbad_client.http.jobs import remap
+from deepsimbad_client.http.local_server import LocalServer
+from deepsimbad_client.http.upload import upload
 from deepsimbad_client.replay import replay
 from deepsimbad_client.report import summarise
 from deepsimbad_client.sources import open_source
-from deepsimbad_client.upload import upload
 
 N_FRAMES, N_LANDMARKS, TOLERANCE_M = 40, 20, 3.0
 pytestmark = pytest.mark.slow

@@ -8,9 +8,9 @@ import pytest
 from click.testing import CliRunner
 
 from deepsimbad_client import Client, RetryPolicy
-from deepsimbad_client.demo import demo
-from deepsimbad_client.local_server import LocalServer
-from deepsimbad_client.remap import remap
+from deepsimbad_client.commands.demo import demo
+from deepsimbad_client.http.jobs import remap
+from deepsimbad_client.http.local_server import LocalServer
 
 
 @pytest.mark.slow

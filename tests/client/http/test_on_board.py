@@ -16,7 +16,7 @@ from deepsimbad.errors import MissingPackageError
 from deepsimbad.evaluators.image import decode_image
 from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
 from deepsimbad_client import AsyncClient, Client, RetryPolicy, errors
-from deepsimbad_client.on_board import OnBoardEncoder
+from deepsimbad_client.http.on_board import OnBoardEncoder
 
 N_LANDMARKS = 300
 GRADIENTS = {"kind": "feature_l2", "extractor": "gradient_grid"}
@@ -226,7 +226,7 @@ def test_encoding_on_board_needs_nothing_of_the_service_but_core_and_evaluators(
     OnBoardEncoder(content).save(tmp_path / "campus.npz")
     (tmp_path / "view.png").write_bytes(picture(1))
     code = f"""
-from deepsimbad_client.on_board import OnBoardEncoder
+from deepsimbad_client.http.on_board import OnBoardEncoder
 print(len(OnBoardEncoder.load({str(tmp_path / "campus.npz")!r}).ranks({str(tmp_path / "view.png")!r}).body))
 """
     hidden = {"fastapi", "starlette", "uvicorn", "sqlite_utils", "prometheus_client", "pydantic_settings"}

@@ -9,7 +9,7 @@ import httpx2
 import pytest
 
 from deepsimbad_client import AsyncClient, Client, RetryPolicy, errors
-from deepsimbad_client.models import Answer, Job, Localization
+from deepsimbad_client.http.models import Answer, Job, Localization
 
 from .test_requests import BELIEF, LOCALIZATION
 

@@ -2,7 +2,6 @@
 
 import ast
 import asyncio
-import inspect
 import json
 import subprocess
 import sys
@@ -15,11 +14,11 @@ import numpy as np
 import pydantic
 import pytest
 
-from deepsimbad_client import AsyncClient, Client, admin, async_admin, async_client, client, errors
+from deepsimbad_client import AsyncClient, Client, errors
 from deepsimbad_client.errors import BY_CODE, BY_STATUS, InvalidArgumentError
-from deepsimbad_client.models import Domain, Traverse
-from deepsimbad_client.observation import media_type_of, observation
-from deepsimbad_client.retry import RETRIED_STATUSES
+from deepsimbad_client.http.models import Domain, Traverse
+from deepsimbad_client.http.observation import media_type_of, observation
+from deepsimbad_client.http.retry import RETRIED_STATUSES
 
 BELIEF = {
     "mean_m": 1.0,
@@ -241,21 +240,6 @@ def test_what_a_traverse_has(index: int) -> None:
 def test_a_domain_without_a_map() -> None:
     service, _ = asked({"name": "d", "map_version": None, "evaluator": {"kind": "feature_l2"}})
     assert service.domain("d") == Domain(name="d", evaluator={"kind": "feature_l2"})
-
-
-@pytest.mark.parametrize(
-    ("blocking", "awaiting"),
-    [(client.Client, async_client.AsyncClient), (admin.Admin, async_admin.AsyncAdmin)],
-)
-def test_the_async_twin_has_the_same_calls(blocking: type, awaiting: type) -> None:
-    def calls(kind: type) -> dict[str, list[str]]:
-        return {
-            name: list(inspect.signature(call).parameters)
-            for name, call in inspect.getmembers(kind, inspect.isfunction)
-            if not name.startswith("_") and name not in {"close", "aclose"}
-        }
-
-    assert calls(blocking) == calls(awaiting)
 
 
 def test_events_of_a_job_in_both_clients() -> None:

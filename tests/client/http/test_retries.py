@@ -10,7 +10,7 @@ import httpx2
 import pytest
 
 from deepsimbad_client import AsyncClient, Client, RetryPolicy, errors
-from deepsimbad_client.retry import retry_after_s
+from deepsimbad_client.http.retry import retry_after_s
 
 OK = {"status": "alive"}
 DOMAIN = {"name": "d"}
@@ -78,7 +78,7 @@ def test_every_wait_is_told_to_the_log_with_its_reason(caplog: pytest.LogCapture
     refused = httpx2.Response(
         503, json=overloaded, headers={"content-type": "application/problem+json", "retry-after": "7"}
     )
-    caplog.set_level("INFO", "deepsimbad_client.retry")
+    caplog.set_level("INFO", "deepsimbad_client.http.retry")
     Script(httpx2.ConnectError, refused, answer(200, OK)).client().health()
     assert caplog.messages == [
         "GET /healthz at http://service: scripted; trying again in 1.0 s (try 2 of 4)",
@@ -87,7 +87,7 @@ def test_every_wait_is_told_to_the_log_with_its_reason(caplog: pytest.LogCapture
 
 
 def test_the_last_failure_is_an_error_and_no_wait(caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level("INFO", "deepsimbad_client.retry")
+    caplog.set_level("INFO", "deepsimbad_client.http.retry")
     with pytest.raises(errors.ApiError):
         Script(answer(503, retry_after="31")).client().health()  # longer than is waited out
     with pytest.raises(errors.ApiError):

@@ -19,9 +19,9 @@ from deepsimbad.api.bodies import RemapBody
 from deepsimbad.api.session_bodies import SessionBody
 from deepsimbad.settings import Settings
 from deepsimbad_client import AsyncClient, AsyncSession, Client, RetryPolicy, Session
-from deepsimbad_client.commands import cli
-from deepsimbad_client.models import SessionState
-from deepsimbad_client.remap import remap
+from deepsimbad_client.commands.group import cli
+from deepsimbad_client.http.jobs import remap
+from deepsimbad_client.http.models import SessionState
 
 NO_ANSWER = httpx2.ConnectError
 STATE = SessionState.model_validate(
@@ -123,11 +123,11 @@ def test_every_operation_has_its_call_in_both_clients(operation: str, tmp_path: 
 
     client = Client("http://service", retry=once, transport=httpx2.MockTransport(nobody))
     with pytest.raises(Exception, match="nobody is here"):
-        _exhaust(ask(client, Session(client._transport, STATE, keep=True), tmp_path / "file"))
+        _exhaust(ask(client, Session(client._wire, STATE, keep=True), tmp_path / "file"))
 
     async def await_it() -> None:
         twin = AsyncClient("http://service", retry=once, transport=httpx2.MockTransport(nobody))
-        given = ask(twin, AsyncSession(twin._transport, STATE, keep=True), tmp_path / "file")
+        given = ask(twin, AsyncSession(twin._wire, STATE, keep=True), tmp_path / "file")
         if inspect.isasyncgen(given):
             async for _ in given:
                 pass

@@ -9,10 +9,11 @@ import httpx2
 import pytest
 from rich.console import Console
 
-from deepsimbad_client import Client, RetryPolicy, console, errors, job_commands
-from deepsimbad_client.commands import run
-from deepsimbad_client.follow import follow_job
-from deepsimbad_client.models import Job
+from deepsimbad_client import Client, RetryPolicy, commands, console, errors
+from deepsimbad_client.commands import jobs
+from deepsimbad_client.commands.group import run
+from deepsimbad_client.http.jobs import follow_job
+from deepsimbad_client.http.models import Job
 
 EVENTS = "/v1/admin/jobs/7/events"
 
@@ -185,10 +186,8 @@ def test_ctrl_c_asks_whether_to_cancel(cancel: bool, monkeypatch: pytest.MonkeyP
         questions.append(question)
         return cancel
 
-    monkeypatch.setattr(job_commands, "_answer", answer)
-    monkeypatch.setattr(
-        job_commands, "Client", lambda url, key: Client(url, key, transport=httpx2.MockTransport(respond))
-    )
+    monkeypatch.setattr(jobs, "confirmed", answer)
+    monkeypatch.setattr(commands, "Client", lambda url, key: Client(url, key, transport=httpx2.MockTransport(respond)))
     assert run(["remap", "--domain", "d", "--training", "t", "--server", "http://service"]) == 130
     assert questions == ["Cancel job 7 on the server too?"]
     assert (("DELETE", "/v1/admin/jobs/7") in asked) == cancel
@@ -224,7 +223,7 @@ def test_the_bar_shows_what_happens(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_without_a_terminal_nobody_is_asked() -> None:
-    assert job_commands._answer("?") is False
+    assert commands.confirmed("?") is False
 
 
 @pytest.mark.parametrize(
@@ -244,9 +243,7 @@ def test_a_cancel_says_what_came_of_it(
         asked.append(request.method)
         return httpx2.Response(204) if request.method == "DELETE" else httpx2.Response(200, json=job(state))
 
-    monkeypatch.setattr(
-        job_commands, "Client", lambda url, key: Client(url, key, transport=httpx2.MockTransport(respond))
-    )
+    monkeypatch.setattr(commands, "Client", lambda url, key: Client(url, key, transport=httpx2.MockTransport(respond)))
     assert run(["jobs", "7", "--cancel", "--json", "--server", "http://service"]) == 0
     shown = capsys.readouterr()
     assert asked == ["DELETE", "GET"]

@@ -7,13 +7,12 @@ import httpx2
 import pytest
 
 from deepsimbad_client import Client, errors
-from deepsimbad_client.in_order import in_order
-from deepsimbad_client.models import Localization
-from deepsimbad_client.remap import remap
+from deepsimbad_client.http.jobs import remap
+from deepsimbad_client.http.models import Localization
+from deepsimbad_client.http.upload import UploadReport, in_order, upload
 from deepsimbad_client.replay import replay
 from deepsimbad_client.sources import open_source
 from deepsimbad_client.step_log import Step
-from deepsimbad_client.upload import UploadProgress, upload
 
 
 def test_a_replay_goes_on_where_it_was_stopped(service: str, encodings: Path, tmp_path: Path) -> None:
@@ -25,7 +24,7 @@ def test_a_replay_goes_on_where_it_was_stopped(service: str, encodings: Path, tm
             counted.append(request.url.path)
 
     with Client(service) as client:
-        client._transport._http.event_hooks = {"request": [count], "response": []}
+        client._wire.link.http.event_hooks = {"request": [count], "response": []}
         client.admin.put_domain("stopped", {"kind": "feature_l2", "extractor": "none"})
         upload(client, open_source(str(encodings / "summer.npy")), "stopped", "summer")
         remap(client, "stopped", "summer", landmark_traverse="summer", n_landmarks=50)
@@ -55,10 +54,10 @@ def test_a_replay_goes_on_where_it_was_stopped(service: str, encodings: Path, tm
 
 
 def test_an_upload_that_is_stopped_goes_on(service: str, encodings: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("deepsimbad_client.upload.BATCH_BYTES", 10 * 32 * 4)
+    monkeypatch.setattr("deepsimbad_client.http.upload.BATCH_BYTES", 10 * 32 * 4)
     recording = open_source(str(encodings / "summer.npy"))
 
-    def stop(progress: UploadProgress) -> None:
+    def stop(progress: UploadReport) -> None:
         if progress.n_done >= 50:
             raise KeyboardInterrupt
 

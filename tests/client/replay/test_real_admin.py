@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from deepsimbad_client import Client, errors
-from deepsimbad_client.commands import run
-from deepsimbad_client.remap import remap
+from deepsimbad_client.commands.group import run
+from deepsimbad_client.http.jobs import remap
+from deepsimbad_client.http.upload import upload
 from deepsimbad_client.sources import open_source
-from deepsimbad_client.upload import upload
 
 ENCODINGS = {"kind": "feature_l2", "extractor": "none"}
 
@@ -129,7 +129,7 @@ def test_a_download_goes_on_where_an_earlier_one_stopped(service: str, domain: s
 
     with Client(service) as client:
         whole = client.admin.download_map(domain, 1, tmp_path / "whole")
-        client._transport._http.event_hooks = {"request": [], "response": [note]}
+        client._wire.link.http.event_hooks = {"request": [], "response": [note]}
         (tmp_path / f"map.{whole.sha256}.part").write_bytes(whole.path.read_bytes()[:50_000])
         again = client.admin.download_map(domain, 1, tmp_path / "map")
         assert answered.pop() == (206, whole.file_bytes - 50_000)

@@ -9,10 +9,10 @@ import pytest
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.records import KeyScope
 from deepsimbad_client import Client, errors
-from deepsimbad_client.commands import run
-from deepsimbad_client.remap import remap
+from deepsimbad_client.commands.group import run
+from deepsimbad_client.http.jobs import remap
+from deepsimbad_client.http.upload import upload
 from deepsimbad_client.sources import open_source
-from deepsimbad_client.upload import upload
 
 from .conftest import serving
 

@@ -12,12 +12,11 @@ import pytest
 from deepsimbad_client import AsyncClient, Client, errors
 from deepsimbad_client.active_replay import active_replay
 from deepsimbad_client.active_report import summarise_active
-from deepsimbad_client.commands import run
-from deepsimbad_client.follow import follow_job
+from deepsimbad_client.commands.group import run
+from deepsimbad_client.http.jobs import follow_job, remap
+from deepsimbad_client.http.upload import upload
 from deepsimbad_client.recording import Recording
-from deepsimbad_client.remap import remap
 from deepsimbad_client.sources import open_source
-from deepsimbad_client.upload import upload
 
 PLANNERS = ["default", "nnql", "random", "constant:10"]
 

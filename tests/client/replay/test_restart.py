@@ -6,11 +6,11 @@ from pathlib import Path
 import pytest
 
 from deepsimbad_client import Client
-from deepsimbad_client.follow import follow_job
-from deepsimbad_client.local_server import LocalServer
-from deepsimbad_client.models import Job
+from deepsimbad_client.http.jobs import follow_job
+from deepsimbad_client.http.local_server import LocalServer
+from deepsimbad_client.http.models import Job
+from deepsimbad_client.http.upload import upload
 from deepsimbad_client.sources import open_source
-from deepsimbad_client.upload import upload
 
 pytestmark = pytest.mark.slow
 

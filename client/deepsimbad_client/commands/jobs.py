@@ -1,16 +1,14 @@
 """`deepsimbad-client remap` and `jobs`."""
 
-import sys
 from itertools import islice
-from typing import Any
 
 import click
 
-from deepsimbad_client.client import Client
+from deepsimbad_client.commands import confirmed, domain_option, json_flag, of_domain, serving, show_list
 from deepsimbad_client.console import REMARKS, JobBar, as_json, show
-from deepsimbad_client.follow import follow_job
-from deepsimbad_client.models import Job
-from deepsimbad_client.options import domain_option, json_flag, serving
+from deepsimbad_client.http.client import Client
+from deepsimbad_client.http.jobs import follow_job
+from deepsimbad_client.http.models import Job
 from deepsimbad_client.tables import gate_verdict, job_table
 
 
@@ -59,6 +57,7 @@ from deepsimbad_client.tables import gate_verdict, job_table
 @json_flag
 @serving
 def remap(
+    client: Client,
     domain: str,
     training: str,
     landmarks: str | None,
@@ -74,8 +73,6 @@ def remap(
     same_route: bool | None,
     wait: bool,
     json_output: bool,
-    server: str,
-    api_key: str | None,
 ) -> None:
     """Make a new map from uploaded traverses.
 
@@ -85,64 +82,54 @@ def remap(
     """
     if append and landmarks is not None:
         raise click.UsageError("--append keeps the active map's landmarks: leave --landmarks out")
-    config: dict[str, Any] = {
-        "landmark_traverse": landmarks,
-        "n_landmarks": n_landmarks,
-        "list_length": list_length,
-        "relevance": relevance,
-        "training_episodes": training_episodes,
-        "seed": seed,
-        "activate": activate,
-        "check_traverse": check,
-        "gate_margin": gate,
-        "append": True if append else None,
-        "same_route": same_route,
-    }
-    given = {key: value for key, value in config.items() if value is not None}
-    with Client(server, api_key) as client:
-        job = client.admin.remap(domain, training_traverse=training, **given)
-        if wait:
-            job = _follow(client, job)
-    _show_job(job, json_output)
+    job = client.admin.remap(
+        domain,
+        training_traverse=training,
+        landmark_traverse=landmarks,
+        n_landmarks=n_landmarks,
+        list_length=list_length,
+        relevance=relevance,
+        training_episodes=training_episodes,
+        seed=seed,
+        activate=activate,
+        check_traverse=check,
+        gate_margin=gate,
+        append=append or None,
+        same_route=same_route,
+    )
+    _show_job(_follow(client, job) if wait else job, json_output)
 
 
 @click.command()
 @click.argument("job_id", required=False)
-@click.option("--domain", metavar="NAME", help="Only this domain's.")
+@of_domain
 @click.option("--last", type=click.IntRange(min=1), metavar="N", help="Only the newest N.")
 @click.option("--follow", is_flag=True, help="Follow JOB_ID to its end.")
 @click.option("--cancel", is_flag=True, help="Cancel JOB_ID.")
 @json_flag
 @serving
 def jobs(
+    client: Client,
     job_id: str | None,
     domain: str | None,
     last: int | None,
     follow: bool,
     cancel: bool,
     json_output: bool,
-    server: str,
-    api_key: str | None,
 ) -> None:
     """List jobs, or show, follow or cancel one."""
-    if job_id is None and (follow or cancel):
-        raise click.UsageError("--follow and --cancel need a JOB_ID")
-    with Client(server, api_key) as client:
-        if job_id is None:
-            found = tuple(islice(client.admin.iter_jobs(domain), last))
-            if json_output:
-                click.echo(as_json([job.model_dump(mode="json") for job in found]))
-            else:
-                show(job_table(found))
-            return
-        if cancel:
-            client.admin.cancel_job(job_id)
-        job = client.admin.job(job_id)
-        if cancel:
-            REMARKS.print(_cancel_told(job), soft_wrap=True)
-        if follow and not job.ended:
-            job = _follow(client, job)
-    _show_job(job, json_output)
+    if job_id is None:
+        if follow or cancel:
+            raise click.UsageError("--follow and --cancel need a JOB_ID")
+        listed = tuple(islice(client.admin.iter_jobs(domain), last))
+        show_list(listed, job_table(listed), json_output)
+        return
+    if cancel:
+        client.admin.cancel_job(job_id)
+    job = client.admin.job(job_id)
+    if cancel:
+        REMARKS.print(_cancelled(job), soft_wrap=True)
+    _show_job(_follow(client, job) if follow and not job.ended else job, json_output)
 
 
 def _follow(client: Client, job: Job) -> Job:
@@ -153,7 +140,7 @@ def _follow(client: Client, job: Job) -> Job:
             bar(job)
             return follow_job(client, job.job_id, bar, on_silence=bar.silent)
     except KeyboardInterrupt:
-        if _answer(f"Cancel job {job.job_id} on the server too?"):
+        if confirmed(f"Cancel job {job.job_id} on the server too?"):
             client.admin.cancel_job(job.job_id)
             REMARKS.print(f"job {job.job_id} is being cancelled")
         else:
@@ -164,23 +151,13 @@ def _follow(client: Client, job: Job) -> Job:
         raise
 
 
-def _cancel_told(job: Job) -> str:
+def _cancelled(job: Job) -> str:
     """What a cancel has come to by now."""
     if job.state == "cancelled":
         return f"job {job.job_id} is cancelled"
     if job.ended:
         return f"job {job.job_id} had ended before it could be cancelled"
     return f"job {job.job_id} is being cancelled; see how it ends with: deepsimbad-client jobs {job.job_id} --follow"
-
-
-def _answer(question: str) -> bool:
-    """Ask on a terminal; where there is none, or on a second Ctrl-C, the answer is no."""
-    if not sys.stdin.isatty():
-        return False
-    try:
-        return click.confirm(question, default=False, err=True)
-    except click.Abort:
-        return False
 
 
 def _show_job(job: Job, json_output: bool) -> None:

@@ -2,13 +2,13 @@
 
 import math
 import time
-from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import partial
+from typing import TypeVar
 
-import numpy as np
-
-from deepsimbad_client.client import Client
 from deepsimbad_client.errors import (
     BrokenFrameError,
     ConflictError,
@@ -16,8 +16,8 @@ from deepsimbad_client.errors import (
     SourceError,
     UnknownTraverseError,
 )
-from deepsimbad_client.in_order import in_order
-from deepsimbad_client.models import Traverse
+from deepsimbad_client.http.client import Client
+from deepsimbad_client.http.models import Traverse
 from deepsimbad_client.recording import Frame, Recording
 
 BATCH_BYTES = 8 * 2**20
@@ -26,25 +26,13 @@ CONCURRENCY = 4
 NAMED_BROKEN_FRAMES = 20
 UNUSABLE_IMAGE_CODES = frozenset({"undecodable_image", "truncated_image", "empty_body"})
 
-
-@dataclass(frozen=True)
-class UploadProgress:
-    """How far an upload is.
-
-    Attributes:
-        n_done: Frames sent, skipped or broken.
-        n_frames: Frames in all.
-        bytes_sent: Bytes of images and encodings sent by this run.
-    """
-
-    n_done: int
-    n_frames: int
-    bytes_sent: int
+Item = TypeVar("Item")
+Result = TypeVar("Result")
 
 
 @dataclass
 class UploadReport:
-    """What became of a recording's frames.
+    """What has become of a recording's frames.
 
     Attributes:
         n_frames: Frames of the recording that could be sent.
@@ -73,16 +61,7 @@ class UploadReport:
 
     def as_dict(self) -> dict[str, object]:
         """The report, JSON-ready."""
-        return {
-            "n_frames": self.n_frames,
-            "n_sent": self.n_sent,
-            "n_skipped": self.n_skipped,
-            "n_broken": dict(self.n_broken),
-            "broken_names": self.broken_names,
-            "left_out": self.left_out,
-            "bytes_sent": self.bytes_sent,
-            "seconds": round(self.seconds, 3),
-        }
+        return {**vars(self), "seconds": round(self.seconds, 3)}
 
 
 def upload(
@@ -93,7 +72,7 @@ def upload(
     *,
     concurrency: int = CONCURRENCY,
     resend: bool = False,
-    on_progress: Callable[[UploadProgress], None] | None = None,
+    on_progress: Callable[[UploadReport], None] | None = None,
     clock: Callable[[], float] = time.monotonic,
 ) -> UploadReport:
     """Send the frames of a recording that the service does not have yet.
@@ -108,7 +87,7 @@ def upload(
         traverse: Made when it does not exist.
         concurrency: Images under way at once.
         resend: Send also what is there already.
-        on_progress: Told after every frame or batch.
+        on_progress: Told how far it is after every frame or batch.
         clock: Seconds that never go backwards.
 
     Raises:
@@ -127,31 +106,63 @@ def upload(
 
     def tell() -> None:
         if on_progress is not None:
-            on_progress(UploadProgress(report.n_done, report.n_frames, report.bytes_sent))
+            on_progress(report)
 
     tell()
     if recording.encodings is not None:
-        for n_bytes, batch in _send_batches(client, recording, recording.encodings, domain, traverse, rows):
+        batch_size = max(1, BATCH_BYTES // max(1, 4 * recording.encodings.shape[1]))
+        for start in range(0, len(rows), batch_size):
+            batch = rows[start : start + batch_size]
+            values = recording.encodings[batch]
+            columns = _columns([recording.frames[row] for row in batch])
+            client.admin.put_frames(domain, traverse, encodings=values, **columns)
             report.n_sent += len(batch)
-            report.bytes_sent += n_bytes
+            report.bytes_sent += values.nbytes
             tell()
     else:
-        frames = [recording.frames[row] for row in rows]
-        send = _image_sender(client, recording, domain, traverse, input_size)
-        for frame, outcome in in_order(send, frames, concurrency):
-            if isinstance(outcome, str):
+        send = partial(_send_image, client, recording, domain, traverse, input_size)
+        for frame, outcome in in_order(send, [recording.frames[row] for row in rows], concurrency):
+            if isinstance(outcome, int):
+                report.n_sent += 1
+                report.bytes_sent += outcome
+            else:
                 report.n_broken[outcome] += 1
                 if len(report.broken_names) < NAMED_BROKEN_FRAMES:
                     report.broken_names.append(frame.name)
-            else:
-                report.n_sent += 1
-                report.bytes_sent += outcome
             tell()
     report.seconds = clock() - started
     if report.n_sent + report.n_skipped == 0:
         reasons = ", ".join(f"{count} {reason}" for reason, count in report.n_broken.items())
         raise SourceError(f"none of the {report.n_frames} frames of {recording.name} could be sent: {reasons}")
     return report
+
+
+def in_order(
+    work: Callable[[Item], Result],
+    items: Iterable[Item],
+    concurrency: int,
+    on_end: Callable[[], None] | None = None,
+) -> Iterator[tuple[Item, Result]]:
+    """Yield (item, work(item)) in the items' order, with at most `concurrency` at work and as many waiting.
+
+    The first failure is raised in its turn; what has not begun by then never begins. So it is when the caller stops.
+    `on_end` is called then, before what is still at work is waited for: long work can look whether it should go on.
+    """
+    executor = ThreadPoolExecutor(max_workers=concurrency, thread_name_prefix="deepsimbad-client")
+    pending: deque[tuple[Item, Future[Result]]] = deque()
+    try:
+        for item in items:
+            pending.append((item, executor.submit(work, item)))
+            if len(pending) >= 2 * concurrency:
+                first, future = pending.popleft()
+                yield first, future.result()
+        while pending:
+            first, future = pending.popleft()
+            yield first, future.result()
+    finally:
+        if on_end is not None:
+            on_end()
+        executor.shutdown(wait=True, cancel_futures=True)
 
 
 def _open_traverse(client: Client, domain: str, name: str) -> Traverse:
@@ -165,62 +176,43 @@ def _open_traverse(client: Client, domain: str, name: str) -> Traverse:
         return client.admin.traverse(domain, name)
 
 
-def _image_sender(
-    client: Client, recording: Recording, domain: str, traverse: str, input_size: tuple[int, int] | None
-) -> Callable[[Frame], int | str]:
-    def send(frame: Frame) -> int | str:
-        """Bytes sent, or the reason why the frame is broken."""
-        try:
-            image = recording.image(frame, input_size)
-            client.admin.put_frame(
-                domain,
-                traverse,
-                frame.index,
-                image.body,
-                content_type=image.content_type,
-                position_m=frame.position_m,
-                timestamp_us=frame.timestamp_us,
-                x_m=frame.x_m,
-                y_m=frame.y_m,
-            )
-        except BrokenFrameError as error:
-            return error.reason
-        except InvalidInputError as error:
-            if error.code not in UNUSABLE_IMAGE_CODES:
-                raise
-            return f"refused by the service as {error.code}"
-        return len(image.body)
-
-    return send
-
-
-def _send_batches(
+def _send_image(
     client: Client,
     recording: Recording,
-    encodings: "np.typing.NDArray[np.float32]",
     domain: str,
     traverse: str,
-    rows: Sequence[int],
-) -> Iterator[tuple[int, Sequence[int]]]:
-    batch_size = max(1, BATCH_BYTES // max(1, 4 * encodings.shape[1]))
-    for start in range(0, len(rows), batch_size):
-        batch = rows[start : start + batch_size]
-        frames = [recording.frames[row] for row in batch]
-        values = encodings[batch]
-        known_xy = any(frame.x_m is not None and frame.y_m is not None for frame in frames)
-        known_time = any(frame.timestamp_us is not None for frame in frames)
-        client.admin.put_frames(
-            domain,
-            traverse,
-            encodings=values,
-            index=[frame.index for frame in frames],
-            position_m=[frame.position_m for frame in frames],
-            timestamp_us=[_or(frame.timestamp_us, -1) for frame in frames] if known_time else None,
-            x_m=[_or(frame.x_m, math.nan) for frame in frames] if known_xy else None,
-            y_m=[_or(frame.y_m, math.nan) for frame in frames] if known_xy else None,
+    input_size: tuple[int, int] | None,
+    frame: Frame,
+) -> int | str:
+    """Send one frame; returns its bytes, or the reason why it is broken."""
+    try:
+        image = recording.image(frame, input_size)
+        client.admin.put_frame(
+            *(domain, traverse, frame.index, image.body),
+            content_type=image.content_type,
+            position_m=frame.position_m,
+            timestamp_us=frame.timestamp_us,
+            x_m=frame.x_m,
+            y_m=frame.y_m,
         )
-        yield values.nbytes, batch
+    except BrokenFrameError as error:
+        return error.reason
+    except InvalidInputError as error:
+        if error.code not in UNUSABLE_IMAGE_CODES:
+            raise
+        return f"refused by the service as {error.code}"
+    return len(image.body)
 
 
-def _or(value: float | int | None, unknown: float) -> float | int:
-    return unknown if value is None else value
+def _columns(frames: Sequence[Frame]) -> dict[str, list[float]]:
+    """What is known of frames, as a batch tells it; one of which something is unknown has -1 or NaN for it."""
+    columns: dict[str, list[float]] = {
+        "index": [frame.index for frame in frames],
+        "position_m": [frame.position_m for frame in frames],
+    }
+    if any(frame.timestamp_us is not None for frame in frames):
+        columns["timestamp_us"] = [-1 if frame.timestamp_us is None else frame.timestamp_us for frame in frames]
+    if any(frame.x_m is not None and frame.y_m is not None for frame in frames):
+        columns["x_m"] = [math.nan if frame.x_m is None else frame.x_m for frame in frames]
+        columns["y_m"] = [math.nan if frame.y_m is None else frame.y_m for frame in frames]
+    return columns

@@ -18,18 +18,18 @@ from rich.table import Table
 from deepsimbad_client.active_demo import EPISODES, compare_planners, steps_that_fit, tell_episode
 from deepsimbad_client.campus import PAPER_DATES, write_campus
 from deepsimbad_client.campus.season import SeasonName
-from deepsimbad_client.client import Client
 from deepsimbad_client.console import FrameBar, JobBar, ReplayBar, UploadBar
 from deepsimbad_client.errors import DeepSimbadClientError
-from deepsimbad_client.local_server import LocalServer
+from deepsimbad_client.http.client import Client
+from deepsimbad_client.http.jobs import remap
+from deepsimbad_client.http.local_server import LocalServer
+from deepsimbad_client.http.upload import upload
 from deepsimbad_client.plots import draw_all
 from deepsimbad_client.recording import Recording
-from deepsimbad_client.remap import remap
 from deepsimbad_client.replay import Replay, replay
 from deepsimbad_client.report import summarise, write_summary
 from deepsimbad_client.sources import open_source
 from deepsimbad_client.stage import Stage
-from deepsimbad_client.upload import upload
 
 DOMAIN = "campus"
 SEASONS: tuple[SeasonName, SeasonName, SeasonName] = ("winter", "spring", "summer")

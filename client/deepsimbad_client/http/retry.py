@@ -4,18 +4,18 @@ Nothing here waits or sends: `Attempts` is told what happened and says what to d
 share every rule.
 """
 
+import json
 import logging
-import random
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from email.utils import parsedate_to_datetime
-from enum import Enum, auto
+from enum import Enum
+from typing import Any
 
 import httpx2
 
 from deepsimbad_client.errors import TransportError, TransportTimeoutError
-from deepsimbad_client.problem import problem_of
 
 logger = logging.getLogger(__name__)
 
@@ -32,13 +32,13 @@ LASTING_CODES = frozenset({"damaged_map", "damaged_file"})
 
 
 class Repeat(Enum):
-    """Which failures make a call safe to send again."""
+    """Which failures make a call safe to send again; its value is the statuses that do."""
 
-    ALWAYS = auto()
+    ALWAYS = RETRIED_STATUSES
     """Idempotent: reads, stateless localizations, puts, deletes, frame batches."""
-    IF_UNTOUCHED = auto()
+    IF_UNTOUCHED = REFUSED_STATUSES
     """Acts once: only when the service surely did not act (no connection, 408, 429, 503)."""
-    NEVER = auto()
+    NEVER = frozenset[int]()
     """The caller has its own way to go on."""
 
 
@@ -65,25 +65,26 @@ class RetryPolicy:
         return longest * (0.5 + 0.5 * jitter)
 
 
-def retry_after_s(header: str | None, now: datetime) -> float | None:
+def problem_of(response: httpx2.Response) -> dict[str, Any]:
+    """The problem document (RFC 9457) of an error answer; empty where it holds none, as a proxy's own page."""
+    try:
+        document = json.loads(response.content)
+    except ValueError:
+        return {}
+    return document if isinstance(document, dict) else {}
+
+
+def retry_after_s(header: str | None, now: datetime | None = None) -> float | None:
     """Seconds that a `Retry-After` header asks for (seconds or an HTTP date); None when it says nothing usable."""
-    if header is None:
-        return None
-    header = header.strip()
+    header = (header or "").strip()
     if header.isascii() and header.isdigit():
         return float(header)
     try:
         date = parsedate_to_datetime(header)
     except ValueError:
         return None
-    if date.tzinfo is None:
-        date = date.replace(tzinfo=UTC)
-    return max(0.0, (date - now).total_seconds())
-
-
-def utc_now() -> datetime:
-    """The time of day, for HTTP dates."""
-    return datetime.now(UTC)
+    date = date if date.tzinfo else date.replace(tzinfo=UTC)
+    return max(0.0, (date - (now or datetime.now(UTC))).total_seconds())
 
 
 @dataclass
@@ -95,17 +96,15 @@ class Attempts:
         repeat: What is safe.
         what: The request in words, for errors.
         jitter: Draws in 0..1.
-        now: Time of day.
+        answer_lost: Whether an earlier try may have been acted on without our hearing of it.
     """
 
     policy: RetryPolicy
     repeat: Repeat
     what: str
-    jitter: Callable[[], float] = random.random
-    now: Callable[[], datetime] = utc_now
+    jitter: Callable[[], float]
     n_sent: int = 0
-    answer_lost: bool = field(default=False)
-    """Whether an earlier try may have been acted on without our hearing of it."""
+    answer_lost: bool = False
 
     def after_failure(self, error: httpx2.TransportError) -> float:
         """Seconds to wait before the next try.
@@ -129,17 +128,12 @@ class Attempts:
         """Seconds to wait before the next try; None when this answer is the last word."""
         self.n_sent += 1
         status = response.status_code
-        retried = {
-            Repeat.ALWAYS: RETRIED_STATUSES,
-            Repeat.IF_UNTOUCHED: REFUSED_STATUSES,
-            Repeat.NEVER: frozenset[int](),
-        }[self.repeat]
-        if status not in retried or self.n_sent >= self.policy.attempts:
+        if status not in self.repeat.value or self.n_sent >= self.policy.attempts:
             return None
         code = problem_of(response).get("code")
         if code in LASTING_CODES:
             return None
-        wait_s = retry_after_s(response.headers.get("retry-after"), self.now())
+        wait_s = retry_after_s(response.headers.get("retry-after"))
         if wait_s is None:
             self.answer_lost |= status not in REFUSED_STATUSES
             wait_s = self.policy.backoff_s(self.n_sent, self.jitter())

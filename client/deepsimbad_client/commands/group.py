@@ -1,4 +1,4 @@
-"""The commands of `deepsimbad-client`.
+"""The group of all commands, and what becomes of their errors.
 
 Exit codes: 0 done, 1 a named error (one line on standard error), 2 wrong usage, 130 cancelled. Results go to standard
 output, progress and remarks to standard error.
@@ -11,15 +11,10 @@ from importlib import import_module
 
 import click
 
+from deepsimbad_client.commands import admin, jobs, recordings
 from deepsimbad_client.console import show_waits
-from deepsimbad_client.delete_commands import delete_domain, delete_map, delete_session, delete_traverse
 from deepsimbad_client.errors import DeepSimbadClientError
-from deepsimbad_client.job_commands import jobs, remap
-from deepsimbad_client.list_commands import sessions, traverses
-from deepsimbad_client.map_commands import activate, download, maps, rollback
-from deepsimbad_client.place_commands import domains, localize
 from deepsimbad_client.replay_command import replay
-from deepsimbad_client.upload_command import upload
 from deepsimbad_client.watch_command import watch
 
 DONE, FAILED, CANCELLED = 0, 1, 130
@@ -57,10 +52,9 @@ def cli() -> None:
 
 
 COMMANDS = (
-    *(upload, remap, replay, watch, localize),
-    *(domains, traverses, jobs, sessions, maps),
-    *(activate, rollback, download),
-    *(delete_domain, delete_traverse, delete_map, delete_session),
+    *(recordings.upload, recordings.localize, jobs.remap, jobs.jobs, replay, watch),
+    *(admin.domains, admin.traverses, admin.sessions, admin.maps, admin.activate, admin.rollback, admin.download),
+    *(admin.delete_domain, admin.delete_traverse, admin.delete_map, admin.delete_session),
 )
 for command in COMMANDS:
     cli.add_command(command)

@@ -1,0 +1,366 @@
+"""What an administrator asks for, on the blocking and the async client: domains, traverses, jobs, maps, sessions."""
+
+from collections.abc import AsyncGenerator, Callable, Mapping, Sequence
+from contextlib import aclosing, suppress
+from io import BytesIO
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pydantic import ValidationError
+
+from deepsimbad_client.errors import NoEarlierMapError
+from deepsimbad_client.http.call import Call, in_path, model_of, once, require_numpy, session_path
+from deepsimbad_client.http.download import MapDownload, MapFile
+from deepsimbad_client.http.models import (
+    Domain,
+    FramesStored,
+    FrameStored,
+    Job,
+    ListedSession,
+    MapVersion,
+    Traverse,
+)
+from deepsimbad_client.http.observation import Image, Numbers, known_positions, observation
+from deepsimbad_client.http.retry import Repeat
+from deepsimbad_client.http.wire import Awaiting, Blocking, Face, shared, shared_stream
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+_JOBS = "/v1/admin/jobs"
+
+
+class AdminCalls(Face):
+    """The calls that need a key of scope `admin`.
+
+    Lists come page by page. `jobs` and its like fetch every page at once; `iter_jobs` and its like fetch a page when
+    its first entry is wanted.
+    """
+
+    @shared
+    async def put_domain(
+        self,
+        name: str,
+        evaluator: Mapping[str, Any],
+        *,
+        closed: bool = False,
+        actions_m: Sequence[float] | None = None,
+    ) -> Domain:
+        """Make a domain; the same again changes nothing.
+
+        Args:
+            name: Letters, digits, '.', '_' and '-', at most 64.
+            evaluator: `{"kind": ..., ...}`, how observations are compared with landmarks.
+            closed: Whether the route's end is its start.
+            actions_m: The forward moves a robot may be told to make; absent: the service's default.
+
+        Raises:
+            DomainDiffersError: A domain of that name exists with another configuration.
+        """
+        actions = None if actions_m is None else [float(action) for action in actions_m]
+        document = {"evaluator": dict(evaluator), "closed": closed, "actions_m": actions}
+        return model_of(Domain, await self._wire.send(Call.with_json("PUT", _domain(name), document)))
+
+    @shared
+    async def delete_domain(self, name: str) -> None:
+        """Remove a domain with all its maps and traverses."""
+        await self._wire.send(Call.delete(_domain(name)))
+
+    @shared
+    async def create_traverse(self, domain: str, name: str) -> Traverse:
+        """Make an empty traverse; one of that name that is there stays as it is."""
+        in_path("traverse", name)
+        call = Call.with_json("POST", f"{_domain(domain)}/traverses", {"name": name})
+        return model_of(Traverse, await self._wire.send(call))
+
+    @shared
+    async def traverses(self, domain: str) -> tuple[Traverse, ...]:
+        """Every traverse of a domain, by name."""
+        return tuple([traverse async for traverse in AdminCalls.iter_traverses(self, domain)])
+
+    @shared_stream
+    def iter_traverses(self, domain: str) -> AsyncGenerator[Traverse, None]:
+        """Yield every traverse of a domain, by name, a page at a time."""
+        return self._wire.pages(Traverse, "traverses", f"{_domain(domain)}/traverses")
+
+    @shared
+    async def traverse(self, domain: str, name: str) -> Traverse:
+        """One traverse: how many frames have arrived and which are missing."""
+        return model_of(Traverse, await self._wire.send(Call("GET", _traverse(domain, name))))
+
+    @shared
+    async def delete_traverse(self, domain: str, name: str) -> None:
+        """Remove a traverse and its frames."""
+        await self._wire.send(Call.delete(_traverse(domain, name)))
+
+    @shared
+    async def put_frame(
+        self,
+        domain: str,
+        traverse: str,
+        index: int,
+        image: Image | None = None,
+        *,
+        position_m: float,
+        timestamp_us: int | None = None,
+        x_m: float | None = None,
+        y_m: float | None = None,
+        content_type: str | None = None,
+        encoding: Numbers | None = None,
+    ) -> FrameStored:
+        """Send one frame, an image or a ready encoding; the same index again replaces it.
+
+        Args:
+            domain: The domain.
+            traverse: One of its traverses.
+            index: The frame's place in the recording, from 0.
+            image: An encoded image or its path.
+            position_m: Distance along the route.
+            timestamp_us: When it was taken.
+            x_m: Where it was taken.
+            y_m: Where it was taken.
+            content_type: The image's media type; absent: read from its first bytes.
+            encoding: A ready encoding instead of an image.
+        """
+        view = observation(image, content_type, encoding=encoding)
+        place = {"position_m": position_m, "timestamp_us": timestamp_us, "x_m": x_m, "y_m": y_m}
+        call = Call("PUT", f"{_traverse(domain, traverse)}/frames/{int(index)}", place, view.headers, view.body)
+        return model_of(FrameStored, await self._wire.send(call))
+
+    @shared
+    async def put_frames(
+        self,
+        domain: str,
+        traverse: str,
+        *,
+        encodings: "ArrayLike",
+        index: "ArrayLike",
+        position_m: "ArrayLike",
+        timestamp_us: "ArrayLike | None" = None,
+        x_m: "ArrayLike | None" = None,
+        y_m: "ArrayLike | None" = None,
+    ) -> FramesStored:
+        """Send a batch of frames whose encodings [n, d] are known (needs numpy); the same indices again replace them.
+
+        Args:
+            domain: The domain.
+            traverse: One of its traverses.
+            encodings: [n, d], sent as float32.
+            index: [n] places in the recording, from 0.
+            position_m: [n] distances along the route.
+            timestamp_us: [n] when they were taken.
+            x_m: [n] where they were taken; sent with `y_m` alone.
+            y_m: [n] where they were taken; sent with `x_m` alone.
+        """
+        np = require_numpy()
+        columns: dict[str, tuple[Any, Any]] = {"encodings": (encodings, np.float32), "index": (index, np.int64)}
+        columns |= {"position_m": (position_m, np.float64), "timestamp_us": (timestamp_us, np.int64)}
+        if x_m is not None and y_m is not None:
+            columns |= {"x_m": (x_m, np.float64), "y_m": (y_m, np.float64)}
+        packed = BytesIO()
+        np.savez(packed, **{name: np.asarray(*column) for name, column in columns.items() if column[0] is not None})
+        headers = {"Content-Type": "application/octet-stream"}
+        call = Call("POST", f"{_traverse(domain, traverse)}/frames", headers=headers, body=packed.getvalue())
+        return model_of(FramesStored, await self._wire.send(call))
+
+    @shared
+    async def remap(self, /, domain: str, *, idempotency_key: str | None = None, **config: Any) -> Job:
+        """Submit a remap and return its job at once; `deepsimbad_client.http.jobs.remap` also follows it.
+
+        A lost answer is asked for again and makes no second job.
+
+        Args:
+            domain: The domain to map anew.
+            idempotency_key: Names this request, so that it can be repeated after a `TransportError`; absent: a new one.
+            **config: `training_traverse` and, where they should differ from the service's defaults, the other arguments
+                of `deepsimbad_client.http.jobs.remap`.
+
+        Raises:
+            TooManyJobsError: As many jobs wait as may.
+        """
+        call = Call.with_json("POST", f"{_domain(domain)}/remaps", config, headers=once(idempotency_key))
+        return model_of(Job, await self._wire.send(call))
+
+    @shared
+    async def feed_experience(
+        self, domain: str, session_id: str, true_positions_m: Numbers, *, idempotency_key: str | None = None
+    ) -> Job:
+        """Teach the next map: where a session's robot truly was at each of its observations, known only afterwards.
+
+        Args:
+            domain: The session's domain.
+            session_id: The session; it may have ended a while ago.
+            true_positions_m: A position along the map's route for each observation, in order; None where unknown.
+            idempotency_key: As of `remap`.
+
+        Returns:
+            The job that makes the next map version.
+
+        Raises:
+            TooManyJobsError: As many jobs wait as may.
+        """
+        document = {"session_id": session_id, "true_positions_m": known_positions(true_positions_m)}
+        call = Call.with_json("POST", f"{_domain(domain)}/experience", document, headers=once(idempotency_key))
+        return model_of(Job, await self._wire.send(call))
+
+    @shared
+    async def jobs(self, domain: str | None = None) -> tuple[Job, ...]:
+        """Jobs, newest first, of one domain or all."""
+        return tuple([job async for job in AdminCalls.iter_jobs(self, domain)])
+
+    @shared_stream
+    def iter_jobs(self, domain: str | None = None) -> AsyncGenerator[Job, None]:
+        """Yield jobs, newest first, of one domain or all, a page at a time."""
+        return self._wire.pages(Job, "jobs", _JOBS, domain=domain)
+
+    @shared
+    async def job(self, job_id: str) -> Job:
+        """One job."""
+        return model_of(Job, await self._wire.send(Call("GET", _job(job_id))))
+
+    @shared_stream
+    async def job_events(self, job_id: str) -> AsyncGenerator[Job, None]:
+        """Yield the job each time it has moved, the last time ended; one connection, not renewed when it breaks.
+
+        Raises:
+            TransportError: The connection failed or broke off.
+        """
+        call = Call("GET", f"{_job(job_id)}/events", headers={"Accept": "text/event-stream"}, repeat=Repeat.NEVER)
+        async with aclosing(self._wire.events(call)) as events:
+            async for event in events:
+                with suppress(ValidationError):  # an event may hold no job
+                    yield Job.model_validate_json(event.data)
+                if event.event == "done":
+                    return
+
+    @shared
+    async def cancel_job(self, job_id: str) -> None:
+        """Ask a job to stop; it ends as cancelled soon after."""
+        await self._wire.send(Call("DELETE", _job(job_id)))
+
+    @shared
+    async def maps(self, domain: str) -> tuple[MapVersion, ...]:
+        """A domain's history of maps, newest version first."""
+        return tuple([version async for version in AdminCalls.iter_maps(self, domain)])
+
+    @shared_stream
+    def iter_maps(self, domain: str) -> AsyncGenerator[MapVersion, None]:
+        """Yield a domain's history of maps, newest version first, a page at a time."""
+        return self._wire.pages(MapVersion, "maps", f"{_domain(domain)}/maps")
+
+    @shared
+    async def activate(self, domain: str, version: int, *, expected: int | None = None) -> MapVersion:
+        """Serve another version (or roll back to an older one).
+
+        Args:
+            domain: The domain.
+            version: The version to serve.
+            expected: The version believed active now; absent: whichever is.
+
+        Raises:
+            LostActivationError: Another version than the expected one was active.
+            RetiredMapError: The version's file was removed.
+        """
+        # After a lost answer, a repetition of a conditional switch would report its own success as a lost race.
+        call = Call.with_json(
+            "PUT",
+            f"{_domain(domain)}/active-map",
+            {"version": int(version), "expected": None if expected is None else int(expected)},
+            repeat=Repeat.ALWAYS if expected is None else Repeat.IF_UNTOUCHED,
+        )
+        return model_of(MapVersion, await self._wire.send(call))
+
+    @shared
+    async def rollback(self, domain: str) -> MapVersion:
+        """Serve the version again that served before the active one; once more, and the present one is back.
+
+        Raises:
+            NoEarlierMapError: No other version has served, or their files were removed.
+            LostActivationError: Another version was activated meanwhile.
+        """
+        maps = await AdminCalls.maps(self, domain)
+        active = next((version.version for version in maps if version.state == "active"), None)
+        earlier = [version for version in maps if version.state == "retired" and version.removed_at is None]
+        if not earlier:
+            raise NoEarlierMapError(
+                f"no map of domain {domain} has served before the present one and is still there: "
+                f"list them with `deepsimbad-client maps {domain}`"
+            )
+        # Times of one form sort as texts; a service that does not tell them has the highest number last.
+        last = max(earlier, key=lambda version: (version.retired_at or "", version.version))
+        rolled_back: MapVersion = await AdminCalls.activate(self, domain, last.version, expected=active)
+        return rolled_back
+
+    @shared
+    async def delete_map(self, domain: str, version: int) -> None:
+        """Remove the file of a version; its place in the history stays.
+
+        Raises:
+            MapInUseError: It serves, is being built, or a living session keeps it.
+        """
+        await self._wire.send(Call.delete(f"{_domain(domain)}/maps/{int(version)}"))
+
+    @shared
+    async def download_map(
+        self,
+        domain: str,
+        version: int,
+        path: str | Path,
+        *,
+        on_progress: Callable[[int, int | None], None] | None = None,
+    ) -> MapFile:
+        """Fetch the sealed file of a version, to keep or to import it elsewhere.
+
+        It is written beside `path`, checked against the digest that the service names, and then renamed. A download
+        that was interrupted goes on where it stopped, this time or the next.
+
+        Args:
+            domain: The domain.
+            version: One of its versions.
+            path: Where it shall lie; a file of that name is replaced.
+            on_progress: Told of the bytes there and the bytes in all (None: not known).
+
+        Raises:
+            RetiredMapError: Its file was removed.
+            DamagedDownloadError: What came has another digest than the service named.
+            NotSavedError: It cannot be written.
+        """
+        # As its bytes are: compressed on the way, its parts could not be put together.
+        headers = {"Accept": "application/vnd.sqlite3, application/octet-stream", "Accept-Encoding": "identity"}
+        call = Call("GET", f"{_domain(domain)}/maps/{int(version)}/file", headers=headers)
+        return await MapDownload(self._wire, call, Path(path), on_progress).run()
+
+    @shared
+    async def sessions(self, domain: str | None = None) -> tuple[ListedSession, ...]:
+        """Living sessions, newest first, of one domain or all; `Client.attach_session` looks into one or ends it."""
+        return tuple([session async for session in AdminCalls.iter_sessions(self, domain)])
+
+    @shared_stream
+    def iter_sessions(self, domain: str | None = None) -> AsyncGenerator[ListedSession, None]:
+        """Yield living sessions, newest first, of one domain or all, a page at a time."""
+        return self._wire.pages(ListedSession, "sessions", "/v1/admin/sessions", domain=domain)
+
+    @shared
+    async def delete_session(self, session_id: str) -> None:
+        """End a session, whoever began it."""
+        await self._wire.send(Call.delete(session_path(session_id)))
+
+
+class Admin(AdminCalls, Blocking):
+    """The administrator's calls of a `Client`."""
+
+
+class AsyncAdmin(AdminCalls, Awaiting):
+    """The administrator's calls of an `AsyncClient`."""
+
+
+def _domain(name: str) -> str:
+    return f"/v1/admin/domains/{in_path('domain', name)}"
+
+
+def _traverse(domain: str, name: str) -> str:
+    return f"{_domain(domain)}/traverses/{in_path('traverse', name)}"
+
+
+def _job(job_id: str) -> str:
+    return f"{_JOBS}/{in_path('job', job_id)}"

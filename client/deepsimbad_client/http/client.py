@@ -1,0 +1,501 @@
+"""What a robot asks for: domains, places and sessions, on the blocking and the async client."""
+
+import asyncio
+import math
+import random
+import time
+from collections.abc import Awaitable, Callable, Sequence
+from typing import TYPE_CHECKING, Generic, TypeVar
+
+import httpx2
+
+from deepsimbad_client.errors import DeepSimbadClientError, GoneError, InvalidArgumentError
+from deepsimbad_client.http.admin import Admin, AsyncAdmin
+from deepsimbad_client.http.call import (
+    BINARY,
+    Call,
+    domain_path,
+    float_array,
+    model_of,
+    once,
+    page_of,
+    require_on_board,
+    session_path,
+)
+from deepsimbad_client.http.models import (
+    Domain,
+    Health,
+    Localization,
+    NextBestView,
+    SessionAnswer,
+    SessionState,
+    TruthScore,
+)
+from deepsimbad_client.http.observation import Image, Numbers, Observation, known_positions, observation
+from deepsimbad_client.http.retry import Repeat, RetryPolicy
+from deepsimbad_client.http.wire import (
+    THIN_LINK_TIMEOUT,
+    Awaiting,
+    AwaitingLink,
+    Blocking,
+    BlockingLink,
+    Face,
+    Wire,
+    finished,
+    shared,
+    speaking_to,
+)
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from deepsimbad_client.http.on_board import OnBoardEncoder
+
+AnySession = TypeVar("AnySession", bound="SessionCalls")
+
+
+class SessionCalls(Face):
+    """The calls of a session.
+
+    Attributes:
+        opened: What the service said when the session was made or found.
+        keep: Whether it outlives its `with` block.
+    """
+
+    def __init__(self, wire: Wire, opened: SessionState, *, keep: bool) -> None:
+        super().__init__(wire)
+        self.opened = opened
+        self.keep = keep
+        self._path = session_path(opened.session_id)
+        self._deleted = False
+
+    @property
+    def session_id(self) -> str:
+        """By which `Client.attach_session` finds the session again, from this process or another."""
+        return self.opened.session_id
+
+    @property
+    def domain(self) -> str:
+        """The session's domain."""
+        return self.opened.domain
+
+    @property
+    def map_version(self) -> int:
+        """The map that the session began on and keeps, whatever is activated later."""
+        return self.opened.map_version
+
+    @shared
+    async def observe(
+        self,
+        image: Image | None = None,
+        *,
+        action_m: float | None = None,
+        action_std_m: float | None = None,
+        content_type: str | None = None,
+        ranked_landmarks: Numbers | None = None,
+        dissimilarities: Numbers | None = None,
+        encoding: Numbers | None = None,
+        ranked: Observation | None = None,
+        shortlist: int | None = None,
+        idempotency_key: str | None = None,
+    ) -> SessionAnswer:
+        """Tell what the robot sees now, after the metres it has moved; give exactly one form of the view.
+
+        A lost answer is asked for again and counts once. To repeat an observation yourself after a `TransportError`,
+        choose its key, and send the same again under it.
+
+        Args:
+            image: As `Client.localize` takes it, and so the other forms of a view.
+            action_m: Metres really moved since the last view; absent: stood still. Ignored for the first view.
+            action_std_m: How well that is known; absent: the service's usual odometry.
+            content_type: The image's media type; absent: read from its first bytes.
+            ranked_landmarks: Landmark ids, nearest first, 1..r of them.
+            dissimilarities: r finite numbers in landmark order, smaller is nearer.
+            encoding: A ready encoding, where the domain takes them.
+            ranked: What an `OnBoardEncoder` made of an image, a few bytes.
+            shortlist: Length of `retrieval` and `belief.top`; absent: the service's default.
+            idempotency_key: Names this observation; absent: a new one.
+
+        Raises:
+            InvalidMoveError: The move is negative or too long; `PastTheEndError`: past the end of the route.
+            LandmarkModelDiffersError: `ranked` was made with other landmarks than those of the session's map.
+            InvalidInputError: The service cannot use the view; its detail says why.
+            GoneError: The session has ended, or its map was removed.
+        """
+        view = observation(image, content_type, ranked_landmarks, dissimilarities, encoding, ranked)
+        moved = {"action_m": action_m, "action_std_m": action_std_m}
+        for name, value in moved.items():
+            if value is not None and not math.isfinite(value):
+                raise InvalidArgumentError(f"{name} is {value}: give metres, or nothing when the robot stood still")
+        call = Call(
+            "POST",
+            f"{self._path}/observations",
+            params={name: None if value is None else float(value) for name, value in moved.items()}
+            | {"shortlist": shortlist},
+            headers=view.headers | once(idempotency_key),
+            body=view.body,
+        )
+        return model_of(SessionAnswer, await self._wire.send(call))
+
+    @shared
+    async def state(self) -> SessionState:
+        """What it believes now, and how many views that rests on."""
+        return model_of(SessionState, await self._wire.send(Call("GET", self._path)))
+
+    @shared
+    async def belief_masses(self) -> "NDArray[np.float32]":
+        """The whole belief: [n] float32 over the map images, sums to 1 (needs numpy)."""
+        return float_array(await self._wire.send(Call("GET", f"{self._path}/belief", headers=BINARY)))
+
+    @shared
+    async def next_best_view(self) -> NextBestView | None:
+        """The move that would tell most, without another view; None where the map can name none."""
+        response = await self._wire.send(Call("GET", f"{self._path}/next-best-view"))
+        return None if response.content.strip() == b"null" else model_of(NextBestView, response)
+
+    @shared
+    async def set_prior(self, position_m: float, std_m: float) -> SessionState:
+        """Forget the belief for one around a position: the robot was carried, or got a fix.
+
+        Raises:
+            InvalidPriorError: The position is far off the route, or the deviation cannot be one.
+        """
+        prior = {"position_m": float(position_m), "std_m": float(std_m)}
+        return model_of(SessionState, await self._wire.send(Call.with_json("PUT", f"{self._path}/prior", prior)))
+
+    @shared
+    async def truths(
+        self,
+        true_positions_m: Numbers,
+        *,
+        true_map_images: Sequence[Sequence[int]] | None = None,
+        first_observation: int = 0,
+    ) -> TruthScore:
+        """Tell where the robot truly was at each of its observations, known only afterwards: how good were the answers?
+
+        The service raises its alarm by this; the map learns nothing from it (`Admin.feed_experience`). The same truths
+        again count once.
+
+        Args:
+            true_positions_m: A position along the map's route for each observation, in order; None where unknown.
+            true_map_images: For each of the same observations the map images that show its place: the answer's
+                `retrieval_ranks` then tell where each view by itself placed the best of them.
+            first_observation: The observation that the first of them belongs to: truths may be told bit by bit.
+
+        Raises:
+            InvalidInputError: As many positions as observations there are not.
+        """
+        return await _truths(self._wire, self._path, true_positions_m, true_map_images, first_observation)
+
+    @shared
+    async def delete(self) -> None:
+        """End the session; nothing more can be asked of it."""
+        await self._wire.send(Call.delete(self._path))
+        self._deleted = True
+
+    async def _leave(self, error: BaseException | None, /) -> None:
+        if self.keep or self._deleted:
+            return
+        try:
+            await SessionCalls.delete(self)
+        except GoneError:
+            pass  # it has expired, which is as good
+        except DeepSimbadClientError:
+            if error is None:  # else the block's own error matters more; the session expires by itself
+                raise
+
+
+class Session(SessionCalls, Blocking):
+    """One robot's belief, kept by the service and moved on by every observation.
+
+    Made by `Client.session` or `Client.attach_session`. It is a context manager: the session ends with the block unless
+    `keep` says otherwise. One session belongs to one robot: views sent by two threads at once count in the order of
+    their arrival.
+    """
+
+
+class AsyncSession(SessionCalls, Awaiting):
+    """A `Session` whose calls are awaited."""
+
+
+class ClientCalls(Face, Generic[AnySession]):
+    """The calls that need no key of scope `admin`."""
+
+    _session: type[AnySession]
+
+    @property
+    def url(self) -> str:
+        """The service's address."""
+        return self._wire.url
+
+    @shared
+    async def health(self) -> Health:
+        """Whether the process is alive."""
+        return model_of(Health, await self._wire.send(Call("GET", "/healthz")))
+
+    @shared
+    async def ready(self) -> Health:
+        """Whether it can answer now; asked once.
+
+        Raises:
+            UnavailableError: Not yet; its detail says why.
+        """
+        return model_of(Health, await self._wire.send(Call("GET", "/readyz", repeat=Repeat.NEVER)))
+
+    @shared
+    async def metrics(self) -> str:
+        """What the service counts, in Prometheus' text format."""
+        return (await self._wire.send(Call("GET", "/metrics"))).text
+
+    @shared
+    async def domains(self) -> tuple[Domain, ...]:
+        """Every domain."""
+        return page_of(Domain, "domains", await self._wire.send(Call("GET", "/v1/domains")))[0]
+
+    @shared
+    async def domain(self, name: str) -> Domain:
+        """One domain and its active map.
+
+        Raises:
+            UnknownDomainError: There is none of that name.
+        """
+        return model_of(Domain, await self._wire.send(Call("GET", domain_path(name))))
+
+    @shared
+    async def on_board(self, domain: str, *, map_version: int | None = None) -> "OnBoardEncoder":
+        """Fetch a map's landmarks once, to rank them here and send a few bytes a view (needs `deep-simbad[edge]`).
+
+        Args:
+            domain: Where the robot is.
+            map_version: A version that a session keeps; absent: the active map.
+
+        Raises:
+            UnknownDomainError, UnknownMapVersionError: There is none.
+            NoActiveMapError: The domain has no map yet.
+            RetiredMapError: That version was removed.
+            MissingExtraError: The packages of `deep-simbad[edge]` are not installed.
+        """
+        encoder = require_on_board()
+        call = Call("GET", f"{domain_path(domain)}/landmark-model", {"map_version": map_version}, BINARY)
+        return encoder((await self._wire.send(call)).content)
+
+    @shared
+    async def localize(
+        self,
+        domain: str,
+        image: Image | None = None,
+        *,
+        content_type: str | None = None,
+        ranked_landmarks: Numbers | None = None,
+        dissimilarities: Numbers | None = None,
+        encoding: Numbers | None = None,
+        ranked: Observation | None = None,
+        shortlist: int | None = None,
+    ) -> Localization:
+        """Where one view probably is; give exactly one form of it.
+
+        Args:
+            domain: Where to look.
+            image: An encoded image (JPEG, PNG, TIFF, WebP) or its path, sent as it is.
+            content_type: The image's media type; absent: read from its first bytes.
+            ranked_landmarks: Landmark ids, nearest first, 1..r of them.
+            dissimilarities: r finite numbers in landmark order, smaller is nearer.
+            encoding: A ready encoding, where the domain takes them.
+            ranked: What an `OnBoardEncoder` made of an image, a few bytes.
+            shortlist: Length of `retrieval` and `belief.top`; absent: the service's default.
+
+        Raises:
+            UnknownDomainError: No such domain.
+            NoActiveMapError: The domain has no map yet.
+            LandmarkModelDiffersError: `ranked` was made with other landmarks than the map's; fetch them by `on_board`.
+            InvalidInputError: The service cannot use the view; its detail says why.
+        """
+        view = observation(image, content_type, ranked_landmarks, dissimilarities, encoding, ranked)
+        path = f"{domain_path(domain)}/localizations"
+        call = Call("POST", path, {"shortlist": shortlist}, view.headers, view.body)
+        return model_of(Localization, await self._wire.send(call))
+
+    @shared
+    async def relevances(
+        self,
+        domain: str,
+        image: Image | None = None,
+        *,
+        content_type: str | None = None,
+        ranked_landmarks: Numbers | None = None,
+        dissimilarities: Numbers | None = None,
+        encoding: Numbers | None = None,
+        ranked: Observation | None = None,
+    ) -> "NDArray[np.float32]":
+        """How well every map image answers one view: [n] float32, larger is better (needs numpy).
+
+        Takes the same forms of a view, and raises the same errors, as `localize`.
+        """
+        view = observation(image, content_type, ranked_landmarks, dissimilarities, encoding, ranked)
+        path = f"{domain_path(domain)}/localizations"
+        return float_array(await self._wire.send(Call("POST", path, headers=view.headers | BINARY, body=view.body)))
+
+    @shared
+    async def session(
+        self,
+        domain: str,
+        start_position_m: float | None = None,
+        start_std_m: float | None = None,
+        *,
+        seed: int | None = None,
+        planner: str | None = None,
+        belief: str | None = None,
+        update: str | None = None,
+        keep: bool = False,
+        idempotency_key: str | None = None,
+    ) -> AnySession:
+        """Begin a session: the service keeps this robot's belief from view to view.
+
+        Use it as `with client.session(...) as session`, or `async with await client.session(...) as session`. A lost
+        answer is asked for again and begins no second session.
+
+        Args:
+            domain: Where the robot is.
+            start_position_m: About where it starts along the route; absent: anywhere.
+            start_std_m: How well that is known; absent: the service's default.
+            seed: Of everything drawn at random; absent: the service's default.
+            planner: Who chooses the next view (`nnql`, `random`, `constant:3`, ...); absent: the service's default.
+            belief: `particle` or `grid`; absent: the service's default.
+            update: How a view changes the belief; absent: the map's default.
+            keep: Let it outlive its `with` block.
+            idempotency_key: Names this beginning, so that it can be repeated after a `TransportError`; absent: a new
+                one.
+
+        Raises:
+            UnknownDomainError: No such domain.
+            NoActiveMapError: The domain has no map yet.
+            InvalidPriorError: The start is far off the route.
+            TooManySessionsError: The service holds as many as it may.
+        """
+        document = {
+            "start_position_m": start_position_m,
+            "start_std_m": start_std_m,
+            "seed": seed,
+            "planner": planner,
+            "belief": belief,
+            "update": update,
+        }
+        call = Call.with_json("POST", f"{domain_path(domain)}/sessions", document, headers=once(idempotency_key))
+        return self._session(self._wire, model_of(SessionState, await self._wire.send(call)), keep=keep)
+
+    @shared
+    async def attach_session(self, session_id: str, *, keep: bool = True) -> AnySession:
+        """Find a session again that was kept.
+
+        Raises:
+            UnknownSessionError: No such session.
+            EndedSessionError: It expired or was deleted.
+            RetiredMapError: Its map was removed.
+        """
+        response = await self._wire.send(Call("GET", session_path(session_id)))
+        return self._session(self._wire, model_of(SessionState, response), keep=keep)
+
+    @shared
+    async def truths(self, session_id: str, true_positions_m: Numbers) -> TruthScore:
+        """Tell where a session's robot truly was, as `Session.truths` does; the session may have ended a while ago.
+
+        Raises:
+            UnknownSessionError: No such session, or it ended long ago.
+            InvalidInputError: As many positions as observations there are not.
+        """
+        return await _truths(self._wire, session_path(session_id), true_positions_m)
+
+    async def _leave(self, _error: BaseException | None, /) -> None:
+        await self._wire.link.close()
+
+
+class Client(ClientCalls[Session], Blocking):
+    """Talks to one Deep SIMBAD service and blocks; safe to share between threads.
+
+    Connection errors and the answers 408, 429, 502, 503 and 504 are retried with exponential backoff and jitter, or
+    after the service's own `Retry-After`, where repeating is safe: every call here but `admin.activate` with
+    `expected`, which is sent again only when the service surely did not act on it. A refused key (401, 403) is never
+    tried again.
+
+    Args:
+        url: The service's address; absent: `$DEEPSIMBAD_URL`, else http://127.0.0.1:8000.
+        api_key: Absent: `$DEEPSIMBAD_API_KEY`, else none is sent.
+        timeout: Connect, read, write and pool timeouts in seconds.
+        retry: How often and how long to try.
+        request_id: Names every request that is sent, each try anew, in the service's log too: 1 to 64 letters, digits,
+            '.', '_' and '-'; absent: the service names them. Answers and errors tell it as their `request_id`.
+        transport: Another httpx2 transport (tests, proxies, Unix sockets).
+        sleep: Waits between tries.
+        jitter: Draws in 0..1 that spread the waits.
+
+    Attributes:
+        admin: The calls that need a key of scope `admin`.
+    """
+
+    _session = Session
+
+    def __init__(
+        self,
+        url: str | None = None,
+        api_key: str | None = None,
+        *,
+        timeout: httpx2.Timeout = THIN_LINK_TIMEOUT,
+        retry: RetryPolicy | None = None,
+        request_id: Callable[[], str] | None = None,
+        transport: httpx2.BaseTransport | None = None,
+        sleep: Callable[[float], None] = time.sleep,
+        jitter: Callable[[], float] = random.random,
+    ) -> None:
+        http = httpx2.Client(**speaking_to(url, api_key, timeout), transport=transport)
+        super().__init__(Wire(BlockingLink(http, sleep), retry or RetryPolicy(), request_id, jitter))
+        self.admin = Admin(self._wire)
+
+    def close(self) -> None:
+        """Close the connections; the client cannot be used afterwards."""
+        finished(self._leave(None))
+
+
+class AsyncClient(ClientCalls[AsyncSession], Awaiting):
+    """A `Client` whose calls are awaited.
+
+    Args and attributes are those of `Client`, but that `transport` and `sleep` await too.
+    """
+
+    _session = AsyncSession
+
+    def __init__(
+        self,
+        url: str | None = None,
+        api_key: str | None = None,
+        *,
+        timeout: httpx2.Timeout = THIN_LINK_TIMEOUT,
+        retry: RetryPolicy | None = None,
+        request_id: Callable[[], str] | None = None,
+        transport: httpx2.AsyncBaseTransport | None = None,
+        sleep: Callable[[float], Awaitable[None]] = asyncio.sleep,
+        jitter: Callable[[], float] = random.random,
+    ) -> None:
+        http = httpx2.AsyncClient(**speaking_to(url, api_key, timeout), transport=transport)
+        super().__init__(Wire(AwaitingLink(http, sleep), retry or RetryPolicy(), request_id, jitter))
+        self.admin = AsyncAdmin(self._wire)
+
+    async def aclose(self) -> None:
+        """Close the connections; the client cannot be used afterwards."""
+        await self._leave(None)
+
+
+async def _truths(
+    wire: Wire,
+    path: str,
+    true_positions_m: Numbers,
+    true_map_images: Sequence[Sequence[int]] | None = None,
+    first_observation: int = 0,
+) -> TruthScore:
+    images = None if true_map_images is None else [[int(image) for image in images] for images in true_map_images]
+    document = {
+        "true_positions_m": known_positions(true_positions_m),
+        "true_map_images": images,
+        "first_observation": first_observation or None,
+    }
+    return model_of(TruthScore, await wire.send(Call.with_json("POST", f"{path}/truths", document)))

@@ -1,0 +1,159 @@
+"""Map a domain anew, and follow a job to its end, through lost connections and restarted services."""
+
+import time
+from collections.abc import Callable
+
+from deepsimbad_client.errors import ApiError, JobCancelledError, JobFailedError, TransportError
+from deepsimbad_client.http.client import Client
+from deepsimbad_client.http.models import Job
+from deepsimbad_client.http.retry import RETRIED_STATUSES
+
+PATIENCE_S = 600.0
+POLL_S = 1.0
+LONGEST_POLL_S = 15.0
+
+
+def remap(
+    client: Client,
+    domain: str,
+    training_traverse: str,
+    *,
+    landmark_traverse: str | None = None,
+    n_landmarks: int | None = None,
+    list_length: int | None = None,
+    relevance: str | None = None,
+    training_episodes: int | None = None,
+    seed: int | None = None,
+    activate: bool | None = None,
+    check_traverse: str | None = None,
+    gate_margin: float | None = None,
+    append: bool | None = None,
+    same_route: bool | None = None,
+    on_progress: Callable[[Job], None] | None = None,
+    patience_s: float = PATIENCE_S,
+) -> Job:
+    """Make a new map of a domain and wait for it; what is None is left to the service's default.
+
+    Args:
+        client: The client.
+        domain: The domain to map.
+        training_traverse: The traverse that becomes the map.
+        landmark_traverse: Where landmarks are chosen; None: the active map's landmarks stay.
+        n_landmarks: r, how many landmarks.
+        list_length: h, how many of them a map image keeps.
+        relevance: How a map image is compared with a query.
+        training_episodes: Length of the planner's training.
+        seed: Seed of whatever is random.
+        activate: Whether the new map serves at once.
+        check_traverse: The drive that the new map and the active one are compared on.
+        gate_margin: By how many percentage points of ANR the new map may be worse and still be activated.
+        append: Whether the traverse is added to a copy of the active map.
+        same_route: Whether the training and the landmark traverse count their positions along one route; None: only
+            where both know x, y. `metrics["second_season"]` of the result says whether the map learnt from both.
+        on_progress: Told of the job each time something is heard of it; first when it is submitted.
+        patience_s: Longest silence of the service that is waited out.
+
+    Returns:
+        The job, succeeded; its `result` holds `map_version`, `active` and `metrics`. Where the new map lost against the
+        active one by more than the gate's margin, `active` is false and `check["why"]` says so.
+
+    Raises:
+        JobFailedError: The service could not make the map.
+        ApiError: The service refused the request.
+        TransportError: Nothing was heard for `patience_s`.
+    """
+    job = client.admin.remap(
+        domain,
+        training_traverse=training_traverse,
+        landmark_traverse=landmark_traverse,
+        n_landmarks=n_landmarks,
+        list_length=list_length,
+        relevance=relevance,
+        training_episodes=training_episodes,
+        seed=seed,
+        activate=activate,
+        check_traverse=check_traverse,
+        gate_margin=gate_margin,
+        append=append,
+        same_route=same_route,
+    )
+    if on_progress is not None:
+        on_progress(job)
+    return follow_job(client, job.job_id, on_progress, patience_s=patience_s)
+
+
+def follow_job(
+    client: Client,
+    job_id: str,
+    on_progress: Callable[[Job], None] | None = None,
+    *,
+    on_silence: Callable[[float], None] | None = None,
+    patience_s: float = PATIENCE_S,
+    sleep: Callable[[float], None] = time.sleep,
+    clock: Callable[[], float] = time.monotonic,
+) -> Job:
+    """Follow a job until it has succeeded.
+
+    Listens to its event stream; where that breaks off, asks for the job now and then until the service answers again
+    and listens anew; where there is no stream at all, goes on asking. A service that was restarted takes the job up
+    again: it is queued once more, and its progress may be less than it was.
+
+    Args:
+        client: The client.
+        job_id: The job.
+        on_progress: Told of the job each time something is heard of it.
+        on_silence: Told the seconds since then each time the service has not answered.
+        patience_s: Longest silence of the service that is waited out.
+        sleep: Waits.
+        clock: Seconds that never go backwards.
+
+    Returns:
+        The job, succeeded.
+
+    Raises:
+        JobFailedError: It failed.
+        JobCancelledError: It was cancelled.
+        TransportError: Nothing was heard for `patience_s`; the job itself may go on.
+        ApiError: The service does not know the job, or refuses to tell.
+    """
+    last_heard, wait_s, streams = clock(), POLL_S, True
+    while True:
+        try:
+            for job in client.admin.job_events(job_id) if streams else ():
+                last_heard, wait_s = clock(), POLL_S
+                if on_progress is not None:
+                    on_progress(job)
+                if job.ended:
+                    return _succeeded(job)
+        except TransportError:
+            pass
+        except ApiError as error:
+            streams = _passes(error)
+        try:
+            job = client.admin.job(job_id)
+        except (TransportError, ApiError) as error:
+            if not _passes(error) or clock() - last_heard > patience_s:
+                raise
+            if on_silence is not None:
+                on_silence(clock() - last_heard)
+            wait_s = min(2 * wait_s, LONGEST_POLL_S)
+        else:
+            last_heard, wait_s = clock(), POLL_S
+            if on_progress is not None:
+                on_progress(job)
+            if job.ended:
+                return _succeeded(job)
+        sleep(wait_s)
+
+
+def _passes(error: TransportError | ApiError) -> bool:
+    """Whether the service may answer again later."""
+    return isinstance(error, TransportError) or error.status >= 500 or error.status in RETRIED_STATUSES
+
+
+def _succeeded(job: Job) -> Job:
+    if job.state == "cancelled":
+        raise JobCancelledError(f"job {job.job_id} was cancelled", job)
+    if job.state != "succeeded":
+        raise JobFailedError(f"job {job.job_id} failed: {job.error_text or 'the service gave no reason'}", job)
+    return job
