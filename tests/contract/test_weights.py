@@ -11,6 +11,7 @@ import pytest
 from starlette.testclient import TestClient
 
 from deepsimbad.api.app import create_app
+from deepsimbad.engine import encoders
 from deepsimbad.errors import InvalidWeightsError
 from deepsimbad.jobs.perform import InThisProcess
 
@@ -104,7 +105,9 @@ def test_views_and_frames_of_other_weights_are_refused_with_both_digests(tmp_pat
         assert client.post(VIEW, content=encoded(picture(1)), headers=JPEG).status_code == 200
 
 
-def test_a_domain_whose_weights_are_gone_says_so_and_the_others_go_on(tmp_path: Path) -> None:
+def test_a_domain_whose_weights_are_gone_says_so_and_the_others_go_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     weights = tmp_path / "weights" / "eyes.onnx"
     write_network(weights, 1)
     with service(tmp_path) as client:
@@ -129,6 +132,8 @@ def test_a_domain_whose_weights_are_gone_says_so_and_the_others_go_on(tmp_path: 
         assert client.post("/v1/domains/ready/localizations", json={"ranked_landmarks": [1]}).status_code == 200
         assert client.get("/readyz").status_code == 200
         weights.write_bytes(body)  # brought back, without a restart
+        refused(client.post(VIEW, content=encoded(picture(1)), headers=JPEG), 503, "evaluator_unavailable")
+        monkeypatch.setattr(encoders, "RETRY_AFTER_S", 0.0)  # later
         assert client.post(VIEW, content=encoded(picture(1)), headers=JPEG).status_code == 200
 
 
@@ -180,7 +185,7 @@ def test_weights_that_cannot_be_read_keep_no_service_from_starting(
         raise PermissionError(13, "Permission denied")
 
     monkeypatch.setattr(Path, "read_bytes", refused_by_the_disk)
-    monkeypatch.setattr("deepsimbad.evaluators.extractors.onnx_file.file_sha256", refused_by_the_disk)
+    monkeypatch.setattr("deepsimbad.evaluators.weights.lock.file_sha256", refused_by_the_disk)
     with service(tmp_path) as client:
         assert client.get("/readyz").status_code == 200
         assert client.get("/v1/domains/street").json()["evaluator_problem"] == "invalid_weights"

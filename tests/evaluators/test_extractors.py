@@ -1,15 +1,22 @@
 """Laws of the extractors that come with the service, and what they are good for."""
 
+import re
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from deepsimbad.evaluators.compute import Compute
+from deepsimbad.evaluators.compute import Compute, Runtime
+from deepsimbad.evaluators.extractors.efficientnet_lite0 import weights_file
 from deepsimbad.evaluators.feature_l2 import FeatureL2
 from deepsimbad.evaluators.image import decode_image
 from deepsimbad.evaluators.registry import make_extractor
+from deepsimbad.evaluators.weights.files import file_sha256
+
+from .netvlad_reference import random_network, write_pytorch_netvlad
+from .test_onnx_file import model
+from .test_squeezenet import random_parameters, write_caffe
 
 
 @pytest.fixture(params=["gradient_grid", "efficientnet_lite0"], scope="module")
@@ -72,6 +79,26 @@ def test_size_hardly_matters(extractor):
     scene, other = _scene(), np.linalg.norm(extractor(_scene()) - extractor(_scene(5)))
     half = cv2.resize(scene, (160, 120), interpolation=cv2.INTER_AREA)
     assert np.linalg.norm(extractor(scene) - extractor(half)) < 0.3 * other
+
+
+@pytest.mark.parametrize(
+    ("extractor", "file"),
+    [("efficientnet_lite0", None), ("squeezenet:small.npz", "small.npz"), ("onnx:small.onnx", "small.onnx"),
+     ("netvlad:small.pth", "small.pth")],
+)  # fmt: skip
+def test_another_recipe_is_told_apart_as_other_weights_are(tmp_path, monkeypatch, extractor, file):
+    """The first recipe adds nothing: what was encoded before recipes were counted stays comparable."""
+    write_caffe(tmp_path / "small.npz", random_parameters())
+    (tmp_path / "small.onnx").write_bytes(model().SerializeToString())
+    write_pytorch_netvlad(tmp_path / "small.pth", random_network("pytorch_netvlad"))
+    kind = {"onnx": "onnx_file"}.get(extractor.partition(":")[0], extractor.partition(":")[0])
+    compute = Compute(Runtime.TORCH, weights_dir=tmp_path)
+    first = make_extractor(extractor, compute).weights_sha256
+    assert first == file_sha256(tmp_path / file if file else weights_file())
+    monkeypatch.setattr(f"deepsimbad.evaluators.extractors.{kind}._RECIPE", 2)
+    second = make_extractor(extractor, compute).weights_sha256
+    assert re.fullmatch("[0-9a-f]{64}", second)
+    assert second != first
 
 
 @pytest.mark.real_data

@@ -1,5 +1,8 @@
 """Too little memory: smaller batches where they help, a named error where they do not; and which runtime is taken."""
 
+import subprocess
+import sys
+
 import cv2
 import numpy as np
 import pytest
@@ -8,9 +11,9 @@ from torch import nn
 
 from deepsimbad.api.problems import status_of
 from deepsimbad.errors import InvalidImageError, MissingPackageError, OutOfMemoryError
-from deepsimbad.evaluators import image as image_module
 from deepsimbad.evaluators import runtimes
 from deepsimbad.evaluators.compute import Compute, Runtime
+from deepsimbad.evaluators.feature_l2 import FeatureL2
 from deepsimbad.evaluators.image import decode_image
 from deepsimbad.evaluators.runtimes import make_run
 
@@ -68,24 +71,52 @@ def test_another_fault_stays_what_it_is():
         run(pixels(2))
 
 
-def test_too_little_memory_to_decode_is_no_bad_image(monkeypatch):
+def test_what_a_decoder_complains_of_is_the_images_fault(monkeypatch):
+    def imdecode(*_):
+        raise cv2.error("(-215:Assertion failed)")
+
     body = cv2.imencode(".png", np.zeros((4, 4, 3), np.uint8))[1].tobytes()
-
-    def starved(code):
-        error = cv2.error("Insufficient memory")
-        error.code = code
-
-        def imdecode(*_):
-            raise error
-
-        monkeypatch.setattr(image_module.cv2, "imdecode", imdecode)
-
-    starved(cv2.Error.StsNoMem)
-    with pytest.raises(OutOfMemoryError):
-        decode_image(body, 100)
-    starved(cv2.Error.StsAssert)
+    monkeypatch.setattr(cv2, "imdecode", imdecode)
     with pytest.raises(InvalidImageError):
         decode_image(body, 100)
+
+
+STARVED = """
+import resource, sys
+import cv2, numpy as np
+from deepsimbad.errors import OutOfMemoryError
+from deepsimbad.evaluators.feature_l2 import FeatureL2
+from deepsimbad.evaluators.image import decode_image
+
+def written(side):
+    image = np.zeros((side, side, 3), np.uint8)
+    return [cv2.imencode(ending, image)[1].tobytes() for ending in (".png", ".jpg", ".webp", ".tiff")]
+
+small, large = written(20), written(4000)
+[decode_image(body, 400) for body in small]
+taken = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
+resource.setrlimit(resource.RLIMIT_AS, (taken + (60 << 20),) * 2)  # room for the picture, and not for its decoder
+for body in large:
+    try:
+        decode_image(body, 10**8)
+    except OutOfMemoryError:
+        print("starved")
+"""
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the limit is Linux's")
+def test_a_decoder_without_memory_finds_no_fault_with_the_image():
+    done = subprocess.run([sys.executable, "-c", STARVED], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["starved"] * 4
+
+
+def test_too_little_memory_to_bring_an_image_to_size_is_named():
+    evaluator = FeatureL2("gradient_grid")
+    evaluator.load()
+    evaluator._loaded.prepare = evaluator._loaded.encode = Hungry(0, cv2.error("(-4:Insufficient memory)"))
+    for work in (evaluator.prepare, lambda image: evaluator.encode([image])):
+        with pytest.raises(OutOfMemoryError):
+            work(np.zeros((4, 4, 3), np.uint8))
 
 
 def test_a_runtime_that_is_not_installed_is_said(monkeypatch):

@@ -1,7 +1,6 @@
 """Images on their way from a body to the inference worker: few are decoded at once, whatever is sent."""
 
 from dataclasses import dataclass
-from typing import cast
 
 from anyio import CapacityLimiter
 from anyio.to_thread import run_sync
@@ -10,7 +9,7 @@ from deepsimbad.engine.encoders import ready
 from deepsimbad.engine.worker import Priority
 from deepsimbad.errors import OverloadedError
 from deepsimbad.evaluators.base import Evaluator, Image
-from deepsimbad.evaluators.image import KEPT_PIXELS, claimed_pixels, decode_image, is_blank
+from deepsimbad.evaluators.image import KEPT_PIXELS, ImageFile, is_blank
 
 SLOTS = {Priority.LIVE: 4, Priority.BATCH: 2}  # images decoded and not yet reduced, each of up to KEPT_PIXELS
 LARGE_WAITING = 8  # larger images that may wait for the one that is being decoded
@@ -49,26 +48,23 @@ class Decoders:
         """The image in a body.
 
         Raises:
-            InvalidImageError, ImageTooLargeError, EmptyBodyError: As `decode_image`.
+            InvalidImageError, ImageTooLargeError, EmptyBodyError: As `ImageFile`.
             UnsupportedMediaTypeError: The evaluator takes ready encodings alone.
             EvaluatorUnavailableError: It cannot be loaded any more.
             OverloadedError: The image is large, and as many large ones wait as may.
         """
         slots = self._slots[priority]
-        decoded = await run_sync(self._decode, body, evaluator, KEPT_PIXELS, limiter=slots)
-        if decoded is not None:
-            return decoded
+        image = await run_sync(self._read, body, evaluator, limiter=slots)
+        if isinstance(image, Decoded):
+            return image
         self._check_large()
         async with self._large:
-            return cast("Decoded", await run_sync(self._decode, body, evaluator, self._max_pixels, limiter=slots))
+            return await run_sync(_decode, image, evaluator, limiter=slots)
 
-    def _decode(self, body: bytes, evaluator: Evaluator, most_pixels: int) -> Decoded | None:
-        """None: it has more pixels than these, and was not decoded."""
-        if claimed_pixels(body, self._max_pixels) > most_pixels:
-            return None
-        ready(evaluator)  # where it is not, decoding is in vain
-        image = decode_image(body, self._max_pixels)
-        return Decoded(evaluator.prepare(image), is_blank(image))
+    def _read(self, body: bytes, evaluator: Evaluator) -> Decoded | ImageFile:
+        """The file where its image is large, else what it decodes to."""
+        file = ImageFile.read(body, self._max_pixels)
+        return file if file.n_pixels > KEPT_PIXELS else _decode(file, evaluator)
 
     def _check_large(self) -> None:
         if self._large.statistics().tasks_waiting >= LARGE_WAITING:
@@ -78,3 +74,9 @@ class Decoders:
                 retry_after_s=1,
                 most_pixels_at_once=KEPT_PIXELS,
             )
+
+
+def _decode(file: ImageFile, evaluator: Evaluator) -> Decoded:
+    ready(evaluator)  # where it is not, decoding is in vain
+    image = file.decode()
+    return Decoded(evaluator.prepare(image), is_blank(image))

@@ -4,8 +4,9 @@ import json
 import logging
 import threading
 from collections.abc import Mapping, Sequence
-from time import perf_counter
+from time import monotonic, perf_counter
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,9 @@ from deepsimbad.evaluators.compute import Compute
 from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
 
 log = logging.getLogger(__name__)
+
+RETRY_AFTER_S = 30.0  # an extractor that cannot be loaded is not tried again before: to read its weights takes seconds
+_failures: WeakKeyDictionary[Evaluator, tuple[float, InvalidInputError]] = WeakKeyDictionary()
 
 
 class EvaluatorPool:
@@ -63,16 +67,23 @@ def ready(evaluator: Evaluator) -> Evaluator:
     """The evaluator of a domain that exists, loaded; the first time that takes a moment.
 
     Raises:
-        EvaluatorUnavailableError: It cannot be loaded any more; what the robot sent is not at fault.
+        EvaluatorUnavailableError: It cannot be loaded, or could not some seconds ago; what the robot sent is not at
+            fault.
         OutOfMemoryError: There is too little memory for it.
     """
-    try:
-        evaluator.load()
-    except InvalidInputError as error:
-        raise EvaluatorUnavailableError(
-            f"the domain's extractor cannot be loaded: {error.message}", reason=error.code, **error.hints
-        ) from error
-    return evaluator
+    failed_at, failure = _failures.get(evaluator, (0.0, None))
+    if failure is None or monotonic() - failed_at >= RETRY_AFTER_S:
+        try:
+            evaluator.load()
+        except InvalidInputError as error:
+            failure = error
+            _failures[evaluator] = (monotonic(), error)
+        else:
+            _failures.pop(evaluator, None)
+            return evaluator
+    raise EvaluatorUnavailableError(
+        f"the domain's extractor cannot be loaded: {failure.message}", reason=failure.code, **failure.hints
+    ) from failure
 
 
 def encode_images(evaluator: Evaluator, images: Sequence[Image]) -> list[EncodedImage]:

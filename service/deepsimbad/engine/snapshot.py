@@ -107,9 +107,8 @@ class MapSnapshot:
         """SHA-256 in hex of the landmark model; worked out at first need, in about a second a gigabyte."""
         return landmark_model_digest(self.landmark_model)
 
-    @cached_property
     def portable_landmarks(self) -> bytes:
-        """The landmark model as it travels to robots; made at first need and kept."""
+        """The landmark model as it travels to robots; not kept, for a map has megabytes of it already."""
         return pack_landmarks(
             PortableLandmarks(
                 self.landmark_model, self.n_landmarks, self.version, self.evaluator, self.weights_sha256 or ""

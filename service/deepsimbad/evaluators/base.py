@@ -5,11 +5,14 @@ two steps, `encode` and `dissimilarities`, so that each observation is encoded o
 change.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
+
+from deepsimbad.errors import OutOfMemoryError
 
 Image: TypeAlias = NDArray[np.uint8]
 """[height, width, 3] BGR, upright, as `evaluators.image.decode_image` gives it."""
@@ -41,7 +44,7 @@ class Evaluator(Protocol):
 
     @property
     def weights_sha256(self) -> str | None:
-        """SHA-256 in hex of the file that encoding depends on; None where it depends on none."""
+        """SHA-256 in hex that encodings are told apart by: of their weights, and of what is done with them; or None."""
 
     @property
     def largest_batch(self) -> int:
@@ -115,3 +118,28 @@ class Evaluator(Protocol):
         Raises:
             InvalidEncodingError: Wrong length, NaN or infinity, or so large that the dissimilarity overflows.
         """
+
+
+_LACK_OF_MEMORY = ("out of memory", "allocate memory", "bad_alloc", "bad allocation", "insufficient memory")
+
+
+def is_lack_of_memory(error: BaseException) -> bool:
+    """Whether an error of Python, numpy, OpenCV, PyTorch or ONNX Runtime speaks of too little memory."""
+    return isinstance(error, MemoryError) or any(words in str(error).lower() for words in _LACK_OF_MEMORY)
+
+
+@contextmanager
+def named_lack_of_memory(work: str) -> Iterator[None]:
+    """What anybody says of too little memory, as one error: nobody's image is at fault. All else passes.
+
+    Args:
+        work: What is done with the image.
+    """
+    try:
+        yield
+    except Exception as error:
+        if isinstance(error, OutOfMemoryError) or not is_lack_of_memory(error):
+            raise
+        raise OutOfMemoryError(
+            f"there is too little memory to {work} an image now: try again, or give the service more"
+        ) from error

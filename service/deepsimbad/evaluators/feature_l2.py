@@ -8,7 +8,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from deepsimbad.errors import InvalidEncodingError, InvalidImageError, UnsupportedMediaTypeError
-from deepsimbad.evaluators.base import LandmarkModel, Observation
+from deepsimbad.evaluators.base import LandmarkModel, Observation, named_lack_of_memory
 from deepsimbad.evaluators.compute import Compute
 from deepsimbad.evaluators.extractors.base import Extractor
 from deepsimbad.evaluators.registry import ExtractorName, make_extractor
@@ -70,12 +70,14 @@ class FeatureL2:
     def prepare(self, observation: Observation) -> Observation:
         """See `Evaluator.prepare`."""
         self._check((observation,))
-        return self._extractor.prepare(observation)
+        with named_lack_of_memory("prepare"):
+            return self._extractor.prepare(observation)
 
     def encode(self, observations: Sequence[Observation]) -> NDArray[np.float32]:
         """See `Evaluator.encode`."""
         self._check(observations)
-        return self._extractor.encode(observations)
+        with named_lack_of_memory("encode"):
+            return self._extractor.encode(observations)
 
     def _check(self, observations: Sequence[Observation]) -> None:
         if not self.takes_images:

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepsimbad.errors import MissingPackageError, OutOfMemoryError
+from deepsimbad.evaluators.base import named_lack_of_memory
 from deepsimbad.evaluators.compute import Compute, Device, Runtime, available_cores
 
 if TYPE_CHECKING:
@@ -41,7 +42,6 @@ INSTALL_FAST = "install ONNX Runtime: pip install 'deep-simbad[fast]'"
 
 _INPUT = "pixels"
 _DIGEST_BYTES = 32
-_NO_MEMORY = "there is too little memory to encode an image now: try again, or give the service more"
 _BATCH_ON_CPU = 1  # a larger one leaves the caches: docs/results/encode.md
 _BATCH_ON_CUDA = 32
 
@@ -142,14 +142,14 @@ class _TorchRun:
         module.eval().requires_grad_(False)
         if in_bf16:
             module.trunk.to(torch.bfloat16)
-        with _named_lack_of_memory():
+        with named_lack_of_memory("encode"):
             self._module = module.to(device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.largest_batch = compute.largest_batch or (_BATCH_ON_CPU if device == "cpu" else _BATCH_ON_CUDA)
 
     def __call__(self, pixels: NDArray[np.uint8]) -> NDArray[np.float32]:
         """See `Run`. Where a batch does not fit the memory it is halved, and so is every later one."""
         try:
-            with _named_lack_of_memory(), self._torch.inference_mode():
+            with named_lack_of_memory("encode"), self._torch.inference_mode():
                 shown = self._torch.from_numpy(pixels).to(self._device)
                 return np.asarray(self._module(shown).cpu().numpy(), np.float32)
         except OutOfMemoryError:
@@ -180,7 +180,7 @@ class _OnnxRun:
         return np.concatenate(list(self._threads.map(self._one, np.split(pixels, len(pixels)))))
 
     def _one(self, pixels: NDArray[np.uint8]) -> NDArray[np.float32]:
-        with _named_lack_of_memory():
+        with named_lack_of_memory("encode"):
             return np.asarray(self._session.run(None, {_INPUT: pixels})[0], np.float32)
 
 
@@ -257,17 +257,3 @@ def _quiet_export() -> Iterator[None]:
             yield
     finally:
         exporter.setLevel(level)
-
-
-@contextmanager
-def _named_lack_of_memory() -> Iterator[None]:
-    """What both runtimes say of too little memory, as one error; the rest passes."""
-    try:
-        yield
-    except MemoryError as error:
-        raise OutOfMemoryError(_NO_MEMORY) from error
-    except Exception as error:  # torch raises RuntimeError and kinds of it, ONNX Runtime kinds of Exception
-        text = str(error).lower()
-        if any(words in text for words in ("out of memory", "allocate memory", "bad_alloc", "bad allocation")):
-            raise OutOfMemoryError(_NO_MEMORY) from error
-        raise

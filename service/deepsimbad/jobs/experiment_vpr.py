@@ -28,7 +28,7 @@ from deepsimbad.evaluators.base import Evaluator, LandmarkModel
 from deepsimbad.jobs.build_map import Described, map_contents
 from deepsimbad.jobs.encoded_traverse import EncodedTraverse
 from deepsimbad.jobs.progress import Progress
-from deepsimbad.store.arrays import halved
+from deepsimbad.store.arrays import is_halvable
 from deepsimbad.store.map_file import index_bytes, write_map
 from deepsimbad.store.records import DomainRecord
 from deepsimbad.store.sealing import seal
@@ -177,7 +177,7 @@ def run_vpr(
         seconds,
         same_route,
         encoding_dim=int(test.encodings.shape[1]),
-        bytes_per_encoding=halved(test.encodings).nbytes // len(test.encodings),
+        bytes_per_encoding=test.encodings.shape[1] * (2 if is_halvable(test.encodings) else 4),
         encode_ms=test.encode_ms,
     )
 

@@ -39,16 +39,13 @@ def save_arrays(db: Database, table: str, arrays: Mapping[str, NDArray[Any]], ch
         array = np.asarray(arrays[name])
         if array.dtype.kind not in _KINDS:
             raise InvalidInputError(f"array {name} of {table} holds {array.dtype}, not numbers")
-        array = halved(array) if array.dtype == np.float32 else array
-        shape = to_json(list(array.shape))
-        numbers = np.ascontiguousarray(array, array.dtype.newbyteorder("<")).reshape(-1)
-        octets = numbers.view(np.uint8)
-        for part, start in enumerate(range(0, max(octets.size, 1), PART_BYTES)):
-            body = octets[start : start + PART_BYTES].tobytes()
-            checksum.add(table, name, part, numbers.dtype.str, shape, body)
-            db.table(table).insert(
-                {"name": name, "part": part, "dtype": numbers.dtype.str, "shape": shape, "body": body}
-            )
+        dtype = np.dtype("<f2") if is_halvable(array) else array.dtype.newbyteorder("<")
+        shape, numbers = to_json(list(array.shape)), np.ascontiguousarray(array).reshape(-1)
+        a_part = PART_BYTES // dtype.itemsize
+        for part, start in enumerate(range(0, max(numbers.size, 1), a_part)):
+            body = numbers[start : start + a_part].astype(dtype).tobytes()
+            checksum.add(table, name, part, dtype.str, shape, body)
+            db.table(table).insert({"name": name, "part": part, "dtype": dtype.str, "shape": shape, "body": body})
 
 
 def load_arrays(db: Database, table: str, checksum: Checksum) -> dict[str, NDArray[Any]]:
@@ -86,8 +83,11 @@ def load_arrays(db: Database, table: str, checksum: Checksum) -> dict[str, NDArr
     return arrays
 
 
-def halved(numbers: NDArray[np.float32]) -> NDArray[np.float16] | NDArray[np.float32]:
-    """Numbers as float16 where nothing is lost by it: our networks' encodings are rounded to that."""
+def is_halvable(numbers: NDArray[Any]) -> bool:
+    """Whether float32 lose nothing as float16: our networks' encodings are rounded to that."""
+    if numbers.dtype != np.float32:
+        return False
+    flat = numbers.reshape(-1)
     with np.errstate(over="ignore"):
-        half = numbers.astype(np.float16)
-    return half if np.array_equal(half, numbers) else numbers
+        parts = (flat[start : start + PART_BYTES // 4] for start in range(0, flat.size, PART_BYTES // 4))
+        return all(np.array_equal(part.astype(np.float16), part) for part in parts)

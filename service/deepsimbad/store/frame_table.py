@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from sqlite_utils import Database
 
 from deepsimbad.errors import DamagedFileError, InvalidEncodingError, WeightsDifferError
-from deepsimbad.store.arrays import halved
+from deepsimbad.store.arrays import is_halvable
 from deepsimbad.store.frames import UNKNOWN_TIMESTAMP, TraverseFrames
 
 _DTYPE_OF_BYTES = {2.0: "<f2", 4.0: "<f4"}  # by the bytes of one number
@@ -166,8 +166,7 @@ def _bodies(frames: TraverseFrames) -> Iterator[tuple[int, int, bytes]]:
 
 
 def _body(encoding: NDArray[np.float32]) -> bytes:
-    kept = halved(encoding)
-    return kept.astype(kept.dtype.newbyteorder("<")).tobytes()
+    return encoding.astype("<f2" if is_halvable(encoding) else "<f4").tobytes()
 
 
 def _check_weights(db: Database, given: str | None) -> None:

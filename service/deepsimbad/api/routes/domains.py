@@ -76,7 +76,7 @@ async def get_landmark_model(
             snapshot = running.maps.snapshot(domain, map_version)
         etag = f'"{snapshot.landmark_model_digest}"'
         is_known = names(request.headers.get("if-none-match"), etag)
-        return etag, None if is_known else snapshot.portable_landmarks
+        return etag, None if is_known else snapshot.portable_landmarks()
 
     etag, content = await off_the_loop(packed)
     told = {**KEPT, "ETag": etag}

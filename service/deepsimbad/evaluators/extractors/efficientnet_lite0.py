@@ -19,7 +19,7 @@ from deepsimbad.evaluators.compute import Compute
 from deepsimbad.evaluators.extractors.gradient_grid import GradientGrid
 from deepsimbad.evaluators.extractors.network import NetworkExtractor
 from deepsimbad.evaluators.runtimes import INSTALL_TORCH, make_run
-from deepsimbad.evaluators.weights.files import file_sha256, read_state_dict
+from deepsimbad.evaluators.weights.files import encodings_sha256, file_sha256, read_state_dict
 
 if TYPE_CHECKING:
     from torch import nn
@@ -30,7 +30,7 @@ _SIDE = 224  # pixels
 _CELLS = (6, 5)  # rows and columns: a drive is offset sideways and turned, hardly ever lifted
 _TAKEN = {7: 80, 10: 112}  # block -> its channels; both at stride 16
 _GRADIENT_SHARE = 0.5  # length of the gradient grid beside the network's 1
-_RECIPE = "1"  # counts up with whatever changes an encoding
+_RECIPE = 1  # see `encodings_sha256`; the gradient grid is part of it
 _NETWORK_DIM = _CELLS[0] * _CELLS[1] * sum(_TAKEN.values())
 
 
@@ -78,7 +78,8 @@ def efficientnet_lite0(_argument: str, compute: Compute) -> EfficientNetLite0:
     path = weights_file()
     sha256 = file_sha256(path)
     run = make_run(lambda: _module(path), compute, (_SIDE, _SIDE), f"efficientnet_lite0-{_RECIPE}-{sha256[:16]}")
-    return EfficientNetLite0(NetworkExtractor(run, _NETWORK_DIM, sha256, (_SIDE, _SIDE)))
+    network = NetworkExtractor(run, _NETWORK_DIM, encodings_sha256(sha256, _RECIPE), (_SIDE, _SIDE))
+    return EfficientNetLite0(network)
 
 
 def weights_file() -> Path:

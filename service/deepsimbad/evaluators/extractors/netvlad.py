@@ -4,8 +4,10 @@ from deepsimbad.errors import MissingPackageError
 from deepsimbad.evaluators.compute import Compute
 from deepsimbad.evaluators.extractors.network import NetworkExtractor
 from deepsimbad.evaluators.runtimes import INSTALL_TORCH, has_torch, make_run
+from deepsimbad.evaluators.weights.files import encodings_sha256
 from deepsimbad.evaluators.weights.lock import Lock
 
+_RECIPE = 1  # see `encodings_sha256`; the presets of the families are part of it
 _USUAL_SIZE = (640, 480)
 _SHORTEST_SIDE = 16  # pixels: of fewer, nothing is left behind four maxima
 
@@ -32,6 +34,6 @@ def netvlad(file: str, compute: Compute) -> NetworkExtractor:
     preset = weights.preset
     run = make_run(weights.module, compute, preset.input_size or _USUAL_SIZE)
     return NetworkExtractor(
-        run, weights.encoding_dim, sha256, preset.input_size,
+        run, weights.encoding_dim, encodings_sha256(sha256, _RECIPE), preset.input_size,
         longest_side=preset.longest_side, shortest_side=_SHORTEST_SIDE,
     )  # fmt: skip

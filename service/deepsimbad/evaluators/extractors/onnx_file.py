@@ -15,15 +15,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepsimbad.errors import InvalidWeightsError, MissingPackageError, OutOfMemoryError
+from deepsimbad.evaluators.base import is_lack_of_memory
 from deepsimbad.evaluators.compute import Compute, available_cores
 from deepsimbad.evaluators.extractors.network import NetworkExtractor
 from deepsimbad.evaluators.runtimes import INSTALL_FAST, has_onnxruntime, onnx_session
-from deepsimbad.evaluators.weights.files import file_sha256, weights_path
+from deepsimbad.evaluators.weights.files import encodings_sha256
 from deepsimbad.evaluators.weights.lock import Lock
 
 if TYPE_CHECKING:
     from onnx import AttributeProto, GraphProto, ModelProto, TensorProto
 
+_RECIPE = 1  # see `encodings_sha256`
 _SIDE = 224  # pixels of a side that the file leaves open
 _LONGEST_SIDE = 4096
 _LARGEST = 1e6  # number that images are normalised by
@@ -55,15 +57,13 @@ def onnx_file(argument: str, compute: Compute) -> NetworkExtractor:
     """
     if not has_onnxruntime():
         raise MissingPackageError(f"onnx:{argument} needs ONNX Runtime: {INSTALL_FAST}")
-    path = weights_path(compute.weights_dir, argument)
+    path, sha256 = Lock.read(compute.weights_dir).pinned(argument)
     if path.stat().st_size > _MOST_BYTES:
         raise InvalidWeightsError(f"{argument} is larger than an ONNX file can be", file=argument)
-    sha256 = file_sha256(path)
-    Lock.read(compute.weights_dir).check_file(argument, sha256)
     run = _FileRun(argument, path.read_bytes(), compute)
     width, height = run.input_size
     given = run(np.zeros((1, height, width, 3), np.uint8))
-    return NetworkExtractor(run, given.shape[1], sha256, run.input_size)
+    return NetworkExtractor(run, given.shape[1], encodings_sha256(sha256, _RECIPE), run.input_size)
 
 
 @dataclass(frozen=True)
@@ -171,8 +171,7 @@ class _FileRun:
         )
 
     def _failure(self, what: str, error: Exception) -> InvalidWeightsError | OutOfMemoryError:
-        text = str(error).lower()
-        if isinstance(error, MemoryError) or "allocate memory" in text or "bad_alloc" in text:
+        if is_lack_of_memory(error):
             return OutOfMemoryError(f"there is too little memory for {self._file}")
         return InvalidWeightsError(f"{self._file} {what}", file=self._file)
 

@@ -11,6 +11,7 @@ from deepsimbad.errors import MissingPackageError
 from deepsimbad.evaluators.compute import Compute
 from deepsimbad.evaluators.extractors.network import NetworkExtractor
 from deepsimbad.evaluators.runtimes import INSTALL_TORCH, has_torch, make_run
+from deepsimbad.evaluators.weights.files import encodings_sha256
 from deepsimbad.evaluators.weights.lock import Lock
 
 if TYPE_CHECKING:
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
 CELLS = (6, 5)  # rows and columns, as of the default extractor
 TAKEN = {9: 512}  # fire module -> its channels
 ENCODING_DIM = CELLS[0] * CELLS[1] * sum(TAKEN.values())
-_RECIPE = "1"  # counts up with whatever changes an encoding
+_RECIPE = 1  # see `encodings_sha256`
 
 
 def squeezenet(file: str, compute: Compute) -> NetworkExtractor:
@@ -41,7 +42,7 @@ def squeezenet(file: str, compute: Compute) -> NetworkExtractor:
     path, sha256 = Lock.read(compute.weights_dir).pinned(file)
     size = (preset_of(path).side,) * 2
     run = make_run(lambda: _module(path), compute, size, f"squeezenet-{_RECIPE}-{sha256[:16]}")
-    return NetworkExtractor(run, ENCODING_DIM, sha256, size)
+    return NetworkExtractor(run, ENCODING_DIM, encodings_sha256(sha256, _RECIPE), size)
 
 
 def _module(path: Path) -> "nn.Module":

@@ -29,15 +29,17 @@ from deepsimbad.errors import (
     MissingWeightsError,
     OutOfMemoryError,
 )
+from deepsimbad.evaluators.base import is_lack_of_memory
 from deepsimbad.evaluators.compute import Compute, Runtime
 from deepsimbad.evaluators.extractors.network import NetworkExtractor
 from deepsimbad.evaluators.runtimes import make_run
 from deepsimbad.evaluators.weights.downloads import check_digest
-from deepsimbad.evaluators.weights.files import file_sha256
+from deepsimbad.evaluators.weights.files import encodings_sha256, file_sha256
 from deepsimbad.evaluators.weights.library import HUB, Argument
 from deepsimbad.evaluators.weights.lock import CHECKPOINTS, HUB_FOLDER, HubRecord, Lock
 
 _MEAN, _STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # ImageNet's, RGB
+_RECIPE = 1  # see `encodings_sha256`
 _NETWORK_EVENTS = {"urllib.Request", "socket.getaddrinfo", "socket.gethostbyname"}
 # A nested `torch.hub.load` asks this first, and is content with what is here where nobody answers.
 _BRANCH_QUESTION = re.compile(r"https://github\.com/[^/]+/[^/]+/tree/main/")
@@ -72,7 +74,8 @@ def torchhub(argument: str, compute: Compute) -> NetworkExtractor:
     width, height = record.input_size
     with _named_failures(extractor, f"cannot be run in {in_float32.runtime.value}"):
         run(np.zeros((1, height, width, 3), np.uint8))
-    return NetworkExtractor(run, record.encoding_dim, record.weights_sha256, record.input_size)
+    sha256 = encodings_sha256(record.weights_sha256, _RECIPE)
+    return NetworkExtractor(run, record.encoding_dim, sha256, record.input_size)
 
 
 class HubModule(nn.Module):
@@ -336,7 +339,7 @@ def _named_failures(extractor: str, what: str, tree: Path | None = None, watch: 
         raise
     except (Exception, SystemExit) as error:
         text = f"{type(error).__name__}: {error}"
-        if isinstance(error, MemoryError) or "allocate memory" in text or "out of memory" in text:
+        if is_lack_of_memory(error):
             raise OutOfMemoryError(f"there is too little memory for {extractor}") from error
         if watch is not None and watch.refused:
             raise MissingWeightsError(

@@ -38,6 +38,17 @@ def file_sha256(path: Path) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
+def encodings_sha256(weights_sha256: str, recipe: int) -> str:
+    """What encodings are told apart by: their weights, and what is done with them.
+
+    Args:
+        weights_sha256: Of the weights.
+        recipe: Counts up with whatever else changes an encoding (layers, grid, size, normalisation). The first adds
+            nothing, so what was encoded before recipes were counted stays comparable.
+    """
+    return weights_sha256 if recipe == 1 else hashlib.sha256(f"{weights_sha256} {recipe}".encode()).hexdigest()
+
+
 def load_checkpoint(path: Path) -> Any:
     """What `torch.save` wrote: tensors, numbers, texts, lists and dicts; a file that names any code runs nothing.
 
