@@ -23,7 +23,7 @@ from bench.nordland import kept_frames, season_folder
 from bench.recordings import RESULTS, real_recordings
 from deepsimbad.cli import run
 from deepsimbad_client.campus.writer import write_campus
-from deepsimbad_client.sources import open_source
+from deepsimbad_client.recordings.sources import open_source
 
 N_LANDMARKS, N_CAMPUS_LANDMARKS = 300, 290  # a campus of 300 frames has a few without ground truth
 CAMPUS_SEASONS = ("winter", "summer", "autumn")

@@ -29,7 +29,7 @@ from deepsimbad.evaluators.feature_l2 import FeatureL2
 from deepsimbad.evaluators.image import decode_image
 from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
 from deepsimbad_client.campus.writer import write_campus
-from deepsimbad_client.sources import open_source
+from deepsimbad_client.recordings.sources import open_source
 
 EXTRACTORS = ("gradient_grid", "efficientnet_lite0")
 NETVLAD = ("nr", "nq", "nq2")

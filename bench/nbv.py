@@ -26,7 +26,7 @@ from deepsimbad.jobs.encoded_traverse import encode_recording
 from deepsimbad.jobs.episodes import TestDrive
 from deepsimbad.jobs.experiment_nbv import CLAIRVOYANT, NbvConfig, NbvReport, nbv_stages, run_nbv
 from deepsimbad.jobs.progress import Progress
-from deepsimbad_client.sources import open_source
+from deepsimbad_client.recordings.sources import open_source
 
 Shares = NDArray[np.float64]
 _RESAMPLES = 2000

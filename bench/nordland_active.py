@@ -20,7 +20,7 @@ from deepsimbad_client.active_report import distance_table, localized_table, pla
 from deepsimbad_client.http.jobs import remap
 from deepsimbad_client.http.local_server import LocalServer
 from deepsimbad_client.http.upload import upload
-from deepsimbad_client.sources import open_source
+from deepsimbad_client.recordings.sources import open_source
 
 PLANNERS = ("default", "random", "constant:10", "constant:8", "constant:5", "nnql")
 EPISODES = 150

@@ -14,7 +14,7 @@ from PIL import Image
 from bench.recordings import RESULTS
 from deepsimbad_client.campus import PAPER_DATES
 from deepsimbad_client.commands.demo import SEASONS
-from deepsimbad_client.nclt import read_nclt
+from deepsimbad_client.recordings.nclt import read_nclt
 
 IMAGES = RESULTS.parent / "images"
 _PLACES = (0.08, 0.25, 0.42, 0.58, 0.75, 0.92)  # shares of the route

@@ -11,7 +11,7 @@ from deepsimbad_client.active_replay import active_replay
 from deepsimbad_client.active_report import localized_table, planner_table, summarise_active
 from deepsimbad_client.console import EpisodeBar
 from deepsimbad_client.http.client import Client
-from deepsimbad_client.recording import Recording
+from deepsimbad_client.recordings.recording import Recording
 from deepsimbad_client.report import write_summary
 from deepsimbad_client.stage import DEFAULT_PLANNER, Stage
 from deepsimbad_client.story import told

@@ -13,7 +13,7 @@ from deepsimbad_client.http.models import Domain
 from deepsimbad_client.http.upload import CONCURRENCY, in_order
 from deepsimbad_client.judge import TRUTH_WITHIN_M
 from deepsimbad_client.map_route import MapRoute
-from deepsimbad_client.recording import Recording
+from deepsimbad_client.recordings.recording import Recording
 from deepsimbad_client.replay import changed_map
 from deepsimbad_client.stage import DEFAULT_PLANNER, Stage
 

@@ -9,7 +9,7 @@ from deepsimbad_client.active_replay import active_replay
 from deepsimbad_client.active_report import distance_table, localized_table, planner_table, summarise_active
 from deepsimbad_client.console import REMARKS, EpisodeBar, as_json, show
 from deepsimbad_client.http.client import Client
-from deepsimbad_client.recording import Recording
+from deepsimbad_client.recordings.recording import Recording
 from deepsimbad_client.report import write_summary
 
 

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from deepsimbad_client.episode_log import EpisodeStep
 from deepsimbad_client.map_route import MapRoute, Truth, path_of_frames
-from deepsimbad_client.recording import Recording
+from deepsimbad_client.recordings.recording import Recording
 from deepsimbad_client.replay import rank_of_truth
 from deepsimbad_client.walk import Seen
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepsimbad_client.http.models import Localization
-from deepsimbad_client.recording import Frame
+from deepsimbad_client.recordings.recording import Frame
 
 HEADING_CHORD_M = 1.0
 """A direction of travel is that of the chord over this much of the path to either side."""

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from deepsimbad_client.map_route import Truth, path_of_frames
 from deepsimbad_client.plot_style import CHANCE, DOT, GRID, INK, LINE, new_figure, quiet, saved
-from deepsimbad_client.recording import Frame
+from deepsimbad_client.recordings.recording import Frame
 from deepsimbad_client.replay import Replay
 from deepsimbad_client.step_log import Step
 

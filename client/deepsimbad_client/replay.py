@@ -16,7 +16,7 @@ from deepsimbad_client.http.client import Client
 from deepsimbad_client.http.models import Domain
 from deepsimbad_client.http.upload import CONCURRENCY, UNUSABLE_IMAGE_CODES, in_order
 from deepsimbad_client.map_route import MapRoute, Truth, map_route_of, path_of_frames
-from deepsimbad_client.recording import Frame, Recording
+from deepsimbad_client.recordings.recording import Frame, Recording
 from deepsimbad_client.step_log import Step, StepLog
 
 TOLERANCE_M = 2.0

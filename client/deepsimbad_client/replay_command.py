@@ -9,10 +9,10 @@ from deepsimbad_client.active_replay_command import replay_actively
 from deepsimbad_client.commands import at_once, domain_option, json_flag, reading, serving
 from deepsimbad_client.console import REMARKS, ReplayBar, as_json, show
 from deepsimbad_client.http.client import Client
+from deepsimbad_client.recordings.sources import open_source
 from deepsimbad_client.replay import TOLERANCE_M
 from deepsimbad_client.replay import replay as replay_recording
 from deepsimbad_client.report import summarise, table, write_summary
-from deepsimbad_client.sources import open_source
 
 
 @click.command()

@@ -12,7 +12,7 @@ from deepsimbad_client.errors import ReplayError
 from deepsimbad_client.http.client import Client, Session
 from deepsimbad_client.http.models import Domain
 from deepsimbad_client.judge import Judge
-from deepsimbad_client.recording import Recording
+from deepsimbad_client.recordings.recording import Recording
 from deepsimbad_client.replay import changed_map, fetch_route
 from deepsimbad_client.walk import Seen, Walk, drive
 

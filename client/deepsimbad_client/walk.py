@@ -10,7 +10,7 @@ from deepsimbad_client.errors import BrokenFrameError, InvalidInputError, PastTh
 from deepsimbad_client.http.client import Session
 from deepsimbad_client.http.models import SessionAnswer
 from deepsimbad_client.http.upload import UNUSABLE_IMAGE_CODES
-from deepsimbad_client.recording import Frame, Recording, nearest_frame, positions_m
+from deepsimbad_client.recordings.recording import Frame, Recording
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Walk:
 
     def __init__(self, recording: Recording, input_size: tuple[int, int] | None) -> None:
         self.recording = recording
-        self.position_m = positions_m(recording)
+        self.position_m = np.array([frame.position_m for frame in recording.frames], np.float64)
         self._input_size = input_size
         if not len(self.position_m):
             raise ReplayError(f"{recording.name} has no frames to drive along")
@@ -99,9 +99,7 @@ class Walk:
             raise ReplayError(f"none of the frames of {self.recording.name} can be used")
         ahead = usable[self.position_m[usable] > beyond_m]
         usable = ahead if ahead.size else usable
-        along = self.position_m[usable]
-        nearest = nearest_frame(along, float(np.clip(commanded_m, along[0], along[-1])))
-        return int(usable[0 if nearest is None else nearest])
+        return int(usable[np.abs(self.position_m[usable] - commanded_m).argmin()])
 
     def view(self, row: int) -> dict[str, Any]:
         """What is seen there, as arguments of `Session.observe`.
@@ -109,10 +107,7 @@ class Walk:
         Raises:
             BrokenFrameError: The image cannot be read.
         """
-        if self.recording.encodings is not None:
-            return {"encoding": self.recording.encodings[row]}
-        image = self.recording.image(self.frame(row), self._input_size)
-        return {"image": image.body, "content_type": image.content_type}
+        return self.recording.view(row, self._input_size)
 
 
 def drive(

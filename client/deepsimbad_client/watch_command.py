@@ -8,7 +8,7 @@ from rich.console import Console
 from deepsimbad_client.active_replay import STEPS
 from deepsimbad_client.commands import reading, serving
 from deepsimbad_client.http.client import Client
-from deepsimbad_client.sources import open_source
+from deepsimbad_client.recordings.sources import open_source
 from deepsimbad_client.stage import DEFAULT_PLANNER, Stage
 from deepsimbad_client.watch import watch_episode, watch_session
 

@@ -21,7 +21,7 @@ import pytest
 from deepsimbad_client import Client
 from deepsimbad_client.campus import PAPER_DATES, write_campus
 from deepsimbad_client.http.local_server import LocalServer
-from deepsimbad_client.sources import open_source
+from deepsimbad_client.recordings.sources import open_source
 
 from .conftest import PROJECT, Page
 

@@ -18,9 +18,9 @@ from deepsimbad_client.campus import PAPER_DATES, write_campus
 from deepsimbad_client.http.jobs import remap
 from deepsimbad_client.http.local_server import LocalServer
 from deepsimbad_client.http.upload import upload
+from deepsimbad_client.recordings.sources import open_source
 from deepsimbad_client.replay import replay
 from deepsimbad_client.report import summarise
-from deepsimbad_client.sources import open_source
 
 N_FRAMES, N_LANDMARKS, TOLERANCE_M = 40, 20, 3.0
 pytestmark = pytest.mark.slow

@@ -1,7 +1,5 @@
 """Recordings become encodings beside positions; what cannot be used is counted."""
 
-from typing import ClassVar
-
 import cv2
 import numpy as np
 import pytest
@@ -11,8 +9,8 @@ from deepsimbad.evaluators.image import decode_image
 from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
 from deepsimbad.jobs.encoded_traverse import encode_recording
 from deepsimbad.store.frames import UNKNOWN_TIMESTAMP
-from deepsimbad_client.recording import Frame
-from deepsimbad_client.sources import open_source
+from deepsimbad_client.recordings.recording import Frame, Recording
+from deepsimbad_client.recordings.sources import open_source
 
 MAX_PIXELS = 1_000_000
 
@@ -98,25 +96,17 @@ def test_ready_encodings_are_taken_as_they_are(tmp_path, judge):
     assert encoded.route.x_m is None
 
 
-class Placed:
+def placed(*positions_m):
     """A recording that knows the ground coordinates of some frames."""
-
-    name = "placed"
-    left_out: ClassVar[dict[str, int]] = {}
-    encodings = np.eye(3, dtype=np.float32)
-
-    def __init__(self, *positions_m):
-        self.frames = tuple(
-            Frame(i, str(i), at, timestamp_us=i, x_m=None if i == 1 else 1.0 * i, y_m=2.0)
-            for i, at in enumerate(positions_m)
-        )
-
-    def image(self, frame, input_size):
-        raise AssertionError("ready encodings have no images")
+    frames = tuple(
+        Frame(i, str(i), at, timestamp_us=i, x_m=None if i == 1 else 1.0 * i, y_m=2.0)
+        for i, at in enumerate(positions_m)
+    )
+    return Recording("placed", frames, encodings=np.eye(3, dtype=np.float32))
 
 
 def test_ground_coordinates_and_times_are_kept(judge):
-    encoded = encode_recording(Placed(0, 1, 2), judge, MAX_PIXELS, ignore)
+    encoded = encode_recording(placed(0, 1, 2), judge, MAX_PIXELS, ignore)
     assert encoded.frames.timestamp_us.tolist() == [0, 1, 2]
     np.testing.assert_array_equal(encoded.route.x_m, [0.0, np.nan, 2.0])
     np.testing.assert_array_equal(encoded.route.y_m, [2.0, 2.0, 2.0])
@@ -124,4 +114,4 @@ def test_ground_coordinates_and_times_are_kept(judge):
 
 def test_positions_that_go_backwards_are_named(judge):
     with pytest.raises(InvalidRouteError, match="frame 2"):
-        encode_recording(Placed(0, 2, 1), judge, MAX_PIXELS, ignore)
+        encode_recording(placed(0, 2, 1), judge, MAX_PIXELS, ignore)

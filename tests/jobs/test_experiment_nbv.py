@@ -10,7 +10,7 @@ from deepsimbad.errors import CancelledError, InvalidMapConfigError
 from deepsimbad.jobs.encoded_traverse import encode_recording
 from deepsimbad.jobs.experiment_nbv import NbvConfig, NbvReport, nbv_stages, run_nbv
 from deepsimbad.jobs.progress import Progress
-from deepsimbad_client.sources import open_source
+from deepsimbad_client.recordings.sources import open_source
 
 QUICK = NbvConfig(n_landmarks=40, actions_m=(1.0, 2.0, 4.0), n_steps=4, training_episodes=60, episodes=60)
 PLANNERS = {"random", "constant_1", "constant_2", "constant_4", "clairvoyant", "nnql", "telling"}

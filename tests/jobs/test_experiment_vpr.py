@@ -14,7 +14,7 @@ from deepsimbad.errors import CancelledError, TooFewCandidatesError
 from deepsimbad.jobs.encoded_traverse import encode_recording
 from deepsimbad.jobs.experiment_vpr import VprConfig, run_vpr, vpr_stages
 from deepsimbad.jobs.progress import Progress
-from deepsimbad_client.sources import open_source
+from deepsimbad_client.recordings.sources import open_source
 
 MAX_PIXELS = 1
 TIED = 1e-6  # relevances this near are one number, whatever the order in which they were summed

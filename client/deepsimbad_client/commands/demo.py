@@ -25,10 +25,10 @@ from deepsimbad_client.http.jobs import remap
 from deepsimbad_client.http.local_server import LocalServer
 from deepsimbad_client.http.upload import upload
 from deepsimbad_client.plots import draw_all
-from deepsimbad_client.recording import Recording
+from deepsimbad_client.recordings.recording import Recording
+from deepsimbad_client.recordings.sources import open_source
 from deepsimbad_client.replay import Replay, replay
 from deepsimbad_client.report import summarise, write_summary
-from deepsimbad_client.sources import open_source
 from deepsimbad_client.stage import Stage
 
 DOMAIN = "campus"

@@ -9,13 +9,13 @@ import click
 
 from deepsimbad_client.commands import at_once, domain_option, json_flag, reading, serving
 from deepsimbad_client.console import REMARKS, UploadBar, as_json, show
-from deepsimbad_client.encodings import SUFFIXES
 from deepsimbad_client.errors import UnknownDomainError
-from deepsimbad_client.folder import FolderRecording
 from deepsimbad_client.http.client import Client
 from deepsimbad_client.http.upload import upload as upload_recording
-from deepsimbad_client.recording import Frame, Recording
-from deepsimbad_client.sources import open_source
+from deepsimbad_client.recordings.encodings import SUFFIXES
+from deepsimbad_client.recordings.folder import FolderRecording
+from deepsimbad_client.recordings.recording import Frame, Recording
+from deepsimbad_client.recordings.sources import open_source
 from deepsimbad_client.tables import place_table
 
 IMAGE_EVALUATOR = {"kind": "feature_l2"}
@@ -99,16 +99,14 @@ def _views(images: Iterable[str], input_size: tuple[int, int] | None) -> Iterato
     for name in images:
         path = Path(name)
         is_image = path.is_file() and path.suffix.lower() not in SUFFIXES
-        alone = FolderRecording(path.parent.name, path.parent, (Frame(0, path.name, 0.0),)) if is_image else None
-        recording = alone or open_source(name)
+        if is_image:
+            recording: Recording = FolderRecording(
+                name=path.parent.name, frames=(Frame(0, path.name, 0.0),), folder=path.parent
+            )
+        else:
+            recording = open_source(name)
         for row, frame in enumerate(recording.frames):
-            view: dict[str, Any]
-            if recording.encodings is not None:
-                view = {"encoding": recording.encodings[row]}
-            else:
-                image = recording.image(frame, input_size)
-                view = {"image": image.body, "content_type": image.content_type}
-            yield name if is_image else frame.name, view
+            yield name if is_image else frame.name, recording.view(row, input_size)
 
 
 def _make_domain_if_missing(

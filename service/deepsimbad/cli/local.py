@@ -37,7 +37,7 @@ from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.frames import TraverseFrames
 from deepsimbad.store.layout import checked_name
 from deepsimbad.store.traverses import Traverse
-from deepsimbad_client.sources import open_source
+from deepsimbad_client.recordings.sources import open_source
 
 _READING = {"read landmarks": 4.0, "read training": 4.0}
 _ACTIONS_M = tuple(float(metres) for metres in range(1, 11))

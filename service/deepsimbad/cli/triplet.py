@@ -14,7 +14,7 @@ from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.registry import EvaluatorConfig, make_evaluator
 from deepsimbad.jobs.encoded_traverse import EncodedTraverse, encode_recording
 from deepsimbad.jobs.progress import Progress
-from deepsimbad_client.sources import open_source
+from deepsimbad_client.recordings.sources import open_source
 
 READING_STAGES = {"read landmarks": 2.0, "read training": 2.0, "read test": 2.0}
 STANDARD_OUTPUT = Path("-")

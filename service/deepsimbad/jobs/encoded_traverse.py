@@ -18,7 +18,7 @@ from deepsimbad.evaluators.base import Evaluator, Image
 from deepsimbad.evaluators.image import decode_image
 from deepsimbad.store.frames import UNKNOWN_TIMESTAMP, TraverseFrames
 from deepsimbad_client.errors import BrokenFrameError
-from deepsimbad_client.recording import Recording
+from deepsimbad_client.recordings.recording import Recording
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from deepsimbad_client import Client, RetryPolicy
-from deepsimbad_client.recording import Recording
-from deepsimbad_client.sources import open_source
+from deepsimbad_client.recordings.recording import Recording
+from deepsimbad_client.recordings.sources import open_source
 
 N_IMAGES = 150
 ACTIONS_M = tuple(float(metres) for metres in range(1, 11))

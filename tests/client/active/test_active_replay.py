@@ -1,8 +1,9 @@
 """Active replays against a small service: what is driven, what is scored, and how they go on."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import httpx2
 import numpy as np
@@ -11,7 +12,7 @@ import pytest
 from deepsimbad_client import errors
 from deepsimbad_client.active_replay import ActiveReplay, active_replay
 from deepsimbad_client.episode_log import Episode
-from deepsimbad_client.recording import Recording, sliced
+from deepsimbad_client.recordings.recording import Recording
 from deepsimbad_client.walk import Walk
 
 PLANNERS = ("default", "random", "constant:3")
@@ -47,7 +48,7 @@ def test_the_robot_goes_where_it_is_sent(fake: Any, drive: Recording, tmp_path: 
 
 
 def test_moves_between_sparse_frames_are_told_as_they_were(fake: Any, drive: Recording, tmp_path: Path) -> None:
-    every_fourth = sliced(drive, slice(0, None, 4))
+    every_fourth = drive.sliced(slice(0, None, 4))
     (episode,) = driven(fake, every_fourth, tmp_path, planners=["constant:7"], episodes=1).episodes["constant:7"]
     assert [step.action_m for step in episode.steps[1:]] == [8.0] * 5
     moves = [path for path in fake.asked if path.endswith("observations")]
@@ -129,9 +130,9 @@ def test_a_damaged_line_is_named(fake: Any, drive: Recording, tmp_path: Path) ->
 
 def test_a_recording_too_short_for_its_moves(fake: Any, drive: Recording, tmp_path: Path) -> None:
     with pytest.raises(errors.ReplayError, match="fewer steps"):
-        driven(fake, sliced(drive, slice(0, 50)), tmp_path)
+        driven(fake, drive.sliced(slice(0, 50)), tmp_path)
     assert fake.sessions == {}
-    starts = {Walk(sliced(drive, slice(0, 51)), None).start(5, 10.0, 0, episode)[0] for episode in range(20)}
+    starts = {Walk(drive.sliced(slice(0, 51)), None).start(5, 10.0, 0, episode)[0] for episode in range(20)}
     assert starts == {0}
 
 
@@ -145,33 +146,20 @@ def test_starts_are_uniform_and_do_not_depend_on_how_many_there_are(drive: Recor
 
 
 def test_frames_that_cannot_be_used_are_passed_over(fake: Any, drive: Recording, tmp_path: Path) -> None:
-    class Torn:
-        """Every third frame is refused by the service as undecodable."""
-
-        name, frames, left_out = drive.name, drive.frames, drive.left_out
-        encodings: ClassVar[list[Any]] = [
-            row if at % 3 else row[:1] for at, row in enumerate(np.asarray(drive.encodings))
-        ]
-
-    replay = driven(fake, Torn(), tmp_path, planners=["constant:3"], episodes=3)
+    views = np.asarray(drive.encodings)
+    torn: Any = [row if at % 3 else row[:1] for at, row in enumerate(views)]  # those are refused as undecodable
+    replay = driven(fake, replace(drive, encodings=torn), tmp_path, planners=["constant:3"], episodes=3)
     for episode in replay.episodes["constant:3"]:
         assert all(step.index % 3 for step in episode.steps)
         assert all(step.action_m >= 0 for step in episode.steps)
-    every = Torn()
-    every.encodings = [row[:1] for row in np.asarray(drive.encodings)]
     with pytest.raises(errors.ReplayError, match="none of the"):
-        driven(fake, every, tmp_path / "none", planners=["constant:3"], episodes=1)
+        driven(fake, replace(drive, encodings=views[:, :1]), tmp_path / "none", planners=["constant:3"], episodes=1)
 
 
 def test_a_belief_without_room_for_the_move_is_given_up(fake: Any, drive: Recording, tmp_path: Path) -> None:
-    class Misleading:
-        """Looks like the route's end everywhere."""
-
-        name, frames, left_out = drive.name, drive.frames, drive.left_out
-        encodings = np.tile(np.array([148.0, 0.5], np.float32), (150, 1))
-
+    misleading = replace(drive, encodings=np.tile(np.array([148.0, 0.5], np.float32), (150, 1)))  # the end everywhere
     fake.doubt = 1e-6
-    (episode,) = driven(fake, Misleading(), tmp_path, planners=["constant:10"], episodes=1).episodes["constant:10"]
+    (episode,) = driven(fake, misleading, tmp_path, planners=["constant:10"], episodes=1).episodes["constant:10"]
     assert any(step.forgot for step in episode.steps)
     assert len(episode.steps) == 6
 

@@ -12,7 +12,7 @@ from rich.console import Console
 
 from deepsimbad_client import errors
 from deepsimbad_client.active_demo import compare_planners, steps_that_fit, tell_episode
-from deepsimbad_client.recording import Recording, sliced
+from deepsimbad_client.recordings.recording import Recording
 from deepsimbad_client.stage import Stage
 from deepsimbad_client.story import BLOCKS, belief_blocks, resampled
 from deepsimbad_client.watch import watch_episode, watch_session
@@ -118,5 +118,5 @@ def test_the_demos_active_half(fake: Any, drive: Recording, tmp_path: Path) -> N
     assert summary["n_episodes"] == 10
     assert {path.name for path in pictures} >= {"belief_by_step.png", "by_step.png"}
     assert steps_that_fit(drive, 10.0) == 7
-    assert steps_that_fit(sliced(drive, slice(0, 10)), 10.0) == 0
+    assert steps_that_fit(drive.sliced(slice(0, 10)), 10.0) == 0
     assert np.isfinite(summary["anr"]["default"])

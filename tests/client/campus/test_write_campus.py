@@ -8,7 +8,7 @@ from click.testing import CliRunner
 from deepsimbad_client.campus import PAPER_DATES, write_campus
 from deepsimbad_client.campus.command import campus_command
 from deepsimbad_client.errors import InvalidArgumentError, SourceError
-from deepsimbad_client.sources import open_source
+from deepsimbad_client.recordings.sources import open_source
 
 WINTER, SUMMER = PAPER_DATES["winter"], PAPER_DATES["summer"]
 

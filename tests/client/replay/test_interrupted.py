@@ -10,8 +10,8 @@ from deepsimbad_client import Client, errors
 from deepsimbad_client.http.jobs import remap
 from deepsimbad_client.http.models import Localization
 from deepsimbad_client.http.upload import UploadReport, in_order, upload
+from deepsimbad_client.recordings.sources import open_source
 from deepsimbad_client.replay import replay
-from deepsimbad_client.sources import open_source
 from deepsimbad_client.step_log import Step
 
 

@@ -12,7 +12,7 @@ from deepsimbad_client import Client, errors
 from deepsimbad_client.commands.group import run
 from deepsimbad_client.http.jobs import remap
 from deepsimbad_client.http.upload import upload
-from deepsimbad_client.sources import open_source
+from deepsimbad_client.recordings.sources import open_source
 
 from .conftest import serving
 

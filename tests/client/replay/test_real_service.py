@@ -15,9 +15,9 @@ from deepsimbad_client import AsyncClient, Client, errors
 from deepsimbad_client.commands.group import run
 from deepsimbad_client.http.jobs import remap
 from deepsimbad_client.http.upload import upload
+from deepsimbad_client.recordings.sources import open_source
 from deepsimbad_client.replay import replay
 from deepsimbad_client.report import summarise
-from deepsimbad_client.sources import open_source
 
 ENCODINGS = {"kind": "feature_l2", "extractor": "none"}
 

@@ -15,8 +15,8 @@ from deepsimbad_client.active_report import summarise_active
 from deepsimbad_client.commands.group import run
 from deepsimbad_client.http.jobs import follow_job, remap
 from deepsimbad_client.http.upload import upload
-from deepsimbad_client.recording import Recording
-from deepsimbad_client.sources import open_source
+from deepsimbad_client.recordings.recording import Recording
+from deepsimbad_client.recordings.sources import open_source
 
 PLANNERS = ["default", "nnql", "random", "constant:10"]
 

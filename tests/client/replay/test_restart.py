@@ -10,7 +10,7 @@ from deepsimbad_client.http.jobs import follow_job
 from deepsimbad_client.http.local_server import LocalServer
 from deepsimbad_client.http.models import Job
 from deepsimbad_client.http.upload import upload
-from deepsimbad_client.sources import open_source
+from deepsimbad_client.recordings.sources import open_source
 
 pytestmark = pytest.mark.slow
 

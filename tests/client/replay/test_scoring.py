@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from deepsimbad_client.errors import ReplayError
 from deepsimbad_client.heat import RelevanceHeat
 from deepsimbad_client.map_route import MapRoute, RoutePath, Truth, path_of_frames
-from deepsimbad_client.recording import Frame
+from deepsimbad_client.recordings.recording import Frame
 from deepsimbad_client.replay import Replay, rank_of_truth
 from deepsimbad_client.report import summarise
 from deepsimbad_client.step_log import Step, StepLog

@@ -9,22 +9,20 @@ a csv of 100-150 poses a second. People unpack the archives in several ways and 
                                               ROOT/ground_truth/DATE.csv
 """
 
-import threading
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from deepsimbad_client.errors import BrokenFrameError, SourceError
-from deepsimbad_client.ground_truth import MAX_GAP_S, read_ground_truth
-from deepsimbad_client.image_files import Image, as_jpeg, decode, read_file
-from deepsimbad_client.recording import EncodedImage, Frame
-from deepsimbad_client.undistortion import UndistortionMap, find_undistortion_file, load_undistortion
+from deepsimbad_client.recordings.ground_truth import MAX_GAP_S, read_ground_truth
+from deepsimbad_client.recordings.images import Image, as_jpeg, decode, read_file
+from deepsimbad_client.recordings.recording import EncodedImage, Frame, Recording
+from deepsimbad_client.recordings.undistortion import UndistortionMap, find_undistortion_file, load_undistortion
 
 FRONT_CAMERA = 5
 N_CAMERAS = 6
@@ -35,26 +33,23 @@ N_SIZE_PROBES = 9
 SUFFIXES = frozenset({".tiff", ".tif"})
 
 
-@dataclass(frozen=True, eq=False)
-class NcltRecording:
-    """The frames of one camera on one date that have ground truth, in time order; see `Recording`.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class NcltRecording(Recording):
+    """The frames of one camera on one date that have ground truth, in time order.
+
+    Frames have `timestamp_us`, x north, y east, heading and position along the ground truth. Left out are: "before or
+    after the ground truth", "gap in the ground truth", "missing in Cam<k>" (another camera has an image of that time),
+    "file name is not a time".
 
     Attributes:
-        name: The date.
-        images_dir: The camera's folder.
-        frames: With `timestamp_us`, x north, y east, heading and position along the ground truth.
-        left_out: Reasons: "before or after the ground truth", "gap in the ground truth", "missing in Cam<k>"
-            (another camera has an image of that time), "file name is not a time".
+        folder: The camera's.
+        probes: File names of a few frames spread over the drive.
         undistortion: Applied to the stored image before it is turned upright.
     """
 
-    name: str
-    images_dir: Path
-    frames: Sequence[Frame]
-    left_out: Mapping[str, int]
+    folder: Path
+    probes: Sequence[str]
     undistortion: UndistortionMap | None = None
-    encodings: NDArray[np.float32] | None = None
-    _probing: threading.Lock = field(default_factory=threading.Lock, repr=False)
 
     def image(self, frame: Frame, input_size: tuple[int, int] | None) -> EncodedImage:
         """Read a frame upright, no larger than asked, as JPEG; see `Recording.image`."""
@@ -64,15 +59,13 @@ class NcltRecording:
         """Read a frame, undistorted where asked, turned upright: 1232 wide, 1616 high in the dataset itself.
 
         Raises:
-            BrokenFrameError: missing, undecodable, or not of the size of the others.
+            BrokenFrameError: Missing, undecodable, or not of the size of the others.
         """
-        path = self.images_dir / frame.name
-        stored = decode(read_file(path), path, as_stored=True)
-        with self._probing:
-            expected = self.stored_size
-        if (stored.shape[1], stored.shape[0]) != expected:
+        stored = self._stored(frame.name)
+        size, expected = (stored.shape[1], stored.shape[0]), self.stored_size
+        if size != expected:
             raise BrokenFrameError(
-                f"{path} is {stored.shape[1]} x {stored.shape[0]}, the recording's images are "
+                f"{self.folder / frame.name} is {size[0]} x {size[1]}, the recording's images are "
                 f"{expected[0]} x {expected[1]}",
                 "wrong size",
             )
@@ -90,16 +83,19 @@ class NcltRecording:
         if self.undistortion is not None:
             return self.undistortion.size
         sizes: Counter[tuple[int, int]] = Counter()
-        for place in np.unique(np.linspace(0, len(self.frames) - 1, N_SIZE_PROBES).round().astype(int)):
-            path = self.images_dir / self.frames[place].name
+        for name in self.probes:
             try:
-                image = decode(read_file(path), path, as_stored=True)
+                image = self._stored(name)
             except BrokenFrameError:
                 continue
             sizes[image.shape[1], image.shape[0]] += 1
         most = max(sizes.values(), default=0)
         commonest = [size for size, n in sizes.items() if n == most]
         return commonest[0] if commonest and STORED_SIZE not in commonest else STORED_SIZE
+
+    def _stored(self, name: str) -> Image:
+        path = self.folder / name
+        return decode(read_file(path), path, as_stored=True)
 
 
 def read_nclt(
@@ -115,41 +111,48 @@ def read_nclt(
 
     Args:
         root: The folder that holds the dates (see the layouts at the top of this module).
-        date: The session's date, e.g. 2012-01-22.
+        date: The drive's date, e.g. 2012-01-22.
         camera: 0..5; 5 looks forward, 0 up.
         undistortion: A `U2D_Cam<k>_*.txt` or the folder of them; None: images stay as the lens made them.
         max_gap_s: Images between two ground-truth rows farther apart than this are left out.
         cache_dir: Where parsed undistortion tables are kept; None: the user's cache folder.
 
     Raises:
-        SourceError: no images, no ground truth, or no image that has ground truth.
+        SourceError: No images, no ground truth, or no image that has ground truth.
     """
     if not 0 <= camera < N_CAMERAS:
         raise SourceError(f"camera {camera}: NCLT has cameras 0 to {N_CAMERAS - 1}; 5 looks forward")
-    images_dir = _find_images(root, date, camera)
-    truth = read_ground_truth(_find_ground_truth(root, date))
-    names, n_not_times = _images_by_time(images_dir)
+    places = [above / date / "lb3" / f"Cam{camera}" for above in (root, root / "images")]
+    folder = _first(f"images of NCLT {date}", places, Path.is_dir)
+    truths = [
+        root / "ground_truth" / f"groundtruth_{date}.csv",
+        root / date / f"groundtruth_{date}.csv",
+        root / date / "groundtruth.csv",
+        root / "ground_truth" / f"{date}.csv",
+    ]
+    truth = read_ground_truth(_first(f"ground truth of NCLT {date}", truths, Path.is_file))
+    names, n_not_times = _images_by_time(folder)
     if not names:
-        raise SourceError(f"{images_dir} holds no image named <utime>.tiff")
+        raise SourceError(f"{folder} holds no image named <utime>.tiff")
     time_us = np.array(sorted(names), dtype=np.int64)
     poses = truth.at(time_us, max_gap_s)
     usable = np.flatnonzero(poses.covered & ~poses.in_gap)
+    if not len(usable):
+        raise SourceError(
+            f"none of the {len(names)} images in {folder} has ground truth, which covers "
+            f"{truth.time_us[0]} to {truth.time_us[-1]} microseconds: are they of one date?"
+        )
     left_out = {
         "before or after the ground truth": int((~poses.covered).sum()),
         "gap in the ground truth": int(poses.in_gap.sum()),
-        f"missing in Cam{camera}": _n_missing(images_dir, names),
+        f"missing in Cam{camera}": _n_missing(folder, names),
         "file name is not a time": n_not_times,
     }
-    if not len(usable):
-        raise SourceError(
-            f"none of the {len(names)} images in {images_dir} has ground truth, which covers "
-            f"{truth.time_us[0]} to {truth.time_us[-1]} microseconds: are they of one date?"
-        )
     frames = tuple(
         Frame(
-            index=index,
-            name=names[int(time_us[at])],
-            position_m=float(poses.position_m[at]),
+            index,
+            names[int(time_us[at])],
+            float(poses.position_m[at]),
             timestamp_us=int(time_us[at]),
             x_m=float(poses.x_m[at]),
             y_m=float(poses.y_m[at]),
@@ -160,57 +163,38 @@ def read_nclt(
     table = None
     if undistortion is not None:
         table = load_undistortion(find_undistortion_file(undistortion, camera), cache_dir)
-    counted = {reason: n for reason, n in left_out.items() if n}
-    return NcltRecording(name=date, images_dir=images_dir, frames=frames, left_out=counted, undistortion=table)
+    probed = np.unique(np.linspace(0, len(frames) - 1, N_SIZE_PROBES).round().astype(int))
+    return NcltRecording(
+        name=date,
+        frames=frames,
+        left_out={reason: n for reason, n in left_out.items() if n},
+        folder=folder,
+        probes=[frames[place].name for place in probed],
+        undistortion=table,
+    )
 
 
-def _find_images(root: Path, date: str, camera: int) -> Path:
-    looked = [folder / date / "lb3" / f"Cam{camera}" for folder in (root, root / "images")]
-    for folder in looked:
-        if folder.is_dir():
-            return folder
-    raise SourceError(f"no images of NCLT {date}: looked for {_listed(looked)}")
-
-
-def _find_ground_truth(root: Path, date: str) -> Path:
-    looked = [
-        root / "ground_truth" / f"groundtruth_{date}.csv",
-        root / date / f"groundtruth_{date}.csv",
-        root / date / "groundtruth.csv",
-        root / "ground_truth" / f"{date}.csv",
-    ]
-    for path in looked:
-        if path.is_file():
-            return path
-    raise SourceError(f"no ground truth of NCLT {date}: looked for {_listed(looked)}")
-
-
-def _listed(paths: Sequence[Path]) -> str:
-    return ", ".join(str(path) for path in paths)
+def _first(what: str, places: Sequence[Path], is_there: Callable[[Path], bool]) -> Path:
+    for place in places:
+        if is_there(place):
+            return place
+    raise SourceError(f"no {what}: looked for {', '.join(map(str, places))}")
 
 
 def _images_by_time(folder: Path) -> tuple[dict[int, str], int]:
     """List a camera's folder: Unix microseconds -> file name, and how many TIFFs are not named by a time."""
-    names: dict[int, str] = {}
-    n_not_times = 0
     try:
-        found = list(folder.iterdir())
+        paths = [path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and path.name[0] != "."]
     except OSError as error:
         raise SourceError(f"cannot read the folder {folder}: {error.strerror or error}") from error
-    for path in found:
-        if path.suffix.lower() not in SUFFIXES or path.name.startswith("."):
-            continue
-        if path.stem.isascii() and path.stem.isdigit() and len(path.stem) <= 18:
-            names[int(path.stem)] = path.name
-        else:
-            n_not_times += 1
-    return names, n_not_times
+    timed = [path for path in paths if path.stem.isascii() and path.stem.isdigit() and len(path.stem) <= 18]
+    return {int(path.stem): path.name for path in timed}, len(paths) - len(timed)
 
 
-def _n_missing(images_dir: Path, names: Mapping[int, str]) -> int:
+def _n_missing(folder: Path, names: Mapping[int, str]) -> int:
     """How many times of exposure the other cameras on disk have and this one lacks."""
     others: set[int] = set()
-    for folder in images_dir.parent.glob("Cam[0-9]"):
-        if folder != images_dir and folder.is_dir():
-            others.update(_images_by_time(folder)[0])
+    for other in folder.parent.glob("Cam[0-9]"):
+        if other != folder and other.is_dir():
+            others.update(_images_by_time(other)[0])
     return len(others - names.keys())

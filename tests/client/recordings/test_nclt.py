@@ -1,11 +1,12 @@
+import gzip
+
 import cv2
 import numpy as np
 import pytest
 
 from deepsimbad_client.errors import BrokenFrameError, SourceError
-from deepsimbad_client.nclt import read_nclt
-from deepsimbad_client.recording import positions_m
-from deepsimbad_client.sources import open_source
+from deepsimbad_client.recordings.nclt import read_nclt
+from deepsimbad_client.recordings.sources import open_source
 
 
 def decoded(encoded):
@@ -151,7 +152,7 @@ def test_a_standing_robot_stays_where_it_is(nclt_tree):
     nclt_tree.truth(nclt_tree.row(nclt_tree.start_us + 10_000 * i, x[i], y[i]) for i in range(len(x)))
     for i in range(199):
         nclt_tree.image_file(nclt_tree.start_us + 200_000 * i)
-    position = positions_m(open_source(nclt_tree.source))
+    position = np.array([frame.position_m for frame in open_source(nclt_tree.source).frames])
     assert position[25 + 145] - position[30] < 0.05, "30 s of standing"
     assert position[-1] == pytest.approx(10, abs=0.6)
     assert np.all(np.diff(position) >= 0)
@@ -179,3 +180,78 @@ def test_an_undistortion_table_of_another_size_stops_the_reading(nclt_tree, tmp_
     recording = read_nclt(nclt_tree.root, nclt_tree.date, undistortion=table, cache_dir=tmp_path / "cache")
     with pytest.raises(SourceError, match="2 x 2"):
         recording.image(recording.frames[0], None)
+
+
+@pytest.fixture
+def front(real_data, nclt_tree):
+    """The real front camera's frame at its true size in a tree of one second."""
+    sample = cv2.imread(str(real_data / "nclt" / "frames" / "cam5_sample.jpg"), cv2.IMREAD_COLOR)
+    assert sample.shape == (616, 808, 3), "half the resolution, as stored"
+    stored = cv2.resize(sample, (1616, 1232), interpolation=cv2.INTER_CUBIC)
+    nclt_tree.image_file(nclt_tree.start_us + 500_000, nclt_tree.tiff(stored))
+    nclt_tree.truth(nclt_tree.walk_north(1))
+    return open_source(nclt_tree.source)
+
+
+@pytest.mark.real_data
+def test_the_front_camera_is_upright_sky_up_ground_down(front):
+    image = decoded(front.image(front.frames[0], None)).astype(float)
+    assert image.shape == (1616, 1232, 3)
+    top, bottom = image[: 1616 // 3], image[-1616 // 3 :]
+    assert top.mean() > 1.2 * bottom.mean(), "the sky is brighter than the ground"
+    # One turned the wrong way, or mirrored, is told by the sun: it stands high and right of the middle.
+    sun_row, sun_column = np.unravel_index(cv2.blur(image.mean(axis=2), (101, 101)).argmax(), image.shape[:2])
+    assert sun_row < 1616 / 3
+    assert sun_column > 1232 / 2
+
+
+@pytest.mark.real_data
+def test_what_travels_is_small(front):
+    sent = front.image(front.frames[0], (320, 240))
+    assert decoded(sent).shape == (240, 320, 3)
+    assert len(sent.body) < 40_000
+
+
+@pytest.mark.real_data
+@pytest.mark.parametrize(("date", "length_km"), [("2012-01-08", 6.5), ("2012-08-04", 5.5)])
+@pytest.mark.real_data
+def test_a_real_drive(real_data, nclt_tree, date, length_km):
+    with gzip.open(real_data / "nclt" / "trajectories" / f"{date}.tum.txt.gz", "rt") as text:
+        track = np.loadtxt(text)
+    time_us = np.round(track[:, 0] * 1e6).astype(np.int64)
+    x, y = track[:, 1], track[:, 2]
+    # The files change from quaternions to roll, pitch, yaw in the middle; their w is 0 from there on.
+    yaw = np.where(track[:, 7] == 0, track[:, 6], 2 * np.arctan2(track[:, 6], track[:, 7]))
+    # As published: 100 rows a second, unfinished ones among them, and the pose trembling by a centimetre.
+    dense_us = np.arange(time_us[0], time_us[-1], 10_000)
+    rng = np.random.default_rng(0)
+    dense_x, dense_y = (np.interp(dense_us, time_us, axis) + rng.normal(0, 0.01, len(dense_us)) for axis in (x, y))
+    dense_yaw = np.interp(dense_us, time_us, np.unwrap(yaw))
+    broken = rng.random(len(dense_us)) < 0.01
+    rows = [
+        f"{t},NaN,NaN,NaN,NaN,NaN,NaN" if nan else nclt_tree.row(t, *pose)
+        for t, nan, *pose in zip(dense_us.tolist(), broken, dense_x, dense_y, dense_yaw, strict=True)
+    ]
+    nclt_tree.truth(rows)
+    asked_us = np.arange(time_us[0] - 2_000_000, time_us[-1] + 2_000_000, 200_000)
+    for utime in asked_us.tolist():
+        nclt_tree.image_file(utime, b"")
+    recording = open_source(nclt_tree.source)
+
+    assert len(recording.frames) + recording.left_out["before or after the ground truth"] == len(asked_us)
+    assert 19 <= recording.left_out["before or after the ground truth"] <= 21
+    position = np.array([frame.position_m for frame in recording.frames])
+    assert np.all(np.diff(position) >= 0)
+    assert position[-1] == pytest.approx(1000 * length_km, rel=0.01)
+    steps = np.hypot(np.diff(dense_x), np.diff(dense_y)).sum()
+    assert steps > 1.5 * position[-1], "summed as they are the poses go half as far again"
+
+    frames_us = np.array([frame.timestamp_us for frame in recording.frames])
+    frame_x, frame_y = (np.array([getattr(frame, axis) for frame in recording.frames]) for axis in ("x_m", "y_m"))
+    assert np.abs(frame_x - np.interp(frames_us, time_us, x)).max() < 0.06
+    assert np.abs(frame_y - np.interp(frames_us, time_us, y)).max() < 0.06
+    # Where the robot moves, it looks where it goes.
+    moving = np.flatnonzero(np.diff(position, prepend=0) > 0.15)
+    course = np.arctan2(np.gradient(frame_y), np.gradient(frame_x))
+    heading = np.array([frame.heading_rad for frame in recording.frames])
+    assert np.mean(np.cos(heading - course)[moving] > 0) > 0.97

@@ -11,11 +11,11 @@ import math
 import re
 from pathlib import Path
 
-from deepsimbad_client.encodings import SUFFIXES, read_encodings
 from deepsimbad_client.errors import SourceError
-from deepsimbad_client.folder import read_folder
-from deepsimbad_client.nclt import FRONT_CAMERA, read_nclt
-from deepsimbad_client.recording import Recording, sliced
+from deepsimbad_client.recordings.encodings import SUFFIXES, read_encodings
+from deepsimbad_client.recordings.folder import read_folder
+from deepsimbad_client.recordings.nclt import FRONT_CAMERA, read_nclt
+from deepsimbad_client.recordings.recording import Recording
 
 NCLT_PREFIX = "nclt:"
 
@@ -34,13 +34,13 @@ def open_source(
         undistortion: NCLT's undistortion table or the folder of them; None: not undistorted.
 
     Raises:
-        SourceError: there is no such recording, or it cannot be used; the message says why.
+        SourceError: There is no such recording, or it cannot be used; the message says why.
     """
     if not (math.isfinite(spacing_m) and spacing_m > 0):
         raise SourceError(f"a spacing of {spacing_m} m: frames must be more than 0 m apart")
     place, part = split_slice(source)
     recording = _open_whole(place, spacing_m, camera, undistortion)
-    return recording if part is None else sliced(recording, part)
+    return recording if part is None else recording.sliced(part)
 
 
 def split_slice(source: str) -> tuple[str, slice | None]:
@@ -50,15 +50,14 @@ def split_slice(source: str) -> tuple[str, slice | None]:
     not, where no such file exists either, is an error rather than silently the whole recording.
 
     Raises:
-        SourceError: what follows the `#` is neither.
+        SourceError: What follows the `#` is neither.
     """
     place, mark, ending = source.rpartition("#")
     if not mark:
         return source, None
     match = _SLICE.fullmatch(ending)
     if match:
-        start, stop, step = (None if number is None else int(number) for number in match.groups())
-        return place, slice(start, stop, step)
+        return place, slice(*(None if number is None else int(number) for number in match.groups()))
     if Path(source.removeprefix(NCLT_PREFIX)).expanduser().exists():
         return source, None
     raise SourceError(f"{source}: a slice is #START:STOP or #START:STOP:STEP in whole frames, not #{ending}")
@@ -66,10 +65,10 @@ def split_slice(source: str) -> tuple[str, slice | None]:
 
 def _open_whole(place: str, spacing_m: float, camera: int, undistortion: Path | None) -> Recording:
     if place.startswith(NCLT_PREFIX):
-        session = Path(place.removeprefix(NCLT_PREFIX)).expanduser()
-        if not session.name or session.name == "..":
+        drive = Path(place.removeprefix(NCLT_PREFIX)).expanduser()
+        if not drive.name or drive.name == "..":
             raise SourceError(f"{place}: expected nclt:ROOT/DATE, for example nclt:/data/nclt/2012-01-22")
-        return read_nclt(session.parent, session.name, camera=camera, undistortion=undistortion)
+        return read_nclt(drive.parent, drive.name, camera=camera, undistortion=undistortion)
     path = Path(place).expanduser()
     if not place or not path.exists():
         raise SourceError(

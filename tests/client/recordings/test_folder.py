@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from deepsimbad_client.errors import BrokenFrameError, SourceError
-from deepsimbad_client.sources import open_source
+from deepsimbad_client.recordings.sources import open_source
 
 
 @pytest.fixture

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepsimbad_client.errors import SourceError
-from deepsimbad_client.image_files import Image
+from deepsimbad_client.recordings.images import Image
 
 logger = logging.getLogger(__name__)
 
@@ -43,31 +43,18 @@ class UndistortionMap:
         return self.u.shape[1], self.u.shape[0]
 
     def apply(self, stored: Image) -> Image:
-        """Undistort an image in its stored orientation; what the camera did not see becomes black.
-
-        Raises:
-            SourceError: the image is not of the table's size.
-        """
-        if stored.shape[:2] != self.u.shape:
-            raise SourceError(
-                f"the undistortion table is for {self.size[0]} x {self.size[1]} images as stored, these are "
-                f"{stored.shape[1]} x {stored.shape[0]}"
-            )
+        """Undistort an image in its stored orientation; what the camera did not see becomes black."""
         return np.asarray(cv2.remap(stored, self.u, self.v, cv2.INTER_LINEAR), dtype=np.uint8)
 
 
 def find_undistortion_file(path: Path, camera: int) -> Path:
-    """Find one camera's table: `path` itself, or the one for the camera in the folder `path`.
-
-    Raises:
-        SourceError: there is none.
-    """
+    """Find one camera's table: `path` itself, or the one for the camera in the folder `path`; else SourceError."""
     if path.is_file():
         return path
-    found = sorted(path.glob(f"U2D_Cam{camera}_*.txt"))
-    if not found:
+    tables = sorted(path.glob(f"U2D_Cam{camera}_*.txt"))
+    if not tables:
         raise SourceError(f"no undistortion table for camera {camera}: looked for {path}/U2D_Cam{camera}_*.txt")
-    return found[0]
+    return tables[0]
 
 
 def load_undistortion(path: Path, cache_dir: Path | None = None) -> UndistortionMap:
@@ -79,9 +66,17 @@ def load_undistortion(path: Path, cache_dir: Path | None = None) -> Undistortion
             ($XDG_CACHE_HOME, else ~/.cache). A cache that cannot be written is done without.
 
     Raises:
-        SourceError: the file cannot be read or is not a complete table.
+        SourceError: The file cannot be read or is not a complete table.
     """
-    cached = (cache_dir or _user_cache()) / f"undistortion-{_fingerprint(path)}.npz"
+    try:
+        about = path.stat()
+    except OSError as error:
+        raise SourceError(f"cannot read the undistortion table {path}: {error.strerror or error}") from error
+    # Names this version of the file without reading its 60 MB.
+    identity = f"{path.resolve()}|{about.st_size}|{about.st_mtime_ns}"
+    caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    folder = cache_dir or caches / "deep-simbad"
+    cached = folder / f"undistortion-{hashlib.sha256(identity.encode()).hexdigest()[:24]}.npz"
     table = _read_cached(cached)
     if table is None:
         table = parse_undistortion(path)
@@ -131,21 +126,6 @@ def _header_allows(header: str, width: int, height: int) -> bool:
     return len(fields) != 2 or fields == [str(width), str(height)] or {width, height} <= as_written
 
 
-def _user_cache() -> Path:
-    base = os.environ.get("XDG_CACHE_HOME")
-    return (Path(base) if base else Path.home() / ".cache") / "deep-simbad"
-
-
-def _fingerprint(path: Path) -> str:
-    """Name this version of the file without reading its 60 MB: where it is, how long, and when it was changed."""
-    try:
-        about = path.stat()
-    except OSError as error:
-        raise SourceError(f"cannot read the undistortion table {path}: {error.strerror or error}") from error
-    identity = f"{path.resolve()}|{about.st_size}|{about.st_mtime_ns}"
-    return hashlib.sha256(identity.encode()).hexdigest()[:24]
-
-
 def _read_cached(cached: Path) -> UndistortionMap | None:
     try:
         # Opened here, because numpy leaves a file open that turns out not to be an archive.
@@ -160,14 +140,11 @@ def _read_cached(cached: Path) -> UndistortionMap | None:
 
 def _write_cached(cached: Path, table: UndistortionMap) -> None:
     """Write beside and rename, so that two readers starting together never see half a file."""
-    beside: Path | None = None
     try:
         cached.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=cached.parent, suffix=".npz.part", delete=False) as file:
-            beside = Path(file.name)
-            np.savez(file, u=table.u, v=table.v)
-        beside.replace(cached)
+        with tempfile.TemporaryDirectory(dir=cached.parent) as folder:
+            beside = Path(folder) / cached.name
+            np.savez(beside, u=table.u, v=table.v)
+            beside.replace(cached)
     except OSError as error:
         logger.warning("cannot keep the parsed undistortion table in %s: %s", cached.parent, error)
-        if beside is not None:
-            beside.unlink(missing_ok=True)

@@ -3,9 +3,9 @@ import logging
 import numpy as np
 import pytest
 
-from deepsimbad_client import undistortion
 from deepsimbad_client.errors import SourceError
-from deepsimbad_client.undistortion import find_undistortion_file, load_undistortion, parse_undistortion
+from deepsimbad_client.recordings import undistortion
+from deepsimbad_client.recordings.undistortion import find_undistortion_file, load_undistortion, parse_undistortion
 
 WIDTH, HEIGHT = 6, 4
 
