@@ -7,7 +7,6 @@ interface, as a robot's would.
 
 import signal
 import sys
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +14,12 @@ import click
 from rich.console import Console
 from rich.table import Table
 
-from deepsimbad_client.active_demo import EPISODES, compare_planners, steps_that_fit, tell_episode
+from deepsimbad_client.active_plots import draw_active
+from deepsimbad_client.active_replay import active_replay
+from deepsimbad_client.active_report import localized_table, planner_table, summarise_active
 from deepsimbad_client.campus import PAPER_DATES, write_campus
 from deepsimbad_client.campus.season import SeasonName
-from deepsimbad_client.console import FrameBar, JobBar, ReplayBar, UploadBar
+from deepsimbad_client.console import EpisodeBar, FrameBar, JobBar, ReplayBar, UploadBar
 from deepsimbad_client.errors import DeepSimbadClientError
 from deepsimbad_client.http.client import Client
 from deepsimbad_client.http.jobs import remap
@@ -29,26 +30,22 @@ from deepsimbad_client.recordings.recording import Recording
 from deepsimbad_client.recordings.sources import open_source
 from deepsimbad_client.replay import Replay, replay
 from deepsimbad_client.report import summarise, write_summary
-from deepsimbad_client.stage import Stage
+from deepsimbad_client.stage import DEFAULT_PLANNER, Stage
+from deepsimbad_client.story import told
 
 DOMAIN = "campus"
 SEASONS: tuple[SeasonName, SeasonName, SeasonName] = ("winter", "spring", "summer")
 LANDMARK_SEASON, MAP_SEASON, LIVE_SEASON = SEASONS
 # The one that ships comes last: it stays active.
 RELEVANCES = ("brute_force", "bag_of_landmarks", "simbad", "rrf", "standardised", "calibrated")
+STEPS = 10
+EPISODES = 10
+PLANNERS = (DEFAULT_PLANNER, "random", "constant:10")
 _N_LANDMARKS = 250
 _TRAINING_EPISODES = 2000
+_SEED = 0
 
 _say = Console(highlight=False, soft_wrap=True).print
-
-
-@dataclass(frozen=True)
-class Scored:
-    """What the live drive came to under one relevance."""
-
-    replay: Replay
-    summary: dict[str, Any]
-    bits_per_map_image: float | None
 
 
 @click.command()
@@ -67,12 +64,22 @@ def demo(folder: Path, frames: int, seed: int) -> None:
         _upload(client, drives)
         _say(f"4. Map {MAP_SEASON}, drive {LIVE_SEASON}: every relevance by the live service")
         n_landmarks = min(_N_LANDMARKS, len(drives[LANDMARK_SEASON].frames))
-        scored = {name: _drive(client, drives[LIVE_SEASON], name, n_landmarks, folder) for name in RELEVANCES}
-        _say(_table(scored))
+        table = Table("relevance", "ANR %", "R@1 %", "R@5 %", "median answer", caption="ANR: 0 is perfect, 50 chance")
+        for column in table.columns[1:]:
+            column.justify = "right"
+        driven = {name: _drive(client, drives[LIVE_SEASON], name, n_landmarks, folder) for name in RELEVANCES}
+        for name, (_, summary) in sorted(driven.items(), key=lambda item: item[1][1]["anr"]):
+            table.add_row(
+                f"{name} (default)" if name == RELEVANCES[-1] else name,
+                f"{summary['anr']:.2f}",
+                f"{summary['recall_at_1']:.1f}",
+                f"{summary['recall_at_5']:.1f}",
+                f"{summary['latency_ms']['median']:.1f} ms",
+            )
+        _say(table)
         _show_one(client, drives[LIVE_SEASON])
-        shipped = scored[RELEVANCES[-1]].replay
-        pictures = draw_all(shipped, shipped.folder)
-        pictures += _drive_actively(client, drives[LIVE_SEASON], folder / "active")
+        shipped, _ = driven[RELEVANCES[-1]]
+        pictures = draw_all(shipped, shipped.folder) + _drive_actively(client, drives[LIVE_SEASON], folder / "active")
         _say("8. Pictures: " + ", ".join(str(picture) for picture in pictures))
         if sys.stdin.isatty() and sys.stdout.isatty():
             _say(f"\nThe service stays up at {server.url} (API: {server.url}/docs). Ctrl-C ends it.")
@@ -91,10 +98,12 @@ def _upload(client: Client, drives: dict[str, Recording]) -> None:
         )
 
 
-def _drive(client: Client, live: Recording, relevance: str, n_landmarks: int, folder: Path) -> Scored:
-    """Map for one relevance and replay the live drive against it."""
+def _drive(
+    client: Client, live: Recording, relevance: str, n_landmarks: int, folder: Path
+) -> tuple[Replay, dict[str, Any]]:
+    """Map for one relevance and replay the live drive against it; what that came to."""
     with JobBar(f"mapping for {relevance}") as bar:
-        job = remap(
+        remap(
             client,
             DOMAIN,
             MAP_SEASON,
@@ -108,40 +117,38 @@ def _drive(client: Client, live: Recording, relevance: str, n_landmarks: int, fo
         driven = replay(client, live, DOMAIN, folder / "replays" / relevance, restart=True, on_progress=bar)
     summary = summarise(driven)
     write_summary(summary, driven.folder)
-    bits = (job.result or {}).get("metrics", {}).get("index_bits_per_map_image")
-    return Scored(driven, summary, bits)
+    return driven, summary
 
 
 def _drive_actively(client: Client, live: Recording, folder: Path) -> list[Path]:
     """One episode in words, then the default planner against blind moves; returns the pictures."""
     stage = Stage.of(client, live, DOMAIN)
-    steps = steps_that_fit(live, max(stage.domain.actions_m))
+    length_m = live.frames[-1].position_m - live.frames[0].position_m
+    steps = min(STEPS, int(length_m / 2 / max(stage.domain.actions_m)))  # half of the drive is left to start from
     if steps < 1:
         _say("6. The drive is too short for an active robot: give it more --frames")
         return []
     _say(f"6. An active robot, put down anywhere on the {LIVE_SEASON} drive, chooses its own next views:")
-    tell_episode(stage, steps, _say)
+    row, seed = stage.start(steps, _SEED, 0)
+    with stage.session(DEFAULT_PLANNER, seed) as session:
+        for _, step in stage.play(session, row, steps):
+            _say(f"   {told(step)}")
     _say(f"7. The same from {EPISODES} random starts, against blind moves:")
-    tables, pictures, _ = compare_planners(client, live, DOMAIN, folder, steps)
-    for table in tables:
-        _say(table)
-    return pictures
-
-
-def _table(scored: dict[str, Scored]) -> Table:
-    table = Table("relevance", "ANR %", "R@1 %", "R@5 %", "median answer", caption="ANR: 0 is perfect, 50 chance")
-    for column in table.columns[1:]:
-        column.justify = "right"
-    for name, each in sorted(scored.items(), key=lambda item: item[1].summary["anr"]):
-        figures = each.summary
-        table.add_row(
-            f"{name} (default)" if name == RELEVANCES[-1] else name,
-            f"{figures['anr']:.2f}",
-            f"{figures['recall_at_1']:.1f}",
-            f"{figures['recall_at_5']:.1f}",
-            f"{figures['latency_ms']['median']:.1f} ms",
+    with EpisodeBar("driving actively", len(PLANNERS) * EPISODES) as bar:
+        driven = active_replay(
+            *(client, live, DOMAIN, folder),
+            planners=PLANNERS,
+            episodes=EPISODES,
+            steps=steps,
+            seed=_SEED,
+            restart=True,
+            on_progress=bar,
         )
-    return table
+    summary = summarise_active(driven)
+    write_summary(summary, folder)
+    _say(planner_table(summary))
+    _say(localized_table(summary))
+    return draw_active(driven, summary, folder)
 
 
 def _show_one(client: Client, live: Recording) -> None:

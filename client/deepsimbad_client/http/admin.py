@@ -4,7 +4,7 @@ from collections.abc import AsyncGenerator, Callable, Mapping, Sequence
 from contextlib import aclosing, suppress
 from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypedDict, Unpack
 
 from pydantic import ValidationError
 
@@ -28,6 +28,34 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
 _JOBS = "/v1/admin/jobs"
+
+
+class RemapOptions(TypedDict, total=False):
+    """What a remap may be told; what is absent or None is left to the service's default."""
+
+    landmark_traverse: str | None
+    """Where landmarks are chosen; absent: the active map's landmarks stay."""
+    n_landmarks: int | None
+    """r, how many landmarks."""
+    list_length: int | None
+    """h, how many of them a map image keeps."""
+    relevance: str | None
+    """How a map image is compared with a query."""
+    training_episodes: int | None
+    """Length of the planner's training."""
+    seed: int | None
+    """Of whatever is random."""
+    activate: bool | None
+    """Whether the new map serves at once."""
+    check_traverse: str | None
+    """The drive that the new map and the active one are compared on."""
+    gate_margin: float | None
+    """By how many percentage points of ANR the new map may be worse and still be activated."""
+    append: bool | None
+    """Whether the traverse is added to a copy of the active map."""
+    same_route: bool | None
+    """Whether the training and the landmark traverse count their positions along one route; absent: only where both
+    know x, y. `second_season` of the job says whether the map learnt from both."""
 
 
 class AdminCalls(Face):
@@ -164,21 +192,30 @@ class AdminCalls(Face):
         return model_of(FramesStored, await self._wire.send(call))
 
     @shared
-    async def remap(self, /, domain: str, *, idempotency_key: str | None = None, **config: Any) -> Job:
+    async def remap(
+        self,
+        /,
+        domain: str,
+        *,
+        training_traverse: str,
+        idempotency_key: str | None = None,
+        **options: Unpack[RemapOptions],
+    ) -> Job:
         """Submit a remap and return its job at once; `deepsimbad_client.http.jobs.remap` also follows it.
 
         A lost answer is asked for again and makes no second job.
 
         Args:
             domain: The domain to map anew.
+            training_traverse: The traverse that becomes the map.
             idempotency_key: Names this request, so that it can be repeated after a `TransportError`; absent: a new one.
-            **config: `training_traverse` and, where they should differ from the service's defaults, the other arguments
-                of `deepsimbad_client.http.jobs.remap`.
+            **options: `RemapOptions`.
 
         Raises:
             TooManyJobsError: As many jobs wait as may.
         """
-        call = Call.with_json("POST", f"{_domain(domain)}/remaps", config, headers=once(idempotency_key))
+        document = {"training_traverse": training_traverse, **options}
+        call = Call.with_json("POST", f"{_domain(domain)}/remaps", document, headers=once(idempotency_key))
         return model_of(Job, await self._wire.send(call))
 
     @shared

@@ -106,7 +106,7 @@ class SessionCalls(Face):
         choose its key, and send the same again under it.
 
         Args:
-            image: As `Client.localize` takes it, and so the other forms of a view.
+            image: An encoded image (JPEG, PNG, TIFF, WebP) or its path, sent as it is.
             action_m: Metres really moved since the last view; absent: stood still. Ignored for the first view.
             action_std_m: How well that is known; absent: the service's usual odometry.
             content_type: The image's media type; absent: read from its first bytes.

@@ -2,8 +2,10 @@
 
 import time
 from collections.abc import Callable
+from typing import Unpack
 
 from deepsimbad_client.errors import ApiError, JobCancelledError, JobFailedError, TransportError
+from deepsimbad_client.http.admin import RemapOptions
 from deepsimbad_client.http.client import Client
 from deepsimbad_client.http.models import Job
 from deepsimbad_client.http.retry import RETRIED_STATUSES
@@ -18,40 +20,19 @@ def remap(
     domain: str,
     training_traverse: str,
     *,
-    landmark_traverse: str | None = None,
-    n_landmarks: int | None = None,
-    list_length: int | None = None,
-    relevance: str | None = None,
-    training_episodes: int | None = None,
-    seed: int | None = None,
-    activate: bool | None = None,
-    check_traverse: str | None = None,
-    gate_margin: float | None = None,
-    append: bool | None = None,
-    same_route: bool | None = None,
     on_progress: Callable[[Job], None] | None = None,
     patience_s: float = PATIENCE_S,
+    **options: Unpack[RemapOptions],
 ) -> Job:
-    """Make a new map of a domain and wait for it; what is None is left to the service's default.
+    """Make a new map of a domain and wait for it.
 
     Args:
         client: The client.
         domain: The domain to map.
         training_traverse: The traverse that becomes the map.
-        landmark_traverse: Where landmarks are chosen; None: the active map's landmarks stay.
-        n_landmarks: r, how many landmarks.
-        list_length: h, how many of them a map image keeps.
-        relevance: How a map image is compared with a query.
-        training_episodes: Length of the planner's training.
-        seed: Seed of whatever is random.
-        activate: Whether the new map serves at once.
-        check_traverse: The drive that the new map and the active one are compared on.
-        gate_margin: By how many percentage points of ANR the new map may be worse and still be activated.
-        append: Whether the traverse is added to a copy of the active map.
-        same_route: Whether the training and the landmark traverse count their positions along one route; None: only
-            where both know x, y. `metrics["second_season"]` of the result says whether the map learnt from both.
         on_progress: Told of the job each time something is heard of it; first when it is submitted.
         patience_s: Longest silence of the service that is waited out.
+        **options: What `RemapOptions` names.
 
     Returns:
         The job, succeeded; its `result` holds `map_version`, `active` and `metrics`. Where the new map lost against the
@@ -62,21 +43,7 @@ def remap(
         ApiError: The service refused the request.
         TransportError: Nothing was heard for `patience_s`.
     """
-    job = client.admin.remap(
-        domain,
-        training_traverse=training_traverse,
-        landmark_traverse=landmark_traverse,
-        n_landmarks=n_landmarks,
-        list_length=list_length,
-        relevance=relevance,
-        training_episodes=training_episodes,
-        seed=seed,
-        activate=activate,
-        check_traverse=check_traverse,
-        gate_margin=gate_margin,
-        append=append,
-        same_route=same_route,
-    )
+    job = client.admin.remap(domain, training_traverse=training_traverse, **options)
     if on_progress is not None:
         on_progress(job)
     return follow_job(client, job.job_id, on_progress, patience_s=patience_s)

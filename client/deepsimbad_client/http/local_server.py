@@ -5,6 +5,7 @@ import socket
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -62,20 +63,16 @@ class LocalServer:
                 stderr=log,
                 env={**os.environ, **self._environment},
             )
+        give_up_at = time.monotonic() + _READY_WITHIN_S
         try:
-            self._wait_until_ready()
+            while not self._is_ready():
+                if self._process.poll() is not None or time.monotonic() > give_up_at:
+                    lines = self.log_path.read_text(encoding="utf-8", errors="replace").splitlines()[-5:]
+                    raise DeepSimbadClientError(f"the service did not start; its log ends: {' | '.join(lines)}")
+                time.sleep(0.05)
         except BaseException:  # nobody else would end it
             self.stop()
             raise
-
-    def _wait_until_ready(self) -> None:
-        give_up_at = time.monotonic() + _READY_WITHIN_S
-        while not self._is_ready():
-            has_ended = self._process is None or self._process.poll() is not None
-            if has_ended or time.monotonic() > give_up_at:
-                lines = self.log_path.read_text(encoding="utf-8", errors="replace").splitlines()[-5:]
-                raise DeepSimbadClientError(f"the service did not start; its log ends: {' | '.join(lines)}")
-            time.sleep(0.05)
 
     @property
     def pid(self) -> int:
@@ -95,16 +92,11 @@ class LocalServer:
 
     def stop(self) -> None:
         """Ask it to end, then insist."""
-        if self._process is None:
-            return
-        if self._process.poll() is None:
+        if self._process is not None:
             self._process.terminate()
-            try:
+            with suppress(subprocess.TimeoutExpired):
                 self._process.wait(_STOPPED_WITHIN_S)
-            except subprocess.TimeoutExpired:
-                self._process.kill()
-                self._process.wait()
-        self._process = None
+            self.kill()
 
     def kill(self) -> None:
         """End it at once, as a power cut would."""

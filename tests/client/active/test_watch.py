@@ -1,17 +1,14 @@
 """A session in a terminal, and an episode in words."""
 
 import io
-from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
 from deepsimbad_client import errors
-from deepsimbad_client.active_demo import compare_planners, steps_that_fit, tell_episode
 from deepsimbad_client.recordings.recording import Recording
 from deepsimbad_client.stage import Stage
 from deepsimbad_client.story import BLOCKS, belief_blocks, resampled
@@ -106,17 +103,3 @@ def test_blocks_are_as_high_as_the_belief() -> None:
     assert line[3] == BLOCKS[-1]
     assert BLOCKS.index(line[2]) == 4
     assert belief_blocks([0.0, 0.0], 3) == "   "
-
-
-def test_the_demos_active_half(fake: Any, drive: Recording, tmp_path: Path) -> None:
-    said: list[str] = []
-    with fake.client() as client:
-        tell_episode(Stage.of(client, drive, "route"), 3, said.append)
-        tables, pictures, summary = compare_planners(client, drive, "route", tmp_path, 3)
-    assert [line.split()[0] for line in said] == ["It", "Move", "Move", "Move"]
-    assert len(tables) == 2
-    assert summary["n_episodes"] == 10
-    assert {path.name for path in pictures} >= {"belief_by_step.png", "by_step.png"}
-    assert steps_that_fit(drive, 10.0) == 7
-    assert steps_that_fit(drive.sliced(slice(0, 10)), 10.0) == 0
-    assert np.isfinite(summary["anr"]["default"])
