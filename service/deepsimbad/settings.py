@@ -10,7 +10,7 @@ from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from deepsimbad.errors import SettingsError
 from deepsimbad.evaluators.compute import DEFAULT_WEIGHTS_DIR, Compute, Device, Runtime
-from deepsimbad.jobs.job_priority import JobPriority
+from deepsimbad.jobs.child import JobPriority
 
 MEBIBYTE = 1024 * 1024
 _ORIGIN = re.compile(r"\*|[a-z][a-z0-9+.-]*://[^/\s*?#@]+")

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from starlette.testclient import TestClient
 
 from deepsimbad.api.app import create_app
-from deepsimbad.jobs.perform import InThisProcess
+from deepsimbad.jobs.runner import InThisProcess
 from deepsimbad.settings import Settings
 
 N_READY, DIM, N_LANDMARKS = 40, 8, 10

@@ -10,7 +10,7 @@ from starlette.testclient import TestClient
 
 from deepsimbad.api.app import create_app
 from deepsimbad.engine.maps import load_snapshot
-from deepsimbad.jobs.perform import InThisProcess
+from deepsimbad.jobs.runner import InThisProcess
 
 from .conftest import N_LANDMARKS, make_ready_domain, ready_encodings, remap, small_settings, wait_for
 

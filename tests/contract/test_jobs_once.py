@@ -10,7 +10,7 @@ import pytest
 from starlette.testclient import TestClient
 
 from deepsimbad.api.app import create_app
-from deepsimbad.jobs.perform import InThisProcess
+from deepsimbad.jobs.runner import InThisProcess
 
 from .conftest import make_ready_domain, ready_encodings, small_settings, wait_for
 

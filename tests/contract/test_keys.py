@@ -16,7 +16,7 @@ from starlette.testclient import TestClient
 from deepsimbad.api import routes
 from deepsimbad.api.app import create_app
 from deepsimbad.cli import run as deepsimbad
-from deepsimbad.jobs.perform import InThisProcess
+from deepsimbad.jobs.runner import InThisProcess
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.records import KeyScope
 

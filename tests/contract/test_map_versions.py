@@ -11,7 +11,7 @@ import pytest
 from starlette.testclient import TestClient
 
 from deepsimbad.api.app import create_app
-from deepsimbad.jobs.perform import InThisProcess
+from deepsimbad.jobs.runner import InThisProcess
 
 from .conftest import DIM, N_READY, NPZ, make_ready_domain, npz, ready_encodings, remap, small_settings
 

@@ -13,7 +13,7 @@ from starlette.testclient import TestClient
 
 from deepsimbad.api.app import create_app
 from deepsimbad.api.dependencies import Services
-from deepsimbad.jobs.perform import InThisProcess
+from deepsimbad.jobs.runner import InThisProcess
 from deepsimbad.store.catalog import Catalog
 
 from .conftest import N_READY, NPZ, make_ready_domain, npz, ready_encodings, remap, small_settings

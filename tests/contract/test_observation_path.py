@@ -11,7 +11,7 @@ from starlette.testclient import TestClient
 
 import deepsimbad
 from deepsimbad.api.app import create_app
-from deepsimbad.jobs.perform import InThisProcess
+from deepsimbad.jobs.runner import InThisProcess
 
 from .conftest import N_LANDMARKS, make_ready_domain, small_settings
 

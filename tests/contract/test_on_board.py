@@ -13,7 +13,7 @@ from starlette.testclient import TestClient
 
 from deepsimbad.api.app import create_app
 from deepsimbad.core.descriptor import pack_ranked_landmarks
-from deepsimbad.jobs.perform import InThisProcess
+from deepsimbad.jobs.runner import InThisProcess
 from deepsimbad_client import Client, Observation
 from deepsimbad_client.errors import LandmarkModelDiffersError
 from deepsimbad_client.http.on_board import OnBoardEncoder

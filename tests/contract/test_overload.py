@@ -10,7 +10,7 @@ from anyio.to_thread import current_default_thread_limiter, run_sync
 from starlette.testclient import TestClient
 
 from deepsimbad.api.app import create_app
-from deepsimbad.jobs.perform import InThisProcess
+from deepsimbad.jobs.runner import InThisProcess
 
 from .conftest import NPZ, make_ready_domain, small_settings
 

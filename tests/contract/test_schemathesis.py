@@ -20,7 +20,7 @@ import pytest
 from starlette.testclient import TestClient
 
 from deepsimbad.api.app import create_app
-from deepsimbad.jobs.perform import InThisProcess
+from deepsimbad.jobs.runner import InThisProcess
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.records import KeyScope
 
@@ -85,7 +85,7 @@ import sys
 from functools import partial
 from pathlib import Path
 from deepsimbad.api import server
-from deepsimbad.jobs.perform import InThisProcess
+from deepsimbad.jobs.runner import InThisProcess
 from deepsimbad.settings import Settings
 data_dir = Path(sys.argv[1])
 # A hundred processes for a hundred tiny jobs would only take the time of the requests.

@@ -15,7 +15,7 @@ from starlette.testclient import TestClient
 
 from deepsimbad.api import long_work
 from deepsimbad.api.app import create_app
-from deepsimbad.jobs.perform import InThisProcess
+from deepsimbad.jobs.runner import InThisProcess
 
 from .conftest import DIM, N_LANDMARKS, N_READY, encoded, make_ready_domain, picture, remap, small_settings
 

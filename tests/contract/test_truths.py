@@ -11,7 +11,7 @@ from starlette.testclient import TestClient
 
 from deepsimbad.api.app import create_app
 from deepsimbad.errors import UnavailableError
-from deepsimbad.jobs.perform import InThisProcess
+from deepsimbad.jobs.runner import InThisProcess
 
 from .conftest import N_READY, make_ready_domain, ready_encodings, remap, small_settings, wait_for
 

@@ -13,7 +13,7 @@ from starlette.testclient import TestClient
 from deepsimbad.api.app import create_app
 from deepsimbad.engine import encoders
 from deepsimbad.errors import InvalidWeightsError
-from deepsimbad.jobs.perform import InThisProcess
+from deepsimbad.jobs.runner import InThisProcess
 
 from .conftest import N_SEEN, encoded, make_ready_domain, picture, remap, small_settings
 

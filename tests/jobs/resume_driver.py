@@ -19,10 +19,9 @@ import numpy as np
 from deepsimbad.core.descriptor import rank_landmarks
 from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
 from deepsimbad.jobs.map_config import RemapConfig
-from deepsimbad.jobs.perform import InThisProcess
 from deepsimbad.jobs.progress import Progress
 from deepsimbad.jobs.remap import REMAP_STAGES, remap
-from deepsimbad.jobs.runner import JobRunner
+from deepsimbad.jobs.runner import InThisProcess, JobRunner
 from deepsimbad.jobs.session_walks import ExperienceConfig
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.frames import UNKNOWN_TIMESTAMP, TraverseFrames

@@ -23,18 +23,17 @@ from deepsimbad.errors import (
     TooFewCandidatesError,
     UnavailableError,
 )
-from deepsimbad.jobs.cores import available_cores, job_threads
-from deepsimbad.jobs.job_priority import JobPriority
-from deepsimbad.jobs.job_process import BrokenJobError, InAnotherProcess
+from deepsimbad.evaluators.compute import available_cores
+from deepsimbad.jobs.child import JobPriority
 from deepsimbad.jobs.map_config import RemapConfig
-from deepsimbad.jobs.perform import REMAP, InThisProcess
+from deepsimbad.jobs.runner import REMAP, BrokenJobError, InAnotherProcess, InThisProcess, job_threads
 from deepsimbad.store.checkpoints import Checkpoints
 from deepsimbad.store.map_file import read_map
 
 DOMAIN = "route"
 WITHIN_S = 30
 CONFIG = RemapConfig("drive", "other", n_landmarks=8, training_episodes=200)
-COMMAND = [sys.executable, "-P", "-m", "deepsimbad.jobs.job_child", "idle"]
+COMMAND = [sys.executable, "-P", "-m", "deepsimbad.jobs.child", "idle"]
 
 
 def never():
@@ -237,8 +236,8 @@ def test_without_its_parent_it_ends(catalog, job):
 SERVICE = """
 import sys, threading
 from pathlib import Path
-from deepsimbad.jobs.job_priority import JobPriority
-from deepsimbad.jobs.job_process import InAnotherProcess
+from deepsimbad.jobs.child import JobPriority
+from deepsimbad.jobs.runner import InAnotherProcess
 from deepsimbad.store.catalog import Catalog
 import logging
 logging.basicConfig(level=logging.INFO, stream=sys.stdout, format="%(pid)s")

@@ -11,9 +11,9 @@ import pytest
 
 from deepsimbad.core.relevance import Relevance
 from deepsimbad.jobs.map_config import RemapConfig
-from deepsimbad.jobs.perform import REMAP, InThisProcess
 from deepsimbad.jobs.progress import Progress
 from deepsimbad.jobs.remap import REMAP_STAGES, remap
+from deepsimbad.jobs.runner import REMAP, InThisProcess
 from deepsimbad.store.checkpoints import Checkpoints
 from deepsimbad.store.map_file import read_map
 from deepsimbad.store.map_table import ANY

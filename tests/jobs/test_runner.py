@@ -15,8 +15,7 @@ from deepsimbad.errors import (
     UnknownJobError,
 )
 from deepsimbad.jobs.map_config import RemapConfig
-from deepsimbad.jobs.perform import InThisProcess
-from deepsimbad.jobs.runner import JobRunner
+from deepsimbad.jobs.runner import InThisProcess, JobRunner
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.records import JobState
 

@@ -17,7 +17,6 @@ from deepsimbad.api.auth import AuthMiddleware, KeyRing
 from deepsimbad.api.decoders import Decoders
 from deepsimbad.api.dependencies import Services
 from deepsimbad.api.envelope import EnvelopeMiddleware
-from deepsimbad.api.job_watch import watched
 from deepsimbad.api.limits import BodyLimitMiddleware
 from deepsimbad.api.metrics import Metrics
 from deepsimbad.api.openapi import install_openapi
@@ -50,10 +49,7 @@ from deepsimbad.engine.warm_up import warm_up
 from deepsimbad.engine.worker import InferenceWorker, Priority
 from deepsimbad.errors import DeepSimbadError
 from deepsimbad.evaluators.registry import fallback
-from deepsimbad.jobs.cores import job_threads
-from deepsimbad.jobs.job_process import InAnotherProcess
-from deepsimbad.jobs.perform import RunJob
-from deepsimbad.jobs.runner import JobRunner
+from deepsimbad.jobs.runner import InAnotherProcess, JobRunner, RunJob, job_threads
 from deepsimbad.release import release
 from deepsimbad.settings import Settings
 from deepsimbad.store.catalog import Catalog
@@ -231,10 +227,7 @@ def _start(settings: Settings, metrics: Metrics, keys: KeyRing, run_job: RunJob,
         except DeepSimbadError:
             log.exception("a new map cannot be served", extra={"domain": domain})
 
-    def goes_on(job_id: str) -> bool:
-        return runner.gives_back(job_id)
-
-    runner = JobRunner(catalog, watched(run_job, metrics, goes_on), switched, settings.max_jobs)
+    runner = JobRunner(catalog, run_job, switched, settings.max_jobs, metrics.job_ended)
     parts.callback(runner.close)
     readiness = ReadinessCheck(
         catalog,

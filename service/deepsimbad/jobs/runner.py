@@ -1,45 +1,82 @@
-"""One thread that has jobs done one after the other and keeps their rows true."""
+"""Jobs: done one after the other, each in a process of its own so that no live query waits for one (decision 0011).
 
+A job whose process or service died starts again from what is durable, and makes one map.
+"""
+
+import dataclasses
+import json
 import logging
+import os
 import queue
+import signal
+import subprocess
+import sys
 import threading
-from collections.abc import Callable
-from typing import Any, TypeVar
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeAlias, TypeVar
 
 from deepsimbad.errors import (
     CancelledError,
     DamagedFileError,
     DeepSimbadError,
     IdempotencyKeyReusedError,
+    InvalidInputError,
     JobInterruptedError,
+    OutOfMemoryError,
     TooManyJobsError,
     UnavailableError,
     UnknownJobError,
 )
+from deepsimbad.evaluators.compute import available_cores
+from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
+from deepsimbad.jobs.child import JobPriority
+from deepsimbad.jobs.learn_online import LEARN_STAGES, learn_online, serve_learnt
 from deepsimbad.jobs.map_config import RemapConfig
-from deepsimbad.jobs.perform import REMAP, RunJob, error_document
-from deepsimbad.jobs.progress import ProgressState
-from deepsimbad.jobs.session_walks import EXPERIENCE, ExperienceConfig
+from deepsimbad.jobs.progress import Progress, ProgressState
+from deepsimbad.jobs.remap import REMAP_STAGES, remap
+from deepsimbad.jobs.remap_stages import RemapSize, remap_stages
+from deepsimbad.jobs.session_walks import EXPERIENCE, ExperienceConfig, walks_of
 from deepsimbad.store.catalog import Catalog
-from deepsimbad.store.checkpoints import remove_checkpoints
+from deepsimbad.store.checkpoints import Checkpoints, remove_checkpoints
 from deepsimbad.store.records import JobRecord, JobState
+from deepsimbad.store.sessions import SessionStore
 
 _log = logging.getLogger(__name__)
+REMAP = "remap"  # the kind of job
+_KINDS = (REMAP, EXPERIENCE)
 _MAX_WAITING = 100
 _RETRY_AFTER_S = 30  # a place is free when a job has ended, which takes longer than a query
 _WRITTEN_AGAIN_S = 1.0
+_THREAD_VARIABLES = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+_LOOK_AGAIN_S = 0.1
+_ENDS_WITHIN_S = 10.0  # after its last word
 
 _Written = TypeVar("_Written")
+RunJob: TypeAlias = Callable[[JobRecord, Callable[[ProgressState], None], Callable[[], bool]], dict[str, Any]]
+"""Does a job, whose row is the caller's to write: told of every new state, asking again and again if it is cancelled.
+
+Returns the job's result. Raises CancelledError, JobInterruptedError where the process that did it died, or what else is
+wrong by name.
+"""
+
+
+def job_threads(asked: int) -> int:
+    """The threads that a job beside a living service computes in; 0 asks for one less than there are cores."""
+    return asked or max(1, available_cores() - 1)
 
 
 class JobRunner:
-    """Runs remaps, and what sessions taught, in the order they came; first those that an earlier service left.
+    """Runs jobs in one thread, in the order they came; first those that an earlier service left.
 
     Args:
         catalog: Where jobs are recorded; `Catalog.discard_unfinished` has been called.
-        run_job: Does a job; called in one thread that lives until `close`.
+        run_job: Does a job; called in a thread that lives until `close`.
         on_activated: Called with the domain's name after a job activated a map.
         max_waiting: Jobs that may wait their turn.
+        on_ended: Called with a job's kind, how it ended, and the seconds it took.
     """
 
     def __init__(
@@ -48,11 +85,13 @@ class JobRunner:
         run_job: RunJob,
         on_activated: Callable[[str], None],
         max_waiting: int = _MAX_WAITING,
+        on_ended: Callable[[str, str, float], None] = lambda *_: None,
     ) -> None:
         self._catalog = catalog
         self._run_job = run_job
         self._on_activated = on_activated
         self._max_waiting = max_waiting
+        self._on_ended = on_ended
         self._submitting = threading.Lock()
         self._waiting: queue.Queue[str | None] = queue.Queue()
         self._cancelled: dict[str, threading.Event] = {}
@@ -83,9 +122,9 @@ class JobRunner:
             UnavailableError: The service is shutting down.
         """
         with self._submitting:
-            made = self.made_before(job_id, config)
-            if made is not None:
-                return made
+            earlier = self.made_before(job_id, config)
+            if earlier is not None:
+                return earlier
             if self._closing.is_set():
                 raise UnavailableError("the service is shutting down and takes no new job")
             if len(self._catalog.waiting_jobs()) >= self._max_waiting:
@@ -128,11 +167,6 @@ class JobRunner:
             event.set()
         return job
 
-    def gives_back(self, job_id: str) -> bool:
-        """Whether a job that stops now is left to the next service; False: it was cancelled, or nothing stops it."""
-        cancelled = self._cancelled.get(job_id)
-        return self._closing.is_set() and not (cancelled is not None and cancelled.is_set())
-
     def close(self) -> None:
         """Stop what runs and wait for its clean end; it and what is queued are left to the next service."""
         self._closing.set()
@@ -158,49 +192,70 @@ class JobRunner:
         except UnknownJobError:  # cancelled while it waited, and then its domain was deleted
             return
         if job.state is not JobState.RUNNING:  # cancelled while it waited
-            self._forget_checkpoints(job_id)
             return
-        cancelled = self._cancelled[job_id]
-        ending: dict[str, Any]
-        try:
-            result = self._run_job(
-                job,
-                lambda state: self._record(job_id, state),
-                lambda: cancelled.is_set() or self._closing.is_set(),
-            )
-            ending = self._succeeded(job, result)
-        except CancelledError as error:
-            self._written(self._clear_away)
-            if not cancelled.is_set():  # the service stops: nobody gave the job up
-                self._catalog.give_back_job(job_id)
-                return
-            ending = self._done_all_the_same(job) or {"state": JobState.CANCELLED, "error": error_document(error)}
-        except JobInterruptedError as error:
-            _log.error("a job's process died", extra={"job_id": job_id, "why": error.message})
-            self._written(self._clear_away)
-            ending = self._done_all_the_same(job) or {"state": JobState.FAILED, "error": error_document(error)}
-        except DeepSimbadError as error:
-            _log.warning("a job failed", extra={"job_id": job_id, "code": error.code, "why": error.message})
-            self._written(self._clear_away)
-            ending = {"state": JobState.FAILED, "error": error_document(error)}
-        except Exception:
-            _log.exception("a job broke", extra={"job_id": job_id})
-            broken = {"code": "internal_error", "message": "the job broke; the service's log tells where"}
-            ending = {"state": JobState.FAILED, "error": broken}
+        named = {"job_id": job_id, "domain": job.domain, "kind": job.kind}
+        _log.info("job started", extra={**named, "n_starts": job.n_starts})
+        began = time.perf_counter()
+        ending = self._ending(job, self._cancelled[job_id])
+        seconds = time.perf_counter() - began
+        told = {**named, "seconds": round(seconds, 2)}
+        if ending is None:
+            self._catalog.give_back_job(job_id)
+            _log.info("job stopped", extra=told)
+            return
         self._written(lambda: self._catalog.update_job(job_id, eta_s=None, **ending))
-        self._forget_checkpoints(job_id)
+        remove_checkpoints(self._catalog.data_dir, job_id)
+        state = ending["state"].value
+        error, result = ending.get("error"), ending.get("result")
+        told |= {"code": error["code"], "why": error["message"]} if error else {}
+        told |= {"map_version": result["map_version"], "active": result["active"]} if result else {}
+        _log.info("job ended", extra={**told, "state": state})
+        self._on_ended(job.kind, state, seconds)
+
+    def _ending(self, job: JobRecord, cancelled: threading.Event) -> dict[str, Any] | None:
+        """Do a job; answers what its row is to say, or None where the service stops: nobody gave the job up."""
+
+        def record(state: ProgressState) -> None:
+            try:
+                self._catalog.update_job(job.job_id, stage=state.stage, progress=state.progress, eta_s=state.eta_s)
+            except DeepSimbadError as error:  # no reason to give hours of work up
+                _log.warning("progress not recorded", extra={"job_id": job.job_id, "why": error.message})
+
+        try:
+            return self._succeeded(
+                job, self._run_job(job, record, lambda: cancelled.is_set() or self._closing.is_set())
+            )
+        except DeepSimbadError as error:
+            state = JobState.CANCELLED if isinstance(error, CancelledError) else JobState.FAILED
+            failed = {"state": state, "error": {"code": error.code, "message": error.message, **error.hints}}
+            about = {"job_id": job.job_id, "why": error.message}
+            if isinstance(error, JobInterruptedError):
+                _log.error("a job's process died", extra=about)
+            elif state is JobState.FAILED:
+                _log.warning("a job failed", extra={**about, "code": error.code})
+            self._written(self._clear_away)
+            if isinstance(error, CancelledError) and not cancelled.is_set():
+                return None
+            if isinstance(error, CancelledError | JobInterruptedError):  # perhaps behind its last step
+                sealed = self._catalog.map_of_job(job.domain, job.job_id)
+                if sealed is not None and sealed.activated_at is not None:
+                    result = {"map_version": sealed.version, "active": True, "metrics": sealed.metrics}
+                    return self._succeeded(job, result)
+            return failed
+        except Exception:
+            _log.exception("a job broke", extra={"job_id": job.job_id})
+            broken = {"code": "internal_error", "message": "the job broke; the service's log tells where"}
+            return {"state": JobState.FAILED, "error": broken}
 
     def _succeeded(self, job: JobRecord, result: dict[str, Any]) -> dict[str, Any]:
         if result["active"]:
             self._on_activated(job.domain)
         return {"state": JobState.SUCCEEDED, "result": result, "progress": 1.0}
 
-    def _done_all_the_same(self, job: JobRecord) -> dict[str, Any] | None:
-        """The ending of a job that was stopped, or died, behind its last step; None where it was before that."""
-        made = self._catalog.map_of_job(job.domain, job.job_id)
-        if made is None or made.activated_at is None:
-            return None
-        return self._succeeded(job, {"map_version": made.version, "active": True, "metrics": made.metrics})
+    def _clear_away(self) -> None:
+        """Discard the map that a killed process was building."""
+        for line in self._catalog.discard_abandoned_maps():
+            _log.info("discarded", extra={"what": line})
 
     def _written(self, write: Callable[[], _Written]) -> _Written:
         """Write to the catalog, and again until a full disk has room; no job waits for ever for its end to be noted.
@@ -219,19 +274,218 @@ class JobRunner:
                 if self._closing.wait(_WRITTEN_AGAIN_S):
                     raise
 
-    def _clear_away(self) -> None:
-        """Discard the map that a killed process was building."""
-        for line in self._catalog.discard_abandoned_maps():
-            _log.info("discarded", extra={"what": line})
 
-    def _forget_checkpoints(self, job_id: str) -> None:
-        try:
-            remove_checkpoints(self._catalog.data_dir, job_id)
-        except DeepSimbadError as error:  # the next start sweeps them away
-            _log.warning("checkpoints not removed", extra={"job_id": job_id, "why": error.message})
+@dataclass(frozen=True)
+class InThisProcess:
+    """Does jobs in the caller's thread: in a job's own process, for commands and tests.
 
-    def _record(self, job_id: str, state: ProgressState) -> None:
+    Attributes:
+        data_dir: The data directory; the catalog and the sessions are opened anew.
+        n_threads: Threads to compute in.
+    """
+
+    data_dir: Path
+    n_threads: int = 1
+
+    def __call__(
+        self, job: JobRecord, on_progress: Callable[[ProgressState], None], is_cancelled: Callable[[], bool]
+    ) -> dict[str, Any]:
+        """As `RunJob`."""
+        if job.kind not in _KINDS:
+            raise InvalidInputError(f"this release does no job of the kind {job.kind!a}", known=_KINDS)
+        progress = Progress(self._stages(job), on_progress, is_cancelled)
         try:
-            self._catalog.update_job(job_id, stage=state.stage, progress=state.progress, eta_s=state.eta_s)
-        except DeepSimbadError as error:  # no reason to give hours of work up
-            _log.warning("progress not recorded", extra={"job_id": job_id, "why": error.message})
+            with (
+                Catalog.open(self.data_dir) as catalog,
+                Checkpoints.open(self.data_dir, job.job_id, progress.check) as checkpoints,
+            ):
+                progress.check()
+                if job.kind == EXPERIENCE:
+                    return self._learn(catalog, job, progress)
+                evaluator = make_evaluator(evaluator_config(catalog.domain(job.domain).evaluator))
+                config = RemapConfig.from_dict(job.config)
+                return remap(catalog, job.domain, config, evaluator, progress, checkpoints, self.n_threads)
+        except MemoryError as error:
+            raise OutOfMemoryError("too little memory is left for the job") from error
+
+    def _stages(self, job: JobRecord) -> dict[str, float]:
+        if job.kind == EXPERIENCE:
+            return LEARN_STAGES
+        config = RemapConfig.from_dict(job.config)
+        try:
+            return remap_stages(config, RemapSize.of(self.data_dir, job.domain, config))
+        except DeepSimbadError:  # the stage that needs the traverse will say so
+            return REMAP_STAGES
+
+    def _learn(self, catalog: Catalog, job: JobRecord, progress: Progress) -> dict[str, Any]:
+        sealed = catalog.map_of_job(job.domain, job.job_id)
+        if sealed is not None:  # what it learnt is in there; a second time would count double
+            return serve_learnt(catalog, job.domain, sealed, progress)
+        with SessionStore.open(self.data_dir) as sessions:
+            walks = walks_of(sessions, catalog, job.domain, job.config["session_id"])
+        return learn_online(catalog, job.domain, walks, progress, job_id=job.job_id)
+
+
+class BrokenJobError(Exception):
+    """A job broke by a fault of its own; the notes hold the child's stack, for the log alone."""
+
+
+@dataclass(frozen=True)
+class InAnotherProcess:
+    """Does every job in a child process that gives way to this one and dies with it.
+
+    Call it from a thread that lives as long as the child may: Linux ties the child to the thread that started it.
+
+    Attributes:
+        data_dir: The data directory.
+        n_threads: Threads the child computes in.
+        priority: How far the child gives way to everything else.
+        stops_within_s: A child that does not stop so soon after a cancel is killed, which harms nothing either.
+    """
+
+    data_dir: Path
+    n_threads: int
+    priority: JobPriority = JobPriority.IDLE
+    stops_within_s: float = 3.0
+
+    def __call__(
+        self, job: JobRecord, on_progress: Callable[[ProgressState], None], is_cancelled: Callable[[], bool]
+    ) -> dict[str, Any]:
+        """As `RunJob`."""
+        child = self._start(job)
+        _log.info("a job's process started", extra={"job_id": job.job_id, "pid": child.pid})
+        with child:
+            try:
+                for message in _messages(child, is_cancelled, self.stops_within_s):
+                    match message:
+                        case {"progress": progress}:
+                            on_progress(ProgressState(**progress))
+                        case {"log": record}:
+                            _log_here(record, job.job_id)
+                        case {"said": line}:
+                            _log.warning("the job's process said", extra={"job_id": job.job_id, "line": line})
+                        case {"error": {"code": code, "message": text, "hints": hints}}:
+                            raise _error_class(code)(text, **hints)
+                        case {"broken": stack}:
+                            broken = BrokenJobError("in the job's process:")
+                            broken.add_note(stack)
+                            raise broken
+                        case {"result": result}:
+                            return dict(result)
+                raise _death(child.wait(), is_cancelled())
+            finally:
+                _end(child)
+
+    def _start(self, job: JobRecord) -> "subprocess.Popen[bytes]":
+        order = {
+            "job": dataclasses.asdict(job),
+            "data_dir": str(self.data_dir.resolve()),
+            "n_threads": self.n_threads,
+            "parent_pid": os.getpid(),
+            "log_level": logging.getLogger("deepsimbad").getEffectiveLevel(),
+        }
+        try:
+            child = subprocess.Popen(  # noqa: S603 - our own interpreter and module
+                [sys.executable, "-P", "-m", "deepsimbad.jobs.child", self.priority],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+                env={**os.environ, **dict.fromkeys(_THREAD_VARIABLES, str(self.n_threads))},
+                process_group=0,  # Ctrl-C is for the service alone; as a session of its own it would be its equal
+            )
+        except OSError as error:
+            raise UnavailableError(
+                f"no process could be started for the job: {error.strerror}", reason="no_process"
+            ) from error
+        _send(child, json.dumps(order).encode())
+        return child
+
+
+def _messages(
+    child: "subprocess.Popen[bytes]", is_cancelled: Callable[[], bool], stops_within_s: float
+) -> Iterator[dict[str, Any]]:
+    """What a child says, until it says no more; a cancel is handed on, and enforced where it is not obeyed."""
+    lines: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
+
+    def read() -> None:
+        for line in child.stdout or ():
+            lines.put(line)
+        lines.put(None)
+
+    threading.Thread(target=read, name="a job's words", daemon=True).start()
+    kill_at: float | None = None
+    line: bytes | None = b""
+    while line is not None:
+        try:
+            line = lines.get(timeout=_LOOK_AGAIN_S)
+        except queue.Empty:
+            line = b""
+        if line and line.strip():
+            yield _message(line)
+        if kill_at is None and is_cancelled():
+            _send(child, b"cancel")
+            kill_at = time.monotonic() + stops_within_s
+        elif kill_at is not None and time.monotonic() > kill_at:
+            child.kill()
+
+
+def _message(line: bytes) -> dict[str, Any]:
+    try:
+        message = json.loads(line)
+    except ValueError:  # what a library printed, or the half of a line that its death cut off
+        message = None
+    return message if isinstance(message, dict) else {"said": line.decode("utf-8", "replace").rstrip()}
+
+
+def _send(child: "subprocess.Popen[bytes]", line: bytes) -> None:
+    try:
+        if child.stdin is not None:
+            child.stdin.write(line + b"\n")
+            child.stdin.flush()
+    except BrokenPipeError:  # it has died; what it said last tells more
+        return
+
+
+def _end(child: "subprocess.Popen[bytes]") -> None:
+    """Nothing of a child is left, whatever happened."""
+    if child.stdin is not None:
+        child.stdin.close()
+    try:
+        child.wait(_ENDS_WITHIN_S)
+    except subprocess.TimeoutExpired:
+        child.kill()
+        child.wait()
+
+
+def _death(code: int, is_cancelled: bool) -> DeepSimbadError:
+    """Why a child ended without a last word."""
+    if is_cancelled:
+        return CancelledError("cancelled; it was killed, because it did not stop by itself")
+    if code >= 0:
+        return JobInterruptedError(f"the job's process ended with code {code}: start it again", exit_code=code)
+    try:
+        name = signal.Signals(-code).name
+    except ValueError:  # a real-time signal
+        name = f"signal {-code}"
+    why = ", as the system does where memory runs out" if -code == signal.SIGKILL else ""
+    return JobInterruptedError(f"the job's process was ended by {name}{why}: start it again", signal=name)
+
+
+def _log_here(record: dict[str, Any], job_id: str) -> None:
+    """Write a record of the child to this process's log."""
+    levelname = logging.getLevelName(record["levelno"])
+    plain = {"name": record["name"], "levelno": record["levelno"], "levelname": levelname}
+    text = {"msg": "%s", "args": (record["msg"],)}
+    logging.getLogger(record["name"]).handle(
+        logging.makeLogRecord({**record["extra"], **plain, **text, "job_id": job_id})
+    )
+
+
+def _error_class(code: str) -> type[DeepSimbadError]:
+    """The class of the tree that has a code; the root where none has."""
+    waiting: list[type[DeepSimbadError]] = [DeepSimbadError]
+    for candidate in waiting:
+        if candidate.code == code:
+            return candidate
+        waiting.extend(candidate.__subclasses__())
+    return DeepSimbadError

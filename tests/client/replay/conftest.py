@@ -11,7 +11,7 @@ import pytest
 import uvicorn
 
 from deepsimbad.api.app import create_app
-from deepsimbad.jobs.perform import InThisProcess
+from deepsimbad.jobs.runner import InThisProcess
 from deepsimbad.settings import Settings
 
 

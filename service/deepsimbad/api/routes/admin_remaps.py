@@ -11,7 +11,7 @@ from deepsimbad.api.rendering import render_job
 from deepsimbad.api.schemas import JobAnswer
 from deepsimbad.errors import NoActiveMapError
 from deepsimbad.jobs.known_frames import refuse_known_traverse
-from deepsimbad.jobs.perform import REMAP
+from deepsimbad.jobs.runner import REMAP
 from deepsimbad.store.traverses import Traverse
 
 router = APIRouter(prefix="/v1/admin/domains", tags=["admin: maps"])

@@ -1,0 +1,123 @@
+"""The process of one job: `python -m deepsimbad.jobs.child PRIORITY`, started by `jobs.runner` (decision 0011).
+
+It says everything as JSON lines on its standard output, and takes from its standard input one line that says which job,
+then perhaps one more, which cancels. When its input ends, its parent is dead and it ends at once.
+
+Nothing heavy is imported before the priority is low: threads inherit it from the one that starts them.
+"""
+
+import ctypes
+import faulthandler
+import json
+import logging
+import os
+import signal
+import sys
+import threading
+import traceback
+from contextlib import suppress
+from enum import StrEnum
+from pathlib import Path
+from typing import Any
+
+_LOWEST_NICE = 19
+_PR_SET_PDEATHSIG = 1
+_KILL_ME_FIRST = 500  # of 1000: where memory runs out, the kernel shall end the job rather than the service
+_ORPHANED = 3  # exit code
+
+
+class JobPriority(StrEnum):
+    """How far a job gives way to whatever else runs on the machine, from the politest on."""
+
+    IDLE = "idle"
+    LOW = "low"
+    NORMAL = "normal"
+
+
+def take_priority(priority: JobPriority) -> None:
+    """Let this process, and the threads it starts from now on, run so; what a system does not have is left out.
+
+    Idle takes the machine only while nobody else wants it. Low, batch work at nice 19, still keeps about a seventieth
+    of a contended core, so that it goes on where others never rest, and, worse for them, is not preempted by a thread
+    that wakes up. An idle-class thread is preempted at once, and the kernel (since 5.4) counts a core that runs
+    nothing else as free when it places a waking thread.
+    """
+    if priority is JobPriority.NORMAL:
+        return
+    with suppress(OSError):
+        os.nice(_LOWEST_NICE)
+    if hasattr(os, "SCHED_IDLE"):
+        with suppress(OSError):
+            kind = os.SCHED_IDLE if priority is JobPriority.IDLE else os.SCHED_BATCH
+            os.sched_setscheduler(0, kind, os.sched_param(0))
+
+
+_writing = threading.Lock()
+
+
+def _tell(**message: Any) -> None:
+    """Send one message, on a line of its own whatever a library has printed."""
+    with _writing, suppress(BrokenPipeError):  # the parent is gone, and this process soon as well
+        os.write(1, b"\n" + json.dumps(message, default=str).encode() + b"\n")
+
+
+class _LogToParent(logging.Handler):
+    """Sends log records as messages."""
+
+    _PLAIN = frozenset(logging.makeLogRecord({}).__dict__) | {"message", "taskName"}
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Send one record."""
+        extra = {name: value for name, value in record.__dict__.items() if name not in self._PLAIN}
+        if record.exc_info:
+            extra["exception"] = logging.Formatter().formatException(record.exc_info)
+        _tell(log={"name": record.name, "levelno": record.levelno, "msg": record.getMessage(), "extra": extra})
+
+
+def _listen(commands: Any, cancelled: threading.Event) -> None:
+    """Wait for the one thing that may follow the order, or for the end."""
+    while commands.readline():
+        cancelled.set()
+    os._exit(_ORPHANED)
+
+
+def main() -> None:
+    """Do the job that standard input names."""
+    for signal_number in (signal.SIGINT, signal.SIGTERM):  # meant for the service, which then stops its job itself
+        signal.signal(signal_number, signal.SIG_IGN)
+    take_priority(JobPriority(sys.argv[1]))
+    with suppress(OSError):
+        Path("/proc/self/oom_score_adj").write_text(str(_KILL_ME_FIRST), encoding="ascii")
+    faulthandler.enable()
+    line = sys.stdin.buffer.readline()
+    if not line.endswith(b"\n"):
+        os._exit(_ORPHANED)
+    order, cancelled = json.loads(line), threading.Event()
+    if sys.platform == "linux":  # the kernel ends this process with its parent at once, the listener a little later
+        with suppress(OSError, AttributeError):
+            ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
+    if os.getppid() != order["parent_pid"]:  # it died before that
+        os._exit(_ORPHANED)
+    threading.Thread(target=_listen, args=(sys.stdin.buffer, cancelled), name="parent", daemon=True).start()
+    logging.getLogger().addHandler(_LogToParent())
+    logging.getLogger("deepsimbad").setLevel(order["log_level"])
+    logging.captureWarnings(True)
+
+    from deepsimbad.errors import DeepSimbadError  # noqa: PLC0415 - nothing heavy before the priority is low
+    from deepsimbad.jobs.runner import InThisProcess  # noqa: PLC0415
+    from deepsimbad.store.records import JobRecord, JobState  # noqa: PLC0415
+
+    job = JobRecord(**{**order["job"], "state": JobState(order["job"]["state"])})
+    run_job = InThisProcess(Path(order["data_dir"]), order["n_threads"])
+    try:
+        result = run_job(job, lambda state: _tell(progress=vars(state)), cancelled.is_set)
+    except DeepSimbadError as error:
+        _tell(error={"code": error.code, "message": error.message, "hints": error.hints})
+    except Exception:
+        _tell(broken=traceback.format_exc())
+    else:
+        _tell(result=result)
+
+
+if __name__ == "__main__":
+    main()
