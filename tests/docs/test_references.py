@@ -12,7 +12,7 @@ from click.testing import CliRunner
 
 from deepsimbad.api.app import create_app
 from deepsimbad.cli import deepsimbad
-from deepsimbad.cli.settings import shown as shown_setting
+from deepsimbad.cli.serve import shown as shown_setting
 from deepsimbad.settings import Settings
 from deepsimbad.settings_sources import CONFIG_VARIABLE, load_settings, variable_of
 from deepsimbad_client.commands.group import cli as deepsimbad_client

@@ -8,14 +8,11 @@ from collections.abc import Sequence
 
 import click
 
-from deepsimbad.cli.backup import backup, restore
-from deepsimbad.cli.check import check
 from deepsimbad.cli.experiment import experiment
 from deepsimbad.cli.keys import keys
 from deepsimbad.cli.local import delete, info, localize, map_
-from deepsimbad.cli.serve import serve
-from deepsimbad.cli.settings import settings
-from deepsimbad.cli.transfer import export, import_
+from deepsimbad.cli.serve import serve, settings
+from deepsimbad.cli.storage import backup, check, export, import_, restore
 from deepsimbad.cli.weights import weights
 from deepsimbad.errors import CancelledError, DeepSimbadError, UnavailableError
 from deepsimbad_client.errors import DeepSimbadClientError

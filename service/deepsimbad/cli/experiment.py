@@ -1,9 +1,87 @@
 """`deepsimbad experiment`: the paper's experiments on a landmark-training-test triplet of recordings."""
 
-import click
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import reduce
+from pathlib import Path
+from typing import Any, TypeVar
 
-from deepsimbad.cli.nbv import nbv
-from deepsimbad.cli.vpr import vpr
+import click
+from rich.table import Table
+
+from deepsimbad.cli.options import (
+    RELEVANCES,
+    config_option,
+    evaluator_option,
+    evaluators_option,
+    given_settings,
+    spacing_option,
+)
+from deepsimbad.cli.terminal import print_table, progress_bar, write_json
+from deepsimbad.core.planners import DEFAULT_PLANNER
+from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Relevance
+from deepsimbad.core.true_images import true_images_of
+from deepsimbad.core.update_rules import DEFAULT_UPDATE, UpdateRule
+from deepsimbad.evaluators.base import Evaluator
+from deepsimbad.evaluators.registry import EvaluatorConfig, make_evaluator
+from deepsimbad.jobs.encoded_traverse import EncodedTraverse, encode_recording
+from deepsimbad.jobs.experiment_nbv import NbvConfig, NbvReport, nbv_stages, run_nbv
+from deepsimbad.jobs.experiment_vpr import VprConfig, VprReport, run_vpr, vpr_stages
+from deepsimbad.jobs.ground_truth import read_ground_truth
+from deepsimbad.jobs.map_config import DEFAULT_TRAINING_EPISODES
+from deepsimbad.jobs.progress import Progress
+from deepsimbad_client.recordings.sources import open_source
+
+_ROLES = ("landmarks", "training", "test")
+_READING_STAGES = {f"read {role}": 2.0 for role in _ROLES}
+_STANDARD_OUTPUT = Path("-")
+
+_Command = TypeVar("_Command", bound=Callable[..., Any])
+
+
+@dataclass(frozen=True)
+class _Triplet:
+    """Three encoded recordings, what measures them, and what was read, for the result's `config`."""
+
+    landmarks: EncodedTraverse
+    training: EncodedTraverse
+    test: EncodedTraverse
+    evaluator: Evaluator
+    sources: dict[str, Any]
+
+
+def _triplet_options(command: _Command) -> _Command:
+    """The options that every experiment has; their values are `asked` of what follows."""
+    options = (
+        click.option("--landmarks", required=True, help="SOURCE landmarks are selected from."),
+        click.option("--training", required=True, help="SOURCE that becomes the map."),
+        click.option("--test", required=True, help="SOURCE of the live views, in the order they were driven."),
+        spacing_option,
+        click.option("--n-landmarks", type=click.IntRange(min=1), default=300, show_default=True),
+        click.option("--list-length", type=click.IntRange(min=1), default=4, show_default=True),
+        click.option(
+            "--same-route/--no-same-route",
+            default=None,
+            help="Whether landmarks and training count their positions along one route, as test and training do.  "
+            "[default: they do]",
+        ),
+        click.option(
+            "--json",
+            "json_file",
+            type=click.Path(dir_okay=False, path_type=Path),
+            is_flag=False,
+            flag_value=_STANDARD_OUTPUT,
+            help="Write the result as JSON to FILE; without FILE to standard output.",
+        ),
+        config_option,
+        click.option(  # as every command does, so that a script may give it to all of them
+            "--data-dir",
+            type=click.Path(file_okay=False, path_type=Path),
+            expose_value=False,
+            help="Taken as by every command; an experiment reads and keeps nothing there.",
+        ),
+    )
+    return reduce(lambda decorated, option: option(decorated), reversed(options), command)
 
 
 @click.group()
@@ -11,5 +89,179 @@ def experiment() -> None:
     """Measure: the paper's tables on your recordings."""
 
 
-experiment.add_command(vpr)
-experiment.add_command(nbv)
+@experiment.command()
+@_triplet_options
+@evaluators_option
+@click.option("--relevance", "names", type=RELEVANCES, multiple=True, help="Only this one; may be repeated.")
+@click.option(
+    "--tolerance",
+    type=click.FloatRange(min=0),
+    default=2.0,
+    show_default=True,
+    help="Metres within which a match is true.",
+)
+@click.option(
+    "--ground-truth",
+    type=click.Path(path_type=Path),
+    help="FILE.npy of accepted training frames for every test frame, in place of --tolerance; positions then count as "
+    "comparable only where x, y are known or --same-route is given.",
+)
+def vpr(
+    evaluators: tuple[EvaluatorConfig, ...],
+    names: tuple[str, ...],
+    tolerance: float,
+    ground_truth: Path | None,
+    **asked: Any,
+) -> None:
+    """Single-view place recognition (III, Fig. 6): ANR and recall of every relevance."""
+    relevances = tuple(Relevance(name) for name in names) or tuple(Relevance)
+    same_route = asked["same_route"]
+    if same_route is None and ground_truth is None:
+        same_route = True  # test and training are scored by their positions: they count along one route
+    config = VprConfig(asked["n_landmarks"], asked["list_length"], tolerance, relevances, same_route=same_route)
+    documents: dict[str, Any] = {}
+    reports: dict[str, VprReport] = {}
+    for evaluator in evaluators:
+        extractor = evaluator.options["extractor"]
+        with progress_bar(_READING_STAGES | vpr_stages(config), extractor) as progress:
+            triplet = _read_triplet(asked, evaluator, progress)
+            if ground_truth is None:
+                truth = true_images_of(triplet.test.route, triplet.training.route, tolerance)
+            else:
+                truth = read_ground_truth(ground_truth, triplet.test.frames.index, triplet.training.frames.index)
+            report = run_vpr(
+                config, triplet.evaluator, triplet.landmarks, triplet.training, triplet.test, truth, progress
+            )
+        sources = triplet.sources | {"ground_truth": None if ground_truth is None else str(ground_truth)}
+        documents[extractor], reports[extractor] = report.as_dict(sources), report
+    if len(reports) > 1:
+        _tell({"extractors": documents}, asked["json_file"], lambda: _print_extractors(reports))
+    else:
+        _tell(documents[extractor], asked["json_file"], lambda: _print_relevances(report))
+
+
+@experiment.command()
+@_triplet_options
+@evaluator_option
+@click.option("--relevance", type=RELEVANCES, help=f"Of our set-up.  [default: {DEFAULT_RELEVANCE.value}]")
+@click.option(
+    "--update",
+    type=click.Choice([rule.value for rule in UpdateRule]),
+    help="How a view changes the belief.  [default: as suits the relevance]",
+)
+@click.option("--training-episodes", type=click.IntRange(min=0), default=DEFAULT_TRAINING_EPISODES, show_default=True)
+@click.option(
+    "--episodes", type=click.IntRange(min=2), default=2000, show_default=True, help="Test episodes of every planner."
+)
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
+def nbv(
+    evaluator: EvaluatorConfig,
+    relevance: str | None,
+    update: str | None,
+    training_episodes: int,
+    episodes: int,
+    seed: int,
+    **asked: Any,
+) -> None:
+    """Active self-localization (III, Fig. 7): ANR of every planner over episodes of ten moves.
+
+    Every planner has the same starts. The paper's set-up (rrf, additive relevance) is measured beside ours.
+    """
+    chosen = Relevance(relevance) if relevance else DEFAULT_RELEVANCE
+    config = NbvConfig(
+        n_landmarks=asked["n_landmarks"],
+        list_length=asked["list_length"],
+        relevance=chosen,
+        update=UpdateRule(update) if update else DEFAULT_UPDATE[chosen],
+        training_episodes=training_episodes,
+        episodes=episodes,
+        seed=seed,
+        same_route=asked["same_route"] is not False,
+    )
+    with progress_bar(_READING_STAGES | nbv_stages(config), "experiment") as progress:
+        triplet = _read_triplet(asked, evaluator, progress)
+        report = run_nbv(config, triplet.evaluator, triplet.landmarks, triplet.training, triplet.test, progress)
+    document = report.as_dict(triplet.sources)
+    _tell(document, asked["json_file"], lambda: _print_planners(report, document))
+
+
+def _read_triplet(asked: dict[str, Any], config: EvaluatorConfig, progress: Progress) -> _Triplet:
+    settings = given_settings()
+    evaluator = make_evaluator(config, settings.compute())
+    traverses = []
+    for stage, role in zip(_READING_STAGES, _ROLES, strict=True):
+        progress.stage(stage)
+        recording = open_source(asked[role], spacing_m=asked["spacing_m"])
+        traverses.append(encode_recording(recording, evaluator, settings.max_pixels, progress.update))
+    sources = {
+        **{role: asked[role] for role in _ROLES},
+        "evaluator": config.as_dict(),
+        "spacing_m": asked["spacing_m"],
+        "left_out": {role: traverse.left_out for role, traverse in zip(_ROLES, traverses, strict=True)},
+    }
+    landmarks, training, test = traverses
+    return _Triplet(landmarks, training, test, evaluator, sources)
+
+
+def _tell(document: dict[str, Any], json_file: Path | None, print_for_people: Callable[[], None]) -> None:
+    """Where `--json` is standard output, that holds nothing else."""
+    if json_file is not None:
+        write_json(document, None if json_file == _STANDARD_OUTPUT else json_file)
+    if json_file != _STANDARD_OUTPUT:
+        print_for_people()
+
+
+def _print_extractors(reports: dict[str, VprReport]) -> None:
+    """One extractor a row."""
+    scores = next(iter(reports.values())).scores
+    titles = (f"{relevance.value}: ANR / R@1 / R@5" for relevance in scores)
+    table = Table("extractor", "numbers", "bytes", "ms an image", *titles)
+    for extractor, report in reports.items():
+        time_ms = "-" if report.encode_ms is None else f"{report.encode_ms:.1f}"
+        cells = (
+            f"{score.anr:.2f} / {score.recall_at[1]:.0f} / {score.recall_at[5]:.0f}" for score in report.scores.values()
+        )
+        table.add_row(extractor, str(report.encoding_dim), str(report.bytes_per_encoding), time_ms, *cells)
+    first = next(iter(scores.values()))
+    print_table(table, f"{first.n_queries} queries scored, {first.n_left_out} left out (no true image)", numbers=True)
+
+
+def _print_relevances(report: VprReport) -> None:
+    table = Table("relevance", "ANR %", "R@1 %", "R@5 %")
+    for name, score in report.scores.items():
+        shown = f"{name.value} (default)" if name is DEFAULT_RELEVANCE else name.value
+        table.add_row(shown, f"{score.anr:.2f}", f"{score.recall_at[1]:.1f}", f"{score.recall_at[5]:.1f}")
+    first = next(iter(report.scores.values()))
+    print_table(
+        table,
+        f"{first.n_queries} queries scored, {first.n_left_out} left out (no true image); "
+        f"index {report.index_bits_per_map_image:.1f} bits a map image",
+        *_no_second_season(report.same_route.why),
+        numbers=True,
+    )
+
+
+def _print_planners(report: NbvReport, document: dict[str, Any]) -> None:
+    at_distance = document["anr_at_distance_m"]
+    distances_m = next(iter(at_distance.values()))
+    table = Table("planner", "ANR %", "95 %", "ANR % as in the paper", *(f"after {metres} m" for metres in distances_m))
+    for name, anr in sorted(document["anr"].items(), key=lambda item: float(item[1])):
+        low, high = document["interval_95"][name]
+        table.add_row(
+            f"{name} (default)" if name == DEFAULT_PLANNER else name,
+            f"{anr:.3f}",
+            f"{low:.3f} .. {high:.3f}",
+            f"{document['anr_paper'][name]:.2f}",
+            *("-" if value is None else f"{value:.2f}" for value in at_distance[name].values()),
+        )
+    pairs = document["difference_95"].items()
+    print_table(
+        table,
+        *(f"{pair}: {low:+.3f} .. {high:+.3f} % (paired, 95 %)" for pair, (low, high) in pairs),
+        *_no_second_season(None if report.same_route is None else report.same_route.why),
+        numbers=True,
+    )
+
+
+def _no_second_season(why: str | None) -> tuple[str, ...]:
+    return () if why is None else (f"no second season was learnt from: {why}",)

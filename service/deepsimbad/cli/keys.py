@@ -7,8 +7,8 @@ import click
 from rich.markup import escape
 from rich.table import Table
 
-from deepsimbad.cli.options import data_dir_option, given_settings
-from deepsimbad.cli.terminal import console, write_json
+from deepsimbad.cli.options import data_dir_option, given_settings, json_option
+from deepsimbad.cli.terminal import print_table, report, write_json
 from deepsimbad.errors import UnknownKeyError
 from deepsimbad.store.api_key import ApiKey
 from deepsimbad.store.catalog import Catalog
@@ -63,12 +63,12 @@ def list_(as_json: bool, data_dir: Path | None) -> None:
     table = Table("key", "name", "scope", "state", "created", "expires", "revoked")
     for record in records:
         table.add_row(*("-" if value is None else escape(value) for value in _described(record).values()))
-    console().print(table)
+    print_table(table)
 
 
 @keys.command()
 @click.argument("key_id")
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON document.")
+@json_option
 @data_dir_option
 def revoke(key_id: str, as_json: bool, data_dir: Path | None) -> None:
     """Let a key open nothing any more. KEY_ID is what `keys list` shows; a whole key, a leaked one say, does too."""
@@ -78,12 +78,9 @@ def revoke(key_id: str, as_json: bool, data_dir: Path | None) -> None:
         raise UnknownKeyError(f"there are no keys in {folder}: name their folder with --data-dir")
     with Catalog.open(folder) as catalog:
         record = catalog.revoke_key(key_id if whole is None else whole.key_id)
-        known = catalog.keys()
-    if as_json:
-        write_json(_described(record))
-    else:
-        click.echo(f"key {record.key_id} is revoked", err=True)
-    if not any(other.is_usable(now()) for other in known):
+        records = catalog.keys()
+    report(as_json, _described(record), f"key {record.key_id} is revoked")
+    if not any(other.is_usable(now()) for other in records):
         click.echo("no usable key is left: the service stays closed until one is created", err=True)
 
 

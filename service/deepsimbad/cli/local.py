@@ -1,6 +1,7 @@
 """`deepsimbad map`, `localize` and `info`: the same data directory as the server's, without a server."""
 
 from pathlib import Path
+from typing import Any
 
 import click
 from rich.table import Table
@@ -13,20 +14,16 @@ from deepsimbad.cli.options import (
     evaluator_option,
     existing_data_dir,
     given_settings,
+    json_option,
     spacing_option,
 )
-from deepsimbad.cli.terminal import console, progress_bar, write_json
+from deepsimbad.cli.terminal import print_table, progress_bar, write_json
 from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Relevance
 from deepsimbad.engine.encoders import EvaluatorPool
 from deepsimbad.engine.localizer import localize as localize_view
 from deepsimbad.engine.maps import Maps
 from deepsimbad.engine.views import Stopwatch
-from deepsimbad.errors import (
-    ImageTooLargeError,
-    InvalidImageError,
-    InvalidSourceError,
-    TooFewCandidatesError,
-)
+from deepsimbad.errors import ImageTooLargeError, InvalidImageError, InvalidSourceError, TooFewCandidatesError
 from deepsimbad.evaluators.compute import available_cores
 from deepsimbad.evaluators.image import decode_image
 from deepsimbad.evaluators.registry import EvaluatorConfig, make_evaluator
@@ -65,23 +62,19 @@ _ACTIONS_M = tuple(float(metres) for metres in range(1, 11))
 )
 @click.option("--closed", is_flag=True, help="The end of the route joins its start.")
 @spacing_option
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON document.")
+@json_option
 @data_dir_option
 def map_(
     domain: str,
     landmarks: str,
     training: str,
     evaluator: EvaluatorConfig,
-    n_landmarks: int | None,
-    list_length: int,
     relevance: str,
-    training_episodes: int,
-    seed: int,
-    same_route: bool | None,
     closed: bool,
     spacing_m: float,
     as_json: bool,
     data_dir: Path | None,
+    **options: Any,
 ) -> None:
     """Map a route from two recordings: one gives the landmarks, the other becomes the map.
 
@@ -89,24 +82,17 @@ def map_(
     encodings; each may end in #START:STOP[:STEP].
     """
     config = RemapConfig(
-        training_traverse="training",
-        landmark_traverse="landmarks",
-        n_landmarks=n_landmarks,
-        list_length=list_length,
-        relevance=Relevance(relevance),
-        training_episodes=training_episodes,
-        seed=seed,
-        same_route=same_route,
+        training_traverse="training", landmark_traverse="landmarks", relevance=Relevance(relevance), **options
     )
     checked_name(domain, "domain")
     settings = given_settings(data_dir=data_dir)
-    judge = make_evaluator(evaluator, settings.compute())
+    measure = make_evaluator(evaluator, settings.compute())
     # A mistake in what was typed should cost no minutes of encoding, and leave no domain behind.
     recordings = {
         role: open_source(source, spacing_m=spacing_m)
         for role, source in (("landmarks", landmarks), ("training", training))
     }
-    n_candidates = len(recordings["landmarks"].frames)
+    n_candidates, n_landmarks = len(recordings["landmarks"].frames), config.n_landmarks
     if n_landmarks is not None and n_candidates < n_landmarks:
         raise TooFewCandidatesError(
             f"{n_candidates} candidates for {n_landmarks} landmarks; ask for fewer (--n-landmarks) or drive further"
@@ -116,9 +102,9 @@ def map_(
         with progress_bar(_READING | REMAP_STAGES, f"map {domain}") as progress:
             for role, recording in recordings.items():
                 progress.stage(f"read {role}")
-                encoded = encode_recording(recording, judge, settings.max_pixels, progress.update)
-                _store(catalog, domain, role, encoded.frames)
-            result = remap(catalog, domain, config, judge, progress, n_threads=available_cores())
+                encoded = encode_recording(recording, measure, settings.max_pixels, progress.update)
+                _store(catalog.data_dir, domain, role, encoded.frames)
+            result = remap(catalog, domain, config, measure, progress, n_threads=available_cores())
     if as_json:
         write_json({"domain": domain, **result})
         return
@@ -138,7 +124,7 @@ def localize(domain: str, images: tuple[Path, ...], as_json: bool, data_dir: Pat
     settings = given_settings(data_dir=data_dir)
     with Catalog.open(existing_data_dir(settings.data_dir)) as catalog:
         active = Maps(catalog).active(domain)
-        judge = EvaluatorPool(settings.compute()).evaluator(active.record.evaluator)
+        evaluator = EvaluatorPool(settings.compute()).evaluator(active.record.evaluator)
         answers = []
         for path in images:
             watch = Stopwatch()
@@ -151,24 +137,19 @@ def localize(domain: str, images: tuple[Path, ...], as_json: bool, data_dir: Pat
             except (InvalidImageError, ImageTooLargeError) as error:
                 raise type(error)(f"{path}: {error.message}", **error.hints) from error
             watch.lap("decode")
-            found = localize_view(active.snapshot, judge, view)
-            watch.take(found.timings_ms)
-            answers.append(render_localization(found, watch))
+            localization = localize_view(active.snapshot, evaluator, view)
+            watch.take(localization.timings_ms)
+            answers.append(render_localization(localization, watch))
     if as_json:
         write_json([{"image": str(path), **answer.model_dump()} for path, answer in zip(images, answers, strict=True)])
         return
     table = Table("image", "most likely at", "mean +- std", "95 % within", "entropy")
     for path, answer in zip(images, answers, strict=True):
         belief = answer.belief
-        low, high = belief.credible_95_m
-        table.add_row(
-            str(path),
-            f"{belief.mode_m:.1f} m",
-            f"{belief.mean_m:.1f} +- {belief.std_m:.1f} m",
-            f"{low:.1f} .. {high:.1f} m",
-            f"{belief.entropy_bits:.1f} bit",
-        )
-    console().print(table)
+        mean, (low, high) = f"{belief.mean_m:.1f} +- {belief.std_m:.1f} m", belief.credible_95_m
+        within = f"{low:.1f} .. {high:.1f} m"
+        table.add_row(str(path), f"{belief.mode_m:.1f} m", mean, within, f"{belief.entropy_bits:.1f} bit")
+    print_table(table)
 
 
 @click.command()
@@ -184,7 +165,7 @@ def delete(domain: str, data_dir: Path | None) -> None:
 
 @click.command()
 @click.argument("domain")
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON document.")
+@json_option
 @data_dir_option
 def info(domain: str, as_json: bool, data_dir: Path | None) -> None:
     """Describe a domain and its active map."""
@@ -197,12 +178,12 @@ def info(domain: str, as_json: bool, data_dir: Path | None) -> None:
     table = Table.grid(padding=(0, 2))
     for name, value in answer.model_dump().items():
         table.add_row(name, "-" if value is None else str(value))
-    console().print(table)
+    print_table(table)
 
 
-def _store(catalog: Catalog, domain: str, role: str, frames: TraverseFrames) -> None:
+def _store(data_dir: Path, domain: str, role: str, frames: TraverseFrames) -> None:
     """Keep what was read as the domain's traverse of that role, in place of an earlier one."""
-    if role in Traverse.list(catalog.data_dir, domain):
-        Traverse.delete(catalog.data_dir, domain, role)
-    with Traverse.create(catalog.data_dir, domain, role) as traverse:
+    if role in Traverse.list(data_dir, domain):
+        Traverse.delete(data_dir, domain, role)
+    with Traverse.create(data_dir, domain, role) as traverse:
         traverse.put_frames(frames)

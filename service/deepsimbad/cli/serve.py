@@ -1,20 +1,35 @@
-"""`deepsimbad serve`."""
+"""`deepsimbad serve`, and `settings`: every setting as a command would take it, and where it comes from."""
 
 import logging
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any, TypeVar
 
 import click
+from rich.markup import escape
+from rich.table import Table
 
-from deepsimbad.cli.options import address_options, data_dir_option, given_settings
+from deepsimbad.cli.options import data_dir_option, given_settings, json_option, traced_settings
+from deepsimbad.cli.terminal import print_table, write_json
 from deepsimbad.errors import DeepSimbadError
-from deepsimbad.settings_sources import unknown_variables
+from deepsimbad.settings_sources import Origin, unknown_variables, variable_of
 
 log = logging.getLogger(__name__)
+
+_Command = TypeVar("_Command", bound=Callable[..., Any])
+
+
+def _address_options(command: _Command) -> _Command:
+    host = click.option("--host", help="Address to listen on.  [default: $DEEPSIMBAD_HOST, else 127.0.0.1]")
+    port = click.option(
+        "--port", type=int, help="Port to listen on; 0 takes a free one.  [default: $DEEPSIMBAD_PORT, else 8000]"
+    )
+    return host(port(command))
 
 
 @click.command()
 @data_dir_option
-@address_options
+@_address_options
 def serve(data_dir: Path | None, host: str | None, port: int | None) -> None:
     """Serve the domains over HTTP until interrupted. Ready when /readyz answers 200."""
     from deepsimbad.api.logs import configure_logging  # noqa: PLC0415 - other commands need no server
@@ -32,3 +47,37 @@ def serve(data_dir: Path | None, host: str | None, port: int | None) -> None:
             configure_logging("ERROR")  # the settings themselves may be what is wrong
             log.error("cannot start", extra={"code": error.code, "why": error.message})
             raise
+
+
+@click.command()
+@json_option
+@data_dir_option
+@_address_options
+def settings(as_json: bool, data_dir: Path | None, host: str | None, port: int | None) -> None:
+    """Print every setting with its value and where it comes from: flag, environment, file or default."""
+    traced = traced_settings(data_dir=data_dir, host=host, port=port)
+    for variable in unknown_variables():
+        click.echo(f"deepsimbad: {variable} is set in the environment and is no setting", err=True)
+    values: dict[str, Any] = traced.settings.model_dump(mode="json")
+    if as_json:
+        document = {
+            name: {"value": value, "origin": traced.origins[name].value, "variable": variable_of(name)}
+            for name, value in values.items()
+        }
+        write_json({"file": None if traced.file is None else str(traced.file), "settings": document})
+        return
+    table = Table("setting", "value", "from")
+    for name, value in values.items():
+        origin = traced.origins[name]
+        place = str(traced.file) if origin is Origin.FILE else origin.value
+        table.add_row(name, escape(shown(value)), escape(place))
+    print_table(table)
+
+
+def shown(value: Any) -> str:
+    """A setting's value as it is written in the environment; `none` where there is none."""
+    if value is None or isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(f'"{item}"' for item in value) + "]"
+    return str(value)

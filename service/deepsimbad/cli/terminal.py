@@ -13,6 +13,7 @@ import click
 from rich.console import Console
 from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from rich.progress import Progress as Bars
+from rich.table import Table
 
 from deepsimbad.jobs.progress import Progress, ProgressState
 
@@ -32,15 +33,9 @@ def progress_bar(stages: Mapping[str, float], title: str) -> Iterator[Progress]:
         interrupted = True
 
     errors = Console(stderr=True)
-    bars = Bars(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TaskProgressColumn(),
-        TimeRemainingColumn(),
-        console=errors,
-        transient=True,
-        disable=not errors.is_terminal,  # a log keeps an error's one line, and no blank ones
-    )
+    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
+    # Where it is no terminal, a log keeps an error's one line, and no blank ones.
+    bars = Bars(*columns, console=errors, transient=True, disable=not errors.is_terminal)
     task = bars.add_task(title, total=1.0)
 
     def show(state: ProgressState) -> None:
@@ -54,9 +49,28 @@ def progress_bar(stages: Mapping[str, float], title: str) -> Iterator[Progress]:
         signal.signal(signal.SIGINT, before)
 
 
-def console() -> Console:
-    """Standard output; wide enough for a table to stay whole where it is not a terminal."""
-    return Console(width=None if sys.stdout.isatty() else 160)
+def print_table(table: Table, *remarks: str, numbers: bool = False) -> None:
+    """A table on standard output, whole where that is no terminal, and what there is to say below it.
+
+    Args:
+        table: It.
+        remarks: Lines.
+        numbers: Whether all columns but the first hold numbers.
+    """
+    for column in table.columns[1:] if numbers else ():
+        column.justify = "right"
+    console = Console(width=None if sys.stdout.isatty() else 160)
+    console.print(table)
+    for remark in remarks:
+        console.print(remark)
+
+
+def report(as_json: bool, document: Any, line: str) -> None:
+    """What was done: one JSON document for a script, one line on standard error for a person."""
+    if as_json:
+        write_json(document)
+    else:
+        click.echo(line, err=True)
 
 
 def write_json(document: Any, file: Path | None = None) -> None:
@@ -70,9 +84,7 @@ def write_json(document: Any, file: Path | None = None) -> None:
 
 def _finite(value: Any) -> Any:
     if isinstance(value, Mapping):
-        return {str(key): _finite(each) for key, each in value.items()}
+        return {str(key): _finite(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_finite(each) for each in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
+        return [_finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

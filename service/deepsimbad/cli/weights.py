@@ -5,6 +5,7 @@ import re
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import asdict
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, TypeVar
@@ -16,12 +17,12 @@ from rich.progress import BarColumn, DownloadColumn, Progress, TaskID, TextColum
 from rich.table import Column, Table
 
 from deepsimbad.cli.options import data_dir_option, given_settings
-from deepsimbad.cli.terminal import console, write_json
+from deepsimbad.cli.terminal import print_table, write_json
 from deepsimbad.errors import InvalidInputError, MissingWeightsError
 from deepsimbad.evaluators.registry import EXTRACTOR_FORMS, EXTRACTOR_PATTERN
 from deepsimbad.evaluators.weights.downloads import HubWish, Tell, pull_file, pull_hub
 from deepsimbad.evaluators.weights.library import HUB, KNOWN, Argument, canonical, known
-from deepsimbad.evaluators.weights.lock import HUB_FOLDER, FileRecord, HubRecord, Lock
+from deepsimbad.evaluators.weights.lock import HUB_FOLDER, Lock
 
 DIFFERENCE_FOUND = 1
 
@@ -57,11 +58,11 @@ def list_(as_json: bool, data_dir: Path | None, weights_dir: Path | None) -> Non
         return
     titles = ("name", "extractor", "dimension", "input", "licence", "size", "here")
     table = Table(*(Column(title, overflow="fold") for title in titles))  # names are there to be copied
-    for each in rows:
-        size = None if each["size_mb"] is None else f"{each['size_mb']} MB"
-        cells = (each["name"], each["extractor"], each["encoding_dim"], each["input"], each["licence"], size)
-        table.add_row(*("-" if cell is None else escape(str(cell)) for cell in (*cells, each["state"])))
-    console().print(table)
+    for row in rows:
+        size = None if row["size_mb"] is None else f"{row['size_mb']} MB"
+        cells = (row["name"], row["extractor"], row["encoding_dim"], row["input"], row["licence"], size, row["state"])
+        table.add_row(*("-" if cell is None else escape(str(cell)) for cell in cells))
+    print_table(table)
 
 
 @weights.command()
@@ -75,16 +76,7 @@ def list_(as_json: bool, data_dir: Path | None, weights_dir: Path | None) -> Non
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON list of what was recorded.")
 @_folder_options
 def pull(
-    names: tuple[str, ...],
-    url: str | None,
-    sha256: str | None,
-    commit: str | None,
-    arguments: tuple[str, ...],
-    input_size: str | None,
-    yes: bool,
-    as_json: bool,
-    data_dir: Path | None,
-    weights_dir: Path | None,
+    names: tuple[str, ...], yes: bool, as_json: bool, data_dir: Path | None, weights_dir: Path | None, **asked: Any
 ) -> None:
     """Bring weights here and record their digests. NAME is of `weights list`, or an extractor's, as netvlad:FILE.
 
@@ -93,27 +85,27 @@ def pull(
     """
     folder = given_settings(data_dir=data_dir, weights_dir=weights_dir).weights_dir
     extractors = [_extractor(name) for name in names]
-    if len(names) > 1 and (url or sha256 or commit or arguments or input_size):
+    hub = [extractor for extractor in extractors if extractor.startswith(HUB)]
+    url, sha256, commit, arguments = (asked[name] for name in ("url", "sha256", "commit", "arguments"))
+    if len(names) > 1 and any(asked.values()):
         raise click.UsageError("--url, --sha256, --commit, --argument and --input-size are for one NAME")
     _check_form("--sha256", sha256, _SHA256)
     _check_form("--commit", commit, _COMMIT)
-    size = _check_form("--input-size", input_size, _SIZE)
-    is_hub = [extractor.startswith(HUB) for extractor in extractors]
-    if (url and any(is_hub)) or ((commit or arguments or input_size) and not all(is_hub)):
+    size = _check_form("--input-size", asked["input_size"], _SIZE)
+    if (url and hub) or ((commit or arguments or size) and len(hub) < len(names)):
         raise click.UsageError("--url is for files; --commit, --argument and --input-size are for torch hub")
-    _agree([extractor for extractor in extractors if extractor.startswith(HUB)], yes)
+    values, sides = dict(map(_argument, arguments)), (int(size[1]), int(size[2])) if size else None
+    for extractor in hub:
+        _agree(extractor, yes)
     pulled = []
     for extractor in extractors:
-        record: HubRecord | FileRecord
         with _download_bar() as tell:
-            if extractor.startswith(HUB):
-                given = dict(map(_argument, arguments))
-                sides = (int(size[1]), int(size[2])) if size else None
-                record = pull_hub(folder, HubWish(extractor, commit, sha256, given, sides), tell)
-                digest, where = record.tree_sha256, folder / HUB_FOLDER / record.folder
+            if extractor in hub:
+                tree = pull_hub(folder, HubWish(extractor, commit, sha256, values, sides), tell)
+                digest, where = tree.tree_sha256, folder / HUB_FOLDER / tree.folder
             else:
-                record = pull_file(folder, extractor, tell, url, sha256)
-                digest, where = record.sha256, folder / extractor.partition(":")[2]
+                digest = pull_file(folder, extractor, tell, url, sha256).sha256
+                where = folder / extractor.partition(":")[2]
         click.echo(f"{extractor} is at {where}, sha256 {digest}", err=True)
         pulled.append({"extractor": extractor, "path": str(where), "sha256": digest})
     if as_json:
@@ -131,14 +123,16 @@ def verify(
     """Compute the digests of what was pulled anew: one line each, exit code 1 if one differs or is missing."""
     lock = Lock.read(given_settings(data_dir=data_dir, weights_dir=weights_dir).weights_dir)
     findings = [finding for name in _recorded(lock, names) for finding in lock.findings(name)]
+    are_good = all(finding.is_good for finding in findings)
     if as_json:
-        told = [{"path": str(each.path), "recorded": each.recorded, "found": each.found} for each in findings]
-        write_json({"ok": all(each.is_good for each in findings), "findings": told})
-    for each in [] if as_json else findings:
-        state = "good" if each.is_good else "missing" if each.found is None else "differs"
-        recorded = "" if each.is_good else f" (recorded: {each.recorded})"
-        click.echo(f"{state}: {each.path}: {each.found or 'not there'}{recorded}")
-    if not all(each.is_good for each in findings):
+        write_json(
+            {"ok": are_good, "findings": [{**asdict(finding), "path": str(finding.path)} for finding in findings]}
+        )
+    for finding in [] if as_json else findings:
+        state = "good" if finding.is_good else "missing" if finding.found is None else "differs"
+        recorded = "" if finding.is_good else f" (recorded: {finding.recorded})"
+        click.echo(f"{state}: {finding.path}: {finding.found or 'not there'}{recorded}")
+    if not are_good:
         context.exit(DIFFERENCE_FOUND)
 
 
@@ -167,12 +161,10 @@ def _recorded(lock: Lock, names: tuple[str, ...]) -> Iterator[str]:
 
 
 def _check_form(option: str, value: str | None, form: re.Pattern[str]) -> re.Match[str] | None:
-    if value is None:
-        return None
-    found = form.fullmatch(value)
-    if found is None:
+    match = None if value is None else form.fullmatch(value)
+    if value is not None and match is None:
         raise click.BadParameter(f"{value!r} is none", param_hint=option)
-    return found
+    return match
 
 
 def _argument(text: str) -> tuple[str, Argument]:
@@ -187,16 +179,15 @@ def _argument(text: str) -> tuple[str, Argument]:
     return name, read if isinstance(read, bool | int | float | None) else value
 
 
-def _agree(extractors: list[str], yes: bool) -> None:
+def _agree(extractor: str, yes: bool) -> None:
     """Have it confirmed that code of others will be run."""
-    for extractor in extractors:
-        repository = extractor.removeprefix(HUB).partition(":")[0]
-        warning = f"{extractor} runs the code of github.com/{repository} on this machine, now and whenever it is used"
-        click.echo(warning, err=True)
-        if not yes:
-            if not sys.stdin.isatty():
-                raise click.UsageError(f"{warning}: say --yes if you trust it")
-            click.confirm("Do you trust it?", abort=True, err=True)
+    repository = extractor.removeprefix(HUB).partition(":")[0]
+    warning = f"{extractor} runs the code of github.com/{repository} on this machine, now and whenever it is used"
+    click.echo(warning, err=True)
+    if not yes:
+        if not sys.stdin.isatty():
+            raise click.UsageError(f"{warning}: say --yes if you trust it")
+        click.confirm("Do you trust it?", abort=True, err=True)
 
 
 @contextmanager
@@ -217,43 +208,43 @@ def _download_bar() -> Iterator[Tell]:
 
 def _rows(lock: Lock) -> Iterator[dict[str, Any]]:
     """What is known, and what else was pulled."""
-    for each in KNOWN:
-        hub, file = lock.hub_record(each.extractor), lock.files.get(each.file or "")
-        row = _row(lock, each.name, each.extractor, hub or file)
-        size = hub.input_size if hub else each.input_size
-        row |= {"input": _shown_size(size), "licence": each.licence, "packages": list(each.packages), "page": each.page}
-        row |= {"encoding_dim": row["encoding_dim"] or each.encoding_dim, "size_mb": row["size_mb"] or each.size_mb}
-        if each.package is not None:
-            is_there = find_spec(each.package.replace("-", "_")) is not None
+    for weights_ in KNOWN:
+        row = _row(lock, weights_.name, weights_.extractor)
+        row |= {"licence": weights_.licence, "packages": list(weights_.packages), "page": weights_.page}
+        for name, value in (
+            ("encoding_dim", weights_.encoding_dim),
+            ("input", _shown_size(weights_.input_size)),
+            ("size_mb", weights_.size_mb),
+        ):
+            row[name] = row[name] or value
+        if weights_.package is not None:
+            is_there = find_spec(weights_.package.replace("-", "_")) is not None
             row["state"] = "with its package" if is_there else "no package"
         yield row
-    known_files, known_hub = {each.file for each in KNOWN}, {canonical(each.extractor) for each in KNOWN}
-    for name, file in lock.files.items():
-        if name not in known_files:
-            yield _row(lock, name, file.extractor, file)
-    for extractor, hub in lock.hub.items():
-        if extractor not in known_hub:
-            yield {**_row(lock, hub.repository, extractor, hub), "input": _shown_size(hub.input_size)}
+    known_files, known_hub = {known.file for known in KNOWN}, {canonical(known.extractor) for known in KNOWN}
+    yield from (_row(lock, name, file.extractor) for name, file in lock.files.items() if name not in known_files)
+    yield from (_row(lock, hub.repository, name) for name, hub in lock.hub.items() if name not in known_hub)
 
 
-def _row(lock: Lock, name: str, extractor: str, record: HubRecord | FileRecord | None) -> dict[str, Any]:
+def _row(lock: Lock, name: str, extractor: str) -> dict[str, Any]:
     """What the lock and the folder tell; whether it is still what came is for `verify`."""
-    hub = record if isinstance(record, HubRecord) else None
-    file = record if isinstance(record, FileRecord) else None
-    is_there = (lock.folder / HUB_FOLDER / hub.folder).exists() if hub else False
-    if not extractor.startswith(HUB):
-        is_there = (lock.folder / extractor.partition(":")[2]).exists()
+    file_name = extractor.partition(":")[2]
+    hub, file = lock.hub_record(extractor), None if extractor.startswith(HUB) else lock.files.get(file_name)
+    if extractor.startswith(HUB):
+        is_there = hub is not None and (lock.folder / HUB_FOLDER / hub.folder).exists()
+    else:
+        is_there = bool(file_name) and (lock.folder / file_name).exists()
     states = {(True, True): "pulled", (True, False): "missing", (False, True): "not recorded", (False, False): "-"}
     return {
         "name": name,
         "extractor": extractor,
         "encoding_dim": hub.encoding_dim if hub else None,
-        "input": None,
+        "input": _shown_size(hub.input_size) if hub else None,
         "licence": None,
         "size_mb": round(file.n_bytes / 1e6, 1) if file else None,
         "packages": [],
         "page": file.url if file else None,
-        "state": states[record is not None, is_there],
+        "state": states[bool(hub or file), is_there],
     }
 
 

@@ -1,0 +1,111 @@
+"""`deepsimbad backup`, `restore`, `export`, `import` and `check`: data directories and maps as files."""
+
+from dataclasses import asdict
+from pathlib import Path
+
+import click
+
+from deepsimbad.cli.options import data_dir_option, existing_data_dir, given_settings, json_option
+from deepsimbad.cli.terminal import progress_bar, report, write_json
+from deepsimbad.errors import UnavailableError
+from deepsimbad.jobs.import_map import import_map
+from deepsimbad.release import release
+from deepsimbad.store.backup import back_up
+from deepsimbad.store.catalog import Catalog
+from deepsimbad.store.exported_map import export_map
+from deepsimbad.store.inspection import inspect
+from deepsimbad.store.layout import catalog_path, domains_folder
+from deepsimbad.store.restore import restore as restore_backup
+
+DAMAGE_FOUND = 1
+
+_file_argument = click.argument("file", type=click.Path(path_type=Path))
+
+
+@click.command()
+@_file_argument
+@json_option
+@data_dir_option
+def backup(file: Path, as_json: bool, data_dir: Path | None) -> None:
+    """Copy everything (domains, maps, traverses, sessions, keys) into FILE, beside a running service or not."""
+    source = existing_data_dir(given_settings(data_dir=data_dir).data_dir)
+    with progress_bar({"copy": 1.0}, "backup") as progress:
+        progress.stage("copy")
+        made = back_up(source, file, release(), progress.update)
+    counts = f"{made.n_domains} domains, {made.n_maps} maps, {made.n_traverses} traverses"
+    report(as_json, asdict(made), f"{file}: {counts}, {made.bytes} bytes, sha256 {made.sha256}")
+
+
+@click.command()
+@_file_argument
+@json_option
+@data_dir_option
+def restore(file: Path, as_json: bool, data_dir: Path | None) -> None:
+    """Make a data directory of the backup FILE. It must be absent or empty, and no service may run on it."""
+    target = given_settings(data_dir=data_dir).data_dir
+    with progress_bar({"unpack": 1.0}, "restore") as progress:
+        progress.stage("unpack")
+        made = restore_backup(file, target, progress.update)
+    report(as_json, asdict(made), f"{made.data_dir}: {made.n_files} files, {made.bytes} bytes, as of {made.created_at}")
+
+
+@click.command()
+@click.argument("domain")
+@_file_argument
+@click.option("--version", type=int, help="Which version.  [default: the active one]")
+@json_option
+@data_dir_option
+def export(domain: str, file: Path, version: int | None, as_json: bool, data_dir: Path | None) -> None:
+    """Copy a sealed map of DOMAIN into FILE, byte for byte, checked against its digest."""
+    with Catalog.open(existing_data_dir(given_settings(data_dir=data_dir).data_dir)) as catalog:
+        made = export_map(catalog, domain, version, file)
+    line = f"map {made.map_version} of {domain} is in {file}: {made.bytes} bytes, sha256 {made.sha256}"
+    report(as_json, asdict(made), line)
+
+
+@click.command("import")
+@_file_argument
+@click.option("--domain", help="What its domain is called here.  [default: as where it was made]")
+@click.option("--sha256", metavar="HEX", help="Digest that the file must have.")
+@click.option("--activate/--no-activate", default=True, show_default=True, help="Whether it shall serve at once.")
+@json_option
+@data_dir_option
+def import_(
+    file: Path, domain: str | None, sha256: str | None, activate: bool, as_json: bool, data_dir: Path | None
+) -> None:
+    """Take over an exported map as its domain's next version; a running service serves it within a second or so.
+
+    The domain is made where it is absent; else it must have the same evaluator, actions and kind of route.
+    """
+    with Catalog.open(given_settings(data_dir=data_dir).data_dir) as catalog:
+        made = import_map(catalog, file, domain, sha256, activate=activate)
+    state = "active" if made.active else "sealed"
+    report(as_json, asdict(made), f"map {made.map_version} of {made.domain} is {state}: {made.bytes} bytes")
+
+
+@click.command()
+@json_option
+@data_dir_option
+@click.pass_context
+def check(context: click.Context, as_json: bool, data_dir: Path | None) -> None:
+    """Verify every file, beside a running service or without one: one line a problem, exit code 1 if one is damaged.
+
+    Nothing is changed. What a crash left over is named too, and is no damage: the next start of the service removes it.
+    """
+    folder = given_settings(data_dir=data_dir).data_dir
+    if not catalog_path(folder).exists() and not domains_folder(folder).exists():
+        raise UnavailableError(f"there is nothing to check in {folder}: name its folder with --data-dir")
+    with progress_bar({"read": 1.0}, "check") as progress:
+        progress.stage("read")
+        seen = inspect(folder, progress.update)
+    if as_json:
+        write_json({"ok": not seen.damaged, **asdict(seen)})
+    else:
+        for kind, findings in (("damaged", seen.damaged), ("left over", seen.left_over)):
+            for finding in findings:
+                click.echo(f"{kind}: {finding.file}: {finding.what}")
+        click.echo(
+            f"{seen.n_files} files read, {len(seen.damaged)} problems, {len(seen.left_over)} left over", err=True
+        )
+    if seen.damaged:
+        context.exit(DAMAGE_FOUND)
