@@ -9,23 +9,9 @@ import httpx2
 import numpy as np
 import pytest
 
-from deepsimbad_client import AsyncClient, AsyncSession, Client, Session, errors
+from deepsimbad_client import AsyncClient, Client, Session, errors
 
-STATE = {
-    "session_id": "s1",
-    "domain": "d",
-    "map_version": 4,
-    "n_observations": 0,
-    "belief": {
-        "mean_m": 0.0,
-        "mode_m": 0.0,
-        "std_m": 0.0,
-        "credible_95_m": [0.0, 0.0],
-        "entropy_bits": 0.0,
-        "histogram": {"edges_m": [0.0, 1.0], "mass": [1.0]},
-        "top": [],
-    },
-}
+from ..http.scripted import JOB, STATE, Script, answer
 
 
 @pytest.fixture
@@ -65,10 +51,12 @@ def test_what_travels(client: Client, fake: Any) -> None:
 
     fake.lose_answers = remember
     wishes = {"planner": "nnql", "belief": "particle", "update": "log_likelihood"}
+    client.session("route", keep=True)
     with client.session("route", 12.5, 3, seed=0, **wishes) as session:
         session.observe(encoding=[1, 2], action_m=1.5, action_std_m=0.25, shortlist=3, idempotency_key="mine")
         session.observe(encoding=[1, 2])
-    created, given, bare, _ = seen
+    plain, created, given, bare, _ = seen
+    assert json.loads(plain.content) == {}
     assert json.loads(created.content) == {
         "start_position_m": 12.5,
         "start_std_m": 3,
@@ -79,13 +67,6 @@ def test_what_travels(client: Client, fake: Any) -> None:
     assert given.headers["idempotency-key"] == "mine"
     assert bare.url.query == b""
     assert len(bare.headers["idempotency-key"]) >= 16
-
-
-def test_a_plain_session_asks_for_nothing_in_particular(client: Client, fake: Any) -> None:
-    bodies: list[bytes] = []
-    fake.lose_answers = lambda request: bodies.append(request.content) or False
-    client.session("route")
-    assert json.loads(bodies[0]) == {}
 
 
 def test_a_lost_answer_counts_once(fake: Any, client: Client) -> None:
@@ -129,23 +110,24 @@ def test_a_start_given_up_is_repeated_under_its_key(fake: Any, client: Client) -
     assert list(fake.begun) == ["mine"]
 
 
-def test_truths_are_told() -> None:
-    asked: list[httpx2.Request] = []
-
-    def respond(request: httpx2.Request) -> httpx2.Response:
-        asked.append(request)
-        if request.url.path.endswith("/truths"):
-            return httpx2.Response(200, json={"n_scored": 2, "n_left_out": 1, "anr": 3.5, "map_version": 4})
-        return httpx2.Response(201, json=STATE)
-
-    with Client("http://service", transport=httpx2.MockTransport(respond)) as client:
-        session = client.session("d", keep=True)
-        score = session.truths(np.array([1.0, np.nan, 4.5]))
+def test_truths_are_told_and_experience_is_fed_back() -> None:
+    places, plain = np.array([1.0, np.nan, 4.5]), [1.0, None, 4.5]
+    script = Script(
+        answer(201, STATE),
+        answer(200, {"n_scored": 2, "n_left_out": 1, "anr": 3.5, "map_version": 4}),
+        answer(202, JOB),
+    )
+    client = script.client()
+    session = client.session("d", keep=True)
+    assert session.truths(places, true_map_images=[[0], [], [4, 5]], first_observation=2).anr == 3.5
+    assert client.admin.feed_experience("d", "s", places).job_id == "j"
+    for refused in (session.truths, lambda truths: client.admin.feed_experience("d", "s", truths)):
         with pytest.raises(errors.InvalidArgumentError):
-            session.truths([float("inf")])
-    assert (score.n_scored, score.n_left_out, score.anr, score.map_version) == (2, 1, 3.5, 4)
-    assert asked[-1].url.path == "/v1/sessions/s1/truths"
-    assert json.loads(asked[-1].content) == {"true_positions_m": [1.0, None, 4.5]}
+            refused([float("inf")])
+    _, truths, experience = [(request.url.path, json.loads(request.content)) for request in script.requests]
+    told = {"true_positions_m": plain, "true_map_images": [[0], [], [4, 5]], "first_observation": 2}
+    assert truths == ("/v1/sessions/s/truths", told)
+    assert experience == ("/v1/admin/domains/d/experience", {"session_id": "s", "true_positions_m": plain})
 
 
 def test_a_delete_whose_answer_was_lost_is_done(fake: Any, client: Client) -> None:
@@ -209,24 +191,6 @@ def test_past_the_end_is_a_move_that_cannot_be(client: Client) -> None:
     assert isinstance(raised.value, errors.InvalidMoveError)
 
 
-@pytest.mark.parametrize(
-    ("status", "code", "error"),
-    [
-        (410, "retired_map", errors.RetiredMapError),
-        (429, "too_many_sessions", errors.TooManySessionsError),
-        (410, "of_the_future", errors.GoneError),
-    ],
-)
-def test_errors_of_a_start(status: int, code: str, error: type[errors.ApiError]) -> None:
-    response = httpx2.Response(status, json={"code": code, "detail": "no"}, headers={"retry-after": "3600"})
-    with (
-        Client("http://service", transport=httpx2.MockTransport(lambda request: response)) as client,
-        pytest.raises(error) as raised,
-    ):
-        client.session("route")
-    assert raised.value.retry_after_s == 3600
-
-
 def test_no_next_best_view(fake: Any, client: Client) -> None:
     fake.plans = False
     with client.session("route") as session:
@@ -251,25 +215,3 @@ def test_the_async_twin(fake: Any) -> None:
             return int(planned.action_m)
 
     assert asyncio.run(drive()) == 2
-
-
-def test_the_async_session_has_the_same_calls() -> None:
-    def calls(kind: type) -> set[str]:
-        return {name for name in vars(kind) if not name.startswith("_")}
-
-    assert calls(Session) == calls(AsyncSession)
-
-
-def test_experience_is_fed_back() -> None:
-    asked: list[httpx2.Request] = []
-
-    def respond(request: httpx2.Request) -> httpx2.Response:
-        asked.append(request)
-        return httpx2.Response(202, json={"job_id": "j", "domain": "d", "state": "queued"})
-
-    with Client("http://service", transport=httpx2.MockTransport(respond)) as client:
-        assert client.admin.feed_experience("d", "s1", np.array([1.0, np.nan, 4.5])).job_id == "j"
-        with pytest.raises(errors.InvalidArgumentError):
-            client.admin.feed_experience("d", "s1", [float("inf")])
-    assert asked[0].url.path == "/v1/admin/domains/d/experience"
-    assert json.loads(asked[0].content) == {"session_id": "s1", "true_positions_m": [1.0, None, 4.5]}

@@ -1,6 +1,5 @@
 """`OnBoardEncoder`: fetched by either client or loaded from a file, and all that can be wrong with it."""
 
-import asyncio
 import subprocess
 import sys
 from pathlib import Path
@@ -15,8 +14,10 @@ from deepsimbad.core.landmark_model import PortableLandmarks, landmark_model_dig
 from deepsimbad.errors import MissingPackageError
 from deepsimbad.evaluators.image import decode_image
 from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
-from deepsimbad_client import AsyncClient, Client, RetryPolicy, errors
+from deepsimbad_client import Client, errors
 from deepsimbad_client.http.on_board import OnBoardEncoder
+
+from .scripted import Script, answer
 
 N_LANDMARKS = 300
 GRADIENTS = {"kind": "feature_l2", "extractor": "gradient_grid"}
@@ -149,45 +150,21 @@ def test_a_missing_package_is_named(content: bytes, monkeypatch: pytest.MonkeyPa
         encoder.load_extractor()
 
 
-def test_both_clients_fetch_it(content: bytes) -> None:
-    asked = []
-
-    def serve(request: httpx2.Request) -> httpx2.Response:
-        asked.append(str(request.url))
-        return httpx2.Response(200, content=content, headers={"Content-Type": "application/octet-stream"})
-
-    client = Client("http://service", retry=RetryPolicy(attempts=1), transport=httpx2.MockTransport(serve))
-    fetched = client.on_board("campus")
-
-    async def fetch() -> OnBoardEncoder:
-        async with AsyncClient("http://service", transport=httpx2.MockTransport(serve)) as twin:
-            return await twin.on_board("campus", map_version=3)
-
-    assert asyncio.run(fetch()).digest == fetched.digest
+def test_it_is_fetched_for_a_map_and_sent_as_it_is(content: bytes) -> None:
+    problem = {"code": "landmark_model_differs", "detail": "another", "map_version": 9}
+    model = httpx2.Response(200, content=content)
+    script = Script(model, model, answer(409, problem))
+    with script.client() as client:
+        fetched = client.on_board("campus")
+        assert client.on_board("campus", map_version=3).digest == fetched.digest
+        seen = fetched.ranks(picture(1))
+        with pytest.raises(errors.LandmarkModelDiffersError, match="map_version=9"):
+            client.localize("campus", ranked=seen)
     base = "http://service/v1/domains/campus/landmark-model"
-    assert asked == [base, f"{base}?map_version=3"]
-
-
-def test_both_clients_send_it_as_it_is(content: bytes) -> None:
-    sent = []
-
-    def refuse(request: httpx2.Request) -> httpx2.Response:
-        sent.append((request.headers["content-type"], request.headers["if-match"], request.content))
-        problem = {"code": "landmark_model_differs", "detail": "another", "map_version": 9}
-        return httpx2.Response(409, json=problem, headers={"Content-Type": "application/problem+json"})
-
-    seen = OnBoardEncoder(content).ranks(picture(1))
-    client = Client("http://service", transport=httpx2.MockTransport(refuse))
-    with pytest.raises(errors.LandmarkModelDiffersError, match="map_version=9"):
-        client.localize("campus", ranked=seen)
-
-    async def localize() -> None:
-        async with AsyncClient("http://service", transport=httpx2.MockTransport(refuse)) as twin:
-            await twin.localize("campus", ranked=seen)
-
-    with pytest.raises(errors.LandmarkModelDiffersError):
-        asyncio.run(localize())
-    assert sent == [(RANKS, seen.headers["If-Match"], seen.body)] * 2
+    assert [str(request.url) for request in script.requests[:2]] == [base, f"{base}?map_version=3"]
+    sent = script.requests[2]
+    assert (sent.headers["content-type"], sent.headers["if-match"]) == (RANKS, f'"{fetched.digest}"')
+    assert sent.content == seen.body
 
 
 HIDDEN = """

@@ -1,7 +1,7 @@
 """What goes over the wire, and what becomes of the answers."""
 
 import ast
-import asyncio
+import itertools
 import json
 import subprocess
 import sys
@@ -14,58 +14,29 @@ import numpy as np
 import pydantic
 import pytest
 
-from deepsimbad_client import AsyncClient, Client, errors
+from deepsimbad import errors as service_errors
+from deepsimbad_client import Client, errors
 from deepsimbad_client.errors import BY_CODE, BY_STATUS, InvalidArgumentError
-from deepsimbad_client.http.models import Domain, Traverse
+from deepsimbad_client.http.models import Domain, Job, Localization, Traverse
 from deepsimbad_client.http.observation import media_type_of, observation
 from deepsimbad_client.http.retry import RETRIED_STATUSES
 
-BELIEF = {
-    "mean_m": 1.0,
-    "mode_m": 2.0,
-    "std_m": 0.5,
-    "credible_95_m": [9.0, 1.0],
-    "entropy_bits": 2.0,
-    "off_route": None,
-    "histogram": {"edges_m": [0.0, 1.0], "mass": [1.0]},
-    "top": [{"map_image": 3, "route_position_m": 2.0, "x_m": None, "y_m": None, "mass": 0.5}],
-}
-LOCALIZATION = {
-    "map_version": 7,
-    "timings_ms": {"total": 1.5},
-    "belief": BELIEF,
-    "retrieval": [{"map_image": 3, "route_position_m": 2.0, "relevance": 1.25}],
-    "next_best_view": None,
-}
+from .scripted import JOB, LOCALIZATION, STATE, Script, answer
 
-
-class Recorder:
-    """Answers everything alike and remembers the last request."""
-
-    def __init__(self, response: httpx2.Response) -> None:
-        self.response = response
-        self.request = httpx2.Request("GET", "http://nothing")
-
-    def __call__(self, request: httpx2.Request) -> httpx2.Response:
-        self.request = request
-        return self.response
-
-
-def asked(document: Any, status: int = 200, **options: Any) -> tuple[Client, Recorder]:
-    recorder = Recorder(httpx2.Response(status, json=document))
-    return Client("http://service/", transport=httpx2.MockTransport(recorder), **options), recorder
+JOBS = [{**JOB, "job_id": f"j{number}"} for number in range(7)]
 
 
 def test_localize_reads_the_whole_answer_and_what_it_does_not_know_yet() -> None:
-    service, recorder = asked(LOCALIZATION | {"of_the_future": [1]})
-    found = service.localize("campus", b"\x89PNG\r\n\x1a\n...", shortlist=4)
-    assert (found.map_version, found.belief.credible_95_m, found.retrieval[0].relevance) == (7, (9.0, 1.0), 1.25)
-    assert found.belief.top[0].x_m is None
-    assert (found.model_extra or {})["of_the_future"] == [1]
-    assert recorder.request.url == "http://service/v1/domains/campus/localizations?shortlist=4"
-    assert recorder.request.headers["content-type"] == "image/png"
+    script = Script(answer(200, LOCALIZATION | {"of_the_future": [1]}))
+    place = script.client().localize("campus", b"\x89PNG\r\n\x1a\n...", shortlist=4)
+    assert (place.map_version, place.belief.credible_95_m, place.retrieval[0].relevance) == (7, (9.0, 1.0), 1.25)
+    assert place.belief.top[0].x_m is None
+    assert (place.model_extra or {})["of_the_future"] == [1]
+    (request,) = script.requests
+    assert request.url == "http://service/v1/domains/campus/localizations?shortlist=4"
+    assert request.headers["content-type"] == "image/png"
     with pytest.raises(pydantic.ValidationError):
-        found.map_version = 8  # type: ignore[misc]
+        place.map_version = 8  # type: ignore[misc]
 
 
 @pytest.mark.parametrize(
@@ -78,10 +49,10 @@ def test_localize_reads_the_whole_answer_and_what_it_does_not_know_yet() -> None
     ],
 )
 def test_what_a_robot_encodes_itself_travels_as_json(form: dict[str, Any], body: dict[str, Any]) -> None:
-    service, recorder = asked(LOCALIZATION)
-    service.localize("campus", **form)
-    assert json.loads(recorder.request.content) == body
-    assert recorder.request.headers["content-type"] == "application/json"
+    script = Script(answer(200, LOCALIZATION))
+    script.client().localize("campus", **form)
+    assert json.loads(script.requests[0].content) == body
+    assert script.requests[0].headers["content-type"] == "application/json"
 
 
 @pytest.mark.parametrize(
@@ -95,12 +66,9 @@ def test_what_a_robot_encodes_itself_travels_as_json(form: dict[str, Any], body:
         {"ranked_landmarks": [object()]},
     ],
 )
-def test_what_can_never_be_sent_is_refused_here(form: dict[str, Any]) -> None:
+def test_what_can_never_be_sent_is_refused_here(form: dict[str, Any], tmp_path: Path) -> None:
     with pytest.raises(InvalidArgumentError):
         observation(**form)
-
-
-def test_an_image_file_that_is_not_there(tmp_path: Path) -> None:
     with pytest.raises(errors.BrokenFrameError, match=r"no\.jpg"):
         observation(tmp_path / "no.jpg")
 
@@ -123,9 +91,8 @@ def test_media_type_of(body: bytes, media_type: str | None) -> None:
 
 @pytest.mark.parametrize("name", ["", ".", "..", "a/b", "a b", "-a", "é", "a" * 65, "a\n"])
 def test_a_name_that_could_leave_its_place_in_the_address(name: str) -> None:
-    service, _ = asked({})
     with pytest.raises(InvalidArgumentError, match="letters"):
-        service.domain(name)
+        Client("http://service").domain(name)
 
 
 @pytest.mark.parametrize("url", ["service:8000", "ftp://service", "http://", "//service", "http://:::"])
@@ -135,98 +102,84 @@ def test_an_address_that_is_none(url: str) -> None:
 
 
 def test_address_and_key_from_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    script = Script(answer(200, []))
+    with pytest.raises(InvalidArgumentError) as raised:
+        script.client(key="geheim\n")
+    assert "geheim" not in str(raised.value)
+    monkeypatch.delenv("DEEPSIMBAD_API_KEY", raising=False)
+    script.client().domains()
     monkeypatch.setenv("DEEPSIMBAD_URL", "http://elsewhere:81/below")
     monkeypatch.setenv("DEEPSIMBAD_API_KEY", "from-environment")
-    recorder = Recorder(httpx2.Response(200, json=[]))
-    with Client(transport=httpx2.MockTransport(recorder)) as service:
-        assert service.domains() == ()
-    assert recorder.request.url == "http://elsewhere:81/below/v1/domains"
-    assert recorder.request.headers["authorization"] == "Bearer from-environment"
-    with Client("http://here", "given", transport=httpx2.MockTransport(recorder)) as service:
-        service.domains()
-    assert recorder.request.headers["authorization"] == "Bearer given"
-    assert recorder.request.url.host == "here"
-
-
-def test_a_key_is_neither_sent_where_there_is_none_nor_shown(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("DEEPSIMBAD_API_KEY", raising=False)
-    service, recorder = asked([])
-    service.domains()
-    assert "authorization" not in recorder.request.headers
-    with pytest.raises(InvalidArgumentError) as raised:
-        Client("http://service", "geheim\n")
-    assert "geheim" not in str(raised.value)
+    with script.client(None) as client:
+        assert client.domains() == ()
+    script.client("http://here", "given").domains()
+    bare, environment, given = script.requests
+    assert "authorization" not in bare.headers
+    assert environment.url == "http://elsewhere:81/below/v1/domains"
+    assert environment.headers["authorization"] == "Bearer from-environment"
+    assert (given.url.host, given.headers["authorization"]) == ("here", "Bearer given")
 
 
 def test_frames_travel_as_npz() -> None:
-    service, recorder = asked({"n_new": 2, "n_replaced": 0, "n_frames": 2})
-    service.admin.put_frames("d", "t", encodings=[[1.0], [2.0]], index=[0, 5], position_m=[0, 1.5])
-    with np.load(BytesIO(recorder.request.content)) as sent:
+    script = Script(answer(200, {"n_new": 2, "n_replaced": 0, "n_frames": 2}))
+    script.client().admin.put_frames("d", "t", encodings=[[1.0], [2.0]], index=[0, 5], position_m=[0, 1.5])
+    with np.load(BytesIO(script.requests[0].content)) as sent:
         assert sorted(sent) == ["encodings", "index", "position_m"]
         assert sent["encodings"].dtype == np.float32
         assert sent["index"].tolist() == [0, 5]
-    assert recorder.request.headers["content-type"] == "application/octet-stream"
+    assert script.requests[0].headers["content-type"] == "application/octet-stream"
 
 
 def test_relevances_are_an_array() -> None:
     packed = BytesIO()
     np.save(packed, np.array([0.5, -1.0], np.float32))
-    recorder = Recorder(httpx2.Response(200, content=packed.getvalue()))
-    service = Client("http://service", transport=httpx2.MockTransport(recorder))
-    assert service.relevances("d", ranked_landmarks=[0]).tolist() == [0.5, -1.0]
-    assert recorder.request.headers["accept"] == "application/octet-stream"
+    script = Script(httpx2.Response(200, content=packed.getvalue()))
+    assert script.client().relevances("d", ranked_landmarks=[0]).tolist() == [0.5, -1.0]
+    assert script.requests[0].headers["accept"] == "application/octet-stream"
 
 
 @pytest.mark.parametrize("content", [b"", b"<html>", b"{}", b"\x93NUMPY\x01\x00"])
 def test_something_else_answers_at_this_address(content: bytes) -> None:
-    recorder = Recorder(httpx2.Response(200, content=content))
-    service = Client("http://service", transport=httpx2.MockTransport(recorder))
-    for call in (service.domains, lambda: service.domain("d"), lambda: service.relevances("d", encoding=[1])):
+    client = Script(httpx2.Response(200, content=content)).client()
+    for call in (client.domains, lambda: client.domain("d"), lambda: client.relevances("d", encoding=[1])):
         with pytest.raises(errors.UnexpectedAnswerError, match="http://service/v1"):
             call()
 
 
 def test_a_redirect_is_not_followed_with_the_key() -> None:
-    recorder = Recorder(httpx2.Response(307, headers={"location": "http://evil/"}))
-    service = Client("http://service", "key", transport=httpx2.MockTransport(recorder))
     with pytest.raises(errors.UnexpectedAnswerError, match="http://evil/"):
-        service.domains()
+        Script(answer(307, location="http://evil/")).client(key="key").domains()
 
 
 @pytest.mark.parametrize("code", sorted(BY_CODE))
 def test_every_code_has_its_class(code: str) -> None:
     problem = {"code": code, "detail": "what is wrong", "limit": 5}
-    service, _ = asked(problem, 418)
     with pytest.raises(BY_CODE[code], match="what is wrong") as raised:
-        service.health()
+        Script(answer(418, problem)).client().health()
     assert raised.value.code == code
     assert raised.value.problem["limit"] == 5
 
 
 @pytest.mark.parametrize("status", [status for status in BY_STATUS if status not in RETRIED_STATUSES])
 def test_an_unheard_code_falls_back_on_the_status(status: int) -> None:
-    recorder = Recorder(httpx2.Response(status, json={"code": "of_the_future"}, headers={"x-request-id": "abc"}))
-    service = Client("http://service", transport=httpx2.MockTransport(recorder))
     with pytest.raises(BY_STATUS[status]) as raised:
-        service.health()
+        Script(answer(status, {"code": "of_the_future"}, x_request_id="abc")).client().health()
     assert type(raised.value) is BY_STATUS[status]
     assert (raised.value.code, raised.value.status, raised.value.request_id) == ("of_the_future", status, "abc")
     assert "abc" in str(raised.value)
 
 
 def test_the_code_words_are_those_of_the_service() -> None:
-    from deepsimbad import errors as service_errors  # noqa: PLC0415
-
     def words(kind: type[service_errors.DeepSimbadError]) -> set[str]:
         return {kind.code}.union(*(words(below) for below in kind.__subclasses__()))
 
+    assert len(BY_CODE) > 20
     assert set(BY_CODE) <= words(service_errors.DeepSimbadError)
 
 
 def test_a_proxys_page_is_an_error_too() -> None:
-    recorder = Recorder(httpx2.Response(500, content=b"<h1>oops</h1>"))
     with pytest.raises(errors.ServerError) as raised:
-        Client("http://service", transport=httpx2.MockTransport(recorder)).health()
+        Script(httpx2.Response(500, content=b"<h1>oops</h1>")).client().health()
     assert raised.value.code == "http_500"
 
 
@@ -238,26 +191,94 @@ def test_what_a_traverse_has(index: int) -> None:
 
 
 def test_a_domain_without_a_map() -> None:
-    service, _ = asked({"name": "d", "map_version": None, "evaluator": {"kind": "feature_l2"}})
-    assert service.domain("d") == Domain(name="d", evaluator={"kind": "feature_l2"})
+    script = Script(answer(200, {"name": "d", "map_version": None, "evaluator": {"kind": "feature_l2"}}))
+    assert script.client().domain("d") == Domain(name="d", evaluator={"kind": "feature_l2"})
 
 
-def test_events_of_a_job_in_both_clients() -> None:
-    job = {"job_id": "1", "domain": "d", "state": "running", "progress": 0.5}
-    done = job | {"state": "succeeded", "progress": 1.0}
-    stream = f": ping\n\nevent: progress\ndata: {json.dumps(job)}\n\nevent: done\ndata: {json.dumps(done)}\n\n"
+def shelf(request: httpx2.Request) -> httpx2.Response:
+    """Gives out jobs three at a time, whatever length is asked for."""
+    first = int(request.url.params.get("after", "jobs-0").removeprefix("jobs-"))
+    following = f"jobs-{first + 3}" if first + 3 < len(JOBS) else None
+    return httpx2.Response(200, json={"jobs": JOBS[first : first + 3], "next": following})
 
-    def respond(request: httpx2.Request) -> httpx2.Response:
-        assert request.headers["accept"] == "text/event-stream"
-        return httpx2.Response(200, content=stream.encode(), headers={"content-type": "text/event-stream"})
 
-    async def listen() -> list[str]:
-        async with AsyncClient("http://service", transport=httpx2.MockTransport(respond)) as service:
-            return [heard.state async for heard in service.admin.job_events("1")]
+def test_a_list_is_read_to_its_end_and_a_page_fetched_when_it_is_wanted() -> None:
+    asked: list[dict[str, str]] = []
 
-    with Client("http://service", transport=httpx2.MockTransport(respond)) as service:
-        assert [heard.state for heard in service.admin.job_events("1")] == ["running", "succeeded"]
-    assert asyncio.run(listen()) == ["running", "succeeded"]
+    def note(request: httpx2.Request) -> httpx2.Response:
+        asked.append(dict(request.url.params))
+        return shelf(request)
+
+    with Client("http://service", transport=httpx2.MockTransport(note)) as client:
+        assert [job.job_id for job in client.admin.jobs("d")] == [job["job_id"] for job in JOBS]
+        assert [page.get("after") for page in asked] == [None, "jobs-3", "jobs-6"]
+        assert {page["domain"] for page in asked} == {"d"}
+        jobs = client.admin.iter_jobs()
+        assert len(asked) == 3
+        assert [next(jobs).job_id for _ in range(3)] == ["j0", "j1", "j2"]
+        assert len(asked) == 4
+        assert next(jobs).job_id == "j3"
+        assert len(asked) == 5
+
+
+@pytest.mark.parametrize("document", [{"jobs": JOBS[:2]}, {"jobs": JOBS[:2], "next": None}, JOBS[:2]])
+def test_a_list_that_names_no_next_page_is_whole(document: Any) -> None:
+    """As those of an older service."""
+    assert len(Script(answer(200, document)).client().admin.jobs()) == 2
+
+
+@pytest.mark.parametrize("document", [{}, {"next": None}, {"jobs": 7, "next": None}, {"jobs": [{}], "next": None}])
+def test_what_is_no_list_is_said(document: Any) -> None:
+    with pytest.raises(errors.UnexpectedAnswerError):
+        Script(answer(200, document)).client().admin.jobs()
+
+
+def test_every_answer_knows_its_request_which_the_caller_may_name() -> None:
+    documents = [
+        LOCALIZATION,
+        STATE,
+        {**LOCALIZATION, "n_observations": 1},
+        {"planner": "telling", "action_m": 2.0},
+        JOB,
+    ]
+    for names in (None, itertools.count()):
+        script = Script(*(answer(200, document, x_request_id=f"r{n}") for n, document in enumerate(documents)))
+        with script.client(request_id=None if names is None else lambda: f"robot.{next(names)}") as client:  # noqa: B023
+            place = client.localize("d", ranked_landmarks=[0])
+            session = client.session("d", keep=True)
+            answers = [place, session.opened, session.observe(ranked_landmarks=[0]), session.next_best_view()]
+            answers.append(client.admin.job("j"))
+        assert [got.request_id for got in answers if got is not None] == ["r0", "r1", "r2", "r3", "r4"]
+        sent = [request.headers.get("x-request-id") for request in script.requests]
+        assert sent == [None if names is None else f"robot.{n}" for n in range(5)]
+    assert Script(answer(200, JOB)).client().admin.job("j").request_id is None
+
+
+def test_every_try_has_an_id_of_its_own_and_the_error_tells_the_last() -> None:
+    names = itertools.count()
+    script = Script(answer(503, {}, x_request_id="t0"), answer(404, {}, x_request_id="t1"))
+    with script.client(request_id=lambda: f"t{next(names)}") as client, pytest.raises(errors.NotFoundError) as raised:
+        client.domain("gone")
+    assert [request.headers["x-request-id"] for request in script.requests] == ["t0", "t1"]
+    assert raised.value.request_id == "t1"
+
+
+@pytest.mark.parametrize("bad", ["", "a b", "ä", "x\r\ny: z", "x" * 65])
+def test_an_id_that_the_service_would_not_take_is_not_sent(bad: str) -> None:
+    script = Script(answer(200, []))
+    with pytest.raises(InvalidArgumentError, match="cannot name a request"):
+        script.client(request_id=lambda: bad).domains()
+    assert script.requests == []
+
+
+def test_a_requests_id_is_no_part_of_what_was_answered() -> None:
+    known, unknown = Localization.model_validate(LOCALIZATION), Localization.model_validate(LOCALIZATION)
+    assert known.answering("r1").request_id == "r1"
+    assert unknown.request_id is None
+    assert known == unknown
+    assert known.model_dump() == unknown.model_dump()
+    assert "r1" not in known.model_dump_json() + repr(known)
+    assert Job.model_validate({**JOB, "_request_id": "theirs", "request_id": "theirs"}).request_id is None
 
 
 def test_importing_the_client_needs_httpx2_and_pydantic_alone() -> None:

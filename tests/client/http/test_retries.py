@@ -1,6 +1,5 @@
 """What is sent again, when, and after how long."""
 
-import asyncio
 from collections.abc import Callable, Sequence
 from datetime import UTC, datetime, timedelta
 from email.utils import format_datetime
@@ -9,46 +8,15 @@ from typing import Any
 import httpx2
 import pytest
 
-from deepsimbad_client import AsyncClient, Client, RetryPolicy, errors
+from deepsimbad_client import Client, errors
 from deepsimbad_client.http.retry import retry_after_s
+
+from .scripted import POLICY, Script, answer
 
 OK = {"status": "alive"}
 DOMAIN = {"name": "d"}
 JOB = {"job_id": "1", "domain": "d", "state": "queued"}
-POLICY = RetryPolicy(attempts=4, base_s=1.0, max_backoff_s=3.0, max_retry_after_s=30.0)
-
 Outcome = httpx2.Response | type[httpx2.TransportError]
-
-
-class Script:
-    """Answers one outcome after the other and remembers what was asked."""
-
-    def __init__(self, *outcomes: Outcome) -> None:
-        self.outcomes = list(outcomes)
-        self.requests: list[httpx2.Request] = []
-        self.slept: list[float] = []
-
-    def __call__(self, request: httpx2.Request) -> httpx2.Response:
-        self.requests.append(request)
-        outcome = self.outcomes.pop(0)
-        if isinstance(outcome, httpx2.Response):
-            return outcome
-        raise outcome("scripted", request=request)
-
-    def client(self) -> Client:
-        return Client(
-            "http://service",
-            retry=POLICY,
-            transport=httpx2.MockTransport(self),
-            sleep=self.slept.append,
-            jitter=lambda: 1.0,
-        )
-
-
-def answer(status: int, document: object = None, **headers: str) -> httpx2.Response:
-    named = {name.replace("_", "-"): value for name, value in headers.items()}
-    return httpx2.Response(status, json=document, headers=named)
-
 
 RETRIED: Sequence[Callable[[], Outcome]] = (
     lambda: httpx2.ConnectError,
@@ -86,15 +54,6 @@ def test_every_wait_is_told_to_the_log_with_its_reason(caplog: pytest.LogCapture
     ]
 
 
-def test_the_last_failure_is_an_error_and_no_wait(caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level("INFO", "deepsimbad_client.http.retry")
-    with pytest.raises(errors.ApiError):
-        Script(answer(503, retry_after="31")).client().health()  # longer than is waited out
-    with pytest.raises(errors.ApiError):
-        Script(answer(404)).client().health()
-    assert caplog.messages == []
-
-
 def test_an_upload_is_sent_again_with_its_body() -> None:
     script = Script(httpx2.ReadError, answer(201, {"index": 3, "n_frames": 1}))
     image = b"\xff\xd8\xff rest"
@@ -113,18 +72,13 @@ def test_other_answers_are_the_last_word(outcome: int) -> None:
     assert script.slept == []
 
 
-@pytest.mark.parametrize("failure", [httpx2.ReadTimeout, httpx2.ReadError, httpx2.RemoteProtocolError])
-def test_a_switch_that_may_have_been_made_is_not_sent_again(failure: type[httpx2.TransportError]) -> None:
-    script = Script(failure)
-    with pytest.raises(errors.TransportError):
-        script.client().admin.activate("d", 2, expected=1)
-    assert len(script.requests) == 1
-
-
-@pytest.mark.parametrize("status", [502, 504])
-def test_a_switch_behind_a_failing_proxy_is_not_sent_again(status: int) -> None:
-    script = Script(answer(status))
-    with pytest.raises(errors.ServerError):
+@pytest.mark.parametrize(
+    "outcome",
+    [lambda: httpx2.ReadTimeout, lambda: httpx2.ReadError, lambda: httpx2.RemoteProtocolError, *RETRIED[-3::2]],
+)
+def test_a_switch_that_may_have_been_made_is_not_sent_again(outcome: Callable[[], Outcome]) -> None:
+    script = Script(outcome())
+    with pytest.raises((errors.TransportError, errors.ServerError)):
         script.client().admin.activate("d", 2, expected=1)
     assert len(script.requests) == 1
 
@@ -167,22 +121,17 @@ def test_a_job_may_be_named_by_who_asks_for_it() -> None:
 
 
 def test_the_last_failure_is_raised_after_the_last_try() -> None:
-    script = Script(*[httpx2.ConnectError] * 4)
+    with pytest.raises(errors.TransportTimeoutError):
+        Script(httpx2.ReadTimeout).client().health()
+    script = Script(httpx2.ConnectError)
     with pytest.raises(errors.TransportError, match="GET /healthz at http://service after 4 tries") as raised:
         script.client().health()
     assert isinstance(raised.value.__cause__, httpx2.ConnectError)
     assert script.slept == [1.0, 2.0, 3.0]  # doubled, up to the longest
 
 
-def test_a_timeout_has_a_class_of_its_own() -> None:
-    script = Script(*[httpx2.ReadTimeout] * 4)
-    with pytest.raises(errors.TransportTimeoutError):
-        script.client().health()
-
-
 def test_the_last_refusal_is_raised_with_what_the_service_said() -> None:
-    refusals = [answer(429, {"code": "slow_down", "detail": "too fast"}, retry_after="2") for _ in range(4)]
-    script = Script(*refusals)
+    script = Script(answer(429, {"code": "slow_down", "detail": "too fast"}, retry_after="2"))
     with pytest.raises(errors.RateLimitedError, match="too fast") as raised:
         script.client().health()
     assert (raised.value.code, raised.value.retry_after_s) == ("slow_down", 2.0)
@@ -196,19 +145,20 @@ def test_retry_after_as_a_date_is_waited_out() -> None:
     assert 15 < script.slept[0] <= 20
 
 
-def test_a_longer_wait_than_the_cap_is_not_begun() -> None:
-    script = Script(answer(503, retry_after="31"))
-    with pytest.raises(errors.UnavailableError) as raised:
-        script.client().health()
-    assert raised.value.retry_after_s == 31
-    assert script.slept == []
-
-
-def test_a_damaged_map_is_not_waited_for() -> None:
-    script = Script(answer(503, {"code": "damaged_map", "detail": "digest"}, retry_after="5"))
-    with pytest.raises(errors.DamagedMapError):
+@pytest.mark.parametrize(
+    ("problem", "wait", "error"),
+    [({}, "31", errors.UnavailableError), ({"code": "damaged_map"}, "5", errors.DamagedMapError)],
+)
+def test_what_waiting_does_not_cure_is_not_waited_for(
+    problem: dict[str, str], wait: str, error: type[errors.ApiError], caplog: pytest.LogCaptureFixture
+) -> None:
+    """A longer wait than the longest allowed, and a map that is damaged."""
+    caplog.set_level("INFO", "deepsimbad_client.http.retry")
+    script = Script(answer(503, problem, retry_after=wait))
+    with pytest.raises(error) as raised:
         script.client().domain("d")
-    assert script.slept == []
+    assert raised.value.retry_after_s == float(wait)
+    assert (script.slept, caplog.messages) == ([], [])
 
 
 def test_a_delete_whose_answer_was_lost_is_not_an_error() -> None:
@@ -243,7 +193,7 @@ def test_overload_is_waited_out_as_long_as_the_service_says() -> None:
     assert script.client().domain("d").name == "d"
     assert script.slept == [3.0]
     with pytest.raises(errors.OverloadedError):
-        Script(*[answer(503, overloaded) for _ in range(4)]).client().domain("d")
+        Script(answer(503, overloaded)).client().domain("d")
 
 
 def test_jitter_spreads_over_the_upper_half() -> None:
@@ -266,26 +216,3 @@ def test_jitter_spreads_over_the_upper_half() -> None:
 )
 def test_retry_after(header: str | None, seconds: float | None) -> None:
     assert retry_after_s(header, datetime(2015, 10, 21, 7, 28, tzinfo=UTC)) == seconds
-
-
-def test_the_async_client_obeys_the_same_rules() -> None:
-    slept = []
-
-    async def sleep(seconds: float) -> None:
-        slept.append(seconds)
-
-    async def ask(script: Script) -> str:
-        async with AsyncClient(
-            "http://service",
-            retry=POLICY,
-            transport=httpx2.MockTransport(script),
-            sleep=sleep,
-            jitter=lambda: 1.0,
-        ) as client:
-            return (await client.health()).status
-
-    script = Script(httpx2.ConnectError, answer(503, retry_after="4"), answer(200, OK))
-    assert asyncio.run(ask(script)) == "alive"
-    assert slept == [1.0, 4.0]
-    with pytest.raises(errors.TransportError):
-        asyncio.run(ask(Script(*[httpx2.ReadError] * 4)))

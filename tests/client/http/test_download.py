@@ -1,6 +1,5 @@
 """A map on its way into a file: every byte checked, nothing fetched twice, nothing half in its place."""
 
-import asyncio
 import hashlib
 from base64 import b64encode
 from collections.abc import Iterator
@@ -11,6 +10,9 @@ import httpx2
 import pytest
 
 from deepsimbad_client import AsyncClient, Client, RetryPolicy, errors
+
+from .scripted import Script, answer
+from .test_faces import run_async
 
 BODY = bytes(range(256)) * 400
 OTHER = BODY[::-1]
@@ -161,27 +163,18 @@ def test_the_digest_may_stand_in_repr_digest_alone(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("repr_digest", [None, "sha-256=:AAAA:", "sha-256=:=:", "md5=:AAAA:"])
 def test_a_file_of_no_digest_is_not_taken(tmp_path: Path, repr_digest: str | None) -> None:
-    with (
-        Shelf(etag='W/"1"', repr_digest=repr_digest).client() as client,
-        pytest.raises(errors.UnexpectedAnswerError, match="sha256"),
-    ):
+    client = Shelf(etag='W/"1"', repr_digest=repr_digest).client()
+    with pytest.raises(errors.UnexpectedAnswerError, match="sha256"):
         client.admin.download_map("d", 3, tmp_path / "m")
     assert list(tmp_path.iterdir()) == []
 
 
 def test_refusals_have_their_names_and_are_waited_out_where_they_pass(tmp_path: Path) -> None:
-    answers = [
-        httpx2.Response(503, json={"code": "overloaded"}, headers={"retry-after": "7"}),
-        httpx2.Response(410, json={"code": "retired_map", "detail": "map 3 was removed"}),
-    ]
-    slept: list[float] = []
-    transport = httpx2.MockTransport(lambda request: answers.pop(0))
-    with (
-        Client("http://service", transport=transport, sleep=slept.append) as client,
-        pytest.raises(errors.RetiredMapError, match="was removed"),
-    ):
-        client.admin.download_map("d", 3, tmp_path / "m")
-    assert slept == [7.0]
+    retired = {"code": "retired_map", "detail": "map 3 was removed"}
+    script = Script(answer(503, {"code": "overloaded"}, retry_after="7"), answer(410, retired))
+    with pytest.raises(errors.RetiredMapError, match="was removed"):
+        script.client().admin.download_map("d", 3, tmp_path / "m")
+    assert script.slept == [7.0]
 
 
 def test_a_place_where_no_file_can_lie_is_refused_before_anything_is_asked(tmp_path: Path) -> None:
@@ -198,15 +191,10 @@ def test_a_place_where_no_file_can_lie_is_refused_before_anything_is_asked(tmp_p
 def test_the_async_client_fetches_the_same(tmp_path: Path) -> None:
     shelf = Shelf(breaks=(10_000, 20_000))
 
-    async def sleep(seconds: float) -> None:
-        shelf.slept.append(seconds)
+    async def fetch(client: AsyncClient) -> None:
+        there = await client.admin.download_map("d", 3, str(tmp_path / "m.sqlite"))
+        assert there.sha256 == sha256(BODY)
 
-    async def fetch() -> None:
-        async with AsyncClient("http://service", transport=httpx2.MockTransport(shelf), sleep=sleep) as client:
-            there = await client.admin.download_map("d", 3, str(tmp_path / "m.sqlite"))
-            assert there.sha256 == sha256(BODY)
-
-    asyncio.run(fetch())
+    assert len(run_async(shelf, fetch)) == 2
     assert (tmp_path / "m.sqlite").read_bytes() == BODY
     assert shelf.ranges == ["", "bytes=10000-", "bytes=30000-"]
-    assert len(shelf.slept) == 2

@@ -1,10 +1,8 @@
-"""Every operation of the service has its call in both clients, the blocking and the async one, and it is that call.
-
-An operation without a twin fails here by name: add the call to both clients and a line to `ASKED`.
-"""
+"""Every operation of the service has its call, and the blocking and the async client have the same calls."""
 
 import asyncio
 import inspect
+import json
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -18,29 +16,13 @@ from deepsimbad.api.app import create_app
 from deepsimbad.api.bodies import RemapBody
 from deepsimbad.api.session_bodies import SessionBody
 from deepsimbad.settings import Settings
-from deepsimbad_client import AsyncClient, AsyncSession, Client, RetryPolicy, Session
+from deepsimbad_client import AsyncClient, AsyncSession, Client, Session, errors
 from deepsimbad_client.commands.group import cli
-from deepsimbad_client.http.admin import RemapOptions
+from deepsimbad_client.http.admin import Admin, AsyncAdmin, RemapOptions
 from deepsimbad_client.http.models import SessionState
 
-NO_ANSWER = httpx2.ConnectError
-STATE = SessionState.model_validate(
-    {
-        "session_id": "s",
-        "domain": "d",
-        "map_version": 1,
-        "n_observations": 0,
-        "belief": {
-            "mean_m": 0,
-            "mode_m": 0,
-            "std_m": 0,
-            "credible_95_m": [0, 0],
-            "entropy_bits": 0,
-            "histogram": {"edges_m": [0, 1], "mass": [1]},
-            "top": [],
-        },
-    }
-)
+from .scripted import JOB, POLICY, STATE, Script, answer
+from .test_requests import JOBS, shelf
 
 Ask = Callable[[Any, Any, Path], Any]
 """From a client, one of its sessions and a file: what the call gives."""
@@ -94,65 +76,30 @@ def document() -> dict[str, Any]:
 OPERATIONS = sorted(f"{method.upper()} {path}" for path, methods in document()["paths"].items() for method in methods)
 
 
-class Nobody:
-    """Answers nothing and remembers what it was asked."""
-
-    def __init__(self) -> None:
-        self.asked: list[str] = []
-
-    def __call__(self, request: httpx2.Request) -> httpx2.Response:
-        self.asked.append(f"{request.method} {request.url.path}")
-        raise NO_ANSWER("nobody is here", request=request)
-
-
-def leads_to(operation: str, asked: str) -> bool:
-    method, _, path = operation.partition(" ")
-    return re.fullmatch(f"{method} {re.sub('{[^}]*}', '[^/]+', path)}", asked) is not None
-
-
-def test_no_twin_is_of_a_call_that_is_gone() -> None:
-    assert sorted(ASKED) == OPERATIONS
-
-
 @pytest.mark.parametrize("operation", OPERATIONS)
-def test_every_operation_has_its_call_in_both_clients(operation: str, tmp_path: Path) -> None:
-    assert operation in ASKED, f"{operation} has no call in the clients"
-    ask = ASKED[operation]
-    nobody = Nobody()
-    once = RetryPolicy(attempts=1)
-
-    client = Client("http://service", retry=once, transport=httpx2.MockTransport(nobody))
-    with pytest.raises(Exception, match="nobody is here"):
-        _exhaust(ask(client, Session(client._wire, STATE, keep=True), tmp_path / "file"))
-
-    async def await_it() -> None:
-        twin = AsyncClient("http://service", retry=once, transport=httpx2.MockTransport(nobody))
-        given = ask(twin, AsyncSession(twin._wire, STATE, keep=True), tmp_path / "file")
-        if inspect.isasyncgen(given):
-            async for _ in given:
-                pass
-        else:
-            await given
-
-    with pytest.raises(Exception, match="nobody is here"):
-        asyncio.run(await_it())
-    assert len(nobody.asked) == 2
-    assert all(leads_to(operation, asked) for asked in nobody.asked), nobody.asked
+def test_every_operation_has_its_call(operation: str, tmp_path: Path) -> None:
+    assert operation in ASKED, f"{operation} has no call in the client"
+    script = Script(httpx2.ConnectError)
+    client = script.client()
+    session = Session(client._wire, SessionState.model_validate(STATE), keep=True)
+    with pytest.raises(errors.TransportError):
+        tuple(ASKED[operation](client, session, tmp_path / "file"))
+    method, _, path = operation.partition(" ")
+    request = script.requests[0]
+    assert request.method == method
+    assert re.fullmatch(re.sub("{[^}]*}", "[^/]+", path), request.url.path)
 
 
-def _exhaust(given: Any) -> None:
-    if inspect.isgenerator(given):
-        for _ in given:
-            pass
+def test_no_call_is_of_an_operation_that_is_gone() -> None:
+    assert sorted(ASKED) == OPERATIONS
 
 
 def test_every_option_of_a_remap_can_be_given_in_python_and_on_the_command_line() -> None:
     members = set(RemapBody.model_fields)
-    assert members == set(RemapOptions.__annotations__) | {"training_traverse"}
-    command = cli.commands["remap"]
+    assert members == {"training_traverse", *RemapOptions.__annotations__}
     options = {
         name.lstrip("-").replace("-", "_")
-        for option in command.params
+        for option in cli.commands["remap"].params
         for name in (*option.opts, *option.secondary_opts)
         if isinstance(option, click.Option)
     }
@@ -160,5 +107,77 @@ def test_every_option_of_a_remap_can_be_given_in_python_and_on_the_command_line(
 
 
 def test_every_option_of_a_session_can_be_given() -> None:
-    for client in (Client, AsyncClient):
-        assert set(SessionBody.model_fields) <= set(inspect.signature(client.session).parameters)
+    assert set(SessionBody.model_fields) <= set(inspect.signature(Client.session).parameters)
+
+
+@pytest.mark.parametrize(
+    ("blocking", "awaiting"), [(Client, AsyncClient), (Session, AsyncSession), (Admin, AsyncAdmin)]
+)
+def test_both_faces_show_signature_and_docstring(blocking: type, awaiting: type) -> None:
+    calls = [name for name, _ in inspect.getmembers(blocking, inspect.isfunction) if name[0] != "_" and name != "close"]
+    assert len(calls) > 6
+    for name in calls:
+        ours, theirs = getattr(blocking, name), getattr(awaiting, name)
+        assert inspect.signature(ours) == inspect.signature(theirs)
+        assert ours.__doc__ == theirs.__doc__ != ""
+        assert not inspect.iscoroutinefunction(ours)
+        assert inspect.iscoroutinefunction(theirs) != (name.startswith("iter_") or name == "job_events")
+
+
+def run_async(transport: Callable[[httpx2.Request], httpx2.Response], act: Callable[[AsyncClient], Any]) -> list[float]:
+    """Run what is awaited on an async client; returns what it waited between tries."""
+    slept: list[float] = []
+
+    async def sleep(seconds: float) -> None:
+        slept.append(seconds)
+
+    async def run() -> None:
+        given = {"retry": POLICY, "sleep": sleep, "jitter": lambda: 1.0}
+        async with AsyncClient("http://service", transport=httpx2.MockTransport(transport), **given) as client:
+            await act(client)
+
+    asyncio.run(run())
+    return slept
+
+
+def test_the_async_client_obeys_the_same_rules() -> None:
+    async def ask(client: AsyncClient) -> None:
+        assert (await client.health()).status == "alive"
+
+    assert run_async(
+        Script(httpx2.ConnectError, answer(503, retry_after="4"), answer(200, {"status": "alive"})), ask
+    ) == [
+        1.0,
+        4.0,
+    ]
+    with pytest.raises(errors.TransportError):
+        run_async(Script(httpx2.ReadError), ask)
+
+
+def test_the_async_client_reads_lists() -> None:
+    async def read(client: AsyncClient) -> None:
+        some = []
+        async for job in client.admin.iter_jobs():
+            some.append(job.job_id)
+            if len(some) == 4:
+                break
+        assert some == ["j0", "j1", "j2", "j3"]
+        assert len(await client.admin.jobs("d")) == len(JOBS)
+
+    run_async(shelf, read)
+
+
+def test_events_of_a_job_in_both_clients() -> None:
+    done = {**JOB, "state": "succeeded"}
+    stream = f": ping\n\nevent: progress\ndata: {json.dumps(JOB)}\n\nevent: done\ndata: {json.dumps(done)}\n\n"
+
+    def events() -> Script:
+        return Script(httpx2.Response(200, content=stream.encode(), headers={"content-type": "text/event-stream"}))
+
+    async def listen(client: AsyncClient) -> None:
+        assert [job.state async for job in client.admin.job_events("j")] == ["running", "succeeded"]
+
+    script = events()
+    assert [job.state for job in script.client().admin.job_events("j")] == ["running", "succeeded"]
+    assert script.requests[0].headers["accept"] == "text/event-stream"
+    run_async(events(), listen)

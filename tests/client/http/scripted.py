@@ -1,0 +1,53 @@
+"""A service that answers by script, behind httpx2's MockTransport."""
+
+from typing import Any
+
+import httpx2
+
+from deepsimbad_client import Client, RetryPolicy
+
+POLICY = RetryPolicy(attempts=4, base_s=1.0, max_backoff_s=3.0, max_retry_after_s=30.0)
+JOB = {"job_id": "j", "domain": "d", "state": "running"}
+BELIEF = {
+    "mean_m": 1.0,
+    "mode_m": 2.0,
+    "std_m": 0.5,
+    "credible_95_m": [9.0, 1.0],
+    "entropy_bits": 2.0,
+    "off_route": None,
+    "histogram": {"edges_m": [0.0, 1.0], "mass": [1.0]},
+    "top": [{"map_image": 3, "route_position_m": 2.0, "x_m": None, "y_m": None, "mass": 0.5}],
+}
+STATE = {"session_id": "s", "domain": "d", "map_version": 1, "n_observations": 1, "belief": BELIEF}
+LOCALIZATION = {
+    "map_version": 7,
+    "timings_ms": {"total": 1.5},
+    "belief": BELIEF,
+    "retrieval": [{"map_image": 3, "route_position_m": 2.0, "relevance": 1.25}],
+    "next_best_view": None,
+}
+
+
+def answer(status: int, document: object = None, **headers: str) -> httpx2.Response:
+    named = {name.replace("_", "-"): value for name, value in headers.items()}
+    return httpx2.Response(status, json=document, headers=named)
+
+
+class Script:
+    """Gives one outcome after the other, the last of them for ever, and remembers what was asked."""
+
+    def __init__(self, *outcomes: httpx2.Response | type[httpx2.TransportError]) -> None:
+        self.outcomes = list(outcomes)
+        self.requests: list[httpx2.Request] = []
+        self.slept: list[float] = []
+
+    def __call__(self, request: httpx2.Request) -> httpx2.Response:
+        self.requests.append(request)
+        outcome = self.outcomes.pop(0) if len(self.outcomes) > 1 else self.outcomes[0]
+        if isinstance(outcome, httpx2.Response):
+            return outcome
+        raise outcome("scripted", request=request)
+
+    def client(self, url: str | None = "http://service/", key: str | None = None, **options: Any) -> Client:
+        given = {"retry": POLICY, "sleep": self.slept.append, "jitter": lambda: 1.0, **options}
+        return Client(url, key, transport=httpx2.MockTransport(self), **given)
