@@ -1,6 +1,7 @@
 """`deepsimbad-client remap` and `jobs`."""
 
 from itertools import islice
+from typing import Any
 
 import click
 
@@ -14,10 +15,11 @@ from deepsimbad_client.tables import gate_verdict, job_table
 
 @click.command()
 @domain_option
-@click.option("--training", "--training-traverse", required=True, metavar="TRAVERSE", help="Becomes the map.")
 @click.option(
-    "--landmarks",
-    "--landmark-traverse",
+    "--training", "--training-traverse", "training_traverse", required=True, metavar="TRAVERSE", help="Becomes the map."
+)
+@click.option(
+    *("--landmarks", "--landmark-traverse", "landmark_traverse"),
     metavar="TRAVERSE",
     help="Where landmarks are chosen; absent: the active map's landmarks stay.",
 )
@@ -32,21 +34,21 @@ from deepsimbad_client.tables import gate_verdict, job_table
 @click.option("--seed", type=int)
 @click.option("--activate/--no-activate", default=True, show_default=True, help="Serve the new map at once.")
 @click.option(
-    "--check",
-    "--check-traverse",
+    *("--check", "--check-traverse", "check_traverse"),
     metavar="TRAVERSE",
     help="Drive that the new map and the active one are compared on; absent: frames held out of the training one.",
 )
 @click.option(
-    "--gate",
-    "--gate-margin",
+    *("--gate", "--gate-margin", "gate_margin"),
     type=click.FloatRange(min=0),
     metavar="MARGIN",
     help="Serve the new map only if its ANR is worse than the active one's by no more than so many percentage points; "
     "else it is sealed, the command says why and still ends with 0 (--json: result.active is false). "
     "Give --check a drive of another day with it: frames held out of the map's own drive are kind to the new map.",
 )
-@click.option("--append", is_flag=True, help="Add the drive to a copy of the active map, whose landmarks stay.")
+@click.option(
+    "--append", is_flag=True, default=None, help="Add the drive to a copy of the active map, whose landmarks stay."
+)
 @click.option(
     "--same-route/--no-same-route",
     default=None,
@@ -56,47 +58,16 @@ from deepsimbad_client.tables import gate_verdict, job_table
 @click.option("--wait/--no-wait", default=True, show_default=True, help="Follow the job to its end.")
 @json_flag
 @serving
-def remap(
-    client: Client,
-    domain: str,
-    training: str,
-    landmarks: str | None,
-    n_landmarks: int | None,
-    list_length: int | None,
-    relevance: str | None,
-    training_episodes: int | None,
-    seed: int | None,
-    activate: bool,
-    check: str | None,
-    gate: float | None,
-    append: bool,
-    same_route: bool | None,
-    wait: bool,
-    json_output: bool,
-) -> None:
+def remap(client: Client, domain: str, wait: bool, json_output: bool, **options: Any) -> None:
     """Make a new map from uploaded traverses.
 
     Follows the job to its end, through lost connections and a restarted service.
 
     Ctrl-C asks whether the job should be cancelled too.
     """
-    if append and landmarks is not None:
+    if options["append"] and options["landmark_traverse"] is not None:
         raise click.UsageError("--append keeps the active map's landmarks: leave --landmarks out")
-    job = client.admin.remap(
-        domain,
-        training_traverse=training,
-        landmark_traverse=landmarks,
-        n_landmarks=n_landmarks,
-        list_length=list_length,
-        relevance=relevance,
-        training_episodes=training_episodes,
-        seed=seed,
-        activate=activate,
-        check_traverse=check,
-        gate_margin=gate,
-        append=append or None,
-        same_route=same_route,
-    )
+    job = client.admin.remap(domain, **options)
     _show_job(_follow(client, job) if wait else job, json_output)
 
 
@@ -144,10 +115,8 @@ def _follow(client: Client, job: Job) -> Job:
             client.admin.cancel_job(job.job_id)
             REMARKS.print(f"job {job.job_id} is being cancelled")
         else:
-            REMARKS.print(
-                f"job {job.job_id} goes on; see it with: deepsimbad-client jobs {job.job_id} --follow",
-                soft_wrap=True,
-            )
+            later = f"deepsimbad-client jobs {job.job_id} --follow"
+            REMARKS.print(f"job {job.job_id} goes on; see it with: {later}", soft_wrap=True)
         raise
 
 

@@ -76,11 +76,7 @@ class LocalServer:
 
     @property
     def pid(self) -> int:
-        """Of the process.
-
-        Raises:
-            DeepSimbadClientError: It is not up.
-        """
+        """Of the process; raises DeepSimbadClientError where it is not up."""
         if self._process is None:
             raise DeepSimbadClientError("the service is not up")
         return self._process.pid

@@ -4,6 +4,7 @@ Fields the contract adds later are kept (`extra="allow"`), states are plain word
 may be unknown are None: a client of this version goes on reading what a newer service says.
 """
 
+from contextlib import suppress
 from typing import Any, Self
 
 from pydantic import BaseModel, ConfigDict
@@ -20,11 +21,10 @@ class Answer(BaseModel):
     @property
     def request_id(self) -> str | None:
         """By which the service's log tells of the request answered by this; None in a stream of events."""
-        try:
-            told: str | None = object.__getattribute__(self, "_request_id")
-        except AttributeError:
-            return None
-        return told
+        with suppress(AttributeError):
+            request_id: str | None = object.__getattribute__(self, "_request_id")
+            return request_id
+        return None
 
     def answering(self, request_id: str | None) -> Self:
         """The same answer, which knows its request from now on."""
@@ -231,21 +231,19 @@ class Job(Answer):
     @property
     def check(self) -> dict[str, Any]:
         """How its map compares with the one active before; empty where that was not looked at."""
-        return _in_metrics((self.result or {}).get("metrics"), "check")
+        return _within(self.result, "metrics", "check")
 
     @property
     def second_season(self) -> dict[str, Any]:
         """Whether its map learnt from a second drive of the route, and why not; empty where there was none."""
-        return _in_metrics((self.result or {}).get("metrics"), "second_season")
+        return _within(self.result, "metrics", "second_season")
 
     @property
     def error_text(self) -> str:
         """What went wrong, in the service's words; "" when nothing did."""
         if isinstance(self.error, dict):
-            for key in ("detail", "message", "title", "code"):
-                if self.error.get(key):
-                    return str(self.error[key])
-            return str(self.error)
+            words = (self.error.get(key) for key in ("detail", "message", "title", "code"))
+            return str(next(filter(None, words), self.error))
         return self.error or ""
 
 
@@ -270,9 +268,11 @@ class MapVersion(Answer):
     @property
     def check(self) -> dict[str, Any]:
         """How it compares with the map that was active when it was made; empty where that was not looked at."""
-        return _in_metrics(self.metrics, "check")
+        return _within(self.metrics, "check")
 
 
-def _in_metrics(metrics: Any, name: str) -> dict[str, Any]:
-    found = metrics.get(name) if isinstance(metrics, dict) else None
-    return found if isinstance(found, dict) else {}
+def _within(document: Any, *names: str) -> dict[str, Any]:
+    """What lies so deep in a document; empty where nothing does."""
+    for name in names:
+        document = document.get(name) if isinstance(document, dict) else None
+    return document if isinstance(document, dict) else {}

@@ -175,14 +175,12 @@ class OnBoardEncoder:
             return self._compared(evaluator.encode([pixels]))
 
     def _of_encoding(self, encoding: Numbers | None) -> NDArray[np.float32]:
-        values = np.asarray(encoding, np.float32).reshape(1, -1)
         try:
-            return self._compared(values)
+            return self._compared(np.asarray(encoding, np.float32).reshape(1, -1))
         except InvalidInputError as error:
             raise InvalidArgumentError(error.message) from error
 
     def _compared(self, encodings: NDArray[np.float32]) -> NDArray[np.float32]:
-        """[r] dissimilarities of one encoding, [1, d]."""
         return np.asarray(self._evaluator.dissimilarities(encodings, self.landmarks.model)[0])
 
 

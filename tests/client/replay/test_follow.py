@@ -22,25 +22,27 @@ def job(state: str, progress: float = 0.0, **more: Any) -> dict[str, Any]:
     return {"job_id": "7", "domain": "d", "state": state, "progress": progress, **more}
 
 
-class Broken(httpx2.SyncByteStream):
-    """A stream that gives some events and breaks off."""
+class Events(httpx2.SyncByteStream):
+    """A stream that gives some events and ends, or breaks off."""
 
-    def __init__(self, *events: dict[str, Any]) -> None:
+    def __init__(self, events: tuple[dict[str, Any], ...], breaks_off: bool) -> None:
         self.events = events
+        self.breaks_off = breaks_off
 
     def __iter__(self) -> Any:
         for event in self.events:
             yield f"event: progress\ndata: {json.dumps(event)}\n\n".encode()
-        raise httpx2.ReadError("the link is gone")
+        if self.breaks_off:
+            raise httpx2.ReadError("the link is gone")
 
 
-def stream(*events: dict[str, Any]) -> httpx2.Response:
-    text = "".join(f"event: progress\ndata: {json.dumps(event)}\n\n" for event in events)
-    return httpx2.Response(200, content=text.encode(), headers={"content-type": "text/event-stream"})
+def stream(*events: dict[str, Any], breaks_off: bool = False) -> Callable[[], httpx2.Response]:
+    headers = {"content-type": "text/event-stream"}
+    return lambda: httpx2.Response(200, stream=Events(events, breaks_off), headers=headers)
 
 
-def broken_stream(*events: dict[str, Any]) -> httpx2.Response:
-    return httpx2.Response(200, stream=Broken(*events), headers={"content-type": "text/event-stream"})
+def answer(status: int, document: dict[str, Any]) -> Callable[[], httpx2.Response]:
+    return lambda: httpx2.Response(status, json=document)
 
 
 class Service:
@@ -80,68 +82,67 @@ class Service:
         )
 
 
+DONE = stream(job("succeeded", 1.0))
+
+
 def test_a_stream_that_lasts_is_all_there_is() -> None:
-    events = lambda: stream(job("running", 0.5), job("succeeded", 1.0))  # noqa: E731
-    service = Service([events], [httpx2.ReadError])
+    service = Service([stream(job("running", 0.5), job("succeeded", 1.0))], [httpx2.ReadError])
     assert service.follow().state == "succeeded"
     assert [heard.progress for heard in service.heard] == [0.5, 1.0]
     assert service.asked == [EVENTS]
 
 
 def test_a_stream_that_breaks_off_is_listened_to_again() -> None:
-    first: Callable[[], httpx2.Response] = lambda: broken_stream(job("running", 0.2))  # noqa: E731
-    last: Callable[[], httpx2.Response] = lambda: stream(job("succeeded", 1.0))  # noqa: E731
-    service = Service([first, httpx2.ConnectError, last], [httpx2.ConnectError, job("running", 0.6)])
+    first = stream(job("running", 0.2), breaks_off=True)
+    service = Service([first, httpx2.ConnectError, DONE], [httpx2.ConnectError, job("running", 0.6)])
     assert service.follow().state == "succeeded"
     assert [heard.progress for heard in service.heard] == [0.2, 0.6, 1.0]
 
 
 def test_a_restarted_service_takes_the_job_up_again() -> None:
     """It was far, goes back to the queue while the service starts, and is resumed behind its last finished stage."""
-    before: Callable[[], httpx2.Response] = lambda: broken_stream(job("running", 0.7))  # noqa: E731
-    starting = lambda: httpx2.Response(503, json={"code": "unavailable"})  # noqa: E731
-    after: Callable[[], httpx2.Response] = lambda: stream(  # noqa: E731
-        job("queued", 0.0), job("running", 0.5), job("succeeded", 1.0)
-    )
+    before = stream(job("running", 0.7), breaks_off=True)
+    starting = answer(503, {"code": "unavailable"})
+    after = stream(job("queued", 0.0), job("running", 0.5), job("succeeded", 1.0))
     service = Service([before, httpx2.ConnectError, starting, after], [httpx2.ConnectError, starting, job("queued")])
     assert service.follow().state == "succeeded"
-    assert [(heard.state, heard.progress) for heard in service.heard] == [
-        ("running", 0.7),
-        ("queued", 0.0),
-        ("queued", 0.0),
-        ("running", 0.5),
-        ("succeeded", 1.0),
-    ]
+    states = [(heard.state, heard.progress) for heard in service.heard]
+    queued = ("queued", 0.0)
+    assert states == [("running", 0.7), queued, queued, ("running", 0.5), ("succeeded", 1.0)]
     assert service.silences == [0.0, 2.0]
 
 
 @pytest.mark.parametrize("status", [408, 429, 502, 503])
 def test_a_service_with_too_much_to_do_is_asked_again(status: int) -> None:
-    busy = lambda: httpx2.Response(status, json={"code": "busy"})  # noqa: E731
-    last: Callable[[], httpx2.Response] = lambda: stream(job("succeeded", 1.0))  # noqa: E731
-    service = Service([busy, last], [busy])
+    busy = answer(status, {"code": "busy"})
+    service = Service([busy, DONE], [busy])
     assert service.follow().state == "succeeded"
     assert service.asked.count(EVENTS) == 2
 
 
-@pytest.mark.parametrize(("status", "error"), [(401, errors.UnauthorizedError), (403, errors.ForbiddenError)])
-def test_a_key_that_was_revoked_meanwhile_ends_it(status: int, error: type[errors.ApiError]) -> None:
-    refused = lambda: httpx2.Response(status, json={"detail": "no"})  # noqa: E731
-    with pytest.raises(error, match="keys create"):
+@pytest.mark.parametrize(
+    ("status", "code", "error", "words"),
+    [
+        (401, "unauthorized", errors.UnauthorizedError, "keys create"),  # the key was revoked meanwhile
+        (403, "forbidden", errors.ForbiddenError, "keys create"),
+        (404, "unknown_job", errors.UnknownJobError, "no job 7"),
+    ],
+)
+def test_a_refusal_ends_it(status: int, code: str, error: type[errors.ApiError], words: str) -> None:
+    refused = answer(status, {"code": code, "detail": "no job 7"})
+    with pytest.raises(error, match=words):
         Service([refused], [refused]).follow()
 
 
 def test_without_streams_the_job_is_asked_for() -> None:
-    refusal = lambda: httpx2.Response(404, json={"code": "not_found"})  # noqa: E731
-    service = Service([refusal], [job("queued"), job("running", 0.5), job("succeeded", 1.0)])
+    service = Service([answer(404, {"code": "not_found"})], [job("queued"), job("running", 0.5), job("succeeded", 1.0)])
     assert service.follow().state == "succeeded"
     assert service.asked.count(EVENTS) == 1
 
 
 def test_a_page_instead_of_a_stream_is_no_end() -> None:
     page = lambda: httpx2.Response(200, content=b"<html>", headers={"content-type": "text/html"})  # noqa: E731
-    service = Service([page], [job("succeeded", 1.0)])
-    assert service.follow().state == "succeeded"
+    assert Service([page], [job("succeeded", 1.0)]).follow().state == "succeeded"
 
 
 @pytest.mark.parametrize(
@@ -150,7 +151,7 @@ def test_a_page_instead_of_a_stream_is_no_end() -> None:
 def test_a_job_without_success_is_an_error(state: str, error: type[errors.JobFailedError]) -> None:
     ended = job(state, error={"code": "too_few_candidates", "detail": "only 3 candidates"})
     with pytest.raises(error) as raised:
-        Service([lambda: stream(ended)], [ended]).follow()
+        Service([stream(ended)], [ended]).follow()
     assert raised.value.job.state == state
     assert state != "failed" or "only 3 candidates" in str(raised.value)
 
@@ -160,12 +161,6 @@ def test_silence_is_not_waited_out_for_ever() -> None:
     with pytest.raises(errors.TransportError):
         service.follow(patience_s=60)
     assert 60 < service.now < 120
-
-
-def test_an_unknown_job_is_said_at_once() -> None:
-    unknown = lambda: httpx2.Response(404, json={"code": "unknown_job", "detail": "no job 7"})  # noqa: E731
-    with pytest.raises(errors.UnknownJobError):
-        Service([unknown], [unknown]).follow()
 
 
 @pytest.mark.parametrize("cancel", [True, False])
@@ -209,16 +204,8 @@ def test_the_bar_shows_what_happens(monkeypatch: pytest.MonkeyPatch) -> None:
         bar.silent(12.4)
         bar._progress.refresh()
     printed = shown.file.getvalue()  # type: ignore[attr-defined]
-    for words in (
-        "beginning",
-        "train planner",
-        "70 %",
-        "1:02:03",
-        "waiting for its turn",
-        "rank",
-        "40 %",
-        "no answer for 12 s, still trying",
-    ):
+    shown_words = ("beginning", "train planner", "70 %", "1:02:03", "waiting for its turn", "rank", "40 %")
+    for words in (*shown_words, "no answer for 12 s, still trying"):
         assert words in printed
 
 
