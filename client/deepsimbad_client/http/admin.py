@@ -76,11 +76,8 @@ class AdminCalls(Face):
     ) -> Domain:
         """Make a domain; the same again changes nothing.
 
-        Args:
-            name: Letters, digits, '.', '_' and '-', at most 64.
-            evaluator: `{"kind": ..., ...}`, how observations are compared with landmarks.
-            closed: Whether the route's end is its start.
-            actions_m: The forward moves a robot may be told to make; absent: the service's default.
+        `evaluator` is `{"kind": ..., ...}`, how observations are compared with landmarks; `closed` says that the
+        route's end is its start; `actions_m` are the moves a robot may be told to make, absent: the service's default.
 
         Raises:
             DomainDiffersError: A domain of that name exists with another configuration.
@@ -136,19 +133,9 @@ class AdminCalls(Face):
         content_type: str | None = None,
         encoding: Numbers | None = None,
     ) -> FrameStored:
-        """Send one frame, an image or a ready encoding; the same index again replaces it.
+        """Send one frame, an image as `Client.localize` takes it or a ready encoding; the same index again replaces it.
 
-        Args:
-            domain: The domain.
-            traverse: One of its traverses.
-            index: The frame's place in the recording, from 0.
-            image: An encoded image or its path.
-            position_m: Distance along the route.
-            timestamp_us: When it was taken.
-            x_m: Where it was taken.
-            y_m: Where it was taken.
-            content_type: The image's media type; absent: read from its first bytes.
-            encoding: A ready encoding instead of an image.
+        `index` is its place in the recording, from 0; `position_m` its distance along the route.
         """
         view = observation(image, content_type, encoding=encoding)
         place = {"position_m": position_m, "timestamp_us": timestamp_us, "x_m": x_m, "y_m": y_m}
@@ -170,15 +157,7 @@ class AdminCalls(Face):
     ) -> FramesStored:
         """Send a batch of frames whose encodings [n, d] are known (needs numpy); the same indices again replace them.
 
-        Args:
-            domain: The domain.
-            traverse: One of its traverses.
-            encodings: [n, d], sent as float32.
-            index: [n] places in the recording, from 0.
-            position_m: [n] distances along the route.
-            timestamp_us: [n] when they were taken.
-            x_m: [n] where they were taken; sent with `y_m` alone.
-            y_m: [n] where they were taken; sent with `x_m` alone.
+        Everything else is [n]; unknown times are -1, unknown places NaN. `x_m` and `y_m` are sent together or not.
         """
         np = require_numpy()
         columns: dict[str, tuple[Any, Any]] = {"encodings": (encodings, np.float32), "index": (index, np.int64)}
@@ -203,13 +182,9 @@ class AdminCalls(Face):
     ) -> Job:
         """Submit a remap and return its job at once; `deepsimbad_client.http.jobs.remap` also follows it.
 
-        A lost answer is asked for again and makes no second job.
-
-        Args:
-            domain: The domain to map anew.
-            training_traverse: The traverse that becomes the map.
-            idempotency_key: Names this request, so that it can be repeated after a `TransportError`; absent: a new one.
-            **options: `RemapOptions`.
+        A lost answer is asked for again and makes no second job. `training_traverse` becomes the map; for the options
+        see `RemapOptions`. The `idempotency_key` names this request, so that it can be repeated after a
+        `TransportError`; absent: a new one.
 
         Raises:
             TooManyJobsError: As many jobs wait as may.
@@ -224,14 +199,8 @@ class AdminCalls(Face):
     ) -> Job:
         """Teach the next map: where a session's robot truly was at each of its observations, known only afterwards.
 
-        Args:
-            domain: The session's domain.
-            session_id: The session; it may have ended a while ago.
-            true_positions_m: A position along the map's route for each observation, in order; None where unknown.
-            idempotency_key: As of `remap`.
-
-        Returns:
-            The job that makes the next map version.
+        The job makes the next map version; the session may have ended a while ago. A position along the map's route for
+        each observation, in order, is None or NaN where unknown; the key is as that of `remap`.
 
         Raises:
             TooManyJobsError: As many jobs wait as may.
@@ -287,12 +256,7 @@ class AdminCalls(Face):
 
     @shared
     async def activate(self, domain: str, version: int, *, expected: int | None = None) -> MapVersion:
-        """Serve another version (or roll back to an older one).
-
-        Args:
-            domain: The domain.
-            version: The version to serve.
-            expected: The version believed active now; absent: whichever is.
+        """Serve another version, forward or back, if `expected` (absent: whichever) is the active one now.
 
         Raises:
             LostActivationError: Another version than the expected one was active.
@@ -349,13 +313,8 @@ class AdminCalls(Face):
         """Fetch the sealed file of a version, to keep or to import it elsewhere.
 
         It is written beside `path`, checked against the digest that the service names, and then renamed. A download
-        that was interrupted goes on where it stopped, this time or the next.
-
-        Args:
-            domain: The domain.
-            version: One of its versions.
-            path: Where it shall lie; a file of that name is replaced.
-            on_progress: Told of the bytes there and the bytes in all (None: not known).
+        that was interrupted goes on where it stopped, this time or the next. `on_progress` is told of the bytes there
+        and the bytes in all (None: not known).
 
         Raises:
             RetiredMapError: Its file was removed.

@@ -102,20 +102,10 @@ class SessionCalls(Face):
     ) -> SessionAnswer:
         """Tell what the robot sees now, after the metres it has moved; give exactly one form of the view.
 
-        A lost answer is asked for again and counts once. To repeat an observation yourself after a `TransportError`,
-        choose its key, and send the same again under it.
-
-        Args:
-            image: An encoded image (JPEG, PNG, TIFF, WebP) or its path, sent as it is.
-            action_m: Metres really moved since the last view; absent: stood still. Ignored for the first view.
-            action_std_m: How well that is known; absent: the service's usual odometry.
-            content_type: The image's media type; absent: read from its first bytes.
-            ranked_landmarks: Landmark ids, nearest first, 1..r of them.
-            dissimilarities: r finite numbers in landmark order, smaller is nearer.
-            encoding: A ready encoding, where the domain takes them.
-            ranked: What an `OnBoardEncoder` made of an image, a few bytes.
-            shortlist: Length of `retrieval` and `belief.top`; absent: the service's default.
-            idempotency_key: Names this observation; absent: a new one.
+        The forms of a view and `shortlist` are those of `Client.localize`. `action_m` are the metres really moved since
+        the last view (absent: stood still; ignored for the first view), `action_std_m` how well they are known (absent:
+        the service's usual odometry). A lost answer is asked for again and counts once. To repeat an observation
+        yourself after a `TransportError`, choose its `idempotency_key`, and send the same again under it.
 
         Raises:
             InvalidMoveError: The move is negative or too long; `PastTheEndError`: past the end of the route.
@@ -266,9 +256,7 @@ class ClientCalls(Face, Generic[AnySession]):
     async def on_board(self, domain: str, *, map_version: int | None = None) -> "OnBoardEncoder":
         """Fetch a map's landmarks once, to rank them here and send a few bytes a view (needs `deep-simbad[edge]`).
 
-        Args:
-            domain: Where the robot is.
-            map_version: A version that a session keeps; absent: the active map.
+        `map_version` is one that a session keeps; absent: the active map.
 
         Raises:
             UnknownDomainError, UnknownMapVersionError: There is none.

@@ -3,8 +3,6 @@
 import hashlib
 import os
 import re
-from base64 import b64decode
-from binascii import Error as NotBase64
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -25,7 +23,6 @@ from deepsimbad_client.http.wire import Wire
 
 WHOLE, PART, BEYOND_THE_END = 200, 206, 416
 _ETAG = re.compile(r'"sha256:([0-9a-f]{64})"')
-_REPR_DIGEST = re.compile(r"\bsha-256=:([A-Za-z0-9+/=]+):")
 _CONTENT_RANGE = re.compile(r"bytes (\d+)-\d+/(\d+|\*)")
 _READ_BYTES = 1 << 20
 
@@ -51,11 +48,7 @@ class MapDownload:
     What has come waits in `<name>.<sha256>.part`: the name tells a later try, in this process or another, of which file
     it is the beginning.
 
-    Args:
-        wire: Sends.
-        call: Asks for the file from its first byte on.
-        path: Where it shall lie.
-        on_progress: Told of the bytes there and the bytes in all (None: not known).
+    `call` asks for the file from its first byte on; `on_progress` is told of the bytes there and in all, where known.
 
     Raises:
         InvalidArgumentError: No file can lie at that path.
@@ -80,9 +73,7 @@ class MapDownload:
         """Receive the file until all of it is there; as long as something comes now and then it never gives up.
 
         Raises:
-            TransportError: No answer came.
-            ApiError: The service refused.
-            UnexpectedAnswerError: Something else answers at this address.
+            TransportError, ApiError, UnexpectedAnswerError: As `Wire.send`.
             DamagedDownloadError: It has another digest than the service named; it is removed.
             NotSavedError: The file cannot be written.
         """
@@ -103,8 +94,7 @@ class MapDownload:
     async def _receive(self, attempts: Attempts) -> float | None:
         """Receive what comes; answers how long to wait before asking for more, None where nothing is missing."""
         link = self._wire.link
-        response = await link.send(self._wire.request(self._asking()), stream=True)
-        try:
+        async with link.stream(self._wire.request(self._asking())) as response:
             if response.status_code in {WHOLE, PART}:
                 with self._saving():
                     part = await link.aside(lambda: self._part_for(response))
@@ -115,15 +105,12 @@ class MapDownload:
                     with self._saving():
                         part.close()
                 return None
-            await link.read(response)
             if response.status_code == BEYOND_THE_END and self._forget_parts():
                 return 0.0
             wait_s = attempts.after_answer(response)
             if wait_s is None:
                 raise_for_problem(response)
             return wait_s
-        finally:
-            await link.close(response)
 
     def _asking(self) -> Call:
         """The call for what is still to come; the whole file, where it is another one by now."""
@@ -207,13 +194,7 @@ class MapDownload:
 
 def _digest_of(response: httpx2.Response) -> str:
     """The sha256 that an answer names, as hex."""
-    if etag := _ETAG.search(response.headers.get("etag", "")):
-        return etag[1]
-    digest = _REPR_DIGEST.search(response.headers.get("repr-digest", ""))
-    try:
-        decoded = b64decode(digest[1], validate=True) if digest is not None else b""
-    except NotBase64:
-        decoded = b""
-    if len(decoded) != hashlib.sha256().digest_size:
+    etag = _ETAG.search(response.headers.get("etag", ""))
+    if etag is None:
         raise UnexpectedAnswerError(f"{response.request.url} does not name the sha256 of the file: is this a map?")
-    return decoded.hex()
+    return etag[1]

@@ -24,19 +24,11 @@ def remap(
     patience_s: float = PATIENCE_S,
     **options: Unpack[RemapOptions],
 ) -> Job:
-    """Make a new map of a domain and wait for it.
+    """Make a new map of a domain of `training_traverse` and what `RemapOptions` names, and follow its job to its end.
 
-    Args:
-        client: The client.
-        domain: The domain to map.
-        training_traverse: The traverse that becomes the map.
-        on_progress: Told of the job each time something is heard of it; first when it is submitted.
-        patience_s: Longest silence of the service that is waited out.
-        **options: What `RemapOptions` names.
-
-    Returns:
-        The job, succeeded; its `result` holds `map_version`, `active` and `metrics`. Where the new map lost against the
-        active one by more than the gate's margin, `active` is false and `check["why"]` says so.
+    The `result` of the job holds `map_version`, `active` and `metrics`. Where the new map lost against the active one
+    by more than the gate's margin, `active` is false and `check["why"]` says so. `on_progress` and `patience_s` are as
+    in `follow_job`.
 
     Raises:
         JobFailedError: The service could not make the map.
@@ -65,17 +57,8 @@ def follow_job(
     and listens anew; where there is no stream at all, goes on asking. A service that was restarted takes the job up
     again: it is queued once more, and its progress may be less than it was.
 
-    Args:
-        client: The client.
-        job_id: The job.
-        on_progress: Told of the job each time something is heard of it.
-        on_silence: Told the seconds since then each time the service has not answered.
-        patience_s: Longest silence of the service that is waited out.
-        sleep: Waits.
-        clock: Seconds that never go backwards.
-
-    Returns:
-        The job, succeeded.
+    `on_progress` is told of the job each time something is heard of it, `on_silence` the seconds since then each time
+    the service has not answered; longer than `patience_s` it is not waited for.
 
     Raises:
         JobFailedError: It failed.

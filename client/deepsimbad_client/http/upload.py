@@ -80,15 +80,8 @@ def upload(
     Images go one by one, a few at once, resized to what the domain asks for; ready encodings go in batches. A frame
     that cannot be read here, or decoded there, is counted and passed over.
 
-    Args:
-        client: The client; its key needs the scope `admin`.
-        recording: What to send.
-        domain: An existing domain.
-        traverse: Made when it does not exist.
-        concurrency: Images under way at once.
-        resend: Send also what is there already.
-        on_progress: Told how far it is after every frame or batch.
-        clock: Seconds that never go backwards.
+    The domain must exist, the traverse is made. What is there already is sent again with `resend` alone. `on_progress`
+    is told how far it is after every frame or batch.
 
     Raises:
         SourceError: The recording has no frames, or none of them could be sent.

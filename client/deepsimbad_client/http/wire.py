@@ -10,6 +10,7 @@ import asyncio
 import os
 import re
 from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Callable, Coroutine, Iterator
+from contextlib import AbstractAsyncContextManager, aclosing, asynccontextmanager, closing
 from functools import wraps
 from types import TracebackType
 from typing import Any, Concatenate, Generic, ParamSpec, Protocol, Self, TypeVar, overload
@@ -22,6 +23,8 @@ from deepsimbad_client.http.retry import Attempts, RetryPolicy
 
 P = ParamSpec("P")
 T = TypeVar("T")
+Blocked = TypeVar("Blocked")
+Awaited = TypeVar("Awaited")
 
 URL_VARIABLE = "DEEPSIMBAD_URL"
 KEY_VARIABLE = "DEEPSIMBAD_API_KEY"
@@ -62,11 +65,11 @@ class Link(Protocol):
     def http(self) -> httpx2.Client | httpx2.AsyncClient:
         """What sends."""
 
-    async def send(self, request: httpx2.Request, *, stream: bool = False) -> httpx2.Response:
-        """Send once; a streamed answer must be closed."""
+    async def send(self, request: httpx2.Request) -> httpx2.Response:
+        """Send once and read the answer."""
 
-    async def read(self, response: httpx2.Response) -> None:
-        """Read the rest of a streamed answer."""
+    def stream(self, request: httpx2.Request) -> AbstractAsyncContextManager[httpx2.Response]:
+        """Send once; of a refusal the whole answer is read, of another the content is still to come."""
 
     def pieces(self, response: httpx2.Response) -> AsyncIterator[bytes]:
         """The content of a streamed answer, as it comes."""
@@ -80,8 +83,8 @@ class Link(Protocol):
     async def sleep(self, seconds: float) -> None:
         """Wait."""
 
-    async def close(self, response: httpx2.Response | None = None) -> None:
-        """Close a streamed answer, or every connection."""
+    async def close(self) -> None:
+        """Close the connections."""
 
 
 class BlockingLink:
@@ -91,11 +94,15 @@ class BlockingLink:
         self.http = http
         self._sleep = sleep
 
-    async def send(self, request: httpx2.Request, *, stream: bool = False) -> httpx2.Response:
-        return self.http.send(request, stream=stream)
+    async def send(self, request: httpx2.Request) -> httpx2.Response:
+        return self.http.send(request)
 
-    async def read(self, response: httpx2.Response) -> None:
-        response.read()
+    @asynccontextmanager
+    async def stream(self, request: httpx2.Request) -> AsyncIterator[httpx2.Response]:
+        with closing(self.http.send(request, stream=True)) as response:
+            if not response.is_success:
+                response.read()
+            yield response
 
     async def pieces(self, response: httpx2.Response) -> AsyncIterator[bytes]:
         for piece in response.iter_bytes():
@@ -111,8 +118,8 @@ class BlockingLink:
     async def sleep(self, seconds: float) -> None:
         self._sleep(seconds)
 
-    async def close(self, response: httpx2.Response | None = None) -> None:
-        (response or self.http).close()
+    async def close(self) -> None:
+        self.http.close()
 
 
 class AwaitingLink:
@@ -122,11 +129,15 @@ class AwaitingLink:
         self.http = http
         self._sleep = sleep
 
-    async def send(self, request: httpx2.Request, *, stream: bool = False) -> httpx2.Response:
-        return await self.http.send(request, stream=stream)
+    async def send(self, request: httpx2.Request) -> httpx2.Response:
+        return await self.http.send(request)
 
-    async def read(self, response: httpx2.Response) -> None:
-        await response.aread()
+    @asynccontextmanager
+    async def stream(self, request: httpx2.Request) -> AsyncIterator[httpx2.Response]:
+        async with aclosing(await self.http.send(request, stream=True)) as response:
+            if not response.is_success:
+                await response.aread()
+            yield response
 
     def pieces(self, response: httpx2.Response) -> AsyncIterator[bytes]:
         return response.aiter_bytes()
@@ -140,8 +151,8 @@ class AwaitingLink:
     async def sleep(self, seconds: float) -> None:
         await self._sleep(seconds)
 
-    async def close(self, response: httpx2.Response | None = None) -> None:
-        await (response or self.http).aclose()
+    async def close(self) -> None:
+        await self.http.aclose()
 
 
 class Wire:
@@ -168,11 +179,7 @@ class Wire:
         return Attempts(self._retry, call.repeat, f"{call} at {self.url}", self._jitter)
 
     def request(self, call: Call) -> httpx2.Request:
-        """A call as an HTTP request, under an id of the caller's where he gives them.
-
-        Raises:
-            InvalidArgumentError: The service would not take that id.
-        """
+        """A call as an HTTP request, under an id of the caller's where he gives them; raises InvalidArgumentError."""
         headers = dict(call.headers)
         if self._request_id is not None:
             headers[REQUEST_ID] = self._request_id()
@@ -227,15 +234,10 @@ class Wire:
         """
         what = f"{call} at {self.url}"
         try:
-            response = await self.link.send(self.request(call), stream=True)
-            try:
-                if not response.is_success:
-                    await self.link.read(response)
-                    raise_for_problem(response)
+            async with self.link.stream(self.request(call)) as response:
+                raise_for_problem(response)
                 async for event in self.link.events(response):
                     yield event
-            finally:
-                await self.link.close(response)
         except httpx2.TimeoutException as error:
             raise TransportTimeoutError(f"{what} fell silent: {error or type(error).__name__}") from error
         except httpx2.TransportError as error:
@@ -289,25 +291,20 @@ class Awaiting(Face):
         await self._leave(error)
 
 
-class shared(Generic[P, T]):  # noqa: N801 - a decorator
-    """A call that is a plain method of a `Blocking` class and a coroutine method of an `Awaiting` one.
+class Shared(Generic[P, Blocked, Awaited]):
+    """A call as two functions, of which a `Blocking` class shows the one and every other class the other.
 
-    In the class that holds it, it is the coroutine function: written `AdminCalls.maps(self, domain)`, a call can be
-    awaited by another whatever the face.
+    So `AdminCalls.maps(self, domain)`, in the class that holds a call, can be awaited whatever the face.
     """
 
-    def __init__(self, awaiting: Callable[Concatenate[Any, P], Coroutine[Any, Any, T]]) -> None:
-        @wraps(awaiting)
-        def blocking(*args: Any, **kwargs: Any) -> T:
-            return finished(awaiting(*args, **kwargs))
-
-        self._awaiting: Any = awaiting
-        self._blocking: Any = blocking
+    def __init__(self, blocking: Any, awaiting: Any) -> None:
+        self._blocking: Any = wraps(awaiting)(blocking)
+        self._awaiting = awaiting
 
     @overload
-    def __get__(self, face: Blocking, owner: type[Face]) -> Callable[P, T]: ...
+    def __get__(self, face: Blocking, owner: type[Face]) -> Callable[P, Blocked]: ...
     @overload
-    def __get__(self, face: Awaiting, owner: type[Face]) -> Callable[P, Coroutine[Any, Any, T]]: ...
+    def __get__(self, face: Awaiting, owner: type[Face]) -> Callable[P, Awaited]: ...
     @overload
     def __get__(self, face: None, owner: type[Face]) -> Callable[..., Any]: ...
     def __get__(self, face: Face | None, owner: type[Face]) -> Any:
@@ -315,30 +312,26 @@ class shared(Generic[P, T]):  # noqa: N801 - a decorator
         return function if face is None else function.__get__(face, owner)
 
 
-class shared_stream(Generic[P, T]):  # noqa: N801 - a decorator
-    """A call that gives an iterator in a `Blocking` class and an async iterator in an `Awaiting` one."""
+def shared(
+    awaiting: Callable[Concatenate[Any, P], Coroutine[Any, Any, T]],
+) -> Shared[P, T, Coroutine[Any, Any, T]]:
+    """Make a plain method of a `Blocking` class and a coroutine method of an `Awaiting` one."""
+    return Shared(lambda *args, **kwargs: finished(awaiting(*args, **kwargs)), awaiting)
 
-    def __init__(self, awaiting: Callable[Concatenate[Any, P], AsyncGenerator[T, None]]) -> None:
-        @wraps(awaiting)
-        def blocking(*args: Any, **kwargs: Any) -> Iterator[T]:
-            items = awaiting(*args, **kwargs)
-            try:
-                while True:
-                    yield finished(items.__anext__())
-            except StopAsyncIteration:
-                return
-            finally:
-                finished(items.aclose())
 
-        self._awaiting: Any = awaiting
-        self._blocking: Any = blocking
+def shared_stream(
+    awaiting: Callable[Concatenate[Any, P], AsyncGenerator[T, None]],
+) -> Shared[P, Iterator[T], AsyncIterator[T]]:
+    """Make a method that gives an iterator in a `Blocking` class and an async iterator in an `Awaiting` one."""
 
-    @overload
-    def __get__(self, face: Blocking, owner: type[Face]) -> Callable[P, Iterator[T]]: ...
-    @overload
-    def __get__(self, face: Awaiting, owner: type[Face]) -> Callable[P, AsyncIterator[T]]: ...
-    @overload
-    def __get__(self, face: None, owner: type[Face]) -> Callable[..., Any]: ...
-    def __get__(self, face: Face | None, owner: type[Face]) -> Any:
-        function = self._blocking if issubclass(owner, Blocking) else self._awaiting
-        return function if face is None else function.__get__(face, owner)
+    def blocking(*args: Any, **kwargs: Any) -> Iterator[T]:
+        items = awaiting(*args, **kwargs)
+        try:
+            while True:
+                yield finished(items.__anext__())
+        except StopAsyncIteration:
+            return
+        finally:
+            finished(items.aclose())
+
+    return Shared(blocking, awaiting)
