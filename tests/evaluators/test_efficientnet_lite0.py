@@ -10,6 +10,7 @@ from deepsimbad.evaluators.compute import Compute, Device, Runtime
 from deepsimbad.evaluators.extractors import efficientnet_lite0 as module
 from deepsimbad.evaluators.nets.efficientnet_lite import EfficientNetLite
 from deepsimbad.evaluators.registry import make_extractor
+from deepsimbad.evaluators.runtimes import has_onnxruntime
 from deepsimbad.evaluators.weights.files import read_state_dict
 
 STAGES = ((1, 3, 1, 1), (2, 3, 2, 6), (2, 5, 2, 6), (3, 3, 2, 6), (3, 5, 1, 6))  # repeats, kernel, stride, expansion
@@ -90,24 +91,24 @@ def test_the_encoding_is_cells_of_two_maps_beside_the_gradient_grid(tensors):
     np.testing.assert_allclose(encoding, expected / np.linalg.norm(expected), rtol=2e-3, atol=1e-5)
 
 
-@pytest.mark.parametrize("runtime", [r for r in Runtime if r is not Runtime.TORCH])
-def test_all_runtimes_agree(runtime, tmp_path):
-    if runtime is Runtime.ONNXRUNTIME:
-        pytest.importorskip("onnxruntime")
-        pytest.importorskip("onnxscript")
+def test_all_runtimes_agree(tmp_path):
     rng = np.random.default_rng(2)
     coarse = [rng.integers(0, 256, (9, 12, 3), np.uint8) for _ in range(4)]
     images = [cv2.resize(each, (320, 240), interpolation=cv2.INTER_CUBIC) for each in coarse]
-    exact = make_extractor("efficientnet_lite0", Compute(runtime=Runtime.TORCH)).encode(images)
-    other = make_extractor("efficientnet_lite0", Compute(runtime=runtime, weights_dir=tmp_path)).encode(images)
-    cosine = np.einsum("nd,nd->n", exact, other)
-    assert (cosine > 1 - 1e-3).all()
-    if runtime is Runtime.ONNXRUNTIME:
-        assert np.abs(exact - other).max() < 1e-3
+
+    def encodings(runtime):
+        return make_extractor("efficientnet_lite0", Compute(runtime=runtime, weights_dir=tmp_path)).encode(images)
+
+    exact = encodings(Runtime.TORCH)
+    others = {runtime: encodings(runtime) for runtime in (Runtime.TORCH_BF16, Runtime.AUTO)}
+    if has_onnxruntime():
+        others[Runtime.ONNXRUNTIME] = encodings(Runtime.ONNXRUNTIME)
+        assert np.abs(exact - others[Runtime.ONNXRUNTIME]).max() < 1e-3
         (exported,) = (tmp_path / "exported").iterdir()
         exported.write_bytes(exported.read_bytes()[:5000])  # a disk that was full
-        again = make_extractor("efficientnet_lite0", Compute(runtime=runtime, weights_dir=tmp_path)).encode(images)
-        np.testing.assert_array_equal(again, other)
+        np.testing.assert_array_equal(encodings(Runtime.ONNXRUNTIME), others[Runtime.ONNXRUNTIME])
+    for runtime, other in others.items():
+        assert (np.einsum("nd,nd->n", exact, other) > 1 - 1e-3).all(), runtime
 
 
 def test_a_batch_changes_nothing_that_counts():

@@ -152,24 +152,24 @@ def test_an_entry_encodes_as_its_model_says(tmp_path, capfd):
     assert given.dtype == np.float32
     np.testing.assert_allclose(given, [by_hand(image) for image in images], atol=3e-4)
     assert (extractor.encoding_dim, extractor.input_size) == (8, SIZE)
-    assert extractor.weights_sha256 == record.weights_sha256
+    by_name = make_evaluator(  # which may be in capitals
+        evaluator_config({"kind": "feature_l2", "extractor": "torchhub:SOMEONE/places:entry"}),
+        Compute(weights_dir=tmp_path, device=Device.CPU),
+    )
+    np.testing.assert_array_equal(by_name.encode(images), given)
+    assert by_name.weights_sha256 == extractor.weights_sha256 == record.weights_sha256
 
 
-@pytest.mark.parametrize("form", ["tensor", "pair", "zero"])
-def test_encodings_have_unit_length_and_stand_for_themselves(tmp_path, form):
-    pulled(tmp_path, arguments={"form": form})
-    extractor = loaded(tmp_path, largest_batch=2)
+@pytest.mark.parametrize(
+    ("entry", "arguments"), [("entry", {"form": form}) for form in ("tensor", "pair", "zero")] + [("wrapped", {})]
+)
+def test_encodings_have_unit_length_and_stand_for_themselves(tmp_path, entry, arguments):
+    """Also of several outputs, of one that sees nothing, and of a model for several devices."""
+    pulled(tmp_path, entry, arguments=arguments)
+    extractor = loaded(tmp_path, entry, largest_batch=2)
     given = extractor.encode(scenes())
     np.testing.assert_allclose(np.linalg.norm(given, axis=1), 1, rtol=1e-3)
     np.testing.assert_allclose(given, [extractor.encode([image])[0] for image in scenes()], atol=3e-4)
-
-
-def test_it_is_made_by_name(tmp_path):
-    record = pulled(tmp_path)
-    config = evaluator_config({"kind": "feature_l2", "extractor": f"torchhub:{REPOSITORY}:entry"})
-    evaluator = make_evaluator(config, Compute(weights_dir=tmp_path, device=Device.CPU))
-    assert evaluator.encode(scenes()).shape == (3, 8)
-    assert evaluator.weights_sha256 == record.weights_sha256
 
 
 def test_arguments_are_recorded_and_given_at_every_load(tmp_path):
@@ -180,16 +180,6 @@ def test_arguments_are_recorded_and_given_at_every_load(tmp_path):
     }
     assert loaded(tmp_path).encode(scenes()).shape == (3, 5)
     assert record.weights_sha256 != first.weights_sha256
-
-
-def test_the_repositorys_name_may_be_in_capitals(tmp_path):
-    pulled(tmp_path)
-    assert torchhub("SOMEONE/places:entry", Compute(weights_dir=tmp_path, device=Device.CPU)).encoding_dim == 8
-
-
-def test_a_model_of_several_devices_is_taken_out_of_its_wrapper(tmp_path):
-    pulled(tmp_path, "wrapped")
-    np.testing.assert_allclose(np.linalg.norm(loaded(tmp_path, "wrapped").encode(scenes()), axis=1), 1, rtol=1e-3)
 
 
 def test_by_itself_it_is_computed_in_float32(tmp_path):
