@@ -3,11 +3,10 @@
 import cv2
 import numpy as np
 
-from deepsimbad_client.campus import PAPER_DATES
-from deepsimbad_client.campus.drive import Drive, drive_length_m
-from deepsimbad_client.campus.render import Renderer
-from deepsimbad_client.campus.season import drive_date
-from deepsimbad_client.campus.world import World
+from deepsimbad_campus.renderer import Renderer
+from deepsimbad_campus.route import Drive, drive_length_m
+from deepsimbad_campus.season import PAPER_DATES, drive_date
+from deepsimbad_campus.world import World
 
 _QUALITY, _SPACING_M = 90, 1.75
 
@@ -16,7 +15,7 @@ def jpegs(n_pictures: int) -> list[bytes]:
     """JPEG files of 1232 x 1616 pixels, upright, one a place along a drive."""
     date = drive_date(next(iter(PAPER_DATES)))
     world = World(0, drive_length_m(n_pictures, _SPACING_M))
-    renderer = Renderer(world, Drive(world.route, 0, date, n_pictures, _SPACING_M), date)
+    renderer = Renderer(world, Drive(world.route, 0, date, n_pictures, _SPACING_M))
     return [_jpeg(renderer, frame) for frame in range(n_pictures)]
 
 

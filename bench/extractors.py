@@ -22,7 +22,7 @@ from bench import machine
 from bench.nordland import kept_frames, season_folder
 from bench.recordings import RESULTS, real_recordings
 from deepsimbad.cli import run
-from deepsimbad_client.campus.writer import write_campus
+from deepsimbad_campus.writer import write_campus
 from deepsimbad_client.recordings.sources import open_source
 
 N_LANDMARKS, N_CAMPUS_LANDMARKS = 300, 290  # a campus of 300 frames has a few without ground truth
@@ -82,15 +82,15 @@ def corridor(data: Path) -> Iterator[Split]:
 
 def campus(work: Path) -> Iterator[Split]:
     """The client's rendered campus in three seasons, all six triplets; the landmark drive is of the same route."""
-    drives = [_as_sent(work, drive.date) for drive in write_campus(work, CAMPUS_SEASONS, 300, 0)]
+    drives = [_as_sent(work, source) for source in write_campus(work, CAMPUS_SEASONS, 300, 0)]
     for landmarks, training, test in itertools.permutations(drives):
         more = ("--tolerance", str(CAMPUS_TOLERANCE_M))
         yield Split("campus, six triplets", landmarks, training, test, N_CAMPUS_LANDMARKS, more)
 
 
-def _as_sent(work: Path, date: str) -> str:
+def _as_sent(work: Path, source: str) -> str:
     """A drive's images as a client sends them, in a folder of their own: read once from TIFF, not by every split."""
-    recording, folder = open_source(f"nclt:{work}/{date}"), work / f"sent-{date}"
+    recording, folder = open_source(source), work / f"sent-{Path(source).name}"
     folder.mkdir()
     lines = ["name,x_m,y_m"]
     for frame in recording.frames:

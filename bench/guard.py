@@ -28,7 +28,7 @@ from deepsimbad.evaluators.base import Evaluator, Image
 from deepsimbad.evaluators.feature_l2 import FeatureL2
 from deepsimbad.evaluators.image import decode_image
 from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
-from deepsimbad_client.campus.writer import write_campus
+from deepsimbad_campus.writer import write_campus
 from deepsimbad_client.recordings.sources import open_source
 
 EXTRACTORS = ("gradient_grid", "efficientnet_lite0")
@@ -294,8 +294,8 @@ def encode(folder: Path, data: Path) -> None:
         if all((folder / f"{name}.{extractor}.npz").exists() for name in names for extractor in EXTRACTORS):
             continue
         with tempfile.TemporaryDirectory() as root:
-            for name, written in zip(names, write_campus(Path(root), SEASONS, n_frames, seed), strict=True):
-                recording = open_source(f"nclt:{root}/{written.date}")
+            for name, source in zip(names, write_campus(Path(root), SEASONS, n_frames, seed), strict=True):
+                recording = open_source(source)
                 images = [
                     decode_image(recording.image(frame, (224, 224)).body, MAX_PIXELS) for frame in recording.frames
                 ]

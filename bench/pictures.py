@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from bench.recordings import RESULTS
-from deepsimbad_client.campus import PAPER_DATES
+from deepsimbad_campus.season import PAPER_DATES
 from deepsimbad_client.commands.demo import SEASONS
 from deepsimbad_client.recordings.nclt import read_nclt
 

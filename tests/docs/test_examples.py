@@ -18,8 +18,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from deepsimbad_campus.season import PAPER_DATES
+from deepsimbad_campus.writer import write_campus
 from deepsimbad_client import Client
-from deepsimbad_client.campus import PAPER_DATES, write_campus
 from deepsimbad_client.http.local_server import LocalServer
 from deepsimbad_client.recordings.sources import open_source
 

@@ -13,8 +13,9 @@ from pathlib import Path
 
 import pytest
 
+from deepsimbad_campus.season import PAPER_DATES
+from deepsimbad_campus.writer import write_campus
 from deepsimbad_client import Client
-from deepsimbad_client.campus import PAPER_DATES, write_campus
 from deepsimbad_client.http.local_server import LocalServer
 
 from .conftest import Page

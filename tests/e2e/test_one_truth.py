@@ -13,8 +13,9 @@ from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
 from deepsimbad.jobs.encoded_traverse import encode_recording
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.map_file import read_map
+from deepsimbad_campus.season import PAPER_DATES
+from deepsimbad_campus.writer import write_campus
 from deepsimbad_client import Client
-from deepsimbad_client.campus import PAPER_DATES, write_campus
 from deepsimbad_client.http.jobs import remap
 from deepsimbad_client.http.local_server import LocalServer
 from deepsimbad_client.http.upload import upload

@@ -14,11 +14,11 @@ import click
 from rich.console import Console
 from rich.table import Table
 
+from deepsimbad_campus.season import CampusError
+from deepsimbad_campus.writer import write_campus
 from deepsimbad_client.active_plots import draw_active
 from deepsimbad_client.active_replay import active_replay
 from deepsimbad_client.active_report import localized_table, planner_table, summarise_active
-from deepsimbad_client.campus import PAPER_DATES, write_campus
-from deepsimbad_client.campus.season import SeasonName
 from deepsimbad_client.console import EpisodeBar, FrameBar, JobBar, ReplayBar, UploadBar
 from deepsimbad_client.errors import DeepSimbadClientError
 from deepsimbad_client.http.client import Client
@@ -34,7 +34,7 @@ from deepsimbad_client.stage import DEFAULT_PLANNER, Stage
 from deepsimbad_client.story import told
 
 DOMAIN = "campus"
-SEASONS: tuple[SeasonName, SeasonName, SeasonName] = ("winter", "spring", "summer")
+SEASONS = ("winter", "spring", "summer")
 LANDMARK_SEASON, MAP_SEASON, LIVE_SEASON = SEASONS
 # The one that ships comes last: it stays active.
 RELEVANCES = ("brute_force", "bag_of_landmarks", "simbad", "rrf", "standardised", "calibrated")
@@ -57,8 +57,8 @@ def demo(folder: Path, frames: int, seed: int) -> None:
     root = folder / "campus"
     _say(f"1. A campus in three seasons, {frames} frames each, in NCLT's layout: {root}")
     with FrameBar("rendering", len(SEASONS) * frames) as bar:
-        write_campus(root, SEASONS, frames, seed, on_progress=bar)
-    drives: dict[str, Recording] = {season: open_source(f"nclt:{root}/{PAPER_DATES[season]}") for season in SEASONS}
+        sources = write_campus(root, SEASONS, frames, seed, on_progress=bar)
+    drives = {season: open_source(source) for season, source in zip(SEASONS, sources, strict=True)}
     with LocalServer(folder / "data") as server, Client(server.url) as client:
         _say(f"2. The service runs at {server.url}; its log is {server.log_path}")
         _upload(client, drives)
@@ -169,7 +169,7 @@ def main() -> None:
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     try:
         demo()
-    except DeepSimbadClientError as error:
+    except (DeepSimbadClientError, CampusError) as error:
         sys.exit(f"{error.code}: {error}")
 
 

@@ -18,7 +18,7 @@ from deepsimbad_client.replay_command import replay
 from deepsimbad_client.watch_command import watch
 
 DONE, FAILED, CANCELLED = 0, 1, 130
-ELSEWHERE = {"campus": "deepsimbad_client.campus.command:campus_command"}
+ELSEWHERE = {"campus": "deepsimbad_campus.__main__:campus_command"}
 """Commands that are imported when they are asked for."""
 
 

@@ -1,4 +1,4 @@
-"""The command that renders a campus: `deepsimbad-client campus ROOT`."""
+"""`python -m deepsimbad_campus ROOT` renders a campus."""
 
 from pathlib import Path
 
@@ -6,8 +6,8 @@ import click
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from deepsimbad_client.campus.season import PAPER_DATES
-from deepsimbad_client.campus.writer import write_campus
+from deepsimbad_campus.season import PAPER_DATES, CampusError
+from deepsimbad_campus.writer import write_campus
 
 
 @click.command("campus")
@@ -37,9 +37,12 @@ def campus_command(root: Path, seasons: str, frames: int, seed: int, spacing_m: 
         def show(done: int, total: int) -> None:
             progress.update(task, completed=done, total=total)
 
-        drives = write_campus(root, names, frames, seed, spacing_m=spacing_m, on_progress=show)
-    for drive in drives:
-        click.echo(f"nclt:{root}/{drive.date}")
+        try:
+            sources = write_campus(root, names, frames, seed, spacing_m=spacing_m, on_progress=show)
+        except CampusError as error:
+            raise click.ClickException(str(error)) from error
+    for source in sources:
+        click.echo(source)
 
 
 if __name__ == "__main__":

@@ -1,0 +1,69 @@
+"""The front camera: an upright pinhole 1.2 m above the ground, and the canvas it sees the world on."""
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Image = NDArray[np.uint8]  # [height, width, 3] blue, green, red, where nothing else is said
+Colour = tuple[float, ...]  # blue, green, red, 0..255
+
+UPRIGHT_SIZE = (1232, 1616)
+"""Width and height of a picture the right way up; it is stored turned 90 degrees counter-clockwise."""
+
+CANVAS_SIZE, SEEN_SIZE = (560, 728), (528, 693)
+"""Width and height pictures are drawn at, and of the part that is seen: a little less, so that the robot may nod."""
+
+FOCAL_PX, EYE_M, NEAR_M = 300.0, 1.2, 0.35
+CENTRE_X, HORIZON_Y = CANVAS_SIZE[0] / 2, CANVAS_SIZE[1] * 0.47
+HALF_VIEW = CENTRE_X / FOCAL_PX + 0.02
+
+
+class View(NamedTuple):
+    """Where the camera is and what it looks along: clockwise from north, up and leaning right."""
+
+    north_m: float
+    east_m: float
+    heading_rad: float
+    pitch_rad: float = 0.0
+    roll_rad: float = 0.0
+
+    def to_camera(self, points: Array) -> Array:
+        """[n, 2] metres to the right of and ahead of the camera, of [n, 2] north and east."""
+        cos, sin = np.cos(self.heading_rad), np.sin(self.heading_rad)
+        return np.asarray((points - (self.north_m, self.east_m)) @ np.array([[-sin, cos], [cos, sin]]), np.float64)
+
+
+def project(right_ahead: Array, height_m: Array | float = 0.0) -> Array:
+    """[n, 2] canvas pixels (x right, y down) of [n, 2] points right and ahead, before the view's pitch and roll."""
+    per_m = FOCAL_PX / np.maximum(right_ahead[:, 1], 1e-3)
+    return np.stack([CENTRE_X + right_ahead[:, 0] * per_m, HORIZON_Y + (EYE_M - height_m) * per_m], axis=1)
+
+
+def clip_near(polygon: Array) -> Array:
+    """The part of an [n, 2] ground polygon (right, ahead) that lies ahead of the camera; may be empty."""
+    ahead, following = polygon[:, 1] - NEAR_M, np.roll(polygon, -1, axis=0)
+    behind_next = following[:, 1] < NEAR_M
+    crossing = (ahead < 0) != behind_next
+    share = ahead / np.where(crossing, ahead - (following[:, 1] - NEAR_M), 1.0)
+    cuts = polygon + share[:, None] * (following - polygon)
+    return np.asarray(np.stack([polygon, cuts], axis=1)[np.stack([ahead >= 0, crossing], axis=1)], np.float64)
+
+
+def sixteenths(pixels: Array) -> NDArray[np.int32]:
+    """Pixels as OpenCV takes those of polygons with a shift of 4."""
+    return np.clip(np.round(pixels * 16), -400_000, 400_000).astype(np.int32)
+
+
+def fill(image: Image, ground: Array, ink: Colour, first_row: int = 0, line: int = cv2.LINE_AA) -> None:
+    """Fill a convex [n, 2] ground polygon (right, ahead) on the canvas, or on what begins at one of its rows."""
+    seen = clip_near(ground)
+    if len(seen) >= 3:
+        cv2.fillConvexPoly(image, sixteenths(project(seen) - (0, first_row)), ink, line, 4)
+
+
+def ink(colour: Array) -> tuple[int, ...]:
+    """A colour as OpenCV draws with it."""
+    return tuple(int(value) for value in np.clip(colour, 0, 255))

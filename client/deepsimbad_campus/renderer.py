@@ -1,0 +1,271 @@
+"""Pictures of one drive, painted from back to front: sky, ground, and what stands on it."""
+
+from collections.abc import Callable
+from functools import lru_cache, partial
+from itertools import pairwise
+from operator import itemgetter
+
+import cv2
+import numpy as np
+
+from deepsimbad_campus import things
+from deepsimbad_campus.camera import (
+    CANVAS_SIZE,
+    CENTRE_X,
+    EYE_M,
+    FOCAL_PX,
+    HALF_VIEW,
+    HORIZON_Y,
+    NEAR_M,
+    SEEN_SIZE,
+    UPRIGHT_SIZE,
+    Array,
+    Image,
+    View,
+    fill,
+    ink,
+)  # fmt: skip
+from deepsimbad_campus.pictures import (
+    PAVING,
+    SKY_PX_PER_DEG,
+    SKY_TOP_DEG,
+    TILE_M,
+    TILE_PX,
+    draw_facade,
+    draw_ground,
+    draw_sky,
+    draw_trees,
+)  # fmt: skip
+from deepsimbad_campus.route import Drive, stream
+from deepsimbad_campus.season import Light, season_of
+from deepsimbad_campus.things import Shot
+from deepsimbad_campus.world import BUSH, FIRST_CONIFER, SIGHT_M, Style, World
+
+GRAIN = 4.0
+FACADES = 96
+"""Pictures of walls kept; about 1 MB each."""
+
+GLARE_PX, DRIFT_DEG_PER_FRAME = 420, 0.06
+BANDS_M = (0.0, 4.0, 10.0, 24.0, 55.0, 1e9)
+"""Distances at which a coarser picture of the ground takes over."""
+
+LONGEST_SHADOW_M = 45.0
+LABELS = {name: label for label, name in enumerate(("grass", *PAVING))}
+
+# Where the canvas's pixels look: sky rows from the top, ground rows from the first below the horizon.
+WIDTH, HEIGHT = CANVAS_SIZE
+SLOPE = (np.arange(WIDTH) - CENTRE_X) / FOCAL_PX
+RISE = (HORIZON_Y - np.arange(int(np.ceil(HORIZON_Y)) + 1))[:, None] / FOCAL_PX
+AZIMUTH_DEG = np.rad2deg(np.arctan(SLOPE))
+ELEVATION_DEG = np.rad2deg(np.arctan2(RISE, np.sqrt(1 + SLOPE * SLOPE)))
+GROUND_ROW = int(HORIZON_Y) + 2
+AHEAD_M = np.asarray(FOCAL_PX * EYE_M / (np.arange(GROUND_ROW, HEIGHT) - HORIZON_Y), np.float64)
+
+
+class Renderer:
+    """Paints any frame of a drive; safe to use from several threads at once."""
+
+    def __init__(self, world: World, drive: Drive) -> None:
+        self._world, self._drive = world, drive
+        date, seed, number = drive.date.isoformat(), world.seed, drive.date.toordinal()
+        self._season = season = season_of(drive.date, seed)
+        self._skyline, self._dome = world.skyline(), draw_sky(season, stream(seed, f"sky {date}"))
+        radius = np.hypot(*np.mgrid[-GLARE_PX:GLARE_PX, -GLARE_PX:GLARE_PX]) / GLARE_PX
+        self._glare = np.clip(1 - radius, 0, 1)[:, :, None] ** 3.0 * np.array(season.sun)
+        self._tiles, self._trees = draw_ground(season, date, seed), draw_trees(season, seed)
+        self._facade = lru_cache(FACADES)(partial(draw_facade, season=season, drive=number))
+        grain = stream(seed, f"grain {date}").normal(0, GRAIN, (UPRIGHT_SIZE[0] + 64, UPRIGHT_SIZE[1] + 64, 1))
+        self._grain = np.clip(np.repeat(grain, 3, axis=2) + 128, 0, 255).astype(np.uint8)
+
+    def stored(self, frame: int) -> Image:
+        """[1232, 1616, 3] BGR, the picture of a frame as it is stored: turned counter-clockwise."""
+        view = self._drive.view(frame)
+        # What is drawn, seen from the middle, leans and nods and turns: a stored column is an upright row, and stored
+        # rows count the upright columns from the right. Enlarging comes last because it is dearest.
+        lean, nod = -view.roll_rad, FOCAL_PX * np.tan(view.pitch_rad)
+        cos, sin = np.cos(lean), np.sin(lean)
+        x, y = WIDTH / 2, HEIGHT / 2 - nod
+        (wide, tall), (width, height) = SEEN_SIZE, UPRIGHT_SIZE
+        turn = np.array([[sin, cos, tall / 2 - sin * x - cos * y], [-cos, sin, wide / 2 + cos * x - sin * y]])
+        seen = cv2.warpAffine(self.canvas(frame, view), turn, (tall, wide), flags=cv2.INTER_LINEAR)
+        picture = cv2.resize(seen, (height, width), interpolation=cv2.INTER_LINEAR)
+        row, column = stream(self._world.seed + self._drive.date.toordinal(), "grain", frame).integers(0, 64, 2)
+        grain = self._grain[row : row + width, column : column + height]
+        return np.asarray(cv2.addWeighted(picture, 1.0, grain, 1.0, -128), np.uint8)
+
+    def canvas(self, frame: int, view: View) -> Image:
+        """[728, 560, 3] BGR, the picture of a frame as drawn: upright, level and without grain."""
+        drive, canvas = self._drive, np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+        clouds = 2.4 * (self._season.cloud_share - 0.5)
+        sunshine = float(np.clip(0.5 + 1.6 * (drive.sunniness[frame] - clouds), 0, 1))
+        light = Light(self._season, sunshine, float(drive.exposure[frame]))
+        time_s = int(drive.utime[frame] - drive.utime[0]) / 1e6
+        shot = Shot(canvas, view, light, float(drive.position_m[frame]), time_s)
+        self._paint_sky(shot, frame)
+        turn = (np.deg2rad(self._season.sun_azimuth_deg) - view.heading_rad + np.pi) % (2 * np.pi) - np.pi
+        x = int(CENTRE_X + FOCAL_PX * np.tan(turn))
+        y = int(HORIZON_Y - FOCAL_PX * np.tan(np.deg2rad(self._season.sun_elevation_deg)) / np.cos(turn))
+        dazzling = abs(turn) <= 1.05 and sunshine > 0.3
+        if dazzling:
+            self._glow(canvas, x, y, 1.5 * sunshine)
+        self._paint_ground(shot)
+        self._draw_things(shot)
+        if dazzling and 0 <= x < WIDTH and 0 <= y < HEIGHT and canvas[y, x].min() > 200:  # nothing stands before it
+            self._glow(canvas, x, y, 0.8 * sunshine)
+            rows = canvas[max(0, y - 1) : y + 2]  # it bleeds along the sensor's columns, which lie level
+            cv2.add(rows, np.full_like(rows, 110), dst=rows)
+        return canvas
+
+    def _paint_sky(self, shot: Shot, frame: int) -> None:
+        season, light, heading = self._season, shot.light, np.rad2deg(shot.view.heading_rad)
+        rows = np.clip((SKY_TOP_DEG - ELEVATION_DEG) * SKY_PX_PER_DEG, 0, len(self._dome) - 1).astype(np.float32)
+        azimuth = AZIMUTH_DEG + (heading + DRIFT_DEG_PER_FRAME * frame) % 360
+        columns = np.broadcast_to((azimuth * SKY_PX_PER_DEG).astype(np.float32), rows.shape)
+        sky = cv2.remap(self._dome, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+        shot.canvas[: len(sky)] = cv2.convertScaleAbs(sky, alpha=light.exposure * (0.86 + 0.14 * light.sunshine))
+        woods = np.array(season.leaves[0]) * 0.5 + np.array(season.grass) * 0.2 + 30 * season.snow
+        for lift, share in ((1.0, 0.62), (0.55, 0.38)):
+            angles = ((AZIMUTH_DEG + heading) % 360 * (2 - lift)) % 360
+            height = np.deg2rad(np.interp(angles, np.arange(361), self._skyline) * lift)
+            top = HORIZON_Y - FOCAL_PX * np.tan(height) / np.cos(np.deg2rad(AZIMUTH_DEG))
+            corners = [[WIDTH - 1, HORIZON_Y + 3], [0, HORIZON_Y + 3]]
+            outline = np.concatenate([np.stack([np.arange(WIDTH), top], axis=1), corners])
+            colour = ink(woods * light.in_shade * (1 - share) + light.air * share)
+            cv2.fillPoly(shot.canvas, [np.round(outline).astype(np.int32)], colour)
+
+    def _glow(self, canvas: Image, x: int, y: int, strength: float) -> None:
+        """Add the sun's glow around a pixel that may lie outside of the canvas."""
+        left, top = x - GLARE_PX, y - GLARE_PX
+        roi = canvas[max(0, top) : max(0, y + GLARE_PX), max(0, left) : max(0, x + GLARE_PX)]
+        part = self._glare[max(0, -top) :, max(0, -left) :][: roi.shape[0], : roi.shape[1]]
+        if roi.size:
+            cv2.add(roi, np.clip(part * strength, 0, 255).astype(np.uint8), dst=roi)
+
+    def _draw_things(self, shot: Shot) -> None:
+        queue: list[tuple[float, Callable[[], None]]] = []
+        drive, route, view = self._drive, self._world.route, shot.view
+
+        def stand(place: Array, margin_m: float, draw: Callable[[Array], None]) -> None:
+            foot = view.to_camera(place[None])[0]
+            if NEAR_M < foot[1] < SIGHT_M and abs(foot[0]) < foot[1] * HALF_VIEW + margin_m:
+                queue.append((foot[1], partial(draw, foot)))
+
+        for section in self._world.ahead(shot.position_m):
+            for feet, style in section.facades:
+                north, east = (feet[1] - feet[0]) / np.hypot(*(feet[1] - feet[0]))
+                gain = shot.light.gain(-east * shot.light.sun[0] + north * shot.light.sun[1])  # its normal points right
+                for ahead, ends, span in things.panels(feet, view):
+                    queue.append((ahead, partial(self._draw_panel, shot, style, gain, ends, span)))
+            for tree in section.trees:
+                stand(tree[0], 5.0, partial(things.draw_tree, shot, self._trees[tree[2]], tree))
+            for post in section.posts:
+                stand(post[0], 1.5, partial(things.draw_post, shot, post))
+            for car in (*things.parked(section, drive), *things.driving(section, drive, route, shot.time_s)):
+                stand(car[0], 3.0, partial(things.draw_car, shot, car))
+        for walker in things.walking(drive, route, shot.position_m, shot.time_s):
+            stand(walker[0], 1.0, partial(things.draw_person, shot, walker))
+        for _, draw in sorted(queue, key=itemgetter(0), reverse=True):
+            draw()
+
+    def _draw_panel(self, shot: Shot, style: Style, gain: Array, feet: Array, span: Array) -> None:
+        things.draw_panel(shot, self._facade(style), style.height_m, gain, feet, span)
+
+    def _paint_ground(self, shot: Shot) -> None:
+        light, ground, labels, shadows = shot.light, shot.canvas[GROUND_ROW:], self._labels(shot), self._shadows(shot)
+        for level, (near, far) in enumerate(pairwise(BANDS_M)):
+            rows = np.flatnonzero((near <= AHEAD_M) & (far > AHEAD_M))
+            band = slice(rows[0], rows[-1] + 1)
+            painted = self._surfaces(AHEAD_M[band], level, shot.view, labels[band])
+            distance = min(AHEAD_M[band].mean(), 90.0)
+            ground[band] = light.shine_on(painted, light.on_ground, distance)
+            cv2.copyTo(light.shine_on(painted, light.in_shade, distance), shadows[band], ground[band])
+        self._mark(shot)
+
+    def _surfaces(self, ahead_m: Array, level: int, view: View, labels: Image) -> Image:
+        """The ground's own colours in a band of rows."""
+        scale = np.float32(TILE_PX / TILE_M / (1 << level))
+        cos, sin = np.float32(np.cos(view.heading_rad)), np.float32(np.sin(view.heading_rad))
+        ahead = ahead_m[:, None].astype(np.float32)
+        right = (ahead * SLOPE).astype(np.float32)
+        north = (ahead * cos - right * sin + np.float32(view.north_m % TILE_M)) * scale
+        east = (ahead * sin + right * cos + np.float32(view.east_m % TILE_M)) * scale
+        if (
+            max(np.abs(north).max(), np.abs(east).max()) >= 15_000
+        ):  # coordinates of a remap are 16 bits wide; the picture repeats anyway
+            side = np.float32(TILE_PX >> level)
+            north, east = north % side, east % side
+        painted = np.zeros((*labels.shape, 3), np.uint8)
+        for label in np.flatnonzero(np.bincount(labels.ravel())):
+            tile = self._tiles[label][level]
+            layer = cv2.remap(tile, east, north, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+            cv2.copyTo(layer, (labels == label).view(np.uint8), painted)
+        return painted
+
+    def _labels(self, shot: Shot) -> Image:
+        """What every pixel below the horizon is paved with, an index of the tiles."""
+        labels = np.zeros((HEIGHT - GROUND_ROW, WIDTH), np.uint8)
+        sections, here = self._world.ahead(shot.position_m), shot.position_m
+        # Short pieces of path near by, where a bend shows; long ones far away.
+        pieces = here + np.concatenate([np.arange(-4, 21, 1.5), np.arange(23, 60, 4), np.arange(62, 125, 9)])
+        for section in sections:
+            for outline, surface in section.patches:
+                fill(labels, shot.view.to_camera(outline), (LABELS[surface],), GROUND_ROW, cv2.LINE_8)
+        for section in reversed(sections):
+            first, last = max(section.stretch.start_m, here - 4), min(section.stretch.end_m, here + 125)
+            if first < last:
+                where = np.concatenate([[first], pieces[(first < pieces) & (pieces < last)], [last]])
+                half, route = section.path_half_width_m, self._world.route
+                left, right = (shot.view.to_camera(route.place(where, side)) for side in (-half, half))
+                for quad in np.stack([left[:-1], left[1:], right[1:], right[:-1]], axis=1):
+                    fill(labels, quad, (LABELS[section.path_surface],), GROUND_ROW, cv2.LINE_8)
+        return labels
+
+    def _shadows(self, shot: Shot) -> Image:
+        """Where the ground is in shade, 255 or 0."""
+        mask, light = np.zeros((HEIGHT - GROUND_ROW, WIDTH), np.uint8), shot.light
+        north, east, up = light.sun
+        away, ring = -np.array([north, east]) / max(up, 0.05), np.linspace(0, 2 * np.pi, 10, endpoint=False)
+        long, circle = np.hypot(*away), np.stack([np.cos(ring), np.sin(ring)], axis=1)
+        along, leaves = away / max(long, 1e-6), light.season.leaf_share
+
+        def shade(outline: Array) -> None:
+            fill(mask, shot.view.to_camera(outline), (255,), GROUND_ROW, cv2.LINE_8)
+
+        for section in self._world.ahead(shot.position_m) if light.sunshine >= 0.15 else ():
+            for block in section.blocks:
+                reach = away * block.height_m
+                reach = reach * min(1.0, LONGEST_SHADOW_M / max(np.hypot(*reach), 1e-6))
+                corners = np.concatenate([block.corners(), block.corners() + reach]).astype(np.float32)
+                shade(np.asarray(cv2.convexHull(corners), np.float64)[:, 0])
+            for place, height, species, _ in section.trees:
+                reach, ahead = away * height * 0.62, shot.view.to_camera(place[None])[0, 1]
+                if species < BUSH and np.hypot(*reach) <= LONGEST_SHADOW_M and -30 < ahead < 70:
+                    side = np.array([-along[1], along[0]]) * 0.12
+                    shade(place + np.stack([-side, side, reach + side, reach - side]))
+                    bare = leaves < 0.15 and species < FIRST_CONIFER
+                    spread = circle * (height * (0.12 if bare else 0.16 + 0.12 * leaves))
+                    shade(place + reach + (spread + np.outer(spread @ along * (1 + 0.5 * long - 1), along)))
+        return mask
+
+    def _mark(self, shot: Shot) -> None:
+        """Draw the path's joints and the road's broken line."""
+        route, here, light = self._world.route, shot.position_m, shot.light
+        joint, paint = (light.colour(c, light.on_ground, 0) for c in ((112, 116, 118), (170, 200, 205)))
+
+        def line(along_m: Array, right_m: Array, width_m: float, ink: tuple[int, ...]) -> None:
+            first, last = route.place(along_m, right_m)
+            north, east = last - first
+            side = np.array([-east, north]) / max(np.hypot(north, east), 1e-6) * width_m / 2
+            fill(
+                shot.canvas, shot.view.to_camera(np.stack([first - side, last - side, last + side, first + side])), ink
+            )
+
+        for section in self._world.ahead(here):
+            stretch, half, road = section.stretch, section.path_half_width_m, section.road_right_m
+            if section.path_surface == "concrete":
+                for where in np.arange(stretch.start_m + 2, min(stretch.end_m, here + 30), 2.5):
+                    if where > here - 2:
+                        line(np.array([where, where]), np.array([-half, half]), 0.03, joint)
+            for where in np.arange(stretch.start_m, stretch.start_m + stretch.straight_m, 6.0):
+                if road is not None and here - 4 < where < here + 70:
+                    line(np.array([where, where + 3.0]), np.array([road, road]), 0.12, paint)

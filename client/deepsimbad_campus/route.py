@@ -1,0 +1,191 @@
+"""The route, the drives along it and their ground truth: a campus before anything stands on it.
+
+A campus grows with its number of frames, so random numbers are drawn for a numbered block or in order: the first part
+of a long world is the short world.
+"""
+
+import datetime
+import zlib
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deepsimbad_campus.camera import Array, View
+
+STEP_M = 0.5
+"""Distance between two samples of the centre line."""
+
+MAX_HEADING_RAD = np.deg2rad(62)
+"""Headings stay within this of the general direction, so the route cannot meet itself again."""
+
+BLOCK = 100
+"""Frames drawn from one block of randomness; a longer drive begins like a shorter one."""
+
+INTERVAL_US, TRUTH_STEP_US = 700_000, 10_000
+START_M, WIDEST_M = 2.0, 1.2
+UNCOVERED_FIRST, UNCOVERED_LAST = 2.4, 1.4
+"""Intervals between pictures without ground truth at the beginning and the end."""
+
+NAN_SHARE, NAN_FIRST = 0.004, 3
+
+
+def stream(seed: int, name: str, block: int = 0) -> np.random.Generator:
+    """A generator of its own for every (seed, name, block); platforms and processes agree on it."""
+    return np.random.default_rng([seed, zlib.crc32(name.encode()), block])
+
+
+def smooth_line(rng: np.random.Generator, where: Array) -> Array:
+    """[n] smooth noise at [n] places (not negative) along a line that has a standard normal knot at whole numbers."""
+    left = where.astype(np.int64)
+    knots = rng.standard_normal(int(left.max()) + 2)
+    t = where - left
+    t = t * t * (3 - 2 * t)
+    return np.asarray(knots[left] * (1 - t) + knots[left + 1] * t, np.float64)
+
+
+class Stretch(NamedTuple):
+    """A straight part of the route, where it begins along the route, and the bend that follows it."""
+
+    number: int
+    start_m: float
+    straight_m: float
+    bend_m: float
+
+    @property
+    def end_m(self) -> float:
+        """Route position where the bend ends."""
+        return self.start_m + self.straight_m + self.bend_m
+
+
+class Route:
+    """The centre line every drive follows, in the local north-east plane: stretches, never crossing themselves.
+
+    Args:
+        seed: Seed of the campus.
+        length_m: At least so long; the beginning of a longer route is the shorter route.
+    """
+
+    def __init__(self, seed: int, length_m: float) -> None:
+        rng = stream(seed, "route")
+        general, offset, position = rng.uniform(-np.pi, np.pi), 0.0, 0.0
+        headings: list[Array] = []
+        self.stretches: list[Stretch] = []
+        while position < length_m:
+            straight = rng.integers(70, 150) * STEP_M
+            turn = rng.uniform(0.35, 1.5) * rng.choice([-1.0, 1.0])
+            if abs(offset + turn) > MAX_HEADING_RAD:
+                turn = -turn
+            turn = float(np.clip(offset + turn, -MAX_HEADING_RAD, MAX_HEADING_RAD) - offset)
+            bend = max(6.0, np.ceil(abs(turn) * rng.uniform(9, 20) / STEP_M) * STEP_M)
+            self.stretches.append(Stretch(len(self.stretches), position, straight, bend))
+            headings.append(np.full(int(straight / STEP_M), general + offset))
+            headings.append(general + offset + turn * ((np.arange(int(bend / STEP_M)) + 0.5) * STEP_M / bend))
+            offset += turn
+            position += straight + bend
+        self._heading = np.concatenate(headings)
+        self._north, self._east = (
+            np.concatenate([[0.0], np.cumsum(step) * STEP_M]) for step in (np.cos(self._heading), np.sin(self._heading))
+        )
+        self._position = np.arange(len(self._north)) * STEP_M
+
+    def heading(self, position_m: Array) -> Array:
+        """[n] heading of the centre line in radians, clockwise from north, at [n] route positions."""
+        return np.interp(position_m, self._position[:-1] + STEP_M / 2, self._heading)
+
+    def place(self, position_m: Array, right_m: Array | float = 0.0) -> Array:
+        """[n, 2] north and east, in metres, of the points `right_m` to the right of [n] route positions."""
+        heading = self.heading(position_m)
+        north = np.interp(position_m, self._position, self._north) - np.sin(heading) * right_m
+        east = np.interp(position_m, self._position, self._east) + np.cos(heading) * right_m
+        return np.stack([north, east], axis=1)
+
+    def between(self, first_m: float, last_m: float) -> Array:
+        """[n, 2] north and east of the centre line's samples between two route positions."""
+        samples = slice(max(0, int(first_m / STEP_M)), int(last_m / STEP_M) + 1)
+        return np.stack([self._north[samples], self._east[samples]], axis=1)
+
+
+def drive_length_m(n_frames: int, spacing_m: float) -> float:
+    """Route positions a drive of so many frames never goes beyond."""
+    return START_M + -(-n_frames // BLOCK) * BLOCK * spacing_m + 1
+
+
+class Drive:
+    """One drive along the route: where the robot is at every frame and when it stands still.
+
+    Attributes:
+        utime: [n] int64 microseconds, strictly rising.
+        position_m: [n] route positions, never falling.
+        sunniness: [n] how free of clouds the sun is, compared within the drive.
+        exposure: [n] the camera's gain, about 1.
+    """
+
+    def __init__(self, route: Route, seed: int, date: datetime.date, n_frames: int, spacing_m: float) -> None:
+        self._route, self.seed, self.date, self.spacing_m = route, seed, date, spacing_m
+        blocks = range(-(-n_frames // BLOCK))
+        moves = [_block_moves(stream(seed, f"moves {date}", k), BLOCK * spacing_m) for k in blocks]
+        jitter = [stream(seed, f"clock {date}", k).integers(-20_000, 20_000, BLOCK) for k in blocks]
+        rng = stream(seed, f"drive {date}")
+        afternoon = datetime.datetime.combine(date, datetime.time(16), datetime.UTC)
+        start = int(afternoon.timestamp()) * 1_000_000 + int(rng.integers(0, 3_600_000_000))
+        self.utime = start + np.arange(n_frames) * INTERVAL_US + np.concatenate(jitter)[:n_frames]
+        self.position_m = along = (START_M + np.concatenate([[0.0], np.cumsum(np.concatenate(moves))]))[:n_frames]
+        frames = np.arange(n_frames, dtype=np.float64)
+        bias, lean = rng.uniform(-0.5, 0.5), rng.normal(0, np.deg2rad(2.6), 2)
+
+        def noise(name: str, where: Array) -> Array:
+            return smooth_line(stream(seed, f"{name} {date}"), where)
+
+        self._right = np.clip(bias + 0.6 * noise("right", along / 19), -WIDEST_M, WIDEST_M)
+        self._turn = lean[0] + np.deg2rad(6.0) * noise("turn", along / 11)
+        self._pitch = lean[1] * 0.2 + np.deg2rad(0.55) * noise("pitch", along / 2.3)
+        self._roll = np.deg2rad(0.5) * noise("roll", along / 3.1)
+        self.sunniness, self.exposure = noise("cloud", frames / 17), np.exp(0.11 * noise("exposure", frames / 7))
+
+    def poses(self, utime: NDArray[np.int64]) -> tuple[Array, ...]:
+        """[n] route position, north, east, yaw, pitch and roll at [n] moments between the first and last picture."""
+        values = (self.position_m, self._right, self._turn, self._pitch, self._roll)
+        position, right, turn, pitch, roll = (np.interp(utime, self.utime, value) for value in values)
+        yaw = (self._route.heading(position) + turn + np.pi) % (2 * np.pi) - np.pi
+        return position, *self._route.place(position, right).T, yaw, pitch, roll
+
+    def view(self, frame: int) -> View:
+        """Where the camera is at a frame."""
+        return View(*(float(value[0]) for value in self.poses(self.utime[frame : frame + 1])[1:]))
+
+    def ground_truth(self) -> Iterator[Array]:
+        """The poses as NCLT publishes them, at about 100 Hz, with the quirks a reader must survive.
+
+        The first and last few pictures lie outside of the time covered (unless the drive is too short for that), some
+        rows hold NaN, and no row falls exactly on a picture. A block at a time, so that any length fits in memory.
+
+        Yields:
+            [m, 7] utime (microseconds), x (north), y (east), z (down) in metres, roll, pitch, yaw in radians.
+        """
+        cut = INTERVAL_US if len(self.utime) >= 8 else 0
+        first, last = int(self.utime[0] + cut * UNCOVERED_FIRST), int(self.utime[-1] - cut * UNCOVERED_LAST)
+        for block, start in enumerate(range(first, max(last, first + 1), BLOCK * INTERVAL_US)):
+            rng = stream(self.seed, f"ground truth {self.date}", block)
+            clock = np.arange(start, min(start + BLOCK * INTERVAL_US, last + 1), TRUTH_STEP_US)
+            clock = clock + rng.integers(-2_000, 2_000, len(clock))
+            position, north, east, yaw, pitch, roll = self.poses(clock)
+            rows = np.stack([clock, north, east, 0.4 * np.sin(position / 60), roll, pitch, yaw], axis=1)
+            unknown = rng.random(len(rows)) < NAN_SHARE
+            burst = int(rng.integers(0, max(1, len(rows) - 10)))
+            unknown[burst : burst + int(rng.integers(2, 8))] = len(rows) > 20
+            if block == 0:
+                unknown[:NAN_FIRST] = len(rows) > 20
+            rows[unknown, 1:] = np.nan
+            yield rows
+
+
+def _block_moves(rng: np.random.Generator, length_m: float) -> Array:
+    """[100] metres moved after each frame of a block; they add up to its length, standing still included."""
+    pace = np.exp(0.18 * smooth_line(rng, np.arange(BLOCK) / 6))
+    for _ in range(2):
+        if rng.random() < 0.7:
+            first = int(rng.integers(5, BLOCK - 15))
+            pace[first : first + int(rng.integers(3, 7))] = 0.0
+    return np.asarray(pace * (length_m / pace.sum()), np.float64)

@@ -1,0 +1,239 @@
+"""What stands and moves on the ground, and how it is drawn: walls and trees in perspective, cars, people and posts."""
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from deepsimbad_campus.camera import (
+    CANVAS_SIZE,
+    FOCAL_PX,
+    HALF_VIEW,
+    NEAR_M,
+    Array,
+    Colour,
+    Image,
+    View,
+    project,
+    sixteenths,
+)  # fmt: skip
+from deepsimbad_campus.pictures import TREE_HEIGHT, TREE_WIDTH
+from deepsimbad_campus.route import INTERVAL_US, START_M, Drive, Route, stream
+from deepsimbad_campus.season import Light
+from deepsimbad_campus.world import SIGHT_M, Post, Section, Tree
+
+CELL_M = 18.0
+"""People come in groups, one group or none for every so many metres of route."""
+
+PARKED_SHARE, PEOPLE_SHARE = 0.6, 0.8
+LANE_M, LOOP_M = 1.8, 150.0
+CARS: tuple[Colour, ...] = (
+    (40, 40, 44), (190, 192, 196), (225, 228, 230), (40, 36, 150), (140, 84, 40), (96, 100, 104), (60, 96, 62),
+)  # fmt: skip
+COATS: tuple[Colour, ...] = (
+    (36, 34, 34), (140, 70, 40), (44, 40, 160), (70, 110, 60), (40, 150, 200), (170, 170, 175), (110, 60, 110),
+)  # fmt: skip
+METAL, WOOD, GLASS = (48, 50, 48), (60, 96, 130), (74, 66, 58)
+
+# A car's side, from the rear, [4] metres along and up; the cabin stands on the body.
+BODY = np.array([(-2.1, 0.28), (-2.1, 0.95), (2.05, 0.82), (2.15, 0.28)]).T
+CABIN = np.array([(-1.8, 0.93), (-1.35, 1.48), (0.35, 1.46), (1.05, 0.86)]).T
+HALF_WIDTH_M = 0.86
+
+Car = tuple[Array, float, Colour]  # its place, heading in radians and paint
+Walker = tuple[Array, int, float]  # somebody's place, look (clothes and build) and stride
+Box = tuple[float, float, float, float, Colour]  # left, right, low and high in metres
+
+
+class Shot(NamedTuple):
+    """One picture being painted: its canvas, what the camera sees of the world, and by what light."""
+
+    canvas: Image
+    view: View
+    light: Light
+    position_m: float  # along the route
+    time_s: float  # since the drive began
+
+
+def parked(section: Section, drive: Drive) -> Iterator[Car]:
+    """The cars that stand in a section's bays during a drive."""
+    for place, heading, number in section.bays:
+        rng = stream(drive.seed, f"bay {drive.date}", number)
+        if rng.random() < PARKED_SHARE:
+            turn = rng.normal(0, 0.03) + (np.pi if rng.random() < 0.3 else 0)
+            yield place, heading + turn, CARS[rng.integers(0, len(CARS))]
+
+
+def driving(section: Section, drive: Drive, route: Route, time_s: float) -> Iterator[Car]:
+    """The cars on a section's road, at a time since a drive began."""
+    rng = stream(drive.seed, f"traffic {drive.date}", section.stretch.number)
+    for _ in range(rng.integers(1, 4) if section.road_right_m is not None else 0):
+        speed = rng.uniform(6, 11) * rng.choice([-1, 1])
+        along = (rng.uniform(0, LOOP_M) + speed * time_s) % LOOP_M
+        paint = CARS[rng.integers(0, len(CARS))]
+        if along <= section.stretch.straight_m:
+            where, lane = np.array([section.stretch.start_m + along]), section.road_right_m + np.sign(speed) * LANE_M
+            yield route.place(where, lane)[0], route.heading(where)[0] + (np.pi if speed < 0 else 0.0), paint
+
+
+def walking(drive: Drive, route: Route, position_m: float, time_s: float) -> Iterator[Walker]:
+    """The people in sight of a route position, at a time since a drive began."""
+    first, last = int(max(0.0, position_m - 2 * CELL_M) / CELL_M), int((position_m + SIGHT_M / 2) / CELL_M)
+    for cell in range(first, last + 1):
+        rng = stream(drive.seed, f"people {drive.date}", cell)
+        if rng.random() <= PEOPLE_SHARE:
+            home = (cell + rng.random()) * CELL_M
+            met_s = (home - START_M) / (drive.spacing_m / (INTERVAL_US / 1e6)) + rng.normal(0, 6)
+            speed, side = rng.uniform(0.9, 1.5) * rng.choice([-1, 0, 1]), rng.choice([-1, 1])
+            for k in range(rng.integers(1, 5)):
+                right, look = side * rng.uniform(0.9, 3.0), int(rng.integers(0, 1 << 31))
+                where = home + speed * float(np.clip(time_s - met_s, -40, 40)) + 0.9 * k
+                if where > 0:
+                    yield route.place(np.array([where]), right)[0], look, 2.2 * where if speed else 0.4
+
+
+def panels(feet: Array, view: View) -> Iterator[tuple[float, Array, Array]]:
+    """Cut the part of a wall that is in view into panels short enough to be sorted by distance.
+
+    Yields:
+        Distance ahead in metres, [2, 2] (right, ahead) of the panel's left and right foot, and [2] where these lie
+        along the wall, 0 its left and 1 its right edge.
+    """
+    (x0, z0), (x1, z1) = ends = view.to_camera(feet)
+    if x1 * z0 - x0 * z1 <= 0 or max(z0, z1) < NEAR_M or min(z0, z1) > SIGHT_M:
+        return
+    first = (NEAR_M - z0) / (z1 - z0) if z0 < NEAR_M else 0.0
+    last = (NEAR_M - z0) / (z1 - z0) if z1 < NEAR_M else 1.0
+    length, near = (last - first) * np.hypot(x1 - x0, z1 - z0), max(NEAR_M, min(z0, z1))
+    cuts = np.linspace(first, last, int(np.ceil(length / max(5.0, 0.4 * near))) + 1)
+    feet = ends[0] + cuts[:, None] * (ends[1] - ends[0])
+    ahead = np.maximum(feet[:, 1], 1e-3)
+    slope = feet[:, 0] / ahead
+    for k in np.flatnonzero((slope[:-1] < HALF_VIEW) & (slope[1:] > -HALF_VIEW)):
+        yield (ahead[k] + ahead[k + 1]) / 2, feet[k : k + 2], cuts[k : k + 2]
+
+
+def draw_panel(shot: Shot, levels: Sequence[Image], height_m: float, gain: Array, feet: Array, span: Array) -> None:
+    """Draw one panel of a wall, given the wall's picture and its halvings."""
+    low, high = project(feet), project(feet, height_m)
+    tall = max(1.0, (low - high)[:, 1].max())
+    level = int(np.clip(np.log2(max(levels[0].shape[0] / tall, 1.0)), 0, len(levels) - 1))
+    height, width = levels[level].shape[:2]
+    outline = np.stack([high[0], high[1], low[1], low[0]])
+    left, top = np.maximum(0, outline.min(0).astype(int) - (2, 1))
+    right, bottom = np.minimum(CANVAS_SIZE, outline.max(0).astype(int) - (-3, -2))
+    if left >= right or top >= bottom:
+        return
+    first, last = max(0, int(span[0] * width) - 1), min(width, int(np.ceil(span[1] * width)) + 1)
+    part = shot.light.shine_on(np.ascontiguousarray(levels[level][:, first:last]), gain, feet[:, 1].mean())
+    u0, u1 = span * width - first - 0.5
+    source = np.array([(u0, -0.5), (u1, -0.5), (u1, height - 0.5), (u0, height - 0.5)], np.float32)
+    bend = cv2.getPerspectiveTransform(source, (outline - (left, top)).astype(np.float32))
+    roi, size = shot.canvas[top:bottom, left:right], (int(right - left), int(bottom - top))
+    cv2.warpPerspective(part, bend, size, dst=roi, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_TRANSPARENT)
+
+
+def draw_tree(shot: Shot, levels: Sequence[Image], tree: Tree, foot: Array) -> None:
+    """Draw a tree whose foot is at metres right and ahead."""
+    (x, y), ahead, light = project(foot[None])[0], foot[1], shot.light
+    _, height_m, _, mirrored = tree
+    tall = FOCAL_PX * height_m / ahead
+    scale = tall / TREE_HEIGHT
+    wide = TREE_WIDTH * scale
+    left, right = max(0, int(x - wide / 2)), min(CANVAS_SIZE[0], int(x + wide / 2) + 1)
+    top, bottom = max(0, int(y - tall)), min(CANVAS_SIZE[1], int(y) + 1)
+    if left >= right or top >= bottom:
+        return
+    picture = levels[int(np.clip(np.log2(max(1.0, 1 / scale)), 0, len(levels) - 1))]
+    side, grow_x, grow_y = -1 if mirrored else 1, wide / picture.shape[1], tall / picture.shape[0]
+    place = np.array([[side * grow_x, 0, x - side * wide / 2 - left], [0, grow_y, y - tall - top]])
+    part = cv2.warpAffine(picture, place, (right - left, bottom - top), flags=cv2.INTER_LINEAR)
+    colour, alpha = cv2.cvtColor(part, cv2.COLOR_BGRA2BGR), cv2.merge([part[:, :, 3]] * 3)
+    share, shades = light.haze(ahead), np.arange(256)[:, None]
+    lit = np.clip(shades * light.between(0.55) * (1 - share), 0, 255).astype(np.uint8)[None]
+    colour = cv2.LUT(colour, lit)
+    if share > 0.03:
+        hazy = np.clip(shades * light.air / 255 * share, 0, 255).astype(np.uint8)[None]
+        cv2.add(colour, cv2.LUT(alpha, hazy), dst=colour)
+    roi = shot.canvas[top:bottom, left:right]
+    cv2.multiply(roi, cv2.bitwise_not(alpha), dst=roi, scale=1 / 255)
+    cv2.add(roi, colour, dst=roi)
+
+
+def draw_car(shot: Shot, car: Car, centre: Array) -> None:
+    """Draw a car at metres right and ahead."""
+    (_, heading, paint), light, distance = car, shot.light, centre[1]
+    if distance < NEAR_M + 2.8:
+        return
+    turn = heading - shot.view.heading_rad
+    nose, side = np.array([np.sin(turn), np.cos(turn)]), np.array([np.cos(turn), -np.sin(turn)])
+
+    def face(ground: Array, heights: Array, colour: Colour, gain: Array) -> None:
+        ink = light.colour(colour, gain, distance)
+        cv2.fillPoly(shot.canvas, [sixteenths(project(ground, heights))], ink, cv2.LINE_AA, 4)
+
+    shadow = np.stack([centre + nose * a + side * b for a, b in ((-2.3, -1), (2.3, -1), (2.3, 1), (-2.3, 1))])
+    face(shadow, np.zeros(4), (46, 46, 48), light.in_shade)
+    base = light.between(0.45)
+    for (along, up), colour in ((BODY, paint), (CABIN, GLASS)):
+        feet = centre + along[:, None] * nose
+        left, right = feet - HALF_WIDTH_M * side, feet + HALF_WIDTH_M * side
+        faces = [(left, up, colour, base), (right, up, colour, base * 0.92)]
+        for k, own, tone in ((0, colour, 0.8), (1, paint, 1.12), (2, colour, 0.9)):  # rear, top and front
+            quad = np.stack([left[k], left[k + 1], right[k + 1], right[k]])
+            faces.append((quad, up[[k, k + 1, k + 1, k]], own, base * tone))
+        for args in sorted(faces, key=lambda args: -np.hypot(*args[0].mean(0))):
+            face(*args)
+    near, ring = -1.0 if centre @ side > 0 else 1.0, np.linspace(0, 2 * np.pi, 14, endpoint=False)
+    for along in (-1.35, 1.35) if distance < 45 else ():
+        hub = centre + nose * along + side * near * HALF_WIDTH_M
+        face(hub + nose * 0.33 * np.cos(ring)[:, None], 0.33 + 0.33 * np.sin(ring), (24, 24, 26), light.in_shade)
+
+
+def draw_person(shot: Shot, walker: Walker, foot: Array) -> None:
+    """Draw somebody walking, at metres right and ahead."""
+    (_, look, stride), ahead = walker, foot[1]
+    if ahead < 0.9:
+        return
+    rng, swing, gain = np.random.default_rng(look), 0.16 * np.sin(stride), shot.light.between(0.5)
+    unit = FOCAL_PX / ahead * rng.uniform(1.58, 1.9) / 1.75
+    coat = COATS[rng.integers(0, len(COATS))]
+    legs = (70, 52, 40) if rng.random() < 0.6 else (44, 44, 46)
+    arms = ((-0.33, -0.22, 0.8 + swing, 1.42, coat), (0.22, 0.33, 0.8 - swing, 1.42, coat))
+    feet = ((-0.14 - swing, 0.0 - swing, 0.0, 0.85, legs), (0.0 + swing, 0.14 + swing, 0.0, 0.85, legs))
+    x, y = _draw_boxes(shot, (*feet, (-0.25, 0.25, 0.78, 1.46, coat), *arms), foot, unit, gain, taper=0.9)
+    head = (round(x), round(y - 1.6 * unit))
+    for colour, centre, size in (
+        ((38, 46, 60), head, 0.13),
+        ((120, 150, 196), (head[0], head[1] + round(0.03 * unit)), 0.1),
+    ):
+        ink = shot.light.colour(colour, gain, ahead)
+        cv2.circle(shot.canvas, centre, max(1, round(size * unit)), ink, -1, cv2.LINE_AA)
+
+
+def draw_post(shot: Shot, post: Post, foot: Array) -> None:
+    """Draw a lamp, sign, bollard or bench at metres right and ahead."""
+    _, kind, size, colour = post
+    boxes: list[Box] = [(-0.06, 0.06, 0, size, METAL), (-0.16, 0.16, 0, 0.35, METAL)]
+    boxes += [(-0.22, 0.22, size, size + 0.45, (205, 215, 220)), (-0.26, 0.26, size + 0.42, size + 0.52, METAL)]
+    if kind == "sign":
+        boxes = [(-0.04, 0.04, 0, size, METAL), (-0.38, 0.38, size - 0.75, size, colour)]
+        boxes += [(-0.28, 0.28, size - 0.45, size - 0.32, (230, 230, 230))]
+    elif kind == "bollard":
+        boxes = [(-0.1, 0.1, 0, size, METAL), (-0.1, 0.1, size * 0.7, size * 0.82, (60, 200, 220))]
+    elif kind == "bench":
+        boxes = [(-size / 2, size / 2, 0.42, 0.5, WOOD), (-size / 2, size / 2, 0.62, 0.88, WOOD)]
+        boxes += [(leg * size, leg * size + 0.07, 0, 0.88, METAL) for leg in (-0.42, 0.36)]
+    if foot[1] >= 0.8:
+        _draw_boxes(shot, boxes, foot, FOCAL_PX / foot[1], shot.light.between(0.4))
+
+
+def _draw_boxes(shot: Shot, boxes: Sequence[Box], foot: Array, unit: float, gain: Array, taper: float = 1.0) -> Array:
+    """Draw upright boxes around a foot, so many pixels a metre; returns the foot's pixel."""
+    pixel: Array = project(foot[None])[0]
+    for left, right, low, high, colour in boxes:
+        corners = np.array([(left, low), (right, low), (right * taper, high), (left * taper, high)])
+        ink = shot.light.colour(colour, gain, foot[1])
+        cv2.fillConvexPoly(shot.canvas, sixteenths(pixel + corners * (unit, -unit)), ink, cv2.LINE_AA, 4)
+    return pixel

@@ -1,0 +1,290 @@
+"""What stands along the route, the same in every season: buildings, trees, paving and posts, by kind of stretch."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deepsimbad_campus.camera import Array, Colour
+from deepsimbad_campus.route import Route, Stretch, stream
+
+SIGHT_M, BEHIND_M = 130.0, 25.0
+"""Nothing farther along the route than this is drawn."""
+
+NEIGHBOURS = 24
+"""How many of the buildings before are looked at when a new one is placed."""
+
+DECK = ("court", "street", "avenue", "twins", "field", "wall", "parking", "twins")
+"""Every eight stretches are of these zones, shuffled."""
+
+BAY_NUMBERS = 64
+FIRST_CONIFER, BUSH = 11, 14
+MATERIALS = ("brick", "sandstone", "concrete", "plaster", "glass", "brick")
+SIGN_COLOURS = ((40, 40, 190), (150, 70, 20), (40, 130, 40), (30, 170, 220), (200, 200, 200))
+POST_SIZES_M = {"lamp": 5.0, "sign": 2.3, "bollard": 0.9, "bench": 1.6, "bush": 1.3}
+
+Tree = tuple[Array, float, int, bool]  # its place, height in metres, species (or BUSH), whether it is mirrored
+Post = tuple[Array, str, float, Colour]  # its place, kind, size in metres and colour
+Bay = tuple[Array, float, int]  # where a car may stand, its heading in radians, a number of the bay
+
+
+class Style(NamedTuple):
+    """Everything a wall's picture depends on; equal styles look alike and are drawn once."""
+
+    seed: int
+    material: str
+    width_m: float
+    height_m: float
+    floors: int  # 0: a plain wall without windows
+    bay_m: float  # between two windows
+    door: bool
+
+
+class Block(NamedTuple):
+    """A building: a solid with a wall on every side."""
+
+    centre: Array
+    axes: Array  # [2, 2] unit vectors along and to the right of it
+    half: tuple[float, float]
+    height_m: float
+
+    def corners(self) -> Array:
+        """[4, 2] its footprint; each edge runs left to right as seen from outside."""
+        (a, b), (forward, side) = self.half, self.axes
+        return np.stack([self.centre + x * forward + y * side for x, y in ((a, -b), (-a, -b), (-a, b), (a, b))])
+
+    def contains(self, points: Array, margin_m: float) -> NDArray[np.bool_]:
+        """[n] whether [n, 2] points lie within it or so near."""
+        along, across = ((points - self.centre) @ axis for axis in self.axes)
+        near = (np.abs(along) < self.half[0] + margin_m) & (np.abs(across) < self.half[1] + margin_m)
+        return np.asarray(near, np.bool_)
+
+    def meets(self, other: "Block") -> bool:
+        """Whether another is less than a metre away: no axis of either separates them."""
+        axes = np.concatenate([self.axes, other.axes]).T
+        a, b = self.corners() @ axes, other.corners() @ axes
+        return not bool(((a.max(0) + 1.0 < b.min(0)) | (b.max(0) + 1.0 < a.min(0))).any())
+
+
+class Section:
+    """One stretch and all that stands along it; things are placed by metres along and right of its straight part.
+
+    Args:
+        route: The centre line nothing may stand on.
+        stretch: The part of it to furnish.
+        zone: What kind of place it is.
+        rng: The stretch's own randomness.
+        earlier: The buildings placed before; grows.
+    """
+
+    def __init__(
+        self, route: Route, stretch: Stretch, zone: str, rng: np.random.Generator, earlier: list[Block]
+    ) -> None:
+        self.stretch, self.zone, self._rng, self._earlier = stretch, zone, rng, earlier
+        self.blocks: list[Block] = []
+        self.facades: list[tuple[Array, Style]] = []  # [2, 2] feet of a wall's left and right edge, seen from outside
+        self.trees: list[Tree] = []
+        self.posts: list[Post] = []
+        self.bays: list[Bay] = []
+        self.patches: list[tuple[Array, str]] = []  # [4, 2] a paved piece of ground, and with what
+        self.road_right_m: float | None = None
+        start = np.array([stretch.start_m + 0.25])
+        self.heading_rad = heading = float(route.heading(start)[0])
+        self._origin = route.place(start)[0]
+        self._axes = np.array([[np.cos(heading), np.sin(heading)], [-np.sin(heading), np.cos(heading)]])
+        self._line = route.between(stretch.start_m - 160, stretch.end_m + 160)
+        self.path_half_width_m = rng.uniform(1.3, 2.2)
+        self.path_surface = ("concrete", "asphalt", "paving")[rng.integers(0, 3)]
+        getattr(self, f"_{zone}")(rng, stretch.straight_m)
+        self._surround(rng, stretch.straight_m)
+
+    def _point(self, along: float, right: float) -> Array:
+        return np.asarray(self._origin + along * self._axes[0] + right * self._axes[1], np.float64)
+
+    def _free(self, place: Array, clearance: float) -> bool:
+        near = self._earlier[-NEIGHBOURS:]
+        on_route = np.hypot(*(self._line - place).T).min() < clearance
+        return not (on_route or any(block.contains(place[None], 1.0)[0] for block in near))
+
+    def _build(
+        self, along: float, setback: float, size: tuple[float, ...], material: str, seed: int, clearance: float = 4.0
+    ) -> None:
+        """Put up a building, if it fits: its near end and near face (negative is left), its width, depth and height."""
+        width, depth, height = size
+        centre = self._point(along + width / 2, setback + np.copysign(depth / 2, setback))
+        block = Block(centre, self._axes, (width / 2, depth / 2), height)
+        if block.contains(self._line, clearance).any() or any(map(block.meets, self._earlier[-NEIGHBOURS:])):
+            return
+        self._earlier.append(block)
+        self.blocks.append(block)
+        details, corners = np.random.default_rng([seed, 7]), block.corners()
+        floors = 0 if material == "wall" else max(1, int(height / details.uniform(3.1, 3.9)))
+        bay = details.uniform(2.2, 4.2)
+        for edge in range(4):
+            feet, door = corners[[edge, (edge + 1) % 4]], edge == (0 if setback > 0 else 2)
+            wide = round(float(np.hypot(*(feet[1] - feet[0]))), 2)
+            self.facades.append((feet, Style(seed, material, wide, height, floors, bay, door)))
+
+    def _row(self, side: float, setbacks: tuple[float, float], share: float, heights: tuple[float, float]) -> None:
+        """Line one side with buildings and gaps."""
+        rng = self._rng
+        along = rng.uniform(0, 6)
+        while along < self.stretch.straight_m - 4:
+            width = 8.0
+            if rng.random() < share:
+                setback = side * rng.uniform(*setbacks)
+                width, depth, height = rng.uniform(9, 24), rng.uniform(9, 18), rng.uniform(*heights)
+                material = MATERIALS[rng.integers(0, len(MATERIALS))]
+                self._build(along, setback, (width, depth, height), material, int(rng.integers(0, 1 << 31)))
+            along = along + width + rng.uniform(2, 9)
+
+    def _tree(self, along: float, right: float, species: int = -1, clearance: float = 3.0, height: float = 0.0) -> None:
+        """Plant a tree, if there is room, of any species and height where none is given."""
+        place, rng = self._point(along, right), self._rng
+        species = int(rng.integers(0, BUSH)) if species < 0 else species
+        tree = (place, height or rng.uniform(6, 13), species, rng.random() < 0.5)
+        if self._free(place, clearance):
+            self.trees.append(tree)
+
+    def _post(self, kind: str, along: float = -1.0) -> None:
+        """Put a post or bush beside the path, if there is room, anywhere along it where no place is given."""
+        rng = self._rng
+        along = rng.uniform(0, self.stretch.straight_m) if along < 0 else along
+        place = self._point(along, rng.choice([-1, 1]) * rng.uniform(2.8, 6))
+        colour, size = SIGN_COLOURS[rng.integers(0, len(SIGN_COLOURS))], POST_SIZES_M[kind] * rng.uniform(0.8, 1.3)
+        if self._free(place, 2.5) and kind == "bush":
+            self.trees.append((place, size, BUSH, False))
+        elif self._free(place, 2.5):
+            self.posts.append((place, kind, size, colour))
+
+    def _bay(self, along: float, right: float, turn: float = 0.0) -> None:
+        place = self._point(along, right)
+        if self._free(place, 3.2):
+            self.bays.append((place, self.heading_rad + turn, self.stretch.number * BAY_NUMBERS + len(self.bays)))
+
+    def _pave(self, first: float, last: float, left: float, right: float, surface: str) -> None:
+        corners = ((first, left), (last, left), (last, right), (first, right))
+        self.patches.append((np.stack([self._point(*corner) for corner in corners]), surface))
+
+    def _surround(self, rng: np.random.Generator, length: float) -> None:
+        """What every stretch has: distant buildings and bushes, trees at its bend, perhaps a crossing path."""
+        if self.zone not in ("field", "wall"):
+            self._row(-1 if rng.random() < 0.5 else 1, (45, 70), 0.5, (9, 26))
+            for _ in range(rng.integers(1, 5)):
+                self._post("bush")
+        for _ in range(rng.integers(2, 6)):
+            self._tree(rng.uniform(length, length + self.stretch.bend_m), rng.uniform(-25, 25), clearance=4.5)
+        if rng.random() < 0.6:
+            along = rng.uniform(0.2, 0.8) * length
+            self._pave(along, along + rng.uniform(1.6, 4), -40, 40, "concrete")
+
+    def _court(self, rng: np.random.Generator, length: float) -> None:
+        for side in (-1, 1):
+            self._row(side, (7, 14), 0.85, (5, 17))
+        for _ in range(rng.integers(9, 17)):
+            self._tree(rng.uniform(0, length), rng.choice([-1, 1]) * rng.uniform(3.8, 7))
+        for kind in ("lamp", "sign", "bench", "bollard"):
+            for _ in range(rng.integers(1, 4)):
+                self._post(kind)
+
+    def _street(self, rng: np.random.Generator, length: float) -> None:
+        side = int(rng.choice([-1, 1]))
+        self.road_right_m = middle = side * 7.5
+        self._pave(-3, length + 3, middle - 3.6, middle + 3.6, "asphalt")
+        self._row(side, (14, 18), 0.9, (6, 18))
+        self._row(-side, (6, 9), 0.9, (6, 18))
+        for along in np.arange(4.0, length, 22):
+            self._post("lamp", along)
+        for along in np.arange(2.0, length - 4, 6.2):
+            self._bay(along, middle - side * 2.6)
+            if rng.random() < 0.6:
+                self._tree(along + 4, -side * rng.uniform(3.8, 5))
+        for _ in range(3):
+            self._post("sign")
+
+    def _avenue(self, rng: np.random.Generator, length: float) -> None:
+        species = int(rng.integers(0, 10))
+        for along in np.arange(2.0, length, rng.uniform(7, 10)):
+            for side in (-1, 1):
+                tall = rng.uniform(9, 11)
+                self._tree(along, side * rng.uniform(4.2, 4.8), species, height=tall)
+        for side in (-1, 1):
+            self._row(side, (18, 30), 0.35, (6, 15))
+        for _ in range(2):
+            self._post("bench")
+
+    def _twins(self, rng: np.random.Generator, length: float) -> None:
+        """Buildings that look alike: places that are hard to tell apart."""
+        seed, width, gap = int(rng.integers(0, 1 << 31)), rng.uniform(10, 13), rng.uniform(2, 4)
+        size, material = (round(width, 2), 11.0, rng.uniform(7, 11)), MATERIALS[rng.integers(0, len(MATERIALS))]
+        for side in (-1, 1):
+            for along in np.arange(1.0, length - width + 2, width + gap):
+                self._build(along, side * 8.5, size, material, seed)
+                self._tree(along + width + gap / 2, side * 5.5, seed % 10, height=6.5)
+
+    def _field(self, rng: np.random.Generator, length: float) -> None:
+        """Hardly anything: places without a landmark."""
+        for _ in range(14):
+            side = rng.choice([-1, 1])
+            self._tree(rng.uniform(-10, length + 30), side * rng.uniform(45, 90))
+        if rng.random() < 0.7:
+            self._tree(rng.uniform(10, length), rng.uniform(8, 25))
+        self._post("bench")
+
+    def _wall(self, rng: np.random.Generator, length: float) -> None:
+        side, size = rng.choice([-1, 1]), (length - 1, 0.4, rng.uniform(2.4, 3.4))
+        self._build(0.5, side * 4.2, size, "wall", int(rng.integers(0, 1 << 31)), clearance=3.0)
+        for along in np.arange(0.0, length, rng.uniform(8, 14)):
+            self._tree(along, side * rng.uniform(8, 20))
+        for _ in range(3):
+            self._tree(rng.uniform(0, length), -side * rng.uniform(14, 50))
+
+    def _parking(self, rng: np.random.Generator, length: float) -> None:
+        side = int(rng.choice([-1, 1]))
+        self._pave(0, length, side * 4, side * 24, "asphalt")
+        for right, turn in ((6.5, np.pi / 2), (20.5, -np.pi / 2)):
+            for along in np.arange(2.0, length - 2, 2.8):
+                self._bay(along, side * right, turn)
+        self._row(side, (27, 33), 0.8, (6, 15))
+        self._row(-side, (7, 12), 0.7, (5, 14))
+        for _ in range(6):
+            self._tree(rng.uniform(0, length), -side * rng.uniform(3.8, 6))
+        for _ in range(2):
+            self._post("lamp")
+
+
+class World:
+    """Everything that stays where it is; made whole at once, a few hundred bytes per metre.
+
+    Args:
+        seed: Equal seeds make equal worlds.
+        length_m: Length of the route to furnish; the beginning of a longer world is the shorter world.
+    """
+
+    def __init__(self, seed: int, length_m: float) -> None:
+        self.seed = seed
+        # A stretch is furnished knowing the route well beyond it, so the route goes on past the last of them.
+        self.route = Route(seed, length_m + 2 * SIGHT_M + 400)
+        self.sections: list[Section] = []
+        blocks: list[Block] = []
+        for index, stretch in enumerate(self.route.stretches):
+            if stretch.start_m <= length_m + SIGHT_M:
+                deck = stream(seed, "deck", index // len(DECK)).permutation(DECK)
+                zone, rng = deck[index % len(DECK)], stream(seed, "stretch", index)
+                self.sections.append(Section(self.route, stretch, zone, rng, blocks))
+        self._starts = np.array([section.stretch.start_m for section in self.sections])
+
+    def ahead(self, position_m: float) -> list[Section]:
+        """The sections that may be seen from a route position, nearest first."""
+        ends = np.searchsorted(self._starts, [position_m - BEHIND_M, position_m + SIGHT_M], "right") - 1
+        first, last = np.clip(ends, 0, len(self._starts) - 1)
+        return self.sections[first : last + 1]
+
+    def skyline(self) -> Array:
+        """[361] elevation in degrees of the far hills and woods, by azimuth in degrees."""
+        rng = stream(self.seed, "skyline")
+        angles, height = np.deg2rad(np.arange(360.0)), np.full(360, 2.6)
+        for waves in range(2, 40):
+            phase, amplitude = rng.uniform(0, 2 * np.pi), rng.normal() * 1.6 / waves**0.7
+            height += amplitude * np.sin(waves * angles + phase)
+        return np.pad(np.clip(height, 0.6, 8), (0, 1), mode="wrap")

@@ -1,0 +1,124 @@
+"""What the camera sees: perspective, light, seasons."""
+
+import datetime
+
+import cv2
+import numpy as np
+import pytest
+
+from deepsimbad_campus.camera import CANVAS_SIZE, EYE_M, HORIZON_Y, View, clip_near, project
+from deepsimbad_campus.pictures import draw_facade, draw_trees, tile_noise
+from deepsimbad_campus.renderer import Renderer
+from deepsimbad_campus.route import Drive, drive_length_m
+from deepsimbad_campus.season import PAPER_DATES, Light, drive_date, season_of
+from deepsimbad_campus.things import Shot, draw_panel, panels
+from deepsimbad_campus.world import Style, World
+
+N_FRAMES = 60
+
+
+def _renderer(season):
+    world = World(0, drive_length_m(N_FRAMES, 1.75))
+    return Renderer(world, Drive(world.route, 0, drive_date(season), N_FRAMES, 1.75))
+
+
+@pytest.fixture(scope="module")
+def renderers():
+    return {name: _renderer(name) for name in PAPER_DATES}
+
+
+def _upright(renderer, frame):
+    return cv2.rotate(renderer.stored(frame), cv2.ROTATE_90_CLOCKWISE)
+
+
+def test_the_eye_is_at_the_height_of_the_horizon_and_right_is_right():
+    view = View(10.0, 20.0, heading_rad=np.pi / 2)  # looks east
+    ahead, right = view.to_camera(np.array([[10.0, 50.0], [5.0, 50.0]]))
+    np.testing.assert_allclose(ahead, [0, 30], atol=1e-9)
+    np.testing.assert_allclose(right, [5, 30], atol=1e-9)
+    assert project(ahead[None], EYE_M)[0] == pytest.approx([CANVAS_SIZE[0] / 2, HORIZON_Y])
+    assert project(ahead[None], 0.0)[0, 1] > HORIZON_Y > project(ahead[None], 3.0)[0, 1]
+    assert project(right[None], 0.0)[0, 0] > CANVAS_SIZE[0] / 2
+
+
+def test_only_what_lies_ahead_is_left_of_a_polygon():
+    square = np.array([[-1.0, -1], [1, -1], [1, 1], [-1, 1]])
+    np.testing.assert_allclose(clip_near(square), [[1, 0.35], [1, 1], [-1, 1], [-1, 0.35]])
+    assert clip_near(square - np.array([0, 5])).shape == (0, 2)
+    np.testing.assert_array_equal(clip_near(square + np.array([0, 5])), square + np.array([0, 5]))
+
+
+def test_tiles_have_no_seam():
+    tile = tile_noise(np.random.default_rng(0), (128, 256), (4, 8), 4)
+    assert tile.shape == (128, 256)
+    assert np.abs(tile[0] - tile[-1]).max() <= 1.05 * np.abs(np.diff(tile, axis=0)).max()
+    assert np.abs(tile[:, 0] - tile[:, -1]).max() <= 1.05 * np.abs(np.diff(tile, axis=1)).max()
+    assert abs(float(tile.std()) - 1) < 1e-3
+
+
+def test_pictures_are_stored_turned_counter_clockwise_with_the_sky_up_when_upright(renderers):
+    stored = renderers["summer"].stored(20)
+    assert (stored.shape, stored.dtype) == ((1232, 1616, 3), np.uint8)
+    upright = _upright(renderers["summer"], 20).astype(int)
+    sky, ground = upright[:200].mean((0, 1)), upright[-300:].mean((0, 1))
+    assert sky[0] > sky[2] + 40  # blue
+    assert ground[0] < ground[1] + 25
+    assert sky.mean() > ground.mean() * 0.9
+
+
+def test_winter_ground_is_whiter_and_summer_trees_are_fuller(renderers):
+    ground = {name: _upright(r, 8)[900:1250].astype(float) for name, r in renderers.items()}
+    white = {name: (part.min(axis=2) > 150).mean() for name, part in ground.items()}
+    assert white["winter"] > 0.25
+    assert white["winter"] > 3 * max(white["spring"], white["autumn"])
+    opaque = {
+        name: np.mean([levels[0][:300, :, 3] > 128 for levels in draw_trees(season_of(drive_date(name), 0), 0)[:11]])
+        for name in PAPER_DATES
+    }
+    assert opaque["winter"] < opaque["autumn"] < opaque["summer"]
+
+
+def test_a_frame_does_not_depend_on_what_was_drawn_before(renderers):
+    first = renderers["autumn"].stored(33)
+    for frame in (2, 50, 11):
+        renderers["autumn"].stored(frame)
+    np.testing.assert_array_equal(renderers["autumn"].stored(33), first)
+
+
+def test_drives_of_one_season_differ_too(renderers):
+    pictures = [renderer.stored(5).astype(int) for renderer in (renderers["summer"], _renderer("2012-08-20"))]
+    assert np.abs(pictures[0] - pictures[1]).mean() > 4
+
+
+STYLE = Style(5, "brick", 10.0, 6.0, 2, 3.0, True)
+
+
+def _wall_on_black(feet):
+    season = season_of(datetime.date(2012, 8, 4), 0)
+    canvas, view, light = (
+        np.zeros((CANVAS_SIZE[1], CANVAS_SIZE[0], 3), np.uint8),
+        View(0, 0, 0),
+        Light(season, 1.0, 1.0),
+    )
+    shot, levels = Shot(canvas, view, light, 0.0, 0.0), draw_facade(STYLE, season, 1)
+    for _, ends, span in panels(np.array(feet, float), view):
+        draw_panel(shot, levels, STYLE.height_m, light.on_ground, ends, span)
+    return canvas
+
+
+@pytest.mark.parametrize("feet", [((20, -5), (20, 5)), ((12, -6), (20, 0)), ((0.5, -3), (40, -3))])
+def test_a_wall_covers_exactly_its_outline_and_is_not_seen_from_inside(feet):
+    camera = View(0, 0, 0).to_camera(np.array(feet, float))
+    foot, top = project(camera, 0.0), project(camera, STYLE.height_m)
+    wanted = np.zeros(CANVAS_SIZE[::-1], np.uint8)
+    outline = np.round(np.array([foot[0], foot[1], top[1], top[0]]) * 16).astype(np.int32)
+    cv2.fillConvexPoly(wanted, outline, 1, cv2.LINE_8, 4)
+    assert (_wall_on_black(feet).any(axis=2) != wanted.astype(bool)).mean() < 0.012  # edges alone
+    assert not _wall_on_black(feet[::-1]).any()
+
+
+def test_low_sun_lights_what_faces_it():
+    light = Light(season_of(drive_date("autumn"), 0), 1.0, 1.0)
+    assert np.linalg.norm(light.sun) == pytest.approx(1)
+    assert light.gain(1.0).mean() > 1.3 * light.in_shade.mean()
+    assert (light.gain(-1.0) == light.in_shade).all()

@@ -1,0 +1,154 @@
+"""Campuses on disk: NCLT's layout, equal bytes for equal arguments, nothing mixed or overwritten."""
+
+import cv2
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from PIL import Image
+
+from deepsimbad_campus.__main__ import campus_command
+from deepsimbad_campus.season import PAPER_DATES, CampusError
+from deepsimbad_campus.writer import write_campus
+from deepsimbad_client.recordings.sources import open_source
+
+WINTER, SUMMER = PAPER_DATES["winter"], PAPER_DATES["summer"]
+
+
+@pytest.fixture(scope="module")
+def campus(tmp_path_factory):
+    root = tmp_path_factory.mktemp("campus")
+    assert write_campus(root, ["winter", "summer"], 12, seed=1) == [f"nclt:{root}/{WINTER}", f"nclt:{root}/{SUMMER}"]
+    return root
+
+
+def _files(root):
+    return {str(path.relative_to(root)): path.read_bytes() for path in root.rglob("*") if path.is_file()}
+
+
+def _winter(root):
+    return {name: body for name, body in _files(root).items() if WINTER in name}
+
+
+def test_the_layout_is_that_of_nclt(campus):
+    for date in (WINTER, SUMMER):
+        pictures = sorted((campus / date / "lb3" / "Cam5").iterdir())
+        assert len(pictures) == 12
+        assert all(len(path.stem) == 16 and path.suffix == ".tiff" for path in pictures)
+        truth = (campus / "ground_truth" / f"groundtruth_{date}.csv").read_text().splitlines()
+        assert all(len(line.split(",")) == 7 for line in truth)
+        assert truth[0].split(",")[1] == "nan"
+        assert len(truth[0].split(",")[0]) == 16
+
+
+def test_pictures_are_jpeg_compressed_tiffs_as_the_camera_stores_them(campus):
+    path = sorted((campus / WINTER / "lb3" / "Cam5").iterdir())[3]
+    with Image.open(path) as picture:
+        assert (picture.format, picture.size, picture.mode, picture.info["compression"]) == (
+            *("TIFF", (1616, 1232), "RGB", "jpeg"),
+        )
+    assert 100_000 < path.stat().st_size < 1_200_000
+
+
+def test_our_reader_reads_it(campus):
+    recording = open_source(f"nclt:{campus}/{SUMMER}")
+    assert 5 <= len(recording.frames) < 12
+    assert sum(recording.left_out.values()) == 12 - len(recording.frames)
+    image = recording.image(recording.frames[0], (154, 202))
+    decoded = cv2.imdecode(np.frombuffer(image.body, np.uint8), cv2.IMREAD_COLOR).astype(int)
+    assert decoded.shape == (202, 154, 3)
+    assert decoded[:30, :, 0].mean() > decoded[-30:, :, 0].mean() + 20  # blue sky up
+
+
+def test_other_seeds_give_other_pictures(campus, tmp_path):
+    write_campus(tmp_path, ["winter"], 1, seed=2)
+    (other,) = (tmp_path / WINTER / "lb3" / "Cam5").iterdir()
+    assert other.read_bytes() != min((campus / WINTER / "lb3" / "Cam5").iterdir()).read_bytes()
+
+
+class _CutShortError(Exception):
+    pass
+
+
+def test_it_goes_on_where_it_was_cut_short_to_equal_bytes(campus, tmp_path):
+    def stop(done, total):
+        if done == 5:
+            raise _CutShortError
+
+    with pytest.raises(_CutShortError):
+        write_campus(tmp_path, ["winter"], 12, seed=1, on_progress=stop)
+    folder = tmp_path / WINTER / "lb3" / "Cam5"
+    before = {path: path.stat().st_mtime_ns for path in folder.glob("*.tiff")}
+    assert 5 <= len(before) < 12
+    (folder / f".{min(before).name}.part").write_bytes(b"half a pict")
+    write_campus(tmp_path, ["winter"], 12, seed=1)
+    assert all(path.stat().st_mtime_ns == at for path, at in before.items())
+    assert _files(tmp_path) == _winter(campus)
+
+
+def test_more_frames_are_added_to_those_there(campus, tmp_path):
+    write_campus(tmp_path, ["winter"], 4, seed=1)
+    before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.tiff")}
+    assert len(before) == 4
+    write_campus(tmp_path, ["winter"], 12, seed=1)
+    assert all(path.stat().st_mtime_ns == at for path, at in before.items())
+    assert _files(tmp_path) == _winter(campus)
+
+
+def test_progress_counts_every_picture_of_every_drive(tmp_path):
+    for _ in range(2):
+        calls = []
+        write_campus(tmp_path, ["2012-05-11", "autumn"], 2, on_progress=lambda *call, calls=calls: calls.append(call))
+        assert calls == [(done, 4) for done in range(1, 5)]
+
+
+@pytest.mark.parametrize(
+    "change", [{"seed": 4}, {"n_frames": 2}, {"spacing_m": 1.0}], ids=["seed", "fewer frames", "spacing"]
+)
+def test_drives_made_otherwise_are_not_mixed(campus, change):
+    before = _files(campus)
+    with pytest.raises(CampusError, match="choose another folder"):
+        write_campus(campus, **{"seasons": ["winter"], "n_frames": 12, "seed": 1, **change})
+    assert _files(campus) == before
+
+
+@pytest.mark.parametrize(
+    "there", [f"{SUMMER}/lb3/Cam5/1344104400000000.tiff", f"ground_truth/groundtruth_{SUMMER}.csv"]
+)
+def test_a_real_recording_is_never_touched(tmp_path, there):
+    (tmp_path / there).parent.mkdir(parents=True)
+    (tmp_path / there).write_bytes(b"real")
+    with pytest.raises(CampusError, match="not as a rendered campus"):
+        write_campus(tmp_path, ["winter", "summer"], 2)
+    assert _files(tmp_path) == {there: b"real"}
+
+
+@pytest.mark.parametrize("text", ["[]", "{", '{"seed": 0}'])
+def test_a_damaged_order_is_named(tmp_path, text):
+    (tmp_path / SUMMER).mkdir()
+    (tmp_path / SUMMER / "campus.json").write_text(text)
+    with pytest.raises(CampusError, match="damaged"):
+        write_campus(tmp_path, ["summer"], 2)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        *({"n_frames": 0}, {"spacing_m": 0.0}, {"spacing_m": float("nan")}, {"seed": -1}),
+        *({"seasons": []}, {"seasons": ["winter", "2012-01-22"]}),
+        *({"seasons": [season]} for season in ("", "Winter", "monsoon", "2012-13-01", "22.1.2012")),
+    ],
+)
+def test_impossible_arguments_are_refused_before_anything_is_written(tmp_path, wrong):
+    with pytest.raises(CampusError):
+        write_campus(tmp_path, **{"seasons": ["winter"], "n_frames": 1, **wrong})
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_command_renders_and_says_what_to_open_or_what_is_wrong(tmp_path):
+    result = CliRunner().invoke(campus_command, [str(tmp_path), "--seasons", "winter, autumn", "--frames", "2"])
+    assert result.exit_code == 0, result.output
+    assert result.stdout.splitlines() == [f"nclt:{tmp_path}/2012-01-22", f"nclt:{tmp_path}/2012-11-17"]
+    assert len(list(tmp_path.rglob("*.tiff"))) == 4
+    result = CliRunner().invoke(campus_command, [str(tmp_path), "--seasons", "mud"])
+    assert result.exit_code == 1
+    assert "season 'mud' is neither one of winter" in result.stderr
