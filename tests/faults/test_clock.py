@@ -7,7 +7,7 @@ from typing import Self
 import pytest
 
 from deepsimbad.engine.maps import beyond_keeping
-from deepsimbad.jobs.map_config import RemapConfig
+from deepsimbad.jobs.remap_config import RemapConfig
 from deepsimbad.store import documents
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.records import JobState

@@ -17,7 +17,7 @@ import pytest
 from sqlite_utils import Database
 
 from deepsimbad.errors import InvalidMapConfigError, UnavailableError
-from deepsimbad.jobs.map_config import RemapConfig
+from deepsimbad.jobs.remap_config import RemapConfig
 from deepsimbad.jobs.runner import JobRunner
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.records import JobRecord, JobState

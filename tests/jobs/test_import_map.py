@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from deepsimbad.core.map import Map
 from deepsimbad.engine.maps import Maps
 from deepsimbad.errors import (
     ConflictError,
@@ -29,7 +30,6 @@ from deepsimbad.errors import (
 from deepsimbad.jobs.import_map import import_map
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.exported_map import export_map
-from deepsimbad.store.map_contents import MapContents
 from deepsimbad.store.map_file import write_map
 from deepsimbad.store.map_table import ANY
 from deepsimbad.store.records import MapState
@@ -39,9 +39,11 @@ from deepsimbad.store.traverses import Traverse
 EVALUATOR = {"kind": "feature_l2", "extractor": "none"}
 ACTIONS_M = (1.0, 2.0)
 Add = Callable[..., int]
+CALIBRATED = {"relevance": "calibrated", "n_landmarks": 9}
+TRUST = {"correlation": np.full(9, 0.6), "listed_score": np.ones((3, 9))}
 
 
-def contents(domain: str, version: int, **changes: Any) -> MapContents:
+def contents(domain: str, version: int, **changes: Any) -> Map:
     rng = np.random.default_rng(version)
     parts: dict[str, Any] = {
         "config": {"relevance": "rrf", "n_landmarks": 9, "training_traverse": "summer", "landmark_traverse": "winter"},
@@ -53,7 +55,7 @@ def contents(domain: str, version: int, **changes: Any) -> MapContents:
         "position_m": np.arange(30.0),
         "metrics": {"anr": 4.5},
     }
-    return MapContents(domain=domain, version=version, created_at="2026-01-01T00:00:00Z", **{**parts, **changes})
+    return Map(domain=domain, version=version, created_at="2026-01-01T00:00:00Z", **{**parts, **changes})
 
 
 def add(catalog: Catalog, domain: str, **changes: Any) -> int:
@@ -100,7 +102,7 @@ def test_the_bytes_travel_unchanged(there: Catalog, here: Catalog, tmp_path: Pat
     assert (record.sha256, record.state, record.metrics["anr"]) == (sent.sha256, MapState.ACTIVE, 4.5)
     assert record.config["imported"] == {"domain": "campus", "version": 1, "sha256": sent.sha256}
     assert record.config["training_traverse"] is None, "a traverse of that name here is another drive"
-    snapshot = Maps(here).snapshot("garden")
+    snapshot = Maps(here).active("garden").snapshot
     assert (snapshot.domain, snapshot.version, snapshot.n_images) == ("garden", 1, 30)
 
 
@@ -240,7 +242,10 @@ import_map(catalog, Path(sys.argv[2]))
         {"actions_m": ()},
         {"actions_m": (-1.0, 2.0)},
         {"actions_m": (2.0, 1.0)},
-        {"actions_m": (1.0, "2")},
+        {"position_m": np.full(30, 5.0)},
+        {"config": CALIBRATED, "statistics": np.full((2, 9), np.nan), **TRUST},
+        {"config": CALIBRATED, "statistics": np.zeros((2, 9)), **TRUST},
+        {"telling_bits": np.full(30, np.inf, np.float32)},
     ],
 )
 def test_a_map_that_could_answer_nothing_is_refused(here: Catalog, tmp_path: Path, changes: dict[str, Any]) -> None:

@@ -15,6 +15,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from deepsimbad.core.drive import Drive
+from deepsimbad.core.map import Map
 from deepsimbad.errors import (
     CancelledError,
     ConflictError,
@@ -28,8 +30,6 @@ from deepsimbad.store import archive as archive_module
 from deepsimbad.store.archive import MANIFEST
 from deepsimbad.store.backup import back_up, is_member
 from deepsimbad.store.catalog import Catalog
-from deepsimbad.store.frames import TraverseFrames
-from deepsimbad.store.map_contents import MapContents
 from deepsimbad.store.map_file import read_map, write_map
 from deepsimbad.store.map_table import ANY
 from deepsimbad.store.restore import restore
@@ -39,8 +39,8 @@ from deepsimbad.store.session_records import ObservedRow, SessionRecord
 from deepsimbad.store.sessions import SessionStore
 from deepsimbad.store.traverses import Traverse
 
-MakeMap = Callable[..., MapContents]
-MakeFrames = Callable[..., TraverseFrames]
+MakeMap = Callable[..., Map]
+MakeFrames = Callable[..., Drive]
 
 
 def silent(_: float) -> None:

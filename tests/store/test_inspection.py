@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from deepsimbad.core.drive import Drive
+from deepsimbad.core.map import Map
 from deepsimbad.errors import CancelledError
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.checkpoints import Checkpoints
-from deepsimbad.store.frames import TraverseFrames
 from deepsimbad.store.inspection import Inspection, inspect
-from deepsimbad.store.map_contents import MapContents
 from deepsimbad.store.map_file import write_map
 from deepsimbad.store.map_table import ANY
 from deepsimbad.store.sealing import seal
@@ -20,8 +20,8 @@ from deepsimbad.store.session_records import ObservedRow, SessionRecord
 from deepsimbad.store.sessions import SessionStore
 from deepsimbad.store.traverses import Traverse
 
-MakeMap = Callable[..., MapContents]
-MakeFrames = Callable[..., TraverseFrames]
+MakeMap = Callable[..., Map]
+MakeFrames = Callable[..., Drive]
 CATALOG, SESSIONS = "catalog.sqlite", "sessions.sqlite"
 TRAVERSE = "domains/campus/traverses/summer.sqlite"
 MAP = "domains/campus/maps/000001.sqlite"

@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 
+from deepsimbad.core.map import Map
 from deepsimbad.errors import TraverseInUseError
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.checkpoints import Checkpoints
-from deepsimbad.store.map_contents import MapContents
 from deepsimbad.store.map_file import write_map
 from deepsimbad.store.map_table import ANY
 from deepsimbad.store.records import JobState, MapState
@@ -151,7 +151,7 @@ def test_closing_a_catalog_gives_its_work_up(campus: Catalog) -> None:
         assert list((campus.data_dir / "owners").iterdir()) == []
 
 
-def test_orphans_go_and_everything_owned_stays(campus: Catalog, make_map: Callable[..., MapContents]) -> None:
+def test_orphans_go_and_everything_owned_stays(campus: Catalog, make_map: Callable[..., Map]) -> None:
     version = campus.begin_map("campus", {})
     building, final = campus.building_path("campus", version), campus.map_path("campus", version)
     write_map(building, make_map())

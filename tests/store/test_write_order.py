@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from deepsimbad.core.map import Map
 from deepsimbad.store import connection
 from deepsimbad.store.backup import back_up
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.exported_map import export_map
-from deepsimbad.store.map_contents import MapContents
 from deepsimbad.store.map_file import write_map
 from deepsimbad.store.restore import restore
 from deepsimbad.store.sealing import seal
@@ -21,7 +21,7 @@ from deepsimbad.store.session_records import ObservedRow, SessionRecord
 from deepsimbad.store.sessions import SessionStore
 from deepsimbad.store.traverses import Traverse
 
-MakeMap = Callable[..., MapContents]
+MakeMap = Callable[..., Map]
 _CALLS = ("fsync", "rename", "replace", "link", "chmod", "unlink", "mkdir")
 
 

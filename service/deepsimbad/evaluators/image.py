@@ -20,12 +20,7 @@ from typing import Any, NoReturn
 import cv2
 import numpy as np
 
-from deepsimbad.errors import (
-    EmptyBodyError,
-    ImageTooLargeError,
-    InvalidImageError,
-    TruncatedImageError,
-)
+from deepsimbad.errors import EmptyBodyError, ImageTooLargeError, InvalidImageError, TruncatedImageError
 from deepsimbad.evaluators.base import Image, named_lack_of_memory
 
 KEPT_PIXELS = 3840 * 2160

@@ -8,9 +8,7 @@ from typing import Self
 
 from sqlite_utils import Database
 
-from deepsimbad.errors import (
-    DamagedFileError,
-)
+from deepsimbad.errors import DamagedFileError
 from deepsimbad.store import layout
 from deepsimbad.store.connection import check_integrity, migrate, open_database, use_write_ahead_log, write_transaction
 from deepsimbad.store.data_dir import make_data_dir

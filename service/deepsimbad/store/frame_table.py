@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from sqlite_utils import Database
 
+from deepsimbad.core.drive import UNKNOWN_TIMESTAMP, Drive
 from deepsimbad.errors import DamagedFileError, InvalidEncodingError, WeightsDifferError
 from deepsimbad.store.arrays import is_halvable
-from deepsimbad.store.frames import UNKNOWN_TIMESTAMP, TraverseFrames
 
 _DTYPE_OF_BYTES = {2.0: "<f2", 4.0: "<f4"}  # by the bytes of one number
 _Place = tuple[float, int | None, float | None, float | None]  # position_m, timestamp_us, x_m, y_m
@@ -50,7 +50,7 @@ def missing(db: Database) -> list[tuple[int, int]]:
     return [(first, last) for first, last in rows]
 
 
-def upsert(db: Database, frames: TraverseFrames) -> None:
+def upsert(db: Database, frames: Drive) -> None:
     """Store checked frames, replacing those of the same index; one row at a time, never a second copy of the batch.
 
     Raises:
@@ -82,14 +82,14 @@ def upsert(db: Database, frames: TraverseFrames) -> None:
     )
 
 
-def read(db: Database) -> TraverseFrames:
+def read(db: Database) -> Drive:
     """All frames in index order, every checksum checked; one array of encodings, no copy beside it.
 
     Raises:
         DamagedFileError: A frame is not what was stored.
     """
     n, dim = count(db), encoding_dim(db) or 0
-    frames = TraverseFrames(
+    frames = Drive(
         index=np.empty(n, np.int64),
         position_m=np.empty(n, np.float64),
         timestamp_us=np.empty(n, np.int64),
@@ -148,7 +148,7 @@ def _checked_rows(db: Database, dim: int) -> Iterator[tuple[Any, ...]]:
         yield index, position_m, timestamp_us, x_m, y_m, encoding
 
 
-def _place(frames: TraverseFrames, row: int) -> _Place:
+def _place(frames: Drive, row: int) -> _Place:
     timestamp_us = int(frames.timestamp_us[row])
     x_m, y_m = float(frames.x_m[row]), float(frames.y_m[row])
     return (
@@ -159,7 +159,7 @@ def _place(frames: TraverseFrames, row: int) -> _Place:
     )
 
 
-def _bodies(frames: TraverseFrames) -> Iterator[tuple[int, int, bytes]]:
+def _bodies(frames: Drive) -> Iterator[tuple[int, int, bytes]]:
     for row, index in enumerate(frames.index):
         body = _body(frames.encodings[row])
         yield int(index), _checksum(_place(frames, row), body), body

@@ -2,9 +2,7 @@
 
 from datetime import timedelta
 
-from deepsimbad.errors import (
-    InvalidInputError,
-)
+from deepsimbad.errors import InvalidInputError
 from deepsimbad.store import key_table
 from deepsimbad.store.api_key import ApiKey
 from deepsimbad.store.catalog_file import CatalogFile

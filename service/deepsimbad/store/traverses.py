@@ -11,18 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 from sqlite_utils import Database
 
-from deepsimbad.errors import (
-    ConflictError,
-    DamagedFileError,
-    UnknownDomainError,
-    UnknownTraverseError,
-)
+from deepsimbad.core.drive import UNKNOWN_TIMESTAMP, Drive
+from deepsimbad.errors import ConflictError, DamagedFileError, UnknownDomainError, UnknownTraverseError
 from deepsimbad.store import frame_table, layout
 from deepsimbad.store.connection import migrate, open_database, use_write_ahead_log, write_transaction
 from deepsimbad.store.documents import now
 from deepsimbad.store.durable import remove_database, sync_file, sync_folder
 from deepsimbad.store.faults import storage_faults
-from deepsimbad.store.frames import UNKNOWN_TIMESTAMP, TraverseFrames
 from deepsimbad.store.open_file import OpenFile
 from deepsimbad.store.write_ahead_log import check_log
 from deepsimbad_migrations.traverse.migrations import migrations
@@ -172,7 +167,7 @@ class Traverse(OpenFile):
         Raises:
             InvalidInputError, InvalidRouteError, InvalidEncodingError: As `put_frames`.
         """
-        frames = TraverseFrames(
+        frames = Drive(
             index=np.array([index]),
             position_m=np.array([position_m], np.float64),
             timestamp_us=np.array([UNKNOWN_TIMESTAMP if timestamp_us is None else timestamp_us]),
@@ -183,7 +178,7 @@ class Traverse(OpenFile):
         )
         return self.put_frames(frames)[0] == 1
 
-    def put_frames(self, frames: TraverseFrames) -> tuple[int, int]:
+    def put_frames(self, frames: Drive) -> tuple[int, int]:
         """Store a batch in one transaction, replacing frames of the same index.
 
         Returns:
@@ -223,7 +218,7 @@ class Traverse(OpenFile):
         with self._reading() as db:
             return frame_table.missing(db)
 
-    def read(self) -> TraverseFrames:
+    def read(self) -> Drive:
         """All frames in index order, every checksum checked; one array of encodings, no copy beside it."""
         with self._reading() as db:
             return frame_table.read(db)
