@@ -3,8 +3,7 @@
 import json
 import logging
 import os
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 from rich.console import Console
 from rich.progress import (
@@ -13,18 +12,17 @@ from rich.progress import (
     Progress,
     ProgressColumn,
     SpinnerColumn,
-    TaskID,
     TextColumn,
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
 from rich.table import Table
 
-from deepsimbad_client.episode_log import Episode
+from deepsimbad_client.commands.tables import lasting
 from deepsimbad_client.http.models import Job
 from deepsimbad_client.http.upload import UploadReport
-from deepsimbad_client.step_log import Step
-from deepsimbad_client.tables import lasting
+from deepsimbad_client.replay.active import Episode
+from deepsimbad_client.replay.passive import Step
 
 REMARKS = Console(stderr=True, highlight=False, markup=False)
 """Progress and remarks; names may hold brackets, so nothing is read as markup."""
@@ -61,37 +59,24 @@ def as_json(document: Any) -> str:
     return json.dumps(document, indent=2, allow_nan=False)
 
 
-class Bar:
+class Bar(Progress):
     """A progress bar on standard error; off a terminal it stays silent."""
 
     def __init__(
         self, label: str, total: float | None, *, counted: bool = True, left: ProgressColumn | None = None
     ) -> None:
-        middle = [MofNCompleteColumn()] if counted else [TextColumn("{task.percentage:>3.0f} %")]
-        self._progress = Progress(
+        super().__init__(
             SpinnerColumn(finished_text="[green]✓"),
             TextColumn("{task.description}", markup=False),
             BarColumn(bar_width=32),
-            *middle,
+            MofNCompleteColumn() if counted else TextColumn("{task.percentage:>3.0f} %"),
             TimeElapsedColumn(),
             left or TimeRemainingColumn(),
             TextColumn("{task.fields[note]}", markup=False),
             console=REMARKS,
             disable=not REMARKS.is_terminal,
         )
-        self._task: TaskID = self._progress.add_task(label, total=total, note="", left="")
-
-    def __enter__(self) -> Self:
-        self._progress.start()
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self._progress.stop()
+        self._bar = self.add_task(label, total=total, note="", left="")
 
 
 class FrameBar(Bar):
@@ -99,7 +84,7 @@ class FrameBar(Bar):
 
     def __call__(self, n_done: int, n_frames: int) -> None:
         """Show how many there are."""
-        self._progress.update(self._task, completed=n_done, total=n_frames)
+        self.update(self._bar, completed=n_done, total=n_frames)
 
 
 class UploadBar(Bar):
@@ -108,7 +93,7 @@ class UploadBar(Bar):
     def __call__(self, progress: UploadReport) -> None:
         """Show how far an upload is."""
         note = f"{progress.bytes_sent / 1e6:.1f} MB sent"
-        self._progress.update(self._task, completed=progress.n_done, total=progress.n_frames, note=note)
+        self.update(self._bar, completed=progress.n_done, total=progress.n_frames, note=note)
 
 
 class JobBar(Bar):
@@ -120,11 +105,11 @@ class JobBar(Bar):
     def __call__(self, job: Job) -> None:
         """Show how far a job is; one whose service was restarted waits in the queue again."""
         stage = "waiting for its turn" if job.state == "queued" else job.stage_name
-        self._progress.update(self._task, completed=job.progress, note=stage, left=lasting(job.eta_s))
+        self.update(self._bar, completed=job.progress, note=stage, left=lasting(job.eta_s))
 
     def silent(self, seconds: float) -> None:
         """Show that nothing has been heard for a while."""
-        self._progress.update(self._task, note=f"no answer for {seconds:.0f} s, still trying")
+        self.update(self._bar, note=f"no answer for {seconds:.0f} s, still trying")
 
 
 class DownloadBar(Bar):
@@ -135,7 +120,7 @@ class DownloadBar(Bar):
 
     def __call__(self, n_bytes: int, n_in_all: int | None) -> None:
         """Show how much of a file has come."""
-        self._progress.update(self._task, completed=n_bytes, total=n_in_all, note=f"{n_bytes / 1e6:.1f} MB")
+        self.update(self._bar, completed=n_bytes, total=n_in_all, note=f"{n_bytes / 1e6:.1f} MB")
 
 
 class ReplayBar(Bar):
@@ -143,18 +128,16 @@ class ReplayBar(Bar):
 
     def __init__(self, label: str, total: int) -> None:
         super().__init__(label, total)
-        self._sum = 0.0
-        self._scored = 0
+        self._ranks: list[float] = []
 
     def __call__(self, step: Step, n_done: int) -> None:
         """Show how far a replay is."""
         note = "broken frame" if step.broken else "not in the map"
         if step.rank_percent is not None:
-            self._sum += step.rank_percent
-            self._scored += 1
-        if self._scored:
-            note = f"ANR {self._sum / self._scored:.2f} %"
-        self._progress.update(self._task, completed=n_done, note=note)
+            self._ranks.append(step.rank_percent)
+        if self._ranks:
+            note = f"ANR {sum(self._ranks) / len(self._ranks):.2f} %"
+        self.update(self._bar, completed=n_done, note=note)
 
 
 class EpisodeBar(Bar):
@@ -168,6 +151,6 @@ class EpisodeBar(Bar):
         """Show how far an active replay is."""
         ranks = self._ranks.setdefault(episode.planner, [])
         ranks += [step.rank_percent for step in episode.steps[1:] if step.rank_percent is not None]
-        means = {planner: sum(each) / len(each) for planner, each in self._ranks.items() if each}
+        means = {planner: sum(values) / len(values) for planner, values in self._ranks.items() if values}
         note = "  ".join(f"{planner} {mean:.1f} %" for planner, mean in means.items())
-        self._progress.update(self._task, completed=n_done, note=note)
+        self.update(self._bar, completed=n_done, note=note)
