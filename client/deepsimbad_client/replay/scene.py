@@ -7,8 +7,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from deepsimbad.core.route import Route
-from deepsimbad.core.true_images import true_images_of
+from deepsimbad.core.route import Route, true_images_of
 from deepsimbad_client.errors import (
     BrokenFrameError,
     IdempotencyKeyReusedError,
