@@ -15,8 +15,8 @@ from deepsimbad.api import auth
 from deepsimbad.api.auth import KEPT_S, AuthMiddleware, KeyRing, needed_scope, presented_key
 from deepsimbad.api.rate_limit import RateLimit
 from deepsimbad.errors import UnauthorizedError, UnavailableError
-from deepsimbad.store.api_key import ApiKey
 from deepsimbad.store.catalog import Catalog
+from deepsimbad.store.catalog_keys import ApiKey
 from deepsimbad.store.records import KeyRecord, KeyScope
 
 KEY = ApiKey.new()

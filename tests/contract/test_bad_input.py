@@ -13,7 +13,7 @@ import pytest
 from starlette.testclient import TestClient
 
 from deepsimbad.store.catalog import Catalog
-from deepsimbad.store.map_table import ANY
+from deepsimbad.store.catalog_maps import ANY
 
 from .conftest import DIM, N_LANDMARKS, N_READY, NPZ, encoded, make_ready_domain, npz, picture, remap, wait_for
 

@@ -10,8 +10,8 @@ from deepsimbad.engine import maps as maps_module
 from deepsimbad.engine.maps import Maps
 from deepsimbad.errors import DamagedMapError, NoActiveMapError, UnavailableError, UnknownDomainError
 from deepsimbad.store.catalog import Catalog
+from deepsimbad.store.catalog_maps import ANY
 from deepsimbad.store.map_file import write_map
-from deepsimbad.store.map_table import ANY
 from deepsimbad.store.sealing import seal
 
 from .conftest import N_IMAGES, add_domain, add_map, map_contents

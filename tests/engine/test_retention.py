@@ -13,8 +13,8 @@ from deepsimbad.engine.maps import Retention, beyond_keeping
 from deepsimbad.engine.session import SessionConfig
 from deepsimbad.errors import MapInUseError, RetiredMapError, UnavailableError, UnknownMapVersionError
 from deepsimbad.store.catalog import Catalog
+from deepsimbad.store.catalog_maps import ANY
 from deepsimbad.store.layout import catalog_path
-from deepsimbad.store.map_table import ANY
 from deepsimbad.store.records import KeptMap, MapState
 
 from .conftest import add_domain, add_map
@@ -230,14 +230,14 @@ def test_a_crash_between_the_mark_and_the_file_is_finished_at_the_next_start(
 
     with running(mapped) as live:
         with monkeypatch.context() as patched:
-            patched.setattr("deepsimbad.store.map_removal.remove_database", dies)
+            patched.setattr("deepsimbad.store.catalog_maps.remove_database", dies)
             with pytest.raises(KeyboardInterrupt):
                 retention_of(live).remove(DOMAIN, 1)
         assert mapped.map(DOMAIN, 1).removed_at is not None
         assert mapped.map_path(DOMAIN, 1).is_file()
         with pytest.raises(RetiredMapError):
             mapped.activate(DOMAIN, 1, ANY)
-    assert mapped.discard_unfinished() == ["removed 000001.sqlite of domain d, which no map version owns"]
+    assert mapped.discard_unfinished() == ["removed the file of the removed map 1 of domain d"]
     assert with_files(mapped) == [2]
 
 

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from deepsimbad.core.belief import FilterKind
-from deepsimbad.core.localizer import ActiveLocalizer, LocalizerConfig
+from deepsimbad.core.filters import FilterKind
 from deepsimbad.core.relevance import Relevance
 from deepsimbad.engine import session as session_module
+from deepsimbad.engine.active_localizer import ActiveLocalizer, LocalizerConfig
 from deepsimbad.engine.localizer import describe
 from deepsimbad.engine.session import SessionConfig
 from deepsimbad.engine.views import View
@@ -35,7 +35,7 @@ from deepsimbad.errors import (
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.feature_l2 import FeatureL2
 from deepsimbad.store.catalog import Catalog
-from deepsimbad.store.map_table import ANY
+from deepsimbad.store.catalog_maps import ANY
 from deepsimbad.store.session_records import SessionRecord
 
 from .conftest import N_IMAGES, add_domain, add_map

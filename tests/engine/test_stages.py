@@ -13,7 +13,7 @@ from deepsimbad.engine.session import SessionConfig
 from deepsimbad.engine.views import Stopwatch, View
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.store.catalog import Catalog
-from deepsimbad.store.map_table import ANY
+from deepsimbad.store.catalog_maps import ANY
 
 from .conftest import add_domain, add_map
 from .live_service import Live, ranked, run

@@ -17,7 +17,7 @@ import pytest
 from sqlite_utils import Database
 
 from deepsimbad.errors import InvalidMapConfigError, UnavailableError
-from deepsimbad.jobs.remap_config import RemapConfig
+from deepsimbad.jobs.map_config import RemapConfig
 from deepsimbad.jobs.runner import JobRunner
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.records import JobRecord, JobState
@@ -99,7 +99,7 @@ def test_the_service_names_it_and_goes_on_when_there_is_room(disk: tuple[Path, F
         assert service.ended_job(job["job_id"])["state"] == "succeeded"
         assert service.told("GET", "/v1/domains/loop")["map_version"] == version
         service.kill()
-        check_is_clean(data_dir, may_have_left_over=True)
+        check_is_clean(data_dir)
     with Service(data_dir) as service:
         assert service.told("GET", f"/v1/sessions/{session_id}")["n_observations"] == 4
         if begun.status_code < 400:
@@ -107,6 +107,25 @@ def test_the_service_names_it_and_goes_on_when_there_is_room(disk: tuple[Path, F
         assert service.told("GET", "/v1/domains/loop")["map_version"] == version
         assert service.told("GET", "/v1/admin/domains/yard/traverses/drive")["n_frames"] == 100
     check_is_clean(data_dir)
+
+
+def test_a_service_that_is_restarted_on_a_full_disk_answers_who_only_asks(furnished: Path) -> None:
+    with small_disk(48 * 2**20) as folder:
+        data_dir = Path(shutil.copytree(furnished, folder / "data"))
+        with Service(data_dir) as service:
+            session_id = begin(service, 3)
+        for is_killed in (False, True):
+            with no_room_left(folder, service), Service(data_dir, ready=False) as service:
+                view = service.told("POST", "/v1/domains/loop/localizations", json={"ranked_landmarks": [1, 2, 3]})
+                assert view["map_version"] == 2
+                assert service.told("GET", f"/v1/sessions/{session_id}")["n_observations"] == 3
+                assert service.ask("GET", "/readyz").status_code == 503
+                assert service.refused("POST", "/v1/domains/loop/sessions", json={})["status"] == 503
+                if is_killed:
+                    service.kill()
+        with Service(data_dir) as service:
+            assert service.told("POST", **service.observe(session_id, 3))["n_observations"] == 4
+        check_is_clean(data_dir)
 
 
 def test_a_job_that_finds_the_disk_full_says_so_and_leaves_nothing(furnished: Path) -> None:

@@ -14,7 +14,7 @@ import deepsimbad_migrations
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.map_file import read_map
 from deepsimbad.store.records import JobState
-from deepsimbad.store.session_records import ClockRecord, PriorRow
+from deepsimbad.store.session_records import PriorRow
 from deepsimbad.store.sessions import SessionStore
 from deepsimbad.store.traverses import Traverse
 from deepsimbad_migrations.catalog.migrations import migrations as catalog_migrations
@@ -136,12 +136,13 @@ def test_a_past_file_reaches_today_and_keeps_its_rows(dump: Path, by_command: bo
     assert schema_of(past) == schema_of(new)
     after = rows_of(past)
     for table, rows in before.items():
-        if table == "_sqlite_migrations":
+        if table in {"_sqlite_migrations", "clock"}:
             continue
         assert len(rows) >= 1 or table in ("doomed_folder", "map_image_encoding"), f"the dump shows no {table}"
         assert len(after[table]) == len(rows)
         for old_row, row in zip(rows, after[table], strict=True):
-            assert row.items() >= old_row.items()
+            lost = dict(old_row.items() - row.items())
+            assert lost.keys() <= (set() if kind == "map" else {"checksum", "owner"})
 
 
 def the_catalog(data_dir: Path) -> Iterator[object]:
@@ -168,7 +169,7 @@ def the_map(data_dir: Path) -> Iterator[object]:
     contents = read_map(data_dir / "domains/campus/maps/000001.sqlite")
     yield contents.lists.tolist()
     yield contents.landmark_model["prototypes"].tolist()
-    yield (contents.closed, tuple(contents.actions_m.tolist()), contents.position_m.tolist(), contents.metrics)
+    yield (contents.closed, contents.actions_m, contents.position_m.tolist(), contents.metrics)
     yield contents.q_values.round(2).tolist()
 
 
@@ -195,63 +196,36 @@ def the_sessions(data_dir: Path) -> Iterator[object]:
         yield store.named(alive.number, "k1")
 
 
-def the_sessions_with_a_clock(data_dir: Path) -> Iterator[object]:
-    yield from the_sessions(data_dir)
-    with SessionStore.open(data_dir) as store:
-        yield store.clock()
-
-
 @pytest.mark.parametrize(
     ("dump", "place", "read", "expected"),
     [
         ("catalog_v1", "catalog.sqlite", the_catalog, [1, {"anr": 4.5}, [JobState.SUCCEEDED]]),
-        (
-            "catalog_v2",
-            "catalog.sqlite",
-            the_catalog_with_keys,
-            [1, {"anr": 4.5}, [JobState.SUCCEEDED], ["2026-11-20T10:00:00.000Z", 2]],
+        *(
+            (
+                f"catalog_v{version}",
+                "catalog.sqlite",
+                the_catalog_with_keys,
+                [1, {"anr": 4.5}, [JobState.SUCCEEDED], ["2026-11-20T10:00:00.000Z", 2]],
+            )
+            for version in (2, 3, 4)
         ),
-        (
-            "catalog_v3",
-            "catalog.sqlite",
-            the_catalog_with_keys,
-            [1, {"anr": 4.5}, [JobState.SUCCEEDED], ["2026-11-20T10:00:00.000Z", 2]],
+        *(
+            (
+                f"traverse_v{version}",
+                "domains/campus/traverses/summer.sqlite",
+                the_traverse,
+                [[[1, 2], [3, 4], [5, 6]], ([(2, 2)], [10, -1, 30])],
+            )
+            for version in (1, 2, 3)
         ),
-        (
-            "traverse_v1",
-            "domains/campus/traverses/summer.sqlite",
-            the_traverse,
-            [[[1, 2], [3, 4], [5, 6]], ([(2, 2)], [10, -1, 30])],
-        ),
-        (
-            "session_v1",
-            "sessions.sqlite",
-            the_sessions,
-            [("a" * 32, {"filter": "grid", "seed": 7}, 3, 4630.0), (2, [0.25, 0.75], [3]), True, (1, b"\x01\x02")],
-        ),
-        (
-            "session_v2",
-            "sessions.sqlite",
-            the_sessions_with_a_clock,
-            [
-                ("a" * 32, {"filter": "grid", "seed": 7}, 3, 4630.0),
-                (2, [0.25, 0.75], [3]),
-                True,
-                (1, b"\x01\x02"),
-                (ClockRecord("b-1", 900.0, 1050.0), 1040.0),
-            ],
-        ),
-        (
-            "session_v3",
-            "sessions.sqlite",
-            the_sessions_with_a_clock,
-            [
-                ("a" * 32, {"filter": "grid", "seed": 7}, 3, 4630.0),
-                (2, [0.25, 0.75], [3]),
-                True,
-                (1, b"\x01\x02"),
-                (ClockRecord("b-1", 900.0, 1050.0), 1040.0),
-            ],
+        *(
+            (
+                f"session_v{version}",
+                "sessions.sqlite",
+                the_sessions,
+                [("a" * 32, {"filter": "grid", "seed": 7}, 3, 4630.0), (2, [0.25, 0.75], [3]), True, (1, b"\x01\x02")],
+            )
+            for version in (1, 2, 3, 4)
         ),
         (
             "map_v1",

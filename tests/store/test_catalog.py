@@ -1,6 +1,13 @@
+"""What the catalog keeps, refuses and clears away: domains, map versions, jobs, keys."""
+
+import re
 import shutil
+import signal
 import sqlite3
+import subprocess
+import sys
 import threading
+from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -14,16 +21,19 @@ from deepsimbad.errors import (
     DomainDiffersError,
     InvalidInputError,
     LostActivationError,
+    TooManyDomainsError,
     TraverseInUseError,
     UnavailableError,
     UnknownDomainError,
     UnknownJobError,
+    UnknownKeyError,
     UnknownMapVersionError,
 )
 from deepsimbad.store import durable
 from deepsimbad.store.catalog import Catalog
-from deepsimbad.store.map_table import ANY
-from deepsimbad.store.records import JobState, MapState
+from deepsimbad.store.catalog_keys import ApiKey
+from deepsimbad.store.catalog_maps import ANY
+from deepsimbad.store.records import JobState, KeyScope, MapState, now
 from deepsimbad.store.traverses import Traverse
 
 EVALUATOR = {"kind": "feature_l2", "extractor": "none"}
@@ -144,6 +154,23 @@ def test_activation_is_a_compare_and_swap(campus: Catalog) -> None:
     assert campus.domain("campus").active_version == second
 
 
+def test_which_map_served_last_is_known_though_the_clock_was_set_back(
+    campus: Catalog, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Earlier(datetime):
+        @classmethod
+        def now(cls, tz: Any = None) -> datetime:
+            return datetime.now(tz) - timedelta(days=400)
+
+    first, second = sealed(campus), sealed(campus)
+    campus.activate("campus", first, None)
+    campus.activate("campus", second, first)
+    monkeypatch.setattr("deepsimbad.store.records.datetime", Earlier)
+    campus.activate("campus", first, second)
+    retired_at = {record.version: record.retired_at or "" for record in campus.maps("campus")}
+    assert retired_at[second] > retired_at[first]
+
+
 def test_of_many_swaps_at_once_one_wins(campus: Catalog) -> None:
     versions = [sealed(campus) for _ in range(8)]
     won: list[int] = []
@@ -200,16 +227,6 @@ def test_the_life_of_a_job(campus: Catalog) -> None:
     assert campus.jobs("campus") == campus.jobs()
 
 
-@pytest.mark.parametrize(
-    "fields", [{"owner": "x"}, {"created_at": "x"}, {"state": "dancing"}, {"progress": 1.5}, {"progress": float("nan")}]
-)
-def test_a_job_refuses_what_cannot_be(campus: Catalog, fields: dict[str, object]) -> None:
-    job = campus.create_job("campus", "remap", {})
-    with pytest.raises(InvalidInputError):
-        campus.update_job(job.job_id, **fields)
-    assert campus.job(job.job_id) == job
-
-
 @pytest.mark.parametrize("job_id", ["", "x", "0" * 32, "\ud800", "' OR 1=1 --"])
 def test_an_unknown_job(campus: Catalog, job_id: str) -> None:
     with pytest.raises(UnknownJobError):
@@ -264,6 +281,28 @@ def test_a_damaged_catalog_gives_named_errors_alone(campus: Catalog) -> None:
             read_everything(campus.data_dir)
 
 
+@pytest.mark.parametrize(
+    "statement", ["CREATE TRIGGER t AFTER INSERT ON job BEGIN SELECT 1; END", "CREATE VIEW v AS SELECT 1"]
+)
+def test_a_catalog_that_would_run_what_its_maker_wrote_is_refused(campus: Catalog, statement: str) -> None:
+    campus.close()
+    with sqlite3.connect(campus.data_dir / "catalog.sqlite") as raw:
+        raw.execute(statement)
+    raw.close()
+    with pytest.raises(DamagedFileError, match="no release writes"):
+        Catalog.open(campus.data_dir)
+
+
+def test_a_catalog_that_was_removed_meanwhile_takes_no_more(campus: Catalog) -> None:
+    campus.domains()
+    (campus.data_dir / "catalog.sqlite").unlink()
+    with pytest.raises(DamagedFileError, match="was removed under the running service"):
+        campus.create_domain("more", EVALUATOR, False, [1])
+    assert [record.name for record in campus.domains()] == ["campus"], "who reads is answered"
+    with pytest.raises(DamagedFileError, match="was removed"):
+        campus.check()
+
+
 def test_a_lost_catalog_is_not_silently_made_anew(campus: Catalog) -> None:
     campus.close()
     (campus.data_dir / "catalog.sqlite").unlink()
@@ -273,14 +312,18 @@ def test_a_lost_catalog_is_not_silently_made_anew(campus: Catalog) -> None:
 
 def test_the_catalog_is_plain_sqlite_with_its_rules_inside(campus: Catalog) -> None:
     sealed(campus)
+    campus.create_job("campus", "remap", {})
+    campus.create_key(KeyScope.ADMIN)
     with sqlite3.connect(campus.data_dir / "catalog.sqlite") as connection:
         connection.execute("PRAGMA foreign_keys = ON")
         for statement in (
             "UPDATE map SET state = 'lost'",
             "UPDATE map SET sha256 = NULL",
             "UPDATE domain SET closed = 2",
-            "INSERT INTO job (job_id, domain, kind, config, state, owner, created_at)"
-            " VALUES ('a', 'nowhere', '', '', 'queued', '', '')",
+            "UPDATE job SET progress = 1.5",
+            "UPDATE api_key SET scope = 'root'",
+            "INSERT INTO job (job_id, domain, kind, config, state, created_at)"
+            " VALUES ('a', 'nowhere', '', '', 'queued', '')",
         ):
             with pytest.raises(sqlite3.IntegrityError):
                 connection.execute(statement)
@@ -346,3 +389,229 @@ def test_a_settled_map_waits_for_a_removal_under_way(campus: Catalog) -> None:
     removing.join()
     looking.join()
     assert found == [True]
+
+
+def test_a_key_is_kept_without_its_secret(catalog: Catalog) -> None:
+    record, key = catalog.create_key(KeyScope.ADMIN, "the operator")
+    assert re.fullmatch(r"dsk_[0-9a-f]{12}_[A-Za-z0-9_-]{43}", key.text)
+    assert ApiKey.parse(key.text) == key
+    assert record.key_id == key.key_id
+    assert (record.name, record.scope, record.secret_sha256) == ("the operator", KeyScope.ADMIN, key.secret_sha256)
+    assert (record.expires_at, record.revoked_at) == (None, None)
+    assert catalog.keys() == [record]
+    assert key.secret not in repr(key)
+    catalog.close()
+    for path in catalog.data_dir.iterdir():
+        if path.is_file():
+            assert key.secret.encode() not in path.read_bytes(), path.name
+
+
+def test_keys_differ(catalog: Catalog) -> None:
+    made = [catalog.create_key(KeyScope.LOCALIZE)[1] for _ in range(20)]
+    assert len({key.key_id for key in made}) == len({key.secret for key in made}) == 20
+    kept = catalog.keys()
+    assert [record.key_id for record in kept] == [key.key_id for key in made]
+
+
+def test_a_revoked_key_stays_in_the_list(catalog: Catalog) -> None:
+    record, _ = catalog.create_key(KeyScope.LOCALIZE)
+    assert record.is_usable(now())
+    revoked = catalog.revoke_key(record.key_id)
+    assert revoked.revoked_at is not None
+    assert not revoked.is_usable(now())
+    assert catalog.revoke_key(record.key_id) == revoked
+    assert catalog.keys() == [revoked]
+
+
+@pytest.mark.parametrize("key_id", ["0123456789ab", "", "\ud800", "' OR 1=1 --", "0" * 10_000])
+def test_an_unknown_key_cannot_be_revoked(catalog: Catalog, key_id: str) -> None:
+    kept, _ = catalog.create_key(KeyScope.LOCALIZE)
+    with pytest.raises(UnknownKeyError):
+        catalog.revoke_key(key_id)
+    assert catalog.keys() == [kept]
+
+
+def test_a_key_expires(catalog: Catalog) -> None:
+    record, _ = catalog.create_key(KeyScope.LOCALIZE, lifetime=timedelta(days=2))
+    assert record.expires_at is not None
+    assert record.is_usable(now())
+    assert not record.is_usable(record.expires_at)
+    assert record.expires_at > record.created_at
+
+
+def test_what_cannot_be_a_key_is_refused(catalog: Catalog) -> None:
+    for name in ("a\nb", "\ud800", "x" * 101, "\x1b[31m"):
+        with pytest.raises(InvalidInputError):
+            catalog.create_key(KeyScope.ADMIN, name)
+    for lifetime in (timedelta(0), timedelta(days=-1), timedelta(days=9_000_000)):
+        with pytest.raises(InvalidInputError):
+            catalog.create_key(KeyScope.ADMIN, lifetime=lifetime)
+    assert catalog.keys() == []
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "dsk_",
+        "dsk_0123456789ab_",
+        "dsk_0123456789AB_" + "a" * 43,
+        "dsk_0123456789ab_" + "a" * 42 + "\n",
+        "dsk_0123456789ab_" + "a" * 44,
+        "dsk_0123456789ab_" + "a" * 42 + "ä",
+        " dsk_0123456789ab_" + "a" * 43,
+    ],
+)
+def test_other_text_is_no_key(text: str) -> None:
+    assert ApiKey.parse(text) is None
+
+
+def test_scopes(catalog: Catalog) -> None:
+    assert KeyScope.ADMIN.includes(KeyScope.LOCALIZE)
+    assert KeyScope.ADMIN.includes(KeyScope.ADMIN)
+    assert KeyScope.LOCALIZE.includes(KeyScope.LOCALIZE)
+    assert not KeyScope.LOCALIZE.includes(KeyScope.ADMIN)
+
+
+def test_two_processes_see_each_others_keys(catalog: Catalog) -> None:
+    with Catalog.open(catalog.data_dir) as other:
+        record, _ = other.create_key(KeyScope.ADMIN)
+        assert catalog.keys() == [record]
+        revoked = other.revoke_key(record.key_id)
+    assert catalog.keys() == [revoked]
+
+
+def test_domains_are_limited(catalog: Catalog) -> None:
+    for name in ("a", "b"):
+        catalog.create_domain(name, EVALUATOR, False, [1], max_domains=2)
+    with pytest.raises(TooManyDomainsError) as caught:
+        catalog.create_domain("c", EVALUATOR, False, [1], max_domains=2)
+    assert caught.value.hints == {"max_domains": 2}
+    assert not (catalog.data_dir / "domains" / "c").exists()
+    _, created = catalog.create_domain("a", EVALUATOR, False, [1], max_domains=2)
+    assert not created, "the same again is no new one"
+    catalog.delete_domain("a")
+    catalog.create_domain("c", EVALUATOR, False, [1], max_domains=2)
+    catalog.create_domain("d", EVALUATOR, False, [1])
+
+
+# What a crash leaves behind
+
+CHILD = """
+import sys
+from pathlib import Path
+from deepsimbad.store.catalog import Catalog
+catalog = Catalog.open(Path(sys.argv[1]))
+version = catalog.begin_map("campus", {})
+catalog.building_path("campus", version).write_bytes(b"half a map")
+catalog.map_path("campus", version).write_bytes(b"renamed, not yet in the catalog")
+print(version, flush=True)
+sys.stdin.read()
+"""
+
+
+def test_only_the_maps_of_dead_processes_are_discarded(campus: Catalog) -> None:
+    with subprocess.Popen(
+        [sys.executable, "-c", CHILD, str(campus.data_dir)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as child:
+        assert child.stdout is not None
+        version = int(child.stdout.readline())
+        assert campus.discard_unfinished() == []
+        assert campus.map("campus", version).state is MapState.BUILDING
+        with pytest.raises(TraverseInUseError):
+            campus.delete_domain("campus")
+        child.send_signal(signal.SIGKILL)
+    own = campus.begin_map("campus", {})
+    assert campus.discard_abandoned_maps() == [], "while anybody builds one of the domain nobody can tell"
+    campus.discard_map("campus", own)
+    assert campus.discard_unfinished() == [f"discarded the unfinished map {version} of domain campus"]
+    assert campus.maps("campus") == []
+    assert list((campus.data_dir / "domains/campus/maps").iterdir()) == []
+    assert campus.discard_unfinished() == []
+
+
+@pytest.mark.parametrize(("n_starts", "then"), [(1, JobState.QUEUED), (2, JobState.QUEUED), (3, JobState.FAILED)])
+def test_a_job_is_started_three_times_at_most(campus: Catalog, n_starts: int, then: JobState) -> None:
+    waits, runs = (campus.create_job("campus", "remap", {}).job_id for _ in range(2))
+    for _ in range(n_starts - 1):
+        campus.start_job(runs)
+        campus.take_over_jobs()
+    campus.start_job(runs)
+    campus.update_job(runs, stage="train", progress=0.5, eta_s=9)
+    with pytest.raises(TraverseInUseError):
+        campus.delete_domain("campus")
+    (line,) = campus.discard_unfinished()
+    assert runs in line
+    job = campus.job(runs)
+    assert (job.state, job.n_starts, job.eta_s) == (then, n_starts, None)
+    if then is JobState.FAILED:
+        why = "it was started 3 times and the service died each time"
+        assert job.error == {"code": "job_interrupted", "message": why, "n_starts": 3}
+        assert job.finished_at is not None
+    else:
+        assert (job.stage, job.progress, job.error, job.finished_at) == (None, 0, None, None)
+    assert campus.waiting_jobs() == ([waits, runs] if then is JobState.QUEUED else [waits])
+    assert campus.discard_unfinished() == []
+
+
+def test_a_clean_stop_counts_as_no_start(campus: Catalog) -> None:
+    job_id = campus.create_job("campus", "remap", {}).job_id
+    started_at = campus.start_job(job_id).started_at
+    campus.update_job(job_id, stage="train", progress=0.4, eta_s=3)
+    job = campus.give_back_job(job_id)
+    assert (job.state, job.n_starts, job.stage, job.progress, job.eta_s) == (JobState.QUEUED, 0, None, 0, None)
+    assert campus.give_back_job(job_id) == job, "only what runs is given back"
+    assert campus.start_job(job_id).started_at == started_at, "when work first began"
+    assert campus.start_job(job_id).n_starts == 1, "it runs already"
+
+
+def test_cancelling_is_for_jobs_that_wait(campus: Catalog) -> None:
+    waits, runs = (campus.create_job("campus", "remap", {}).job_id for _ in range(2))
+    campus.start_job(runs)
+    assert campus.cancel_queued_job(runs).state is JobState.RUNNING
+    cancelled = campus.cancel_queued_job(waits)
+    assert cancelled.state is JobState.CANCELLED
+    assert cancelled.finished_at is not None
+    assert campus.start_job(waits).state is JobState.CANCELLED
+    assert campus.waiting_jobs() == []
+
+
+def test_a_deletion_that_was_cut_short_is_finished(campus: Catalog) -> None:
+    folder = campus.data_dir / "domains/campus"
+    (folder / "traverses/summer.sqlite").write_bytes(b"old frames")
+    with campus._writing() as db:  # the crash comes between the two transactions of delete_domain
+        db.execute("DELETE FROM domain")
+        db.execute("INSERT INTO doomed_folder VALUES ('campus')")
+    campus.close()
+    with Catalog.open(campus.data_dir) as again:
+        assert len(again.discard_unfinished()) == 1
+        assert not folder.exists()
+        assert again.discard_unfinished() == []
+
+
+def test_a_new_domain_does_not_inherit_files_of_a_deleted_one(campus: Catalog) -> None:
+    stale = campus.data_dir / "domains/campus/traverses/summer.sqlite"
+    stale.write_bytes(b"old frames")
+    with campus._writing() as db:
+        db.execute("DELETE FROM domain")
+        db.execute("INSERT INTO doomed_folder VALUES ('campus')")
+    campus.create_domain("campus", {}, False, [1])
+    assert not stale.exists()
+    assert stale.parent.is_dir()
+    assert campus.discard_unfinished() == []
+    assert stale.parent.is_dir()
+
+
+def test_a_removal_that_was_cut_short_is_finished(campus: Catalog) -> None:
+    sealed(campus)
+    with campus._writing() as db:  # the crash comes before the file is unlinked
+        db.execute("UPDATE map SET state = 'retired', removed_at = ?", [now()])
+    assert campus.discard_unfinished() == ["removed the file of the removed map 1 of domain campus"]
+    assert not campus.map_path("campus", 1).exists()
+
+
+def test_what_older_releases_kept_of_unfinished_work_goes(campus: Catalog) -> None:
+    for folder in ("jobs", "owners"):
+        (campus.data_dir / folder / "0").mkdir(parents=True)
+    campus.discard_unfinished()
+    assert sorted(path.name for path in campus.data_dir.iterdir() if path.is_dir()) == ["domains"]

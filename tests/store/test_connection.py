@@ -1,13 +1,20 @@
+"""How files are opened and locked, and what the disk and SQLite answer."""
+
 import errno
+import fcntl
+import os
+import signal
 import sqlite3
+import subprocess
+import sys
 import threading
 from pathlib import Path
-from typing import Any, cast
 
 import pytest
 
-from deepsimbad.errors import DamagedFileError, InvalidInputError, UnavailableError
-from deepsimbad.store.connection import migrate, open_database, use_write_ahead_log, write_transaction
+from deepsimbad.errors import DamagedFileError, DataDirInUseError, InvalidInputError, UnavailableError
+from deepsimbad.store.connection import close_with_log, migrate, open_database, use_write_ahead_log, write_transaction
+from deepsimbad.store.data_dir import ServiceLock
 from deepsimbad.store.faults import storage_faults
 from deepsimbad_migrations.catalog.migrations import migrations as catalog_migrations
 from deepsimbad_migrations.traverse.migrations import migrations as traverse_migrations
@@ -63,41 +70,6 @@ def test_a_write_transaction_is_undone_on_any_error(tmp_path: Path) -> None:
         with write_transaction(db):
             db.execute("INSERT INTO a VALUES (1)")
         assert db.execute("SELECT count(*) FROM a").fetchone() == (1,)
-
-
-class FailingCommits:
-    """A connection whose next COMMIT fails, as one does whose sync the disk refused."""
-
-    def __init__(self, connection: sqlite3.Connection) -> None:
-        self._connection = connection
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._connection, name)
-
-    def execute(self, statement: str, *values: Any) -> sqlite3.Cursor:
-        if statement == "COMMIT":
-            raise sqlite3.OperationalError("disk I/O error")
-        return self._connection.execute(statement, *values)
-
-
-def test_after_a_commit_that_failed_the_log_begins_anew(tmp_path: Path) -> None:
-    """What the failed one may have left in it would look like lost commits behind a shorter one."""
-    path = tmp_path / "a.sqlite"
-    log = path.with_name("a.sqlite-wal")
-    with open_database(path, create=True) as db:
-        use_write_ahead_log(db)
-        with write_transaction(db):
-            db.execute("CREATE TABLE t (x)")
-        salts = log.read_bytes()[16:24]
-        connection = db.conn
-        db.conn = cast("sqlite3.Connection", FailingCommits(connection))
-        with pytest.raises(sqlite3.OperationalError), write_transaction(db):
-            db.execute("INSERT INTO t VALUES (1)")
-        db.conn = connection
-        with write_transaction(db):
-            db.execute("INSERT INTO t VALUES (2)")
-        assert log.read_bytes()[16:24] != salts
-        assert db.execute("SELECT x FROM t").fetchall() == [(2,)]
 
 
 def test_a_locked_file_is_busy_by_name(tmp_path: Path) -> None:
@@ -165,3 +137,98 @@ def test_a_file_of_another_kind_or_of_a_newer_release_is_refused(tmp_path: Path)
         )
         with pytest.raises(DamagedFileError, match="m999_future"):
             migrate(db, catalog_migrations, path)
+
+
+def test_a_closed_file_keeps_its_log_empty(tmp_path: Path) -> None:
+    """On a full disk the next one to open it could not make a log."""
+    path = tmp_path / "a.sqlite"
+    db = open_database(path, create=True)
+    use_write_ahead_log(db)
+    db.execute("CREATE TABLE a (b)")
+    close_with_log(db, path)
+    sizes = {file.name: file.stat().st_size for file in tmp_path.iterdir()}
+    assert sizes == {"a.sqlite": 8192, "a.sqlite-wal": 0, "a.sqlite-shm": 32768}
+
+
+CHILD = """
+import sys
+from pathlib import Path
+from deepsimbad.store.data_dir import ServiceLock
+lock = ServiceLock.take(Path(sys.argv[1]), "127.0.0.1:8000")
+print("locked", flush=True)
+sys.stdin.read()
+"""
+
+
+def test_the_second_is_refused_and_told_whose_it_is(tmp_path: Path) -> None:
+    data_dir = tmp_path / "a" / "b"
+    with ServiceLock.take(data_dir, "127.0.0.1:8000"):
+        with pytest.raises(DataDirInUseError) as caught:
+            ServiceLock.take(data_dir, "127.0.0.1:8001")
+        assert f"process {os.getpid()}, listening on 127.0.0.1:8000" in caught.value.message
+        assert caught.value.hints == {"pid": os.getpid(), "address": "127.0.0.1:8000"}
+        with ServiceLock.take(tmp_path / "other", "127.0.0.1:8001"):
+            pass
+    with ServiceLock.take(data_dir, "127.0.0.1:8001"):
+        pass
+
+
+def test_releasing_twice_frees_nothing_of_another(tmp_path: Path) -> None:
+    first = ServiceLock.take(tmp_path, "a")
+    first.release()
+    with ServiceLock.take(tmp_path, "b"):
+        first.release()
+        with pytest.raises(DataDirInUseError):
+            ServiceLock.take(tmp_path, "c")
+
+
+def test_a_killed_service_holds_nothing(tmp_path: Path) -> None:
+    with subprocess.Popen(
+        [sys.executable, "-c", CHILD, str(tmp_path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as child:
+        assert child.stdout is not None
+        assert child.stdout.readline() == "locked\n"
+        with pytest.raises(DataDirInUseError, match=f"process {child.pid}"):
+            ServiceLock.take(tmp_path, "x")
+        child.send_signal(signal.SIGKILL)
+        child.wait()
+    ServiceLock.take(tmp_path, "x").release()
+
+
+@pytest.mark.parametrize("content", [None, b"", b"\xff\xfe", b'{"pid": 1'])
+def test_a_lock_whose_file_says_nothing_or_is_gone_is_one_all_the_same(tmp_path: Path, content: bytes | None) -> None:
+    with ServiceLock.take(tmp_path, "x"):
+        (tmp_path / "service.lock").unlink()
+        if content is not None:
+            (tmp_path / "service.lock").write_bytes(content)
+        with pytest.raises(DataDirInUseError, match="process unknown"):
+            ServiceLock.take(tmp_path, "x")
+    ServiceLock.take(tmp_path, "x").release()
+
+
+def test_a_folder_that_cannot_be_made_is_named() -> None:
+    with pytest.raises(UnavailableError, match="the data directory /proc/nowhere/here cannot be made"):
+        ServiceLock.take(Path("/proc/nowhere/here"), "x")
+
+
+def test_a_file_in_the_place_of_the_folder_is_named(tmp_path: Path) -> None:
+    (tmp_path / "data").write_text("mine")
+    with pytest.raises(UnavailableError, match=f"the data directory {tmp_path / 'data'} cannot be made: File exists"):
+        ServiceLock.take(tmp_path / "data", "x")
+
+
+@pytest.mark.parametrize("number", [errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS])
+def test_a_file_system_without_locks_is_named(tmp_path: Path, number: int) -> None:
+    """What flock answers on such a file system; none can be counted on to be at hand."""
+    with pytest.raises(UnavailableError, match="local disk") as caught, storage_faults(tmp_path / "lock"):
+        raise OSError(number, os.strerror(number))
+    assert caught.value.hints["reason"] == "no_locks"
+
+
+def test_a_lock_that_the_file_system_refuses_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(descriptor: int, operation: int) -> None:
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+
+    monkeypatch.setattr(fcntl, "flock", refuse)
+    with pytest.raises(UnavailableError, match=r"cannot be locked .* local disk"):
+        ServiceLock.take(tmp_path, "x")

@@ -1,15 +1,20 @@
-"""The file of live sessions."""
+"""The file of live sessions: what is acknowledged is committed, in order, and one bad write harms no other."""
 
 import sqlite3
-from collections.abc import Iterator
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import wait
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from sqlite_utils import Database
 
-from deepsimbad.errors import DamagedFileError, InvalidInputError, UnknownSessionError
-from deepsimbad.store.journal_table import pack_ranks, unpack_ranks
+from deepsimbad.errors import DamagedFileError, InvalidInputError, UnavailableError, UnknownSessionError
+from deepsimbad.store.group_commit import MAX_BATCH
+from deepsimbad.store.journal import pack_ranks, unpack_ranks
 from deepsimbad.store.session_records import IdempotencyKey, ObservedRow, PriorRow, SessionRecord, StateSnapshot
 from deepsimbad.store.sessions import SessionStore
 
@@ -215,3 +220,74 @@ def test_a_session_of_an_id_that_is_taken_is_the_one_there(store: SessionStore) 
     first = store.create(RECORD).result()
     assert store.create(replace(RECORD, domain="another", created_at=150.0)).result() == first
     assert store.living() == [first]
+
+
+def test_sessions_that_were_removed_meanwhile_take_no_more(store: SessionStore, tmp_path: Path) -> None:
+    number = store.create(RECORD).result().number
+    (tmp_path / "sessions.sqlite").unlink()
+    with pytest.raises(DamagedFileError, match="was removed under the running service"):
+        store.append(number, observed(1), 1.0).result()
+    (tmp_path / "sessions.sqlite").touch()  # another one of its name is none
+    with pytest.raises(DamagedFileError, match="was removed"):
+        store.try_writing().result()
+    assert store.find("s1").n_events == 0
+
+
+# Group commit
+
+
+def insert(n: int) -> Callable[[Database], Any]:
+    def run(db: Database) -> int:
+        db.execute("INSERT INTO snapshot VALUES (1, ?, 1, '', '', '')", [str(n)])
+        return n
+
+    return run
+
+
+@pytest.fixture
+def batches(store: SessionStore) -> list[int]:
+    sizes: list[int] = []
+    store.create(RECORD).result()
+    store._commits._on_commit = sizes.append
+    return sizes
+
+
+def rows(folder: Path) -> list[int]:
+    """As another connection sees them: what is not committed is not there."""
+    with sqlite3.connect(folder / "sessions.sqlite") as other:
+        numbers = [int(name) for (name,) in other.execute("SELECT name FROM snapshot ORDER BY rowid")]
+    other.close()
+    return numbers
+
+
+def test_what_waits_is_committed_together_and_in_order(store: SessionStore, batches: list[int], tmp_path: Path) -> None:
+    hold = threading.Event()
+    store._commits.submit(lambda db: hold.wait())
+    while not store._commits._waiting.empty():
+        pass
+    waiting = [store._commits.submit(insert(n)) for n in range(MAX_BATCH + 40)]
+    assert waiting[7].cancel() is False, "who goes away does not undo what is on its way"
+    assert rows(tmp_path) == []
+    hold.set()
+    wait(waiting)
+    assert rows(tmp_path) == list(range(MAX_BATCH + 40))
+    assert batches == [1, MAX_BATCH, 40]
+
+
+def test_one_bad_write_fails_alone(store: SessionStore, batches: list[int], tmp_path: Path) -> None:
+    hold = threading.Event()
+    store._commits.submit(lambda db: hold.wait())
+    futures = [store._commits.submit(insert(n)) for n in (1, 2, 1, 3)]
+    hold.set()
+    wait(futures)
+    assert [type(one.exception()) for one in futures] == [type(None), type(None), InvalidInputError, type(None)]
+    assert rows(tmp_path) == [1, 2, 3]
+
+
+def test_closing_commits_what_waits_and_takes_no_more(store: SessionStore, batches: list[int]) -> None:
+    futures = [store._commits.submit(insert(n)) for n in range(5)]
+    store.close()
+    assert [future.result(0) for future in futures] == list(range(5))
+    with pytest.raises(UnavailableError):
+        store.try_writing()
+    assert not store.is_committing

@@ -85,3 +85,12 @@ def m003_row_checksums(db: Database) -> None:
     """A checksum in every row; NULL where none was computed yet."""
     for table in ("domain", "map", "job", "api_key"):
         db.execute(f"ALTER TABLE {table} ADD COLUMN checksum INTEGER")
+
+
+@migrations()
+def m004_without_owners_and_row_checksums(db: Database) -> None:
+    """A job belongs to the one service, a map being built to whoever locks its folder; SQLite is trusted with rows."""
+    for table in ("domain", "map", "job", "api_key"):
+        db.execute(f"ALTER TABLE {table} DROP COLUMN checksum")
+    for table in ("map", "job"):
+        db.execute(f"ALTER TABLE {table} DROP COLUMN owner")

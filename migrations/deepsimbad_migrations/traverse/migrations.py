@@ -39,3 +39,9 @@ def m001_frames(db: Database) -> None:
 def m002_weights(db: Database) -> None:
     """By which weights the images of the traverse were encoded. From here on a body may hold float16 too."""
     db.execute("ALTER TABLE traverse ADD COLUMN weights_sha256 TEXT")
+
+
+@migrations()
+def m003_without_checksums(db: Database) -> None:
+    """SQLite is trusted with rows."""
+    db.execute("ALTER TABLE encoding DROP COLUMN checksum")

@@ -47,13 +47,13 @@ from deepsimbad.engine.traverses import OpenTraverses
 from deepsimbad.engine.truths import Truths
 from deepsimbad.engine.warm_up import warm_up
 from deepsimbad.engine.worker import InferenceWorker, Priority
-from deepsimbad.errors import DeepSimbadError
+from deepsimbad.errors import DeepSimbadError, UnavailableError
 from deepsimbad.evaluators.registry import fallback
 from deepsimbad.jobs.runner import InAnotherProcess, JobRunner, RunJob, job_threads
 from deepsimbad.release import release
 from deepsimbad.settings import Settings
 from deepsimbad.store.catalog import Catalog
-from deepsimbad.store.service_lock import ServiceLock
+from deepsimbad.store.data_dir import ServiceLock
 from deepsimbad.store.sessions import SessionStore
 
 log = logging.getLogger(__name__)
@@ -191,8 +191,13 @@ def _start(settings: Settings, metrics: Metrics, keys: KeyRing, run_job: RunJob,
     catalog = parts.enter_context(Catalog.open(settings.data_dir))
     keys.load(catalog.keys)
     settings.check_exposure(keys.n_created)
-    for line in catalog.discard_unfinished():
-        log.warning("discarded at start", extra={"what": line})
+    try:
+        for line in catalog.discard_unfinished():
+            log.warning("discarded at start", extra={"what": line})
+    except UnavailableError as error:
+        if error.hints.get("reason") != "disk_full":
+            raise
+        log.warning("nothing was discarded at start", extra={"why": error.message})  # who only reads is answered
     if (told := fallback()) is not None:
         log.warning("the default network is not installed", extra={"why": told})
     evaluators = EvaluatorPool(settings.compute())

@@ -12,9 +12,8 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from deepsimbad.api.limits import refuse_unread
 from deepsimbad.api.rate_limit import RateLimit
 from deepsimbad.errors import DeepSimbadError, ForbiddenError, UnauthorizedError, UnavailableError
-from deepsimbad.store.api_key import ApiKey
-from deepsimbad.store.documents import now
-from deepsimbad.store.records import KeyRecord, KeyScope
+from deepsimbad.store.catalog_keys import ApiKey
+from deepsimbad.store.records import KeyRecord, KeyScope, now
 
 log = logging.getLogger(__name__)
 

@@ -16,7 +16,7 @@ from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Relevance
 from deepsimbad.engine.views import Dissimilarities, RankedLandmarks, ReadyEncoding
 from deepsimbad.errors import EmptyBodyError, UnsupportedMediaTypeError
 from deepsimbad.evaluators.registry import EXTRACTOR_PATTERN, EvaluatorKind
-from deepsimbad.jobs.remap_config import DEFAULT_LIST_LENGTH, DEFAULT_TRAINING_EPISODES, RemapConfig
+from deepsimbad.jobs.map_config import DEFAULT_LIST_LENGTH, DEFAULT_TRAINING_EPISODES, RemapConfig
 
 JSON = "application/json"
 BINARY = "application/octet-stream"

@@ -1,9 +1,9 @@
 """Describing a domain, whatever state its map is in."""
 
 from deepsimbad.api.schemas import DomainAnswer
-from deepsimbad.core.map import Map
 from deepsimbad.engine.encoders import EvaluatorPool, ready
 from deepsimbad.engine.maps import Maps
+from deepsimbad.engine.snapshot import MapSnapshot
 from deepsimbad.errors import NoActiveMapError, UnavailableError
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.store.records import DomainRecord
@@ -29,7 +29,7 @@ def describe_domain(record: DomainRecord, evaluators: EvaluatorPool, maps: Maps)
         created_at=record.created_at,
         map_version=snapshot.version if snapshot else record.active_version,
         map_problem=problem,
-        relevance=snapshot and snapshot.relevance.value,
+        relevance=snapshot and snapshot.retrieval.relevance.value,
         route_length_m=snapshot and snapshot.route.length_m,
         n_map_images=snapshot and snapshot.n_images,
         n_landmarks=snapshot and snapshot.n_landmarks,
@@ -47,7 +47,7 @@ def _evaluator(evaluators: EvaluatorPool, record: DomainRecord) -> tuple[Evaluat
         return None, error.hints.get("reason", error.code)
 
 
-def _active_map(maps: Maps, record: DomainRecord) -> tuple[Map | None, str | None]:
+def _active_map(maps: Maps, record: DomainRecord) -> tuple[MapSnapshot | None, str | None]:
     """The active map, or the code of what is wrong with it; neither where there is none yet."""
     try:
         return maps.active(record.name).snapshot, None

@@ -7,8 +7,8 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from deepsimbad.core.drive import UNKNOWN_TIMESTAMP, Drive
 from deepsimbad.errors import DeepSimbadError, InvalidInputError, TooLargeError
+from deepsimbad.store.frames import UNKNOWN_TIMESTAMP, TraverseFrames
 
 MEMBERS = {"encodings": 2, "index": 1, "position_m": 1, "timestamp_us": 1, "x_m": 1, "y_m": 1}
 REQUIRED = ("encodings", "index", "position_m")
@@ -26,7 +26,7 @@ class InvalidBatchError(InvalidInputError):
     code = "invalid_batch"
 
 
-def read_batch(file: IO[bytes], max_bytes: int) -> Drive:
+def read_batch(file: IO[bytes], max_bytes: int) -> TraverseFrames:
     """Read the arrays of a batch.
 
     Args:
@@ -116,11 +116,11 @@ def _check_header(name: str, stream: IO[bytes], member_bytes: int) -> None:
         raise InvalidBatchError(f"{name} does not hold the {n_values} numbers its header says")
 
 
-def _arranged(arrays: dict[str, NDArray[Any]]) -> Drive:
+def _arranged(arrays: dict[str, NDArray[Any]]) -> TraverseFrames:
     """The store's form; it judges the values."""
     n_frames = len(arrays["encodings"])
     unknown = np.full(n_frames, np.nan)
-    return Drive(
+    return TraverseFrames(
         index=arrays["index"],
         position_m=arrays["position_m"],
         timestamp_us=arrays.get("timestamp_us", np.full(n_frames, UNKNOWN_TIMESTAMP)),

@@ -163,8 +163,8 @@ class Metrics:
     def render(self) -> bytes:
         """The text exposition; reads files."""
         with self._scrape:
-            census = None if self._state is None else self._state.look()
-            if census is not None:  # a view that was on its way brought a deleted domain back
-                for domain in self._domains.difference(census.domains):
+            state = None if self._state is None else self._state.look()
+            if state is not None:  # a view that was on its way brought a deleted domain back
+                for domain in self._domains.difference(record.name for record in state.domains):
                     self.forget_domain(domain)
             return generate_latest(self._registry)

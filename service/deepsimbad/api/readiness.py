@@ -10,7 +10,6 @@ from pathlib import Path
 
 from deepsimbad.errors import DeepSimbadError
 from deepsimbad.store.catalog import Catalog
-from deepsimbad.store.session_records import ClockRecord
 from deepsimbad.store.sessions import SessionStore
 
 MEBIBYTE = 1024 * 1024
@@ -66,7 +65,7 @@ class ReadinessCheck:
         return list(dict.fromkeys(found))
 
     def _write(self) -> None:
-        self._sessions.note_clock(ClockRecord(None, 0.0, time.time())).result(_WRITE_TIMEOUT_S)
+        self._sessions.try_writing().result(_WRITE_TIMEOUT_S)
 
 
 def disk_faults(data_dir: Path) -> list[str]:

@@ -5,8 +5,8 @@ from typing import Annotated
 from pydantic import FailFast, Field, StrictFloat, StrictInt
 
 from deepsimbad.api.bodies import GREATEST_EXACT_INTEGER, GREATEST_ID, JsonBody, Name
-from deepsimbad.core.belief import FilterKind
-from deepsimbad.core.relevance import UpdateRule
+from deepsimbad.core.filters import FilterKind
+from deepsimbad.core.update_rules import UpdateRule
 from deepsimbad.engine.session import DEFAULT_START_STD_M, SessionConfig
 
 MAX_OBSERVATIONS_FED_BACK = 100_000

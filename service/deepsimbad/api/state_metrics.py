@@ -3,19 +3,23 @@
 import platform
 import shutil
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from datetime import datetime
 from pathlib import Path
+from typing import Self
 
 from prometheus_client.core import GaugeMetricFamily
 from prometheus_client.registry import Collector
 
 from deepsimbad.engine.maps import Maps
 from deepsimbad.errors import DeepSimbadError
+from deepsimbad.jobs.runner import REMAP
 from deepsimbad.store.catalog import Catalog
-from deepsimbad.store.census import GATE_LOST, Census
-from deepsimbad.store.records import JobState
+from deepsimbad.store.records import DomainRecord, JobRecord, JobState, MapRecord
 
+GATE_LOST = "gate_lost"  # sealed, but worse than the active map by more than its gate allowed
 REMAP_OUTCOMES = (JobState.SUCCEEDED.value, GATE_LOST, JobState.FAILED.value, JobState.CANCELLED.value)
 
 
@@ -42,6 +46,32 @@ class WatchedState:
     n_sessions: Callable[[], int]
 
 
+@dataclass(frozen=True)
+class CatalogState:
+    """What the catalog says: domains, every job, oldest first, and the active map of each domain that has one."""
+
+    domains: Sequence[DomainRecord]
+    jobs: Sequence[JobRecord]
+    serving: Mapping[str, MapRecord]
+
+    @classmethod
+    def of(cls, catalog: Catalog) -> Self:
+        """Read it; raises DeepSimbadError."""
+        domains = catalog.domains()
+        versions = {domain.name: domain.active_version for domain in domains}
+        serving = {name: catalog.map(name, version) for name, version in versions.items() if version is not None}
+        return cls(domains, catalog.jobs(), serving)
+
+    def last_remaps(self) -> Mapping[str, JobRecord]:
+        """The remap of each domain that ended last.
+
+        They are done one after the other as they came, whatever the clock was set to; one that was cancelled while it
+        waited, out of that order, tells of nothing that was done and counts only beside others such.
+        """
+        ended = [job for job in self.jobs if job.kind == REMAP and job.finished_at is not None]
+        return {job.domain: job for job in sorted(ended, key=lambda job: job.n_starts > 0)}
+
+
 class StateCollector(Collector):
     """Gives what `look` saw; series of deleted domains end by themselves, since nothing is kept from scrape to scrape.
 
@@ -53,15 +83,15 @@ class StateCollector(Collector):
     def __init__(self, watched: WatchedState, wall: Callable[[], float] = time.time) -> None:
         self._watched = watched
         self._wall = wall
-        self._census: Census | None = None
+        self._seen: CatalogState | None = None
 
-    def look(self) -> Census | None:
+    def look(self) -> CatalogState | None:
         """Read the catalog for the next `collect`; None where it cannot be read."""
         try:
-            self._census = self._watched.catalog.census()
+            self._seen = CatalogState.of(self._watched.catalog)
         except DeepSimbadError:  # `deepsimbad_ready` tells; what needs no catalog is shown all the same
-            self._census = None
-        return self._census
+            self._seen = None
+        return self._seen
 
     def collect(self) -> Iterator[GaugeMetricFamily]:
         """Every family."""
@@ -77,8 +107,8 @@ class StateCollector(Collector):
         yield _plain("deepsimbad_loaded_maps", "Active maps held in memory.", watched.maps.n_loaded)
         yield _plain("deepsimbad_sessions", "Sessions that have not ended.", watched.n_sessions())
         yield from self._disk()
-        if self._census is not None:
-            yield from self._of_catalog(self._census)
+        if self._seen is not None:
+            yield from self._of_catalog(self._seen)
 
     def _disk(self) -> Iterator[GaugeMetricFamily]:
         try:
@@ -88,32 +118,33 @@ class StateCollector(Collector):
         yield _plain("deepsimbad_data_dir_free_bytes", "Free where the data directory lies.", usage.free)
         yield _plain("deepsimbad_data_dir_size_bytes", "Size of the disk it lies on.", usage.total)
 
-    def _of_catalog(self, census: Census) -> Iterator[GaugeMetricFamily]:
+    def _of_catalog(self, state: CatalogState) -> Iterator[GaugeMetricFamily]:
         now = self._wall()
-        serving = census.serving
+        n_jobs = Counter(job.state for job in state.jobs)
+        remaps = state.last_remaps()
         snapshots = [one.snapshot for one in self._watched.maps.loaded()]
         damaged = self._watched.maps.damaged()
         yield _labelled(
             "deepsimbad_jobs",
             "Jobs the catalog knows, by state.",
             ("state",),
-            [((state.value,), n) for state, n in census.jobs.items()],
+            [((value.value,), n_jobs[value]) for value in JobState],
         )
-        yield _plain("deepsimbad_domains", "Domains there are.", len(census.domains))
+        yield _plain("deepsimbad_domains", "Domains there are.", len(state.domains))
         yield _by_domain(
             "deepsimbad_active_map_version",
             "Version of the map that serves.",
-            [(one.domain, one.version) for one in serving],
+            [(domain, record.version) for domain, record in state.serving.items()],
         )
         yield _by_domain(
             "deepsimbad_map_age_seconds",
             "Time since the map that serves was built.",
-            [(one.domain, max(0.0, now - one.created_at)) for one in serving],
+            [(domain, max(0.0, now - _seconds(record.created_at))) for domain, record in state.serving.items()],
         )
         yield _by_domain(
             "deepsimbad_map_damaged",
             "1 where the map that serves could not be loaded.",
-            [(one.domain, int(damaged.get(one.domain) == one.version)) for one in serving],
+            [(domain, int(damaged.get(domain) == record.version)) for domain, record in state.serving.items()],
         )
         yield _by_domain(
             "deepsimbad_map_images",
@@ -130,16 +161,25 @@ class StateCollector(Collector):
             "1 for the outcome of the remap that ended last, else 0.",
             ("domain", "outcome"),
             [
-                ((one.domain, outcome), int(outcome == one.outcome))
-                for one in census.remaps
+                ((domain, outcome), int(outcome == _outcome(job)))
+                for domain, job in sorted(remaps.items())
                 for outcome in REMAP_OUTCOMES
             ],
         )
         yield _by_domain(
             "deepsimbad_last_remap_timestamp_seconds",
             "When it ended, seconds since 1970.",
-            [(one.domain, one.finished_at) for one in census.remaps],
+            [(domain, _seconds(job.finished_at or "")) for domain, job in sorted(remaps.items())],
         )
+
+
+def _outcome(job: JobRecord) -> str:
+    check = ((job.result or {}).get("metrics") or {}).get("check") or {}
+    return GATE_LOST if job.state is JobState.SUCCEEDED and check.get("passed") is False else job.state.value
+
+
+def _seconds(iso: str) -> float:
+    return datetime.fromisoformat(iso).timestamp()
 
 
 def _plain(name: str, meaning: str, value: float) -> GaugeMetricFamily:

@@ -10,11 +10,10 @@ from rich.table import Table
 from deepsimbad.cli.options import data_dir_option, given_settings, json_option
 from deepsimbad.cli.terminal import print_table, report, write_json
 from deepsimbad.errors import UnknownKeyError
-from deepsimbad.store.api_key import ApiKey
 from deepsimbad.store.catalog import Catalog
-from deepsimbad.store.documents import now
+from deepsimbad.store.catalog_keys import ApiKey
 from deepsimbad.store.layout import catalog_path
-from deepsimbad.store.records import KeyRecord, KeyScope
+from deepsimbad.store.records import KeyRecord, KeyScope, now
 
 
 @click.group()

@@ -11,11 +11,11 @@ from deepsimbad.errors import UnavailableError
 from deepsimbad.jobs.import_map import import_map
 from deepsimbad.release import release
 from deepsimbad.store.backup import back_up
+from deepsimbad.store.backup import restore as restore_backup
 from deepsimbad.store.catalog import Catalog
-from deepsimbad.store.exported_map import export_map
 from deepsimbad.store.inspection import inspect
 from deepsimbad.store.layout import catalog_path, domains_folder
-from deepsimbad.store.restore import restore as restore_backup
+from deepsimbad.store.sealing import export_map
 
 DAMAGE_FOUND = 1
 
@@ -90,7 +90,7 @@ def import_(
 def check(context: click.Context, as_json: bool, data_dir: Path | None) -> None:
     """Verify every file, beside a running service or without one: one line a problem, exit code 1 if one is damaged.
 
-    Nothing is changed. What a crash left over is named too, and is no damage: the next start of the service removes it.
+    Nothing is changed.
     """
     folder = given_settings(data_dir=data_dir).data_dir
     if not catalog_path(folder).exists() and not domains_folder(folder).exists():
@@ -101,11 +101,8 @@ def check(context: click.Context, as_json: bool, data_dir: Path | None) -> None:
     if as_json:
         write_json({"ok": not seen.damaged, **asdict(seen)})
     else:
-        for kind, findings in (("damaged", seen.damaged), ("left over", seen.left_over)):
-            for finding in findings:
-                click.echo(f"{kind}: {finding.file}: {finding.what}")
-        click.echo(
-            f"{seen.n_files} files read, {len(seen.damaged)} problems, {len(seen.left_over)} left over", err=True
-        )
+        for finding in seen.damaged:
+            click.echo(f"damaged: {finding.file}: {finding.what}")
+        click.echo(f"{seen.n_files} files read, {len(seen.damaged)} problems", err=True)
     if seen.damaged:
         context.exit(DAMAGE_FOUND)

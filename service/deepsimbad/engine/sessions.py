@@ -42,7 +42,7 @@ from deepsimbad.errors import (
     TooManySessionsError,
     UnknownSessionError,
 )
-from deepsimbad.store.list_page import ListPage
+from deepsimbad.store.records import ListPage
 from deepsimbad.store.session_records import JournalRow, ListedSession, ObservedRow, PriorRow, SessionRecord
 from deepsimbad.store.sessions import SessionStore
 
@@ -349,7 +349,7 @@ class Sessions:
         snapshot.check_landmark_model(observation.landmark_models)
         query = describe(snapshot, state.engine.evaluator, view)
         watch.lap("describe")
-        relevance = snapshot.relevance
+        relevance = snapshot.retrieval.relevance
         row = ObservedRow(  # what the map's relevance compares, and no more
             sequence=state.sequence + 1,
             expires_at=expires_at,

@@ -1,23 +1,22 @@
 """The catalog: which domains, map versions, jobs and keys there are, and which version serves."""
 
+import shutil
 from collections.abc import Sequence
 from typing import Any
 
 from sqlite_utils import Database
 
-from deepsimbad.errors import ConflictError, TraverseInUseError
-from deepsimbad.store import domain_table, job_table, layout, map_table, unfinished
-from deepsimbad.store.census import Census
-from deepsimbad.store.census import take as take_census
-from deepsimbad.store.checkpoints import sweep_checkpoints
-from deepsimbad.store.documents import from_json, to_json
+from deepsimbad.errors import ConflictError, DomainDiffersError, TooManyDomainsError, TraverseInUseError
+from deepsimbad.store import layout
+from deepsimbad.store.catalog_file import all_domains, find_domain, get_domain
+from deepsimbad.store.catalog_jobs import JobCatalog
+from deepsimbad.store.catalog_keys import KeyCatalog
+from deepsimbad.store.catalog_maps import MapCatalog
 from deepsimbad.store.durable import bury, empty_graves, sync_folder
-from deepsimbad.store.job_catalog import JobCatalog
-from deepsimbad.store.key_catalog import KeyCatalog
-from deepsimbad.store.map_catalog import MapCatalog
-from deepsimbad.store.ownership import is_alive
-from deepsimbad.store.records import DomainRecord
+from deepsimbad.store.records import DomainRecord, now, to_json
 from deepsimbad.store.traverses import Traverse
+
+_OF_OLDER_RELEASES = ("jobs", "owners")  # folders of what unfinished work needed then
 
 
 class Catalog(MapCatalog, JobCatalog, KeyCatalog):
@@ -27,11 +26,6 @@ class Catalog(MapCatalog, JobCatalog, KeyCatalog):
     UnavailableError (`hints["reason"]`: disk_full, read_only, busy, ...) or DamagedFileError where the file cannot be
     used, beside what it names itself.
     """
-
-    def census(self) -> Census:
-        """What the catalog holds, counted."""
-        with self._reading() as db:
-            return take_census(db)
 
     def create_domain(
         self,
@@ -60,34 +54,45 @@ class Catalog(MapCatalog, JobCatalog, KeyCatalog):
             ConflictError: Files that no domain owns lie where its files would.
         """
         folder = layout.domain_folder(self.data_dir, name)
-        evaluator = from_json(to_json(evaluator))
-        actions = tuple(float(action) for action in actions_m)
+        row = {
+            "evaluator": to_json(evaluator),
+            "closed": int(closed),
+            "actions_m": to_json([float(action) for action in actions_m]),
+        }
         with self._writing() as db:
-            if max_domains is not None:
-                domain_table.check_room(db, name, max_domains)
-            record, created = domain_table.insert(db, name, evaluator, closed, actions)
-            if created:
-                self._finish_deletion(db, name)
-                if any(path.is_file() for path in folder.rglob("*")):
-                    raise ConflictError(
-                        f"files of an unknown domain lie in {folder.parent.name}/{name}: move them away first"
-                    )
-                layout.traverses_folder(self.data_dir, name).mkdir(parents=True, exist_ok=True)
-                layout.maps_folder(self.data_dir, name).mkdir(parents=True, exist_ok=True)
-                for made in (folder, folder.parent, self.data_dir):
-                    sync_folder(made)
+            present = find_domain(db, name)
+            if present is not None:
+                _check_alike(present, row)
+                return present, False
+            n_domains = db.table("domain").count
+            if max_domains is not None and n_domains >= max_domains:
+                raise TooManyDomainsError(
+                    f"there are {n_domains} domains, as many as may be: delete one, or raise the setting max_domains",
+                    max_domains=max_domains,
+                )
+            self._finish_deletion(db, name)
+            if any(path.is_file() for path in folder.rglob("*")):
+                raise ConflictError(
+                    f"files of an unknown domain lie in {folder.parent.name}/{name}: move them away first"
+                )
+            db.table("domain").insert({"name": name, **row, "created_at": now()})
+            layout.traverses_folder(self.data_dir, name).mkdir(parents=True, exist_ok=True)
+            layout.maps_folder(self.data_dir, name).mkdir(parents=True, exist_ok=True)
+            for changed in (folder, folder.parent, self.data_dir):
+                sync_folder(changed)
+            record = get_domain(db, name)
         empty_graves(folder.parent)
-        return record, created
+        return record, True
 
     def domain(self, name: str) -> DomainRecord:
         """One domain; raises UnknownDomainError."""
         with self._reading() as db:
-            return domain_table.get(db, name)
+            return get_domain(db, name)
 
     def domains(self) -> list[DomainRecord]:
         """Every domain by name."""
         with self._reading() as db:
-            return domain_table.all_domains(db)
+            return all_domains(db)
 
     def delete_domain(self, name: str, *, only_empty: bool = False) -> None:
         """Delete a domain with its jobs, maps and traverses.
@@ -101,55 +106,59 @@ class Catalog(MapCatalog, JobCatalog, KeyCatalog):
             TraverseInUseError: A job on it has not ended, or a living process builds a map of it.
         """
         with self._writing() as db:
-            domain_table.get(db, name)
-            if only_empty and (map_table.of_domain(db, name) or Traverse.list(self.data_dir, name)):
+            get_domain(db, name)
+            has_maps = db.table("map").count_where("domain = ?", [name]) > 0
+            if only_empty and (has_maps or Traverse.list(self.data_dir, name)):
                 return
-            builders = {owner for domain, _, owner in map_table.building(db) if domain == name}
-            # A job whose process died counts as well: the next service goes on with it.
-            if job_table.unfinished(db, name) or any(is_alive(self._owners, owner) for owner in builders):
+            n_jobs = db.table("job").count_where("domain = ? AND state IN ('queued', 'running')", [name])
+            if n_jobs or self._is_built(name):
                 raise TraverseInUseError(f"a job on domain {name} has not ended: cancel it or wait for its end")
-            domain_table.doom(db, name)
+            db.table("domain").delete(name)
+            db.table("doomed_folder").insert({"domain": name}, ignore=True)
         with self._writing() as db:  # from here on a crash is finished at the next start
             self._finish_deletion(db, name)
         empty_graves(layout.domains_folder(self.data_dir))  # gigabytes take seconds, in which others may write
 
-    def _finish_deletion(self, db: Database, name: str) -> None:
-        if name in domain_table.doomed(db):
+    def _finish_deletion(self, db: Database, name: str) -> bool:
+        is_doomed = db.table("doomed_folder").count_where("domain = ?", [name]) > 0
+        if is_doomed:
             bury(layout.domain_folder(self.data_dir, name))
-            domain_table.forget_doomed(db, name)
-
-    # Recovery
+            db.table("doomed_folder").delete(name)
+        return is_doomed
 
     def discard_unfinished(self) -> list[str]:
-        """Clear away what dead processes left: call it once at start, before any work.
+        """Clear away what dead processes left: the service calls it once at its start, before any work.
 
-        Maps that were being built are discarded, jobs that were queued or running wait for this process
-        (`waiting_jobs`), folders of deleted domains, checkpoints of ended jobs and files that no map version owns are
-        removed. A job that was started too often, and its service died each time, fails (job_interrupted). Work of
-        living processes, this one included, stays.
+        Maps that were being built are discarded, jobs that ran wait again (`waiting_jobs`), files of removed maps and
+        folders of deleted domains go.
 
         Returns:
             One line for each thing done, for the log.
         """
-        domains = layout.domains_folder(self.data_dir)
-        buried = empty_graves(domains)
+        lines = [*self.take_over_jobs(), *self.discard_abandoned_maps()]
         with self._writing() as db:
-            lines = [
-                *(f"removed {name}" for name in buried),
-                *unfinished.take_over_abandoned_jobs(db, self._owners, self._owner.token),
-                *unfinished.discard_abandoned_maps(db, self.data_dir, self._owners),
-                *unfinished.remove_orphans(db, self.data_dir),
-            ]
-            unended = {job_id for job_id, _ in job_table.unfinished(db)}
-            swept = sweep_checkpoints(self.data_dir, unended)
-            lines += [f"removed the checkpoints of the ended job {job_id}" for job_id in swept]
-            for name in domain_table.doomed(db):
+            for domain, version in db.execute(
+                "SELECT domain, version FROM map WHERE removed_at IS NOT NULL"
+            ).fetchall():
+                if self._unlink(domain, version):
+                    lines.append(f"removed the file of the removed map {version} of domain {domain}")
+            for (name,) in db.execute("SELECT domain FROM doomed_folder").fetchall():
                 self._finish_deletion(db, name)
                 lines.append(f"removed the folder of the deleted domain {name}")
-        empty_graves(domains)
+        empty_graves(layout.domains_folder(self.data_dir))
+        for folder in _OF_OLDER_RELEASES:
+            shutil.rmtree(self.data_dir / folder, ignore_errors=True)
         return lines
 
-    def discard_abandoned_maps(self) -> list[str]:
-        """Discard the maps that dead processes were building; returns one line for each."""
-        with self._writing() as db:
-            return list(unfinished.discard_abandoned_maps(db, self.data_dir, self._owners))
+
+def _check_alike(present: DomainRecord, row: dict[str, Any]) -> None:
+    of_present = (to_json(present.evaluator), int(present.closed), to_json(present.actions_m))
+    if of_present != (row["evaluator"], row["closed"], row["actions_m"]):
+        raise DomainDiffersError(
+            f"domain {present.name} exists with another configuration: delete it first, or choose another name",
+            present={
+                "evaluator": present.evaluator,
+                "closed": present.closed,
+                "actions_m": list(present.actions_m),
+            },
+        )

@@ -1,24 +1,35 @@
-"""The catalog's file: how it is opened, checked, read and written."""
+"""The catalog's file: how it is opened, checked, read and written, and the domains in it."""
 
+import os
 import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 from sqlite_utils import Database
 
-from deepsimbad.errors import DamagedFileError
+from deepsimbad.errors import DamagedFileError, UnknownDomainError
 from deepsimbad.store import layout
-from deepsimbad.store.connection import check_integrity, migrate, open_database, use_write_ahead_log, write_transaction
+from deepsimbad.store.connection import (
+    OpenFile,
+    check_integrity,
+    close_with_log,
+    migrate,
+    open_database,
+    use_write_ahead_log,
+    write_transaction,
+)
 from deepsimbad.store.data_dir import make_data_dir
 from deepsimbad.store.durable import sync_folder
 from deepsimbad.store.faults import storage_faults
-from deepsimbad.store.open_file import OpenFile
-from deepsimbad.store.ownership import Owner
-from deepsimbad.store.row_checksums import CATALOG_TABLES, RowChecksums, verify_rows
-from deepsimbad.store.write_ahead_log import check_log
+from deepsimbad.store.records import DomainRecord, from_json
 from deepsimbad_migrations.catalog.migrations import migrations
+
+_DOMAINS = """
+    SELECT domain.name, evaluator, closed, actions_m, active.version, domain.created_at
+    FROM domain LEFT JOIN map AS active ON active.domain = domain.name AND active.state = 'active'
+"""
 
 
 class CatalogFile(OpenFile):
@@ -27,18 +38,15 @@ class CatalogFile(OpenFile):
     Args:
         data_dir: The data directory.
         db: The open catalog file.
-        checksums: Of its rows.
     """
 
-    def __init__(self, data_dir: Path, db: Database, checksums: RowChecksums) -> None:
+    def __init__(self, data_dir: Path, db: Database) -> None:
         super().__init__(layout.catalog_path(data_dir), db)
         self.data_dir = data_dir
-        self._checksums = checksums
         # Readers do not wait for who writes, nor for who waits to: a robot's answer needs the catalog.
         self._reader = open_database(self._path)
         self._reader_lock = threading.RLock()
-        self._owners = layout.owners_folder(data_dir)
-        self._owner = Owner(self._owners)
+        self._building: dict[tuple[str, int], int] = {}
 
     @classmethod
     def open(cls, data_dir: Path) -> Self:
@@ -48,7 +56,6 @@ class CatalogFile(OpenFile):
         with storage_faults(path), ExitStack() as on_error:
             domains = layout.domains_folder(data_dir)
             has_domains = domains.is_dir() and any(domains.iterdir())  # looked at before the rows: they come first
-            check_log(path)
             db = open_database(path, create=True)
             on_error.callback(db.close)
             if has_domains and not db.table_names():
@@ -60,20 +67,18 @@ class CatalogFile(OpenFile):
             check_integrity(db, path)
             use_write_ahead_log(db)
             migrate(db, migrations, path)
-            checksums = RowChecksums(db, CATALOG_TABLES)
-            checksums.fill_if_new()
-            verify_rows(db, CATALOG_TABLES, path.name)
             sync_folder(data_dir)
             on_error.pop_all()
-        return cls(data_dir, db, checksums)
+        return cls(data_dir, db)
 
     def close(self) -> None:
-        """Close the file. Unfinished work begun through this object counts as abandoned from here on."""
+        """Close the file. Maps that are being built through this object count as abandoned from here on."""
         with self._lock:
-            self._owner.release()
+            for domain, version in list(self._building):
+                self._give_up_building(domain, version)
             with self._reader_lock:
                 self._reader.close()
-            super().close()
+            close_with_log(self._db, self._path)
 
     @contextmanager
     def _reading(self) -> Iterator[Database]:
@@ -83,13 +88,47 @@ class CatalogFile(OpenFile):
 
     @contextmanager
     def _writing(self) -> Iterator[Database]:
-        with self._lock, storage_faults(self._path), write_transaction(self._db) as db:
-            yield db
-            self._checksums.note()
+        with self._lock, storage_faults(self._path):
+            self.check_is_there()
+            with write_transaction(self._db) as db:
+                yield db
 
     def check(self) -> None:
         """Raise what keeps the file from being read."""
         with self._reading() as db:
             db.execute("SELECT name FROM domain LIMIT 1").fetchall()
-        if not self._path.exists():  # an open file goes on without its name, until it is closed
-            raise DamagedFileError(f"{self._path.name} was removed under the running service", file=self._path.name)
+        self.check_is_there()
+
+    def _give_up_building(self, domain: str, version: int) -> None:
+        descriptor = self._building.pop((domain, version), None)
+        if descriptor is not None:
+            os.close(descriptor)
+
+
+def find_domain(db: Database, name: str) -> DomainRecord | None:
+    """The domain of that name, if there is one."""
+    if not layout.is_name(name):  # such a name cannot exist, and need not be valid Unicode either
+        return None
+    rows = db.execute(f"{_DOMAINS} WHERE domain.name = ?", [name])
+    return next((_domain(row) for row in rows), None)
+
+
+def get_domain(db: Database, name: str) -> DomainRecord:
+    """The domain of that name; raises UnknownDomainError."""
+    record = find_domain(db, name)
+    if record is None:
+        known = [row[0] for row in db.execute("SELECT name FROM domain ORDER BY name LIMIT 20")]
+        raise UnknownDomainError(f"there is no domain {name!a}", known=known)
+    return record
+
+
+def all_domains(db: Database) -> list[DomainRecord]:
+    """Every domain by name."""
+    return [_domain(row) for row in db.execute(f"{_DOMAINS} ORDER BY domain.name")]
+
+
+def _domain(row: tuple[Any, ...]) -> DomainRecord:
+    name, evaluator, closed, actions_m, active_version, created_at = row
+    return DomainRecord(
+        name, from_json(evaluator), bool(closed), tuple(from_json(actions_m)), active_version, created_at
+    )

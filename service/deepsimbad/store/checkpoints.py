@@ -18,9 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepsimbad.store import layout
-from deepsimbad.store.documents import from_json, to_json
 from deepsimbad.store.durable import sync_file, sync_folder
 from deepsimbad.store.faults import storage_faults
+from deepsimbad.store.records import from_json, to_json
 
 _log = logging.getLogger(__name__)
 _SUFFIX, _NEW_SUFFIX = ".checkpoint", ".new"

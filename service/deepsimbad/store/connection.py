@@ -1,16 +1,19 @@
-"""How every SQLite file is opened, brought to today's schema and written to."""
+"""How every SQLite file is opened, brought to today's schema, read and written."""
 
 import sqlite3
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TypeVar
+from typing import Self, TypeVar
 
 from sqlite_utils import Database, Migrations
 
 from deepsimbad.errors import DamagedFileError, DamagedMapError
+from deepsimbad.store.faults import storage_faults
 
 BUSY_TIMEOUT_S = 10.0
+_STRANGE_SCHEMA = "SELECT 1 FROM sqlite_schema WHERE type NOT IN ('table', 'index') OR rootpage = 0 LIMIT 1"
 
 _Answer = TypeVar("_Answer")
 
@@ -52,10 +55,10 @@ def open_database(path: Path, *, read_only: bool = False, create: bool = False, 
 
 
 def look_at(path: Path, ask: Callable[[Database], _Answer]) -> _Answer:
-    """Ask a file something without leaving a trace of the asking, whether others write to it meanwhile or not.
+    """Ask a file something without writing anything, whether others write to it meanwhile or not.
 
-    A reader that SQLite lets join a write-ahead log creates the log where nobody has it open, and leaves it there. So
-    a file without a log is read as one that does not change, and read again where it did.
+    A file whose log is empty is read as one that does not change, which works on a read-only disk too, and is read
+    again where it has changed meanwhile.
 
     Args:
         path: The file.
@@ -64,25 +67,25 @@ def look_at(path: Path, ask: Callable[[Database], _Answer]) -> _Answer:
     Raises:
         sqlite3.Error: As SQLite says it; callers stand inside `storage_faults`.
     """
-    log = path.with_name(f"{path.name}-wal")
-    if not log.exists():
-        before = _age(path)
+    before = _state(path)
+    if before[-1] == 0:
         try:
             with open_database(path, immutable=True) as db:
                 answer = ask(db)
         except BaseException:
-            if _age(path) == before and not log.exists():
+            if _state(path) == before:
                 raise
         else:
-            if _age(path) == before and not log.exists():
+            if _state(path) == before:
                 return answer
     with open_database(path, read_only=True) as db:
         return ask(db)
 
 
-def _age(path: Path) -> tuple[int, int, int]:
-    found = path.stat()
-    return found.st_ino, found.st_size, found.st_mtime_ns
+def _state(path: Path) -> tuple[int, ...]:
+    """What changes with every write: the file's inode, size and time, and the size of its log."""
+    file, log = path.stat(), path.with_name(f"{path.name}-wal")
+    return file.st_ino, file.st_size, file.st_mtime_ns, log.stat().st_size if log.exists() else 0
 
 
 def use_write_ahead_log(db: Database) -> None:
@@ -101,21 +104,9 @@ def write_transaction(db: Database) -> Iterator[Database]:
     db.conn.execute("BEGIN IMMEDIATE")
     try:
         yield db
-        _commit(db)
+        db.conn.execute("COMMIT")
     except BaseException:
         db.rollback()
-        raise
-
-
-def _commit(db: Database) -> None:
-    try:
-        db.conn.execute("COMMIT")
-    except sqlite3.Error:
-        # Where the sync failed, the log holds a transaction that we call failed, with its end. The next one, if
-        # shorter, would leave that end behind it, which looks like lost commits: a log begun anew has other salts.
-        db.rollback()
-        with suppress(sqlite3.Error):
-            db.conn.execute("PRAGMA wal_checkpoint(RESTART)")
         raise
 
 
@@ -137,8 +128,11 @@ def pending_migrations(
     """Whether the file has an older schema than ours; an empty file has the oldest.
 
     Raises:
-        DamagedFileError: (or `damaged`) The file is of another kind, or a newer release wrote it.
+        DamagedFileError: (or `damaged`) The file is of another kind, a newer release wrote it, or it holds triggers,
+            views or virtual tables, which no release writes: using it would run what its maker wrote.
     """
+    if db.execute(_STRANGE_SCHEMA).fetchone() is not None:
+        raise damaged(f"{path.name} is damaged: it holds what no release writes", file=path.name)
     try:
         pending = {migration.name for migration in migrations.pending(db)}
         applied = {migration.name for migration in migrations.applied(db)}
@@ -166,7 +160,7 @@ def in_todays_schema(
     """The file as it is where its schema is today's, else a copy in memory that is brought to it.
 
     Raises:
-        DamagedFileError: (or `damaged`) The file is of another kind, or a newer release wrote it.
+        DamagedFileError: (or `damaged`) As `pending_migrations`.
     """
     if not pending_migrations(db, migrations, path, damaged):
         yield db
@@ -181,8 +175,63 @@ def migrate(db: Database, migrations: Migrations, path: Path) -> None:
     """Bring the file to today's schema, in one transaction; two processes that try at once both succeed.
 
     Raises:
-        DamagedFileError: The file is of another kind, or a newer release wrote it.
+        DamagedFileError: As `pending_migrations`.
     """
     if pending_migrations(db, migrations, path):
         with write_transaction(db):
             migrations.apply(db)
+
+
+class OpenFile:
+    """What every kind of working file has in common; usable from any thread.
+
+    Args:
+        path: The file, for messages.
+        db: The same, open.
+    """
+
+    def __init__(self, path: Path, db: Database) -> None:
+        self._path = path
+        self._db = db
+        self._lock = threading.RLock()
+        self._inode = path.stat().st_ino
+
+    def close(self) -> None:
+        """Close the file."""
+        with self._lock:
+            self._db.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+    @contextmanager
+    def _reading(self) -> Iterator[Database]:
+        """One consistent state of the file."""
+        with self._lock, storage_faults(self._path), self._db.atomic() as db:
+            yield db
+
+    @property
+    def is_deleted(self) -> bool:
+        """Whether the file is gone, or another lies in its place."""
+        with storage_faults(self._path):
+            try:
+                return self._path.stat().st_ino != self._inode
+            except FileNotFoundError:
+                return True
+
+    def check_is_there(self) -> None:
+        """Raise DamagedFileError where the file is gone: an open one goes on without its name, until it is closed."""
+        if self.is_deleted:
+            raise DamagedFileError(f"{self._path.name} was removed under the running service", file=self._path.name)
+
+
+def close_with_log(db: Database, path: Path) -> None:
+    """Close a file's last writer so that its log, empty, stays: on a full disk the next start could make no new one."""
+    with suppress(sqlite3.Error), open_database(path, read_only=True) as last:
+        db.conn.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+        last.execute("SELECT 1 FROM sqlite_schema LIMIT 1").fetchall()  # a reader that is the last leaves it
+        db.close()
+    db.close()

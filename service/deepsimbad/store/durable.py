@@ -1,6 +1,7 @@
 """Files that are on the disk when we say so, and their digests."""
 
 import errno
+import fcntl
 import hashlib
 import os
 import secrets
@@ -9,6 +10,8 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+
+from deepsimbad.errors import ConflictError, InvalidInputError
 
 _GRAVE_PREFIX = ".removing-"
 _NO_HARD_LINKS = {errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK, errno.EACCES}
@@ -29,18 +32,26 @@ def sync_folder(folder: Path) -> None:
 
 
 @contextmanager
-def written_aside(file: Path) -> Iterator[Path]:
+def written_aside(file: Path, what: str) -> Iterator[Path]:
     """Let a new file appear whole or not at all, and never in the place of another.
+
+    Args:
+        file: The file.
+        what: It is, for messages: "a backup".
 
     Yields:
         A path to write it at, in a folder beside it that holds whatever else is needed meanwhile and goes away.
 
     Raises:
-        FileExistsError: There is a file of that name.
+        InvalidInputError: There is no folder for it.
+        ConflictError: There is a file of that name.
         OSError: The disk is full, ...
     """
+    taken = ConflictError(f"{file} exists: {what} never replaces a file, choose another name")
+    if not file.parent.is_dir():
+        raise InvalidInputError(f"there is no folder {file.parent} for {what}")
     if file.exists():
-        raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(file))
+        raise taken
     folder = Path(tempfile.mkdtemp(prefix=f".{file.name}.", suffix=".part", dir=file.parent))
     try:
         new = folder / file.name
@@ -49,7 +60,9 @@ def written_aside(file: Path) -> Iterator[Path]:
         try:
             os.link(new, file)  # unlike a rename it never replaces
         except OSError as error:
-            if error.errno not in _NO_HARD_LINKS or file.exists():
+            if file.exists():
+                raise taken from error
+            if error.errno not in _NO_HARD_LINKS:
                 raise
             new.rename(file)
         sync_folder(file.parent)
@@ -82,9 +95,35 @@ def bury(folder: Path) -> None:
         sync_folder(folder.parent)
 
 
-def empty_graves(parent: Path) -> list[str]:
-    """Remove what was buried in a folder, also by others who may be at it now; returns names."""
-    graves = sorted(parent.glob(f"{_GRAVE_PREFIX}*"))
-    for grave in graves:
+def empty_graves(parent: Path) -> None:
+    """Remove what was buried in a folder, also by others who may be at it now."""
+    for grave in parent.glob(f"{_GRAVE_PREFIX}*"):
         shutil.rmtree(grave, ignore_errors=True)
-    return [grave.name for grave in graves]
+
+
+def lock_folder(folder: Path, operation: int) -> int | None:
+    """Open and lock a folder; the lock ends with the descriptor, or with the process in any way.
+
+    Args:
+        folder: Which; its name leads to the folder that was locked.
+        operation: As of `fcntl.flock`.
+
+    Returns:
+        The descriptor; None: LOCK_NB was asked for and another holds it.
+
+    Raises:
+        OSError: There is no such folder, or its file system locks nothing.
+    """
+    while True:
+        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        try:
+            fcntl.flock(descriptor, operation)
+            if folder.stat().st_ino == os.fstat(descriptor).st_ino:  # else another has taken its place meanwhile
+                return descriptor
+        except BlockingIOError:
+            os.close(descriptor)
+            return None
+        except BaseException:
+            os.close(descriptor)
+            raise
+        os.close(descriptor)

@@ -1,12 +1,18 @@
 """What the disk and SQLite can answer, said in the product's own errors."""
 
 import errno
+import json
 import sqlite3
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from deepsimbad.errors import DamagedFileError, DamagedMapError, InvalidInputError, UnavailableError
+from deepsimbad.errors import (
+    DamagedFileError,
+    DamagedMapError,
+    InvalidInputError,
+    UnavailableError,
+)
 
 _REASONS_BY_ERRNO = {
     errno.ENOSPC: "disk_full",
@@ -66,8 +72,8 @@ def storage_faults(path: Path, damaged: type[DamagedFileError | DamagedMapError]
         yield
     except sqlite3.Error as error:
         raise _from_sqlite(error, path, damaged) from error
-    except UnicodeDecodeError as error:  # of a message in which SQLite quotes what is in the file
-        raise damaged(f"{path.name} is damaged: it holds text that is none", file=path.name) from error
+    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise damaged(f"{path.name} is damaged: it holds text that cannot be read", file=path.name) from error
     except MemoryError as error:  # SQLite's is raised as this one too
         raise _unavailable(path, "out_of_memory") from error
     except OSError as error:

@@ -3,51 +3,36 @@
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future
-from dataclasses import dataclass
-from pathlib import Path
-from queue import Empty, SimpleQueue
+from contextlib import AbstractContextManager
+from queue import SimpleQueue
 from typing import Any, TypeVar
 
 from sqlite_utils import Database
 
 from deepsimbad.errors import UnavailableError
-from deepsimbad.store.connection import write_transaction
-from deepsimbad.store.faults import storage_faults
 
 T = TypeVar("T")
 
 MAX_BATCH = 256
 
-
-@dataclass(frozen=True)
-class _Write:
-    run: Callable[[Database], Any]
-    done: Future[Any]
+_Write = tuple[Callable[[Database], Any], "Future[Any]"]
 
 
 class GroupCommit:
     """One thread that commits what others hand in; a write counts when its future has a result, not earlier.
 
     Args:
-        db: An open file that nothing else writes through.
-        path: The file, for messages.
+        transaction: Gives a write transaction.
         on_commit: Called with the number of writes of every transaction.
-        before_commit: Called as the last thing inside every transaction.
     """
 
     def __init__(
-        self,
-        db: Database,
-        path: Path,
-        on_commit: Callable[[int], None] = lambda _: None,
-        before_commit: Callable[[], None] = lambda: None,
+        self, transaction: Callable[[], AbstractContextManager[Database]], on_commit: Callable[[int], None]
     ) -> None:
-        self._db = db
-        self._path = path
+        self._transaction = transaction
         self._on_commit = on_commit
-        self._before_commit = before_commit
         self._waiting: SimpleQueue[_Write | None] = SimpleQueue()
-        self._open = True
+        self._is_open = True
         self._lock = threading.Lock()
         self._thread = threading.Thread(target=self._work, name="commits", daemon=True)
         self._thread.start()
@@ -71,61 +56,43 @@ class GroupCommit:
         """
         done: Future[T] = Future()
         with self._lock:
-            if not self._open:
+            if not self._is_open:
                 raise UnavailableError("the service is shutting down")
-            self._waiting.put(_Write(run, done))
+            self._waiting.put((run, done))
+        done.set_running_or_notify_cancel()  # whoever stops waiting does not undo it
         return done
 
     def close(self) -> None:
         """Commit what waits, then end the thread."""
         with self._lock:
-            if not self._open:
-                return
-            self._open = False
-            self._waiting.put(None)
+            if self._is_open:
+                self._is_open = False
+                self._waiting.put(None)
         self._thread.join()
 
     def _work(self) -> None:
-        closing = False
-        while not closing:
-            batch: list[_Write] = []
-            write = self._waiting.get()
-            while write is not None:
+        while (write := self._waiting.get()) is not None:
+            batch = [write]
+            while len(batch) < MAX_BATCH and not self._waiting.empty():
+                write = self._waiting.get()
+                if write is None:
+                    break
                 batch.append(write)
-                if len(batch) == MAX_BATCH:
-                    break
-                try:
-                    write = self._waiting.get_nowait()
-                except Empty:
-                    break
-            closing = write is None
-            for each in batch:
-                each.done.set_running_or_notify_cancel()  # too late to cancel; one cancelled earlier is written as well
             self._commit(batch)
+            if write is None:
+                return
 
     def _commit(self, batch: list[_Write]) -> None:
-        if not batch:
-            return
         try:
-            with storage_faults(self._path), write_transaction(self._db) as db:
-                results = [write.run(db) for write in batch]
-                self._before_commit()
+            with self._transaction() as db:
+                results = [run(db) for run, _ in batch]
         except BaseException as error:
             if len(batch) == 1:
-                _settle(batch[0].done, error=error)
+                batch[0][1].set_exception(error)
                 return
             for write in batch:  # one that cannot be written should not take the others with it
                 self._commit([write])
             return
         self._on_commit(len(batch))
-        for write, result in zip(batch, results, strict=True):
-            _settle(write.done, result)
-
-
-def _settle(done: Future[Any], result: Any = None, error: BaseException | None = None) -> None:
-    if done.cancelled():
-        return
-    if error is not None:
-        done.set_exception(error)
-    else:
-        done.set_result(result)
+        for (_, done), result in zip(batch, results, strict=True):
+            done.set_result(result)

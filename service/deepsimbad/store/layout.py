@@ -7,6 +7,7 @@ from deepsimbad.errors import InvalidInputError
 
 NAME_PATTERN = r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}"
 _NAME = re.compile(NAME_PATTERN)
+SEALING_SUFFIX = ".sealing"  # of a map that is being sealed
 _MAX_VERSION = 2**53
 _JOB_ID = re.compile(r"[0-9a-f]{32}")
 
@@ -41,13 +42,8 @@ def sessions_path(data_dir: Path) -> Path:
 
 
 def service_lock_path(data_dir: Path) -> Path:
-    """The file that the one service of a data directory holds locked."""
+    """The file in which the one service of a data directory says who it is."""
     return data_dir / "service.lock"
-
-
-def owners_folder(data_dir: Path) -> Path:
-    """The folder of the lock files that tell living processes from dead ones."""
-    return data_dir / "owners"
 
 
 def jobs_folder(data_dir: Path) -> Path:

@@ -1,8 +1,16 @@
-"""What the catalog knows of a domain, a map version, a job and an API key."""
+"""What the catalog knows of domains, map versions, jobs and API keys; how lists, JSON and times are written."""
 
+import json
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
 from enum import StrEnum
-from typing import Any
+from typing import Any, Generic, TypeVar
+
+from deepsimbad.errors import InvalidInputError
+
+Record = TypeVar("Record")
+Key = TypeVar("Key", int, str)
 
 
 class MapState(StrEnum):
@@ -26,7 +34,7 @@ class JobState(StrEnum):
     @property
     def is_final(self) -> bool:
         """Whether nothing follows."""
-        return self in (JobState.SUCCEEDED, JobState.FAILED, JobState.CANCELLED)
+        return self not in (JobState.QUEUED, JobState.RUNNING)
 
 
 class KeyScope(StrEnum):
@@ -48,7 +56,7 @@ class DomainRecord:
         name: Matches `layout.NAME_PATTERN`.
         evaluator: The evaluator's configuration, as it was given.
         closed: Whether the route is a loop.
-        actions_m: The moves a robot may be asked to make, in metres.
+        actions_m: Moves a robot may be asked to make, in metres.
         active_version: The map version that serves, if any.
         created_at: ISO 8601, UTC.
     """
@@ -136,5 +144,69 @@ class KeyRecord:
     revoked_at: str | None
 
     def is_usable(self, at: str) -> bool:
-        """Whether it opens anything at a time (as `documents.now` writes it)."""
+        """Whether it opens anything at a time (as `now` writes it)."""
         return self.revoked_at is None and (self.expires_at is None or at < self.expires_at)
+
+
+@dataclass(frozen=True)
+class ListPage(Generic[Record, Key]):
+    """Some records in the list's order.
+
+    A page is found by the key of the record before it, never by a count: whatever is made or removed meanwhile, no
+    record that stays is shown twice or left out.
+
+    Attributes:
+        records: At most as many as were asked for.
+        last_key: The key of the last of them where more follow; None: this is the end.
+    """
+
+    records: tuple[Record, ...]
+    last_key: Key | None
+
+    @classmethod
+    def of(cls, rows: Iterable[tuple[Key, Record]], limit: int) -> "ListPage[Record, Key]":
+        """The page of what a statement gave that asked for one record more than the `limit`."""
+        rows = list(rows)
+        page = rows[:limit]
+        return cls(tuple(record for _, record in page), page[-1][0] if len(rows) > limit else None)
+
+
+def to_json(value: Mapping[str, Any] | Sequence[Any]) -> str:
+    """The one text of a JSON value: sorted keys, no spaces, no NaN, so that equal values are equal texts.
+
+    Raises:
+        InvalidInputError: The value has no JSON form.
+    """
+    try:
+        return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False, ensure_ascii=True)
+    except (TypeError, ValueError, RecursionError) as error:
+        raise InvalidInputError(f"not a JSON value: {error}") from error
+
+
+def from_json(text: str | None) -> Any:
+    """The value of a JSON column, None of an empty one; raises ValueError on damage."""
+    return None if text is None else json.loads(text)
+
+
+def now(behind: str | None = None) -> str:
+    """The present moment in UTC as ISO 8601, to the millisecond; texts sort as times do.
+
+    Args:
+        behind: A moment that it must follow, though the clock was set back since.
+    """
+    moment = _text(datetime.now(UTC))
+    if behind is None or moment > behind:
+        return moment
+    return _text(datetime.fromisoformat(behind) + timedelta(milliseconds=1))
+
+
+def after(wait: timedelta) -> str:
+    """The moment that follows now by `wait`, as `now` writes it; raises InvalidInputError past the year 9999."""
+    try:
+        return _text(datetime.now(UTC) + wait)
+    except OverflowError as error:
+        raise InvalidInputError("a time past the year 9999 cannot be kept") from error
+
+
+def _text(moment: datetime) -> str:
+    return moment.isoformat(timespec="milliseconds").replace("+00:00", "Z")

@@ -1,16 +1,19 @@
-"""Turning a built map into the file that serves, and checking later that it is still that file."""
+"""Turning a built map into the file that serves, checking later that it is still that file, and carrying it away."""
 
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
-from deepsimbad.errors import ConflictError, DamagedMapError
+from deepsimbad.errors import ConflictError, DamagedMapError, NoActiveMapError, UnknownMapVersionError
+from deepsimbad.store.catalog import Catalog
+from deepsimbad.store.catalog_maps import removed
 from deepsimbad.store.connection import check_integrity, open_database
-from deepsimbad.store.durable import remove_database, sha256_of, sync_file, sync_folder
+from deepsimbad.store.durable import remove_database, sha256_of, sync_file, sync_folder, written_aside
 from deepsimbad.store.faults import storage_faults
+from deepsimbad.store.layout import SEALING_SUFFIX
 from deepsimbad.store.map_file import read_map
-from deepsimbad.store.unfinished import SEALING_SUFFIX
 
 
 def seal(building_path: Path, final_path: Path) -> tuple[str, int]:
@@ -89,3 +92,55 @@ def verify(path: Path, sha256: str) -> None:
         raise DamagedMapError(
             f"{path.name} is not the file that was sealed: its SHA-256 differs", file=path.name, sha256=digest
         )
+
+
+@dataclass(frozen=True)
+class ExportReport:
+    """What was written where."""
+
+    domain: str
+    map_version: int
+    file: str
+    bytes: int
+    sha256: str
+
+
+def export_map(catalog: Catalog, domain: str, version: int | None, file: Path) -> ExportReport:
+    """Copy a sealed map, byte for byte.
+
+    Args:
+        catalog: Of the data directory.
+        domain: Whose map.
+        version: Which; None: the active one.
+        file: The new file; it appears when it is whole.
+
+    Raises:
+        UnknownDomainError, UnknownMapVersionError, NoActiveMapError: There is no such map.
+        RetiredMapError: Its file was removed.
+        DamagedMapError: Its file is not what was sealed; nothing is written.
+        ConflictError: There is a file of that name.
+        InvalidInputError: There is no folder for it.
+        UnavailableError: The disk is full, ...
+    """
+    if version is None:
+        version = catalog.domain(domain).active_version
+        if version is None:
+            raise NoActiveMapError(f"domain {domain} has no active map: name another with --version", domain=domain)
+    record = catalog.map(domain, version)
+    if record.removed_at is not None:
+        raise removed(domain, version)
+    if record.sha256 is None:
+        raise UnknownMapVersionError(f"map {version} of domain {domain} is still being built", version=version)
+    source = catalog.map_path(domain, version)
+    if not source.is_file():
+        raise DamagedMapError(f"map {version} of domain {domain} is damaged: its file is missing", map_version=version)
+    try:
+        with storage_faults(file), written_aside(file, "an export") as new:
+            shutil.copyfile(source, new)
+            verify(new, record.sha256)
+            new.chmod(0o444)
+    except DamagedMapError as error:
+        raise DamagedMapError(
+            f"map {version} of domain {domain} is damaged: it was not exported", domain=domain, map_version=version
+        ) from error
+    return ExportReport(domain, version, str(file), file.stat().st_size, record.sha256)

@@ -114,18 +114,3 @@ class StateSnapshot:
 
     sequence: int
     arrays: dict[str, NDArray[Any]]
-
-
-@dataclass(frozen=True)
-class ClockRecord:
-    """A moment of the clock that sessions live by; times are seconds since 1970 by that clock.
-
-    Attributes:
-        boot: Names the run of the operating system; None where it has no name.
-        booted_at: When that run began.
-        seen_at: The moment itself.
-    """
-
-    boot: str | None
-    booted_at: float
-    seen_at: float

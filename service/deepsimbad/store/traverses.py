@@ -5,25 +5,32 @@ import os
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from sqlite_utils import Database
 
-from deepsimbad.core.drive import UNKNOWN_TIMESTAMP, Drive
-from deepsimbad.errors import ConflictError, DamagedFileError, UnknownDomainError, UnknownTraverseError
-from deepsimbad.store import frame_table, layout
-from deepsimbad.store.connection import migrate, open_database, use_write_ahead_log, write_transaction
-from deepsimbad.store.documents import now
-from deepsimbad.store.durable import remove_database, sync_file, sync_folder
+from deepsimbad.errors import (
+    ConflictError,
+    DamagedFileError,
+    InvalidEncodingError,
+    UnknownDomainError,
+    UnknownTraverseError,
+    WeightsDifferError,
+)
+from deepsimbad.store import layout
+from deepsimbad.store.arrays import is_halvable
+from deepsimbad.store.connection import OpenFile, migrate, open_database, use_write_ahead_log, write_transaction
+from deepsimbad.store.durable import lock_folder, remove_database, sync_file, sync_folder
 from deepsimbad.store.faults import storage_faults
-from deepsimbad.store.open_file import OpenFile
-from deepsimbad.store.write_ahead_log import check_log
+from deepsimbad.store.frames import UNKNOWN_TIMESTAMP, TraverseFrames
+from deepsimbad.store.records import now
 from deepsimbad_migrations.traverse.migrations import migrations
 
 IndexRanges = list[tuple[int, int]]  # the class has a `list` of its own
 _NEW_SUFFIX = ".new"  # a file being made; never a traverse's own ending
+_DTYPE_OF_BYTES = {2.0: "<f2", 4.0: "<f4"}  # by the bytes of one number
 
 
 class Traverse(OpenFile):
@@ -41,7 +48,6 @@ class Traverse(OpenFile):
     def __init__(self, name: str, path: Path, db: Database) -> None:
         super().__init__(path, db)
         self.name = name
-        self._inode = path.stat().st_ino
 
     @classmethod
     def create(cls, data_dir: Path, domain: str, name: str) -> Self:
@@ -79,7 +85,6 @@ class Traverse(OpenFile):
         if not path.is_file():
             raise UnknownTraverseError(f"domain {domain} has no traverse {name}", known=cls.list(data_dir, domain)[:20])
         with _named(name), storage_faults(path), ExitStack() as on_error:
-            check_log(path)
             db = open_database(path)
             on_error.callback(db.close)
             if not db.table_names():
@@ -117,15 +122,6 @@ class Traverse(OpenFile):
             if not folder.is_dir():
                 return []
             return sorted(path.stem for path in folder.iterdir() if path.suffix == ".sqlite")
-
-    @property
-    def is_deleted(self) -> bool:
-        """Whether its file is gone, or another lies in its place."""
-        with storage_faults(self._path):
-            try:
-                return self._path.stat().st_ino != self._inode
-            except FileNotFoundError:
-                return True
 
     @contextmanager
     def _reading(self) -> Iterator[Database]:
@@ -167,7 +163,7 @@ class Traverse(OpenFile):
         Raises:
             InvalidInputError, InvalidRouteError, InvalidEncodingError: As `put_frames`.
         """
-        frames = Drive(
+        frames = TraverseFrames(
             index=np.array([index]),
             position_m=np.array([position_m], np.float64),
             timestamp_us=np.array([UNKNOWN_TIMESTAMP if timestamp_us is None else timestamp_us]),
@@ -178,8 +174,8 @@ class Traverse(OpenFile):
         )
         return self.put_frames(frames)[0] == 1
 
-    def put_frames(self, frames: Drive) -> tuple[int, int]:
-        """Store a batch in one transaction, replacing frames of the same index.
+    def put_frames(self, frames: TraverseFrames) -> tuple[int, int]:
+        """Store a batch in one transaction, replacing frames of the same index; never holds a second copy of it.
 
         Returns:
             (n_new, n_replaced).
@@ -195,48 +191,116 @@ class Traverse(OpenFile):
         if frames.n_frames == 0:
             return 0, 0
         with self._writing() as db:
-            n_before = frame_table.count(db)
-            frame_table.upsert(db, frames)
-            n_new = frame_table.count(db) - n_before
+            n_before = _count(db)
+            dim = frames.encodings.shape[1]
+            db.execute("UPDATE traverse SET encoding_dim = ? WHERE encoding_dim IS NULL", [dim])
+            present_dim, weights_sha256 = _described(db)
+            if dim != present_dim:
+                raise InvalidEncodingError(
+                    f"encodings of this traverse hold {present_dim} numbers, these {dim}", encoding_dim=present_dim
+                )
+            WeightsDifferError.check("the traverse", weights_sha256, "a frame", frames.weights_sha256)
+            if frames.weights_sha256 is not None:
+                db.execute("UPDATE traverse SET weights_sha256 = ?", [frames.weights_sha256])
+            db.conn.executemany(
+                """
+                INSERT INTO frame (frame_index, position_m, timestamp_us, x_m, y_m) VALUES (?, ?, ?, ?, ?)
+                ON CONFLICT (frame_index) DO UPDATE SET position_m = excluded.position_m,
+                    timestamp_us = excluded.timestamp_us, x_m = excluded.x_m, y_m = excluded.y_m
+                """,
+                _places(frames),
+            )
+            db.conn.executemany(
+                """
+                INSERT INTO encoding (frame_index, body) VALUES (?, ?)
+                ON CONFLICT (frame_index) DO UPDATE SET body = excluded.body
+                """,
+                _bodies(frames),
+            )
+            n_new = _count(db) - n_before
         return n_new, frames.n_frames - n_new
 
     @property
     def n_frames(self) -> int:
-        """How many frames there are."""
+        """How many frames there are; reads no encodings."""
         with self._reading() as db:
-            return frame_table.count(db)
+            return _count(db)
 
     @property
     def encoding_dim(self) -> int | None:
         """The length of the encodings; None before the first frame."""
         with self._reading() as db:
-            return frame_table.encoding_dim(db)
+            return _described(db)[0]
 
     @property
     def missing(self) -> IndexRanges:
         """The ranges [first, last] of indices below the greatest that have no frame."""
         with self._reading() as db:
-            return frame_table.missing(db)
+            rows = db.execute(
+                """
+                SELECT previous + 1, frame_index - 1 FROM (
+                    SELECT lag(frame_index, 1, -1) OVER (ORDER BY frame_index) AS previous, frame_index FROM frame
+                ) WHERE frame_index > previous + 1 ORDER BY frame_index
+                """
+            )
+            return [(first, last) for first, last in rows]
 
-    def read(self) -> Drive:
-        """All frames in index order, every checksum checked; one array of encodings, no copy beside it."""
+    def read(self) -> TraverseFrames:
+        """All frames in index order; one array of encodings, no copy beside it."""
         with self._reading() as db:
-            return frame_table.read(db)
+            n, (dim, weights_sha256) = _count(db), _described(db)
+            places = np.empty((n, 3))
+            index, timestamp_us = np.empty(n, np.int64), np.empty(n, np.int64)
+            encodings = np.empty((n, dim or 0), np.float32)
+            rows = db.execute(
+                """
+                SELECT frame.frame_index, coalesce(timestamp_us, ?), position_m, x_m, y_m, body
+                FROM frame LEFT JOIN encoding ON encoding.frame_index = frame.frame_index
+                ORDER BY frame.frame_index
+                """,
+                [UNKNOWN_TIMESTAMP],
+            )
+            for row, (frame_index, moment_us, *place, body) in enumerate(rows):
+                dtype = _DTYPE_OF_BYTES.get(len(body or b"") / (dim or 1))  # a single number would be broadcast
+                if dtype is None:
+                    raise DamagedFileError(
+                        f"it is damaged: the encoding of frame {frame_index} has another length; delete it and "
+                        "upload it again"
+                    )
+                index[row], timestamp_us[row], places[row] = frame_index, moment_us, place  # None becomes NaN
+                encodings[row] = np.frombuffer(body, dtype)
+        position_m, x_m, y_m = places.T.copy()
+        return TraverseFrames(index, position_m, timestamp_us, x_m, y_m, encodings, weights_sha256)
 
 
-def remove_leftovers(data_dir: Path, domain: str) -> list[str]:
-    """Remove what cut-short creations and deletions left in a domain's traverses; returns the files' names."""
-    folder = layout.traverses_folder(data_dir, domain)
-    if not folder.is_dir():
-        return []
-    removed = []
-    with storage_faults(folder), _locked_folder(folder, domain):
-        for path in sorted(folder.iterdir()):
-            owner = path.with_name(path.name.removesuffix("-wal").removesuffix("-shm"))
-            if _NEW_SUFFIX in (path.suffix, path.suffix.partition("-")[0]) or not owner.exists():
-                path.unlink(missing_ok=True)
-                removed.append(path.name)
-    return removed
+def _count(db: Database) -> int:
+    (n_frames,) = db.execute("SELECT count(*) FROM frame").fetchone()
+    return int(n_frames)
+
+
+def _described(db: Database) -> tuple[int | None, str | None]:
+    """The length of the encodings, and by which weights images were encoded; None where there are none yet."""
+    row: tuple[int | None, str | None] | None = db.execute(
+        "SELECT encoding_dim, weights_sha256 FROM traverse"
+    ).fetchone()
+    if row is None:
+        raise DamagedFileError("it is damaged: it does not describe itself; delete it and upload it again")
+    return row
+
+
+def _places(frames: TraverseFrames) -> Iterator[tuple[Any, ...]]:
+    """Index, position, time, x and y of every frame; unknown ones are None."""
+    for row, index in enumerate(frames.index):
+        timestamp_us = int(frames.timestamp_us[row])
+        x_m, y_m = (None if np.isnan(value) else float(value) for value in (frames.x_m[row], frames.y_m[row]))
+        known_us = None if timestamp_us == UNKNOWN_TIMESTAMP else timestamp_us
+        yield int(index), float(frames.position_m[row]), known_us, x_m, y_m
+
+
+def _bodies(frames: TraverseFrames) -> Iterator[tuple[int, bytes]]:
+    for row, index in enumerate(frames.index):
+        encoding = frames.encodings[row]
+        yield int(index), encoding.astype("<f2" if is_halvable(encoding) else "<f4").tobytes()
 
 
 @contextmanager
@@ -252,11 +316,11 @@ def _named(name: str) -> Iterator[None]:
 def _locked_folder(folder: Path, domain: str) -> Iterator[None]:
     """Keep other processes from making or deleting a traverse of the domain meanwhile."""
     try:
-        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+        descriptor = lock_folder(folder, fcntl.LOCK_EX)
     except FileNotFoundError as error:
         raise UnknownDomainError(f"there is no domain {domain}") from error
+    assert descriptor is not None
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX)
         yield
     finally:
         os.close(descriptor)

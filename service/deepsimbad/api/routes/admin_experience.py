@@ -16,7 +16,7 @@ from deepsimbad.api.rendering import render_job
 from deepsimbad.api.schemas import JobAnswer
 from deepsimbad.api.session_bodies import ExperienceBody
 from deepsimbad.errors import DeepSimbadError
-from deepsimbad.jobs.learn import EXPERIENCE, ExperienceConfig, keep_true_positions
+from deepsimbad.jobs.session_walks import EXPERIENCE, ExperienceConfig, keep_true_positions
 from deepsimbad.store.records import JobRecord
 
 log = logging.getLogger(__name__)

@@ -25,7 +25,6 @@ from deepsimbad.api.dependencies import DomainName, Running, Services, TraverseN
 from deepsimbad.api.frame_batch import read_batch
 from deepsimbad.api.openapi import problems
 from deepsimbad.api.schemas import BatchAnswer, FrameAnswer
-from deepsimbad.core.drive import MAX_POSITION_M
 from deepsimbad.engine.encoders import ready_encodings
 from deepsimbad.engine.views import EncodedImage, View
 from deepsimbad.engine.worker import Priority
@@ -33,6 +32,7 @@ from deepsimbad.errors import EmptyBodyError
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.image import MEDIA_TYPES
 from deepsimbad.store.faults import storage_faults
+from deepsimbad.store.frames import MAX_POSITION_M
 
 router = APIRouter(prefix="/v1/admin/domains/{domain}/traverses/{name}/frames", tags=["admin: traverses"])
 

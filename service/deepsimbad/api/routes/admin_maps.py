@@ -15,7 +15,7 @@ from deepsimbad.api.rendering import render_map
 from deepsimbad.api.schemas import MapAnswer, MapList
 from deepsimbad.engine.maps import load_snapshot, unreadable
 from deepsimbad.errors import ConflictError, DamagedMapError, UnknownMapVersionError
-from deepsimbad.store.map_table import ANY, removed
+from deepsimbad.store.catalog_maps import ANY, removed
 from deepsimbad.store.records import MapState
 
 router = APIRouter(prefix="/v1/admin/domains", tags=["admin: maps"])

@@ -10,7 +10,7 @@ from deepsimbad.api.openapi import problems
 from deepsimbad.api.rendering import render_job
 from deepsimbad.api.schemas import JobAnswer
 from deepsimbad.errors import NoActiveMapError
-from deepsimbad.jobs.remap import refuse_known_traverse
+from deepsimbad.jobs.known_frames import refuse_known_traverse
 from deepsimbad.jobs.runner import REMAP
 from deepsimbad.store.traverses import Traverse
 

@@ -11,7 +11,7 @@ from deepsimbad.api.openapi import problems
 from deepsimbad.api.paging import USUALLY_AT_ONCE, AfterTraverse, Limit, cursor_of, name_of
 from deepsimbad.api.schemas import TraverseAnswer, TraverseList
 from deepsimbad.errors import ConflictError, TraverseInUseError, UnknownTraverseError
-from deepsimbad.store.list_page import ListPage
+from deepsimbad.store.records import ListPage
 from deepsimbad.store.traverses import Traverse
 
 router = APIRouter(prefix="/v1/admin/domains/{domain}/traverses", tags=["admin: traverses"])

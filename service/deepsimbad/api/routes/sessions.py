@@ -6,7 +6,14 @@ from typing import Annotated
 
 from fastapi import APIRouter, Header, Query, Request, Response
 
-from deepsimbad.api.bodies import GREATEST_ID, JSON, declare_json, media_type_of, read_bytes, read_json
+from deepsimbad.api.bodies import (
+    GREATEST_ID,
+    JSON,
+    declare_json,
+    media_type_of,
+    read_bytes,
+    read_json,
+)
 from deepsimbad.api.dependencies import DomainName, Running, SessionId
 from deepsimbad.api.entity_tags import LandmarkModelTag, insisted_on
 from deepsimbad.api.idempotency import KEY_HEADER, KeyWord, id_under_key
