@@ -1,10 +1,9 @@
 """`python -m deepsimbad_campus ROOT` renders a campus."""
 
+import sys
 from pathlib import Path
 
 import click
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from deepsimbad_campus.season import PAPER_DATES, CampusError
 from deepsimbad_campus.writer import write_campus
@@ -30,15 +29,9 @@ def campus_command(root: Path, seasons: str, frames: int, seed: int, spacing_m: 
     more frames it adds to those that are there.
     """
     names = [name.strip() for name in seasons.split(",") if name.strip()]
-    columns = (TextColumn("rendering"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True)) as progress:
-        task = progress.add_task("rendering", total=len(names) * frames)
-
-        def show(done: int, total: int) -> None:
-            progress.update(task, completed=done, total=total)
-
+    with click.progressbar(length=len(names) * frames, label="rendering", file=sys.stderr) as bar:
         try:
-            sources = write_campus(root, names, frames, seed, spacing_m=spacing_m, on_progress=show)
+            sources = write_campus(root, names, frames, seed, spacing_m=spacing_m, on_progress=lambda *_: bar.update(1))
         except CampusError as error:
             raise click.ClickException(str(error)) from error
     for source in sources:

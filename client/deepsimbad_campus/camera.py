@@ -17,8 +17,17 @@ CANVAS_SIZE, SEEN_SIZE = (560, 728), (528, 693)
 """Width and height pictures are drawn at, and of the part that is seen: a little less, so that the robot may nod."""
 
 FOCAL_PX, EYE_M, NEAR_M = 300.0, 1.2, 0.35
-CENTRE_X, HORIZON_Y = CANVAS_SIZE[0] / 2, CANVAS_SIZE[1] * 0.47
+WIDTH, HEIGHT = CANVAS_SIZE
+CENTRE_X, HORIZON_Y = WIDTH / 2, HEIGHT * 0.47
 HALF_VIEW = CENTRE_X / FOCAL_PX + 0.02
+
+# Where the canvas's pixels look: [560] columns, sky rows from the top, ground rows from the first below the horizon.
+SLOPE = (np.arange(WIDTH) - CENTRE_X) / FOCAL_PX
+RISE = (HORIZON_Y - np.arange(int(np.ceil(HORIZON_Y)) + 1))[:, None] / FOCAL_PX
+AZIMUTH_DEG = np.rad2deg(np.arctan(SLOPE))
+ELEVATION_DEG = np.rad2deg(np.arctan2(RISE, np.sqrt(1 + SLOPE * SLOPE)))
+GROUND_ROW = int(HORIZON_Y) + 2
+AHEAD_M = np.asarray(FOCAL_PX * EYE_M / (np.arange(GROUND_ROW, HEIGHT) - HORIZON_Y), np.float64)
 
 
 class View(NamedTuple):
@@ -57,11 +66,12 @@ def sixteenths(pixels: Array) -> NDArray[np.int32]:
     return np.clip(np.round(pixels * 16), -400_000, 400_000).astype(np.int32)
 
 
-def fill(image: Image, ground: Array, ink: Colour, first_row: int = 0, line: int = cv2.LINE_AA) -> None:
-    """Fill a convex [n, 2] ground polygon (right, ahead) on the canvas, or on what begins at one of its rows."""
-    seen = clip_near(ground)
+def fill(image: Image, ground: Array, ink: Colour) -> None:
+    """Fill a convex [n, 2] ground polygon (right, ahead) on the canvas, or on a mask of the ground."""
+    seen, is_mask = clip_near(ground), image.ndim == 2
     if len(seen) >= 3:
-        cv2.fillConvexPoly(image, sixteenths(project(seen) - (0, first_row)), ink, line, 4)
+        outline = sixteenths(project(seen) - (0, GROUND_ROW if is_mask else 0))
+        cv2.fillConvexPoly(image, outline, ink, cv2.LINE_8 if is_mask else cv2.LINE_AA, 4)
 
 
 def ink(colour: Array) -> tuple[int, ...]:

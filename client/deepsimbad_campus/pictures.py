@@ -240,7 +240,7 @@ def draw_ground(season: Season, drive: str, seed: int) -> list[list[Image]]:
     surfaces = []
     for name in ("grass", *PAVING):
         rng = stream(seed, f"ground {name} {drive}")
-        tile = _cover(_paved(name, season, rng) if name in PAVING else _grass(season, rng), season, rng, name in PAVING)
+        tile = _cover(_tile(name, season, rng), season, rng, name in PAVING)
         levels = [np.clip(tile, 0, 255).astype(np.uint8)]
         while len(levels) < TILE_LEVELS:  # a tile wraps around, so it is halved with its neighbours beside it
             wide = np.pad(levels[-1], ((8, 8), (8, 8), (0, 0)), mode="wrap")
@@ -249,19 +249,18 @@ def draw_ground(season: Season, drive: str, seed: int) -> list[list[Image]]:
     return surfaces
 
 
-def _tile(rng: np.random.Generator, cells: tuple[int, int], octaves: int) -> NDArray[np.float32]:
+def _noise(rng: np.random.Generator, cells: tuple[int, int], octaves: int) -> NDArray[np.float32]:
     return tile_noise(rng, (TILE_PX, TILE_PX), cells, octaves)[:, :, None]
 
 
-def _grass(season: Season, rng: np.random.Generator) -> NDArray[np.float32]:
-    blades, clumps = _tile(rng, (128, 256), 3) * 13, _tile(rng, (6, 6), 5) * 12
-    dry = np.clip(_tile(rng, (5, 5), 4) * 0.35, 0, 0.7)
-    tile = np.array(season.grass, np.float32) + (blades + clumps)
-    return np.asarray(tile * (1 - dry) + np.array([92, 130, 142], np.float32) * dry, np.float32)
-
-
-def _paved(name: str, season: Season, rng: np.random.Generator) -> NDArray[np.float32]:
-    grain, stains = _tile(rng, (256, 256), 2) * (9 if name == "asphalt" else 5), _tile(rng, (4, 4), 5) * 7
+def _tile(name: str, season: Season, rng: np.random.Generator) -> NDArray[np.float32]:
+    """[1024, 1024, 3] a surface as it is without leaves and snow."""
+    if name == "grass":
+        blades, clumps = _noise(rng, (128, 256), 3) * 13, _noise(rng, (6, 6), 5) * 12
+        tile, dry = np.array(season.grass, np.float32) + (blades + clumps), _noise(rng, (5, 5), 4)
+        dry = np.clip(dry * 0.35, 0, 0.7)
+        return np.asarray(tile * (1 - dry) + np.array([92, 130, 142], np.float32) * dry, np.float32)
+    grain, stains = _noise(rng, (256, 256), 2) * (9 if name == "asphalt" else 5), _noise(rng, (4, 4), 5) * 7
     tile = np.array(PAVING[name], np.float32) * (1 - 0.3 * season.wet) + (grain + stains)
     if name == "paving":
         bricks = rng.normal(0, 10, (32, 64)).astype(np.float32)
@@ -283,10 +282,10 @@ def _cover(tile: NDArray[np.float32], season: Season, rng: np.random.Generator, 
         for place, pick, size, tone in zip(places.tolist(), picks, sizes.tolist(), tones, strict=True):
             cv2.circle(tile, place, size, tuple(float(v * tone) for v in season.leaves[pick]), -1)
     if season.snow:
-        depth = _tile(rng, (3, 3), 6)
+        depth = _noise(rng, (3, 3), 6)
         bar = float(np.quantile(depth, 1 - season.snow * (0.22 if paved else 1.0)))
         opacity = np.clip((depth - bar) / 0.35, 0, 1)
-        white = np.array([236, 232, 228], np.float32) + _tile(rng, (32, 32), 4) * 5
+        white = np.array([236, 232, 228], np.float32) + _noise(rng, (32, 32), 4) * 5
         tile = np.asarray(tile * (1 - opacity) + white * opacity, np.float32)
     return tile
 

@@ -8,34 +8,8 @@ from operator import itemgetter
 import cv2
 import numpy as np
 
-from deepsimbad_campus import things
-from deepsimbad_campus.camera import (
-    CANVAS_SIZE,
-    CENTRE_X,
-    EYE_M,
-    FOCAL_PX,
-    HALF_VIEW,
-    HORIZON_Y,
-    NEAR_M,
-    SEEN_SIZE,
-    UPRIGHT_SIZE,
-    Array,
-    Image,
-    View,
-    fill,
-    ink,
-)  # fmt: skip
-from deepsimbad_campus.pictures import (
-    PAVING,
-    SKY_PX_PER_DEG,
-    SKY_TOP_DEG,
-    TILE_M,
-    TILE_PX,
-    draw_facade,
-    draw_ground,
-    draw_sky,
-    draw_trees,
-)  # fmt: skip
+from deepsimbad_campus import camera, pictures, things
+from deepsimbad_campus.camera import FOCAL_PX, GROUND_ROW, HEIGHT, HORIZON_Y, WIDTH, Array, Image, View, fill, ink
 from deepsimbad_campus.route import Drive, stream
 from deepsimbad_campus.season import Light, season_of
 from deepsimbad_campus.things import Shot
@@ -50,16 +24,7 @@ BANDS_M = (0.0, 4.0, 10.0, 24.0, 55.0, 1e9)
 """Distances at which a coarser picture of the ground takes over."""
 
 LONGEST_SHADOW_M = 45.0
-LABELS = {name: label for label, name in enumerate(("grass", *PAVING))}
-
-# Where the canvas's pixels look: sky rows from the top, ground rows from the first below the horizon.
-WIDTH, HEIGHT = CANVAS_SIZE
-SLOPE = (np.arange(WIDTH) - CENTRE_X) / FOCAL_PX
-RISE = (HORIZON_Y - np.arange(int(np.ceil(HORIZON_Y)) + 1))[:, None] / FOCAL_PX
-AZIMUTH_DEG = np.rad2deg(np.arctan(SLOPE))
-ELEVATION_DEG = np.rad2deg(np.arctan2(RISE, np.sqrt(1 + SLOPE * SLOPE)))
-GROUND_ROW = int(HORIZON_Y) + 2
-AHEAD_M = np.asarray(FOCAL_PX * EYE_M / (np.arange(GROUND_ROW, HEIGHT) - HORIZON_Y), np.float64)
+LABELS = {name: label for label, name in enumerate(("grass", *pictures.PAVING))}
 
 
 class Renderer:
@@ -69,12 +34,13 @@ class Renderer:
         self._world, self._drive = world, drive
         date, seed, number = drive.date.isoformat(), world.seed, drive.date.toordinal()
         self._season = season = season_of(drive.date, seed)
-        self._skyline, self._dome = world.skyline(), draw_sky(season, stream(seed, f"sky {date}"))
+        self._skyline, self._dome = world.skyline(), pictures.draw_sky(season, stream(seed, f"sky {date}"))
         radius = np.hypot(*np.mgrid[-GLARE_PX:GLARE_PX, -GLARE_PX:GLARE_PX]) / GLARE_PX
         self._glare = np.clip(1 - radius, 0, 1)[:, :, None] ** 3.0 * np.array(season.sun)
-        self._tiles, self._trees = draw_ground(season, date, seed), draw_trees(season, seed)
-        self._facade = lru_cache(FACADES)(partial(draw_facade, season=season, drive=number))
-        grain = stream(seed, f"grain {date}").normal(0, GRAIN, (UPRIGHT_SIZE[0] + 64, UPRIGHT_SIZE[1] + 64, 1))
+        self._tiles, self._trees = pictures.draw_ground(season, date, seed), pictures.draw_trees(season, seed)
+        self._facade = lru_cache(FACADES)(partial(pictures.draw_facade, season=season, drive=number))
+        width, height = camera.UPRIGHT_SIZE
+        grain = stream(seed, f"grain {date}").normal(0, GRAIN, (width + 64, height + 64, 1))
         self._grain = np.clip(np.repeat(grain, 3, axis=2) + 128, 0, 255).astype(np.uint8)
 
     def stored(self, frame: int) -> Image:
@@ -85,7 +51,7 @@ class Renderer:
         lean, nod = -view.roll_rad, FOCAL_PX * np.tan(view.pitch_rad)
         cos, sin = np.cos(lean), np.sin(lean)
         x, y = WIDTH / 2, HEIGHT / 2 - nod
-        (wide, tall), (width, height) = SEEN_SIZE, UPRIGHT_SIZE
+        (wide, tall), (width, height) = camera.SEEN_SIZE, camera.UPRIGHT_SIZE
         turn = np.array([[sin, cos, tall / 2 - sin * x - cos * y], [-cos, sin, wide / 2 + cos * x - sin * y]])
         seen = cv2.warpAffine(self.canvas(frame, view), turn, (tall, wide), flags=cv2.INTER_LINEAR)
         picture = cv2.resize(seen, (height, width), interpolation=cv2.INTER_LINEAR)
@@ -103,7 +69,7 @@ class Renderer:
         shot = Shot(canvas, view, light, float(drive.position_m[frame]), time_s)
         self._paint_sky(shot, frame)
         turn = (np.deg2rad(self._season.sun_azimuth_deg) - view.heading_rad + np.pi) % (2 * np.pi) - np.pi
-        x = int(CENTRE_X + FOCAL_PX * np.tan(turn))
+        x = int(camera.CENTRE_X + FOCAL_PX * np.tan(turn))
         y = int(HORIZON_Y - FOCAL_PX * np.tan(np.deg2rad(self._season.sun_elevation_deg)) / np.cos(turn))
         dazzling = abs(turn) <= 1.05 and sunshine > 0.3
         if dazzling:
@@ -118,16 +84,17 @@ class Renderer:
 
     def _paint_sky(self, shot: Shot, frame: int) -> None:
         season, light, heading = self._season, shot.light, np.rad2deg(shot.view.heading_rad)
-        rows = np.clip((SKY_TOP_DEG - ELEVATION_DEG) * SKY_PX_PER_DEG, 0, len(self._dome) - 1).astype(np.float32)
-        azimuth = AZIMUTH_DEG + (heading + DRIFT_DEG_PER_FRAME * frame) % 360
-        columns = np.broadcast_to((azimuth * SKY_PX_PER_DEG).astype(np.float32), rows.shape)
+        rows = (pictures.SKY_TOP_DEG - camera.ELEVATION_DEG) * pictures.SKY_PX_PER_DEG
+        rows = np.clip(rows, 0, len(self._dome) - 1).astype(np.float32)
+        azimuth = camera.AZIMUTH_DEG + (heading + DRIFT_DEG_PER_FRAME * frame) % 360
+        columns = np.broadcast_to((azimuth * pictures.SKY_PX_PER_DEG).astype(np.float32), rows.shape)
         sky = cv2.remap(self._dome, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
         shot.canvas[: len(sky)] = cv2.convertScaleAbs(sky, alpha=light.exposure * (0.86 + 0.14 * light.sunshine))
         woods = np.array(season.leaves[0]) * 0.5 + np.array(season.grass) * 0.2 + 30 * season.snow
         for lift, share in ((1.0, 0.62), (0.55, 0.38)):
-            angles = ((AZIMUTH_DEG + heading) % 360 * (2 - lift)) % 360
+            angles = ((camera.AZIMUTH_DEG + heading) % 360 * (2 - lift)) % 360
             height = np.deg2rad(np.interp(angles, np.arange(361), self._skyline) * lift)
-            top = HORIZON_Y - FOCAL_PX * np.tan(height) / np.cos(np.deg2rad(AZIMUTH_DEG))
+            top = HORIZON_Y - FOCAL_PX * np.tan(height) / np.cos(np.deg2rad(camera.AZIMUTH_DEG))
             corners = [[WIDTH - 1, HORIZON_Y + 3], [0, HORIZON_Y + 3]]
             outline = np.concatenate([np.stack([np.arange(WIDTH), top], axis=1), corners])
             colour = ink(woods * light.in_shade * (1 - share) + light.air * share)
@@ -147,7 +114,7 @@ class Renderer:
 
         def stand(place: Array, margin_m: float, draw: Callable[[Array], None]) -> None:
             foot = view.to_camera(place[None])[0]
-            if NEAR_M < foot[1] < SIGHT_M and abs(foot[0]) < foot[1] * HALF_VIEW + margin_m:
+            if camera.NEAR_M < foot[1] < SIGHT_M and abs(foot[0]) < foot[1] * camera.HALF_VIEW + margin_m:
                 queue.append((foot[1], partial(draw, foot)))
 
         for section in self._world.ahead(shot.position_m):
@@ -173,26 +140,24 @@ class Renderer:
     def _paint_ground(self, shot: Shot) -> None:
         light, ground, labels, shadows = shot.light, shot.canvas[GROUND_ROW:], self._labels(shot), self._shadows(shot)
         for level, (near, far) in enumerate(pairwise(BANDS_M)):
-            rows = np.flatnonzero((near <= AHEAD_M) & (far > AHEAD_M))
+            rows = np.flatnonzero((near <= camera.AHEAD_M) & (far > camera.AHEAD_M))
             band = slice(rows[0], rows[-1] + 1)
-            painted = self._surfaces(AHEAD_M[band], level, shot.view, labels[band])
-            distance = min(AHEAD_M[band].mean(), 90.0)
+            painted = self._surfaces(camera.AHEAD_M[band], level, shot.view, labels[band])
+            distance = min(camera.AHEAD_M[band].mean(), 90.0)
             ground[band] = light.shine_on(painted, light.on_ground, distance)
             cv2.copyTo(light.shine_on(painted, light.in_shade, distance), shadows[band], ground[band])
         self._mark(shot)
 
     def _surfaces(self, ahead_m: Array, level: int, view: View, labels: Image) -> Image:
         """The ground's own colours in a band of rows."""
-        scale = np.float32(TILE_PX / TILE_M / (1 << level))
+        scale = np.float32(pictures.TILE_PX / pictures.TILE_M / (1 << level))
         cos, sin = np.float32(np.cos(view.heading_rad)), np.float32(np.sin(view.heading_rad))
         ahead = ahead_m[:, None].astype(np.float32)
-        right = (ahead * SLOPE).astype(np.float32)
-        north = (ahead * cos - right * sin + np.float32(view.north_m % TILE_M)) * scale
-        east = (ahead * sin + right * cos + np.float32(view.east_m % TILE_M)) * scale
-        if (
-            max(np.abs(north).max(), np.abs(east).max()) >= 15_000
-        ):  # coordinates of a remap are 16 bits wide; the picture repeats anyway
-            side = np.float32(TILE_PX >> level)
+        right = (ahead * camera.SLOPE).astype(np.float32)
+        north = (ahead * cos - right * sin + np.float32(view.north_m % pictures.TILE_M)) * scale
+        east = (ahead * sin + right * cos + np.float32(view.east_m % pictures.TILE_M)) * scale
+        if max(np.abs(north).max(), np.abs(east).max()) >= 15_000:  # a remap's are 16 bits wide; the picture repeats
+            side = np.float32(pictures.TILE_PX >> level)
             north, east = north % side, east % side
         painted = np.zeros((*labels.shape, 3), np.uint8)
         for label in np.flatnonzero(np.bincount(labels.ravel())):
@@ -209,7 +174,7 @@ class Renderer:
         pieces = here + np.concatenate([np.arange(-4, 21, 1.5), np.arange(23, 60, 4), np.arange(62, 125, 9)])
         for section in sections:
             for outline, surface in section.patches:
-                fill(labels, shot.view.to_camera(outline), (LABELS[surface],), GROUND_ROW, cv2.LINE_8)
+                fill(labels, shot.view.to_camera(outline), (LABELS[surface],))
         for section in reversed(sections):
             first, last = max(section.stretch.start_m, here - 4), min(section.stretch.end_m, here + 125)
             if first < last:
@@ -217,7 +182,7 @@ class Renderer:
                 half, route = section.path_half_width_m, self._world.route
                 left, right = (shot.view.to_camera(route.place(where, side)) for side in (-half, half))
                 for quad in np.stack([left[:-1], left[1:], right[1:], right[:-1]], axis=1):
-                    fill(labels, quad, (LABELS[section.path_surface],), GROUND_ROW, cv2.LINE_8)
+                    fill(labels, quad, (LABELS[section.path_surface],))
         return labels
 
     def _shadows(self, shot: Shot) -> Image:
@@ -229,7 +194,7 @@ class Renderer:
         along, leaves = away / max(long, 1e-6), light.season.leaf_share
 
         def shade(outline: Array) -> None:
-            fill(mask, shot.view.to_camera(outline), (255,), GROUND_ROW, cv2.LINE_8)
+            fill(mask, shot.view.to_camera(outline), (255,))
 
         for section in self._world.ahead(shot.position_m) if light.sunshine >= 0.15 else ():
             for block in section.blocks:
@@ -256,9 +221,8 @@ class Renderer:
             first, last = route.place(along_m, right_m)
             north, east = last - first
             side = np.array([-east, north]) / max(np.hypot(north, east), 1e-6) * width_m / 2
-            fill(
-                shot.canvas, shot.view.to_camera(np.stack([first - side, last - side, last + side, first + side])), ink
-            )
+            outline = np.stack([first - side, last - side, last + side, first + side])
+            fill(shot.canvas, shot.view.to_camera(outline), ink)
 
         for section in self._world.ahead(here):
             stretch, half, road = section.stretch, section.path_half_width_m, section.road_right_m

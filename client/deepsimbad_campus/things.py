@@ -7,17 +7,18 @@ import cv2
 import numpy as np
 
 from deepsimbad_campus.camera import (
-    CANVAS_SIZE,
     FOCAL_PX,
     HALF_VIEW,
+    HEIGHT,
     NEAR_M,
+    WIDTH,
     Array,
     Colour,
     Image,
     View,
     project,
     sixteenths,
-)  # fmt: skip
+)
 from deepsimbad_campus.pictures import TREE_HEIGHT, TREE_WIDTH
 from deepsimbad_campus.route import INTERVAL_US, START_M, Drive, Route, stream
 from deepsimbad_campus.season import Light
@@ -122,7 +123,7 @@ def draw_panel(shot: Shot, levels: Sequence[Image], height_m: float, gain: Array
     height, width = levels[level].shape[:2]
     outline = np.stack([high[0], high[1], low[1], low[0]])
     left, top = np.maximum(0, outline.min(0).astype(int) - (2, 1))
-    right, bottom = np.minimum(CANVAS_SIZE, outline.max(0).astype(int) - (-3, -2))
+    right, bottom = np.minimum((WIDTH, HEIGHT), outline.max(0).astype(int) - (-3, -2))
     if left >= right or top >= bottom:
         return
     first, last = max(0, int(span[0] * width) - 1), min(width, int(np.ceil(span[1] * width)) + 1)
@@ -141,8 +142,8 @@ def draw_tree(shot: Shot, levels: Sequence[Image], tree: Tree, foot: Array) -> N
     tall = FOCAL_PX * height_m / ahead
     scale = tall / TREE_HEIGHT
     wide = TREE_WIDTH * scale
-    left, right = max(0, int(x - wide / 2)), min(CANVAS_SIZE[0], int(x + wide / 2) + 1)
-    top, bottom = max(0, int(y - tall)), min(CANVAS_SIZE[1], int(y) + 1)
+    left, right = max(0, int(x - wide / 2)), min(WIDTH, int(x + wide / 2) + 1)
+    top, bottom = max(0, int(y - tall)), min(HEIGHT, int(y) + 1)
     if left >= right or top >= bottom:
         return
     picture = levels[int(np.clip(np.log2(max(1.0, 1 / scale)), 0, len(levels) - 1))]
@@ -203,11 +204,8 @@ def draw_person(shot: Shot, walker: Walker, foot: Array) -> None:
     arms = ((-0.33, -0.22, 0.8 + swing, 1.42, coat), (0.22, 0.33, 0.8 - swing, 1.42, coat))
     feet = ((-0.14 - swing, 0.0 - swing, 0.0, 0.85, legs), (0.0 + swing, 0.14 + swing, 0.0, 0.85, legs))
     x, y = _draw_boxes(shot, (*feet, (-0.25, 0.25, 0.78, 1.46, coat), *arms), foot, unit, gain, taper=0.9)
-    head = (round(x), round(y - 1.6 * unit))
-    for colour, centre, size in (
-        ((38, 46, 60), head, 0.13),
-        ((120, 150, 196), (head[0], head[1] + round(0.03 * unit)), 0.1),
-    ):
+    (x, y), face_y = (round(x), round(y - 1.6 * unit)), round(y - 1.6 * unit) + round(0.03 * unit)
+    for colour, centre, size in (((38, 46, 60), (x, y), 0.13), ((120, 150, 196), (x, face_y), 0.1)):
         ink = shot.light.colour(colour, gain, ahead)
         cv2.circle(shot.canvas, centre, max(1, round(size * unit)), ink, -1, cv2.LINE_AA)
 

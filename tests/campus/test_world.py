@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from deepsimbad_campus.route import BLOCK, WIDEST_M, Drive, Route, drive_length_m
-from deepsimbad_campus.world import DECK, World
+from deepsimbad_campus.world import World
 
 WINTER, SUMMER = datetime.date(2012, 1, 22), datetime.date(2012, 8, 4)
 
@@ -14,14 +14,6 @@ WINTER, SUMMER = datetime.date(2012, 1, 22), datetime.date(2012, 8, 4)
 @pytest.fixture(scope="module")
 def route():
     return Route(0, 900)
-
-
-@pytest.mark.parametrize("seed", range(6))
-def test_the_route_never_comes_near_itself_again(seed):
-    where = np.arange(0, 1500, 4.0)
-    place = Route(seed, 1500).place(where)
-    distance = np.hypot(*(place[:, None] - place[None]).transpose(2, 0, 1))
-    assert distance[np.abs(where[:, None] - where[None]) > 40].min() > 18
 
 
 def test_position_is_arc_length_heading_is_the_way_it_goes_and_right_is_to_the_right(route):
@@ -126,20 +118,3 @@ def test_nothing_stands_on_the_route_and_walls_look_outward(seed):
                 for share in np.linspace(0, 1, 40):
                     assert np.hypot(*(line - feet[0] - share * along).T).min() >= 2.8
                 assert np.array([-along[1], along[0]]) @ (feet.mean(axis=0) - block.centre) > 0
-
-
-def test_every_eight_stretches_hold_every_zone_bland_and_repeated_ones_too():
-    zones = [section.zone for section in World(7, 2500).sections]
-    for first in range(0, len(zones) - len(DECK), len(DECK)):
-        assert sorted(zones[first : first + len(DECK)]) == sorted(DECK)
-
-
-def test_twins_look_alike_and_courts_do_not():
-    kinds = {"twins": [], "court": []}
-    for section in World(0, 1500).sections:
-        fronts = [style for _, style in section.facades if style.door]
-        if section.zone in kinds and len(fronts) > 3:
-            kinds[section.zone].append(len(set(fronts)) / len(fronts))
-    assert kinds["twins"]
-    assert max(kinds["twins"]) < 0.55  # a distant building or two may stand behind
-    assert min(kinds["court"]) == 1.0
