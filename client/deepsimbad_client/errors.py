@@ -196,10 +196,6 @@ class UnknownSessionError(NotFoundError, code="unknown_session"):
     """No such session, or one that ended long ago."""
 
 
-class RequestTimeoutError(ApiError, status=408, code="request_timeout"):
-    """408: the request's bytes stopped coming, so the service gave it up."""
-
-
 class ConflictError(ApiError, status=409):
     """409: the request is sound but the present state forbids it."""
 
@@ -253,10 +249,6 @@ class RetiredMapError(GoneError, code="retired_map"):
 
 class TooLargeError(ApiError, status=413):
     """413: more bytes or pixels than a limit allows."""
-
-
-class HeadersTooLargeError(TooLargeError, status=431, code="headers_too_large"):
-    """431: the request's headers, the key among them, are longer than the service takes."""
 
 
 class UnsupportedMediaTypeError(ApiError, status=415):

@@ -324,12 +324,6 @@ class ImageTooLargeError(TooLargeError):
     code = "image_too_large"
 
 
-class HeadersTooLargeError(TooLargeError):
-    """Request headers over the limit."""
-
-    code = "headers_too_large"
-
-
 class UnsupportedMediaTypeError(DeepSimbadError):
     """A missing or unsupported content type."""
 
@@ -354,16 +348,16 @@ class ForbiddenError(AccessError):
     code = "forbidden"
 
 
+class ForeignHostError(ForbiddenError):
+    """A call that a page of another host may have sent to a service that asks for no key."""
+
+    code = "foreign_host"
+
+
 class UnreadableRequestError(DeepSimbadError):
-    """Bytes that are no request."""
+    """A request that can be read in two ways."""
 
     code = "unreadable_request"
-
-
-class RequestTimeoutError(DeepSimbadError):
-    """A request whose bytes stopped coming."""
-
-    code = "request_timeout"
 
 
 class UnavailableError(DeepSimbadError):

@@ -1,18 +1,29 @@
-"""What an operator may set: one frozen object, read by the command line and the API alone."""
+"""What an operator may set: one frozen object, read by the command line and the API alone.
+
+Flags go before the environment, the environment before a file, the file before defaults.
+"""
 
 import ipaddress
+import os
 import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from difflib import get_close_matches
+from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
-from pydantic import Field, field_validator
-from pydantic_settings import BaseSettings, SettingsConfigDict
+from pydantic import Field, ValidationError, field_validator
+from pydantic_settings import BaseSettings, EnvSettingsSource, SettingsConfigDict, TomlConfigSettingsSource
+from pydantic_settings import SettingsError as UndecodableError
 
 from deepsimbad.errors import SettingsError
 from deepsimbad.evaluators.compute import DEFAULT_WEIGHTS_DIR, Compute, Device, Runtime
 from deepsimbad.jobs.child import JobPriority
 
 MEBIBYTE = 1024 * 1024
+CONFIG_VARIABLE = "DEEPSIMBAD_CONFIG"
+CONFIG_FILE = Path("deepsimbad.toml")
 _ORIGIN = re.compile(r"\*|[a-z][a-z0-9+.-]*://[^/\s*?#@]+")
 
 
@@ -20,7 +31,7 @@ class Settings(BaseSettings):
     """Settings of the service. Each has an environment variable: `DEEPSIMBAD_` and its name in capitals.
 
     Arguments given to the constructor go before the environment, the environment before the defaults;
-    `settings_sources.load_settings` reads a settings file as well.
+    `load_settings` reads a settings file as well.
     """
 
     model_config = SettingsConfigDict(
@@ -37,6 +48,9 @@ class Settings(BaseSettings):
     allow_open: Annotated[
         bool,
         Field(description="Serve without keys on an address other machines can reach. Off: refuse to start."),
+    ] = False
+    require_keys: Annotated[
+        bool, Field(description="Refuse to start before a key was created, on a loopback address too.")
     ] = False
     log_level: Annotated[
         str, Field(description="Least level that is logged.", pattern="^(DEBUG|INFO|WARNING|ERROR)$")
@@ -62,7 +76,7 @@ class Settings(BaseSettings):
     max_uploads: Annotated[int, Field(description="Batches of frames on their way at once.", ge=1)] = 4
     max_event_streams: Annotated[int, Field(description="Job event streams open at once.", ge=1)] = 64
     max_connections: Annotated[
-        int, Field(description="Connections open at once; for one more the longest silent is closed.", ge=1)
+        int, Field(description="Connections, or requests, open at once; with one more all are answered 503.", ge=1)
     ] = 1024
     max_domains: Annotated[int, Field(description="Domains that may exist.", ge=1)] = 1000
     rate_limit_per_s: Annotated[
@@ -74,18 +88,11 @@ class Settings(BaseSettings):
     cors_origins: Annotated[
         tuple[str, ...], Field(description="Origins whose pages may call the service (CORS), a JSON list; empty: none.")
     ] = ()
-    tls_certificate: Annotated[Path | None, Field(description="PEM file to serve HTTPS with; none: HTTP.")] = None
+    tls_certificate: Annotated[
+        Path | None, Field(description="PEM file to serve HTTPS with, its key in it or in `tls_key`; none: HTTP.")
+    ] = None
     tls_key: Annotated[Path | None, Field(description="PEM file of the certificate's key.")] = None
 
-    header_timeout_s: Annotated[
-        float, Field(description="A connection is closed where a request's headers take longer.", gt=0)
-    ] = 10.0
-    stall_timeout_s: Annotated[
-        float,
-        Field(
-            description="A connection is closed where a body's, or an answer's, bytes stop moving for so long.", gt=0
-        ),
-    ] = 30.0
     keep_alive_s: Annotated[int, Field(description="An idle connection is closed after this.", ge=1)] = 75
     shutdown_grace_s: Annotated[
         int, Field(description="Requests under way at shutdown get this long to finish.", ge=0)
@@ -168,12 +175,7 @@ class Settings(BaseSettings):
     @property
     def is_loopback(self) -> bool:
         """Whether only this machine can reach the service."""
-        if self.host == "localhost":
-            return True
-        try:
-            return ipaddress.ip_address(self.host).is_loopback
-        except ValueError:
-            return False
+        return is_loopback(self.host)
 
     def check_exposure(self, n_keys: int) -> None:
         """Refuse to be reachable from other machines while the service asks for no key.
@@ -182,8 +184,15 @@ class Settings(BaseSettings):
             n_keys: Keys that were ever created, revoked ones too.
 
         Raises:
-            SettingsError: There is none, `host` is not a loopback address and `allow_open` is off.
+            SettingsError: There is none, and `require_keys` is on; or `host` is not a loopback address and
+                `allow_open` is off.
         """
+        if n_keys == 0 and self.require_keys:
+            raise SettingsError(
+                "refusing to serve without keys, because require_keys is set: make one with `deepsimbad keys create "
+                "--scope admin`; if there were keys, this is not their data directory",
+                setting="require_keys",
+            )
         if n_keys == 0 and not self.is_loopback and not self.allow_open:
             raise SettingsError(
                 f"refusing to serve without keys on {self.host}, which other machines can reach: make a key with "
@@ -191,3 +200,142 @@ class Settings(BaseSettings):
                 "the network is trusted",
                 host=self.host,
             )
+
+
+def is_loopback(host: str) -> bool:
+    """Whether a name or an address means this machine alone."""
+    try:
+        return host == "localhost" or ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+# Where settings come from
+
+
+class Origin(StrEnum):
+    """What decided a setting, strongest first."""
+
+    FLAG = "flag"
+    ENVIRONMENT = "environment"
+    FILE = "file"
+    DEFAULT = "default"
+
+
+@dataclass(frozen=True)
+class TracedSettings:
+    """Settings, and where each comes from.
+
+    Attributes:
+        settings: The settings.
+        origins: What decided each, by name.
+        file: The settings file that was read, if any.
+    """
+
+    settings: Settings
+    origins: Mapping[str, Origin]
+    file: Path | None
+
+
+def load_settings(config: Path | None = None, **given: object) -> Settings:
+    """As `trace_settings`, without the origins."""
+    return trace_settings(config, **given).settings
+
+
+def trace_settings(config: Path | None = None, **given: object) -> TracedSettings:
+    """Settings from what is given, the environment, the settings file and the defaults, in this order.
+
+    Args:
+        config: The settings file; None: the one that $DEEPSIMBAD_CONFIG names, else ./deepsimbad.toml if it is there.
+        **given: Settings by name, as flags give them; those that are None count as not given.
+
+    Raises:
+        SettingsError: The file cannot be read, a name is unknown or a value cannot be used.
+    """
+    file = _settings_file(config)
+    sources: dict[Origin, dict[str, Any]] = {
+        Origin.FLAG: {name: value for name, value in given.items() if value is not None},
+        Origin.ENVIRONMENT: _environment(),
+        Origin.FILE: {} if file is None else _read(file),
+        Origin.DEFAULT: {name: field.default for name, field in Settings.model_fields.items()},
+    }
+    for origin, values in sources.items():
+        for name in values:
+            if name not in Settings.model_fields:
+                raise _unknown(name, _place(origin, name, file))
+    origins = {name: next(origin for origin in Origin if name in sources[origin]) for name in Settings.model_fields}
+    values = {name: sources[origin][name] for name, origin in origins.items() if origin is not Origin.DEFAULT}
+    try:
+        settings = Settings(**values)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        name = str(first["loc"][0]) if first["loc"] else "?"
+        place = _place(origins.get(name, Origin.DEFAULT), name, file)
+        raise SettingsError(f"setting {name!r} of {place} cannot be used: {first['msg']}", setting=name) from error
+    return TracedSettings(settings, origins, file)
+
+
+def unknown_variables() -> list[str]:
+    """The variables of the environment that look like settings and are none: perhaps mistyped."""
+    others = {
+        CONFIG_VARIABLE,
+        "DEEPSIMBAD_URL",
+        "DEEPSIMBAD_API_KEY",
+        "DEEPSIMBAD_REAL_DATA",
+    }  # the client's, the tests'
+    meant = {variable_of(name) for name in Settings.model_fields} | others
+    prefix = Settings.model_config["env_prefix"]
+    return sorted(name for name in os.environ if name.startswith(prefix) and name not in meant)
+
+
+def variable_of(name: str) -> str:
+    """The environment variable of a setting."""
+    return f"{Settings.model_config['env_prefix']}{name.upper()}"
+
+
+def _settings_file(config: Path | None) -> Path | None:
+    """The file to read; a file that was asked for must be there, the one of the working folder need not."""
+    asked_by = "--config"
+    if config is None and os.environ.get(CONFIG_VARIABLE):
+        config, asked_by = Path(os.environ[CONFIG_VARIABLE]), CONFIG_VARIABLE
+    if config is None:
+        return CONFIG_FILE if CONFIG_FILE.exists() else None
+    if not config.exists():
+        raise SettingsError(f"there is no settings file {config}, which {asked_by} names", file=str(config))
+    return config
+
+
+def _read(file: Path) -> dict[str, Any]:
+    if not file.is_file():
+        raise SettingsError(f"{file} is no settings file", file=str(file))
+    try:
+        return TomlConfigSettingsSource(Settings, toml_file=file)()
+    except OSError as error:
+        raise SettingsError(f"settings file {file} cannot be read: {error.strerror}", file=str(file)) from error
+    except ValueError as error:  # not TOML, or not UTF-8
+        raise SettingsError(f"settings file {file} is not TOML: {error}", file=str(file)) from error
+
+
+def _environment() -> dict[str, Any]:
+    try:
+        return EnvSettingsSource(Settings)()
+    except UndecodableError as error:
+        name = next((name for name in Settings.model_fields if f'"{name}"' in str(error)), "?")
+        place = _place(Origin.ENVIRONMENT, name, None)
+        raise SettingsError(f"setting {name!r} of {place} cannot be used: not a JSON list", setting=name) from error
+
+
+def _place(origin: Origin, name: str, file: Path | None) -> str:
+    places = {
+        Origin.FLAG: "the command line",
+        Origin.ENVIRONMENT: f"the environment ({variable_of(name)})",
+        Origin.FILE: str(file),
+        Origin.DEFAULT: "the defaults",
+    }
+    return places[origin]
+
+
+def _unknown(name: str, place: str) -> SettingsError:
+    near = get_close_matches(name.lower(), Settings.model_fields, 1)
+    meant = f": did you mean {near[0]!r}?" if near else "; `deepsimbad settings` lists those there are"
+    return SettingsError(f"there is no setting {name!r}, which stands in {place}{meant}", setting=name)

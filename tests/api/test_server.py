@@ -1,15 +1,24 @@
-"""A service that cannot start says why."""
+"""A service that cannot start says why; over TLS it serves; its log lines are JSON, whatever is in them."""
 
+import json
 import logging
+import os
 import socket
+import ssl
+import subprocess
+import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from deepsimbad.api.server import serve
-from deepsimbad.errors import UnavailableError
+from deepsimbad.api.server import JsonFormatter, configure_logging, serve
+from deepsimbad.errors import SettingsError, UnavailableError
 from deepsimbad.settings import Settings
+
+FILES = Path(__file__).parent / "tls"
+CERTIFICATE, KEY = FILES / "certificate.pem", FILES / "key.pem"
 
 
 @pytest.fixture(autouse=True)
@@ -37,3 +46,101 @@ def test_a_port_that_is_taken(tmp_path: Path) -> None:
         port = taken.getsockname()[1]
         with pytest.raises(UnavailableError, match=f"cannot listen on 127.0.0.1:{port}"):
             serve(Settings(data_dir=tmp_path, port=port))
+
+
+@pytest.mark.parametrize(
+    ("host", "why"), [("192.0.2.1", "assign requested address"), ("no.such.host.invalid", r"name|resolution|service")]
+)
+def test_an_address_that_is_not_ours(tmp_path: Path, host: str, why: str) -> None:
+    with pytest.raises(UnavailableError, match=f"cannot listen on {host}:0: .*(?i:{why})"):
+        serve(Settings(data_dir=tmp_path, host=host, port=0, allow_open=True))
+
+
+@pytest.mark.parametrize(
+    ("certificate", "key"),
+    [
+        (None, KEY),
+        (FILES / "none.pem", KEY),
+        (CERTIFICATE, FILES / "none.pem"),
+        (CERTIFICATE, FILES / "other_key.pem"),
+        (KEY, CERTIFICATE),
+        (CERTIFICATE, FILES / "locked_key.pem"),
+    ],
+)
+def test_a_certificate_that_cannot_be_used(tmp_path: Path, certificate: Path | None, key: Path) -> None:
+    with pytest.raises(SettingsError, match="tls_certificate") as caught:
+        serve(Settings(data_dir=tmp_path / "data", port=0, tls_certificate=certificate, tls_key=key))
+    assert caught.value.hints["setting"] == "tls_certificate"
+    assert not (tmp_path / "data").exists()
+
+
+@pytest.mark.slow
+def test_the_service_on_https(tmp_path: Path) -> None:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "deepsimbad", "serve", "--data-dir", str(tmp_path / "data"), "--port", str(port)],
+        env={**os.environ, "DEEPSIMBAD_TLS_CERTIFICATE": str(CERTIFICATE), "DEEPSIMBAD_TLS_KEY": str(KEY)},
+        stderr=subprocess.DEVNULL,
+        cwd=tmp_path,
+    )
+    context = ssl.create_default_context(cafile=CERTIFICATE)
+    answer = b""
+    try:
+        for _ in range(600):
+            try:
+                with (
+                    socket.create_connection(("127.0.0.1", port), timeout=20) as connection,
+                    context.wrap_socket(connection, server_hostname="localhost") as secured,
+                ):
+                    secured.sendall(b"GET /readyz HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n")
+                    answer = secured.recv(65536)
+                    break
+            except OSError:
+                time.sleep(0.1)
+        assert answer.startswith(b"HTTP/1.1 200 ")
+        process.terminate()
+        assert process.wait(30) == 0
+    finally:
+        process.kill()
+        process.wait()
+
+
+# Log lines
+
+
+def test_a_line_holds_message_extras_and_exception() -> None:
+    record = logging.LogRecord("a.b", logging.WARNING, "file", 1, "two %s", ("words",), None)
+    record.request_id = "r1"
+    record.odd = {1, 2}
+    line = json.loads(JsonFormatter().format(record))
+    assert (line["level"], line["logger"], line["message"]) == ("WARNING", "a.b", "two words")
+    assert line["request_id"] == "r1"
+    assert line["odd"] == "{1, 2}"
+    assert line["time"].endswith("Z")
+    assert "exception" not in line
+
+
+def test_an_exception_stays_on_one_line() -> None:
+    try:
+        raise ValueError("lone \ud800\nsurrogate")
+    except ValueError as error:
+        record = logging.LogRecord("a", logging.ERROR, "f", 1, "m", (), (ValueError, error, error.__traceback__))
+    line = JsonFormatter().format(record)
+    assert "\n" not in line
+    assert line.isascii()
+    assert "ValueError" in json.loads(line)["exception"]
+
+
+def test_configuring_keeps_uvicorns_access_lines_out() -> None:
+    root, ours = logging.getLogger(), logging.getLogger("deepsimbad")
+    kept = root.handlers[:], root.level, ours.level
+    try:
+        configure_logging("ERROR")
+        assert not logging.getLogger("uvicorn.access").isEnabledFor(logging.INFO)
+        assert not ours.isEnabledFor(logging.WARNING)
+    finally:
+        root.handlers[:], ours.level = kept[0], kept[2]
+        root.setLevel(kept[1])
+        ours.setLevel(kept[2])

@@ -10,8 +10,7 @@ from starlette.testclient import TestClient
 from deepsimbad.api.app import create_app
 from deepsimbad.api.server import serve
 from deepsimbad.errors import SettingsError
-from deepsimbad.settings import Settings
-from deepsimbad.settings_sources import Origin, load_settings, trace_settings, unknown_variables
+from deepsimbad.settings import Origin, Settings, load_settings, trace_settings, unknown_variables
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.records import KeyScope
 
@@ -92,7 +91,7 @@ def test_the_file_is_that_of_the_flag_the_environment_or_here(monkeypatch: pytes
         (b"prot = 1", "no setting 'prot', which stands in bad.toml: did you mean 'port'"),
         (b"[server]\nport = 1", "no setting 'server', which stands in bad.toml"),
         (b"port = 70000", "setting 'port' of bad.toml cannot be used"),
-        (b"header_timeout_s = nan", "setting 'header_timeout_s' of bad.toml cannot be used"),
+        (b"session_ttl_s = nan", "setting 'session_ttl_s' of bad.toml cannot be used"),
         (b"port = ", "bad.toml is not TOML"),
         (b"host = '\xff'", "bad.toml is not TOML"),
         (b"port = 1\nport = 2", "bad.toml is not TOML"),
@@ -160,6 +159,17 @@ def test_an_existing_folder_without_keys_is_refused_on_other_addresses(tmp_path:
     app = create_app(Settings(host="::", data_dir=tmp_path))
     with pytest.raises(SettingsError, match="without keys"), TestClient(app):
         pass
+
+
+def test_keys_may_be_required_on_loopback_too(tmp_path: Path) -> None:
+    settings = Settings(require_keys=True, data_dir=tmp_path)
+    with pytest.raises(SettingsError, match="require_keys is set") as caught, TestClient(create_app(settings)):
+        pass
+    assert caught.value.hints == {"setting": "require_keys"}
+    with Catalog.open(tmp_path) as catalog:
+        catalog.create_key(KeyScope.ADMIN)
+    with TestClient(create_app(settings)) as client:
+        assert client.get("/v1/domains").status_code == 401
 
 
 @pytest.mark.parametrize("origin", ["https://map.example.org", "http://localhost:5173", "*", "app://robot"])

@@ -9,7 +9,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -145,6 +145,20 @@ class Robot:
     n_answered: int = 0
     faults: list[str] = field(default_factory=list)
     stopped: threading.Event = field(default_factory=threading.Event)
+    may_go: threading.Event = field(default_factory=threading.Event)
+    is_waiting: threading.Event = field(default_factory=threading.Event)
+
+    def __post_init__(self) -> None:
+        self.may_go.set()
+
+    @contextlib.contextmanager
+    def paused(self) -> Iterator[None]:
+        """It asks nothing inside the block."""
+        self.is_waiting.clear()
+        self.may_go.clear()
+        assert self.is_waiting.wait(30)
+        yield
+        self.may_go.set()
 
     def drive(self) -> None:
         connection = http.client.HTTPConnection("127.0.0.1", self.served.port, timeout=30)
@@ -161,6 +175,9 @@ class Robot:
         try:
             session_id = ask("/v1/domains/ready/sessions", {})["session_id"]
             while not self.stopped.is_set():
+                if not self.may_go.is_set():
+                    self.is_waiting.set()
+                    assert self.may_go.wait(120)
                 ask("/v1/domains/ready/localizations", {"ranked_landmarks": [3, 1, 2]})
                 ask(f"/v1/sessions/{session_id}/observations", {"ranked_landmarks": [1, 2]})
                 self.n_answered += 2

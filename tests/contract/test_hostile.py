@@ -4,10 +4,8 @@ import contextlib
 import gzip
 import io
 import json
-import socket
 import struct
 import threading
-import time
 import zipfile
 import zlib
 from collections.abc import Iterator
@@ -21,7 +19,7 @@ from .served import Robot, Served, make_ready_domain, until
 
 pytestmark = pytest.mark.slow
 
-HEADER_S, STALL_S, MAX_CONNECTIONS, MAX_REQUESTS = 1.0, 1.5, 100, 16
+MAX_CONNECTIONS, MAX_REQUESTS = 100, 16
 MEBIBYTE = 1024 * 1024
 MOST_PEAK_MIB = 120  # that one attack may cost for a moment; what decoders and batches may take is more
 READY = "/v1/domains/ready/localizations"
@@ -39,8 +37,6 @@ def served(data_dir: Path) -> Iterator[Served]:
     made = Served.start(
         data_dir,
         data_dir.parent / "log",
-        header_timeout_s=HEADER_S,
-        stall_timeout_s=STALL_S,
         max_connections=MAX_CONNECTIONS,
         max_requests=MAX_REQUESTS,
         max_batch_bytes=64 * MEBIBYTE,
@@ -85,7 +81,12 @@ def _nothing_is_kept(served: Served, robot: Robot) -> Iterator[None]:
 
 
 def request(method: str, path: str, body: bytes = b"", **headers: str) -> bytes:
-    sent = {"Host": "x", "Connection": "close", "Content-Type": "application/json", "Content-Length": str(len(body))}
+    sent = {
+        "Host": "127.0.0.1",
+        "Connection": "close",
+        "Content-Type": "application/json",
+        "Content-Length": str(len(body)),
+    }
     sent |= {name.replace("_", "-"): value for name, value in headers.items()}
     lines = [f"{method} {path} HTTP/1.1", *(f"{name}: {value}" for name, value in sent.items() if value), "", ""]
     return "\r\n".join(lines).encode("utf-8", "surrogateescape") + body
@@ -195,9 +196,6 @@ def test_packed_bodies_are_not_unpacked(served: Served) -> None:
         kind = "application/octet-stream" if path == BATCH else "application/json"
         status, problem = ask(served, "POST", path, bomb, Content_Encoding=coding, Content_Type=kind)
         assert (status, problem["code"], problem["allowed"]) == (415, "unsupported_media_type", ["identity"])
-    head = request("POST", READY, Content_Length="", Transfer_Encoding="gzip, chunked")
-    status, problem = parsed(served.tell(head + b"5\r\nxxxxx\r\n0\r\n\r\n"))
-    assert (status, problem["code"], problem["allowed"]) == (415, "unsupported_media_type", ["chunked"])
 
 
 def batch_of(n_noughts: int) -> bytes:
@@ -253,140 +251,85 @@ def test_ten_thousand_chunks_of_one_byte(served: Served, robot: Robot) -> None:
     assert answer.startswith(b"HTTP/1.1 200 ")
 
 
-def test_unfinished_heads_on_many_connections(served: Served, robot: Robot) -> None:
-    """Slow loris: each sends a header now and then, and never the last."""
-    with contextlib.ExitStack() as stack:
-        connections = [stack.enter_context(served.connect()) for _ in range(MAX_CONNECTIONS - 20)]
-        for connection in connections:
-            connection.sendall(b"GET / HTTP/1.1\r\nHost: x\r\n")
-        robot.answered_more(100)
-        for _ in range(4):
-            time.sleep(HEADER_S / 2)
-            for connection in connections:
-                with contextlib.suppress(OSError):
-                    connection.sendall(b"X-A: b\r\n")
-            robot.answered_more(10)
-        for connection in connections:
-            answer = b""
-            with contextlib.suppress(ConnectionError):
-                while more := connection.recv(65536):
-                    answer += more
-            assert parsed(answer)[1]["code"] == "request_timeout"
-
-
 def test_unfinished_bodies_on_many_connections_take_nobodys_turn(served: Served, robot: Robot) -> None:
     """Far more than may be under way at once."""
     with contextlib.ExitStack() as stack:
-        n_held = 4 * MAX_REQUESTS
-        connections = [stack.enter_context(served.connect()) for _ in range(n_held)]
+        connections = [stack.enter_context(served.connect()) for _ in range(4 * MAX_REQUESTS)]
         for connection in connections:
             connection.sendall(request("POST", READY, Content_Length="1000000") + b"{")
-        for _ in range(6):
-            time.sleep(STALL_S / 4)
-            for connection in connections:
-                connection.sendall(b" ")
-            robot.answered_more(20)
-        for connection in connections:
-            answer = b""
-            with contextlib.suppress(ConnectionError):
-                while more := connection.recv(65536):
-                    answer += more
-            assert parsed(answer)[1]["code"] == "request_timeout"
+        robot.answered_more(100)
 
 
-def test_more_connections_than_may_be(served: Served, robot: Robot) -> None:
-    with contextlib.ExitStack() as stack:
-        held = [stack.enter_context(served.connect()) for _ in range(2 * MAX_CONNECTIONS)]
-        robot.answered_more(50)  # those that are there go on
-        assert ask(served, "GET", "/healthz")[0] == 200  # and who has something to say is let in
-        for connection in held:
-            with contextlib.suppress(ConnectionError):
-                assert connection.recv(1) == b""
-    assert ask(served, "GET", "/healthz")[0] == 200
-
-
-def test_answers_that_nobody_reads(served: Served, robot: Robot) -> None:
-    ask_much = request("GET", "/openapi.json", Connection="") * 40
-    with contextlib.ExitStack() as stack:
-        connections = []
-        for _ in range(20):
-            connection = stack.enter_context(socket.socket())
-            connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-            connection.connect(("127.0.0.1", served.port))
-            connection.settimeout(0.05)
-            with contextlib.suppress(TimeoutError, ConnectionError):
-                for _ in range(20):
-                    connection.sendall(ask_much)
-            connections.append(connection)
-        robot.answered_more(50)
-        n_sockets = served.n_sockets
-        until(lambda: served.n_sockets <= n_sockets - len(connections) + 2)
+def test_with_more_connections_than_may_be_all_are_told_so(served: Served, robot: Robot) -> None:
+    """Plain words of the server: an operator's proxy keeps so many from coming."""
+    with robot.paused(), contextlib.ExitStack() as stack:
+        for _ in range(MAX_CONNECTIONS):
+            stack.enter_context(served.connect())
+        asked = request("GET", "/healthz")
+        until(lambda: served.tell(asked).startswith(b"HTTP/1.1 503 "))
+    until(lambda: served.tell(asked).startswith(b"HTTP/1.1 200 "))
 
 
 # Heads
 
 
+LINE, HOST = b"GET / HTTP/1.1\r\n", b"Host: localhost\r\n"
+POST = b"POST / HTTP/1.1\r\n" + HOST
+
+
 @pytest.mark.parametrize(
-    ("head", "status", "code"),
+    "head",
     [
-        (b"GET /" + b"a" * MEBIBYTE + b" HTTP/1.1\r\n\r\n", 431, "headers_too_large"),
-        (b"GET /v1/domains?" + b"a=b&" * 100_000 + b" HTTP/1.1\r\n\r\n", 431, "headers_too_large"),
-        (b"GET / HTTP/1.1\r\nA: " + b"a" * MEBIBYTE + b"\r\n\r\n", 431, "headers_too_large"),
-        (b"GET / HTTP/1.1\r\n" + b"A" * MEBIBYTE + b": b\r\n\r\n", 431, "headers_too_large"),
-        (b"GET / HTTP/1.1\r\n" + b"A: b\r\n" * 100_000 + b"\r\n", 431, "headers_too_large"),
-        (b"GET / HTTP/1.1\nHost: x\n\n", 400, "unreadable_request"),
-        (b"GET /v1/domains HTTP/1.1\r\nHost: x\n\r\n", 400, "unreadable_request"),
-        (b"GET /v1/\x00 HTTP/1.1\r\n\r\n", 400, "unreadable_request"),
-        (b"GET / HTTP/1.1\r\nHost: \x00\r\n\r\n", 400, "unreadable_request"),
-        (
-            b"POST / HTTP/1.1\r\nContent-Length: 5\r\nTransfer-Encoding: chunked\r\n\r\n0\r\n\r\n",
-            400,
-            "unreadable_request",
-        ),
-        (b"POST / HTTP/1.1\r\nContent-Length: 5\r\nContent-Length: 6\r\n\r\nhello!", 400, "unreadable_request"),
-        (b"POST / HTTP/1.1\r\nContent-Length: five\r\n\r\nhello", 400, "unreadable_request"),
-        (b"POST / HTTP/1.1\r\nContent-Length: 18446744073709551616\r\n\r\nhello", 400, "unreadable_request"),
-        (b"POST / HTTP/1.1\r\nContent-Length: 18446744073709551615\r\n\r\nhello", 413, "body_too_large"),
-        (b"POST / HTTP/1.1\r\nTransfer-Encoding: xchunked\r\n\r\nhello", 400, "unreadable_request"),
-        (b"POST / HTTP/1.1\r\nTransfer-Encoding: chunked\r\n\r\nxyz\r\n", 400, "unreadable_request"),
-        (b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03", 400, "unreadable_request"),
-        (b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n", 400, "unreadable_request"),
-        (b"SSH-2.0-OpenSSH_9.6\r\n", 400, "unreadable_request"),
-        (bytes(1000), 400, "unreadable_request"),
+        b"GET /" + b"a" * MEBIBYTE + b" HTTP/1.1\r\n\r\n",
+        b"GET /v1/domains?" + b"a=b&" * 100_000 + b" HTTP/1.1\r\n\r\n",
+        LINE + HOST + b"A: " + b"a" * MEBIBYTE + b"\r\n\r\n",
+        LINE + HOST + b"A" * MEBIBYTE + b": b\r\n\r\n",
+        LINE + HOST + b"A: b\r\n" * 100_000 + b"\r\n",
+        LINE + b"\r\n",  # no Host
+        LINE + HOST + HOST + b"\r\n",
+        b"GET /v1/\x00 HTTP/1.1\r\n" + HOST + b"\r\n",
+        LINE + b"Host: \x00\r\n\r\n",
+        POST + b"Content-Length: 5\r\nContent-Length: 6\r\n\r\nhello!",
+        POST + b"Content-Length: five\r\n\r\nhello",
+        POST + b"Content-Length: -1\r\n\r\nhello",
+        POST + b"Transfer-Encoding: xchunked\r\n\r\nhello",
+        POST + b"Transfer-Encoding: gzip, chunked\r\n\r\n5\r\nhello\r\n0\r\n\r\n",
+        b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03" + bytes(70_000),
+        b"SSH-2.0-OpenSSH_9.6\r\n\r\n",
+        bytes(1000) + b"\r\n\r\n",
     ],
-    ids=range(20),
+    ids=range(17),
 )
-def test_heads(served: Served, head: bytes, status: int, code: str) -> None:
+def test_what_is_no_request_is_answered_400_in_plain_words(served: Served, head: bytes) -> None:
     answer = served.tell(head)
     assert answer.count(b"HTTP/1.1 ") == 1
-    assert parsed(answer)[0] == status
-    assert parsed(answer)[1]["code"] == code
+    assert answer.startswith((b"HTTP/1.1 400 ", b"HTTP/1.1 501 "))
+
+
+def test_a_content_length_that_no_body_has(served: Served) -> None:
+    status, problem = parsed(served.tell(POST + b"Content-Length: 18446744073709551615\r\nConnection: close\r\n\r\n"))
+    assert (status, problem["code"]) == (413, "body_too_large")
+
+
+def test_two_ways_of_ending_a_body_at_once(served: Served) -> None:
+    """Whoever stands between might take the other one, and see another request behind it."""
+    smuggled = b"0\r\n\r\n" + request("GET", "/v1/domains")
+    both = b"Content-Length: %d\r\nTransfer-Encoding: chunked\r\n\r\n" % len(smuggled)
+    answer = served.tell(POST + both + smuggled)
+    assert answer.count(b"HTTP/1.1 ") == 1
+    assert parsed(answer)[1]["code"] == "unreadable_request"
 
 
 def test_a_content_length_that_is_too_short_makes_garbage_of_the_rest(served: Served) -> None:
     body = b'{"ranked_landmarks": [1, 2]}'
-    sent = request("POST", READY, body, Connection="") + body
-    first, second = [b"HTTP/1.1 " + one for one in served.tell(sent).split(b"HTTP/1.1 ")[1:]]
-    assert first.startswith(b"HTTP/1.1 200 ")
-    assert parsed(second)[1]["code"] == "unreadable_request"
-
-
-def test_a_content_length_that_is_too_long_stalls(served: Served) -> None:
-    status, problem = ask(served, "POST", READY, b"{}", Content_Length="50")
-    assert (status, problem["code"]) == (408, "request_timeout")
+    answers = served.tell(request("POST", READY, body, Connection="") + body + b"\r\n\r\n").split(b"HTTP/1.1 ")[1:]
+    assert [answer[:3] for answer in answers] == [b"200", b"400"]
 
 
 def test_garbage_behind_requests(served: Served) -> None:
     good = request("POST", READY, b'{"ranked_landmarks": [1]}', Connection="")
-    *answers, last = served.tell(good * 10 + b"garbage\r\n\r\n" + good).split(b"HTTP/1.1 ")[1:]
-    assert [answer[:3] for answer in answers] == [b"200"] * 10
-    assert parsed(b"HTTP/1.1 " + last)[1]["code"] == "unreadable_request"
-
-
-def test_ten_thousand_requests_at_once_on_one_connection(served: Served) -> None:
-    answers = served.tell(request("GET", "/healthz", Connection="") * 10_000).split(b"HTTP/1.1 ")[1:]
-    assert len(answers) < 200
-    assert parsed(b"HTTP/1.1 " + answers[-1])[1]["code"] == "overloaded"
+    answers = served.tell(good * 10 + b"garbage\r\n\r\n" + good).split(b"HTTP/1.1 ")[1:]
+    assert [answer[:3] for answer in answers] == [b"200"] * 10 + [b"400"]
 
 
 # Names
@@ -497,7 +440,6 @@ def test_headers_that_are_none_of_ours(served: Served) -> None:
         "Accept": ",".join(["application/octet-stream;q=nan"] * 1000),
         "Authorization": "Bearer " + "a" * 10_000,
         "X-API-Key": "' OR 1=1 --",
-        "Host": "../../etc/passwd",
         "Range": "bytes=" + ",".join(f"{i}-{i}" for i in range(1000)),
         "X-Forwarded-For": "x" * 1000,
         "Expect": "the-unexpected",

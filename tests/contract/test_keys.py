@@ -1,20 +1,17 @@
 """A service with keys: every operation asks for one, nobody is asked twice, and changes count without a restart."""
 
-import importlib
 import json
 import logging
 import re
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from pkgutil import iter_modules
 from typing import Any
 
 import pytest
 from starlette.testclient import TestClient
 
-from deepsimbad.api import routes
-from deepsimbad.api.app import create_app
+from deepsimbad.api.app import _ROUTERS, create_app
 from deepsimbad.cli import run as deepsimbad
 from deepsimbad.jobs.runner import InThisProcess
 from deepsimbad.store.catalog import Catalog
@@ -88,18 +85,14 @@ def test_the_document_tells_how_to_send_a_key_and_what_refusals_look_like(keyed:
     schemes = document["components"]["securitySchemes"]
     assert (schemes["bearer"]["type"], schemes["bearer"]["scheme"]) == ("http", "bearer")
     assert (schemes["api_key"]["in"], schemes["api_key"]["name"]) == ("header", "X-API-Key")
-    for method, path, operation in operations(keyed.client):
+    for _, path, operation in operations(keyed.client):
         declared = set(operation["responses"])
-        assert "431" in declared, path
-        assert {"401", "429"} <= declared or not path.startswith("/v1/"), path
-        assert ("403" in declared) == path.startswith("/v1/admin/"), path
-        assert ("408" in declared) == (method in {"POST", "PUT"}), path
+        assert ({"401", "403", "429"} <= declared) == path.startswith("/v1/"), path
         assert "WWW-Authenticate" in operation["responses"].get("401", {"headers": "WWW-Authenticate"})["headers"]
 
 
 def test_nothing_outside_v1_is_served_but_what_needs_no_key(keyed: Keyed) -> None:
-    modules = [importlib.import_module(f"{routes.__name__}.{found.name}") for found in iter_modules(routes.__path__)]
-    served = {route.path for module in modules for route in module.router.routes}
+    served = {route.path for router in _ROUTERS for route in router.routes}
     assert len(served) > 20
     assert {path for path in served if not path.startswith("/v1/")} <= WITHOUT_KEY
     assert {path for _, path, _ in operations(keyed.client) if not path.startswith("/v1/")} <= WITHOUT_KEY
@@ -152,7 +145,6 @@ def test_a_large_body_without_a_key_is_answered_and_not_read(keyed: Keyed) -> No
 
     answer = keyed.client.put("/v1/admin/domains/ready/traverses/drive/frames/0?position_m=0", content=pieces())
     check(answer, 401, "unauthorized")
-    assert answer.headers["connection"] == "close"
 
 
 def test_log_lines_name_key_and_domain_and_never_the_secret(keyed: Keyed, caplog: pytest.LogCaptureFixture) -> None:

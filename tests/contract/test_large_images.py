@@ -3,21 +3,14 @@
 import http.client
 import io
 import json
-import signal
-import struct
 import threading
-import zlib
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-import cv2
 import httpx2
-import numpy as np
 import pytest
 from PIL import Image as Pillow
-
-from deepsimbad.api.native_lines import LINES_A_MINUTE
 
 from .conftest import encoded, picture
 from .served import Served, make_ready_domain
@@ -104,37 +97,3 @@ def test_many_just_under_the_limit_at_once(served: Served) -> None:
     # And none of it is kept: each is answered when it comes alone.
     for number, (kind, body) in enumerate(bombs.items()):
         assert sent(served, "PUT", f"{FRAMES}/{100 + number}?position_m=0", body, kind) == (201, "")
-
-
-def png_with_a_damaged_text() -> bytes:
-    def chunk(name: bytes, content: bytes) -> bytes:
-        return struct.pack(">I", len(content)) + name + content + struct.pack(">I", zlib.crc32(name + content))
-
-    header = chunk(b"IHDR", struct.pack(">IIBBBBB", 16, 16, 8, 2, 0, 0, 0))
-    remarks = chunk(b"zTXt", b"a") * 1000
-    return b"\x89PNG\r\n\x1a\n" + header + remarks + chunk(b"IDAT", zlib.compress(bytes(49 * 16))) + chunk(b"IEND", b"")
-
-
-def damaged_jpeg() -> bytes:
-    """Its markers are whole, its picture is not: half of it is another's."""
-    noisy = np.random.default_rng(0).integers(0, 255, (160, 160, 3), np.uint8)
-    body = bytearray(cv2.imencode(".jpg", noisy)[1].tobytes())
-    middle = len(body) // 2
-    body[middle : middle + 400] = b"\x00\x01" * 200
-    return bytes(body)
-
-
-def test_damaged_images_leave_the_log_in_json(served: Served) -> None:
-    n_sent = 40
-    for number in range(n_sent):
-        assert sent(served, "PUT", f"{FRAMES}/{number}?position_m=0", png_with_a_damaged_text(), "png")[0] == 201
-        assert sent(served, "PUT", f"{FRAMES}/{number}?position_m=0", damaged_jpeg(), "jpeg")[0] in {200, 422}
-    served.process.send_signal(signal.SIGTERM)
-    assert served.process.wait(60) == 0
-    lines = [json.loads(line) for line in served.log.read_text().splitlines()]
-    said = [line for line in lines if line["message"] == "a library said"]
-    assert said
-    assert all("JPEG" in line["line"] for line in said), "what a PNG's texts are is nobody's business"
-    left_out = [line["n_lines"] for line in lines if line["message"] == "libraries said more"]
-    assert len(said) + sum(left_out) >= n_sent
-    assert len(said) <= LINES_A_MINUTE * (1 + len(left_out))

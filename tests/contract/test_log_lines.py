@@ -18,7 +18,7 @@ from deepsimbad.store.records import JobState
 
 from .conftest import make_ready_domain, remap, small_settings
 
-ENVELOPE = "deepsimbad.api.envelope"
+DOOR = "deepsimbad.api.door"
 
 
 @pytest.fixture
@@ -28,7 +28,7 @@ def lines(caplog: pytest.LogCaptureFixture) -> Iterator[pytest.LogCaptureFixture
 
 
 def last(lines: pytest.LogCaptureFixture) -> dict[str, Any]:
-    return [vars(record) for record in lines.records if record.name == ENVELOPE][-1]
+    return [vars(record) for record in lines.records if record.name == DOOR][-1]
 
 
 def told(line: dict[str, Any], *names: str) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from fastapi import FastAPI
 from starlette.testclient import TestClient
 
 from deepsimbad.api.app import create_app
-from deepsimbad.api.dependencies import Services
+from deepsimbad.api.requests import Services
 from deepsimbad.jobs.runner import InThisProcess
 from deepsimbad.store.catalog import Catalog
 

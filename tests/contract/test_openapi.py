@@ -7,9 +7,8 @@ from typing import Any
 import pytest
 from starlette.testclient import TestClient
 
-from deepsimbad.api.bodies import DECLARED_BODIES, ObservationBody
-from deepsimbad.api.examples import ENCODED_ON_BOARD
-from deepsimbad.api.session_bodies import DECLARED_SESSION_BODIES
+from deepsimbad.api.localizations import ObservationBody
+from deepsimbad.api.openapi import BODY_EXAMPLES, ENCODED_ON_BOARD, _declared_bodies
 
 OPERATIONS = """
 GET /healthz
@@ -122,7 +121,8 @@ def test_names_carry_their_pattern(operations: dict[str, Any]) -> None:
 
 
 def test_every_body_has_an_example_that_is_taken(document: dict[str, Any]) -> None:
-    for model in (*DECLARED_BODIES, *DECLARED_SESSION_BODIES):
+    assert set(_declared_bodies) == set(BODY_EXAMPLES)
+    for model in _declared_bodies.values():
         (example,) = document["components"]["schemas"][model.__name__]["examples"]
         model.model_validate_json(json.dumps(example))
     ObservationBody.model_validate_json(json.dumps(ENCODED_ON_BOARD))

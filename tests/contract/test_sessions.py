@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from starlette.testclient import TestClient
 
-from deepsimbad.api import long_work
+from deepsimbad.api import requests
 from deepsimbad.api.app import create_app
 from deepsimbad.jobs.runner import InThisProcess
 
@@ -47,15 +47,15 @@ def test_long_answers_of_every_route_are_written_beside_the_loop(
     client: TestClient, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     n_beside = 0
-    off_the_loop = long_work.off_the_loop
+    run_sync = requests.run_sync
 
-    async def counting(run: Callable[[], Any]) -> Any:
+    async def counting(run: Callable[..., Any], *given: Any, limiter: Any = None) -> Any:
         nonlocal n_beside
-        n_beside += 1
-        return await off_the_loop(run)
+        n_beside += limiter is client.app.state.services.long_work  # type: ignore[attr-defined]
+        return await run_sync(run, *given, limiter=limiter)
 
-    monkeypatch.setattr(long_work, "off_the_loop", counting)
-    monkeypatch.setattr(long_work, "LONG_LIST", 20)
+    monkeypatch.setattr(requests, "run_sync", counting)
+    monkeypatch.setattr(requests, "LONG_LIST", 20)
     path = path_of(begin(client))
     asked = [
         ("POST", "/v1/domains/ready/localizations", RANKS),

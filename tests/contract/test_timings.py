@@ -10,7 +10,7 @@ import pytest
 from fastapi import FastAPI
 from starlette.testclient import TestClient
 
-from deepsimbad.api.dependencies import Services
+from deepsimbad.api.requests import Services
 
 from .conftest import N_LANDMARKS, encoded, picture
 

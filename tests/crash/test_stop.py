@@ -250,7 +250,7 @@ def test_event_streams_end(service: Service) -> None:
 def test_a_second_signal_does_not_wait(service: Service, by: int, code: int) -> None:
     service.signal(signal.SIGTERM)
     assert service.ended() == 0
-    service.start(shutdown_grace_s=600, stall_timeout_s=600)
+    service.start(shutdown_grace_s=600)
     robot = Robot(service, 1)
     robot.begin()
     with send_frame(service, 5):

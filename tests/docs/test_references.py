@@ -13,8 +13,7 @@ from click.testing import CliRunner
 from deepsimbad.api.app import create_app
 from deepsimbad.cli import deepsimbad
 from deepsimbad.cli.serve import shown as shown_setting
-from deepsimbad.settings import Settings
-from deepsimbad.settings_sources import CONFIG_VARIABLE, load_settings, variable_of
+from deepsimbad.settings import CONFIG_VARIABLE, Settings, load_settings, variable_of
 from deepsimbad_client.commands.group import cli as deepsimbad_client
 from deepsimbad_client.http.wire import KEY_VARIABLE, URL_VARIABLE
 

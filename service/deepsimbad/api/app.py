@@ -2,51 +2,28 @@
 
 import asyncio
 import logging
-import re
 from collections.abc import AsyncIterator, Callable
 from contextlib import AbstractAsyncContextManager, ExitStack, asynccontextmanager
 
 from anyio.to_thread import run_sync
 from fastapi import FastAPI
-from starlette.middleware.cors import CORSMiddleware
 from starlette.routing import Route
-from starlette.types import Scope
 
-from deepsimbad.api.admission import AdmissionLimits, AdmissionMiddleware
-from deepsimbad.api.auth import AuthMiddleware, KeyRing
-from deepsimbad.api.decoders import Decoders
-from deepsimbad.api.dependencies import Services
-from deepsimbad.api.envelope import EnvelopeMiddleware
-from deepsimbad.api.limits import BodyLimitMiddleware
-from deepsimbad.api.metrics import Metrics
+from deepsimbad.api import domains, health, jobs, localizations, maps, sessions, traverses
+from deepsimbad.api.door import Door
+from deepsimbad.api.health import ReadinessCheck
+from deepsimbad.api.keys import KeyRing
+from deepsimbad.api.metrics import Metrics, WatchedState
 from deepsimbad.api.openapi import install_openapi
 from deepsimbad.api.problems import install_problem_handlers
-from deepsimbad.api.rate_limit import RateLimit
-from deepsimbad.api.readiness import ReadinessCheck
-from deepsimbad.api.routes import (
-    admin_domains,
-    admin_experience,
-    admin_frames,
-    admin_jobs,
-    admin_maps,
-    admin_remaps,
-    admin_sessions,
-    admin_traverses,
-    docs,
-    domains,
-    health,
-    localizations,
-    sessions,
-    truths,
-)
-from deepsimbad.api.state_metrics import StateCollector, WatchedState
+from deepsimbad.api.requests import Decoders, Services, Slots
 from deepsimbad.engine.encoders import EvaluatorPool
 from deepsimbad.engine.maps import Maps, Retention
 from deepsimbad.engine.sessions import Sessions
 from deepsimbad.engine.traverses import OpenTraverses
 from deepsimbad.engine.truths import Truths
 from deepsimbad.engine.warm_up import warm_up
-from deepsimbad.engine.worker import InferenceWorker, Priority
+from deepsimbad.engine.worker import InferenceWorker
 from deepsimbad.errors import DeepSimbadError, UnavailableError
 from deepsimbad.evaluators.registry import fallback
 from deepsimbad.jobs.runner import InAnotherProcess, JobRunner, RunJob, job_threads
@@ -59,29 +36,16 @@ from deepsimbad.store.sessions import SessionStore
 log = logging.getLogger(__name__)
 
 _ROUTERS = (
-    health,
-    docs,
-    domains,
-    localizations,
-    sessions,
-    truths,
-    admin_domains,
-    admin_traverses,
-    admin_frames,
-    admin_remaps,
-    admin_experience,
-    admin_jobs,
-    admin_maps,
-    admin_sessions,
-)
-_BATCH_PATH = re.compile(r"/v1/admin/domains/[^/]+/traverses/[^/]+/frames")
-_CORS_SENT = (
-    *("Authorization", "X-API-Key", "Content-Type", "X-Request-ID", "Idempotency-Key"),
-    *("Range", "If-Range", "If-None-Match"),
-)
-_CORS_SHOWN = (
-    *("X-Request-ID", "Retry-After", "Location", "WWW-Authenticate"),
-    *("ETag", "Repr-Digest", "Content-Range", "Content-Disposition"),
+    health.router,
+    domains.router,
+    localizations.router,
+    sessions.router,
+    domains.admin,
+    traverses.router,
+    jobs.making,
+    jobs.router,
+    maps.router,
+    sessions.listing,
 )
 _DESCRIPTION = (
     "Where on a prelearned route a robot is, from what it sees; every error is an RFC 9457 problem document. "
@@ -110,36 +74,11 @@ def create_app(settings: Settings, run_job: RunJob | None = None) -> FastAPI:
         docs_url=None,  # the framework's page loads its script from another host
         redoc_url=None,
     )
-    for module in _ROUTERS:
-        app.include_router(module.router)
-    routes = [route for module in _ROUTERS for route in module.router.routes if isinstance(route, Route)]
-    install_problem_handlers(app, routes)
+    for router in _ROUTERS:
+        app.include_router(router)
+    install_problem_handlers(app, [route for router in _ROUTERS for route in router.routes if isinstance(route, Route)])
     install_openapi(app)
-    app.state.metrics = metrics  # the server counts too
-    app.add_middleware(BodyLimitMiddleware, limit_of=_body_limits(settings))
-
-    def queue_is_full(priority: Priority) -> bool:
-        services: Services = app.state.services
-        return services.worker.is_full(priority)
-
-    app.add_middleware(
-        AdmissionMiddleware,
-        limits=AdmissionLimits(
-            settings.max_requests, settings.max_uploads, settings.max_event_streams, settings.max_body_memory_bytes
-        ),
-        queue_is_full=queue_is_full,
-    )
-    rate_limit = RateLimit(settings.rate_limit_per_s, settings.rate_limit_burst)
-    app.add_middleware(AuthMiddleware, keys=keys, rate_limit=rate_limit)
-    if settings.cors_origins:
-        app.add_middleware(
-            CORSMiddleware,
-            allow_origins=settings.cors_origins,
-            allow_methods=("GET", "POST", "PUT", "DELETE"),
-            allow_headers=_CORS_SENT,
-            expose_headers=_CORS_SHOWN,
-        )
-    app.add_middleware(EnvelopeMiddleware, metrics=metrics)
+    app.add_middleware(Door, settings=settings, keys=keys, metrics=metrics)
     return app
 
 
@@ -202,15 +141,15 @@ def _start(settings: Settings, metrics: Metrics, keys: KeyRing, run_job: RunJob,
         log.warning("the default network is not installed", extra={"why": told})
     evaluators = EvaluatorPool(settings.compute())
     evaluators.load_all({record.name: record.evaluator for record in catalog.domains()})
-    maps = Maps(catalog)
-    damaged = maps.load_all()
+    maps_ = Maps(catalog)
+    damaged = maps_.load_all()
     worker = InferenceWorker(max_waiting=settings.max_queue, longest_wait_s=settings.encode_wait_ms / 1000)
     parts.callback(worker.close)
     worker.submit(warm_up).result()
     store = parts.enter_context(SessionStore.open(settings.data_dir, metrics.committed))
     live = Sessions(
         store,
-        maps,
+        maps_,
         evaluators,
         worker,
         ttl_s=settings.session_ttl_s,
@@ -222,12 +161,12 @@ def _start(settings: Settings, metrics: Metrics, keys: KeyRing, run_job: RunJob,
     open_traverses = OpenTraverses(settings.data_dir)
     parts.callback(open_traverses.close)
 
-    retention = Retention(catalog, store, maps, settings.keep_maps)
+    retention = Retention(catalog, store, maps_, settings.keep_maps)
     retention.prune()
 
     def switched(domain: str) -> None:
         try:
-            maps.refresh(domain)
+            maps_.refresh(domain)
             retention.prune(domain)
         except DeepSimbadError:
             log.exception("a new map cannot be served", extra={"domain": domain})
@@ -243,16 +182,16 @@ def _start(settings: Settings, metrics: Metrics, keys: KeyRing, run_job: RunJob,
             ("the thread that runs jobs", lambda: runner.is_alive),
         ],
     )
-    state = WatchedState(
-        version=release(),
-        data_dir=settings.data_dir,
-        catalog=catalog,
-        maps=maps,
-        faults=readiness.faults,
-        queue_length=lambda: worker.n_waiting,
-        n_sessions=lambda: live.n_living,
+    metrics.watch(
+        WatchedState(
+            data_dir=settings.data_dir,
+            catalog=catalog,
+            maps=maps_,
+            faults=readiness.faults,
+            queue_length=lambda: worker.n_waiting,
+            n_sessions=lambda: live.n_living,
+        )
     )
-    metrics.watch(StateCollector(state))
     exposure = {"host": settings.host, "port": settings.port, "n_keys": keys.n_usable}
     if keys.n_created == 0:
         log.warning("runs open: no key was ever created, so whoever reaches this address may do all", extra=exposure)
@@ -262,7 +201,7 @@ def _start(settings: Settings, metrics: Metrics, keys: KeyRing, run_job: RunJob,
         "opened",
         extra={
             "n_domains": len(catalog.domains()),
-            "n_maps": maps.n_loaded,
+            "n_maps": maps_.n_loaded,
             "n_sessions": live.n_living,
             "damaged": list(damaged),
         },
@@ -271,7 +210,7 @@ def _start(settings: Settings, metrics: Metrics, keys: KeyRing, run_job: RunJob,
         settings=settings,
         metrics=metrics,
         catalog=catalog,
-        maps=maps,
+        maps=maps_,
         evaluators=evaluators,
         open_traverses=open_traverses,
         sessions=live,
@@ -282,17 +221,7 @@ def _start(settings: Settings, metrics: Metrics, keys: KeyRing, run_job: RunJob,
         decoders=Decoders(settings.max_pixels),
         runner=runner,
         keys=keys,
-        readiness=readiness,
+        faults=readiness.faults,
+        uploads=Slots(settings.max_uploads, "batches of frames are on their way", "max_uploads"),
+        event_streams=Slots(settings.max_event_streams, "event streams are open", "max_event_streams"),
     )
-
-
-def _body_limits(settings: Settings) -> Callable[[Scope], int]:
-    """The most bytes a request may carry: a batch, an image, or JSON."""
-
-    def limit(scope: Scope) -> int:
-        if scope["method"] == "POST" and _BATCH_PATH.fullmatch(scope["path"]):
-            return settings.max_batch_bytes
-        content_type = next((value for name, value in scope["headers"] if name == b"content-type"), b"")
-        return settings.max_image_bytes if content_type.lower().startswith(b"image/") else settings.max_json_bytes
-
-    return limit

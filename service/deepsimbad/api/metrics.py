@@ -3,9 +3,17 @@
 Every metric is explained in `docs/operations.md`, and a test compares.
 """
 
+import platform
+import shutil
 import threading
-from collections.abc import Iterable, Mapping
+import time
+from collections import Counter as CountOf
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime
 from functools import cache
+from pathlib import Path
+from typing import Self
 
 from prometheus_client import (
     CollectorRegistry,
@@ -16,17 +24,49 @@ from prometheus_client import (
     disable_created_metrics,
     generate_latest,
 )
+from prometheus_client.core import GaugeMetricFamily
 from prometheus_client.exposition import CONTENT_TYPE_LATEST
+from prometheus_client.registry import Collector
 
-from deepsimbad.api.state_metrics import StateCollector
+from deepsimbad.engine.maps import Maps
+from deepsimbad.errors import DeepSimbadError
+from deepsimbad.jobs.runner import REMAP
+from deepsimbad.release import release
+from deepsimbad.store.catalog import Catalog
+from deepsimbad.store.records import DomainRecord, JobRecord, JobState, MapRecord
 
 # A gauge beside every counter that says when it began: nobody asks.
 disable_created_metrics()  # type: ignore[no-untyped-call]
 
+GATE_LOST = "gate_lost"  # sealed, but worse than the active map by more than its gate allowed
+REMAP_OUTCOMES = (JobState.SUCCEEDED.value, GATE_LOST, JobState.FAILED.value, JobState.CANCELLED.value)
 _LATENCY_BUCKETS_S = (0.001, 0.002, 0.004, 0.008, 0.016, 0.032, 0.064, 0.125, 0.25, 0.5, 1, 2, 4, 8, 30)
 _PERCENT_BUCKETS = (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 30, 40, 50, 75, 100)
 _JOB_BUCKETS_S = (1, 2, 5, 10, 20, 30, 60, 120, 300, 600, 1800, 3600, 7200)
 _BATCH_BUCKETS = (1, 2, 4, 8, 16, 32, 64, 128, 256)
+
+
+@dataclass(frozen=True)
+class WatchedState:
+    """Where gauges are read at the moment of a scrape.
+
+    Attributes:
+        data_dir: The data directory.
+        catalog: Domains, maps and jobs.
+        maps: Those in memory.
+        faults: What keeps the service from being ready.
+        queue_length: Of the inference worker.
+        n_sessions: That have not ended.
+        wall: Seconds since 1970.
+    """
+
+    data_dir: Path
+    catalog: Catalog
+    maps: Maps
+    faults: Callable[[], Sequence[str]]
+    queue_length: Callable[[], int]
+    n_sessions: Callable[[], int]
+    wall: Callable[[], float] = time.time
 
 
 class Metrics:
@@ -39,26 +79,27 @@ class Metrics:
     content_type = CONTENT_TYPE_LATEST
 
     def __init__(self) -> None:
-        self._registry = CollectorRegistry()
-        self._requests = Counter(
-            "deepsimbad_requests",
-            "Requests answered.",
-            ["method", "route", "status"],
-            registry=self._registry,
+        self._registry = registry = CollectorRegistry()
+        self._requests = cache(
+            Counter(
+                "deepsimbad_requests", "Requests answered.", ["method", "route", "status"], registry=registry
+            ).labels
         )
-        self._request_seconds = Histogram(
-            "deepsimbad_request_seconds",
-            "Time from a request's head to the end of its answer.",
-            ["route"],
-            buckets=_LATENCY_BUCKETS_S,
-            registry=self._registry,
+        self._request_seconds = cache(
+            Histogram(
+                "deepsimbad_request_seconds",
+                "Time from a request's head to the end of its answer.",
+                ["route"],
+                buckets=_LATENCY_BUCKETS_S,
+                registry=registry,
+            ).labels
         )
         stage_seconds = Histogram(
             "deepsimbad_localization_stage_seconds",
             "Time of the stages of one answer to a view, and their total.",
             ["stage"],
             buckets=_LATENCY_BUCKETS_S,
-            registry=self._registry,
+            registry=registry,
         )
         self._seconds_of_stage = cache(stage_seconds.labels)  # a view has a dozen: looked up, they cost twice as much
         self._entropy_bits = Histogram(
@@ -66,7 +107,7 @@ class Metrics:
             "Entropy of the belief after one view: high when the map no longer tells places apart.",
             ["domain"],
             buckets=tuple(range(0, 25, 2)),
-            registry=self._registry,
+            registry=registry,
         )
         self._live_anr_percent = Histogram(
             "deepsimbad_live_anr_percent",
@@ -74,45 +115,43 @@ class Metrics:
             "perfect, 50 chance.",
             ["domain"],
             buckets=_PERCENT_BUCKETS,
-            registry=self._registry,
+            registry=registry,
         )
         self._observations = Counter(
             "deepsimbad_observations",
             "Observations of sessions: accepted, repeated (counted before), or the code of what was wrong.",
             ["outcome"],
-            registry=self._registry,
+            registry=registry,
         )
         self._commit_writes = Histogram(
             "deepsimbad_session_commit_writes",
             "Writes that shared one transaction of the sessions' file.",
             buckets=_BATCH_BUCKETS,
-            registry=self._registry,
+            registry=registry,
         )
         self._refused = Counter(
             "deepsimbad_refused_requests",
-            "Requests and connections turned away for what they are or how many, by reason.",
+            "Requests turned away for what they are or how many, by reason.",
             ["reason"],
-            registry=self._registry,
+            registry=registry,
         )
         self._job_seconds = Histogram(
             "deepsimbad_job_seconds",
             "Time from a job's start to its end.",
             ["kind", "state"],
             buckets=_JOB_BUCKETS_S,
-            registry=self._registry,
+            registry=registry,
         )
-        self._in_flight = Gauge(
-            "deepsimbad_requests_in_flight", "Requests being answered now.", registry=self._registry
-        )
-        ProcessCollector(registry=self._registry)
+        self._in_flight = Gauge("deepsimbad_requests_in_flight", "Requests being answered now.", registry=registry)
+        ProcessCollector(registry=registry)
         self._state: StateCollector | None = None
         self._domains: set[str] = set()  # that have series here
         self._scrape = threading.Lock()
 
-    def watch(self, state: StateCollector) -> None:
+    def watch(self, state: WatchedState) -> None:
         """Show this state too, from now on."""
-        self._state = state
-        self._registry.register(state)
+        self._state = StateCollector(state)
+        self._registry.register(self._state)
 
     def request_began(self) -> None:
         """Count a request as being answered."""
@@ -121,8 +160,8 @@ class Metrics:
     def request_ended(self, method: str, route: str, status: int, seconds: float) -> None:
         """Count a request as answered."""
         self._in_flight.dec()
-        self._requests.labels(method, route, str(status)).inc()
-        self._request_seconds.labels(route).observe(seconds)
+        self._requests(method, route, str(status)).inc()
+        self._request_seconds(route).observe(seconds)
 
     def localized(self, domain: str, timings_ms: Mapping[str, float], entropy_bits: float) -> None:
         """Record one localization."""
@@ -147,7 +186,7 @@ class Metrics:
         self._commit_writes.observe(n_writes)
 
     def refused(self, reason: str) -> None:
-        """Count what was turned away: an error's code, or another word of ours."""
+        """Count what was turned away: an error's code, or the setting whose limit was met."""
         self._refused.labels(reason).inc()
 
     def job_ended(self, kind: str, state: str, seconds: float) -> None:
@@ -168,3 +207,147 @@ class Metrics:
                 for domain in self._domains.difference(record.name for record in state.domains):
                     self.forget_domain(domain)
             return generate_latest(self._registry)
+
+
+@dataclass(frozen=True)
+class CatalogState:
+    """What the catalog says: domains, every job, oldest first, and the active map of each domain that has one."""
+
+    domains: Sequence[DomainRecord]
+    jobs: Sequence[JobRecord]
+    serving: Mapping[str, MapRecord]
+
+    @classmethod
+    def of(cls, catalog: Catalog) -> Self:
+        """Read it; raises DeepSimbadError."""
+        domains = catalog.domains()
+        versions = {domain.name: domain.active_version for domain in domains}
+        serving = {name: catalog.map(name, version) for name, version in versions.items() if version is not None}
+        return cls(domains, catalog.jobs(), serving)
+
+    def last_remaps(self) -> Mapping[str, JobRecord]:
+        """The remap of each domain that ended last.
+
+        They are done one after the other as they came, whatever the clock was set to; one that was cancelled while it
+        waited, out of that order, tells of nothing that was done and counts only beside others such.
+        """
+        ended = [job for job in self.jobs if job.kind == REMAP and job.finished_at is not None]
+        return {job.domain: job for job in sorted(ended, key=lambda job: job.n_starts > 0)}
+
+
+class StateCollector(Collector):
+    """Gives what `look` saw; series of deleted domains end by themselves, since nothing is kept from scrape to scrape.
+
+    Args:
+        watched: Where it is read.
+    """
+
+    def __init__(self, watched: WatchedState) -> None:
+        self._watched = watched
+        self._seen: CatalogState | None = None
+
+    def look(self) -> CatalogState | None:
+        """Read the catalog for the next `collect`; None where it cannot be read."""
+        try:
+            self._seen = CatalogState.of(self._watched.catalog)
+        except DeepSimbadError:  # `deepsimbad_ready` tells; what needs no catalog is shown all the same
+            self._seen = None
+        return self._seen
+
+    def collect(self) -> Iterator[GaugeMetricFamily]:
+        """Every family."""
+        watched = self._watched
+        yield _gauge(
+            "deepsimbad_build_info",
+            "Always 1; the labels tell the release.",
+            {(release(), platform.python_version()): 1},
+            ("version", "python"),
+        )
+        yield _gauge("deepsimbad_ready", "1 where /readyz answers 200.", {(): 0 if watched.faults() else 1})
+        yield _gauge(
+            "deepsimbad_inference_queue", "Work waiting for the inference worker.", {(): watched.queue_length()}
+        )
+        yield _gauge("deepsimbad_loaded_maps", "Active maps held in memory.", {(): watched.maps.n_loaded})
+        yield _gauge("deepsimbad_sessions", "Sessions that have not ended.", {(): watched.n_sessions()})
+        try:
+            usage = shutil.disk_usage(watched.data_dir)
+        except OSError:
+            pass
+        else:
+            yield _gauge("deepsimbad_data_dir_free_bytes", "Free where the data directory lies.", {(): usage.free})
+            yield _gauge("deepsimbad_data_dir_size_bytes", "Size of the disk it lies on.", {(): usage.total})
+        if self._seen is not None:
+            yield from self._of_catalog(self._seen)
+
+    def _of_catalog(self, state: CatalogState) -> Iterator[GaugeMetricFamily]:
+        now, by_domain = self._watched.wall(), ("domain",)
+        n_jobs, remaps = CountOf(job.state for job in state.jobs), sorted(state.last_remaps().items())
+        snapshots = [mapped.snapshot for mapped in self._watched.maps.loaded()]
+        damaged = self._watched.maps.damaged()
+        yield _gauge(
+            "deepsimbad_jobs",
+            "Jobs the catalog knows, by state.",
+            {(job_state.value,): n_jobs[job_state] for job_state in JobState},
+            ("state",),
+        )
+        yield _gauge("deepsimbad_domains", "Domains there are.", {(): len(state.domains)})
+        yield _gauge(
+            "deepsimbad_active_map_version",
+            "Version of the map that serves.",
+            {(domain,): record.version for domain, record in state.serving.items()},
+            by_domain,
+        )
+        yield _gauge(
+            "deepsimbad_map_age_seconds",
+            "Time since the map that serves was built.",
+            {(name,): max(0.0, now - _seconds(record.created_at)) for name, record in state.serving.items()},
+            by_domain,
+        )
+        yield _gauge(
+            "deepsimbad_map_damaged",
+            "1 where the map that serves could not be loaded.",
+            {(domain,): damaged.get(domain) == record.version for domain, record in state.serving.items()},
+            by_domain,
+        )
+        yield _gauge(
+            "deepsimbad_map_images",
+            "Map images of the map in memory.",
+            {(snapshot.domain,): snapshot.route.n_images for snapshot in snapshots},
+            by_domain,
+        )
+        yield _gauge(
+            "deepsimbad_map_index_bytes",
+            "Bytes of its index in the map file.",
+            {(snapshot.domain,): snapshot.index_bytes for snapshot in snapshots},
+            by_domain,
+        )
+        yield _gauge(
+            "deepsimbad_last_remap",
+            "1 for the outcome of the remap that ended last, else 0.",
+            {(domain, outcome): outcome == _outcome(job) for domain, job in remaps for outcome in REMAP_OUTCOMES},
+            ("domain", "outcome"),
+        )
+        yield _gauge(
+            "deepsimbad_last_remap_timestamp_seconds",
+            "When it ended, seconds since 1970.",
+            {(domain,): _seconds(job.finished_at or "") for domain, job in remaps},
+            by_domain,
+        )
+
+
+def _outcome(job: JobRecord) -> str:
+    check = ((job.result or {}).get("metrics") or {}).get("check") or {}
+    return GATE_LOST if job.state is JobState.SUCCEEDED and check.get("passed") is False else job.state.value
+
+
+def _seconds(iso: str) -> float:
+    return datetime.fromisoformat(iso).timestamp()
+
+
+def _gauge(
+    name: str, meaning: str, values: Mapping[tuple[str, ...], float], labels: Sequence[str] = ()
+) -> GaugeMetricFamily:
+    family = GaugeMetricFamily(name, meaning, labels=labels)
+    for label_values, value in values.items():
+        family.add_metric(label_values, int(value) if isinstance(value, bool) else value)
+    return family

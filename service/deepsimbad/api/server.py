@@ -1,11 +1,15 @@
-"""Serving the application with uvicorn."""
+"""Serving the application with uvicorn, and its log: lines a machine can read, one JSON object each."""
 
-import asyncio
+import json
 import logging
+import logging.config
 import signal
 import socket
 import ssl
-from collections.abc import Callable
+import sys
+import time
+from functools import lru_cache
+from itertools import islice
 from types import FrameType
 from typing import Any
 
@@ -13,16 +17,64 @@ import uvicorn
 from fastapi import FastAPI
 
 from deepsimbad.api.app import create_app
-from deepsimbad.api.logs import configure_logging
-from deepsimbad.api.open_files import allow_open_files
-from deepsimbad.api.protocol import WireLimits, protocol_class
-from deepsimbad.api.tls import loop_for_tls, tls_context
-from deepsimbad.errors import DeepSimbadError, UnavailableError
+from deepsimbad.errors import SettingsError, UnavailableError
 from deepsimbad.release import release
 from deepsimbad.settings import Settings
 from deepsimbad.store.layout import catalog_path
 
 log = logging.getLogger(__name__)
+
+_ENCODER = json.JSONEncoder(default=str)
+_N_STANDARD = len(logging.makeLogRecord({}).__dict__)
+_STANDARD = frozenset(logging.makeLogRecord({}).__dict__) | {"message", "asctime", "taskName", "color_message"}
+
+
+class JsonFormatter(logging.Formatter):
+    """One line a record: time, level, logger, message, and whatever was given as `extra`."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Render a record."""
+        line = {
+            "time": f"{_second(int(record.created))}.{int(record.msecs):03d}Z",
+            "level": record.levelname,
+            "logger": record.name,
+            "message": record.getMessage(),
+        }
+        # What was given as `extra` was put behind what every record has.
+        extra = islice(record.__dict__.items(), _N_STANDARD, None)
+        line |= {name: value for name, value in extra if name not in _STANDARD}
+        if record.exc_info:
+            line["exception"] = self.formatException(record.exc_info)
+        return _ENCODER.encode(line)
+
+
+@lru_cache(maxsize=2)
+def _second(since_1970: int) -> str:
+    return time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime(since_1970))
+
+
+def configure_logging(level: str) -> None:
+    """Send everything at `level` and above to standard error as JSON lines; uvicorn's own lines too."""
+    # No line of ours tells these, and every record would look them up.
+    logging.logThreads = logging.logProcesses = logging.logMultiprocessing = False
+    if sys.version_info >= (3, 12):
+        logging.logAsyncioTasks = False
+    logging.config.dictConfig(
+        {
+            "version": 1,
+            "disable_existing_loggers": False,
+            "formatters": {"json": {"()": JsonFormatter}},
+            "handlers": {"stderr": {"class": "logging.StreamHandler", "formatter": "json"}},
+            "root": {"level": "WARNING", "handlers": ["stderr"]},
+            "loggers": {
+                "deepsimbad": {"level": level},
+                "uvicorn": {"level": level, "handlers": [], "propagate": True},
+                "uvicorn.error": {"level": level},
+                # One line a request is ours, with its id; uvicorn's would be a second.
+                "uvicorn.access": {"level": "WARNING"},
+            },
+        }
+    )
 
 
 class _Server(uvicorn.Server):
@@ -59,20 +111,6 @@ class _Server(uvicorn.Server):
             await self.lifespan.shutdown()
 
 
-class _Config(uvicorn.Config):
-    """With a loop of ours where connections begin with a handshake."""
-
-    def __init__(self, app: FastAPI, settings: Settings, context: ssl.SSLContext | None, **more: Any) -> None:
-        super().__init__(app, ssl_context_factory=None if context is None else lambda *_: context, **more)
-        self._handshake_timeout_s = None if context is None else settings.header_timeout_s
-
-    def get_loop_factory(self) -> Callable[[], asyncio.AbstractEventLoop] | None:
-        """What makes the event loop."""
-        if self._handshake_timeout_s is None:
-            return super().get_loop_factory()
-        return loop_for_tls(self._handshake_timeout_s)
-
-
 def serve(settings: Settings) -> None:
     """Serve until a signal ends it; requests under way are finished first.
 
@@ -86,9 +124,7 @@ def serve(settings: Settings) -> None:
     """
     if not catalog_path(settings.data_dir).is_file():  # then there is no key, and no need to make the folder first
         settings.check_exposure(n_keys=0)
-    context = tls_context(settings.tls_certificate, settings.tls_key)
     configure_logging(settings.log_level)
-    allow_open_files(settings.max_connections)
     log.info(
         "starting",
         extra={
@@ -98,41 +134,68 @@ def serve(settings: Settings) -> None:
         },
     )
     app = create_app(settings)
-    limits = WireLimits(
-        header_timeout_s=settings.header_timeout_s,
-        stall_timeout_s=settings.stall_timeout_s,
-        max_header_bytes=settings.max_header_bytes,
-        max_connections=settings.max_connections,
-        refused=app.state.metrics.refused,
-    )
-    config = _Config(
+    config = uvicorn.Config(
         app,
-        settings,
-        context,
-        http=protocol_class(limits),
         host=settings.host,
         port=settings.port,
+        http="h11",  # the one that bounds a request's head
+        ws="none",
+        h11_max_incomplete_event_size=settings.max_header_bytes,
+        limit_concurrency=settings.max_connections,
+        timeout_keep_alive=settings.keep_alive_s,
+        timeout_graceful_shutdown=settings.shutdown_grace_s,
+        ssl_certfile=settings.tls_certificate,
+        ssl_keyfile=settings.tls_key,
+        ssl_keyfile_password="",
         log_config=None,
         access_log=False,
         server_header=False,
         proxy_headers=False,
-        ws="none",
-        timeout_keep_alive=settings.keep_alive_s,
-        timeout_graceful_shutdown=settings.shutdown_grace_s,
     )
+    try:
+        if settings.tls_key is not None and settings.tls_certificate is None:
+            raise FileNotFoundError("tls_certificate is missing")
+        config.load()
+    except (OSError, ssl.SSLError) as error:
+        raise SettingsError(
+            f"settings 'tls_certificate' and 'tls_key': {settings.tls_certificate} and {settings.tls_key} are no PEM "
+            f"files that can be read, belong together and need no passphrase: {error}",
+            setting="tls_certificate",
+        ) from error
 
     def is_news(record: logging.LogRecord) -> bool:
         """Whoever called gets the named error; its stack in the log would only hide it."""
         return not (hasattr(app.state, "startup_error") and record.getMessage().startswith("Traceback"))
 
     logging.getLogger("uvicorn.error").addFilter(is_news)
+    sockets = _bound(settings.host, settings.port)
     try:
-        _Server(config, app).run()
+        _Server(config, app).run(sockets)
     except SystemExit as ended:  # how uvicorn says that it could not start
-        why: DeepSimbadError | None = getattr(app.state, "startup_error", None)
-        if why is None:
-            why = UnavailableError(f"cannot listen on {settings.host}:{settings.port}: is the port taken?")
-        raise why from ended
+        unforeseen = UnavailableError("the service could not start: the log says why")
+        raise getattr(app.state, "startup_error", unforeseen) from ended
+    finally:
+        for bound in sockets:
+            bound.close()
+
+
+def _bound(host: str, port: int) -> list[socket.socket]:
+    """Sockets bound to all addresses of a host, which do not listen yet."""
+    sockets: list[socket.socket] = []
+    try:
+        for family, kind, protocol, _, address in dict.fromkeys(
+            socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
+        ):
+            sockets.append(socket.socket(family, kind, protocol))
+            sockets[-1].setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            if family == socket.AF_INET6:  # its IPv4 side, where there is one, has a socket of its own
+                sockets[-1].setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
+            sockets[-1].bind(address)
+    except OSError as error:
+        for opened in sockets:
+            opened.close()
+        raise UnavailableError(f"cannot listen on {host}:{port}: {error.strerror or error}") from error
+    return sockets
 
 
 def _changed(settings: Settings) -> dict[str, Any]:

@@ -6,8 +6,8 @@ from typing import Any
 import click
 from rich.table import Table
 
-from deepsimbad.api.domain_answers import describe_domain
-from deepsimbad.api.rendering import render_localization
+from deepsimbad.api.domains import describe_domain
+from deepsimbad.api.localizations import render_localization
 from deepsimbad.cli.options import (
     RELEVANCES,
     data_dir_option,
@@ -141,14 +141,14 @@ def localize(domain: str, images: tuple[Path, ...], as_json: bool, data_dir: Pat
             watch.take(localization.timings_ms)
             answers.append(render_localization(localization, watch))
     if as_json:
-        write_json([{"image": str(path), **answer.model_dump()} for path, answer in zip(images, answers, strict=True)])
+        write_json([{"image": str(path), **answer} for path, answer in zip(images, answers, strict=True)])
         return
     table = Table("image", "most likely at", "mean +- std", "95 % within", "entropy")
     for path, answer in zip(images, answers, strict=True):
-        belief = answer.belief
-        mean, (low, high) = f"{belief.mean_m:.1f} +- {belief.std_m:.1f} m", belief.credible_95_m
+        belief = answer["belief"]
+        mean, (low, high) = f"{belief['mean_m']:.1f} +- {belief['std_m']:.1f} m", belief["credible_95_m"]
         within = f"{low:.1f} .. {high:.1f} m"
-        table.add_row(str(path), f"{belief.mode_m:.1f} m", mean, within, f"{belief.entropy_bits:.1f} bit")
+        table.add_row(str(path), f"{belief['mode_m']:.1f} m", mean, within, f"{belief['entropy_bits']:.1f} bit")
     print_table(table)
 
 

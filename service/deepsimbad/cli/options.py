@@ -18,8 +18,7 @@ from deepsimbad.evaluators.registry import (
     fallback,
 )
 from deepsimbad.evaluators.weights.lock import Lock
-from deepsimbad.settings import Settings
-from deepsimbad.settings_sources import TracedSettings, trace_settings
+from deepsimbad.settings import Settings, TracedSettings, trace_settings
 from deepsimbad.store.layout import catalog_path
 
 _Command = TypeVar("_Command", bound=Callable[..., Any])

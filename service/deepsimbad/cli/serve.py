@@ -12,7 +12,7 @@ from rich.table import Table
 from deepsimbad.cli.options import data_dir_option, given_settings, json_option, traced_settings
 from deepsimbad.cli.terminal import print_table, write_json
 from deepsimbad.errors import DeepSimbadError
-from deepsimbad.settings_sources import Origin, unknown_variables, variable_of
+from deepsimbad.settings import Origin, unknown_variables, variable_of
 
 log = logging.getLogger(__name__)
 
@@ -32,21 +32,19 @@ def _address_options(command: _Command) -> _Command:
 @_address_options
 def serve(data_dir: Path | None, host: str | None, port: int | None) -> None:
     """Serve the domains over HTTP until interrupted. Ready when /readyz answers 200."""
-    from deepsimbad.api.logs import configure_logging  # noqa: PLC0415 - other commands need no server
-    from deepsimbad.api.native_lines import native_lines_in_the_log  # noqa: PLC0415
+    from deepsimbad.api.server import configure_logging  # noqa: PLC0415 - other commands need no server
     from deepsimbad.api.server import serve as serve_until_stopped  # noqa: PLC0415
 
-    with native_lines_in_the_log():
-        try:
-            settings = given_settings(data_dir=data_dir, host=host, port=port)
-            configure_logging(settings.log_level)
-            for variable in unknown_variables():
-                log.warning("set in the environment, and no setting", extra={"variable": variable})
-            serve_until_stopped(settings)
-        except DeepSimbadError as error:
-            configure_logging("ERROR")  # the settings themselves may be what is wrong
-            log.error("cannot start", extra={"code": error.code, "why": error.message})
-            raise
+    try:
+        settings = given_settings(data_dir=data_dir, host=host, port=port)
+        configure_logging(settings.log_level)
+        for variable in unknown_variables():
+            log.warning("set in the environment, and no setting", extra={"variable": variable})
+        serve_until_stopped(settings)
+    except DeepSimbadError as error:
+        configure_logging("ERROR")  # the settings themselves may be what is wrong
+        log.error("cannot start", extra={"code": error.code, "why": error.message})
+        raise
 
 
 @click.command()

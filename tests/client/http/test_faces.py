@@ -13,8 +13,8 @@ import httpx2
 import pytest
 
 from deepsimbad.api.app import create_app
-from deepsimbad.api.bodies import RemapBody
-from deepsimbad.api.session_bodies import SessionBody
+from deepsimbad.api.jobs import RemapBody
+from deepsimbad.api.sessions import SessionBody
 from deepsimbad.settings import Settings
 from deepsimbad_client import AsyncClient, AsyncSession, Client, Session, errors
 from deepsimbad_client.commands.group import cli

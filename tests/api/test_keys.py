@@ -1,20 +1,17 @@
-"""Keys: what a request may carry, what the ring makes of it, and that nothing is read before."""
+"""Keys: what a request may carry, what the ring makes of it; rates, on a clock of our own."""
 
 import asyncio
-import json
 import time
 from collections.abc import Callable, Iterator
 from datetime import timedelta
 from pathlib import Path
-from typing import Any
 
 import pytest
-from starlette.types import Message, Receive, Scope, Send
+from starlette.types import Scope
 
-from deepsimbad.api import auth
-from deepsimbad.api.auth import KEPT_S, AuthMiddleware, KeyRing, needed_scope, presented_key
-from deepsimbad.api.rate_limit import RateLimit
-from deepsimbad.errors import UnauthorizedError, UnavailableError
+from deepsimbad.api import keys
+from deepsimbad.api.keys import KEPT_S, KeyRing, RateLimit, needed_scope, presented_key
+from deepsimbad.errors import RateLimitedError, UnauthorizedError, UnavailableError
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.catalog_keys import ApiKey
 from deepsimbad.store.records import KeyRecord, KeyScope
@@ -178,13 +175,13 @@ def test_every_key_is_compared_known_or_not(catalog: Catalog, monkeypatch: pytes
     record, key = catalog.create_key(KeyScope.ADMIN)
     ring = ring_of(catalog)
     compared: list[tuple[str, str]] = []
-    real = auth.hmac.compare_digest
+    real = keys.hmac.compare_digest
 
     def watched(given: str, kept: str) -> bool:
         compared.append((given, kept))
         return real(given, kept)
 
-    monkeypatch.setattr(auth.hmac, "compare_digest", watched)
+    monkeypatch.setattr(keys.hmac, "compare_digest", watched)
     unknown = ApiKey.new()
     with pytest.raises(UnauthorizedError):
         ring.holder(unknown.text)
@@ -225,7 +222,7 @@ def test_a_ring_that_was_never_read_is_not_open() -> None:
 
 
 def test_it_follows_the_catalog(catalog: Catalog, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(auth, "REREAD_S", 0.001)
+    monkeypatch.setattr(keys, "REREAD_S", 0.001)
     n_read = 0
 
     def read() -> list[KeyRecord]:
@@ -249,103 +246,79 @@ def test_it_follows_the_catalog(catalog: Catalog, monkeypatch: pytest.MonkeyPatc
     asyncio.run(asyncio.wait_for(until_closed(), 30))
 
 
-# The middleware
+# Rates
 
 
-class Caller:
-    """Sends one request straight to the middleware; notes whether the application and the body were reached."""
+class Clock:
+    def __init__(self) -> None:
+        self.s = 100.0
 
-    def __init__(self, ring: KeyRing, rate_limit: RateLimit | None = None) -> None:
-        self.middleware = AuthMiddleware(self._app, ring, rate_limit or RateLimit(0, 1))
-        self.n_reached = 0
-        self.n_received = 0
-
-    async def _app(self, scope: Scope, receive: Receive, send: Send) -> None:
-        self.n_reached += 1
-        self.reached = scope
-
-    def __call__(self, scope: Scope) -> tuple[int, dict[str, str], dict[str, Any]] | None:
-        sent: list[Message] = []
-
-        async def receive() -> Message:
-            self.n_received += 1
-            return {"type": "http.disconnect"}
-
-        async def send(message: Message) -> None:
-            sent.append(message)
-
-        asyncio.run(self.middleware(scope, receive, send))
-        if not sent:
-            return None
-        headers = {name.decode(): value.decode() for name, value in sent[0]["headers"]}
-        return sent[0]["status"], headers, json.loads(b"".join(each.get("body", b"") for each in sent[1:]))
+    def __call__(self) -> float:
+        return self.s
 
 
-def test_scopes(catalog: Catalog) -> None:
-    _, robot = catalog.create_key(KeyScope.LOCALIZE)
-    admin_record, admin = catalog.create_key(KeyScope.ADMIN)
-    call = Caller(ring_of(catalog))
-    for path, key in (("/v1/domains", robot), ("/v1/domains", admin), ("/v1/admin/jobs", admin)):
-        assert call(scope_of(path, bearer(key.text))) is None, path
-    assert call.n_reached == 3
-    assert call.reached["state"]["key_id"] == admin_record.key_id
-    answer = call(scope_of("/v1/admin/jobs", bearer(robot.text)))
-    assert answer is not None
-    assert (answer[0], answer[2]["code"], answer[2]["needed"]) == (403, "forbidden", "admin")
-    assert call(scope_of("/healthz")) is None
-    assert call.n_reached == 4
+def taken(limit: RateLimit, key_id: str, n: int) -> int:
+    """How many of n requests pass."""
+    passed = 0
+    for _ in range(n):
+        try:
+            limit.take(key_id)
+        except RateLimitedError:
+            continue
+        passed += 1
+    return passed
 
 
-def test_the_log_line_of_a_revoked_key_says_whose(catalog: Catalog) -> None:
-    record, key = catalog.create_key(KeyScope.LOCALIZE)
-    ring = ring_of(catalog)
-    catalog.revoke_key(record.key_id)
-    asyncio.run(ring.reread())
-    scope = scope_of("/v1/domains", bearer(key.text))
-    answer = Caller(ring)(scope)
-    assert answer is not None
-    assert answer[0] == 401
-    assert scope["state"]["key_id"] == record.key_id
-    forged = scope_of("/v1/domains", bearer(ApiKey(record.key_id, ApiKey.new().secret).text))
-    Caller(ring)(forged)
-    assert "key_id" not in forged["state"], "who only knows an id is nobody"
+def test_a_burst_then_the_rate() -> None:
+    clock = Clock()
+    limit = RateLimit(2.0, 5, clock)
+    assert taken(limit, "a", 10) == 5
+    assert taken(limit, "b", 10) == 5, "each key has its own"
+    clock.s += 1.0
+    assert taken(limit, "a", 10) == 2
+    clock.s += 1000.0
+    assert taken(limit, "a", 10) == 5, "no more than a burst is saved up"
 
 
-def test_refused_before_the_body(catalog: Catalog) -> None:
-    catalog.create_key(KeyScope.ADMIN)
-    call = Caller(ring_of(catalog))
-    scope = scope_of("/v1/admin/domains/a", ("Content-Length", b"1000"), bearer("dsk_x"), method="PUT")
-    answer = call(scope)
-    assert answer is not None
-    status, headers, problem = answer
-    assert (status, problem["code"]) == (401, "unauthorized")
-    assert headers["www-authenticate"] == "Bearer"
-    assert headers["content-type"] == "application/problem+json"
-    assert (call.n_reached, call.n_received) == (0, 0)
+def test_in_the_long_run_it_is_the_rate() -> None:
+    clock = Clock()
+    limit = RateLimit(3.0, 4, clock)
+    passed = 0
+    for _ in range(1000):
+        clock.s += 0.1
+        passed += taken(limit, "a", 2)
+    assert passed == pytest.approx(4 + 3.0 * 100, abs=1)
 
 
-def test_no_ring_no_entry() -> None:
-    call = Caller(KeyRing())
-    answer = call(scope_of("/v1/domains"))
-    assert answer is not None
-    assert (answer[0], answer[1]["retry-after"]) == (503, "5")
-    assert call(scope_of("/healthz")) is None
+def test_a_refusal_says_how_long_to_wait_and_costs_nothing() -> None:
+    clock = Clock()
+    limit = RateLimit(0.25, 1, clock)
+    limit.take("a")
+    for _ in range(3):
+        with pytest.raises(RateLimitedError) as caught:
+            limit.take("a")
+        assert caught.value.hints == {"retry_after_s": 4, "rate_limit_per_s": 0.25, "rate_limit_burst": 1}
+    clock.s += 3.0
+    with pytest.raises(RateLimitedError) as caught:
+        limit.take("a")
+    assert caught.value.hints["retry_after_s"] == 1
+    clock.s += 1.0
+    limit.take("a")
 
 
-def test_the_rate_is_counted_by_key(catalog: Catalog) -> None:
-    _, one = catalog.create_key(KeyScope.LOCALIZE)
-    _, other = catalog.create_key(KeyScope.LOCALIZE)
-    call = Caller(ring_of(catalog), RateLimit(0.5, 2))
-    assert [call(scope_of("/v1/domains", bearer(one.text))) for _ in range(2)] == [None, None]
-    answer = call(scope_of("/v1/domains", bearer(one.text)))
-    assert answer is not None
-    status, headers, problem = answer
-    assert (status, problem["code"], headers["retry-after"]) == (429, "rate_limited", "2")
-    assert call(scope_of("/v1/domains", bearer(other.text))) is None
-    assert call(scope_of("/readyz", bearer(one.text))) is None
+def test_no_limit() -> None:
+    limit = RateLimit(0.0, 1, Clock())
+    assert taken(limit, "a", 1000) == 1000
+    assert limit.n_buckets == 0
 
 
-def test_an_open_service_asks_nobody(catalog: Catalog) -> None:
-    call = Caller(ring_of(catalog), RateLimit(0.5, 1))
-    for headers in ([], [bearer("nonsense")], [bearer("a"), ("X-API-Key", b"b")]):
-        assert call(scope_of("/v1/admin/jobs", *headers)) is None
+def test_memory_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(keys, "MAX_BUCKETS", 3)
+    limit = RateLimit(1.0, 1, Clock())
+    for key_id in ("a", "b", "c"):
+        limit.take(key_id)
+    assert taken(limit, "a", 1) == 0
+    limit.take("d")  # b was used longest ago
+    assert limit.n_buckets == 3
+    assert [taken(limit, key_id, 1) for key_id in ("a", "c", "d")] == [0, 0, 0]
+    assert taken(limit, "b", 1) == 1

@@ -1,17 +1,17 @@
-"""Who may ask: API keys, looked at before a byte of a body is read."""
+"""Who may ask, and how often: API keys and their rates."""
 
 import asyncio
 import hmac
 import logging
+import math
 import time
+from collections import OrderedDict
 from collections.abc import Callable, Sequence
 
 from anyio.to_thread import run_sync
-from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.types import Scope
 
-from deepsimbad.api.limits import refuse_unread
-from deepsimbad.api.rate_limit import RateLimit
-from deepsimbad.errors import DeepSimbadError, ForbiddenError, UnauthorizedError, UnavailableError
+from deepsimbad.errors import RateLimitedError, UnauthorizedError, UnavailableError
 from deepsimbad.store.catalog_keys import ApiKey
 from deepsimbad.store.records import KeyRecord, KeyScope, now
 
@@ -19,6 +19,7 @@ log = logging.getLogger(__name__)
 
 REREAD_S = 1.0  # a key that was made or revoked counts within this time
 KEPT_S = 60.0  # a catalog that cannot be read lets the last known keys count for so long
+MAX_BUCKETS = 10_000
 _NO_DIGEST = "0" * 64  # what a key that does not exist is compared with
 _HOW = "send a key as `Authorization: Bearer <key>` or `X-API-Key: <key>`; `deepsimbad keys create` makes one"
 
@@ -54,18 +55,18 @@ class KeyRing:
         if self._read is None:
             return
         try:
-            found = await run_sync(self._read)
+            records = await run_sync(self._read)
         except Exception as error:  # whatever it is, the next try may succeed
             log.warning("the keys cannot be read: %s", error)
             return
         was_open = not self._keys
-        self._keep(found)
+        self._keep(records)
         if was_open and self._keys:
             log.info("the first key was created: from now on a key is asked")
 
-    def _keep(self, found: Sequence[KeyRecord]) -> None:
-        if found or not self._keys:
-            self._keys = {record.key_id: record for record in found}
+    def _keep(self, records: Sequence[KeyRecord]) -> None:
+        if records or not self._keys:
+            self._keys = {record.key_id: record for record in records}
         self._read_at = self._clock()
 
     @property
@@ -113,45 +114,6 @@ class KeyRing:
         return record
 
 
-class AuthMiddleware:
-    """Lets nobody past without a key of the scope that the path needs, nor more often than the rate limit allows.
-
-    `/v1/admin/...` needs `admin`, the rest of `/v1/...` needs `localize`; other paths need no key. A refusal is
-    answered before the body is read.
-    """
-
-    def __init__(self, app: ASGIApp, keys: KeyRing, rate_limit: RateLimit) -> None:
-        self.app = app
-        self.keys = keys
-        self.rate_limit = rate_limit
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:  # noqa: D102 - ASGI
-        needed = None if scope["type"] != "http" else needed_scope(scope["path"])
-        if needed is not None:
-            try:
-                self._check(scope, needed)
-            except DeepSimbadError as error:
-                await refuse_unread(scope, receive, send, error)
-                return
-        await self.app(scope, receive, send)
-
-    def _check(self, scope: Scope, needed: KeyScope) -> None:
-        if self.keys.is_open:
-            return
-        noted = scope.setdefault("state", {})  # for the log
-        try:
-            record = self.keys.holder(presented_key(scope))
-        except UnauthorizedError as error:
-            noted |= {name: value for name, value in error.hints.items() if name == "key_id"}  # revoked or expired
-            raise
-        noted["key_id"] = record.key_id
-        self.rate_limit.take(record.key_id)
-        if not record.scope.includes(needed):
-            raise ForbiddenError(
-                f"this call needs a key of scope {needed}; this one has {record.scope}", needed=needed.value
-            )
-
-
 def needed_scope(path: str) -> KeyScope | None:
     """The scope that a decoded path needs; None: no key is asked."""
     if path == "/v1/admin" or path.startswith("/v1/admin/"):
@@ -182,3 +144,46 @@ def presented_key(scope: Scope) -> str:
         return (bearer or own)[0].decode("ascii")
     except UnicodeDecodeError as error:
         raise UnauthorizedError(f"the key is malformed: {_HOW}") from error
+
+
+class RateLimit:
+    """A bucket of `burst` tokens for each key, filled by `per_s` tokens a second; a request takes one.
+
+    Memory is bounded: the bucket that was used longest ago makes room, and whoever owned it begins with a full one.
+
+    Args:
+        per_s: Requests a second in the long run; 0: any number.
+        burst: Requests at once.
+        clock: Seconds that never go back.
+    """
+
+    def __init__(self, per_s: float, burst: int, clock: Callable[[], float] = time.monotonic) -> None:
+        self._per_s = per_s
+        self._burst = float(burst)
+        self._clock = clock
+        self._buckets: OrderedDict[str, tuple[float, float]] = OrderedDict()  # tokens, and when there were so many
+
+    @property
+    def n_buckets(self) -> int:
+        """Keys that are remembered."""
+        return len(self._buckets)
+
+    def take(self, key_id: str) -> None:
+        """Count a request of a key; raises RateLimitedError, which counts nothing."""
+        if self._per_s == 0:
+            return
+        at = self._clock()
+        tokens, since = self._buckets.pop(key_id, (self._burst, at))
+        tokens = min(self._burst, tokens + (at - since) * self._per_s)
+        is_allowed = tokens >= 1
+        self._buckets[key_id] = (tokens - 1 if is_allowed else tokens, at)
+        if len(self._buckets) > MAX_BUCKETS:
+            self._buckets.popitem(last=False)
+        if not is_allowed:
+            wait_s = max(1, math.ceil((1 - tokens) / self._per_s))
+            raise RateLimitedError(
+                f"this key may send {self._per_s:g} requests a second; send fewer, or wait {wait_s} s",
+                retry_after_s=wait_s,
+                rate_limit_per_s=self._per_s,
+                rate_limit_burst=int(self._burst),
+            )

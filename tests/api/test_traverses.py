@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from deepsimbad.api.frame_batch import InvalidBatchError, read_batch
+from deepsimbad.api.traverses import InvalidBatchError, read_batch
 from deepsimbad.errors import TooLargeError
 
 GOOD: dict[str, Any] = {

@@ -11,16 +11,16 @@ from fastapi import FastAPI
 from sqlite_utils import Database
 from starlette.testclient import TestClient
 
-from deepsimbad.api import readiness
+from deepsimbad.api import health
 from deepsimbad.api.app import create_app
-from deepsimbad.api.dependencies import Services
+from deepsimbad.api.requests import Services
 from deepsimbad.settings import Settings
 from deepsimbad.store.layout import catalog_path, sessions_path
 
 
 @pytest.fixture
 def app(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> FastAPI:
-    monkeypatch.setattr(readiness, "TRUSTED_S", -1.0)  # look every time
+    monkeypatch.setattr(health, "TRUSTED_S", -1.0)  # look every time
     return create_app(Settings(data_dir=tmp_path))
 
 
@@ -101,7 +101,7 @@ def test_what_is_broken_is_told(client: TestClient, breaks: Callable[[TestClient
 
 
 def test_a_disk_almost_full(client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(readiness, "LEAST_FREE_BYTES", 1 << 60)
+    monkeypatch.setattr(health, "LEAST_FREE_BYTES", 1 << 60)
     (fault,) = faults(client)
     assert re.fullmatch(r"\d+ MiB are free in the data directory, fewer than 1099511627776", fault)
 
@@ -126,7 +126,7 @@ def test_it_is_ready_again_when_the_fault_is_gone(client: TestClient) -> None:
 
 def test_whoever_asks_often_is_answered_from_memory(client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
     """Or a stranger could keep the disk busy."""
-    monkeypatch.setattr(readiness, "TRUSTED_S", 1000.0)
+    monkeypatch.setattr(health, "TRUSTED_S", 1000.0)
     assert client.get("/readyz").status_code == 200
     refuse_writes(client)
     assert client.get("/readyz").status_code == 200

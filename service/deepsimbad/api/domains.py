@@ -1,0 +1,283 @@
+"""Domains: what there are, making and removing them, the landmarks of their maps."""
+
+import logging
+from http import HTTPStatus
+from typing import Annotated, Any, Self
+
+from anyio.to_thread import run_sync
+from fastapi import APIRouter, Query, Request, Response
+from pydantic import Field, model_validator
+
+from deepsimbad.api.openapi import binary, declare_json, problems
+from deepsimbad.api.requests import (
+    BINARY,
+    GREATEST_ID,
+    KEPT,
+    Answer,
+    DomainName,
+    JsonBody,
+    Running,
+    Services,
+    names,
+    read_json,
+)
+from deepsimbad.engine.encoders import EvaluatorPool, ready
+from deepsimbad.engine.maps import Maps
+from deepsimbad.errors import NoActiveMapError, UnavailableError, UnknownDomainError
+from deepsimbad.evaluators.registry import EXTRACTOR_PATTERN, EvaluatorConfig, EvaluatorKind, evaluator_config
+from deepsimbad.store.records import DomainRecord
+
+router = APIRouter(prefix="/v1/domains", tags=["domains"])
+admin = APIRouter(prefix="/v1/admin/domains", tags=["admin: domains"])
+log = logging.getLogger(__name__)
+
+# Bodies and answers
+
+
+_EVALUATOR_SCHEMA = {
+    "type": "object",
+    "required": ["kind"],
+    "properties": {
+        "kind": {"enum": [kind.value for kind in EvaluatorKind]},
+        "extractor": {"type": "string", "pattern": EXTRACTOR_PATTERN},
+    },
+    "additionalProperties": False,
+}
+
+
+class DomainBody(JsonBody):
+    """A domain to be made."""
+
+    evaluator: Annotated[
+        dict[str, Any], Field(description="Its `kind`, and options.", json_schema_extra=_EVALUATOR_SCHEMA)
+    ]
+    closed: Annotated[bool, Field(strict=True, description="Whether the end of the route joins its start.")] = False
+    actions_m: Annotated[
+        tuple[Annotated[float, Field(strict=True, gt=0, le=1000, allow_inf_nan=False)], ...],
+        Field(min_length=1, max_length=64, description="Moves in metres, ascending."),
+    ] = tuple(float(action) for action in range(1, 11))
+
+    @model_validator(mode="after")
+    def _ascending(self) -> Self:
+        if any(longer <= shorter for shorter, longer in zip(self.actions_m, self.actions_m[1:], strict=False)):
+            raise ValueError("actions_m must ascend")
+        return self
+
+
+class DomainAnswer(Answer):
+    """A domain and its active map; the map's members are null while it has none or it is damaged."""
+
+    name: str
+    evaluator: Annotated[dict[str, Any], Field(description="Its `kind` and options, defaults filled in.")]
+    evaluator_problem: Annotated[
+        str | None, Field(description="Code of what keeps the extractor from being loaded; images are then a 503.")
+    ]
+    input_size: Annotated[
+        tuple[int, int] | None,
+        Field(
+            description="[width, height] in pixels to resize an image to; null: images are taken as they are, or not "
+            "at all where `encoding_dim` is null too."
+        ),
+    ]
+    encoding_dim: Annotated[
+        int | None,
+        Field(
+            description="Length of an image's encoding; null: no images are taken. Ready ones may have any one length."
+        ),
+    ]
+    weights_sha256: Annotated[
+        str | None, Field(description="SHA-256 of the file of weights that images are encoded by; null: of none.")
+    ]
+    closed: Annotated[bool, Field(description="Whether the end of the route joins its start.")]
+    actions_m: Annotated[list[float], Field(description="The moves a planner may choose, in metres.")]
+    created_at: str
+    map_version: Annotated[int | None, Field(description="The active one.")]
+    map_problem: Annotated[str | None, Field(description="Code of what keeps the active map from answering.")]
+    relevance: str | None
+    route_length_m: float | None
+    n_map_images: int | None
+    n_landmarks: int | None
+    list_length: int | None
+    index_bits_per_map_image: float | None
+    landmark_model_digest: Annotated[
+        str | None, Field(description="SHA-256 of the landmarks that a robot may rank itself: see `landmark-model`.")
+    ]
+
+
+class DomainList(Answer):
+    """All domains, by name."""
+
+    domains: list[DomainAnswer]
+
+
+def describe_domain(record: DomainRecord, evaluators: EvaluatorPool, maps: Maps) -> DomainAnswer:
+    """A domain and its active map, whatever state they are in; may read files, so it belongs in a thread.
+
+    Raises:
+        UnknownDomainError: It was deleted meanwhile.
+    """
+    evaluator = snapshot = evaluator_problem = map_problem = None
+    try:
+        evaluator = ready(evaluators.evaluator(record.evaluator))
+    except UnavailableError as error:
+        evaluator_problem = error.hints.get("reason", error.code)
+    try:
+        snapshot = maps.active(record.name).snapshot
+    except NoActiveMapError:
+        pass
+    except UnavailableError as error:  # damaged, or not to be read at this moment
+        map_problem = error.code
+    return DomainAnswer(
+        name=record.name,
+        evaluator=record.evaluator,
+        evaluator_problem=evaluator_problem,
+        input_size=evaluator and evaluator.input_size,
+        encoding_dim=evaluator and evaluator.encoding_dim,
+        weights_sha256=evaluator and evaluator.weights_sha256,
+        closed=record.closed,
+        actions_m=list(record.actions_m),
+        created_at=record.created_at,
+        map_version=snapshot.version if snapshot else record.active_version,
+        map_problem=map_problem,
+        relevance=snapshot and snapshot.retrieval.relevance.value,
+        route_length_m=snapshot and snapshot.route.length_m,
+        n_map_images=snapshot and snapshot.n_images,
+        n_landmarks=snapshot and snapshot.n_landmarks,
+        list_length=snapshot and snapshot.list_length,
+        index_bits_per_map_image=snapshot and snapshot.index_bits_per_map_image,
+        landmark_model_digest=snapshot and snapshot.landmark_model_digest,
+    )
+
+
+# Handlers
+
+
+@router.get("", responses=problems())
+async def list_domains(running: Running) -> DomainList:
+    """All domains, by name."""
+
+    def described() -> DomainList:
+        answers = []
+        for record in running.catalog.domains():
+            try:
+                answers.append(describe_domain(record, running.evaluators, running.maps))
+            except UnknownDomainError:  # deleted since it was listed
+                continue
+        return DomainList(domains=answers)
+
+    return await run_sync(described)
+
+
+@router.get("/{domain}", responses=problems(404, 422))
+async def get_domain(domain: DomainName, running: Running) -> DomainAnswer:
+    """One domain and its active map."""
+    return await run_sync(lambda: describe_domain(running.catalog.domain(domain), running.evaluators, running.maps))
+
+
+@router.get(
+    "/{domain}/landmark-model",
+    response_class=Response,
+    responses={
+        200: {
+            "content": binary(
+                "numpy npz without pickles: the landmark model's arrays by name, and 0-d arrays `map_version`, "
+                "`n_landmarks`, `evaluator` (its configuration as JSON) and `weights_sha256` (empty where there are "
+                "none)"
+            ),
+            "headers": {"ETag": {"description": "The landmark model's digest, quoted.", "schema": {"type": "string"}}},
+        },
+        304: {"description": "`If-None-Match` names this landmark model"},
+        **problems(404, 409, 410, 422),
+    },
+)
+async def get_landmark_model(
+    domain: DomainName,
+    request: Request,
+    running: Running,
+    map_version: Annotated[
+        int | None,
+        Query(ge=1, le=GREATEST_ID, description="A version that a session is pinned to; absent: the active one."),
+    ] = None,
+) -> Response:
+    """The landmarks of a map, for a robot that encodes on board and sends ranks.
+
+    What it sends with the tag in `If-Match` is never compared with other landmarks.
+    """
+
+    def packed() -> tuple[str, bytes | None]:
+        if map_version is None:
+            snapshot = running.maps.active(domain).snapshot
+        else:
+            snapshot = running.maps.snapshot(domain, map_version)
+        etag = f'"{snapshot.landmark_model_digest}"'
+        is_known = names(request.headers.get("if-none-match"), etag)
+        return etag, None if is_known else snapshot.portable_landmarks()
+
+    etag, content = await run_sync(packed, limiter=running.long_work)
+    headers = {**KEPT, "ETag": etag}
+    if content is None:
+        return Response(status_code=HTTPStatus.NOT_MODIFIED, headers=headers)
+    return Response(content, headers=headers, media_type=BINARY)
+
+
+@admin.put(
+    "/{domain}",
+    status_code=201,
+    responses={200: {"model": DomainAnswer, "description": "It was there already"}, **problems(409, 413, 415, 422)},
+    openapi_extra=declare_json(DomainBody),
+)
+async def put_domain(domain: DomainName, request: Request, response: Response, running: Running) -> DomainAnswer:
+    """Make a domain; the same again changes nothing, a different one is a 409."""
+    body = await read_json(request, DomainBody)
+    evaluator_config(body.evaluator)
+
+    def make() -> tuple[DomainAnswer, bool]:
+        evaluator = _completed(body.evaluator, running, domain)
+        record, created = running.catalog.create_domain(
+            domain, dict(evaluator.as_dict()), body.closed, body.actions_m, running.settings.max_domains
+        )
+        return describe_domain(record, running.evaluators, running.maps), created
+
+    answer, created = await run_sync(make)
+    response.status_code = 201 if created else 200
+    if created:
+        log.info("domain made", extra={"domain": domain})
+    return answer
+
+
+@admin.delete("/{domain}", status_code=204, responses=problems(404, 409, 422))
+async def delete_domain(domain: DomainName, running: Running) -> None:
+    """Remove a domain with its traverses and maps, and end its sessions; a job that still works on it is a 409."""
+    await run_sync(running.open_traverses.forget, domain)
+    deleted = False
+    try:
+        await run_sync(running.catalog.delete_domain, domain)
+        deleted = True
+    finally:  # where only its folder could not be removed, the domain is gone all the same
+        if deleted or await run_sync(_is_gone, running, domain):
+            running.maps.forget(domain)
+            await running.sessions.end_those(lambda session: session.domain == domain)
+            running.metrics.forget_domain(domain)
+    log.info("domain deleted", extra={"domain": domain})
+
+
+def _completed(given: dict[str, Any], running: Services, domain: str) -> EvaluatorConfig:
+    """The configuration of a domain that is made now, loaded once; where it exists, what was left out is as it has it.
+
+    The default may have changed since it was made.
+    """
+    try:
+        present = running.catalog.domain(domain).evaluator
+    except UnknownDomainError:
+        config = evaluator_config(given)
+        running.evaluators.evaluator(config.as_dict()).load()  # one that cannot be loaded should not be stored
+        return config
+    return evaluator_config({**present, **given} if present.get("kind") == given["kind"] else given)
+
+
+def _is_gone(running: Services, domain: str) -> bool:
+    try:
+        running.catalog.domain(domain)
+    except UnknownDomainError:
+        return True
+    return False

@@ -1,0 +1,299 @@
+"""The door of the service, which every request passes: its id, its key, its size, its turn, its log line.
+
+Nothing that happens behind it leaves the sender without an answer or the log without a line.
+"""
+
+import asyncio
+import logging
+import re
+import secrets
+import time
+from urllib.parse import urlsplit
+
+from starlette.middleware.cors import CORSMiddleware
+from starlette.requests import ClientDisconnect
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from deepsimbad.api.keys import KeyRing, RateLimit, needed_scope, presented_key
+from deepsimbad.api.metrics import Metrics
+from deepsimbad.api.problems import error_response, unexpected_response
+from deepsimbad.api.requests import Slots
+from deepsimbad.errors import (
+    BodyTooLargeError,
+    DeepSimbadError,
+    ForbiddenError,
+    ForeignHostError,
+    InvalidInputError,
+    UnauthorizedError,
+    UnavailableError,
+    UnreadableRequestError,
+    UnsupportedMediaTypeError,
+)
+from deepsimbad.settings import Settings, is_loopback
+from deepsimbad.store.records import KeyScope
+
+log = logging.getLogger(__name__)
+
+FREE_BYTES = 1 << 16  # of a body, not counted; as much as the server buffers of every connection anyway
+ALWAYS_ANSWERED = frozenset({"/healthz", "/readyz", "/metrics"})
+# What every answer carries unless its route says otherwise: nothing here is for a browser to guess, keep or embed.
+SECURITY_HEADERS = (
+    (b"x-content-type-options", b"nosniff"),
+    (b"cache-control", b"no-store"),
+    (b"content-security-policy", b"default-src 'none'; frame-ancestors 'none'"),
+    (b"referrer-policy", b"no-referrer"),
+    (b"x-frame-options", b"DENY"),
+    (b"cross-origin-resource-policy", b"same-origin"),
+)
+# Codes of answers that turn a request away for what it is or how many there are, before it is looked into.
+REFUSALS = frozenset(
+    {
+        *("unauthorized", "forbidden", "foreign_host", "rate_limited", "overloaded"),
+        *("too_many_sessions", "too_many_jobs", "too_many_domains", "body_too_large", "image_too_large"),
+    }
+)
+_CORS_SENT = (
+    *("Authorization", "X-API-Key", "Content-Type", "X-Request-ID", "Idempotency-Key"),
+    *("Range", "If-Range", "If-None-Match"),
+)
+_CORS_SHOWN = (
+    *("X-Request-ID", "Retry-After", "Location", "WWW-Authenticate"),
+    *("ETag", "Repr-Digest", "Content-Range", "Content-Disposition"),
+)
+UNROUTED = "(none)"
+STOPPING = UnavailableError("the service is shutting down")
+_REQUEST_ID = re.compile(rb"[A-Za-z0-9._-]{1,64}")
+_BATCH_PATH = re.compile(r"/v1/admin/domains/[^/]+/traverses/[^/]+/frames")
+_METHODS = {"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"}
+_NAMED = ("domain", "session_id", "job_id")  # parameters of paths
+_NOTED = ("key_id", "domain", "code", "limit")  # by whoever learnt it
+_LONGEST_PATH = 256  # of a path in the log: the sender chooses it
+_SENDER_LEFT = 499  # as proxies log it; never sent
+
+
+class Door:
+    """ASGI middleware around all routes.
+
+    A request counts as under way from when its body has come to when its answer begins: whoever sends or reads slowly
+    takes memory for what was sent, but nobody's turn. Health, readiness and metrics are always answered.
+    """
+
+    def __init__(self, app: ASGIApp, settings: Settings, keys: KeyRing, metrics: Metrics) -> None:
+        self._routes = app
+        self._app: ASGIApp = self._let_in
+        if settings.cors_origins:
+            self._app = CORSMiddleware(
+                self._let_in,
+                allow_origins=settings.cors_origins,
+                allow_methods=("GET", "POST", "PUT", "DELETE"),
+                allow_headers=_CORS_SENT,
+                expose_headers=_CORS_SHOWN,
+            )
+        self.settings = settings
+        self.keys = keys
+        self.metrics = metrics
+        self.rate_limit = RateLimit(settings.rate_limit_per_s, settings.rate_limit_burst)
+        self.under_way = Slots(settings.max_requests, "requests are under way", "max_requests")
+        self.body_bytes = Slots(settings.max_body_memory_bytes, "bytes of bodies are held", "max_body_memory_bytes")
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:  # noqa: D102 - ASGI
+        if scope["type"] != "http":
+            await self._routes(scope, receive, send)
+            return
+        request = scope["door"] = _Request(self, scope, receive, send)
+        self.metrics.request_began()
+        try:
+            await self._app(scope, request.receive, request.send)
+        except asyncio.CancelledError:  # the server stops and waits no longer
+            if request.status == 0:
+                await error_response(scope, STOPPING)(scope, receive, request.send)
+        except ClientDisconnect:  # nobody is left to be answered
+            request.status = request.status or _SENDER_LEFT
+        except Exception:
+            log.exception("request failed", extra={"request_id": scope["state"]["request_id"], **request.about()})
+            if request.status == 0:
+                await unexpected_response(scope)(scope, receive, request.send)
+        finally:
+            request.end()
+
+    async def _let_in(self, scope: Scope, receive: Receive, send: Send) -> None:
+        request: _Request = scope["door"]
+        try:
+            request.check()
+        except DeepSimbadError as error:
+            await error_response(scope, error)(scope, receive, send)
+        else:
+            await self._routes(scope, receive, send)
+
+
+class _Request:
+    """One request on its way through the door."""
+
+    def __init__(self, door: Door, scope: Scope, receive: Receive, send: Send) -> None:
+        self.status = 0
+        self._door = door
+        self._scope = scope
+        self._receive = receive
+        self._send = send
+        self._began = time.perf_counter()
+        self._was_counted = self._is_counted = False
+        self._is_batch = scope["method"] == "POST" and _BATCH_PATH.fullmatch(scope["path"]) is not None
+        self._n_bytes = self._n_held = 0  # of the body, so far
+        self._most_bytes = 0
+        self._headers = dict(scope["headers"])
+        request_id = self._headers.get(b"x-request-id", b"")
+        if not _REQUEST_ID.fullmatch(request_id):
+            request_id = secrets.token_hex(8).encode()
+        scope.setdefault("state", {})["request_id"] = request_id.decode()
+        self._own_headers: tuple[tuple[bytes, bytes], ...] = ((b"x-request-id", request_id), *SECURITY_HEADERS)
+
+    # What the head tells
+
+    def check(self) -> None:
+        """Judge the head; raises the error that the sender is answered."""
+        needed = needed_scope(self._scope["path"])
+        if self._door.keys.n_created == 0:
+            self._check_page()
+        if needed is not None and not self._door.keys.is_open:
+            self._check_key(needed)
+        self._check_size()
+
+    def _check_page(self) -> None:
+        """While no key is asked, refuse what a page of another host may have sent.
+
+        A page's own name may be answered by a loopback address (DNS rebinding): its Host betrays it.
+        """
+        settings = self._door.settings
+        host, origin = (self._headers.get(name, b"").decode("latin-1") for name in (b"host", b"origin"))
+        name, reached = _name(host), (self._scope.get("server") or ("",))[0]
+        if origin and urlsplit(origin).netloc != host and not {origin, "*"} & set(settings.cors_origins):
+            what = f"a page of {origin[:100]!r} may not call it"
+        elif host and settings.is_loopback and not (is_loopback(name) or name in {settings.host, reached} - {""}):
+            what = f"it is not asked by the name {host[:100]!r}"
+        else:
+            return
+        raise ForeignHostError(f"this service asks for no key and answers its own machine alone: {what}")
+
+    def _check_key(self, needed: KeyScope) -> None:
+        noted = self._scope["state"]  # for the log
+        try:
+            key = self._door.keys.holder(presented_key(self._scope))
+        except UnauthorizedError as error:
+            noted |= {name: value for name, value in error.hints.items() if name == "key_id"}  # revoked or expired
+            raise
+        noted["key_id"] = key.key_id
+        self._door.rate_limit.take(key.key_id)
+        if not key.scope.includes(needed):
+            raise ForbiddenError(
+                f"this call needs a key of scope {needed}; this one has {key.scope}", needed=needed.value
+            )
+
+    def _check_size(self) -> None:
+        """Judge how the body will come, and whether there is room for it."""
+        settings, headers = self._door.settings, self._headers
+        is_image = headers.get(b"content-type", b"").lower().startswith(b"image/")
+        self._most_bytes = settings.max_image_bytes if is_image else settings.max_json_bytes
+        if self._is_batch:
+            self._most_bytes = settings.max_batch_bytes
+        declared = headers.get(b"content-length", b"0").strip()
+        if not declared.isdigit():
+            raise InvalidInputError("Content-Length is not a number")
+        n_declared, is_chunked = int(declared), b"transfer-encoding" in headers
+        if is_chunked and b"content-length" in headers:  # whoever stands between us may have taken the other one
+            self._own_headers += ((b"connection", b"close"),)
+            raise UnreadableRequestError("the body has both a Content-Length and a Transfer-Encoding")
+        has_body = n_declared > 0 or is_chunked
+        packing = headers.get(b"content-encoding", b"").strip().lower() or b"identity"
+        if has_body and packing != b"identity":  # what it unpacks to is not known from its length
+            raise UnsupportedMediaTypeError(
+                f"Content-Encoding {packing[:100].decode('ascii', 'replace')!r} is not taken: send the body as it is",
+                allowed=["identity"],
+            )
+        if n_declared > self._most_bytes:
+            raise self._too_large(f"the body has {n_declared} bytes")
+        if self._scope["path"] in ALWAYS_ANSWERED:
+            self._was_counted = True
+        elif has_body:  # only asked for: who announces much and sends nothing should keep nobody out
+            self._door.under_way.check()
+            self._door.body_bytes.check(0 if self._is_batch else n_declared - FREE_BYTES)
+        else:
+            self._count()
+
+    # What comes and goes
+
+    async def receive(self) -> Message:
+        """The next part of the body, counted; raises BodyTooLargeError or OverloadedError."""
+        message = await self._receive()
+        if message["type"] == "http.request":
+            self._n_bytes += len(message.get("body", b""))
+            if self._n_bytes > self._most_bytes:
+                raise self._too_large("the body is longer than is taken")
+            n_more = self._n_bytes - FREE_BYTES - self._n_held
+            if n_more > 0 and not self._is_batch:  # those go to the disk as they come
+                self._door.body_bytes.take(n_more)
+                self._n_held += n_more
+            if not self._was_counted and not message.get("more_body", False):
+                self._count()
+        return message
+
+    async def send(self, message: Message) -> None:
+        """Give a part of the answer on; its first ends the request's turn."""
+        if message["type"] == "http.response.start":
+            self._uncount()
+            self.status = message["status"]
+            headers = message.get("headers", ())
+            names = {name for name, _ in headers}
+            message["headers"] = [*headers, *(header for header in self._own_headers if header[0] not in names)]
+        await self._send(message)
+
+    def end(self) -> None:
+        """The answer has gone, or nobody waits for it: give back what was taken, and tell of it."""
+        self._uncount()
+        self._door.body_bytes.give_back(self._n_held)
+        seconds = time.perf_counter() - self._began
+        scope, metrics = self._scope, self._door.metrics
+        # Labels come from our own words alone: a stranger's paths would grow the registry without end.
+        route = getattr(scope.get("route"), "path", UNROUTED)
+        method = scope["method"] if scope["method"] in _METHODS else "OTHER"
+        metrics.request_ended(method, route, self.status, seconds)
+        about = self.about()
+        if about.get("code") in REFUSALS:
+            metrics.refused(about.get("limit", about["code"]))
+        if log.isEnabledFor(logging.INFO):
+            line = {
+                "request_id": scope["state"]["request_id"],
+                "peer": (scope.get("client") or ("",))[0],
+                "method": method,
+                "path": scope["path"][:_LONGEST_PATH],
+                "status": self.status,
+                "ms": round(seconds * 1000, 2),
+            }
+            log.info("request", extra=line | about)
+
+    def about(self) -> dict[str, str]:
+        """Whose request it is, what it is about and the code of what was wrong, as far as each is known."""
+        named, noted = self._scope.get("path_params") or {}, self._scope["state"]
+        return {name: noted[name] for name in _NOTED if name in noted} | {
+            name: named[name] for name in _NAMED if name in named
+        }
+
+    def _count(self) -> None:
+        self._door.under_way.take()
+        self._was_counted = self._is_counted = True
+
+    def _uncount(self) -> None:
+        if self._is_counted:
+            self._is_counted = False
+            self._door.under_way.give_back()
+
+    def _too_large(self, what: str) -> BodyTooLargeError:
+        most = self._most_bytes
+        return BodyTooLargeError(f"{what}; at most {most} are taken here, send less at once", max_bytes=most)
+
+
+def _name(host: str) -> str:
+    """The name or address in a Host header, without its port; empty where there is none."""
+    try:
+        return urlsplit(f"//{host}").hostname or ""
+    except ValueError:  # a bracket that is not closed
+        return ""

@@ -1,0 +1,342 @@
+"""Jobs: asking for the next map of a domain, following and cancelling; what operators learn of them."""
+
+import asyncio
+import logging
+import time
+from collections.abc import AsyncIterator
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from anyio.to_thread import run_sync
+from fastapi import APIRouter, Depends, Path, Request, Response
+from fastapi.sse import EventSourceResponse, ServerSentEvent
+from numpy.typing import NDArray
+from pydantic import Field
+
+from deepsimbad.api.localizations import MAX_LANDMARKS
+from deepsimbad.api.openapi import declare_json, problems
+from deepsimbad.api.requests import (
+    GREATEST_EXACT_INTEGER,
+    NAME_PATTERN,
+    USUALLY_AT_ONCE,
+    Answer,
+    DomainName,
+    JsonBody,
+    KeyOfJob,
+    Limit,
+    Name,
+    Next,
+    OfDomain,
+    Running,
+    after,
+    cursor_of,
+    id_under_key,
+    key_id_of,
+    number_of,
+    read_json,
+)
+from deepsimbad.api.sessions import TruePositions
+from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Relevance
+from deepsimbad.errors import DeepSimbadError, NoActiveMapError, UnknownJobError
+from deepsimbad.jobs.known_frames import refuse_known_traverse
+from deepsimbad.jobs.map_config import DEFAULT_LIST_LENGTH, DEFAULT_TRAINING_EPISODES, RemapConfig
+from deepsimbad.jobs.runner import REMAP
+from deepsimbad.jobs.session_walks import EXPERIENCE, ExperienceConfig, keep_true_positions
+from deepsimbad.store.records import JobRecord
+from deepsimbad.store.traverses import Traverse
+
+router = APIRouter(prefix="/v1/admin/jobs", tags=["admin: jobs"])
+making = APIRouter(prefix="/v1/admin/domains", tags=["admin: maps"])
+log = logging.getLogger(__name__)
+
+JobId = Annotated[str, Path(pattern=NAME_PATTERN, description="A job's id.")]
+
+# Bodies and answers
+
+
+class RemapBody(JsonBody):
+    """What to build the next map of a domain from."""
+
+    training_traverse: Annotated[Name, Field(description="Its frames become the map images.")]
+    landmark_traverse: Annotated[
+        Name | None,
+        Field(description="Landmarks are selected among its frames; null keeps the active map's landmarks."),
+    ] = None
+    n_landmarks: Annotated[
+        Annotated[int, Field(strict=True, ge=1, le=MAX_LANDMARKS)] | None,
+        Field(description="r; null: 500, all frames of a shorter drive, or the active map's where they stay."),
+    ] = None
+    list_length: Annotated[int, Field(strict=True, ge=1, le=MAX_LANDMARKS, description="h, at most r")] = (
+        DEFAULT_LIST_LENGTH
+    )
+    relevance: Relevance = DEFAULT_RELEVANCE
+    training_episodes: Annotated[
+        int, Field(strict=True, ge=0, le=10_000_000, description="Of what the planner `nnql` knows; 0: nothing.")
+    ] = DEFAULT_TRAINING_EPISODES
+    seed: Annotated[int, Field(strict=True, ge=0, le=GREATEST_EXACT_INTEGER)] = 0
+    activate: Annotated[
+        bool, Field(strict=True, description="Switch to the new map when it is sealed, whatever serves by then.")
+    ] = True
+    check_traverse: Annotated[
+        Name | None,
+        Field(
+            description="Drive that the new map and the active one are compared on; "
+            "null: every tenth frame of the training traverse, held out."
+        ),
+    ] = None
+    gate_margin: Annotated[
+        Annotated[float, Field(strict=True, ge=0, le=100, allow_inf_nan=False)] | None,
+        Field(
+            description="Percentage points of ANR by which the new map may be worse than the active one; "
+            "one that is worse is sealed but not activated. null: no gate."
+        ),
+    ] = None
+    append: Annotated[
+        bool,
+        Field(
+            strict=True,
+            description="Add the training traverse to a copy of the active map, whose images and landmarks stay; "
+            "landmark_traverse must be null.",
+        ),
+    ] = False
+    same_route: Annotated[
+        Annotated[bool, Field(strict=True)] | None,
+        Field(
+            description="Whether the training traverse and the one that the map would learn a second season from (the "
+            "landmark traverse, else what the active map was made of) count positions along one route; null: only "
+            "where both know x, y. Where their views disagree nothing is learnt, and metrics.second_season says why."
+        ),
+    ] = None
+
+    def config(self) -> RemapConfig:
+        """The job's form; raises InvalidMapConfigError."""
+        return RemapConfig(**{name: getattr(self, name) for name in type(self).model_fields})
+
+
+class ExperienceBody(TruePositions):
+    """Where the robot of a session truly was."""
+
+    session_id: Name
+
+
+class JobResult(Answer):
+    """What a remap made."""
+
+    map_version: int
+    active: bool
+    metrics: dict[str, Any]
+
+
+class JobError(Answer):
+    """Why a job failed."""
+
+    code: str
+    detail: str
+
+
+class JobAnswer(Answer):
+    """A job on its way, or ended."""
+
+    job_id: str
+    domain: str
+    kind: str
+    state: Literal["queued", "running", "succeeded", "failed", "cancelled"]
+    stage: str | None
+    progress: Annotated[float, Field(ge=0, le=1)]
+    eta_s: float | None
+    result: JobResult | None
+    error: JobError | None
+    config: dict[str, Any]
+    created_at: str
+    started_at: str | None
+    finished_at: str | None
+
+
+class JobList(Answer):
+    """Jobs, newest first."""
+
+    jobs: list[JobAnswer]
+    next: Next
+
+
+def render_job(record: JobRecord) -> JobAnswer:
+    """A job."""
+    error = record.error
+    return JobAnswer(
+        job_id=record.job_id,
+        domain=record.domain,
+        kind=record.kind,
+        state=record.state.value,
+        stage=record.stage,
+        progress=record.progress,
+        eta_s=record.eta_s,
+        result=None if record.result is None else JobResult(**record.result),
+        error=None if error is None else JobError(code=error["code"], detail=error["message"]),
+        config=record.config,
+        created_at=record.created_at,
+        started_at=record.started_at,
+        finished_at=record.finished_at,
+    )
+
+
+# Handlers
+
+
+@making.post(
+    "/{domain}/remaps",
+    status_code=202,
+    responses={
+        202: {"headers": {"Location": {"description": "The job.", "schema": {"type": "string"}}}},
+        **problems(404, 409, 413, 415, 422, 429),
+    },
+    openapi_extra=declare_json(RemapBody),
+)
+async def post_remap(
+    domain: DomainName, request: Request, response: Response, running: Running, idempotency_key: KeyOfJob = None
+) -> JobAnswer:
+    """Build the next map of a domain as a job; what serves stays until the new map is sealed.
+
+    Without `landmark_traverse` the active map's landmarks stay, which is the cheap way to retrain; with `append` its
+    images stay too, and the training traverse is added to them. The new map is compared with the active one
+    (`metrics.check` of the result), and with a `gate_margin` sealed but not activated where it is worse by more.
+    """
+    body = await read_json(request, RemapBody)
+    config = body.config()
+    job_id = id_under_key(request, REMAP, domain, idempotency_key)
+
+    def submit() -> JobAnswer:
+        made = running.runner.made_before(job_id, config)
+        if made is not None:
+            return render_job(made)
+        record = running.catalog.domain(domain)
+        for name in (config.training_traverse, config.landmark_traverse, config.check_traverse):
+            if name is not None:
+                Traverse.open(running.settings.data_dir, domain, name).close()
+        if config.landmark_traverse is None and record.active_version is None:
+            wanted = (
+                "that could be appended to; make one first, without append"
+                if config.append
+                else "whose landmarks could stay; give a landmark_traverse"
+            )
+            raise NoActiveMapError(f"domain {domain} has no active map {wanted}", domain=domain)
+        if config.append and record.active_version is not None:
+            active = running.catalog.map(domain, record.active_version)
+            refuse_known_traverse(active.config, active.version, config.training_traverse)
+        return render_job(running.runner.submit(domain, config, job_id))
+
+    job = await run_sync(submit)
+    response.headers["Location"] = f"/v1/admin/jobs/{job.job_id}"
+    return job
+
+
+@making.post(
+    "/{domain}/experience",
+    status_code=202,
+    responses={
+        202: {"headers": {"Location": {"description": "The job.", "schema": {"type": "string"}}}},
+        **problems(404, 409, 410, 413, 415, 422, 429),
+    },
+    openapi_extra=declare_json(ExperienceBody),
+)
+async def post_experience(
+    domain: DomainName, request: Request, response: Response, running: Running, idempotency_key: KeyOfJob = None
+) -> JobAnswer:
+    """Let the next map version learn from a session, whose true positions are known by now, as a job.
+
+    The next version is the active one with a better experience database; the session may have ended, up to
+    a day ago unless the settings say otherwise. What it tells of the live answers counts as it does for `truths`.
+    """
+    body = await read_json(request, ExperienceBody)
+    config = ExperienceConfig.of(body.session_id, body.true_positions_m)
+    job_id = id_under_key(request, EXPERIENCE, domain, idempotency_key)
+
+    def keep() -> NDArray[np.float64] | None:
+        return keep_true_positions(
+            running.session_store, running.catalog, domain, body.session_id, body.true_positions_m, time.time()
+        )
+
+    async def learn() -> JobRecord:
+        before_m = await run_sync(keep)
+        try:
+            return await run_sync(running.runner.submit, domain, config, job_id)
+        finally:  # what was kept counts now or never, though the job be refused
+            await count(before_m)
+
+    async def count(before_m: NDArray[np.float64] | None) -> None:
+        try:
+            ranked = await running.truths.rank(body.session_id, body.true_positions_m)
+        except DeepSimbadError as error:  # the job is on its way all the same
+            about = {"domain": domain, "session_id": body.session_id}
+            log.warning("truths could not be ranked: %s", error, extra=about)
+        else:
+            await run_sync(running.metrics.fed_back, domain, ranked.new_since(before_m).tolist())
+
+    job = await run_sync(running.runner.made_before, job_id, config) or await learn()
+    response.headers["Location"] = f"/v1/admin/jobs/{job.job_id}"
+    return render_job(job)
+
+
+async def _job(job_id: JobId, running: Running) -> JobRecord:
+    """The job of the path, so that an unknown one is refused before a stream begins."""
+    return await run_sync(running.catalog.job, job_id)
+
+
+async def _stream(running: Running) -> AsyncIterator[None]:
+    """Room for one more stream, until it ends."""
+    with running.event_streams.taken():
+        yield
+
+
+@router.get("", responses=problems(404, 422))
+async def list_jobs(
+    running: Running,
+    domain: OfDomain = None,
+    limit: Limit = USUALLY_AT_ONCE,
+    cursor: Annotated[str | None, after("jobs")] = None,
+) -> JobList:
+    """Jobs, newest first."""
+    page = await run_sync(running.catalog.newest_jobs, domain, number_of(cursor), limit)
+    return JobList(jobs=[render_job(record) for record in page.records], next=cursor_of("jobs", page.last_key))
+
+
+@router.get("/{job_id}", responses=problems(404, 422))
+async def get_job(job: Annotated[JobRecord, Depends(_job)]) -> JobAnswer:
+    """One job."""
+    return render_job(job)
+
+
+@router.get(
+    "/{job_id}/events",
+    response_class=EventSourceResponse,
+    dependencies=[Depends(_stream)],
+    responses={
+        200: {"description": "`progress` events holding the job whenever it changed, and `done` at its end."},
+        **problems(404, 422),
+    },
+)
+async def get_job_events(
+    job: Annotated[JobRecord, Depends(_job)], request: Request, running: Running
+) -> AsyncIterator[ServerSentEvent]:
+    """Follow a job: server-sent events, each holding the job as JSON; the last one is named `done`.
+
+    The stream may end earlier, when the service shuts down or the key is revoked: ask for the job again.
+    """
+    sent: JobRecord | None = None
+    key_id = key_id_of(request)
+    while not running.stopping.is_set() and running.keys.still_opens(key_id):
+        if job != sent:
+            sent = job
+            yield ServerSentEvent(data=render_job(job), event="done" if job.state.is_final else "progress")
+        if job.state.is_final:
+            return
+        await asyncio.sleep(running.settings.event_poll_s)
+        try:
+            job = await run_sync(running.catalog.job, job.job_id)
+        except UnknownJobError:  # its domain was deleted
+            return
+
+
+@router.delete("/{job_id}", status_code=204, responses=problems(404, 422))
+async def cancel_job(job_id: JobId, running: Running) -> None:
+    """Ask a job to stop; one that has ended stays as it is."""
+    await run_sync(running.runner.cancel, job_id)

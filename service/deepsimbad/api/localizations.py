@@ -1,0 +1,359 @@
+"""Where a single view places the robot, from a uniform prior; and what every answer to a view is made of."""
+
+import math
+from io import BytesIO
+from typing import Annotated, Any, Self
+
+import numpy as np
+from fastapi import APIRouter, Query, Request, Response
+from numpy.typing import NDArray
+from pydantic import FailFast, Field, StrictFloat, StrictInt, model_validator
+from pydantic_core import to_json
+from typing_extensions import TypedDict
+
+from deepsimbad.api.openapi import binary, declare, problems
+from deepsimbad.api.requests import (
+    BINARY,
+    GREATEST_ID,
+    JSON,
+    MAX_NUMBERS,
+    DomainName,
+    JsonBody,
+    LandmarkModelTag,
+    Running,
+    Services,
+    insisted_on,
+    media_type_of,
+    parse_json,
+    read_bytes,
+)
+from deepsimbad.core.belief_summary import BeliefSummary
+from deepsimbad.core.planners import Plan
+from deepsimbad.core.route import Route
+from deepsimbad.engine.localizer import Localization, Retrieval, localize, retrieve, shortlist_length
+from deepsimbad.engine.views import (
+    Dissimilarities,
+    NothingSeen,
+    PackedRanks,
+    RankedLandmarks,
+    ReadyEncoding,
+    Stopwatch,
+    View,
+)
+from deepsimbad.engine.worker import Priority
+from deepsimbad.evaluators.base import Evaluator
+from deepsimbad.evaluators.image import MEDIA_TYPES
+
+router = APIRouter(prefix="/v1/domains", tags=["localization"])
+
+RANKS = "application/vnd.deepsimbad.ranks"
+MAX_LANDMARKS = 0xFFFF
+
+# Bodies
+
+
+class ObservationBody(JsonBody):
+    """What a robot made of a view on board: exactly one of the three.
+
+    NaN and infinity pass here, and are refused by what knows the right code for them.
+    """
+
+    ranked_landmarks: Annotated[tuple[StrictInt, ...], FailFast()] = ()
+    dissimilarities: Annotated[tuple[StrictFloat, ...], FailFast()] = ()
+    encoding: Annotated[tuple[StrictFloat, ...], FailFast()] = ()
+
+    @model_validator(mode="after")
+    def _one(self) -> Self:
+        if len(self.model_fields_set) != 1:
+            raise ValueError("give exactly one of ranked_landmarks, dissimilarities, encoding")
+        return self
+
+    def view(self) -> RankedLandmarks | Dissimilarities | ReadyEncoding:
+        """The engine's form."""
+        if "ranked_landmarks" in self.model_fields_set:
+            return RankedLandmarks(self.ranked_landmarks)
+        if "dissimilarities" in self.model_fields_set:
+            return Dissimilarities(np.array(self.dissimilarities, np.float64))
+        return ReadyEncoding(np.array(self.encoding, np.float64))
+
+
+def only(name: str, items: dict[str, Any], description: str) -> dict[str, Any]:
+    """The schema of an object with one list of numbers."""
+    values = {"type": "array", "items": items, "minItems": 1, "maxItems": MAX_NUMBERS, "description": description}
+    return {"type": "object", "required": [name], "properties": {name: values}, "additionalProperties": False}
+
+
+IMAGE_SCHEMA: dict[str, Any] = {"type": "string", "format": "binary"}
+_OBSERVATION_SCHEMA = {
+    "oneOf": [
+        only(
+            "ranked_landmarks",
+            {"type": "integer", "minimum": 0, "maximum": MAX_LANDMARKS - 1},
+            "Distinct landmark ids from 0, nearest first, 1..r of them; of the rest no more is known than that they "
+            "are farther, and that landmarks go together as they did along the map's own drive.",
+        ),
+        only("dissimilarities", {"type": "number"}, "r finite numbers in landmark order, smaller is nearer."),
+        only("encoding", {"type": "number"}, "A ready encoding, as long as those the map was made of."),
+    ]
+}
+_RANKS_SCHEMA: dict[str, Any] = {
+    **IMAGE_SCHEMA,
+    "description": "The same in fewest bytes: their number m in two, big-endian, then m landmark ids, nearest first, "
+    "of ceil(log2 r) bits each, most significant bit first; zero bits fill the last byte.",
+}
+OBSERVATION_TYPES = (*MEDIA_TYPES, JSON, RANKS)
+OBSERVATION_BODY = declare(
+    {**dict.fromkeys(MEDIA_TYPES, IMAGE_SCHEMA), JSON: _OBSERVATION_SCHEMA, RANKS: _RANKS_SCHEMA}
+)
+Shortlist = Annotated[
+    int | None,
+    Query(
+        ge=1,
+        le=GREATEST_ID,
+        description="Length of `retrieval` and `top`, up to the number of map images; absent: 10 or all.",
+    ),
+]
+
+# Answers: plain dictionaries, because there are some forty in one of them, made for every view
+
+
+class HistogramAnswer(TypedDict):
+    """The belief in equal bins along the whole route, at most 200 of them whatever the number of map images."""
+
+    edges_m: Annotated[list[float], Field(description="One longer than `mass`.", min_length=2, max_length=201)]
+    mass: Annotated[list[float], Field(description="Sums to 1.", min_length=1, max_length=200)]
+
+
+class PlaceAnswer(TypedDict):
+    """A map image that the belief favours."""
+
+    map_image: int
+    route_position_m: float
+    x_m: float | None
+    y_m: float | None
+    mass: float
+
+
+class BeliefAnswer(TypedDict):
+    """Where on the route the robot probably is."""
+
+    mean_m: float
+    mode_m: Annotated[float, Field(description="Position of the likeliest map image.")]
+    std_m: float
+    credible_95_m: Annotated[
+        tuple[float, float],
+        Field(description="Shortest stretch with 95 % of the mass; lo > hi crosses a closed route's start."),
+    ]
+    entropy_bits: Annotated[float, Field(description="Over map images.", ge=0)]
+    off_route: Annotated[
+        float | None, Field(description="Probability that the robot is nowhere on the route; null: unknown.")
+    ]
+    histogram: HistogramAnswer
+    top: Annotated[list[PlaceAnswer], Field(description="Likeliest map images, best first.")]
+
+
+class RetrievedAnswer(TypedDict):
+    """A map image and how well it answers the view."""
+
+    map_image: int
+    route_position_m: float
+    relevance: Annotated[float, Field(description="Larger is better.")]
+
+
+class ActionAnswer(TypedDict):
+    """What the experience database expects of a move."""
+
+    action_m: float
+    q_value: float | None
+
+
+class NextBestViewAnswer(TypedDict):
+    """The move that would tell most."""
+
+    planner: str
+    action_m: float
+    actions: list[ActionAnswer]
+
+
+Timings = Annotated[
+    dict[str, float],
+    Field(
+        description="Milliseconds by stage: `receive` (the body), `wait` (for its turn and the worker), `decode`, "
+        "`describe`, `retrieve`, ..., `commit` (to the disk); and their `total`, with what is in no stage."
+    ),
+]
+
+
+class LocalizationAnswer(TypedDict):
+    """Where one view places the robot, from a uniform prior."""
+
+    map_version: int
+    timings_ms: Timings
+    belief: BeliefAnswer
+    retrieval: Annotated[list[RetrievedAnswer], Field(description="Most relevant map images, best first.")]
+    next_best_view: Annotated[NextBestViewAnswer | None, Field(description="null until the map was trained for it.")]
+
+
+def render_localization(localization: Localization, watch: Stopwatch) -> LocalizationAnswer:
+    """The answer to one view.
+
+    Args:
+        localization: What the engine found.
+        watch: Runs since the request arrived.
+    """
+    snapshot = localization.snapshot
+    belief = render_belief(snapshot.route, localization.belief)
+    retrieval = render_shortlist(snapshot.route, localization.shortlist, localization.retrieval.relevance)
+    return {
+        "map_version": snapshot.version,
+        "timings_ms": watch.timings_ms(),
+        "belief": belief,
+        "retrieval": retrieval,
+        "next_best_view": render_plan(localization.plan, snapshot.actions_m),
+    }
+
+
+def render_shortlist(route: Route, ids: NDArray[np.int64], relevance: NDArray[np.float32]) -> list[RetrievedAnswer]:
+    """Map images with their places and relevances."""
+    rows = zip(ids.tolist(), route.position_m[ids].tolist(), relevance[ids].tolist(), strict=True)
+    return [{"map_image": image, "route_position_m": at_m, "relevance": worth} for image, at_m, worth in rows]
+
+
+def render_plan(plan: Plan | None, actions_m: NDArray[np.float64]) -> NextBestViewAnswer | None:
+    """A recommended move; None where there is none."""
+    if plan is None:
+        return None
+    values = [None] * actions_m.size if plan.values is None else plan.values.tolist()
+    rows = zip(actions_m.tolist(), values, strict=True)
+    actions: list[ActionAnswer] = [{"action_m": action_m, "q_value": value} for action_m, value in rows]
+    return {"planner": plan.planner, "action_m": plan.action_m, "actions": actions}
+
+
+def render_belief(route: Route, belief: BeliefSummary) -> BeliefAnswer:
+    """A belief, with the coordinates of its likeliest places."""
+    top = belief.top
+    rows = zip(
+        top.tolist(),
+        route.position_m[top].tolist(),
+        _finite(route.x_m, top),
+        _finite(route.y_m, top),
+        belief.top_mass.tolist(),
+        strict=True,
+    )
+    return {
+        "mean_m": belief.mean_m,
+        "mode_m": belief.mode_m,
+        "std_m": belief.std_m,
+        "credible_95_m": belief.credible_95_m,
+        "entropy_bits": belief.entropy_bits,
+        "off_route": belief.off_route,
+        "histogram": {"edges_m": belief.histogram_edges_m.tolist(), "mass": belief.histogram_mass.tolist()},
+        "top": [
+            {"map_image": image, "route_position_m": at_m, "x_m": x_m, "y_m": y_m, "mass": mass}
+            for image, at_m, x_m, y_m, mass in rows
+        ],
+    }
+
+
+def _finite(values: NDArray[np.float64] | None, ids: NDArray[np.int64]) -> list[float | None]:
+    """Values at these ids, None where unknown."""
+    if values is None:
+        return [None] * ids.size
+    return [value if math.isfinite(value) else None for value in values[ids].tolist()]
+
+
+def json_response(answer: Any, status: int = 200, headers: dict[str, str] | None = None) -> Response:
+    """An answer of dictionaries, lists and numbers that the engine computed: not checked a second time."""
+    return Response(to_json(answer), status, headers, JSON)
+
+
+# Handlers
+
+
+@router.post(
+    "/{domain}/localizations",
+    response_model=LocalizationAnswer,
+    responses={
+        200: {"content": binary("float32 npy [n]: the relevance of every map image, in route order")},
+        **problems(404, 409, 413, 415, 422),
+    },
+    openapi_extra=OBSERVATION_BODY,
+)
+async def post_localization(
+    domain: DomainName,
+    request: Request,
+    running: Running,
+    shortlist: Shortlist = None,
+    if_match: LandmarkModelTag = None,
+) -> Response:
+    """Localize one view.
+
+    The body is the image itself, or what a robot that encodes on board made of it. An image's real format is read
+    from its bytes, whichever of the image types the header names. With `Accept: application/octet-stream` the answer
+    is the relevance of every map image.
+    """
+    watch = Stopwatch()
+    active = await running.active(domain)
+    snapshot = active.snapshot
+    media_type = media_type_of(request, OBSERVATION_TYPES)
+    shortlist_length(snapshot, shortlist)  # a bad query should not cost an upload
+    landmark_models = insisted_on(if_match)
+    body = await read_bytes(request)
+    watch.lap("receive")
+    evaluator = running.evaluators.evaluator(active.record.evaluator)
+    view = await view_in(body, running, media_type, evaluator)
+    if prefers_binary(request):
+
+        def compare(view: View) -> Retrieval:
+            snapshot.check_landmark_model(landmark_models)
+            return retrieve(snapshot, evaluator, view)
+
+        return npy_response((await running.look(evaluator, view, compare)).relevance)
+    watch.lap("decode")
+
+    def look(view: View) -> Localization:
+        watch.lap("wait", view)
+        snapshot.check_landmark_model(landmark_models)
+        localization = localize(snapshot, evaluator, view, shortlist)
+        watch.take(localization.timings_ms)
+        return localization
+
+    localization = await running.look(evaluator, view, look)
+
+    def write() -> tuple[LocalizationAnswer, Response]:
+        answer = render_localization(localization, watch)
+        return answer, json_response(answer)
+
+    answer, response = await running.written(localization.belief.top.size, write)
+    running.metrics.localized(domain, answer["timings_ms"], answer["belief"]["entropy_bits"])
+    return response
+
+
+async def view_in(body: bytes, running: Services, media_type: str, evaluator: Evaluator) -> View:
+    """The observation in a body that has been read; an image at its evaluator's size."""
+    if media_type == JSON:
+        return (await parse_json(body, ObservationBody, running)).view()
+    if media_type == RANKS:
+        return PackedRanks(body)
+    image, is_blank = await running.decoders.decoded(body, evaluator, Priority.LIVE)
+    return NothingSeen() if is_blank else image
+
+
+def prefers_binary(request: Request) -> bool:
+    """Whether `Accept` asks for the npy rather than for JSON."""
+    wanted = {}
+    for part in request.headers.get("accept", "").split(","):
+        media_type, *parameters = (piece.strip().lower() for piece in part.split(";"))
+        quality = next((piece[2:] for piece in parameters if piece.startswith("q=")), "1")
+        try:
+            wanted[media_type] = float(quality)
+        except ValueError:
+            wanted[media_type] = 0.0
+    return wanted.get(BINARY, 0.0) > wanted.get(JSON, 0.0)
+
+
+def npy_response(values: NDArray[np.floating]) -> Response:
+    """An array as a float32 npy file."""
+    packed = BytesIO()
+    np.save(packed, values.astype("<f4", copy=False), allow_pickle=False)
+    return Response(packed.getvalue(), media_type=BINARY)

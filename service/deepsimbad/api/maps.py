@@ -1,0 +1,227 @@
+"""A domain's map versions: their history, switching between them, their files."""
+
+import base64
+import hashlib
+import logging
+import re
+from http import HTTPStatus
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from anyio.to_thread import run_sync
+from fastapi import APIRouter, Request
+from fastapi import Path as PathParameter
+from pydantic import Field
+from starlette.exceptions import HTTPException
+from starlette.responses import FileResponse, Response, StreamingResponse
+
+from deepsimbad.api.openapi import declare_json, problems
+from deepsimbad.api.requests import (
+    GREATEST_ID,
+    KEPT,
+    USUALLY_AT_ONCE,
+    Answer,
+    DomainName,
+    JsonBody,
+    Limit,
+    Next,
+    Running,
+    after,
+    cursor_of,
+    names,
+    number_of,
+    read_json,
+)
+from deepsimbad.engine.maps import load_snapshot, unreadable
+from deepsimbad.errors import ConflictError, DamagedMapError, UnknownMapVersionError
+from deepsimbad.store.catalog_maps import ANY, removed
+from deepsimbad.store.faults import storage_faults
+from deepsimbad.store.records import MapRecord, MapState
+
+router = APIRouter(prefix="/v1/admin/domains", tags=["admin: maps"])
+log = logging.getLogger(__name__)
+
+Headers = list[tuple[bytes, bytes]]
+MEDIA_TYPE = "application/vnd.sqlite3"
+MapVersion = Annotated[int, PathParameter(ge=1, le=GREATEST_ID, description="A map version's number.")]
+MapsAfter = Annotated[str | None, after("maps")]
+_RANGE = re.compile(r"bytes=(\d{0,18})-(\d{0,18})")
+
+_TEXT = {"type": "string"}
+_FILE = {
+    "description": "The file",
+    "content": {MEDIA_TYPE: {"schema": {"type": "string", "format": "binary"}}},
+    "headers": {
+        "ETag": {"description": 'The SHA-256 of the whole file, as `"sha256:..."` in hex.', "schema": _TEXT},
+        "Repr-Digest": {"description": "The same, as RFC 9530 writes it.", "schema": _TEXT},
+    },
+}
+
+
+class ActiveMapBody(JsonBody):
+    """Which version to activate, and which one must be active for that."""
+
+    version: Annotated[int, Field(strict=True, ge=1, le=GREATEST_ID)]
+    expected: Annotated[
+        Annotated[int, Field(strict=True, ge=1, le=GREATEST_ID)] | None,
+        Field(
+            description="The version thought active; null: none. Another one being active is a 409. "
+            "Absent: switch whichever is active."
+        ),
+    ] = None
+
+
+class MapAnswer(Answer):
+    """One version in a domain's history."""
+
+    version: int
+    state: Literal["building", "sealed", "active", "retired"]
+    created_at: str
+    activated_at: Annotated[str | None, Field(description="When it last began to serve.")]
+    retired_at: Annotated[str | None, Field(description="When it last ceased to serve.")]
+    removed_at: Annotated[str | None, Field(description="When its file was removed; it cannot serve again.")]
+    sha256: str | None
+    file_bytes: int | None
+    config: dict[str, Any]
+    metrics: dict[str, Any]
+
+
+class MapList(Answer):
+    """The versions of a domain's map, newest first."""
+
+    maps: list[MapAnswer]
+    next: Next
+
+
+def render_map(record: MapRecord) -> MapAnswer:
+    """A map version."""
+    return MapAnswer(
+        version=record.version,
+        state=record.state.value,
+        created_at=record.created_at,
+        activated_at=record.activated_at,
+        retired_at=record.retired_at,
+        removed_at=record.removed_at,
+        sha256=record.sha256,
+        file_bytes=record.file_bytes,
+        config=record.config,
+        metrics=record.metrics,
+    )
+
+
+@router.get("/{domain}/maps", responses=problems(404, 422))
+async def list_maps(
+    domain: DomainName,
+    running: Running,
+    limit: Limit = USUALLY_AT_ONCE,
+    cursor: MapsAfter = None,
+) -> MapList:
+    """The history of a domain's map, newest version first."""
+    page = await run_sync(running.catalog.newest_maps, domain, number_of(cursor), limit)
+    return MapList(maps=[render_map(record) for record in page.records], next=cursor_of("maps", page.last_key))
+
+
+@router.put(
+    "/{domain}/active-map", responses=problems(404, 409, 410, 413, 415, 422), openapi_extra=declare_json(ActiveMapBody)
+)
+async def put_active_map(domain: DomainName, request: Request, running: Running) -> MapAnswer:
+    """Activate a version, forward or back, if the active one is still `expected`.
+
+    The version's file is checked first, so that a damaged one never takes over. One whose file was removed is a 410.
+    """
+    body = await read_json(request, ActiveMapBody)
+    expected = body.expected if "expected" in body.model_fields_set else ANY
+
+    def switch() -> MapAnswer:
+        if running.catalog.map(domain, body.version).state is MapState.BUILDING:
+            raise ConflictError(f"map {body.version} of domain {domain} is still being built")
+        load_snapshot(running.catalog, domain, body.version)
+        record = running.catalog.activate(domain, body.version, expected)
+        running.maps.refresh(domain)
+        running.retention.prune(domain)
+        return render_map(record)
+
+    return await run_sync(switch)  # what switches it logs it too, whoever asked
+
+
+@router.delete("/{domain}/maps/{version}", status_code=204, responses=problems(404, 409, 410, 422))
+async def delete_map(domain: DomainName, version: MapVersion, running: Running) -> None:
+    """Remove the file of a version; it stays in the history, retired.
+
+    The version that serves, one being built and one that a session lives on are a 409.
+    """
+    await run_sync(running.retention.remove, domain, version)
+    log.info("map removed", extra={"domain": domain, "map_version": version})
+
+
+@router.get(
+    "/{domain}/maps/{version}/file",
+    response_class=StreamingResponse,
+    responses={
+        200: _FILE,
+        206: {**_FILE, "description": "The range that was asked for"},
+        304: {"description": "`If-None-Match` names these bytes"},
+        **problems(404, 410, 416, 422),
+    },
+)
+async def get_map_file(domain: DomainName, version: MapVersion, request: Request, running: Running) -> Response:
+    """A sealed version whole, as one SQLite file that another server can import.
+
+    It is read against its digest before the first byte is sent; `Repr-Digest` and `ETag` tell that digest.
+    """
+
+    def checked() -> tuple[Path, str, int]:
+        record = running.catalog.map(domain, version)
+        if record.removed_at is not None:
+            raise removed(domain, version)
+        if record.sha256 is None:
+            raise UnknownMapVersionError(f"map {version} of domain {domain} is still being built", version=version)
+        path = running.catalog.map_path(domain, version)
+        try:
+            check_digest(path, record.sha256)
+        except DamagedMapError as error:
+            raise unreadable(running.catalog, domain, version) from error
+        return path, record.sha256, path.stat().st_size
+
+    path, sha256, n_bytes = await run_sync(checked)
+    etag = f'"sha256:{sha256}"'
+    if names(request.headers.get("if-none-match"), etag):
+        return Response(status_code=HTTPStatus.NOT_MODIFIED, headers={**KEPT, "ETag": etag})
+    request.scope["headers"] = one_range(request.scope["headers"], n_bytes)
+    repr_digest = base64.b64encode(bytes.fromhex(sha256)).decode()
+    headers = {**KEPT, "ETag": etag, "Repr-Digest": f"sha-256=:{repr_digest}:"}
+    return FileResponse(path, headers=headers, media_type=MEDIA_TYPE, filename=f"{domain}-{version:06d}.sqlite")
+
+
+def check_digest(path: Path, sha256: str) -> None:
+    """Read a file against its digest.
+
+    Raises:
+        DamagedMapError: It is missing, or not the one that was sealed.
+        UnavailableError: The disk failed, ...
+    """
+    if not path.is_file():
+        raise DamagedMapError(f"{path.name} is missing", file=path.name)
+    with storage_faults(path, DamagedMapError), path.open("rb") as stream:
+        if hashlib.file_digest(stream, "sha256").hexdigest() != sha256:
+            raise DamagedMapError(f"{path.name} is not the file that was sealed: its SHA-256 differs", file=path.name)
+
+
+def one_range(headers: Headers, n_bytes: int) -> Headers:
+    """A request's headers without a Range that is none, or more than one: those are answered with the whole file.
+
+    Raises:
+        HTTPException: 416, a range that begins behind the end.
+    """
+    wanted = next((value.decode("latin-1").replace(" ", "") for name, value in headers if name == b"range"), "")
+    match = _RANGE.fullmatch(wanted)
+    first, last = match.groups() if match else ("", "")
+    if (first and last and int(first) > int(last)) or not (first or last):
+        return [(name, value) for name, value in headers if name != b"range"]
+    if int(first) >= n_bytes if first else int(last) == 0:
+        raise HTTPException(
+            HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE,
+            f"the file has {n_bytes} bytes",
+            {"Content-Range": f"bytes */{n_bytes}"},
+        )
+    return headers

@@ -1,0 +1,410 @@
+"""What handlers are given: the running service, parameters with their limits, bodies read and checked, pages of lists.
+
+Handlers read their bodies through this file and not through the framework, whose own reading knows no 415, answers
+deeply nested JSON with 400, and takes NaN.
+"""
+
+import asyncio
+import hashlib
+import re
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Annotated, Any, TypeVar, cast
+
+from anyio import CapacityLimiter
+from anyio.to_thread import run_sync
+from fastapi import Depends, Header, Path, Query, Request
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from deepsimbad.api.keys import KeyRing
+from deepsimbad.api.metrics import Metrics
+from deepsimbad.api.problems import InvalidRequestError, invalid_request
+from deepsimbad.engine.encoders import EvaluatorPool, ready
+from deepsimbad.engine.maps import MappedDomain, Maps, Retention
+from deepsimbad.engine.sessions import Sessions
+from deepsimbad.engine.traverses import OpenTraverses
+from deepsimbad.engine.truths import Truths
+from deepsimbad.engine.views import View
+from deepsimbad.engine.worker import InferenceWorker, Priority
+from deepsimbad.errors import EmptyBodyError, OverloadedError, UnsupportedMediaTypeError
+from deepsimbad.evaluators.base import Evaluator, Image
+from deepsimbad.evaluators.image import KEPT_PIXELS, ImageFile, is_blank
+from deepsimbad.jobs.runner import JobRunner
+from deepsimbad.settings import Settings
+from deepsimbad.store.catalog import Catalog
+from deepsimbad.store.sessions import SessionStore
+
+T = TypeVar("T")
+
+JSON = "application/json"
+BINARY = "application/octet-stream"
+NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$"
+GREATEST_EXACT_INTEGER = 2**53 - 1
+GREATEST_ID = 2**31 - 1
+MAX_NUMBERS = 2**17  # in one body; about 20 ms to parse
+LONG_LIST = 1000  # entries; a list of so many takes some milliseconds
+_LONG_BYTES = 1 << 16
+_MAX_PARTS = 1000  # members, texts, lists: far more than any body here has
+
+# The running service
+
+
+class Slots:
+    """Room for so many of something at once.
+
+    Args:
+        most: How many.
+        what: Their name in a sentence.
+        setting: What allows more.
+    """
+
+    def __init__(self, most: int, what: str, setting: str) -> None:
+        self.most = most
+        self.n_taken = 0
+        self._what = what
+        self._setting = setting
+
+    def check(self, n: int = 1) -> None:
+        """Raise OverloadedError where there is no room for so many more."""
+        if self.n_taken + n > self.most:
+            raise OverloadedError(
+                f"{self.n_taken} {self._what} and no more are taken: try again in a moment",
+                retry_after_s=1,
+                limit=self._setting,
+            )
+
+    def take(self, n: int = 1) -> None:
+        """Take room; raises OverloadedError where there is none."""
+        self.check(n)
+        self.n_taken += n
+
+    def give_back(self, n: int = 1) -> None:
+        """Give back what was taken."""
+        self.n_taken -= n
+
+    @contextmanager
+    def taken(self) -> Iterator[None]:
+        """Room for one inside the block; raises OverloadedError."""
+        self.take()
+        try:
+            yield
+        finally:
+            self.give_back()
+
+
+class Decoders:
+    """Decodes images in few threads and brings them to their evaluator's size there, so that little of each is held.
+
+    An image of more than `KEPT_PIXELS` takes most of a second and memory for all its pixels until it is reduced. So
+    there is one of those at a time, and usual images never wait for one; where eight wait, more are refused.
+
+    Args:
+        max_pixels: Most pixels that an image's header may claim.
+    """
+
+    LARGE_WAITING = 8
+
+    def __init__(self, max_pixels: int) -> None:
+        self._max_pixels = max_pixels
+        # Live views have threads of their own: frames of a traverse must not keep them waiting.
+        self._threads = {Priority.LIVE: CapacityLimiter(4), Priority.BATCH: CapacityLimiter(2)}
+        self._large = CapacityLimiter(1)
+
+    async def decoded(self, body: bytes, evaluator: Evaluator, priority: Priority) -> tuple[Image, bool]:
+        """The image in a body at the size that its evaluator encodes, and whether it shows nothing.
+
+        Returns:
+            [height, width, 3] uint8 BGR, and the answer.
+
+        Raises:
+            InvalidImageError, ImageTooLargeError, EmptyBodyError, OutOfMemoryError: As `ImageFile`.
+            UnsupportedMediaTypeError: The evaluator takes ready encodings alone.
+            EvaluatorUnavailableError: It cannot be loaded any more.
+            OverloadedError: The image is large, and as many large ones wait as may.
+        """
+        threads = self._threads[priority]
+        image = await run_sync(self._read, body, evaluator, limiter=threads)
+        if not isinstance(image, ImageFile):
+            return image
+        if self._large.statistics().tasks_waiting >= self.LARGE_WAITING:
+            raise OverloadedError(
+                f"images of more than {KEPT_PIXELS} pixels are looked at one by one, and {self.LARGE_WAITING} wait: "
+                "send smaller ones, or try again in a moment",
+                retry_after_s=1,
+                most_pixels_at_once=KEPT_PIXELS,
+            )
+        async with self._large:
+            return await run_sync(_decode, image, evaluator, limiter=threads)
+
+    def _read(self, body: bytes, evaluator: Evaluator) -> tuple[Image, bool] | ImageFile:
+        """The file where its image is large, else what it decodes to."""
+        file = ImageFile.read(body, self._max_pixels)
+        return file if file.n_pixels > KEPT_PIXELS else _decode(file, evaluator)
+
+
+def _decode(file: ImageFile, evaluator: Evaluator) -> tuple[Image, bool]:
+    ready(evaluator)  # where it is not, decoding is in vain
+    image = file.decode()
+    return evaluator.prepare(image), is_blank(image)
+
+
+@dataclass(frozen=True)
+class Services:
+    """The running service.
+
+    Attributes:
+        settings: As it was started.
+        metrics: Counters.
+        catalog: What is true of the data directory.
+        maps: Map versions in memory.
+        evaluators: Evaluators in memory.
+        open_traverses: Files kept open while frames arrive.
+        sessions: Live beliefs.
+        session_store: Their file.
+        retention: Which old maps keep their files.
+        truths: What their beliefs were worth.
+        worker: Where encoding and scoring run.
+        decoders: Where images are decoded.
+        runner: Where jobs run.
+        keys: Who may ask.
+        faults: What keeps the service from being ready, a sentence each; may wait for the disk.
+        uploads: Batches of frames on their way.
+        event_streams: Of jobs, open.
+        stopping: Set when shutdown begins; streams end on it.
+        batches: The thread that reads batches into memory.
+        long_work: The thread that reads long bodies and writes long answers: it holds the interpreter, and two would
+            end no sooner.
+        health: Threads for questions about health, which should not wait behind what they ask about.
+    """
+
+    settings: Settings
+    metrics: Metrics
+    catalog: Catalog
+    maps: Maps
+    evaluators: EvaluatorPool
+    open_traverses: OpenTraverses
+    sessions: Sessions
+    session_store: SessionStore
+    retention: Retention
+    truths: Truths
+    worker: InferenceWorker
+    decoders: Decoders
+    runner: JobRunner
+    keys: KeyRing
+    faults: Callable[[], tuple[str, ...]]
+    uploads: Slots
+    event_streams: Slots
+    stopping: threading.Event = field(default_factory=threading.Event)
+    batches: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(1))
+    long_work: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(1))
+    health: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(2))
+
+    async def active(self, domain: str) -> MappedDomain:
+        """A domain and its active map; files are read in a thread."""
+        mapped = self.maps.peek(domain)
+        return mapped if mapped is not None else await run_sync(self.maps.active, domain)
+
+    async def look(
+        self, evaluator: Evaluator, view: View, run: Callable[[View], T], priority: Priority = Priority.LIVE
+    ) -> T:
+        """Run a function of a view on the inference worker, which encodes an image before."""
+        return await asyncio.wrap_future(self.worker.look(evaluator, view, run, priority))
+
+    async def written(self, n_listed: int, write: Callable[[], T]) -> T:
+        """What writes an answer, run in a thread where the answer's longest list is long."""
+        return await run_sync(write, limiter=self.long_work) if n_listed > LONG_LIST else write()
+
+
+async def services_of(request: Request) -> Services:
+    """The running service, for routes. A coroutine, because a plain function would be sent to a thread."""
+    return cast("Services", request.app.state.services)
+
+
+# Parameters
+
+Running = Annotated[Services, Depends(services_of)]
+Name = Annotated[
+    str, Field(pattern=NAME_PATTERN, description="Letters, digits, `.`, `_`, `-`; at most 64, a letter or digit first.")
+]
+DomainName = Annotated[str, Path(alias="domain", pattern=NAME_PATTERN, description="A domain's name.")]
+SessionId = Annotated[str, Path(pattern=NAME_PATTERN, description="A session's id.")]
+OfDomain = Annotated[str | None, Query(pattern=NAME_PATTERN, description="Only this domain's; absent: all.")]
+
+# A page of a list begins at a cursor, which names the list and the key of the last thing shown. It stays good whatever
+# is made or removed meanwhile, and says nothing that the list itself does not.
+USUALLY_AT_ONCE = 100
+Limit = Annotated[int, Query(ge=1, le=1000, description="Most entries of the answer.")]
+Next = Annotated[str | None, Field(description="Ask for the list `after` this for its next page; null: it ends here.")]
+
+
+def after(what: str, key_pattern: str = "[0-9]{1,18}$") -> Any:
+    """The parameter `after` of a list."""
+    description = "`next` of the page before; absent: the first page."
+    return Query(alias="after", pattern=f"^{what}-{key_pattern}", description=description)
+
+
+def key_of(cursor: str | None) -> str | None:
+    """The key that a list goes on behind; None: from its beginning."""
+    return None if cursor is None else cursor.partition("-")[2]
+
+
+def number_of(cursor: str | None) -> int | None:
+    """As `key_of`, of a list of numbers."""
+    return None if cursor is None else int(cursor.partition("-")[2])
+
+
+def cursor_of(what: str, last_key: int | str | None) -> Next:
+    """What `next` says: the cursor of the page behind a key; None where there is none."""
+    return None if last_key is None else f"{what}-{last_key}"
+
+
+# Entity tags: which content a request has, or insists on (RFC 9110, 13.1)
+
+_TAG = r'(?:W/)?"[\x21\x23-\x7e]*"'
+_STRONG = re.compile(r'(W/)?"([\x21\x23-\x7e]*)"')
+KEPT = {"Cache-Control": "private, no-cache"}
+"""What is named by a tag may be kept by who asked, and asked for again: a domain made anew counts its versions anew."""
+LandmarkModelTag = Annotated[
+    str | None,
+    Header(
+        alias="If-Match",
+        pattern=rf"^(?:\*|{_TAG}(?:[ \t]*,[ \t]*{_TAG})*)$",
+        description="The quoted digest of the landmark model that the view was ranked by, as `landmark-model` names "
+        "it: a map with another one does not answer: 409 `landmark_model_differs`.",
+    ),
+]
+
+
+def names(wanted: str | None, etag: str) -> bool:
+    """Whether an If-None-Match names this content; weak tags do."""
+    return wanted is not None and any(tag.strip().removeprefix("W/") in {etag, "*"} for tag in wanted.split(","))
+
+
+def insisted_on(wanted: str | None) -> frozenset[str] | None:
+    """The contents, one of which an If-Match insists on; None: any will do. Weak tags match nothing."""
+    if wanted is None or wanted.strip() == "*":
+        return None
+    return frozenset(tag for weak, tag in _STRONG.findall(wanted) if not weak)
+
+
+# Requests that make something, and make it once however often they are sent
+
+KeyWord = Annotated[str, Field(pattern=r"^[\x21-\x7e]{1,255}$")]
+
+
+def idempotency_header(what_again: str) -> Any:
+    """The header `Idempotency-Key`, described."""
+    return Header(alias="Idempotency-Key", description=f"The same key with the same {what_again}")
+
+
+KeyOfJob = Annotated[
+    KeyWord | None,
+    idempotency_header(
+        "body again makes no second job: the first one is answered, as it stands. Choose one that nobody else will, "
+        "such as a UUID."
+    ),
+]
+
+
+def key_id_of(request: Request) -> str | None:
+    """The id of the API key that a request came with; None where none is asked."""
+    return cast("str | None", request.scope["state"].get("key_id"))
+
+
+def id_under_key(request: Request, kind: str, domain: str, key: str | None) -> str | None:
+    """The id of what a request makes, which follows from its key; a repetition finds it after a restart too.
+
+    Whoever holds another API key makes other things, though the words they choose be the same.
+
+    Args:
+        request: Whose API key counts.
+        kind: What is made.
+        domain: Where.
+        key: The sender's word; None: none was given.
+
+    Returns:
+        32 hexadecimal digits; None without a key.
+    """
+    if key is None:
+        return None
+    return hashlib.sha256(f"{kind}\n{key_id_of(request) or ''}\n{domain}\n{key}".encode()).hexdigest()[:32]
+
+
+# Bodies
+
+
+class JsonBody(BaseModel):
+    """Root of the JSON bodies: unknown members are errors, so a typing mistake is never silent."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class Answer(BaseModel):
+    """Root of the answers. Every field is always present; what is not known is null."""
+
+    model_config = ConfigDict(frozen=True)
+
+
+Body = TypeVar("Body", bound=JsonBody)
+
+
+def media_type_of(request: Request, allowed: tuple[str, ...]) -> str:
+    """The body's media type, without parameters.
+
+    Raises:
+        UnsupportedMediaTypeError: There is none, or it is not one of those allowed.
+    """
+    header = request.headers.get("content-type")
+    media_type = (header or "").partition(";")[0].strip().lower()
+    if media_type not in allowed:
+        what = (
+            "the request has no Content-Type" if header is None else f"Content-Type {media_type[:100]!r} is not taken"
+        )
+        raise UnsupportedMediaTypeError(f"{what}; send one of {', '.join(allowed)}", allowed=list(allowed))
+    return media_type
+
+
+async def read_bytes(request: Request) -> bytes:
+    """The whole body; raises EmptyBodyError."""
+    body = await request.body()
+    if not body:
+        raise EmptyBodyError("the body is empty: send the content that Content-Type names")
+    return body
+
+
+async def read_json(request: Request, kind: type[Body]) -> Body:
+    """A JSON body.
+
+    Raises:
+        UnsupportedMediaTypeError: Its Content-Type is not JSON.
+        InvalidInputError: It is empty, not JSON, or not such a body.
+    """
+    media_type_of(request, (JSON,))
+    return await parse_json(await read_bytes(request), kind, request.app.state.services)
+
+
+async def parse_json(body: bytes, kind: type[Body], running: Services) -> Body:
+    """Check the bytes of a JSON body, those of a long one in a thread; raises InvalidRequestError."""
+    if len(body) > _LONG_BYTES:
+        return await run_sync(_parsed, body, kind, limiter=running.long_work)
+    return _parsed(body, kind)
+
+
+def _parsed(body: bytes, kind: type[Body]) -> Body:
+    # All but numbers costs the parser a hundred times its bytes, and an error of its own where it is wrong: megabytes
+    # of it would take seconds and gigabytes.
+    if len(body) > _MAX_PARTS and any(body.count(mark) > _MAX_PARTS for mark in (b":", b'"', b"{", b"[")):
+        what = f"more than {_MAX_PARTS} members, texts or lists, which no body here has"
+        raise InvalidRequestError(f"body: {what}", errors=[{"loc": ["body"], "msg": what, "type": "too_many_parts"}])
+    # The parser lets no other thread run until it has read all: millions of numbers would hold the event loop up.
+    if body.count(b",") >= MAX_NUMBERS:
+        what = f"more than {MAX_NUMBERS} numbers"
+        raise InvalidRequestError(f"body: {what}", errors=[{"loc": ["body"], "msg": what, "type": "too_many_numbers"}])
+    try:
+        return kind.model_validate_json(body)
+    except ValidationError as error:
+        raise invalid_request(error, "body") from error
+    except (RecursionError, OverflowError, ValueError) as error:
+        raise InvalidRequestError("body: not JSON that can be read") from error

@@ -1,0 +1,436 @@
+"""A robot's live belief: begun, moved on by observations, asked, told the truth, ended."""
+
+import hashlib
+import math
+from datetime import UTC, datetime
+from functools import partial
+from typing import Annotated
+
+from anyio.to_thread import run_sync
+from fastapi import APIRouter, Query, Request, Response
+from pydantic import FailFast, Field, StrictFloat, StrictInt
+from typing_extensions import TypedDict
+
+from deepsimbad.api.localizations import (
+    OBSERVATION_BODY,
+    OBSERVATION_TYPES,
+    BeliefAnswer,
+    NextBestViewAnswer,
+    RetrievedAnswer,
+    Shortlist,
+    Timings,
+    json_response,
+    npy_response,
+    prefers_binary,
+    render_belief,
+    render_plan,
+    render_shortlist,
+    view_in,
+)
+from deepsimbad.api.openapi import binary, declare_json, problems
+from deepsimbad.api.requests import (
+    GREATEST_EXACT_INTEGER,
+    GREATEST_ID,
+    USUALLY_AT_ONCE,
+    Answer,
+    DomainName,
+    JsonBody,
+    KeyWord,
+    LandmarkModelTag,
+    Limit,
+    Next,
+    OfDomain,
+    Running,
+    Services,
+    SessionId,
+    after,
+    cursor_of,
+    id_under_key,
+    idempotency_header,
+    insisted_on,
+    media_type_of,
+    number_of,
+    read_bytes,
+    read_json,
+)
+from deepsimbad.core.filters import FilterKind
+from deepsimbad.core.update_rules import UpdateRule
+from deepsimbad.engine.session import DEFAULT_START_STD_M, Observation, SessionConfig, SessionView
+from deepsimbad.engine.views import Stopwatch
+from deepsimbad.errors import DeepSimbadError
+from deepsimbad.store.session_records import IdempotencyKey, ListedSession
+
+router = APIRouter(prefix="/v1", tags=["sessions"])
+listing = APIRouter(prefix="/v1/admin/sessions", tags=["admin: sessions"])
+
+MAX_OBSERVATIONS_FED_BACK = 100_000
+
+# Bodies
+
+
+class SessionBody(JsonBody):
+    """How a session begins. NaN and infinity are refused by what knows the route."""
+
+    start_position_m: Annotated[
+        StrictFloat | None, Field(description="Where on the route it begins; null: anywhere.")
+    ] = None
+    start_std_m: Annotated[
+        StrictFloat | None, Field(description=f"How sure that is, a standard deviation; null: {DEFAULT_START_STD_M:g}.")
+    ] = None
+    seed: Annotated[
+        Annotated[int, Field(strict=True, ge=0, le=GREATEST_EXACT_INTEGER)] | None,
+        Field(description="Of whatever is random in it; null: 0."),
+    ] = None
+    planner: Annotated[
+        Annotated[str, Field(min_length=1, max_length=64)] | None,
+        Field(description="Who recommends moves: `telling`, `nnql`, `random`, `constant:<m>`; null: the default."),
+    ] = None
+    belief: Annotated[FilterKind | None, Field(description="The filter; null: grid.")] = None
+    update: Annotated[
+        UpdateRule | None, Field(description="How a view counts; null: as the map's relevance wants.")
+    ] = None
+
+    def config(self) -> SessionConfig:
+        """The engine's form."""
+        return SessionConfig(**{name: value for name, value in self if value is not None})
+
+
+class PriorBody(JsonBody):
+    """Where the robot is, from someone who knows."""
+
+    position_m: Annotated[StrictFloat, Field(description="Metres along the route.")]
+    std_m: Annotated[StrictFloat, Field(description="Standard deviation, above 0.")]
+
+
+class TruePositions(JsonBody):
+    """Where the robot truly was, known later."""
+
+    true_positions_m: Annotated[
+        list[StrictFloat | None],
+        Field(
+            min_length=1,
+            max_length=MAX_OBSERVATIONS_FED_BACK,
+            description="One route position for every observation of the session; null where it is unknown, which "
+            "takes back nothing told before.",
+        ),
+        FailFast(),
+    ]
+
+
+class TruthsBody(TruePositions):
+    """Where the robot truly was, known later; truths may be told bit by bit."""
+
+    true_map_images: Annotated[
+        list[list[Annotated[StrictInt, Field(ge=0, le=GREATEST_ID)]]] | None,
+        Field(
+            max_length=MAX_OBSERVATIONS_FED_BACK,
+            description="For each of the same observations the map images that show its place: each view's own "
+            "retrieval is then ranked by them. null: it is not.",
+        ),
+        FailFast(),
+    ] = None
+    first_observation: Annotated[
+        int,
+        Field(strict=True, ge=0, description="The observation, from 0, that the first of the lists belongs to."),
+    ] = 0
+
+
+# Answers
+
+
+class SessionAnswer(TypedDict):
+    """A session as it stands."""
+
+    session_id: str
+    domain: str
+    map_version: Annotated[int, Field(description="The map it began on and keeps.")]
+    n_observations: Annotated[int, Field(description="Views that its belief rests on.")]
+    expires_at: Annotated[str, Field(description="When it ends unless something happens to it; ISO 8601, UTC.")]
+    belief: BeliefAnswer
+    next_best_view: Annotated[NextBestViewAnswer | None, Field(description="null where the map can name none.")]
+
+
+class ObservationAnswer(SessionAnswer):
+    """A session after one more observation."""
+
+    timings_ms: Timings
+    retrieval: Annotated[list[RetrievedAnswer], Field(description="Map images most relevant to this view, best first.")]
+
+
+class ListedSessionAnswer(Answer):
+    """A session in a list, without its belief."""
+
+    session_id: str
+    domain: str
+    map_version: Annotated[int, Field(description="The map it began on and keeps.")]
+    n_observations: Annotated[int, Field(description="Views that were told.")]
+    created_at: Annotated[str, Field(description="ISO 8601, UTC.")]
+    expires_at: Annotated[str, Field(description="When it ends unless something happens to it; ISO 8601, UTC.")]
+
+
+class SessionList(Answer):
+    """Living sessions, newest first."""
+
+    sessions: list[ListedSessionAnswer]
+    next: Next
+
+
+class TruthsAnswer(Answer):
+    """How well a session knew where its robot was."""
+
+    n_scored: Annotated[int, Field(description="Observations whose true position is known.", ge=0)]
+    n_left_out: Annotated[int, Field(description="Observations whose true position is unknown.", ge=0)]
+    anr: Annotated[
+        float | None,
+        Field(
+            description="Averaged normalised rank of the true map image in the belief, in percent: 0 is perfect, 50 "
+            "chance; null where no true position is known.",
+            ge=0,
+            le=100,
+        ),
+    ]
+    retrieval_ranks: Annotated[
+        list[float | None] | None,
+        Field(
+            description="For each observation told of, how many map images its own view placed before the best of its "
+            "`true_map_images`, others tied with that one counted half; null where there is none, null for all where "
+            "none were told."
+        ),
+    ]
+    map_version: Annotated[int, Field(description="The map that the session is pinned to.")]
+
+
+def render_session(view: SessionView) -> SessionAnswer:
+    """A session as it stands."""
+    snapshot = view.snapshot
+    return {
+        "session_id": view.session_id,
+        "domain": snapshot.domain,
+        "map_version": snapshot.version,
+        "n_observations": view.n_observations,
+        "expires_at": _iso(view.expires_at),
+        "belief": render_belief(snapshot.route, view.belief),
+        "next_best_view": render_plan(view.plan, snapshot.actions_m),
+    }
+
+
+def render_observation(view: SessionView, watch: Stopwatch) -> ObservationAnswer:
+    """A session after an observation.
+
+    Args:
+        view: The session.
+        watch: Runs since the request arrived.
+    """
+    retrieval = [] if view.relevance is None else render_shortlist(view.snapshot.route, view.shortlist, view.relevance)
+    return {**render_session(view), "retrieval": retrieval, "timings_ms": watch.timings_ms()}
+
+
+def render_listed(listed: ListedSession) -> ListedSessionAnswer:
+    """A session in a list."""
+    session = listed.session
+    return ListedSessionAnswer(
+        session_id=session.session_id,
+        domain=session.domain,
+        map_version=session.map_version,
+        n_observations=listed.n_observations,
+        created_at=_iso(session.created_at),
+        expires_at=_iso(session.expires_at),
+    )
+
+
+def _iso(seconds: float) -> str:
+    return datetime.fromtimestamp(seconds, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+
+
+async def _answered(running: Services, view: SessionView, status: int = 200, location: str | None = None) -> Response:
+    headers = None if location is None else {"Location": location}
+    return await running.written(view.belief.top.size, lambda: json_response(render_session(view), status, headers))
+
+
+# Handlers
+
+
+@router.post(
+    "/domains/{domain}/sessions",
+    status_code=201,
+    response_model=SessionAnswer,
+    responses={
+        201: {"headers": {"Location": {"description": "The session.", "schema": {"type": "string"}}}},
+        **problems(404, 409, 410, 413, 415, 422, 429),
+    },
+    openapi_extra=declare_json(SessionBody),
+)
+async def post_session(
+    domain: DomainName,
+    request: Request,
+    running: Running,
+    idempotency_key: Annotated[
+        KeyWord | None,
+        idempotency_header(
+            "body again begins no second session: the first one is answered, as it stands. Choose one that nobody "
+            "else will, such as a UUID."
+        ),
+    ] = None,
+) -> Response:
+    """Begin a session on the domain's active map, which it keeps whatever is activated later."""
+    active = await running.active(domain)
+    config = (await read_json(request, SessionBody)).config()
+    session_id = id_under_key(request, "session", domain, idempotency_key)
+    view = await running.sessions.begin(active, config, session_id)
+    return await _answered(running, view, 201, f"/v1/sessions/{view.session_id}")
+
+
+@router.post(
+    "/sessions/{session_id}/observations",
+    response_model=ObservationAnswer,
+    responses=problems(404, 409, 410, 413, 415, 422),
+    openapi_extra=OBSERVATION_BODY,
+)
+async def post_observation(
+    session_id: SessionId,
+    request: Request,
+    running: Running,
+    action_m: Annotated[
+        float,
+        Query(description="Metres moved since the last view, 0 to ten of the longest action; ignored for the first."),
+    ] = 0.0,
+    action_std_m: Annotated[
+        float | None, Query(description="How sure that is, a standard deviation; absent: usual odometry.")
+    ] = None,
+    shortlist: Shortlist = None,
+    idempotency_key: Annotated[
+        KeyWord | None, idempotency_header("observation again counts once, and has the same answer.")
+    ] = None,
+    if_match: LandmarkModelTag = None,
+) -> Response:
+    """Move the belief on by a move and the view after it.
+
+    When this has answered, the observation survives whatever happens to the service. Two at once are both answered, in
+    order of arrival. The body is what `localizations` takes.
+    """
+    watch = Stopwatch()
+    try:
+        media_type = media_type_of(request, OBSERVATION_TYPES)
+        body = await read_bytes(request)
+        watch.lap("receive")
+        named = None
+        if idempotency_key is not None:
+            query = f"{media_type}\n{action_m!r}\n{action_std_m!r}\n".encode()
+            named = IdempotencyKey(idempotency_key, hashlib.sha256(query + body).digest())
+        observation = Observation(
+            partial(view_in, body, running, media_type),
+            action_m,
+            action_std_m,
+            shortlist,
+            named,
+            insisted_on(if_match),
+        )
+        view = await running.sessions.observe(session_id, observation, watch)
+    except DeepSimbadError as error:
+        running.metrics.observed(error.code)
+        raise
+
+    def write() -> tuple[ObservationAnswer, Response]:
+        answer = render_observation(view, watch)
+        return answer, json_response(answer)
+
+    answer, response = await running.written(view.belief.top.size, write)
+    request.state.domain = answer["domain"]
+    running.metrics.observed("repeated" if view.is_repeated else "accepted")
+    running.metrics.localized(answer["domain"], answer["timings_ms"], answer["belief"]["entropy_bits"])
+    return response
+
+
+@router.get("/sessions/{session_id}", response_model=SessionAnswer, responses=problems(404, 410, 422))
+async def get_session(session_id: SessionId, running: Running, shortlist: Shortlist = None) -> Response:
+    """A session as it stands; asking does not keep it from expiring."""
+    return await _answered(running, await running.sessions.view(session_id, shortlist))
+
+
+@router.get(
+    "/sessions/{session_id}/belief",
+    response_model=BeliefAnswer,
+    responses={
+        200: {"content": binary("float32 npy [n]: the mass of every map image, in route order; sums to 1")},
+        **problems(404, 410, 422),
+    },
+)
+async def get_belief(
+    session_id: SessionId, request: Request, running: Running, shortlist: Shortlist = None
+) -> Response:
+    """The belief alone; with `Accept: application/octet-stream` the mass of every map image."""
+    if prefers_binary(request):
+        return npy_response(await running.sessions.mass(session_id))
+    view = await running.sessions.view(session_id, shortlist)
+    route, belief = view.snapshot.route, view.belief
+    return await running.written(belief.top.size, lambda: json_response(render_belief(route, belief)))
+
+
+@router.get("/sessions/{session_id}/next-best-view", responses=problems(404, 410, 422))
+async def get_next_best_view(session_id: SessionId, running: Running) -> NextBestViewAnswer | None:
+    """The move that would tell most, without a new view; null where the map can name none."""
+    plan, actions_m = await running.sessions.next_best_view(session_id)
+    return render_plan(plan, actions_m)
+
+
+@router.put(
+    "/sessions/{session_id}/prior",
+    response_model=SessionAnswer,
+    responses=problems(404, 410, 413, 415, 422),
+    openapi_extra=declare_json(PriorBody),
+)
+async def put_prior(session_id: SessionId, request: Request, running: Running) -> Response:
+    """Replace the belief by one around a position: the robot was carried, or got a fix."""
+    body = await read_json(request, PriorBody)
+    return await _answered(running, await running.sessions.set_prior(session_id, body.position_m, body.std_m))
+
+
+@router.delete("/sessions/{session_id}", status_code=204, responses=problems(404, 410, 422))
+async def delete_session(session_id: SessionId, running: Running) -> None:
+    """End a session; nothing more can be asked of it."""
+    await running.sessions.end(session_id)
+
+
+@router.post(
+    "/sessions/{session_id}/truths",
+    responses=problems(404, 410, 413, 415, 422),
+    openapi_extra=declare_json(TruthsBody),
+)
+async def post_truths(session_id: SessionId, request: Request, running: Running) -> TruthsAnswer:
+    """Rank the truth in the belief as it was after every observation.
+
+    The session may have ended, up to a day ago unless the settings say otherwise. The answer's ANR is that of this
+    session; the metric `deepsimbad_live_anr_percent` counts every observation once, whoever tells of it how often. The
+    positions are kept, so that a map can learn from them.
+    """
+    body = await read_json(request, TruthsBody)
+    ranked, before_m = await running.truths.keep(
+        session_id, body.true_positions_m, body.true_map_images, body.first_observation
+    )
+    await run_sync(running.metrics.fed_back, ranked.domain, ranked.new_since(before_m).tolist())
+    ranks = ranked.retrieval_rank
+    return TruthsAnswer(
+        n_scored=ranked.n_scored,
+        n_left_out=ranked.n_left_out,
+        anr=ranked.anr,
+        retrieval_ranks=None
+        if ranks is None
+        else [None if math.isnan(rank) else rank for rank in ranks[ranked.first :]],
+        map_version=ranked.map_version,
+    )
+
+
+@listing.get("", responses=problems(404, 422))
+async def list_sessions(
+    running: Running,
+    domain: OfDomain = None,
+    limit: Limit = USUALLY_AT_ONCE,
+    cursor: Annotated[str | None, after("sessions")] = None,
+) -> SessionList:
+    """Living sessions, newest first; whoever may list them may also ask and end them by their ids."""
+    if domain is not None:
+        await run_sync(running.catalog.domain, domain)
+    page = await running.sessions.newest(domain, number_of(cursor), limit)
+    return SessionList(
+        sessions=[render_listed(listed) for listed in page.records], next=cursor_of("sessions", page.last_key)
+    )

@@ -1,0 +1,458 @@
+"""Traverses of a domain, and their frames: one by one, or many whose encodings are known."""
+
+import logging
+import struct
+import tempfile
+import zipfile
+from dataclasses import replace
+from typing import IO, Annotated, Any, cast
+
+import numpy as np
+from anyio.to_thread import run_sync
+from fastapi import APIRouter, Path, Query, Request, Response
+from numpy.typing import NDArray
+from pydantic import FailFast, Field, StrictFloat
+
+from deepsimbad.api.localizations import IMAGE_SCHEMA, only
+from deepsimbad.api.openapi import declare, declare_json, problems
+from deepsimbad.api.requests import (
+    BINARY,
+    GREATEST_EXACT_INTEGER,
+    JSON,
+    NAME_PATTERN,
+    USUALLY_AT_ONCE,
+    Answer,
+    DomainName,
+    JsonBody,
+    Limit,
+    Name,
+    Next,
+    Running,
+    Services,
+    after,
+    cursor_of,
+    key_of,
+    media_type_of,
+    parse_json,
+    read_bytes,
+    read_json,
+)
+from deepsimbad.engine.encoders import ready_encodings
+from deepsimbad.engine.views import EncodedImage, View
+from deepsimbad.engine.worker import Priority
+from deepsimbad.errors import (
+    ConflictError,
+    DeepSimbadError,
+    EmptyBodyError,
+    InvalidInputError,
+    TooLargeError,
+    TraverseInUseError,
+    UnknownTraverseError,
+)
+from deepsimbad.evaluators.base import Evaluator
+from deepsimbad.evaluators.image import MEDIA_TYPES
+from deepsimbad.store.faults import storage_faults
+from deepsimbad.store.frames import MAX_POSITION_M, UNKNOWN_TIMESTAMP, TraverseFrames
+from deepsimbad.store.records import ListPage
+from deepsimbad.store.traverses import Traverse
+
+router = APIRouter(prefix="/v1/admin/domains/{domain}/traverses", tags=["admin: traverses"])
+log = logging.getLogger(__name__)
+
+TraverseName = Annotated[str, Path(alias="name", pattern=NAME_PATTERN, description="A traverse's name.")]
+TraversesAfter = Annotated[str | None, after("traverses", NAME_PATTERN.removeprefix("^"))]
+FRAME_TYPES = (*MEDIA_TYPES, JSON)
+_SPOOL_CHUNK_BYTES = 1 << 20
+
+# Bodies and answers
+
+
+class TraverseBody(JsonBody):
+    """A traverse to be made."""
+
+    name: Name
+
+
+class EncodingBody(JsonBody):
+    """A frame that was encoded elsewhere."""
+
+    encoding: Annotated[list[StrictFloat], FailFast()]
+
+
+_ENCODING_SCHEMA = only("encoding", {"type": "number"}, "A ready encoding, as long as the others of the traverse.")
+IndexRange = Annotated[tuple[int, int], Field(description="First and last index of a gap, both inside it.")]
+
+
+class TraverseAnswer(Answer):
+    """A recorded drive and what of it has arrived."""
+
+    name: str
+    n_frames: int
+    missing: Annotated[list[IndexRange], Field(description="Gaps below the greatest index that has arrived.")]
+
+
+class TraverseList(Answer):
+    """The traverses of a domain, by name."""
+
+    traverses: list[TraverseAnswer]
+    next: Next
+
+
+class FrameAnswer(Answer):
+    """A frame has been stored."""
+
+    index: int
+    n_frames: Annotated[int, Field(description="Of the traverse, now.")]
+
+
+class BatchAnswer(Answer):
+    """A batch of frames has been stored, all or none."""
+
+    n_new: int
+    n_replaced: int
+    n_frames: Annotated[int, Field(description="Of the traverse, now.")]
+
+
+def _describe(traverse: Traverse) -> TraverseAnswer:
+    return TraverseAnswer(name=traverse.name, n_frames=traverse.n_frames, missing=traverse.missing)
+
+
+# Handlers of traverses
+
+
+@router.post(
+    "",
+    status_code=201,
+    responses={
+        200: {"model": TraverseAnswer, "description": "It was there already"},
+        **problems(404, 413, 415, 422),
+    },
+    openapi_extra=declare_json(TraverseBody),
+)
+async def post_traverse(domain: DomainName, request: Request, response: Response, running: Running) -> TraverseAnswer:
+    """Make an empty traverse; one of that name that is there stays as it is."""
+    body = await read_json(request, TraverseBody)
+    data_dir = running.settings.data_dir
+
+    def make() -> tuple[TraverseAnswer, bool]:
+        running.catalog.domain(domain)
+        try:
+            with Traverse.create(data_dir, domain, body.name) as traverse:
+                return _describe(traverse), True
+        except ConflictError:
+            with Traverse.open(data_dir, domain, body.name) as traverse:
+                return _describe(traverse), False
+
+    answer, created = await run_sync(make)
+    response.status_code = 201 if created else 200
+    if created:
+        log.info("traverse made", extra={"domain": domain, "traverse": body.name})
+    return answer
+
+
+@router.get("", responses=problems(404, 422))
+async def list_traverses(
+    domain: DomainName,
+    running: Running,
+    limit: Limit = USUALLY_AT_ONCE,
+    cursor: TraversesAfter = None,
+) -> TraverseList:
+    """The traverses of a domain, by name."""
+    data_dir = running.settings.data_dir
+    first = key_of(cursor)
+
+    def described() -> TraverseList:
+        running.catalog.domain(domain)
+        names = [name for name in Traverse.list(data_dir, domain) if first is None or name > first]
+        page = ListPage.of(((name, name) for name in names), limit)
+        answers = []
+        for name in page.records:  # a file each, so that those of other pages stay closed
+            try:
+                with Traverse.open(data_dir, domain, name) as traverse:
+                    answers.append(_describe(traverse))
+            except UnknownTraverseError:  # deleted since it was listed
+                continue
+        return TraverseList(traverses=answers, next=cursor_of("traverses", page.last_key))
+
+    return await run_sync(described)
+
+
+@router.get("/{name}", responses=problems(404, 422))
+async def get_traverse(domain: DomainName, name: TraverseName, running: Running) -> TraverseAnswer:
+    """One traverse: how many frames have arrived, and which are missing."""
+
+    def described() -> TraverseAnswer:
+        running.catalog.domain(domain)
+        with Traverse.open(running.settings.data_dir, domain, name) as traverse:
+            return _describe(traverse)
+
+    return await run_sync(described)
+
+
+@router.delete("/{name}", status_code=204, responses=problems(404, 409, 422))
+async def delete_traverse(domain: DomainName, name: TraverseName, running: Running) -> None:
+    """Remove a traverse and its frames; the maps made from it stay. A job that needs it is a 409."""
+
+    def delete() -> None:
+        for job in running.catalog.jobs(domain):
+            needed = {job.config.get(role) for role in ("training_traverse", "landmark_traverse", "check_traverse")}
+            if name in needed and not job.state.is_final:
+                raise TraverseInUseError(
+                    f"job {job.job_id} needs traverse {name}: cancel it or wait for its end", job_id=job.job_id
+                )
+        running.open_traverses.forget(domain, name)
+        Traverse.delete(running.settings.data_dir, domain, name)
+
+    await run_sync(delete)
+    log.info("traverse deleted", extra={"domain": domain, "traverse": name})
+
+
+# Handlers of frames
+
+
+@router.put(
+    "/{name}/frames/{index}",
+    status_code=201,
+    responses={
+        200: {"model": FrameAnswer, "description": "It replaced the frame of that index"},
+        **problems(404, 413, 415, 422),
+    },
+    openapi_extra=declare({**dict.fromkeys(MEDIA_TYPES, IMAGE_SCHEMA), JSON: _ENCODING_SCHEMA}),
+)
+async def put_frame(
+    domain: DomainName,
+    name: TraverseName,
+    index: Annotated[int, Path(ge=0, le=GREATEST_EXACT_INTEGER, description="Place in the recording, from 0.")],
+    position_m: Annotated[
+        float, Query(ge=-MAX_POSITION_M, le=MAX_POSITION_M, allow_inf_nan=False, description="Metres along the route.")
+    ],
+    request: Request,
+    response: Response,
+    running: Running,
+    timestamp_us: Annotated[
+        int | None, Query(ge=0, le=GREATEST_EXACT_INTEGER, description="Microseconds since 1970.")
+    ] = None,
+    x_m: Annotated[
+        float | None,
+        Query(ge=-MAX_POSITION_M, le=MAX_POSITION_M, allow_inf_nan=False, description="East, in metres."),
+    ] = None,
+    y_m: Annotated[
+        float | None,
+        Query(ge=-MAX_POSITION_M, le=MAX_POSITION_M, allow_inf_nan=False, description="North, in metres."),
+    ] = None,
+) -> FrameAnswer:
+    """Store one frame, in any order; the same index again replaces it.
+
+    The body is the image, or its encoding where that is known. An image is encoded at once and not kept. Positions
+    that go backwards are accepted here and refused by the remap.
+    """
+    evaluator_config = (await run_sync(running.catalog.domain, domain)).evaluator
+    await run_sync(_check_traverse, running, domain, name)
+    media_type = media_type_of(request, FRAME_TYPES)
+    body = await read_bytes(request)
+    evaluator = running.evaluators.evaluator(evaluator_config)
+    encoding, weights_sha256 = await _encoded(body, running, media_type, evaluator)
+
+    def store() -> tuple[bool, int]:
+        with running.open_traverses.lend(domain, name) as traverse:
+            created = traverse.put_frame(index, encoding, position_m, timestamp_us, x_m, y_m, weights_sha256)
+            return created, traverse.n_frames
+
+    created, n_frames = await run_sync(store)
+    response.status_code = 201 if created else 200
+    return FrameAnswer(index=index, n_frames=n_frames)
+
+
+async def _encoded(
+    body: bytes, running: Services, media_type: str, evaluator: Evaluator
+) -> tuple[NDArray[np.float32], str | None]:
+    """The encoding of the frame in a body, and by which weights it was made."""
+    if media_type == JSON:
+        values = np.array((await parse_json(body, EncodingBody, running)).encoding, np.float64)
+        return (await run_sync(ready_encodings, values[np.newaxis]))[0], None
+    image, _ = await running.decoders.decoded(body, evaluator, Priority.BATCH)
+    encoded = await running.look(evaluator, image, _as_encoded, Priority.BATCH)
+    return encoded.values, encoded.weights_sha256
+
+
+def _as_encoded(view: View) -> EncodedImage:
+    """What the inference worker makes of an image."""
+    return cast("EncodedImage", view)
+
+
+@router.post(
+    "/{name}/frames",
+    responses=problems(404, 413, 415, 422),
+    openapi_extra=declare(
+        {
+            BINARY: {
+                "type": "string",
+                "format": "binary",
+                "description": "npz (numpy.savez) of `encodings` [n, d] float, `index` [n] integer, `position_m` [n], "
+                "and where known `timestamp_us` [n] integer (-1: unknown), `x_m` and `y_m` [n] (NaN: unknown). Metres, "
+                "at most 1e9 either way.",
+            }
+        }
+    ),
+)
+async def post_frames(domain: DomainName, name: TraverseName, request: Request, running: Running) -> BatchAnswer:
+    """Store a batch of frames whose encodings are known, all or none; the same indices again replace them."""
+    await run_sync(running.catalog.domain, domain)
+    await run_sync(_check_traverse, running, domain, name)
+    media_type_of(request, (BINARY,))
+    max_bytes = running.settings.max_batch_bytes
+
+    def store(spool: IO[bytes]) -> BatchAnswer:
+        frames = read_batch(spool, max_bytes)
+        encodings = ready_encodings(frames.encodings)
+        with running.open_traverses.lend(domain, name) as traverse:
+            n_new, n_replaced = traverse.put_frames(replace(frames, encodings=encodings))
+            return BatchAnswer(n_new=n_new, n_replaced=n_replaced, n_frames=traverse.n_frames)
+
+    data_dir = running.settings.data_dir  # the system's folder for such files is often memory
+    with running.uploads.taken(), storage_faults(data_dir), tempfile.TemporaryFile(dir=data_dir) as spool:
+        await _spool_body(request, spool)
+        return await run_sync(store, spool, limiter=running.batches)
+
+
+async def _spool_body(request: Request, spool: IO[bytes]) -> None:
+    """Write a body to disk as it streams in, a chunk in memory."""
+    chunk = bytearray()
+    n_bytes = 0
+    async for piece in request.stream():
+        chunk += piece
+        n_bytes += len(piece)
+        if len(chunk) >= _SPOOL_CHUNK_BYTES:
+            await run_sync(spool.write, bytes(chunk))
+            chunk.clear()
+    if n_bytes == 0:
+        raise EmptyBodyError("the body is empty: send an npz file (numpy.savez)")
+    await run_sync(spool.write, bytes(chunk))
+
+
+def _check_traverse(running: Services, domain: str, name: str) -> None:
+    """An unknown traverse should not cost an upload."""
+    with running.open_traverses.lend(domain, name):
+        pass
+
+
+# A batch is read with distrust: what it declares is judged before anything is unpacked.
+
+MEMBERS = {"encodings": 2, "index": 1, "position_m": 1, "timestamp_us": 1, "x_m": 1, "y_m": 1}
+REQUIRED = ("encodings", "index", "position_m")
+
+_END_OF_DIRECTORY = b"PK\x05\x06"
+_LARGE_DIRECTORY = b"PK\x06\x07"
+_MAX_HEADER_BYTES = 4096
+_MAX_RATIO = 100  # of unpacked to packed; encodings shrink by a tenth, only noughts by more than a hundred
+_ANY_RATIO_BYTES = 1 << 24
+
+
+class InvalidBatchError(InvalidInputError):
+    """A batch of frames that is not an npz file of the arrays asked for."""
+
+    code = "invalid_batch"
+
+
+def read_batch(file: IO[bytes], max_bytes: int) -> TraverseFrames:
+    """Read the arrays of a batch.
+
+    Args:
+        file: The npz file, at any position.
+        max_bytes: The most its arrays may hold together, unpacked.
+
+    Returns:
+        The frames, their values not yet judged; `encodings` may still be of another float type.
+
+    Raises:
+        InvalidBatchError: Not such a file; pickled objects are never read.
+        TooLargeError: The arrays are larger than `max_bytes`.
+    """
+    try:
+        _check_directory(file)
+        with zipfile.ZipFile(file) as archive:
+            arrays = _read_members(archive, max_bytes)
+    except DeepSimbadError:
+        raise
+    except Exception as error:  # zipfile and numpy raise some ten kinds over a file that was meddled with
+        raise InvalidBatchError("the batch is not a whole npz file as numpy.savez writes it") from error
+    return _arranged(arrays)
+
+
+def _check_directory(file: IO[bytes]) -> None:
+    """Refuse a table of contents that could be long: zipfile would read all of it into memory."""
+    size = file.seek(0, 2)
+    file.seek(max(0, size - (1 << 16) - 22))
+    tail = file.read()
+    end = tail.rfind(_END_OF_DIRECTORY)
+    if end < 0 or len(tail) - end < 22:
+        raise InvalidBatchError("the batch is not a whole npz file (numpy.savez)")
+    n_members, directory_bytes = struct.unpack_from("<HL", tail, end + 10)
+    large = tail[max(0, end - 20) : end].startswith(_LARGE_DIRECTORY)
+    if n_members > len(MEMBERS) or directory_bytes > 1 << 14 or large:
+        raise InvalidBatchError(f"the batch holds more than the arrays {', '.join(MEMBERS)}", allowed=list(MEMBERS))
+
+
+def _read_members(archive: zipfile.ZipFile, max_bytes: int) -> dict[str, NDArray[Any]]:
+    names = [member.filename.removesuffix(".npy") for member in archive.infolist()]
+    unknown = sorted(set(names) - set(MEMBERS))
+    if unknown or len(names) != len(set(names)):
+        raise InvalidBatchError(
+            f"the batch holds arrays that are not known or stand twice; known are {', '.join(MEMBERS)}",
+            allowed=list(MEMBERS),
+        )
+    missing = [name for name in REQUIRED if name not in names]
+    if missing:
+        raise InvalidBatchError(f"the batch lacks {', '.join(missing)}", missing=missing)
+    declared = sum(member.file_size for member in archive.infolist())
+    if declared > max_bytes:
+        raise TooLargeError(
+            f"the batch unpacks to {declared} bytes; at most {max_bytes} are taken, send fewer frames at once",
+            max_bytes=max_bytes,
+        )
+    packed = sum(member.compress_size for member in archive.infolist())
+    if declared > max(_ANY_RATIO_BYTES, _MAX_RATIO * packed):
+        raise InvalidBatchError(f"the batch unpacks to {declared} bytes from {packed}: these are no encodings")
+    for name, member in zip(names, archive.infolist(), strict=True):
+        with archive.open(member) as stream:
+            _check_header(name, stream, member.file_size)
+    arrays = {}
+    for name, member in zip(names, archive.infolist(), strict=True):
+        with archive.open(member) as stream:
+            arrays[name] = np.lib.format.read_array(stream, allow_pickle=False, max_header_size=_MAX_HEADER_BYTES)
+            if stream.read(1):  # reading to the end is also what checks the member's checksum
+                raise InvalidBatchError(f"{name} is longer than its header says")
+    return arrays
+
+
+def _check_header(name: str, stream: IO[bytes], member_bytes: int) -> None:
+    """Refuse a shape or type that is not the array's own, before its numbers are touched."""
+    version = np.lib.format.read_magic(stream)
+    readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+    if version not in readers:
+        raise InvalidBatchError(f"{name} has npy version {version}; 1.0 and 2.0 are read")
+    shape, _, dtype = readers[version](stream, max_header_size=_MAX_HEADER_BYTES)
+    kinds = "fiu" if name in {"position_m", "x_m", "y_m"} else "f" if name == "encodings" else "iu"
+    if dtype.kind not in kinds or dtype.itemsize > 8:
+        raise InvalidBatchError(f"{name} holds {dtype}; it must hold {'floats' if 'f' in kinds else 'integers'}")
+    if len(shape) != MEMBERS[name]:
+        raise InvalidBatchError(f"{name} has shape {list(shape)}; it must have {MEMBERS[name]} dimensions")
+    n_values = 1
+    for length in shape:
+        n_values *= length
+    if stream.tell() + n_values * dtype.itemsize != member_bytes:
+        raise InvalidBatchError(f"{name} does not hold the {n_values} numbers its header says")
+
+
+def _arranged(arrays: dict[str, NDArray[Any]]) -> TraverseFrames:
+    """The store's form; it judges the values."""
+    n_frames = len(arrays["encodings"])
+    unknown = np.full(n_frames, np.nan)
+    return TraverseFrames(
+        index=arrays["index"],
+        position_m=arrays["position_m"],
+        timestamp_us=arrays.get("timestamp_us", np.full(n_frames, UNKNOWN_TIMESTAMP)),
+        x_m=arrays.get("x_m", unknown),
+        y_m=arrays.get("y_m", unknown),
+        encodings=arrays["encodings"],
+    )
