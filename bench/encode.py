@@ -25,9 +25,9 @@ from bench import machine
 from bench.recordings import RESULTS
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.compute import Compute, Runtime
+from deepsimbad.evaluators.extractors.base import resized
 from deepsimbad.evaluators.extractors.efficientnet_lite0 import EfficientNetLite0
 from deepsimbad.evaluators.extractors.gradient_grid import GradientGrid
-from deepsimbad.evaluators.extractors.network import resized
 from deepsimbad.evaluators.image import decode_image
 from deepsimbad.evaluators.registry import evaluator_config, make_evaluator, make_extractor
 from deepsimbad_client import Client

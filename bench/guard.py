@@ -19,11 +19,10 @@ from numpy.typing import NDArray
 from bench import machine
 from bench.recordings import RESULTS, real_recordings
 from deepsimbad.core.descriptor import rank_landmarks
-from deepsimbad.core.landmark_selection import select_landmarks
-from deepsimbad.core.route import Route
-from deepsimbad.core.same_route import LEAST_CORRELATION, LEAST_PLACES, SIGNIFICANCE, judge
+from deepsimbad.core.drive import LEAST_CORRELATION, LEAST_PLACES, SIGNIFICANCE, judge
+from deepsimbad.core.landmark_model import select_landmarks
+from deepsimbad.core.route import Route, same_places
 from deepsimbad.core.statistics import LandmarkStatistics
-from deepsimbad.core.true_images import same_places
 from deepsimbad.evaluators.base import Evaluator, Image
 from deepsimbad.evaluators.feature_l2 import FeatureL2
 from deepsimbad.evaluators.image import decode_image

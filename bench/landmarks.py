@@ -10,7 +10,7 @@ from time import perf_counter
 import numpy as np
 
 from bench.worlds import ENCODING_DIM, N_LANDMARKS
-from deepsimbad.core.landmark_selection import select_landmarks
+from deepsimbad.core.landmark_model import select_landmarks
 
 N_CANDIDATES = 26_000
 

@@ -3,17 +3,14 @@
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from bench.timing import duration, timed
 from bench.worlds import ENCODING_DIM, N_LANDMARKS, NCLT_IMAGES, Lists, dense_lists, scattered_lists, standardised_map
-from deepsimbad.core.route import Route
-from deepsimbad.engine.snapshot import MapSnapshot
-from deepsimbad.jobs.build_map import Described, map_contents
-from deepsimbad.store.map_contents import MapContents
+from deepsimbad.core.map import Map
 from deepsimbad.store.map_file import index_bytes, read_map, table_bytes, write_map
-from deepsimbad.store.records import DomainRecord
 from deepsimbad.store.sealing import seal
 
 
@@ -45,7 +42,7 @@ def _row(lists: Lists) -> tuple[str, dict[str, int]]:
             seal(building, sealed)
 
         sealing_s = timed(seal_again, repeats=3).median_s - writing.median_s
-        loading = timed(lambda: MapSnapshot.from_contents(read_map(sealed), index_bytes(sealed)), repeats=9)
+        loading = timed(lambda: read_map(sealed), repeats=9)
         bits = 8 * index_bytes(sealed) / NCLT_IMAGES
         row = (
             f"| {lists.name} | {bits:.1f} | {sealed.stat().st_size / 1e6:.1f} MB | {duration(writing.median_s)} "
@@ -54,13 +51,8 @@ def _row(lists: Lists) -> tuple[str, dict[str, int]]:
         return row, table_bytes(sealed)
 
 
-def contents_of(lists: Lists) -> MapContents:
+def contents_of(lists: Lists, **more: Any) -> Map:
     """A map of these lists, with a landmark model of the paper's size."""
-    domain = DomainRecord(
-        "bench", {"kind": "feature_l2"}, closed=False, actions_m=(1.0,), active_version=None, created_at=""
-    )
     prototypes = np.random.default_rng(0).normal(size=(N_LANDMARKS, ENCODING_DIM)).astype(np.float32)
-    route = Route(np.asarray(np.arange(NCLT_IMAGES) * 0.2, np.float64))
-    return map_contents(
-        domain, 1, {}, {"prototypes": prototypes}, Described(standardised_map(lists.lists), None), route
-    )
+    known = {"evaluator": {"kind": "feature_l2"}, "actions_m": np.ones(1), "landmark_model": {"prototypes": prototypes}}
+    return standardised_map(lists.lists, **{**known, **more})

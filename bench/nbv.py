@@ -20,12 +20,12 @@ from numpy.typing import NDArray
 from bench import machine
 from bench.netvlad import DRIVES
 from bench.recordings import RESULTS, real_recordings
+from deepsimbad.core.episodes import TestDrive
 from deepsimbad.core.planners import CONSTANT, DEFAULT_PLANNER, RANDOM
 from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
-from deepsimbad.jobs.encoded_traverse import encode_recording
-from deepsimbad.jobs.episodes import TestDrive
-from deepsimbad.jobs.experiment_nbv import CLAIRVOYANT, NbvConfig, NbvReport, nbv_stages, run_nbv
+from deepsimbad.jobs.experiments import CLAIRVOYANT, NbvConfig, NbvReport, nbv_stages, run_nbv
 from deepsimbad.jobs.progress import Progress
+from deepsimbad.jobs.recordings import encode_recording
 from deepsimbad_client.recordings.sources import open_source
 
 Shares = NDArray[np.float64]

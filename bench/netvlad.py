@@ -18,11 +18,13 @@ import numpy as np
 from bench import machine
 from bench.recordings import RESULTS, real_recordings
 from deepsimbad.cli import run
+from deepsimbad.core.building import build_map
 from deepsimbad.core.descriptor import rank_landmarks
-from deepsimbad.core.landmark_selection import select_landmarks
+from deepsimbad.core.drive import Drive, SecondSeason
+from deepsimbad.core.landmark_model import select_landmarks
 from deepsimbad.core.metrics import RetrievalScorer
-from deepsimbad.core.relevance import Query, Relevance, relevances
-from deepsimbad.core.retrieval import SecondSeason, build_retrieval_map
+from deepsimbad.core.relevance import Query, Relevance
+from deepsimbad.core.retrieval import relevances
 from deepsimbad.evaluators.feature_l2 import FeatureL2
 
 DRIVES = ("nr", "nq", "nq2")
@@ -52,10 +54,11 @@ def alone(folder: Path, triplet: tuple[str, ...]) -> dict[str, float]:
     seen, other, live = (evaluator.dissimilarities(each, model) for each in (training, landmarks, test))
     frames = np.arange(len(training))
     second = SecondSeason(other, np.stack([frames, frames], axis=1))
+    drive = Drive(position_m=frames.astype(float), encodings=training, dissimilarities=seen)
     maps = {
-        "calibrated": build_retrieval_map(Relevance.CALIBRATED, seen, LIST_LENGTH, second_season=second),
-        _FALLEN_BACK: build_retrieval_map(Relevance.CALIBRATED, seen, LIST_LENGTH),
-        "standardised": build_retrieval_map(Relevance.STANDARDISED, seen, LIST_LENGTH),
+        "calibrated": build_map(Relevance.CALIBRATED, drive, LIST_LENGTH, second_season=second),
+        _FALLEN_BACK: build_map(Relevance.CALIBRATED, drive, LIST_LENGTH),
+        "standardised": build_map(Relevance.STANDARDISED, drive, LIST_LENGTH),
     }
     anr = {}
     for name, built in maps.items():

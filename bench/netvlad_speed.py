@@ -21,8 +21,7 @@ from bench import machine
 from bench.recordings import RESULTS
 from bench.timing import Timing, interleaved
 from deepsimbad.evaluators.compute import Compute, Device, Runtime
-from deepsimbad.evaluators.nets.netvlad import NetVlad
-from deepsimbad.evaluators.nets.vgg16 import STAGES
+from deepsimbad.evaluators.nets.netvlad import STAGES, NetVlad
 from deepsimbad.evaluators.runtimes import make_run
 
 CHANNELS = (64, 64, 128, 128, 256, 256, 256, 512, 512, 512, 512, 512, 512)

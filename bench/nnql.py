@@ -16,15 +16,11 @@ from numpy.typing import NDArray
 
 from bench.map_file import contents_of
 from bench.timing import timed
-from bench.worlds import N_LANDMARKS, NCLT_IMAGES, dense_lists, standardised_map
-from deepsimbad.core.inverted_index import InvertedIndex
-from deepsimbad.core.live_views import LiveViews
-from deepsimbad.core.nnql import NnqlConfig, q_of_view
-from deepsimbad.core.nnql_training import train
-from deepsimbad.core.relevance import Relevance, RetrievalMap
-from deepsimbad.core.route import Route
-from deepsimbad.core.training_world import TrainingWorld
-from deepsimbad.core.update_rules import DEFAULT_UPDATE
+from bench.worlds import N_LANDMARKS, NCLT_IMAGES, dense_lists, rrf_map, standardised_map
+from deepsimbad.core.nnql import NnqlConfig
+from deepsimbad.core.planners import NnqlPlanner, PlanningView
+from deepsimbad.core.relevance import DEFAULT_UPDATE, Query, Relevance
+from deepsimbad.core.training import TrainingWorld, train
 from deepsimbad.store.map_file import table_bytes, write_map
 
 ACTIONS_M = tuple(float(metres) for metres in range(1, 11))
@@ -51,13 +47,14 @@ def nnql_table() -> Iterator[str]:
     yield ""
     q_values = _learnt_values()
     relevance_row = np.random.default_rng(0).normal(size=NCLT_IMAGES).astype(np.float32)
-    planning = timed(lambda: q_of_view(q_values, relevance_row, 4), repeats=201, warm_up=20)
+    learnt = rrf_map(dense_lists(NCLT_IMAGES).lists, actions_m=np.array(ACTIONS_M), q_values=q_values)
+    view = PlanningView(learnt, np.empty(0), relevance_row, 0, 1)
+    planning = timed(lambda: NnqlPlanner().plan(view), repeats=201, warm_up=20)
     yield f"Values of a view's 10 actions, the four nearest of {NCLT_IMAGES:,} map images included: {planning}."
     yield ""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "map"
-        contents = contents_of(dense_lists(NCLT_IMAGES))
-        write_map(path, replace(contents, actions_m=ACTIONS_M, q_values=q_values))
+        write_map(path, contents_of(dense_lists(NCLT_IMAGES), actions_m=np.array(ACTIONS_M), q_values=q_values))
         n_bytes = table_bytes(path)["q_value"] / NCLT_IMAGES
     yield f"The experience database takes {n_bytes:.1f} bytes a map image (`dbstat` pages)."
 
@@ -70,12 +67,9 @@ def _world(relevance: Relevance, config: NnqlConfig) -> TrainingWorld:
     level[np.arange(NCLT_IMAGES), lists] *= 0.2
     ranks = np.empty_like(level)
     np.put_along_axis(ranks, level.argsort(axis=1), np.arange(1, N_LANDMARKS + 1, dtype=np.float32)[np.newaxis], axis=1)
-    built = standardised_map(lists)
-    if relevance is Relevance.RRF:
-        built = RetrievalMap(relevance, InvertedIndex(lists, N_LANDMARKS))
-    route = Route(np.asarray(np.arange(NCLT_IMAGES) * SPACING_M, np.float64))
-    views = LiveViews(built, DEFAULT_UPDATE[relevance], config.n_neighbours, ranks)
-    return TrainingWorld.on(route, views, route, np.arange(NCLT_IMAGES), ACTIONS_M, config)
+    make = rrf_map if relevance is Relevance.RRF else standardised_map
+    built = make(lists, actions_m=np.array(ACTIONS_M))
+    return TrainingWorld.on(built, Query(ranks), built.route, np.arange(NCLT_IMAGES), config)
 
 
 def _learnt_values() -> NDArray[np.float32]:

@@ -29,8 +29,8 @@ from bench.nnql_worlds import (
     Triplet,
 )
 from bench.recordings import RESULTS, real_recordings
+from deepsimbad.core.metrics import compare
 from deepsimbad.core.nnql import NnqlConfig
-from deepsimbad.jobs.paired import compare
 
 CHOSEN_ON, REPORTED_ON = (0, 2, 4), (1, 3, 5)
 LONGEST = 9  # place of the 10 m move, the best constant of every triplet's mean

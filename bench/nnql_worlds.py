@@ -13,18 +13,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from deepsimbad.core.descriptor import rank_landmarks
-from deepsimbad.core.live_views import LiveViews
+from deepsimbad.core.drive import Drive
+from deepsimbad.core.map import Map
 from deepsimbad.core.nnql import NnqlConfig, initial_q_values
-from deepsimbad.core.nnql_training import train, walk_greedily
-from deepsimbad.core.relevance import Relevance, RetrievalMap
-from deepsimbad.core.route import Route
-from deepsimbad.core.training_world import TrainingWorld, Walk
-from deepsimbad.core.update_rules import UpdateRule
+from deepsimbad.core.relevance import Relevance, UpdateRule
+from deepsimbad.core.training import TrainingWorld, Walk, train, walk_greedily
 from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
-from deepsimbad.jobs.build_map import choose_landmarks, describe
-from deepsimbad.jobs.train_nnql import DescribedDrive, train_nnql
-from deepsimbad.store.frames import UNKNOWN_TIMESTAMP, TraverseFrames
+from deepsimbad.jobs.build import Built, build, choose_landmarks, measured
+from deepsimbad.jobs.train import train_nnql, world_of
 
 DRIVES = ("nr", "nq", "nq2")
 TRIPLETS = tuple(itertools.permutations(DRIVES))
@@ -61,49 +57,34 @@ class Triplet:
     names: tuple[str, ...]
     setup: Setup
 
-    def _frames(self, place: int) -> TraverseFrames:
-        encodings = np.load(self.folder / f"{self.names[place]}.npy").astype(np.float32)
-        n = len(encodings)
-        unknown = np.full(n, np.nan)
-        times = np.full(n, UNKNOWN_TIMESTAMP)
-        return TraverseFrames(np.arange(n), np.arange(n, dtype=float), times, unknown, unknown, encodings)
-
     @cached_property
-    def _mapped(self) -> tuple[RetrievalMap, RetrievalMap, list[DescribedDrive]]:
+    def _mapped(self) -> tuple[Built, list[Drive]]:
         evaluator = make_evaluator(evaluator_config({"kind": "feature_l2", "extractor": "none"}))
-        drives = [self._frames(place) for place in range(3)]
+        encodings = [np.load(self.folder / f"{name}.npy").astype(np.float32) for name in self.names]
+        drives = [Drive(position_m=np.arange(float(len(rows))), encodings=rows) for rows in encodings]
         model = choose_landmarks(drives[0].encodings, N_LANDMARKS, evaluator, lambda _: None)
-        route = Route(drives[1].position_m)
-        found = describe(
-            drives[1], route, evaluator, model, self.setup.relevance, LIST_LENGTH, drives[0], True, lambda _: None
-        )
-        seen = [DescribedDrive.of(drive, False, evaluator, model) for drive in drives]
-        return found.built, found.rehearsal or found.built, seen
-
-    @property
-    def route(self) -> Route:
-        """Of the map."""
-        return self._mapped[2][1].route
+        how = (model, self.setup.relevance, LIST_LENGTH, ACTIONS_M, False, lambda _: None)
+        built = build(drives[1], drives[0], True, evaluator, *how)
+        return built, [measured(drive, evaluator, model) for drive in drives]
 
     def learn(self, live: str, config: NnqlConfig, pool: Executor) -> NDArray[np.float32]:
         """Q-values learnt from some live images; `held-out frames` and `landmark traverse` as a remap does."""
-        built, rehearsal, (landmarks, own, test) = self._mapped
+        built, (landmarks, own, test) = self._mapped
         config = replace(config, update=self.setup.update, motion_std_m=self.setup.motion_std_m)
         if live in {LANDMARK_DRIVE, HELD_OUT}:
             second = landmarks if live == LANDMARK_DRIVE else None
-            experience = train_nnql(rehearsal, self.route, ACTIONS_M, lambda: own, second, config, lambda _: None, 2)
-            return experience.q_values
-        world = self._world(built if live == TEST_DRIVE else rehearsal, own if live == ITSELF else test, config)
+            return train_nnql(built.rehearsal, lambda: own, second, config, lambda _: None, 2)[0]
+        map_ = built.map if live == TEST_DRIVE else built.rehearsal
+        world = self._world(map_, own if live == ITSELF else test, config)
         return train(world, config, lambda _: None, pool)[0]
 
     def test_world(self, config: NnqlConfig) -> TrainingWorld:
         """The test traverse, to be walked on the map that would serve."""
-        return self._world(self._mapped[0], self._mapped[2][2], replace(config, motion_std_m=self.setup.motion_std_m))
+        built, (_, _, test) = self._mapped
+        return self._world(built.map, test, replace(config, motion_std_m=self.setup.motion_std_m))
 
-    def _world(self, built: RetrievalMap, live: DescribedDrive, config: NnqlConfig) -> TrainingWorld:
-        ranks = rank_landmarks(live.dissimilarities)
-        views = LiveViews(built, self.setup.update, config.n_neighbours, ranks, live.dissimilarities, live.encodings)
-        return TrainingWorld.on(self.route, views, live.route, np.arange(live.route.n_images), ACTIONS_M, config)
+    def _world(self, map_: Map, live: Drive, config: NnqlConfig) -> TrainingWorld:
+        return world_of(map_, live, np.arange(live.n_frames), replace(config, update=self.setup.update))
 
 
 def score(ranks: NDArray[np.float64], n_images: int) -> NDArray[np.float64]:

@@ -23,8 +23,8 @@ from deepsimbad_client.http.jobs import remap
 from deepsimbad_client.http.local_server import LocalServer
 from deepsimbad_client.http.upload import upload
 from deepsimbad_client.recordings.sources import open_source
-from deepsimbad_client.replay import replay
-from deepsimbad_client.report import summarise
+from deepsimbad_client.replay.passive import replay
+from deepsimbad_client.replay.report import summarise
 
 DOMAIN = "nordland"
 RELEVANCES = ("calibrated", "standardised", "rrf", "bag_of_landmarks", "simbad", "brute_force")

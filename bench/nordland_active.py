@@ -15,12 +15,12 @@ from bench import machine
 from bench.nordland import DOMAIN, LIST_LENGTH, N_LANDMARKS, drive_folders
 from bench.recordings import RESULTS, real_recordings
 from deepsimbad_client import Client
-from deepsimbad_client.active_replay import active_replay
-from deepsimbad_client.active_report import distance_table, localized_table, planner_table, summarise_active
 from deepsimbad_client.http.jobs import remap
 from deepsimbad_client.http.local_server import LocalServer
 from deepsimbad_client.http.upload import upload
 from deepsimbad_client.recordings.sources import open_source
+from deepsimbad_client.replay.active import active_replay
+from deepsimbad_client.replay.report import active_tables, summarise_active
 
 PLANNERS = ("default", "random", "constant:10", "constant:8", "constant:5", "nnql")
 EPISODES = 150
@@ -47,8 +47,8 @@ def main() -> None:
             walked = active_replay(client, live, DOMAIN, work / "walks", planners=PLANNERS, episodes=EPISODES)
             summary = summarise_active(walked)
     console = Console(width=150, record=True, file=sys.stdout)
-    for made in (planner_table, localized_table, distance_table):
-        console.print(made(summary))
+    for table in active_tables(summary):
+        console.print(table)
     lines = [
         "# Active episodes on Nordland images, through HTTP",
         "",

@@ -21,11 +21,14 @@ from numpy.typing import NDArray
 from bench import machine
 from bench.nordland import LANDMARK_FRAMES, MAP_FRAMES, kept_frames
 from bench.recordings import RESULTS, real_recordings
+from deepsimbad.core.building import build_map
 from deepsimbad.core.descriptor import normal_scores, pack_ranked_landmarks, rank_landmarks, ranks_from_ranked_landmarks
-from deepsimbad.core.landmark_selection import select_landmarks
+from deepsimbad.core.drive import Drive, SecondSeason
+from deepsimbad.core.landmark_model import select_landmarks
+from deepsimbad.core.map import Map
 from deepsimbad.core.metrics import RetrievalScorer
-from deepsimbad.core.relevance import Query, Relevance, RetrievalMap, relevances
-from deepsimbad.core.retrieval import SecondSeason, build_retrieval_map
+from deepsimbad.core.relevance import Query, Relevance
+from deepsimbad.core.retrieval import relevances, sum_listed
 from deepsimbad.core.statistics import LandmarkStatistics
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.feature_l2 import FeatureL2
@@ -53,7 +56,7 @@ class Drives:
     position: NDArray[np.int64]
     is_of_two_seasons: bool
 
-    def views(self, relevance: Relevance, n_landmarks: int) -> tuple[RetrievalMap, NDArray[np.float32]]:
+    def views(self, relevance: Relevance, n_landmarks: int) -> tuple[Map, NDArray[np.float32]]:
         """The map, and the ranks of the test frames, [n, r]."""
         evaluator = FeatureL2("none")
         model = evaluator.fit_landmarks(self.landmarks[select_landmarks(self.landmarks, n_landmarks)])
@@ -62,10 +65,11 @@ class Drives:
         )
         rows = np.arange(len(self.training))
         second = SecondSeason(other, np.stack([rows, rows], axis=1)) if self.is_of_two_seasons else None
-        return build_retrieval_map(relevance, seen, LIST_LENGTH, second_season=second), rank_landmarks(live)
+        drive = Drive(position_m=np.arange(float(len(rows))), encodings=self.training, dissimilarities=seen)
+        return build_map(relevance, drive, LIST_LENGTH, second_season=second), rank_landmarks(live)
 
 
-def anr(drives: Drives, built: RetrievalMap, ranks: NDArray[np.float32], m: int, how: str) -> tuple[float, float]:
+def anr(drives: Drives, built: Map, ranks: NDArray[np.float32], m: int, how: str) -> tuple[float, float]:
     """ANR in percent over the test drive, and milliseconds a view.
 
     Args:
@@ -77,7 +81,7 @@ def anr(drives: Drives, built: RetrievalMap, ranks: NDArray[np.float32], m: int,
             session in which landmarks that were not sent take the mean of the ranks left for what they are.
     """
     scorer, spent_s = RetrievalScorer(), 0.0
-    live = built.statistics
+    live = built.landmark_statistics
     for frame, all_ranks in enumerate(ranks):
         query = Query(ranks_from_ranked_landmarks(np.argsort(all_ranks)[:m].tolist(), ranks.shape[1]))
         began = time.perf_counter()
@@ -92,15 +96,16 @@ def anr(drives: Drives, built: RetrievalMap, ranks: NDArray[np.float32], m: int,
 
 
 def _by_mean_rank(
-    built: RetrievalMap, live: LandmarkStatistics, ranks: NDArray[np.float32]
+    built: Map, live: LandmarkStatistics, ranks: NDArray[np.float32]
 ) -> tuple[LandmarkStatistics, NDArray[np.float32]]:
     """The statistics after a view, and its relevances, with the shared mean rank read as if it had been measured."""
-    if built.calibration is None:
+    if built.correlation is None or built.listed_score is None:
         raise ValueError("the map is not a calibrated one")
     scores, weight = normal_scores(ranks, ranks.size), live.weight + 1
     mean = live.mean + (scores - live.mean) / weight
     live = replace(live, weight=weight, mean=mean, square=live.square + (np.square(scores) - live.square) / weight)
-    return live, built.index.sum_listed(built.calibration.log_ratios(live.standardise(ranks)))
+    expected = built.correlation * built.listed_score
+    return live, sum_listed(built, expected * live.standardise(ranks) - np.square(expected) / 2)
 
 
 def netvlad(folder: Path) -> list[Drives]:

@@ -61,12 +61,12 @@ def save(picture: Image.Image, path: Path) -> None:
 
 
 def main() -> None:
-    """Write `docs/images/campus.png` and `docs/images/relevance.png`."""
+    """Write `docs/images/campus.png` and `docs/images/belief.png`."""
     folder = Path(sys.argv[1] if len(sys.argv) > 1 else "demo-output")
     save(Image.fromarray(contact_sheet(folder / "campus")[..., ::-1].copy()), IMAGES / "campus.png")
-    with Image.open(folder / "replays" / "standardised" / "relevance_heat.png") as heat:
-        heat.thumbnail((820, 820), Image.Resampling.LANCZOS)
-        save(heat, IMAGES / "relevance.png")
+    with Image.open(folder / "replays" / "calibrated" / "belief_along_drive.png") as belief:
+        belief.thumbnail((820, 820), Image.Resampling.LANCZOS)
+        save(belief, IMAGES / "belief.png")
 
 
 if __name__ == "__main__":

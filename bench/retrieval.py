@@ -6,10 +6,11 @@ import faiss
 import numpy as np
 
 from bench.timing import duration, interleaved
-from bench.worlds import ENCODING_DIM, LIST_LENGTH, N_LANDMARKS, NCLT_IMAGES, scattered_lists, standardised_map
+from bench.worlds import ENCODING_DIM, LIST_LENGTH, N_LANDMARKS, NCLT_IMAGES, rrf_map, scattered_lists, standardised_map
 from deepsimbad.core.descriptor import rank_landmarks
-from deepsimbad.core.relevance import Query, Relevance, RetrievalMap, relevances
-from deepsimbad.core.retrieval import shortlist
+from deepsimbad.core.map import Map
+from deepsimbad.core.relevance import Query
+from deepsimbad.core.retrieval import relevances, shortlist
 
 SIZES = (NCLT_IMAGES, 1_000_000, 10_000_000)
 
@@ -24,7 +25,7 @@ def retrieval_table() -> Iterator[str]:
     dissimilarities = rng.random(N_LANDMARKS, dtype=np.float32)
     for n_images in SIZES:
         standardised = standardised_map(scattered_lists(n_images).lists)
-        maps = [standardised, RetrievalMap(Relevance.RRF, standardised.index)]
+        maps = [standardised, rrf_map(standardised.lists)]
         brute_force = _faiss_index(n_images, rng) if n_images == NCLT_IMAGES else None
         for built in maps:
             yield _row(built, dissimilarities, brute_force, rng)
@@ -36,12 +37,12 @@ def retrieval_table() -> Iterator[str]:
 
 
 def _row(
-    built: RetrievalMap,
+    built: Map,
     dissimilarities: np.ndarray,
     brute_force: "faiss.IndexFlatL2 | None",
     rng: np.random.Generator,
 ) -> str:
-    n_images = built.index.n_images
+    n_images = built.n_images
     relevance = relevances(built, Query(rank_landmarks(dissimilarities)))
     runs = [
         lambda: relevances(built, Query(rank_landmarks(dissimilarities))),
@@ -50,7 +51,7 @@ def _row(
     # Many of our queries for each of brute force: else its half gigabyte evicts ours, which real use would not do.
     ours = interleaved(runs, repeats=1000 if n_images < 100_000 else 30, warm_up=5)
     cells = [f"{n_images:,}", built.relevance.value, str(ours[0]), duration(ours[1].median_s)]
-    cells.append(f"{built.index.lists.nbytes / 1e6:.1f} MB")
+    cells.append(f"{built.lists.nbytes / 1e6:.1f} MB")
     if brute_force is None:
         cells += [f"needs {n_images * ENCODING_DIM * 4 / 1e9:.1f} GB", ""]
     else:

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from deepsimbad.store.frames import UNKNOWN_TIMESTAMP, TraverseFrames
+from deepsimbad.core.drive import Drive
 from deepsimbad.store.traverses import Traverse
 
 SPACING_M = 0.2
@@ -42,10 +42,8 @@ def write_seasons(data_dir: Path, domain: str, n_frames: int, n_candidates: int,
 
 def _season(
     places: NDArray[np.float32], index: NDArray[np.int64], frame: NDArray[np.int64], rng: np.random.Generator
-) -> TraverseFrames:
+) -> Drive:
     """The places as one season shows them: unit vectors, as NetVLAD's are."""
     seen = places + np.float32(0.7) * rng.standard_normal(places.shape, np.float32)
     seen = (seen / np.linalg.norm(seen, axis=1, keepdims=True)).astype(np.float32)
-    unknown = np.full(index.size, np.nan)
-    times = np.full(index.size, UNKNOWN_TIMESTAMP)
-    return TraverseFrames(index, (frame * SPACING_M).astype(np.float64), times, unknown, unknown, seen)
+    return Drive(index=index, position_m=frame * SPACING_M, encodings=seen)

@@ -1,7 +1,6 @@
 """One step of the active localizer after encoding, and its planners alone."""
 
 from collections.abc import Iterator
-from dataclasses import replace
 from statistics import median
 from time import perf_counter
 
@@ -9,14 +8,11 @@ import numpy as np
 
 from bench.timing import Timing, duration
 from bench.worlds import LIST_LENGTH, N_LANDMARKS, NCLT_IMAGES, dense_lists, standardised_map
-from deepsimbad.core.filters import FilterKind
+from deepsimbad.core.belief import FilterKind
+from deepsimbad.core.localizer import ActiveLocalizer, LocalizerConfig
+from deepsimbad.core.map import Map
 from deepsimbad.core.planners import NNQL, TELLING
 from deepsimbad.core.relevance import Query
-from deepsimbad.core.route import Route
-from deepsimbad.engine.active_localizer import ActiveLocalizer, LocalizerConfig
-from deepsimbad.engine.snapshot import MapSnapshot
-from deepsimbad.jobs.build_map import Described, map_contents
-from deepsimbad.store.records import DomainRecord
 
 _STEPS = 300
 _ACTIONS_M = tuple(float(metres) for metres in range(1, 11))
@@ -33,7 +29,7 @@ def step_table() -> Iterator[str]:
     views = [Query(rng.permutation(N_LANDMARKS).astype(np.float32) + 1) for _ in range(32)]
     for kind in FilterKind:
         for planner in (NNQL, TELLING):
-            localizer = ActiveLocalizer(snapshot, LocalizerConfig(filter=kind, planner=planner))
+            localizer = ActiveLocalizer(snapshot, LocalizerConfig(filter=kind, planner=planner), perf_counter)
             yield _row(kind, planner, localizer, views)
     yield ""
     yield f"{_STEPS} steps of 1 m with a random view each, so that the belief stays wide; 1,000 particles."
@@ -52,14 +48,12 @@ def _row(kind: FilterKind, planner: str, localizer: ActiveLocalizer, views: list
     return f"| {kind.value} | `{planner}` | {Timing(tuple(seconds))} | {duration(median(planning_ms) / 1000)} |"
 
 
-def _snapshot() -> MapSnapshot:
+def _snapshot() -> Map:
     """A map whose lists drift, with an experience database and telling places of random values."""
     rng = np.random.default_rng(1)
-    described = Described(
-        standardised_map(dense_lists(NCLT_IMAGES).lists), telling_bits=rng.random(NCLT_IMAGES).astype(np.float32)
+    return standardised_map(
+        dense_lists(NCLT_IMAGES).lists,
+        actions_m=np.array(_ACTIONS_M),
+        telling_bits=rng.random(NCLT_IMAGES).astype(np.float32),
+        q_values=rng.random((NCLT_IMAGES, len(_ACTIONS_M))).astype(np.float32),
     )
-    domain = DomainRecord("bench", {}, False, _ACTIONS_M, None, "")
-    model = {"prototypes": np.zeros((N_LANDMARKS, 1), np.float32)}
-    contents = map_contents(domain, 1, {}, model, described, Route(np.arange(NCLT_IMAGES) * 0.2))
-    q_values = rng.random((NCLT_IMAGES, len(_ACTIONS_M))).astype(np.float32)
-    return MapSnapshot.from_contents(replace(contents, q_values=q_values), index_bytes=0)

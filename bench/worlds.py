@@ -1,13 +1,14 @@
 """Synthetic maps of any size, in the two extremes that matter for size and speed."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from deepsimbad.core.descriptor import rank_landmarks
-from deepsimbad.core.inverted_index import InvertedIndex
-from deepsimbad.core.relevance import Relevance, RetrievalMap
+from deepsimbad.core.map import Map
+from deepsimbad.core.relevance import Relevance
 from deepsimbad.core.statistics import LandmarkStatistics
 
 NCLT_IMAGES = 26_208  # one traverse of the paper
@@ -47,8 +48,20 @@ def dense_lists(n_images: int, seed: int = 0, smoothness: float = 0.99) -> Lists
     return Lists("landmarks that drift from image to image", lists)
 
 
-def standardised_map(lists: NDArray[np.uint16], seed: int = 0) -> RetrievalMap:
-    """A map of these lists for the relevance that ships."""
+def standardised_map(lists: NDArray[np.uint16], seed: int = 0, **more: Any) -> Map:
+    """A map of these lists, five images a metre, for a relevance of ours; `more` of its fields."""
     rng = np.random.default_rng(seed)
     statistics = LandmarkStatistics.of_map(rank_landmarks(rng.random((2000, N_LANDMARKS))))
-    return RetrievalMap(Relevance.STANDARDISED, InvertedIndex(lists, N_LANDMARKS), statistics)
+    return Map(
+        config={"relevance": Relevance.STANDARDISED.value, "n_landmarks": N_LANDMARKS},
+        lists=lists,
+        position_m=np.arange(lists.shape[1]) * 0.2,
+        statistics=np.stack([statistics.mean, statistics.std]),
+        **more,
+    )
+
+
+def rrf_map(lists: NDArray[np.uint16], **more: Any) -> Map:
+    """A map of these lists for the paper's relevance."""
+    config = {"relevance": Relevance.RRF.value, "n_landmarks": N_LANDMARKS}
+    return Map(config=config, lists=lists, position_m=np.arange(lists.shape[1]) * 0.2, **more)

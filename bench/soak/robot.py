@@ -8,8 +8,8 @@ import numpy as np
 from bench.soak.actor import Actor, expect
 from bench.soak.link import Link
 from bench.soak.world import DOMAIN, N_LANDMARKS
-from deepsimbad.core.filters import FilterKind
-from deepsimbad.engine.active_localizer import ActiveLocalizer, LocalizerConfig
+from deepsimbad.core.belief import FilterKind
+from deepsimbad.core.localizer import ActiveLocalizer, LocalizerConfig
 from deepsimbad.engine.localizer import describe
 from deepsimbad.engine.maps import load_snapshot
 from deepsimbad.engine.views import RankedLandmarks

@@ -19,7 +19,7 @@ from bench.soak.mapper import Mapper
 from bench.soak.robot import Robot
 from bench.soak.uploader import Uploader
 from bench.soak.world import make_domain
-from deepsimbad.core.filters import FilterKind
+from deepsimbad.core.belief import FilterKind
 from deepsimbad_client.http.local_server import LocalServer
 
 N_ROBOTS, SHORT_SESSION = 4, 25

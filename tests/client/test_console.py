@@ -7,10 +7,10 @@ from collections.abc import Iterator
 import pytest
 from rich.console import Console
 
-from deepsimbad_client import console
-from deepsimbad_client.console import show, show_waits
+from deepsimbad_client.commands import console
+from deepsimbad_client.commands.console import show, show_waits
+from deepsimbad_client.commands.tables import domain_table, job_table
 from deepsimbad_client.http.models import Domain, Job
-from deepsimbad_client.tables import domain_table, job_table
 
 
 def test_a_table_in_a_pipe_cuts_no_name(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,9 +4,9 @@ from typing import Any
 
 import pytest
 
-from deepsimbad_client.console import show
+from deepsimbad_client.commands.console import show
+from deepsimbad_client.commands.tables import domain_table, job_table
 from deepsimbad_client.http.models import Domain, Job
-from deepsimbad_client.tables import domain_table, job_table
 
 CHECK = {
     "traverse": "winter",

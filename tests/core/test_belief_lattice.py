@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
+from deepsimbad.core.belief import GridFilter
 from deepsimbad.core.belief_lattice import Lattice, Moves, moves_along, step_beliefs, uniform_beliefs
-from deepsimbad.core.grid_filter import GridFilter
 from deepsimbad.core.metrics import rank_of_truth
+from deepsimbad.core.relevance import UpdateRule, evidence
 from deepsimbad.core.route import Route
-from deepsimbad.core.update_rules import UpdateRule, evidence
 
 STILL = -1
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from deepsimbad.core import landmark_selection
-from deepsimbad.core.landmark_selection import select_landmarks
+from deepsimbad.core import landmark_model
+from deepsimbad.core.landmark_model import select_landmarks
 from deepsimbad.errors import CancelledError, InvalidEncodingError, InvalidMapConfigError, TooFewCandidatesError
 
 
@@ -16,7 +16,7 @@ def slow_selection(candidates, n_landmarks):
 
 @pytest.mark.parametrize("n_candidates", [2, 7, 8, 9, 100])
 def test_blocks_give_what_the_whole_matrix_gives(n_candidates, monkeypatch):
-    monkeypatch.setattr(landmark_selection, "_BLOCK", 8)
+    monkeypatch.setattr(landmark_model, "_BLOCK", 8)
     candidates = np.random.default_rng(n_candidates).normal(size=(n_candidates, 12)).astype(np.float32)
     expected = slow_selection(candidates, n_candidates)
     np.testing.assert_array_equal(select_landmarks(candidates, n_candidates), expected)
@@ -42,7 +42,7 @@ def test_too_few_candidates_and_bad_numbers_are_named():
 
 
 def test_progress_reaches_one_and_can_cancel(monkeypatch):
-    monkeypatch.setattr(landmark_selection, "_BLOCK", 4)
+    monkeypatch.setattr(landmark_model, "_BLOCK", 4)
     candidates = np.random.default_rng(0).normal(size=(20, 3)).astype(np.float32)
     shares = []
     select_landmarks(candidates, 2, shares.append)

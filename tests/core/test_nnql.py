@@ -1,25 +1,25 @@
-"""NNQL against slow and obvious references."""
+"""NNQL against slow and obvious references; sessions fed back teach what training on the same moves would have."""
 
 import numpy as np
 import pytest
 
+from deepsimbad.core.belief import GridFilter
+from deepsimbad.core.metrics import rank_of_truth
 from deepsimbad.core.nnql import (
+    KnownWalk,
     NnqlConfig,
     Transitions,
-    append_images,
     initial_q_values,
     learn,
-    learn_online,
     q_of_nearest,
-    q_of_view,
+    transitions_of,
 )
-from deepsimbad.errors import InvalidMapConfigError
+from deepsimbad.core.relevance import Query, Relevance, UpdateRule
+from deepsimbad.core.retrieval import relevances
+from deepsimbad.core.training import TrainingWorld, Walk
+from deepsimbad.errors import InvalidInputError, InvalidMapConfigError
 
-
-def slow_value(q_values, relevance, k, action):
-    """The mean over the k map images most relevant to the view, of two alike the earlier."""
-    order = sorted(range(len(relevance)), key=lambda i: (-relevance[i], i))[:k]
-    return sum(float(q_values[i, action]) for i in order) / len(order)
+from .conftest import a_map
 
 
 def some_moves(rng, n, a, k, t):
@@ -30,16 +30,6 @@ def some_moves(rng, n, a, k, t):
         next_nearest=np.array([rng.choice(n, k, replace=False) for _ in range(t)]),
         next_allowed=rng.random((t, a)) < 0.7,
     )
-
-
-def test_the_value_of_a_view_is_the_mean_over_its_nearest_map_images():
-    rng = np.random.default_rng(0)
-    for n, k in ((30, 4), (3, 4), (30, 1), (100, 70)):
-        q_values = rng.random((n, 5), dtype=np.float32)
-        relevance = rng.integers(0, 6, n).astype(np.float32)  # ties
-        expected = [slow_value(q_values, relevance, k, action) for action in range(5)]
-        assert np.allclose(q_of_view(q_values, relevance, k), expected)
-    assert q_of_view(q_values, relevance, 4).dtype == np.float32
 
 
 def test_learning_is_the_textbook_update_on_each_of_the_k_entries():
@@ -53,12 +43,8 @@ def test_learning_is_the_textbook_update_on_each_of_the_k_entries():
         target = moves.reward[t] + 0.8 * max(values, default=0.0)
         for image in moves.nearest[t]:
             slow[image, moves.action[t]] += 0.3 * (target - slow[image, moves.action[t]])
-    before = q_values.copy()
-    online = learn_online(q_values, moves, config)
-    assert np.array_equal(q_values, before), "a live map is never written to"
     learn(q_values, moves, config)
     assert np.allclose(q_values, slow, rtol=1e-4)
-    assert np.array_equal(online, q_values)
 
 
 def test_values_settle_at_the_sum_of_discounted_rewards():
@@ -69,15 +55,6 @@ def test_values_settle_at_the_sum_of_discounted_rewards():
     for _ in range(3000):
         learn(q_values, moves, config)
     assert np.allclose(q_values, 100 / (1 - 0.9), rtol=1e-3)
-
-
-def test_appended_images_know_nothing_and_the_others_keep_what_they_know():
-    config = NnqlConfig()
-    q_values = np.random.default_rng(0).random((5, 3), dtype=np.float32)
-    longer = append_images(q_values, 2, config)
-    assert longer.shape == (7, 3)
-    assert np.array_equal(longer[:5], q_values)
-    assert np.all(longer[5:] == np.float32(1e-4))
 
 
 def test_values_of_many_views_at_once():
@@ -115,3 +92,90 @@ def test_the_defaults_are_the_papers():
 def test_impossible_hyperparameters(bad):
     with pytest.raises(InvalidMapConfigError):
         NnqlConfig(**bad)
+
+
+# --- live sessions -------------------------------------------------------------------------------------------------
+
+N, R = 60, 15
+ACTIONS_M = (1.0, 2.0, 5.0)
+
+
+@pytest.fixture
+def world():
+    rng = np.random.default_rng(2)
+    places = rng.normal(size=(N, R))
+    mapped, live = (places + 1.5 * rng.normal(size=(2, N, R))).astype(np.float32)
+    built = a_map(Relevance.STANDARDISED, mapped, 4, actions_m=ACTIONS_M)
+    ranks = live.argsort(axis=1).argsort(axis=1).astype(np.float32) + 1
+    return built, ranks
+
+
+def walk_of(ranks, frames, **changes):
+    moved = np.r_[0.0, np.diff(frames)]
+    parts = {
+        "queries": [Query(ranks[frame]) for frame in frames],
+        "action_m": moved,
+        "true_position_m": np.array(frames, float),
+    }
+    return KnownWalk(**(parts | changes))
+
+
+def test_rewards_and_neighbours_are_those_of_training_on_the_same_moves(world):
+    built, ranks = world
+    config = NnqlConfig(top_share=0.03, motion_std_m=0.33, n_neighbours=3)
+    frames = [4, 9, 10, 12, 17, 22, 27, 28, 33]
+    moves = transitions_of(built, walk_of(ranks, frames), config)
+    training = Walk(TrainingWorld.on(built, Query(ranks), built.route, np.arange(N), config), np.array([4]))
+    for t, action in enumerate([2, 0, 1, 2, 2, 2, 0, 2]):
+        assert moves.action[t] == action
+        assert moves.nearest[t].tolist() == training.nearest[0].tolist()
+        training.step(np.array([action]))
+        assert moves.next_nearest[t].tolist() == training.nearest[0].tolist()
+        assert moves.reward[t] == (100.0 if training.ranks[0] < 0.03 * N else 0.0)
+        assert moves.next_allowed[t].tolist() == training.allowed[0].tolist()
+    assert 0 < np.count_nonzero(moves.reward) < len(moves.reward)
+
+
+def test_moves_that_are_no_action_or_lead_nobody_knows_where_teach_nothing(world):
+    built, ranks = world
+    frames = [4, 9, 12, 13, 23, 24, 24, 25]  # 5, 3 (nearer to 2 than half a step: no), 1, 10, 1, 0, 1
+    known = np.array(frames, float)
+    known[5] = np.nan
+    moves = transitions_of(built, walk_of(ranks, frames, true_position_m=known), NnqlConfig())
+    assert moves.action.tolist() == [2, 0, 0]
+    nothing = transitions_of(built, walk_of(ranks, [7]), NnqlConfig())
+    assert nothing.action.size == 0
+    empty = KnownWalk([], np.empty(0), np.empty(0))
+    assert transitions_of(built, empty, NnqlConfig()).nearest.shape == (0, 4)
+    q_values = initial_q_values(N, 3, NnqlConfig())
+    learn(q_values, nothing, NnqlConfig())
+    assert (q_values == np.float32(1e-4)).all()
+
+
+def test_the_end_of_the_route(world):
+    built, ranks = world
+    moves = transitions_of(built, walk_of(ranks, [55, 57, 58, 59]), NnqlConfig())
+    assert moves.next_allowed.tolist() == [[True, True, False], [True, False, False], [False, False, False]]
+
+
+def test_a_belief_wholly_past_the_end_begins_anew(world):
+    built, ranks = world
+    frames = [10, 15, 20]
+    odd = walk_of(ranks, frames, action_m=np.array([0.0, 300.0, 5.0]))
+    moves = transitions_of(built, odd, NnqlConfig(top_share=0.05))
+    assert moves.action.tolist() == [2]
+    live = built.landmark_statistics.observing(ranks[10]).observing(ranks[15])
+    belief = GridFilter.uniform(built.route).updated(
+        relevances(built, Query(ranks[15]), live), UpdateRule.LOG_LIKELIHOOD, 0
+    )
+    belief = belief.predicted(5.0, np.sqrt(0.05**2 + 0.01 * 5), 0)
+    live = live.observing(ranks[20])
+    belief = belief.updated(relevances(built, Query(ranks[20]), live), UpdateRule.LOG_LIKELIHOOD, 0)
+    earned = rank_of_truth(belief.mass, np.array([20])) < 0.05 * N
+    assert moves.reward.tolist() == [100.0 * earned]
+
+
+def test_one_position_a_view(world):
+    _, ranks = world
+    with pytest.raises(InvalidInputError, match="2 true positions for 3 views"):
+        walk_of(ranks, [1, 2, 3], true_position_m=np.zeros(2))

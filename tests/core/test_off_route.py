@@ -5,10 +5,11 @@ import math
 import numpy as np
 import pytest
 
+from deepsimbad.core.drive import SecondSeason
 from deepsimbad.core.off_route import OFF_ROUTE_AT_START, OffRouteModel, agreement_of, off_route_probability
 from deepsimbad.core.relevance import Relevance
-from deepsimbad.core.retrieval import SecondSeason, build_retrieval_map
-from deepsimbad.core.route import Route
+
+from .conftest import a_map
 
 
 def test_agreement_is_by_how_much_belief_explains_a_view_better_than_chance():
@@ -89,8 +90,7 @@ def route_in_two_seasons(n, noise):
     second = place + noise * rng.normal(size=place.shape)
     places = np.stack([np.arange(n), np.arange(n)], axis=1)
     season = SecondSeason(second.astype(np.float32), places)
-    built = build_retrieval_map(Relevance.CALIBRATED, place.astype(np.float32), 4, second_season=season)
-    return built, season, Route(np.arange(float(n)))
+    return a_map(Relevance.CALIBRATED, place.astype(np.float32), 4, season), season
 
 
 def test_it_learns_that_agreement_speaks_for_the_route():
@@ -101,6 +101,6 @@ def test_it_learns_that_agreement_speaks_for_the_route():
 
 
 def test_where_seasons_share_too_short_a_stretch_nothing_is_learnt():
-    built, season, route = route_in_two_seasons(400, noise=0.5)
+    built, season = route_in_two_seasons(400, noise=0.5)
     short = SecondSeason(season.dissimilarities, season.places[:30])
-    assert OffRouteModel.learn(built, short, route) is None
+    assert OffRouteModel.learn(built, short) is None

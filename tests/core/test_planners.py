@@ -1,10 +1,13 @@
-"""Every planner on beliefs whose best move is plain."""
+"""Every planner on beliefs whose best move is plain; which places are telling, against the definition in loops."""
 
-from dataclasses import replace
+import math
 
 import numpy as np
 import pytest
 
+from deepsimbad.core.descriptor import rank_landmarks
+from deepsimbad.core.drive import SecondSeason
+from deepsimbad.core.map import Map
 from deepsimbad.core.planners import (
     DEFAULT_PLANNER,
     ConstantPlanner,
@@ -13,10 +16,13 @@ from deepsimbad.core.planners import (
     RandomPlanner,
     TellingPlanner,
     parse_planner,
+    telling_bits,
 )
-from deepsimbad.core.route import Route
-from deepsimbad.core.telling import bits_ahead
+from deepsimbad.core.relevance import Query, Relevance
+from deepsimbad.core.retrieval import relevances
 from deepsimbad.errors import InvalidInputError
+
+from .conftest import a_map
 
 ACTIONS_M = np.arange(1.0, 11.0)
 N_IMAGES = 200
@@ -28,17 +34,18 @@ def sharp(place):
 
 
 def view_of(mass=None, bits=None, closed=False, **more):
-    route = Route(np.arange(float(N_IMAGES)), closed)
-    return PlanningView(
-        route=route,
-        actions_m=ACTIONS_M,
-        mass=np.full(N_IMAGES, 1 / N_IMAGES) if mass is None else mass,
-        relevance=more.get("relevance"),
+    actions_m = more.get("actions_m", ACTIONS_M)
+    map_ = Map(
+        config={"relevance": "rrf", "n_landmarks": 1},
+        lists=np.zeros((1, N_IMAGES), np.uint16),
+        position_m=np.arange(float(N_IMAGES)),
+        closed=closed,
+        actions_m=actions_m,
+        telling_bits=None if bits is None else bits.copy(),
         q_values=more.get("q_values"),
-        bits_ahead=None if bits is None else bits_ahead(route, bits, ACTIONS_M),
-        seed=more.get("seed", 0),
-        step=more.get("step", 1),
     )
+    mass = np.full(N_IMAGES, 1 / N_IMAGES) if mass is None else mass
+    return PlanningView(map_, mass, more.get("relevance"), more.get("seed", 0), more.get("step", 1))
 
 
 # --- telling -------------------------------------------------------------------------------------------------------
@@ -179,6 +186,79 @@ def test_no_such_planner_is_named_with_those_there_are(text):
 
 @pytest.mark.parametrize("text", ["telling", "nnql", "random", "constant:1"])
 def test_a_domain_of_one_move_gets_that_move(text):
-    view = view_of(sharp(4), np.ones(N_IMAGES, np.float32), relevance=np.ones(N_IMAGES, np.float32))
-    one = replace(view, actions_m=ACTIONS_M[:1], bits_ahead=view.bits_ahead[:, :1], q_values=np.ones((N_IMAGES, 1)))
-    assert parse_planner(text, (1.0,)).plan(one).action_m == 1
+    ones = np.ones(N_IMAGES, np.float32)
+    known = {"relevance": ones, "actions_m": ACTIONS_M[:1], "q_values": ones[:, np.newaxis]}
+    assert parse_planner(text, (1.0,)).plan(view_of(sharp(4), ones, **known)).action_m == 1
+
+
+# --- which places are telling ---------------------------------------------------------------------------------------
+
+N_PLACES, N_LANDMARKS = 60, 15
+
+
+@pytest.fixture
+def two_seasons():
+    """Dissimilarities [n, r] of a route in two seasons; its second half was hardly recognisable in the second."""
+    rng = np.random.default_rng(0)
+    place = rng.normal(size=(N_PLACES, N_LANDMARKS))
+    second = place + rng.normal(size=place.shape) * np.where(np.arange(N_PLACES) < 30, 0.2, 2.0)[:, np.newaxis]
+    return place.astype(np.float32), second.astype(np.float32)
+
+
+def slow_rank(values, truth):
+    """From 0: what is better, and half of what else is as good."""
+    better = sum(value > values[truth] for value in values)
+    tied = sum(value == values[truth] for value in values)
+    return better + 0.5 * (tied - 1)
+
+
+@pytest.mark.parametrize("closed", [False, True])
+def test_what_a_place_tells_equals_its_definition(two_seasons, closed):
+    first, second = two_seasons
+    position_m = np.cumsum(np.random.default_rng(1).uniform(0.2, 2.5, N_PLACES))
+    frames = np.random.default_rng(2).permutation(N_PLACES)[:45]
+    places = np.stack([np.sort(frames), np.sort(frames)], axis=1)
+    season = SecondSeason(second, places)
+    built = a_map(Relevance.CALIBRATED, first, 3, closed=closed, position_m=position_m)
+    found = telling_bits(built, season)
+
+    bits = {}
+    for image, frame in places.tolist():
+        relevance = relevances(built, Query(rank_landmarks(second[frame]))).tolist()
+        bits[image] = math.log2(N_PLACES / (1 + slow_rank(relevance, image)))
+    for image in range(N_PLACES):
+        weight = {
+            other: math.exp(-0.5 * (position_m[other] - position_m[image]) ** 2)
+            for other in bits
+            if abs(position_m[other] - position_m[image]) <= 3
+        }
+        expected = np.mean(list(bits.values()))
+        if weight:
+            expected = sum(weight[other] * bits[other] for other in weight) / sum(weight.values())
+        assert found[image] == pytest.approx(expected, rel=1e-5), image
+    assert found[:25].mean() > found[35:].mean() + 1, "the recognisable half is the telling one"
+
+
+def test_far_from_every_measurement_a_place_tells_the_mean(two_seasons):
+    first, second = two_seasons
+    built = a_map(Relevance.CALIBRATED, first, 3)
+    known = np.arange(35, 55)
+    places = np.stack([known, known], axis=1)
+    found = telling_bits(built, SecondSeason(second, places))
+    assert len(set(found[known].tolist())) > 15
+    assert len(set(found[:32].tolist())) == 1, "further than three metres"
+    measured = [
+        math.log2(N_PLACES / (1 + slow_rank(relevances(built, Query(rank_landmarks(second[i]))).tolist(), i)))
+        for i in known
+    ]
+    assert found[0] == pytest.approx(np.mean(measured))
+
+
+def test_long_traverses_are_sampled(two_seasons):
+    """More than 20,000 pairs are thinned evenly; what is left still covers the route."""
+    first, second = two_seasons
+    built = a_map(Relevance.CALIBRATED, first, 3)
+    once = np.stack([np.arange(N_PLACES), np.arange(N_PLACES)], axis=1)
+    found = telling_bits(built, SecondSeason(second, np.repeat(once, 20_000 // N_PLACES + 1, axis=0)))
+    expected = telling_bits(built, SecondSeason(second, once))
+    np.testing.assert_allclose(found, expected, rtol=1e-5)

@@ -1,17 +1,21 @@
 """Every relevance against a slow obvious reference, and the reference figures on real descriptors."""
 
 import itertools
+from dataclasses import replace
 from statistics import NormalDist
 
 import numpy as np
 import pytest
 
 from deepsimbad.core.descriptor import rank_landmarks
-from deepsimbad.core.inverted_index import InvertedIndex
-from deepsimbad.core.relevance import Query, Relevance, RetrievalMap, relevances
-from deepsimbad.core.retrieval import build_retrieval_map, shortlist
+from deepsimbad.core.drive import SecondSeason
+from deepsimbad.core.map import Map
+from deepsimbad.core.relevance import Query, Relevance, UpdateRule, evidence
+from deepsimbad.core.retrieval import relevances, shortlist, sum_listed
 from deepsimbad.core.statistics import PRIOR_WEIGHT_FRAMES, LandmarkStatistics
 from deepsimbad.errors import InvalidInputError, InvalidMapConfigError
+
+from .conftest import a_map
 
 N_LANDMARKS = 9
 N_IMAGES = 40
@@ -74,8 +78,8 @@ def slow_relevance(name, scene, h):
 @pytest.mark.parametrize("list_length", [1, 4, N_LANDMARKS])
 @pytest.mark.parametrize("name", sorted(set(Relevance) - {Relevance.CALIBRATED}))  # has a test of its own
 def test_relevance_equals_its_definition(name, list_length, scene):
-    built = build_retrieval_map(name, scene["map"], list_length, scene["map encodings"])
-    live = built.statistics
+    built = a_map(name, scene["map"], list_length, encodings=scene["map encodings"])
+    live = built.landmark_statistics
     fast = []
     for dissimilarities, encoding in zip(scene["query"], scene["query encodings"], strict=True):
         query = Query(rank_landmarks(dissimilarities), dissimilarities, encoding)
@@ -85,10 +89,10 @@ def test_relevance_equals_its_definition(name, list_length, scene):
 
 
 def test_a_single_view_uses_the_maps_statistics_alone(scene):
-    built = build_retrieval_map(Relevance.STANDARDISED, scene["map"], 4)
+    built = a_map(Relevance.STANDARDISED, scene["map"], 4)
     ranks = rank_landmarks(scene["query"][0])
-    z = built.statistics.standardise(ranks)
-    expected = [-sum(z[i] for i in column) for column in built.index.lists.T]
+    z = built.landmark_statistics.standardise(ranks)
+    expected = [-sum(z[i] for i in column) for column in built.lists.T]
     np.testing.assert_allclose(relevances(built, Query(ranks)), expected, rtol=1e-5)
 
 
@@ -96,55 +100,44 @@ def test_a_single_view_uses_the_maps_statistics_alone(scene):
 def test_the_fused_sum_equals_indexing_at_every_size(n_images):
     rng = np.random.default_rng(n_images)
     lists = rng.integers(0, 300, (4, n_images)).astype(np.uint16)
-    tables = rng.random((4, 300), dtype=np.float32)
-    expected = sum(tables[j][lists[j]].astype(np.float64) for j in range(4))
-    np.testing.assert_allclose(InvertedIndex(lists, 300).sum_listed(tables), expected, rtol=1e-5)
-
-
-def test_appended_images_score_as_if_they_had_been_there(scene):
-    whole = build_retrieval_map(Relevance.SIMBAD, scene["map"], 3).index
-    first = InvertedIndex(whole.lists[:, :25].copy(), N_LANDMARKS, whole.values[:, :25].copy())
-    grown = first.append(whole.lists[:, 25:], whole.values[:, 25:])
-    assert first.n_images == 25
-    np.testing.assert_array_equal(grown.lists, whole.lists)
-    np.testing.assert_array_equal(grown.values, whole.values)
-    with pytest.raises(InvalidMapConfigError):
-        first.append(whole.lists[:, 25:])
+    config = {"relevance": "rrf", "n_landmarks": 300}
+    map_ = Map(config=config, lists=lists, position_m=np.arange(float(n_images)))
+    tables = rng.random((2, 4, 300), dtype=np.float32)
+    expected = [sum(table[j][lists[j]].astype(np.float64) for j in range(4)) for table in tables]
+    np.testing.assert_allclose(sum_listed(map_, tables), expected, rtol=1e-5)
+    assert np.array_equal(sum_listed(map_, tables[0]), sum_listed(map_, tables)[0])
 
 
 def test_a_landmark_that_never_moved_says_little(scene):
     constant = np.tile(scene["map"][0], (5, 1))
-    built = build_retrieval_map(Relevance.STANDARDISED, constant, 3)
+    built = a_map(Relevance.STANDARDISED, constant, 3)
     assert np.isfinite(relevances(built, Query(rank_landmarks(scene["query"][0])))).all()
 
 
 def test_what_a_relevance_needs_is_asked_for(scene):
     ranks = rank_landmarks(scene["query"][0])
     for name in (Relevance.SIMBAD, Relevance.BRUTE_FORCE):
-        built = build_retrieval_map(name, scene["map"], 4, scene["map encodings"])
+        built = a_map(name, scene["map"], 4, encodings=scene["map encodings"])
         with pytest.raises(InvalidInputError):
             relevances(built, Query(ranks))
     with pytest.raises(InvalidInputError, match="numbers"):
         relevances(built, Query(ranks, encoding=np.zeros(3, np.float32)))
-    with pytest.raises(InvalidMapConfigError):
-        RetrievalMap(Relevance.STANDARDISED, built.index)
+    with pytest.raises(InvalidMapConfigError, match="needs statistics"):
+        replace(built, config={**built.config, "relevance": "standardised"})
 
 
 @pytest.mark.parametrize(("list_length", "n_images"), [(0, 5), (N_LANDMARKS + 1, 5), (2, 0)])
 def test_impossible_maps_are_refused(list_length, n_images, scene):
     with pytest.raises(InvalidMapConfigError):
-        build_retrieval_map(Relevance.RRF, scene["map"][:n_images], list_length)
-
-
-def test_lists_that_name_no_landmark_are_refused():
-    with pytest.raises(InvalidMapConfigError, match="landmark"):
-        InvertedIndex(np.array([[0, 3]], np.uint16), 3)
+        a_map(Relevance.RRF, scene["map"][:n_images], list_length)
 
 
 @pytest.mark.parametrize("length", [1, 7, 64, 65, 500])
 def test_shortlist_is_the_stable_order(length):
     values = np.random.default_rng(length).integers(0, 40, 300).astype(np.float32)
-    assert shortlist(values, length).tolist() == np.argsort(-values, kind="stable")[:length].tolist()
+    expected = np.argsort(-values, kind="stable")[:length].tolist()
+    assert shortlist(values, length).tolist() == expected
+    assert shortlist(np.stack([values, values]), length).tolist() == [expected, expected]
 
 
 @pytest.mark.real_data
@@ -157,7 +150,7 @@ def test_reference_figures_on_real_netvlad_descriptors(real_data):
         squares = lambda a, b: ((a[:, None] - b[None]) ** 2).sum(-1)  # noqa: E731
         apart = squares(landmarks, landmarks) + np.diag(np.full(len(landmarks), np.inf))
         prototypes = landmarks[np.argsort(-apart.min(1), kind="stable")[:300]]
-        built = build_retrieval_map(Relevance.STANDARDISED, squares(training, prototypes), 4)
+        built = a_map(Relevance.STANDARDISED, squares(training, prototypes), 4)
         ranks = rank_landmarks(squares(test, prototypes))
         shares = []
         for at, row in enumerate(ranks):
@@ -179,3 +172,27 @@ def test_live_statistics_start_as_the_maps_and_follow_the_views():
     for _ in range(5000):
         followed = followed.observing(view)
     np.testing.assert_allclose(followed.standardise(view), 0, atol=0.15)
+
+
+@pytest.mark.parametrize("rule", list(UpdateRule))
+@pytest.mark.parametrize("relevance", list(Relevance))
+def test_a_batch_of_views_says_what_each_says_alone(relevance, rule, scene):
+    """And in single precision, as training has it, what double precision has."""
+    places = np.repeat(np.arange(6)[:, np.newaxis], 2, axis=1)
+    second = SecondSeason(scene["query"], places)
+    map_ = a_map(relevance, scene["map"], 4, second, encodings=scene["map encodings"])
+    views = Query(rank_landmarks(scene["query"]), scene["query"], scene["query encodings"])
+    alone = [map_.landmark_statistics] * 6
+    together = map_.landmark_statistics
+    for _ in range(3):
+        together = together and together.observing(views.ranks)
+        batch = relevances(map_, views, together)
+        seen, nearest = evidence(batch, rule), shortlist(batch, 3)
+        for e in range(6):
+            alone[e] = alone[e] and alone[e].observing(views.ranks[e])
+            expected = relevances(map_, views.at(e), alone[e])
+            np.testing.assert_allclose(batch[e], expected, atol=1e-5)
+            if relevance is not Relevance.BRUTE_FORCE:  # of which one matrix product rounds as it likes
+                assert np.array_equal(batch[e], expected)
+                assert nearest[e].tolist() == shortlist(expected, 3).tolist()
+                np.testing.assert_allclose(seen[e], evidence(expected.astype(np.float64), rule), atol=1e-5)

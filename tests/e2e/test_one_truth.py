@@ -1,5 +1,6 @@
 """What the client reports, the service's own metrics say too; a map made here equals one made over HTTP."""
 
+import json
 import os
 import subprocess
 import sys
@@ -8,9 +9,9 @@ import numpy as np
 import pytest
 
 from deepsimbad.core.metrics import RetrievalScorer
-from deepsimbad.core.true_images import true_images_of
+from deepsimbad.core.route import true_images_of
 from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
-from deepsimbad.jobs.encoded_traverse import encode_recording
+from deepsimbad.jobs.recordings import encode_recording
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.map_file import read_map
 from deepsimbad_campus.season import PAPER_DATES
@@ -20,8 +21,8 @@ from deepsimbad_client.http.jobs import remap
 from deepsimbad_client.http.local_server import LocalServer
 from deepsimbad_client.http.upload import upload
 from deepsimbad_client.recordings.sources import open_source
-from deepsimbad_client.replay import replay
-from deepsimbad_client.report import summarise
+from deepsimbad_client.replay.passive import replay
+from deepsimbad_client.replay.report import summarise
 
 N_FRAMES, N_LANDMARKS, TOLERANCE_M = 40, 20, 3.0
 pytestmark = pytest.mark.slow
@@ -48,21 +49,25 @@ def service(campus, tmp_path_factory):
         yield client, folder / "data"
 
 
-def test_the_clients_anr_is_the_services(campus, service, tmp_path):
+def test_a_replay_ranks_as_the_services_own_rules_do(campus, service, tmp_path):
+    """In the plane, of images: another session's answers, scored by core."""
     client, _ = service
     live = open_source(campus["summer"])
-    driven = replay(client, live, "campus", tmp_path, tolerance_m=TOLERANCE_M)
-    summary = summarise(driven)
+    summary = summarise(replay(client, live, "campus", tmp_path, tolerance_m=TOLERANCE_M))
 
     judge = make_evaluator(evaluator_config({"kind": "feature_l2"}))
     routes = [
         encode_recording(open_source(campus[each]), judge, 10**7, lambda _: None).route for each in ("summer", "spring")
     ]
-    input_size = client.domain("campus").input_size
+    described = client.domain("campus")
     scorer = RetrievalScorer()
-    for frame, truth in zip(live.frames, true_images_of(*routes, TOLERANCE_M), strict=True):
-        image = live.image(frame, input_size)
-        scorer.add(client.relevances("campus", image.body, content_type=image.content_type), truth)
+    with client.session("campus") as session:
+        for row, truth in enumerate(true_images_of(*routes, TOLERANCE_M)):
+            view = live.view(row, described.input_size)
+            relevance = np.zeros(described.n_map_images)
+            for place in session.observe(**view, shortlist=described.n_map_images).retrieval:
+                relevance[place.map_image] = place.relevance
+            scorer.add(relevance, truth)
     scores = scorer.result()
     assert scores.n_queries > N_FRAMES / 2
     assert summary["n_queries"] == scores.n_queries
@@ -70,6 +75,41 @@ def test_the_clients_anr_is_the_services(campus, service, tmp_path):
     assert summary["anr"] == pytest.approx(scores.anr, abs=1e-9)
     assert summary["recall_at_1"] == pytest.approx(scores.recall_at[1])
     assert summary["recall_at_5"] == pytest.approx(scores.recall_at[5])
+
+
+@pytest.mark.parametrize("relevance", ["calibrated", "standardised", "rrf"])
+def test_a_replay_has_the_anr_of_the_experiment(service, tmp_path, relevance):
+    """The same drive and map, once over HTTP and once offline: the same number."""
+    client, _ = service
+    rng = np.random.default_rng(7)
+    places = rng.normal(size=(150, 32)) + np.cumsum(rng.normal(size=(150, 32)), axis=0) / 4
+    for season, spread in (("autumn", 0.8), ("spring", 0.3), ("summer", 1.5)):
+        season_of = (places + rng.normal(size=32) + spread * rng.normal(size=places.shape)).astype(np.float32)
+        np.save(tmp_path / f"{season}.npy", season_of)
+    autumn, spring, summer = (str(tmp_path / f"{season}.npy") for season in ("autumn", "spring", "summer"))
+    domain = f"vectors-{relevance}"
+    client.admin.put_domain(domain, {"kind": "feature_l2", "extractor": "none"})
+    for season in (autumn, spring):
+        upload(client, open_source(season), domain, open_source(season).name)
+    settings = {"n_landmarks": 60, "list_length": 4, "relevance": relevance}
+    remap(client, domain, "spring", landmark_traverse="autumn", same_route=True, training_episodes=0, **settings)
+    summary = summarise(replay(client, open_source(summer), domain, tmp_path / "replay", tolerance_m=2))
+    ran = subprocess.run(
+        [
+            *(sys.executable, "-m", "deepsimbad", "experiment", "vpr", "--landmarks", autumn, "--training", spring),
+            *("--test", summer, "--n-landmarks", "60", "--list-length", "4", "--tolerance", "2"),
+            *("--relevance", relevance, "--json", str(tmp_path / "vpr.json")),
+        ],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert ran.returncode == 0, ran.stderr
+    experiment = json.loads((tmp_path / "vpr.json").read_text())
+    assert 1 < summary["anr"] < 40, "else nothing is shown"
+    assert summary["anr"] == pytest.approx(experiment["anr"][relevance], abs=1e-12)
+    assert summary["recall_at_1"] == pytest.approx(experiment["recall_at_1"][relevance])
+    assert (summary["n_queries"], summary["n_left_out"]) == (experiment["n_queries"], experiment["n_left_out"])
 
 
 def test_a_map_made_here_equals_one_made_over_http(campus, service, tmp_path):

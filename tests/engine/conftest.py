@@ -1,17 +1,20 @@
 """A catalog, and maps made without a job."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from deepsimbad.core.building import build_map
+from deepsimbad.core.drive import Drive
+from deepsimbad.core.map import Map
 from deepsimbad.core.relevance import Relevance
-from deepsimbad.core.retrieval import build_retrieval_map
 from deepsimbad.evaluators.feature_l2 import FeatureL2
 from deepsimbad.store.catalog import Catalog
-from deepsimbad.store.map_file import MapContents, write_map
+from deepsimbad.store.map_file import write_map
 from deepsimbad.store.sealing import seal
 
 N_IMAGES, N_LANDMARKS, DIM, LIST_LENGTH = 30, 9, 6, 3
@@ -20,34 +23,23 @@ EVALUATOR = {"kind": "feature_l2", "extractor": "none"}
 
 def map_contents(
     domain: str = "d", version: int = 1, relevance: Relevance = Relevance.STANDARDISED, closed: bool = False
-) -> MapContents:
+) -> Map:
     rng = np.random.default_rng(version)
     encodings = rng.normal(size=(N_IMAGES, DIM)).astype(np.float32)
     evaluator = FeatureL2("none")
     model = evaluator.fit_landmarks(rng.normal(size=(N_LANDMARKS, DIM)).astype(np.float32))
-    built = build_retrieval_map(relevance, evaluator.dissimilarities(encodings, model), LIST_LENGTH, encodings)
-    statistics, calibration = built.statistics, built.calibration
-    return MapContents(
+    measured = evaluator.dissimilarities(encodings, model)
+    drive = Drive(position_m=np.arange(N_IMAGES) * 1.5, encodings=encodings, dissimilarities=measured)
+    built = build_map(relevance, drive, LIST_LENGTH, closed)
+    return replace(
+        built,
         domain=domain,
         version=version,
         created_at="2026-01-01T00:00:00Z",
-        config={"relevance": relevance.value, "n_landmarks": N_LANDMARKS, "list_length": LIST_LENGTH},
         evaluator=EVALUATOR,
-        closed=closed,
-        actions_m=(1.0, 2.0),
+        actions_m=np.array([1.0, 2.0]),
         landmark_model=model,
-        lists=built.index.lists,
-        values=built.index.values,
-        encodings=built.encodings,
-        statistics=None if statistics is None else np.stack([statistics.mean, statistics.std]),
-        correlation=None if calibration is None else calibration.correlation,
-        listed_score=None if calibration is None else calibration.listed_score,
-        position_m=np.arange(N_IMAGES) * 1.5,
-        timestamp_us=None,
-        x_m=None,
-        y_m=None,
-        q_values=None,
-        metrics={},
+        index_bytes=1200,
     )
 
 

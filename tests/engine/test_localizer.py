@@ -5,10 +5,9 @@ from statistics import NormalDist
 import numpy as np
 import pytest
 
-from deepsimbad.core.relevance import Relevance
-from deepsimbad.core.update_rules import LOG_LIKELIHOOD_WEIGHT
+from deepsimbad.core.map import Map
+from deepsimbad.core.relevance import LOG_LIKELIHOOD_WEIGHT, Relevance
 from deepsimbad.engine.localizer import localize, retrieve
-from deepsimbad.engine.snapshot import MapSnapshot
 from deepsimbad.engine.views import Dissimilarities, RankedLandmarks, ReadyEncoding
 from deepsimbad.errors import (
     InvalidDissimilaritiesError,
@@ -23,8 +22,8 @@ from .conftest import DIM, LIST_LENGTH, N_IMAGES, N_LANDMARKS, map_contents
 EVALUATOR = FeatureL2("none")
 
 
-def snapshot_for(relevance: Relevance, closed: bool = False) -> MapSnapshot:
-    return MapSnapshot.from_contents(map_contents(relevance=relevance, closed=closed), index_bytes=1200)
+def snapshot_for(relevance: Relevance, closed: bool = False) -> Map:
+    return map_contents(relevance=relevance, closed=closed)
 
 
 def test_rrf_is_the_papers_inner_product() -> None:
@@ -32,25 +31,24 @@ def test_rrf_is_the_papers_inner_product() -> None:
     ranked = np.random.default_rng(3).permutation(N_LANDMARKS)
     retrieval = retrieve(snapshot, EVALUATOR, RankedLandmarks(tuple(ranked.tolist())))
     rank = {int(landmark): place + 1 for place, landmark in enumerate(ranked)}
-    lists = snapshot.retrieval.index.lists
+    lists = snapshot.lists
     slow = [sum(1 / (j + 1) * 1 / rank[int(lists[j, image])] for j in range(LIST_LENGTH)) for image in range(N_IMAGES)]
     np.testing.assert_allclose(retrieval.relevance, slow, rtol=1e-6)
 
 
 def test_standardised_belief_is_the_normalised_exponential() -> None:
-    contents = map_contents()
-    snapshot = MapSnapshot.from_contents(contents, 1200)
+    snapshot = map_contents()
     ranked = list(range(N_LANDMARKS))
     found = localize(snapshot, EVALUATOR, RankedLandmarks(tuple(ranked)), N_IMAGES)
-    assert contents.statistics is not None
-    mean, std = contents.statistics
+    assert snapshot.statistics is not None
+    mean, std = snapshot.statistics
     z = [(NormalDist().inv_cdf((rank + 0.5) / N_LANDMARKS) - mean[i]) / std[i] for rank, i in enumerate(ranked)]
-    slow = np.array([-sum(z[contents.lists[j, m]] for j in range(LIST_LENGTH)) for m in range(N_IMAGES)])
+    slow = np.array([-sum(z[snapshot.lists[j, m]] for j in range(LIST_LENGTH)) for m in range(N_IMAGES)])
     np.testing.assert_allclose(found.retrieval.relevance, slow, rtol=1e-5, atol=1e-6)
     mass = np.exp(LOG_LIKELIHOOD_WEIGHT * (slow - slow.max()))
     mass /= mass.sum()  # images are evenly spaced: a uniform prior weighs them alike
     np.testing.assert_allclose(found.belief.top_mass, np.sort(mass)[::-1], rtol=1e-4)
-    assert found.belief.mean_m == pytest.approx(mass @ contents.position_m, rel=1e-4)
+    assert found.belief.mean_m == pytest.approx(mass @ snapshot.position_m, rel=1e-4)
     assert found.shortlist.tolist() == np.argsort(-found.retrieval.relevance, kind="stable").tolist()
     assert set(found.timings_ms) == {"describe", "retrieve", "shortlist", "belief", "plan"}
 
@@ -58,8 +56,7 @@ def test_standardised_belief_is_the_normalised_exponential() -> None:
 @pytest.mark.parametrize("relevance", list(Relevance))
 @pytest.mark.parametrize("closed", [False, True])
 def test_every_relevance_finds_its_own_image(relevance: Relevance, closed: bool) -> None:
-    contents = map_contents(relevance=relevance, closed=closed)
-    snapshot = MapSnapshot.from_contents(contents, 1200)
+    snapshot = map_contents(relevance=relevance, closed=closed)
     encodings = np.random.default_rng(1).normal(size=(N_IMAGES, DIM)).astype(np.float32)
     hits = 0
     for image in range(N_IMAGES):
@@ -67,19 +64,6 @@ def test_every_relevance_finds_its_own_image(relevance: Relevance, closed: bool)
         hits += image in found.shortlist
         assert found.belief.histogram_mass.sum() == pytest.approx(1)
     assert hits >= 0.8 * N_IMAGES
-
-
-def test_serving_arrays_are_frozen() -> None:
-    snapshot = snapshot_for(Relevance.BRUTE_FORCE)
-    assert snapshot.retrieval.encodings is not None
-    for array in (
-        snapshot.retrieval.index.lists,
-        snapshot.retrieval.encodings,
-        snapshot.route.position_m,
-        *snapshot.landmark_model.values(),
-    ):
-        with pytest.raises(ValueError, match="read-only"):
-            array[:1] = 0
 
 
 def test_huge_dissimilarities_are_ranked_all_the_same() -> None:

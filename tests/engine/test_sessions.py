@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from deepsimbad.core.filters import FilterKind
+from deepsimbad.core.belief import FilterKind
+from deepsimbad.core.localizer import ActiveLocalizer, LocalizerConfig
 from deepsimbad.core.relevance import Relevance
 from deepsimbad.engine import session as session_module
-from deepsimbad.engine.active_localizer import ActiveLocalizer, LocalizerConfig
 from deepsimbad.engine.localizer import describe
 from deepsimbad.engine.session import SessionConfig
 from deepsimbad.engine.views import View

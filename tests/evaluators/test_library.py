@@ -7,10 +7,10 @@ import zipfile
 import pytest
 
 from deepsimbad.errors import InvalidWeightsError, MissingWeightsError
-from deepsimbad.evaluators.extractors import squeezenet
+from deepsimbad.evaluators.extractors import netvlad, squeezenet
 from deepsimbad.evaluators.extractors.efficientnet_lite0 import EfficientNetLite0
 from deepsimbad.evaluators.registry import EXTRACTOR_PATTERN
-from deepsimbad.evaluators.weights import downloads, netvlad_families, squeezenet_families
+from deepsimbad.evaluators.weights import downloads, squeezenet_families
 from deepsimbad.evaluators.weights.downloads import pull_file, unpack
 from deepsimbad.evaluators.weights.library import HUB, KNOWN, canonical, known
 from deepsimbad.evaluators.weights.lock import FileRecord, Lock, tree_sha256
@@ -47,12 +47,12 @@ def test_what_is_stated_of_our_own_extractors_is_so():
     assert known("squeezenet").encoding_dim == squeezenet.ENCODING_DIM
     assert known("squeezenet").input_size == (squeezenet_families.TORCHVISION.side,) * 2
     for name, preset in (
-        ("netvlad-pitts30k", netvlad_families.MATLAB),
-        ("netvlad-tokyotm", netvlad_families.MATLAB),
-        ("pytorch-netvlad", netvlad_families.PYTORCH_NETVLAD),
-        ("patch-netvlad-mapillary-512", netvlad_families.PATCH_NETVLAD),
-        ("patch-netvlad-pittsburgh-4096", netvlad_families.PATCH_NETVLAD),
-        ("openibl", netvlad_families.OPENIBL),
+        ("netvlad-pitts30k", netvlad.MATLAB),
+        ("netvlad-tokyotm", netvlad.MATLAB),
+        ("pytorch-netvlad", netvlad.PYTORCH_NETVLAD),
+        ("patch-netvlad-mapillary-512", netvlad.PATCH_NETVLAD),
+        ("patch-netvlad-pittsburgh-4096", netvlad.PATCH_NETVLAD),
+        ("openibl", netvlad.OPENIBL),
     ):
         assert known(name).input_size == preset.input_size, name
 

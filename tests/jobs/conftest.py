@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from deepsimbad.core.drive import UNKNOWN_TIMESTAMP, Drive
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
 from deepsimbad.jobs.progress import Progress
-from deepsimbad.jobs.remap import REMAP_STAGES
+from deepsimbad.jobs.remap_config import REMAP_STAGES
 from deepsimbad.store.catalog import Catalog
-from deepsimbad.store.frames import UNKNOWN_TIMESTAMP, TraverseFrames
 from deepsimbad.store.traverses import Traverse
 
 DOMAIN = "route"
@@ -37,7 +37,7 @@ def drive(catalog: Catalog) -> Callable[..., np.ndarray]:
 
     def store(name: str, n: int, seed: int = 0, position_m: Any = None, d: int = 6, **known: Any) -> np.ndarray:
         encodings = np.random.default_rng(seed).normal(size=(n, d)).astype(np.float32)
-        frames = TraverseFrames(
+        frames = Drive(
             index=np.arange(n),
             position_m=np.arange(n, dtype=float) if position_m is None else np.asarray(position_m, float),
             timestamp_us=known.get("timestamp_us", np.full(n, UNKNOWN_TIMESTAMP)),

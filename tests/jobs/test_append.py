@@ -7,20 +7,17 @@ import numpy as np
 import pytest
 
 from deepsimbad.core.descriptor import rank_landmarks
+from deepsimbad.core.drive import Drive
 from deepsimbad.core.nnql import NnqlConfig
-from deepsimbad.core.relevance import Query, Relevance, relevances
+from deepsimbad.core.relevance import Query, Relevance
+from deepsimbad.core.retrieval import relevances
 from deepsimbad.engine.maps import load_snapshot
 from deepsimbad.errors import InvalidEncodingError, InvalidMapConfigError
-from deepsimbad.jobs.append import append_frames
 from deepsimbad.jobs.import_map import import_map
-from deepsimbad.jobs.known_frames import UNKNOWN_FRAME, frame_digests
-from deepsimbad.jobs.map_config import RemapConfig
 from deepsimbad.jobs.progress import Progress
-from deepsimbad.jobs.remap import REMAP_STAGES, remap
-from deepsimbad.store.frames import TraverseFrames
-from deepsimbad.store.map_contents import MapContents
+from deepsimbad.jobs.remap import remap
+from deepsimbad.jobs.remap_config import REMAP_STAGES, RemapConfig
 from deepsimbad.store.map_file import read_map
-from deepsimbad.store.records import MapRecord, MapState
 from deepsimbad.store.traverses import Traverse
 
 DOMAIN = "route"
@@ -46,6 +43,10 @@ def first(drive, run):
         return old, new
 
     return make
+
+
+def digests(encodings):
+    return Drive(position_m=np.arange(len(encodings)), encodings=encodings).digests().tolist()
 
 
 def contents(catalog, version):
@@ -91,7 +92,7 @@ def test_old_images_stay_and_appended_places_are_found(first, run, catalog, eval
 
 def rank(snapshot, evaluator, encoding, image):
     dissimilarities = evaluator.dissimilarities(encoding[np.newaxis], snapshot.landmark_model)[0]
-    relevance = relevances(snapshot.retrieval, Query(rank_landmarks(dissimilarities), dissimilarities, encoding))
+    relevance = relevances(snapshot, Query(rank_landmarks(dissimilarities), dissimilarities, encoding))
     return np.count_nonzero(relevance > relevance[image])
 
 
@@ -106,47 +107,6 @@ def test_experience_comes_from_the_nearest_old_image(first, run, catalog):
     near, far = after.q_values[~is_old][:10], after.q_values[~is_old][10:]
     assert near == pytest.approx(before.q_values[20:30], abs=step)
     assert far == pytest.approx(np.full_like(far, NnqlConfig().initial_q), abs=step)
-
-
-def test_telling_bits_of_what_is_far_are_the_mean(catalog, evaluator):
-    rng = np.random.default_rng(0)
-    before = a_map(evaluator, rng)
-    frames = TraverseFrames(
-        index=np.arange(2),
-        position_m=np.array([3.2, 90.0]),
-        timestamp_us=np.array([5, 6]),
-        x_m=np.array([1.0, np.nan]),
-        y_m=np.array([2.0, np.nan]),
-        encodings=rng.normal(size=(2, 6)).astype(np.float32),
-    )
-    record = MapRecord(7, MapState.ACTIVE, "", None, None, before.config, {}, None, None, None)
-    made = append_frames(before, record, RemapConfig("more", append=True), frames, evaluator, lambda _: None)
-    assert np.flatnonzero(made.frame_digest != UNKNOWN_FRAME).tolist() == [4, 10], "where the new ones are"
-    bits = made.telling_bits
-    assert bits[[4, 10]] == pytest.approx([before.telling_bits[3], before.telling_bits.mean()])
-    assert np.delete(bits, [4, 10]).tolist() == before.telling_bits.tolist()
-    assert made.timestamp_us.tolist() == [-1, -1, -1, -1, 5, -1, -1, -1, -1, -1, 6]
-    assert made.x_m[4] == 1.0
-    assert np.isnan(np.delete(made.x_m, 4)).all()
-    assert made.off_route_model is before.off_route_model
-
-
-def a_map(evaluator, rng):
-    model = evaluator.fit_landmarks(rng.normal(size=(5, 6)).astype(np.float32))
-    return MapContents(
-        domain=DOMAIN,
-        version=1,
-        created_at="2026-01-01T00:00:00Z",
-        config={"relevance": "rrf", "n_landmarks": 5, "list_length": 2, "training_traverse": "drive"},
-        evaluator={},
-        closed=False,
-        actions_m=(1.0, 2.0),
-        landmark_model=model,
-        lists=rng.integers(0, 5, (2, 9)).astype(np.uint16),
-        position_m=np.arange(9.0),
-        telling_bits=rng.random(9).astype(np.float32),
-        off_route_model=np.array([1.0, 2.0]),
-    )
 
 
 def test_times_and_coordinates_are_merged(drive, run, catalog):
@@ -176,7 +136,7 @@ def test_the_config_records_what_was_appended(first, run, catalog, drive):
         ]
         assert (config["append"], config["check_traverse"], config["gate_margin"]) == (True, "more", 100.0)
     assert catalog.map(DOMAIN, 3).metrics["training"] == catalog.map(DOMAIN, 1).metrics["training"]
-    assert contents(catalog, 3).n_map_images == 60
+    assert contents(catalog, 3).n_images == 60
     # The next remap that keeps the landmarks learns from what the map was first made of.
     drive("fourth", 40, seed=5)
     assert run("fourth", training_episodes=0)["map_version"] == 4
@@ -248,17 +208,17 @@ def test_the_same_frames_are_not_appended_under_another_name(first, run, catalog
 def test_a_map_knows_the_frames_it_is_made_of(first, run, catalog):
     old, new = first(training_episodes=0)
     run("more", append=True)
-    assert contents(catalog, 1).frame_digest.tolist() == frame_digests(old).tolist()
+    assert contents(catalog, 1).frame_digest.tolist() == digests(old)
     after = contents(catalog, 2)
     is_old = np.isin(after.position_m, np.arange(40.0))
-    assert after.frame_digest[is_old].tolist() == frame_digests(old).tolist()
-    assert after.frame_digest[~is_old].tolist() == frame_digests(new).tolist()
+    assert after.frame_digest[is_old].tolist() == digests(old)
+    assert after.frame_digest[~is_old].tolist() == digests(new)
 
 
 def test_digests_stay_as_they_are():
     """They are compared with those in map files of other releases."""
     frames = np.array([[1.0, 2.0], [0.0, -1.5]], np.float32)
-    assert frame_digests(frames).tolist() == [
+    assert digests(frames) == [
         7373934272132878346,
         14435273145991011183,
     ]
@@ -305,7 +265,7 @@ def test_a_loop_takes_the_frames_of_any_turn(catalog, evaluator, drive):
     drive("lap", 30, seed=3, position_m=np.arange(30) + 30.5)  # past the start after 10 m
     remap(catalog, DOMAIN, RemapConfig("lap", append=True), evaluator, Progress(REMAP_STAGES))
     after = contents(catalog, 2)
-    assert after.n_map_images == 70
+    assert after.n_images == 70
     assert after.position_m.max() == 39.5
     snapshot = load_snapshot(catalog, DOMAIN, 2)
     assert snapshot.route.length_m == pytest.approx(40.0, abs=0.51)

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from deepsimbad.errors import CancelledError, InvalidMapConfigError
-from deepsimbad.jobs.encoded_traverse import encode_recording
-from deepsimbad.jobs.experiment_nbv import NbvConfig, NbvReport, nbv_stages, run_nbv
+from deepsimbad.jobs.experiments import NbvConfig, NbvReport, nbv_stages, run_nbv
 from deepsimbad.jobs.progress import Progress
+from deepsimbad.jobs.recordings import encode_recording
 from deepsimbad_client.recordings.sources import open_source
 
 QUICK = NbvConfig(n_landmarks=40, actions_m=(1.0, 2.0, 4.0), n_steps=4, training_episodes=60, episodes=60)
@@ -29,7 +29,7 @@ def drives(tmp_path_factory):
 
 def experiment(sources, evaluator, config, progress=None, spacing_m=1.0):
     driven = [
-        encode_recording(open_source(sources[role], spacing_m=spacing_m), evaluator, 1, lambda _: None)
+        encode_recording(open_source(sources[role], spacing_m=spacing_m), evaluator, 1, lambda _: None).drive
         for role in ("landmarks", "training", "test")
     ]
     return run_nbv(config, evaluator, *driven, progress or Progress(nbv_stages(config)))

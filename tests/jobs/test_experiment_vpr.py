@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from deepsimbad.core.relevance import Relevance
-from deepsimbad.core.true_images import true_images_of
+from deepsimbad.core.route import true_images_of
 from deepsimbad.errors import CancelledError, TooFewCandidatesError
-from deepsimbad.jobs.encoded_traverse import encode_recording
-from deepsimbad.jobs.experiment_vpr import VprConfig, run_vpr, vpr_stages
+from deepsimbad.jobs.experiments import VprConfig, run_vpr, vpr_stages
 from deepsimbad.jobs.progress import Progress
+from deepsimbad.jobs.recordings import encode_recording
 from deepsimbad_client.recordings.sources import open_source
 
 MAX_PIXELS = 1
@@ -55,7 +55,7 @@ def slow_second_season(map_scores, other_scores):
     own, other = ((scores - scores.mean(axis=0)) / scores.std(axis=0) for scores in (map_scores, other_scores))
     pairs = [(min(f, len(own) - 1), f) for f in range(len(other)) if f - (len(own) - 1) <= 2]
     rho = np.mean([own[m] * other[f] for m, f in pairs], axis=0)
-    if rho.mean() < 0.15:  # far from the drives of one route here; `deepsimbad.core.same_route` has tests of its own
+    if rho.mean() < 0.15:  # far from the drives of one route here; `deepsimbad.core.drive` has tests of its own
         return None
     rho = np.clip(rho, 0.05, 0.95)
     both = own.copy()
@@ -170,16 +170,10 @@ def experiment(sources, evaluator, config, progress=None):
         role: encode_recording(open_source(source), evaluator, MAX_PIXELS, lambda _: None)
         for role, source in sources.items()
     }
-    truth = true_images_of(driven["test"].route, driven["training"].route, config.tolerance_m)
-    return run_vpr(
-        config,
-        evaluator,
-        driven["landmarks"],
-        driven["training"],
-        driven["test"],
-        truth,
-        progress or Progress(vpr_stages(config)),
-    )
+    landmarks, training, test = (driven[role] for role in ("landmarks", "training", "test"))
+    truth = true_images_of(test.drive.route(), training.drive.route(), config.tolerance_m)
+    told = progress or Progress(vpr_stages(config))
+    return run_vpr(config, evaluator, landmarks.drive, training.drive, test, truth, told)
 
 
 # Of 50 map images some tie in exact arithmetic, which float32 sums of several terms break: a half place of one query

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from deepsimbad.core.map import Map
 from deepsimbad.engine.maps import Maps
 from deepsimbad.errors import (
     ConflictError,
@@ -29,7 +30,6 @@ from deepsimbad.errors import (
 from deepsimbad.jobs.import_map import import_map
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.catalog_maps import ANY
-from deepsimbad.store.map_contents import MapContents
 from deepsimbad.store.map_file import write_map
 from deepsimbad.store.records import MapState
 from deepsimbad.store.sealing import export_map, seal
@@ -38,9 +38,11 @@ from deepsimbad.store.traverses import Traverse
 EVALUATOR = {"kind": "feature_l2", "extractor": "none"}
 ACTIONS_M = (1.0, 2.0)
 Add = Callable[..., int]
+CALIBRATED = {"relevance": "calibrated", "n_landmarks": 9}
+TRUST = {"correlation": np.full(9, 0.6), "listed_score": np.ones((3, 9))}
 
 
-def contents(domain: str, version: int, **changes: Any) -> MapContents:
+def contents(domain: str, version: int, **changes: Any) -> Map:
     rng = np.random.default_rng(version)
     parts: dict[str, Any] = {
         "config": {"relevance": "rrf", "n_landmarks": 9, "training_traverse": "summer", "landmark_traverse": "winter"},
@@ -52,7 +54,7 @@ def contents(domain: str, version: int, **changes: Any) -> MapContents:
         "position_m": np.arange(30.0),
         "metrics": {"anr": 4.5},
     }
-    return MapContents(domain=domain, version=version, created_at="2026-01-01T00:00:00Z", **{**parts, **changes})
+    return Map(domain=domain, version=version, created_at="2026-01-01T00:00:00Z", **{**parts, **changes})
 
 
 def add(catalog: Catalog, domain: str, **changes: Any) -> int:
@@ -239,7 +241,10 @@ import_map(catalog, Path(sys.argv[2]))
         {"actions_m": ()},
         {"actions_m": (-1.0, 2.0)},
         {"actions_m": (2.0, 1.0)},
-        {"actions_m": (1.0, "2")},
+        {"position_m": np.full(30, 5.0)},
+        {"config": CALIBRATED, "statistics": np.full((2, 9), np.nan), **TRUST},
+        {"config": CALIBRATED, "statistics": np.zeros((2, 9)), **TRUST},
+        {"telling_bits": np.full(30, np.inf, np.float32)},
     ],
 )
 def test_a_map_that_could_answer_nothing_is_refused(here: Catalog, tmp_path: Path, changes: dict[str, Any]) -> None:

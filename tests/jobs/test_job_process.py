@@ -25,7 +25,7 @@ from deepsimbad.errors import (
 )
 from deepsimbad.evaluators.compute import available_cores
 from deepsimbad.jobs.child import JobPriority
-from deepsimbad.jobs.map_config import RemapConfig
+from deepsimbad.jobs.remap_config import RemapConfig
 from deepsimbad.jobs.runner import REMAP, BrokenJobError, InAnotherProcess, InThisProcess, job_threads
 from deepsimbad.store.checkpoints import Checkpoints
 from deepsimbad.store.map_file import read_map
@@ -78,16 +78,6 @@ def test_what_breaks_has_its_stack_in_the_notes_alone(catalog, job):
         InAnotherProcess(catalog.data_dir, 1)(replace(job, config={"levitate": True}), nothing, never)
     assert "levitate" not in str(raised.value)
     assert "Traceback" in raised.value.__notes__[0]
-
-
-def test_its_log_lines_are_the_services_with_the_jobs_id(catalog, job, caplog):
-    with Checkpoints.open(catalog.data_dir, job.job_id) as held:
-        held.save("select landmarks", "other inputs", {}, {})
-    with caplog.at_level(logging.INFO, "deepsimbad"):
-        InAnotherProcess(catalog.data_dir, 1)(job, nothing, never)
-    (record,) = [record for record in caplog.records if record.getMessage() == "checkpoint not used"]
-    assert (record.levelname, record.name) == ("WARNING", "deepsimbad.store.checkpoints")
-    assert (record.__dict__["job_id"], record.__dict__["stage"]) == (job.job_id, "select landmarks")
 
 
 def about(pid, what):

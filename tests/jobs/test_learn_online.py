@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from deepsimbad.core.descriptor import rank_landmarks
-from deepsimbad.core.known_walk import KnownWalk
+from deepsimbad.core.nnql import KnownWalk
 from deepsimbad.core.relevance import Query
 from deepsimbad.errors import CancelledError, NoActiveMapError, UnknownDomainError
-from deepsimbad.jobs.learn_online import LEARN_STAGES, learn_online
-from deepsimbad.jobs.map_config import RemapConfig
+from deepsimbad.jobs.learn import LEARN_STAGES, learn_online
 from deepsimbad.jobs.progress import Progress
 from deepsimbad.jobs.remap import remap
+from deepsimbad.jobs.remap_config import RemapConfig
 from deepsimbad.store.map_file import read_map
 from deepsimbad.store.records import MapState
 from deepsimbad.store.sealing import verify

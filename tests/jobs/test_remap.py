@@ -1,10 +1,12 @@
-"""Remapping: what the map file holds, what stays when it fails."""
+"""Remapping: what the map file holds, what stays when it fails; what it is asked for, and how its stages weigh."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from deepsimbad.core.drive import Drive
 from deepsimbad.core.relevance import Relevance
 from deepsimbad.errors import (
     CancelledError,
@@ -15,11 +17,10 @@ from deepsimbad.errors import (
     UnknownDomainError,
     UnknownTraverseError,
 )
-from deepsimbad.jobs.map_config import RemapConfig
 from deepsimbad.jobs.progress import Progress
-from deepsimbad.jobs.remap import REMAP_STAGES, remap
-from deepsimbad.jobs.remap_inputs import read_inputs
-from deepsimbad.store.frames import UNKNOWN_TIMESTAMP, TraverseFrames
+from deepsimbad.jobs.remap import remap
+from deepsimbad.jobs.remap_config import REMAP_STAGES, RemapConfig, RemapSize, remap_stages
+from deepsimbad.store.catalog_maps import ANY
 from deepsimbad.store.map_file import read_map
 from deepsimbad.store.records import MapState
 from deepsimbad.store.sealing import verify
@@ -238,10 +239,8 @@ def route(catalog):
         places = rng.normal(size=(PLACES, 16))
         known = np.arange(PLACES, dtype=float) if plane else np.full(PLACES, np.nan)
         for name, seen in (("drive", places), ("other", places), ("strange", rng.normal(size=places.shape))):
-            frames = TraverseFrames(
-                index=np.arange(PLACES),
+            frames = Drive(
                 position_m=np.arange(PLACES, dtype=float),
-                timestamp_us=np.full(PLACES, UNKNOWN_TIMESTAMP),
                 x_m=known,
                 y_m=0 * known,
                 encodings=(seen + 0.3 * rng.normal(size=seen.shape)).astype(np.float32),
@@ -302,7 +301,140 @@ def test_where_landmarks_stay_the_active_maps_drive_is_judged(catalog, route, ev
     assert remap(catalog, DOMAIN, back, evaluator, Progress(REMAP_STAGES))["metrics"]["second_season"]["accepted"]
 
 
-def test_what_is_said_of_the_positions_is_an_input(catalog, route, evaluator):
-    route()
-    digests = {read_inputs(catalog, DOMAIN, config(same_route=said)).digest() for said in (None, False, True)}
-    assert len(digests) == 3
+# --- what is asked for ----------------------------------------------------------------------------------------------
+
+CONFIG = RemapConfig("drive", "other")
+SIZE = RemapSize(12_000, 12_000, 512)
+
+
+def test_the_stages_stay_the_same_and_none_weighs_nothing():
+    for config in (
+        CONFIG,
+        replace(CONFIG, training_episodes=0),
+        replace(CONFIG, relevance="brute_force"),
+        RemapConfig("drive", append=True),
+    ):
+        for size in (SIZE, RemapSize(0, 0, 0)):
+            stages = remap_stages(config, size)
+            assert list(stages) == list(REMAP_STAGES)
+            assert min(stages.values()) > 0
+
+
+def test_training_weighs_by_its_episodes_up_to_what_a_small_map_takes():
+    def trained(n_episodes, size=SIZE):
+        return remap_stages(replace(CONFIG, training_episodes=n_episodes), size)["train"]
+
+    assert trained(300_000) == pytest.approx(30 * trained(10_000), rel=0.01)
+    assert trained(10_000_000) == trained(25 * 12_000)
+    small = RemapSize(100, 100, 512)
+    assert trained(300_000, small) == trained(2_500, small)
+
+
+def test_landmarks_that_stay_cost_nothing_and_what_is_appended_is_not_trained():
+    kept = remap_stages(RemapConfig("drive"), replace(SIZE, n_candidates=0))
+    assert kept["select landmarks"] < 0.1 < remap_stages(CONFIG, SIZE)["select landmarks"]
+    appended = remap_stages(RemapConfig("drive", append=True), replace(SIZE, n_candidates=0))
+    assert appended["train"] < 0.1 < kept["train"]
+
+
+@pytest.mark.parametrize("n_episodes", [0, 10_000, 300_000])
+def test_the_time_left_is_right_from_describe_on_where_stages_take_what_they_weigh(n_episodes):
+    config = replace(CONFIG, training_episodes=n_episodes)
+    now_s, seen = [0.0], []
+    stages = remap_stages(config, SIZE)
+    progress = Progress(stages, seen.append, interval_s=0, clock=lambda: now_s[0])
+    for stage, seconds in stages.items():
+        progress.stage(stage)
+        for percent in range(1, 101):
+            now_s[0] += 3 * seconds / 100  # on a slower machine
+            progress.update(percent / 100)
+            if seen[-1].eta_s is not None:
+                assert seen[-1].eta_s == pytest.approx(3 * sum(stages.values()) - now_s[0], abs=0.01)
+    assert next(state.stage for state in seen if state.eta_s is not None) in list(stages)[:3]
+
+
+def test_the_size_is_that_of_the_traverses(catalog, drive):
+    drive("drive", 12)
+    drive("other", 30)
+    drive("empty", 0)
+    data_dir = catalog.data_dir
+    assert RemapSize.of(data_dir, "route", CONFIG) == RemapSize(12, 30, 6)
+    assert RemapSize.of(data_dir, "route", RemapConfig("drive")) == RemapSize(12, 0, 6)
+    assert RemapSize.of(data_dir, "route", RemapConfig("empty", "drive")) == RemapSize(0, 12, 0)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"list_length": 0},
+        {"list_length": 5, "n_landmarks": 4},
+        {"n_landmarks": 0},
+        {"n_landmarks": 65_536},
+        {"training_episodes": -1},
+        {"seed": -1},
+    ],
+)
+def test_contradictions_are_named(wrong):
+    with pytest.raises(InvalidMapConfigError):
+        RemapConfig("drive", **wrong)
+
+
+def test_the_greatest_numbers_that_fit_are_taken():
+    RemapConfig("drive", n_landmarks=65_535)
+    RemapConfig("drive", n_landmarks=4, list_length=4)
+
+
+def test_it_survives_its_json_form():
+    config = RemapConfig("drive", "other", 40, 3, Relevance.RRF, 5, 6, activate=False, same_route=True)
+    assert RemapConfig.from_dict(json.loads(json.dumps(config.as_dict()))) == config
+
+
+# --- a job that was interrupted ------------------------------------------------------------------------------------
+
+JOB = "0123456789abcdef" * 2
+
+
+class DiedError(BaseException):
+    """Stands for the end of the process."""
+
+
+def work(catalog, config, evaluator, dies_at=None):
+    """One start of the job, until its end or until a stage begins."""
+
+    def on_change(state):
+        if state.stage == dies_at:
+            raise DiedError(dies_at)
+
+    return remap(catalog, DOMAIN, config, evaluator, Progress(REMAP_STAGES, on_change), job_id=JOB)
+
+
+def test_a_sealed_map_is_only_activated(catalog, drive, evaluator):
+    drive("other", 30, seed=1)
+    drive("drive", 12)
+    with pytest.raises(DiedError):
+        work(catalog, config(), evaluator, dies_at="activate")
+    assert catalog.map(DOMAIN, 1).state is MapState.SEALED
+    Traverse.delete(catalog.data_dir, DOMAIN, "drive")  # nothing is read any more
+    result = work(catalog, config(), evaluator)
+    assert result == {"map_version": 1, "active": True, "metrics": catalog.map(DOMAIN, 1).metrics}
+    assert [record.state for record in catalog.maps(DOMAIN)] == [MapState.ACTIVE]
+
+
+def test_a_rollback_before_the_job_ended_is_not_undone(catalog, drive, evaluator, quiet):
+    drive("other", 30, seed=1)
+    drive("drive", 12)
+    remap(catalog, DOMAIN, config(), evaluator, quiet)
+    work(catalog, config(), evaluator)  # its process dies before the row says that it ended
+    catalog.activate(DOMAIN, 1, ANY)
+    assert work(catalog, config(), evaluator)["map_version"] == 2
+    assert catalog.domain(DOMAIN).active_version == 1
+    assert len(catalog.maps(DOMAIN)) == 2
+
+
+def test_a_map_that_is_not_to_serve_stays_sealed(catalog, drive, evaluator):
+    drive("other", 30, seed=1)
+    drive("drive", 12)
+    for _ in range(2):
+        result = work(catalog, config(activate=False), evaluator)
+        assert (result["map_version"], result["active"]) == (1, False)
+    assert [record.state for record in catalog.maps(DOMAIN)] == [MapState.SEALED]

@@ -14,7 +14,7 @@ from deepsimbad.errors import (
     UnknownDomainError,
     UnknownJobError,
 )
-from deepsimbad.jobs.map_config import RemapConfig
+from deepsimbad.jobs.remap_config import RemapConfig
 from deepsimbad.jobs.runner import InThisProcess, JobRunner
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.records import JobState
@@ -299,27 +299,3 @@ def test_a_job_whose_process_died_behind_its_last_step_has_succeeded(catalog, dr
         job = ended(catalog, runner.submit(DOMAIN, CONFIG).job_id)
     assert (job.state, job.result["map_version"], job.error) == (JobState.SUCCEEDED, 1, None)
     assert activated == [DOMAIN]
-
-
-def test_no_checkpoint_outlives_its_job(catalog, drives):
-    seen = []
-
-    def watching(job, on_progress, is_cancelled):
-        def look(state):
-            seen.extend(path.name for path in (catalog.data_dir / "jobs" / job.job_id).iterdir())
-            on_progress(state)
-
-        return InThisProcess(catalog.data_dir)(job, look, is_cancelled)
-
-    with running(catalog, watching) as runner:
-        ended(catalog, runner.submit(DOMAIN, CONFIG).job_id)
-        ended(catalog, runner.submit(DOMAIN, RemapConfig("drive", "other", n_landmarks=31)).job_id)
-    assert set(seen) == {"select_landmarks.checkpoint", "describe.checkpoint", "train.checkpoint"}
-    assert list((catalog.data_dir / "jobs").iterdir()) == []
-
-
-def test_an_unknown_kind_of_job_fails_by_name(catalog, drives):
-    job_id = catalog.create_job(DOMAIN, "levitate", {}).job_id
-    with running(catalog):
-        job = ended(catalog, job_id)
-    assert (job.state, job.error["code"]) == (JobState.FAILED, "invalid_input")

@@ -169,7 +169,7 @@ def the_map(data_dir: Path) -> Iterator[object]:
     contents = read_map(data_dir / "domains/campus/maps/000001.sqlite")
     yield contents.lists.tolist()
     yield contents.landmark_model["prototypes"].tolist()
-    yield (contents.closed, contents.actions_m, contents.position_m.tolist(), contents.metrics)
+    yield (contents.closed, tuple(contents.actions_m.tolist()), contents.position_m.tolist(), contents.metrics)
     yield contents.q_values.round(2).tolist()
 
 

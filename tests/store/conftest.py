@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from deepsimbad.core.drive import Drive
+from deepsimbad.core.map import Map
 from deepsimbad.store.catalog import Catalog
-from deepsimbad.store.frames import TraverseFrames
-from deepsimbad.store.map_contents import MapContents
 
 EVALUATOR = {"kind": "feature_l2", "extractor": "none"}
 
@@ -27,8 +27,8 @@ def campus(catalog: Catalog) -> Catalog:
 
 
 @pytest.fixture
-def make_map() -> Callable[..., MapContents]:
-    def make(n: int = 60, r: int = 20, h: int = 4, seed: int = 0, **changes: Any) -> MapContents:
+def make_map() -> Callable[..., Map]:
+    def make(n: int = 60, r: int = 20, h: int = 4, seed: int = 0, **changes: Any) -> Map:
         generator = np.random.default_rng(seed)
         lists = np.argsort(generator.random((n, r)), axis=1)[:, :h].T.astype(np.uint16).copy()
         parts: dict[str, Any] = {
@@ -49,18 +49,18 @@ def make_map() -> Callable[..., MapContents]:
             "q_values": generator.random((n, 3), dtype=np.float32),
             "metrics": {"anr": 4.25},
         }
-        return MapContents(**{**parts, **changes})
+        return Map(**{**parts, **changes})
 
     return make
 
 
 @pytest.fixture
-def make_frames() -> Callable[..., TraverseFrames]:
-    def make(index: list[int] | np.ndarray, dim: int = 8, seed: int = 0) -> TraverseFrames:
+def make_frames() -> Callable[..., Drive]:
+    def make(index: list[int] | np.ndarray, dim: int = 8, seed: int = 0) -> Drive:
         index = np.asarray(index)
         generator = np.random.default_rng(seed)
         n = len(index)
-        return TraverseFrames(
+        return Drive(
             index=index,
             position_m=index * 1.5,
             timestamp_us=index * 1000,

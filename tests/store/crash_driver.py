@@ -13,9 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
+from deepsimbad.core.drive import Drive
+from deepsimbad.core.map import Map
 from deepsimbad.store.catalog import Catalog
-from deepsimbad.store.frames import TraverseFrames
-from deepsimbad.store.map_contents import MapContents
 from deepsimbad.store.map_file import read_map, write_map
 from deepsimbad.store.records import JobState, MapState
 from deepsimbad.store.sealing import seal, verify
@@ -27,14 +27,14 @@ N_FRAMES = 5
 DONE = ["traverse", "frames", "job", "begun", "written", "sealed", "noted", "active", "finished", "deleted"]
 
 
-def frames() -> TraverseFrames:
+def frames() -> Drive:
     n = np.arange(N_FRAMES)
-    return TraverseFrames(n, n * 1.0, n, n * 1.0, n * 1.0, np.ones((N_FRAMES, 4), np.float32))
+    return Drive(n, n * 1.0, n, n * 1.0, n * 1.0, np.ones((N_FRAMES, 4), np.float32))
 
 
-def contents(version: int) -> MapContents:
+def contents(version: int) -> Map:
     lists = np.array([[0, 1, 2, 0], [1, 2, 0, 2]], np.uint16)
-    return MapContents(
+    return Map(
         "campus",
         version,
         "",

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
+from deepsimbad.core.map import Map
 from deepsimbad.errors import ConflictError, DamagedMapError, UnavailableError
-from deepsimbad.store.map_contents import MapContents
 from deepsimbad.store.map_file import read_map, write_map
 from deepsimbad.store.sealing import seal, verify
 
-MakeMap = Callable[..., MapContents]
+MakeMap = Callable[..., Map]
 
 
 def test_a_sealed_map_is_whole_alone_and_read_only(make_map: MakeMap, tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from deepsimbad.core.drive import MAX_POSITION_M, Drive
 from deepsimbad.errors import (
     ConflictError,
     DamagedFileError,
@@ -21,10 +22,9 @@ from deepsimbad.errors import (
     WeightsDifferError,
 )
 from deepsimbad.store.catalog import Catalog
-from deepsimbad.store.frames import MAX_POSITION_M, TraverseFrames
 from deepsimbad.store.traverses import Traverse
 
-MakeFrames = Callable[..., TraverseFrames]
+MakeFrames = Callable[..., Drive]
 
 
 @pytest.fixture
@@ -33,8 +33,12 @@ def summer(campus: Catalog) -> Iterator[Traverse]:
         yield traverse
 
 
-def same(left: TraverseFrames, right: TraverseFrames) -> bool:
-    ours, theirs = left.arrays(), right.arrays()
+def arrays_of(drive: Drive) -> dict[str, np.ndarray]:
+    return {name: array for name, array in vars(drive).items() if isinstance(array, np.ndarray)}
+
+
+def same(left: Drive, right: Drive) -> bool:
+    ours, theirs = arrays_of(left), arrays_of(right)
     return left.weights_sha256 == right.weights_sha256 and all(
         ours[name].dtype == theirs[name].dtype and np.array_equal(ours[name], theirs[name], equal_nan=True)
         for name in ours
@@ -77,7 +81,7 @@ def test_frames_come_back_exactly_and_in_index_order(
     )
     assert summer.put_frames(frames) == (4, 0)
     order = np.argsort(frames.index)
-    expected = TraverseFrames(**{name: array[order] for name, array in frames.arrays().items()})
+    expected = Drive(**{name: array[order] for name, array in arrays_of(frames).items()})
     assert same(summer.read(), expected)
     assert (summer.n_frames, summer.encoding_dim) == (4, 8)
     assert summer.missing == [(1, 1), (3, 4), (6, 6)]

@@ -10,7 +10,7 @@ import click
 from pydantic import BaseModel
 from rich.table import Table
 
-from deepsimbad_client.console import as_json, show
+from deepsimbad_client.commands.console import as_json, show
 from deepsimbad_client.http.client import Client
 from deepsimbad_client.http.upload import CONCURRENCY
 from deepsimbad_client.http.wire import DEFAULT_URL, KEY_VARIABLE, URL_VARIABLE

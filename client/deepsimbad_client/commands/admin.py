@@ -6,10 +6,10 @@ from pathlib import Path
 import click
 
 from deepsimbad_client.commands import json_flag, of_domain, serving, show_list
-from deepsimbad_client.console import DownloadBar, as_json
+from deepsimbad_client.commands.console import DownloadBar, as_json
+from deepsimbad_client.commands.tables import domain_table, gate_verdict, map_table, session_table, traverse_table
 from deepsimbad_client.http.client import Client
 from deepsimbad_client.http.models import MapVersion
-from deepsimbad_client.tables import domain_table, gate_verdict, map_table, session_table, traverse_table
 
 asking = click.option("--yes", is_flag=True, help="Do not ask.")
 domain_argument = click.argument("domain")

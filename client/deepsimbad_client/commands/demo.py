@@ -1,7 +1,7 @@
 """`make demo`: a campus is rendered in three seasons, mapped, and driven again against a live service.
 
-The paper's triplet WI-SP-SU: landmarks from winter, the map from spring, the robot comes in summer. First every view is
-localized on its own, then an active robot chooses where to look next. Everything goes through the service's HTTP
+The paper's triplet WI-SP-SU: landmarks from winter, the map from spring, the robot comes in summer. First the whole
+drive is one session, then an active robot chooses where to look next. Everything goes through the service's HTTP
 interface, as a robot's would.
 """
 
@@ -16,22 +16,20 @@ from rich.table import Table
 
 from deepsimbad_campus.season import CampusError
 from deepsimbad_campus.writer import write_campus
-from deepsimbad_client.active_plots import draw_active
-from deepsimbad_client.active_replay import active_replay
-from deepsimbad_client.active_report import localized_table, planner_table, summarise_active
-from deepsimbad_client.console import EpisodeBar, FrameBar, JobBar, ReplayBar, UploadBar
+from deepsimbad_client.commands.console import EpisodeBar, FrameBar, JobBar, ReplayBar, UploadBar
 from deepsimbad_client.errors import DeepSimbadClientError
 from deepsimbad_client.http.client import Client
 from deepsimbad_client.http.jobs import remap
 from deepsimbad_client.http.local_server import LocalServer
 from deepsimbad_client.http.upload import upload
-from deepsimbad_client.plots import draw_all
 from deepsimbad_client.recordings.recording import Recording
 from deepsimbad_client.recordings.sources import open_source
-from deepsimbad_client.replay import Replay, replay
-from deepsimbad_client.report import summarise, write_summary
-from deepsimbad_client.stage import DEFAULT_PLANNER, Stage
-from deepsimbad_client.story import told
+from deepsimbad_client.replay.active import Stage, active_replay
+from deepsimbad_client.replay.passive import Replay, replay
+from deepsimbad_client.replay.plots import draw_active, draw_passive
+from deepsimbad_client.replay.report import active_tables, summarise, summarise_active, write_summary
+from deepsimbad_client.replay.scene import DEFAULT_PLANNER
+from deepsimbad_client.replay.watch import in_words
 
 DOMAIN = "campus"
 SEASONS = ("winter", "spring", "summer")
@@ -79,7 +77,9 @@ def demo(folder: Path, frames: int, seed: int) -> None:
         _say(table)
         _show_one(client, drives[LIVE_SEASON])
         shipped, _ = driven[RELEVANCES[-1]]
-        pictures = draw_all(shipped, shipped.folder) + _drive_actively(client, drives[LIVE_SEASON], folder / "active")
+        pictures = draw_passive(shipped, shipped.folder) + _drive_actively(
+            client, drives[LIVE_SEASON], folder / "active"
+        )
         _say("8. Pictures: " + ", ".join(str(picture) for picture in pictures))
         if sys.stdin.isatty() and sys.stdout.isatty():
             _say(f"\nThe service stays up at {server.url} (API: {server.url}/docs). Ctrl-C ends it.")
@@ -122,17 +122,17 @@ def _drive(
 
 def _drive_actively(client: Client, live: Recording, folder: Path) -> list[Path]:
     """One episode in words, then the default planner against blind moves; returns the pictures."""
-    stage = Stage.of(client, live, DOMAIN)
+    stage = Stage(client, live, DOMAIN)
     length_m = live.frames[-1].position_m - live.frames[0].position_m
-    steps = min(STEPS, int(length_m / 2 / max(stage.domain.actions_m)))  # half of the drive is left to start from
+    steps = min(STEPS, int(length_m / 2 / max(stage.scene.domain.actions_m)))  # half of the drive is left to start from
     if steps < 1:
         _say("6. The drive is too short for an active robot: give it more --frames")
         return []
     _say(f"6. An active robot, put down anywhere on the {LIVE_SEASON} drive, chooses its own next views:")
     row, seed = stage.start(steps, _SEED, 0)
-    with stage.session(DEFAULT_PLANNER, seed) as session:
+    with stage.scene.session(DEFAULT_PLANNER, seed) as session:
         for _, step in stage.play(session, row, steps):
-            _say(f"   {told(step)}")
+            _say(f"   {in_words(step)}")
     _say(f"7. The same from {EPISODES} random starts, against blind moves:")
     with EpisodeBar("driving actively", len(PLANNERS) * EPISODES) as bar:
         driven = active_replay(
@@ -146,8 +146,8 @@ def _drive_actively(client: Client, live: Recording, folder: Path) -> list[Path]
         )
     summary = summarise_active(driven)
     write_summary(summary, folder)
-    _say(planner_table(summary))
-    _say(localized_table(summary))
+    for table in active_tables(summary)[:2]:
+        _say(table)
     return draw_active(driven, summary, folder)
 
 

@@ -12,10 +12,9 @@ from importlib import import_module
 import click
 
 from deepsimbad_client.commands import admin, jobs, recordings
-from deepsimbad_client.console import show_waits
+from deepsimbad_client.commands.console import show_waits
+from deepsimbad_client.commands.replay import replay, watch
 from deepsimbad_client.errors import DeepSimbadClientError
-from deepsimbad_client.replay_command import replay
-from deepsimbad_client.watch_command import watch
 
 DONE, FAILED, CANCELLED = 0, 1, 130
 ELSEWHERE = {"campus": "deepsimbad_campus.__main__:campus_command"}

@@ -8,7 +8,8 @@ from typing import Any
 import click
 
 from deepsimbad_client.commands import at_once, domain_option, json_flag, reading, serving
-from deepsimbad_client.console import REMARKS, UploadBar, as_json, show
+from deepsimbad_client.commands.console import REMARKS, UploadBar, as_json, show
+from deepsimbad_client.commands.tables import place_table
 from deepsimbad_client.errors import UnknownDomainError
 from deepsimbad_client.http.client import Client
 from deepsimbad_client.http.upload import upload as upload_recording
@@ -16,7 +17,6 @@ from deepsimbad_client.recordings.encodings import SUFFIXES
 from deepsimbad_client.recordings.folder import FolderRecording
 from deepsimbad_client.recordings.recording import Frame, Recording
 from deepsimbad_client.recordings.sources import open_source
-from deepsimbad_client.tables import place_table
 
 IMAGE_EVALUATOR = {"kind": "feature_l2"}
 ENCODING_EVALUATOR = {"kind": "feature_l2", "extractor": "none"}

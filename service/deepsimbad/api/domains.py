@@ -139,7 +139,7 @@ def describe_domain(record: DomainRecord, evaluators: EvaluatorPool, maps: Maps)
         created_at=record.created_at,
         map_version=snapshot.version if snapshot else record.active_version,
         map_problem=map_problem,
-        relevance=snapshot and snapshot.retrieval.relevance.value,
+        relevance=snapshot and snapshot.relevance.value,
         route_length_m=snapshot and snapshot.route.length_m,
         n_map_images=snapshot and snapshot.n_images,
         n_landmarks=snapshot and snapshot.n_landmarks,

@@ -53,8 +53,8 @@ from deepsimbad.api.requests import (
     read_bytes,
     read_json,
 )
-from deepsimbad.core.filters import FilterKind
-from deepsimbad.core.update_rules import UpdateRule
+from deepsimbad.core.belief import FilterKind
+from deepsimbad.core.relevance import UpdateRule
 from deepsimbad.engine.session import DEFAULT_START_STD_M, Observation, SessionConfig, SessionView
 from deepsimbad.engine.views import Stopwatch
 from deepsimbad.errors import DeepSimbadError

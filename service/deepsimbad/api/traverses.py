@@ -37,6 +37,7 @@ from deepsimbad.api.requests import (
     read_bytes,
     read_json,
 )
+from deepsimbad.core.drive import MAX_POSITION_M, UNKNOWN_TIMESTAMP, Drive
 from deepsimbad.engine.encoders import ready_encodings
 from deepsimbad.engine.views import EncodedImage, View
 from deepsimbad.engine.worker import Priority
@@ -52,7 +53,6 @@ from deepsimbad.errors import (
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.image import MEDIA_TYPES
 from deepsimbad.store.faults import storage_faults
-from deepsimbad.store.frames import MAX_POSITION_M, UNKNOWN_TIMESTAMP, TraverseFrames
 from deepsimbad.store.records import ListPage
 from deepsimbad.store.traverses import Traverse
 
@@ -354,7 +354,7 @@ class InvalidBatchError(InvalidInputError):
     code = "invalid_batch"
 
 
-def read_batch(file: IO[bytes], max_bytes: int) -> TraverseFrames:
+def read_batch(file: IO[bytes], max_bytes: int) -> Drive:
     """Read the arrays of a batch.
 
     Args:
@@ -444,11 +444,11 @@ def _check_header(name: str, stream: IO[bytes], member_bytes: int) -> None:
         raise InvalidBatchError(f"{name} does not hold the {n_values} numbers its header says")
 
 
-def _arranged(arrays: dict[str, NDArray[Any]]) -> TraverseFrames:
+def _arranged(arrays: dict[str, NDArray[Any]]) -> Drive:
     """The store's form; it judges the values."""
     n_frames = len(arrays["encodings"])
     unknown = np.full(n_frames, np.nan)
-    return TraverseFrames(
+    return Drive(
         index=arrays["index"],
         position_m=arrays["position_m"],
         timestamp_us=arrays.get("timestamp_us", np.full(n_frames, UNKNOWN_TIMESTAMP)),

@@ -19,17 +19,23 @@ from deepsimbad.cli.options import (
 )
 from deepsimbad.cli.terminal import print_table, progress_bar, write_json
 from deepsimbad.core.planners import DEFAULT_PLANNER
-from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Relevance
-from deepsimbad.core.true_images import true_images_of
-from deepsimbad.core.update_rules import DEFAULT_UPDATE, UpdateRule
+from deepsimbad.core.relevance import DEFAULT_RELEVANCE, DEFAULT_UPDATE, Relevance, UpdateRule
+from deepsimbad.core.route import true_images_of
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.registry import EvaluatorConfig, make_evaluator
-from deepsimbad.jobs.encoded_traverse import EncodedTraverse, encode_recording
-from deepsimbad.jobs.experiment_nbv import NbvConfig, NbvReport, nbv_stages, run_nbv
-from deepsimbad.jobs.experiment_vpr import VprConfig, VprReport, run_vpr, vpr_stages
-from deepsimbad.jobs.ground_truth import read_ground_truth
-from deepsimbad.jobs.map_config import DEFAULT_TRAINING_EPISODES
+from deepsimbad.jobs.experiments import (
+    NbvConfig,
+    NbvReport,
+    VprConfig,
+    VprReport,
+    nbv_stages,
+    run_nbv,
+    run_vpr,
+    vpr_stages,
+)
 from deepsimbad.jobs.progress import Progress
+from deepsimbad.jobs.recordings import EncodedRecording, encode_recording, read_ground_truth
+from deepsimbad.jobs.remap_config import DEFAULT_TRAINING_EPISODES
 from deepsimbad_client.recordings.sources import open_source
 
 _ROLES = ("landmarks", "training", "test")
@@ -43,9 +49,9 @@ _Command = TypeVar("_Command", bound=Callable[..., Any])
 class _Triplet:
     """Three encoded recordings, what measures them, and what was read, for the result's `config`."""
 
-    landmarks: EncodedTraverse
-    training: EncodedTraverse
-    test: EncodedTraverse
+    landmarks: EncodedRecording
+    training: EncodedRecording
+    test: EncodedRecording
     evaluator: Evaluator
     sources: dict[str, Any]
 
@@ -125,13 +131,12 @@ def vpr(
         extractor = evaluator.options["extractor"]
         with progress_bar(_READING_STAGES | vpr_stages(config), extractor) as progress:
             triplet = _read_triplet(asked, evaluator, progress)
+            training, test = triplet.training.drive, triplet.test
             if ground_truth is None:
-                truth = true_images_of(triplet.test.route, triplet.training.route, tolerance)
+                truth = true_images_of(test.drive.route(), training.route(), tolerance)
             else:
-                truth = read_ground_truth(ground_truth, triplet.test.frames.index, triplet.training.frames.index)
-            report = run_vpr(
-                config, triplet.evaluator, triplet.landmarks, triplet.training, triplet.test, truth, progress
-            )
+                truth = read_ground_truth(ground_truth, test.drive.index, training.index)
+            report = run_vpr(config, triplet.evaluator, triplet.landmarks.drive, training, test, truth, progress)
         sources = triplet.sources | {"ground_truth": None if ground_truth is None else str(ground_truth)}
         documents[extractor], reports[extractor] = report.as_dict(sources), report
     if len(reports) > 1:
@@ -180,7 +185,8 @@ def nbv(
     )
     with progress_bar(_READING_STAGES | nbv_stages(config), "experiment") as progress:
         triplet = _read_triplet(asked, evaluator, progress)
-        report = run_nbv(config, triplet.evaluator, triplet.landmarks, triplet.training, triplet.test, progress)
+        drives = (triplet.landmarks.drive, triplet.training.drive, triplet.test.drive)
+        report = run_nbv(config, triplet.evaluator, *drives, progress)
     document = report.as_dict(triplet.sources)
     _tell(document, asked["json_file"], lambda: _print_planners(report, document))
 

@@ -18,6 +18,7 @@ from deepsimbad.cli.options import (
     spacing_option,
 )
 from deepsimbad.cli.terminal import print_table, progress_bar, write_json
+from deepsimbad.core.drive import Drive
 from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Relevance
 from deepsimbad.engine.encoders import EvaluatorPool
 from deepsimbad.engine.localizer import localize as localize_view
@@ -27,11 +28,16 @@ from deepsimbad.errors import ImageTooLargeError, InvalidImageError, InvalidSour
 from deepsimbad.evaluators.compute import available_cores
 from deepsimbad.evaluators.image import decode_image
 from deepsimbad.evaluators.registry import EvaluatorConfig, make_evaluator
-from deepsimbad.jobs.encoded_traverse import encode_recording
-from deepsimbad.jobs.map_config import DEFAULT_LIST_LENGTH, DEFAULT_N_LANDMARKS, DEFAULT_TRAINING_EPISODES, RemapConfig
-from deepsimbad.jobs.remap import REMAP_STAGES, remap
+from deepsimbad.jobs.recordings import encode_recording
+from deepsimbad.jobs.remap import remap
+from deepsimbad.jobs.remap_config import (
+    DEFAULT_LIST_LENGTH,
+    DEFAULT_N_LANDMARKS,
+    DEFAULT_TRAINING_EPISODES,
+    REMAP_STAGES,
+    RemapConfig,
+)
 from deepsimbad.store.catalog import Catalog
-from deepsimbad.store.frames import TraverseFrames
 from deepsimbad.store.layout import checked_name
 from deepsimbad.store.traverses import Traverse
 from deepsimbad_client.recordings.sources import open_source
@@ -103,7 +109,7 @@ def map_(
             for role, recording in recordings.items():
                 progress.stage(f"read {role}")
                 encoded = encode_recording(recording, measure, settings.max_pixels, progress.update)
-                _store(catalog.data_dir, domain, role, encoded.frames)
+                _store(catalog.data_dir, domain, role, encoded.drive)
             result = remap(catalog, domain, config, measure, progress, n_threads=available_cores())
     if as_json:
         write_json({"domain": domain, **result})
@@ -181,7 +187,7 @@ def info(domain: str, as_json: bool, data_dir: Path | None) -> None:
     print_table(table)
 
 
-def _store(data_dir: Path, domain: str, role: str, frames: TraverseFrames) -> None:
+def _store(data_dir: Path, domain: str, role: str, frames: Drive) -> None:
     """Keep what was read as the domain's traverse of that role, in place of an earlier one."""
     if role in Traverse.list(data_dir, domain):
         Traverse.delete(data_dir, domain, role)

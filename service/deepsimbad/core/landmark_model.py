@@ -1,23 +1,129 @@
-"""A landmark model as it travels to a robot that ranks landmarks itself: named arrays, and a digest that names them.
+"""Landmarks: the choice of candidates that are least like any other (II-B), and their model as it travels to robots.
 
-The digest is of what ranks follow from, so two maps with the same landmarks have the same one whatever else differs.
+A robot that ranks landmarks itself gets named arrays, and a digest that names them: of what ranks follow from, so two
+maps with the same landmarks have the same one whatever else differs.
 """
 
 import hashlib
 import io
 import json
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
-from deepsimbad.errors import InvalidArchiveError
+from deepsimbad.errors import (
+    InvalidArchiveError,
+    InvalidEncodingError,
+    InvalidMapConfigError,
+    TooFewCandidatesError,
+)
 
+_BLOCK = 1536  # candidates a side of one block of products: 9 MB, and large enough for the full speed of BLAS
 _ABOUT = ("evaluator", "map_version", "n_landmarks", "weights_sha256")
 _EPOCH = (1980, 1, 1, 0, 0, 0)  # a zip's earliest time: the same model is the same bytes whenever it is written
+
+
+def select_landmarks(
+    candidates: NDArray[np.float32],
+    n_landmarks: int,
+    on_progress: Callable[[float], None] | None = None,
+) -> NDArray[np.int64]:
+    """The r candidates farthest from their nearest other candidate.
+
+    Every pair is compared once, block by block, so memory holds no n x n matrix. Nearest neighbours are found in
+    float32; their distances, which decide the order, are then computed again in float64.
+
+    Args:
+        candidates: [n, d] encodings of the landmark traverse.
+        n_landmarks: r, 1..n.
+        on_progress: Called with the share done, 0..1; may raise to cancel.
+
+    Returns:
+        [r] int64 indices of candidates, best first, ties by index.
+
+    Raises:
+        TooFewCandidatesError: n < r.
+        InvalidEncodingError: NaN or infinity among the candidates.
+    """
+    n_candidates = candidates.shape[0]
+    if n_landmarks < 1:
+        raise InvalidMapConfigError("n_landmarks must be at least 1", n_landmarks=n_landmarks)
+    if n_candidates < n_landmarks:
+        raise TooFewCandidatesError(
+            f"{n_candidates} candidates for {n_landmarks} landmarks; ask for fewer landmarks or drive further",
+            n_candidates=n_candidates,
+            n_landmarks=n_landmarks,
+        )
+    candidates = np.ascontiguousarray(candidates, np.float32)
+    half_squares = 0.5 * np.einsum("nd,nd->n", candidates, candidates)
+    if not np.isfinite(half_squares).all():
+        raise InvalidEncodingError("an encoding of the landmark traverse holds NaN, infinity or huge numbers")
+    if n_candidates == 1:
+        return np.zeros(1, np.int64)
+    neighbours = _nearest_neighbours(candidates, half_squares, on_progress or (lambda _: None))
+    scores = _squared_distances(candidates, neighbours)
+    return np.argsort(-scores, kind="stable")[:n_landmarks].astype(np.int64)
+
+
+def _nearest_neighbours(
+    candidates: NDArray[np.float32], half_squares: NDArray[np.float32], on_progress: Callable[[float], None]
+) -> NDArray[np.int64]:
+    """[n] index of each candidate's nearest other one. Half squared distance = |a|^2/2 + |b|^2/2 - a.b."""
+    n_candidates = candidates.shape[0]
+    nearest = np.zeros(n_candidates, np.int64)
+    least = np.full(n_candidates, np.inf, np.float32)
+    starts = range(0, n_candidates, _BLOCK)
+    n_blocks, n_done = len(starts) * (len(starts) + 1) // 2, 0
+    for row in starts:
+        for column in range(row, n_candidates, _BLOCK):
+            rows, columns = candidates[row : row + _BLOCK], candidates[column : column + _BLOCK]
+            _keep_nearest(rows @ columns.T, half_squares, row, column, nearest, least)
+            n_done += 1
+            on_progress(n_done / n_blocks)
+    return nearest
+
+
+@njit(cache=True, nogil=True)
+def _keep_nearest(
+    products: NDArray[np.float32],
+    half_squares: NDArray[np.float32],
+    row: int,
+    column: int,
+    nearest: NDArray[np.int64],
+    least: NDArray[np.float32],
+) -> None:
+    """Take the block's distances into account for its rows and its columns alike."""
+    n_rows, n_columns = products.shape
+    for i in range(n_rows):
+        a = row + i
+        best, best_b = least[a], nearest[a]
+        for j in range(n_columns):
+            b = column + j
+            if a == b:
+                continue
+            half_distance = half_squares[a] + half_squares[b] - products[i, j]
+            if half_distance < best:
+                best, best_b = half_distance, b
+            if half_distance < least[b]:
+                least[b] = half_distance
+                nearest[b] = a
+        if best < least[a]:
+            least[a], nearest[a] = best, best_b
+
+
+def _squared_distances(candidates: NDArray[np.float32], others: NDArray[np.int64]) -> NDArray[np.float64]:
+    """[n] float64 squared distance of each candidate to the one named, a block at a time."""
+    distances = np.empty(candidates.shape[0])
+    for start in range(0, candidates.shape[0], _BLOCK):
+        block = slice(start, start + _BLOCK)
+        difference = candidates[block].astype(np.float64) - candidates[others[block]]
+        distances[block] = np.einsum("nd,nd->n", difference, difference)
+    return distances
 
 
 @dataclass(frozen=True)

@@ -1,18 +1,23 @@
 """Nearest-neighbour Q-learning (II-D): the map's images are the states, and a view borrows those most relevant to it.
 
 The experience database is `Q[map image, action]`. The value of a view is the mean over its k nearest map images,
-nearest by relevance; what is learnt from a view moves the entries of the same images.
+nearest by relevance; what is learnt from a view moves the entries of the same images. A live session teaches as well,
+once its true positions are known: `KnownWalk`.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from deepsimbad.core.retrieval import shortlist
-from deepsimbad.core.update_rules import UpdateRule
-from deepsimbad.errors import InvalidMapConfigError
+from deepsimbad.core.belief import GridFilter, motion_std_m
+from deepsimbad.core.map import Map
+from deepsimbad.core.metrics import rank_of_truth
+from deepsimbad.core.relevance import Query, UpdateRule
+from deepsimbad.core.retrieval import relevances, shortlist
+from deepsimbad.errors import InvalidInputError, InvalidMapConfigError, PastTheEndError
 
 
 @dataclass(frozen=True)
@@ -95,28 +100,6 @@ def initial_q_values(n_images: int, n_actions: int, config: NnqlConfig) -> NDArr
     return np.full((n_images, n_actions), config.initial_q, np.float32)
 
 
-def append_images(
-    q_values: NDArray[np.float32], n_images: int, config: NnqlConfig | None = None
-) -> NDArray[np.float32]:
-    """The experience database with further map images [m, a] behind the present ones; this one is unchanged."""
-    fresh = initial_q_values(n_images, q_values.shape[1], config or NnqlConfig())
-    return np.concatenate([q_values, fresh])
-
-
-def q_of_view(q_values: NDArray[np.float32], relevance: NDArray[np.float32], k: int) -> NDArray[np.float32]:
-    """`Q(s, a) = |N(s)|^-1 sum over s' in N(s) of Q(s', a)`: the value of every action in a view.
-
-    Args:
-        q_values: [n, a].
-        relevance: [n] of every map image to the view, larger is better.
-        k: Nearest map images that are asked; ties by id.
-
-    Returns:
-        [a] float32.
-    """
-    return np.asarray(q_values[shortlist(relevance, k)].mean(axis=0, dtype=np.float64), np.float32)
-
-
 def q_of_nearest(q_values: NDArray[np.float32], nearest: NDArray[np.int64]) -> NDArray[np.float64]:
     """The values [t, a] of views whose nearest map images [t, k] are known."""
     return np.asarray(q_values[nearest].mean(axis=1, dtype=np.float64))
@@ -137,15 +120,6 @@ def learn(q_values: NDArray[np.float32], moves: Transitions, config: NnqlConfig)
         config.learning_rate,
         config.discount,
     )
-
-
-def learn_online(
-    q_values: NDArray[np.float32], transitions: Transitions, config: NnqlConfig | None = None
-) -> NDArray[np.float32]:
-    """The experience database after moves of a live session, once its true positions are known; a new one."""
-    learnt = q_values.astype(np.float32, copy=True)
-    learn(learnt, transitions, config or NnqlConfig())
-    return learnt
 
 
 @njit(cache=True, nogil=True)
@@ -173,3 +147,75 @@ def _learn(
         for j in range(k):
             old = q_values[nearest[t, j], action[t]]
             q_values[nearest[t, j], action[t]] = old + learning_rate * (target - old)
+
+
+@dataclass(frozen=True)
+class KnownWalk:
+    """A session's views and moves, and where they truly were.
+
+    Attributes:
+        queries: The t described views, in order.
+        action_m: [t] metres moved before every view; the first is not read.
+        true_position_m: [t] route positions; NaN where unknown.
+    """
+
+    queries: Sequence[Query]
+    action_m: NDArray[np.float64]
+    true_position_m: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        if not len(self.queries) == self.action_m.size == self.true_position_m.size:
+            raise InvalidInputError(
+                f"{self.true_position_m.size} true positions for {len(self.queries)} views; give one for each, "
+                "null where it is unknown",
+                n_observations=len(self.queries),
+            )
+
+
+def transitions_of(map_: Map, walk: KnownWalk, config: NnqlConfig) -> Transitions:
+    """Replay a walk from a uniform belief, and reward its moves as training does.
+
+    A move counts for the domain's action nearest to it, if that is nearer than half the step between two actions (of
+    one action alone, than half of it). Other moves, and those to an unknown place, teach nothing.
+
+    Args:
+        map_: The map.
+        walk: What happened.
+        config: The hyperparameters.
+    """
+    moves, route = map_.actions_m, map_.route
+    reach_m = np.diff(moves).min() / 2 if moves.size > 1 else moves[0] / 2
+    rule = config.update or map_.update_rule
+    belief, live = GridFilter.uniform(route), map_.landmark_statistics
+    nearest: list[NDArray[np.int64]] = []
+    rewarded: list[tuple[int, int, float]] = []  # view, action, reward
+    for t, query in enumerate(walk.queries):
+        if t > 0:
+            action_m = float(walk.action_m[t])
+            std_m = motion_std_m(action_m) if config.motion_std_m is None else config.motion_std_m
+            try:
+                belief = belief.predicted(action_m, std_m, t)
+            except PastTheEndError:
+                belief = GridFilter.uniform(route)
+        live = None if live is None else live.observing(query.ranks)
+        relevance = relevances(map_, query, live)
+        belief = belief.updated(relevance, rule, t)
+        nearest.append(shortlist(relevance, config.n_neighbours))
+        if t == 0 or np.isnan(walk.true_position_m[t]):
+            continue
+        action = int(np.abs(moves - walk.action_m[t]).argmin())
+        if abs(moves[action] - walk.action_m[t]) <= reach_m:
+            truth = route.nearest_image(walk.true_position_m[[t]]).astype(np.int64)
+            earned = rank_of_truth(belief.mass, truth) < config.top_share * route.n_images
+            rewarded.append((t, action, config.reward * earned))
+    views = np.array([view for view, _, _ in rewarded], np.int64)
+    k = min(config.n_neighbours, route.n_images)
+    rows = np.array(nearest, np.int64).reshape(-1, k)
+    ahead_m = walk.true_position_m[views][:, np.newaxis] + moves
+    return Transitions(
+        nearest=rows[views - 1],
+        action=np.array([action for _, action, _ in rewarded], np.int64),
+        reward=np.array([reward for _, _, reward in rewarded], np.float64),
+        next_nearest=rows[views],
+        next_allowed=route.closed | (ahead_m <= route.position_m[-1] + 1e-9),
+    )

@@ -10,13 +10,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from deepsimbad.core.belief import GridFilter, motion_std_m
 from deepsimbad.core.descriptor import rank_landmarks
-from deepsimbad.core.filters import motion_std_m
-from deepsimbad.core.grid_filter import GridFilter
-from deepsimbad.core.relevance import Query, RetrievalMap, relevances
-from deepsimbad.core.retrieval import SecondSeason
+from deepsimbad.core.drive import SecondSeason
+from deepsimbad.core.map import Map
+from deepsimbad.core.relevance import LOG_LIKELIHOOD_WEIGHT, Query, UpdateRule
+from deepsimbad.core.retrieval import relevances
 from deepsimbad.core.route import Route
-from deepsimbad.core.update_rules import LOG_LIKELIHOOD_WEIGHT, UpdateRule
 from deepsimbad.errors import PastTheEndError
 
 OFF_ROUTE_AT_START = 0.02  # before anything was seen
@@ -43,6 +43,11 @@ class OffRouteModel:
         return float(np.clip(self.intercept + self.slope * agreement, -_MAX_LOG_ODDS, _MAX_LOG_ODDS))
 
     @classmethod
+    def of(cls, map_: Map) -> "OffRouteModel | None":
+        """What a map has learnt; None where it has not."""
+        return None if map_.off_route_model is None else cls(*map_.off_route_model.tolist())
+
+    @classmethod
     def fit(cls, on_route: NDArray[np.float64], off_route: NDArray[np.float64]) -> "OffRouteModel":
         """Logistic regression between two samples of agreements, by Newton's method with a light ridge."""
         agreement = np.r_[on_route, off_route]
@@ -58,12 +63,17 @@ class OffRouteModel:
         return cls(float(weights[1] / scale), float(weights[0] - weights[1] * centre / scale))
 
     @classmethod
-    def learn(cls, built: RetrievalMap, second: SecondSeason, route: Route) -> "OffRouteModel | None":
+    def learn(cls, map_: Map, second: SecondSeason) -> "OffRouteModel | None":
         """Walk the second season's frames over the map, and over the map without the places they walk through.
+
+        Args:
+            map_: The map; its lists must not know the second season.
+            second: Another drive of its route.
 
         Returns:
             The model; None where the two seasons share too short a stretch for a walk.
         """
+        route = map_.route
         frames = _frames_by_distance(second.places, route)
         starts = np.arange(0, len(frames) - _VIEWS + 1)
         if starts.size == 0:
@@ -76,9 +86,9 @@ class OffRouteModel:
             ranks = rank_landmarks(second.dissimilarities[walked])
             reach = np.abs(route.position_m[:, np.newaxis] - route.position_m[images]).min(axis=1)
             elsewhere = reach > min(_SURROUNDINGS_M, route.length_m / 8)
-            on_route += _agreements(built, route, ranks, np.ones(route.n_images, bool))
+            on_route += _agreements(map_, ranks, np.ones(route.n_images, bool))
             if elsewhere.sum() > route.n_images / 4:
-                off_route += _agreements(built, route, ranks, elsewhere)
+                off_route += _agreements(map_, ranks, elsewhere)
         return cls.fit(np.array(on_route), np.array(off_route)) if off_route else None
 
 
@@ -116,16 +126,15 @@ def _frames_by_distance(places: NDArray[np.int64], route: Route) -> NDArray[np.i
     return np.asarray(ordered[chosen], np.int64)
 
 
-def _agreements(
-    built: RetrievalMap, route: Route, ranks: NDArray[np.float32], mapped: NDArray[np.bool_]
-) -> list[float]:
+def _agreements(map_: Map, ranks: NDArray[np.float32], mapped: NDArray[np.bool_]) -> list[float]:
     """The agreements of one walk's views behind the first, on the part of the map that counts as mapped."""
-    live, found = built.statistics, []
+    route, live = map_.route, map_.landmark_statistics
+    agreements: list[float] = []
     mass = np.where(mapped, route.cell_m, 0.0)
     belief = GridFilter(route, mass / mass.sum())
     for number, view in enumerate(ranks):
         live = live.observing(view) if live else None
-        relevance = np.where(mapped, relevances(built, Query(view), live), _EXCLUDED)
+        relevance = np.where(mapped, relevances(map_, Query(view), live), _EXCLUDED)
         if number > 0:
             try:
                 predicted = belief.predicted(_STEP_M, motion_std_m(_STEP_M), number)
@@ -135,6 +144,6 @@ def _agreements(
             if inside.sum() <= 0:
                 break
             belief = GridFilter(route, inside / inside.sum())
-            found.append(agreement_of(belief.mass[mapped], relevance[mapped]))
+            agreements.append(agreement_of(belief.mass[mapped], relevance[mapped]))
         belief = belief.updated(relevance, UpdateRule.LOG_LIKELIHOOD, number)
-    return found
+    return agreements

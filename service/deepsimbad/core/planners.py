@@ -1,4 +1,4 @@
-"""Next-best-view planners: which move would tell the robot most (II-D, and ours)."""
+"""Which move would tell the robot most (II-D, and ours): what places are telling, and the planners."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,13 +8,20 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from deepsimbad.core.retrieval import shortlist
+from deepsimbad.core.descriptor import rank_landmarks
+from deepsimbad.core.drive import SecondSeason
+from deepsimbad.core.map import Map
+from deepsimbad.core.metrics import rank_of_truth
+from deepsimbad.core.relevance import Query
+from deepsimbad.core.retrieval import relevances, shortlist
 from deepsimbad.core.route import Route
 from deepsimbad.errors import InvalidInputError
 
 NNQL, TELLING, RANDOM, CONSTANT = "nnql", "telling", "random", "constant"
 DEFAULT_PLANNER = TELLING
 NNQL_NEIGHBOURS = 4  # k of the paper
+_SMOOTHED_OVER_M = 1.0  # one view is a noisy measurement of its place; neighbours show much the same
+_MAX_VIEWS = 20_000  # more would only take longer
 _BITS_PER_METRE = 0.12  # what a longer move is worth for being less like the view before
 
 
@@ -23,23 +30,16 @@ class PlanningView:
     """All a planner may look at.
 
     Attributes:
-        route: Where the map images are.
-        actions_m: [a] the moves there are, ascending.
+        map: The map.
         mass: [n] belief.
         relevance: [n] of the last view; None before any.
-        q_values: [n, a] the experience database; None where the map has none.
-        bits_ahead: [n, a] float32, by how much a view from where each move leads narrows the map down
-            (`telling.bits_ahead`); None where nobody knows.
         seed: What random choices are drawn from, together with `step`.
         step: Number of the last observation.
     """
 
-    route: Route
-    actions_m: NDArray[np.float64]
+    map: Map
     mass: NDArray[np.float64]
     relevance: NDArray[np.float32] | None
-    q_values: NDArray[np.float32] | None
-    bits_ahead: NDArray[np.float32] | None
     seed: int
     step: int
 
@@ -96,7 +96,7 @@ class RandomPlanner:
 
     def plan(self, view: PlanningView) -> Plan:
         """See `Planner.plan`."""
-        drawn = np.random.default_rng([view.seed, view.step]).choice(view.actions_m)
+        drawn = np.random.default_rng([view.seed, view.step]).choice(view.map.actions_m)
         return Plan(self.name, float(drawn))
 
 
@@ -109,11 +109,11 @@ class NnqlPlanner:
 
     def plan(self, view: PlanningView) -> Plan | None:
         """See `Planner.plan`; needs a view and an experience database."""
-        if view.q_values is None or view.relevance is None:
+        if view.map.q_values is None or view.relevance is None:
             return None
         nearest = shortlist(view.relevance, self.n_neighbours)
-        values = _mean_rows(view.q_values, nearest)
-        return Plan(self.name, float(view.actions_m[np.argmax(values)]), values)
+        values = _mean_rows(view.map.q_values, nearest)
+        return Plan(self.name, float(view.map.actions_m[np.argmax(values)]), values)
 
 
 @dataclass(frozen=True)
@@ -131,11 +131,11 @@ class TellingPlanner:
 
     def plan(self, view: PlanningView) -> Plan:
         """See `Planner.plan`; where nobody knows what is telling, the longest move."""
-        if view.bits_ahead is None:
-            return Plan(self.name, float(view.actions_m[-1]))
-        worth = np.sqrt(_doubt(view.mass)) * _averaged(view.mass, view.bits_ahead)
-        values = self.bits_per_metre * view.actions_m + worth
-        return Plan(self.name, float(view.actions_m[np.argmax(values)]), values)
+        if view.map.bits_ahead is None:
+            return Plan(self.name, float(view.map.actions_m[-1]))
+        worth = np.sqrt(_doubt(view.mass)) * _averaged(view.mass, view.map.bits_ahead)
+        values = self.bits_per_metre * view.map.actions_m + worth
+        return Plan(self.name, float(view.map.actions_m[np.argmax(values)]), values)
 
 
 def _doubt(mass: NDArray[np.float64]) -> float:
@@ -180,3 +180,40 @@ def parse_planner(text: str, actions_m: Sequence[float]) -> Planner:
             if metres == f"{action_m:g}":
                 return ConstantPlanner(action_m)
     raise InvalidInputError(f"{text!r} is no planner of this domain", allowed=allowed)
+
+
+def telling_bits(map_: Map, second: SecondSeason) -> NDArray[np.float32]:
+    """By how many bits a view from every map image's place narrows the map down: how telling it is (ours).
+
+    The landmark traverse stands for a live drive of another season. Where it saw a place of the map, the rank of that
+    place in its retrieval says how telling the place is.
+
+    Args:
+        map_: The map; its lists must not know the second season.
+        second: Its `places` hold at least one pair.
+
+    Returns:
+        [n] float32.
+    """
+    step = -(-len(second.places) // _MAX_VIEWS)
+    places = second.places[::step]
+    bits = np.empty(len(places))
+    for row, (image, frame) in enumerate(places):
+        relevance = relevances(map_, Query(rank_landmarks(second.dissimilarities[frame])))
+        bits[row] = np.log2(relevance.size / (1 + rank_of_truth(relevance, np.array([image]))))
+    return _smooth(map_.route, map_.position_m[places[:, 0]], bits).astype(np.float32)
+
+
+def _smooth(route: Route, at_m: NDArray[np.float64], bits: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[n] local mean of measurements along the route; far from all of them their overall mean."""
+    order = np.argsort(at_m, kind="stable")
+    at_m, bits = at_m[order], bits[order]
+    reach = 3 * _SMOOTHED_OVER_M
+    first = np.searchsorted(at_m, route.position_m - reach)
+    stop = np.searchsorted(at_m, route.position_m + reach, side="right")
+    smoothed = np.full(route.n_images, bits.mean())
+    for image, (low, high) in enumerate(zip(first, stop, strict=True)):
+        if high > low:
+            near = np.exp(-0.5 * np.square((at_m[low:high] - route.position_m[image]) / _SMOOTHED_OVER_M))
+            smoothed[image] = (near * bits[low:high]).sum() / near.sum()
+    return smoothed

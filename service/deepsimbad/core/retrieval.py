@@ -1,105 +1,186 @@
-"""Building what retrieval reads from a traverse's dissimilarities, and the shortlist of an answer (II-C)."""
+"""The relevance of every map image to described views, and the shortlist of an answer (II-C, III)."""
 
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from deepsimbad.core.calibration import SeasonsOfRoute, live_prior
-from deepsimbad.core.descriptor import nearest_landmarks, rank_landmarks
-from deepsimbad.core.inverted_index import InvertedIndex
-from deepsimbad.core.relevance import Relevance, RetrievalMap
-from deepsimbad.core.statistics import LandmarkStatistics, common_factors
-from deepsimbad.errors import InvalidMapConfigError
+from deepsimbad.core.map import Map
+from deepsimbad.core.relevance import Query, Relevance
+from deepsimbad.core.statistics import LandmarkStatistics
+from deepsimbad.errors import InvalidInputError, InvalidMapConfigError
 
+_BLOCK = 4096  # images whose sums stay in the first-level cache
+_IMAGES_WORTH_A_THREAD = 250_000  # below, waking a second core costs more than it saves
 _SCAN_UP_TO = 64  # a longer shortlist is sorted whole
-_BLOCK = 256  # values that are looked at in one vectorised sweep
+_SCAN_BLOCK = 256  # values that are looked at in one vectorised sweep
 
 
-@dataclass(frozen=True)
-class SecondSeason:
-    """What another drive of the mapped route tells of it; `deepsimbad.core.same_route` says whether one is.
-
-    Attributes:
-        dissimilarities: [m, r] of its frames to the landmarks.
-        places: [k, 2] int64, (map image, its frame) where both saw the same place; some.
-    """
-
-    dissimilarities: NDArray[np.float32]
-    places: NDArray[np.int64]
-
-
-def build_retrieval_map(
-    relevance: Relevance,
-    dissimilarities: NDArray[np.float32],
-    list_length: int,
-    encodings: NDArray[np.float32] | None = None,
-    second_season: SecondSeason | None = None,
-) -> RetrievalMap:
-    """Describe every map image by the h landmarks its relevance keeps.
+def relevances(map_: Map, query: Query, live: LandmarkStatistics | None = None) -> NDArray[np.float32]:
+    """Relevance of every map image.
 
     Args:
-        relevance: What the map is built for.
-        dissimilarities: [n, r] of the training traverse's frames to the landmarks, smaller is nearer.
-        list_length: h.
-        encodings: [n, d] of the same frames; kept for `brute_force` alone.
-        second_season: Read by `calibrated` alone.
+        map_: The map.
+        query: The described view, or a batch of views.
+        live: A session's own statistics, in place of the map's; of a batch [e, r].
+
+    Returns:
+        [n] float32, larger is better; of a batch [e, n].
 
     Raises:
-        InvalidMapConfigError: No image, or h not within 1..r.
+        InvalidInputError: The query lacks what the map's relevance compares.
     """
-    if dissimilarities.ndim != 2 or dissimilarities.shape[0] == 0:
-        raise InvalidMapConfigError("a map needs at least one image")
-    n_landmarks = dissimilarities.shape[1]
-    if not 1 <= list_length <= n_landmarks:
-        raise InvalidMapConfigError(
-            f"list_length {list_length} is not within 1 and the number of landmarks, {n_landmarks}",
-            list_length=list_length,
-            n_landmarks=n_landmarks,
-        )
-    ranks = rank_landmarks(dissimilarities)
-    if relevance in {Relevance.STANDARDISED, Relevance.CALIBRATED}:
-        return _standardised_map(relevance, ranks, list_length, second_season)
-    lists = nearest_landmarks(ranks, list_length)
-    values = None
-    if relevance is Relevance.SIMBAD:
-        listed = np.take_along_axis(dissimilarities, lists.T.astype(np.intp), axis=1)
-        values = np.ascontiguousarray(listed.T, np.float32)
-    kept = encodings if relevance is Relevance.BRUTE_FORCE else None
-    return RetrievalMap(relevance, InvertedIndex(lists, n_landmarks, values), encodings=kept)
+    return _RULES[map_.relevance](map_, query, live or map_.landmark_statistics)
 
 
-def _standardised_map(
-    relevance: Relevance, ranks: NDArray[np.float32], list_length: int, second: SecondSeason | None
-) -> RetrievalMap:
-    own = LandmarkStatistics.of_map(ranks)
-    scores = own.standardise(ranks)
-    own = replace(own, loadings=common_factors(scores))
-    if relevance is Relevance.STANDARDISED:
-        return RetrievalMap(relevance, InvertedIndex(nearest_landmarks(scores, list_length), ranks.shape[1]), own)
-    known = [own]
-    seasons = SeasonsOfRoute.learn(scores)
-    if second is not None:
-        other_ranks = rank_landmarks(second.dissimilarities)
-        other = LandmarkStatistics.of_map(other_ranks)
-        seasons = SeasonsOfRoute.learn(scores, other.standardise(other_ranks), second.places)
-        known.append(other)
-    lists = nearest_landmarks(seasons.scores, list_length)
-    index = InvertedIndex(lists, ranks.shape[1])
-    return RetrievalMap(relevance, index, live_prior(known), seasons.calibration(lists))
+def _standardised(map_: Map, query: Query, live: LandmarkStatistics | None) -> NDArray[np.float32]:
+    """Sum of -z over the list: a landmark counts by how unusually near it is."""
+    return _sum_listed_alike(map_, -_statistics(live).view(query.ranks).z)
+
+
+def _calibrated(map_: Map, query: Query, live: LandmarkStatistics | None) -> NDArray[np.float32]:
+    """Sum over the list of log-likelihood ratios: seen from here, against seen from anywhere (`core.calibration`)."""
+    seen, expected = _statistics(live).view(query.ranks), _expected_scores(map_)
+    known = seen.known[..., np.newaxis, :]
+    return sum_listed(map_, expected * seen.z[..., np.newaxis, :] - known * np.square(expected) / 2)
+
+
+def _rrf(map_: Map, query: Query, _: LandmarkStatistics | None) -> NDArray[np.float32]:
+    """Inner product of reciprocal rank features; the query keeps all r ranks, the map image h."""
+    reciprocal = 1.0 / np.arange(1, map_.list_length + 1)
+    return sum_listed(map_, reciprocal[:, np.newaxis] * (1.0 / query.ranks.astype(np.float64))[..., np.newaxis, :])
+
+
+def _bag_of_landmarks(map_: Map, query: Query, _: LandmarkStatistics | None) -> NDArray[np.float32]:
+    """How many landmarks the two lists of h share."""
+    return _sum_listed_alike(map_, query.ranks <= map_.list_length)
+
+
+def _simbad(map_: Map, query: Query, _: LandmarkStatistics | None) -> NDArray[np.float32]:
+    """-L2 between h-hot dissimilarity vectors, `|q - m|^2 = |q|^2 + sum over the list of (q_i - m_i)^2 - q_i^2`."""
+    if query.dissimilarities is None or map_.values is None:
+        raise InvalidInputError("a simbad map compares dissimilarities; ranks alone cannot answer it")
+    if query.ranks.ndim > 1:  # one after the other: [e, h, n] numbers would be too many
+        return np.stack([_simbad(map_, query.at(row), None) for row in range(len(query.ranks))])
+    h_hot = np.where(query.ranks <= map_.list_length, query.dissimilarities, 0.0).astype(np.float64)
+    listed = h_hot[map_.lists]  # [h, n]
+    squared = np.square(h_hot).sum() + (np.square(listed - map_.values) - np.square(listed)).sum(axis=0)
+    return np.asarray(-np.sqrt(np.maximum(squared, 0.0)), np.float32)
+
+
+def _brute_force(map_: Map, query: Query, _: LandmarkStatistics | None) -> NDArray[np.float32]:
+    """-L2 between encodings, by one matrix product."""
+    encodings = map_.encodings
+    if query.encoding is None or encodings is None:
+        raise InvalidInputError("a brute_force map compares encodings; send an image or an encoding")
+    queries = np.atleast_2d(query.encoding)
+    if queries.shape[1:] != encodings.shape[1:]:
+        raise InvalidInputError(f"an encoding of {queries.shape[1]} numbers; the map's have {encodings.shape[1]}")
+    squares = np.einsum("nd,nd->n", encodings, encodings)
+    query_squares = np.einsum("qd,qd->q", queries, queries)
+    squared = query_squares[:, np.newaxis] + squares - 2.0 * (queries @ encodings.T)
+    distances = -np.sqrt(np.maximum(squared, 0.0))
+    return np.asarray(distances if query.encoding.ndim > 1 else distances[0], np.float32)
+
+
+_RULES: dict[Relevance, Callable[[Map, Query, LandmarkStatistics | None], NDArray[np.float32]]] = {
+    Relevance.STANDARDISED: _standardised,
+    Relevance.CALIBRATED: _calibrated,
+    Relevance.RRF: _rrf,
+    Relevance.BAG_OF_LANDMARKS: _bag_of_landmarks,
+    Relevance.SIMBAD: _simbad,
+    Relevance.BRUTE_FORCE: _brute_force,
+}
+
+
+def _statistics(live: LandmarkStatistics | None) -> LandmarkStatistics:
+    if live is None:
+        raise InvalidMapConfigError("the map has no landmark statistics")
+    return live
+
+
+def _expected_scores(map_: Map) -> NDArray[np.float64]:
+    """[h, r] what a landmark that is listed at a rank will score in another season: rho * z_m."""
+    if map_.correlation is None or map_.listed_score is None:
+        raise InvalidMapConfigError("the map has no calibration")
+    return map_.correlation * map_.listed_score
+
+
+def _sum_listed_alike(map_: Map, worth: NDArray[np.generic]) -> NDArray[np.float32]:
+    """`sum_listed` of landmarks that are worth the same at every rank, [..., r]."""
+    tables = np.empty((*worth.shape[:-1], map_.list_length, worth.shape[-1]), np.float32)
+    tables[...] = worth[..., np.newaxis, :]
+    return sum_listed(map_, tables)
+
+
+def sum_listed(map_: Map, tables: NDArray[np.number]) -> NDArray[np.float32]:
+    """Sum over every map image's list what a view gives each landmark at each rank.
+
+    The durable form of the lists is posting lists by (landmark, rank) (`core.packing`). Since a view keeps all r ranks,
+    every posting takes part in every query, so memory holds the same postings sorted by map image.
+
+    Args:
+        map_: The map.
+        tables: [h, r], what landmark i is worth at rank j + 1; of a batch of views [e, h, r].
+
+    Returns:
+        [n] float32, or [e, n].
+    """
+    h, r, n = map_.list_length, map_.n_landmarks, map_.n_images
+    if tables.shape[-2:] != (h, r):
+        raise InvalidMapConfigError(f"tables have shape {tables.shape}, not [h, r]")
+    worth = np.ascontiguousarray(tables, np.float32).reshape(-1, h, r)
+    sums = np.empty((len(worth), n), np.float32)
+    if len(worth) == 1 and n >= 2 * _IMAGES_WORTH_A_THREAD:
+        half = n // 2
+        other = _second_core().submit(_sum_listed, map_.lists[:, half:], worth, sums[:, half:])
+        _sum_listed(map_.lists[:, :half], worth, sums[:, :half])
+        other.result()
+    else:
+        _sum_listed(map_.lists, worth, sums)
+    return sums.reshape(*tables.shape[:-2], n)
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"})
+def _sum_listed(lists: NDArray[np.uint16], tables: NDArray[np.float32], sums: NDArray[np.float32]) -> None:
+    """`sums[e, m] = sum over j of tables[e, j, lists[j, m]]`, block by block."""
+    list_length, n_images = lists.shape
+    for view in range(len(tables)):
+        for start in range(0, n_images, _BLOCK):
+            stop = min(start + _BLOCK, n_images)
+            block = sums[view, start:stop]
+            table, row = tables[view, 0], lists[0, start:stop]
+            for m in range(block.size):
+                block[m] = table[row[m]]
+            for j in range(1, list_length):
+                table, row = tables[view, j], lists[j, start:stop]
+                for m in range(block.size):
+                    block[m] += table[row[m]]
+
+
+@cache
+def _second_core() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(max_workers=1, thread_name_prefix="index")
 
 
 def shortlist(values: NDArray[np.floating], length: int) -> NDArray[np.int64]:
     """The ids of the greatest values, best first, ties by id.
 
     Args:
-        values: [n] relevances or masses.
+        values: [n] relevances or masses; of a batch [e, n].
         length: How many, at least 1; at most n come back.
+
+    Returns:
+        [length], or [e, length].
     """
-    if length <= _SCAN_UP_TO:
-        return _scan(np.ascontiguousarray(values), min(length, values.size))
-    return np.argsort(-values, kind="stable")[:length].astype(np.int64)
+    if length > _SCAN_UP_TO:
+        return np.argsort(-values, axis=-1, kind="stable")[..., :length].astype(np.int64)
+    rows = np.ascontiguousarray(values).reshape(-1, values.shape[-1])
+    best = _scan(rows, min(length, rows.shape[1]))
+    return best if values.ndim > 1 else best[0]
 
 
 @njit(cache=True, nogil=True)
@@ -112,31 +193,24 @@ def _count_above(block: NDArray[np.floating], threshold: float) -> int:
 
 
 @njit(cache=True, nogil=True)
-def _scan(values: NDArray[np.floating], length: int) -> NDArray[np.int64]:
-    """One pass that keeps the best so far in order; a block with nothing better is passed over whole."""
-    best = np.empty(length, np.int64)
-    n_kept = 0
-    for start in range(0, values.size, _BLOCK):
-        block = values[start : start + _BLOCK]
-        if n_kept == length and _count_above(block, values[best[length - 1]]) == 0:
-            continue
-        for candidate in range(start, start + block.size):
-            value = values[candidate]
-            if n_kept == length and not value > values[best[length - 1]]:
+def _scan(rows: NDArray[np.floating], length: int) -> NDArray[np.int64]:
+    """One pass over every row that keeps the best so far in order; a block with nothing better is passed over whole."""
+    bests = np.empty((len(rows), length), np.int64)
+    for view in range(len(rows)):
+        values, best = rows[view], bests[view]
+        n_kept = 0
+        for start in range(0, values.size, _SCAN_BLOCK):
+            block = values[start : start + _SCAN_BLOCK]
+            if n_kept == length and _count_above(block, values[best[length - 1]]) == 0:
                 continue
-            place = min(n_kept, length - 1)
-            while place > 0 and value > values[best[place - 1]]:
-                best[place] = best[place - 1]
-                place -= 1
-            best[place] = candidate
-            n_kept = min(n_kept + 1, length)
-    return best
-
-
-@njit(cache=True, nogil=True)
-def shortlists(values: NDArray[np.floating], length: int) -> NDArray[np.int64]:
-    """`shortlist` of many views, [e, n] to [e, length]; at most n of each."""
-    best = np.empty((len(values), min(length, values.shape[1])), np.int64)
-    for row in range(len(values)):
-        best[row] = _scan(values[row], best.shape[1])
-    return best
+            for candidate in range(start, start + block.size):
+                value = values[candidate]
+                if n_kept == length and not value > values[best[length - 1]]:
+                    continue
+                place = min(n_kept, length - 1)
+                while place > 0 and value > values[best[place - 1]]:
+                    best[place] = best[place - 1]
+                    place -= 1
+                best[place] = candidate
+                n_kept = min(n_kept + 1, length)
+    return bests

@@ -21,7 +21,10 @@ from numpy.typing import NDArray
 from deepsimbad.core.descriptor import n_ranked, normal_scores
 
 PRIOR_WEIGHT_FRAMES = 50.0  # how many live frames the map's statistics are worth at the start of a session
+# A live season differs from those that a calibrated map knows: its own views soon say more than their statistics do.
+CALIBRATED_PRIOR_WEIGHT_FRAMES = 20.0
 _LEAST_STD = 1e-6
+_ALL_KNOWN = np.ones(1)
 _MAX_FACTORS = 64
 _MAX_FACTOR_FRAMES = 1024  # neighbouring frames of a drive say the same
 _LEAST_FACTOR_FRAMES = 30
@@ -37,7 +40,7 @@ class ViewScores:
 
     Attributes:
         z: [r] float64, standardised scores, lowest is nearest; expected ones where a landmark was not sent.
-        known: [r] float64, how much of each is known: 1 less its variance, so 1 where it was sent.
+        known: [r] float64, how much of each is known: 1 less its variance, so 1 where it was sent; [1] where all were.
     """
 
     z: NDArray[np.float64]
@@ -89,7 +92,7 @@ class LandmarkStatistics:
         return np.where(std > _LEAST_STD, std, 1.0)
 
     def observing(self, ranks: NDArray[np.float32]) -> Self:
-        """The statistics after one more frame, [r] ranks; that frame counts in its own standardisation.
+        """The statistics after one more frame, [r] ranks, or one more of every drive, [e, r]; it counts in its own z.
 
         Of landmarks that were not sent the expected moments count.
         """
@@ -122,20 +125,22 @@ class LandmarkStatistics:
         """What a view says of every landmark, of those too that a robot did not send.
 
         Args:
-            ranks: [r], as `core.descriptor` gives them of dissimilarities or of ranked landmarks.
+            ranks: [r], as `core.descriptor` gives them of dissimilarities or of ranked landmarks; of a batch [e, r],
+                all of them sent.
         """
-        n_landmarks, n_sent = ranks.size, n_ranked(ranks)
+        n_landmarks = ranks.shape[-1]
+        n_sent = n_landmarks if ranks.ndim > 1 else n_ranked(ranks)
+        if n_sent == n_landmarks:
+            return ViewScores(self.standardise(ranks), _ALL_KNOWN)
         if n_sent == 0:
             return ViewScores(np.zeros(n_landmarks), np.zeros(n_landmarks))
-        z = self.standardise(ranks)
-        known = np.ones(n_landmarks)
-        if n_sent < n_landmarks:
-            sent = ranks <= n_sent
-            between = np.full(1, n_sent + 0.5, np.float32)  # the last that was sent and the first that was not
-            loadings = np.zeros((n_landmarks, 0), np.float32) if self.loadings is None else self.loadings
-            least = ((normal_scores(between, n_landmarks) - self.mean) / self.std)[~sent]
-            z[~sent], variance = _expected_beyond(least, loadings[~sent], z[sent], loadings[sent])
-            known[~sent] = 1.0 - np.minimum(variance, 1.0)
+        z, known = self.standardise(ranks), np.ones(n_landmarks)
+        sent = ranks <= n_sent
+        between = np.full(1, n_sent + 0.5, np.float32)  # the last that was sent and the first that was not
+        loadings = np.zeros((n_landmarks, 0), np.float32) if self.loadings is None else self.loadings
+        least = ((normal_scores(between, n_landmarks) - self.mean) / self.std)[~sent]
+        z[~sent], variance = _expected_beyond(least, loadings[~sent], z[sent], loadings[sent])
+        known[~sent] = 1.0 - np.minimum(variance, 1.0)
         return ViewScores(z, known)
 
 

@@ -7,24 +7,17 @@ from time import perf_counter
 import numpy as np
 from numpy.typing import NDArray
 
+from deepsimbad.core.belief import GridFilter
 from deepsimbad.core.belief_summary import BeliefSummary, summarise
 from deepsimbad.core.descriptor import rank_landmarks, ranks_from_ranked_landmarks, unpack_ranked_landmarks
-from deepsimbad.core.grid_filter import GridFilter
+from deepsimbad.core.localizer import ActiveLocalizer, LocalizerConfig, LocalizerState
+from deepsimbad.core.map import Map
 from deepsimbad.core.off_route import OFF_ROUTE_AT_START
 from deepsimbad.core.planners import Plan
-from deepsimbad.core.relevance import Query, relevances
-from deepsimbad.core.retrieval import shortlist
-from deepsimbad.engine.active_localizer import ActiveLocalizer, LocalizerConfig, LocalizerState
+from deepsimbad.core.relevance import Query
+from deepsimbad.core.retrieval import relevances, shortlist
 from deepsimbad.engine.encoders import encode_images, ready_encodings
-from deepsimbad.engine.snapshot import MapSnapshot
-from deepsimbad.engine.views import (
-    Dissimilarities,
-    EncodedImage,
-    NothingSeen,
-    PackedRanks,
-    RankedLandmarks,
-    View,
-)
+from deepsimbad.engine.views import Dissimilarities, EncodedImage, NothingSeen, PackedRanks, RankedLandmarks, View
 from deepsimbad.errors import InvalidDissimilaritiesError, InvalidInputError, WeightsDifferError
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.image import is_blank
@@ -61,7 +54,7 @@ class Localization:
         timings_ms: Milliseconds by stage.
     """
 
-    snapshot: MapSnapshot
+    snapshot: Map
     retrieval: Retrieval
     shortlist: NDArray[np.int64]
     belief: BeliefSummary
@@ -69,7 +62,7 @@ class Localization:
     timings_ms: Mapping[str, float]
 
 
-def localize(snapshot: MapSnapshot, evaluator: Evaluator, view: View, n_shortlist: int | None = None) -> Localization:
+def localize(snapshot: Map, evaluator: Evaluator, view: View, n_shortlist: int | None = None) -> Localization:
     """Localize one view on its own.
 
     Args:
@@ -88,7 +81,7 @@ def localize(snapshot: MapSnapshot, evaluator: Evaluator, view: View, n_shortlis
     listed = perf_counter()
     belief = GridFilter.uniform(snapshot.route).updated(retrieval.relevance, snapshot.update_rule, step=0)
     # One view from a belief that expects nothing says nothing about being off the route.
-    off_route = None if snapshot.off_route is None else OFF_ROUTE_AT_START
+    off_route = None if snapshot.off_route_model is None else OFF_ROUTE_AT_START
     summary = summarise(snapshot.route, belief.mass, length, off_route)
     believed = perf_counter()
     plan = None
@@ -105,20 +98,20 @@ def localize(snapshot: MapSnapshot, evaluator: Evaluator, view: View, n_shortlis
     return Localization(snapshot, retrieval, best, summary, plan, timings_ms)
 
 
-def retrieve(snapshot: MapSnapshot, evaluator: Evaluator, view: View) -> Retrieval:
+def retrieve(snapshot: Map, evaluator: Evaluator, view: View) -> Retrieval:
     """The relevance of every map image to one view, by the map's statistics alone."""
     began = perf_counter()
     query = describe(snapshot, evaluator, view)
     described = perf_counter()
     relevance = np.zeros(snapshot.n_images, np.float32)
     if query.is_informative:
-        relevance = relevances(snapshot.retrieval, query)
+        relevance = relevances(snapshot, query)
     retrieved = perf_counter()
     timings_ms = {"describe": 1000 * (described - began), "retrieve": 1000 * (retrieved - described)}
     return Retrieval(query.ranks, relevance, timings_ms)
 
 
-def describe(snapshot: MapSnapshot, evaluator: Evaluator, view: View) -> Query:
+def describe(snapshot: Map, evaluator: Evaluator, view: View) -> Query:
     """Rank the landmarks for a view (II-A, II-C); one that shows nothing comes out as uninformative.
 
     Raises:
@@ -152,7 +145,7 @@ def describe(snapshot: MapSnapshot, evaluator: Evaluator, view: View) -> Query:
     return Query(rank_landmarks(dissimilarities), dissimilarities, encoding)
 
 
-def shortlist_length(snapshot: MapSnapshot, wanted: int | None) -> int:
+def shortlist_length(snapshot: Map, wanted: int | None) -> int:
     """How many map images a shortlist holds.
 
     Raises:

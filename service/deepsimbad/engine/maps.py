@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from weakref import WeakValueDictionary
 
-from deepsimbad.engine.snapshot import MapSnapshot
+from deepsimbad.core.map import Map
 from deepsimbad.errors import (
     DamagedMapError,
     DeepSimbadError,
@@ -24,7 +24,7 @@ from deepsimbad.errors import (
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.catalog_maps import removed
 from deepsimbad.store.faults import storage_faults
-from deepsimbad.store.map_file import index_bytes, read_map
+from deepsimbad.store.map_file import read_map
 from deepsimbad.store.records import DomainRecord, KeptMap, MapState
 from deepsimbad.store.sealing import verify
 from deepsimbad.store.sessions import SessionStore
@@ -40,7 +40,7 @@ class MappedDomain:
     """A domain and one of its maps, as of one moment."""
 
     record: DomainRecord
-    snapshot: MapSnapshot
+    snapshot: Map
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class Maps:
         self._damaged: dict[str, _Damage] = {}
         self._announced: dict[str, int] = {}
         # By domain, version and digest: a domain that was deleted and made anew has other maps.
-        self._held: WeakValueDictionary[tuple[str, int, str | None], MapSnapshot] = WeakValueDictionary()
+        self._held: WeakValueDictionary[tuple[str, int, str | None], Map] = WeakValueDictionary()
         self._loading = threading.RLock()
         self._n_beginning: Counter[tuple[str, int]] = Counter()
         self._counting = threading.Lock()
@@ -160,7 +160,7 @@ class Maps:
         self._active.pop(domain, None)
         self._checked_at.pop(domain, None)
 
-    def _current(self, record: DomainRecord) -> MapSnapshot:
+    def _current(self, record: DomainRecord) -> Map:
         domain, version = record.name, record.active_version
         if version is None:
             raise NoActiveMapError(
@@ -180,7 +180,7 @@ class Maps:
             log.error("damaged map", extra={"domain": domain, "map_version": version}, exc_info=error)
             raise
 
-    def _once(self, domain: str, version: int, digest: str | None) -> MapSnapshot:
+    def _once(self, domain: str, version: int, digest: str | None) -> Map:
         snapshot = self._held.get((domain, version, digest))
         if snapshot is None:
             snapshot = load_snapshot(self._catalog, domain, version)
@@ -200,7 +200,7 @@ class Maps:
     # Those that sessions are pinned to
 
     @contextmanager
-    def beginning(self, snapshot: MapSnapshot) -> Iterator[None]:
+    def beginning(self, snapshot: Map) -> Iterator[None]:
         """A session is about to begin on a version, which keeps its file until the session's own row says that it must.
 
         Entered before the catalog is asked in `digest`; who removes a version notes that in the catalog and asks here
@@ -222,7 +222,7 @@ class Maps:
         with self._counting:
             return (domain, version) in self._n_beginning
 
-    def digest(self, snapshot: MapSnapshot) -> str:
+    def digest(self, snapshot: Map) -> str:
         """The digest of a map that a session begins on, inside `beginning`; may read files.
 
         Raises:
@@ -251,7 +251,7 @@ class Maps:
                 raise retired(domain, version)
             return MappedDomain(record, self._once(domain, version, digest))
 
-    def snapshot(self, domain: str, version: int) -> MapSnapshot:
+    def snapshot(self, domain: str, version: int) -> Map:
         """A sealed map version that need not serve, as a session may be pinned to one; may read files.
 
         Raises:
@@ -352,7 +352,7 @@ def beyond_keeping(kept: Iterable[KeptMap], keep_maps: int) -> list[KeptMap]:
     return beyond
 
 
-def load_snapshot(catalog: Catalog, domain: str, version: int) -> MapSnapshot:
+def load_snapshot(catalog: Catalog, domain: str, version: int) -> Map:
     """Check a map file's digest and read it; domain and version are the catalog's, whatever the file calls them.
 
     Raises:
@@ -370,8 +370,9 @@ def load_snapshot(catalog: Catalog, domain: str, version: int) -> MapSnapshot:
             if record.sha256 is not None:
                 verify(path, record.sha256)
             # A map moved here from another server says in its file what it was called there.
-            contents = replace(read_map(path), domain=domain, version=version)
-            return MapSnapshot.from_contents(contents, index_bytes(path))
+            snapshot = replace(read_map(path), domain=domain, version=version)
+            _ = snapshot.relevance  # without one it can answer nothing
+            return snapshot
     except UnavailableError as error:
         if isinstance(error, DamagedMapError):
             raise unreadable(catalog, domain, version) from error

@@ -14,16 +14,15 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from deepsimbad.core.belief import FilterKind
 from deepsimbad.core.belief_summary import BeliefSummary, summarise
-from deepsimbad.core.filters import FilterKind
+from deepsimbad.core.localizer import ActiveLocalizer, LocalizerConfig, LocalizerState, Step
+from deepsimbad.core.map import Map
 from deepsimbad.core.planners import Plan
-from deepsimbad.core.relevance import Query
+from deepsimbad.core.relevance import Query, UpdateRule
 from deepsimbad.core.retrieval import shortlist
 from deepsimbad.core.route import Route
-from deepsimbad.core.update_rules import UpdateRule
-from deepsimbad.engine.active_localizer import ActiveLocalizer, LocalizerConfig, LocalizerState, Step
 from deepsimbad.engine.localizer import shortlist_length
-from deepsimbad.engine.snapshot import MapSnapshot
 from deepsimbad.engine.views import View
 from deepsimbad.engine.worker import InferenceWorker, Priority
 from deepsimbad.errors import (
@@ -34,13 +33,7 @@ from deepsimbad.errors import (
     UnknownSessionError,
 )
 from deepsimbad.evaluators.base import Evaluator
-from deepsimbad.store.session_records import (
-    IdempotencyKey,
-    JournalRow,
-    PriorRow,
-    SessionRecord,
-    StateSnapshot,
-)
+from deepsimbad.store.session_records import IdempotencyKey, JournalRow, PriorRow, SessionRecord, StateSnapshot
 from deepsimbad.store.sessions import SessionStore
 
 DEFAULT_START_STD_M = 5.0
@@ -110,17 +103,17 @@ class SessionEngine:
     """What moves one session on: its configuration, its map, the domain's evaluator and the algorithm."""
 
     config: SessionConfig
-    snapshot: MapSnapshot
+    snapshot: Map
     evaluator: Evaluator
     localizer: ActiveLocalizer
 
     @classmethod
-    def of(cls, config: SessionConfig, snapshot: MapSnapshot, evaluator: Evaluator) -> Self:
+    def of(cls, config: SessionConfig, snapshot: Map, evaluator: Evaluator) -> Self:
         """The engine of a session; raises InvalidInputError where the configuration cannot be."""
         algorithm = LocalizerConfig(
             filter=config.belief, update=config.update, planner=config.planner, seed=config.seed
         )
-        return cls(config, snapshot, evaluator, ActiveLocalizer(snapshot, algorithm))
+        return cls(config, snapshot, evaluator, ActiveLocalizer(snapshot, algorithm, perf_counter))
 
 
 @dataclass(frozen=True)
@@ -282,7 +275,7 @@ class SessionView:
 
     session_id: str
     expires_at: float
-    snapshot: MapSnapshot
+    snapshot: Map
     n_observations: int
     belief: BeliefSummary
     plan: Plan | None
@@ -332,7 +325,7 @@ def check_prior(route: Route, position_m: float | None, std_m: float) -> None:
         )
 
 
-def check_move(snapshot: MapSnapshot, action_m: float, action_std_m: float | None) -> None:
+def check_move(snapshot: Map, action_m: float, action_std_m: float | None) -> None:
     """Refuse a move that no robot of the domain makes.
 
     Raises:

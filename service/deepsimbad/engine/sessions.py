@@ -349,7 +349,7 @@ class Sessions:
         snapshot.check_landmark_model(observation.landmark_models)
         query = describe(snapshot, state.engine.evaluator, view)
         watch.lap("describe")
-        relevance = snapshot.retrieval.relevance
+        relevance = snapshot.relevance
         row = ObservedRow(  # what the map's relevance compares, and no more
             sequence=state.sequence + 1,
             expires_at=expires_at,

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from deepsimbad.core.localizer import LocalizerState
 from deepsimbad.core.metrics import rank_of_truth
 from deepsimbad.core.route import Route
-from deepsimbad.engine.active_localizer import LocalizerState
 from deepsimbad.engine.session import SessionEngine, SessionState, replayed_until
 from deepsimbad.engine.sessions import Sessions
 from deepsimbad.engine.worker import InferenceWorker

@@ -20,12 +20,7 @@ from typing import Any, NoReturn
 import cv2
 import numpy as np
 
-from deepsimbad.errors import (
-    EmptyBodyError,
-    ImageTooLargeError,
-    InvalidImageError,
-    TruncatedImageError,
-)
+from deepsimbad.errors import EmptyBodyError, ImageTooLargeError, InvalidImageError, TruncatedImageError
 from deepsimbad.evaluators.base import Image, named_lack_of_memory
 
 KEPT_PIXELS = 3840 * 2160
@@ -48,9 +43,9 @@ _PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # by colour type
 _PNG_UNPACKED = 1 << 18  # bytes of picture data: what is packed in less keeps a decoder for a quarter of a second
 _TIFF_FIELD_BYTES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4}
 _TIFF_FORMATS = {1: "B", 3: "H", 4: "I", 13: "I"}  # the integer field types: BYTE, SHORT, LONG, IFD
-_TIFF_WIDTH, _TIFF_HEIGHT, _TIFF_SAMPLES, _TIFF_TILE_WIDTH, _TIFF_TILE_HEIGHT = 256, 257, 277, 322, 323
+_TIFF_SIZES = (256, 257, 322, 323, 277)  # width and height, those of tiles, samples of a pixel
 _TIFF_PARTS = ((273, 279), (324, 325))  # offsets and byte counts of strips, of tiles
-_TIFF_TAGS = {_TIFF_WIDTH, _TIFF_HEIGHT, _TIFF_SAMPLES, _TIFF_TILE_WIDTH, _TIFF_TILE_HEIGHT, 273, 279, 324, 325}
+_TIFF_TAGS = {*_TIFF_SIZES, *_TIFF_PARTS[0], *_TIFF_PARTS[1]}
 _TIFF_MAX_SAMPLES = 5  # CMYK and alpha
 
 
@@ -59,36 +54,30 @@ class ImageFile:
     """A file that is whole and claims no more pixels than it may.
 
     Attributes:
-        media_type: What its first bytes speak of, whatever the sender called it.
         picture: The file, without what a decoder need not see.
         n_pixels: Of the largest surface that its header makes a decoder allocate.
     """
 
-    media_type: str
     picture: bytes
     n_pixels: int
 
     @classmethod
     def read(cls, body: bytes, max_pixels: int) -> "ImageFile":
-        """Look at a file from one end to the other.
-
-        Args:
-            body: Its bytes.
-            max_pixels: Greatest width x height accepted.
+        """Look at a file from one end to the other; what it is stands in its first bytes, whatever it was called.
 
         Raises:
             EmptyBodyError: No bytes.
-            ImageTooLargeError: The header claims more pixels.
+            ImageTooLargeError: The header claims more pixels than `max_pixels`.
             TruncatedImageError: The end of the file is missing.
             InvalidImageError: Not one of `MEDIA_TYPES`, or it contradicts itself.
             OutOfMemoryError: There is too little memory for it.
         """
         if not body:
             raise EmptyBodyError("the body is empty: send the image's bytes")
-        for media_type, (signature, walk) in _FORMATS.items():
-            if signature.match(body):
+        for signature, walk in _FORMATS.values():
+            if re.match(signature, body, re.DOTALL):
                 with named_lack_of_memory("decode"):
-                    return cls(media_type, *walk(body, max_pixels))
+                    return cls(*walk(body, max_pixels))
         raise InvalidImageError("this is not a JPEG, PNG, TIFF or WebP image", allowed=list(MEDIA_TYPES))
 
     def decode(self) -> Image:
@@ -101,17 +90,12 @@ class ImageFile:
         try:
             with named_lack_of_memory("decode"):
                 image = cv2.imdecode(np.frombuffer(self.picture, np.uint8), cv2.IMREAD_COLOR_BGR)
-                if image is None:  # all that a codec says of damage, and of too little memory
-                    np.empty(_DECODER_BYTES * self.n_pixels, np.uint8)
-                    self._refuse("cannot be decoded")
-                if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 or image.size == 0:
-                    self._refuse(f"decodes to {list(image.shape)} {image.dtype}, not to 8-bit colour")
-                return _reduced(np.ascontiguousarray(image, np.uint8))
+                if image is not None and image.dtype == np.uint8 and image.size and image.shape[2:] == (3,):
+                    return _reduced(np.ascontiguousarray(image, np.uint8))
+                np.empty(_DECODER_BYTES * self.n_pixels, np.uint8)  # codecs say of too little memory what of damage
         except cv2.error as error:
-            raise InvalidImageError(f"the {self.media_type} image cannot be decoded") from error
-
-    def _refuse(self, why: str) -> NoReturn:
-        raise InvalidImageError(f"the {self.media_type} image {why}")
+            raise InvalidImageError("the image cannot be decoded") from error
+        raise InvalidImageError("the image cannot be decoded")
 
 
 def decode_image(body: bytes, max_pixels: int) -> Image:
@@ -137,7 +121,7 @@ def _reduced(image: Image) -> Image:
 
 def _n_pixels(width: int, height: int, max_pixels: int) -> int:
     if width < 1 or height < 1:
-        raise InvalidImageError(f"the image's header claims {width} x {height} pixels")
+        _damaged(f"it claims {width} x {height} pixels")
     if width * height > max_pixels:
         raise ImageTooLargeError(
             f"the image claims {width} x {height} pixels, at most {max_pixels} are accepted",
@@ -156,8 +140,8 @@ def _truncated() -> NoReturn:
     raise TruncatedImageError("the image file ends too early: its end is missing")
 
 
-def _too_many_parts() -> NoReturn:
-    raise InvalidImageError(f"the image file has more than {_MAX_PARTS} parts")
+def _damaged(why: str) -> NoReturn:
+    raise InvalidImageError(f"the image file is damaged: {why}")
 
 
 def _jpeg(body: bytes, max_pixels: int) -> tuple[bytes, int]:
@@ -165,7 +149,7 @@ def _jpeg(body: bytes, max_pixels: int) -> tuple[bytes, int]:
     at, n_frames, n_scans, n_pixels = 2, 0, 0, 0
     for _ in range(_MAX_PARTS):
         if n_scans == 0 and at < len(body) and body[at] != 0xFF:
-            raise InvalidImageError("the JPEG file is damaged: no marker where one must be")
+            _damaged("no marker where one must be")
         marked = _JPEG_MARKER.search(body, at)
         if marked is None:
             _truncated()
@@ -176,19 +160,19 @@ def _jpeg(body: bytes, max_pixels: int) -> tuple[bytes, int]:
             continue
         (length,) = _unpack(">H", body, at)
         if length < 2:
-            raise InvalidImageError("the JPEG file is damaged: a segment shorter than its own length")
+            _damaged("a segment shorter than its own length")
         if marker in _JPEG_FRAMES:
             n_frames += 1
             _, height, width = _unpack(">BHH", body, at + 2)
             n_pixels = _n_pixels(width, height, max_pixels)
         n_scans += marker == _JPEG_SCAN
         if n_frames > 1 or n_scans > _JPEG_MAX_SCANS or n_scans * n_pixels > _JPEG_MAX_SCANNED:
-            raise InvalidImageError(f"the JPEG file has {n_frames} frames and {n_scans} scans")
+            _damaged(f"it has {n_frames} frames and {n_scans} scans")
         at += length
     else:
-        _too_many_parts()
+        _damaged(f"it has more than {_MAX_PARTS} parts")
     if n_frames == 0 or n_scans == 0:
-        raise InvalidImageError("the JPEG file has no picture in it")
+        _damaged("it has no picture")
     return body, n_pixels
 
 
@@ -200,7 +184,7 @@ def _png(body: bytes, max_pixels: int) -> tuple[bytes, int]:
     """
     length, name, width, height, bits, colour = _unpack(">I4sIIBB", body, len(_PNG_SIGNATURE))
     if name != b"IHDR" or length != 13:
-        raise InvalidImageError("the PNG file does not begin with its header")
+        _damaged("it does not begin with its header")
     n_pixels = _n_pixels(width, height, max_pixels)
     view, at = memoryview(body), len(_PNG_SIGNATURE)
     packed, picture = [], [view[:at]]
@@ -209,7 +193,7 @@ def _png(body: bytes, max_pixels: int) -> tuple[bytes, int]:
         name, end = body[at + 4 : at + 8], at + 12 + length
         (checksum,) = _unpack(">I", body, end - 4)
         if zlib.crc32(view[at + 4 : end - 4]) != checksum:
-            raise InvalidImageError("the PNG file is damaged: a checksum does not fit")
+            _damaged("a checksum does not fit")
         if name in _PNG_PICTURE:
             picture.append(view[at:end])
         if name == b"IDAT":
@@ -218,7 +202,7 @@ def _png(body: bytes, max_pixels: int) -> tuple[bytes, int]:
         if name == b"IEND":
             break
     else:
-        _too_many_parts()
+        _damaged(f"it has more than {_MAX_PARTS} parts")
     # Twice, for interlacing adds a little.
     _check_unpacks(packed, 2 * height * (1 + width * bits * _PNG_CHANNELS.get(colour, 4) // 8) + (1 << 16))
     return b"".join(picture), n_pixels
@@ -236,9 +220,9 @@ def _check_unpacks(packed: list[memoryview], most: int) -> None:
                 n_bytes += len(unpacker.decompress(rest, 1 << 20))
                 rest = unpacker.unconsumed_tail
                 if n_bytes > most:
-                    raise InvalidImageError("the PNG file unpacks to more than the pixels that its header claims")
+                    _damaged("it unpacks to more than the pixels that its header claims")
     except zlib.error as error:
-        raise InvalidImageError("the PNG file is damaged: its picture cannot be unpacked") from error
+        raise InvalidImageError("the image file is damaged: its picture cannot be unpacked") from error
 
 
 def _tiff(body: bytes, max_pixels: int) -> tuple[bytes, int]:
@@ -254,24 +238,18 @@ def _tiff(body: bytes, max_pixels: int) -> tuple[bytes, int]:
             _truncated()
         if tag in _TIFF_TAGS and tag not in fields and kind in _TIFF_FORMATS:
             if count > _MAX_PARTS:
-                _too_many_parts()
+                _damaged(f"it has more than {_MAX_PARTS} parts")
             fields[tag] = _unpack(f"{order}{count}{_TIFF_FORMATS[kind]}", body, offset if size > 4 else entry + 8)
-    width, height, tile_width, tile_height, samples = (
-        max(fields.get(tag, ()), default=0)
-        for tag in (_TIFF_WIDTH, _TIFF_HEIGHT, _TIFF_TILE_WIDTH, _TIFF_TILE_HEIGHT, _TIFF_SAMPLES)
-    )
+    width, height, tile_width, tile_height, samples = (max(fields.get(tag, ()), default=0) for tag in _TIFF_SIZES)
     if samples > _TIFF_MAX_SAMPLES:
-        raise InvalidImageError(f"the TIFF header claims {samples} channels")
+        _damaged(f"it claims {samples} channels")
     if width * height > 0 and tile_width * tile_height > width * height:
         width, height = tile_width, tile_height
     n_pixels = _n_pixels(width, height, max_pixels)
-    ends = [
-        offset + count
-        for offsets, counts in _TIFF_PARTS
-        for offset, count in zip(fields.get(offsets, ()), fields.get(counts, ()), strict=False)
-    ]
+    parts = (zip(fields.get(begin, ()), fields.get(length, ()), strict=False) for begin, length in _TIFF_PARTS)
+    ends = [begin + length for part in parts for begin, length in part]
     if not ends:
-        raise InvalidImageError("the TIFF file has no picture in it")
+        _damaged("it has no picture")
     if max(ends) > len(body):
         _truncated()
     return body, n_pixels
@@ -294,10 +272,10 @@ def _webp(body: bytes, max_pixels: int) -> tuple[bytes, int]:
     return body, n_pixels
 
 
-_FORMATS: Mapping[str, tuple[re.Pattern[bytes], Callable[[bytes, int], tuple[bytes, int]]]] = {
-    "image/jpeg": (re.compile(rb"\xff\xd8\xff"), _jpeg),
-    "image/png": (re.compile(re.escape(_PNG_SIGNATURE)), _png),
-    "image/tiff": (re.compile(rb"II\*\0|MM\0\*"), _tiff),
-    "image/webp": (re.compile(rb"RIFF....WEBP", re.DOTALL), _webp),
+_FORMATS: Mapping[str, tuple[bytes, Callable[[bytes, int], tuple[bytes, int]]]] = {
+    "image/jpeg": (rb"\xff\xd8\xff", _jpeg),
+    "image/png": (_PNG_SIGNATURE, _png),
+    "image/tiff": (rb"II\*\0|MM\0\*", _tiff),
+    "image/webp": (rb"RIFF....WEBP", _webp),
 }
 MEDIA_TYPES = tuple(_FORMATS)

@@ -8,13 +8,15 @@ from functools import cache
 from importlib import import_module
 from importlib.util import find_spec
 from types import MappingProxyType
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 from deepsimbad.errors import InvalidInputError, InvalidWeightsError, MissingPackageError
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.compute import Compute
-from deepsimbad.evaluators.extractors.base import Extractor
 from deepsimbad.evaluators.runtimes import INSTALL_TORCH, has_torch
+
+if TYPE_CHECKING:
+    from deepsimbad.evaluators.extractors.base import Extractor
 
 
 class EvaluatorKind(StrEnum):
@@ -35,55 +37,38 @@ class ExtractorName(StrEnum):
     NONE = "none"
 
 
-@dataclass(frozen=True)
-class _Making:
-    """How an extractor is made.
-
-    Attributes:
-        target: "module:function" of `(argument, compute) -> Extractor`; None: there is none to make.
-        argument: What follows the name and a colon, as people are told it; None: nothing does.
-        pattern: Of that argument.
-    """
-
-    target: str | None
-    argument: str | None = None
-    pattern: str = ""
-
-
-_FILE = r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}"  # a name in the weights' folder, never a path: admins may be elsewhere
-_HUB = r"[A-Za-z0-9][A-Za-z0-9_.-]*/[A-Za-z0-9_.-]+:[A-Za-z_][A-Za-z0-9_]*"
-_PACKAGE = "deepsimbad.evaluators.extractors"
-_EXTRACTORS: Mapping[ExtractorName, _Making] = {
-    ExtractorName.EFFICIENTNET_LITE0: _Making(f"{_PACKAGE}.efficientnet_lite0:efficientnet_lite0"),
-    ExtractorName.GRADIENT_GRID: _Making(f"{_PACKAGE}.gradient_grid:gradient_grid"),
-    ExtractorName.SQUEEZENET: _Making(f"{_PACKAGE}.squeezenet:squeezenet", "FILE", _FILE),
-    ExtractorName.NETVLAD: _Making(f"{_PACKAGE}.netvlad:netvlad", "FILE", _FILE),
-    ExtractorName.TORCHHUB: _Making(f"{_PACKAGE}.torchhub:torchhub", "OWNER/REPO:ENTRY", _HUB),
-    ExtractorName.ONNX: _Making(f"{_PACKAGE}.onnx_file:onnx_file", "FILE", _FILE),
-    ExtractorName.NONE: _Making(None),
+# What follows a name and a colon: as people are told it, and the pattern of it.
+_FILE = ("FILE", r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")  # in the weights' folder, never a path: admins may be elsewhere
+_ENTRY = ("OWNER/REPO:ENTRY", r"[A-Za-z0-9][A-Za-z0-9_.-]*/[A-Za-z0-9_.-]+:[A-Za-z_][A-Za-z0-9_]*")
+_ARGUMENTS: Mapping[ExtractorName, tuple[str, str]] = {
+    ExtractorName.SQUEEZENET: _FILE,
+    ExtractorName.NETVLAD: _FILE,
+    ExtractorName.TORCHHUB: _ENTRY,
+    ExtractorName.ONNX: _FILE,
 }
-EXTRACTOR_PATTERN = "^(" + "|".join(
-    name.value + (f":{making.pattern}" if making.argument else "") for name, making in _EXTRACTORS.items()
-) + ")$"  # fmt: skip
-EXTRACTOR_FORMS = tuple(
-    name.value + (f":{making.argument}" if making.argument else "") for name, making in _EXTRACTORS.items()
+EXTRACTOR_FORMS, _PATTERNS = (
+    tuple(name.value + (f":{_ARGUMENTS[name][part]}" if name in _ARGUMENTS else "") for name in ExtractorName)
+    for part in (0, 1)
 )
-
-_EVALUATORS: Mapping[EvaluatorKind, str] = {
-    EvaluatorKind.FEATURE_L2: "deepsimbad.evaluators.feature_l2:FeatureL2",
+EXTRACTOR_PATTERN = f"^({'|'.join(_PATTERNS)})$"
+# "module:maker" of `(argument, compute) -> Extractor`, and of `(**options, compute) -> Evaluator`.
+_PACKAGE = "deepsimbad.evaluators.extractors"
+_EXTRACTORS: Mapping[ExtractorName, str] = {
+    ExtractorName.EFFICIENTNET_LITE0: f"{_PACKAGE}.efficientnet_lite0:efficientnet_lite0",
+    ExtractorName.GRADIENT_GRID: f"{_PACKAGE}.gradient_grid:gradient_grid",
+    ExtractorName.SQUEEZENET: f"{_PACKAGE}.squeezenet:squeezenet",
+    ExtractorName.NETVLAD: f"{_PACKAGE}.netvlad:netvlad",
+    ExtractorName.TORCHHUB: f"{_PACKAGE}.torchhub:torchhub",
+    ExtractorName.ONNX: f"{_PACKAGE}.onnx_file:onnx_file",
 }
+_EVALUATORS: Mapping[EvaluatorKind, str] = {EvaluatorKind.FEATURE_L2: "deepsimbad.evaluators.feature_l2:FeatureL2"}
 # Per kind: its options. Unknown options are errors: a typing mistake is never silent.
 _OPTIONS: Mapping[EvaluatorKind, tuple[str, ...]] = {EvaluatorKind.FEATURE_L2: ("extractor",)}
 
 
 @dataclass(frozen=True)
 class EvaluatorConfig:
-    """A checked evaluator configuration, stored with the domain and every map.
-
-    Attributes:
-        kind: Which evaluator.
-        options: Its options, complete: defaults are filled in.
-    """
+    """A checked evaluator configuration, its options complete, stored with the domain and every map."""
 
     kind: EvaluatorKind
     options: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
@@ -119,23 +104,14 @@ def evaluator_config(raw: Mapping[str, Any]) -> EvaluatorConfig:
     Raises:
         InvalidInputError: Unknown kind, unknown option or unknown value; the hints hold what is allowed.
     """
-    allowed_kinds = [k.value for k in EvaluatorKind]
-    named = raw.get("kind")
-    if not isinstance(named, str) or named not in allowed_kinds:
-        raise InvalidInputError(
-            f"the evaluator's kind must be one of {', '.join(allowed_kinds)}",
-            field="kind",
-            allowed=allowed_kinds,
-        )
-    kind = EvaluatorKind(named)
-    known = _OPTIONS[kind]
-    unknown = sorted(str(key) for key in raw if key != "kind" and key not in known)
+    kinds = [kind.value for kind in EvaluatorKind]
+    if raw.get("kind") not in kinds:
+        raise InvalidInputError(f"the evaluator's kind must be one of {', '.join(kinds)}", field="kind", allowed=kinds)
+    kind = EvaluatorKind(raw["kind"])
+    allowed = ["kind", *_OPTIONS[kind]]
+    unknown = sorted(str(key) for key in raw if key not in allowed)
     if unknown:
-        raise InvalidInputError(
-            f"{kind.value} has no option {', '.join(unknown)}",
-            unknown=unknown,
-            allowed=["kind", *sorted(known)],
-        )
+        raise InvalidInputError(f"{kind.value} has no option {', '.join(unknown)}", unknown=unknown, allowed=allowed)
     extractor = raw.get("extractor", default_extractor().value)
     if not isinstance(extractor, str) or re.fullmatch(EXTRACTOR_PATTERN, extractor) is None:
         raise InvalidInputError(
@@ -150,33 +126,27 @@ def make_evaluator(config: EvaluatorConfig, compute: Compute | None = None) -> E
     """Build the evaluator a configuration names; its extractor is loaded at first need, or by `Evaluator.load`.
 
     Args:
-        config: Which.
+        config: As `evaluator_config` gives it.
         compute: How its network, if it has one, is computed; None: by the defaults.
-
-    Raises:
-        InvalidInputError: The options do not fit (only for configurations not made by `evaluator_config`).
     """
-    checked = evaluator_config({"kind": config.kind, **config.options})
-    return cast("Evaluator", _load(_EVALUATORS[checked.kind])(**checked.options, compute=compute))
+    return cast("Evaluator", _load(_EVALUATORS[config.kind])(**config.options, compute=compute))
 
 
-def make_extractor(text: str, compute: Compute) -> Extractor:
-    """Load the extractor that a configuration's `extractor` names; `none` is not one.
+def make_extractor(text: str, compute: Compute) -> "Extractor":
+    """Load the extractor that a configuration's `extractor` names, which is not `none`.
 
     Raises:
         MissingPackageError, MissingWeightsError, InvalidWeightsError: It cannot be loaded.
         OutOfMemoryError: There is too little memory for it.
     """
     name, _, argument = text.partition(":")
-    target = _EXTRACTORS[ExtractorName(name)].target
-    if target is None:
-        raise InvalidInputError(f"{name} is no extractor")
     try:
-        return cast("Extractor", _load(target)(argument, compute))
+        return cast("Extractor", _load(_EXTRACTORS[ExtractorName(name)])(argument, compute))
     except OSError as error:
         raise InvalidWeightsError(f"the weights of {text} cannot be read: {error}") from error
     except ImportError as error:
-        raise MissingPackageError(f"a package that {name} needs cannot be imported: {error}") from error
+        advice = f": {INSTALL_TORCH}" if error.name == "torch" else ""
+        raise MissingPackageError(f"a package that {name} needs cannot be imported: {error}{advice}") from error
 
 
 def _load(target: str) -> Callable[..., Any]:

@@ -2,20 +2,17 @@
 
 from contextlib import suppress
 from dataclasses import dataclass
-from itertools import pairwise
-from math import isfinite
 from pathlib import Path
 from typing import Any
 
-from deepsimbad.engine.snapshot import MapSnapshot
-from deepsimbad.errors import DamagedMapError, DeepSimbadError, InvalidArchiveError, InvalidInputError
+from deepsimbad.core.map import Map
+from deepsimbad.errors import DamagedMapError, DeepSimbadError, InvalidArchiveError
 from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.catalog_maps import ANY
 from deepsimbad.store.durable import sha256_of
 from deepsimbad.store.layout import is_name
-from deepsimbad.store.map_contents import MapContents
-from deepsimbad.store.map_file import index_bytes, read_map
+from deepsimbad.store.map_file import read_map
 from deepsimbad.store.records import MapRecord
 from deepsimbad.store.sealing import adopt
 
@@ -53,11 +50,11 @@ def import_map(
         DomainDiffersError: The domain exists with another evaluator, other actions or the other kind of route.
         UnavailableError: The disk is full, ...
     """
-    digest, contents, metrics = _read(file, sha256)
-    name = contents.domain if domain is None else domain
-    _, is_new = catalog.create_domain(name, contents.evaluator, contents.closed, contents.actions_m)
+    digest, map_, metrics = _read(file, sha256)
+    name = map_.domain if domain is None else domain
+    _, is_new = catalog.create_domain(name, dict(map_.evaluator), map_.closed, map_.actions_m.tolist())
     try:
-        record = _adopt(catalog, name, file, digest, contents, metrics)
+        record = _adopt(catalog, name, file, digest, map_, metrics)
     except BaseException:
         if is_new:
             with suppress(DeepSimbadError):  # the first error is the one to tell
@@ -68,12 +65,10 @@ def import_map(
     return ImportReport(name, record.version, activate, is_new, record.file_bytes or 0, digest)
 
 
-def _adopt(
-    catalog: Catalog, domain: str, file: Path, digest: str, contents: MapContents, metrics: dict[str, Any]
-) -> MapRecord:
-    config = {name: value for name, value in contents.config.items() if name != "appended"}
+def _adopt(catalog: Catalog, domain: str, file: Path, digest: str, map_: Map, metrics: dict[str, Any]) -> MapRecord:
+    config = {name: value for name, value in map_.config.items() if name != "appended"}
     config |= dict.fromkeys(_NAMES_THERE)
-    config["imported"] = {"domain": contents.domain, "version": contents.version, "sha256": digest}
+    config["imported"] = {"domain": map_.domain, "version": map_.version, "sha256": digest}
     version = catalog.begin_map(domain, config)
     try:
         n_bytes = adopt(file, catalog.map_path(domain, version), digest)
@@ -83,8 +78,8 @@ def _adopt(
         raise
 
 
-def _read(file: Path, sha256: str | None) -> tuple[str, MapContents, dict[str, Any]]:
-    """Digest, contents and metrics of a file that can serve here."""
+def _read(file: Path, sha256: str | None) -> tuple[str, Map, dict[str, Any]]:
+    """Digest, map_ and metrics of a file that can serve here."""
     try:
         digest = sha256_of(file)
     except OSError as error:
@@ -92,22 +87,13 @@ def _read(file: Path, sha256: str | None) -> tuple[str, MapContents, dict[str, A
     if sha256 is not None and digest != sha256.strip().lower().removeprefix("sha256:"):
         raise InvalidArchiveError(f"{file} is another file: its SHA-256 is {digest}", file=str(file), sha256=digest)
     try:
-        contents = read_map(file)
-        if not is_name(contents.domain):
+        map_ = read_map(file)
+        if not is_name(map_.domain):
             raise DamagedMapError(f"{file.name} is damaged: its domain has no name")
-        _check_actions(contents.actions_m)
-        make_evaluator(evaluator_config(contents.evaluator)).check_model(contents.landmark_model, contents.n_landmarks)
-        n_bytes = index_bytes(file)
-        snapshot = MapSnapshot.from_contents(contents, n_bytes)
+        map_.check()
+        make_evaluator(evaluator_config(map_.evaluator)).check_model(map_.landmark_model, map_.n_landmarks)
     except (DeepSimbadError, KeyError, TypeError, ValueError, OverflowError) as error:
         why = error.message if isinstance(error, DeepSimbadError) else "its parts contradict each other"
         raise InvalidArchiveError(f"{file} is no map that can serve here: {why}", file=str(file)) from error
-    measured = {"n_map_images": snapshot.n_images, "index_bits_per_map_image": snapshot.index_bits_per_map_image}
-    return digest, contents, {**contents.metrics, **measured}
-
-
-def _check_actions(actions_m: tuple[float, ...]) -> None:
-    """The file did not come through the door at which domains are made; raises InvalidInputError."""
-    ascends = all(shorter < longer for shorter, longer in pairwise((0.0, *actions_m)))
-    if not actions_m or not ascends or not isfinite(actions_m[-1]):
-        raise InvalidInputError(f"its actions_m {list(actions_m)} are no moves that ascend")
+    measured = {"n_map_images": map_.n_images, "index_bits_per_map_image": map_.index_bits_per_map_image}
+    return digest, map_, {**map_.metrics, **measured}

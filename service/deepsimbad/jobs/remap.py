@@ -1,42 +1,37 @@
-"""Remapping a domain: from stored traverses to a sealed, active map version (design section 5)."""
+"""Remapping a domain: from stored traverses to a sealed, active map version (design section 5).
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from functools import partial
+A remap makes a map of its own, or appends a drive to a copy of the active one: then no frame that is in the map is
+encoded or described again, and how landmarks are to be trusted, and how a robot off the route is known, stay as two
+seasons taught them.
+"""
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from functools import cache, partial
 from typing import Any
 
+import numpy as np
+
+from deepsimbad.core.building import append_drive
+from deepsimbad.core.drive import UNKNOWN_TIMESTAMP, Drive
+from deepsimbad.core.map import Map
 from deepsimbad.core.nnql import NnqlConfig
-from deepsimbad.core.relevance import Relevance
-from deepsimbad.engine.snapshot import MapSnapshot
-from deepsimbad.errors import LostActivationError
-from deepsimbad.evaluators.base import Evaluator, LandmarkModel
-from deepsimbad.jobs.append import append_frames
-from deepsimbad.jobs.build_map import Described, choose_landmarks, describe, map_contents
-from deepsimbad.jobs.check_map import CheckedMap, CheckFrames, check_map
-from deepsimbad.jobs.known_frames import frame_digests
-from deepsimbad.jobs.map_config import DEFAULT_N_LANDMARKS, RemapConfig
+from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Relevance
+from deepsimbad.errors import InvalidEncodingError, InvalidMapConfigError, LostActivationError, WeightsDifferError
+from deepsimbad.evaluators.base import Evaluator
+from deepsimbad.jobs.build import build, choose_landmarks, measured
+from deepsimbad.jobs.check import CheckFrames, check_map, traverses_in
 from deepsimbad.jobs.progress import Progress
-from deepsimbad.jobs.remap_inputs import RemapInputs, read_inputs
-from deepsimbad.jobs.remap_stages import RemapSize, remap_stages
+from deepsimbad.jobs.remap_config import DEFAULT_LIST_LENGTH, DEFAULT_N_LANDMARKS, RemapConfig
 from deepsimbad.jobs.seal_version import activate_once, seal_version
-from deepsimbad.jobs.stage_results import (
-    pack_described,
-    pack_experience,
-    pack_model,
-    unpack_described,
-    unpack_experience,
-    unpack_model,
-)
-from deepsimbad.jobs.stages import Stages
-from deepsimbad.jobs.train_nnql import DescribedDrive, Experience, train_nnql
+from deepsimbad.jobs.train import train_nnql
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.catalog_maps import ANY
-from deepsimbad.store.checkpoints import Checkpoints
-from deepsimbad.store.map_contents import MapContents, with_weights
-from deepsimbad.store.records import MapRecord
-
-# Of a remap whose size is not known beforehand.
-REMAP_STAGES = remap_stages(RemapConfig("drive", "another"), RemapSize(5_000, 5_000, 1_000))
+from deepsimbad.store.map_file import read_map
+from deepsimbad.store.records import DomainRecord, MapRecord
+from deepsimbad.store.traverses import Traverse
 
 
 def remap(
@@ -45,8 +40,8 @@ def remap(
     config: RemapConfig,
     evaluator: Evaluator,
     progress: Progress,
-    checkpoints: Checkpoints | None = None,
     n_threads: int = 1,
+    job_id: str | None = None,
 ) -> dict[str, Any]:
     """Build, seal and, if asked, activate the next map version of a domain.
 
@@ -61,9 +56,8 @@ def remap(
         config: What is asked for.
         evaluator: The domain's.
         progress: Reports the stages of REMAP_STAGES; may cancel.
-        checkpoints: Of the job that this is; a job that was interrupted goes on behind its last finished stage, and one
-            that has sealed its version makes no other. None: it is no job.
         n_threads: Threads to compute in.
+        job_id: The job that this is: one that was interrupted after it sealed its version makes no other. None: none.
 
     Returns:
         `{"map_version", "active", "metrics"}`, as the job's result.
@@ -71,9 +65,9 @@ def remap(
     Raises:
         DeepSimbadError: Whatever is wrong with the traverses, the parameters or the storage, by name.
     """
-    sealed = None if checkpoints is None else catalog.map_of_job(domain, checkpoints.job_id)
+    sealed = None if job_id is None else catalog.map_of_job(domain, job_id)
     if sealed is None:
-        sealed = _built(catalog, domain, config, evaluator, progress, checkpoints, n_threads)
+        sealed = _Remap(catalog, domain, config, evaluator, progress, n_threads).sealed(job_id)
     progress.stage("activate")
     check = sealed.metrics["check"]
     active = config.activate and check["passed"] is not False
@@ -87,35 +81,26 @@ def remap(
     return {"map_version": sealed.version, "active": active, "metrics": {**sealed.metrics, "check": check}}
 
 
-def _built(
-    catalog: Catalog,
-    domain: str,
-    config: RemapConfig,
-    evaluator: Evaluator,
-    progress: Progress,
-    checkpoints: Checkpoints | None,
-    n_threads: int,
-) -> MapRecord:
-    """The next version, sealed. What is decided of it later must stand in its metrics: a resumed job reads no more."""
-    stages = Stages(progress, checkpoints)
-    inputs = stages.run("read frames", partial(read_inputs, catalog, domain, config))
-    if checkpoints is not None:
-        stages.inputs = inputs.digest()
-    if inputs.kept is not None and config.append:
-        made = _appended(catalog, inputs, inputs.kept, evaluator, stages, progress)
-    else:
-        made = _mapped(inputs, evaluator, stages, progress, n_threads)
-    check = stages.run("check", partial(_checked, catalog, inputs, made, evaluator, progress))
-    progress.stage("seal")
-    metrics = {
-        "n_map_images": made.contents.n_map_images,
-        "seconds": stages.seconds,
-        "training": made.training,
-        "second_season": made.second_season,
-        "check": check,
-    }
-    job_id = None if checkpoints is None else checkpoints.job_id
-    return seal_version(catalog, domain, made.contents, made.config, metrics, progress.update, job_id)
+@dataclass(frozen=True)
+class _Inputs:
+    """What a remap reads before it begins.
+
+    Attributes:
+        domain: Whose map is made.
+        training: The traverse that becomes the map.
+        candidates: The traverse landmarks are selected from; None: those of `kept` stay.
+        kept: The active map whose landmarks stay; None where they are selected.
+        second: The drive that a calibrated map learns from: the landmark traverse, else what the active map was made
+            of; None where there is none of the same encoder, or where frames are appended.
+        check: The drive that the new map is checked on; None: on frames of `training` that are held out.
+    """
+
+    domain: DomainRecord
+    training: Drive
+    candidates: Drive | None
+    kept: Map | None
+    second: Drive | None
+    check: Drive | None
 
 
 @dataclass(frozen=True)
@@ -123,130 +108,270 @@ class _Made:
     """A map that is not yet sealed.
 
     Attributes:
-        contents: All of it; its version is not known yet.
+        map: All of it; its version is not known yet.
         config: As the catalog keeps it.
         training: How its experience database was learnt; None where it has none.
         second_season: Whether it learnt from a second drive, and why not; None where there was none.
     """
 
-    contents: MapContents
+    map: Map
     config: Mapping[str, Any]
     training: Mapping[str, Any] | None
     second_season: Mapping[str, Any] | None
 
 
-def _appended(
-    catalog: Catalog,
-    inputs: RemapInputs,
-    before: MapContents,
-    evaluator: Evaluator,
-    stages: Stages,
-    progress: Progress,
-) -> _Made:
-    """A copy of the active map with the training traverse among its images."""
-    record = catalog.map(inputs.domain.name, inputs.domain.active_version or 0)
-    append = partial(append_frames, before, record, inputs.config, inputs.training, evaluator, progress.update)
-    contents = stages.run("describe", append)
-    known = record.metrics
-    return _Made(contents, contents.config, known.get("training"), known.get("second_season"))
+@dataclass(frozen=True)
+class _Remap:
+    """One remap's surroundings, as the arguments of `remap`; the methods are its stages."""
+
+    catalog: Catalog
+    domain: str
+    config: RemapConfig
+    evaluator: Evaluator
+    progress: Progress
+    n_threads: int
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    def sealed(self, job_id: str | None) -> MapRecord:
+        """The next version, sealed; what is decided of it later must stand in its metrics."""
+        with self._stage("read frames"):
+            inputs = self._read()
+        made = self._appended(inputs, inputs.kept) if inputs.kept and self.config.append else self._mapped(inputs)
+        with self._stage("check"):
+            check = self._checked(inputs, made)
+        self.progress.stage("seal")
+        metrics = {
+            "n_map_images": made.map.n_images,
+            "seconds": self.seconds,
+            "training": made.training,
+            "second_season": made.second_season,
+            "check": check,
+        }
+        return seal_version(self.catalog, self.domain, made.map, made.config, metrics, self.progress.update, job_id)
+
+    @contextmanager
+    def _stage(self, name: str) -> Iterator[None]:
+        """Report a stage and time it."""
+        self.progress.stage(name)
+        began = time.perf_counter()
+        yield
+        self.seconds[name.replace(" ", "_")] = time.perf_counter() - began
+
+    def _read(self) -> _Inputs:
+        """Read what is needed, every traverse once.
+
+        Raises:
+            UnknownDomainError, UnknownTraverseError: There is none such.
+            InvalidMapConfigError: A traverse is empty, or no landmarks could stay.
+            InvalidRouteError: The training or the check traverse goes backwards.
+            InvalidEncodingError: The traverses come from two encoders.
+            WeightsDifferError: Their images were encoded by other weights.
+        """
+        config, record = self.config, self.catalog.domain(self.domain)
+        read = cache(self._drive)
+        training = read(config.training_traverse)
+        training.route(record.closed)  # what is wrong with it is said now, not after the map is built
+        candidates = kept = check = None
+        if config.landmark_traverse is None:
+            kept = self._active_map(record)
+            joining = f"traverse {config.training_traverse}"
+            WeightsDifferError.check("the active map", kept.weights_sha256, joining, training.weights_sha256)
+        else:
+            candidates = read(config.landmark_traverse)
+            self._check_encoder(config.landmark_traverse, candidates, training)
+        if config.check_traverse is not None:
+            check = read(config.check_traverse)
+            self._check_encoder(config.check_traverse, check, training)
+            check.route(record.closed)
+        second = None if config.append else self._second_season(record, training, read)
+        return _Inputs(record, training, candidates, kept, second, check)
+
+    def _drive(self, name: str) -> Drive:
+        with Traverse.open(self.catalog.data_dir, self.domain, name) as traverse:
+            drive = traverse.read()
+        if drive.n_frames == 0:
+            raise InvalidMapConfigError(f"traverse {name} has no frames yet; upload some first", traverse=name)
+        return drive
+
+    def _check_encoder(self, name: str, drive: Drive, training: Drive) -> None:
+        training_name = self.config.training_traverse
+        if drive.encoding_dim != training.encoding_dim:
+            raise InvalidEncodingError(
+                f"traverse {name} holds encodings of {drive.encoding_dim} numbers, traverse {training_name} of "
+                f"{training.encoding_dim}; both must come from the same encoder"
+            )
+        WeightsDifferError.check(
+            f"traverse {training_name}", training.weights_sha256, f"traverse {name}", drive.weights_sha256
+        )
+
+    def _second_season(self, record: DomainRecord, training: Drive, read: Callable[[str], Drive]) -> Drive | None:
+        names = [self.config.landmark_traverse]
+        if names[0] is None and record.active_version is not None:
+            before = self.catalog.map(record.name, record.active_version).config
+            names = [before["training_traverse"], before["landmark_traverse"]]
+        stored = Traverse.list(self.catalog.data_dir, record.name)
+        for name in names:
+            if name is not None and name != self.config.training_traverse and name in stored:
+                second = read(name)
+                weights = {second.weights_sha256, training.weights_sha256} - {None}
+                if second.encoding_dim == training.encoding_dim and len(weights) <= 1:
+                    return second  # else another encoder made it anew
+        return None
+
+    def _active_map(self, record: DomainRecord) -> Map:
+        wanted = self.config.n_landmarks
+        if record.active_version is None:
+            raise InvalidMapConfigError(
+                f"domain {record.name} has no active map that could be appended to"
+                if self.config.append
+                else f"domain {record.name} has no active map whose landmarks could stay; give a landmark_traverse"
+            )
+        kept = read_map(self.catalog.map_path(record.name, record.active_version))
+        if wanted not in {None, kept.n_landmarks}:
+            raise InvalidMapConfigError(
+                f"the active map has {kept.n_landmarks} landmarks, not {wanted}; give a landmark_traverse to select "
+                "anew",
+                n_landmarks=kept.n_landmarks,
+            )
+        return kept
+
+    def _mapped(self, inputs: _Inputs) -> _Made:
+        """The training traverse as a map of its own."""
+        config, domain, training = self.config, inputs.domain, inputs.training
+        with self._stage("select landmarks"):
+            if inputs.kept is not None:
+                model = inputs.kept.landmark_model
+            else:
+                candidates = (inputs.candidates or training).encodings
+                n_landmarks = config.n_landmarks or min(DEFAULT_N_LANDMARKS, len(candidates))
+                model = choose_landmarks(candidates, n_landmarks, self.evaluator, self.progress.update)
+        with self._stage("describe"):
+            built = build(
+                training,
+                inputs.second,
+                config.same_route,
+                self.evaluator,
+                model,
+                config.relevance,
+                config.list_length,
+                domain.actions_m,
+                domain.closed,
+                self.progress.update,
+            )
+        q_values = learning = None
+        # The baseline that compares whole encodings would need hours for it, and serves no robot.
+        if config.training_episodes and config.relevance is not Relevance.BRUTE_FORCE:
+            with self._stage("train"):
+                q_values, learning = train_nnql(
+                    built.rehearsal,
+                    partial(measured, training, self.evaluator, model),
+                    built.second,
+                    NnqlConfig(n_episodes=config.training_episodes, seed=config.seed),
+                    self.progress.update,
+                    self.n_threads,
+                )
+        asked = config.as_dict()
+        landmarks_from = inputs.kept or inputs.candidates
+        weights_sha256 = training.weights_sha256 or (landmarks_from and landmarks_from.weights_sha256)
+        if weights_sha256 is not None:
+            asked["weights_sha256"] = weights_sha256
+        map_ = replace(
+            built.map,
+            domain=domain.name,
+            evaluator=domain.evaluator,
+            config={**asked, **built.map.config},
+            timestamp_us=training.timestamp_us if (training.timestamp_us != UNKNOWN_TIMESTAMP).any() else None,
+            frame_digest=training.digests(),
+            q_values=q_values,
+        )
+        second_season = None if built.same_route is None else built.same_route.as_dict()
+        return _Made(map_, asked, learning, second_season)
+
+    def _appended(self, inputs: _Inputs, before: Map) -> _Made:
+        """A copy of the active map with the training traverse among its images."""
+        config, drive = self.config, inputs.training
+        record = self.catalog.map(self.domain, inputs.domain.active_version or 0)
+        with self._stage("describe"):
+            refuse_known_traverse(record.config, record.version, config.training_traverse)
+            if before.frame_digest is not None and np.isin(drive.digests(), before.frame_digest).all():
+                raise InvalidMapConfigError(
+                    f"map {record.version}, which serves, holds every frame of traverse {config.training_traverse} "
+                    "already, under another name: nothing is appended twice. Append another drive, or activate a map "
+                    "without this one first",
+                    traverse=config.training_traverse,
+                    map_version=record.version,
+                )
+            _check_alike(before, config)
+            map_ = append_drive(before, measured(drive, self.evaluator, before.landmark_model, self.progress.update))
+        asked = config.as_dict()
+        added = {"traverse": config.training_traverse, "n_frames": drive.n_frames, "to_version": record.version}
+        # The catalog's configuration: the file of an imported map names traverses of another server.
+        config_after = {
+            **record.config,
+            "n_landmarks": before.n_landmarks,
+            **{name: asked[name] for name in ("append", "check_traverse", "gate_margin", "activate")},
+            "appended": [*record.config.get("appended", ()), added],
+        }
+        weights_sha256 = drive.weights_sha256 or before.weights_sha256
+        if weights_sha256 is not None:
+            config_after["weights_sha256"] = weights_sha256
+        metrics = record.metrics
+        map_ = replace(map_, config=config_after)
+        return _Made(map_, config_after, metrics.get("training"), metrics.get("second_season"))
+
+    def _checked(self, inputs: _Inputs, made: _Made) -> dict[str, Any]:
+        """How the new map compares with the active one."""
+        config, closed = self.config, inputs.domain.closed
+        if config.check_traverse is not None and inputs.check is not None:
+            frames = CheckFrames.of_traverse(config.check_traverse, inputs.check, closed)
+        else:
+            frames = CheckFrames.held_out(config.training_traverse, inputs.training, closed)
+        traverses = traverses_in(made.config)
+        return check_map(
+            self.catalog,
+            self.domain,
+            made.map,
+            traverses,
+            frames,
+            config.gate_margin,
+            self.evaluator,
+            self.progress.update,
+        )
 
 
-def _mapped(inputs: RemapInputs, evaluator: Evaluator, stages: Stages, progress: Progress, n_threads: int) -> _Made:
-    """The training traverse as a map of its own."""
-    config = inputs.config
-    model = stages.run_once(
-        "select landmarks", partial(_landmark_model, inputs, evaluator, progress), pack_model, unpack_model
-    )
-    found = stages.run_once(
-        "describe",
-        partial(_described, inputs, evaluator, model, progress),
-        pack_described,
-        partial(unpack_described, encodings=inputs.training.encodings),
-    )
-    experience = None
-    # The baseline that compares whole encodings would need hours for it, and serves no robot.
-    if config.training_episodes and config.relevance is not Relevance.BRUTE_FORCE:
-        train = partial(_trained, inputs, evaluator, model, found, progress, n_threads)
-        experience = stages.run_once("train", train, pack_experience, unpack_experience)
-    contents = _contents(inputs, model, found, experience)
-    training = None if experience is None else experience.metrics
-    second_season = None if found.same_route is None else found.same_route.as_dict()
-    return _Made(contents, with_weights(config.as_dict(), inputs.weights_sha256), training, second_season)
+def refuse_known_traverse(config: Mapping[str, Any], version: int, name: str) -> None:
+    """Refuse to append a traverse that a map holds by name, though it may hold other frames by now.
+
+    Args:
+        config: The map's, as the catalog keeps it.
+        version: The map.
+        name: The traverse.
+
+    Raises:
+        InvalidMapConfigError: The map is made of a traverse of that name.
+    """
+    if name in traverses_in(config):
+        raise InvalidMapConfigError(
+            f"map {version}, which serves, holds traverse {name} already: nothing is appended twice. Append another "
+            "drive (a new one needs a name of its own), or activate a map without this one first",
+            traverse=name,
+            map_version=version,
+        )
 
 
-def _checked(
-    catalog: Catalog, inputs: RemapInputs, made: _Made, evaluator: Evaluator, progress: Progress
-) -> dict[str, Any]:
-    """How the new map compares with the active one."""
-    config, closed = inputs.config, inputs.domain.closed
-    if config.check_traverse is not None and inputs.check is not None:
-        frames = CheckFrames.of_traverse(config.check_traverse, inputs.check, closed)
-    else:
-        frames = CheckFrames.held_out(config.training_traverse, inputs.training, closed)
-    checked = CheckedMap.of(MapSnapshot.from_contents(made.contents, index_bytes=0), made.config)
-    return check_map(catalog, inputs.domain.name, checked, frames, config.gate_margin, evaluator, progress.update)
+def _check_alike(before: Map, config: RemapConfig) -> None:
+    """What describes the images of one map is the same for all of them; what is left at its default is the map's.
 
-
-def _landmark_model(inputs: RemapInputs, evaluator: Evaluator, progress: Progress) -> LandmarkModel:
-    """Select new landmarks where a landmark traverse is given; else keep the active map's."""
-    if inputs.kept is not None:
-        return dict(inputs.kept.landmark_model)
-    candidates = (inputs.candidates or inputs.training).encodings
-    n_landmarks = inputs.config.n_landmarks or min(DEFAULT_N_LANDMARKS, len(candidates))
-    return choose_landmarks(candidates, n_landmarks, evaluator, progress.update)
-
-
-def _described(inputs: RemapInputs, evaluator: Evaluator, model: LandmarkModel, progress: Progress) -> Described:
-    """The training traverse as a map."""
-    config = inputs.config
-    return describe(
-        inputs.training,
-        inputs.route,
-        evaluator,
-        model,
-        config.relevance,
-        config.list_length,
-        inputs.second,
-        config.same_route,
-        progress.update,
-    )
-
-
-def _trained(
-    inputs: RemapInputs,
-    evaluator: Evaluator,
-    model: LandmarkModel,
-    found: Described,
-    progress: Progress,
-    n_threads: int,
-) -> Experience:
-    """The experience database."""
-    config, closed = inputs.config, inputs.domain.closed
-    second = None
-    if inputs.second is not None and found.is_of_two_drives:
-        second = DescribedDrive.of(inputs.second, closed, evaluator, model, found.second_dissimilarities)
-    return train_nnql(
-        found.rehearsal or found.built,
-        inputs.route,
-        inputs.domain.actions_m,
-        partial(DescribedDrive.of, inputs.training, closed, evaluator, model),
-        second,
-        NnqlConfig(n_episodes=config.training_episodes, seed=config.seed),
-        progress.update,
-        n_threads,
-    )
-
-
-def _contents(
-    inputs: RemapInputs, model: LandmarkModel, found: Described, experience: Experience | None
-) -> MapContents:
-    """Everything the map file holds; its version is not known yet."""
-    config = with_weights(inputs.config.as_dict(), inputs.weights_sha256)
-    contents = map_contents(inputs.domain, 0, config, model, found, inputs.route)
-    times = inputs.training.timestamp_us
-    return replace(
-        contents,
-        timestamp_us=times if (times >= 0).any() else None,
-        frame_digest=frame_digests(inputs.training.encodings),
-        q_values=None if experience is None else experience.q_values,
-    )
+    Raises:
+        InvalidMapConfigError: Something else is asked for than the map has.
+    """
+    asked = {
+        "n_landmarks": (config.n_landmarks, None, before.n_landmarks),
+        "list_length": (config.list_length, DEFAULT_LIST_LENGTH, before.list_length),
+        "relevance": (config.relevance.value, DEFAULT_RELEVANCE.value, before.relevance.value),
+    }
+    for name, (wanted, default, has) in asked.items():
+        if wanted not in {default, has}:
+            raise InvalidMapConfigError(
+                f"the active map has {name} {has}, not {wanted}; what is appended to it must be alike", **{name: has}
+            )

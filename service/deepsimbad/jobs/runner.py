@@ -33,12 +33,10 @@ from deepsimbad.errors import (
 from deepsimbad.evaluators.compute import available_cores
 from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
 from deepsimbad.jobs.child import JobPriority
-from deepsimbad.jobs.learn_online import LEARN_STAGES, learn_online, serve_learnt
-from deepsimbad.jobs.map_config import RemapConfig
+from deepsimbad.jobs.learn import EXPERIENCE, LEARN_STAGES, ExperienceConfig, learn_online, serve_learnt, walks_of
 from deepsimbad.jobs.progress import Progress, ProgressState
-from deepsimbad.jobs.remap import REMAP_STAGES, remap
-from deepsimbad.jobs.remap_stages import RemapSize, remap_stages
-from deepsimbad.jobs.session_walks import EXPERIENCE, ExperienceConfig, walks_of
+from deepsimbad.jobs.remap import remap
+from deepsimbad.jobs.remap_config import REMAP_STAGES, RemapConfig, RemapSize, remap_stages
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.checkpoints import Checkpoints, remove_checkpoints
 from deepsimbad.store.records import JobRecord, JobState
@@ -297,14 +295,14 @@ class InThisProcess:
         try:
             with (
                 Catalog.open(self.data_dir) as catalog,
-                Checkpoints.open(self.data_dir, job.job_id, progress.check) as checkpoints,
+                Checkpoints.open(self.data_dir, job.job_id, progress.check),
             ):
                 progress.check()
                 if job.kind == EXPERIENCE:
                     return self._learn(catalog, job, progress)
                 evaluator = make_evaluator(evaluator_config(catalog.domain(job.domain).evaluator))
                 config = RemapConfig.from_dict(job.config)
-                return remap(catalog, job.domain, config, evaluator, progress, checkpoints, self.n_threads)
+                return remap(catalog, job.domain, config, evaluator, progress, self.n_threads, job.job_id)
         except MemoryError as error:
             raise OutOfMemoryError("too little memory is left for the job") from error
 

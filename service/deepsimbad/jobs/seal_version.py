@@ -5,9 +5,9 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from typing import Any
 
+from deepsimbad.core.map import Map
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.catalog_maps import AnyVersion
-from deepsimbad.store.map_contents import MapContents
 from deepsimbad.store.map_file import index_bytes, write_map
 from deepsimbad.store.records import MapRecord
 from deepsimbad.store.sealing import seal
@@ -16,7 +16,7 @@ from deepsimbad.store.sealing import seal
 def seal_version(
     catalog: Catalog,
     domain: str,
-    contents: MapContents,
+    map_: Map,
     config: Mapping[str, Any],
     metrics: Mapping[str, Any],
     on_progress: Callable[[float], None],
@@ -27,7 +27,7 @@ def seal_version(
     Args:
         catalog: Of the data directory.
         domain: Whose map it is.
-        contents: What it holds; its domain, version and time are set here.
+        map_: What it holds; its domain, version and time are set here.
         config: What was asked for; kept in the catalog.
         metrics: What was measured; the size of the index is added.
         on_progress: Called with the share written; may raise to cancel.
@@ -41,9 +41,9 @@ def seal_version(
     try:
         building, sealed = catalog.building_path(domain, version), catalog.map_path(domain, version)
         created_at = datetime.now(UTC).isoformat(timespec="seconds")
-        write_map(building, replace(contents, domain=domain, version=version, created_at=created_at), on_progress)
+        write_map(building, replace(map_, domain=domain, version=version, created_at=created_at), on_progress)
         digest, n_bytes = seal(building, sealed)
-        bits = 8 * index_bytes(sealed) / contents.n_map_images
+        bits = 8 * index_bytes(sealed) / map_.n_images
         on_progress(1.0)
         measured = {**metrics, "index_bits_per_map_image": bits, "job_id": job_id}
         return catalog.seal_map(domain, version, digest, n_bytes, measured)

@@ -1,4 +1,4 @@
-"""Named arrays in the array tables of a map file, which all have one layout."""
+"""Named arrays in the array tables of a map file, which all have one layout; one of them may be packed."""
 
 import math
 import zlib
@@ -14,6 +14,7 @@ from deepsimbad.store.records import from_json, to_json
 
 PART_BYTES = 16 * 2**20  # far below SQLite's limit for a value, and all that is held beside the array itself
 _KINDS = "fiu"
+_CODES = np.dtype("<u2")
 
 
 class Checksum:
@@ -91,3 +92,51 @@ def is_halvable(numbers: NDArray[Any]) -> bool:
     with np.errstate(over="ignore"):
         parts = (flat[start : start + PART_BYTES // 4] for start in range(0, flat.size, PART_BYTES // 4))
         return all(np.array_equal(part.astype(np.float16), part) for part in parts)
+
+
+def save_packed(db: Database, table: str, arrays: Mapping[str, NDArray[Any]], checksum: Checksum) -> None:
+    """Write at most one array at two bytes a number: the nearest of 65,536 equal steps from its lowest to its highest.
+
+    High bytes lie before low ones, so that values which are alike compress.
+
+    Raises:
+        InvalidInputError: A value is NaN or infinite.
+    """
+    for name, array in arrays.items():
+        if not np.isfinite(array).all():
+            raise InvalidInputError(f"{name} holds NaN or infinity; every one must be finite")
+        lowest, highest = (float(array.min()), float(array.max())) if array.size else (0.0, 0.0)
+        step = (highest - lowest) / np.iinfo(_CODES).max
+        scaled = (array.astype(np.float64) - lowest) / step if step > 0 else np.zeros(array.shape)
+        codes = np.ascontiguousarray(np.rint(scaled), _CODES)
+        body = zlib.compress(codes.reshape(-1, 1).view(np.uint8)[:, ::-1].T.tobytes(), 6)
+        shape = to_json(list(array.shape))
+        checksum.add(table, name, 0, _CODES.str, shape, repr(lowest), repr(step), body)
+        row = {"part": 0, "name": name, "dtype": _CODES.str, "shape": shape, "lowest": lowest, "step": step}
+        db.table(table).insert({**row, "body": body})
+
+
+def load_packed(db: Database, table: str, checksum: Checksum) -> dict[str, NDArray[Any]]:
+    """Read what `save_packed` or the first schema wrote, frozen; nothing where the map never learnt.
+
+    Raises:
+        ValueError: The row does not make up an array.
+    """
+    rows = list(db.table(table).rows_where("step IS NOT NULL"))
+    if not rows:
+        return load_arrays(db, table, checksum)
+    row = rows[0]
+    lowest, step, body = row["lowest"], row["step"], row["body"]
+    checksum.add(table, row["name"], row["part"], row["dtype"], row["shape"], repr(lowest), repr(step), body)
+    shape = tuple(from_json(row["shape"]))
+    if len(rows) > 1 or row["dtype"] != _CODES.str:
+        raise ValueError(f"{table} holds what no release wrote")
+    n_bytes = math.prod(shape) * _CODES.itemsize
+    try:
+        planes = zlib.decompressobj().decompress(body, n_bytes + 1)
+    except zlib.error as error:
+        raise ValueError(f"{table} is damaged: {error}") from error
+    if len(planes) != n_bytes:
+        raise ValueError(f"{table} is not whole")
+    codes = np.frombuffer(planes, np.uint8).reshape(_CODES.itemsize, -1)[::-1].T.copy().view(_CODES).reshape(shape)
+    return {row["name"]: (lowest + step * codes).astype(np.float32)}

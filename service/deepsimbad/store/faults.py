@@ -7,12 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from deepsimbad.errors import (
-    DamagedFileError,
-    DamagedMapError,
-    InvalidInputError,
-    UnavailableError,
-)
+from deepsimbad.errors import DamagedFileError, DamagedMapError, InvalidInputError, UnavailableError
 
 _REASONS_BY_ERRNO = {
     errno.ENOSPC: "disk_full",

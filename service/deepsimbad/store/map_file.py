@@ -1,4 +1,7 @@
-"""One map version as a self-contained file: landmark model, inverted index, route, experience."""
+"""One map version as a self-contained file: its description, posting lists, and named arrays.
+
+What the arrays mean is not known here: `core.map` names them, a table holds each.
+"""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -8,18 +11,18 @@ from typing import Any
 from numpy.typing import NDArray
 from sqlite_utils import Database
 
+from deepsimbad.core.map import Map
 from deepsimbad.core.packing import pack_index, unpack_index
-from deepsimbad.errors import DamagedMapError, InvalidMapConfigError
-from deepsimbad.store.arrays import Checksum, load_arrays, save_arrays
+from deepsimbad.errors import DamagedMapError, InvalidMapConfigError, InvalidRouteError
+from deepsimbad.store.arrays import Checksum, load_arrays, load_packed, save_arrays, save_packed
 from deepsimbad.store.connection import in_todays_schema, open_database
 from deepsimbad.store.durable import remove_database
-from deepsimbad.store.experience import EXPERIENCE_TABLE, load_experience, save_experience
 from deepsimbad.store.faults import storage_faults
-from deepsimbad.store.map_contents import MapContents
 from deepsimbad.store.pages import bytes_by_table, fitting_page_size
 from deepsimbad.store.records import from_json, to_json
 from deepsimbad_migrations.map.migrations import migrations
 
+_AS_JSON = frozenset({"config", "evaluator", "actions_m", "metrics"})  # columns of `map`
 _DESCRIPTION = (  # the columns of `map` in the order of the checksum
     "domain",
     "version",
@@ -36,36 +39,34 @@ _DESCRIPTION = (  # the columns of `map` in the order of the checksum
 _NO_PLAIN_TABLE = "SELECT 1 FROM sqlite_schema WHERE type NOT IN ('table', 'index') OR rootpage = 0 LIMIT 1"
 _WAL_HEADER = bytes([2, 2])  # read and write version at offset 18 of a file that may have a write-ahead log
 
-
-# Which array table holds which attributes; None: the landmark model's own names.
-_TABLES: dict[str, tuple[str, ...]] = {
-    "calibration": ("correlation", "listed_score", "telling_bits", "off_route_model"),
-    "landmark_statistics": ("statistics", "loadings"),
-    "listed_dissimilarity": ("values",),
-    "map_image_encoding": ("encodings",),
-    EXPERIENCE_TABLE: ("q_values",),
-    "route": ("position_m", "timestamp_us", "x_m", "y_m", "frame_digest"),
+_MODEL_TABLE, _PACKED_TABLE = "landmark_model", "q_value"
+# In which table of the frozen schema an array lies, all of one layout; what is not named here, what seasons teach.
+_TABLE_OF = {
+    **dict.fromkeys(("statistics", "loadings"), "landmark_statistics"),
+    "values": "listed_dissimilarity",
+    "encodings": "map_image_encoding",
+    "q_values": _PACKED_TABLE,
+    **dict.fromkeys(("position_m", "timestamp_us", "x_m", "y_m", "frame_digest"), "route"),
 }
-_MODEL_TABLE = "landmark_model"
+_TABLES = ("calibration", "landmark_statistics", "listed_dissimilarity", "map_image_encoding", _PACKED_TABLE, "route")
 
 
-def write_map(path: Path, contents: MapContents, on_progress: Callable[[float], None] | None = None) -> None:
+def write_map(path: Path, map_: Map, on_progress: Callable[[float], None] | None = None) -> None:
     """Write a new, unsealed map file; one of the same name is replaced.
 
     It is not synced: only `sealing.seal` makes it durable. A failure leaves no file.
 
     Args:
         path: Where; `Catalog.building_path`.
-        contents: What.
+        map_: What.
         on_progress: Called with 0..1; what it raises (a cancel) ends the writing.
 
     Raises:
-        InvalidMapConfigError: The parts do not fit together.
+        InvalidInputError: A Q-value is NaN or infinite.
         UnavailableError: The disk is full, read-only, ...
     """
-    contents.check()
     report = on_progress or (lambda _: None)
-    postings = list(pack_index(contents.lists, contents.n_landmarks))
+    postings = list(pack_index(map_.lists, map_.n_landmarks))
     report(0.3)
     with storage_faults(path, DamagedMapError):
         remove_database(path)
@@ -76,7 +77,7 @@ def write_map(path: Path, contents: MapContents, on_progress: Callable[[float], 
                 db.execute("PRAGMA synchronous = OFF")
                 migrations.apply(db)
                 with db.atomic():
-                    _write(db, contents, postings, report)
+                    _write(db, map_, postings, report)
         except BaseException:
             remove_database(path)
             raise
@@ -85,41 +86,34 @@ def write_map(path: Path, contents: MapContents, on_progress: Callable[[float], 
 
 def _write(
     db: Database,
-    contents: MapContents,
+    map_: Map,
     postings: list[tuple[int, int, bytes]],
     report: Callable[[float], None],
 ) -> None:
     checksum = Checksum()
-    description: dict[str, str | int] = {
-        "domain": contents.domain,
-        "version": contents.version,
-        "created_at": contents.created_at,
-        "config": to_json(contents.config),
-        "evaluator": to_json(contents.evaluator),
-        "closed": int(contents.closed),
-        "actions_m": to_json(list(contents.actions_m)),
-        "metrics": to_json(contents.metrics),
-        "n_map_images": contents.n_map_images,
-        "n_landmarks": contents.n_landmarks,
-        "list_length": contents.list_length,
+    description = {
+        column: to_json(value) if column in _AS_JSON else int(value) if isinstance(value, bool) else value
+        for column, value in map_.document().items()
     }
     checksum.add(*(description[column] for column in _DESCRIPTION))
     for posting in postings:
         checksum.add(*posting)
     db.conn.executemany("INSERT INTO posting (landmark, rank, image_ids) VALUES (?, ?, ?)", postings)
     report(0.5)
-    save_arrays(db, _MODEL_TABLE, contents.landmark_model, checksum)
-    for table, names in _TABLES.items():
-        present = {name: getattr(contents, name) for name in names if getattr(contents, name) is not None}
-        if table == EXPERIENCE_TABLE:
-            save_experience(db, contents.q_values, checksum)
-        else:
-            save_arrays(db, table, present, checksum)
+    save_arrays(db, _MODEL_TABLE, map_.landmark_model, checksum)
+    arrays = {name: array for name, array in map_.arrays().items() if name != "lists"}
+    for table in _TABLES:
+        of_table = {name: array for name, array in arrays.items() if _table_of(name) == table}
+        (save_packed if table == _PACKED_TABLE else save_arrays)(db, table, of_table, checksum)
         report(0.7)
     db.table("map").insert({"id": 1, **description, "checksum": checksum.value})
 
 
-def read_map(path: Path) -> MapContents:
+def _table_of(name: str) -> str:
+    return _TABLE_OF.get(name, "calibration")
+
+
+def read_map(path: Path) -> Map:
     """Read a map file whole and check it against its own checksum.
 
     A file of an older schema is brought to today's in memory; the sealed file stays as it is.
@@ -133,11 +127,11 @@ def read_map(path: Path) -> MapContents:
             return _read(db, path)
     except (KeyError, TypeError, ValueError, IndexError, OverflowError, RecursionError) as error:
         raise DamagedMapError(f"{path.name} is damaged: {error}", file=path.name) from error
-    except InvalidMapConfigError as error:
+    except (InvalidMapConfigError, InvalidRouteError) as error:
         raise DamagedMapError(f"{path.name} is damaged: {error.message}", file=path.name) from error
 
 
-def _read(db: Database, path: Path) -> MapContents:
+def _read(db: Database, path: Path) -> Map:
     rows = list(db.table("map").rows)
     if not rows:
         raise DamagedMapError(f"{path.name} is damaged: it was never finished", file=path.name)
@@ -150,27 +144,12 @@ def _read(db: Database, path: Path) -> MapContents:
     model = load_arrays(db, _MODEL_TABLE, checksum)
     arrays: dict[str, NDArray[Any]] = {}
     for table in _TABLES:
-        load = load_experience if table == EXPERIENCE_TABLE else load_arrays
-        arrays |= load(db, table, checksum)
+        arrays |= (load_packed if table == _PACKED_TABLE else load_arrays)(db, table, checksum)
     if checksum.value != stored["checksum"]:
         raise DamagedMapError(f"{path.name} is damaged: it does not match its checksum", file=path.name)
-    lists = unpack_index(postings, stored["list_length"], stored["n_map_images"])
-    lists.setflags(write=False)
-    contents = MapContents(
-        domain=stored["domain"],
-        version=stored["version"],
-        created_at=stored["created_at"],
-        config=from_json(stored["config"]),
-        evaluator=from_json(stored["evaluator"]),
-        closed=bool(stored["closed"]),
-        actions_m=tuple(from_json(stored["actions_m"])),
-        landmark_model=model,
-        lists=lists,
-        metrics=from_json(stored["metrics"]),
-        **arrays,
-    )
-    contents.check()
-    return contents
+    arrays["lists"] = unpack_index(postings, stored["list_length"], stored["n_map_images"])
+    document = {name: from_json(stored[name]) if name in _AS_JSON else stored[name] for name in _DESCRIPTION}
+    return Map.from_arrays(document, model, arrays, bytes_by_table(db.conn, path)["posting"])
 
 
 def index_bytes(path: Path) -> int:
@@ -181,7 +160,7 @@ def index_bytes(path: Path) -> int:
 def table_bytes(path: Path) -> dict[str, int]:
     """The pages of every table with its indexes, in bytes; raises as `read_map`."""
     with _opened(path) as db:
-        return bytes_by_table(db.conn)
+        return bytes_by_table(db.conn, path)
 
 
 @contextmanager
@@ -200,6 +179,3 @@ def _opened(path: Path) -> Iterator[Database]:
                 raise DamagedMapError(f"{path.name} is damaged: it is empty", file=path.name)
             with in_todays_schema(db, migrations, path, DamagedMapError) as current:
                 yield current
-
-
-__all__ = ["MapContents", "index_bytes", "read_map", "table_bytes", "write_map"]

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sqlite_utils import Database
 
+from deepsimbad.core.drive import UNKNOWN_TIMESTAMP, Drive
 from deepsimbad.errors import (
     ConflictError,
     DamagedFileError,
@@ -24,7 +25,6 @@ from deepsimbad.store.arrays import is_halvable
 from deepsimbad.store.connection import OpenFile, migrate, open_database, use_write_ahead_log, write_transaction
 from deepsimbad.store.durable import lock_folder, remove_database, sync_file, sync_folder
 from deepsimbad.store.faults import storage_faults
-from deepsimbad.store.frames import UNKNOWN_TIMESTAMP, TraverseFrames
 from deepsimbad.store.records import now
 from deepsimbad_migrations.traverse.migrations import migrations
 
@@ -163,7 +163,7 @@ class Traverse(OpenFile):
         Raises:
             InvalidInputError, InvalidRouteError, InvalidEncodingError: As `put_frames`.
         """
-        frames = TraverseFrames(
+        frames = Drive(
             index=np.array([index]),
             position_m=np.array([position_m], np.float64),
             timestamp_us=np.array([UNKNOWN_TIMESTAMP if timestamp_us is None else timestamp_us]),
@@ -174,7 +174,7 @@ class Traverse(OpenFile):
         )
         return self.put_frames(frames)[0] == 1
 
-    def put_frames(self, frames: TraverseFrames) -> tuple[int, int]:
+    def put_frames(self, frames: Drive) -> tuple[int, int]:
         """Store a batch in one transaction, replacing frames of the same index; never holds a second copy of it.
 
         Returns:
@@ -245,7 +245,7 @@ class Traverse(OpenFile):
             )
             return [(first, last) for first, last in rows]
 
-    def read(self) -> TraverseFrames:
+    def read(self) -> Drive:
         """All frames in index order; one array of encodings, no copy beside it."""
         with self._reading() as db:
             n, (dim, weights_sha256) = _count(db), _described(db)
@@ -270,7 +270,10 @@ class Traverse(OpenFile):
                 index[row], timestamp_us[row], places[row] = frame_index, moment_us, place  # None becomes NaN
                 encodings[row] = np.frombuffer(body, dtype)
         position_m, x_m, y_m = places.T.copy()
-        return TraverseFrames(index, position_m, timestamp_us, x_m, y_m, encodings, weights_sha256)
+        return Drive(
+            index=index, position_m=position_m, timestamp_us=timestamp_us, x_m=x_m, y_m=y_m, encodings=encodings,
+            weights_sha256=weights_sha256,
+        )  # fmt: skip
 
 
 def _count(db: Database) -> int:
@@ -288,7 +291,7 @@ def _described(db: Database) -> tuple[int | None, str | None]:
     return row
 
 
-def _places(frames: TraverseFrames) -> Iterator[tuple[Any, ...]]:
+def _places(frames: Drive) -> Iterator[tuple[Any, ...]]:
     """Index, position, time, x and y of every frame; unknown ones are None."""
     for row, index in enumerate(frames.index):
         timestamp_us = int(frames.timestamp_us[row])
@@ -297,7 +300,7 @@ def _places(frames: TraverseFrames) -> Iterator[tuple[Any, ...]]:
         yield int(index), float(frames.position_m[row]), known_us, x_m, y_m
 
 
-def _bodies(frames: TraverseFrames) -> Iterator[tuple[int, bytes]]:
+def _bodies(frames: Drive) -> Iterator[tuple[int, bytes]]:
     for row, index in enumerate(frames.index):
         encoding = frames.encodings[row]
         yield int(index), encoding.astype("<f2" if is_halvable(encoding) else "<f4").tobytes()

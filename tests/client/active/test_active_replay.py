@@ -10,10 +10,8 @@ import numpy as np
 import pytest
 
 from deepsimbad_client import errors
-from deepsimbad_client.active_replay import ActiveReplay, active_replay
-from deepsimbad_client.episode_log import Episode
 from deepsimbad_client.recordings.recording import Recording
-from deepsimbad_client.walk import Walk
+from deepsimbad_client.replay.active import ActiveReplay, Episode, Stage, active_replay
 
 PLANNERS = ("default", "random", "constant:3")
 
@@ -132,17 +130,19 @@ def test_a_recording_too_short_for_its_moves(fake: Any, drive: Recording, tmp_pa
     with pytest.raises(errors.ReplayError, match="fewer steps"):
         driven(fake, drive.sliced(slice(0, 50)), tmp_path)
     assert fake.sessions == {}
-    starts = {Walk(drive.sliced(slice(0, 51)), None).start(5, 10.0, 0, episode)[0] for episode in range(20)}
-    assert starts == {0}
+    with fake.client() as client:
+        stage = Stage(client, drive.sliced(slice(0, 51)), "route")
+    assert {stage.start(5, 0, episode)[0] for episode in range(20)} == {0}
 
 
-def test_starts_are_uniform_and_do_not_depend_on_how_many_there_are(drive: Recording) -> None:
-    walk = Walk(drive, None)
-    rows = [walk.start(10, 10.0, 0, episode)[0] for episode in range(3000)]
+def test_starts_are_uniform_and_do_not_depend_on_how_many_there_are(fake: Any, drive: Recording) -> None:
+    with fake.client() as client:
+        stage = Stage(client, drive, "route")
+    rows = [stage.start(10, 0, episode)[0] for episode in range(3000)]
     assert set(rows) == set(range(50))
     assert max(np.bincount(rows)) < 100
-    assert rows[:5] == [walk.start(10, 10.0, 0, episode)[0] for episode in range(5)]
-    assert rows[:5] != [walk.start(10, 10.0, 1, episode)[0] for episode in range(5)]
+    assert rows[:5] == [stage.start(10, 0, episode)[0] for episode in range(5)]
+    assert rows[:5] != [stage.start(10, 1, episode)[0] for episode in range(5)]
 
 
 def test_frames_that_cannot_be_used_are_passed_over(fake: Any, drive: Recording, tmp_path: Path) -> None:

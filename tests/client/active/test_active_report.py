@@ -8,18 +8,10 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from deepsimbad_client.active_plots import draw_active
-from deepsimbad_client.active_replay import ActiveReplay
-from deepsimbad_client.active_report import (
-    at_distance,
-    distance_table,
-    localized_table,
-    planner_table,
-    summarise_active,
-)
-from deepsimbad_client.bootstrap import Resampling, mean_known
-from deepsimbad_client.episode_log import Episode, EpisodeStep
-from deepsimbad_client.map_route import MapRoute, RoutePath
+from deepsimbad.core.route import Route
+from deepsimbad_client.replay.active import ActiveReplay, Episode, EpisodeStep
+from deepsimbad_client.replay.plots import draw_active
+from deepsimbad_client.replay.report import Resampling, active_tables, at_distance, summarise_active
 
 
 def step(number: int, rank: float | None, error_m: float | None, action_m: float, travelled_m: float) -> EpisodeStep:
@@ -69,7 +61,7 @@ def replay_of(**ranks: list[list[float | None]]) -> ActiveReplay:
         for name, rows in ranks.items()
     }
     along = np.arange(100.0)
-    route = MapRoute(1, RoutePath(along, along, np.zeros(100)), False, 99.0)
+    route = Route(along, False, along.copy(), np.zeros(100))
     identity: dict[str, Any] = {"recording": "drive", "domain": "route", "map_version": 1, "steps": 2, "seed": 0}
     return ActiveReplay(Path(), tuple(ranks), episodes, route, identity | {"planners": list(ranks)}, 1.0)
 
@@ -127,18 +119,17 @@ def test_intervals_against_a_bootstrap_by_hand() -> None:
         picked = rng.integers(30, size=30)
         drawn.append(np.nanmean(ours[picked]) - np.nanmean(theirs[picked]))
     expected = np.percentile(drawn, [2.5, 97.5])
-    found = Resampling.of(30).difference(ours, theirs)
-    assert found == pytest.approx(tuple(expected), abs=0.03)
-    assert Resampling.of(30).interval(ours) == Resampling.of(30).interval(ours)
+    assert Resampling(30).interval(ours, theirs) == pytest.approx(list(expected), abs=0.03)
+    assert Resampling(30).interval(ours) == Resampling(30).interval(ours)
 
 
 def test_pairing_takes_out_what_the_starts_have_in_common() -> None:
     rng = np.random.default_rng(0)
     start = rng.normal(0, 10, (50, 1))
-    resampling = Resampling.of(50)
-    paired = resampling.difference(start + 1.0, start)
+    resampling = Resampling(50)
+    paired = resampling.interval(start + 1.0, start)
     alone = resampling.interval(start)
-    assert paired == pytest.approx((1.0, 1.0))
+    assert paired == pytest.approx([1.0, 1.0])
     assert alone is not None
     assert alone[1] - alone[0] > 3
 
@@ -150,8 +141,7 @@ def test_nothing_known_is_none_and_never_nan() -> None:
     assert summary["anr"] == {"default": None, "random": None}
     assert summary["interval_95"]["default"] is None
     assert summary["against"]["random"] == {"anr": None, "interval_95": None}
-    assert mean_known(np.array([np.nan])) is None
-    for table in (planner_table(summary), localized_table(summary), distance_table(summary)):
+    for table in active_tables(summary):
         Console(quiet=True).print(table)
 
 
@@ -159,7 +149,7 @@ def test_tables_name_every_planner(capsys: pytest.CaptureFixture[str]) -> None:
     replay = replay_of(default=[[50.0, 1.0, 2.0], [40.0, 3.0, 1.0]], random=[[50.0, 8.0, 6.0], [40.0, 3.0, 3.0]])
     summary = summarise_active(replay)
     console = Console(width=80)
-    for table in (planner_table(summary), localized_table(summary), distance_table(summary)):
+    for table in active_tables(summary):
         console.print(table)
     printed = capsys.readouterr().out
     assert printed.count("telling (default)") == 3

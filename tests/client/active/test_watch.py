@@ -10,9 +10,8 @@ from rich.console import Console
 
 from deepsimbad_client import errors
 from deepsimbad_client.recordings.recording import Recording
-from deepsimbad_client.stage import Stage
-from deepsimbad_client.story import BLOCKS, belief_blocks, resampled
-from deepsimbad_client.watch import watch_episode, watch_session
+from deepsimbad_client.replay.active import Stage
+from deepsimbad_client.replay.watch import BLOCKS, belief_blocks, resampled, watch_episode, watch_session
 
 
 def console(*, terminal: bool) -> tuple[Console, io.StringIO]:
@@ -24,7 +23,7 @@ def test_an_episode_off_a_terminal_is_a_line_for_each_view(fake: Any, drive: Rec
     shown, written = console(terminal=False)
     slept: list[float] = []
     with fake.client() as client:
-        stage = Stage.of(client, drive, "route")
+        stage = Stage(client, drive, "route")
         steps = watch_episode(stage, shown, planner="constant:7", steps=4, seed=2, pause_s=0.5, sleep=slept.append)
     lines = written.getvalue().splitlines()
     assert len(lines) == len(steps) == 5
@@ -38,7 +37,7 @@ def test_an_episode_off_a_terminal_is_a_line_for_each_view(fake: Any, drive: Rec
 def test_an_episode_on_a_terminal_shows_belief_moves_and_truth(fake: Any, drive: Recording) -> None:
     shown, written = console(terminal=True)
     with fake.client() as client:
-        stage = Stage.of(client, drive, "route")
+        stage = Stage(client, drive, "route")
         steps = watch_episode(stage, shown, planner="default", steps=2, seed=0, pause_s=0, sleep=lambda _: None)
     text = written.getvalue()
     for expected in (

@@ -9,8 +9,8 @@ import httpx2
 import pytest
 from rich.console import Console
 
-from deepsimbad_client import Client, RetryPolicy, commands, console, errors
-from deepsimbad_client.commands import jobs
+from deepsimbad_client import Client, RetryPolicy, commands, errors
+from deepsimbad_client.commands import console, jobs
 from deepsimbad_client.commands.group import run
 from deepsimbad_client.http.jobs import follow_job
 from deepsimbad_client.http.models import Job
@@ -200,9 +200,9 @@ def test_the_bar_shows_what_happens(monkeypatch: pytest.MonkeyPatch) -> None:
             job("running", 0.4, stage="rank"),
         ):
             bar(Job.model_validate(state))
-            bar._progress.refresh()
+            bar.refresh()
         bar.silent(12.4)
-        bar._progress.refresh()
+        bar.refresh()
     printed = shown.file.getvalue()  # type: ignore[attr-defined]
     shown_words = ("beginning", "train planner", "70 %", "1:02:03", "waiting for its turn", "rank", "40 %")
     for words in (*shown_words, "no answer for 12 s, still trying"):

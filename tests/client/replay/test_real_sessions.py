@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from deepsimbad_client import AsyncClient, Client, errors
-from deepsimbad_client.active_replay import active_replay
-from deepsimbad_client.active_report import summarise_active
 from deepsimbad_client.commands.group import run
 from deepsimbad_client.http.jobs import follow_job, remap
 from deepsimbad_client.http.upload import upload
 from deepsimbad_client.recordings.recording import Recording
 from deepsimbad_client.recordings.sources import open_source
+from deepsimbad_client.replay.active import active_replay
+from deepsimbad_client.replay.report import summarise_active
 
 PLANNERS = ["default", "nnql", "random", "constant:10"]
 

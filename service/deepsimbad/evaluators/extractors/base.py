@@ -1,12 +1,15 @@
-"""The contract of an extractor."""
+"""What an extractor is, and one whose work is a network's: images are brought to its size, then computed in batches."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Protocol
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from deepsimbad.evaluators.base import Image
+from deepsimbad.evaluators.runtimes import Run
 
 
 class Extractor(Protocol):
@@ -22,7 +25,7 @@ class Extractor(Protocol):
 
     @property
     def weights_sha256(self) -> str | None:
-        """SHA-256 in hex of the file its weights come from; None where it has none."""
+        """As `Evaluator.weights_sha256`."""
 
     @property
     def largest_batch(self) -> int:
@@ -42,5 +45,71 @@ class Extractor(Protocol):
             others in the call beyond the last bits of a float32.
 
         Raises:
-            UnavailableError: There is no memory left for it.
+            OutOfMemoryError: There is no memory left for it.
         """
+
+
+@dataclass(frozen=True)
+class NetworkExtractor:
+    """An extractor whose work is a network's.
+
+    Attributes:
+        run: The network, ready.
+        encoding_dim: d.
+        weights_sha256: As `encodings_sha256` gives it.
+        input_size: (width, height) every image is brought to; None: see `longest_side`.
+        longest_side: Where images keep their aspect, the most pixels of their longer side; larger ones are reduced.
+        side_multiple: Where images keep their aspect, width and height are brought down to multiples of this.
+        shortest_side: Where images keep their aspect, the fewest pixels of either side; smaller ones are enlarged.
+    """
+
+    run: Run
+    encoding_dim: int
+    weights_sha256: str | None
+    input_size: tuple[int, int] | None
+    longest_side: int = 1024
+    side_multiple: int = 1
+    shortest_side: int = 1
+
+    @property
+    def largest_batch(self) -> int:
+        """See `Extractor`."""
+        return self.run.largest_batch
+
+    def encode(self, images: Sequence[Image]) -> NDArray[np.float32]:
+        """See `Extractor`."""
+        encodings = np.empty((len(images), self.encoding_dim), np.float32)
+        first = 0
+        while first < len(images):
+            pixels = [self.prepare(images[first])]
+            while len(pixels) < min(self.largest_batch, len(images) - first):
+                following = self.prepare(images[first + len(pixels)])
+                if following.shape != pixels[0].shape:
+                    break
+                pixels.append(following)
+            # Rounded, so that a file holds them in half the bytes; that changes no cosine by more than 1e-6.
+            encodings[first : first + len(pixels)] = self.run(np.stack(pixels)).astype(np.float16)
+            first += len(pixels)
+        return encodings
+
+    def prepare(self, image: Image) -> Image:
+        """See `Extractor`."""
+        height, width = image.shape[:2]
+        if self.input_size is not None:
+            return resized(image, self.input_size)
+        shrink = min(1.0, self.longest_side / max(width, height))
+        least = max(self.side_multiple, self.shortest_side)
+        wide, high = (max(least, round(side * shrink)) for side in (width, height))
+        return resized(image, (wide - wide % self.side_multiple, high - high % self.side_multiple))
+
+
+def resized(image: Image, size: tuple[int, int]) -> Image:
+    """An image at (width, height): averaged where it shrinks, interpolated linearly where it grows; aspect not kept.
+
+    Clients resize by the same rule, so that a view encodes to the same numbers wherever it was made small.
+    """
+    height, width = image.shape[:2]
+    if (width, height) == size:
+        return image
+    shrinks = width >= size[0] and height >= size[1]
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR), np.uint8)

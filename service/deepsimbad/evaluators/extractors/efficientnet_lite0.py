@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from deepsimbad.errors import MissingPackageError
 from deepsimbad.evaluators.base import Image
 from deepsimbad.evaluators.compute import Compute
+from deepsimbad.evaluators.extractors.base import NetworkExtractor
 from deepsimbad.evaluators.extractors.gradient_grid import GradientGrid
-from deepsimbad.evaluators.extractors.network import NetworkExtractor
 from deepsimbad.evaluators.runtimes import INSTALL_TORCH, make_run
 from deepsimbad.evaluators.weights.files import encodings_sha256, file_sha256, read_state_dict
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from deepsimbad.errors import InvalidWeightsError, MissingPackageError, OutOfMemoryError
 from deepsimbad.evaluators.base import is_lack_of_memory
 from deepsimbad.evaluators.compute import Compute, available_cores
-from deepsimbad.evaluators.extractors.network import NetworkExtractor
+from deepsimbad.evaluators.extractors.base import NetworkExtractor
 from deepsimbad.evaluators.runtimes import INSTALL_FAST, has_onnxruntime, onnx_session
 from deepsimbad.evaluators.weights.files import encodings_sha256
 from deepsimbad.evaluators.weights.lock import Lock

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from deepsimbad.errors import MissingPackageError
 from deepsimbad.evaluators.compute import Compute
-from deepsimbad.evaluators.extractors.network import NetworkExtractor
+from deepsimbad.evaluators.extractors.base import NetworkExtractor
 from deepsimbad.evaluators.runtimes import INSTALL_TORCH, has_torch, make_run
 from deepsimbad.evaluators.weights.files import encodings_sha256
 from deepsimbad.evaluators.weights.lock import Lock

@@ -31,7 +31,7 @@ from deepsimbad.errors import (
 )
 from deepsimbad.evaluators.base import is_lack_of_memory
 from deepsimbad.evaluators.compute import Compute, Runtime
-from deepsimbad.evaluators.extractors.network import NetworkExtractor
+from deepsimbad.evaluators.extractors.base import NetworkExtractor
 from deepsimbad.evaluators.runtimes import make_run
 from deepsimbad.evaluators.weights.downloads import check_digest
 from deepsimbad.evaluators.weights.files import encodings_sha256, file_sha256

@@ -1,0 +1,1 @@
+"""Recordings driven against a live service, judged by the truth, told and drawn."""

@@ -1,0 +1,359 @@
+"""Drive a recording as an active robot: ask where to look next, go there, look, and be scored against the truth."""
+
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from deepsimbad.core.metrics import rank_of_truth
+from deepsimbad.core.route import Route
+from deepsimbad_client.errors import ReplayError
+from deepsimbad_client.http.client import Client, Session
+from deepsimbad_client.http.upload import CONCURRENCY, in_order
+from deepsimbad_client.recordings.recording import Recording
+from deepsimbad_client.replay.journal import Journal, write_lines
+from deepsimbad_client.replay.scene import DEFAULT_PLANNER, Scene, Seen, changed_map
+
+EPISODES = 20
+STEPS = 10
+EPISODES_WITH_MASS = 10
+"""Of so many the belief along the route is kept for pictures; of thousands it would fill the memory."""
+TRUTH_WITHIN_M = 10.0
+"""A frame farther than this from every map image is off the map and has no right answer."""
+_LONGEST_ACTION_M = 10.0
+_MASS_DIGITS = 5
+
+
+@dataclass(frozen=True)
+class EpisodeStep:
+    """One view of an episode, and how well the belief after it knows where the robot is; None: not known."""
+
+    step: int  # 0 for the first view, then the number of moves made
+    index: int  # the frame's place in the whole recording
+    name: str
+    position_m: float  # along the recording's own route
+    x_m: float | None
+    y_m: float | None
+    commanded_m: float | None  # the move asked for; None before the first
+    action_m: float  # metres really moved
+    travelled_m: float  # since the episode's start
+    forgot: bool  # the belief had no room left for the move and was set back to knowing nothing
+    true_map_image: int | None  # the one nearest to the truth; None where the map does not hold the place
+    true_route_m: float | None  # where that lies along the map's route
+    rank: float | None  # map images that the belief places before it, ties half
+    rank_percent: float | None  # the same in percent of the map's images
+    mode_m: float  # the likeliest place along the map's route
+    mode_x_m: float | None
+    mode_y_m: float | None
+    low_m: float  # 95 % of the belief lie from here
+    high_m: float  # to here
+    error_m: float | None  # from the truth to the likeliest place
+    entropy_bits: float  # how much is open
+    off_route: float | None  # probability that the robot is nowhere on the route
+    next_action_m: float | None  # the move asked for next
+    latency_ms: float  # from posting the view to the answer
+    mass: tuple[float, ...] = ()  # the belief in equal stretches of the map's route; of the first few episodes alone
+
+
+@dataclass(frozen=True)
+class Episode:
+    """One episode from its start to its last move.
+
+    Attributes:
+        planner: As it was asked for.
+        planner_named: What the service calls it.
+        episode: Its number: every planner's episode of a number starts from the same place.
+        seed: Of its session.
+        edges_m: Where the first stretch of `EpisodeStep.mass` begins and the last ends.
+        steps: The views.
+    """
+
+    planner: str
+    planner_named: str
+    episode: int
+    seed: int
+    edges_m: tuple[float, float]
+    steps: tuple[EpisodeStep, ...]
+
+
+@dataclass(frozen=True)
+class ActiveReplay:
+    """An active replay that has come to its end.
+
+    Attributes:
+        folder: Where its files are.
+        planners: As they were asked for; the first is the one the others are compared with.
+        episodes: For each planner, its episodes in order; the same numbers for all.
+        route: The map's images.
+        identity: What was replayed against what.
+        seconds: How long this run took.
+    """
+
+    folder: Path
+    planners: tuple[str, ...]
+    episodes: dict[str, list[Episode]]
+    route: Route
+    identity: dict[str, Any]
+    seconds: float
+
+
+class _Stopped(Exception):  # noqa: N818 - never leaves this module
+    """The replay ends before this episode does."""
+
+
+def active_replay(
+    client: Client,
+    recording: Recording,
+    domain: str,
+    folder: Path,
+    *,
+    planners: Sequence[str] = (DEFAULT_PLANNER,),
+    episodes: int = EPISODES,
+    steps: int = STEPS,
+    concurrency: int = CONCURRENCY,
+    seed: int = 0,
+    restart: bool = False,
+    on_progress: Callable[[Episode, int], None] | None = None,
+    clock: Callable[[], float] = time.perf_counter,
+) -> ActiveReplay:
+    """Drive episodes from random starts and compare what planners come to know.
+
+    Every planner starts from the same places with the same session seeds. Each step takes the recorded frame nearest
+    to the commanded place and tells the service the metres really moved. Interrupted at any moment, the same call goes
+    on after the last episode written down; more planners and more episodes can be added to a folder later.
+
+    Args:
+        client: The client.
+        recording: What there is to see, in travel order.
+        domain: A domain with an active map.
+        folder: Where `replay.json`, `episodes.jsonl` and `steps.jsonl` go.
+        planners: Names the service knows (`nnql`, `random`, `constant:3`, ...); `default` is the one that ships.
+        episodes: How many for each planner.
+        steps: Moves in an episode.
+        concurrency: Episodes under way at once.
+        seed: Of the starts and the sessions.
+        restart: Throw away what an earlier replay left in the folder.
+        on_progress: Told of every episode, those of an earlier run first, and how many there are so far.
+        clock: Seconds that never go backwards.
+
+    Raises:
+        ReplayError: No active map, one that changed meanwhile, a recording too short, or a folder of another replay.
+        ApiError: The service refused, for example an unknown planner.
+        TransportError: The service did not answer.
+    """
+    started = clock()
+    stage = Stage(client, recording, domain, clock)
+    starts = [stage.start(steps, seed, episode) for episode in range(episodes)]
+    planners = tuple(dict.fromkeys(planners))
+    identity = {
+        "kind": "active",
+        **stage.scene.identity,
+        "steps": steps,
+        "seed": seed,
+        "truth_within_m": TRUTH_WITHIN_M,
+    }
+    stopping = threading.Event()
+    with Journal(folder, "episodes.jsonl", identity, _episode, "episode", restart=restart) as journal:
+        wanted = [(planner, episode) for episode in range(episodes) for planner in planners]
+        done = {(episode.planner, episode.episode): episode for episode in journal.earlier}
+        n_shown = 0
+
+        def show(episode: Episode) -> None:
+            nonlocal n_shown
+            n_shown += 1
+            if on_progress is not None:
+                on_progress(episode, n_shown)
+
+        def drive(key: tuple[str, int]) -> Episode:
+            return stage.drive(*key, *starts[key[1]], steps, stopping)
+
+        todo = [key for key in wanted if key not in done]
+        for key in wanted:
+            if key in done:
+                show(done[key])
+        for key, episode in in_order(drive, todo, concurrency, on_end=stopping.set):
+            journal.append(asdict(episode))
+            done[key] = episode
+            show(episode)
+        if client.domain(domain).map_version != stage.scene.domain.map_version:
+            raise changed_map(domain)
+    by_planner = {name: [done[name, number] for number in range(episodes)] for name in planners}
+    write_lines(
+        folder / "steps.jsonl",
+        (
+            {"planner": episode.planner, "episode": episode.episode}
+            | {name: value for name, value in asdict(step).items() if name != "mass"}
+            for name in planners
+            for episode in by_planner[name]
+            for step in episode.steps
+        ),
+    )
+    identity |= {"planners": list(planners), "n_episodes": episodes}
+    return ActiveReplay(folder, planners, by_planner, stage.scene.route, identity, clock() - started)
+
+
+class Stage:
+    """A recording driven as an active robot drives: where it may start, what it comes to when it moves, what it sees.
+
+    Args:
+        client: The client.
+        recording: What there is to see, in travel order.
+        domain: A domain with an active map.
+        clock: Seconds that never go backwards.
+
+    Raises:
+        ReplayError: The domain has no active map, or the recording cannot be driven along.
+    """
+
+    def __init__(
+        self, client: Client, recording: Recording, domain: str, clock: Callable[[], float] = time.perf_counter
+    ) -> None:
+        self.scene = Scene.of(client, recording, domain, TRUTH_WITHIN_M, clock)
+        self.position_m = self.scene.position_m
+        if (np.diff(self.position_m) < 0).any():
+            raise ReplayError(f"the positions of {recording.name} go backwards: a robot cannot drive along it")
+
+    def start(self, steps: int, seed: int, episode: int) -> tuple[int, int]:
+        """Draw where an episode starts, uniform over the frames from which all its moves fit, and a seed for it.
+
+        The draw depends on `seed` and `episode` alone, so every planner starts from the same places.
+
+        Returns:
+            The row, and the seed of the episode's session.
+
+        Raises:
+            ReplayError: The recording is too short for that many moves.
+        """
+        longest_m = max(self.scene.domain.actions_m, default=_LONGEST_ACTION_M)
+        room_m = float(self.position_m[-1]) - steps * longest_m
+        n_starts = int(np.searchsorted(self.position_m, room_m, side="right"))
+        if n_starts == 0:
+            length_m = float(self.position_m[-1] - self.position_m[0])
+            raise ReplayError(
+                f"{steps} moves of up to {longest_m:g} m do not fit the {length_m:g} m of "
+                f"{self.scene.recording.name}: ask for fewer steps"
+            )
+        rng = np.random.default_rng([seed, episode])
+        return int(rng.integers(n_starts)), int(rng.integers(2**31))
+
+    def nearest(self, commanded_m: float, broken: frozenset[int], beyond_m: float = -np.inf) -> int:
+        """The usable row recorded nearest to a place; past the recording's end its last, before it its first.
+
+        Args:
+            commanded_m: The place.
+            broken: Rows that cannot be used.
+            beyond_m: Only frames farther along than this, where there are any: a robot told to move does move, though
+                the next frame may be farther than it was told, and does not look at the same picture twice.
+
+        Raises:
+            ReplayError: Every frame is broken.
+        """
+        usable = np.delete(np.arange(len(self.position_m)), sorted(broken))
+        if not usable.size:
+            raise ReplayError(f"none of the frames of {self.scene.recording.name} can be used")
+        ahead = usable[self.position_m[usable] > beyond_m]
+        usable = ahead if ahead.size else usable
+        return int(usable[np.abs(self.position_m[usable] - commanded_m).argmin()])
+
+    def play(self, session: Session, row: int, steps: int) -> Iterator[tuple[Seen, EpisodeStep]]:
+        """Drive one episode: look, ask for the next-best view, move there, look again; judge every view.
+
+        A frame that cannot be used is passed over for the nearest that can.
+
+        Yields:
+            `steps` + 1 views, the first without a move.
+
+        Raises:
+            ReplayError: No frame can be used, or the planner names no next move.
+            ApiError: The service refused more than a frame.
+            TransportError: The service did not answer.
+        """
+        broken: frozenset[int] = frozenset()
+        here_m, travelled_m, commanded_m = float(self.position_m[row]), 0.0, None
+        for step in range(steps + 1):
+            while True:
+                action_m = float(self.position_m[row]) - here_m
+                view = self.scene.view(row)
+                seen = view if isinstance(view, str) else self.scene.look(session, view, action_m if step else None)
+                if not isinstance(seen, str):
+                    break
+                broken |= {row}
+                row = self.nearest(here_m + (commanded_m or 0.0), broken, here_m if commanded_m else -np.inf)
+            action_m = action_m if step else 0.0
+            travelled_m += action_m
+            moves = {"step": step, "commanded_m": commanded_m, "action_m": action_m, "travelled_m": travelled_m}
+            yield seen, self._judged(row, seen, session, moves)
+            if step == steps:
+                return
+            plan = seen.answer.next_best_view
+            if plan is None:
+                raise ReplayError(
+                    f"the map of {session.domain} names no next-best view for this planner: remap with training "
+                    "episodes"
+                )
+            here_m, commanded_m = float(self.position_m[row]), plan.action_m
+            row = self.nearest(here_m + commanded_m, broken, here_m if commanded_m > 0 else -np.inf)
+
+    def drive(self, planner: str, number: int, row: int, seed: int, steps: int, stopping: threading.Event) -> Episode:
+        """One whole episode in a session of its own; cut off when `stopping` is set."""
+        done: list[EpisodeStep] = []
+        named, edges_m = planner, (0.0, 0.0)
+        with self.scene.session(planner, seed) as session:
+            for seen, step in self.play(session, row, steps):
+                if stopping.is_set():
+                    raise _Stopped
+                done.append(step if number < EPISODES_WITH_MASS else replace(step, mass=()))
+                edges = seen.answer.belief.histogram.edges_m
+                edges_m = (edges[0], edges[-1])
+                if seen.answer.next_best_view is not None:
+                    named = seen.answer.next_best_view.planner
+        return Episode(planner, named, number, seed, edges_m, tuple(done))
+
+    def _judged(self, row: int, seen: Seen, session: Session, moves: dict[str, Any]) -> EpisodeStep:
+        """How well the belief after a view knows where the robot truly is."""
+        scene, frame, route = self.scene, self.scene.recording.frames[row], self.scene.route
+        true = scene.nearest_right(row)
+        rank = None if true is None else rank_of_truth(session.belief_masses(), np.array([true]))
+        belief, plan = seen.answer.belief, seen.answer.next_best_view
+        mode = int(np.abs(route.position_m - belief.mode_m).argmin())
+        mode_x_m, mode_y_m = scene.place(mode)
+        return EpisodeStep(
+            **moves,
+            index=frame.index,
+            name=frame.name,
+            position_m=frame.position_m,
+            x_m=frame.x_m,
+            y_m=frame.y_m,
+            forgot=seen.forgot,
+            true_map_image=true,
+            true_route_m=None if true is None else float(route.position_m[true]),
+            rank=rank,
+            rank_percent=None if rank is None else 100 * rank / route.n_images,
+            mode_m=belief.mode_m,
+            mode_x_m=mode_x_m,
+            mode_y_m=mode_y_m,
+            low_m=belief.credible_95_m[0],
+            high_m=belief.credible_95_m[1],
+            error_m=None if true is None else float(scene.apart_m(row, np.array([mode]))[0]),
+            entropy_bits=belief.entropy_bits,
+            off_route=belief.off_route,
+            next_action_m=None if plan is None else plan.action_m,
+            latency_ms=seen.latency_ms,
+            mass=tuple(round(share, _MASS_DIGITS) for share in belief.histogram.mass),
+        )
+
+
+_FIELDS = frozenset(field.name for field in fields(EpisodeStep))
+
+
+def _episode(document: dict[str, Any]) -> Episode:
+    steps = tuple(
+        EpisodeStep(**{key: value for key, value in step.items() if key in _FIELDS} | {"mass": tuple(step["mass"])})
+        for step in document["steps"]
+    )
+    low_m, high_m = document["edges_m"]
+    return Episode(**document | {"edges_m": (low_m, high_m), "steps": steps})

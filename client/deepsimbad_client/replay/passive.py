@@ -1,0 +1,233 @@
+"""Drive a recording against a map as one session, in order; the service ranks the truth when it is told."""
+
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, fields, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from deepsimbad.core.route import Route
+from deepsimbad_client.errors import GoneError, ReplayError, UnknownSessionError
+from deepsimbad_client.http.client import Client, Session
+from deepsimbad_client.http.upload import CONCURRENCY, in_order
+from deepsimbad_client.recordings.recording import Recording
+from deepsimbad_client.replay.journal import Journal, write_lines
+from deepsimbad_client.replay.scene import Scene, Seen
+
+TOLERANCE_M = 2.0
+VIEWS_A_TRUTH, IMAGES_A_TRUTH = 20, 50_000
+"""So many views' truths are told at once, or of so many right map images."""
+MOST_ROWS = 400
+"""Of so many views the belief is kept for a picture; of a long drive every few."""
+_MASS_DIGITS = 5
+
+
+@dataclass(frozen=True)
+class Step:
+    """One frame of a passive replay and what came back; None: not known, or there is none."""
+
+    query: int  # place among the replayed frames, from 0
+    index: int  # place in the whole recording
+    name: str
+    position_m: float  # along the recording's own route
+    x_m: float | None
+    y_m: float | None
+    broken: str | None = None  # why the frame could not be asked
+    n_true: int | None = None  # map images that are right answers
+    true_route_m: float | None = None  # where the nearest of them lies along the map's route
+    rank: float | None = None  # images that this view placed before the best right answer, ties half
+    rank_percent: float | None = None  # the same in percent of the map's images
+    best_map_image: int | None = None  # the most relevant one
+    best_position_m: float | None = None  # where it lies along the route
+    best_x_m: float | None = None
+    best_y_m: float | None = None
+    best_relevance: float | None = None
+    error_m: float | None = None  # from the truth to the most relevant map image
+    forgot: bool = False  # the belief had no room for the move and was set back to knowing nothing
+    latency_ms: float | None = None  # from asking to answer, preparation of the image left out
+    mass: tuple[float, ...] = ()  # the belief in equal stretches of the map's route, of every few views
+
+
+_FIELDS = frozenset(field.name for field in fields(Step))
+_Record = Step | list[float | None]  # a view, or the ranks of views before it in order
+
+
+@dataclass(frozen=True)
+class Replay:
+    """A replay that has come to its end.
+
+    Attributes:
+        folder: Where its files are.
+        steps: Every frame, in order.
+        route: The map's images.
+        identity: What was replayed against what.
+        seconds: How long this run took.
+    """
+
+    folder: Path
+    steps: list[Step]
+    route: Route
+    identity: dict[str, Any]
+    seconds: float
+
+
+def replay(
+    client: Client,
+    recording: Recording,
+    domain: str,
+    folder: Path,
+    *,
+    tolerance_m: float = TOLERANCE_M,
+    concurrency: int = CONCURRENCY,
+    restart: bool = False,
+    on_progress: Callable[[Step, int], None] | None = None,
+    clock: Callable[[], float] = time.perf_counter,
+) -> Replay:
+    """Ask the service for the place of every frame in order, in one session, and compare with the truth.
+
+    Statistics are the session's: what it learnt of the frames before helps with each. Interrupted at any moment, the
+    same call goes on after the last answer written down, while the session lives.
+
+    Args:
+        client: The client.
+        recording: The queries.
+        domain: A domain with an active map.
+        folder: Where `replay.json`, `views.jsonl` (the journal) and `steps.jsonl` (all steps, at the end) go.
+        tolerance_m: How far a right answer may be, in the plane where both sides know x and y, else along the route.
+        concurrency: Images made ready at once; they are posted in order all the same.
+        restart: Throw away what an earlier replay left in the folder.
+        on_progress: Told of every step, those of an earlier run first, and how many there are so far.
+        clock: Seconds that never go backwards.
+
+    Raises:
+        ReplayError: No active map, one that changed meanwhile, a folder of another replay, or a session that ended.
+        ApiError: The service refused more than a frame.
+        TransportError: The service did not answer.
+    """
+    started = clock()
+    scene = Scene.of(client, recording, domain, tolerance_m, clock)
+    identity = {"kind": "passive", **scene.identity, "tolerance_m": tolerance_m}
+    with Journal(folder, "views.jsonl", identity, _record, "view", restart=restart) as journal:
+        drive = _Drive(scene, journal, on_progress)
+        for row, view in in_order(scene.view, range(len(drive.steps), len(recording.frames)), concurrency):
+            drive.observe(row, view)
+        drive.tell_truths()
+        drive.end()
+    lines = [asdict(step) for step in drive.steps]
+    write_lines(folder / "steps.jsonl", ({name: line[name] for name in line if name != "mass"} for line in lines))
+    return Replay(folder, drive.steps, scene.route, identity, clock() - started)
+
+
+class _Drive:
+    """A passive replay under way.
+
+    Attributes:
+        steps: So far, in order; the last few still without their ranks.
+    """
+
+    def __init__(
+        self, scene: Scene, journal: Journal[_Record], on_progress: Callable[[Step, int], None] | None
+    ) -> None:
+        self._scene = scene
+        self._journal = journal
+        self._on_progress = on_progress
+        self._n_shown = 0
+        self.steps = [record for record in journal.earlier if isinstance(record, Step)]
+        ranks = [rank for record in journal.earlier if isinstance(record, list) for rank in record]
+        observed = [row for row, step in enumerate(self.steps) if step.broken is None]
+        self._last = observed[-1] if observed else None
+        self._n_told, self._untold = len(ranks), observed[len(ranks) :]
+        self._rank(observed, ranks)
+        self._show(self._untold[0] if self._untold else len(self.steps))
+
+    @cached_property
+    def _session(self) -> Session:
+        """The one of an earlier run, or a new one; it outlives an interruption."""
+        earlier = self._journal.document.get("session_id")
+        if earlier is None:
+            session = self._scene.session(keep=True)
+            self._journal.note(session_id=session.session_id)
+            return session
+        try:
+            return self._scene.client.attach_session(earlier)
+        except (GoneError, UnknownSessionError) as error:
+            raise ReplayError(f"this replay's session has ended meanwhile ({error}): restart it") from error
+
+    def observe(self, row: int, view: dict[str, Any] | str) -> None:
+        """Post a view, or note why there is none, and write down what came back."""
+        scene, frame = self._scene, self._scene.recording.frames[row]
+        step = Step(row, frame.index, frame.name, frame.position_m, frame.x_m, frame.y_m)
+        action_m = None if self._last is None else float(scene.position_m[row] - scene.position_m[self._last])
+        # Under a key of its own: one that was answered, but not written down, is told again and counts once.
+        named: dict[str, Any] = {"idempotency_key": f"view-{row}", "shortlist": 1}
+        seen = view if isinstance(view, str) else scene.look(self._session, view, action_m, **named)
+        if isinstance(seen, str):
+            step = replace(step, broken=seen)
+        else:
+            step = self._answered(step, seen)
+            self._last = row
+            self._untold.append(row)
+        self._journal.append(asdict(step))
+        self.steps.append(step)
+        n_images = sum(scene.right[row].size for row in self._untold)
+        if len(self._untold) >= VIEWS_A_TRUTH or n_images > IMAGES_A_TRUTH:
+            self.tell_truths()
+
+    def _answered(self, step: Step, seen: Seen) -> Step:
+        scene, row = self._scene, step.query
+        best, nearest = seen.answer.retrieval[0], scene.nearest_right(row)
+        x_m, y_m = scene.place(best.map_image)
+        mass = seen.answer.belief.histogram.mass if row % -(-len(scene.right) // MOST_ROWS) == 0 else ()
+        return replace(
+            step,
+            n_true=int(scene.right[row].size),
+            true_route_m=None if nearest is None else float(scene.route.position_m[nearest]),
+            best_map_image=best.map_image,
+            best_position_m=best.route_position_m,
+            best_x_m=x_m,
+            best_y_m=y_m,
+            best_relevance=best.relevance,
+            error_m=float(scene.apart_m(row, np.array([best.map_image]))[0]),
+            forgot=seen.forgot,
+            latency_ms=seen.latency_ms,
+            mass=tuple(round(share, _MASS_DIGITS) for share in mass),
+        )
+
+    def tell_truths(self) -> None:
+        """Have the views ranked that are not yet, and show them."""
+        if self._untold:
+            images = [self._scene.right[row].tolist() for row in self._untold]
+            unknown = [None] * len(images)  # positions are for robots' own alarm and experience
+            score = self._session.truths(unknown, true_map_images=images, first_observation=self._n_told)
+            ranks = list(score.retrieval_ranks or ())
+            self._journal.append(ranks)
+            self._rank(self._untold, ranks)
+            self._n_told, self._untold = self._n_told + len(ranks), []
+        self._show(len(self.steps))
+
+    def _rank(self, rows: list[int], ranks: list[float | None]) -> None:
+        n_images = self._scene.route.n_images
+        for row, rank in zip(rows, ranks, strict=False):
+            percent = None if rank is None else 100 * rank / n_images
+            self.steps[row] = replace(self.steps[row], rank=rank, rank_percent=percent)
+
+    def _show(self, until: int) -> None:
+        if self._on_progress is not None:
+            for row in range(self._n_shown, until):
+                self._on_progress(self.steps[row], row + 1)
+        self._n_shown = until
+
+    def end(self) -> None:
+        """End the session, if this run had one."""
+        if "_session" in vars(self):
+            self._session.delete()
+
+
+def _record(document: Any) -> _Record:
+    if isinstance(document, list):
+        return [None if rank is None else float(rank) for rank in document]
+    known = {key: value for key, value in document.items() if key in _FIELDS}
+    return Step(**known | {"mass": tuple(document["mass"])})

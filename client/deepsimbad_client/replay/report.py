@@ -1,0 +1,318 @@
+"""What replays came to: figures, the file they go into, and tables for people."""
+
+import json
+import math
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.table import Table
+
+from deepsimbad_client.replay.active import ActiveReplay, Episode
+from deepsimbad_client.replay.passive import Replay
+from deepsimbad_client.replay.scene import DEFAULT_PLANNER
+
+NEAR_M = (5.0, 10.0)
+N_RESAMPLES = 2000
+_TAILS = (2.5, 97.5)
+_DIGITS = 4
+_MOST_DISTANCES = 10
+
+Reals = NDArray[np.float64]
+
+
+def summarise(replay: Replay) -> dict[str, Any]:
+    """Figures of a passive replay, flat and JSON-ready; those that nothing was counted for are None.
+
+    `anr` is the averaged normalised rank in percent: 0 is perfect, 50 chance. Queries without a right answer in the
+    map are left out of it and counted in `n_left_out`.
+    """
+    asked = [step for step in replay.steps if step.broken is None]
+    scored = [step for step in asked if step.rank is not None]
+    errors = [step.error_m for step in scored if step.error_m is not None]
+    latencies = [step.latency_ms for step in asked if step.latency_ms is not None]
+    ranks = [step.rank for step in scored if step.rank is not None]
+
+    def share(hits: Sequence[bool]) -> float | None:
+        return 100 * sum(hits) / len(hits) if hits else None
+
+    def quantile(values: Sequence[float], q: float) -> float | None:
+        return round(float(np.quantile(values, q)), 3) if values else None
+
+    return {
+        "anr": math.fsum(step.rank_percent or 0.0 for step in scored) / len(scored) if scored else None,
+        "recall_at_1": share([rank < 1 for rank in ranks]),
+        "recall_at_5": share([rank < 5 for rank in ranks]),
+        "n_queries": len(scored),
+        "n_left_out": len(asked) - len(scored),
+        "n_broken": dict(Counter(step.broken for step in replay.steps if step.broken is not None)),
+        "n_map_images": replay.route.n_images,
+        "error_m": {"median": quantile(errors, 0.5), "p90": quantile(errors, 0.9)},
+        "within_5_m": share([error <= 5 for error in errors]),
+        "within_10_m": share([error <= 10 for error in errors]),
+        "latency_ms": {"median": quantile(latencies, 0.5), "p95": quantile(latencies, 0.95)},
+        "config": dict(replay.identity),
+        "seconds": round(replay.seconds, 3),
+    }
+
+
+def write_summary(summary: dict[str, Any], folder: Path) -> Path:
+    """Write `summary.json`."""
+    path = folder / "summary.json"
+    path.write_text(json.dumps(summary, indent=2, allow_nan=False) + "\n")
+    return path
+
+
+def table(summary: dict[str, Any]) -> Table:
+    """The figures of a passive replay as a table."""
+    config = summary["config"]
+    made = _table(
+        f"{config['recording']} against {config['domain']}, map {config['map_version']}",
+        "figure",
+        ["value"],
+        caption="ANR: 0 is perfect, 50 is chance. One session: statistics are its own.",
+    )
+    tolerance = f"within {config['tolerance_m']:g} m"
+    made.add_row("ANR", _shown(summary["anr"], ".2f", " %"), style="bold")
+    made.add_row(f"R@1 {tolerance}", _shown(summary["recall_at_1"], ".1f", " %"))
+    made.add_row(f"R@5 {tolerance}", _shown(summary["recall_at_5"], ".1f", " %"))
+    made.add_row("median error of the best match", _shown(summary["error_m"]["median"], ".1f", " m"))
+    made.add_row("best match within 5 m", _shown(summary["within_5_m"], ".1f", " %"))
+    made.add_row("best match within 10 m", _shown(summary["within_10_m"], ".1f", " %"))
+    made.add_row("time an answer takes, median", _shown(summary["latency_ms"]["median"], ".1f", " ms"))
+    made.add_row("time an answer takes, 95 %", _shown(summary["latency_ms"]["p95"], ".1f", " ms"), end_section=True)
+    made.add_row("queries scored", str(summary["n_queries"]))
+    made.add_row("left out: no right answer in the map", str(summary["n_left_out"]))
+    for reason, count in summary["n_broken"].items():
+        made.add_row(f"left out: {reason}", str(count))
+    made.add_row("map images", str(summary["n_map_images"]))
+    return made
+
+
+class Resampling:
+    """Bootstrap: the same episodes drawn again and again with replacement, for every planner alike (paired by start).
+
+    Args:
+        n_episodes: e.
+        seed: Of the draws.
+    """
+
+    def __init__(self, n_episodes: int, seed: int = 0) -> None:
+        rng = np.random.default_rng([seed, n_episodes])
+        share = np.full(n_episodes, 1 / n_episodes)
+        self.times = rng.multinomial(n_episodes, share, size=N_RESAMPLES).astype(np.float64)
+
+    def interval(self, values: Reals, less: Reals | None = None) -> list[float] | None:
+        """95 % interval of the mean of the known values [e, ...], or of that mean less another's.
+
+        NaN is unknown; a resample in which nothing is known does not count.
+        """
+        drawn = self._means(values) if less is None else self._means(values) - self._means(less)
+        drawn = drawn[np.isfinite(drawn)]
+        return [round(float(end), _DIGITS) for end in np.percentile(drawn, _TAILS)] if drawn.size else None
+
+    def _means(self, values: Reals) -> Reals:
+        rows = values.reshape(len(values), -1)
+        known = np.isfinite(rows)
+        sums = self.times @ np.where(known, rows, 0.0).sum(1)
+        counts = self.times @ known.sum(1)
+        return np.asarray(np.divide(sums, counts, out=np.full(len(sums), np.nan), where=counts > 0))
+
+
+def figures(episodes: Sequence[Episode], name: str) -> Reals:
+    """One figure of every step: [episodes, steps + 1] float64, NaN where it is not known."""
+    return np.array([[getattr(step, name) for step in episode.steps] for episode in episodes], np.float64)
+
+
+def at_distance(episodes: Sequence[Episode], name: str, metres: float) -> Reals:
+    """One figure as it stood when each episode had travelled so far: [episodes], NaN for one that ended before."""
+    values, travelled_m = figures(episodes, name), figures(episodes, "travelled_m")
+    last = (travelled_m <= metres).sum(1) - 1
+    reached = travelled_m[:, -1] >= metres
+    return np.where(reached, values[np.arange(len(values)), last], np.nan)
+
+
+def distances_m(replay: ActiveReplay) -> list[float]:
+    """Metres travelled at which planners are compared: as far as half of the episodes of any planner come."""
+    furthest = max(float(np.median(figures(each, "travelled_m")[:, -1])) for each in replay.episodes.values())
+    apart = max(1.0, float(np.ceil(furthest / _MOST_DISTANCES)))
+    return [float(metres) for metres in np.arange(0, furthest + 1e-9, apart)]
+
+
+def summarise_active(replay: ActiveReplay) -> dict[str, Any]:
+    """Figures of an active replay, JSON-ready; those that nothing was counted for are None.
+
+    `anr` is the averaged normalised rank in percent over all frames after each action, the first view left out: 0 is
+    perfect, 50 chance. `against` holds how much better (negative) the first planner is than each other, with the 95 %
+    interval of that difference over the same starts.
+    """
+    first, *others = replay.planners
+    resampling = Resampling(len(replay.episodes[first]), int(replay.identity["seed"]))
+    moved = {name: figures(each, "rank_percent")[:, 1:] for name, each in replay.episodes.items()}
+    grid_m = distances_m(replay)
+    against = {}
+    for name in others:
+        ours, theirs = _known(moved[first]), _known(moved[name])
+        against[name] = {
+            "anr": _rounded(ours.mean() - theirs.mean()) if ours.size and theirs.size else None,
+            "interval_95": resampling.interval(moved[first], moved[name]),
+        }
+    return {
+        "anr": {name: _mean(each) for name, each in moved.items()},
+        "interval_95": {name: resampling.interval(each) for name, each in moved.items()},
+        "against": against,
+        "by_step": {name: _by_step(each, resampling) for name, each in replay.episodes.items()},
+        "by_distance": {name: _by_distance(each, grid_m, resampling) for name, each in replay.episodes.items()},
+        "travelled_m": {name: _mean(figures(each, "travelled_m")[:, -1]) for name, each in replay.episodes.items()},
+        "planner_named": {name: each[0].planner_named for name, each in replay.episodes.items()},
+        "n_episodes": len(replay.episodes[first]),
+        "n_frames": {name: int(np.isfinite(each).sum()) for name, each in moved.items()},
+        "n_left_out": {name: int(np.isnan(each).sum()) for name, each in moved.items()},
+        "n_forgot": {name: int(figures(each, "forgot").sum()) for name, each in replay.episodes.items()},
+        "n_map_images": replay.route.n_images,
+        "latency_ms": {
+            name: _rounded(float(np.median(figures(each, "latency_ms")))) for name, each in replay.episodes.items()
+        },
+        "config": dict(replay.identity),
+        "seconds": round(replay.seconds, 3),
+    }
+
+
+def active_tables(summary: dict[str, Any]) -> list[Table]:
+    """Planners against each other, where they know to be after their last move, and at equal distance travelled."""
+    config = summary["config"]
+    names = config["planners"]
+    first = names[0]
+    named = {name: shown_name(name, summary["planner_named"][name]) for name in names}
+    compared = _table(
+        f"{config['recording']} against {config['domain']}, map {config['map_version']}: "
+        f"{summary['n_episodes']} episodes of {config['steps']} moves",
+        "planner",
+        ["ANR %", "95 %", f"{first} gains", "95 %"],
+        caption="ANR after each move: 0 is perfect, 50 is chance. 95 %: over resampled starts, the same for all.",
+    )
+    localized = _table(
+        f"after {config['steps']} moves", "planner", ["median error", "within 5 m", "within 10 m", "moved", "forgot"]
+    )
+    metres = summary["by_distance"][first]["travelled_m"]
+    picked = sorted({round(at) for at in np.linspace(0, len(metres) - 1, min(6, len(metres)))}) if metres else []
+    by_distance = _table("ANR % at equal distance travelled", "planner", [f"{metres[at]:g} m" for at in picked])
+    for name in names:
+        against = summary["against"].get(name, {"anr": None, "interval_95": None})
+        gain = _shown(None if against["anr"] is None else -against["anr"], "z.2f")
+        compared.add_row(
+            named[name],
+            _shown(summary["anr"][name], ".2f"),
+            _ends(summary["interval_95"][name]),
+            "" if name == first else gain,
+            "" if name == first else _ends(against["interval_95"], -1),
+        )
+        last = {figure: values[-1] for figure, values in summary["by_step"][name].items()}
+        localized.add_row(
+            named[name],
+            _shown(last["median_error_m"], ".1f", " m"),
+            _shown(last["within_5_m"], ".0f", " %"),
+            _shown(last["within_10_m"], ".0f", " %"),
+            _shown(summary["travelled_m"][name], ".0f", " m"),
+            str(summary["n_forgot"][name]),
+        )
+        values = summary["by_distance"][name]["anr"]
+        by_distance.add_row(named[name], *(_shown(values[at], ".1f") for at in picked))
+    return [compared, localized, by_distance]
+
+
+def shown_name(asked: str, named: str) -> str:
+    """A planner for people: what `default` stands for is said."""
+    return f"{named} (default)" if asked == DEFAULT_PLANNER and named != DEFAULT_PLANNER else asked
+
+
+def _by_step(episodes: Sequence[Episode], resampling: Resampling) -> dict[str, list[Any]]:
+    error_m = figures(episodes, "error_m")
+    shares = {
+        f"within_{near_m:g}_m": 100 * np.where(np.isfinite(error_m), error_m <= near_m, np.nan) for near_m in NEAR_M
+    }
+    by_step: dict[str, list[Any]] = {
+        "travelled_m": _means(figures(episodes, "travelled_m").T),
+        **_banded("anr", figures(episodes, "rank_percent").T, resampling),
+        **_banded("error_m", error_m.T, resampling, "error_interval_95"),
+        "median_error_m": [_middle(column) for column in error_m.T],
+        "entropy_bits": _means(figures(episodes, "entropy_bits").T),
+    }
+    for name, share in shares.items():
+        by_step |= _banded(name, share.T, resampling)
+    return by_step
+
+
+def _by_distance(episodes: Sequence[Episode], grid_m: Sequence[float], resampling: Resampling) -> dict[str, list[Any]]:
+    """Beyond where half of the episodes come nothing is told: those that do are no fair sample."""
+    ends_m = figures(episodes, "travelled_m")[:, -1]
+
+    def columns(name: str) -> list[Reals]:
+        unknown = np.full(len(episodes), np.nan)
+        fair = [2 * int((ends_m >= metres).sum()) >= len(episodes) for metres in grid_m]
+        return [
+            at_distance(episodes, name, metres) if is_fair else unknown
+            for metres, is_fair in zip(grid_m, fair, strict=True)
+        ]
+
+    ranks, errors_m = columns("rank_percent"), columns("error_m")
+    return {
+        "travelled_m": list(grid_m),
+        **_banded("anr", ranks, resampling),
+        **_banded("error_m", errors_m, resampling, "error_interval_95"),
+        "n_episodes": [_known(each).size for each in ranks],
+    }
+
+
+def _banded(
+    name: str, columns: Iterable[Reals], resampling: Resampling, interval: str | None = None
+) -> dict[str, list[Any]]:
+    """The mean of each column, and its 95 % interval."""
+    columns = list(columns)
+    interval = interval or f"{name}_interval_95"
+    return {name: _means(columns), interval: [resampling.interval(column) for column in columns]}
+
+
+def _means(columns: Iterable[Reals]) -> list[float | None]:
+    return [_mean(column) for column in columns]
+
+
+def _mean(values: Reals) -> float | None:
+    """Of the values that are not NaN; None where all are."""
+    known = _known(values)
+    return _rounded(known.mean()) if known.size else None
+
+
+def _middle(values: Reals) -> float | None:
+    known = _known(values)
+    return _rounded(float(np.median(known))) if known.size else None
+
+
+def _known(values: Reals) -> Reals:
+    return values[np.isfinite(values)]
+
+
+def _rounded(value: float) -> float:
+    return round(float(value), _DIGITS)
+
+
+def _table(title: str, first: str, headings: Sequence[str], caption: str | None = None) -> Table:
+    made = Table(title=title, caption=caption, title_justify="left", caption_justify="left")
+    made.add_column(first, style=None if first == "figure" else "bold", no_wrap=True)
+    for heading in headings:
+        made.add_column(heading, justify="right", no_wrap=True)
+    return made
+
+
+def _ends(interval: list[float] | None, sign: int = 1) -> str:
+    if interval is None:
+        return "-"
+    low, high = sorted(sign * end for end in interval)
+    return f"{low:z.2f} .. {high:z.2f}"
+
+
+def _shown(value: float | None, form: str, unit: str = "") -> str:
+    return "-" if value is None else format(value, form) + unit

@@ -1,0 +1,211 @@
+"""What a replay plays on: a domain's map, a recording to drive along, and the truth by core's own rules."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deepsimbad.core.route import Route, true_images_of
+from deepsimbad_client.errors import (
+    BrokenFrameError,
+    IdempotencyKeyReusedError,
+    InvalidInputError,
+    InvalidMoveError,
+    ReplayError,
+)
+from deepsimbad_client.http.client import Client, Session
+from deepsimbad_client.http.models import Domain, Localization, SessionAnswer
+from deepsimbad_client.http.upload import UNUSABLE_IMAGE_CODES
+from deepsimbad_client.recordings.recording import Recording
+
+DEFAULT_PLANNER = "default"
+"""Asks the service for the planner that ships."""
+
+
+@dataclass(frozen=True)
+class Seen:
+    """The service's answer to one view.
+
+    Attributes:
+        answer: What it believes now and asks for next.
+        latency_ms: From posting the view to the answer.
+        forgot: The belief had no room for the move, so the session was set back to knowing nothing.
+    """
+
+    answer: SessionAnswer
+    latency_ms: float
+    forgot: bool
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A recording before a domain's active map.
+
+    Attributes:
+        client: The client.
+        domain: As the service described it; it has an active map.
+        recording: What there is to see.
+        position_m: [m] float64 along the recording's own route.
+        route: The map's images.
+        right: For each frame the ids of the map images that are right answers.
+        clock: Seconds that never go backwards.
+    """
+
+    client: Client
+    domain: Domain
+    recording: Recording
+    position_m: NDArray[np.float64]
+    route: Route
+    right: list[NDArray[np.int64]]
+    clock: Callable[[], float]
+
+    @classmethod
+    def of(cls, client: Client, recording: Recording, domain: str, within_m: float, clock: Callable[[], float]) -> Self:
+        """Learn what is needed of a domain.
+
+        Args:
+            client: The client.
+            recording: What there is to see.
+            domain: Its name.
+            within_m: How far a right answer may be, in the plane where both sides know x and y, else along the route.
+            clock: Seconds that never go backwards.
+
+        Raises:
+            ReplayError: It has no active map, one that changed meanwhile, or the recording has no frame of use.
+        """
+        if not recording.frames:
+            raise ReplayError(f"{recording.name} has no frames to replay")
+        described = client.domain(domain)
+        if described.map_version is None or described.n_map_images is None:
+            raise ReplayError(f"domain {domain} has no active map to replay against: remap it first")
+        position_m = np.array([frame.position_m for frame in recording.frames], np.float64)
+        route = _map_route(client, described, recording)
+        return cls(client, described, recording, position_m, route, right_answers(recording, route, within_m), clock)
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """What must be the same for a replay to go on."""
+        frames = self.recording.frames
+        return {
+            "domain": self.domain.name,
+            "map_version": self.domain.map_version,
+            "n_map_images": self.route.n_images,
+            "recording": self.recording.name,
+            "n_frames": len(frames),
+            "first_index": frames[0].index,
+            "last_index": frames[-1].index,
+        }
+
+    def session(self, planner: str = DEFAULT_PLANNER, seed: int | None = None, *, keep: bool = False) -> Session:
+        """Begin a session.
+
+        Raises:
+            ReplayError: The active map is another than the one that was described.
+            ApiError: The service refused, for example an unknown planner.
+        """
+        wanted = None if planner == DEFAULT_PLANNER else planner
+        session = self.client.session(self.domain.name, seed=seed, planner=wanted, keep=keep)
+        if session.map_version != self.domain.map_version:
+            session.delete()
+            raise changed_map(self.domain.name)
+        return session
+
+    def view(self, row: int) -> dict[str, Any] | str:
+        """What is seen from a frame, as arguments of `Session.observe`, or why the frame is broken."""
+        try:
+            return self.recording.view(row, self.domain.input_size)
+        except BrokenFrameError as error:
+            return error.reason
+
+    def look(self, session: Session, view: dict[str, Any], action_m: float | None, **options: Any) -> Seen | str:
+        """Tell a session of a move and the view after it.
+
+        A belief that is wrong may leave no room for the move that was really made, and a recording may jump or go
+        backwards; the robot then starts anew from knowing nothing.
+
+        Args:
+            session: The session.
+            view: What is seen.
+            action_m: Metres really moved; None: none, as before the first view.
+            options: Of `Session.observe`.
+
+        Returns:
+            The answer, or why the service cannot use the view.
+        """
+        began, forgot = self.clock(), False
+        try:
+            try:
+                answer = session.observe(**view, **options, action_m=action_m)
+            except (InvalidMoveError, IdempotencyKeyReusedError):  # the key's: told before as what follows
+                middle_m = float(np.median(self.route.position_m))
+                session.set_prior(middle_m, 100 * max(self.route.length_m, 1.0))
+                forgot = True
+                answer = session.observe(**view, **options)
+        except InvalidInputError as error:
+            if error.code not in UNUSABLE_IMAGE_CODES:
+                raise
+            return f"refused by the service as {error.code}"
+        return Seen(answer, round(1000 * (self.clock() - began), 3), forgot)
+
+    def apart_m(self, row: int, images: NDArray[np.int64]) -> NDArray[np.float64]:
+        """[k] distance from a frame to map images, in the plane where both know it, else along the route."""
+        frame, route = self.recording.frames[row], self.route
+        along = np.abs(route.offset_m(route.position_m[images], frame.position_m))
+        if frame.x_m is None or frame.y_m is None or route.x_m is None or route.y_m is None:
+            return along
+        plane = np.hypot(route.x_m[images] - frame.x_m, route.y_m[images] - frame.y_m)
+        return np.where(np.isfinite(plane), plane, along)
+
+    def nearest_right(self, row: int) -> int | None:
+        """The right answer nearest to a frame; None where the map does not hold its place."""
+        right = self.right[row]
+        return int(right[self.apart_m(row, right).argmin()]) if right.size else None
+
+    def place(self, image: int) -> tuple[float | None, float | None]:
+        """A map image's x and y; None where unknown."""
+        axes = (self.route.x_m, self.route.y_m)
+        x_m, y_m = (np.nan if axis is None else float(axis[image]) for axis in axes)
+        return (None if np.isnan(x_m) else x_m, None if np.isnan(y_m) else y_m)
+
+
+def changed_map(domain: str) -> ReplayError:
+    """The error for a map that was switched while a replay ran."""
+    return ReplayError(f"the active map of {domain} changed during the replay: restart it against the new one")
+
+
+def right_answers(recording: Recording, route: Route, within_m: float) -> list[NDArray[np.int64]]:
+    """Right answers to each frame; of frames taken backwards as well, which still look forwards."""
+    columns = [[frame.position_m, frame.x_m, frame.y_m] for frame in recording.frames]
+    position_m, x_m, y_m = np.array(columns, np.float64).T
+    order = np.argsort(position_m, kind="stable")
+    knows_plane = bool(np.isfinite(x_m).any() and np.isfinite(y_m).any())
+    plane = (x_m[order], y_m[order]) if knows_plane else (None, None)
+    images = true_images_of(Route(position_m[order], False, *plane), route, within_m)
+    return [images[place] for place in np.argsort(order)]
+
+
+def _map_route(client: Client, domain: Domain, recording: Recording) -> Route:
+    """Learn where every map image lies from one answer that lists them all."""
+    for row in range(len(recording.frames)):
+        try:
+            view = recording.view(row, domain.input_size)
+            answer: Localization = client.localize(domain.name, shortlist=domain.n_map_images, **view)
+        except BrokenFrameError:
+            continue
+        except InvalidInputError as error:
+            if error.code not in UNUSABLE_IMAGE_CODES:
+                raise
+            continue
+        if answer.map_version != domain.map_version or len(answer.retrieval) != domain.n_map_images:
+            raise changed_map(domain.name)
+        position_m, x_m, y_m = np.full((3, len(answer.retrieval)), np.nan)
+        for entry in answer.retrieval:
+            position_m[entry.map_image] = entry.route_position_m
+        for place in answer.belief.top:
+            if place.x_m is not None and place.y_m is not None:
+                x_m[place.map_image], y_m[place.map_image] = place.x_m, place.y_m
+        plane = (x_m, y_m) if np.isfinite(x_m).any() else (None, None)
+        return Route(position_m, domain.closed, *plane)
+    raise ReplayError(f"none of the {len(recording.frames)} frames of {recording.name} can be used")

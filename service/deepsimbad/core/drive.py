@@ -1,0 +1,350 @@
+"""A recorded drive, and whether two of them saw one route (ours), so that the map of one may learn from the other.
+
+Positions count from where a recording began: drives of two places have equal ones too. So the positions must be said to
+be comparable, by x, y or in so many words, and then the views must agree at equal positions better than they do where
+one drive is shifted against the other.
+
+A route that changes slowly makes the test harder than it looks. Shifts by one station and by two are nearly one and the
+same there, so that few of them are trials of their own, and two slow trends agree or disagree as a whole. So views are
+compared with their surroundings, which takes trends out, and agreement is looked at by its frequency along the route.
+Shifting one drive turns the phase of every frequency by its own angle: of drives that share nothing every phase is
+equally likely, independently of the others, and at shift 0 of one route all are 0. The agreement at shift 0 is the sum
+of the cosines of these phases, weighted by how strong each frequency is; over all shifts it has mean 0 and a variance
+that the weights give.
+
+The theory takes a route for a stationary process. Real scenery repeats: of two places of one railway some agree better
+than chance allows, a little. So agreement must also be worth learning from.
+"""
+
+import hashlib
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from statistics import NormalDist
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deepsimbad.core.descriptor import normal_scores, rank_landmarks
+from deepsimbad.core.route import Route, same_places
+from deepsimbad.core.statistics import LandmarkStatistics
+from deepsimbad.errors import InvalidEncodingError, InvalidInputError, InvalidMapConfigError, InvalidRouteError
+
+UNKNOWN_TIMESTAMP = -1
+MAX_FRAME_INDEX = 2**53
+MAX_POSITION_M = 1e9  # either way; 25 times round the earth, and squares and spans are far from overflow
+_ROWS_AT_ONCE = 1024
+_DIGEST_BYTES = 8
+
+SIGNIFICANCE = 0.002  # of the agreement at shift 0, up to which it counts as more than chance
+LEAST_CORRELATION = (
+    0.2  # mean, of scores at equal positions; where scenery repeats, chance goes far, but rarely this far
+)
+LEAST_PLACES = 30  # that both saw
+_STATION_M = 1.0  # frames nearer together, as of a robot that stands, say nothing new
+_FEWEST_STATIONS, _MOST_STATIONS = 64, 512  # a short route is cut finer, a long one coarser
+_SURROUNDINGS = 16  # stations to either side
+_LEAST_CYCLES = 1  # along the stretch that both saw: its mean tells nothing
+_LEAST_SPREAD = 1e-9  # of similarities; below, one drive shows the same everywhere
+
+_Unknown: Any = None  # filled in by __post_init__
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Drive:
+    """Frames of one traverse, in the order they were driven.
+
+    Attributes:
+        position_m: Route position, [n] float64, at most MAX_POSITION_M either way; need not increase here.
+        encodings: [n, d] float32, finite.
+        index: Place in the whole recording, [n] int64, distinct, from 0.
+        timestamp_us: [n] int64, microseconds, -1 where unknown.
+        x_m: East, [n] float64, at most MAX_POSITION_M either way, NaN where unknown.
+        y_m: North, likewise.
+        weights_sha256: Of the network that encoded images among them; None where none did, or nobody knows.
+        dissimilarities: [n, r] float32 to a map's landmarks, smaller is nearer; None before they are measured.
+    """
+
+    position_m: NDArray[np.float64]
+    encodings: NDArray[np.float32]
+    index: NDArray[np.int64] = _Unknown
+    timestamp_us: NDArray[np.int64] = _Unknown
+    x_m: NDArray[np.float64] = _Unknown
+    y_m: NDArray[np.float64] = _Unknown
+    weights_sha256: str | None = None
+    dissimilarities: NDArray[np.float32] | None = None
+
+    def __post_init__(self) -> None:
+        n = len(self.encodings)
+        unknown = {
+            "index": np.arange(n),
+            "timestamp_us": np.full(n, UNKNOWN_TIMESTAMP, np.int64),
+            "x_m": np.full(n, np.nan),
+            "y_m": np.full(n, np.nan),
+        }
+        for name, array in unknown.items():
+            if getattr(self, name) is None:
+                object.__setattr__(self, name, array)
+
+    @property
+    def n_frames(self) -> int:
+        """n."""
+        return len(self.encodings)
+
+    @property
+    def encoding_dim(self) -> int:
+        """d."""
+        return int(self.encodings.shape[1])
+
+    def at(self, frames: NDArray[np.integer[Any]]) -> Self:
+        """Some of the frames alone."""
+        arrays = {name: array[frames] for name, array in vars(self).items() if isinstance(array, np.ndarray)}
+        return replace(self, **arrays)
+
+    def route(self, closed: bool = False) -> Route:
+        """The frames' positions as a route; x, y only where some frame knows them.
+
+        Raises:
+            InvalidRouteError: The positions go backwards or are NaN.
+        """
+        has_plane = bool(np.isfinite(self.x_m).any() and np.isfinite(self.y_m).any())
+        return Route(self.position_m, closed, self.x_m if has_plane else None, self.y_m if has_plane else None)
+
+    def digests(self) -> NDArray[np.uint64]:
+        """[n] one digest a frame of its encoding's bytes; kept in map files, so it stays as it is.
+
+        A frame is known by its encoding, whatever traverse it is in: a drive that was uploaded again under another name
+        is found out, and so is one that was deleted since, or that came with a map of another server.
+        """
+        rows = np.ascontiguousarray(self.encodings, "<f4")
+        digests = b"".join(hashlib.blake2b(row, digest_size=_DIGEST_BYTES).digest() for row in rows)
+        return np.frombuffer(digests, "<u8").astype(np.uint64)
+
+    def checked(self) -> Self:
+        """The same frames with exact dtypes, fit to be stored.
+
+        Raises:
+            InvalidInputError: Shapes differ, an index is out of range or there twice, a place is too far away.
+            InvalidRouteError: A position is NaN or too far away.
+            InvalidEncodingError: An encoding is empty or not finite.
+        """
+        encodings = np.asarray(self.encodings, np.float32)
+        if encodings.ndim != 2 or encodings.shape[1] == 0:
+            raise InvalidEncodingError(f"encodings have shape {encodings.shape}, not [n, d]")
+        frames = replace(
+            self,
+            index=_integers(self.index, "index"),
+            position_m=_reals(self.position_m, "position_m"),
+            timestamp_us=_integers(self.timestamp_us, "timestamp_us"),
+            x_m=_reals(self.x_m, "x_m"),
+            y_m=_reals(self.y_m, "y_m"),
+            encodings=encodings,
+        )
+        n = encodings.shape[0]
+        for name in ("index", "position_m", "timestamp_us", "x_m", "y_m"):
+            shape = getattr(frames, name).shape
+            if shape != (n,):
+                raise InvalidInputError(f"{name} has shape {shape}; there are {n} encodings")
+        frames._check_values()
+        return frames
+
+    def _check_values(self) -> None:
+        out_of_range = (self.index < 0) | (self.index > MAX_FRAME_INDEX)
+        if out_of_range.any():
+            raise InvalidInputError(f"frame indices count from 0; {self.index[out_of_range][0]} is none")
+        values, counts = np.unique(self.index, return_counts=True)
+        if (counts > 1).any():
+            raise InvalidInputError(f"frame index {values[counts > 1][0]} is there twice in one batch")
+        bad = ~np.isfinite(self.position_m)
+        if bad.any():
+            raise InvalidRouteError(f"position_m of frame {self.index[bad][0]} is not a finite number")
+        _check_near("position_m", self.position_m, self.index, InvalidRouteError)
+        if (self.timestamp_us < UNKNOWN_TIMESTAMP).any():
+            raise InvalidInputError("timestamp_us counts from 0; -1 stands for unknown")
+        for name, values_m in (("x_m", self.x_m), ("y_m", self.y_m)):
+            if np.isinf(values_m).any():
+                raise InvalidInputError(f"{name} is infinite; NaN stands for unknown")
+            _check_near(name, values_m, self.index, InvalidInputError)
+        for start in range(0, self.n_frames, _ROWS_AT_ONCE):  # no mask as large as the batch
+            finite = np.isfinite(self.encodings[start : start + _ROWS_AT_ONCE]).all(axis=1)
+            if not finite.all():
+                frame = self.index[start + int(np.argmin(finite))]
+                raise InvalidEncodingError(f"the encoding of frame {frame} holds NaN or infinity")
+
+
+def _check_near(
+    name: str, values_m: NDArray[np.float64], index: NDArray[np.int64], error: type[InvalidInputError]
+) -> None:
+    far = np.abs(values_m) > MAX_POSITION_M  # not NaN
+    if far.any():
+        raise error(f"{name} of frame {index[far][0]} is {values_m[far][0]:g} m: {MAX_POSITION_M:g} m is the most")
+
+
+def _integers(values: NDArray[np.int64], name: str) -> NDArray[np.int64]:
+    array = np.asarray(values)
+    if array.dtype.kind not in "iu" and array.size:
+        raise InvalidInputError(f"{name} holds {array.dtype}, not whole numbers")
+    return array.astype(np.int64, copy=False)
+
+
+def _reals(values: NDArray[np.float64], name: str) -> NDArray[np.float64]:
+    array = np.asarray(values)
+    if array.dtype.kind not in "iuf" and array.size:
+        raise InvalidInputError(f"{name} holds {array.dtype}, not numbers")
+    return array.astype(np.float64, copy=False) + 0.0  # SQLite does not keep the sign of -0.0
+
+
+@dataclass(frozen=True)
+class SecondSeason:
+    """What another drive of the mapped route tells of it.
+
+    Attributes:
+        dissimilarities: [m, r] of its frames to the landmarks.
+        places: [k, 2] int64, (map image, its frame) where both saw the same place; some.
+    """
+
+    dissimilarities: NDArray[np.float32]
+    places: NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class SameRoute:
+    """Whether a drive saw the mapped route.
+
+    Attributes:
+        accepted: It did: the map may learn from it.
+        why: In a sentence, why it was not accepted; None where it was.
+        n_pairs: Frames that have a map image at their position.
+        correlation: Mean correlation of landmarks' scores at equal positions; None where nothing was compared.
+        statistic: Agreement at equal positions, in standard deviations of the agreement over all shifts; None
+            likewise.
+        significance: Chance that drives of two routes agree so well or better; None likewise.
+    """
+
+    accepted: bool
+    why: str | None
+    n_pairs: int
+    correlation: float | None = None
+    statistic: float | None = None
+    significance: float | None = None
+
+    def as_dict(self) -> dict[str, Any]:
+        """The JSON form."""
+        return asdict(self)
+
+
+def second_season(
+    own: Drive, closed: bool, other: Drive, same_route: bool | None, measure: Callable[[Drive], Drive]
+) -> tuple[SecondSeason | None, Drive | None, SameRoute]:
+    """What a map can learn from another drive: something only where both drove one route.
+
+    Args:
+        own: The drive that becomes the map, its dissimilarities measured.
+        closed: Whether its route is a loop.
+        other: Another drive.
+        same_route: Whether their positions are said to be comparable; None: where both know x, y.
+        measure: Measures the other's dissimilarities; asked only where positions are comparable.
+
+    Returns:
+        What it tells and the measured drive, None both where it tells nothing; and the verdict.
+    """
+    route, other_route = own.route(closed), other.route()
+    if same_route is False:
+        return None, None, SameRoute(False, "the two drives are said not to share their positions", 0)
+    if same_route is None and (route.x_m is None or other_route.x_m is None):
+        why = "without x, y of both drives nothing says that their positions are comparable; say same_route"
+        return None, None, SameRoute(False, why, 0)
+    if own.dissimilarities is None or (other := measure(other)).dissimilarities is None:
+        raise InvalidMapConfigError("dissimilarities are not measured")
+    places = same_places(other_route, route)
+    verdict = judge(own.dissimilarities, other.dissimilarities, places, own.position_m)
+    if not verdict.accepted:
+        return None, None, verdict
+    return SecondSeason(other.dissimilarities, places), other, verdict
+
+
+def judge(
+    own: NDArray[np.float32], other: NDArray[np.float32], places: NDArray[np.int64], position_m: NDArray[np.float64]
+) -> SameRoute:
+    """Test whether drives with comparable positions saw one route.
+
+    Args:
+        own: [n, r] dissimilarities of the map images to the landmarks.
+        other: [m, r] of the other drive's frames.
+        places: [k, 2] (map image, frame) at equal positions.
+        position_m: [n] of the map images.
+    """
+    stations = _stations(places, position_m)
+    if len(stations) < LEAST_PLACES:
+        few = f"the two drives share {len(stations)} places by their positions, and {LEAST_PLACES} are the least"
+        return SameRoute(False, few, len(places))
+    images, frames = stations.T
+    scores, others = _scores(own[images]), _scores(other[frames])
+    correlation = float((scores * others).mean())
+    statistic = _agreement(_against_surroundings(scores), _against_surroundings(others))
+    significance = NormalDist().cdf(-statistic)
+    why: str | None = None
+    if significance > SIGNIFICANCE:
+        why = (
+            "at equal positions the two drives agree no better than where one is shifted against the other "
+            f"(significance {significance:.2g}, {SIGNIFICANCE:g} is asked for)"
+        )
+    elif correlation < LEAST_CORRELATION:
+        why = (
+            f"at equal positions the two drives agree too little to learn from (mean correlation {correlation:.2f}, "
+            f"{LEAST_CORRELATION:g} is asked for)"
+        )
+    return SameRoute(why is None, why, len(places), correlation, statistic, significance)
+
+
+def _stations(places: NDArray[np.int64], position_m: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Pairs [s, 2] in route order, one of each stretch of equal length that has any."""
+    ordered = places[np.argsort(position_m[places[:, 0]], kind="stable")]
+    if len(ordered) == 0:
+        return ordered
+    at_m = position_m[ordered[:, 0]] - position_m[ordered[0, 0]]
+    station_m = np.clip(_STATION_M, at_m[-1] / _MOST_STATIONS, at_m[-1] / _FEWEST_STATIONS)
+    # What lies on a border belongs to the stretch behind it, however positions were rounded.
+    stretch = np.floor(at_m / station_m * (1 + 1e-9)) if station_m > 0 else at_m
+    return np.asarray(ordered[np.unique(stretch, return_index=True)[1]], np.int64)
+
+
+def _scores(dissimilarities: NDArray[np.float32]) -> NDArray[np.float64]:
+    """[s, r] standardised by what is usual over these stations."""
+    ranks = rank_landmarks(dissimilarities)
+    return LandmarkStatistics.of_map(ranks).standardise(ranks)
+
+
+def _against_surroundings(scores: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[s, r] scores less their mean over the surroundings."""
+    before = np.concatenate([np.zeros((1, scores.shape[1])), np.cumsum(scores, axis=0)])
+    station = np.arange(len(scores))
+    first, stop = np.maximum(station - _SURROUNDINGS, 0), np.minimum(station + _SURROUNDINGS + 1, len(scores))
+    return np.asarray(scores - (before[stop] - before[first]) / (stop - first)[:, np.newaxis])
+
+
+def _agreement(own: NDArray[np.float64], other: NDArray[np.float64]) -> float:
+    """Agreement at shift 0 in standard deviations of that over all shifts.
+
+    Args:
+        own: [s, r] scores of one drive along the route.
+        other: [s, r] of the other.
+    """
+    similarity = own @ other.T / own.shape[1]
+    if similarity.std() < _LEAST_SPREAD:
+        return 0.0
+    # Ranked, a few places that are unlike all others (tunnels) count as any other places do.
+    ranked = (_normal_ranks(similarity) + _normal_ranks(similarity.T).T) / 2
+    spectrum = np.fft.fft2(ranked)
+    power = np.square(np.abs(spectrum))
+    cycles = np.arange(_LEAST_CYCLES, (len(ranked) + 1) // 2)
+    # A drive's slow frequencies are its strongest, and those that noise and inexact positions spoil least, yet a few.
+    # Divided by the square root of what they would have by chance, they lead without deciding alone.
+    by_chance = power.sum(axis=1)[cycles] * power.sum(axis=0)[-cycles]
+    cross = spectrum[cycles, -cycles] / np.sqrt(np.sqrt(np.maximum(by_chance, np.finfo(np.float64).tiny)))
+    return float(cross.real.sum() / max(np.sqrt(np.square(np.abs(cross)).sum() / 2), np.finfo(np.float64).tiny))
+
+
+def _normal_ranks(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Normal scores of every row's ranks."""
+    return normal_scores(rank_landmarks(values), values.shape[1])

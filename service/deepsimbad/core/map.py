@@ -1,0 +1,325 @@
+"""All that is known of a mapped route, as one frozen value: built, stored, served, checked and learnt from.
+
+Its arrays are named once, here, with their axes: what writes them, reads them, or takes some of the images need not
+know what they mean.
+"""
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deepsimbad.core.descriptor import MAX_LANDMARKS
+from deepsimbad.core.landmark_model import PortableLandmarks, landmark_model_digest, pack_landmarks
+from deepsimbad.core.relevance import DEFAULT_UPDATE, Relevance, UpdateRule
+from deepsimbad.core.route import Route
+from deepsimbad.core.statistics import CALIBRATED_PRIOR_WEIGHT_FRAMES, PRIOR_WEIGHT_FRAMES, LandmarkStatistics
+from deepsimbad.errors import InvalidMapConfigError, LandmarkModelDiffersError
+
+UNKNOWN_FRAME = 0  # no digest was kept of what an image was made of
+
+# A relevance compares more than lists.
+_NEEDS: dict[str | None, tuple[str, ...]] = {
+    Relevance.STANDARDISED: ("statistics",),
+    Relevance.CALIBRATED: ("statistics", "correlation", "listed_score"),
+    Relevance.SIMBAD: ("values",),
+    Relevance.BRUTE_FORCE: ("encodings",),
+}
+
+
+def _row(dtype: type[np.generic], *axes: str | int, unknown: float | None = None) -> dict[str, Any]:
+    """One row of the table of named arrays.
+
+    Args:
+        dtype: Of its numbers.
+        axes: n: map images in route order, h: places of a list, r: landmarks, a: actions, *: any length, or a number.
+        unknown: What an image holds of which this is not known; None: every image has it.
+    """
+    return {"dtype": np.dtype(dtype), "axes": axes, "unknown": unknown}
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Map:
+    """A mapped route; nothing in it changes, so any number of threads may read it.
+
+    Attributes:
+        config: What it was built with; `relevance` and `n_landmarks` are in it.
+        domain, version, created_at: Which map; the time in ISO 8601, UTC.
+        evaluator: The evaluator's configuration.
+        closed: Whether the route is a loop.
+        actions_m: [a] the moves of the domain in metres, ascending.
+        metrics: What was measured when it was built.
+        landmark_model: The evaluator's named arrays.
+        index_bytes: Size of the posting tables in its file; 0 before it has one.
+
+        lists: Row j holds every map image's landmark of rank j + 1.
+        position_m: Route position of every map image, not decreasing.
+        values: The listed dissimilarities (`simbad` alone).
+        encodings: Of every map image (`brute_force` alone).
+        statistics: Mean and std of every landmark's normal score (`standardised`: over the map's drive; `calibrated`:
+            over both seasons that the map knows). A live session starts from them.
+        loadings: On common factors, how landmarks go together, where the drive tells.
+        correlation: How far each landmark can be trusted across seasons (`calibrated` alone).
+        listed_score: Mean score of a landmark where it is listed at a rank (`calibrated` alone).
+        telling_bits: By how many bits a view from a place narrows the map down, where a second season is known.
+        off_route_model: Slope and intercept of the log-odds of being off the route, likewise.
+        timestamp_us: Microseconds since 1970, -1 where unknown.
+        frame_digest: Which frame every image was made of (`Drive.digests`), 0 where nobody noted it.
+        x_m, y_m: East and north, NaN where unknown.
+        q_values: The experience database.
+    """
+
+    config: Mapping[str, Any]
+    domain: str = ""
+    version: int = 0
+    created_at: str = ""
+    evaluator: Mapping[str, Any] = field(default_factory=dict)
+    closed: bool = False
+    actions_m: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
+    metrics: Mapping[str, Any] = field(default_factory=dict)
+    landmark_model: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    index_bytes: int = 0
+
+    lists: NDArray[np.uint16] = field(metadata=_row(np.uint16, "h", "n"))
+    position_m: NDArray[np.float64] = field(metadata=_row(np.float64, "n"))
+    values: NDArray[np.float32] | None = field(default=None, metadata=_row(np.float32, "h", "n"))
+    encodings: NDArray[np.float32] | None = field(default=None, metadata=_row(np.float32, "n", "*"))
+    statistics: NDArray[np.float64] | None = field(default=None, metadata=_row(np.float64, 2, "r"))
+    loadings: NDArray[np.float32] | None = field(default=None, metadata=_row(np.float32, "r", "*"))
+    correlation: NDArray[np.float64] | None = field(default=None, metadata=_row(np.float64, "r"))
+    listed_score: NDArray[np.float64] | None = field(default=None, metadata=_row(np.float64, "h", "r"))
+    telling_bits: NDArray[np.float32] | None = field(default=None, metadata=_row(np.float32, "n"))
+    off_route_model: NDArray[np.float64] | None = field(default=None, metadata=_row(np.float64, 2))
+    timestamp_us: NDArray[np.int64] | None = field(default=None, metadata=_row(np.int64, "n", unknown=-1))
+    frame_digest: NDArray[np.uint64] | None = field(default=None, metadata=_row(np.uint64, "n", unknown=UNKNOWN_FRAME))
+    x_m: NDArray[np.float64] | None = field(default=None, metadata=_row(np.float64, "n", unknown=np.nan))
+    y_m: NDArray[np.float64] | None = field(default=None, metadata=_row(np.float64, "n", unknown=np.nan))
+    q_values: NDArray[np.float32] | None = field(default=None, metadata=_row(np.float32, "n", "a"))
+
+    def __post_init__(self) -> None:
+        actions_m = np.asarray(self.actions_m)
+        if actions_m.ndim != 1 or (actions_m.size and actions_m.dtype.kind not in "iuf"):
+            raise InvalidMapConfigError("actions_m are no metres")
+        object.__setattr__(self, "actions_m", actions_m.astype(np.float64))
+        self._check_shapes()
+        for name in _NEEDS.get(self.config.get("relevance"), ()):
+            if getattr(self, name) is None:
+                raise InvalidMapConfigError(f"a map for {self.relevance} needs {name}")
+        for array in (*self.arrays().values(), *self.landmark_model.values(), self.actions_m):
+            array.setflags(write=False)
+        _ = self.route  # raises InvalidRouteError
+
+    def _check_shapes(self) -> None:
+        if not isinstance(self.config.get("n_landmarks"), int):
+            raise InvalidMapConfigError("the map's config does not say n_landmarks")
+        if self.lists.ndim != 2 or 0 in self.lists.shape or self.n_landmarks > MAX_LANDMARKS:
+            raise InvalidMapConfigError(
+                f"lists of {self.n_landmarks} landmarks have shape {self.lists.shape}, not [h, n]"
+            )
+        lengths = {"n": self.n_images, "h": self.list_length, "r": self.n_landmarks, "a": self.actions_m.size}
+        for name, array in self.arrays().items():
+            row = ARRAYS[name]
+            shape = tuple(lengths.get(axis, axis) if isinstance(axis, str) else axis for axis in row.axes)
+            fits = len(shape) == array.ndim and all(
+                want in {"*", length} for want, length in zip(shape, array.shape, strict=True)
+            )
+            if array.dtype != row.dtype or not fits:
+                raise InvalidMapConfigError(f"{name} is {array.dtype} {array.shape}, not {row.dtype} {list(shape)}")
+        if (
+            self.list_length > self.n_landmarks or int(self.lists.max()) >= self.n_landmarks
+        ):  # scoring does not ask again
+            raise InvalidMapConfigError(
+                f"lists of {self.list_length} name landmarks that are not among the {self.n_landmarks}"
+            )
+
+    def check(self) -> None:
+        """Check that a map of whatever origin makes sense before it serves.
+
+        Raises:
+            InvalidMapConfigError: What was learnt is NaN or infinite, nothing varies, or there is no way to move.
+        """
+        for name, array in self.arrays().items():
+            if array.dtype.kind == "f" and ARRAYS[name].unknown is None and not np.isfinite(array).all():
+                raise InvalidMapConfigError(f"{name} holds NaN or infinity")
+        if self.statistics is not None and not (self.statistics[1] > 0).all():
+            raise InvalidMapConfigError("the statistics of a landmark have no spread")
+        if self.n_images > 1 and self.route.length_m <= 0:
+            raise InvalidMapConfigError("all map images are at one position")
+        moves_m = np.concatenate([[0.0], self.actions_m])
+        if not self.actions_m.size or not np.isfinite(moves_m).all() or not (np.diff(moves_m) > 0).all():
+            raise InvalidMapConfigError(f"its actions_m {self.actions_m.tolist()} are no moves that ascend")
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """The named arrays that it has."""
+        named = {name: getattr(self, name) for name in ARRAYS}
+        return {name: array for name, array in named.items() if array is not None}
+
+    def document(self) -> dict[str, Any]:
+        """All that is no array of its own, JSON-ready."""
+        names = ("domain", "version", "created_at", "closed")
+        return {
+            **{name: getattr(self, name) for name in names},
+            **{name: dict(getattr(self, name)) for name in ("config", "evaluator", "metrics")},
+            "actions_m": self.actions_m.tolist(),
+            "n_map_images": self.n_images,
+            "n_landmarks": self.n_landmarks,
+            "list_length": self.list_length,
+        }
+
+    @classmethod
+    def from_arrays(
+        cls,
+        document: Mapping[str, Any],
+        landmark_model: Mapping[str, NDArray[Any]],
+        arrays: Mapping[str, Any],
+        index_bytes: int = 0,
+    ) -> Self:
+        """Back from `document`, the landmark model and `arrays`.
+
+        Raises:
+            InvalidMapConfigError, InvalidRouteError: They contradict each other.
+            KeyError, TypeError, ValueError: Or are not what a map gives.
+        """
+        said = {name: document[name] for name in document.keys() - {"n_map_images", "n_landmarks", "list_length"}}
+        said["closed"] = bool(said["closed"])
+        return cls(**said, landmark_model=landmark_model, index_bytes=index_bytes, **arrays)
+
+    def at(self, images: NDArray[np.integer[Any]]) -> Self:
+        """The same map of some of its images alone, [m] in route order."""
+        some: dict[str, Any] = {
+            name: np.ascontiguousarray(array.take(images, ARRAYS[name].axes.index("n")))
+            for name, array in self.arrays().items()
+            if "n" in ARRAYS[name].axes
+        }
+        return replace(self, **some)
+
+    def with_images(self, new: Mapping[str, NDArray[Any] | None]) -> Self:
+        """With further images, merged by route position; of images at one position the old come first.
+
+        Args:
+            new: Named arrays of the m new images. What only the old or only the new ones have is unknown of the others.
+        """
+        both: dict[str, NDArray[Any]] = {}
+        n_old, n_new = self.n_images, new["position_m"].size  # type: ignore[union-attr]
+        for name, row in ARRAYS.items():
+            old, added = getattr(self, name), new.get(name)
+            if "n" not in row.axes or (old is None and added is None):
+                continue
+            if old is None:
+                old = np.full(n_old, row.unknown, row.dtype)
+            if added is None:
+                added = np.full(n_new, row.unknown, row.dtype)
+            both[name] = np.concatenate([old, added], axis=row.axes.index("n"))
+        order = np.argsort(both["position_m"], kind="stable")
+        merged: dict[str, Any] = {
+            name: np.ascontiguousarray(array.take(order, ARRAYS[name].axes.index("n"))) for name, array in both.items()
+        }
+        return replace(self, **merged)
+
+    @property
+    def n_images(self) -> int:
+        """n."""
+        return int(self.lists.shape[1])
+
+    @property
+    def list_length(self) -> int:
+        """h."""
+        return int(self.lists.shape[0])
+
+    @property
+    def n_landmarks(self) -> int:
+        """r."""
+        return int(self.config["n_landmarks"])
+
+    @cached_property
+    def relevance(self) -> Relevance:
+        """What it was built for; raises KeyError or ValueError where its configuration names none that exists."""
+        return Relevance(self.config["relevance"])
+
+    @property
+    def update_rule(self) -> UpdateRule:
+        """How a view changes the belief, where nobody chose."""
+        return DEFAULT_UPDATE[self.relevance]
+
+    @property
+    def weights_sha256(self) -> str | None:
+        """Of the network that its images were encoded by; None where none did, or nobody knows."""
+        return weights_of(self.config)
+
+    @property
+    def index_bits_per_map_image(self) -> float:
+        """The paper's figure for the size of a map."""
+        return 8 * self.index_bytes / self.n_images
+
+    @cached_property
+    def route(self) -> Route:
+        """Where the map images are."""
+        return Route(self.position_m, self.closed, self.x_m, self.y_m)
+
+    @cached_property
+    def landmark_statistics(self) -> LandmarkStatistics | None:
+        """What is usual for each landmark at the start of a session; None where the relevance asks for none."""
+        if self.statistics is None:
+            return None
+        calibrated = self.relevance is Relevance.CALIBRATED
+        weight = CALIBRATED_PRIOR_WEIGHT_FRAMES if calibrated else PRIOR_WEIGHT_FRAMES
+        mean, std = self.statistics
+        return LandmarkStatistics.from_mean_std(mean, std, weight, self.loadings)
+
+    @cached_property
+    def bits_ahead(self) -> NDArray[np.float32] | None:
+        """[n, a] how telling the place is where every move leads; None where nobody knows."""
+        return None if self.telling_bits is None else self.route.ahead(self.telling_bits, self.actions_m)
+
+    @cached_property
+    def landmark_model_digest(self) -> str:
+        """SHA-256 in hex of the landmark model; worked out at first need, in about a second a gigabyte."""
+        return landmark_model_digest(self.landmark_model)
+
+    def portable_landmarks(self) -> bytes:
+        """The landmark model as it travels to robots; not kept, for a map has megabytes of it already."""
+        weights_sha256 = self.weights_sha256 or ""
+        return pack_landmarks(
+            PortableLandmarks(self.landmark_model, self.n_landmarks, self.version, self.evaluator, weights_sha256)
+        )
+
+    def check_landmark_model(self, digests: Collection[str] | None) -> None:
+        """Check that a view was ranked by this map's landmarks.
+
+        Args:
+            digests: Of landmark models, one of which must be this map's; None: nobody said by which.
+
+        Raises:
+            LandmarkModelDiffersError: None of them is.
+        """
+        if digests is None or self.landmark_model_digest in digests:
+            return
+        raise LandmarkModelDiffersError(
+            f"the view was ranked by another landmark model than that of map {self.version}: fetch it from "
+            f"/v1/domains/{self.domain}/landmark-model?map_version={self.version}",
+            landmark_model_digest=self.landmark_model_digest,
+            given_landmark_models=sorted(digests),
+            map_version=self.version,
+        )
+
+
+@dataclass(frozen=True)
+class NamedArray:
+    """One row of the table of named arrays; see `_row`."""
+
+    dtype: np.dtype[Any]
+    axes: tuple[str | int, ...]
+    unknown: float | None
+
+
+ARRAYS = {row.name: NamedArray(**row.metadata) for row in fields(Map) if row.metadata}
+"""All named arrays of a map."""
+
+
+def weights_of(config: Mapping[str, Any]) -> str | None:
+    """SHA-256 of the weights that the images of a map were encoded by, from its configuration; None where unknown."""
+    weights_sha256 = config.get("weights_sha256")
+    return weights_sha256 if isinstance(weights_sha256, str) else None

@@ -1,0 +1,323 @@
+"""Training of the experience database: many robots at once on a live drive through the map (II-D, III)."""
+
+from collections.abc import Callable
+from concurrent.futures import Executor
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deepsimbad.core.belief import motion_std_m
+from deepsimbad.core.belief_lattice import Lattice, Moves, moves_along, step_beliefs, uniform_beliefs
+from deepsimbad.core.map import Map
+from deepsimbad.core.nnql import NnqlConfig, Transitions, initial_q_values, learn, q_of_nearest
+from deepsimbad.core.relevance import Query, UpdateRule, evidence
+from deepsimbad.core.retrieval import relevances, shortlist
+from deepsimbad.core.route import Route
+from deepsimbad.core.statistics import LandmarkStatistics
+
+EPISODES_A_POINT = 100  # of the learning curve
+_EVALUATION = 0xE7A1  # part of the evaluation's seed, which no batch of training has
+_CELLS_AT_ONCE = 300_000  # of one thread: its episodes' beliefs and evidence stay in the second-level cache
+
+
+@dataclass(frozen=True)
+class TrainingWorld:
+    """A drive along the map's route, on which a robot can be moved.
+
+    Attributes:
+        map: What its frames look at; none of them is an image of it.
+        views: The m described frames, as a batch.
+        rule: How a view's relevance becomes evidence.
+        n_neighbours: k, how many nearest map images a view has.
+        lattice: Of the map's route.
+        true_image: [m] int64, the map image nearest to every frame; -1 where there is none.
+        next_frame: [m, a] int64, the frame nearest to where a move leads; -1 where the drive ends before.
+        start_frames: Where episodes may start.
+        moves: [a] the moves on the lattice.
+    """
+
+    map: Map
+    views: Query
+    rule: UpdateRule
+    n_neighbours: int
+    lattice: Lattice
+    true_image: NDArray[np.int64]
+    next_frame: NDArray[np.int64]
+    start_frames: NDArray[np.int64]
+    moves: Moves
+
+    @classmethod
+    def on(
+        cls, map_: Map, views: Query, live_route: Route, true_image: NDArray[np.int64], config: NnqlConfig
+    ) -> "TrainingWorld":
+        """A world of one drive.
+
+        Args:
+            map_: The map.
+            views: The drive's frames.
+            live_route: Where they are, along the drive itself.
+            true_image: As the attribute.
+            config: For the length of an episode, the moves' error, and how views count.
+        """
+        actions_m = map_.actions_m
+        lattice = Lattice.along(map_.route, float(actions_m.min()))
+        stds_m = [motion_std_m(m) if config.motion_std_m is None else config.motion_std_m for m in actions_m.tolist()]
+        return cls(
+            map_,
+            views,
+            config.update or map_.update_rule,
+            config.n_neighbours,
+            lattice,
+            true_image,
+            _next_frames(live_route, actions_m),
+            _start_frames(live_route, true_image, float(actions_m.max()) * config.n_actions_per_episode),
+            moves_along(lattice, actions_m.tolist(), stds_m),
+        )
+
+    @property
+    def n_images(self) -> int:
+        """n."""
+        return self.map.n_images
+
+    @property
+    def n_actions(self) -> int:
+        """a."""
+        return int(self.next_frame.shape[1])
+
+    def observing(self, live: LandmarkStatistics | None, frames: NDArray[np.int64]) -> LandmarkStatistics | None:
+        """The episodes' own statistics after one more frame each, [e, r]; None where the relevance has none."""
+        start = live or self.map.landmark_statistics
+        return None if start is None else start.observing(self.views.ranks[frames])
+
+    def look(
+        self, frames: NDArray[np.int64], live: LandmarkStatistics | None
+    ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+        """Look at the map from some frames.
+
+        Args:
+            frames: [e].
+            live: The episodes' own statistics, [e, r].
+
+        Returns:
+            Evidence [e, n] float32, and the nearest map images [e, k] int64, best first.
+        """
+        relevance = relevances(self.map, self.views.at(frames), live)
+        return evidence(relevance, self.rule), shortlist(relevance, self.n_neighbours)
+
+
+def _next_frames(route: Route, actions_m: NDArray[np.float64]) -> NDArray[np.int64]:
+    target = route.position_m[:, np.newaxis] + actions_m
+    if route.closed and route.length_m > 0:
+        return np.asarray(route.nearest_image(route.wrapped(target)), np.int64)
+    return np.where(target <= route.position_m[-1] + 1e-9, route.nearest_image(target), -1)
+
+
+def _start_frames(route: Route, true_image: NDArray[np.int64], episode_m: float) -> NDArray[np.int64]:
+    """Frames of known place from which a whole episode fits; where there is none, all of known place."""
+    known = true_image >= 0
+    fits = known & (route.closed | (route.position_m + episode_m <= route.position_m[-1] + 1e-9))
+    return np.flatnonzero(fits if fits.any() else known)
+
+
+class Walk:
+    """Episodes that move in lockstep, each with its own belief and statistics.
+
+    Attributes:
+        world: Where they move.
+        frames: [e] where the robots are.
+        nearest: [e, k] map images nearest to their views.
+        ranks: [e] rank of the truth's belief from 0; below 0 where it is unknown.
+    """
+
+    def __init__(self, world: TrainingWorld, starts: NDArray[np.int64], pool: Executor | None = None) -> None:
+        self.world = world
+        self._pool = pool
+        self._beliefs = uniform_beliefs(world.lattice, starts.size)
+        self._live = world.observing(None, starts)
+        self.frames = starts
+        self._see(np.full(starts.size, -1, np.int64))
+
+    @property
+    def allowed(self) -> NDArray[np.bool_]:
+        """[e, a] the moves that are possible."""
+        return self.world.next_frame[self.frames] >= 0
+
+    def step(self, action: NDArray[np.int64]) -> None:
+        """Move every robot, [e] places of the moves; -1: its episode is over and it stays."""
+        moving = action >= 0
+        self.frames = np.where(moving, self.world.next_frame[self.frames, action], self.frames)
+        self._live = self.world.observing(self._live, self.frames)
+        self._see(action)
+
+    def _see(self, action: NDArray[np.int64]) -> None:
+        e = self.frames.size
+        self.nearest = np.empty((e, min(self.world.n_neighbours, self.world.n_images)), np.int64)
+        self.ranks = np.empty(e)
+        size = max(1, min(-(-e // 2), _CELLS_AT_ONCE // self.world.lattice.n_cells))
+        parts = [slice(first, first + size) for first in range(0, e, size)]
+        see = map if self._pool is None else self._pool.map
+        for _ in see(partial(self._see_some, action), parts):
+            pass
+
+    def _see_some(self, action: NDArray[np.int64], some: slice) -> None:
+        world, moved, frames = self.world, action[some], self.frames[some]
+        live = self._live
+        if live is not None:
+            live = replace(live, mean=live.mean[some], square=live.square[some])
+        seen, self.nearest[some] = world.look(frames, live)
+        moves = Moves(
+            np.where(moved >= 0, world.moves.shift[moved], -1), world.moves.fraction[moved], world.moves.taps[moved]
+        )
+        self.ranks[some] = step_beliefs(
+            world.lattice,
+            self._beliefs[some],
+            moves,
+            seen,
+            world.true_image[frames],
+            additive=world.rule is not UpdateRule.LOG_LIKELIHOOD,
+        )
+
+
+@dataclass(frozen=True)
+class LearningCurve:
+    """How training went.
+
+    Attributes:
+        reward_share: Share of the moves that earned the reward, by hundred episodes.
+        greedy_reward_share: The same of the learnt values without exploration.
+        random_reward_share: Of random moves from the same starts.
+    """
+
+    reward_share: tuple[float, ...]
+    greedy_reward_share: float
+    random_reward_share: float
+
+    def as_dict(self) -> dict[str, Any]:
+        """JSON-ready."""
+        return {
+            "reward_share": [round(share, 4) for share in self.reward_share],
+            "greedy_reward_share": self.greedy_reward_share,
+            "random_reward_share": self.random_reward_share,
+        }
+
+
+def train(
+    world: TrainingWorld, config: NnqlConfig, on_progress: Callable[[float], None], pool: Executor | None = None
+) -> tuple[NDArray[np.float32], LearningCurve]:
+    """Learn the experience database from nothing.
+
+    The result depends on the seed alone, not on how many threads the pool has.
+
+    Args:
+        world: Where the episodes run.
+        config: The hyperparameters.
+        on_progress: Called with the share done; may raise to cancel.
+        pool: Takes half of every batch in a thread of its own.
+
+    Returns:
+        Q-values [n, a] float32, and the learning curve.
+    """
+    q_values = initial_q_values(world.n_images, world.n_actions, config)
+    earned = np.full((config.n_episodes, config.n_actions_per_episode), np.nan)
+    for batch, first in enumerate(range(0, config.n_episodes, config.batch_episodes)):
+        episodes = np.arange(first, min(first + config.batch_episodes, config.n_episodes))
+        rng = np.random.default_rng([config.seed, batch])
+        exploration = config.exploration_at(episodes)
+        walk = Walk(world, rng.choice(world.start_frames, episodes.size), pool)
+        for step in range(config.n_actions_per_episode):
+            earned[episodes, step] = _learning_step(walk, q_values, exploration, rng, config)
+        on_progress((first + episodes.size) / config.n_episodes)
+    curve = [_share(earned[first : first + EPISODES_A_POINT]) for first in range(0, len(earned), EPISODES_A_POINT)]
+    n_starts = max(EPISODES_A_POINT, config.n_episodes // 50)
+    starts = np.random.default_rng([config.seed, _EVALUATION]).choice(world.start_frames, n_starts)
+    greedy, random = (
+        _share(_earned(walk_greedily(world, starts, values, config, pool), world, config))
+        for values in (q_values, initial_q_values(world.n_images, world.n_actions, config))
+    )
+    return q_values, LearningCurve(tuple(curve), greedy, random)
+
+
+def walk_greedily(
+    world: TrainingWorld,
+    starts: NDArray[np.int64],
+    q_values: NDArray[np.float32],
+    config: NnqlConfig,
+    pool: Executor | None = None,
+) -> NDArray[np.float64]:
+    """Rank of the truth's belief after every move of episodes that follow the Q-values without exploration.
+
+    Args:
+        world: Where the episodes run.
+        starts: [e] frames.
+        q_values: [n, a]; where all are alike the moves are random.
+        config: For the length of an episode, and the seed by which ties are broken.
+        pool: As for `train`.
+
+    Returns:
+        [e, t], from 0; below 0 where the place is unknown or the episode is over.
+    """
+    rng = np.random.default_rng([config.seed, _EVALUATION, 1])
+    walk = Walk(world, starts, pool)
+    ranks = np.empty((starts.size, config.n_actions_per_episode))
+    for step in range(config.n_actions_per_episode):
+        action = choose_actions(q_of_nearest(q_values, walk.nearest), walk.allowed, np.zeros(starts.size), rng)
+        walk.step(action)
+        ranks[:, step] = np.where(action >= 0, walk.ranks, -1.0)
+    return ranks
+
+
+def choose_actions(
+    values: NDArray[np.float64],
+    allowed: NDArray[np.bool_],
+    exploration: NDArray[np.float64],
+    rng: np.random.Generator,
+) -> NDArray[np.int64]:
+    """Epsilon-greedy moves, ties broken at random.
+
+    Args:
+        values: [e, a].
+        allowed: [e, a].
+        exploration: [e], how often to draw from all that are allowed.
+        rng: Of the draws; as many whatever the values are.
+
+    Returns:
+        [e], -1 where nothing is allowed.
+    """
+    lots = rng.random(values.shape)
+    explores = rng.random(len(values)) < exploration
+    best = np.where(allowed, values, -np.inf).max(axis=1, keepdims=True)
+    candidates = allowed & ((values == best) | explores[:, np.newaxis])
+    chosen = np.where(candidates, lots, -1.0).argmax(axis=1)
+    return np.where(allowed.any(axis=1), chosen, -1)
+
+
+def _learning_step(
+    walk: Walk,
+    q_values: NDArray[np.float32],
+    exploration: NDArray[np.float64],
+    rng: np.random.Generator,
+    config: NnqlConfig,
+) -> NDArray[np.float64]:
+    """One move of every episode, and what it teaches; 1 where it earned the reward, 0 where not, NaN unknown."""
+    nearest = walk.nearest
+    action = choose_actions(q_of_nearest(q_values, nearest), walk.allowed, exploration, rng)
+    walk.step(action)
+    earned = _earned(np.where(action >= 0, walk.ranks, -1.0), walk.world, config)
+    known = np.flatnonzero(~np.isnan(earned))
+    moves = Transitions(
+        nearest[known], action[known], config.reward * earned[known], walk.nearest[known], walk.allowed[known]
+    )
+    learn(q_values, moves, config)
+    return earned
+
+
+def _earned(ranks: NDArray[np.float64], world: TrainingWorld, config: NnqlConfig) -> NDArray[np.float64]:
+    return np.where(ranks < 0, np.nan, ranks < config.top_share * world.n_images)
+
+
+def _share(earned: NDArray[np.float64]) -> float:
+    known = earned[~np.isnan(earned)]
+    return float(known.mean()) if known.size else 0.0

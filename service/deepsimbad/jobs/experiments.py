@@ -1,0 +1,466 @@
+"""The paper's experiments on one landmark-training-test triplet: single views (III, Fig. 6) and active ones (Fig. 7).
+
+The first compares every relevance, the second every planner from the same starts, ours beside the paper's.
+"""
+
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deepsimbad.core.building import build_map
+from deepsimbad.core.drive import Drive, SameRoute, second_season
+from deepsimbad.core.episodes import (
+    Chooser,
+    ClairvoyantChooser,
+    ConstantChooser,
+    Episode,
+    EpisodeRunner,
+    RandomChooser,
+    TestDrive,
+    follow_plan,
+)
+from deepsimbad.core.localizer import ActiveLocalizer, LocalizerConfig
+from deepsimbad.core.map import Map
+from deepsimbad.core.metrics import Comparison, RetrievalScorer, RetrievalScores, compare, mean_interval
+from deepsimbad.core.nnql import NnqlConfig
+from deepsimbad.core.planners import CONSTANT, DEFAULT_PLANNER, NNQL, RANDOM
+from deepsimbad.core.relevance import DEFAULT_RELEVANCE, DEFAULT_UPDATE, Query, Relevance, UpdateRule
+from deepsimbad.core.retrieval import relevances
+from deepsimbad.core.route import same_places
+from deepsimbad.errors import InvalidMapConfigError
+from deepsimbad.evaluators.base import Evaluator, LandmarkModel
+from deepsimbad.evaluators.compute import available_cores
+from deepsimbad.jobs.build import build, choose_landmarks, measured, views_of
+from deepsimbad.jobs.progress import Progress
+from deepsimbad.jobs.recordings import EncodedRecording
+from deepsimbad.jobs.train import train_nnql
+from deepsimbad.store.arrays import is_halvable
+from deepsimbad.store.map_file import index_bytes, write_map
+from deepsimbad.store.sealing import seal
+
+_QUERIES_A_BLOCK = 64  # of brute force: large enough for a matrix product, small enough for memory
+CLAIRVOYANT = "clairvoyant"
+PAPER = (Relevance.RRF, UpdateRule.ADDITIVE_RELEVANCE)
+PAPER_ACTION_STD_M = 0.7  # the reference figures' blur for the paper's set-up
+DISTANCES_M = (10.0, 20.0, 50.0)
+
+
+@dataclass(frozen=True)
+class VprConfig:
+    """What is compared, and how it is scored.
+
+    Attributes:
+        n_landmarks: r.
+        list_length: h.
+        tolerance_m: How far from the query a map image may be and still be true.
+        relevances: Which to compare, in the order of the report.
+        seed: Kept with the result; nothing here is random.
+        same_route: Whether positions of landmark and training traverse are comparable; None: where both know x, y.
+    """
+
+    n_landmarks: int = 300
+    list_length: int = 4
+    tolerance_m: float = 2.0
+    relevances: tuple[Relevance, ...] = tuple(Relevance)
+    seed: int = 0
+    same_route: bool | None = True
+
+
+@dataclass(frozen=True)
+class VprReport:
+    """Scores by relevance, and what they cost.
+
+    Attributes:
+        scores: By relevance.
+        index_bits_per_map_image: Size on disk of the posting tables, of the map for the relevance that ships (or
+            of the first asked for).
+        seconds: Seconds by stage.
+        same_route: Whether the landmark traverse drove the mapped route.
+        encoding_dim: d.
+        bytes_per_encoding: Of one frame in a traverse's file, places apart.
+        encode_ms: Median from reading an image to its encoding; None where encodings came ready.
+    """
+
+    config: VprConfig
+    scores: dict[Relevance, RetrievalScores]
+    index_bits_per_map_image: float
+    seconds: dict[str, float]
+    same_route: SameRoute
+    encoding_dim: int
+    bytes_per_encoding: int
+    encode_ms: float | None
+
+    def as_dict(self, sources: dict[str, Any]) -> dict[str, Any]:
+        """The stable flat JSON document of design section 7."""
+        first = next(iter(self.scores.values()))
+        return {
+            "anr": {name.value: score.anr for name, score in self.scores.items()},
+            "recall_at_1": {name.value: score.recall_at[1] for name, score in self.scores.items()},
+            "recall_at_5": {name.value: score.recall_at[5] for name, score in self.scores.items()},
+            "default": DEFAULT_RELEVANCE.value,
+            "n_queries": first.n_queries,
+            "n_left_out": first.n_left_out,
+            "index_bits_per_map_image": self.index_bits_per_map_image,
+            "second_season": self.same_route.as_dict(),
+            "encoding_dim": self.encoding_dim,
+            "bytes_per_encoding": self.bytes_per_encoding,
+            "encode_ms": self.encode_ms,
+            "config": {**asdict(self.config), **sources},
+            "seconds": self.seconds,
+        }
+
+
+def vpr_stages(config: VprConfig) -> dict[str, float]:
+    """The stages `run_vpr` reports, with their weights."""
+    return {"select landmarks": 2.0, "describe": 1.0} | {
+        f"query by {name.value}": 3.0 if name is Relevance.BRUTE_FORCE else 1.0 for name in config.relevances
+    }
+
+
+def run_vpr(
+    config: VprConfig,
+    evaluator: Evaluator,
+    landmarks: Drive,
+    training: Drive,
+    test: EncodedRecording,
+    true_images: Sequence[NDArray[np.int64]],
+    progress: Progress,
+) -> VprReport:
+    """Select landmarks, map the training traverse, query every test frame in order as one passive session.
+
+    Args:
+        config: What is compared.
+        evaluator: Measures dissimilarities of encodings.
+        landmarks: The landmark traverse; where it drove the mapped route, `calibrated` learns from it.
+        training: The mapped traverse.
+        test: The queries, in the order they were driven.
+        true_images: For every test frame the map images that count as true.
+        progress: Reports; stages of `vpr_stages`.
+    """
+    seconds: dict[str, float] = {}
+    started = time.perf_counter()
+
+    def lap(stage: str) -> None:
+        nonlocal started
+        now = time.perf_counter()
+        seconds[stage.replace(" ", "_")] = now - started
+        started = now
+
+    progress.stage("select landmarks")
+    model = choose_landmarks(landmarks.encodings, config.n_landmarks, evaluator, progress.update)
+    lap("select landmarks")
+
+    progress.stage("describe")
+    measure = partial(measured, evaluator=evaluator, model=model)
+    own = measure(training)
+    progress.update(0.3)
+    views = views_of(measure(test.drive))
+    progress.update(0.6)
+    season, _, verdict = second_season(own, False, landmarks, config.same_route, measure)
+    lap("describe")
+
+    scores: dict[Relevance, RetrievalScores] = {}
+    maps: dict[Relevance, Map] = {}
+    for name in config.relevances:
+        progress.stage(f"query by {name.value}")
+        maps[name] = build_map(name, own, config.list_length, second_season=season)
+        scores[name] = _score(maps[name], views, true_images, progress.update)
+        lap(f"query by {name.value}")
+    sized = maps.get(DEFAULT_RELEVANCE, maps[config.relevances[0]])
+    return VprReport(
+        config,
+        scores,
+        _bits_per_map_image(replace(sized, landmark_model=model)),
+        seconds,
+        verdict,
+        encoding_dim=test.drive.encoding_dim,
+        bytes_per_encoding=test.drive.encoding_dim * (2 if is_halvable(test.drive.encodings) else 4),
+        encode_ms=test.encode_ms,
+    )
+
+
+def _bits_per_map_image(map_: Map) -> float:
+    """Write the map to a file, as a remap would, and count the pages of its posting tables."""
+    with tempfile.TemporaryDirectory() as folder:
+        building, sealed = Path(folder) / "1.building", Path(folder) / "1.sqlite"
+        write_map(building, map_)
+        seal(building, sealed)
+        return 8 * index_bytes(sealed) / map_.n_images
+
+
+def _score(
+    map_: Map, views: Query, true_images: Sequence[NDArray[np.int64]], on_progress: Callable[[float], None]
+) -> RetrievalScores:
+    scorer = RetrievalScorer()
+    live = map_.landmark_statistics
+    # Without a session's statistics every view is compared by itself; many at once are one matrix product.
+    size = _QUERIES_A_BLOCK if map_.relevance is Relevance.BRUTE_FORCE else 1
+    for first in range(0, len(true_images), size):
+        asked = views.at(slice(first, first + size))
+        live = live.observing(asked.ranks[0]) if live else None
+        for row, truth in zip(relevances(map_, asked, live), true_images[first : first + size], strict=True):
+            scorer.add(row, truth)
+        on_progress(min(1.0, (first + size) / len(true_images)))
+    return scorer.result()
+
+
+@dataclass(frozen=True)
+class NbvConfig:
+    """What is compared.
+
+    Attributes:
+        n_landmarks, list_length: r and h.
+        relevance, update: Of our set-up; the paper's is measured beside it.
+        actions_m: The moves.
+        n_steps: Moves an episode.
+        training_episodes: Of NNQL.
+        episodes: Test episodes of every planner.
+        seed: Of starts, random moves and training.
+        same_route: Whether positions of landmark and training traverse are comparable; None: where both know x, y.
+    """
+
+    n_landmarks: int = 300
+    list_length: int = 4
+    relevance: Relevance = DEFAULT_RELEVANCE
+    update: UpdateRule = DEFAULT_UPDATE[DEFAULT_RELEVANCE]
+    actions_m: tuple[float, ...] = tuple(float(metres) for metres in range(1, 11))
+    n_steps: int = 10
+    training_episodes: int = 10_000
+    episodes: int = 2000
+    seed: int = 0
+    same_route: bool | None = True
+
+
+@dataclass(frozen=True)
+class _Setup:
+    name: str
+    relevance: Relevance
+    update: UpdateRule
+    action_std_m: float | None
+
+
+@dataclass(frozen=True)
+class NbvReport:
+    """What every planner scored.
+
+    Attributes:
+        config: What was compared.
+        ours, paper: Rank shares [episodes, steps] by planner, under our set-up and the paper's.
+        travelled_m: Metres [episodes, steps] by planner, under our set-up.
+        same_route: Whether the landmark traverse drove the mapped route; None: nobody looked.
+    """
+
+    config: NbvConfig
+    ours: dict[str, NDArray[np.float64]]
+    paper: dict[str, NDArray[np.float64]]
+    travelled_m: dict[str, NDArray[np.float64]]
+    same_route: SameRoute | None = None
+
+    @property
+    def best_constant(self) -> str:
+        """The constant move that did best, known only afterwards."""
+        return min((name for name in self.ours if name.startswith(CONSTANT)), key=lambda name: self.ours[name].mean())
+
+    def comparisons(self) -> dict[str, Comparison]:
+        """The default planner against random and the best constant move, episode by episode."""
+        default = self.ours[DEFAULT_PLANNER].mean(axis=1)
+        return {
+            rival: compare(default, self.ours[rival].mean(axis=1), self.config.seed)
+            for rival in (RANDOM, self.best_constant)
+        }
+
+    def as_dict(self, sources: dict[str, Any]) -> dict[str, Any]:
+        """The stable flat JSON document of design section 7; percent."""
+        seed = self.config.seed
+        return {
+            "anr": {name: _percent(shares) for name, shares in self.ours.items()},
+            "default": DEFAULT_PLANNER,
+            "anr_paper": {name: _percent(shares) for name, shares in self.paper.items()},
+            "interval_95": {
+                name: [100 * end for end in mean_interval(shares.mean(axis=1), seed)]
+                for name, shares in self.ours.items()
+            },
+            "difference_95": {
+                f"{DEFAULT_PLANNER} - {rival}": [100 * end for end in comparison.interval]
+                for rival, comparison in self.comparisons().items()
+            },
+            "best_constant": self.best_constant,
+            "anr_by_step": {name: (100 * shares.mean(axis=0)).tolist() for name, shares in self.ours.items()},
+            "anr_at_distance_m": {
+                name: _at_distances(shares, self.travelled_m[name]) for name, shares in self.ours.items()
+            },
+            "n_episodes": self.config.episodes,
+            "second_season": None if self.same_route is None else self.same_route.as_dict(),
+            "config": {**asdict(self.config), **sources},
+        }
+
+
+def nbv_stages(config: NbvConfig) -> dict[str, float]:
+    """The stages `run_nbv` reports, with their weights."""
+    stages = {"select landmarks": 2.0}
+    for setup in ("ours", "paper"):
+        stages |= {f"map ({setup})": 1.0, f"train ({setup})": 4.0}
+        stages |= {f"{name} ({setup})": 4.0 if name in {RANDOM, CLAIRVOYANT} else 1.0 for name in _names(config)}
+    return stages
+
+
+def run_nbv(
+    config: NbvConfig, evaluator: Evaluator, landmarks: Drive, training: Drive, test: Drive, progress: Progress
+) -> NbvReport:
+    """Map, train, and drive every planner's episodes.
+
+    Raises:
+        InvalidMapConfigError: The test traverse is shorter than an episode.
+    """
+    progress.stage("select landmarks")
+    model = choose_landmarks(landmarks.encodings, config.n_landmarks, evaluator, progress.update)
+    drive = TestDrive(views_of(measured(test, evaluator, model)), test.route(), _nearest_images(test, training))
+    travel_m = config.n_steps * max(config.actions_m)
+    starts = drive.starts(travel_m, config.episodes, config.seed)
+    if starts.size == 0:
+        raise InvalidMapConfigError(f"the test traverse is shorter than an episode of {travel_m:g} m")
+
+    results: dict[str, dict[str, list[Episode]]] = {}
+    same_route = None
+    setups = (
+        _Setup("ours", config.relevance, config.update, None),
+        _Setup("paper", *PAPER, PAPER_ACTION_STD_M),
+    )
+    for setup in setups:
+        map_, same_route = _mapped(config, setup, evaluator, model, landmarks, training, progress)
+        results[setup.name] = {}
+        for name in _names(config):
+            progress.stage(f"{name} ({setup.name})")
+            localizer = ActiveLocalizer(map_, LocalizerConfig(update=setup.update, planner=_planner(name, config)))
+            runner = EpisodeRunner(localizer, drive, config.n_steps, setup.action_std_m)
+            chooser = _chooser(name, runner, config)
+            results[setup.name][name] = _episodes(runner, starts, chooser, name == RANDOM, progress.update)
+    ours = results["ours"]
+    return NbvReport(
+        config,
+        {name: _stack(episodes) for name, episodes in ours.items()},
+        {name: _stack(episodes) for name, episodes in results["paper"].items()},
+        {name: np.stack([episode.travelled_m for episode in episodes]) for name, episodes in ours.items()},
+        same_route,
+    )
+
+
+def _mapped(
+    config: NbvConfig,
+    setup: _Setup,
+    evaluator: Evaluator,
+    model: LandmarkModel,
+    landmarks: Drive,
+    training: Drive,
+    progress: Progress,
+) -> tuple[Map, SameRoute | None]:
+    """The map with its experience database, as a remap makes it, and whether it learnt from the landmark traverse."""
+    progress.stage(f"map ({setup.name})")
+    built = build(
+        training,
+        landmarks,
+        config.same_route,
+        evaluator,
+        model,
+        setup.relevance,
+        config.list_length,
+        config.actions_m,
+        False,
+        progress.update,
+    )
+    progress.stage(f"train ({setup.name})")
+    q_values, _ = train_nnql(
+        built.rehearsal,
+        partial(measured, training, evaluator, model),
+        built.second,
+        NnqlConfig(
+            config.training_episodes,
+            config.n_steps,
+            update=setup.update,
+            motion_std_m=setup.action_std_m,
+            seed=config.seed,
+        ),
+        progress.update,
+        available_cores(),
+    )
+    return replace(built.map, q_values=q_values), built.same_route
+
+
+def _names(config: NbvConfig) -> list[str]:
+    return [RANDOM, *(_constant(action_m) for action_m in config.actions_m), CLAIRVOYANT, NNQL, DEFAULT_PLANNER]
+
+
+def _constant(action_m: float) -> str:
+    return f"{CONSTANT}_{action_m:g}"
+
+
+def _planner(name: str, config: NbvConfig) -> str:
+    """The localizer's own planner; those that only an experiment has are choosers, and it then costs nothing."""
+    return name if name in {NNQL, DEFAULT_PLANNER} else f"{CONSTANT}:{config.actions_m[0]:g}"
+
+
+def _chooser(name: str, runner: EpisodeRunner, config: NbvConfig) -> Chooser:
+    actions_m = np.array(config.actions_m)
+    if name == RANDOM:
+        return RandomChooser(actions_m, config.seed)
+    if name == CLAIRVOYANT:
+        return ClairvoyantChooser(runner, actions_m)
+    if name in {NNQL, DEFAULT_PLANNER}:
+        return follow_plan
+    return ConstantChooser(float(name.removeprefix(f"{CONSTANT}_")))
+
+
+def _episodes(
+    runner: EpisodeRunner,
+    starts: NDArray[np.int64],
+    choose: Chooser,
+    draws: bool,
+    on_progress: Callable[[float], None],
+) -> list[Episode]:
+    """Every start's episode; where nothing is drawn, equal starts have equal episodes and are run once."""
+    driven: dict[int, Episode] = {}
+    episodes = []
+    for number, start in enumerate(starts.tolist()):
+        if draws:
+            episodes.append(runner.run(number, start, choose))
+        else:
+            if start not in driven:
+                driven[start] = runner.run(number, start, choose)
+            episodes.append(driven[start])
+        on_progress((number + 1) / starts.size)
+    return episodes
+
+
+def _nearest_images(test: Drive, training: Drive) -> NDArray[np.int64]:
+    """[m] the map image nearest to every test frame: in the plane where both know it, else along the route."""
+    route = training.route()
+    nearest = route.nearest_image(test.position_m).astype(np.int64)
+    pairs = same_places(test.route(), route, tolerance_m=np.inf)
+    nearest[pairs[:, 1]] = pairs[:, 0]
+    return nearest
+
+
+def _stack(episodes: Sequence[Episode]) -> NDArray[np.float64]:
+    return np.stack([episode.rank_share for episode in episodes])
+
+
+def _percent(shares: NDArray[np.float64]) -> float:
+    return float(100 * shares.mean())
+
+
+def _at_distances(shares: NDArray[np.float64], travelled_m: NDArray[np.float64]) -> dict[str, float | None]:
+    """ANR of the last view within each distance, over the episodes that went so far."""
+    anr: dict[str, float | None] = {}
+    for distance_m in DISTANCES_M:
+        n_within = (travelled_m <= distance_m + 1e-9).sum(axis=1)
+        reached = (travelled_m[:, -1] >= distance_m - 1e-9) & (n_within > 0)
+        last = shares[np.arange(len(shares)), np.maximum(n_within - 1, 0)]
+        anr[f"{distance_m:g}"] = _percent(last[reached]) if reached.any() else None
+    return anr

@@ -1,0 +1,246 @@
+"""Whether two drives saw one route: on drives with slow drifts, trends, stops, gaps and errors in their positions."""
+
+import time
+
+import numpy as np
+import pytest
+
+from deepsimbad.core.drive import LEAST_CORRELATION, LEAST_PLACES, SIGNIFICANCE, judge, second_season
+from deepsimbad.core.route import Route, same_places
+
+from .conftest import a_drive
+
+R = 40
+
+
+def scenery(rng, n, slowness_m=8.0, dims=12):
+    """[n, dims] what is seen along a route, a metre a row: a drift that forgets itself over some metres."""
+    kept = np.exp(-1 / slowness_m)
+    seen = np.empty((n, dims))
+    seen[0] = rng.normal(size=dims)
+    for row in range(1, n):
+        seen[row] = kept * seen[row - 1] + np.sqrt(1 - kept**2) * rng.normal(size=dims)
+    return seen
+
+
+def dissimilarities(rng, *drives, noise=0.5):
+    """Of each drive to landmarks of the last one, with noise of their own."""
+    seen = [drive + noise * rng.normal(size=drive.shape) for drive in drives]
+    landmarks = seen[-1][rng.permutation(len(seen[-1]))[:R]]
+    return [((one[:, np.newaxis] - landmarks) ** 2).sum(axis=2).astype(np.float32) for one in seen]
+
+
+def diagonal(n):
+    return np.stack([np.arange(n), np.arange(n)], axis=1)
+
+
+def verdict(rng, first, second, places=None, position_m=None, noise=0.5):
+    own, other = dissimilarities(rng, first, second, noise=noise)
+    n = min(len(first), len(second))
+    position_m = np.arange(len(first), dtype=float) if position_m is None else position_m
+    return judge(own, other, diagonal(n) if places is None else places, position_m)
+
+
+@pytest.mark.parametrize("n", [60, 150])
+@pytest.mark.parametrize("slowness_m", [1.0, 8.0, 20.0])
+def test_drives_of_one_route_are_told_from_those_of_two(n, slowness_m):
+    rng = np.random.default_rng(n)
+    unrelated = [verdict(rng, *(scenery(rng, n, slowness_m) for _ in range(2))).accepted for _ in range(60)]
+    related = [verdict(rng, place, place).accepted for place in (scenery(rng, n, slowness_m) for _ in range(30))]
+    assert sum(unrelated) <= 1
+    assert sum(related) >= 29
+
+
+def test_the_significance_is_what_it_says():
+    """Of unrelated drives a tenth reach one of 0.1, about."""
+    rng = np.random.default_rng(5)
+    found = [verdict(rng, scenery(rng, 80), scenery(rng, 80)).significance for _ in range(300)]
+    assert 0.05 < np.mean(np.array(found) <= 0.1) < 0.17
+
+
+def test_a_verdict_tells_its_reasons():
+    rng = np.random.default_rng(1)
+    place = scenery(rng, 120)
+    same, other = verdict(rng, place, place), verdict(rng, place, scenery(rng, 120))
+    assert (same.accepted, same.why, same.n_pairs) == (True, None, 120)
+    assert same.significance <= SIGNIFICANCE < other.significance
+    assert same.statistic > 3 > other.statistic
+    assert same.correlation > 0.5 > 0.2 > other.correlation
+    assert (other.accepted, other.n_pairs) == (False, 120)
+    assert "agree no better than where one is shifted" in other.why
+    assert set(other.as_dict()) == {"accepted", "why", "n_pairs", "correlation", "statistic", "significance"}
+
+
+def test_common_trends_are_no_common_route():
+    """The light goes, in both drives, and changes as much as the scenery does."""
+    rng = np.random.default_rng(2)
+    accepted = []
+    for _ in range(40):
+        trend = np.linspace(-1.5, 1.5, 120)[:, np.newaxis] * rng.normal(size=12)
+        accepted.append(verdict(rng, scenery(rng, 120) + trend, scenery(rng, 120) + trend).accepted)
+    assert sum(accepted) <= 1
+
+
+def test_a_few_places_unlike_all_others_do_not_decide():
+    """A tunnel at the same position of two routes."""
+    rng = np.random.default_rng(3)
+
+    def with_tunnel():
+        seen = scenery(rng, 120, 2.0)
+        seen[50:55] = 20.0
+        return seen
+
+    assert sum(verdict(rng, with_tunnel(), with_tunnel()).accepted for _ in range(40)) <= 1
+
+
+def test_a_reversed_drive_is_refused():
+    rng = np.random.default_rng(4)
+    accepted = [verdict(rng, place, place[::-1]).accepted for place in (scenery(rng, 120) for _ in range(40))]
+    assert sum(accepted) <= 1
+
+
+def test_a_drive_that_began_elsewhere_on_the_route_is_refused():
+    rng = np.random.default_rng(6)
+    places = [scenery(rng, 160) for _ in range(40)]
+    assert sum(verdict(rng, place[:120], place[40:]).accepted for place in places) <= 1
+
+
+def test_a_metre_of_error_in_positions_is_borne():
+    rng = np.random.default_rng(7)
+    for _ in range(10):
+        place = scenery(rng, 150)
+        moved = np.maximum.accumulate(np.arange(150) + rng.normal(0, 1, 150))
+        pairs = same_places(Route(moved), Route(np.arange(150.0)))
+        assert verdict(rng, place, place, pairs).accepted
+
+
+def test_a_part_of_the_route_is_enough():
+    rng = np.random.default_rng(8)
+    place = scenery(rng, 200)
+    pairs = np.stack([np.arange(110, 170), np.arange(60)], axis=1)
+    assert verdict(rng, place, place[110:170], pairs).accepted
+    with_gap = np.concatenate([diagonal(200)[:30], diagonal(200)[120:160]])
+    assert verdict(rng, place, place, with_gap).accepted
+
+
+def test_laps_of_one_loop_are_one_route():
+    rng = np.random.default_rng(9)
+    lap = scenery(rng, 80)
+    assert verdict(rng, np.tile(lap, (3, 1)), np.tile(lap, (3, 1))).accepted
+
+
+def test_frames_of_one_stop_are_one_place():
+    """Two drives that stood at one place and then drove apart agree in a hundred frames of one place."""
+    rng = np.random.default_rng(10)
+    stop = rng.normal(size=12)
+    stands = np.r_[np.zeros(100), np.arange(1, 61)]
+
+    def with_stop():
+        return np.concatenate([np.tile(stop, (100, 1)), scenery(rng, 60)])
+
+    assert sum(verdict(rng, with_stop(), with_stop(), position_m=stands).accepted for _ in range(20)) <= 1
+    alone = verdict(rng, rng.normal(size=(124, 12)), rng.normal(size=(124, 12)), position_m=np.zeros(124))
+    assert (alone.accepted, alone.statistic, alone.significance) == (False, None, None)
+    assert f"share 1 places by their positions, and {LEAST_PLACES} are the least" in alone.why
+
+
+@pytest.mark.parametrize(("n", "accepted"), [(0, False), (29, False), (30, True)])
+def test_thirty_places_are_the_least(n, accepted):
+    rng = np.random.default_rng(11)
+    place = rng.normal(size=(90, 12))
+    found = verdict(rng, place, place, diagonal(n), noise=0.1)
+    assert (found.accepted, found.n_pairs) == (accepted, n)
+
+
+def test_what_agrees_a_little_is_not_worth_learning_from():
+    """Scenery that repeats agrees beyond chance on a long route; its landmarks would be trusted for nothing."""
+    rng = np.random.default_rng(18)
+    found = verdict(rng, *[rng.normal(size=(500, 12))] * 2, noise=2.5)
+    assert (found.accepted, found.significance < SIGNIFICANCE) == (False, True)
+    assert 0 < found.correlation < LEAST_CORRELATION
+    assert "agree too little to learn from" in found.why
+
+
+@pytest.mark.filterwarnings("error")
+def test_what_never_changes_tells_nothing():
+    same = np.tile(np.arange(R, dtype=np.float32), (100, 1))
+    moving = np.random.default_rng(12).normal(size=(100, R)).astype(np.float32)
+    for own, other in ((same, same), (same, moving), (moving, same)):
+        found = judge(own, other, diagonal(100), np.arange(100.0))
+        assert (found.accepted, found.statistic, found.significance) == (False, 0.0, 0.5)
+    one = judge(moving[:, :1], moving[:, :1], diagonal(100), np.arange(100.0))
+    assert (one.accepted, one.statistic) == (False, 0.0), "one landmark is always the nearest"
+
+
+def test_columns_that_never_change_do_no_harm():
+    rng = np.random.default_rng(13)
+    place = scenery(rng, 100)
+    own, other = dissimilarities(rng, place, place)
+    own[:, :5], other[:, 3:9] = 1e3, -1.0
+    found = judge(own, other, diagonal(100), np.arange(100.0))
+    assert found.accepted
+    assert np.isfinite([found.statistic, found.significance]).all()
+
+
+def test_a_dense_recording_is_cut_into_places():
+    """Half a metre a frame and ten frames a metre: not every frame is a trial of its own."""
+    rng = np.random.default_rng(14)
+    position_m = np.arange(600) / 10
+    accepted = [
+        verdict(rng, scenery(rng, 600, 60.0), scenery(rng, 600, 60.0), position_m=position_m).accepted
+        for _ in range(20)
+    ]
+    assert sum(accepted) <= 1
+    place = scenery(rng, 600, 60.0)
+    assert verdict(rng, place, place, position_m=position_m).accepted
+
+
+def test_a_long_route_is_judged_in_a_moment_and_always_alike():
+    rng = np.random.default_rng(15)
+    own = rng.random((26_000, 500), np.float32)
+    other = (own + 0.1 * rng.random((26_000, 500), np.float32)).astype(np.float32)
+    begun = time.perf_counter()
+    found = judge(own, other, diagonal(26_000), np.arange(26_000.0))
+    assert time.perf_counter() - begun < 2
+    assert found.accepted
+    assert found == judge(own, other, diagonal(26_000), np.arange(26_000.0))
+
+
+# --- whether positions are comparable ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("said", "planes", "accepted", "why"),
+    [
+        (True, (False, False), True, None),
+        (True, (True, True), True, None),
+        (None, (True, True), True, None),
+        (None, (True, False), False, "without x, y of both drives nothing says"),
+        (None, (False, False), False, "without x, y of both drives nothing says"),
+        (False, (True, True), False, "are said not to share their positions"),
+    ],
+)
+def test_positions_must_be_said_to_be_comparable(said, planes, accepted, why):
+    rng = np.random.default_rng(16)
+    place = scenery(rng, 100)
+    own, other = (
+        a_drive(seen, **({"x_m": np.arange(100.0), "y_m": np.zeros(100)} if plane else {}))
+        for seen, plane in zip(dissimilarities(rng, place, place), planes, strict=True)
+    )
+    asked = []
+    season, measured, found = second_season(own, False, other, said, lambda drive: asked.append(drive) or drive)
+    assert found.accepted is accepted
+    assert asked == ([other] if accepted else []), "a drive that cannot be compared is not described"
+    if accepted:
+        assert (measured, season.places.tolist()) == (other, diagonal(100).tolist())
+        assert season.dissimilarities is other.dissimilarities
+    else:
+        assert (season, measured) == (None, None)
+        assert why in found.why
+
+
+def test_said_comparable_is_not_enough():
+    rng = np.random.default_rng(17)
+    own, other = map(a_drive, dissimilarities(rng, scenery(rng, 100), scenery(rng, 100)))
+    season, _, found = second_season(own, False, other, True, lambda drive: drive)
+    assert (season, found.accepted) == (None, False)

@@ -1,0 +1,114 @@
+"""The one value of a map: what it refuses, what of it can be taken, and its form in a file."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from deepsimbad.core.map import ARRAYS, Map
+from deepsimbad.core.relevance import Relevance
+from deepsimbad.errors import InvalidMapConfigError, InvalidRouteError
+
+N, H, R = 8, 2, 5
+
+
+def whole(**changes):
+    """A map that has every array there is."""
+    rng = np.random.default_rng(0)
+    lengths = {"n": N, "h": H, "r": R, "a": 2, "*": 3}
+    arrays = {
+        name: rng.random([lengths.get(axis, axis) for axis in row.axes]).astype(row.dtype)
+        for name, row in ARRAYS.items()
+    }
+    arrays["lists"] = rng.integers(0, R, (H, N)).astype(np.uint16)
+    arrays["position_m"] = np.arange(float(N))
+    config = {"relevance": "calibrated", "n_landmarks": R, "seed": 3}
+    return Map(**{"config": config, "actions_m": (1.0, 2.5), "domain": "d", "version": 7, **arrays, **changes})
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"config": {"relevance": "rrf"}}, "does not say n_landmarks"),
+        ({"config": {"relevance": "rrf", "n_landmarks": 70_000}}, "70000 landmarks"),
+        ({"config": {"relevance": "rrf", "n_landmarks": 1}}, "not"),
+        ({"lists": np.zeros((H, N), np.int64)}, "lists is int64"),
+        ({"lists": np.zeros((H, 0), np.uint16)}, "not .h, n."),
+        ({"lists": np.full((H, N), R, np.uint16)}, "not among the 5"),
+        ({"values": np.zeros((H, N + 1), np.float32)}, "values is"),
+        ({"q_values": np.zeros((N, 3), np.float32)}, "q_values is"),
+        ({"statistics": None}, "a map for calibrated needs statistics"),
+        ({"listed_score": None}, "needs listed_score"),
+        ({"actions_m": (1.0, "2")}, "no metres"),
+    ],
+)
+def test_parts_that_do_not_fit_are_refused(changes, says):
+    with pytest.raises(InvalidMapConfigError, match=says):
+        whole(**changes)
+
+
+def test_a_route_that_goes_backwards_and_an_unknown_relevance_are_refused():
+    with pytest.raises(InvalidRouteError):
+        whole(position_m=np.arange(float(N))[::-1])
+    with pytest.raises(ValueError, match="telepathy"):
+        _ = whole(config={"relevance": "telepathy", "n_landmarks": R}).relevance
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"statistics": np.full((2, R), np.nan)}, "statistics holds NaN"),
+        ({"statistics": np.zeros((2, R))}, "no spread"),
+        ({"q_values": np.full((N, 2), np.inf, np.float32)}, "q_values holds NaN"),
+        ({"position_m": np.full(N, 4.0)}, "at one position"),
+        ({"actions_m": (2.0, 1.0)}, "no moves that ascend"),
+        ({"actions_m": (), "q_values": None}, "no moves that ascend"),
+        ({"actions_m": (-1.0, 1.0)}, "no moves that ascend"),
+    ],
+)
+def test_what_makes_no_sense_may_not_serve(changes, says):
+    whole().check()
+    whole(x_m=np.full(N, np.nan)).check()
+    with pytest.raises(InvalidMapConfigError, match=says):
+        whole(**changes).check()
+
+
+def test_nothing_in_it_can_be_written_to():
+    map_ = whole(landmark_model={"prototypes": np.zeros(3)})
+    for array in (*map_.arrays().values(), *map_.landmark_model.values(), map_.actions_m):
+        with pytest.raises(ValueError, match="read-only"):
+            array[:1] = 0
+
+
+def test_it_comes_back_from_its_document_and_arrays():
+    map_ = whole(landmark_model={"prototypes": np.zeros(3)}, metrics={"anr": 1.5}, closed=True)
+    again = Map.from_arrays(map_.document(), map_.landmark_model, map_.arrays(), 80)
+    assert again.document() == map_.document()
+    assert again.arrays().keys() == map_.arrays().keys() == ARRAYS.keys()
+    assert all(np.array_equal(again.arrays()[name], array) for name, array in map_.arrays().items())
+    assert (again.index_bytes, again.index_bits_per_map_image, again.relevance) == (80, 80, Relevance.CALIBRATED)
+
+
+def test_a_part_of_its_images_and_those_put_together_again():
+    map_ = whole()
+    some, others = np.array([0, 1, 4, 6]), np.array([2, 3, 5, 7])
+    part = map_.at(some)
+    assert part.position_m.tolist() == [0, 1, 4, 6]
+    assert np.array_equal(part.lists, map_.lists[:, some])
+    assert np.array_equal(part.q_values, map_.q_values[some])
+    assert part.correlation is map_.correlation
+    added = {name: array for name, array in map_.at(others).arrays().items() if "n" in ARRAYS[name].axes}
+    for name, array in part.with_images(added).arrays().items():
+        assert np.array_equal(array, map_.arrays()[name]), name
+
+
+def test_of_added_images_what_only_the_others_know_is_unknown():
+    map_ = replace(whole(), x_m=None, y_m=None)
+    required = {name: map_.arrays()[name] for name, row in ARRAYS.items() if "n" in row.axes and row.unknown is None}
+    longer = map_.with_images({**required, "x_m": np.arange(float(N))})
+    assert longer.n_images == 2 * N
+    assert np.isnan(longer.x_m[::2]).all(), "at one position the old come first"
+    assert longer.x_m[1::2].tolist() == list(range(N))
+    assert (longer.timestamp_us[1::2] == -1).all()
+    assert (longer.frame_digest[1::2] == 0).all()
+    assert longer.y_m is None

@@ -1,0 +1,165 @@
+"""Training: against a slow reference, by seed alone, and on a route where only few places tell anything."""
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from deepsimbad.core.belief import GridFilter
+from deepsimbad.core.map import Map
+from deepsimbad.core.metrics import rank_of_truth
+from deepsimbad.core.nnql import NnqlConfig, initial_q_values
+from deepsimbad.core.relevance import Query, Relevance, UpdateRule
+from deepsimbad.core.retrieval import relevances, shortlist
+from deepsimbad.core.route import Route
+from deepsimbad.core.training import TrainingWorld, Walk, choose_actions, train, walk_greedily
+from deepsimbad.errors import CancelledError
+
+from .conftest import a_map
+
+ACTIONS_M = (1.0, 2.0, 3.0)
+
+
+def random_world(config: NnqlConfig, closed: bool = False, known: float = 1.0) -> TrainingWorld:
+    rng = np.random.default_rng(5)
+    n, r = 80, 15
+    mapped, live = rng.normal(size=(2, n, r)).astype(np.float32)
+    map_ = a_map(Relevance.RRF, mapped, 4, closed=closed, actions_m=ACTIONS_M)
+    views = Query(live.argsort(axis=1).argsort(axis=1) + np.float32(1))
+    true_image = np.where(rng.random(n) < known, np.arange(n), -1)
+    return TrainingWorld.on(map_, views, map_.route, true_image, config)
+
+
+def slow_training(world: TrainingWorld, config: NnqlConfig, closed: bool) -> np.ndarray:
+    """One episode after the other in plain loops: the served filter, the served relevance. Batches of one."""
+    n, n_actions = world.n_images, len(ACTIONS_M)
+    route = Route(np.arange(n, dtype=float), closed)
+    q_values = np.full((n, n_actions), config.initial_q)
+    for episode in range(config.n_episodes):
+        rng = np.random.default_rng([config.seed, episode])
+        frame = int(rng.choice(world.start_frames, 1)[0])
+        epsilon = config.exploration_at(np.array([episode]))
+        belief = GridFilter.uniform(route)
+
+        def look(belief, frame):
+            relevance = relevances(world.map, world.views.at(frame))
+            return belief.updated(relevance, world.rule, 0), shortlist(relevance, config.n_neighbours)
+
+        belief, near = look(belief, frame)
+        for _ in range(config.n_actions_per_episode):
+            allowed = np.array([closed or frame + m <= n - 1 for m in ACTIONS_M])
+            action = int(choose_actions(q_values[near].mean(axis=0)[None], allowed[None], epsilon, rng)[0])
+            if action < 0:
+                break
+            frame = int(frame + ACTIONS_M[action]) % n
+            belief = belief.predicted(ACTIONS_M[action], config.motion_std_m, 0)
+            belief, then = look(belief, frame)
+            if world.true_image[frame] >= 0:
+                rank = rank_of_truth(belief.mass, np.array([frame]))
+                reward = config.reward if rank < config.top_share * n else 0.0
+                then_allowed = [a for a, m in enumerate(ACTIONS_M) if closed or frame + m <= n - 1]
+                best = max((q_values[then, a].mean() for a in then_allowed), default=0.0)
+                target = reward + config.discount * best
+                for image in near:
+                    q_values[image, action] += config.learning_rate * (target - q_values[image, action])
+            near = then
+    return q_values
+
+
+@pytest.mark.parametrize(("closed", "known"), [(False, 1.0), (True, 0.6)])
+def test_the_same_values_as_plain_loops(closed, known):
+    config = NnqlConfig(n_episodes=60, batch_episodes=1, motion_std_m=0.33, top_share=0.2, exploration=0.5, seed=3)
+    world = random_world(config, closed, known)
+    learnt, _ = train(world, config, lambda _: None)
+    expected = slow_training(world, config, closed)
+    assert (expected > 1).any()
+    assert np.allclose(learnt, expected, rtol=1e-4, atol=1e-5)
+
+
+def test_the_seed_decides_and_threads_do_not():
+    config = NnqlConfig(n_episodes=250, seed=7, motion_std_m=0.5)
+    world = random_world(config)
+    alone, curve = train(world, config, lambda _: None)
+    with ThreadPoolExecutor(2) as pool:
+        together, same_curve = train(world, config, lambda _: None, pool)
+    assert np.array_equal(alone, together)
+    assert curve == same_curve
+    assert len(curve.reward_share) == 3
+    other, _ = train(world, NnqlConfig(n_episodes=250, seed=8, motion_std_m=0.5), lambda _: None)
+    assert not np.array_equal(alone, other)
+
+
+def test_a_cancel_ends_training_between_two_batches():
+    config = NnqlConfig(n_episodes=300)
+    seen: list[float] = []
+
+    def cancel(share: float) -> None:
+        seen.append(share)
+        if share > 0.5:
+            raise CancelledError("asked to stop")
+
+    with pytest.raises(CancelledError):
+        train(random_world(config), config, cancel)
+    assert seen == [pytest.approx(1 / 3), pytest.approx(2 / 3)]
+
+
+def test_no_episodes_teach_nothing():
+    config = NnqlConfig(n_episodes=0)
+    world = random_world(config)
+    learnt, curve = train(world, config, lambda _: None)
+    assert np.array_equal(learnt, initial_q_values(80, 3, config))
+    assert curve.reward_share == ()
+    assert curve.greedy_reward_share == curve.random_reward_share
+
+
+def test_an_episode_ends_with_the_route():
+    config = NnqlConfig(n_episodes=1)
+    world = random_world(config)
+    walk = Walk(world, np.array([77, 10]))
+    assert walk.allowed.tolist() == [[True, True, False], [True, True, True]]
+    walk.step(np.array([1, 2]))
+    assert walk.frames.tolist() == [79, 13]
+    assert not walk.allowed[0].any()
+    walk.step(np.array([-1, 0]))
+    assert walk.frames.tolist() == [79, 14]
+
+
+def test_starts_leave_room_for_a_whole_episode_where_there_is_any():
+    world = random_world(NnqlConfig(n_episodes=1))
+    assert world.start_frames.max() == 49
+    long = random_world(NnqlConfig(n_episodes=1, n_actions_per_episode=100))
+    assert long.start_frames.max() == 79
+    assert random_world(NnqlConfig(n_episodes=1), closed=True).start_frames.max() == 79
+
+
+def telling_world(config: NnqlConfig) -> TrainingWorld:
+    """Every tenth place shows a landmark of its own; the nine between show how far on it is, and nothing else.
+
+    Who steps onto the telling places knows where it is; who wanders sees them once in ten views.
+    """
+    n, period = 300, 10
+    place = np.arange(n)
+    first = np.where(place % period == 0, period + place // period, place % period)
+    r = period + n // period
+    ranks = np.full((n, r), (r + 2) / 2, np.float32)
+    ranks[place, first] = 1
+    lists = first[np.newaxis].astype(np.uint16)
+    map_ = Map(
+        config={"relevance": "rrf", "n_landmarks": r},
+        lists=lists,
+        position_m=place.astype(float),
+        actions_m=np.arange(1.0, 10.0),
+    )
+    return TrainingWorld.on(map_, Query(ranks), map_.route, place, replace(config, update=UpdateRule.LOG_LIKELIHOOD))
+
+
+def test_where_only_every_tenth_place_tells_the_learnt_moves_find_it():
+    config = NnqlConfig(n_episodes=1500, n_actions_per_episode=3, top_share=0.02, motion_std_m=0.0, n_neighbours=4)
+    world = telling_world(config)
+    learnt, curve = train(world, config, lambda _: None)
+    assert curve.greedy_reward_share > curve.random_reward_share + 0.15
+    starts = world.start_frames
+    greedy = walk_greedily(world, starts, learnt, config)
+    random = walk_greedily(world, starts, initial_q_values(300, 9, config), config)
+    assert greedy.mean() < 0.7 * random.mean()

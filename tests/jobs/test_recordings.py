@@ -1,0 +1,243 @@
+"""Recordings become encodings beside positions, and what cannot be used is counted; ground truth files run nothing."""
+
+import os
+import pickle
+from typing import ClassVar
+
+import cv2
+import numpy as np
+import pytest
+
+from deepsimbad.core.drive import UNKNOWN_TIMESTAMP
+from deepsimbad.errors import ImageTooLargeError, InvalidRouteError, InvalidSourceError
+from deepsimbad.evaluators.image import decode_image
+from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
+from deepsimbad.jobs.recordings import encode_recording, read_ground_truth
+from deepsimbad_client.recordings.recording import Frame
+from deepsimbad_client.recordings.sources import open_source
+
+MAX_PIXELS = 1_000_000
+
+
+@pytest.fixture(scope="module")
+def judge():
+    return make_evaluator(evaluator_config({"kind": "feature_l2"}))
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Six images, the third of them no image at all."""
+    for place in range(6):
+        coarse = np.random.default_rng(place).integers(0, 255, (6, 8, 3), np.uint8)
+        cv2.imwrite(str(tmp_path / f"{place}.png"), cv2.resize(coarse, (160, 90), interpolation=cv2.INTER_CUBIC))
+    (tmp_path / "2.png").write_bytes(b"no image")
+    return tmp_path
+
+
+def ignore(_share):
+    pass
+
+
+def test_images_are_encoded_as_the_service_would_encode_what_is_posted(folder, judge):
+    recording = open_source(str(folder), spacing_m=2.5)
+    encoded = encode_recording(recording, judge, MAX_PIXELS, ignore)
+    assert encoded.drive.index.tolist() == [0, 1, 3, 4, 5]
+    assert encoded.drive.position_m.tolist() == [0.0, 2.5, 7.5, 10.0, 12.5]
+    assert encoded.drive.route().position_m.tolist() == [0.0, 2.5, 7.5, 10.0, 12.5]
+    for row, place in enumerate([0, 1, 3, 4, 5]):
+        posted = recording.image(recording.frames[place], judge.input_size).body
+        assert np.array_equal(encoded.drive.encodings[row], judge.encode([decode_image(posted, MAX_PIXELS)])[0])
+
+
+def test_broken_frames_are_counted_by_reason(folder, judge):
+    encoded = encode_recording(open_source(str(folder)), judge, MAX_PIXELS, ignore)
+    assert sum(encoded.left_out.values()) == 1
+    (reason,) = encoded.left_out
+    assert reason
+
+
+def test_the_readers_own_count_is_kept(folder, judge):
+    (folder / "positions.csv").write_text("name,position_m\n0.png,0\n1.png,1\n2.png,2\n9.png,9\n")
+    recording = open_source(str(folder))
+    encoded = encode_recording(recording, judge, MAX_PIXELS, ignore)
+    assert encoded.drive.index.tolist() == [0, 1]
+    assert encoded.left_out["not in positions.csv"] == 3
+    assert encoded.left_out["in positions.csv without an image"] == 1
+    assert sum(encoded.left_out.values()) == 5
+
+
+def test_every_frame_is_reported_broken_or_not(folder, judge):
+    shares = []
+    encode_recording(open_source(str(folder)), judge, MAX_PIXELS, shares.append)
+    assert shares == [place / 6 for place in range(1, 7)]
+
+
+def test_a_recording_of_broken_frames_alone_is_named(folder, judge):
+    with pytest.raises(InvalidSourceError, match="no frame that can be used"):
+        encode_recording(open_source(f"{folder}#2:3"), judge, MAX_PIXELS, ignore)
+
+
+def test_an_image_over_the_limit_is_an_error_not_a_broken_frame(folder, judge):
+    with pytest.raises(ImageTooLargeError):
+        encode_recording(open_source(str(folder)), judge, 100, ignore)
+
+
+def test_images_need_an_extractor(folder):
+    ready = make_evaluator(evaluator_config({"kind": "feature_l2", "extractor": "none"}))
+    with pytest.raises(InvalidSourceError, match="ready encodings alone"):
+        encode_recording(open_source(str(folder)), ready, MAX_PIXELS, ignore)
+
+
+def test_ready_encodings_are_taken_as_they_are(tmp_path, judge):
+    rows = np.random.default_rng(0).normal(size=(9, 5)).astype(np.float32)
+    np.save(tmp_path / "drive.npy", rows)
+    encoded = encode_recording(open_source(f"{tmp_path / 'drive.npy'}#2:9:3"), judge, MAX_PIXELS, ignore)
+    assert np.array_equal(encoded.drive.encodings, rows[2:9:3])
+    assert encoded.drive.index.tolist() == [2, 5, 8]
+    assert encoded.drive.position_m.tolist() == [2.0, 5.0, 8.0]
+    assert (encoded.drive.timestamp_us == UNKNOWN_TIMESTAMP).all()
+    assert np.isnan(encoded.drive.x_m).all()
+    assert encoded.drive.route().x_m is None
+
+
+class Placed:
+    """A recording that knows the ground coordinates of some frames."""
+
+    name = "placed"
+    left_out: ClassVar[dict[str, int]] = {}
+    encodings = np.eye(3, dtype=np.float32)
+
+    def __init__(self, *positions_m):
+        self.frames = tuple(
+            Frame(i, str(i), at, timestamp_us=i, x_m=None if i == 1 else 1.0 * i, y_m=2.0)
+            for i, at in enumerate(positions_m)
+        )
+
+    def image(self, frame, input_size):
+        raise AssertionError("ready encodings have no images")
+
+
+def test_ground_coordinates_and_times_are_kept(judge):
+    encoded = encode_recording(Placed(0, 1, 2), judge, MAX_PIXELS, ignore)
+    assert encoded.drive.timestamp_us.tolist() == [0, 1, 2]
+    np.testing.assert_array_equal(encoded.drive.route().x_m, [0.0, np.nan, 2.0])
+    np.testing.assert_array_equal(encoded.drive.route().y_m, [2.0, 2.0, 2.0])
+
+
+def test_positions_that_go_backwards_are_named(judge):
+    with pytest.raises(InvalidRouteError, match="frame 2"):
+        encode_recording(Placed(0, 2, 1), judge, MAX_PIXELS, ignore)
+
+
+# --- ground truth --------------------------------------------------------------------------------------------------
+
+
+def lists(found):
+    return [ids.tolist() for ids in found]
+
+
+def saved(path, array, **how):
+    np.save(path, array, **how)
+    return path
+
+
+def vpr_bench(rows):
+    """[q, 2] object array of (query, list), as VPR-Bench writes it."""
+    array = np.empty((len(rows), 2), object)
+    for row, (query, truth) in zip(array, rows, strict=True):
+        row[0], row[1] = query, truth
+    return array
+
+
+def test_pairs_of_a_query_and_its_list(tmp_path):
+    path = saved(tmp_path / "truth.npy", vpr_bench([(0, [2, 1]), (1, np.array([0])), (2, [])]), allow_pickle=True)
+    assert lists(read_ground_truth(path, np.arange(3), np.arange(3))) == [[1, 2], [0], []]
+
+
+def test_the_pairs_may_come_in_any_order_and_with_gaps(tmp_path):
+    path = saved(tmp_path / "truth.npy", vpr_bench([(7, [3]), (2, [1])]), allow_pickle=True)
+    assert lists(read_ground_truth(path, np.array([2, 5, 7]), np.arange(4))) == [[1], [], [3]]
+
+
+def test_lists_in_test_frame_order(tmp_path):
+    array = np.empty(2, object)
+    array[0], array[1] = [1], [0, 2]
+    path = saved(tmp_path / "truth.npy", array, allow_pickle=True)
+    assert lists(read_ground_truth(path, np.arange(2), np.arange(3))) == [[1], [0, 2]]
+
+
+def test_numbers_padded_with_minus_one(tmp_path):
+    path = saved(tmp_path / "truth.npy", np.array([[1, -1], [0, 2], [-1, -1]]))
+    assert lists(read_ground_truth(path, np.arange(3), np.arange(3))) == [[1], [0, 2], []]
+
+
+def test_frames_are_named_by_their_place_in_the_whole_recording(tmp_path):
+    path = saved(tmp_path / "truth.npy", np.array([[10], [11], [12], [13]]))
+    found = read_ground_truth(path, test_index=np.array([1, 3]), training_index=np.array([11, 12, 13]))
+    assert lists(found) == [[0], [2]]
+
+
+def test_a_training_frame_that_is_not_mapped_is_no_answer(tmp_path):
+    path = saved(tmp_path / "truth.npy", np.array([[0, 99]]))
+    assert lists(read_ground_truth(path, np.arange(1), np.arange(2))) == [[0]]
+
+
+class Malice:
+    def __init__(self, marker):
+        self.marker = marker
+
+    def __reduce__(self):
+        return os.mkdir, (str(self.marker),)
+
+
+def test_a_malicious_pickle_runs_nothing(tmp_path):
+    marker = tmp_path / "it ran"
+    path = saved(tmp_path / "truth.npy", vpr_bench([(0, Malice(marker))]), allow_pickle=True)
+    with pytest.raises(InvalidSourceError, match="mkdir"):
+        read_ground_truth(path, np.arange(1), np.arange(1))
+    assert not marker.exists()
+    np.load(path, allow_pickle=True)
+    assert marker.exists(), "the pickle would have run"
+
+
+def test_a_bare_pickle_is_no_ground_truth(tmp_path):
+    path = tmp_path / "truth.npy"
+    path.write_bytes(pickle.dumps([[0]]))
+    with pytest.raises(InvalidSourceError, match="no ground truth file"):
+        read_ground_truth(path, np.arange(1), np.arange(1))
+
+
+@pytest.mark.parametrize("body", [b"", b"words", b"\x93NUMPY\x01\x00"])
+def test_what_is_no_array_is_named(tmp_path, body):
+    path = tmp_path / "truth.npy"
+    path.write_bytes(body)
+    with pytest.raises(InvalidSourceError, match=r"truth\.npy"):
+        read_ground_truth(path, np.arange(1), np.arange(1))
+
+
+def test_a_truncated_array_is_named(tmp_path):
+    path = saved(tmp_path / "truth.npy", vpr_bench([(0, [1, 2, 3])] * 5), allow_pickle=True)
+    path.write_bytes(path.read_bytes()[:-20])
+    with pytest.raises(InvalidSourceError):
+        read_ground_truth(path, np.arange(1), np.arange(1))
+
+
+def test_words_in_place_of_frame_numbers_are_named(tmp_path):
+    path = saved(tmp_path / "truth.npy", vpr_bench([(0, ["a place"])]), allow_pickle=True)
+    with pytest.raises(InvalidSourceError):
+        read_ground_truth(path, np.arange(1), np.arange(1))
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(InvalidSourceError, match="cannot read"):
+        read_ground_truth(tmp_path / "nowhere.npy", np.arange(1), np.arange(1))
+
+
+@pytest.mark.real_data
+def test_the_corridor_of_vpr_bench(real_data):
+    path = real_data / "corridor" / "ground_truth_new.npy"
+    found = read_ground_truth(path, np.arange(111), np.arange(111))
+    expected = {int(query): sorted(truth) for query, truth in np.load(path, allow_pickle=True)}
+    assert len(found) == 111
+    assert lists(found) == [expected[query] for query in range(111)]
+    assert all(len(ids) for ids in found)

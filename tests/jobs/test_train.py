@@ -1,0 +1,151 @@
+"""Which live images a map is trained on, and what remaps keep of it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from deepsimbad.core.building import build_map
+from deepsimbad.core.drive import Drive
+from deepsimbad.core.nnql import NnqlConfig
+from deepsimbad.core.relevance import Relevance
+from deepsimbad.core.training import TrainingWorld
+from deepsimbad.errors import CancelledError
+from deepsimbad.jobs.progress import Progress
+from deepsimbad.jobs.remap import remap
+from deepsimbad.jobs.remap_config import REMAP_STAGES, RemapConfig
+from deepsimbad.jobs.train import HELD_OUT, SECOND_DRIVE, train_nnql
+from deepsimbad.store.map_file import read_map
+
+DOMAIN = "route"
+N, R = 90, 20
+
+
+def drives(noise: float = 0.4, seed: int = 0) -> tuple[Drive, Drive]:
+    """The map's own drive and a second one of the same places."""
+    rng = np.random.default_rng(seed)
+    places = rng.normal(size=(N, R))
+
+    def seen() -> Drive:
+        views = (places + noise * rng.normal(size=(N, R))).astype(np.float32)
+        return Drive(position_m=np.arange(N, dtype=float), encodings=views, dissimilarities=views)
+
+    return seen(), seen()
+
+
+def a_map(relevance, own, actions_m=(1.0, 2.0, 5.0)):
+    return replace(build_map(relevance, own, 4), actions_m=np.array(actions_m))
+
+
+def trained(relevance=Relevance.RRF, second=None, own=None, config=None, on_progress=lambda _: None):
+    own = own or drives()[0]
+    return train_nnql(a_map(relevance, own), lambda: own, second, config or NnqlConfig(n_episodes=200), on_progress)
+
+
+@pytest.fixture
+def worlds(monkeypatch):
+    """Every world that training makes: its map, views and the route they lie on."""
+    seen = []
+    on = TrainingWorld.on
+
+    def recording(map_, views, live_route, *rest):
+        seen.append((map_, views, live_route))
+        return on(map_, views, live_route, *rest)
+
+    monkeypatch.setattr(TrainingWorld, "on", recording)
+    return seen
+
+
+def test_a_second_drive_of_the_route_gives_the_live_images(worlds):
+    own, second = drives()
+    q_values, metrics = trained(second=second, own=own)
+    assert metrics["live_images"] == SECOND_DRIVE
+    assert metrics["n_episodes"] == 200
+    ((map_, views, _),) = worlds
+    assert map_.n_images == N
+    assert views.dissimilarities is second.dissimilarities
+    assert q_values.shape == (N, 3)
+    assert q_values.dtype == np.float32
+    assert (q_values > 1).mean() > 0.5
+
+
+def test_else_alternate_frames_are_held_out_of_the_map_they_look_at(worlds):
+    own, _ = drives()
+    q_values, metrics = trained(own=own)
+    assert metrics["live_images"] == HELD_OUT
+    assert len(metrics["curves"]) == len(worlds) == 2
+    for map_, _, live_route in worlds:
+        assert not set(map_.position_m) & set(live_route.position_m), "a live image is a map image"
+        assert map_.n_images == N // 2
+        for image, position_m in enumerate(map_.position_m):  # the half's lists are those of its frames
+            nearest = np.argsort(own.dissimilarities[int(position_m)], kind="stable")[:4]
+            assert map_.lists[:, image].tolist() == nearest.tolist()
+    touched = (q_values != np.float32(1e-4)).any(axis=1)
+    assert touched[::2].mean() > 0.5
+    assert touched[1::2].mean() > 0.5
+
+
+@pytest.mark.parametrize("relevance", list(Relevance))
+def test_maps_for_every_relevance_learn(relevance):
+    own, second = drives()
+    for live in (None, second):
+        q_values, _ = trained(relevance, live, own, NnqlConfig(n_episodes=40))
+        assert np.isfinite(q_values).all()
+        assert (q_values > 1).any()
+
+
+def test_small_maps_take_fewer_episodes_and_one_image_none():
+    own, _ = drives()
+    assert trained(own=own.at(np.arange(6)), config=NnqlConfig())[1]["n_episodes"] == 150
+    q_values, metrics = trained(own=own.at(np.arange(1)))
+    assert q_values.tolist() == [[np.float32(1e-4)] * 3]
+    assert metrics["curves"] == []
+    nothing, _ = trained(second=drives()[1], config=NnqlConfig(n_episodes=0))
+    assert (nothing == np.float32(1e-4)).all()
+
+
+def test_progress_rises_and_a_cancel_gets_through():
+    for second in (None, drives()[1]):
+        shares: list[float] = []
+        trained(second=second, on_progress=shares.append)
+        assert shares == sorted(shares)
+        assert shares[-1] == 1.0
+
+        def cancel(share: float) -> None:
+            raise CancelledError("asked to stop")
+
+        with pytest.raises(CancelledError):
+            trained(second=second, on_progress=cancel)
+
+
+def remap_config(**changes):
+    return RemapConfig(**{"training_traverse": "drive", "landmark_traverse": "other", "n_landmarks": 8} | changes)
+
+
+def test_a_remap_stores_what_it_learnt(catalog, drive, evaluator, quiet):
+    drive("other", 30, seed=1)
+    drive("drive", 12)
+    stages: list[str] = []
+    progress = Progress(REMAP_STAGES, lambda state: stages.append(state.stage))
+    result = remap(catalog, DOMAIN, remap_config(), evaluator, progress)
+    assert "train" in stages
+    training = result["metrics"]["training"]
+    assert training["n_episodes"] == 300
+    assert training["live_images"] == HELD_OUT
+    assert all(0 <= share <= 1 for curve in training["curves"] for share in curve["reward_share"])
+    assert training["hyperparameters"]["learning_rate"] == 0.1
+    assert catalog.map(DOMAIN, 1).metrics["training"] == training
+    q_values = read_map(catalog.map_path(DOMAIN, 1)).q_values
+    assert q_values.shape == (12, 2)
+    again = remap(catalog, DOMAIN, remap_config(), evaluator, quiet)
+    assert np.array_equal(read_map(catalog.map_path(DOMAIN, again["map_version"])).q_values, q_values)
+    other_seed = remap(catalog, DOMAIN, remap_config(seed=1), evaluator, Progress(REMAP_STAGES))
+    assert not np.array_equal(read_map(catalog.map_path(DOMAIN, other_seed["map_version"])).q_values, q_values)
+
+
+def test_a_remap_without_episodes_has_no_experience(catalog, drive, evaluator, quiet):
+    drive("other", 30, seed=1)
+    drive("drive", 12)
+    result = remap(catalog, DOMAIN, remap_config(training_episodes=0), evaluator, quiet)
+    assert result["metrics"]["training"] is None
+    assert read_map(catalog.map_path(DOMAIN, 1)).q_values is None
