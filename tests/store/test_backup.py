@@ -366,9 +366,8 @@ def test_a_restore_that_was_killed_is_begun_anew(archive: Path, tmp_path: Path) 
     there = tmp_path / "there"
     (there / ".restoring").mkdir(parents=True)
     (there / "domains/campus").mkdir(parents=True)  # it had begun to publish; the catalog comes last
-    with pytest.raises(DamagedFileError, match="missing or empty beside a folder of domains"):
+    with pytest.raises(DamagedFileError, match="missing beside a folder of domains"):
         Catalog.open(there)
-    (there / "catalog.sqlite").unlink()
     (there / "other").touch()
     with pytest.raises(ConflictError, match="not empty"):
         restore(archive, there, silent)

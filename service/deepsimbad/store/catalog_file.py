@@ -3,7 +3,7 @@
 import os
 import threading
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Self
 
@@ -13,11 +13,9 @@ from deepsimbad.errors import DamagedFileError, UnknownDomainError
 from deepsimbad.store import layout
 from deepsimbad.store.connection import (
     OpenFile,
-    check_integrity,
     close_with_log,
-    migrate,
     open_database,
-    use_write_ahead_log,
+    open_working_file,
     write_transaction,
 )
 from deepsimbad.store.data_dir import make_data_dir
@@ -53,22 +51,16 @@ class CatalogFile(OpenFile):
         """Open the catalog of a data directory; makes both where they are missing."""
         path = layout.catalog_path(data_dir)
         make_data_dir(data_dir)
-        with storage_faults(path), ExitStack() as on_error:
+        with storage_faults(path):
             domains = layout.domains_folder(data_dir)
-            has_domains = domains.is_dir() and any(domains.iterdir())  # looked at before the rows: they come first
-            db = open_database(path, create=True)
-            on_error.callback(db.close)
-            if has_domains and not db.table_names():
+            has_domains = domains.is_dir() and any(domains.iterdir())  # looked at before the file, which comes first
+            if has_domains and not path.exists():
                 raise DamagedFileError(
-                    f"{path.name} is missing or empty beside a folder of domains: put a copy of it back, or move "
-                    "the folder away",
+                    f"{path.name} is missing beside a folder of domains: put a copy of it back, or move that folder",
                     file=path.name,
                 )
-            check_integrity(db, path)
-            use_write_ahead_log(db)
-            migrate(db, migrations, path)
+            db = open_working_file(path, migrations, create=not has_domains)
             sync_folder(data_dir)
-            on_error.pop_all()
         return cls(data_dir, db)
 
     def close(self) -> None:

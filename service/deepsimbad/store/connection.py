@@ -182,6 +182,22 @@ def migrate(db: Database, migrations: Migrations, path: Path) -> None:
             migrations.apply(db)
 
 
+def open_working_file(path: Path, migrations: Migrations, *, create: bool = False, is_checked: bool = True) -> Database:
+    """Open a file to work on: with a write-ahead log, of today's schema, and whole unless that is not to be checked."""
+    db = open_database(path, create=create)
+    try:
+        if not create and not db.table_names():
+            raise DamagedFileError(f"{path.name} is damaged: it is empty", file=path.name)
+        if is_checked:
+            check_integrity(db, path)
+        use_write_ahead_log(db)
+        migrate(db, migrations, path)
+    except BaseException:
+        db.close()
+        raise
+    return db
+
+
 class OpenFile:
     """What every kind of working file has in common; usable from any thread.
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Self
 
@@ -14,11 +14,9 @@ from deepsimbad.errors import UnknownSessionError
 from deepsimbad.store import journal, layout
 from deepsimbad.store.connection import (
     OpenFile,
-    check_integrity,
     close_with_log,
-    migrate,
     open_database,
-    use_write_ahead_log,
+    open_working_file,
     write_transaction,
 )
 from deepsimbad.store.data_dir import make_data_dir
@@ -64,18 +62,11 @@ class SessionStore(OpenFile):
         """Open the sessions of a data directory; makes the file where it is missing."""
         path = layout.sessions_path(data_dir)
         make_data_dir(data_dir)
-        with storage_faults(path), ExitStack() as on_error:
-            writing = open_database(path, create=True)
-            on_error.callback(writing.close)
-            use_write_ahead_log(writing)
-            if path.stat().st_size <= _CHECKED_AT_START_BYTES:
-                check_integrity(writing, path)
-            migrate(writing, migrations, path)
-            reading = open_database(path)
-            on_error.callback(reading.close)
+        with storage_faults(path):
+            is_small = not path.exists() or path.stat().st_size <= _CHECKED_AT_START_BYTES
+            writing = open_working_file(path, migrations, create=True, is_checked=is_small)
             sync_folder(data_dir)
-            on_error.pop_all()
-        return cls(path, reading, writing, on_commit)
+            return cls(path, open_database(path), writing, on_commit)
 
     def close(self) -> None:
         """Commit what waits, then close the file."""
