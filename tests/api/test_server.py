@@ -69,7 +69,7 @@ def test_an_address_that_is_not_ours(tmp_path: Path, host: str, why: str) -> Non
 )
 def test_a_certificate_that_cannot_be_used(tmp_path: Path, certificate: Path | None, key: Path) -> None:
     with pytest.raises(SettingsError, match="tls_certificate") as caught:
-        serve(Settings(data_dir=tmp_path / "data", port=0, tls_certificate=certificate, tls_key=key))
+        serve(Settings(data_dir=tmp_path / "data", port=0, tls_certificate=certificate, tls_key=key), create=True)
     assert caught.value.hints["setting"] == "tls_certificate"
     assert not (tmp_path / "data").exists()
 
@@ -80,7 +80,7 @@ def test_the_service_on_https(tmp_path: Path) -> None:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
     process = subprocess.Popen(
-        [sys.executable, "-m", "deepsimbad", "serve", "--data-dir", str(tmp_path / "data"), "--port", str(port)],
+        [sys.executable, "-m", "deepsimbad", "serve", "--create", "--data-dir", str(tmp_path), "--port", str(port)],
         env={**os.environ, "DEEPSIMBAD_TLS_CERTIFICATE": str(CERTIFICATE), "DEEPSIMBAD_TLS_KEY": str(KEY)},
         stderr=subprocess.DEVNULL,
         cwd=tmp_path,

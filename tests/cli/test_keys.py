@@ -16,13 +16,15 @@ def test_a_key_is_printed_alone(deepsimbad, tmp_path):
     assert ran.out.count("\n") == 1
     assert "first" in ran.err
     assert ran.out.strip() not in ran.err
-    second = deepsimbad("keys", "create", "--scope", "localize", "--expires-days", "2", "--data-dir", tmp_path / "d")
+    limits = ("--expires-days", "2", "--domain", "campus", "--domain", "yard")
+    second = deepsimbad("keys", "create", "--scope", "localize", *limits, "--data-dir", tmp_path / "d")
     assert "first" not in second.err
     listed = json.loads(deepsimbad("keys", "list", "--json", "--data-dir", tmp_path / "d").out)
     assert [(key["key_id"], key["name"], key["scope"], key["state"]) for key in listed] == [
         (found[1], "the operator", "admin", "usable"),
         (KEY.fullmatch(second.out.strip())[1], "", "localize", "usable"),
     ]
+    assert [key["domains"] for key in listed] == [None, ["campus", "yard"]]
     assert listed[0]["expires_at"] is None
     assert listed[1]["expires_at"] > listed[1]["created_at"]
 
@@ -60,7 +62,12 @@ def test_mistakes_are_named_and_change_nothing(deepsimbad, tmp_path):
     assert deepsimbad("keys", "create").code == 2
     assert deepsimbad("keys", "create", "--scope", "root").code == 2
     assert deepsimbad("keys", "create", "--scope", "admin", "--expires-days", "0").code == 2
-    for arguments in (("revoke", "0123456789ab"), ("create", "--scope", "admin", "--name", "a\nb")):
+    for arguments in (
+        ("revoke", "0123456789ab"),
+        ("create", "--scope", "admin", "--name", "a\nb"),
+        ("create", "--scope", "admin", "--domain", "campus"),
+        ("create", "--scope", "localize", "--domain", "../campus"),
+    ):
         ran = deepsimbad("keys", *arguments)
         assert (ran.code, ran.out, ran.err.count("\n")) == (1, "", 1)
     ran = deepsimbad("keys", "create", "--scope", "admin", "--expires-days", "1e300")

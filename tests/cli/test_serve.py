@@ -44,7 +44,7 @@ def assert_it_cannot_start(err, code, why):
 @pytest.mark.parametrize(("by", "code"), [(signal.SIGTERM, 0), (signal.SIGINT, 130)])
 def test_it_serves_until_it_is_stopped(process, tmp_path, by, code):
     port = free_port()
-    running = process("serve", "--port", port, "--data-dir", tmp_path / "here")
+    running = process("serve", "--create", "--port", port, "--data-dir", tmp_path / "here")
     assert wait_until_ready(port, running) == 200
     running.send_signal(by)
     out, err = running.communicate(timeout=60)
@@ -56,7 +56,7 @@ def test_it_serves_until_it_is_stopped(process, tmp_path, by, code):
 
 def test_host_and_port_come_from_the_environment_too(process, tmp_path):
     port = free_port()
-    running = process("serve", DEEPSIMBAD_PORT=str(port), DEEPSIMBAD_HOST="127.0.0.1")
+    running = process("serve", "--create", DEEPSIMBAD_PORT=str(port), DEEPSIMBAD_HOST="127.0.0.1")
     assert wait_until_ready(port, running) == 200
     running.terminate()
     running.communicate(timeout=60)
@@ -69,6 +69,22 @@ def test_other_machines_are_refused_while_there_are_no_keys(process):
     assert (running.returncode, out) == (1, "")
     assert_it_cannot_start(err, "invalid_settings", "DEEPSIMBAD_ALLOW_OPEN")
     assert len(err.splitlines()) == 2
+
+
+def test_a_data_directory_must_be_there(deepsimbad, process, tmp_path):
+    running = process("serve", "--port", 0)
+    _, err = running.communicate(timeout=60)
+    assert running.returncode == 1
+    assert_it_cannot_start(err, "invalid_settings", "there is no data directory deepsimbad-data")
+    assert list(tmp_path.iterdir()) == []
+    for _ in range(2):
+        assert deepsimbad("init", "--data-dir", tmp_path / "made").code == 0
+    assert stat.S_IMODE((tmp_path / "made").stat().st_mode) == 0o700
+    port = free_port()
+    running = process("serve", "--port", port, "--data-dir", tmp_path / "made")
+    assert wait_until_ready(port, running) == 200
+    running.terminate()
+    running.communicate(timeout=60)
 
 
 def test_settings_that_cannot_be_used_are_logged_too(process, tmp_path):
@@ -99,7 +115,7 @@ def test_a_port_that_is_taken_is_an_error(process):
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
-        running = process("serve", "--port", taken.getsockname()[1])
+        running = process("serve", "--create", "--port", taken.getsockname()[1])
         _, err = running.communicate(timeout=60)
     assert running.returncode == 1
     assert "address already in use" in err.lower()

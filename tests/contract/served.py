@@ -38,7 +38,8 @@ class Served:
     def start(cls, data_dir: Path, log: Path, **settings: object) -> "Served":
         """Start it and wait until it is ready."""
         port = free_port()
-        command = [sys.executable, "-m", "deepsimbad", "serve", "--data-dir", str(data_dir), "--port", str(port)]
+        command = [sys.executable, "-m", "deepsimbad", "serve", "--create", "--port", str(port)]
+        command += ["--data-dir", str(data_dir)]
         given = {f"DEEPSIMBAD_{name.upper()}": str(value) for name, value in settings.items()}
         with log.open("ab") as stderr:
             process = subprocess.Popen(command, stderr=stderr, env={**os.environ, **given}, cwd=log.parent)

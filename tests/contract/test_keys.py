@@ -163,6 +163,30 @@ def test_log_lines_name_key_and_domain_and_never_the_secret(keyed: Keyed, caplog
     assert secret not in json.dumps([vars(record) for record in caplog.records], default=str)
 
 
+def test_a_key_may_be_for_some_domains_alone(keyed: Keyed) -> None:
+    with Catalog.open(keyed.data_dir) as catalog:
+        _, ready = catalog.create_key(KeyScope.LOCALIZE, domains=["ready"])
+        _, other = catalog.create_key(KeyScope.LOCALIZE, domains=["elsewhere", "other"])
+    headers = {"X-API-Key": ready.text}
+    wait_until(lambda: keyed.client.get("/v1/domains", headers=headers), 200)
+    calls = (
+        ("GET", "/v1/domains/ready", None),
+        ("POST", "/v1/domains/ready/localizations", {"ranked_landmarks": [1]}),
+        ("POST", "/v1/domains/ready/sessions", {}),
+        ("GET", "/v1/domains/ready/landmark-model", None),
+    )
+    for method, path, body in calls:
+        assert keyed.client.request(method, path, json=body, headers=headers).status_code < 300, path
+        refused = keyed.client.request(method, path, json=body, headers={"X-API-Key": other.text})
+        check(refused, 403, "forbidden")
+        assert refused.json()["domains"] == ["elsewhere", "other"]
+        check(
+            keyed.client.request(method, path.replace("ready", "unknown"), json=body, headers=headers), 403, "forbidden"
+        )
+    listed = [keyed.client.get("/v1/domains", headers={"X-API-Key": key.text}).json() for key in (ready, other)]
+    assert [[domain["name"] for domain in answer["domains"]] for answer in listed] == [["ready"], []]
+
+
 def wait_until(answers: Any, status: int) -> None:
     give_up = time.monotonic() + 30
     while answers().status_code != status:

@@ -20,7 +20,7 @@ import sys
 from pathlib import Path
 from deepsimbad.api.server import serve
 from deepsimbad.settings import Settings
-serve(Settings(data_dir=Path(sys.argv[1]), port=int(sys.argv[2])))
+serve(Settings(data_dir=Path(sys.argv[1]), port=int(sys.argv[2])), create=True)
 """
 
 

@@ -1,6 +1,6 @@
 """Every operation of the OpenAPI document, tried by schemathesis: the document is true, and no answer is our own fault.
 
-The command runs against a live server, in its own process. `SCHEMATHESIS_EXAMPLES` (40) says how many cases an
+The command runs against a live server, in its own process. `SCHEMATHESIS_EXAMPLES` (8) says how many cases an
 operation gets in the fuzzing and stateful phases; the examples and coverage phases try what the document holds.
 """
 
@@ -29,8 +29,8 @@ from .test_over_the_wire import free_port
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
-EXAMPLES = int(os.environ.get("SCHEMATHESIS_EXAMPLES", "40"))
-FEWEST_CASES = 2000
+EXAMPLES = int(os.environ.get("SCHEMATHESIS_EXAMPLES", "8"))
+FEWEST_CASES = 1500
 HOOKS = Path(__file__).with_name("schemathesis_hooks.py")
 CHECKS = (
     "not_a_server_error",

@@ -35,7 +35,8 @@ class Service:
         self.process: subprocess.Popen[bytes] | None = None
 
     def start(self, **settings: object) -> None:
-        command = [sys.executable, "-m", "deepsimbad", "serve", "--data-dir", self.data_dir, "--port", str(self.port)]
+        command = [sys.executable, "-m", "deepsimbad", "serve", "--create", "--data-dir", self.data_dir]
+        command += ["--port", str(self.port)]
         given = {f"DEEPSIMBAD_{name.upper()}": str(value) for name, value in settings.items()}
         with self.log.open("ab") as stderr:
             self.process = subprocess.Popen(

@@ -51,6 +51,9 @@ def command(*arguments: object) -> Ran:
     return Ran(done.returncode, done.stdout, done.stderr)
 
 
+SERVE = [sys.executable, "-m", "deepsimbad", "serve", "--create"]
+
+
 class Service:
     """`deepsimbad serve` as a process between `with` and the end of its block, and requests to it.
 
@@ -72,7 +75,7 @@ class Service:
 
     def __enter__(self) -> Self:
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "deepsimbad", "serve", "--data-dir", str(self._data_dir), "--port", str(self._port)],
+            [*SERVE, "--port", str(self._port), "--data-dir", str(self._data_dir)],
             stdout=subprocess.DEVNULL,
             stderr=subprocess.PIPE,
             text=True,

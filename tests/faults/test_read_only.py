@@ -56,7 +56,7 @@ def test_the_service_does_not_start(read_only: Path) -> None:
 
 
 def test_a_data_directory_that_cannot_be_made_is_named(read_only: Path) -> None:
-    ran = unprivileged("serve", "--port", 0, "--data-dir", read_only / "new")
+    ran = unprivileged("serve", "--create", "--port", 0, "--data-dir", read_only / "new")
     assert ran.code == 1
     assert f"the data directory {read_only / 'new'} cannot be made: Permission denied" in ran.err.splitlines()[-1]
 

@@ -21,10 +21,10 @@ import pytest
 
 GOLDEN = Path(__file__).parent
 COMMANDS = [
-    *([], ["serve"], ["keys"], ["keys", "create"], ["keys", "list"], ["keys", "revoke"], ["map"], ["localize"]),
-    *(["info"], ["delete"], ["experiment"], ["experiment", "vpr"], ["experiment", "nbv"], ["settings"], ["backup"]),
-    *(["restore"], ["export"], ["import"], ["check"], ["weights"], ["weights", "list"], ["weights", "pull"]),
-    ["weights", "verify"],
+    *([], ["init"], ["serve"], ["keys"], ["keys", "create"], ["keys", "list"], ["keys", "revoke"], ["map"]),
+    *(["localize"], ["info"], ["delete"], ["experiment"], ["experiment", "vpr"], ["experiment", "nbv"], ["settings"]),
+    *(["backup"], ["restore"], ["export"], ["import"], ["check"], ["weights"], ["weights", "list"]),
+    *(["weights", "pull"], ["weights", "verify"]),
 ]
 CLIENT_COMMANDS = """activate campus delete-domain delete-map delete-session delete-traverse domains download jobs
 localize maps remap replay rollback sessions traverses upload watch""".split()  # noqa: SIM905 - as one writes it
@@ -57,7 +57,8 @@ class Server:
             probe.bind(("127.0.0.1", 0))
             port = probe.getsockname()[1]
         self.url = f"http://127.0.0.1:{port}"
-        command = [sys.executable, "-m", "deepsimbad", "serve", "--data-dir", str(folder / "data"), "--port", str(port)]
+        command = [sys.executable, "-m", "deepsimbad", "serve", "--create", "--port", str(port)]
+        command += ["--data-dir", str(folder / "data")]
         with (folder / "log").open("ab") as log:
             self.process = subprocess.Popen(command, stderr=log, stdout=log, cwd=folder)
         for _ in range(2400):

@@ -53,7 +53,7 @@ class LocalServer:
         Raises:
             DeepSimbadClientError: It ended, or was not ready within a minute; the log's last lines are in the message.
         """
-        command = [sys.executable, "-m", "deepsimbad", "serve", "--data-dir", str(self._data_dir)]
+        command = [sys.executable, "-m", "deepsimbad", "serve", "--create", "--data-dir", str(self._data_dir)]
         self.log_path.parent.mkdir(parents=True, exist_ok=True)
         with self.log_path.open("ab") as log:
             self._process = subprocess.Popen(  # noqa: S603 - our own interpreter and module

@@ -94,3 +94,9 @@ def m004_without_owners_and_row_checksums(db: Database) -> None:
         db.execute(f"ALTER TABLE {table} DROP COLUMN checksum")
     for table in ("map", "job"):
         db.execute(f"ALTER TABLE {table} DROP COLUMN owner")
+
+
+@migrations()
+def m005_domains_of_keys(db: Database) -> None:
+    """The domains that a key opens, a JSON list; NULL: all."""
+    db.execute("ALTER TABLE api_key ADD COLUMN domains TEXT")

@@ -153,12 +153,15 @@ def describe_domain(record: DomainRecord, evaluators: EvaluatorPool, maps: Maps)
 
 
 @router.get("", responses=problems())
-async def list_domains(running: Running) -> DomainList:
+async def list_domains(request: Request, running: Running) -> DomainList:
     """All domains, by name."""
+    opened = request.scope["state"].get("domains")  # to this key; None: all
 
     def described() -> DomainList:
         answers = []
         for record in running.catalog.domains():
+            if opened is not None and record.name not in opened:
+                continue
             try:
                 answers.append(describe_domain(record, running.evaluators, running.maps))
             except UnknownDomainError:  # deleted since it was listed

@@ -14,23 +14,20 @@ from starlette.middleware.cors import CORSMiddleware
 from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from deepsimbad.api.keys import KeyRing, RateLimit, needed_scope, presented_key
+from deepsimbad.api.keys import KeyRing, RateLimit, needed_scope
 from deepsimbad.api.metrics import Metrics
 from deepsimbad.api.problems import error_response, unexpected_response
 from deepsimbad.api.requests import Slots
 from deepsimbad.errors import (
     BodyTooLargeError,
     DeepSimbadError,
-    ForbiddenError,
     ForeignHostError,
     InvalidInputError,
-    UnauthorizedError,
     UnavailableError,
     UnreadableRequestError,
     UnsupportedMediaTypeError,
 )
 from deepsimbad.settings import Settings, is_loopback
-from deepsimbad.store.records import KeyScope
 
 log = logging.getLogger(__name__)
 
@@ -155,7 +152,7 @@ class _Request:
         if self._door.keys.n_created == 0:
             self._check_page()
         if needed is not None and not self._door.keys.is_open:
-            self._check_key(needed)
+            self._door.keys.admit(self._scope, needed, self._door.rate_limit)
         self._check_size()
 
     def _check_page(self) -> None:
@@ -173,20 +170,6 @@ class _Request:
         else:
             return
         raise ForeignHostError(f"this service asks for no key and answers its own machine alone: {what}")
-
-    def _check_key(self, needed: KeyScope) -> None:
-        noted = self._scope["state"]  # for the log
-        try:
-            key = self._door.keys.holder(presented_key(self._scope))
-        except UnauthorizedError as error:
-            noted |= {name: value for name, value in error.hints.items() if name == "key_id"}  # revoked or expired
-            raise
-        noted["key_id"] = key.key_id
-        self._door.rate_limit.take(key.key_id)
-        if not key.scope.includes(needed):
-            raise ForbiddenError(
-                f"this call needs a key of scope {needed}; this one has {key.scope}", needed=needed.value
-            )
 
     def _check_size(self) -> None:
         """Judge how the body will come, and whether there is room for it."""

@@ -4,6 +4,7 @@ import asyncio
 import hmac
 import logging
 import math
+import re
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
@@ -11,7 +12,7 @@ from collections.abc import Callable, Sequence
 from anyio.to_thread import run_sync
 from starlette.types import Scope
 
-from deepsimbad.errors import RateLimitedError, UnauthorizedError, UnavailableError
+from deepsimbad.errors import ForbiddenError, RateLimitedError, UnauthorizedError, UnavailableError
 from deepsimbad.store.catalog_keys import ApiKey
 from deepsimbad.store.records import KeyRecord, KeyScope, now
 
@@ -20,6 +21,7 @@ log = logging.getLogger(__name__)
 REREAD_S = 1.0  # a key that was made or revoked counts within this time
 KEPT_S = 60.0  # a catalog that cannot be read lets the last known keys count for so long
 MAX_BUCKETS = 10_000
+_OF_DOMAIN = re.compile(r"/v1/domains/([^/]+)")
 _NO_DIGEST = "0" * 64  # what a key that does not exist is compared with
 _HOW = "send a key as `Authorization: Bearer <key>` or `X-API-Key: <key>`; `deepsimbad keys create` makes one"
 
@@ -112,6 +114,30 @@ class KeyRing:
             what = "expired" if record.revoked_at is None else "was revoked"
             raise UnauthorizedError(f"the key {what}: ask the operator for another", key_id=record.key_id)
         return record
+
+    def admit(self, scope: Scope, needed: KeyScope, rate_limit: "RateLimit") -> None:
+        """Let a request in, and note whose it is, for the log and for what asks whose it is.
+
+        Raises:
+            UnauthorizedError: Its key is none of ours any more.
+            RateLimitedError: Its key asks too often.
+            ForbiddenError: Its key has not the scope, or not the domain.
+        """
+        noted = scope["state"]
+        try:
+            key = self.holder(presented_key(scope))
+        except UnauthorizedError as error:
+            noted |= {name: value for name, value in error.hints.items() if name == "key_id"}  # revoked or expired
+            raise
+        noted |= {"key_id": key.key_id, "domains": key.domains}
+        rate_limit.take(key.key_id)
+        if not key.scope.includes(needed):
+            raise ForbiddenError(
+                f"this call needs a key of scope {needed}; this one has {key.scope}", needed=needed.value
+            )
+        asked = _OF_DOMAIN.match(scope["path"])
+        if key.domains is not None and asked is not None and asked[1] not in key.domains:
+            raise ForbiddenError("this key is for other domains", domains=list(key.domains))
 
 
 def needed_scope(path: str) -> KeyScope | None:

@@ -111,19 +111,26 @@ class _Server(uvicorn.Server):
             await self.lifespan.shutdown()
 
 
-def serve(settings: Settings) -> None:
+def serve(settings: Settings, create: bool = False) -> None:
     """Serve until a signal ends it; requests under way are finished first.
 
     Args:
         settings: The settings.
+        create: Whether a data directory that is not there is made.
 
     Raises:
-        SettingsError: The address could be reached from other machines, and the service has no keys; or the
-            certificate or its key cannot be used.
+        SettingsError: The address could be reached from other machines, and the service has no keys; the data
+            directory is not there; or the certificate or its key cannot be used.
         DeepSimbadError: What kept it from starting, by name.
     """
     if not catalog_path(settings.data_dir).is_file():  # then there is no key, and no need to make the folder first
         settings.check_exposure(n_keys=0)
+    if not (create or settings.data_dir.exists()):
+        raise SettingsError(
+            f"there is no data directory {settings.data_dir}: make it with `deepsimbad init` or `serve --create`, or "
+            "name another with --data-dir",
+            setting="data_dir",
+        )
     configure_logging(settings.log_level)
     log.info(
         "starting",

@@ -11,7 +11,7 @@ import click
 from deepsimbad.cli.experiment import experiment
 from deepsimbad.cli.keys import keys
 from deepsimbad.cli.local import delete, info, localize, map_
-from deepsimbad.cli.serve import serve, settings
+from deepsimbad.cli.serve import init, serve, settings
 from deepsimbad.cli.storage import backup, check, export, import_, restore
 from deepsimbad.cli.weights import weights
 from deepsimbad.errors import CancelledError, DeepSimbadError, UnavailableError
@@ -27,7 +27,7 @@ def deepsimbad() -> None:
 
 
 for command in (
-    *(serve, map_, localize, info, delete, experiment, keys, settings),
+    *(init, serve, map_, localize, info, delete, experiment, keys, settings),
     *(backup, restore, export, import_, check, weights),
 ):
     deepsimbad.add_command(command)

@@ -2,6 +2,7 @@
 
 from datetime import timedelta
 from pathlib import Path
+from typing import Any
 
 import click
 from rich.markup import escape
@@ -30,16 +31,23 @@ def keys() -> None:
 )
 @click.option("--name", default="", help="What to call it, for `keys list`.")
 @click.option("--expires-days", type=click.FloatRange(min=0, min_open=True), help="Days it lives.  [default: for ever]")
+@click.option(
+    "--domain",
+    "domains",
+    multiple=True,
+    help="What it opens, of scope `localize`; several are allowed.  [default: all]",
+)
 @data_dir_option
-def create(scope: str, name: str, expires_days: float | None, data_dir: Path | None) -> None:
+def create(scope: str, name: str, expires_days: float | None, domains: tuple[str, ...], data_dir: Path | None) -> None:
     """Make a key and print it, alone, on standard output. It is shown this once: only a digest is kept."""
     lifetime = None if expires_days is None else timedelta(days=min(expires_days, timedelta.max.days))
     with Catalog.open(given_settings(data_dir=data_dir).data_dir) as catalog:
         is_first = not catalog.keys()
-        record, key = catalog.create_key(KeyScope(scope), name, lifetime)
+        record, key = catalog.create_key(KeyScope(scope), name, lifetime, domains or None)
     click.echo(key.text)
     until = "" if record.expires_at is None else f" until {record.expires_at}"
-    click.echo(f"key {record.key_id} opens {scope}{until}; keep it now, it cannot be shown again", err=True)
+    where = f" of {', '.join(domains)}" if domains else ""
+    click.echo(f"key {record.key_id} opens {scope}{where}{until}; keep it now, it cannot be shown again", err=True)
     if is_first:
         click.echo("it is the first: from now on every call under /v1 asks for a key", err=True)
 
@@ -59,9 +67,10 @@ def list_(as_json: bool, data_dir: Path | None) -> None:
     if as_json:
         write_json([_described(record) for record in records])
         return
-    table = Table("key", "name", "scope", "state", "created", "expires", "revoked")
+    table = Table("key", "name", "scope", "domains", "state", "created", "expires", "revoked")
     for record in records:
-        table.add_row(*("-" if value is None else escape(value) for value in _described(record).values()))
+        cells = {**_described(record), "domains": "all" if record.domains is None else ", ".join(record.domains)}
+        table.add_row(*("-" if value is None else escape(value) for value in cells.values()))
     print_table(table)
 
 
@@ -83,12 +92,13 @@ def revoke(key_id: str, as_json: bool, data_dir: Path | None) -> None:
         click.echo("no usable key is left: the service stays closed until one is created", err=True)
 
 
-def _described(record: KeyRecord) -> dict[str, str | None]:
+def _described(record: KeyRecord) -> dict[str, Any]:
     state = "usable" if record.is_usable(now()) else "expired"
     return {
         "key_id": record.key_id,
         "name": record.name,
         "scope": record.scope.value,
+        "domains": None if record.domains is None else list(record.domains),
         "state": state if record.revoked_at is None else "revoked",
         "created_at": record.created_at,
         "expires_at": record.expires_at,

@@ -13,6 +13,7 @@ from deepsimbad.cli.options import data_dir_option, given_settings, json_option,
 from deepsimbad.cli.terminal import print_table, write_json
 from deepsimbad.errors import DeepSimbadError
 from deepsimbad.settings import Origin, unknown_variables, variable_of
+from deepsimbad.store.catalog import Catalog
 
 log = logging.getLogger(__name__)
 
@@ -30,7 +31,8 @@ def _address_options(command: _Command) -> _Command:
 @click.command()
 @data_dir_option
 @_address_options
-def serve(data_dir: Path | None, host: str | None, port: int | None) -> None:
+@click.option("--create", is_flag=True, help="Make the data directory if it is not there.")
+def serve(data_dir: Path | None, host: str | None, port: int | None, create: bool) -> None:
     """Serve the domains over HTTP until interrupted. Ready when /readyz answers 200."""
     from deepsimbad.api.server import configure_logging  # noqa: PLC0415 - other commands need no server
     from deepsimbad.api.server import serve as serve_until_stopped  # noqa: PLC0415
@@ -40,11 +42,20 @@ def serve(data_dir: Path | None, host: str | None, port: int | None) -> None:
         configure_logging(settings.log_level)
         for variable in unknown_variables():
             log.warning("set in the environment, and no setting", extra={"variable": variable})
-        serve_until_stopped(settings)
+        serve_until_stopped(settings, create)
     except DeepSimbadError as error:
         configure_logging("ERROR")  # the settings themselves may be what is wrong
         log.error("cannot start", extra={"code": error.code, "why": error.message})
         raise
+
+
+@click.command()
+@data_dir_option
+def init(data_dir: Path | None) -> None:
+    """Make a data directory, for its owner alone; one that is there stays as it is."""
+    folder = given_settings(data_dir=data_dir).data_dir
+    Catalog.open(folder).close()
+    click.echo(f"{folder} is a data directory", err=True)
 
 
 @click.command()

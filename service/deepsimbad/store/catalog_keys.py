@@ -1,8 +1,10 @@
 """API keys: as text `dsk_<key id>_<secret>`, and what the catalog says of them; of a secret only a digest is kept."""
 
 import hashlib
+import json
 import re
 import secrets
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import timedelta
 from typing import Any, Self
@@ -11,12 +13,13 @@ from sqlite_utils import Database
 
 from deepsimbad.errors import InvalidInputError, UnknownKeyError
 from deepsimbad.store.catalog_file import CatalogFile
+from deepsimbad.store.layout import checked_name
 from deepsimbad.store.records import KeyRecord, KeyScope, after, now
 
 _PATTERN = re.compile(r"dsk_([0-9a-f]{12})_([A-Za-z0-9_-]{43})")
 _KEY_ID = re.compile(r"[0-9a-f]{12}")
 _MAX_NAME = 100
-_SELECT = "SELECT key_id, name, scope, secret_sha256, created_at, expires_at, revoked_at FROM api_key"
+_SELECT = "SELECT key_id, name, scope, secret_sha256, domains, created_at, expires_at, revoked_at FROM api_key"
 
 
 @dataclass(frozen=True)
@@ -60,7 +63,11 @@ class KeyCatalog(CatalogFile):
     """The keys. Rows are never deleted: whether a key was ever created decides whether the service runs open."""
 
     def create_key(
-        self, scope: KeyScope, name: str = "", lifetime: timedelta | None = None
+        self,
+        scope: KeyScope,
+        name: str = "",
+        lifetime: timedelta | None = None,
+        domains: Sequence[str] | None = None,
     ) -> tuple[KeyRecord, ApiKey]:
         """Make an API key; its secret is returned here and can never be had again.
 
@@ -68,19 +75,23 @@ class KeyCatalog(CatalogFile):
             scope: What it opens.
             name: What to call it, at most 100 printable letters; may be empty.
             lifetime: From now on, above 0; None: it does not expire.
+            domains: Those that it opens, of scope `localize` alone; they need not exist yet. None: all.
 
         Raises:
-            InvalidInputError: The name or the lifetime cannot be kept.
+            InvalidInputError: The name, the lifetime or the domains cannot be kept.
         """
         if len(name) > _MAX_NAME or not name.isprintable():
             raise InvalidInputError(f"a key is named by at most {_MAX_NAME} printable letters")
         if lifetime is not None and lifetime <= timedelta(0):
             raise InvalidInputError("a key lives for more than no time at all")
+        if domains is not None and scope is KeyScope.ADMIN:
+            raise InvalidInputError("a key of scope admin opens every domain")
+        listed = None if domains is None else json.dumps([checked_name(domain, "domain") for domain in domains])
         expires_at = None if lifetime is None else after(lifetime)
         key = ApiKey.new()
         row = {"key_id": key.key_id, "name": name, "scope": scope, "secret_sha256": key.secret_sha256}
         with self._writing() as db:
-            db.table("api_key").insert({**row, "created_at": now(), "expires_at": expires_at})
+            db.table("api_key").insert({**row, "domains": listed, "created_at": now(), "expires_at": expires_at})
             return _get_key(db, key.key_id), key
 
     def keys(self) -> list[KeyRecord]:
@@ -106,5 +117,6 @@ def _get_key(db: Database, key_id: str) -> KeyRecord:
 
 
 def _key(row: tuple[Any, ...]) -> KeyRecord:
-    key_id, name, scope, secret_sha256, *times = row
-    return KeyRecord(key_id, name, KeyScope(scope), secret_sha256, *times)
+    key_id, name, scope, secret_sha256, domains, *times = row
+    opened = None if domains is None else tuple(json.loads(domains))
+    return KeyRecord(key_id, name, KeyScope(scope), secret_sha256, opened, *times)

@@ -130,6 +130,7 @@ class KeyRecord:
         name: What its maker calls it; may be empty.
         scope: What it opens.
         secret_sha256: Digest of the secret, hexadecimal.
+        domains: Those that it opens; None: all, also those to come.
         created_at: ISO 8601, UTC, as the other times.
         expires_at: From when on it opens nothing; None: never.
         revoked_at: Since when it opens nothing; None: it was not revoked.
@@ -139,6 +140,7 @@ class KeyRecord:
     name: str
     scope: KeyScope
     secret_sha256: str
+    domains: tuple[str, ...] | None
     created_at: str
     expires_at: str | None
     revoked_at: str | None
