@@ -40,7 +40,7 @@ RUN python3 -m venv /opt/deepsimbad \
 # takes its loops for the same kind of processor alone; on another kind it compiles anew, into the volume.
 RUN install -d -m 0700 /var/lib/deepsimbad/data /var/lib/deepsimbad/cache /var/lib/deepsimbad/weights \
     && NUMBA_CACHE_DIR=/var/lib/deepsimbad/cache DEEPSIMBAD_WEIGHTS_DIR=/var/lib/deepsimbad/weights \
-       /opt/deepsimbad/bin/python -c "from deepsimbad.engine.warm_up import warm_up; from deepsimbad.settings import Settings; from deepsimbad.engine.evaluator_pool import EvaluatorPool; warm_up(); EvaluatorPool(Settings().compute()).evaluator({'kind': 'feature_l2'}).load()"
+       /opt/deepsimbad/bin/python -c "from deepsimbad.engine.warm_up import warm_up; from deepsimbad.settings import Settings; from deepsimbad.engine.encoders import EvaluatorPool; warm_up(); EvaluatorPool(Settings().compute()).evaluator({'kind': 'feature_l2'}).load()"
 
 # hadolint ignore=DL3006
 FROM base-${VARIANT} AS service

@@ -11,17 +11,16 @@ import re
 import shlex
 import shutil
 import subprocess
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
+from typing import NamedTuple
 
-KNOWN = frozenset(
+WORDS = frozenset(
     "ARG FROM WORKDIR COPY RUN LABEL ENV USER VOLUME EXPOSE HEALTHCHECK ENTRYPOINT CMD".split()  # noqa: SIM905
 )
 
 
-@dataclass(frozen=True)
-class Instruction:
+class Instruction(NamedTuple):
     """One instruction: its word, its options (`--from=build`) and the rest of it."""
 
     word: str
@@ -35,61 +34,36 @@ class Instruction:
         return words
 
 
-@dataclass
-class Stage:
+class Stage(list[Instruction]):
     """One stage of the build."""
 
-    name: str
-    base: str
-    instructions: list[Instruction] = field(default_factory=list)
-
     def every(self, word: str) -> list[Instruction]:
-        return [each for each in self.instructions if each.word == word]
+        return [instruction for instruction in self if instruction.word == word]
 
     def one(self, word: str) -> Instruction:
-        (found,) = self.every(word)
-        return found
+        (instruction,) = self.every(word)
+        return instruction
 
 
-@dataclass(frozen=True)
-class Dockerfile:
-    """All of it: ARGs before the first stage, and the stages by name."""
-
-    arguments: dict[str, str]
-    stages: dict[str, Stage]
-
-    @classmethod
-    def read(cls, path: Path) -> "Dockerfile":
-        arguments: dict[str, str] = {}
-        stages: dict[str, Stage] = {}
-        stage: Stage | None = None
-        for instruction in _instructions(path.read_text(encoding="utf-8")):
-            assert instruction.word in KNOWN, f"{instruction.word} is not known here"
-            if instruction.word == "FROM":
-                base, name = re.fullmatch(r"(\S+) AS (\S+)", instruction.rest).groups()  # type: ignore[union-attr]
-                stage = stages[name] = Stage(name, base)
-            elif stage is not None:
-                stage.instructions.append(instruction)
-            else:
-                assert instruction.word == "ARG"
-                arguments.update(_pairs(instruction.rest))
-        return cls(arguments, stages)
-
-
-def _instructions(text: str) -> Iterator[Instruction]:
-    lines = [line for line in text.splitlines() if not line.lstrip().startswith("#")]
+def stages_of(path: Path) -> dict[str, Stage]:
+    """A Dockerfile's stages by name, in order; what stands before the first has an empty name."""
+    lines = [line for line in path.read_text(encoding="utf-8").splitlines() if not line.lstrip().startswith("#")]
+    stages = {"": Stage()}
     for line in re.sub(r"\\\n", " ", "\n".join(lines)).splitlines():
-        if not line.strip():
-            continue
         word, _, rest = line.strip().partition(" ")
         options = {}
         while (option := re.match(r"--([a-z-]+)=(\S+)\s+", rest := rest.strip())) is not None:
-            options[option[1]] = option[2]
-            rest = rest[option.end() :]
-        yield Instruction(word, options, rest.strip())
+            options[option[1]], rest = option[2], rest[option.end() :]
+        if word == "FROM":
+            stages[re.fullmatch(r"\S+ AS (\S+)", rest)[1]] = Stage()  # type: ignore[index]
+        elif word:
+            assert word in WORDS, f"{word} is not known here"
+            stages[next(reversed(stages))].append(Instruction(word, options, rest))
+    return stages
 
 
-def _pairs(text: str) -> dict[str, str]:
+def pairs(text: str) -> dict[str, str]:
+    """What an ARG or ENV sets."""
     return dict(pair.split("=", 1) if "=" in pair else (pair, "") for pair in shlex.split(text))
 
 
@@ -97,24 +71,23 @@ def context_of(project: Path, into: Path) -> Path:
     """The build context: the files that `.dockerignore` lets through."""
     rules = [line for line in (project / ".dockerignore").read_text().splitlines() if line and line[0] != "#"]
     assert rules[0] == "*", "everything is left out but what is named"
-    kept = [rule[1:] for rule in rules if rule.startswith("!")]
     dropped = [rule.removeprefix("**/") for rule in rules[1:] if not rule.startswith("!")]
-    for name in kept:
+    into.mkdir(parents=True)
+    for name in (rule[1:] for rule in rules if rule.startswith("!")):
         source = project / name
         assert source.exists(), f".dockerignore keeps {name}, which is not there"
         if source.is_dir():
             shutil.copytree(source, into / name, ignore=shutil.ignore_patterns(*dropped))
         elif not any(fnmatch.fnmatch(name, rule) for rule in dropped):
-            into.mkdir(parents=True, exist_ok=True)
             shutil.copy2(source, into / name)
     return into
 
 
 class Build:
-    """Does the stages, one after the other, below a folder that stands for the image's root.
+    """Does stages, one after the other, below a folder that stands for the image's root.
 
     Args:
-        dockerfile: What to do.
+        stages: What to do.
         context: The build context.
         folder: Where.
         moved: Absolute paths of the image that are moved below the folder.
@@ -124,77 +97,66 @@ class Build:
 
     def __init__(
         self,
-        dockerfile: Dockerfile,
+        stages: Mapping[str, Stage],
         context: Path,
         folder: Path,
         moved: list[str],
-        environment: dict[str, str],
+        environment: Mapping[str, str],
         given: Mapping[str, str],
     ) -> None:
-        self.dockerfile = dockerfile
-        self.context = context
-        self.folder = folder
-        self.root = folder / "root"
-        self.environment = environment
-        self.given = given
+        self._stages, self._context, self._folder = stages, context, folder
+        self._environment, self._given = environment, given
         self._moved = re.compile(rf"(?<![\w.-])(?=(?:{'|'.join(map(re.escape, moved))})(?![\w-]))")
-        self.env: dict[str, str] = {}
+        self.root, self.env = folder / "root", dict[str, str]()
 
     def here(self, text: str) -> str:
         """The text with the image's paths moved."""
         return self._moved.sub(str(self.root), text)
 
     def do(self, name: str) -> None:
-        """Do a stage; from then on `root` is what it left."""
-        stage = self.dockerfile.stages[name]
-        place = self.folder / f"stage-{name}"
-        place.mkdir()
+        """Do a stage; from then on `root` is what it left and `env` what it set."""
+        (place := self._folder / f"stage-{name}").mkdir()
         self.root.unlink(missing_ok=True)
         self.root.symlink_to(place)
-        self.env = {}
-        workdir = PurePosixPath("/")
-        for each in stage.instructions:
-            if each.word == "ARG":
-                self.env.update({name: self.given.get(name, value) for name, value in _pairs(each.rest).items()})
-            elif each.word == "ENV":
-                self.env.update(_pairs(self.here(each.rest)))
-            elif each.word == "WORKDIR":
-                workdir /= each.rest
-                self.path(workdir).mkdir(parents=True, exist_ok=True)
-            elif each.word == "COPY":
-                self._copy(each, workdir)
-            elif each.word == "RUN":
-                self.shell(each.rest, self.path(workdir))
+        self.env, workdir = {}, place
+        for instruction in self._stages[name]:
+            if instruction.word == "ARG":
+                self.env |= {name: self._given.get(name, value) for name, value in pairs(instruction.rest).items()}
+            elif instruction.word == "ENV":
+                self.env |= pairs(self.here(instruction.rest))
+            elif instruction.word == "WORKDIR":
+                workdir = self.root / PurePosixPath(instruction.rest).relative_to("/")
+                workdir.mkdir(parents=True, exist_ok=True)
+            elif instruction.word == "COPY":
+                self._copy(instruction, workdir)
+            elif instruction.word == "RUN":
+                done = subprocess.run(
+                    ["/bin/sh", "-c", self.here(instruction.rest)],
+                    cwd=workdir,
+                    env={**self._environment, **self.env},
+                    capture_output=True,
+                    text=True,
+                    check=False,
+                )
+                assert done.returncode == 0, f"{instruction.rest}\n{done.stdout}\n{done.stderr}"
 
-    def path(self, inside: PurePosixPath) -> Path:
-        return self.root / inside.relative_to("/")
-
-    def shell(self, command: str, cwd: Path) -> None:
-        done = subprocess.run(
-            ["/bin/sh", "-c", self.here(command)],
-            cwd=cwd,
-            env={**self.environment, **self.env},
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        assert done.returncode == 0, f"{command}\n{done.stdout}\n{done.stderr}"
-
-    def _copy(self, each: Instruction, workdir: PurePosixPath) -> None:
-        *sources, target = each.rest.split()
-        origin = self.folder / f"stage-{each.options['from']}" if "from" in each.options else self.context
-        into = self.path(workdir / target)
+    def _copy(self, instruction: Instruction, workdir: Path) -> None:
+        *sources, target = instruction.rest.split()
+        options = instruction.options
+        origin = self._folder / f"stage-{options['from']}" if "from" in options else self._context
+        into = self.root / target.lstrip("/") if target.startswith("/") else workdir / target
         for source in sources:
-            found = origin / source.lstrip("/")
-            assert found.exists(), f"COPY {source}: not there"
-            if found.is_dir():  # a folder's contents, as Docker does it
-                shutil.copytree(found, into, symlinks=True, dirs_exist_ok=True)
-            elif target.endswith("/"):
-                into.mkdir(parents=True, exist_ok=True)
-                shutil.copy2(found, into / found.name)
+            path = origin / source.lstrip("/")
+            assert path.exists(), f"COPY {source}: not there"
+            if path.is_dir():  # a folder's contents, as Docker does it
+                # A second name in the place of a second copy of 1.8 GB; what gets another owner is copied.
+                copy = shutil.copy2 if "chown" in options else os.link
+                shutil.copytree(path, into, symlinks=True, dirs_exist_ok=True, copy_function=copy)
             else:
-                shutil.copy2(found, into)
-        if (owner := each.options.get("chown")) is not None and os.geteuid() == 0:
-            user, group = map(int, owner.split(":"))
+                assert target.endswith("/"), f"COPY {source} into a folder"
+                into.mkdir(parents=True, exist_ok=True)
+                shutil.copy2(path, into / path.name)
+        if "chown" in options and os.geteuid() == 0:
+            user, group = map(int, options["chown"].split(":"))
             for path in (into, *into.rglob("*")):
                 os.chown(path, user, group, follow_symlinks=False)
