@@ -14,9 +14,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from sqlite_utils import Database
 
-from deepsimbad.errors import InvalidMapConfigError, UnavailableError
+from deepsimbad.errors import InvalidMapConfigError
 from deepsimbad.jobs.remap_config import RemapConfig
 from deepsimbad.jobs.runner import JobRunner
 from deepsimbad.store.catalog import Catalog
@@ -195,25 +194,3 @@ def test_the_end_of_a_job_is_noted_once_there_is_room(tmp_path: Path) -> None:
             assert (found.state, found.error and found.error["code"]) == (JobState.FAILED, "invalid_map_config")
         finally:
             runner.close()
-
-
-def test_without_a_disk_to_fill_the_file_itself_may_be_full(tmp_path: Path) -> None:
-    """SQLite's own limit on pages stands for the full disk, where nothing can be mounted."""
-    with Catalog.open(tmp_path) as catalog:
-        catalog.create_domain("campus", {}, False, [1])
-        db: Database = catalog._db
-        (n_pages,) = db.execute("PRAGMA page_count").fetchone()
-        db.execute(f"PRAGMA max_page_count = {n_pages}")
-
-        def fill() -> None:
-            for number in range(200):
-                catalog.create_domain(f"campus-{number}", {"note": "x" * 2000}, False, [1])
-
-        with pytest.raises(UnavailableError) as caught:
-            fill()
-        assert caught.value.hints["reason"] == "disk_full"
-        known = [domain.name for domain in catalog.domains()]
-        db.execute("PRAGMA max_page_count = 1000000")
-        catalog.create_domain("after", {}, False, [1])
-        assert [domain.name for domain in catalog.domains()] == ["after", *known]
-    check_is_clean(tmp_path)
