@@ -160,7 +160,7 @@ def index_bytes(path: Path) -> int:
 def table_bytes(path: Path) -> dict[str, int]:
     """The pages of every table with its indexes, in bytes; raises as `read_map`."""
     with _opened(path) as db:
-        return bytes_by_table(db.conn, path)
+        return bytes_by_table(db.conn)
 
 
 @contextmanager
