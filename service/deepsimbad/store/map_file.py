@@ -149,7 +149,7 @@ def _read(db: Database, path: Path) -> Map:
         raise DamagedMapError(f"{path.name} is damaged: it does not match its checksum", file=path.name)
     arrays["lists"] = unpack_index(postings, stored["list_length"], stored["n_map_images"])
     document = {name: from_json(stored[name]) if name in _AS_JSON else stored[name] for name in _DESCRIPTION}
-    return Map.from_arrays(document, model, arrays, bytes_by_table(db.conn, path)["posting"])
+    return Map.from_arrays(document, model, arrays, bytes_by_table(db.conn)["posting"])
 
 
 def index_bytes(path: Path) -> int:
