@@ -1,0 +1,64 @@
+"""Nobody's first request waits for a kernel: all that the default path runs are ready when the service is."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+from starlette.testclient import TestClient
+
+from deepsimbad.api.app import create_app
+from deepsimbad.jobs.runner import InThisProcess
+
+from .conftest import DIM, NPZ, npz, remap, small_settings
+
+FIRST_REQUESTS = """
+import importlib, json, pkgutil, sys
+from pathlib import Path
+from numba.core.dispatcher import Dispatcher
+from starlette.testclient import TestClient
+import deepsimbad.core
+from deepsimbad.api.app import create_app
+from tests.contract.conftest import small_settings
+
+def compiled():
+    modules = [module for name, module in sys.modules.items() if name.startswith("deepsimbad.")]
+    kernels = {value for module in modules for value in vars(module).values() if isinstance(value, Dispatcher)}
+    return {f"{kernel.py_func.__name__}{signature}" for kernel in kernels for signature in kernel.signatures}
+
+for module in pkgutil.iter_modules(deepsimbad.core.__path__):
+    importlib.import_module(f"deepsimbad.core.{module.name}")
+with TestClient(create_app(small_settings(Path(sys.argv[1])))) as client:
+    ready = compiled()
+    ranked = {"ranked_landmarks": list(range(40))}
+    view = {"encoding": [0.1] * 8}
+    session = client.post("/v1/domains/ready/sessions", json={"start_position_m": 30}).json()["session_id"]
+    path = f"/v1/sessions/{session}/observations?action_m=2"
+    answers = [client.post(path, json=body) for body in (ranked, view, view)]
+    answers += [client.post("/v1/domains/ready/localizations", json=body) for body in (ranked, view)]
+    answers += [client.get(f"/v1/sessions/{session}/belief")]
+    print(json.dumps({"statuses": [answer.status_code for answer in answers], "late": sorted(compiled() - ready)}))
+"""
+
+
+def test_no_kernel_is_compiled_after_the_service_is_ready(tmp_path: Path) -> None:
+    """Of a map that learnt from two seasons, as a map by default does."""
+    random = np.random.default_rng(3)
+    places = random.normal(size=(80, DIM))
+    with TestClient(create_app(small_settings(tmp_path), InThisProcess(tmp_path))) as client:
+        client.put("/v1/admin/domains/ready", json={"evaluator": {"kind": "feature_l2", "extractor": "none"}})
+        for season in ("summer", "winter"):
+            seen = (places + 0.1 * random.normal(size=places.shape)).astype(np.float32)
+            client.post("/v1/admin/domains/ready/traverses", json={"name": season})
+            batch = npz(encodings=seen, index=np.arange(80), position_m=np.arange(80.0))
+            client.post(f"/v1/admin/domains/ready/traverses/{season}/frames", content=batch, headers=NPZ)
+        drives = {"training_traverse": "summer", "landmark_traverse": "winter", "same_route": True, "n_landmarks": 40}
+        job = remap(client, "ready", **drives, training_episodes=20)
+        assert job["result"]["metrics"]["second_season"]["accepted"], job
+    done = subprocess.run(
+        [sys.executable, "-c", FIRST_REQUESTS, str(tmp_path)], capture_output=True, text=True, check=True
+    )
+    told = json.loads(done.stdout)
+    assert set(told["statuses"]) == {200}
+    assert told["late"] == []
