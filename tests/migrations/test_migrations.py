@@ -5,6 +5,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import closing
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -17,16 +18,10 @@ from deepsimbad.store.records import JobState
 from deepsimbad.store.session_records import PriorRow
 from deepsimbad.store.sessions import SessionStore
 from deepsimbad.store.traverses import Traverse
-from deepsimbad_migrations.catalog.migrations import migrations as catalog_migrations
-from deepsimbad_migrations.map.migrations import migrations as map_migrations
-from deepsimbad_migrations.session.migrations import migrations as session_migrations
-from deepsimbad_migrations.traverse.migrations import migrations as traverse_migrations
 
 SETS = {
-    "catalog": catalog_migrations,
-    "map": map_migrations,
-    "traverse": traverse_migrations,
-    "session": session_migrations,
+    name: import_module(f"deepsimbad_migrations.{name}.migrations").migrations
+    for name in ("catalog", "map", "traverse", "session")
 }
 SCHEMAS = Path(__file__).parent / "schemas"
 FROZEN = sorted(SCHEMAS.glob("*.sql"))
@@ -122,13 +117,12 @@ def restore(dump: Path, path: Path) -> None:
 
 
 @pytest.mark.parametrize("dump", FROZEN, ids=lambda path: path.stem)
-@pytest.mark.parametrize("by_command", [False, True], ids=["library", "command"])
-def test_a_past_file_reaches_today_and_keeps_its_rows(dump: Path, by_command: bool, tmp_path: Path) -> None:
+def test_a_past_file_reaches_today_and_keeps_its_rows(dump: Path, tmp_path: Path) -> None:
     kind = dump.stem.rsplit("_v", 1)[0]
     past, new = tmp_path / "past.sqlite", tmp_path / "new.sqlite"
     restore(dump, past)
     before = rows_of(past)
-    if by_command:
+    if dump.stem.endswith("_v1"):  # by hand, where most steps are missing
         run_command(past, MIGRATIONS / kind)
     else:
         apply(past, SETS[kind])
@@ -147,15 +141,10 @@ def test_a_past_file_reaches_today_and_keeps_its_rows(dump: Path, by_command: bo
 
 def the_catalog(data_dir: Path) -> Iterator[object]:
     with Catalog.open(data_dir) as catalog:
-        yield catalog.domain("campus").active_version
-        yield catalog.maps("campus")[0].metrics
-        yield [job.state for job in catalog.jobs("campus")]
-
-
-def the_catalog_with_keys(data_dir: Path) -> Iterator[object]:
-    yield from the_catalog(data_dir)
-    with Catalog.open(data_dir) as catalog:
-        yield [catalog.maps("campus")[0].activated_at, catalog.jobs()[0].n_starts]
+        (record,) = catalog.maps("campus")
+        yield (catalog.domain("campus").active_version, record.metrics, record.activated_at)
+        yield [(job.state, job.n_starts) for job in catalog.jobs("campus")]
+    assert not (data_dir / "domains").exists()
 
 
 def the_traverse(data_dir: Path) -> Iterator[object]:
@@ -196,80 +185,43 @@ def the_sessions(data_dir: Path) -> Iterator[object]:
         yield store.named(alive.number, "k1")
 
 
+MAP_FILE = "domains/campus/maps/000001.sqlite"
+MAP: list[object] = [
+    [[0, 1, 2, 0], [1, 2, 0, 2]],
+    [[0, 1], [2, 3], [4, 5]],
+    (True, (1.0, 2.0, 3.0), [0.0, 1.5, 3.0, 4.5], {"anr": 4.5}),
+]
+Q_VALUES = [[0.0, 25.0, 50.0], [75.0, 100.0, 125.0], [150.0, 175.0, 200.0], [225.0, 250.0, 275.0]]
+CALIBRATION = [
+    ([0.25, 0.5, 0.75], [[-2.0, -1.5, -1.0], [-1.0, -0.5, -0.25]]),
+    ([4.0, 3.0, 2.0, 1.0], [-1.5, 0.5]),
+]
+FRAMES = [[[1, 2], [3, 4], [5, 6]], ([(2, 2)], [10, -1, 30])]
+SESSION = [("a" * 32, {"filter": "grid", "seed": 7}, 3, 4630.0), (2, [0.25, 0.75], [3]), True, (1, b"\x01\x02")]
+
+
 @pytest.mark.parametrize(
     ("dump", "place", "read", "expected"),
     [
-        ("catalog_v1", "catalog.sqlite", the_catalog, [1, {"anr": 4.5}, [JobState.SUCCEEDED]]),
+        ("catalog_v1", "catalog.sqlite", the_catalog, [(1, {"anr": 4.5}, None), [(JobState.SUCCEEDED, 0)]]),
         *(
             (
-                f"catalog_v{version}",
-                "catalog.sqlite",
-                the_catalog_with_keys,
-                [1, {"anr": 4.5}, [JobState.SUCCEEDED], ["2026-11-20T10:00:00.000Z", 2]],
+                *(f"catalog_v{version}", "catalog.sqlite", the_catalog),
+                [(1, {"anr": 4.5}, "2026-11-20T10:00:00.000Z"), [(JobState.SUCCEEDED, 2)]],
             )
-            for version in (2, 3, 4)
+            for version in (2, 3, 4, 5)
         ),
-        *(
-            (
-                f"traverse_v{version}",
-                "domains/campus/traverses/summer.sqlite",
-                the_traverse,
-                [[[1, 2], [3, 4], [5, 6]], ([(2, 2)], [10, -1, 30])],
-            )
-            for version in (1, 2, 3)
-        ),
-        *(
-            (
-                f"session_v{version}",
-                "sessions.sqlite",
-                the_sessions,
-                [("a" * 32, {"filter": "grid", "seed": 7}, 3, 4630.0), (2, [0.25, 0.75], [3]), True, (1, b"\x01\x02")],
-            )
-            for version in (1, 2, 3, 4)
-        ),
-        (
-            "map_v1",
-            "domains/campus/maps/000001.sqlite",
-            the_map,
-            [
-                [[0, 1, 2, 0], [1, 2, 0, 2]],
-                [[0, 1], [2, 3], [4, 5]],
-                (True, (1.0, 2.0, 3.0), [0.0, 1.5, 3.0, 4.5], {"anr": 4.5}),
-                [[0.0, 0.0, 0.0]] * 4,
-            ],
-        ),
-        (
-            "map_v2",
-            "domains/campus/maps/000001.sqlite",
-            the_map,
-            [
-                [[0, 1, 2, 0], [1, 2, 0, 2]],
-                [[0, 1], [2, 3], [4, 5]],
-                (True, (1.0, 2.0, 3.0), [0.0, 1.5, 3.0, 4.5], {"anr": 4.5}),
-                [[0.0, 25.0, 50.0], [75.0, 100.0, 125.0], [150.0, 175.0, 200.0], [225.0, 250.0, 275.0]],
-            ],
-        ),
-        (
-            "map_v3",
-            "domains/campus/maps/000001.sqlite",
-            the_calibrated_map,
-            [
-                [[0, 1, 2, 0], [1, 2, 0, 2]],
-                [[0, 1], [2, 3], [4, 5]],
-                (True, (1.0, 2.0, 3.0), [0.0, 1.5, 3.0, 4.5], {"anr": 4.5}),
-                [[0.0, 25.0, 50.0], [75.0, 100.0, 125.0], [150.0, 175.0, 200.0], [225.0, 250.0, 275.0]],
-                ([0.25, 0.5, 0.75], [[-2.0, -1.5, -1.0], [-1.0, -0.5, -0.25]]),
-                ([4.0, 3.0, 2.0, 1.0], [-1.5, 0.5]),
-            ],
-        ),
+        *((f"traverse_v{v}", "domains/campus/traverses/summer.sqlite", the_traverse, FRAMES) for v in (1, 2, 3)),
+        *((f"session_v{version}", "sessions.sqlite", the_sessions, SESSION) for version in (1, 2, 3, 4)),
+        ("map_v1", MAP_FILE, the_map, [*MAP, [[0.0, 0.0, 0.0]] * 4]),
+        ("map_v2", MAP_FILE, the_map, [*MAP, Q_VALUES]),
+        ("map_v3", MAP_FILE, the_calibrated_map, [*MAP, Q_VALUES, *CALIBRATION]),
     ],
 )
 def test_todays_code_reads_past_files(
     dump: str, place: str, read: Callable[[Path], Iterator[object]], expected: list[object], tmp_path: Path
 ) -> None:
     restore(SCHEMAS / f"{dump}.sql", tmp_path / place)
-    if dump.startswith("catalog"):
-        assert not (tmp_path / "domains").exists()
     assert list(read(tmp_path)) == expected
 
 
