@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import ExitStack, closing
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
@@ -33,6 +34,8 @@ class Endless(BaseHTTPRequestHandler):
     """A service whose one job never ends by itself; it notes what is deleted."""
 
     protocol_version = "HTTP/1.1"
+    deleted: list[str]
+    released: threading.Event
 
     def do_POST(self) -> None:
         self.rfile.read(int(self.headers["content-length"]))
@@ -48,11 +51,11 @@ class Endless(BaseHTTPRequestHandler):
         self.end_headers()
         self.wfile.write(f"event: progress\ndata: {json.dumps(JOB)}\n\n".encode())
         self.wfile.flush()
-        self.server.released.wait(PATIENCE_S)  # type: ignore[attr-defined]
+        self.released.wait(PATIENCE_S)
         self.close_connection = True
 
     def do_DELETE(self) -> None:
-        self.server.deleted.append(self.path)  # type: ignore[attr-defined]
+        self.deleted.append(self.path)
         self.send_response(204)
         self.end_headers()
 
@@ -69,16 +72,19 @@ class Endless(BaseHTTPRequestHandler):
 
 @pytest.fixture
 def endless() -> Iterator[ThreadingHTTPServer]:
-    server = ThreadingHTTPServer(("127.0.0.1", 0), Endless)
-    server.deleted = []  # type: ignore[attr-defined]
-    server.released = threading.Event()  # type: ignore[attr-defined]
+    handler = type("Handler", (Endless,), {"deleted": [], "released": threading.Event()})
+    server = ThreadingHTTPServer(("127.0.0.1", 0), handler)
     thread = threading.Thread(target=server.serve_forever)
     thread.start()
     yield server
-    server.released.set()  # type: ignore[attr-defined]
+    handler.released.set()
     server.shutdown()
     thread.join()
     server.server_close()
+
+
+def deleted(server: ThreadingHTTPServer) -> list[str]:
+    return list(server.RequestHandlerClass.deleted)  # type: ignore[attr-defined]
 
 
 class Terminal:
@@ -97,9 +103,19 @@ class Terminal:
         os.close(theirs)
         self.shown = b""
 
-    def wait_for(self, words: bytes) -> None:
-        """Read until the words stand on the screen."""
-        assert self._shows(words, PATIENCE_S), self.shown
+    def shows(self, words: bytes | None, within_s: float = PATIENCE_S) -> bool:
+        """Whether the words come to stand on the screen, or the command ends where there are none to wait for."""
+        give_up = time.monotonic() + within_s
+        while words is None or words not in self.shown:
+            if not select.select([self.own], [], [], max(0.0, give_up - time.monotonic()))[0]:
+                return False
+            try:
+                self.shown += (more := os.read(self.own, 65536))
+            except OSError:  # the other side is closed
+                more = b""
+            if not more:
+                return words is None
+        return True
 
     def press_ctrl_c(self, then: bytes | None) -> None:
         """Interrupt until the words stand on the screen, or, with None, until the command ends.
@@ -109,7 +125,7 @@ class Terminal:
         """
         for _ in range(N_PRESSES):
             os.write(self.own, CTRL_C)
-            if self._shows(then, PATIENCE_S / N_PRESSES):
+            if self.shows(then, PATIENCE_S / N_PRESSES):
                 return
         raise AssertionError(self.shown)
 
@@ -119,76 +135,47 @@ class Terminal:
             self.press_ctrl_c(then=None)
         else:
             os.write(self.own, keys)
-            assert self._shows(None, PATIENCE_S), self.shown
+            assert self.shows(None), self.shown
         return self.process.wait(PATIENCE_S)
 
-    def _shows(self, words: bytes | None, within_s: float) -> bool:
-        """Whether the words come to stand on the screen, or the command ends where there are none to wait for."""
-        give_up = time.monotonic() + within_s
-        while words is None or words not in self.shown:
-            ready, _, _ = select.select([self.own], [], [], max(0.0, give_up - time.monotonic()))
-            if not ready:
-                return False
-            more = self._read()
-            if not more:
-                return words is None
-            self.shown += more
-        return True
-
-    def _read(self) -> bytes:
-        try:
-            return os.read(self.own, 65536)
-        except OSError:  # the other side is closed
-            return b""
-
     def close(self) -> None:
-        if self.process.poll() is None:
-            self.process.kill()
+        self.process.kill()
         self.process.wait()
         os.close(self.own)
 
 
 @pytest.fixture
 def terminal(endless: ThreadingHTTPServer) -> Iterator[Any]:
-    opened: list[Terminal] = []
+    with ExitStack() as opened:
+        address = f"http://127.0.0.1:{endless.server_port}"
+        yield lambda *words: opened.enter_context(closing(Terminal(*words, "--server", address)))
 
-    def command(*words: str) -> Terminal:
-        opened.append(Terminal(*words, "--server", f"http://127.0.0.1:{endless.server_port}"))
-        return opened[-1]
 
-    yield command
-    for each in opened:
-        each.close()
+FOLLOWED_LATER = ("jobs", "7", "--follow")
+REMAPPED = ("remap", "--domain", "d", "--training", "t")
 
 
 @pytest.mark.parametrize(
-    ("reply", "is_cancelled", "told"),
+    ("command", "reply", "is_cancelled", "told"),
     [
-        (b"y\n", True, b"job 7 is being cancelled"),
-        (b"n\n", False, b"deepsimbad-client jobs 7 --follow"),
-        (b"\n", False, b"deepsimbad-client jobs 7 --follow"),
-        (CTRL_C, False, b"deepsimbad-client jobs 7 --follow"),
+        (REMAPPED, b"y\n", True, b"job 7 is being cancelled"),
+        (FOLLOWED_LATER, b"y\n", True, b"job 7 is being cancelled"),
+        (REMAPPED, b"n\n", False, b"deepsimbad-client jobs 7 --follow"),
+        (REMAPPED, b"\n", False, b"deepsimbad-client jobs 7 --follow"),
+        (REMAPPED, CTRL_C, False, b"deepsimbad-client jobs 7 --follow"),
     ],
-    ids=["yes", "no", "enter", "once more"],
+    ids=["yes", "followed later", "no", "enter", "once more"],
 )
 def test_ctrl_c_asks_whether_to_cancel(
-    endless: ThreadingHTTPServer, terminal: Any, reply: bytes, is_cancelled: bool, told: bytes
+    endless: ThreadingHTTPServer, terminal: Any, command: Any, reply: bytes, is_cancelled: bool, told: bytes
 ) -> None:
-    window = terminal("remap", "--domain", "d", "--training", "t")
-    window.wait_for(b"train planner")
+    window = terminal(*command)
+    assert window.shows(b"train planner"), window.shown
     window.press_ctrl_c(then=b"Cancel job 7 on the server too? [y/N]")
     assert window.answer(reply) == 130
     assert told in window.shown
     assert b"Traceback" not in window.shown
-    assert endless.deleted == (["/v1/admin/jobs/7"] if is_cancelled else [])  # type: ignore[attr-defined]
-
-
-def test_a_job_that_is_followed_later_is_asked_about_too(endless: ThreadingHTTPServer, terminal: Any) -> None:
-    window = terminal("jobs", "7", "--follow")
-    window.wait_for(b"train planner")
-    window.press_ctrl_c(then=b"[y/N]")
-    assert window.answer(b"y\n") == 130
-    assert endless.deleted == ["/v1/admin/jobs/7"]  # type: ignore[attr-defined]
+    assert deleted(endless) == (["/v1/admin/jobs/7"] if is_cancelled else [])
 
 
 @pytest.mark.parametrize(("reply", "code", "n_deleted"), [(b"y\n", 0, 1), (b"n\n", 130, 0), (CTRL_C, 130, 0)])
@@ -196,6 +183,6 @@ def test_a_deletion_is_asked_about(
     endless: ThreadingHTTPServer, terminal: Any, reply: bytes, code: int, n_deleted: int
 ) -> None:
     window = terminal("delete-traverse", "d", "t")
-    window.wait_for(b"Delete traverse t of domain d with its 12 frames? [y/N]")
+    assert window.shows(b"Delete traverse t of domain d with its 12 frames? [y/N]"), window.shown
     assert window.answer(reply) == code
-    assert endless.deleted == ["/v1/admin/domains/d/traverses/t"] * n_deleted  # type: ignore[attr-defined]
+    assert deleted(endless) == ["/v1/admin/domains/d/traverses/t"] * n_deleted
