@@ -61,44 +61,26 @@ class EpisodeStep:
 
 @dataclass(frozen=True)
 class Episode:
-    """One episode from its start to its last move.
+    """One episode from its start to its last move."""
 
-    Attributes:
-        planner: As it was asked for.
-        planner_named: What the service calls it.
-        episode: Its number: every planner's episode of a number starts from the same place.
-        seed: Of its session.
-        edges_m: Where the first stretch of `EpisodeStep.mass` begins and the last ends.
-        steps: The views.
-    """
-
-    planner: str
-    planner_named: str
-    episode: int
-    seed: int
-    edges_m: tuple[float, float]
+    planner: str  # as it was asked for
+    planner_named: str  # what the service calls it
+    episode: int  # every planner's episode of a number starts from the same place
+    seed: int  # of its session
+    edges_m: tuple[float, float]  # where the first stretch of `EpisodeStep.mass` begins and the last ends
     steps: tuple[EpisodeStep, ...]
 
 
 @dataclass(frozen=True)
 class ActiveReplay:
-    """An active replay that has come to its end.
+    """An active replay that has come to its end."""
 
-    Attributes:
-        folder: Where its files are.
-        planners: As they were asked for; the first is the one the others are compared with.
-        episodes: For each planner, its episodes in order; the same numbers for all.
-        route: The map's images.
-        identity: What was replayed against what.
-        seconds: How long this run took.
-    """
-
-    folder: Path
-    planners: tuple[str, ...]
-    episodes: dict[str, list[Episode]]
-    route: Route
-    identity: dict[str, Any]
-    seconds: float
+    folder: Path  # of its files
+    planners: tuple[str, ...]  # as they were asked for; the first is the one the others are compared with
+    episodes: dict[str, list[Episode]]  # for each planner, in order; the same numbers for all
+    route: Route  # the map's images
+    identity: dict[str, Any]  # what was replayed against what
+    seconds: float  # how long this run took
 
 
 class _Stopped(Exception):  # noqa: N818 - never leaves this module
@@ -137,7 +119,7 @@ def active_replay(
         concurrency: Episodes under way at once.
         seed: Of the starts and the sessions.
         restart: Throw away what an earlier replay left in the folder.
-        on_progress: Told of every episode, those of an earlier run first, and how many there are so far.
+        on_progress: Told of every episode, and how many there are so far.
         clock: Seconds that never go backwards.
 
     Raises:

@@ -21,7 +21,7 @@ class Journal(Generic[Record]):
         folder: Made when it does not exist.
         file_name: The file of records.
         identity: What must be the same for the replay to go on.
-        read: Makes a record of a line's document; a ValueError, TypeError, AttributeError or KeyError: none.
+        read: Makes a record of a line's document, or fails.
         what: One record in a word, for errors.
         restart: Throw away what an earlier replay left.
 

@@ -57,21 +57,13 @@ _Record = Step | list[float | None]  # a view, or the ranks of views before it i
 
 @dataclass(frozen=True)
 class Replay:
-    """A replay that has come to its end.
+    """A replay that has come to its end."""
 
-    Attributes:
-        folder: Where its files are.
-        steps: Every frame, in order.
-        route: The map's images.
-        identity: What was replayed against what.
-        seconds: How long this run took.
-    """
-
-    folder: Path
-    steps: list[Step]
-    route: Route
-    identity: dict[str, Any]
-    seconds: float
+    folder: Path  # of its files
+    steps: list[Step]  # every frame, in order
+    route: Route  # the map's images
+    identity: dict[str, Any]  # what was replayed against what
+    seconds: float  # how long this run took
 
 
 def replay(

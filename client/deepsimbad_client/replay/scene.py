@@ -5,9 +5,10 @@ from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
+from deepsimbad.core.true_images import true_images_of
 from numpy.typing import NDArray
 
-from deepsimbad.core.route import Route, true_images_of
+from deepsimbad.core.route import Route
 from deepsimbad_client.errors import (
     BrokenFrameError,
     IdempotencyKeyReusedError,
@@ -26,51 +27,30 @@ DEFAULT_PLANNER = "default"
 
 @dataclass(frozen=True)
 class Seen:
-    """The service's answer to one view.
-
-    Attributes:
-        answer: What it believes now and asks for next.
-        latency_ms: From posting the view to the answer.
-        forgot: The belief had no room for the move, so the session was set back to knowing nothing.
-    """
+    """The service's answer to one view."""
 
     answer: SessionAnswer
-    latency_ms: float
-    forgot: bool
+    latency_ms: float  # from posting the view to the answer
+    forgot: bool  # the belief had no room for the move, so the session was set back to knowing nothing
 
 
 @dataclass(frozen=True)
 class Scene:
-    """A recording before a domain's active map.
-
-    Attributes:
-        client: The client.
-        domain: As the service described it; it has an active map.
-        recording: What there is to see.
-        position_m: [m] float64 along the recording's own route.
-        route: The map's images.
-        right: For each frame the ids of the map images that are right answers.
-        clock: Seconds that never go backwards.
-    """
+    """A recording before a domain's active map."""
 
     client: Client
-    domain: Domain
+    domain: Domain  # as the service described it; it has an active map
     recording: Recording
-    position_m: NDArray[np.float64]
-    route: Route
-    right: list[NDArray[np.int64]]
-    clock: Callable[[], float]
+    position_m: NDArray[np.float64]  # [m] along the recording's own route
+    route: Route  # the map's images
+    right: list[NDArray[np.int64]]  # for each frame the map images that are right answers
+    clock: Callable[[], float]  # seconds that never go backwards
 
     @classmethod
     def of(cls, client: Client, recording: Recording, domain: str, within_m: float, clock: Callable[[], float]) -> Self:
         """Learn what is needed of a domain.
 
-        Args:
-            client: The client.
-            recording: What there is to see.
-            domain: Its name.
-            within_m: How far a right answer may be, in the plane where both sides know x and y, else along the route.
-            clock: Seconds that never go backwards.
+        A right answer may be `within_m`, in the plane where both sides know x and y, else along the route.
 
         Raises:
             ReplayError: It has no active map, one that changed meanwhile, or the recording has no frame of use.
@@ -123,13 +103,7 @@ class Scene:
         """Tell a session of a move and the view after it.
 
         A belief that is wrong may leave no room for the move that was really made, and a recording may jump or go
-        backwards; the robot then starts anew from knowing nothing.
-
-        Args:
-            session: The session.
-            view: What is seen.
-            action_m: Metres really moved; None: none, as before the first view.
-            options: Of `Session.observe`.
+        backwards; the robot then starts anew from knowing nothing. `options` are those of `Session.observe`.
 
         Returns:
             The answer, or why the service cannot use the view.
