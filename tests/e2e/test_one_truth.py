@@ -57,7 +57,8 @@ def test_a_replay_ranks_as_the_services_own_rules_do(campus, service, tmp_path):
 
     judge = make_evaluator(evaluator_config({"kind": "feature_l2"}))
     routes = [
-        encode_recording(open_source(campus[each]), judge, 10**7, lambda _: None).route for each in ("summer", "spring")
+        encode_recording(open_source(campus[each]), judge, 10**7, lambda _: None).drive.route()
+        for each in ("summer", "spring")
     ]
     described = client.domain("campus")
     scorer = RetrievalScorer()

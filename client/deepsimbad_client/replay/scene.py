@@ -5,10 +5,9 @@ from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
-from deepsimbad.core.true_images import true_images_of
 from numpy.typing import NDArray
 
-from deepsimbad.core.route import Route
+from deepsimbad.core.route import Route, true_images_of
 from deepsimbad_client.errors import (
     BrokenFrameError,
     IdempotencyKeyReusedError,

@@ -1,6 +1,7 @@
 """Figures, intervals and tables of active replays, against slow references."""
 
 import json
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -16,33 +17,26 @@ from deepsimbad_client.replay.report import Resampling, active_tables, at_distan
 
 def step(number: int, rank: float | None, error_m: float | None, action_m: float, travelled_m: float) -> EpisodeStep:
     place = 10.0 + travelled_m
-    return EpisodeStep(
-        step=number,
-        index=number,
-        name=f"{number}.jpg",
-        position_m=place,
-        x_m=place,
-        y_m=1.0,
-        commanded_m=None if number == 0 else action_m,
-        action_m=action_m,
-        travelled_m=travelled_m,
-        forgot=False,
-        true_map_image=None if rank is None else int(place),
-        true_route_m=None if rank is None else place,
-        rank=rank,
-        rank_percent=rank,
-        mode_m=place + (error_m or 0),
-        mode_x_m=place + (error_m or 0),
-        mode_y_m=0.0,
-        low_m=0.0,
-        high_m=99.0,
-        error_m=error_m,
-        entropy_bits=5.0 - number,
-        off_route=None,
-        next_action_m=action_m,
-        latency_ms=2.0,
-        mass=(0.25, 0.5, 0.125, 0.125),
-    )
+    told: dict[str, Any] = {
+        "step": number,
+        "action_m": action_m,
+        "travelled_m": travelled_m,
+        "forgot": False,
+        "latency_ms": 2.0,
+        "x_m": place,
+        "y_m": 1.0,
+        "true_route_m": None if rank is None else place,
+        "next_action_m": action_m,
+        "rank": rank,
+        "rank_percent": rank,
+        "error_m": error_m,
+        "entropy_bits": 5.0 - number,
+        "mode_m": place + (error_m or 0),
+        "mode_x_m": place + (error_m or 0),
+        "mode_y_m": 0.0,
+    }
+    unknown = dict.fromkeys(field.name for field in fields(EpisodeStep))
+    return EpisodeStep(**unknown | told | {"mass": (0.25, 0.5, 0.125, 0.125)})
 
 
 def episode(planner: str, number: int, ranks: list[float | None], action_m: float) -> Episode:

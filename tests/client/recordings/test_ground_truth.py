@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from deepsimbad_client.errors import SourceError
-from deepsimbad_client.recordings.ground_truth import DEADBAND_M, arc_length_m, read_ground_truth, wrapped_rad
+from deepsimbad_client.recordings.ground_truth import DEADBAND_M, arc_length_m, read_ground_truth
 
 
 def test_microseconds_stay_whole(nclt_tree):
@@ -72,11 +72,6 @@ def test_times_outside_and_in_long_gaps_are_marked(nclt_tree):
     assert not truth.at(asked, max_gap_s=5).in_gap.any()
 
 
-def test_wrapped_rad():
-    angles = np.array([np.pi, -np.pi, 3 * np.pi, 0.0, 7.0, -1.0])
-    np.testing.assert_allclose(wrapped_rad(angles), [np.pi, np.pi, np.pi, 0, 7 - 2 * np.pi, -1], atol=1e-12)
-
-
 RATE_US = 10_000  # 100 Hz
 
 
@@ -88,12 +83,6 @@ def test_a_straight_drive_is_measured_exactly_at_every_pose():
     x = np.linspace(5, 105, 10_001)
     for time_us in (None, times(10_001)):
         np.testing.assert_allclose(arc_length_m(x, np.full_like(x, 3.0), time_us), x - 5, atol=1e-9)
-
-
-def test_a_circle_has_its_circumference():
-    angle = np.linspace(0, 2 * np.pi, 31_416)  # 50 m radius at 1 m/s
-    travelled = arc_length_m(50 * np.cos(angle), 50 * np.sin(angle), times(len(angle)))
-    assert travelled[-1] == pytest.approx(2 * np.pi * 50, rel=1e-4)
 
 
 @pytest.mark.parametrize("tremble_m", [0.005, 0.02, 0.05])
@@ -108,18 +97,6 @@ def test_a_standing_robot_does_not_crawl_however_its_pose_trembles(tremble_m):
     assert travelled[n_stand - 50] < 5 * tremble_m
     assert travelled[-1] == pytest.approx(20, abs=0.5)
     assert np.all(np.diff(travelled) >= 0)
-
-
-def test_standing_longer_adds_nothing():
-    rng = np.random.default_rng(2)
-    x, y = rng.normal(0, 0.02, (2, 30_000))
-    travelled = arc_length_m(x, y, times(30_000))
-    assert travelled[-1] - travelled[5_000] < 0.03
-
-
-def test_rocking_within_the_dead_band_is_standing():
-    x = 0.1 * np.sin(np.linspace(0, 200 * np.pi, 20_001))
-    assert arc_length_m(x, np.zeros_like(x))[-1] < DEADBAND_M
 
 
 def test_a_drive_back_over_its_own_track_goes_on_counting():

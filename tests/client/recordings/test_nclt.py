@@ -206,13 +206,6 @@ def test_the_front_camera_is_upright_sky_up_ground_down(front):
 
 
 @pytest.mark.real_data
-def test_what_travels_is_small(front):
-    sent = front.image(front.frames[0], (320, 240))
-    assert decoded(sent).shape == (240, 320, 3)
-    assert len(sent.body) < 40_000
-
-
-@pytest.mark.real_data
 @pytest.mark.parametrize(("date", "length_km"), [("2012-01-08", 6.5), ("2012-08-04", 5.5)])
 @pytest.mark.real_data
 def test_a_real_drive(real_data, nclt_tree, date, length_km):
