@@ -1,5 +1,6 @@
 """Jobs in a process of their own: the same results and errors, out of everybody's way, and never an orphan."""
 
+import fcntl
 import json
 import logging
 import os
@@ -27,7 +28,7 @@ from deepsimbad.evaluators.compute import available_cores
 from deepsimbad.jobs.child import JobPriority
 from deepsimbad.jobs.remap_config import RemapConfig
 from deepsimbad.jobs.runner import REMAP, BrokenJobError, InAnotherProcess, InThisProcess, job_threads
-from deepsimbad.store.checkpoints import Checkpoints
+from deepsimbad.store.durable import lock_folder
 from deepsimbad.store.map_file import read_map
 
 DOMAIN = "route"
@@ -85,7 +86,7 @@ def about(pid, what):
 
 
 class Doing:
-    """A job in a child that waits, because its checkpoints are held here."""
+    """A job in a child that cannot begin its map."""
 
     def __init__(self, catalog, job, caplog, run_job=None):
         self.cancelled, self.ending = threading.Event(), None
@@ -122,14 +123,24 @@ class Doing:
 
 
 @contextmanager
+def no_map_begins(catalog):
+    descriptor = lock_folder(catalog.map_path(DOMAIN, 1).parent, fcntl.LOCK_EX)
+    try:
+        yield
+    finally:
+        os.close(descriptor)
+
+
+@contextmanager
 def held(catalog, job, caplog, run_job=None):
-    with caplog.at_level(logging.INFO, "deepsimbad"), Checkpoints.open(catalog.data_dir, job.job_id):
-        doing = Doing(catalog, job, caplog, run_job)
-        try:
-            yield doing
-        finally:
-            doing.cancelled.set()
-            doing.ended()
+    with caplog.at_level(logging.INFO, "deepsimbad"):
+        with no_map_begins(catalog):
+            doing = Doing(catalog, job, caplog, run_job)
+            try:
+                yield doing
+            finally:
+                doing.cancelled.set()
+        doing.ended()
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="the scheduling classes are Linux's")
@@ -210,7 +221,7 @@ def test_without_its_parent_it_ends(catalog, job):
         "parent_pid": os.getpid(),
         "log_level": logging.INFO,
     }
-    with Checkpoints.open(catalog.data_dir, job.job_id):
+    with no_map_begins(catalog):
         for changed, closes in (({}, True), ({"parent_pid": 1}, False)):
             with subprocess.Popen(COMMAND, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL) as child:
                 assert child.stdin is not None
@@ -239,7 +250,7 @@ with Catalog.open(data_dir) as catalog:
 
 
 def test_killed_together_with_its_parent(catalog, job):
-    with Checkpoints.open(catalog.data_dir, job.job_id):
+    with no_map_begins(catalog):
         command = [sys.executable, "-c", SERVICE, str(catalog.data_dir), job.job_id]
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as service:
             assert service.stdout is not None

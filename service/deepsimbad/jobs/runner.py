@@ -38,7 +38,6 @@ from deepsimbad.jobs.progress import Progress, ProgressState
 from deepsimbad.jobs.remap import remap
 from deepsimbad.jobs.remap_config import REMAP_STAGES, RemapConfig, RemapSize, remap_stages
 from deepsimbad.store.catalog import Catalog
-from deepsimbad.store.checkpoints import Checkpoints, remove_checkpoints
 from deepsimbad.store.records import JobRecord, JobState
 from deepsimbad.store.sessions import SessionStore
 
@@ -202,7 +201,6 @@ class JobRunner:
             _log.info("job stopped", extra=told)
             return
         self._written(lambda: self._catalog.update_job(job_id, eta_s=None, **ending))
-        remove_checkpoints(self._catalog.data_dir, job_id)
         state = ending["state"].value
         error, result = ending.get("error"), ending.get("result")
         told |= {"code": error["code"], "why": error["message"]} if error else {}
@@ -293,10 +291,7 @@ class InThisProcess:
             raise InvalidInputError(f"this release does no job of the kind {job.kind!a}", known=_KINDS)
         progress = Progress(self._stages(job), on_progress, is_cancelled)
         try:
-            with (
-                Catalog.open(self.data_dir) as catalog,
-                Checkpoints.open(self.data_dir, job.job_id, progress.check),
-            ):
+            with Catalog.open(self.data_dir) as catalog:
                 progress.check()
                 if job.kind == EXPERIENCE:
                     return self._learn(catalog, job, progress)

@@ -9,7 +9,6 @@ NAME_PATTERN = r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}"
 _NAME = re.compile(NAME_PATTERN)
 SEALING_SUFFIX = ".sealing"  # of a map that is being sealed
 _MAX_VERSION = 2**53
-_JOB_ID = re.compile(r"[0-9a-f]{32}")
 
 
 def is_name(name: str) -> bool:
@@ -44,18 +43,6 @@ def sessions_path(data_dir: Path) -> Path:
 def service_lock_path(data_dir: Path) -> Path:
     """The file in which the one service of a data directory says who it is."""
     return data_dir / "service.lock"
-
-
-def jobs_folder(data_dir: Path) -> Path:
-    """The folder of what unfinished jobs have made so far."""
-    return data_dir / "jobs"
-
-
-def job_folder(data_dir: Path, job_id: str) -> Path:
-    """The folder of one unfinished job; raises InvalidInputError."""
-    if _JOB_ID.fullmatch(job_id) is None:
-        raise InvalidInputError("a job is named by 32 hexadecimal digits")
-    return jobs_folder(data_dir) / job_id
 
 
 def domains_folder(data_dir: Path) -> Path:
