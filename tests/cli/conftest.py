@@ -78,3 +78,12 @@ def pictures(tmp_path_factory) -> Path:
         lines.append(f"{place}.png,{3 * place}")
     (folder / "positions.csv").write_text("\n".join(lines))
     return folder
+
+
+@pytest.fixture
+def mapped(deepsimbad, drives, tmp_path) -> Path:
+    """A data directory with one mapped domain, `route`."""
+    sources = ("--landmarks", drives / "landmarks.npy", "--training", drives / "summer.npy")
+    ran = deepsimbad("map", "route", *sources, "--evaluator", "feature_l2:none", "--n-landmarks", 20)
+    assert ran.code == 0, ran.err
+    return tmp_path / "deepsimbad-data"

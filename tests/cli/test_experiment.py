@@ -1,110 +1,137 @@
-"""`deepsimbad experiment vpr`: its table, its JSON, its options."""
+"""`deepsimbad experiment vpr` and `nbv`: their tables, their JSON, their options."""
 
 import json
-import subprocess
 
 import numpy as np
 import pytest
 
 READY = ("--evaluator", "feature_l2:none", "--n-landmarks", 40)
+QUICK = (*READY, "--episodes", 6, "--training-episodes", 20)
 KEYS = {
-    "anr",
-    "recall_at_1",
-    "recall_at_5",
-    "default",
-    "n_queries",
-    "n_left_out",
-    "index_bits_per_map_image",
-    "second_season",
-    "config",
-    "seconds",
-    "encoding_dim",
-    "bytes_per_encoding",
-    "encode_ms",
+    *("anr", "recall_at_1", "recall_at_5", "default", "n_queries", "n_left_out", "index_bits_per_map_image", "seconds"),
+    *("second_season", "config", "encoding_dim", "bytes_per_encoding", "encode_ms"),
 }
 SIX = {"calibrated", "standardised", "rrf", "bag_of_landmarks", "simbad", "brute_force"}
+PLANNERS = {"random", "clairvoyant", "nnql", "telling", *(f"constant_{action_m}" for action_m in range(1, 11))}
+
+
+def triplet_of(folder, test="winter"):
+    roles = {"--landmarks": "landmarks", "--training": "summer", "--test": test}
+    return [part for role, name in roles.items() for part in (role, folder / f"{name}.npy")]
 
 
 @pytest.fixture
 def triplet(drives):
-    roles = {"--landmarks": "landmarks", "--training": "summer", "--test": "winter"}
-    return [part for role, name in roles.items() for part in (role, drives / f"{name}.npy")]
+    return triplet_of(drives)
 
 
-def test_json_is_one_document_with_the_stable_keys(deepsimbad, triplet):
-    ran = deepsimbad("experiment", "vpr", *triplet, *READY, "--json")
-    assert (ran.code, ran.err) == (0, "")
-    document = json.loads(ran.out)
+@pytest.fixture(scope="session")
+def route(tmp_path_factory):
+    """Three drives of one route of 130 m, long enough for ten moves of ten metres."""
+    folder, rng = tmp_path_factory.mktemp("route"), np.random.default_rng(11)
+    places = rng.normal(size=(130, 16))
+    for name, noise in (("landmarks", 0.3), ("summer", 0.1), ("winter", 0.8)):
+        np.save(folder / f"{name}.npy", (places + noise * rng.normal(size=places.shape)).astype(np.float32))
+    return triplet_of(folder)
+
+
+@pytest.fixture
+def measured(deepsimbad):
+    """The one JSON document of an experiment."""
+
+    def run(*arguments):
+        ran = deepsimbad("experiment", *arguments, "--json")
+        assert (ran.code, ran.err) == (0, "")
+        return json.loads(ran.out, parse_constant=lambda constant: pytest.fail(f"{constant} is no JSON"))
+
+    return run
+
+
+def test_vpr_is_one_document_with_the_stable_keys(measured, triplet):
+    document = measured("vpr", *triplet, *READY)
     assert set(document) == KEYS
     assert set(document["anr"]) == set(document["recall_at_1"]) == set(document["recall_at_5"]) == SIX
     assert all(0 <= anr < 20 for anr in document["anr"].values()), document["anr"]
-    assert document["default"] == "calibrated"
-    assert (document["n_queries"], document["n_left_out"]) == (80, 0)
-    assert document["config"]["n_landmarks"] == 40
-    assert document["config"]["list_length"] == 4
-    assert document["config"]["tolerance_m"] == 2.0
-    assert document["config"]["spacing_m"] == 1.0
-    assert document["config"]["training"].endswith("summer.npy")
+    assert (document["default"], document["n_queries"], document["n_left_out"]) == ("calibrated", 80, 0)
+    config = document["config"]
+    assert (config["n_landmarks"], config["list_length"], config["tolerance_m"], config["spacing_m"]) == (40, 4, 2, 1)
+    assert config["training"].endswith("summer.npy")
     assert all(seconds >= 0 for seconds in document["seconds"].values())
 
 
-def test_json_into_a_file_leaves_the_table_to_people(deepsimbad, triplet, tmp_path):
-    ran = deepsimbad("experiment", "vpr", *triplet, *READY, "--json", tmp_path / "vpr.json")
+def test_nbv_is_one_document_with_the_stable_keys(measured, route):
+    document = measured("nbv", *route, *QUICK)
+    assert set(document) >= {"anr", "default", "anr_paper", "interval_95", "config"}
+    assert set(document["anr"]) == set(document["anr_paper"]) == set(document["interval_95"]) == PLANNERS
+    assert document["default"] == "telling"
+    assert all(0 <= anr < 60 for anr in (*document["anr"].values(), *document["anr_paper"].values()))
+    for name, (low, high) in document["interval_95"].items():
+        assert low <= document["anr"][name] <= high
+    config = document["config"]
+    assert (config["relevance"], config["update"]) == ("calibrated", "log_likelihood")
+    assert (config["n_landmarks"], config["list_length"], config["seed"]) == (40, 4, 0)
+    assert (config["episodes"], config["training_episodes"], config["n_steps"]) == (6, 20, 10)
+    assert (config["actions_m"], config["spacing_m"]) == (list(range(1, 11)), 1.0)
+    assert document["anr_at_distance_m"]["constant_1"]["50"] is None, "ten moves of a metre go ten metres"
+
+
+@pytest.mark.parametrize("kind", ["vpr", "nbv"])
+def test_json_into_a_file_leaves_the_table_to_people(deepsimbad, triplet, route, tmp_path, kind):
+    given = (*triplet, *READY) if kind == "vpr" else (*route, *QUICK)
+    ran = deepsimbad("experiment", kind, *given, "--json", tmp_path / "out.json")
     assert (ran.code, ran.err) == (0, "")
-    document = json.loads((tmp_path / "vpr.json").read_text())
-    assert set(document) == KEYS
-    for name, anr in document["anr"].items():
-        (row,) = [line for line in ran.out.splitlines() if f" {name} " in line]
-        assert f"{anr:.2f}" in row
-    assert "80 queries scored" in ran.out
+    for name, anr in json.loads((tmp_path / "out.json").read_text())["anr"].items():
+        (row,) = [line for line in ran.out.splitlines() if f" {name} " in line and "paired" not in line]
+        assert f"{anr:.2f}" in row if kind == "vpr" else f"{anr:.3f}" in row
+    assert ("80 queries scored" if kind == "vpr" else "telling (default)") in ran.out
 
 
-def test_only_the_relevances_asked_for(deepsimbad, triplet):
-    ran = deepsimbad("experiment", "vpr", *triplet, *READY, "--relevance", "rrf", "--relevance", "simbad", "--json")
-    assert set(json.loads(ran.out)["anr"]) == {"rrf", "simbad"}
-
-
-def test_every_option_is_heeded(deepsimbad, triplet):
-    usual = json.loads(deepsimbad("experiment", "vpr", *triplet, *READY, "--json").out)
-    wide = json.loads(deepsimbad("experiment", "vpr", *triplet, *READY, "--tolerance", 9, "--json").out)
-    assert wide["anr"]["rrf"] < usual["anr"]["rrf"]
-    long = json.loads(deepsimbad("experiment", "vpr", *triplet, *READY, "--list-length", 12, "--json").out)
+def test_every_option_of_vpr_is_heeded(measured, triplet, drives):
+    only = ("--relevance", "rrf", "--relevance", "simbad")
+    usual = measured("vpr", *triplet, *READY, *only)
+    assert set(usual["anr"]) == {"rrf", "simbad"}
+    assert measured("vpr", *triplet, *READY, *only, "--tolerance", 9)["anr"]["rrf"] < usual["anr"]["rrf"]
+    long = measured("vpr", *triplet, *READY, *only, "--list-length", 12)
     assert long["config"]["list_length"] == 12
     assert long["anr"]["rrf"] != usual["anr"]["rrf"]
-    far = json.loads(deepsimbad("experiment", "vpr", *triplet, *READY, "--spacing-m", 3, "--json").out)
-    assert far["config"]["spacing_m"] == 3.0
+    far = measured("vpr", *triplet, *READY, *only, "--spacing-m", 3)
     assert far["anr"]["rrf"] > usual["anr"]["rrf"], "three metres apart, the neighbours are no longer right"
+    sliced = ("--training", f"{drives / 'summer.npy'}#0:40", "--test", f"{drives / 'winter.npy'}#30:60:2")
+    part = measured("vpr", *triplet[:2], *sliced, *READY, *only)
+    assert (part["n_queries"], part["n_left_out"]) == (6, 9), "30..40 lie within 2 m of the map, 42..58 do not"
+    elsewhere = ("--training", f"{drives / 'summer.npy'}#:20", "--test", f"{drives / 'winter.npy'}#60:")
+    none = measured("vpr", *triplet[:2], *elsewhere, *READY, *only)
+    assert (none["n_queries"], set(none["anr"].values())) == (0, {None}), "a number that JSON lacks becomes null"
 
 
-def test_slices_pick_frames_that_keep_their_places(deepsimbad, drives):
-    triplet = (
-        *("--landmarks", drives / "landmarks.npy"),
-        *("--training", f"{drives / 'summer.npy'}#0:40"),
-        *("--test", f"{drives / 'winter.npy'}#30:60:2"),
-    )
-    document = json.loads(deepsimbad("experiment", "vpr", *triplet, *READY, "--json").out)
-    assert (document["n_queries"], document["n_left_out"]) == (6, 9), "30..40 lie within 2 m of the map, 42..58 do not"
+def test_every_option_of_nbv_is_heeded(measured, route):
+    options = ("--relevance", "rrf", "--seed", 7, "--list-length", 3, "--spacing-m", 2)
+    document = measured("nbv", *route, *QUICK, *options)
+    config = document["config"]
+    assert (config["relevance"], config["update"]) == ("rrf", "additive_relevance"), "an update that suits it"
+    assert (config["seed"], config["list_length"], config["spacing_m"]) == (7, 3, 2.0)
+    other = measured("nbv", *route, *QUICK, *options, "--update", "additive_reciprocal_rank")
+    assert other["config"]["update"] == "additive_reciprocal_rank"
+    assert other["anr"]["constant_1"] != document["anr"]["constant_1"]
+    assert other["anr_paper"]["constant_1"] == document["anr_paper"]["constant_1"], "the paper's is always the paper's"
 
 
-def test_ground_truth_replaces_the_tolerance(deepsimbad, triplet, tmp_path):
+def test_ground_truth_replaces_the_tolerance(measured, triplet, tmp_path):
     np.save(tmp_path / "truth.npy", np.array([[(place + 40) % 80] if place else [-1] for place in range(80)]))
-    ran = deepsimbad("experiment", "vpr", *triplet, *READY, "--ground-truth", tmp_path / "truth.npy", "--json")
-    document = json.loads(ran.out)
+    document = measured("vpr", *triplet, *READY, "--ground-truth", tmp_path / "truth.npy")
     assert (document["n_queries"], document["n_left_out"]) == (79, 1)
     assert document["anr"]["brute_force"] > 30, "half a route away is about chance"
     assert document["config"]["ground_truth"] == str(tmp_path / "truth.npy")
 
 
-def test_landmarks_of_another_season_are_told_from_those_of_elsewhere(deepsimbad, drives, tmp_path):
+def test_landmarks_of_another_season_are_told_from_those_of_elsewhere(measured, drives, tmp_path):
     """Positions count as comparable unless something else is said, or other truths are given."""
     np.save(tmp_path / "truth.npy", np.arange(80)[:, np.newaxis])
     truth = ("--ground-truth", tmp_path / "truth.npy")
 
-    def season(landmarks, *said):
-        roles = {"--landmarks": landmarks, "--training": "summer", "--test": "summer"}
-        triplet = [part for role, name in roles.items() for part in (role, drives / f"{name}.npy")]
-        ran = deepsimbad("experiment", "vpr", *triplet, *READY, "--relevance", "calibrated", *said, "--json")
-        return json.loads(ran.out)["second_season"]
+    def season(landmarks, *options):
+        triplet = ("--landmarks", drives / f"{landmarks}.npy", *triplet_of(drives, "summer")[2:])
+        return measured("vpr", *triplet, *READY, "--relevance", "calibrated", *options)["second_season"]
 
     assert season("winter")["accepted"]
     assert not season("landmarks")["accepted"]
@@ -113,58 +140,53 @@ def test_landmarks_of_another_season_are_told_from_those_of_elsewhere(deepsimbad
     assert season("winter", *truth, "--same-route")["accepted"]
 
 
-def test_frames_left_out_are_told(deepsimbad, pictures, tmp_path):
+def test_frames_left_out_are_told(measured, pictures, tmp_path):
     copy = tmp_path / "pictures"
     copy.mkdir()
     for file in pictures.iterdir():
         (copy / file.name).write_bytes(b"broken" if file.name == "4.png" else file.read_bytes())
     triplet = ("--landmarks", pictures, "--training", copy, "--test", pictures)
-    document = json.loads(deepsimbad("experiment", "vpr", *triplet, "--n-landmarks", 20, "--json").out)
+    document = measured("vpr", *triplet, "--n-landmarks", 20)
     left_out = document["config"]["left_out"]
     assert left_out["landmarks"] == left_out["test"] == {}
     assert list(left_out["training"].values()) == [1]
     assert (document["n_queries"], document["n_left_out"]) == (29, 1)
 
 
-def test_named_errors(deepsimbad, triplet, tmp_path):
-    for more in (("--n-landmarks", 99), ("--ground-truth", tmp_path / "nowhere.npy"), ("--list-length", 41)):
-        ran = deepsimbad("experiment", "vpr", *triplet, *READY, *more)
-        assert (ran.code, ran.out) == (1, "")
-        assert len(ran.err.splitlines()) == 1, ran.err
+def test_named_errors(deepsimbad, triplet, route, tmp_path):
+    short = [*route[:-1], f"{route[-1]}#:90"]
+    for kind, sources, more in (
+        *(("vpr", (*triplet, *READY), more) for more in (("--n-landmarks", 99), ("--list-length", 41))),
+        ("vpr", (*triplet, *READY), ("--ground-truth", tmp_path / "nowhere.npy")),
+        ("nbv", (*short, *QUICK), ()),
+        *(("nbv", (*route, *QUICK), more) for more in (("--n-landmarks", 131), ("--list-length", 41))),
+    ):
+        ran = deepsimbad("experiment", kind, *sources, *more)
+        assert (ran.code, ran.out, len(ran.err.splitlines())) == (1, "", 1), ran.err
+    for more in (("--episodes", 1), ("--seed", -1), ("--update", "none"), ("--relevance", "none")):
+        assert deepsimbad("experiment", "nbv", *route, *QUICK, *more).code == 2
 
 
-def test_a_number_json_lacks_becomes_null(deepsimbad, drives):
-    triplet = (
-        *("--landmarks", drives / "landmarks.npy"),
-        *("--training", f"{drives / 'summer.npy'}#:20"),
-        *("--test", f"{drives / 'winter.npy'}#60:"),
-    )
-    ran = deepsimbad("experiment", "vpr", *triplet, *READY, "--json")
-    assert ran.code == 0
-    document = json.loads(ran.out, parse_constant=lambda constant: pytest.fail(f"{constant} is no JSON"))
-    assert document["n_queries"] == 0
-    assert set(document["anr"].values()) == {None}
-
-
-@pytest.mark.slow
-def test_as_a_process(process, triplet):
-    running = process("experiment", "vpr", *triplet, *READY, "--json")
-    out, err = running.communicate(timeout=120)
-    assert (running.returncode, err) == (0, "")
-    assert set(json.loads(out)) == KEYS
+def test_an_experiment_makes_no_data_directory(deepsimbad, tmp_path):
+    given = ("--landmarks", "a.npy", "--training", "b.npy", "--test", "c.npy", "--data-dir", "some")
+    ran = deepsimbad("experiment", "vpr", *given)
+    assert ran.code == 1
+    assert "a.npy" in ran.err
+    assert not (tmp_path / "some").exists()
 
 
 @pytest.mark.slow
 @pytest.mark.real_data
-def test_the_corridor_by_its_own_ground_truth(process, real_data):
+def test_the_corridor_by_its_own_ground_truth_as_a_process(process, real_data):
     corridor = real_data / "corridor"
-    running: subprocess.Popen[str] = process(
+    running = process(
         *("experiment", "vpr", "--landmarks", f"{corridor / 'query'}", "--training", corridor / "ref"),
         *("--test", corridor / "query", "--n-landmarks", 100),
         *("--ground-truth", corridor / "ground_truth_new.npy", "--json"),
     )
     out, err = running.communicate(timeout=250)
-    assert running.returncode == 0, err
+    assert (running.returncode, err) == (0, "")
     document = json.loads(out)
+    assert set(document) == KEYS
     assert (document["n_queries"], document["n_left_out"]) == (111, 0)
     assert document["anr"]["standardised"] < 20

@@ -1,37 +1,54 @@
-"""`deepsimbad settings`: what holds, and why."""
+"""`deepsimbad settings`, and what every command has in common: data directory, settings, help (design section 7)."""
 
 import json
+from collections.abc import Iterator
 
+import click
 import pytest
 
+from deepsimbad.cli import deepsimbad as root
 from deepsimbad.settings import Settings
+
+
+def commands(group: click.Group, *before: str) -> Iterator[tuple[str, ...]]:
+    for name, command in group.commands.items():
+        if isinstance(command, click.Group):
+            yield from commands(command, *before, name)
+        else:
+            yield (*before, name)
+
+
+@pytest.mark.parametrize("words", list(commands(root)), ids=" ".join)
+def test_every_command_takes_a_data_directory(deepsimbad, words):
+    ran = deepsimbad(*words, "--data-dir", "some", "--help")
+    assert (ran.code, ran.err) == (0, "")
+    assert ran.out.startswith("Usage: ")
+    assert "--data-dir" in ran.out
 
 
 def test_every_setting_is_told_with_its_origin(deepsimbad, tmp_path, monkeypatch):
     (tmp_path / "deepsimbad.toml").write_text('keep_maps = 7\ncors_origins = ["https://a", "https://b"]\n')
     monkeypatch.setenv("DEEPSIMBAD_MAX_QUEUE", "5")
+    monkeypatch.setenv("DEEPSIMBAD_PROT", "5")
+    remark = "deepsimbad: DEEPSIMBAD_PROT is set in the environment and is no setting\n"
     ran = deepsimbad("settings", "--json", "--port", 9, "--data-dir", "here")
-    assert (ran.code, ran.err) == (0, "")
+    assert (ran.code, ran.err) == (0, remark)
     document = json.loads(ran.out)
     assert document["file"] == "deepsimbad.toml"
-    told = {name: (one["value"], one["origin"]) for name, one in document["settings"].items()}
-    assert set(told) == set(Settings.model_fields)
-    assert told["port"] == (9, "flag")
-    assert told["data_dir"] == ("here", "flag")
-    assert told["max_queue"] == (5, "environment")
-    assert told["keep_maps"] == (7, "file")
-    assert told["cors_origins"] == (["https://a", "https://b"], "file")
-    assert told["tls_key"] == (None, "default")
+    settings = {name: (setting["value"], setting["origin"]) for name, setting in document["settings"].items()}
+    assert set(settings) == set(Settings.model_fields)
+    assert settings["port"] == (9, "flag")
+    assert settings["data_dir"] == ("here", "flag")
+    assert settings["max_queue"] == (5, "environment")
+    assert settings["keep_maps"] == (7, "file")
+    assert settings["cors_origins"] == (["https://a", "https://b"], "file")
+    assert settings["tls_key"] == (None, "default")
     assert document["settings"]["max_queue"]["variable"] == "DEEPSIMBAD_MAX_QUEUE"
-
-
-def test_for_people_too_and_what_is_no_setting_is_remarked(deepsimbad, tmp_path, monkeypatch):
-    monkeypatch.setenv("DEEPSIMBAD_PROT", "5")
+    (tmp_path / "deepsimbad.toml").unlink()
     ran = deepsimbad("settings")
-    assert ran.code == 0
+    assert (ran.code, ran.err) == (0, remark)
     assert "none" in ran.out
     assert "[]" in ran.out
-    assert ran.err == "deepsimbad: DEEPSIMBAD_PROT is set in the environment and is no setting\n"
 
 
 @pytest.mark.parametrize("command", [("settings",), ("info", "route"), ("localize", "route", "view.jpg")])
@@ -39,10 +56,8 @@ def test_every_command_that_takes_settings_heeds_the_file(deepsimbad, tmp_path, 
     (tmp_path / "bad.toml").write_text("data_dri = 'there'")
     ran = deepsimbad(*command, "--config", "bad.toml")
     assert (ran.code, ran.out) == (1, "")
-    assert ran.err.splitlines() == [
-        "deepsimbad: invalid_settings: there is no setting 'data_dri', which stands in bad.toml: "
-        "did you mean 'data_dir'?"
-    ]
+    why = "there is no setting 'data_dri', which stands in bad.toml: did you mean 'data_dir'?"
+    assert ran.err == f"deepsimbad: invalid_settings: {why}\n"
     assert [path.name for path in tmp_path.iterdir()] == ["bad.toml"]
 
 
