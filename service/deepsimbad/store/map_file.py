@@ -3,7 +3,7 @@
 What the arrays mean is not known here: `core.map` names them, a table holds each.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,6 @@ from deepsimbad.store.arrays import Checksum, load_arrays, load_packed, save_arr
 from deepsimbad.store.connection import in_todays_schema, open_database
 from deepsimbad.store.durable import remove_database
 from deepsimbad.store.faults import storage_faults
-from deepsimbad.store.pages import bytes_by_table, fitting_page_size
 from deepsimbad.store.records import from_json, to_json
 from deepsimbad_migrations.map.migrations import migrations
 
@@ -36,8 +35,10 @@ _DESCRIPTION = (  # the columns of `map` in the order of the checksum
     "n_landmarks",
     "list_length",
 )
-_NO_PLAIN_TABLE = "SELECT 1 FROM sqlite_schema WHERE type NOT IN ('table', 'index') OR rootpage = 0 LIMIT 1"
 _WAL_HEADER = bytes([2, 2])  # read and write version at offset 18 of a file that may have a write-ahead log
+
+_PAGE_SIZES = (4096, 8192, 16384, 32768, 65536)
+_ROW_OVERHEAD = 12  # cell pointer, cell and record headers, landmark and rank of one posting row
 
 _MODEL_TABLE, _PACKED_TABLE = "landmark_model", "q_value"
 # In which table of the frozen schema an array lies, all of one layout; what is not named here, what seasons teach.
@@ -72,7 +73,7 @@ def write_map(path: Path, map_: Map, on_progress: Callable[[float], None] | None
         remove_database(path)
         try:
             with open_database(path, create=True) as db:
-                db.execute(f"PRAGMA page_size = {fitting_page_size([len(blob) for _, _, blob in postings])}")
+                db.execute(f"PRAGMA page_size = {_fitting_page_size([len(blob) for _, _, blob in postings])}")
                 db.execute("PRAGMA journal_mode = MEMORY")  # a crash leaves a file that is discarded anyway
                 db.execute("PRAGMA synchronous = OFF")
                 migrations.apply(db)
@@ -149,7 +150,7 @@ def _read(db: Database, path: Path) -> Map:
         raise DamagedMapError(f"{path.name} is damaged: it does not match its checksum", file=path.name)
     arrays["lists"] = unpack_index(postings, stored["list_length"], stored["n_map_images"])
     document = {name: from_json(stored[name]) if name in _AS_JSON else stored[name] for name in _DESCRIPTION}
-    return Map.from_arrays(document, model, arrays, bytes_by_table(db.conn)["posting"])
+    return Map.from_arrays(document, model, arrays, _bytes_by_table(db)["posting"])
 
 
 def index_bytes(path: Path) -> int:
@@ -160,7 +161,7 @@ def index_bytes(path: Path) -> int:
 def table_bytes(path: Path) -> dict[str, int]:
     """The pages of every table with its indexes, in bytes; raises as `read_map`."""
     with _opened(path) as db:
-        return bytes_by_table(db.conn)
+        return _bytes_by_table(db)
 
 
 @contextmanager
@@ -173,9 +174,47 @@ def _opened(path: Path) -> Iterator[Database]:
             if stream.read(20)[18:] == _WAL_HEADER:  # its newest rows may lie beside it
                 raise DamagedMapError(f"{path.name} was opened for writing after it was sealed", file=path.name)
         with open_database(path, immutable=True) as db:
-            if db.execute(_NO_PLAIN_TABLE).fetchone() is not None:  # reading it would run what its maker wrote
-                raise DamagedMapError(f"{path.name} is damaged: it holds what no release writes", file=path.name)
             if not db.table_names():
                 raise DamagedMapError(f"{path.name} is damaged: it is empty", file=path.name)
             with in_todays_schema(db, migrations, path, DamagedMapError) as current:
                 yield current
+
+
+def _fitting_page_size(blob_lengths: Sequence[int]) -> int:
+    """The page size that stores posting lists of these lengths in the fewest bytes.
+
+    A row of more than about a quarter page spills into pages of its own, the last of which stays part empty; on large
+    maps that would double the index.
+    """
+
+    def cost(page_size: int) -> int:
+        local = spilled = 0
+        for length in blob_lengths:
+            n_local, n_pages = _spill(length + _ROW_OVERHEAD, page_size)
+            local += n_local
+            spilled += n_pages * page_size
+        return spilled + -(-local // (page_size - 12)) * page_size
+
+    return min(_PAGE_SIZES, key=cost)
+
+
+def _bytes_by_table(db: Database) -> dict[str, int]:
+    """Page bytes by table, its indexes included, as SQLite's `dbstat` counts them."""
+    rows = db.execute(
+        """
+        SELECT coalesce(tbl_name, dbstat.name), sum(pgsize)
+        FROM dbstat LEFT JOIN sqlite_schema USING (name) GROUP BY 1
+        """
+    )
+    return dict(rows.fetchall())
+
+
+def _spill(payload: int, page_size: int) -> tuple[int, int]:
+    """The bytes of an index leaf's payload that stay in its page, and its overflow pages (SQLite file format, 1.6)."""
+    most, least = ((page_size - 12) * share // 255 - 23 for share in (64, 32))
+    if payload <= most:
+        return payload, 0
+    local = least + (payload - least) % (page_size - 4)
+    if local > most:
+        local = least
+    return local, -(-(payload - local) // (page_size - 4))
