@@ -22,7 +22,7 @@ from deepsimbad.errors import (
 )
 from deepsimbad.store import layout
 from deepsimbad.store.arrays import is_halvable
-from deepsimbad.store.connection import OpenFile, migrate, open_database, use_write_ahead_log, write_transaction
+from deepsimbad.store.connection import OpenFile, open_database, open_working_file, write_transaction
 from deepsimbad.store.durable import lock_folder, remove_database, sync_file, sync_folder
 from deepsimbad.store.faults import storage_faults
 from deepsimbad.store.records import now
@@ -84,16 +84,8 @@ class Traverse(OpenFile):
         path = layout.traverse_path(data_dir, domain, name)
         if not path.is_file():
             raise UnknownTraverseError(f"domain {domain} has no traverse {name}", known=cls.list(data_dir, domain)[:20])
-        with _named(name), storage_faults(path), ExitStack() as on_error:
-            db = open_database(path)
-            on_error.callback(db.close)
-            if not db.table_names():
-                raise DamagedFileError(f"{path.name} is damaged: it is empty", file=path.name)
-            use_write_ahead_log(db)
-            migrate(db, migrations, path)
-            traverse = cls(name, path, db)
-            on_error.pop_all()
-        return traverse
+        with _named(name), storage_faults(path):
+            return cls(name, path, open_working_file(path, migrations, is_checked=False))
 
     @classmethod
     def delete(cls, data_dir: Path, domain: str, name: str) -> None:
@@ -146,23 +138,7 @@ class Traverse(OpenFile):
         y_m: float | None = None,
         weights_sha256: str | None = None,
     ) -> bool:
-        """Store one frame, replacing one of the same index.
-
-        Args:
-            index: Place in the recording, from 0.
-            encoding: [d] float32, d as for the traverse's first frame.
-            position_m: Route position.
-            timestamp_us: Microseconds, None where unknown.
-            x_m: East, None where unknown.
-            y_m: North, None where unknown.
-            weights_sha256: Of the network that encoded it; None where none did.
-
-        Returns:
-            Whether the frame is new.
-
-        Raises:
-            InvalidInputError, InvalidRouteError, InvalidEncodingError: As `put_frames`.
-        """
+        """As `put_frames` with one frame, of which None is unknown; answers whether it is new."""
         frames = Drive(
             index=np.array([index]),
             position_m=np.array([position_m], np.float64),
