@@ -181,3 +181,27 @@ def test_events_of_a_job_in_both_clients() -> None:
     assert [job.state for job in script.client().admin.job_events("j")] == ["running", "succeeded"]
     assert script.requests[0].headers["accept"] == "text/event-stream"
     run_async(events(), listen)
+
+
+def test_a_stream_that_is_left_early_is_closed() -> None:
+    class Stream(httpx2.SyncByteStream):
+        closed = False
+
+        def __iter__(self) -> Any:
+            while True:
+                yield f"event: progress\ndata: {json.dumps(JOB)}\n\n".encode()
+
+        def close(self) -> None:
+            self.closed = True
+
+    stream = Stream()
+    script = Script(httpx2.Response(200, stream=stream, headers={"content-type": "text/event-stream"}))
+
+    async def leave() -> None:  # under a running loop, what is not closed by hand is closed later
+        events = script.client().admin.job_events("j")
+        assert next(events).state == "running"
+        assert not stream.closed
+        events.close()
+        assert stream.closed
+
+    asyncio.run(leave())
