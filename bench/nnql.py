@@ -18,7 +18,7 @@ from bench.map_file import contents_of
 from bench.timing import timed
 from bench.worlds import N_LANDMARKS, NCLT_IMAGES, dense_lists, rrf_map, standardised_map
 from deepsimbad.core.nnql import NnqlConfig
-from deepsimbad.core.planners import NnqlPlanner, PlanningView
+from deepsimbad.core.planners import PlanningView, plan_by_experience
 from deepsimbad.core.relevance import DEFAULT_UPDATE, Query, Relevance
 from deepsimbad.core.training import TrainingWorld, train
 from deepsimbad.store.map_file import table_bytes, write_map
@@ -49,7 +49,7 @@ def nnql_table() -> Iterator[str]:
     relevance_row = np.random.default_rng(0).normal(size=NCLT_IMAGES).astype(np.float32)
     learnt = rrf_map(dense_lists(NCLT_IMAGES).lists, actions_m=np.array(ACTIONS_M), q_values=q_values)
     view = PlanningView(learnt, np.empty(0), relevance_row, 0, 1)
-    planning = timed(lambda: NnqlPlanner().plan(view), repeats=201, warm_up=20)
+    planning = timed(lambda: plan_by_experience(view), repeats=201, warm_up=20)
     yield f"Values of a view's 10 actions, the four nearest of {NCLT_IMAGES:,} map images included: {planning}."
     yield ""
     with tempfile.TemporaryDirectory() as folder:

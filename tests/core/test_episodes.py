@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from deepsimbad.core.episodes import ClairvoyantChooser, ConstantChooser, EpisodeRunner, RandomChooser, follow_plan
+from deepsimbad.core.episodes import EpisodeRunner, clairvoyant_chooser, follow_plan, random_chooser
 from deepsimbad.core.episodes import TestDrive as Drive
 from deepsimbad.core.planners import Plan
 from deepsimbad.core.route import Route
@@ -64,7 +64,7 @@ def test_starts_are_uniform_over_the_frames_from_which_the_longest_episode_fits(
 
 def test_the_robot_moves_exactly_so_far_and_looks_from_the_nearest_frame(drive):
     notebook = Notebook()
-    episode = EpisodeRunner(notebook, drive, 3, action_std_m=0.7).run(0, 1, ConstantChooser(2.5))
+    episode = EpisodeRunner(notebook, drive, 3, action_std_m=0.7).run(0, 1, lambda *_: 2.5)
     # 0.9, 3.4, 5.9, 8.4 m: what is walked adds up, whatever frame was nearest
     assert notebook.told == [(0, 1, 0.0, None), (1, 3, 2.5, 0.7), (2, 6, 2.5, 0.7), (3, 8, 2.5, 0.7)]
     assert episode.travelled_m.tolist() == [2.5, 5.0, 7.5]
@@ -76,7 +76,9 @@ def test_views_after_moves_count_and_the_first_does_not(drive):
     def believe(views):
         return np.array(masses[views[-1]], float)
 
-    episode = EpisodeRunner(Notebook(believe), drive, 3).run(0, 0, lambda *_: [3.0, 2.0, 3.0][len(_[1].views) - 1])
+    episode = EpisodeRunner(Notebook(believe), drive, 3).run(
+        0, 0, lambda *_: [3.0, 2.0, 3.0][len(_[1].state.views) - 1]
+    )
     # frame 3 is image 1, the best; frame 5 is image 2, tied with three others; frame 8 is image 4, behind two, tied
     assert episode.rank_share.tolist() == [0, 1.5 / 5, 2.5 / 5]
     assert episode.travelled_m.tolist() == [3, 5, 8]
@@ -86,21 +88,21 @@ def test_following_the_plan_does_what_the_last_step_recommends(drive):
     episode = EpisodeRunner(Notebook(), drive, 2).run(0, 0, follow_plan)
     assert episode.travelled_m.tolist() == [2, 5], "2 m after one view, 3 m after two"
     with pytest.raises(ValueError, match="recommends nothing"):
-        follow_plan(0, None, SimpleNamespace(plan=None), 0.0)
+        follow_plan(0, SimpleNamespace(plan=None), 0.0)
 
 
 # --- those who choose ----------------------------------------------------------------------------------------------
 
 
 def test_random_moves_depend_on_seed_episode_and_step_alone():
-    chooser = RandomChooser(np.arange(1.0, 11.0), seed=3)
+    chooser = random_chooser(np.arange(1.0, 11.0), seed=3)
 
     def moves(chooser, episode):
-        return [chooser(episode, SimpleNamespace(n_observations=n), None, 0.0) for n in range(1, 11)]
+        return [chooser(episode, SimpleNamespace(state=SimpleNamespace(n_observations=n)), 0.0) for n in range(1, 11)]
 
-    assert moves(chooser, 0) == moves(RandomChooser(np.arange(1.0, 11.0), seed=3), 0)
+    assert moves(chooser, 0) == moves(random_chooser(np.arange(1.0, 11.0), seed=3), 0)
     assert moves(chooser, 0) != moves(chooser, 1)
-    assert moves(chooser, 0) != moves(RandomChooser(np.arange(1.0, 11.0), seed=4), 0)
+    assert moves(chooser, 0) != moves(random_chooser(np.arange(1.0, 11.0), seed=4), 0)
     drawn = np.array([moves(chooser, episode) for episode in range(300)])
     assert abs(np.bincount(drawn.astype(int).ravel(), minlength=11)[1:] - 300).max() < 70
 
@@ -112,7 +114,7 @@ def test_the_clairvoyant_takes_the_move_after_which_the_truth_ranks_best(drive):
 
     notebook = Notebook(believe)
     runner = EpisodeRunner(notebook, drive, 2)
-    chooser = ClairvoyantChooser(runner, np.array([2.0, 3.0, 5.0]))
+    chooser = clairvoyant_chooser(runner, np.array([2.0, 3.0, 5.0]))
     episode = runner.run(0, 0, chooser)
     assert episode.travelled_m.tolist() == [5, 8]
     assert episode.rank_share.tolist() == [0, 0]
@@ -122,5 +124,5 @@ def test_the_clairvoyant_takes_the_move_after_which_the_truth_ranks_best(drive):
 
 def test_of_equally_good_moves_the_clairvoyant_takes_the_shortest(drive):
     runner = EpisodeRunner(Notebook(), drive, 1)
-    chooser = ClairvoyantChooser(runner, np.array([2.0, 3.0, 5.0]))
+    chooser = clairvoyant_chooser(runner, np.array([2.0, 3.0, 5.0]))
     assert runner.run(0, 0, chooser).travelled_m.tolist() == [2]

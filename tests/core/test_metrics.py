@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from deepsimbad.core.metrics import Comparison, RetrievalScorer, compare, mean_interval, rank_of_truth
+from deepsimbad.core.metrics import RetrievalScorer, mean_interval, rank_of_truth
 
 
 @pytest.mark.parametrize(
@@ -55,19 +55,3 @@ def test_it_covers_the_truth_nineteen_times_of_twenty():
     rng = np.random.default_rng(1)
     covered = [low <= 0 <= high for low, high in (mean_interval(rng.normal(size=100), seed=s) for s in range(120))]
     assert 0.88 <= np.mean(covered) <= 0.99
-
-
-def test_what_both_share_does_not_blur_the_difference():
-    rng = np.random.default_rng(2)
-    shared = 100 * rng.normal(size=500)
-    found = compare(shared + rng.normal(size=500), shared + 1 + rng.normal(size=500), seed=0)
-    assert found.difference == pytest.approx(-1, abs=0.2)
-    assert found.interval[1] - found.interval[0] < 0.4
-    assert found.excludes_zero
-
-
-@pytest.mark.parametrize(
-    ("interval", "excludes"), [((-1, 1), False), ((0.1, 1), True), ((-1, -0.1), True), ((0, 1), False)]
-)
-def test_zero_is_excluded_or_not(interval, excludes):
-    assert Comparison(0.5, interval).excludes_zero is excludes

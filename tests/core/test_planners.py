@@ -10,12 +10,12 @@ from deepsimbad.core.drive import SecondSeason
 from deepsimbad.core.map import Map
 from deepsimbad.core.planners import (
     DEFAULT_PLANNER,
-    ConstantPlanner,
-    NnqlPlanner,
     PlanningView,
-    RandomPlanner,
-    TellingPlanner,
     parse_planner,
+    plan_at_random,
+    plan_by_experience,
+    plan_constantly,
+    plan_for_telling_places,
     telling_bits,
 )
 from deepsimbad.core.relevance import Query, Relevance
@@ -61,34 +61,34 @@ def bits():
 
 @pytest.mark.parametrize("away", [1, 4, 9])
 def test_a_robot_that_knows_its_place_goes_to_the_telling_one(bits, away):
-    plan = TellingPlanner().plan(view_of(sharp(74 - away), bits))
+    plan = plan_for_telling_places(view_of(sharp(74 - away), bits))
     assert plan.action_m == away
     assert plan.values.argmax() == away - 1
 
 
 def test_of_equally_telling_places_the_farther(bits):
     bits[[52, 56]] = 7
-    assert TellingPlanner().plan(view_of(sharp(50), bits)).action_m == 6
+    assert plan_for_telling_places(view_of(sharp(50), bits)).action_m == 6
 
 
 def test_a_robot_that_knows_nothing_goes_far(bits):
-    assert TellingPlanner().plan(view_of(None, bits)).action_m == 10
+    assert plan_for_telling_places(view_of(None, bits)).action_m == 10
 
 
 def test_a_robot_that_is_sure_goes_far(bits):
     """No view can tell it more, and a far one errs unlike the last."""
     bits[53] = 7
-    assert TellingPlanner().plan(view_of(np.eye(N_IMAGES)[50], bits)).action_m == 10
+    assert plan_for_telling_places(view_of(np.eye(N_IMAGES)[50], bits)).action_m == 10
 
 
 def test_where_nobody_knows_what_is_telling_it_goes_far():
-    plan = TellingPlanner().plan(view_of(sharp(3)))
+    plan = plan_for_telling_places(view_of(sharp(3)))
     assert (plan.action_m, plan.values) == (10, None)
 
 
 def test_the_value_of_a_move_is_its_mean_bits_and_a_little_for_every_metre(bits):
     mass = np.random.default_rng(0).dirichlet(np.ones(N_IMAGES))
-    plan = TellingPlanner().plan(view_of(mass, bits))
+    plan = plan_for_telling_places(view_of(mass, bits))
     for action_m, value in zip(ACTIONS_M.astype(int).tolist(), plan.values.tolist(), strict=True):
         ahead = [bits[m + action_m] if m + action_m < N_IMAGES else bits.mean() for m in range(N_IMAGES)]
         doubt = -np.log2(sum(each**2 for each in mass)) / np.log2(N_IMAGES)
@@ -101,16 +101,16 @@ def test_two_places_in_mind_agree_on_what_suits_both(bits):
     bits[:] = 1
     bits[[54, 59]] = 4
     bits[[156, 159]] = 4
-    assert TellingPlanner().plan(view_of(sharp(50), bits)).action_m == 9
+    assert plan_for_telling_places(view_of(sharp(50), bits)).action_m == 9
     bits[[54, 156]] = 8
-    assert TellingPlanner().plan(view_of(sharp(50), bits)).action_m == 4
-    assert TellingPlanner().plan(view_of(0.5 * sharp(50) + 0.5 * sharp(150), bits)).action_m == 9
+    assert plan_for_telling_places(view_of(sharp(50), bits)).action_m == 4
+    assert plan_for_telling_places(view_of(0.5 * sharp(50) + 0.5 * sharp(150), bits)).action_m == 9
 
 
 def test_a_closed_route_goes_on_behind_its_end(bits):
     at_end = sharp(N_IMAGES - 3)
-    assert TellingPlanner().plan(view_of(at_end, bits, closed=True)).action_m == 3, "place 0 tells seven bits"
-    assert TellingPlanner().plan(view_of(at_end, bits)).action_m == 10
+    assert plan_for_telling_places(view_of(at_end, bits, closed=True)).action_m == 3, "place 0 tells seven bits"
+    assert plan_for_telling_places(view_of(at_end, bits)).action_m == 10
 
 
 # --- the paper's ---------------------------------------------------------------------------------------------------
@@ -120,7 +120,7 @@ def test_nnql_averages_the_rows_of_the_most_relevant_images():
     rng = np.random.default_rng(1)
     q_values = rng.random((N_IMAGES, 10)).astype(np.float32)
     relevance = rng.random(N_IMAGES).astype(np.float32)
-    plan = NnqlPlanner().plan(view_of(sharp(0), q_values=q_values, relevance=relevance))
+    plan = plan_by_experience(view_of(sharp(0), q_values=q_values, relevance=relevance))
     nearest = sorted(range(N_IMAGES), key=lambda m: -relevance[m])[:4]
     expected = [np.mean([q_values[m, a] for m in nearest]) for a in range(10)]
     np.testing.assert_allclose(plan.values, expected, rtol=1e-6)
@@ -130,44 +130,34 @@ def test_nnql_averages_the_rows_of_the_most_relevant_images():
 
 def test_nnql_knows_nothing_without_experience_or_a_view():
     relevance, q_values = np.ones(N_IMAGES, np.float32), np.ones((N_IMAGES, 10), np.float32)
-    assert NnqlPlanner().plan(view_of(relevance=relevance)) is None
-    assert NnqlPlanner().plan(view_of(q_values=q_values)) is None
+    assert plan_by_experience(view_of(relevance=relevance)) is None
+    assert plan_by_experience(view_of(q_values=q_values)) is None
 
 
 def test_the_same_move_always():
     for mass in (None, sharp(7)):
-        assert ConstantPlanner(4.0).plan(view_of(mass)).action_m == 4
+        assert plan_constantly(4.0, view_of(mass)).action_m == 4
 
 
 def test_random_moves_are_drawn_alike_from_the_seed_and_the_step():
-    planner = RandomPlanner()
-    moves = [planner.plan(view_of(seed=3, step=step)).action_m for step in range(2000)]
+    moves = [plan_at_random(view_of(seed=3, step=step)).action_m for step in range(2000)]
     counts = np.bincount(np.array(moves, int), minlength=11)[1:]
     assert counts.sum() == 2000
     assert abs(counts - 200).max() < 60
-    again = [planner.plan(view_of(seed=3, step=step)).action_m for step in range(2000)]
-    other = [planner.plan(view_of(seed=4, step=step)).action_m for step in range(2000)]
+    again = [plan_at_random(view_of(seed=3, step=step)).action_m for step in range(2000)]
+    other = [plan_at_random(view_of(seed=4, step=step)).action_m for step in range(2000)]
     assert again == moves != other
 
 
 # --- by name -------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("text", "planner"),
-    [
-        ("telling", TellingPlanner()),
-        ("nnql", NnqlPlanner()),
-        ("random", RandomPlanner()),
-        ("constant:10", ConstantPlanner(10.0)),
-        ("constant:2.5", ConstantPlanner(2.5)),
-    ],
-)
-def test_planners_by_name(text, planner):
-    assert parse_planner(text, (1.0, 2.5, 10.0)) == planner
-    assert planner.name == text
-    plan = planner.plan(view_of(q_values=np.ones((N_IMAGES, 10), np.float32), relevance=np.ones(N_IMAGES, np.float32)))
+@pytest.mark.parametrize("text", ["telling", "nnql", "random", "constant:10", "constant:2.5"])
+def test_planners_by_name(text):
+    ones = np.ones((N_IMAGES, 10), np.float32)
+    plan = parse_planner(text, (1.0, 2.5, 10.0))(view_of(q_values=ones, relevance=ones[:, 0]))
     assert plan.planner == text
+    assert text[:9] != "constant:" or plan.action_m == float(text[9:])
 
 
 def test_the_default_is_ours():
@@ -188,7 +178,7 @@ def test_no_such_planner_is_named_with_those_there_are(text):
 def test_a_domain_of_one_move_gets_that_move(text):
     ones = np.ones(N_IMAGES, np.float32)
     known = {"relevance": ones, "actions_m": ACTIONS_M[:1], "q_values": ones[:, np.newaxis]}
-    assert parse_planner(text, (1.0,)).plan(view_of(sharp(4), ones, **known)).action_m == 1
+    assert parse_planner(text, (1.0,))(view_of(sharp(4), ones, **known)).action_m == 1
 
 
 # --- which places are telling ---------------------------------------------------------------------------------------

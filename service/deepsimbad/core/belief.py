@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import Protocol, Self
+from typing import Self, TypeAlias
 
 import numpy as np
 from numba import njit
@@ -28,42 +28,6 @@ class FilterKind(StrEnum):
     PARTICLE = "particle"
 
 
-class BeliefFilter(Protocol):
-    """A belief over the route. Immutable: every call returns a new one, so a failed step leaves nothing half done."""
-
-    @property
-    def mass(self) -> NDArray[np.float64]:
-        """[n] mass of every map image; sums to 1."""
-        ...
-
-    def predicted(self, action_m: float, action_std_m: float, step: int) -> Self:
-        """The belief after a move.
-
-        Args:
-            action_m: Metres moved forward, at least 0.
-            action_std_m: Standard deviation of the move, at least 0.
-            step: Number of this step in the session; seeds whatever is random in it.
-
-        Raises:
-            PastTheEndError: No place of the belief has that much open route before it.
-        """
-        ...
-
-    def updated(self, relevance: NDArray[np.float32], rule: UpdateRule, step: int) -> Self:
-        """The belief after a view.
-
-        Args:
-            relevance: [n], larger is better.
-            rule: How it counts.
-            step: As in `predicted`.
-        """
-        ...
-
-    def arrays(self) -> dict[str, NDArray[np.float64]]:
-        """All state, to be stored and restored bit for bit."""
-        ...
-
-
 def motion_std_m(action_m: float) -> float:
     """Standard deviation of a move whose odometry says nothing of its own error.
 
@@ -77,7 +41,6 @@ class GridFilter:
     """Masses of the map images.
 
     Attributes:
-        route: Where the map images are.
         mass: [n] float64; sums to 1.
     """
 
@@ -108,7 +71,16 @@ class GridFilter:
         return {"mass": self.mass}
 
     def predicted(self, action_m: float, action_std_m: float, step: int) -> Self:  # noqa: ARG002 - nothing is random
-        """See `BeliefFilter.predicted`; what would be past the end of an open route is impossible and dropped."""
+        """The belief after a move; what would be past the end of an open route is impossible and dropped.
+
+        Args:
+            action_m: Metres moved forward, at least 0.
+            action_std_m: Standard deviation of the move, at least 0.
+            step: Number of this step in the session; seeds whatever is random in it.
+
+        Raises:
+            PastTheEndError: No place of the belief has that much open route before it.
+        """
         places = self.route.places
         at_places = np.asarray(np.bincount(places.of_image, self.mass, places.position_m.size), np.float64)
         length_m = self.route.length_m if self.route.closed else 0.0
@@ -132,7 +104,7 @@ class GridFilter:
         return type(self)(self.route, mass / mass.sum())
 
     def updated(self, relevance: NDArray[np.float32], rule: UpdateRule, step: int) -> Self:  # noqa: ARG002
-        """See `BeliefFilter.updated`."""
+        """The belief after a view of relevance [n]."""
         return type(self)(self.route, weigh(self.mass, evidence(relevance.astype(np.float64), rule), rule))
 
 
@@ -236,7 +208,6 @@ class ParticleFilter:
     """Particles. Whatever is random is drawn from (seed, step), so that no generator's state need be kept.
 
     Attributes:
-        route: Where the map images are.
         position_m: [m] float64, hypotheses of the route position.
         weight: [m] float64; sums to 1.
         seed: Of all draws.
@@ -278,12 +249,12 @@ class ParticleFilter:
 
     @property
     def mass(self) -> NDArray[np.float64]:
-        """See `BeliefFilter.mass`: every particle counts for the map image nearest to it."""
+        """[n] every particle counts for the map image nearest to it."""
         images = self.route.nearest_image(self.position_m)
         return np.asarray(np.bincount(images, self.weight, self.route.n_images), np.float64)
 
     def predicted(self, action_m: float, action_std_m: float, step: int) -> Self:
-        """See `BeliefFilter.predicted`; a particle that would be past the end of an open route dies."""
+        """As `GridFilter.predicted`; a particle that would be past the end of an open route dies."""
         rng = np.random.default_rng([self.seed, step, _MOVE])
         alive = self if self.route.closed or action_m == 0 else self._with_route_ahead(action_m, step)
         moved = alive.position_m + action_m + action_std_m * rng.standard_normal(alive.position_m.size)
@@ -303,7 +274,7 @@ class ParticleFilter:
         return replace(self, weight=weight / weight.sum())._resampled(step)
 
     def updated(self, relevance: NDArray[np.float32], rule: UpdateRule, step: int) -> Self:
-        """See `BeliefFilter.updated`; resamples when the effective sample size falls below half the particles."""
+        """As `GridFilter.updated`; resamples when the effective sample size falls below half the particles."""
         seen = evidence(relevance.astype(np.float64), rule)[self.route.nearest_image(self.position_m)]
         weighed = replace(self, weight=weigh(self.weight, seen, rule))
         effective = 1.0 / np.square(weighed.weight).sum()
@@ -323,3 +294,7 @@ def _onto(route: Route, position_m: NDArray[np.float64]) -> NDArray[np.float64]:
     if route.closed and route.length_m > 0:
         return route.wrapped(position_m)
     return np.clip(position_m, route.start_m, route.position_m[-1])
+
+
+BeliefFilter: TypeAlias = GridFilter | ParticleFilter
+"""A belief over the route. Immutable: every call returns a new one, so a failed step leaves nothing half done."""

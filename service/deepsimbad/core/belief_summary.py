@@ -44,10 +44,8 @@ def summarise(route: Route, mass: NDArray[np.float64], n_top: int, off_route: fl
     """Summarise masses over map images.
 
     Args:
-        route: Where the map images are.
         mass: [n], summing to 1.
         n_top: How many of the likeliest map images to list.
-        off_route: Given on.
     """
     top = shortlist(mass, n_top)
     mean_m, std_m = _moments(route, mass)

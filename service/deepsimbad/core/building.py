@@ -48,7 +48,6 @@ def build_map(
     Args:
         relevance: What the map is built for.
         drive: The training traverse, its dissimilarities measured.
-        list_length: h.
         closed: Whether the route is a loop.
         second_season: Read by `calibrated` alone.
 
@@ -191,7 +190,6 @@ def append_drive(map_: Map, drive: Drive) -> Map:
     place can teach stays. A new image knows of its place what the nearest old one does.
 
     Args:
-        map_: The map.
         drive: The new frames, their dissimilarities to its landmarks measured; along the same route, on a closed one
             any turn of it.
 

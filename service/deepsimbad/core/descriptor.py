@@ -44,7 +44,6 @@ def ranks_from_ranked_landmarks(landmark_ids: Sequence[int], n_landmarks: int) -
 
     Args:
         landmark_ids: Distinct ids from 0, nearest first, 1..r of them.
-        n_landmarks: r.
 
     Returns:
         [r] float32. Landmarks that were not sent share the mean of the ranks left; `n_ranked` tells them.
@@ -92,10 +91,6 @@ def pack_ranked_landmarks(landmark_ids: Sequence[int], n_landmarks: int) -> byte
 
 def unpack_ranked_landmarks(body: bytes, n_landmarks: int) -> tuple[int, ...]:
     """Back from `pack_ranked_landmarks`.
-
-    Args:
-        body: What was packed.
-        n_landmarks: r.
 
     Raises:
         InvalidRankedLandmarksError: The body is not what packing 1..r distinct ids below r gives.
@@ -174,7 +169,6 @@ def normal_scores(ranks: NDArray[np.float32], n_landmarks: int) -> NDArray[np.fl
 
     Args:
         ranks: Any shape; whole or half ranks in 1..r.
-        n_landmarks: r.
 
     Returns:
         float64 of the same shape, about standard normal over the landmarks of one image.

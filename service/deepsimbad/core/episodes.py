@@ -4,8 +4,9 @@ The robot stands on a test frame, looks, is told how far to move, and moves exac
 After each move the belief of the map image nearest to the truth is ranked by ANR's rule.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,12 +50,8 @@ class Episode:
     travelled_m: NDArray[np.float64]
 
 
-class Chooser(Protocol):
-    """Who commands the moves."""
-
-    def __call__(self, episode: int, state: LocalizerState, step: Step, position_m: float) -> float:
-        """The next move in metres; `position_m` is the truth, for those who may know it."""
-        ...
+Chooser: TypeAlias = Callable[[int, Step, float], float]
+"""Commands the next move in metres, of episode number, last step and true position (for those who may know it)."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +77,7 @@ class EpisodeRunner:
         step = self.localizer.step(self.localizer.start(), self.drive.views.at(start))
         moved_m = 0.0
         for number in range(self.n_steps):
-            action_m = choose(episode, step.state, step, position_m)
+            action_m = choose(episode, step, position_m)
             moved_m, position_m = moved_m + action_m, position_m + action_m
             step, shares[number] = self.observe(step.state, position_m, action_m)
             travelled[number] = moved_m
@@ -94,44 +91,27 @@ class EpisodeRunner:
         return step, rank_of_truth(mass, self.drive.true_image[[frame]]) / mass.size
 
 
-def follow_plan(episode: int, state: LocalizerState, step: Step, position_m: float) -> float:  # noqa: ARG001
+def follow_plan(episode: int, step: Step, position_m: float) -> float:  # noqa: ARG001
     """Do what the localizer's own planner recommends."""
     if step.plan is None:
         raise ValueError("the planner recommends nothing on this map")
     return step.plan.action_m
 
 
-@dataclass(frozen=True)
-class ConstantChooser:
-    """The same move always."""
+def random_chooser(actions_m: NDArray[np.float64], seed: int) -> Chooser:
+    """Any move alike, drawn from the seed, the episode's number and the step's."""
 
-    action_m: float
+    def choose(episode: int, step: Step, position_m: float) -> float:  # noqa: ARG001
+        return float(np.random.default_rng([seed, episode, step.state.n_observations]).choice(actions_m))
 
-    def __call__(self, episode: int, state: LocalizerState, step: Step, position_m: float) -> float:  # noqa: ARG002
-        """See `Chooser`."""
-        return self.action_m
+    return choose
 
 
-@dataclass(frozen=True)
-class RandomChooser:
-    """Any move alike, drawn from the seed and the episode's number."""
-
-    actions_m: NDArray[np.float64]
-    seed: int
-
-    def __call__(self, episode: int, state: LocalizerState, step: Step, position_m: float) -> float:  # noqa: ARG002
-        """See `Chooser`."""
-        return float(np.random.default_rng([self.seed, episode, state.n_observations]).choice(self.actions_m))
-
-
-@dataclass(frozen=True)
-class ClairvoyantChooser:
+def clairvoyant_chooser(runner: EpisodeRunner, actions_m: NDArray[np.float64]) -> Chooser:
     """Tries every move on the test traverse itself and takes the best: a bound no planner can know."""
 
-    runner: EpisodeRunner
-    actions_m: NDArray[np.float64]
+    def choose(episode: int, step: Step, position_m: float) -> float:  # noqa: ARG001
+        shares = [runner.observe(step.state, position_m + action_m, action_m)[1] for action_m in actions_m]
+        return float(actions_m[int(np.argmin(shares))])
 
-    def __call__(self, episode: int, state: LocalizerState, step: Step, position_m: float) -> float:  # noqa: ARG002
-        """See `Chooser`."""
-        shares = [self.runner.observe(state, position_m + action_m, action_m)[1] for action_m in self.actions_m]
-        return float(self.actions_m[int(np.argmin(shares))])
+    return choose

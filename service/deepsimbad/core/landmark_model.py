@@ -41,7 +41,6 @@ def select_landmarks(
     Args:
         candidates: [n, d] encodings of the landmark traverse.
         n_landmarks: r, 1..n.
-        on_progress: Called with the share done, 0..1; may raise to cancel.
 
     Returns:
         [r] int64 indices of candidates, best first, ties by index.
@@ -132,7 +131,6 @@ class PortableLandmarks:
 
     Attributes:
         model: The evaluator's named arrays.
-        n_landmarks: r.
         map_version: Of the map they come from.
         evaluator: The evaluator's configuration.
         weights_sha256: Of the weights that the map's images were encoded by; "" where nobody knows or there are none.

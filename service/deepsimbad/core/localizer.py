@@ -86,8 +86,6 @@ class ActiveLocalizer:
     """Localizes one robot on one map.
 
     Args:
-        map_: The map.
-        config: How.
         clock: Seconds, by which the stages of a step are timed.
 
     Raises:
@@ -114,7 +112,6 @@ class ActiveLocalizer:
 
         Args:
             state: Before it.
-            query: The described view.
             action_m: Metres moved since the last view; ignored for the first.
             action_std_m: How sure that is; None: as odometry usually is.
 
@@ -158,7 +155,7 @@ class ActiveLocalizer:
 
     def plan(self, state: LocalizerState) -> Plan | None:
         """The next best view from what is known now."""
-        return self._planner.plan(
+        return self._planner(
             PlanningView(self._map, state.belief.mass, state.relevance, self._config.seed, state.n_observations)
         )
 

@@ -74,30 +74,6 @@ class RetrievalScorer:
         )
 
 
-@dataclass(frozen=True)
-class Comparison:
-    """A paired difference.
-
-    Attributes:
-        difference: Mean of first - second.
-        interval: Its 95 % bootstrap interval.
-    """
-
-    difference: float
-    interval: tuple[float, float]
-
-    @property
-    def excludes_zero(self) -> bool:
-        """Whether one is better than the other by more than chance."""
-        return not self.interval[0] <= 0 <= self.interval[1]
-
-
-def compare(first: NDArray[np.float64], second: NDArray[np.float64], seed: int) -> Comparison:
-    """Compare two scores [n] of the same starts."""
-    difference = first - second
-    return Comparison(float(difference.mean()), mean_interval(difference, seed))
-
-
 def mean_interval(values: NDArray[np.float64], seed: int) -> tuple[float, float]:
     """95 % bootstrap interval of the mean of [n] values."""
     rng = np.random.default_rng([seed, values.size])

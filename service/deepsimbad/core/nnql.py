@@ -177,11 +177,6 @@ def transitions_of(map_: Map, walk: KnownWalk, config: NnqlConfig) -> Transition
 
     A move counts for the domain's action nearest to it, if that is nearer than half the step between two actions (of
     one action alone, than half of it). Other moves, and those to an unknown place, teach nothing.
-
-    Args:
-        map_: The map.
-        walk: What happened.
-        config: The hyperparameters.
     """
     moves, route = map_.actions_m, map_.route
     reach_m = np.diff(moves).min() / 2 if moves.size > 1 else moves[0] / 2

@@ -177,7 +177,6 @@ def pack_index(lists: NDArray[np.uint16], n_landmarks: int) -> Iterator[tuple[in
 
     Args:
         lists: [h, n] uint16; row j holds every map image's landmark of rank j + 1.
-        n_landmarks: r.
 
     Yields:
         (landmark from 0, rank from 1, blob), in that order of keys; empty posting lists are left out.

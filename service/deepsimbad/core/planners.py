@@ -1,8 +1,9 @@
 """Which move would tell the robot most (II-D, and ours): what places are telling, and the planners."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from functools import partial
+from typing import TypeAlias
 
 import numpy as np
 from numba import njit
@@ -27,15 +28,7 @@ _BITS_PER_METRE = 0.12  # what a longer move is worth for being less like the vi
 
 @dataclass(frozen=True)
 class PlanningView:
-    """All a planner may look at.
-
-    Attributes:
-        map: The map.
-        mass: [n] belief.
-        relevance: [n] of the last view; None before any.
-        seed: What random choices are drawn from, together with `step`.
-        step: Number of the last observation.
-    """
+    """All a planner may look at: map, belief [n], relevance [n] of the last view, and what draws depend on."""
 
     map: Map
     mass: NDArray[np.float64]
@@ -59,83 +52,44 @@ class Plan:
     values: NDArray[np.float64] | None = None
 
 
-class Planner(Protocol):
-    """Chooses the next move."""
-
-    @property
-    def name(self) -> str:
-        """As it is asked for."""
-        ...
-
-    def plan(self, view: PlanningView) -> Plan | None:
-        """Recommend a move; None where the planner has nothing to go by."""
-        ...
+Planner: TypeAlias = Callable[[PlanningView], Plan | None]
+"""Recommends a move; None where it has nothing to go by."""
 
 
-@dataclass(frozen=True)
-class ConstantPlanner:
+def plan_constantly(action_m: float, view: PlanningView) -> Plan:  # noqa: ARG001 - that is the point of it
     """The same move always (the paper's a[m])."""
-
-    action_m: float
-
-    @property
-    def name(self) -> str:
-        """`constant:<m>`."""
-        return f"{CONSTANT}:{self.action_m:g}"
-
-    def plan(self, view: PlanningView) -> Plan:  # noqa: ARG002 - that is the point of it
-        """See `Planner.plan`."""
-        return Plan(self.name, self.action_m)
+    return Plan(f"{CONSTANT}:{action_m:g}", action_m)
 
 
-@dataclass(frozen=True)
-class RandomPlanner:
+def plan_at_random(view: PlanningView) -> Plan:
     """Any move alike (the paper's baseline)."""
-
-    name: str = RANDOM
-
-    def plan(self, view: PlanningView) -> Plan:
-        """See `Planner.plan`."""
-        drawn = np.random.default_rng([view.seed, view.step]).choice(view.map.actions_m)
-        return Plan(self.name, float(drawn))
+    return Plan(RANDOM, float(np.random.default_rng([view.seed, view.step]).choice(view.map.actions_m)))
 
 
-@dataclass(frozen=True)
-class NnqlPlanner:
+def plan_by_experience(view: PlanningView) -> Plan | None:
     """The paper's: Q-values of the k map images most relevant to the last view, averaged (II-D)."""
-
-    n_neighbours: int = NNQL_NEIGHBOURS
-    name: str = NNQL
-
-    def plan(self, view: PlanningView) -> Plan | None:
-        """See `Planner.plan`; needs a view and an experience database."""
-        if view.map.q_values is None or view.relevance is None:
-            return None
-        nearest = shortlist(view.relevance, self.n_neighbours)
-        values = _mean_rows(view.map.q_values, nearest)
-        return Plan(self.name, float(view.map.actions_m[np.argmax(values)]), values)
+    if view.map.q_values is None or view.relevance is None:
+        return None
+    values = _mean_rows(view.map.q_values, shortlist(view.relevance, NNQL_NEIGHBOURS))
+    return Plan(NNQL, float(view.map.actions_m[np.argmax(values)]), values)
 
 
-@dataclass(frozen=True)
-class TellingPlanner:
-    """Ours: looks ahead over the map, under the whole belief.
+def plan_for_telling_places(view: PlanningView) -> Plan:
+    """Ours: looks ahead over the map, under the whole belief; where nobody knows what is telling, the longest move.
 
     The value of a move is the number of bits that views from where it leads are known to be worth, averaged over the
     belief, less the less doubt there is left for them to remove, and a little for every metre. While the belief is
     flat that average is much the same everywhere, so the robot moves on as far as it can; once it has a few places in
     mind it seeks the telling ones before them; once it is sure it moves on, to views that are unlike the last.
     """
+    actions_m, bits_ahead = view.map.actions_m, view.map.bits_ahead
+    if bits_ahead is None:
+        return Plan(TELLING, float(actions_m[-1]))
+    values = _BITS_PER_METRE * actions_m + np.sqrt(_doubt(view.mass)) * _averaged(view.mass, bits_ahead)
+    return Plan(TELLING, float(actions_m[np.argmax(values)]), values)
 
-    bits_per_metre: float = _BITS_PER_METRE
-    name: str = TELLING
 
-    def plan(self, view: PlanningView) -> Plan:
-        """See `Planner.plan`; where nobody knows what is telling, the longest move."""
-        if view.map.bits_ahead is None:
-            return Plan(self.name, float(view.map.actions_m[-1]))
-        worth = np.sqrt(_doubt(view.mass)) * _averaged(view.mass, view.map.bits_ahead)
-        values = self.bits_per_metre * view.map.actions_m + worth
-        return Plan(self.name, float(view.map.actions_m[np.argmax(values)]), values)
+_PLANNERS: dict[str, Planner] = {TELLING: plan_for_telling_places, NNQL: plan_by_experience, RANDOM: plan_at_random}
 
 
 def _doubt(mass: NDArray[np.float64]) -> float:
@@ -170,16 +124,10 @@ def parse_planner(text: str, actions_m: Sequence[float]) -> Planner:
     Raises:
         InvalidInputError: No such planner, or a constant move the domain does not have.
     """
-    named: dict[str, Planner] = {TELLING: TellingPlanner(), NNQL: NnqlPlanner(), RANDOM: RandomPlanner()}
-    if text in named:
-        return named[text]
-    kind, _, metres = text.partition(":")
-    allowed = [*named, *(ConstantPlanner(action_m).name for action_m in actions_m)]
-    if kind == CONSTANT:
-        for action_m in actions_m:
-            if metres == f"{action_m:g}":
-                return ConstantPlanner(action_m)
-    raise InvalidInputError(f"{text!r} is no planner of this domain", allowed=allowed)
+    planners = _PLANNERS | {f"{CONSTANT}:{action_m:g}": partial(plan_constantly, action_m) for action_m in actions_m}
+    if text not in planners:
+        raise InvalidInputError(f"{text!r} is no planner of this domain", allowed=list(planners))
+    return planners[text]
 
 
 def telling_bits(map_: Map, second: SecondSeason) -> NDArray[np.float32]:

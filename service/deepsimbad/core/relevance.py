@@ -115,7 +115,6 @@ def weigh(weights: NDArray[np.float64], seen: NDArray[np.float64], rule: UpdateR
     Args:
         weights: [m], summing to 1.
         seen: [m], the evidence at every hypothesis.
-        rule: How to combine them.
     """
     weighed = weights * seen if rule is UpdateRule.LOG_LIKELIHOOD else weights * weights.size + seen
     total = weighed.sum()

@@ -23,7 +23,6 @@ def relevances(map_: Map, query: Query, live: LandmarkStatistics | None = None) 
     """Relevance of every map image.
 
     Args:
-        map_: The map.
         query: The described view, or a batch of views.
         live: A session's own statistics, in place of the map's; of a batch [e, r].
 
@@ -123,7 +122,6 @@ def sum_listed(map_: Map, tables: NDArray[np.number]) -> NDArray[np.float32]:
     every posting takes part in every query, so memory holds the same postings sorted by map image.
 
     Args:
-        map_: The map.
         tables: [h, r], what landmark i is worth at rank j + 1; of a batch of views [e, h, r].
 
     Returns:

@@ -56,7 +56,6 @@ class TrainingWorld:
         """A world of one drive.
 
         Args:
-            map_: The map.
             views: The drive's frames.
             live_route: Where they are, along the drive itself.
             true_image: As the attribute.
@@ -212,9 +211,6 @@ def train(
     The result depends on the seed alone, not on how many threads the pool has.
 
     Args:
-        world: Where the episodes run.
-        config: The hyperparameters.
-        on_progress: Called with the share done; may raise to cancel.
         pool: Takes half of every batch in a thread of its own.
 
     Returns:
@@ -250,7 +246,6 @@ def walk_greedily(
     """Rank of the truth's belief after every move of episodes that follow the Q-values without exploration.
 
     Args:
-        world: Where the episodes run.
         starts: [e] frames.
         q_values: [n, a]; where all are alike the moves are random.
         config: For the length of an episode, and the seed by which ties are broken.

@@ -27,9 +27,6 @@ def choose_landmarks(
 
     Args:
         candidates: [m, d] encodings.
-        n_landmarks: r.
-        evaluator: Fits the model.
-        on_progress: Called with the share done; may raise to cancel.
     """
     return evaluator.fit_landmarks(candidates[select_landmarks(candidates, n_landmarks, on_progress)])
 
@@ -37,14 +34,7 @@ def choose_landmarks(
 def measured(
     drive: Drive, evaluator: Evaluator, model: LandmarkModel, on_progress: Callable[[float], None] = lambda _: None
 ) -> Drive:
-    """The drive with its frames' dissimilarities to the landmarks, measured block by block.
-
-    Args:
-        drive: The frames.
-        evaluator: Measures them.
-        model: The landmarks.
-        on_progress: Called with the share done; may raise to cancel.
-    """
+    """The drive with its frames' dissimilarities to the landmarks, measured block by block."""
     blocks = []
     for start in range(0, drive.n_frames, _FRAMES_A_BLOCK):
         blocks.append(evaluator.dissimilarities(drive.encodings[start : start + _FRAMES_A_BLOCK], model))
@@ -94,13 +84,9 @@ def build(
         training: The traverse that becomes the map.
         second: Another drive, of the same route or not.
         same_route: Whether its positions are said to be comparable; None: where both drives know x, y.
-        evaluator: Measures dissimilarities.
-        model: The landmarks.
         relevance: What the map is built for; only `calibrated` learns from a second season.
-        list_length: h.
         actions_m: The moves.
         closed: Whether the route is a loop.
-        on_progress: Called with the share done; may raise to cancel.
     """
     own = measured(training, evaluator, model, lambda share: on_progress(share if second is None else share / 2))
     season = verdict = other = None

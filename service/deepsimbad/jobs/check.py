@@ -111,14 +111,11 @@ def check_map(
     map serves, or a damaged one, there is nothing to lose and the gate passes. `why` says which it was.
 
     Args:
-        catalog: Of the data directory.
         domain: Whose map is checked.
         new: The new map.
         traverses: What it is made of, by the names of this server.
         frames: On what.
         gate_margin: Percentage points of ANR the new map may be worse; None: no gate.
-        evaluator: The domain's.
-        on_progress: Called with the share done; may raise to cancel.
 
     Returns:
         `metrics["check"]` of a map, JSON-ready.
@@ -210,11 +207,7 @@ def _normalised_ranks(
     """[q] share of the map's images before the true one, 0..1; NaN where the map holds no true image.
 
     Args:
-        map_: The map.
-        frames: What is asked.
         left_out: Images that count as not in the map.
-        evaluator: Measures dissimilarities.
-        on_progress: Called with the share done.
     """
     views = views_of(measured(frames.drive.at(frames.chosen), evaluator, map_.landmark_model))
     is_kept = np.ones(map_.n_images, np.bool_)

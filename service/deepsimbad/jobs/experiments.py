@@ -18,17 +18,16 @@ from deepsimbad.core.building import build_map
 from deepsimbad.core.drive import Drive, SameRoute, second_season
 from deepsimbad.core.episodes import (
     Chooser,
-    ClairvoyantChooser,
-    ConstantChooser,
     Episode,
     EpisodeRunner,
-    RandomChooser,
     TestDrive,
+    clairvoyant_chooser,
     follow_plan,
+    random_chooser,
 )
 from deepsimbad.core.localizer import ActiveLocalizer, LocalizerConfig
 from deepsimbad.core.map import Map
-from deepsimbad.core.metrics import Comparison, RetrievalScorer, RetrievalScores, compare, mean_interval
+from deepsimbad.core.metrics import RetrievalScorer, RetrievalScores, mean_interval
 from deepsimbad.core.nnql import NnqlConfig
 from deepsimbad.core.planners import CONSTANT, DEFAULT_PLANNER, NNQL, RANDOM
 from deepsimbad.core.relevance import DEFAULT_RELEVANCE, DEFAULT_UPDATE, Query, Relevance, UpdateRule
@@ -57,8 +56,6 @@ class VprConfig:
     """What is compared, and how it is scored.
 
     Attributes:
-        n_landmarks: r.
-        list_length: h.
         tolerance_m: How far from the query a map image may be and still be true.
         relevances: Which to compare, in the order of the report.
         seed: Kept with the result; nothing here is random.
@@ -142,7 +139,6 @@ def run_vpr(
         training: The mapped traverse.
         test: The queries, in the order they were driven.
         true_images: For every test frame the map images that count as true.
-        progress: Reports; stages of `vpr_stages`.
     """
     seconds: dict[str, float] = {}
     started = time.perf_counter()
@@ -268,17 +264,9 @@ class NbvReport:
         """The constant move that did best, known only afterwards."""
         return min((name for name in self.ours if name.startswith(CONSTANT)), key=lambda name: self.ours[name].mean())
 
-    def comparisons(self) -> dict[str, Comparison]:
-        """The default planner against random and the best constant move, episode by episode."""
-        default = self.ours[DEFAULT_PLANNER].mean(axis=1)
-        return {
-            rival: compare(default, self.ours[rival].mean(axis=1), self.config.seed)
-            for rival in (RANDOM, self.best_constant)
-        }
-
     def as_dict(self, sources: dict[str, Any]) -> dict[str, Any]:
         """The stable flat JSON document of design section 7; percent."""
-        seed = self.config.seed
+        seed, default = self.config.seed, _means(self.ours, DEFAULT_PLANNER)
         return {
             "anr": {name: _percent(shares) for name, shares in self.ours.items()},
             "default": DEFAULT_PLANNER,
@@ -288,8 +276,10 @@ class NbvReport:
                 for name, shares in self.ours.items()
             },
             "difference_95": {
-                f"{DEFAULT_PLANNER} - {rival}": [100 * end for end in comparison.interval]
-                for rival, comparison in self.comparisons().items()
+                f"{DEFAULT_PLANNER} - {rival}": [
+                    100 * end for end in mean_interval(default - _means(self.ours, rival), seed)
+                ]
+                for rival in (RANDOM, self.best_constant)
             },
             "best_constant": self.best_constant,
             "anr_by_step": {name: (100 * shares.mean(axis=0)).tolist() for name, shares in self.ours.items()},
@@ -409,12 +399,13 @@ def _planner(name: str, config: NbvConfig) -> str:
 def _chooser(name: str, runner: EpisodeRunner, config: NbvConfig) -> Chooser:
     actions_m = np.array(config.actions_m)
     if name == RANDOM:
-        return RandomChooser(actions_m, config.seed)
+        return random_chooser(actions_m, config.seed)
     if name == CLAIRVOYANT:
-        return ClairvoyantChooser(runner, actions_m)
+        return clairvoyant_chooser(runner, actions_m)
     if name in {NNQL, DEFAULT_PLANNER}:
         return follow_plan
-    return ConstantChooser(float(name.removeprefix(f"{CONSTANT}_")))
+    action_m = float(name.removeprefix(f"{CONSTANT}_"))
+    return lambda *_: action_m
 
 
 def _episodes(
@@ -449,6 +440,11 @@ def _nearest_images(test: Drive, training: Drive) -> NDArray[np.int64]:
 
 def _stack(episodes: Sequence[Episode]) -> NDArray[np.float64]:
     return np.stack([episode.rank_share for episode in episodes])
+
+
+def _means(shares: dict[str, NDArray[np.float64]], name: str) -> NDArray[np.float64]:
+    """[episodes] mean over a planner's steps."""
+    return np.asarray(shares[name].mean(axis=1))
 
 
 def _percent(shares: NDArray[np.float64]) -> float:

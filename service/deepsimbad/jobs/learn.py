@@ -73,7 +73,6 @@ def keep_true_positions(
 
     Args:
         store: The sessions.
-        catalog: Of the data directory.
         domain: Which the session must be of.
         session_id: The session.
         positions_m: One for every observation; None where it is unknown.
@@ -169,7 +168,6 @@ def with_experience(map_: Map, walks: Sequence[KnownWalk], config: NnqlConfig) -
     Args:
         map_: The map; one that never learnt starts from nothing.
         walks: Sessions whose true positions are known, in the order they are learnt.
-        config: The hyperparameters.
     """
     if map_.q_values is None:
         q_values = initial_q_values(map_.n_images, map_.actions_m.size, config)
@@ -194,7 +192,6 @@ def learn_online(
     """Seal and activate the next map version: the active one with a better experience database.
 
     Args:
-        catalog: Of the data directory.
         domain: Whose active map learns.
         walks: Sessions on it whose true positions are known.
         progress: Reports the stages of LEARN_STAGES; may cancel.

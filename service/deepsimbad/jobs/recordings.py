@@ -53,10 +53,7 @@ def encode_recording(
     """Encode a recording's images one by one, or take its ready encodings.
 
     Args:
-        recording: What was driven.
-        evaluator: Encodes the images.
         max_pixels: Limit on an image.
-        on_progress: Called with the share done; may raise to cancel.
 
     Raises:
         InvalidSourceError: No frame can be used.

@@ -51,12 +51,8 @@ def remap(
     `metrics.check.why` says so.
 
     Args:
-        catalog: Of the data directory.
         domain: Whose traverses are mapped.
-        config: What is asked for.
-        evaluator: The domain's.
         progress: Reports the stages of REMAP_STAGES; may cancel.
-        n_threads: Threads to compute in.
         job_id: The job that this is: one that was interrupted after it sealed its version makes no other. None: none.
 
     Returns:

@@ -26,7 +26,6 @@ class RemapConfig:
             retraining).
         n_landmarks: r; None means 500 or, of a shorter landmark traverse, every frame; and as many as the active map
             has where its landmarks stay.
-        list_length: h.
         relevance: What the map is built for.
         training_episodes: Of the experience database that NNQL plans by; 0: the map has none.
         seed: Of everything random in the remap.

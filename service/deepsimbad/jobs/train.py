@@ -43,8 +43,6 @@ def train_nnql(
         own: Gives the map's own traverse, measured; asked only where there is no second drive.
         second: Another drive of the same route, measured; None where there is none, or none was found to be.
         config: The hyperparameters; small maps take fewer episodes than it says.
-        on_progress: Called with the share done; may raise to cancel.
-        n_threads: Threads to compute in.
 
     Returns:
         Q-values [n, a] float32; and the learning curve and what it was learnt on, JSON-ready.
