@@ -49,7 +49,7 @@ def test_a_landmark_by_itself_is_a_normal_variable_beyond_the_last_sent(n_sent):
             least = (last - statistics.mean[landmark]) / statistics.std[landmark]
             z, variance = moments_beyond(0.0, 1.0, least)
         assert view.z[landmark] == pytest.approx(z, abs=2e-4)
-        assert view.known[landmark] == pytest.approx(1 - variance, abs=2e-4)
+        assert view.certainty[landmark] == pytest.approx(1 - variance, abs=2e-4)
 
 
 def test_landmarks_go_together_as_a_common_factor_says():
@@ -81,7 +81,7 @@ def test_landmarks_go_together_as_a_common_factor_says():
         further, _ = moments_beyond(expected + step, std, last[landmark])
         follows = (further - mean) / step * loadings[landmark, 0]
         assert view.z[landmark] == pytest.approx(mean, abs=2e-3)
-        assert view.known[landmark] == pytest.approx(1 - variance - follows**2 / -curvature, abs=5e-3)
+        assert view.certainty[landmark] == pytest.approx(1 - variance - follows**2 / -curvature, abs=5e-3)
 
 
 def test_what_is_unusually_near_brings_its_likes_nearer():
@@ -89,7 +89,7 @@ def test_what_is_unusually_near_brings_its_likes_nearer():
     alone, together = statistics_of(6), statistics_of(6, loadings=loadings)
     ranks = ranks_from_ranked_landmarks([0], 6)
     assert together.view(ranks).z[1] < alone.view(ranks).z[1]
-    assert together.view(ranks).known[1] > alone.view(ranks).known[1]
+    assert together.view(ranks).certainty[1] > alone.view(ranks).certainty[1]
     assert together.view(ranks).z[2:] == pytest.approx(alone.view(ranks).z[2:])
 
 
@@ -97,12 +97,12 @@ def test_all_ranks_are_known_or_none():
     statistics = statistics_of(7)
     everything = ranks_from_ranked_landmarks([3, 1, 0, 6, 5, 2, 4], 7)
     assert (statistics.view(everything).z == statistics.standardise(everything)).all()
-    assert (statistics.view(everything).known == 1).all()
+    assert (statistics.view(everything).certainty == 1).all()
     but_the_last = statistics.view(ranks_from_ranked_landmarks([3, 1, 0, 6, 5, 2], 7))
     assert (but_the_last.z == statistics.standardise(everything)).all()
     nothing = Query.uninformative(7).ranks
     assert (statistics.view(nothing).z == 0).all()
-    assert (statistics.view(nothing).known == 0).all()
+    assert (statistics.view(nothing).certainty == 0).all()
     unmoved = statistics.observing(nothing)
     assert unmoved.mean == pytest.approx(statistics.mean)
     assert unmoved.square == pytest.approx(statistics.square)
@@ -114,7 +114,7 @@ def test_running_statistics_take_the_expected_moments():
     view, after = statistics.view(ranks), statistics.observing(ranks)
     for landmark in range(9):
         score = statistics.mean[landmark] + statistics.std[landmark] * view.z[landmark]
-        square = score**2 + statistics.std[landmark] ** 2 * (1 - view.known[landmark])
+        square = score**2 + statistics.std[landmark] ** 2 * (1 - view.certainty[landmark])
         assert after.mean[landmark] == pytest.approx((4 * statistics.mean[landmark] + score) / 5)
         assert after.square[landmark] == pytest.approx((4 * statistics.square[landmark] + square) / 5)
 
@@ -138,7 +138,7 @@ def test_far_beyond_what_is_usual_numbers_stay_numbers():
         usual = LandmarkStatistics.from_mean_std(np.full(5, far), np.full(5, 0.9))
         view = usual.view(ranks_from_ranked_landmarks([2], 5))
         assert np.isfinite(view.z).all()
-        assert ((view.known >= 0) & (view.known <= 1)).all()
+        assert ((view.certainty >= 0) & (view.certainty <= 1)).all()
 
 
 def test_factors_give_the_correlations_of_the_drive():

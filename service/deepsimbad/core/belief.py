@@ -98,9 +98,9 @@ class GridFilter:
         if action_m > 0:  # which of a stop's images comes next is open again
             mass = spread[places.of_image] / places.n_images[places.of_image]
         else:
-            kept = np.where(at_places > 0, spread / np.where(at_places > 0, at_places, 1.0), 0.0)
+            stayed = np.where(at_places > 0, spread / np.where(at_places > 0, at_places, 1.0), 0.0)
             fresh = np.where(at_places > 0, 0.0, spread / places.n_images)
-            mass = self.mass * kept[places.of_image] + fresh[places.of_image]
+            mass = self.mass * stayed[places.of_image] + fresh[places.of_image]
         return type(self)(self.route, mass / mass.sum())
 
     def updated(self, relevance: NDArray[np.float32], rule: UpdateRule, step: int) -> Self:  # noqa: ARG002

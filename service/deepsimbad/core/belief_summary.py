@@ -41,12 +41,7 @@ class BeliefSummary:
 
 
 def summarise(route: Route, mass: NDArray[np.float64], n_top: int, off_route: float | None = None) -> BeliefSummary:
-    """Summarise masses over map images.
-
-    Args:
-        mass: [n], summing to 1.
-        n_top: How many of the likeliest map images to list.
-    """
+    """Summarise masses over map images, [n], which sum to 1; `n_top` of the likeliest are listed."""
     top = shortlist(mass, n_top)
     mean_m, std_m = _moments(route, mass)
     edges_m, bins = route.histogram(HISTOGRAM_BINS)

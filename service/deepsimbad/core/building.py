@@ -15,7 +15,7 @@ that list the landmark at that rank stands for it (`Map.listed_score`).
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -95,21 +95,19 @@ def _described(
     if relevance is Relevance.STANDARDISED:
         statistics = np.stack([own.mean, own.std])
         return {"lists": nearest_landmarks(scores, list_length), "statistics": statistics, "loadings": own.loadings}
-    known_seasons = [own]
-    seasons = SeasonsOfRoute.learn(scores)
+    seasons, correlation = [own], np.full(len(own.mean), DEFAULT_CORRELATION)
     if second is not None:
         other_ranks = rank_landmarks(second.dissimilarities)
-        other = LandmarkStatistics.of_map(other_ranks)
-        seasons = SeasonsOfRoute.learn(scores, other.standardise(other_ranks), second.places)
-        known_seasons.append(other)
-    lists = nearest_landmarks(seasons.scores, list_length)
-    prior = live_prior(known_seasons)
+        seasons.append(LandmarkStatistics.of_map(other_ranks))
+        scores, correlation = both_seasons(scores, seasons[1].standardise(other_ranks), second.places)
+    lists = nearest_landmarks(scores, list_length)
+    prior = live_prior(seasons)
     return {
         "lists": lists,
         "statistics": np.stack([prior.mean, prior.std]),
         "loadings": prior.loadings,
-        "correlation": seasons.correlation,
-        "listed_score": seasons.listed_scores(lists),
+        "correlation": correlation,
+        "listed_score": _listed_scores(scores, lists),
     }
 
 
@@ -118,54 +116,40 @@ def _listed(dissimilarities: NDArray[np.float32], lists: NDArray[np.uint16]) -> 
     return np.ascontiguousarray(np.take_along_axis(dissimilarities, lists.T.astype(np.intp), axis=1).T, np.float32)
 
 
-@dataclass(frozen=True)
-class SeasonsOfRoute:
-    """The standardised scores of the map images over the seasons that are known.
+def both_seasons(
+    own: NDArray[np.float64], second: NDArray[np.float64], places: NDArray[np.int64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The standardised scores of the map images over two seasons, and how these go with a season not yet seen.
 
-    Attributes:
-        scores: [n, r] float64, of both seasons where both are known, else of the map's own; about standard normal.
-        correlation: [r] float64, of these scores with a season not yet seen.
+    Args:
+        own: [n, r] scores of the map images by the map's own statistics.
+        second: [m, r] scores of the landmark traverse's frames by theirs.
+        places: [k, 2] (map image, frame) of the same place, k at least 1.
+
+    Returns:
+        Scores [n, r], about standard normal; correlations [r].
     """
+    of_map, of_second = places.T
+    between = np.einsum("kr,kr->r", own[of_map], second[of_second]) / len(places)
+    between = np.clip(between, *_BOUNDS)
+    weight = SECOND_SEASON_WEIGHT
+    spread = np.sqrt(1 + weight**2 + 2 * weight * between)
+    scores = own.copy()
+    scores[of_map] = (own[of_map] + weight * second[of_second]) / spread
+    # Of a weighted mean of two equally related measurements with a third (Spearman and Brown).
+    return scores, np.clip(between * (1 + weight) / spread, *_BOUNDS)
 
-    scores: NDArray[np.float64]
-    correlation: NDArray[np.float64]
 
-    @classmethod
-    def learn(
-        cls,
-        own: NDArray[np.float64],
-        second: NDArray[np.float64] | None = None,
-        places: NDArray[np.int64] | None = None,
-    ) -> "SeasonsOfRoute":
-        """Combine the seasons.
-
-        Args:
-            own: [n, r] scores of the map images by the map's own statistics.
-            second: [m, r] scores of the landmark traverse's frames by theirs.
-            places: [k, 2] (map image, frame) of the same place, k at least 1; given with `second`.
-        """
-        if second is None or places is None:
-            return cls(own, np.full(own.shape[1], DEFAULT_CORRELATION))
-        of_map, of_second = places.T
-        between = np.einsum("kr,kr->r", own[of_map], second[of_second]) / len(places)
-        between = np.clip(between, *_BOUNDS)
-        weight = SECOND_SEASON_WEIGHT
-        spread = np.sqrt(1 + weight**2 + 2 * weight * between)
-        scores = own.copy()
-        scores[of_map] = (own[of_map] + weight * second[of_second]) / spread
-        # Of a weighted mean of two equally related measurements with a third (Spearman and Brown).
-        return cls(scores, np.clip(between * (1 + weight) / spread, *_BOUNDS))
-
-    def listed_scores(self, lists: NDArray[np.uint16]) -> NDArray[np.float64]:
-        """[h, r] mean score of a landmark where an image of these lists [h, n] has it at a rank."""
-        n_landmarks = self.scores.shape[1]
-        images = np.arange(lists.shape[1])
-        means = np.empty((len(lists), n_landmarks))
-        for rank, row in enumerate(lists):
-            listed = self.scores[images, row]
-            total = np.bincount(row, listed, n_landmarks) + _PSEUDO_IMAGES * listed.mean()
-            means[rank] = total / (np.bincount(row, minlength=n_landmarks) + _PSEUDO_IMAGES)
-        return means
+def _listed_scores(scores: NDArray[np.float64], lists: NDArray[np.uint16]) -> NDArray[np.float64]:
+    """[h, r] mean score [n, r] of a landmark where an image of these lists [h, n] has it at a rank."""
+    n_landmarks = scores.shape[1]
+    images = np.arange(lists.shape[1])
+    means = np.empty((len(lists), n_landmarks))
+    for rank, row in enumerate(lists):
+        listed = scores[images, row]
+        total = np.bincount(row, listed, n_landmarks) + _PSEUDO_IMAGES * listed.mean()
+        means[rank] = total / (np.bincount(row, minlength=n_landmarks) + _PSEUDO_IMAGES)
+    return means
 
 
 def live_prior(seasons: Sequence[LandmarkStatistics]) -> LandmarkStatistics:

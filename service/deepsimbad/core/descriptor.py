@@ -13,13 +13,7 @@ MAX_LANDMARKS = 0xFFFF  # landmark ids are uint16 and the last value means "none
 
 
 def rank_landmarks(dissimilarities: ArrayLike) -> NDArray[np.float32]:
-    """Rank landmarks by ascending dissimilarity, ties by landmark id.
-
-    Args:
-        dissimilarities: [r] or [n, r], smaller is nearer, finite.
-
-    Returns:
-        Ranks of the same shape, float32, 1..r; `ranks[..., i]` is the rank of landmark i.
+    """Ranks 1..r by ascending dissimilarity, [r] or [n, r] as given, float32; ties by landmark id.
 
     Raises:
         InvalidDissimilaritiesError: Not one or two dimensions, no landmarks, or NaN or infinity somewhere.
@@ -40,13 +34,9 @@ def rank_landmarks(dissimilarities: ArrayLike) -> NDArray[np.float32]:
 
 
 def ranks_from_ranked_landmarks(landmark_ids: Sequence[int], n_landmarks: int) -> NDArray[np.float32]:
-    """Ranks of all landmarks from the nearest ones that a robot sent.
+    """[r] ranks of all landmarks from the ids that a robot sent, nearest first, 1..r of them.
 
-    Args:
-        landmark_ids: Distinct ids from 0, nearest first, 1..r of them.
-
-    Returns:
-        [r] float32. Landmarks that were not sent share the mean of the ranks left; `n_ranked` tells them.
+    Landmarks that were not sent share the mean of the ranks left; `n_ranked` tells them.
 
     Raises:
         InvalidRankedLandmarksError: None, too many, out of range or listed twice.
@@ -59,13 +49,9 @@ def ranks_from_ranked_landmarks(landmark_ids: Sequence[int], n_landmarks: int) -
 
 
 def n_ranked(ranks: NDArray[np.float32]) -> int:
-    """How many landmarks a view has a rank of its own for: the nearest m, while all others share the mean rank left.
+    """How many landmarks a view [r] has a rank of its own for: the nearest m, the others share the mean rank left.
 
-    Args:
-        ranks: [r], of dissimilarities or of ranked landmarks.
-
-    Returns:
-        m; r where all ranks are known, 0 for a view that shows nothing.
+    r where all ranks are known, 0 for a view that shows nothing.
     """
     last = float(ranks.max())
     return ranks.size if last == ranks.size else round(2 * last) - 1 - ranks.size
@@ -75,10 +61,6 @@ def pack_ranked_landmarks(landmark_ids: Sequence[int], n_landmarks: int) -> byte
     """The nearest landmarks in the fewest bytes: m in two, big-endian, then m ids, nearest first.
 
     An id takes ceil(log2 r) bits, most significant first; the last byte is filled up with zeros.
-
-    Args:
-        landmark_ids: Distinct ids from 0, nearest first, 1..r of them.
-        n_landmarks: r, at most 65,535.
 
     Raises:
         InvalidRankedLandmarksError: None, too many, out of range or listed twice.
@@ -151,28 +133,13 @@ def _wrong_number(n_sent: int, n_landmarks: int) -> InvalidRankedLandmarksError:
 
 
 def nearest_landmarks(values: ArrayLike, list_length: int) -> NDArray[np.uint16]:
-    """The h landmarks of lowest value (rank, dissimilarity or z) of every image, ties by landmark id.
-
-    Args:
-        values: [n, r], smaller is nearer.
-        list_length: h, at most r.
-
-    Returns:
-        [h, n] uint16, row j the landmark of rank j + 1 of every image: the memory form of the index.
-    """
+    """[h, n] the landmarks of lowest value (rank, dissimilarity or z, [n, r]) of every image, ties by landmark id."""
     order = np.argsort(np.asarray(values), axis=1, kind="stable")[:, :list_length]
     return np.ascontiguousarray(order.T, dtype=np.uint16)
 
 
 def normal_scores(ranks: NDArray[np.float32], n_landmarks: int) -> NDArray[np.float64]:
-    """Normal scores of ranks, `Phi^-1((v - 1/2) / r)`: the nearest landmark gets the lowest.
-
-    Args:
-        ranks: Any shape; whole or half ranks in 1..r.
-
-    Returns:
-        float64 of the same shape, about standard normal over the landmarks of one image.
-    """
+    """Normal scores of whole or half ranks of any shape, `Phi^-1((v - 1/2) / r)`: the nearest landmark's is lowest."""
     half_ranks = np.rint(2 * ranks).astype(np.intp)
     return _scores_of_half_ranks(n_landmarks)[half_ranks]
 

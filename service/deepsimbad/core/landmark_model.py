@@ -33,17 +33,10 @@ def select_landmarks(
     n_landmarks: int,
     on_progress: Callable[[float], None] | None = None,
 ) -> NDArray[np.int64]:
-    """The r candidates farthest from their nearest other candidate.
+    """[r] the candidates [n, d] farthest from their nearest other candidate, best first, ties by index.
 
     Every pair is compared once, block by block, so memory holds no n x n matrix. Nearest neighbours are found in
     float32; their distances, which decide the order, are then computed again in float64.
-
-    Args:
-        candidates: [n, d] encodings of the landmark traverse.
-        n_landmarks: r, 1..n.
-
-    Returns:
-        [r] int64 indices of candidates, best first, ties by index.
 
     Raises:
         TooFewCandidatesError: n < r.

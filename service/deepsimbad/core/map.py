@@ -183,9 +183,9 @@ class Map:
             InvalidMapConfigError, InvalidRouteError: They contradict each other.
             KeyError, TypeError, ValueError: Or are not what a map gives.
         """
-        said = {name: document[name] for name in document.keys() - {"n_map_images", "n_landmarks", "list_length"}}
-        said["closed"] = bool(said["closed"])
-        return cls(**said, landmark_model=landmark_model, index_bytes=index_bytes, **arrays)
+        parts = {name: document[name] for name in document.keys() - {"n_map_images", "n_landmarks", "list_length"}}
+        parts["closed"] = bool(parts["closed"])
+        return cls(**parts, landmark_model=landmark_model, index_bytes=index_bytes, **arrays)
 
     def at(self, images: NDArray[np.integer[Any]]) -> Self:
         """The same map of some of its images alone, [m] in route order."""
@@ -290,7 +290,7 @@ class Map:
         """Check that a view was ranked by this map's landmarks.
 
         Args:
-            digests: Of landmark models, one of which must be this map's; None: nobody said by which.
+            digests: Of landmark models, one of which must be this map's; None: nobody parts by which.
 
         Raises:
             LandmarkModelDiffersError: None of them is.

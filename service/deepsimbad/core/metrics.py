@@ -30,12 +30,7 @@ class RetrievalScores:
 
 
 def rank_of_truth(relevance: NDArray[np.floating], true_images: NDArray[np.int64]) -> float:
-    """Rank, counted from 0, of the best-placed true image: images strictly better plus half the others tied.
-
-    Args:
-        relevance: [n], larger is better.
-        true_images: At least one map image id.
-    """
+    """Rank, counted from 0, of the best-placed of at least one true image: images better plus half the others tied."""
     best = relevance[true_images].max()
     n_better = np.count_nonzero(relevance > best)
     n_tied = np.count_nonzero(relevance == best)

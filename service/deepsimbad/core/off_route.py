@@ -29,11 +29,7 @@ _EXCLUDED = np.float32(-1e4)
 
 @dataclass(frozen=True)
 class OffRouteModel:
-    """Log-odds of being off the route after one view, linear in the agreement of view and belief.
-
-    Attributes:
-        slope, intercept: Log-odds = intercept + slope * agreement, at even prior odds.
-    """
+    """Log-odds of being off the route after one view: intercept + slope * agreement, at even prior odds."""
 
     slope: float
     intercept: float
@@ -66,12 +62,7 @@ class OffRouteModel:
     def learn(cls, map_: Map, second: SecondSeason) -> "OffRouteModel | None":
         """Walk the second season's frames over the map, and over the map without the places they walk through.
 
-        Args:
-            map_: The map; its lists must not know the second season.
-            second: Another drive of its route.
-
-        Returns:
-            The model; None where the two seasons share too short a stretch for a walk.
+        The map's lists must not know the second season. None where the two share too short a stretch for a walk.
         """
         route = map_.route
         frames = _frames_by_distance(second.places, route)
@@ -93,12 +84,7 @@ class OffRouteModel:
 
 
 def agreement_of(mass: NDArray[np.float64], relevance: NDArray[np.float32]) -> float:
-    """How much better the believed places explain a view than the map does on the whole, in nats.
-
-    Args:
-        mass: [n] the belief before the view.
-        relevance: [n] of the view.
-    """
+    """How much better the places believed before a view, [n], explain it than the map does on the whole, in nats."""
     weighed = LOG_LIKELIHOOD_WEIGHT * relevance.astype(np.float64)
     likelihood = np.exp(weighed - weighed.max())
     believed = (mass * likelihood).sum()
@@ -106,12 +92,7 @@ def agreement_of(mass: NDArray[np.float64], relevance: NDArray[np.float32]) -> f
 
 
 def off_route_probability(before: float, log_odds: float) -> float:
-    """Probability of being off the route after a move and a view.
-
-    Args:
-        before: Probability before them.
-        log_odds: What the view says, at even prior odds.
-    """
+    """Probability of being off the route after a move and a view that says `log_odds` at even prior odds."""
     moved = before * (1 - _RETURNS) + (1 - before) * _LEAVES
     odds = moved / (1 - moved) * np.exp(log_odds)
     return float(odds / (1 + odds))

@@ -142,16 +142,10 @@ _EMPTY = np.uint16(0xFFFF)  # no landmark: ids stay below it (see InvertedIndex)
 
 
 def pack_postings(image_ids: NDArray[np.int64]) -> bytes:
-    """Pack one posting list.
-
-    Args:
-        image_ids: Map image ids, [m] strictly increasing from 0.
-
-    Returns:
-        The blob; empty for an empty list.
+    """Pack one posting list, [m] image ids; the blob of an empty one is empty.
 
     Raises:
-        ValueError: The ids are negative or do not increase.
+        ValueError: The ids do not increase strictly from 0.
     """
     image_ids = np.ascontiguousarray(image_ids, np.int64)
     if image_ids.size == 0:
@@ -173,14 +167,7 @@ def unpack_postings(blob: bytes, n_images: int) -> NDArray[np.int64]:
 
 
 def pack_index(lists: NDArray[np.uint16], n_landmarks: int) -> Iterator[tuple[int, int, bytes]]:
-    """Pack map images' landmark lists into posting lists keyed by (landmark, rank).
-
-    Args:
-        lists: [h, n] uint16; row j holds every map image's landmark of rank j + 1.
-
-    Yields:
-        (landmark from 0, rank from 1, blob), in that order of keys; empty posting lists are left out.
-    """
+    """(landmark from 0, rank from 1, blob) of every posting list of landmark lists [h, n], in order; empty ones not."""
     grouped = []
     for row in lists:
         order = np.argsort(row, kind="stable")
@@ -194,10 +181,7 @@ def pack_index(lists: NDArray[np.uint16], n_landmarks: int) -> Iterator[tuple[in
 
 
 def unpack_index(postings: Iterable[tuple[int, int, bytes]], list_length: int, n_images: int) -> NDArray[np.uint16]:
-    """Rebuild the landmark lists from the posting lists.
-
-    Returns:
-        [h, n] uint16.
+    """Rebuild the landmark lists, [h, n] uint16, from the posting lists.
 
     Raises:
         ValueError: A map image is listed twice at a rank, missing from one, or out of range.

@@ -131,17 +131,14 @@ def parse_planner(text: str, actions_m: Sequence[float]) -> Planner:
 
 
 def telling_bits(map_: Map, second: SecondSeason) -> NDArray[np.float32]:
-    """By how many bits a view from every map image's place narrows the map down: how telling it is (ours).
+    """[n] by how many bits a view from every map image's place narrows the map down: how telling it is (ours).
 
     The landmark traverse stands for a live drive of another season. Where it saw a place of the map, the rank of that
     place in its retrieval says how telling the place is.
 
     Args:
-        map_: The map; its lists must not know the second season.
+        map_: Its lists must not know the second season.
         second: Its `places` hold at least one pair.
-
-    Returns:
-        [n] float32.
     """
     step = -(-len(second.places) // _MAX_VIEWS)
     places = second.places[::step]

@@ -84,15 +84,10 @@ _Float = TypeVar("_Float", np.float32, np.float64)
 
 
 def evidence(relevance: NDArray[_Float], rule: UpdateRule) -> NDArray[_Float]:
-    """What views add to weights, or multiply them by; computed in the precision it is given.
+    """What views of some relevance [..., n] add to weights, or multiply them by, [..., n], in the precision given.
 
-    Args:
-        relevance: [..., n], larger is better.
-        rule: Additive rules give what is added to weights whose mean is 1; `log_likelihood` gives factors, the
-            greatest of which is 1.
-
-    Returns:
-        [..., n], not negative.
+    Additive rules give what is added to weights whose mean is 1; `log_likelihood` gives factors, the greatest of which
+    is 1.
     """
     if rule is UpdateRule.LOG_LIKELIHOOD:
         factors: NDArray[_Float] = relevance - relevance.max(axis=-1, keepdims=True)
@@ -114,7 +109,7 @@ def weigh(weights: NDArray[np.float64], seen: NDArray[np.float64], rule: UpdateR
 
     Args:
         weights: [m], summing to 1.
-        seen: [m], the evidence at every hypothesis.
+        seen: [m], the evidence there.
     """
     weighed = weights * seen if rule is UpdateRule.LOG_LIKELIHOOD else weights * weights.size + seen
     total = weighed.sum()

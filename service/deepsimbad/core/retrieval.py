@@ -20,14 +20,10 @@ _SCAN_BLOCK = 256  # values that are looked at in one vectorised sweep
 
 
 def relevances(map_: Map, query: Query, live: LandmarkStatistics | None = None) -> NDArray[np.float32]:
-    """Relevance of every map image.
+    """[n] relevance of every map image, larger is better; of a batch of views [e, n].
 
     Args:
-        query: The described view, or a batch of views.
         live: A session's own statistics, in place of the map's; of a batch [e, r].
-
-    Returns:
-        [n] float32, larger is better; of a batch [e, n].
 
     Raises:
         InvalidInputError: The query lacks what the map's relevance compares.
@@ -43,8 +39,8 @@ def _standardised(map_: Map, query: Query, live: LandmarkStatistics | None) -> N
 def _calibrated(map_: Map, query: Query, live: LandmarkStatistics | None) -> NDArray[np.float32]:
     """Sum over the list of log-likelihood ratios: seen from here, against seen from anywhere (`core.calibration`)."""
     seen, expected = _statistics(live).view(query.ranks), _expected_scores(map_)
-    known = seen.known[..., np.newaxis, :]
-    return sum_listed(map_, expected * seen.z[..., np.newaxis, :] - known * np.square(expected) / 2)
+    certainty = seen.certainty[..., np.newaxis, :]
+    return sum_listed(map_, expected * seen.z[..., np.newaxis, :] - certainty * np.square(expected) / 2)
 
 
 def _rrf(map_: Map, query: Query, _: LandmarkStatistics | None) -> NDArray[np.float32]:
@@ -122,10 +118,7 @@ def sum_listed(map_: Map, tables: NDArray[np.number]) -> NDArray[np.float32]:
     every posting takes part in every query, so memory holds the same postings sorted by map image.
 
     Args:
-        tables: [h, r], what landmark i is worth at rank j + 1; of a batch of views [e, h, r].
-
-    Returns:
-        [n] float32, or [e, n].
+        tables: [h, r], what landmark i is worth at rank j + 1; of a batch of views [e, h, r], which gives [e, n].
     """
     h, r, n = map_.list_length, map_.n_landmarks, map_.n_images
     if tables.shape[-2:] != (h, r):
@@ -165,15 +158,7 @@ def _second_core() -> ThreadPoolExecutor:
 
 
 def shortlist(values: NDArray[np.floating], length: int) -> NDArray[np.int64]:
-    """The ids of the greatest values, best first, ties by id.
-
-    Args:
-        values: [n] relevances or masses; of a batch [e, n].
-        length: How many, at least 1; at most n come back.
-
-    Returns:
-        [length], or [e, length].
-    """
+    """The ids [length, at most n] of the greatest values [n], best first, ties by id; of a batch [e, n] [e, length]."""
     if length > _SCAN_UP_TO:
         return np.argsort(-values, axis=-1, kind="stable")[..., :length].astype(np.int64)
     rows = np.ascontiguousarray(values).reshape(-1, values.shape[-1])

@@ -16,13 +16,7 @@ _LEAST_LENGTH_M = 1e-9  # counted in steps that are far shorter, moves would ove
 
 @dataclass(frozen=True)
 class Places:
-    """The distinct positions of a route; images of one stop share a place.
-
-    Attributes:
-        position_m: [p] float64, strictly increasing.
-        of_image: [n] the place of every map image.
-        n_images: [p] images at every place.
-    """
+    """The distinct positions [p] of a route, the place of every image [n], and how many images share each place [p]."""
 
     position_m: NDArray[np.float64]
     of_image: NDArray[np.intp]
@@ -141,14 +135,14 @@ class Route:
 
     def nearest_image(self, position_m: NDArray[np.float64]) -> NDArray[np.intp]:
         """The map image nearest to each position along the route; of two equally near the earlier."""
-        known = self.position_m
-        after = np.clip(np.searchsorted(known, position_m), 1, max(self.n_images - 1, 1))
+        images_m = self.position_m
+        after = np.clip(np.searchsorted(images_m, position_m), 1, max(self.n_images - 1, 1))
         if self.n_images == 1:
             return np.zeros(np.shape(position_m), np.intp)
         before = after - 1
-        nearest = np.where(position_m - known[before] <= known[after] - position_m, before, after)
+        nearest = np.where(position_m - images_m[before] <= images_m[after] - position_m, before, after)
         if self.closed:  # behind the last image the first may be nearer
-            behind = position_m - known[-1]
+            behind = position_m - images_m[-1]
             nearest = np.where(behind > self._closing_gap_m - behind, 0, nearest)
         return np.asarray(nearest, np.intp)
 
@@ -236,13 +230,13 @@ def _near_in_plane(x_m: NDArray[np.float64], y_m: NDArray[np.float64], tolerance
     one of the eight around it: a drive of 26,000 frames is matched in a second, not in half a minute.
     """
     every = np.arange(x_m.size)
-    known = every[np.isfinite(x_m) & np.isfinite(y_m)]
+    placed = every[np.isfinite(x_m) & np.isfinite(y_m)]
     if not np.isfinite(tolerance_m) or tolerance_m <= 0:
         return lambda _x, _y: every
     nowhere = every[:0]
     squares: defaultdict[tuple[float, float], list[int]] = defaultdict(list)
-    columns, rows = np.floor(x_m[known] / tolerance_m), np.floor(y_m[known] / tolerance_m)
-    for image, column, row in zip(known.tolist(), columns.tolist(), rows.tolist(), strict=True):
+    columns, rows = np.floor(x_m[placed] / tolerance_m), np.floor(y_m[placed] / tolerance_m)
+    for image, column, row in zip(placed.tolist(), columns.tolist(), rows.tolist(), strict=True):
         squares[column, row].append(image)
     around = [(right, up) for right in (-1, 0, 1) for up in (-1, 0, 1)]
 

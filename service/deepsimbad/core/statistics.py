@@ -40,11 +40,11 @@ class ViewScores:
 
     Attributes:
         z: [r] float64, standardised scores, lowest is nearest; expected ones where a landmark was not sent.
-        known: [r] float64, how much of each is known: 1 less its variance, so 1 where it was sent; [1] where all were.
+        certainty: [r] float64, 1 less the variance of each, so 1 where it was sent; [1] where all were.
     """
 
     z: NDArray[np.float64]
-    known: NDArray[np.float64]
+    certainty: NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -66,11 +66,7 @@ class LandmarkStatistics:
 
     @classmethod
     def of_map(cls, ranks: NDArray[np.float32]) -> Self:
-        """The statistics of a map's traverse, weighed as the prior of a live session.
-
-        Args:
-            ranks: [n, r], ranks of every map image.
-        """
+        """The statistics of a traverse of ranks [n, r], weighed as the prior of a live session."""
         scores = normal_scores(ranks, ranks.shape[1])
         return cls(PRIOR_WEIGHT_FRAMES, scores.mean(axis=0), np.square(scores).mean(axis=0))
 
@@ -101,7 +97,7 @@ class LandmarkStatistics:
         if ranks.ndim == 1 and n_ranked(ranks) < ranks.size:
             view = self.view(ranks)
             scores = self.mean + self.std * view.z
-            squares = np.square(scores) + np.square(self.std) * (1.0 - view.known)
+            squares = np.square(scores) + np.square(self.std) * (1.0 - view.certainty)
         weight = self.weight + 1.0
         mean = self.mean + (scores - self.mean) / weight
         square = self.square + (squares - self.square) / weight
@@ -125,8 +121,7 @@ class LandmarkStatistics:
         """What a view says of every landmark, of those too that a robot did not send.
 
         Args:
-            ranks: [r], as `core.descriptor` gives them of dissimilarities or of ranked landmarks; of a batch [e, r],
-                all of them sent.
+            ranks: [r]; of a batch [e, r], all of them sent.
         """
         n_landmarks = ranks.shape[-1]
         n_sent = n_landmarks if ranks.ndim > 1 else n_ranked(ranks)
@@ -134,14 +129,14 @@ class LandmarkStatistics:
             return ViewScores(self.standardise(ranks), _ALL_KNOWN)
         if n_sent == 0:
             return ViewScores(np.zeros(n_landmarks), np.zeros(n_landmarks))
-        z, known = self.standardise(ranks), np.ones(n_landmarks)
+        z, certainty = self.standardise(ranks), np.ones(n_landmarks)
         sent = ranks <= n_sent
         between = np.full(1, n_sent + 0.5, np.float32)  # the last that was sent and the first that was not
         loadings = np.zeros((n_landmarks, 0), np.float32) if self.loadings is None else self.loadings
         least = ((normal_scores(between, n_landmarks) - self.mean) / self.std)[~sent]
         z[~sent], variance = _expected_beyond(least, loadings[~sent], z[sent], loadings[sent])
-        known[~sent] = 1.0 - np.minimum(variance, 1.0)
-        return ViewScores(z, known)
+        certainty[~sent] = 1.0 - np.minimum(variance, 1.0)
+        return ViewScores(z, certainty)
 
 
 def common_factors(scores: NDArray[np.float64]) -> NDArray[np.float32] | None:
@@ -150,11 +145,9 @@ def common_factors(scores: NDArray[np.float64]) -> NDArray[np.float32] | None:
     Correlations of few frames show more than there is, so they are shrunk as far as chance alone would explain them
     (Schäfer and Strimmer). A landmark keeps a variance of its own.
 
-    Args:
-        scores: [n, r] standardised over the drive.
-
     Returns:
-        [r, q] float32, each number one that float16 holds too; None where the frames are too few to tell.
+        [r, q] of scores [n, r] standardised over the drive, each number one that float16 holds too; None where the
+        frames are too few to tell.
     """
     n, n_landmarks = scores.shape
     if n < _LEAST_FACTOR_FRAMES or n_landmarks == 1:
@@ -164,8 +157,8 @@ def common_factors(scores: NDArray[np.float64]) -> NDArray[np.float32] | None:
     _, strength, components = np.linalg.svd(scores / math.sqrt(len(scores)), full_matrices=False)
     mean_square = max((np.sum(strength**4) - n_landmarks) / (n_landmarks * (n_landmarks - 1)), 1e-12)  # correlation's
     by_chance = (1.0 - min(mean_square, 1.0)) ** 2 / (len(scores) - 1)
-    kept = max(1.0 - by_chance / mean_square, 0.0)
-    loadings = math.sqrt(kept) * (strength[:_MAX_FACTORS, np.newaxis] * components[:_MAX_FACTORS]).T
+    shrunk = max(1.0 - by_chance / mean_square, 0.0)
+    loadings = math.sqrt(shrunk) * (strength[:_MAX_FACTORS, np.newaxis] * components[:_MAX_FACTORS]).T
     shared = np.square(loadings).sum(axis=1)
     loadings *= np.sqrt((1.0 - _LEAST_OWN_VARIANCE) / np.maximum(shared, 1.0 - _LEAST_OWN_VARIANCE))[:, np.newaxis]
     return np.asarray(loadings, np.float16).astype(np.float32)
@@ -181,27 +174,27 @@ def _expected_beyond(
 
     Args:
         least: [u], that value.
-        loadings: [u, q] of theirs.
-        sent: [m] the scores that are known.
-        loadings_sent: [m, q] of those.
+        loadings: [u, q].
+        sent: [m] the other scores, which are known.
+        loadings_sent: [m, q].
     """
-    unknown, known = loadings.astype(np.float64), loadings_sent.astype(np.float64)
-    own, own_known = _own_variance(unknown), _own_variance(known)
+    unsent, others = loadings.astype(np.float64), loadings_sent.astype(np.float64)
+    own, own_others = _own_variance(unsent), _own_variance(others)
     std = np.sqrt(own)
     # Gradient and curvature of the log-probability of the factors f, but for what the bounds add: pull - curved @ f.
-    pull = known.T @ (sent / own_known)
-    curved = np.eye(known.shape[1]) + known.T @ (known / own_known[:, np.newaxis])
+    pull = others.T @ (sent / own_others)
+    curved = np.eye(others.shape[1]) + others.T @ (others / own_others[:, np.newaxis])
     factors, precision = np.linalg.solve(curved, pull), curved
     for _ in range(_NEWTON_STEPS):
-        hazard, narrowed = _hazards((least - unknown @ factors) / std)
-        precision = curved + unknown.T @ (unknown * (narrowed / own)[:, np.newaxis])
-        step = np.linalg.solve(precision, pull - curved @ factors + unknown.T @ (hazard / std))
+        hazard, narrowed = _hazards((least - unsent @ factors) / std)
+        precision = curved + unsent.T @ (unsent * (narrowed / own)[:, np.newaxis])
+        step = np.linalg.solve(precision, pull - curved @ factors + unsent.T @ (hazard / std))
         factors = factors + step
         if np.abs(step).max(initial=0.0) < _NEWTON_TOLERANCE:
             break
-    hazard, narrowed = _hazards((least - unknown @ factors) / std)
-    of_factors = np.einsum("uq,qu->u", unknown, np.linalg.solve(precision, unknown.T))
-    mean = unknown @ factors + std * hazard
+    hazard, narrowed = _hazards((least - unsent @ factors) / std)
+    of_factors = np.einsum("uq,qu->u", unsent, np.linalg.solve(precision, unsent.T))
+    mean = unsent @ factors + std * hazard
     return mean, own * (1.0 - narrowed) + np.square(1.0 - narrowed) * of_factors
 
 

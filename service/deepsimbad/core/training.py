@@ -116,9 +116,9 @@ def _next_frames(route: Route, actions_m: NDArray[np.float64]) -> NDArray[np.int
 
 def _start_frames(route: Route, true_image: NDArray[np.int64], episode_m: float) -> NDArray[np.int64]:
     """Frames of known place from which a whole episode fits; where there is none, all of known place."""
-    known = true_image >= 0
-    fits = known & (route.closed | (route.position_m + episode_m <= route.position_m[-1] + 1e-9))
-    return np.flatnonzero(fits if fits.any() else known)
+    is_placed = true_image >= 0
+    fits = is_placed & (route.closed | (route.position_m + episode_m <= route.position_m[-1] + 1e-9))
+    return np.flatnonzero(fits if fits.any() else is_placed)
 
 
 class Walk:
@@ -301,9 +301,9 @@ def _learning_step(
     action = choose_actions(q_of_nearest(q_values, nearest), walk.allowed, exploration, rng)
     walk.step(action)
     earned = _earned(np.where(action >= 0, walk.ranks, -1.0), walk.world, config)
-    known = np.flatnonzero(~np.isnan(earned))
+    judged = np.flatnonzero(~np.isnan(earned))
     moves = Transitions(
-        nearest[known], action[known], config.reward * earned[known], walk.nearest[known], walk.allowed[known]
+        nearest[judged], action[judged], config.reward * earned[judged], walk.nearest[judged], walk.allowed[judged]
     )
     learn(q_values, moves, config)
     return earned
@@ -314,5 +314,5 @@ def _earned(ranks: NDArray[np.float64], world: TrainingWorld, config: NnqlConfig
 
 
 def _share(earned: NDArray[np.float64]) -> float:
-    known = earned[~np.isnan(earned)]
-    return float(known.mean()) if known.size else 0.0
+    judged = earned[~np.isnan(earned)]
+    return float(judged.mean()) if judged.size else 0.0

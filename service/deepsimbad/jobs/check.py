@@ -212,15 +212,15 @@ def _normalised_ranks(
     views = views_of(measured(frames.drive.at(frames.chosen), evaluator, map_.landmark_model))
     is_kept = np.ones(map_.n_images, np.bool_)
     is_kept[left_out] = False
-    kept = np.flatnonzero(is_kept)
+    remaining = np.flatnonzero(is_kept)
     ranks = np.full(len(frames.chosen), np.nan)
     for first in range(0, len(frames.chosen), _QUERIES_A_BLOCK):
         asked = slice(first, first + _QUERIES_A_BLOCK)
         relevance = relevances(map_, views.at(asked))
         near = true_images_of(frames.route, map_.route, TOLERANCE_M, frames=frames.chosen[asked])
         for query, (row, images) in enumerate(zip(relevance, near, strict=True), first):
-            true_images = np.searchsorted(kept, images[is_kept[images]])
+            true_images = np.searchsorted(remaining, images[is_kept[images]])
             if true_images.size:
-                ranks[query] = rank_of_truth(row[kept], true_images) / kept.size
+                ranks[query] = rank_of_truth(row[remaining], true_images) / remaining.size
         on_progress((first + len(relevance)) / len(frames.chosen))
     return ranks

@@ -53,8 +53,8 @@ class ExperienceConfig:
     @classmethod
     def of(cls, session_id: str, positions_m: Sequence[float | None]) -> Self:
         """Of a request that tells of true positions."""
-        told = json.dumps(list(positions_m)).encode()  # NaN, which is refused later, has a form as well
-        return cls(session_id, hashlib.sha256(told).hexdigest())
+        body = json.dumps(list(positions_m)).encode()  # NaN, which is refused later, has a form as well
+        return cls(session_id, hashlib.sha256(body).hexdigest())
 
     def as_dict(self) -> dict[str, Any]:
         """JSON-ready."""
@@ -92,9 +92,9 @@ def keep_true_positions(
     record = _session_of(store, domain, session_id)
     if active is None:
         raise NoActiveMapError(f"domain {domain} has no active map that could learn")
-    known = checked_truths(positions_m, store.n_observations(record.number))
+    truth_m = checked_truths(positions_m, store.n_observations(record.number))
     _check_landmarks(catalog, record, active)
-    return store.save_true_positions(record.number, known, received_at).result()
+    return store.save_true_positions(record.number, truth_m, received_at).result()
 
 
 def walks_of(store: SessionStore, catalog: Catalog, domain: str, session_id: str) -> list[KnownWalk]:
@@ -107,8 +107,8 @@ def walks_of(store: SessionStore, catalog: Catalog, domain: str, session_id: str
         RetiredMapError, DamagedMapError: Its map is no more, or cannot be read.
     """
     record = _session_of(store, domain, session_id)
-    known = store.true_positions(record.number)
-    if known is None:
+    truth_m = store.true_positions(record.number)
+    if truth_m is None:
         raise InvalidInputError(f"the true positions of session {session_id} are not known")
     _check_landmarks(catalog, record, catalog.domain(domain).active_version)
     walks: list[list[ObservedRow]] = [[]]
@@ -122,7 +122,7 @@ def walks_of(store: SessionStore, catalog: Catalog, domain: str, session_id: str
         KnownWalk(
             tuple(Query(row.ranks, row.dissimilarities, row.encoding) for row in walk),
             np.array([row.action_m for row in walk], np.float64),
-            known[end - len(walk) : end],
+            truth_m[end - len(walk) : end],
         )
         for walk, end in zip(walks, ends.tolist(), strict=True)
         if len(walk) > 1

@@ -61,12 +61,12 @@ def encode_recording(
     """
     left_out = dict(recording.left_out)
     if recording.encodings is not None:
-        kept, encodings, encode_ms = list(range(len(recording.frames))), recording.encodings, None
+        places, encodings, encode_ms = list(range(len(recording.frames))), recording.encodings, None
     else:
-        kept, encodings, encode_ms = _encode_images(recording, evaluator, max_pixels, left_out, on_progress)
-    if not kept:
+        places, encodings, encode_ms = _encode_images(recording, evaluator, max_pixels, left_out, on_progress)
+    if not places:
         raise InvalidSourceError(f"{recording.name} has no frame that can be used: {left_out}")
-    used = [recording.frames[place] for place in kept]
+    used = [recording.frames[place] for place in places]
     drive = Drive(
         index=np.array([frame.index for frame in used], np.int64),
         position_m=np.array([frame.position_m for frame in used], np.float64),
@@ -96,7 +96,7 @@ def _encode_images(
     if not evaluator.takes_images or evaluator.encoding_dim is None:
         raise InvalidSourceError("this evaluator takes ready encodings alone; give a .npy or .csv file")
     encodings = np.empty((len(recording.frames), evaluator.encoding_dim), np.float32)
-    kept: list[int] = []
+    places: list[int] = []
     waiting: list[Image] = []  # as many as are best encoded at once
     took_ms: list[float] = []
     began = perf_counter()
@@ -108,13 +108,13 @@ def _encode_images(
         else:
             began = perf_counter() if not waiting else began
             waiting.append(evaluator.prepare(decode_image(body, max_pixels)))
-            kept.append(place)
+            places.append(place)
         if waiting and (len(waiting) >= evaluator.largest_batch or place == len(recording.frames) - 1):
-            encodings[len(kept) - len(waiting) : len(kept)] = evaluator.encode(waiting)
+            encodings[len(places) - len(waiting) : len(places)] = evaluator.encode(waiting)
             took_ms += [1000 * (perf_counter() - began) / len(waiting)] * len(waiting)
             waiting.clear()
         on_progress((place + 1) / len(recording.frames))
-    return kept, encodings[: len(kept)], median(took_ms) if took_ms else None
+    return places, encodings[: len(places)], median(took_ms) if took_ms else None
 
 
 class _ArraysOnly(pickle.Unpickler):

@@ -82,10 +82,10 @@ class _Inputs:
     """What a remap reads before it begins.
 
     Attributes:
-        domain: Whose map is made.
+        domain: Whose map is draft.
         training: The traverse that becomes the map.
-        candidates: The traverse landmarks are selected from; None: those of `kept` stay.
-        kept: The active map whose landmarks stay; None where they are selected.
+        candidates: The traverse landmarks are selected from; None: those of `base` stay.
+        base: The active map whose landmarks stay; None where they are selected.
         second: The drive that a calibrated map learns from: the landmark traverse, else what the active map was made
             of; None where there is none of the same encoder, or where frames are appended.
         check: The drive that the new map is checked on; None: on frames of `training` that are held out.
@@ -94,13 +94,13 @@ class _Inputs:
     domain: DomainRecord
     training: Drive
     candidates: Drive | None
-    kept: Map | None
+    base: Map | None
     second: Drive | None
     check: Drive | None
 
 
 @dataclass(frozen=True)
-class _Made:
+class _Draft:
     """A map that is not yet sealed.
 
     Attributes:
@@ -132,18 +132,18 @@ class _Remap:
         """The next version, sealed; what is decided of it later must stand in its metrics."""
         with self._stage("read frames"):
             inputs = self._read()
-        made = self._appended(inputs, inputs.kept) if inputs.kept and self.config.append else self._mapped(inputs)
+        draft = self._appended(inputs, inputs.base) if inputs.base and self.config.append else self._mapped(inputs)
         with self._stage("check"):
-            check = self._checked(inputs, made)
+            check = self._checked(inputs, draft)
         self.progress.stage("seal")
         metrics = {
-            "n_map_images": made.map.n_images,
+            "n_map_images": draft.map.n_images,
             "seconds": self.seconds,
-            "training": made.training,
-            "second_season": made.second_season,
+            "training": draft.training,
+            "second_season": draft.second_season,
             "check": check,
         }
-        return seal_version(self.catalog, self.domain, made.map, made.config, metrics, self.progress.update, job_id)
+        return seal_version(self.catalog, self.domain, draft.map, draft.config, metrics, self.progress.update, job_id)
 
     @contextmanager
     def _stage(self, name: str) -> Iterator[None]:
@@ -167,11 +167,11 @@ class _Remap:
         read = cache(self._drive)
         training = read(config.training_traverse)
         training.route(record.closed)  # what is wrong with it is said now, not after the map is built
-        candidates = kept = check = None
+        candidates = base = check = None
         if config.landmark_traverse is None:
-            kept = self._active_map(record)
+            base = self._active_map(record)
             joining = f"traverse {config.training_traverse}"
-            WeightsDifferError.check("the active map", kept.weights_sha256, joining, training.weights_sha256)
+            WeightsDifferError.check("the active map", base.weights_sha256, joining, training.weights_sha256)
         else:
             candidates = read(config.landmark_traverse)
             self._check_encoder(config.landmark_traverse, candidates, training)
@@ -180,7 +180,7 @@ class _Remap:
             self._check_encoder(config.check_traverse, check, training)
             check.route(record.closed)
         second = None if config.append else self._second_season(record, training, read)
-        return _Inputs(record, training, candidates, kept, second, check)
+        return _Inputs(record, training, candidates, base, second, check)
 
     def _drive(self, name: str) -> Drive:
         with Traverse.open(self.catalog.data_dir, self.domain, name) as traverse:
@@ -222,21 +222,21 @@ class _Remap:
                 if self.config.append
                 else f"domain {record.name} has no active map whose landmarks could stay; give a landmark_traverse"
             )
-        kept = read_map(self.catalog.map_path(record.name, record.active_version))
-        if wanted not in {None, kept.n_landmarks}:
+        base = read_map(self.catalog.map_path(record.name, record.active_version))
+        if wanted not in {None, base.n_landmarks}:
             raise InvalidMapConfigError(
-                f"the active map has {kept.n_landmarks} landmarks, not {wanted}; give a landmark_traverse to select "
+                f"the active map has {base.n_landmarks} landmarks, not {wanted}; give a landmark_traverse to select "
                 "anew",
-                n_landmarks=kept.n_landmarks,
+                n_landmarks=base.n_landmarks,
             )
-        return kept
+        return base
 
-    def _mapped(self, inputs: _Inputs) -> _Made:
+    def _mapped(self, inputs: _Inputs) -> _Draft:
         """The training traverse as a map of its own."""
         config, domain, training = self.config, inputs.domain, inputs.training
         with self._stage("select landmarks"):
-            if inputs.kept is not None:
-                model = inputs.kept.landmark_model
+            if inputs.base is not None:
+                model = inputs.base.landmark_model
             else:
                 candidates = (inputs.candidates or training).encodings
                 n_landmarks = config.n_landmarks or min(DEFAULT_N_LANDMARKS, len(candidates))
@@ -267,7 +267,7 @@ class _Remap:
                     self.n_threads,
                 )
         asked = config.as_dict()
-        landmarks_from = inputs.kept or inputs.candidates
+        landmarks_from = inputs.base or inputs.candidates
         weights_sha256 = training.weights_sha256 or (landmarks_from and landmarks_from.weights_sha256)
         if weights_sha256 is not None:
             asked["weights_sha256"] = weights_sha256
@@ -281,9 +281,9 @@ class _Remap:
             q_values=q_values,
         )
         second_season = None if built.same_route is None else built.same_route.as_dict()
-        return _Made(map_, asked, learning, second_season)
+        return _Draft(map_, asked, learning, second_season)
 
-    def _appended(self, inputs: _Inputs, before: Map) -> _Made:
+    def _appended(self, inputs: _Inputs, before: Map) -> _Draft:
         """A copy of the active map with the training traverse among its images."""
         config, drive = self.config, inputs.training
         record = self.catalog.map(self.domain, inputs.domain.active_version or 0)
@@ -313,20 +313,20 @@ class _Remap:
             config_after["weights_sha256"] = weights_sha256
         metrics = record.metrics
         map_ = replace(map_, config=config_after)
-        return _Made(map_, config_after, metrics.get("training"), metrics.get("second_season"))
+        return _Draft(map_, config_after, metrics.get("training"), metrics.get("second_season"))
 
-    def _checked(self, inputs: _Inputs, made: _Made) -> dict[str, Any]:
+    def _checked(self, inputs: _Inputs, draft: _Draft) -> dict[str, Any]:
         """How the new map compares with the active one."""
         config, closed = self.config, inputs.domain.closed
         if config.check_traverse is not None and inputs.check is not None:
             frames = CheckFrames.of_traverse(config.check_traverse, inputs.check, closed)
         else:
             frames = CheckFrames.held_out(config.training_traverse, inputs.training, closed)
-        traverses = traverses_in(made.config)
+        traverses = traverses_in(draft.config)
         return check_map(
             self.catalog,
             self.domain,
-            made.map,
+            draft.map,
             traverses,
             frames,
             config.gate_margin,
