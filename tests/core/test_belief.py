@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from deepsimbad.core.belief import GridFilter, ParticleFilter
-from deepsimbad.core.belief_summary import summarise
+from deepsimbad.core.belief import GridFilter, ParticleFilter, summarise
 from deepsimbad.core.relevance import DEFAULT_UPDATE, Relevance, UpdateRule
 from deepsimbad.core.route import Route
 from deepsimbad.errors import PastTheEndError

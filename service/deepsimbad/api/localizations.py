@@ -27,7 +27,7 @@ from deepsimbad.api.requests import (
     parse_json,
     read_bytes,
 )
-from deepsimbad.core.belief_summary import BeliefSummary
+from deepsimbad.core.belief import BeliefSummary
 from deepsimbad.core.planners import Plan
 from deepsimbad.core.route import Route
 from deepsimbad.engine.localizer import Localization, Retrieval, localize, retrieve, shortlist_length

@@ -240,9 +240,7 @@ def second_season(
 
     Args:
         own: The drive that becomes the map, its dissimilarities measured.
-        closed: Whether its route is a loop.
-        other: Another drive.
-        same_route: Whether their positions are said to be comparable; None: where both know x, y.
+        same_route: Whether positions are said to be comparable; None: where both know x, y.
         measure: Measures the other's dissimilarities; asked only where positions are comparable.
 
     Returns:
@@ -269,10 +267,9 @@ def judge(
     """Test whether drives with comparable positions saw one route.
 
     Args:
-        own: [n, r] dissimilarities of the map images to the landmarks.
+        own: [n, r] dissimilarities of the map images, taken at `position_m` [n], to the landmarks.
         other: [m, r] of the other drive's frames.
         places: [k, 2] (map image, frame) at equal positions.
-        position_m: [n] of the map images.
     """
     stations = _stations(places, position_m)
     if len(stations) < LEAST_PLACES:
@@ -324,12 +321,7 @@ def _against_surroundings(scores: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _agreement(own: NDArray[np.float64], other: NDArray[np.float64]) -> float:
-    """Agreement at shift 0 in standard deviations of that over all shifts.
-
-    Args:
-        own: [s, r] scores of one drive along the route.
-        other: [s, r] of the other.
-    """
+    """Agreement at shift 0 of two drives' scores along the route, [s, r], in standard deviations over all shifts."""
     similarity = own @ other.T / own.shape[1]
     if similarity.std() < _LEAST_SPREAD:
         return 0.0

@@ -177,11 +177,7 @@ class ActiveLocalizer:
         return arrays
 
     def from_arrays(self, arrays: dict[str, NDArray[np.generic]]) -> LocalizerState:
-        """Restore what `to_arrays` gave.
-
-        Raises:
-            KeyError: An array is missing.
-        """
+        """Restore what `to_arrays` gave; raises KeyError where an array is missing."""
         prefix = "belief_"
         held = {name.removeprefix(prefix): _floats(a) for name, a in arrays.items() if name.startswith(prefix)}
         belief: BeliefFilter

@@ -53,14 +53,7 @@ class TrainingWorld:
     def on(
         cls, map_: Map, views: Query, live_route: Route, true_image: NDArray[np.int64], config: NnqlConfig
     ) -> "TrainingWorld":
-        """A world of one drive.
-
-        Args:
-            views: The drive's frames.
-            live_route: Where they are, along the drive itself.
-            true_image: As the attribute.
-            config: For the length of an episode, the moves' error, and how views count.
-        """
+        """A world of one drive: its frames, and where they are along the drive itself."""
         actions_m = map_.actions_m
         lattice = Lattice.along(map_.route, float(actions_m.min()))
         stds_m = [motion_std_m(m) if config.motion_std_m is None else config.motion_std_m for m in actions_m.tolist()]
@@ -94,15 +87,7 @@ class TrainingWorld:
     def look(
         self, frames: NDArray[np.int64], live: LandmarkStatistics | None
     ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-        """Look at the map from some frames.
-
-        Args:
-            frames: [e].
-            live: The episodes' own statistics, [e, r].
-
-        Returns:
-            Evidence [e, n] float32, and the nearest map images [e, k] int64, best first.
-        """
+        """Evidence [e, n] and the nearest map images [e, k], best first, of some frames [e] and statistics [e, r]."""
         relevance = relevances(self.map, self.views.at(frames), live)
         return evidence(relevance, self.rule), shortlist(relevance, self.n_neighbours)
 
@@ -206,15 +191,9 @@ class LearningCurve:
 def train(
     world: TrainingWorld, config: NnqlConfig, on_progress: Callable[[float], None], pool: Executor | None = None
 ) -> tuple[NDArray[np.float32], LearningCurve]:
-    """Learn the experience database from nothing.
+    """Learn the experience database, [n, a] float32, from nothing, and tell the learning curve.
 
     The result depends on the seed alone, not on how many threads the pool has.
-
-    Args:
-        pool: Takes half of every batch in a thread of its own.
-
-    Returns:
-        Q-values [n, a] float32, and the learning curve.
     """
     q_values = initial_q_values(world.n_images, world.n_actions, config)
     earned = np.full((config.n_episodes, config.n_actions_per_episode), np.nan)
@@ -248,8 +227,6 @@ def walk_greedily(
     Args:
         starts: [e] frames.
         q_values: [n, a]; where all are alike the moves are random.
-        config: For the length of an episode, and the seed by which ties are broken.
-        pool: As for `train`.
 
     Returns:
         [e, t], from 0; below 0 where the place is unknown or the episode is over.
@@ -273,8 +250,7 @@ def choose_actions(
     """Epsilon-greedy moves, ties broken at random.
 
     Args:
-        values: [e, a].
-        allowed: [e, a].
+        values, allowed: [e, a].
         exploration: [e], how often to draw from all that are allowed.
         rng: Of the draws; as many whatever the values are.
 

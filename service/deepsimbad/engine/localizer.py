@@ -7,8 +7,7 @@ from time import perf_counter
 import numpy as np
 from numpy.typing import NDArray
 
-from deepsimbad.core.belief import GridFilter
-from deepsimbad.core.belief_summary import BeliefSummary, summarise
+from deepsimbad.core.belief import BeliefSummary, GridFilter, summarise
 from deepsimbad.core.descriptor import rank_landmarks, ranks_from_ranked_landmarks, unpack_ranked_landmarks
 from deepsimbad.core.localizer import ActiveLocalizer, LocalizerConfig, LocalizerState
 from deepsimbad.core.map import Map

@@ -14,8 +14,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from deepsimbad.core.belief import FilterKind
-from deepsimbad.core.belief_summary import BeliefSummary, summarise
+from deepsimbad.core.belief import BeliefSummary, FilterKind, summarise
 from deepsimbad.core.localizer import ActiveLocalizer, LocalizerConfig, LocalizerState, Step
 from deepsimbad.core.map import Map
 from deepsimbad.core.planners import Plan

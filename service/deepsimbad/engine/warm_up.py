@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from deepsimbad.core.belief import GridFilter
-from deepsimbad.core.belief_summary import summarise
+from deepsimbad.core.belief import GridFilter, summarise
 from deepsimbad.core.map import Map
 from deepsimbad.core.planners import PlanningView, TellingPlanner
 from deepsimbad.core.relevance import Query, UpdateRule
