@@ -102,28 +102,6 @@ def test_relevance_equals_its_definition(seasons, n_paired):
         np.testing.assert_allclose(actual, expected, rtol=1e-4, atol=1e-4)
 
 
-def test_images_without_a_partner_keep_their_own_scores(seasons):
-    own, second = (slow_scores(season) for season in seasons)
-    own, second = ((each - each.mean(axis=0)) / each.std(axis=0) for each in (own, second))
-    places = np.stack([np.arange(40), np.arange(40)], axis=1)
-    scores, _ = both_seasons(own, second, places)
-    np.testing.assert_array_equal(scores[40:], own[40:])
-    assert np.abs(scores[:40] - own[:40]).max(axis=1).min() > 0.01
-
-
-def test_lists_are_chosen_by_both_seasons():
-    """A landmark that was near in one season only gives way to one that was near in both."""
-    rng = np.random.default_rng(2)
-    place = rng.normal(size=(200, 20))
-    own, second = place + 0.3 * rng.normal(size=place.shape), place + 0.3 * rng.normal(size=place.shape)
-    own[0], second[0] = 0.0, 0.0
-    own[0, [3, 8]], second[0, [3, 8]] = (-2.0, -1.8), (1.5, -1.8)
-    places = np.stack([np.arange(200), np.arange(200)], axis=1)
-    both, _ = both_seasons(own, second, places)
-    assert int(own[0].argmin()) == 3
-    assert int(both[0].argmin()) == 8
-
-
 def test_what_two_seasons_teach_is_found_again():
     """Landmarks planted with known correlations; of the pair with a third season, not of one with the other."""
     rng = np.random.default_rng(6)
@@ -138,18 +116,6 @@ def test_what_two_seasons_teach_is_found_again():
     np.testing.assert_allclose(correlation, measured, atol=0.02)
     np.testing.assert_allclose(scores.std(axis=0), 1, atol=0.02)
     assert (correlation > planted + 0.01).all(), "two seasons say more than one"
-
-
-def test_the_relevance_is_a_sum_of_log_ratios_of_two_normal_distributions(seasons):
-    """log N(z_q; rho z_m, s) - log N(z_q; 0, s), at equal spread s = 1."""
-    built = a_map(Relevance.CALIBRATED, seasons[0], LIST_LENGTH)
-    ranks = rank_landmarks(seasons[1][3])
-    z = built.landmark_statistics.standardise(ranks)
-    expected = 0.0
-    for j, i in enumerate(built.lists[:, 5].tolist()):
-        here = NormalDist(built.correlation[i] * built.listed_score[j, i])
-        expected += np.log(here.pdf(z[i])) - np.log(NormalDist().pdf(z[i]))
-    assert relevances(built, Query(ranks))[5] == pytest.approx(expected, rel=1e-5)
 
 
 # --- when it learns ------------------------------------------------------------------------------------------------

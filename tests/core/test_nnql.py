@@ -11,7 +11,6 @@ from deepsimbad.core.nnql import (
     Transitions,
     initial_q_values,
     learn,
-    q_of_nearest,
     transitions_of,
 )
 from deepsimbad.core.relevance import Query, Relevance, UpdateRule
@@ -45,22 +44,6 @@ def test_learning_is_the_textbook_update_on_each_of_the_k_entries():
             slow[image, moves.action[t]] += 0.3 * (target - slow[image, moves.action[t]])
     learn(q_values, moves, config)
     assert np.allclose(q_values, slow, rtol=1e-4)
-
-
-def test_values_settle_at_the_sum_of_discounted_rewards():
-    config = NnqlConfig()
-    q_values = initial_q_values(4, 1, config)
-    here = np.arange(4)[np.newaxis]
-    moves = Transitions(here, np.array([0]), np.array([100.0]), here, np.array([[True]]))
-    for _ in range(3000):
-        learn(q_values, moves, config)
-    assert np.allclose(q_values, 100 / (1 - 0.9), rtol=1e-3)
-
-
-def test_values_of_many_views_at_once():
-    q_values = np.random.default_rng(0).random((9, 3), dtype=np.float32)
-    nearest = np.array([[0, 4], [8, 8], [2, 1]])
-    assert np.allclose(q_of_nearest(q_values, nearest), [q_values[row].mean(axis=0) for row in nearest])
 
 
 def test_exploration_falls_in_a_straight_line():

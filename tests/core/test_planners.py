@@ -9,7 +9,6 @@ from deepsimbad.core.descriptor import rank_landmarks
 from deepsimbad.core.drive import SecondSeason
 from deepsimbad.core.map import Map
 from deepsimbad.core.planners import (
-    DEFAULT_PLANNER,
     PlanningView,
     parse_planner,
     plan_at_random,
@@ -64,21 +63,6 @@ def test_a_robot_that_knows_its_place_goes_to_the_telling_one(bits, away):
     plan = plan_for_telling_places(view_of(sharp(74 - away), bits))
     assert plan.action_m == away
     assert plan.values.argmax() == away - 1
-
-
-def test_of_equally_telling_places_the_farther(bits):
-    bits[[52, 56]] = 7
-    assert plan_for_telling_places(view_of(sharp(50), bits)).action_m == 6
-
-
-def test_a_robot_that_knows_nothing_goes_far(bits):
-    assert plan_for_telling_places(view_of(None, bits)).action_m == 10
-
-
-def test_a_robot_that_is_sure_goes_far(bits):
-    """No view can tell it more, and a far one errs unlike the last."""
-    bits[53] = 7
-    assert plan_for_telling_places(view_of(np.eye(N_IMAGES)[50], bits)).action_m == 10
 
 
 def test_where_nobody_knows_what_is_telling_it_goes_far():
@@ -158,10 +142,6 @@ def test_planners_by_name(text):
     plan = parse_planner(text, (1.0, 2.5, 10.0))(view_of(q_values=ones, relevance=ones[:, 0]))
     assert plan.planner == text
     assert text[:9] != "constant:" or plan.action_m == float(text[9:])
-
-
-def test_the_default_is_ours():
-    assert DEFAULT_PLANNER == "telling"
 
 
 @pytest.mark.parametrize(

@@ -88,14 +88,6 @@ def test_relevance_equals_its_definition(name, list_length, scene):
     np.testing.assert_allclose(fast, slow_relevance(name, scene, list_length), rtol=1e-4, atol=1e-5)
 
 
-def test_a_single_view_uses_the_maps_statistics_alone(scene):
-    built = a_map(Relevance.STANDARDISED, scene["map"], 4)
-    ranks = rank_landmarks(scene["query"][0])
-    z = built.landmark_statistics.standardise(ranks)
-    expected = [-sum(z[i] for i in column) for column in built.lists.T]
-    np.testing.assert_allclose(relevances(built, Query(ranks)), expected, rtol=1e-5)
-
-
 @pytest.mark.parametrize("n_images", [1, 5000, 600_000])
 def test_the_fused_sum_equals_indexing_at_every_size(n_images):
     rng = np.random.default_rng(n_images)

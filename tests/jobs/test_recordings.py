@@ -149,37 +149,28 @@ def vpr_bench(rows):
     return array
 
 
-def test_pairs_of_a_query_and_its_list(tmp_path):
-    path = saved(tmp_path / "truth.npy", vpr_bench([(0, [2, 1]), (1, np.array([0])), (2, [])]), allow_pickle=True)
-    assert lists(read_ground_truth(path, np.arange(3), np.arange(3))) == [[1, 2], [0], []]
+def rows_of(*lists):
+    """[q] object array of lists."""
+    rows = np.empty(len(lists), object)
+    rows[:] = lists
+    return rows
 
 
-def test_the_pairs_may_come_in_any_order_and_with_gaps(tmp_path):
-    path = saved(tmp_path / "truth.npy", vpr_bench([(7, [3]), (2, [1])]), allow_pickle=True)
-    assert lists(read_ground_truth(path, np.array([2, 5, 7]), np.arange(4))) == [[1], [], [3]]
-
-
-def test_lists_in_test_frame_order(tmp_path):
-    array = np.empty(2, object)
-    array[0], array[1] = [1], [0, 2]
+@pytest.mark.parametrize(
+    ("array", "test_index", "training_index", "expected"),
+    [
+        (vpr_bench([(0, [2, 1]), (1, np.array([0])), (2, [])]), [0, 1, 2], [0, 1, 2], [[1, 2], [0], []]),
+        (vpr_bench([(7, [3]), (2, [1])]), [2, 5, 7], [0, 1, 2, 3], [[1], [], [3]]),
+        (rows_of([1], [0, 2]), [0, 1], [0, 1, 2], [[1], [0, 2]]),
+        (np.array([[1, -1], [0, 2], [-1, -1]]), [0, 1, 2], [0, 1, 2], [[1], [0, 2], []]),
+        (np.array([[10], [11], [12], [13]]), [1, 3], [11, 12, 13], [[0], [2]]),
+        (np.array([[0, 99]]), [0], [0, 1], [[0]]),
+    ],
+    ids=["pairs", "any order, with gaps", "in frame order", "padded", "places in the recording", "not mapped"],
+)
+def test_every_form_of_ground_truth(tmp_path, array, test_index, training_index, expected):
     path = saved(tmp_path / "truth.npy", array, allow_pickle=True)
-    assert lists(read_ground_truth(path, np.arange(2), np.arange(3))) == [[1], [0, 2]]
-
-
-def test_numbers_padded_with_minus_one(tmp_path):
-    path = saved(tmp_path / "truth.npy", np.array([[1, -1], [0, 2], [-1, -1]]))
-    assert lists(read_ground_truth(path, np.arange(3), np.arange(3))) == [[1], [0, 2], []]
-
-
-def test_frames_are_named_by_their_place_in_the_whole_recording(tmp_path):
-    path = saved(tmp_path / "truth.npy", np.array([[10], [11], [12], [13]]))
-    found = read_ground_truth(path, test_index=np.array([1, 3]), training_index=np.array([11, 12, 13]))
-    assert lists(found) == [[0], [2]]
-
-
-def test_a_training_frame_that_is_not_mapped_is_no_answer(tmp_path):
-    path = saved(tmp_path / "truth.npy", np.array([[0, 99]]))
-    assert lists(read_ground_truth(path, np.arange(1), np.arange(2))) == [[0]]
+    assert lists(read_ground_truth(path, np.array(test_index), np.array(training_index))) == expected
 
 
 class Malice:

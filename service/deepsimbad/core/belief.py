@@ -14,7 +14,6 @@ from deepsimbad.core.route import Route
 from deepsimbad.errors import PastTheEndError
 
 LEAST_SURVIVING_SHARE = 1e-9  # of a belief before a move; with less it leads past the end wherever the robot may be
-HISTOGRAM_BINS = 200
 _CREDIBLE_SHARE = 0.95
 DEFAULT_N_PARTICLES = 1000
 _START, _MOVE, _RESAMPLE = range(3)  # what a draw is for; part of its seed
@@ -334,25 +333,20 @@ def summarise(route: Route, mass: NDArray[np.float64], n_top: int, off_route: fl
     """Summarise masses over map images, [n], which sum to 1; `n_top` of the likeliest are listed."""
     top = shortlist(mass, n_top)
     mean_m, std_m = _moments(route, mass)
-    edges_m, bins = route.histogram(HISTOGRAM_BINS)
+    edges_m, bins = route.histogram
+    held = mass[mass > 0]
     return BeliefSummary(
         mean_m=mean_m,
         mode_m=float(route.position_m[top[0]]),
         std_m=std_m,
         credible_95_m=_credible_stretch(route, mass),
-        entropy_bits=entropy_bits(mass),
+        entropy_bits=max(0.0, float(-(held * np.log2(held)).sum())),
         off_route=off_route,
         histogram_edges_m=edges_m,
         histogram_mass=np.asarray(np.bincount(bins, mass, edges_m.size - 1), np.float64),
         top=top,
         top_mass=mass[top],
     )
-
-
-def entropy_bits(mass: NDArray[np.float64]) -> float:
-    """Entropy over map images, in bits."""
-    held = mass[mass > 0]
-    return max(0.0, float(-(held * np.log2(held)).sum()))
 
 
 def _moments(route: Route, mass: NDArray[np.float64]) -> tuple[float, float]:

@@ -20,7 +20,7 @@ from deepsimbad.core.belief import (
     motion_std_m,
 )
 from deepsimbad.core.map import Map
-from deepsimbad.core.off_route import OFF_ROUTE_AT_START, OffRouteModel, agreement_of, off_route_probability
+from deepsimbad.core.off_route import OFF_ROUTE_AT_START, OffRouteModel, agreement_of
 from deepsimbad.core.planners import DEFAULT_PLANNER, Plan, PlanningView, parse_planner
 from deepsimbad.core.relevance import Query, UpdateRule
 from deepsimbad.core.retrieval import relevances
@@ -130,7 +130,9 @@ class ActiveLocalizer:
         if number > 0:
             std_m = motion_std_m(action_m) if action_std_m is None else action_std_m
             belief = belief.predicted(action_m, std_m, number)
-            off_route = self._off_route(off_route, belief, query, relevance)
+            if off_route is not None and self._off_route_model is not None:
+                agreement = agreement_of(belief.mass, relevance) if query.is_informative else None
+                off_route = self._off_route_model.after(off_route, agreement)
         laps.append(self._clock())
 
         if query.is_informative:
@@ -142,16 +144,6 @@ class ActiveLocalizer:
         laps.append(self._clock())
         timings_ms = {stage: 1000 * (end - start) for stage, (start, end) in zip(_STAGES, pairwise(laps), strict=True)}
         return Step(after, plan, timings_ms)
-
-    def _off_route(
-        self, before: float | None, predicted: BeliefFilter, query: Query, relevance: NDArray[np.float32]
-    ) -> float | None:
-        """Whether the view fits where the belief expected it; says nothing of a view that shows nothing."""
-        model = self._off_route_model
-        if before is None or model is None:
-            return None
-        log_odds = model.log_odds(agreement_of(predicted.mass, relevance)) if query.is_informative else 0.0
-        return off_route_probability(before, log_odds)
 
     def plan(self, state: LocalizerState) -> Plan | None:
         """The next best view from what is known now."""

@@ -34,9 +34,14 @@ class OffRouteModel:
     slope: float
     intercept: float
 
-    def log_odds(self, agreement: float) -> float:
-        """What one view says, bounded."""
-        return float(np.clip(self.intercept + self.slope * agreement, -_MAX_LOG_ODDS, _MAX_LOG_ODDS))
+    def after(self, before: float, agreement: float | None) -> float:
+        """Probability of being off the route after a move and a view of some agreement; None: it shows nothing."""
+        log_odds = 0.0
+        if agreement is not None:
+            log_odds = np.clip(self.intercept + self.slope * agreement, -_MAX_LOG_ODDS, _MAX_LOG_ODDS)
+        moved = before * (1 - _RETURNS) + (1 - before) * _LEAVES
+        odds = moved / (1 - moved) * np.exp(log_odds)
+        return float(odds / (1 + odds))
 
     @classmethod
     def of(cls, map_: Map) -> "OffRouteModel | None":
@@ -89,13 +94,6 @@ def agreement_of(mass: NDArray[np.float64], relevance: NDArray[np.float32]) -> f
     likelihood = np.exp(weighed - weighed.max())
     believed = (mass * likelihood).sum()
     return float(np.log(max(believed, 1e-300)) - np.log(likelihood.mean()))
-
-
-def off_route_probability(before: float, log_odds: float) -> float:
-    """Probability of being off the route after a move and a view that says `log_odds` at even prior odds."""
-    moved = before * (1 - _RETURNS) + (1 - before) * _LEAVES
-    odds = moved / (1 - moved) * np.exp(log_odds)
-    return float(odds / (1 + odds))
 
 
 def _frames_by_distance(places: NDArray[np.int64], route: Route) -> NDArray[np.int64]:

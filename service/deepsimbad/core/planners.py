@@ -85,18 +85,14 @@ def plan_for_telling_places(view: PlanningView) -> Plan:
     actions_m, bits_ahead = view.map.actions_m, view.map.bits_ahead
     if bits_ahead is None:
         return Plan(TELLING, float(actions_m[-1]))
-    values = _BITS_PER_METRE * actions_m + np.sqrt(_doubt(view.mass)) * _averaged(view.mass, bits_ahead)
+    doubt = 0.0  # what is left of the greatest there can be, 0..1: entropy (of order 2) over that of no knowledge
+    if view.mass.size > 1:
+        doubt = float(-np.log2(np.square(view.mass).sum()) / np.log2(view.mass.size))
+    values = _BITS_PER_METRE * actions_m + np.sqrt(doubt) * _averaged(view.mass, bits_ahead)
     return Plan(TELLING, float(actions_m[np.argmax(values)]), values)
 
 
 _PLANNERS: dict[str, Planner] = {TELLING: plan_for_telling_places, NNQL: plan_by_experience, RANDOM: plan_at_random}
-
-
-def _doubt(mass: NDArray[np.float64]) -> float:
-    """What is left of the greatest doubt there can be, 0..1: the entropy (of order 2) over that of no knowledge."""
-    if mass.size == 1:
-        return 0.0
-    return float(-np.log2(np.square(mass).sum()) / np.log2(mass.size))
 
 
 @njit(cache=True, nogil=True)

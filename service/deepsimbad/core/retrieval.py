@@ -33,12 +33,17 @@ def relevances(map_: Map, query: Query, live: LandmarkStatistics | None = None) 
 
 def _standardised(map_: Map, query: Query, live: LandmarkStatistics | None) -> NDArray[np.float32]:
     """Sum of -z over the list: a landmark counts by how unusually near it is."""
-    return _sum_listed_alike(map_, -_statistics(live).view(query.ranks).z)
+    if live is None:
+        raise InvalidMapConfigError("the map has no landmark statistics")
+    return _sum_listed_alike(map_, -live.view(query.ranks).z)
 
 
 def _calibrated(map_: Map, query: Query, live: LandmarkStatistics | None) -> NDArray[np.float32]:
     """Sum over the list of log-likelihood ratios: seen from here, against seen from anywhere (`core.calibration`)."""
-    seen, expected = _statistics(live).view(query.ranks), _expected_scores(map_)
+    if live is None or map_.correlation is None or map_.listed_score is None:
+        raise InvalidMapConfigError("the map has no calibration")
+    # What a landmark that is listed at a rank will score in another season, rho * z_m, [h, r].
+    seen, expected = live.view(query.ranks), map_.correlation * map_.listed_score
     certainty = seen.certainty[..., np.newaxis, :]
     return sum_listed(map_, expected * seen.z[..., np.newaxis, :] - certainty * np.square(expected) / 2)
 
@@ -91,19 +96,6 @@ _RULES: dict[Relevance, Callable[[Map, Query, LandmarkStatistics | None], NDArra
 }
 
 
-def _statistics(live: LandmarkStatistics | None) -> LandmarkStatistics:
-    if live is None:
-        raise InvalidMapConfigError("the map has no landmark statistics")
-    return live
-
-
-def _expected_scores(map_: Map) -> NDArray[np.float64]:
-    """[h, r] what a landmark that is listed at a rank will score in another season: rho * z_m."""
-    if map_.correlation is None or map_.listed_score is None:
-        raise InvalidMapConfigError("the map has no calibration")
-    return map_.correlation * map_.listed_score
-
-
 def _sum_listed_alike(map_: Map, worth: NDArray[np.generic]) -> NDArray[np.float32]:
     """`sum_listed` of landmarks that are worth the same at every rank, [..., r]."""
     tables = np.empty((*worth.shape[:-1], map_.list_length, worth.shape[-1]), np.float32)
@@ -120,7 +112,7 @@ def sum_listed(map_: Map, tables: NDArray[np.number]) -> NDArray[np.float32]:
     Args:
         tables: [h, r], what landmark i is worth at rank j + 1; of a batch of views [e, h, r], which gives [e, n].
     """
-    h, r, n = map_.list_length, map_.n_landmarks, map_.n_images
+    (h, n), r = map_.lists.shape, map_.n_landmarks
     if tables.shape[-2:] != (h, r):
         raise InvalidMapConfigError(f"tables have shape {tables.shape}, not [h, r]")
     worth = np.ascontiguousarray(tables, np.float32).reshape(-1, h, r)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from deepsimbad.errors import InvalidRouteError
 
 _NearPoint = Callable[[float, float], NDArray[np.intp]]
+_HISTOGRAM_BINS = 200
 _LEAST_LENGTH_M = 1e-9  # counted in steps that are far shorter, moves would overflow
 
 
@@ -146,18 +147,10 @@ class Route:
             nearest = np.where(behind > self._closing_gap_m - behind, 0, nearest)
         return np.asarray(nearest, np.intp)
 
-    def histogram(self, max_bins: int) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
-        """Edges [b + 1] of equal bins over the whole route, and every map image's bin [n]."""
-        if max_bins not in self._histograms:  # the same for every belief on the route
-            self._histograms[max_bins] = self._histogram(max_bins)
-        return self._histograms[max_bins]
-
     @cached_property
-    def _histograms(self) -> dict[int, tuple[NDArray[np.float64], NDArray[np.intp]]]:
-        return {}
-
-    def _histogram(self, max_bins: int) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
-        n_bins = min(max_bins, self.n_images)
+    def histogram(self) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
+        """Edges [b + 1] of equal bins over the whole route, at most 200, and every map image's bin [n]."""
+        n_bins = min(_HISTOGRAM_BINS, self.n_images)
         width_m = self.length_m / n_bins
         if width_m <= 0:
             return np.array([self.start_m, self.start_m]), np.zeros(self.n_images, np.intp)
