@@ -138,7 +138,7 @@ def _place(blob: NDArray[np.uint8], column: NDArray[np.uint16], landmark: int, e
             n_placed += 1
 
 
-_EMPTY = np.uint16(0xFFFF)  # no landmark: ids stay below it (see InvertedIndex)
+_EMPTY = np.uint16(0xFFFF)  # no landmark: ids stay below it (see Map)
 
 
 def pack_postings(image_ids: NDArray[np.int64]) -> bytes:
