@@ -4,7 +4,7 @@ import numpy as np
 
 from deepsimbad.core.belief import GridFilter, summarise
 from deepsimbad.core.map import Map
-from deepsimbad.core.planners import PlanningView, TellingPlanner
+from deepsimbad.core.planners import PlanningView, plan_for_telling_places
 from deepsimbad.core.relevance import Query, UpdateRule
 from deepsimbad.core.retrieval import relevances, shortlist
 from deepsimbad.evaluators.feature_l2 import squared_distances
@@ -25,7 +25,7 @@ def warm_up() -> None:
     belief = GridFilter.uniform(map_.route).updated(relevance, UpdateRule.ADDITIVE_RELEVANCE, step=0)
     mass = belief.predicted(0.5, 0.1, step=1).mass
     summarise(belief.route, mass, 1)
-    TellingPlanner().plan(PlanningView(map_, mass, relevance, seed=0, step=1))
+    plan_for_telling_places(PlanningView(map_, mass, relevance, seed=0, step=1))
     landmarks = np.zeros((2, 2), np.float32)
     landmarks.setflags(write=False)  # as those of a map are: for a kernel that is another type
     squared_distances(np.zeros((1, 2), np.float32), landmarks)
