@@ -23,7 +23,7 @@ from deepsimbad.errors import ConflictError, DamagedMapError, InvalidArchiveErro
 from deepsimbad.store import layout
 from deepsimbad.store.connection import check_integrity, in_todays_schema, look_at, pending_migrations
 from deepsimbad.store.data_dir import PRIVATE, ServiceLock
-from deepsimbad.store.durable import sha256_of, sync_file, sync_folder, written_aside
+from deepsimbad.store.durable import sha256_of, sync, written_aside
 from deepsimbad.store.faults import storage_faults
 from deepsimbad.store.layout import NAME_PATTERN
 from deepsimbad.store.records import now
@@ -319,7 +319,7 @@ def _unpack(tar: tarfile.TarFile, file: Path, member: dict[str, Any], staging: P
     with storage_faults(target):
         look_at(target, lambda db: pending_migrations(db, migrations, target))
     target.chmod(0o444 if target.parent.name == "maps" else 0o644)
-    sync_file(target)
+    sync(target)
 
 
 def _complete(staging: Path) -> None:
@@ -331,7 +331,7 @@ def _complete(staging: Path) -> None:
         layout.traverses_folder(staging, domain).mkdir(parents=True, exist_ok=True)
         layout.maps_folder(staging, domain).mkdir(parents=True, exist_ok=True)
     for folder, _, _ in os.walk(staging, topdown=False):
-        sync_folder(Path(folder))
+        sync(Path(folder))
 
 
 def _publish(staging: Path, data_dir: Path) -> None:
@@ -342,8 +342,8 @@ def _publish(staging: Path, data_dir: Path) -> None:
     for name in names:
         if (staging / name).exists():
             (staging / name).rename(data_dir / name)
-    sync_folder(data_dir)
-    sync_folder(data_dir.parent)
+    sync(data_dir)
+    sync(data_dir.parent)
 
 
 class _Counter:

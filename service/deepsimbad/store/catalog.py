@@ -12,7 +12,7 @@ from deepsimbad.store.catalog_file import all_domains, find_domain, get_domain
 from deepsimbad.store.catalog_jobs import JobCatalog
 from deepsimbad.store.catalog_keys import KeyCatalog
 from deepsimbad.store.catalog_maps import MapCatalog
-from deepsimbad.store.durable import bury, empty_graves, sync_folder
+from deepsimbad.store.durable import bury, empty_graves, sync
 from deepsimbad.store.records import DomainRecord, now, to_json
 from deepsimbad.store.traverses import Traverse
 
@@ -79,7 +79,7 @@ class Catalog(MapCatalog, JobCatalog, KeyCatalog):
             layout.traverses_folder(self.data_dir, name).mkdir(parents=True, exist_ok=True)
             layout.maps_folder(self.data_dir, name).mkdir(parents=True, exist_ok=True)
             for changed in (folder, folder.parent, self.data_dir):
-                sync_folder(changed)
+                sync(changed)
             record = get_domain(db, name)
         empty_graves(folder.parent)
         return record, True

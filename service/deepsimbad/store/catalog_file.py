@@ -19,7 +19,7 @@ from deepsimbad.store.connection import (
     write_transaction,
 )
 from deepsimbad.store.data_dir import make_data_dir
-from deepsimbad.store.durable import sync_folder
+from deepsimbad.store.durable import sync
 from deepsimbad.store.faults import storage_faults
 from deepsimbad.store.records import DomainRecord, from_json
 from deepsimbad_migrations.catalog.migrations import migrations
@@ -60,7 +60,7 @@ class CatalogFile(OpenFile):
                     file=path.name,
                 )
             db = open_working_file(path, migrations, create=not has_domains)
-            sync_folder(data_dir)
+            sync(data_dir)
         return cls(data_dir, db)
 
     def close(self) -> None:

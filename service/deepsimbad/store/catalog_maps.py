@@ -17,7 +17,7 @@ from deepsimbad.errors import (
 )
 from deepsimbad.store import layout
 from deepsimbad.store.catalog_file import CatalogFile, get_domain
-from deepsimbad.store.durable import lock_folder, remove_database, sync_folder
+from deepsimbad.store.durable import lock_folder, remove_database, sync
 from deepsimbad.store.records import KeptMap, ListPage, MapRecord, MapState, from_json, now, to_json
 
 _SELECT = """
@@ -194,7 +194,7 @@ class MapCatalog(CatalogFile):
         path = self.map_path(domain, version)
         was_there = path.parent.is_dir() and remove_database(path)
         if was_there:
-            sync_folder(path.parent)
+            sync(path.parent)
         return was_there
 
     def maps(self, domain: str) -> list[MapRecord]:

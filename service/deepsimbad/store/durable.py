@@ -17,18 +17,13 @@ _GRAVE_PREFIX = ".removing-"
 _NO_HARD_LINKS = {errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK, errno.EACCES}
 
 
-def sync_file(path: Path) -> None:
-    """Wait until the file's content is on the disk."""
+def sync(path: Path) -> None:
+    """Wait until a file's content, or a folder's entries (new, renamed or removed files), are on the disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
-
-
-def sync_folder(folder: Path) -> None:
-    """Wait until the folder's entries (new, renamed or removed files) are on the disk."""
-    sync_file(folder)
 
 
 @contextmanager
@@ -56,7 +51,7 @@ def written_aside(file: Path, what: str) -> Iterator[Path]:
     try:
         new = folder / file.name
         yield new
-        sync_file(new)
+        sync(new)
         try:
             os.link(new, file)  # unlike a rename it never replaces
         except OSError as error:
@@ -65,7 +60,7 @@ def written_aside(file: Path, what: str) -> Iterator[Path]:
             if error.errno not in _NO_HARD_LINKS:
                 raise
             new.rename(file)
-        sync_folder(file.parent)
+        sync(file.parent)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
 
@@ -92,7 +87,7 @@ def bury(folder: Path) -> None:
     """Take a folder out of sight by one rename; `empty_graves` removes its content, which may take long."""
     if folder.exists():
         folder.rename(folder.with_name(f"{_GRAVE_PREFIX}{secrets.token_hex(8)}"))
-        sync_folder(folder.parent)
+        sync(folder.parent)
 
 
 def empty_graves(parent: Path) -> None:

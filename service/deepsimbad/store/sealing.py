@@ -10,7 +10,7 @@ from deepsimbad.errors import ConflictError, DamagedMapError, NoActiveMapError, 
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.catalog_maps import removed
 from deepsimbad.store.connection import check_integrity, open_database
-from deepsimbad.store.durable import remove_database, sha256_of, sync_file, sync_folder, written_aside
+from deepsimbad.store.durable import remove_database, sha256_of, sync, written_aside
 from deepsimbad.store.faults import storage_faults
 from deepsimbad.store.layout import SEALING_SUFFIX
 from deepsimbad.store.map_file import read_map
@@ -69,12 +69,12 @@ def _taking_its_name(final_path: Path) -> Iterator[Path]:
         try:
             yield sealing_path
             sealing_path.chmod(0o444)
-            sync_file(sealing_path)
+            sync(sealing_path)
             sealing_path.rename(final_path)
         except BaseException:
             remove_database(sealing_path)
             raise
-        sync_folder(final_path.parent)
+        sync(final_path.parent)
 
 
 def verify(path: Path, sha256: str) -> None:

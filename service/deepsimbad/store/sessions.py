@@ -20,7 +20,7 @@ from deepsimbad.store.connection import (
     write_transaction,
 )
 from deepsimbad.store.data_dir import make_data_dir
-from deepsimbad.store.durable import sync_folder
+from deepsimbad.store.durable import sync
 from deepsimbad.store.faults import storage_faults
 from deepsimbad.store.group_commit import GroupCommit
 from deepsimbad.store.records import ListPage, from_json, to_json
@@ -65,7 +65,7 @@ class SessionStore(OpenFile):
         with storage_faults(path):
             is_small = not path.exists() or path.stat().st_size <= _CHECKED_AT_START_BYTES
             writing = open_working_file(path, migrations, create=True, is_checked=is_small)
-            sync_folder(data_dir)
+            sync(data_dir)
             return cls(path, open_database(path), writing, on_commit)
 
     def close(self) -> None:

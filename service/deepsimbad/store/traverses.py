@@ -23,7 +23,7 @@ from deepsimbad.errors import (
 from deepsimbad.store import layout
 from deepsimbad.store.arrays import is_halvable
 from deepsimbad.store.connection import OpenFile, open_database, open_working_file, write_transaction
-from deepsimbad.store.durable import lock_folder, remove_database, sync_file, sync_folder
+from deepsimbad.store.durable import lock_folder, remove_database, sync
 from deepsimbad.store.faults import storage_faults
 from deepsimbad.store.records import now
 from deepsimbad_migrations.traverse.migrations import migrations
@@ -70,12 +70,12 @@ class Traverse(OpenFile):
                 with open_database(new, create=True) as db, db.atomic():
                     migrations.apply(db)
                     db.execute("INSERT INTO traverse (id, created_at) VALUES (1, ?)", [now()])
-                sync_file(new)
+                sync(new)
                 new.rename(path)
             except BaseException:
                 remove_database(new)
                 raise
-            sync_folder(path.parent)
+            sync(path.parent)
         return cls.open(data_dir, domain, name)
 
     @classmethod
@@ -104,7 +104,7 @@ class Traverse(OpenFile):
                     raise
                 # A damaged file cannot be locked, and can be deleted all the same.
             remove_database(path)
-            sync_folder(path.parent)
+            sync(path.parent)
 
     @classmethod
     def list(cls, data_dir: Path, domain: str) -> list[str]:
