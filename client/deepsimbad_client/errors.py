@@ -108,8 +108,7 @@ BY_STATUS: "dict[int, type[ApiError]]" = {}
 class ApiError(DeepSimbadClientError):
     """The service answered with an error (RFC 9457 problem details).
 
-    Args:
-        message: The problem's detail, or the status line when the answer held none.
+    Attributes:
         status: The HTTP status.
         code: The problem's stable code word; `http_<status>` when the answer held none.
         problem: The whole problem document, with whatever limits and allowed values it names.

@@ -99,11 +99,11 @@ def download(client: Client, domain: str, version: int, file: Path, force: bool,
     if file.exists() and not force:
         raise click.UsageError(f"{file} is there already: give --force to replace it")
     with DownloadBar(f"map {version} of {domain}") as bar:
-        there = client.admin.download_map(domain, version, file, on_progress=bar)
+        saved = client.admin.download_map(domain, version, file, on_progress=bar)
     if json_output:
-        click.echo(as_json({"path": str(there.path), "sha256": there.sha256, "file_bytes": there.file_bytes}))
+        click.echo(as_json({"path": str(saved.path), "sha256": saved.sha256, "file_bytes": saved.file_bytes}))
     else:
-        click.echo(f"{there.path}: {there.file_bytes} bytes, sha256 {there.sha256}")
+        click.echo(f"{saved.path}: {saved.file_bytes} bytes, sha256 {saved.sha256}")
 
 
 @click.command("delete-domain")

@@ -135,15 +135,15 @@ def _show_job(job: Job, json_output: bool) -> None:
         return
     show(job_table([job]))
     result = job.result or {}
-    made = result.get("map_version")
-    why = gate_verdict(job.check)
-    if made is None:
+    version = result.get("map_version")
+    if version is None:
         return
+    why = gate_verdict(job.check)
     if not result.get("active", True):
-        click.echo(f"map {made} was sealed but not activated{f': {why}' if why else ''}")
-        click.echo(f"to serve it all the same: deepsimbad-client activate {job.domain} {made}")
+        click.echo(f"map {version} was sealed but not activated{f': {why}' if why else ''}")
+        click.echo(f"to serve it all the same: deepsimbad-client activate {job.domain} {version}")
     elif why:
-        click.echo(f"map {made}: {why}")
+        click.echo(f"map {version}: {why}")
     season = job.second_season
     if season.get("significance") is not None and not season.get("accepted"):  # compared, and found to differ
-        REMARKS.print(f"map {made} learnt nothing of a second season: {season.get('why')}", soft_wrap=True)
+        REMARKS.print(f"map {version} learnt nothing of a second season: {season.get('why')}", soft_wrap=True)

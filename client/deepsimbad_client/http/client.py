@@ -167,11 +167,9 @@ class SessionCalls(Face):
         The service raises its alarm by this; the map learns nothing from it (`Admin.feed_experience`). The same truths
         again count once.
 
-        Args:
-            true_positions_m: A position along the map's route for each observation, in order; None where unknown.
-            true_map_images: For each of the same observations the map images that show its place: the answer's
-                `retrieval_ranks` then tell where each view by itself placed the best of them.
-            first_observation: The observation that the first of them belongs to: truths may be told bit by bit.
+        A position along the map's route for each observation, in order, is None where unknown. `true_map_images` are,
+        for each of the same observations, the map images that show its place: the answer's `retrieval_ranks` then tell
+        where each view by itself placed the best of them. Truths may be told bit by bit, from `first_observation` on.
 
         Raises:
             InvalidInputError: As many positions as observations there are not.
@@ -343,17 +341,11 @@ class ClientCalls(Face, Generic[AnySession]):
         Use it as `with client.session(...) as session`, or `async with await client.session(...) as session`. A lost
         answer is asked for again and begins no second session.
 
-        Args:
-            domain: Where the robot is.
-            start_position_m: About where it starts along the route; absent: anywhere.
-            start_std_m: How well that is known; absent: the service's default.
-            seed: Of everything drawn at random; absent: the service's default.
-            planner: Who chooses the next view (`nnql`, `random`, `constant:3`, ...); absent: the service's default.
-            belief: `particle` or `grid`; absent: the service's default.
-            update: How a view changes the belief; absent: the map's default.
-            keep: Let it outlive its `with` block.
-            idempotency_key: Names this beginning, so that it can be repeated after a `TransportError`; absent: a new
-                one.
+        `start_position_m` is about where it starts along the route (absent: anywhere), `start_std_m` how well that is
+        known. The `planner` chooses the next view (`nnql`, `random`, `constant:3`, ...), `belief` is `particle` or
+        `grid`, `update` says how a view changes it, `seed` all that is drawn at random; what is absent is the
+        service's default. With `keep` it outlives its `with` block. The `idempotency_key` names this beginning, so that
+        it can be repeated after a `TransportError`.
 
         Raises:
             UnknownDomainError: No such domain.

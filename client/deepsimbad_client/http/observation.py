@@ -65,13 +65,13 @@ def observation(
         BrokenFrameError: The image file cannot be read.
     """
     numbers = {"ranked_landmarks": ranked_landmarks, "dissimilarities": dissimilarities, "encoding": encoding}
-    given = [(name, values) for name, values in numbers.items() if values is not None]
-    if len(given) + (image is not None) + (ranked is not None) != 1:
+    forms = [(name, values) for name, values in numbers.items() if values is not None]
+    if len(forms) + (image is not None) + (ranked is not None) != 1:
         raise InvalidArgumentError("give exactly one of image, ranked, ranked_landmarks, dissimilarities and encoding")
     if ranked is not None:
         return ranked
     if image is None:
-        return _json_observation(*given[0])
+        return _json_observation(*forms[0])
     body = image_bytes(image)
     media_type = content_type or media_type_of(body)
     if media_type is None:

@@ -117,11 +117,11 @@ class OnBoardEncoder:
         """The evaluator with its extractor, whose weights are the map's."""
         with _named_errors("the map's extractor cannot be loaded here"):
             self._evaluator.load()
-            here, there = self._evaluator.weights_sha256 or "", self.landmarks.weights_sha256
-        if there and here != there:
+            own, mapped = self._evaluator.weights_sha256 or "", self.landmarks.weights_sha256
+        if mapped and own != mapped:
             raise OtherWeightsError(
-                f"the weights here (sha256 {here or 'none'}) are not those that the images of map {self.map_version} "
-                f"were encoded by (sha256 {there}): install the service's release of them"
+                f"the weights here (sha256 {own or 'none'}) are not those that the images of map {self.map_version} "
+                f"were encoded by (sha256 {mapped}): install the service's release of them"
             )
         return self._evaluator
 

@@ -92,9 +92,9 @@ def upload(
         raise SourceError(f"{recording.name} has no frames to send")
     started = clock()
     input_size = client.domain(domain).input_size
-    there = _open_traverse(client, domain, traverse)
+    stored = _open_traverse(client, domain, traverse)
     report = UploadReport(len(recording.frames), left_out=dict(recording.left_out))
-    rows = [row for row, frame in enumerate(recording.frames) if resend or not there.has(frame.index)]
+    rows = [row for row, frame in enumerate(recording.frames) if resend or not stored.has(frame.index)]
     report.n_skipped = len(recording.frames) - len(rows)
 
     def tell() -> None:
