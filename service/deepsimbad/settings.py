@@ -145,6 +145,9 @@ class Settings(BaseSettings):
         float, Field(description="A session ends when nothing was observed in it for so long.", gt=0, le=31_536_000)
     ] = 3600.0
     max_sessions: Annotated[int, Field(description="Sessions that may live at once.", ge=1)] = 1000
+    max_sessions_per_key: Annotated[int, Field(description="Sessions of one API key that may live at once.", ge=1)] = (
+        100
+    )
     snapshot_every: Annotated[
         int, Field(description="Observations of a session between two snapshots of its belief.", ge=1)
     ] = 32

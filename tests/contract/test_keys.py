@@ -5,6 +5,7 @@ import logging
 import re
 import time
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -256,3 +257,45 @@ def test_a_limit_on_domains(tmp_path: Path) -> None:
         assert client.put("/v1/admin/domains/b", json=body).status_code == 200
         assert client.delete("/v1/admin/domains/a").status_code == 204
         assert client.put("/v1/admin/domains/c", json=body).status_code == 201
+
+
+def test_sessions_belong_to_the_key_that_began_them(tmp_path: Path) -> None:
+    with Catalog.open(tmp_path) as catalog:
+        secrets = [catalog.create_key(scope, "")[1].text for scope in (KeyScope.ADMIN, *2 * [KeyScope.LOCALIZE])]
+        robot_id = catalog.keys()[1].key_id
+    admin, robot, other = ({"X-API-Key": secret} for secret in secrets)
+    settings = small_settings(tmp_path, max_sessions_per_key=2, session_sweep_s=0.05)
+    with TestClient(create_app(settings, InThisProcess(tmp_path)), raise_server_exceptions=False) as client:
+        client.headers.update(admin)
+        make_ready_domain(client, "ready")
+        begin = partial(client.post, "/v1/domains/ready/sessions", json={})
+        mine, _ = (begin(headers=robot).json()["session_id"] for _ in range(2))
+        problem = check(begin(headers=robot), 429, "too_many_sessions")
+        assert (problem["limit"], problem["max_sessions_per_key"]) == ("max_sessions_per_key", 2)
+        assert begin(headers=other).status_code == 201, "another key has room of its own"
+
+        path, view = f"/v1/sessions/{mine}", {"ranked_landmarks": [1, 2]}
+        for method, url, body in (
+            ("POST", f"{path}/observations", view),
+            ("GET", path, None),
+            ("GET", f"{path}/belief", None),
+            ("GET", f"{path}/next-best-view", None),
+            ("PUT", f"{path}/prior", {"position_m": 1.0, "std_m": 1.0}),
+            ("POST", f"{path}/truths", {"true_positions_m": [1.0]}),
+            ("DELETE", path, None),
+        ):
+            check(client.request(method, url, json=body, headers=other), 404, "unknown_session")
+            if method != "DELETE":
+                assert client.request(method, url, json=body, headers=robot).status_code == 200, url
+        assert client.get(path).json()["n_observations"] == 1, "an admin knows of all"
+        listed = client.get("/v1/admin/sessions").json()["sessions"]
+        assert [session["key_id"] for session in listed].count(robot_id) == 2
+
+        with Catalog.open(tmp_path) as catalog:
+            catalog.revoke_key(robot_id)
+        give_up = time.monotonic() + 30
+        while client.get(path).status_code != 410:
+            assert time.monotonic() < give_up, "a revoked key's sessions end"
+            time.sleep(0.05)
+        assert len(client.get("/v1/admin/sessions").json()["sessions"]) == 1
+        check(client.get(path, headers=other), 404, "unknown_session")

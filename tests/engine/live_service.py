@@ -49,6 +49,7 @@ class Live:
             **{
                 "ttl_s": TTL_S,
                 "max_sessions": 20,
+                "max_sessions_per_key": 10,
                 "snapshot_every": 4,
                 "keep_ended_s": KEEP_ENDED_S,
                 "clock": clock,

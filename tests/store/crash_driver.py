@@ -29,22 +29,20 @@ DONE = ["traverse", "frames", "job", "begun", "written", "sealed", "noted", "act
 
 def frames() -> Drive:
     n = np.arange(N_FRAMES)
-    return Drive(n, n * 1.0, n, n * 1.0, n * 1.0, np.ones((N_FRAMES, 4), np.float32))
+    encodings = np.ones((N_FRAMES, 4), np.float32)
+    return Drive(index=n, position_m=n * 1.0, timestamp_us=n, x_m=n * 1.0, y_m=n * 1.0, encodings=encodings)
 
 
 def contents(version: int) -> Map:
     lists = np.array([[0, 1, 2, 0], [1, 2, 0, 2]], np.uint16)
     return Map(
-        "campus",
-        version,
-        "",
-        {"n_landmarks": 3},
-        {},
-        False,
-        (1.0,),
-        {"p": np.ones((3, 4), "f4")},
-        lists,
-        np.arange(4.0),
+        domain="campus",
+        version=version,
+        config={"relevance": "rrf", "n_landmarks": 3},
+        actions_m=np.ones(1),
+        landmark_model={"p": np.ones((3, 4), "f4")},
+        lists=lists,
+        position_m=np.arange(4.0),
     )
 
 

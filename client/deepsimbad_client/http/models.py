@@ -157,6 +157,7 @@ class ListedSession(Answer):
     domain: str
     map_version: int
     n_observations: int
+    key_id: str | None = None
     created_at: str | None = None
     expires_at: str | float | None = None
 

@@ -103,3 +103,9 @@ def m004_without_clock_and_row_checksums(db: Database) -> None:
     db.execute("DROP TABLE clock")
     for table in ("session", "journal", "snapshot", "true_positions"):
         db.execute(f"ALTER TABLE {table} DROP COLUMN checksum")
+
+
+@migrations()
+def m005_key(db: Database) -> None:
+    """The API key that a session was begun with; NULL where none was asked, or nobody noted it."""
+    db.execute("ALTER TABLE session ADD COLUMN key_id TEXT")

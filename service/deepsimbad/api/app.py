@@ -31,6 +31,7 @@ from deepsimbad.release import release
 from deepsimbad.settings import Settings
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.data_dir import ServiceLock
+from deepsimbad.store.session_records import SessionRecord
 from deepsimbad.store.sessions import SessionStore
 
 log = logging.getLogger(__name__)
@@ -112,16 +113,21 @@ async def _sweep(services: Services, every_s: float) -> None:
         await asyncio.sleep(every_s)
         try:
             await services.sessions.sweep()
-            await _end_of_no_domain(services)
+            await _end_of_nobody(services)
             await run_sync(services.retention.prune)
         except DeepSimbadError:
             log.exception("expired sessions could not be ended")
 
 
-async def _end_of_no_domain(services: Services) -> None:
-    """A command beside the service may have deleted a domain."""
+async def _end_of_nobody(services: Services) -> None:
+    """End the sessions whose key was revoked, or whose domain a command beside the service has deleted."""
     domains = {record.name for record in await run_sync(services.catalog.domains)}
-    await services.sessions.end_those(lambda session: session.domain not in domains)
+
+    def is_over(session: SessionRecord) -> bool:
+        has_no_key = session.key_id is not None and not services.keys.still_opens(session.key_id)
+        return has_no_key or session.domain not in domains
+
+    await services.sessions.end_those(is_over)
 
 
 def _start(settings: Settings, metrics: Metrics, keys: KeyRing, run_job: RunJob, parts: ExitStack) -> Services:
@@ -154,6 +160,7 @@ def _start(settings: Settings, metrics: Metrics, keys: KeyRing, run_job: RunJob,
         worker,
         ttl_s=settings.session_ttl_s,
         max_sessions=settings.max_sessions,
+        max_sessions_per_key=settings.max_sessions_per_key,
         snapshot_every=settings.snapshot_every,
         keep_ended_s=settings.keep_ended_sessions_s,
     )

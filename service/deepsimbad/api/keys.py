@@ -129,7 +129,7 @@ class KeyRing:
         except UnauthorizedError as error:
             noted |= {name: value for name, value in error.hints.items() if name == "key_id"}  # revoked or expired
             raise
-        noted |= {"key_id": key.key_id, "domains": key.domains}
+        noted |= {"key_id": key.key_id, "key_scope": key.scope, "domains": key.domains}
         rate_limit.take(key.key_id)
         if not key.scope.includes(needed):
             raise ForbiddenError(

@@ -34,6 +34,7 @@ from deepsimbad.evaluators.image import KEPT_PIXELS, ImageFile, is_blank
 from deepsimbad.jobs.runner import JobRunner
 from deepsimbad.settings import Settings
 from deepsimbad.store.catalog import Catalog
+from deepsimbad.store.records import KeyScope
 from deepsimbad.store.sessions import SessionStore
 
 T = TypeVar("T")
@@ -306,6 +307,12 @@ KeyOfJob = Annotated[
         "such as a UUID."
     ),
 ]
+
+
+def robot_of(request: Request) -> str | None:
+    """The key whose sessions alone the asker may know of; None: of all, with an admin's key or while none is asked."""
+    state = request.scope["state"]
+    return None if state.get("key_scope") == KeyScope.ADMIN else cast("str | None", state.get("key_id"))
 
 
 def key_id_of(request: Request) -> str | None:

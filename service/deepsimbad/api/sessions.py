@@ -48,10 +48,12 @@ from deepsimbad.api.requests import (
     id_under_key,
     idempotency_header,
     insisted_on,
+    key_id_of,
     media_type_of,
     number_of,
     read_bytes,
     read_json,
+    robot_of,
 )
 from deepsimbad.core.belief import FilterKind
 from deepsimbad.core.relevance import UpdateRule
@@ -163,6 +165,7 @@ class ListedSessionAnswer(Answer):
     session_id: str
     domain: str
     map_version: Annotated[int, Field(description="The map it began on and keeps.")]
+    key_id: Annotated[str | None, Field(description="The key it was begun with; null where none was asked.")]
     n_observations: Annotated[int, Field(description="Views that were told.")]
     created_at: Annotated[str, Field(description="ISO 8601, UTC.")]
     expires_at: Annotated[str, Field(description="When it ends unless something happens to it; ISO 8601, UTC.")]
@@ -232,6 +235,7 @@ def render_listed(listed: ListedSession) -> ListedSessionAnswer:
         session_id=session.session_id,
         domain=session.domain,
         map_version=session.map_version,
+        key_id=session.key_id,
         n_observations=listed.n_observations,
         created_at=_iso(session.created_at),
         expires_at=_iso(session.expires_at),
@@ -276,7 +280,7 @@ async def post_session(
     active = await running.active(domain)
     config = (await read_json(request, SessionBody)).config()
     session_id = id_under_key(request, "session", domain, idempotency_key)
-    view = await running.sessions.begin(active, config, session_id)
+    view = await running.sessions.begin(active, config, session_id, key_id_of(request))
     return await _answered(running, view, 201, f"/v1/sessions/{view.session_id}")
 
 
@@ -325,7 +329,7 @@ async def post_observation(
             named,
             insisted_on(if_match),
         )
-        view = await running.sessions.observe(session_id, observation, watch)
+        view = await running.sessions.observe(session_id, observation, watch, robot_of(request))
     except DeepSimbadError as error:
         running.metrics.observed(error.code)
         raise
@@ -342,9 +346,11 @@ async def post_observation(
 
 
 @router.get("/sessions/{session_id}", response_model=SessionAnswer, responses=problems(404, 410, 422))
-async def get_session(session_id: SessionId, running: Running, shortlist: Shortlist = None) -> Response:
+async def get_session(
+    session_id: SessionId, request: Request, running: Running, shortlist: Shortlist = None
+) -> Response:
     """A session as it stands; asking does not keep it from expiring."""
-    return await _answered(running, await running.sessions.view(session_id, shortlist))
+    return await _answered(running, await running.sessions.view(session_id, shortlist, robot_of(request)))
 
 
 @router.get(
@@ -360,16 +366,16 @@ async def get_belief(
 ) -> Response:
     """The belief alone; with `Accept: application/octet-stream` the mass of every map image."""
     if prefers_binary(request):
-        return npy_response(await running.sessions.mass(session_id))
-    view = await running.sessions.view(session_id, shortlist)
+        return npy_response(await running.sessions.mass(session_id, robot_of(request)))
+    view = await running.sessions.view(session_id, shortlist, robot_of(request))
     route, belief = view.snapshot.route, view.belief
     return await running.written(belief.top.size, lambda: json_response(render_belief(route, belief)))
 
 
 @router.get("/sessions/{session_id}/next-best-view", responses=problems(404, 410, 422))
-async def get_next_best_view(session_id: SessionId, running: Running) -> NextBestViewAnswer | None:
+async def get_next_best_view(session_id: SessionId, request: Request, running: Running) -> NextBestViewAnswer | None:
     """The move that would tell most, without a new view; null where the map can name none."""
-    plan, actions_m = await running.sessions.next_best_view(session_id)
+    plan, actions_m = await running.sessions.next_best_view(session_id, robot_of(request))
     return render_plan(plan, actions_m)
 
 
@@ -382,13 +388,14 @@ async def get_next_best_view(session_id: SessionId, running: Running) -> NextBes
 async def put_prior(session_id: SessionId, request: Request, running: Running) -> Response:
     """Replace the belief by one around a position: the robot was carried, or got a fix."""
     body = await read_json(request, PriorBody)
-    return await _answered(running, await running.sessions.set_prior(session_id, body.position_m, body.std_m))
+    view = await running.sessions.set_prior(session_id, body.position_m, body.std_m, robot_of(request))
+    return await _answered(running, view)
 
 
 @router.delete("/sessions/{session_id}", status_code=204, responses=problems(404, 410, 422))
-async def delete_session(session_id: SessionId, running: Running) -> None:
+async def delete_session(session_id: SessionId, request: Request, running: Running) -> None:
     """End a session; nothing more can be asked of it."""
-    await running.sessions.end(session_id)
+    await running.sessions.end(session_id, robot_of(request))
 
 
 @router.post(
@@ -405,7 +412,7 @@ async def post_truths(session_id: SessionId, request: Request, running: Running)
     """
     body = await read_json(request, TruthsBody)
     ranked, before_m = await running.truths.keep(
-        session_id, body.true_positions_m, body.true_map_images, body.first_observation
+        session_id, body.true_positions_m, body.true_map_images, body.first_observation, robot_of(request)
     )
     await run_sync(running.metrics.fed_back, ranked.domain, ranked.new_since(before_m).tolist())
     ranks = ranked.retrieval_rank

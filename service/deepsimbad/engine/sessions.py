@@ -4,6 +4,7 @@ import asyncio
 import math
 import secrets
 import time
+from collections import Counter
 from collections.abc import Callable, Coroutine
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -65,6 +66,7 @@ class Sessions:
         worker: Where views are described and beliefs computed.
         ttl_s: A session ends when nothing happened to it for so long.
         max_sessions: How many may live at once.
+        max_sessions_per_key: How many of one API key.
         snapshot_every: Rows of a journal between two snapshots: how much is replayed after a start.
         keep_ended_s: An ended session is known, with what it saw, for so long.
         clock: Seconds since 1970.
@@ -79,6 +81,7 @@ class Sessions:
         *,
         ttl_s: float,
         max_sessions: int,
+        max_sessions_per_key: int,
         snapshot_every: int,
         keep_ended_s: float,
         clock: Callable[[], float] = time.time,
@@ -89,10 +92,11 @@ class Sessions:
         self._worker = worker
         self._ttl_s = ttl_s
         self._max_sessions = max_sessions
+        self._max_sessions_per_key = max_sessions_per_key
         self._snapshot_every = snapshot_every
         self._keep_ended_s = keep_ended_s
         self._clock = clock
-        self._n_beginning = 0
+        self._beginning: Counter[str | None] = Counter()  # by key
         self._repeating = asyncio.Lock()
         self._summaries = ThreadPoolExecutor(1, "summaries")
         self._under_way: set[asyncio.Task[Any]] = set()
@@ -108,7 +112,13 @@ class Sessions:
         """End the thread of summaries."""
         self._summaries.shutdown()
 
-    async def begin(self, active: MappedDomain, config: SessionConfig, session_id: str | None = None) -> SessionView:
+    async def begin(
+        self,
+        active: MappedDomain,
+        config: SessionConfig,
+        session_id: str | None = None,
+        key_id: str | None = None,
+    ) -> SessionView:
         """Begin a session on a domain's active map.
 
         Args:
@@ -116,10 +126,11 @@ class Sessions:
             config: How it begins.
             session_id: Its id, where a repetition of the request would have the same: the session that was begun by
                 the first one is answered then, as it stands. None: a new one.
+            key_id: The API key that it belongs to; None: no key is asked.
 
         Raises:
             InvalidInputError: The start or the configuration cannot be.
-            TooManySessionsError: As many live as may.
+            TooManySessionsError: As many live as may, of all or of this key.
             IdempotencyKeyReusedError: A session of that id was begun with another configuration.
             EndedSessionError: The session of that id has ended.
         """
@@ -127,15 +138,18 @@ class Sessions:
             with suppress(UnknownSessionError):
                 return await self._begun_before(session_id, config)
         check_prior(active.snapshot.route, config.start_position_m, config.start_std_m)
-        return await self._finished(self._begin(active, config, session_id or secrets.token_hex(16)))
+        return await self._finished(self._begin(active, config, session_id or secrets.token_hex(16), key_id))
 
-    async def observe(self, session_id: str, observation: Observation, watch: Stopwatch | None = None) -> SessionView:
+    async def observe(
+        self, session_id: str, observation: Observation, watch: Stopwatch | None = None, key_id: str | None = None
+    ) -> SessionView:
         """Move a session on by a move and the view after it.
 
         Args:
             session_id: Which session.
             observation: What its robot reports.
             watch: Told of every stage. `wait` is for its turn: behind what came before it, and then for the worker.
+            key_id: Here and below the API key whose sessions alone are known to the asker; None: all are.
 
         Raises:
             UnknownSessionError, EndedSessionError, RetiredMapError: There is no such session, or no more.
@@ -143,27 +157,31 @@ class Sessions:
             LandmarkModelDiffersError: The view was ranked by another landmark model than that of the session's map.
             IdempotencyKeyReusedError: The key named another observation.
         """
-        live = await self._find(session_id)
+        live = await self._find(session_id, key_id)
         return await self._finished(self._observe(live, observation, watch or Stopwatch()))
 
-    async def set_prior(self, session_id: str, position_m: float, std_m: float) -> SessionView:
+    async def set_prior(
+        self, session_id: str, position_m: float, std_m: float, key_id: str | None = None
+    ) -> SessionView:
         """Replace a session's belief by one around a position; raises InvalidPriorError."""
-        live = await self._find(session_id)
+        live = await self._find(session_id, key_id)
         return await self._finished(self._set_prior(live, position_m, std_m))
 
-    async def view(self, session_id: str, n_shortlist: int | None = None) -> SessionView:
+    async def view(self, session_id: str, n_shortlist: int | None = None, key_id: str | None = None) -> SessionView:
         """What a session believes now."""
-        live, state = await self._read(session_id)
+        live, state = await self._read(session_id, key_id)
         return await self._summarised(session_id, live.expires_at, state, n_shortlist)
 
-    async def mass(self, session_id: str) -> NDArray[np.float64]:
+    async def mass(self, session_id: str, key_id: str | None = None) -> NDArray[np.float64]:
         """[n] mass of every map image in a session's belief; sums to 1."""
-        _, state = await self._read(session_id)
+        _, state = await self._read(session_id, key_id)
         return await self._compute(lambda: state.belief.belief.mass)
 
-    async def next_best_view(self, session_id: str) -> tuple[Plan | None, NDArray[np.float64]]:
+    async def next_best_view(
+        self, session_id: str, key_id: str | None = None
+    ) -> tuple[Plan | None, NDArray[np.float64]]:
         """The move to make next, without a new view (None where the map can name none), and the moves there are."""
-        _, state = await self._read(session_id)
+        _, state = await self._read(session_id, key_id)
         engine = state.engine
         if state.step is not None:
             return state.step.plan, engine.snapshot.actions_m
@@ -173,9 +191,9 @@ class Sessions:
         """A page of the living sessions, of a domain or all, newest first, behind number `before`."""
         return await asyncio.to_thread(self._store.newest_living, domain, before, limit, self._clock())
 
-    async def end(self, session_id: str) -> None:
+    async def end(self, session_id: str, key_id: str | None = None) -> None:
         """End a session."""
-        await self._finished(self._end(await self._find(session_id), DELETED))
+        await self._finished(self._end(await self._find(session_id, key_id), DELETED))
 
     async def end_those(self, is_over: Callable[[SessionRecord], bool]) -> None:
         """End the living sessions that something is over for: their domain was deleted, say."""
@@ -213,9 +231,11 @@ class Sessions:
             )
         return await self.view(session_id)
 
-    async def _begin(self, active: MappedDomain, config: SessionConfig, session_id: str) -> SessionView:
-        await self._check_room()
-        self._n_beginning += 1
+    async def _begin(
+        self, active: MappedDomain, config: SessionConfig, session_id: str, key_id: str | None
+    ) -> SessionView:
+        await self._check_room(key_id)
+        self._beginning[key_id] += 1
         try:
             snapshot = active.snapshot
             with self._maps.beginning(snapshot):
@@ -226,7 +246,17 @@ class Sessions:
                 state = await self._compute(lambda: SessionState.start(SessionEngine.of(config, snapshot, evaluator)))
                 answer = self._summarised(session_id, expires_at, state)
                 new = SessionRecord(
-                    0, session_id, snapshot.domain, snapshot.version, digest, config.as_dict(), now, expires_at, 0, None
+                    number=0,
+                    session_id=session_id,
+                    domain=snapshot.domain,
+                    map_version=snapshot.version,
+                    map_sha256=digest,
+                    config=config.as_dict(),
+                    created_at=now,
+                    expires_at=expires_at,
+                    n_events=0,
+                    ending=None,
+                    key_id=key_id,
                 )
                 record = await asyncio.wrap_future(self._store.create(new))
             if replace(record, number=0) != new:  # the same request was on its way twice, and the other was quicker
@@ -235,43 +265,52 @@ class Sessions:
             self._living.setdefault(session_id, LiveSession(record, expires_at, state))
             return await answer
         finally:
-            self._n_beginning -= 1
+            self._beginning[key_id] -= 1
 
-    async def _check_room(self) -> None:
-        """Raise TooManySessionsError where as many live as may."""
-        if self.n_living + self._n_beginning >= self._max_sessions:
-            await self._expire()
-        if self.n_living + self._n_beginning >= self._max_sessions:
-            soonest_s = min((live.expires_at for live in self._living.values()), default=0.0) - self._clock()
-            raise TooManySessionsError(
-                f"{self._max_sessions} sessions live, and no more may: delete one that is done with, or wait",
-                max_sessions=self._max_sessions,
-                retry_after_s=max(1, min(_LONGEST_RETRY_S, math.ceil(soonest_s))),
-            )
+    async def _check_room(self, key_id: str | None) -> None:
+        """Raise TooManySessionsError where as many live as may, of all or of one key."""
+        for is_last_try in (False, True):
+            of_key = [live for live in self._living.values() if live.record.key_id == key_id]
+            if self.n_living + self._beginning.total() >= self._max_sessions:
+                rivals, limit, most = list(self._living.values()), "max_sessions", self._max_sessions
+            elif key_id is not None and len(of_key) + self._beginning[key_id] >= self._max_sessions_per_key:
+                rivals, limit, most = of_key, "max_sessions_per_key", self._max_sessions_per_key
+            else:
+                return
+            if not is_last_try:
+                await self._expire()
+        soonest_s = min((live.expires_at for live in rivals), default=0.0) - self._clock()
+        whose = "sessions" if limit == "max_sessions" else "sessions of this key"
+        hints = {limit: most, "limit": limit, "retry_after_s": max(1, min(_LONGEST_RETRY_S, math.ceil(soonest_s)))}
+        raise TooManySessionsError(
+            f"{most} {whose} live, and no more may: delete one that is done with, or wait", **hints
+        )
 
     # Finding
 
-    async def _find(self, session_id: str) -> LiveSession:
+    async def _find(self, session_id: str, key_id: str | None = None) -> LiveSession:
         """A living session.
 
         Raises:
-            UnknownSessionError: There is none of that id.
+            UnknownSessionError: There is none of that id, or it belongs to another key.
             EndedSessionError: It has been deleted, or has expired.
         """
         live = self._living.get(session_id)
         if live is None:
             record = await asyncio.to_thread(self._store.find, session_id)
+            check_owner(record, key_id)
             if record.ending is not None:
                 raise _ended(session_id, record.ending)
             live = self._living.setdefault(session_id, LiveSession(record, record.expires_at))  # begun this moment
+        check_owner(live.record, key_id)
         if self._clock() >= live.expires_at and not live.lock.locked():
             await self._end(live, EXPIRED)
         if live.ending is not None:
             raise _ended(session_id, live.ending)
         return live
 
-    async def _read(self, session_id: str) -> tuple[LiveSession, SessionState]:
-        live = await self._find(session_id)
+    async def _read(self, session_id: str, key_id: str | None = None) -> tuple[LiveSession, SessionState]:
+        live = await self._find(session_id, key_id)
         if live.state is not None:
             return live, live.state
         async with live.lock:
@@ -442,6 +481,12 @@ class Sessions:
         self._under_way.add(task)
         task.add_done_callback(self._under_way.discard)
         return await asyncio.shield(task)
+
+
+def check_owner(record: SessionRecord, key_id: str | None) -> None:
+    """Deny a session to every key but its own, where it has one; raises UnknownSessionError. No key may know of all."""
+    if key_id is not None and record.key_id not in {None, key_id}:
+        raise UnknownSessionError(f"there is no session {record.session_id!a}")
 
 
 def _ended(session_id: str, ending: str) -> EndedSessionError:

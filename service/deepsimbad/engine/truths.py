@@ -13,7 +13,7 @@ from deepsimbad.core.localizer import LocalizerState
 from deepsimbad.core.metrics import rank_of_truth
 from deepsimbad.core.route import Route
 from deepsimbad.engine.session import SessionEngine, SessionState, replayed_until
-from deepsimbad.engine.sessions import Sessions
+from deepsimbad.engine.sessions import Sessions, check_owner
 from deepsimbad.engine.worker import InferenceWorker
 from deepsimbad.errors import InvalidInputError
 from deepsimbad.store.session_records import JournalRow, ObservedRow, SessionRecord, StateSnapshot
@@ -133,6 +133,7 @@ class Truths:
         positions_m: Sequence[float | None],
         true_map_images: Sequence[Sequence[int]] | None = None,
         first: int = 0,
+        key_id: str | None = None,
     ) -> RankedTruths:
         """Rank the truth in the belief, and where asked in the retrieval, as it was after every observation.
 
@@ -144,6 +145,7 @@ class Truths:
             positions_m: One for every observation; None where it is unknown.
             true_map_images: For every observation the map images that show its place.
             first: The observation that the first of them belongs to.
+            key_id: The API key whose sessions alone are known to the asker; None: all are.
 
         Raises:
             UnknownSessionError: There is none such, or it ended long ago.
@@ -151,7 +153,7 @@ class Truths:
             InvalidInputError: As many as observations there are not, a position is not finite, or no map image is one.
             DamagedMapError, DamagedFileError: The map or the session cannot be read.
         """
-        return (await self._ranked(session_id, positions_m, true_map_images, first))[1]
+        return (await self._ranked(session_id, positions_m, true_map_images, first, key_id))[1]
 
     async def keep(
         self,
@@ -159,13 +161,14 @@ class Truths:
         positions_m: Sequence[float | None],
         true_map_images: Sequence[Sequence[int]] | None = None,
         first: int = 0,
+        key_id: str | None = None,
     ) -> tuple[RankedTruths, NDArray[np.float64] | None]:
         """Rank the truths, then keep the positions for experience; raises as `rank` does, and then nothing was kept.
 
         Returns:
             The ranked truths, and the positions that had been kept before, if any.
         """
-        record, ranked = await self._ranked(session_id, positions_m, true_map_images, first)
+        record, ranked = await self._ranked(session_id, positions_m, true_map_images, first, key_id)
         kept = self._store.save_true_positions(record.number, ranked.position_m, self._clock())
         return ranked, await asyncio.wrap_future(kept)
 
@@ -175,8 +178,9 @@ class Truths:
         positions_m: Sequence[float | None],
         true_map_images: Sequence[Sequence[int]] | None,
         first: int,
+        key_id: str | None,
     ) -> tuple[SessionRecord, RankedTruths]:
-        record, engine, known = await asyncio.to_thread(self._prepared, session_id, positions_m, first)
+        record, engine, known = await asyncio.to_thread(self._prepared, session_id, positions_m, first, key_id)
         route = engine.snapshot.route
         images = checked_images(true_map_images, known.size, first, route.n_images)
         nearest = true_images(route, known)
@@ -198,9 +202,10 @@ class Truths:
         return record, RankedTruths(record.domain, record.map_version, known, share, asked, first)
 
     def _prepared(
-        self, session_id: str, positions_m: Sequence[float | None], first: int
+        self, session_id: str, positions_m: Sequence[float | None], first: int, key_id: str | None
     ) -> tuple[SessionRecord, SessionEngine, NDArray[np.float64]]:
         record = self._store.find(session_id)
+        check_owner(record, key_id)
         known = checked_truths(positions_m, self._store.n_observations(record.number), first)
         return record, self._sessions.engine_of(record), known
 

@@ -20,6 +20,7 @@ class SessionRecord:
         expires_at: When it ends unless something happens to it.
         n_events: Rows of its journal; the last row's sequence number.
         ending: How it ended ("deleted", "expired"); None while it lives.
+        key_id: Of the API key that it was begun with; None where none was asked.
     """
 
     number: int
@@ -32,6 +33,7 @@ class SessionRecord:
     expires_at: float
     n_events: int
     ending: str | None
+    key_id: str | None = None
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,7 @@ _CHECKED_AT_START_BYTES = 64 * 1024 * 1024  # a service shall be ready soon; `de
 _MAX_NUMBER = 2**63 - 1
 _SELECT = """
     SELECT session.number, session_id, domain, map_version, map_sha256, config, created_at,
-           coalesce(latest.expires_at, session.expires_at), coalesce(latest.sequence, 0), ending
+           coalesce(latest.expires_at, session.expires_at), coalesce(latest.sequence, 0), ending, key_id
     FROM session LEFT JOIN journal AS latest
       ON latest.session = session.number
      AND latest.sequence = (SELECT max(sequence) FROM journal WHERE session = session.number)
@@ -110,12 +110,13 @@ class SessionStore(OpenFile):
         def write(db: Database) -> SessionRecord:
             db.execute(
                 """
-                INSERT INTO session (session_id, domain, map_version, map_sha256, config, created_at, expires_at)
-                VALUES (?, ?, ?, ?, ?, ?, ?) ON CONFLICT (session_id) DO NOTHING
+                INSERT INTO session
+                    (session_id, domain, map_version, map_sha256, config, created_at, expires_at, key_id)
+                VALUES (?, ?, ?, ?, ?, ?, ?, ?) ON CONFLICT (session_id) DO NOTHING
                 """,
                 [
                     *(record.session_id, record.domain, record.map_version, record.map_sha256),
-                    *(to_json(record.config), record.created_at, record.expires_at),
+                    *(to_json(record.config), record.created_at, record.expires_at, record.key_id),
                 ],
             )
             return _get(db, record.session_id)
