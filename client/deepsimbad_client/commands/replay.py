@@ -72,9 +72,9 @@ def replay(
     it, and looks again. Writes steps.jsonl, summary.json and pictures; interrupted, the same command goes on where it
     stopped.
     """
-    given = {"--episodes": episodes, "--steps": steps, "--seed": seed}
-    if not planners and any(value is not None for value in given.values()):
-        raise click.UsageError(f"{', '.join(given)} belong to an active replay: give --planner too")
+    active_only = {"--episodes": episodes, "--steps": steps, "--seed": seed}
+    if not planners and any(value is not None for value in active_only.values()):
+        raise click.UsageError(f"{', '.join(active_only)} belong to an active replay: give --planner too")
     if planners and tolerance_m is not None:
         raise click.UsageError("--tolerance belongs to a passive replay: an active one ranks the nearest map image")
     recording = open_source(source, spacing_m=spacing_m, undistortion=undistortion)
@@ -116,8 +116,8 @@ def replay(
     if json_output:
         click.echo(as_json(summary))
     else:
-        for each in tables:
-            show(each)
+        for shown in tables:
+            show(shown)
     REMARKS.print(f"results in {folder}", soft_wrap=True)
 
 

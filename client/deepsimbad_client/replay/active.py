@@ -282,18 +282,18 @@ class Stage:
 
     def drive(self, planner: str, number: int, row: int, seed: int, steps: int, stopping: threading.Event) -> Episode:
         """One whole episode in a session of its own; cut off when `stopping` is set."""
-        done: list[EpisodeStep] = []
+        views: list[EpisodeStep] = []
         named, edges_m = planner, (0.0, 0.0)
         with self.scene.session(planner, seed) as session:
             for seen, step in self.play(session, row, steps):
                 if stopping.is_set():
                     raise _Stopped
-                done.append(step if number < EPISODES_WITH_MASS else replace(step, mass=()))
+                views.append(step if number < EPISODES_WITH_MASS else replace(step, mass=()))
                 edges = seen.answer.belief.histogram.edges_m
                 edges_m = (edges[0], edges[-1])
                 if seen.answer.next_best_view is not None:
                     named = seen.answer.next_best_view.planner
-        return Episode(planner, named, number, seed, edges_m, tuple(done))
+        return Episode(planner, named, number, seed, edges_m, tuple(views))
 
     def _judged(self, row: int, seen: Seen, session: Session, moves: dict[str, Any]) -> EpisodeStep:
         """How well the belief after a view knows where the robot truly is."""
@@ -334,8 +334,7 @@ _FIELDS = frozenset(field.name for field in fields(EpisodeStep))
 
 def _episode(document: dict[str, Any]) -> Episode:
     steps = tuple(
-        EpisodeStep(**{key: value for key, value in step.items() if key in _FIELDS} | {"mass": tuple(step["mass"])})
-        for step in document["steps"]
+        EpisodeStep(**{key: step[key] for key in _FIELDS} | {"mass": tuple(step["mass"])}) for step in document["steps"]
     )
     low_m, high_m = document["edges_m"]
     return Episode(**document | {"edges_m": (low_m, high_m), "steps": steps})

@@ -221,5 +221,4 @@ class _Drive:
 def _record(document: Any) -> _Record:
     if isinstance(document, list):
         return [None if rank is None else float(rank) for rank in document]
-    known = {key: value for key, value in document.items() if key in _FIELDS}
-    return Step(**known | {"mass": tuple(document["mass"])})
+    return Step(**{key: document[key] for key in _FIELDS} | {"mass": tuple(document["mass"])})

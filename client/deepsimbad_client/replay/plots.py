@@ -238,10 +238,10 @@ def _compared(
         for place, name in [*enumerate(others, 1), (0, first)]:
             row, colour = summary[table][name], PLANNER_COLOURS[place % len(PLANNER_COLOURS)]
             points = zip(at[name], row[figure_name], row[interval_name], strict=True)
-            known = [(x, y, *(ends or (y, y))) for x, y, ends in points if y is not None]
-            if not known:
+            drawn = [(x, y, *(ends or (y, y))) for x, y, ends in points if y is not None]
+            if not drawn:
                 continue
-            x, y, low, high = np.array(known).T
+            x, y, low, high = np.array(drawn).T
             axes.fill_between(x, low, high, color=colour, alpha=0.16, lw=0)
             label_of = shown_name(name, summary["planner_named"][name])
             thick = name == first

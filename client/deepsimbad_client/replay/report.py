@@ -3,7 +3,7 @@
 import json
 import math
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -69,27 +69,30 @@ def write_summary(summary: dict[str, Any], folder: Path) -> Path:
 def table(summary: dict[str, Any]) -> Table:
     """The figures of a passive replay as a table."""
     config = summary["config"]
-    made = _table(
+    rows = _table(
         f"{config['recording']} against {config['domain']}, map {config['map_version']}",
         "figure",
         ["value"],
         caption="ANR: 0 is perfect, 50 is chance. One session: statistics are its own.",
     )
     tolerance = f"within {config['tolerance_m']:g} m"
-    made.add_row("ANR", _shown(summary["anr"], ".2f", " %"), style="bold")
-    made.add_row(f"R@1 {tolerance}", _shown(summary["recall_at_1"], ".1f", " %"))
-    made.add_row(f"R@5 {tolerance}", _shown(summary["recall_at_5"], ".1f", " %"))
-    made.add_row("median error of the best match", _shown(summary["error_m"]["median"], ".1f", " m"))
-    made.add_row("best match within 5 m", _shown(summary["within_5_m"], ".1f", " %"))
-    made.add_row("best match within 10 m", _shown(summary["within_10_m"], ".1f", " %"))
-    made.add_row("time an answer takes, median", _shown(summary["latency_ms"]["median"], ".1f", " ms"))
-    made.add_row("time an answer takes, 95 %", _shown(summary["latency_ms"]["p95"], ".1f", " ms"), end_section=True)
-    made.add_row("queries scored", str(summary["n_queries"]))
-    made.add_row("left out: no right answer in the map", str(summary["n_left_out"]))
-    for reason, count in summary["n_broken"].items():
-        made.add_row(f"left out: {reason}", str(count))
-    made.add_row("map images", str(summary["n_map_images"]))
-    return made
+    rows.add_row("ANR", _shown(summary["anr"], ".2f", " %"), style="bold")
+    for label, value, unit in (
+        (f"R@1 {tolerance}", summary["recall_at_1"], "%"),
+        (f"R@5 {tolerance}", summary["recall_at_5"], "%"),
+        ("median error of the best match", summary["error_m"]["median"], "m"),
+        ("best match within 5 m", summary["within_5_m"], "%"),
+        ("best match within 10 m", summary["within_10_m"], "%"),
+        ("time an answer takes, median", summary["latency_ms"]["median"], "ms"),
+        ("time an answer takes, 95 %", summary["latency_ms"]["p95"], "ms"),
+    ):
+        rows.add_row(label, _shown(value, ".1f", f" {unit}"))
+    rows.add_section()
+    counts = {"queries scored": summary["n_queries"], "left out: no right answer in the map": summary["n_left_out"]}
+    counts |= {f"left out: {reason}": count for reason, count in summary["n_broken"].items()}
+    for label, count in (counts | {"map images": summary["n_map_images"]}).items():
+        rows.add_row(label, str(count))
+    return rows
 
 
 class Resampling:
@@ -116,9 +119,9 @@ class Resampling:
 
     def _means(self, values: Reals) -> Reals:
         rows = values.reshape(len(values), -1)
-        known = np.isfinite(rows)
-        sums = self.times @ np.where(known, rows, 0.0).sum(1)
-        counts = self.times @ known.sum(1)
+        is_known = np.isfinite(rows)
+        sums = self.times @ np.where(is_known, rows, 0.0).sum(1)
+        counts = self.times @ is_known.sum(1)
         return np.asarray(np.divide(sums, counts, out=np.full(len(sums), np.nan), where=counts > 0))
 
 
@@ -137,7 +140,8 @@ def at_distance(episodes: Sequence[Episode], name: str, metres: float) -> Reals:
 
 def distances_m(replay: ActiveReplay) -> list[float]:
     """Metres travelled at which planners are compared: as far as half of the episodes of any planner come."""
-    furthest = max(float(np.median(figures(each, "travelled_m")[:, -1])) for each in replay.episodes.values())
+    ends_m = [figures(episodes, "travelled_m")[:, -1] for episodes in replay.episodes.values()]
+    furthest = max(float(np.median(end_m)) for end_m in ends_m)
     apart = max(1.0, float(np.ceil(furthest / _MOST_DISTANCES)))
     return [float(metres) for metres in np.arange(0, furthest + 1e-9, apart)]
 
@@ -151,31 +155,33 @@ def summarise_active(replay: ActiveReplay) -> dict[str, Any]:
     """
     first, *others = replay.planners
     resampling = Resampling(len(replay.episodes[first]), int(replay.identity["seed"]))
-    moved = {name: figures(each, "rank_percent")[:, 1:] for name, each in replay.episodes.items()}
     grid_m = distances_m(replay)
+
+    def of_planners(figure: Callable[[list[Episode]], Any]) -> dict[str, Any]:
+        return {name: figure(episodes) for name, episodes in replay.episodes.items()}
+
+    moved = of_planners(lambda episodes: figures(episodes, "rank_percent")[:, 1:])
     against = {}
     for name in others:
-        ours, theirs = _known(moved[first]), _known(moved[name])
+        ours, theirs = _finite(moved[first]), _finite(moved[name])
         against[name] = {
             "anr": _rounded(ours.mean() - theirs.mean()) if ours.size and theirs.size else None,
             "interval_95": resampling.interval(moved[first], moved[name]),
         }
     return {
-        "anr": {name: _mean(each) for name, each in moved.items()},
-        "interval_95": {name: resampling.interval(each) for name, each in moved.items()},
+        "anr": {name: _mean(ranks) for name, ranks in moved.items()},
+        "interval_95": {name: resampling.interval(ranks) for name, ranks in moved.items()},
         "against": against,
-        "by_step": {name: _by_step(each, resampling) for name, each in replay.episodes.items()},
-        "by_distance": {name: _by_distance(each, grid_m, resampling) for name, each in replay.episodes.items()},
-        "travelled_m": {name: _mean(figures(each, "travelled_m")[:, -1]) for name, each in replay.episodes.items()},
-        "planner_named": {name: each[0].planner_named for name, each in replay.episodes.items()},
+        "by_step": of_planners(lambda episodes: _by_step(episodes, resampling)),
+        "by_distance": of_planners(lambda episodes: _by_distance(episodes, grid_m, resampling)),
+        "travelled_m": of_planners(lambda episodes: _mean(figures(episodes, "travelled_m")[:, -1])),
+        "planner_named": of_planners(lambda episodes: episodes[0].planner_named),
         "n_episodes": len(replay.episodes[first]),
-        "n_frames": {name: int(np.isfinite(each).sum()) for name, each in moved.items()},
-        "n_left_out": {name: int(np.isnan(each).sum()) for name, each in moved.items()},
-        "n_forgot": {name: int(figures(each, "forgot").sum()) for name, each in replay.episodes.items()},
+        "n_frames": {name: _finite(ranks).size for name, ranks in moved.items()},
+        "n_left_out": {name: int(np.isnan(ranks).sum()) for name, ranks in moved.items()},
+        "n_forgot": of_planners(lambda episodes: int(figures(episodes, "forgot").sum())),
         "n_map_images": replay.route.n_images,
-        "latency_ms": {
-            name: _rounded(float(np.median(figures(each, "latency_ms")))) for name, each in replay.episodes.items()
-        },
+        "latency_ms": of_planners(lambda episodes: _middle(figures(episodes, "latency_ms"))),
         "config": dict(replay.identity),
         "seconds": round(replay.seconds, 3),
     }
@@ -263,7 +269,7 @@ def _by_distance(episodes: Sequence[Episode], grid_m: Sequence[float], resamplin
         "travelled_m": list(grid_m),
         **_banded("anr", ranks, resampling),
         **_banded("error_m", errors_m, resampling, "error_interval_95"),
-        "n_episodes": [_known(each).size for each in ranks],
+        "n_episodes": [_finite(column).size for column in ranks],
     }
 
 
@@ -282,16 +288,16 @@ def _means(columns: Iterable[Reals]) -> list[float | None]:
 
 def _mean(values: Reals) -> float | None:
     """Of the values that are not NaN; None where all are."""
-    known = _known(values)
-    return _rounded(known.mean()) if known.size else None
+    finite = _finite(values)
+    return _rounded(finite.mean()) if finite.size else None
 
 
 def _middle(values: Reals) -> float | None:
-    known = _known(values)
-    return _rounded(float(np.median(known))) if known.size else None
+    finite = _finite(values)
+    return _rounded(float(np.median(finite))) if finite.size else None
 
 
-def _known(values: Reals) -> Reals:
+def _finite(values: Reals) -> Reals:
     return values[np.isfinite(values)]
 
 
@@ -300,11 +306,11 @@ def _rounded(value: float) -> float:
 
 
 def _table(title: str, first: str, headings: Sequence[str], caption: str | None = None) -> Table:
-    made = Table(title=title, caption=caption, title_justify="left", caption_justify="left")
-    made.add_column(first, style=None if first == "figure" else "bold", no_wrap=True)
+    empty = Table(title=title, caption=caption, title_justify="left", caption_justify="left")
+    empty.add_column(first, style=None if first == "figure" else "bold", no_wrap=True)
     for heading in headings:
-        made.add_column(heading, justify="right", no_wrap=True)
-    return made
+        empty.add_column(heading, justify="right", no_wrap=True)
+    return empty
 
 
 def _ends(interval: list[float] | None, sign: int = 1) -> str:

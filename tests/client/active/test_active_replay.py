@@ -119,13 +119,6 @@ def test_planners_and_episodes_can_be_added(fake: Any, drive: Recording, tmp_pat
     assert len(driven(fake, drive, tmp_path, seed=6, episodes=1, restart=True).episodes["default"]) == 1
 
 
-def test_a_damaged_line_is_named(fake: Any, drive: Recording, tmp_path: Path) -> None:
-    driven(fake, drive, tmp_path, planners=["random"], episodes=1)
-    (tmp_path / "episodes.jsonl").write_text('{"planner": "random"}\n')
-    with pytest.raises(errors.ReplayError, match=r"line 1 of .* is no episode"):
-        driven(fake, drive, tmp_path, planners=["random"], episodes=1)
-
-
 def test_a_recording_too_short_for_its_moves(fake: Any, drive: Recording, tmp_path: Path) -> None:
     with pytest.raises(errors.ReplayError, match="fewer steps"):
         driven(fake, drive.sliced(slice(0, 50)), tmp_path)
