@@ -6,8 +6,15 @@ from pathlib import Path
 import click
 
 from deepsimbad_client.commands import json_flag, of_domain, serving, show_list
-from deepsimbad_client.commands.console import DownloadBar, as_json
-from deepsimbad_client.commands.tables import domain_table, gate_verdict, map_table, session_table, traverse_table
+from deepsimbad_client.commands.console import (
+    DownloadBar,
+    as_json,
+    domain_table,
+    gate_verdict,
+    map_table,
+    session_table,
+    traverse_table,
+)
 from deepsimbad_client.http.client import Client
 from deepsimbad_client.http.models import MapVersion
 

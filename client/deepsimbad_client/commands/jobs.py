@@ -6,8 +6,7 @@ from typing import Any
 import click
 
 from deepsimbad_client.commands import confirmed, domain_option, json_flag, of_domain, serving, show_list
-from deepsimbad_client.commands.console import REMARKS, JobBar, as_json, show
-from deepsimbad_client.commands.tables import gate_verdict, job_table
+from deepsimbad_client.commands.console import REMARKS, JobBar, as_json, gate_verdict, job_table, show
 from deepsimbad_client.http.client import Client
 from deepsimbad_client.http.jobs import follow_job
 from deepsimbad_client.http.models import Job

@@ -8,15 +8,13 @@ from typing import Any
 import click
 
 from deepsimbad_client.commands import at_once, domain_option, json_flag, reading, serving
-from deepsimbad_client.commands.console import REMARKS, UploadBar, as_json, show
-from deepsimbad_client.commands.tables import place_table
+from deepsimbad_client.commands.console import REMARKS, UploadBar, as_json, place_table, show
 from deepsimbad_client.errors import UnknownDomainError
 from deepsimbad_client.http.client import Client
 from deepsimbad_client.http.upload import upload as upload_recording
-from deepsimbad_client.recordings.encodings import SUFFIXES
 from deepsimbad_client.recordings.folder import FolderRecording
 from deepsimbad_client.recordings.recording import Frame, Recording
-from deepsimbad_client.recordings.sources import open_source
+from deepsimbad_client.recordings.sources import ENCODING_SUFFIXES, open_source
 
 IMAGE_EVALUATOR = {"kind": "feature_l2"}
 ENCODING_EVALUATOR = {"kind": "feature_l2", "extractor": "none"}
@@ -98,7 +96,7 @@ def _views(images: Iterable[str], input_size: tuple[int, int] | None) -> Iterato
     """Every view with its name, made ready as an upload would make it, so that it is encoded like a map's own."""
     for name in images:
         path = Path(name)
-        is_image = path.is_file() and path.suffix.lower() not in SUFFIXES
+        is_image = path.is_file() and path.suffix.lower() not in ENCODING_SUFFIXES
         if is_image:
             recording: Recording = FolderRecording(
                 name=path.parent.name, frames=(Frame(0, path.name, 0.0),), folder=path.parent

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from deepsimbad_client.errors import SourceError
-from deepsimbad_client.recordings import undistortion
-from deepsimbad_client.recordings.undistortion import find_undistortion_file, load_undistortion, parse_undistortion
+from deepsimbad_client.recordings import nclt
+from deepsimbad_client.recordings.nclt import find_undistortion_file, load_undistortion, parse_undistortion
 
 WIDTH, HEIGHT = 6, 4
 
@@ -76,7 +76,7 @@ def test_a_table_is_parsed_once_and_again_when_the_file_or_the_cache_changes(tab
         parsed.append(path)
         return parse_undistortion(path)
 
-    monkeypatch.setattr(undistortion, "parse_undistortion", counting)
+    monkeypatch.setattr(nclt, "parse_undistortion", counting)
     first, second = load_undistortion(table, cache), load_undistortion(table, cache)
     assert len(parsed) == 1
     np.testing.assert_array_equal(first.u, second.u)
