@@ -40,39 +40,26 @@ Times = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class Poses:
-    """Poses at asked times; where `covered` is False or `in_gap` True the values mean nothing.
+    """Poses at [n] asked times; where `covered` is False or `in_gap` True the values mean nothing."""
 
-    Attributes:
-        covered: [n] bool, the time lies between the first and the last ground-truth row.
-        in_gap: [n] bool, covered, but between two rows too far apart to interpolate.
-        x_m: [n] float64 metres north.
-        y_m: [n] float64 metres east.
-        heading_rad: [n] float64 in (-pi, pi], from north towards east.
-        position_m: [n] float64 metres along the track.
-    """
-
-    covered: NDArray[np.bool_]
-    in_gap: NDArray[np.bool_]
-    x_m: Reals
-    y_m: Reals
-    heading_rad: Reals
-    position_m: Reals
+    covered: NDArray[np.bool_]  # the time lies between the first and the last ground-truth row
+    in_gap: NDArray[np.bool_]  # covered, but between two rows too far apart to interpolate
+    x_m: Reals  # north
+    y_m: Reals  # east
+    heading_rad: Reals  # in (-pi, pi], from north towards east
+    position_m: Reals  # along the track
 
 
 @dataclass(frozen=True, eq=False)
 class GroundTruth:
-    """The track of one drive: as `Poses`, at [m] strictly increasing times.
-
-    Attributes:
-        n_skipped_rows: Rows that held NaN, too few values or no numbers.
-    """
+    """The track of one drive: as `Poses`, at [m] strictly increasing times."""
 
     time_us: Times
     x_m: Reals
     y_m: Reals
     heading_rad: Reals
     position_m: Reals
-    n_skipped_rows: int = 0
+    n_skipped_rows: int = 0  # that held NaN, too few values or no numbers
 
     def at(self, time_us: Times, max_gap_s: float = MAX_GAP_S) -> Poses:
         """Interpolate at [n] times, in any order: x, y and position linearly, heading the short way round."""

@@ -48,15 +48,10 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class UndistortionMap:
-    """Where each pixel of the undistorted image lies in the stored one.
+    """Where each pixel of the undistorted image lies in the stored one."""
 
-    Attributes:
-        u: [height, width] float32, column in the stored image.
-        v: [height, width] float32, row in the stored image.
-    """
-
-    u: NDArray[np.float32]
-    v: NDArray[np.float32]
+    u: NDArray[np.float32]  # [height, width] column in the stored image
+    v: NDArray[np.float32]  # [height, width] row in the stored image
 
     @property
     def size(self) -> tuple[int, int]:
@@ -248,10 +243,8 @@ def find_undistortion_file(path: Path, camera: int) -> Path:
 def load_undistortion(path: Path, cache_dir: Path | None = None) -> UndistortionMap:
     """Load a table, from the cache where this very file was parsed before.
 
-    Args:
-        path: The text file.
-        cache_dir: Where parsed tables are kept; None: `deep-simbad` in the user's cache folder
-            ($XDG_CACHE_HOME, else ~/.cache). A cache that cannot be written is done without.
+    Parsed tables are kept in `cache_dir`, else in `deep-simbad` in the user's cache folder ($XDG_CACHE_HOME, else
+    ~/.cache). A cache that cannot be written is done without.
 
     Raises:
         SourceError: The file cannot be read or is not a complete table.

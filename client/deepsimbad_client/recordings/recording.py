@@ -14,25 +14,15 @@ from deepsimbad_client.errors import SourceError
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """One moment of a recording.
+    """One moment of a recording; None: not known."""
 
-    Attributes:
-        index: Place in the whole recording, from 0; kept when the recording is sliced.
-        name: The file's name, or the row's for ready encodings.
-        position_m: Metres along the route.
-        timestamp_us: Unix microseconds; None where unknown, as what follows.
-        x_m: First ground coordinate (NCLT: north).
-        y_m: Second ground coordinate (NCLT: east).
-        heading_rad: Direction in (-pi, pi], turning from x towards y.
-    """
-
-    index: int
-    name: str
-    position_m: float
-    timestamp_us: int | None = None
-    x_m: float | None = None
-    y_m: float | None = None
-    heading_rad: float | None = None
+    index: int  # place in the whole recording, from 0; kept when the recording is sliced
+    name: str  # the file's name, or the row's for ready encodings
+    position_m: float  # along the route
+    timestamp_us: int | None = None  # Unix microseconds
+    x_m: float | None = None  # first ground coordinate (NCLT: north)
+    y_m: float | None = None  # second ground coordinate (NCLT: east)
+    heading_rad: float | None = None  # in (-pi, pi], turning from x towards y
 
 
 @dataclass(frozen=True, slots=True)

@@ -181,12 +181,6 @@ def active_replay(
 class Stage:
     """A recording driven as an active robot drives: where it may start, what it comes to when it moves, what it sees.
 
-    Args:
-        client: The client.
-        recording: What there is to see, in travel order.
-        domain: A domain with an active map.
-        clock: Seconds that never go backwards.
-
     Raises:
         ReplayError: The domain has no active map, or the recording cannot be driven along.
     """
@@ -202,13 +196,8 @@ class Stage:
     def start(self, steps: int, seed: int, episode: int) -> tuple[int, int]:
         """Draw where an episode starts, uniform over the frames from which all its moves fit, and a seed for it.
 
-        The draw depends on `seed` and `episode` alone, so every planner starts from the same places.
-
-        Returns:
-            The row, and the seed of the episode's session.
-
-        Raises:
-            ReplayError: The recording is too short for that many moves.
+        The draw depends on `seed` and `episode` alone, so every planner starts from the same places. Raises
+        ReplayError where the recording is too short for that many moves.
         """
         longest_m = max(self.scene.domain.actions_m, default=_LONGEST_ACTION_M)
         room_m = float(self.position_m[-1]) - steps * longest_m
@@ -223,16 +212,10 @@ class Stage:
         return int(rng.integers(n_starts)), int(rng.integers(2**31))
 
     def nearest(self, commanded_m: float, broken: frozenset[int], beyond_m: float = -np.inf) -> int:
-        """The usable row recorded nearest to a place; past the recording's end its last, before it its first.
+        """The row recorded nearest to a place, of those that are not broken; ReplayError where all are.
 
-        Args:
-            commanded_m: The place.
-            broken: Rows that cannot be used.
-            beyond_m: Only frames farther along than this, where there are any: a robot told to move does move, though
-                the next frame may be farther than it was told, and does not look at the same picture twice.
-
-        Raises:
-            ReplayError: Every frame is broken.
+        Only frames farther along than `beyond_m`, where there are any: a robot told to move does move, though the next
+        frame may be farther than it was told, and does not look at the same picture twice.
         """
         usable = np.delete(np.arange(len(self.position_m)), sorted(broken))
         if not usable.size:

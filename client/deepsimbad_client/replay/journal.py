@@ -26,8 +26,8 @@ class Journal(Generic[Record]):
         restart: Throw away what an earlier replay left.
 
     Attributes:
-        document: What `replay.json` says: the identity, and what was noted beside it.
-        earlier: The records of an earlier run, in the order they were written.
+        document: The identity, and what was noted beside it.
+        earlier: The records of an earlier run, in order.
 
     Raises:
         ReplayError: The folder holds another replay, or cannot be written.

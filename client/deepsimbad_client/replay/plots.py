@@ -27,6 +27,11 @@ LEAST_PERCENT = 0.01
 """Ranks are drawn on a logarithmic axis; a perfect 0 stands at its foot."""
 PERCENT_TICKS = (0.01, 0.1, 1, 10, 50, 100)
 STRIPS = 3
+VIEWS = (
+    ("anr", "anr_interval_95", "map images placed before the truth [%]"),
+    ("error_m", "error_interval_95", "mean error of the likeliest place [m]"),
+    ("within_5_m", "within_5_m_interval_95", "episodes localized within 5 m [%]"),
+)
 
 Reals = NDArray[np.float64]
 
@@ -53,7 +58,8 @@ def draw_active(replay: ActiveReplay, summary: Mapping[str, Any], folder: Path) 
     episodes = replay.episodes[replay.planners[0]]
     drawn = [_belief_strips(episodes[:STRIPS], title, folder / "belief_by_step.png")]
     if any(value is not None for value in summary["anr"].values()):
-        drawn += [_by_step(summary, title, folder / "by_step.png"), _by_distance(summary, title, folder)]
+        for figures, heading in (("by_step", "From move to move"), ("by_distance", "At equal distance travelled")):
+            drawn.append(_compared(summary, figures, heading, title, folder / f"{figures}.png"))
     placed = [episode for episode in episodes if any(step.x_m is not None for step in episode.steps)]
     if replay.route.x_m is not None and placed:
         # The walk that was hardest to find out about is the one worth a picture.
@@ -194,66 +200,43 @@ def _strip(axes: Axes, episode: Episode) -> None:
             axes.annotate(f"+{step.next_action_m:g} m", at, xycoords="axes fraction", **style)
 
 
-def _by_step(summary: Mapping[str, Any], title: str, path: Path) -> Path:
-    """How rank, error and the share localized go on from move to move, with 95 % bands."""
-    views = [
-        ("anr", "anr_interval_95", "map images placed before the truth [%]"),
-        ("error_m", "error_interval_95", "mean error of the likeliest place [m]"),
-        ("within_5_m", "within_5_m_interval_95", "episodes localized within 5 m [%]"),
-    ]
-    moves = {name: list(range(len(steps["anr"]))) for name, steps in summary["by_step"].items()}
-    figure, panels = _compared(summary, "by_step", moves, views, "moves made")
-    _head(panels[0], title, "From move to move")
-    for axes in panels:
-        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    panels[2].set_ylim(0, 103)
-    return _saved(figure, path)
+def _compared(summary: Mapping[str, Any], figures: str, heading: str, title: str, path: Path) -> Path:
+    """Planners with their 95 % bands, a panel for each figure; the first planner is drawn on top.
 
-
-def _by_distance(summary: Mapping[str, Any], title: str, folder: Path) -> Path:
-    """Rank and error against the metres travelled: a planner that moves far has no advantage here."""
-    views = [
-        ("anr", "anr_interval_95", "map images placed before the truth [%]"),
-        ("error_m", "error_interval_95", "mean error of the likeliest place [m]"),
-    ]
-    metres = {name: at["travelled_m"] for name, at in summary["by_distance"].items()}
-    figure, panels = _compared(summary, "by_distance", metres, views, "metres travelled")
-    _head(panels[0], title, "At equal distance travelled")
-    return _saved(figure, folder / "by_distance.png")
-
-
-def _compared(
-    summary: Mapping[str, Any],
-    table: str,
-    at: Mapping[str, Sequence[float]],
-    views: Sequence[tuple[str, str, str]],
-    label: str,
-) -> tuple[Figure, list[Axes]]:
-    """A panel for each figure, a line with its 95 % band for each planner; the first planner is drawn on top."""
+    From move to move, or against the metres travelled: a planner that moves far has no advantage there.
+    """
+    by_distance = figures == "by_distance"
+    views = VIEWS[:2] if by_distance else VIEWS
     figure = _blank((4.5 * len(views) + 0.3, 4.9))
     panels = list(figure.subplots(1, len(views)))
     first, *others = summary["config"]["planners"]
-    for axes, (figure_name, interval_name, y_label) in zip(panels, views, strict=True):
+    for axes, (name, interval, label) in zip(panels, views, strict=True):
         _quiet(axes)
-        for place, name in [*enumerate(others, 1), (0, first)]:
-            row, colour = summary[table][name], PLANNER_COLOURS[place % len(PLANNER_COLOURS)]
-            points = zip(at[name], row[figure_name], row[interval_name], strict=True)
+        for place, planner in [*enumerate(others, 1), (0, first)]:
+            row, colour = summary[figures][planner], PLANNER_COLOURS[place % len(PLANNER_COLOURS)]
+            at = row["travelled_m"] if by_distance else range(len(row[name]))
+            points = zip(at, row[name], row[interval], strict=True)
             drawn = [(x, y, *(ends or (y, y))) for x, y, ends in points if y is not None]
             if not drawn:
                 continue
             x, y, low, high = np.array(drawn).T
             axes.fill_between(x, low, high, color=colour, alpha=0.16, lw=0)
-            label_of = shown_name(name, summary["planner_named"][name])
-            thick = name == first
-            axes.plot(x, y, color=colour, lw=2.4 if thick else 1.6, marker="o", ms=4 if thick else 3, label=label_of)
-        axes.set_ylabel(y_label, color=INK)
-        axes.set_xlabel(label)
+            width, dot = (2.4, 4) if planner == first else (1.6, 3)
+            named = shown_name(planner, summary["planner_named"][planner])
+            axes.plot(x, y, color=colour, lw=width, marker="o", ms=dot, label=named)
+        axes.set_ylabel(label, color=INK)
+        axes.set_xlabel("metres travelled" if by_distance else "moves made")
         axes.set_ylim(bottom=0)
+        if not by_distance:
+            axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    if not by_distance:
+        panels[2].set_ylim(0, 103)
+    _head(panels[0], title, heading)
     handles, labels = panels[0].get_legend_handles_labels()
     handles, labels = handles[-1:] + handles[:-1], labels[-1:] + labels[:-1]
     n_columns = min(6, max(1, len(labels)))
     figure.legend(handles, labels, loc="outside lower center", ncol=n_columns, frameon=False, fontsize=9)
-    return figure, panels
+    return _saved(figure, path)
 
 
 def _walk_map(episode: Episode, route: Route, title: str, path: Path) -> Path:

@@ -33,17 +33,7 @@ def watch_episode(
 ) -> list[EpisodeStep]:
     """Drive one episode and show it as it goes: a moving picture on a terminal, else a line for each view.
 
-    Args:
-        stage: What it is played on.
-        console: Where it is shown.
-        planner: Who chooses the moves.
-        steps: How many moves.
-        seed: Of the start and the session.
-        pause_s: Seconds between views, for the eye.
-        sleep: Waits.
-
-    Returns:
-        The views.
+    Between views it waits `pause_s` seconds, for the eye; `seed` is that of the start and the session.
     """
     row, session_seed = stage.start(steps, seed, 0)
     views: list[EpisodeStep] = []
@@ -78,14 +68,7 @@ def watch_session(
     every_s: float,
     sleep: Callable[[float], None] = time.sleep,
 ) -> int:
-    """Show a session that another robot drives, until it ends; it is left as it is.
-
-    Args:
-        client: The client.
-        session_id: The session.
-        console: Where it is shown.
-        every_s: Seconds from asking to asking.
-        sleep: Waits.
+    """Show a session that another robot drives, until it ends; it is left as it is. Asks every `every_s` seconds.
 
     Returns:
         How many changes were seen.
@@ -184,16 +167,9 @@ def pictured(
     moved_m: float | None = None,
     true_route_m: float | None = None,
 ) -> Group:
-    """A session as a terminal shows it: the belief along the route, the likeliest places, the last move and the next.
+    """A session as a terminal of `width` columns shows it: the belief along the route, the last move and the next.
 
-    Args:
-        heading: Which session of what.
-        belief: What it believes.
-        next_best_view: What it asks for.
-        width: Columns of the terminal.
-        n_observations: Views so far.
-        moved_m: The last move, where known.
-        true_route_m: Where the robot truly is along the map's route, where known.
+    The last move and the true place along the map's route are shown where known.
     """
     columns = max(20, width - 4)
     edges_m = belief.histogram.edges_m
