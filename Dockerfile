@@ -2,23 +2,31 @@
 #
 #   docker build --tag deep-simbad .
 #   docker run --rm --volume deep-simbad:/var/lib/deepsimbad deep-simbad keys create --scope admin
-#   docker run --detach --publish 127.0.0.1:8000:8000 --volume deep-simbad:/var/lib/deepsimbad deep-simbad
+#   docker run --detach --stop-timeout 30 --publish 127.0.0.1:8000:8000 --volume deep-simbad:/var/lib/deepsimbad deep-simbad
 #
 # It listens on every address of its network, so it refuses to start until the first key was created. Any command of
-# `deepsimbad` can stand in the place of `keys create ...`.
+# `deepsimbad` can stand in the place of `keys create ...`. Stopping it lets requests under way finish, and a job record
+# where it stands: hence the timeout, longer than Docker's own ten seconds.
 #
 # It computes on the processor: PyTorch comes from PyTorch's own index of CPU builds, about 1.8 GB of image in all, and
 # ONNX Runtime runs the default extractor. With a GPU,
 #
 #   docker build --build-arg VARIANT=cuda --build-arg PIP_EXTRA_INDEX_URL= --tag deep-simbad:cuda .
 #
-# builds on NVIDIA's CUDA base with PyPI's PyTorch, which brings CUDA's libraries, about 8 GB. EXTRAS says what is
-# installed.
+# builds on NVIDIA's CUDA base with PyPI's PyTorch, which brings CUDA's libraries, about 8 GB.
+#
+# Packages are held to the digests in deploy/requirements-*.txt. Base images are named by their tags; hold them to
+# digests too where builds must repeat: `docker buildx imagetools inspect python:3.11-slim-bookworm` tells one, and
+# `--build-arg PYTHON_IMAGE=python@sha256:...` takes it.
 ARG VARIANT=cpu
+ARG PYTHON_IMAGE=python:3.11-slim-bookworm
+ARG CUDA_IMAGE=nvidia/cuda:12.8.1-base-ubuntu24.04
 
-FROM python:3.11-slim-bookworm AS base-cpu
+# hadolint ignore=DL3006
+FROM ${PYTHON_IMAGE} AS base-cpu
 
-FROM nvidia/cuda:12.8.1-base-ubuntu24.04 AS base-cuda
+# hadolint ignore=DL3006
+FROM ${CUDA_IMAGE} AS base-cuda
 # hadolint ignore=DL3008
 RUN apt-get update \
     && apt-get install --yes --no-install-recommends python3 python3-venv \
@@ -26,16 +34,23 @@ RUN apt-get update \
 
 # hadolint ignore=DL3006
 FROM base-${VARIANT} AS build
-ARG EXTRAS=service,fast
+ARG VARIANT=cpu
 ARG PIP_EXTRA_INDEX_URL=https://download.pytorch.org/whl/cpu
+ENV PIP_NO_CACHE_DIR=1 \
+    PIP_DISABLE_PIP_VERSION_CHECK=1
 WORKDIR /src
-COPY pyproject.toml constraints.txt README.md CHANGELOG.md LICENSE ./
+COPY deploy deploy
+RUN python3 -m venv /opt/deepsimbad \
+    && /opt/deepsimbad/bin/python -m pip install --require-hashes --requirement deploy/requirements-${VARIANT}.txt \
+    && python3 -m venv /src/build \
+    && /src/build/bin/python -m pip install --require-hashes --requirement deploy/requirements-build.txt
+COPY pyproject.toml README.md CHANGELOG.md LICENSE ./
 COPY service service
 COPY client client
 COPY migrations migrations
-RUN python3 -m venv /opt/deepsimbad \
-    && /opt/deepsimbad/bin/python -m pip install --no-cache-dir --disable-pip-version-check --constraint constraints.txt ".[${EXTRAS}]" \
-    && /opt/deepsimbad/bin/python -m pip uninstall --yes --quiet --disable-pip-version-check pip setuptools
+RUN /src/build/bin/python -m pip wheel --no-deps --no-build-isolation --wheel-dir /src/wheel . \
+    && /opt/deepsimbad/bin/python -m pip install --no-deps /src/wheel/*.whl \
+    && /opt/deepsimbad/bin/python -m pip uninstall --yes --quiet pip setuptools
 # The hot loops are compiled, and the default network is made ready, here rather than in front of the first robot. numba
 # takes its loops for the same kind of processor alone; on another kind it compiles anew, into the volume.
 RUN install -d -m 0700 /var/lib/deepsimbad/data /var/lib/deepsimbad/cache /var/lib/deepsimbad/weights \

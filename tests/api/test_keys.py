@@ -101,11 +101,11 @@ def ring_of(catalog: Catalog, clock: Callable[[], float] = time.monotonic) -> Ke
 
 def test_a_ring_without_keys_is_open_until_the_first(catalog: Catalog) -> None:
     ring = ring_of(catalog)
-    assert (ring.is_open, ring.n_created, ring.n_usable) == (True, 0, 0)
+    assert (ring.is_open, len(ring.by_id), ring.n_usable) == (True, 0, 0)
     record, key = catalog.create_key(KeyScope.LOCALIZE)
     assert ring.is_open, "it asks the catalog now and then, not every time"
     asyncio.run(ring.reread())
-    assert (ring.is_open, ring.n_created, ring.n_usable) == (False, 1, 1)
+    assert (ring.is_open, len(ring.by_id), ring.n_usable) == (False, 1, 1)
     assert ring.holder(key.text) == record
 
 
@@ -114,7 +114,7 @@ def test_all_revoked_is_closed(catalog: Catalog) -> None:
     ring = ring_of(catalog)
     catalog.revoke_key(record.key_id)
     asyncio.run(ring.reread())
-    assert (ring.is_open, ring.n_created, ring.n_usable) == (False, 1, 0)
+    assert (ring.is_open, len(ring.by_id), ring.n_usable) == (False, 1, 0)
     with pytest.raises(UnauthorizedError, match="revoked") as caught:
         ring.holder(key.text)
     assert caught.value.hints == {"key_id": record.key_id}

@@ -24,6 +24,8 @@ import httpx2
 import pytest
 import yaml
 
+from deepsimbad.settings import Settings
+
 from .dockerfile import Build, context_of, pairs, stages_of
 
 PROJECT = Path(__file__).resolve().parents[2]
@@ -41,7 +43,9 @@ IMAGE_USER: dict[str, Any] = {"user": 10001, "group": 10001, "extra_groups": []}
 
 
 def test_the_variants_are_there_and_the_context_holds_no_more_than_is_copied(tmp_path: Path) -> None:
-    assert [pairs(argument.rest) for argument in STAGES[""]] == [{"VARIANT": "cpu"}]
+    arguments = {name: value for argument in STAGES[""] for name, value in pairs(argument.rest).items()}
+    assert arguments["VARIANT"] == "cpu"
+    assert set(arguments) == {"VARIANT", "PYTHON_IMAGE", "CUDA_IMAGE"}
     assert list(STAGES) == ["", "base-cpu", "base-cuda", "build", "service"]
     context = context_of(PROJECT, tmp_path / "context")
     copied = {source for copy in STAGES["build"].every("COPY") for source in copy.rest.split()[:-1]}
@@ -80,10 +84,43 @@ def test_compose_agrees_with_the_image() -> None:
         assert each["security_opt"] == ["no-new-privileges:true"], name
         assert each["cap_drop"] == ["ALL"], name
         assert each["mem_limit"], name
-        assert all(port.startswith("127.0.0.1:") for port in each["ports"]), name
+        assert each["ports"] == ["80:80", "443:443"] or all(port.startswith("127.0.0.1:") for port in each["ports"])
+        assert set(each.get("cap_add", ())) <= {"NET_BIND_SERVICE"}, name
         assert {volume.split(":")[0] for volume in each["volumes"] if volume[0] != "."} <= set(COMPOSE["volumes"]), name
     assert "healthcheck" not in service, "the image's own counts"
     assert int(service["stop_grace_period"].removesuffix("s")) > 2 * 10, "the service's own grace, and a job's end"
+
+
+def test_the_proxy_asks_the_service() -> None:
+    proxy, settings = SERVICES["proxy"], Settings()
+    assert re.search(r":\d+\.\d+\.\d+$", proxy["image"]), "pinned"
+    assert "./deploy/Caddyfile:/etc/caddy/Caddyfile:ro" in proxy["volumes"]
+    config = (PROJECT / "deploy" / "Caddyfile").read_text()
+    assert f"{{$DEEPSIMBAD_UPSTREAM:deepsimbad:{PORT}}}" in config
+    limits = {int(n) << {"MiB": 20, "GiB": 30}[unit] for n, unit in re.findall(r"max_size (\d+)(\wiB)", config)}
+    assert limits == {settings.max_image_bytes, settings.max_batch_bytes}
+    (most,) = re.findall(r"max_conns_per_host (\d+)", config)
+    assert int(most) < settings.max_connections
+    assert SERVICES["deepsimbad"]["environment"] == {"DEEPSIMBAD_REQUIRE_KEYS": "true"}
+
+
+def pins_of(path: Path) -> dict[str, str]:
+    """Package and version by line, all of them with digests."""
+    text = path.read_text()
+    pins = {name.lower().replace("_", "-"): pin for name, pin in re.findall(r"^([\w.-]+)==(\S+)", text, re.MULTILINE)}
+    assert path.name == "constraints.txt" or text.count("--hash=sha256:") >= len(pins) > 0
+    return pins
+
+
+def test_the_image_holds_the_versions_that_are_tested() -> None:
+    tested = pins_of(PROJECT / "constraints.txt")
+    for variant in ("cpu", "cuda"):
+        pins = pins_of(PROJECT / "deploy" / f"requirements-{variant}.txt")
+        assert {"fastapi", "torch", "numba", "onnxruntime"} <= set(pins)
+        assert {name: pin for name, pin in pins.items() if tested.get(name, pin) != pin} == {}
+    (backend,) = tomllib.loads((PROJECT / "pyproject.toml").read_text())["build-system"]["requires"]
+    name, _, pin = backend.partition("==")
+    assert pins_of(PROJECT / "deploy" / "requirements-build.txt")[name] == pin
 
 
 def config_of(service: str, option: str = "--config.file") -> tuple[dict[str, Any], dict[str, Path]]:

@@ -135,7 +135,7 @@ def _start(settings: Settings, metrics: Metrics, keys: KeyRing, run_job: RunJob,
     parts.enter_context(ServiceLock.take(settings.data_dir, f"{settings.host}:{settings.port}"))
     catalog = parts.enter_context(Catalog.open(settings.data_dir))
     keys.load(catalog.keys)
-    settings.check_exposure(keys.n_created)
+    settings.check_exposure(len(keys.by_id))
     try:
         for line in catalog.discard_unfinished():
             log.warning("discarded at start", extra={"what": line})
@@ -200,7 +200,7 @@ def _start(settings: Settings, metrics: Metrics, keys: KeyRing, run_job: RunJob,
         )
     )
     exposure = {"host": settings.host, "port": settings.port, "n_keys": keys.n_usable}
-    if keys.n_created == 0:
+    if not keys.by_id:
         log.warning("runs open: no key was ever created, so whoever reaches this address may do all", extra=exposure)
     else:
         log.info("asks for keys", extra=exposure)

@@ -8,6 +8,7 @@ import logging
 import re
 import secrets
 import time
+from functools import lru_cache
 from urllib.parse import urlsplit
 
 from starlette.middleware.cors import CORSMiddleware
@@ -34,14 +35,14 @@ log = logging.getLogger(__name__)
 FREE_BYTES = 1 << 16  # of a body, not counted; as much as the server buffers of every connection anyway
 ALWAYS_ANSWERED = frozenset({"/healthz", "/readyz", "/metrics"})
 # What every answer carries unless its route says otherwise: nothing here is for a browser to guess, keep or embed.
-SECURITY_HEADERS = (
-    (b"x-content-type-options", b"nosniff"),
-    (b"cache-control", b"no-store"),
-    (b"content-security-policy", b"default-src 'none'; frame-ancestors 'none'"),
-    (b"referrer-policy", b"no-referrer"),
-    (b"x-frame-options", b"DENY"),
-    (b"cross-origin-resource-policy", b"same-origin"),
-)
+SECURITY_HEADERS = {
+    b"x-content-type-options": b"nosniff",
+    b"cache-control": b"no-store",
+    b"content-security-policy": b"default-src 'none'; frame-ancestors 'none'",
+    b"referrer-policy": b"no-referrer",
+    b"x-frame-options": b"DENY",
+    b"cross-origin-resource-policy": b"same-origin",
+}
 # Codes of answers that turn a request away for what it is or how many there are, before it is looked into.
 REFUSALS = frozenset(
     {
@@ -65,6 +66,7 @@ _METHODS = {"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"}
 _NAMED = ("domain", "session_id", "job_id")  # parameters of paths
 _NOTED = ("key_id", "domain", "code", "limit")  # by whoever learnt it
 _LONGEST_PATH = 256  # of a path in the log: the sender chooses it
+_LONGEST_LENGTH = 20  # digits
 _SENDER_LEFT = 499  # as proxies log it; never sent
 
 
@@ -87,6 +89,7 @@ class Door:
                 expose_headers=_CORS_SHOWN,
             )
         self.settings = settings
+        self.is_loopback = settings.is_loopback
         self.keys = keys
         self.metrics = metrics
         self.rate_limit = RateLimit(settings.rate_limit_per_s, settings.rate_limit_burst)
@@ -142,17 +145,17 @@ class _Request:
         if not _REQUEST_ID.fullmatch(request_id):
             request_id = secrets.token_hex(8).encode()
         scope.setdefault("state", {})["request_id"] = request_id.decode()
-        self._own_headers: tuple[tuple[bytes, bytes], ...] = ((b"x-request-id", request_id), *SECURITY_HEADERS)
+        self._own_headers = {b"x-request-id": request_id, **SECURITY_HEADERS}
 
     # What the head tells
 
     def check(self) -> None:
         """Judge the head; raises the error that the sender is answered."""
-        needed = needed_scope(self._scope["path"])
-        if self._door.keys.n_created == 0:
+        needed, keys = needed_scope(self._scope["path"]), self._door.keys
+        if not keys.by_id:
             self._check_page()
-        if needed is not None and not self._door.keys.is_open:
-            self._door.keys.admit(self._scope, needed, self._door.rate_limit)
+        if needed is not None and not keys.is_open:
+            keys.admit(self._scope, needed, self._door.rate_limit)
         self._check_size()
 
     def _check_page(self) -> None:
@@ -160,12 +163,12 @@ class _Request:
 
         A page's own name may be answered by a loopback address (DNS rebinding): its Host betrays it.
         """
-        settings = self._door.settings
-        host, origin = (self._headers.get(name, b"").decode("latin-1") for name in (b"host", b"origin"))
-        name, reached = _name(host), (self._scope.get("server") or ("",))[0]
-        if origin and urlsplit(origin).netloc != host and not {origin, "*"} & set(settings.cors_origins):
+        settings, reached = self._door.settings, (self._scope.get("server") or ("",))[0]
+        host = self._headers.get(b"host", b"").decode("latin-1")
+        origin = self._headers.get(b"origin", b"").decode("latin-1")
+        if origin and origin.partition("://")[2] != host and not {origin, "*"} & set(settings.cors_origins):
             what = f"a page of {origin[:100]!r} may not call it"
-        elif host and settings.is_loopback and not (is_loopback(name) or name in {settings.host, reached} - {""}):
+        elif host and self._door.is_loopback and not _is_ours(host, settings.host, reached):
             what = f"it is not asked by the name {host[:100]!r}"
         else:
             return
@@ -179,11 +182,11 @@ class _Request:
         if self._is_batch:
             self._most_bytes = settings.max_batch_bytes
         declared = headers.get(b"content-length", b"0").strip()
-        if not declared.isdigit():
+        if not declared.isdigit() or len(declared) > _LONGEST_LENGTH:
             raise InvalidInputError("Content-Length is not a number")
         n_declared, is_chunked = int(declared), b"transfer-encoding" in headers
         if is_chunked and b"content-length" in headers:  # whoever stands between us may have taken the other one
-            self._own_headers += ((b"connection", b"close"),)
+            self._own_headers[b"connection"] = b"close"
             raise UnreadableRequestError("the body has both a Content-Length and a Transfer-Encoding")
         has_body = n_declared > 0 or is_chunked
         packing = headers.get(b"content-encoding", b"").strip().lower() or b"identity"
@@ -196,11 +199,11 @@ class _Request:
             raise self._too_large(f"the body has {n_declared} bytes")
         if self._scope["path"] in ALWAYS_ANSWERED:
             self._was_counted = True
-        elif has_body:  # only asked for: who announces much and sends nothing should keep nobody out
-            self._door.under_way.check()
-            self._door.body_bytes.check(0 if self._is_batch else n_declared - FREE_BYTES)
-        else:
+        elif not has_body:
             self._count()
+        elif n_declared > FREE_BYTES and not self._is_batch:
+            # Only asked for: who announces much and sends nothing should keep nobody out.
+            self._door.body_bytes.check(n_declared - FREE_BYTES)
 
     # What comes and goes
 
@@ -224,9 +227,7 @@ class _Request:
         if message["type"] == "http.response.start":
             self._uncount()
             self.status = message["status"]
-            headers = message.get("headers", ())
-            names = {name for name, _ in headers}
-            message["headers"] = [*headers, *(header for header in self._own_headers if header[0] not in names)]
+            message["headers"] = list({**self._own_headers, **dict(message.get("headers", ()))}.items())
         await self._send(message)
 
     def end(self) -> None:
@@ -256,9 +257,12 @@ class _Request:
     def about(self) -> dict[str, str]:
         """Whose request it is, what it is about and the code of what was wrong, as far as each is known."""
         named, noted = self._scope.get("path_params") or {}, self._scope["state"]
-        return {name: noted[name] for name in _NOTED if name in noted} | {
-            name: named[name] for name in _NAMED if name in named
-        }
+        about = {}
+        for source, names in ((noted, _NOTED), (named, _NAMED)):
+            for name in names:
+                if name in source:
+                    about[name] = source[name]
+        return about
 
     def _count(self) -> None:
         self._door.under_way.take()
@@ -274,9 +278,11 @@ class _Request:
         return BodyTooLargeError(f"{what}; at most {most} are taken here, send less at once", max_bytes=most)
 
 
-def _name(host: str) -> str:
-    """The name or address in a Host header, without its port; empty where there is none."""
+@lru_cache(maxsize=64)
+def _is_ours(host: str, *names: str) -> bool:
+    """Whether a Host header, its port apart, means this machine, or is one of the names."""
     try:
-        return urlsplit(f"//{host}").hostname or ""
+        name = urlsplit(f"//{host}").hostname
     except ValueError:  # a bracket that is not closed
-        return ""
+        return False
+    return name is not None and (is_loopback(name) or name in names)

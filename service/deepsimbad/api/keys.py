@@ -33,13 +33,16 @@ class KeyRing:
 
     Args:
         clock: Seconds that never go back.
+
+    Attributes:
+        by_id: All that were ever created.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
         self._read: Callable[[], Sequence[KeyRecord]] | None = None
         self._read_at: float | None = None
-        self._keys: dict[str, KeyRecord] = {}
+        self.by_id: dict[str, KeyRecord] = {}
 
     def load(self, read: Callable[[], Sequence[KeyRecord]]) -> None:
         """Read the keys for the first time, and name what reads them from then on; raises what that raises."""
@@ -61,14 +64,14 @@ class KeyRing:
         except Exception as error:  # whatever it is, the next try may succeed
             log.warning("the keys cannot be read: %s", error)
             return
-        was_open = not self._keys
+        was_open = not self.by_id
         self._keep(records)
-        if was_open and self._keys:
+        if was_open and self.by_id:
             log.info("the first key was created: from now on a key is asked")
 
     def _keep(self, records: Sequence[KeyRecord]) -> None:
-        if records or not self._keys:
-            self._keys = {record.key_id: record for record in records}
+        if records or not self.by_id:
+            self.by_id = {record.key_id: record for record in records}
         self._read_at = self._clock()
 
     @property
@@ -76,25 +79,20 @@ class KeyRing:
         """Whether no key is asked; raises UnavailableError where the keys have not been known for too long."""
         if self._read_at is None or self._clock() - self._read_at > KEPT_S:
             raise UnavailableError("the keys cannot be read, so nobody can be let in; try again")
-        return not self._keys
+        return not self.by_id
 
     def still_opens(self, key_id: str | None) -> bool:
         """Whether a request let in with a key (None: while no key was asked) would be let in now; for long answers."""
         if key_id is None:
-            return not self._keys
-        record = self._keys.get(key_id)
+            return not self.by_id
+        record = self.by_id.get(key_id)
         return record is not None and record.is_usable(now())
-
-    @property
-    def n_created(self) -> int:
-        """How many keys there are, those that open nothing any more too."""
-        return len(self._keys)
 
     @property
     def n_usable(self) -> int:
         """How many keys open something now."""
         at = now()
-        return sum(record.is_usable(at) for record in self._keys.values())
+        return sum(record.is_usable(at) for record in self.by_id.values())
 
     def holder(self, presented: str) -> KeyRecord:
         """The key that was presented.
@@ -105,7 +103,7 @@ class KeyRing:
         key = ApiKey.parse(presented)
         if key is None:
             raise UnauthorizedError(f"the key is malformed: {_HOW}")
-        record = self._keys.get(key.key_id)
+        record = self.by_id.get(key.key_id)
         # Always one comparison, so that its time does not tell which ids exist.
         is_right = hmac.compare_digest(key.secret_sha256, _NO_DIGEST if record is None else record.secret_sha256)
         if record is None or not is_right:

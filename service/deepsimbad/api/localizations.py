@@ -1,17 +1,16 @@
 """Where a single view places the robot, from a uniform prior; and what every answer to a view is made of."""
 
-import math
 from io import BytesIO
-from typing import Annotated, Any, Self
+from typing import Annotated, Any
 
 import numpy as np
 from fastapi import APIRouter, Query, Request, Response
 from numpy.typing import NDArray
-from pydantic import FailFast, Field, StrictFloat, StrictInt, model_validator
-from pydantic_core import to_json
+from pydantic import FailFast, Field, StrictFloat, StrictInt
 from typing_extensions import TypedDict
 
 from deepsimbad.api.openapi import binary, declare, problems
+from deepsimbad.api.problems import InvalidRequestError
 from deepsimbad.api.requests import (
     BINARY,
     GREATEST_ID,
@@ -62,14 +61,11 @@ class ObservationBody(JsonBody):
     dissimilarities: Annotated[tuple[StrictFloat, ...], FailFast()] = ()
     encoding: Annotated[tuple[StrictFloat, ...], FailFast()] = ()
 
-    @model_validator(mode="after")
-    def _one(self) -> Self:
-        if len(self.model_fields_set) != 1:
-            raise ValueError("give exactly one of ranked_landmarks, dissimilarities, encoding")
-        return self
-
     def view(self) -> RankedLandmarks | Dissimilarities | ReadyEncoding:
-        """The engine's form."""
+        """The engine's form; raises InvalidRequestError."""
+        if len(self.model_fields_set) != 1:
+            what = "give exactly one of ranked_landmarks, dissimilarities, encoding"
+            raise InvalidRequestError(f"body: {what}", errors=[{"loc": ["body"], "msg": what, "type": "value_error"}])
         if "ranked_landmarks" in self.model_fields_set:
             return RankedLandmarks(self.ranked_landmarks)
         if "dissimilarities" in self.model_fields_set:
@@ -215,8 +211,10 @@ def render_localization(localization: Localization, watch: Stopwatch) -> Localiz
 
 def render_shortlist(route: Route, ids: NDArray[np.int64], relevance: NDArray[np.float32]) -> list[RetrievedAnswer]:
     """Map images with their places and relevances."""
-    rows = zip(ids.tolist(), route.position_m[ids].tolist(), relevance[ids].tolist(), strict=True)
-    return [{"map_image": image, "route_position_m": at_m, "relevance": worth} for image, at_m, worth in rows]
+    rows: list[RetrievedAnswer] = []
+    for image, at_m, worth in zip(ids.tolist(), route.position_m[ids].tolist(), relevance[ids].tolist(), strict=True):
+        rows.append({"map_image": image, "route_position_m": at_m, "relevance": worth})
+    return rows
 
 
 def render_plan(plan: Plan | None, actions_m: NDArray[np.float64]) -> NextBestViewAnswer | None:
@@ -224,22 +222,20 @@ def render_plan(plan: Plan | None, actions_m: NDArray[np.float64]) -> NextBestVi
     if plan is None:
         return None
     values = [None] * actions_m.size if plan.values is None else plan.values.tolist()
-    rows = zip(actions_m.tolist(), values, strict=True)
-    actions: list[ActionAnswer] = [{"action_m": action_m, "q_value": value} for action_m, value in rows]
+    actions: list[ActionAnswer] = []
+    for action_m, value in zip(actions_m.tolist(), values, strict=True):
+        actions.append({"action_m": action_m, "q_value": value})
     return {"planner": plan.planner, "action_m": plan.action_m, "actions": actions}
 
 
 def render_belief(route: Route, belief: BeliefSummary) -> BeliefAnswer:
     """A belief, with the coordinates of its likeliest places."""
-    top = belief.top
-    rows = zip(
-        top.tolist(),
-        route.position_m[top].tolist(),
-        _finite(route.x_m, top),
-        _finite(route.y_m, top),
-        belief.top_mass.tolist(),
-        strict=True,
-    )
+    ids, top = belief.top, list[PlaceAnswer]()
+    x_m, y_m = _finite(route.x_m, ids), _finite(route.y_m, ids)
+    for image, at_m, x, y, mass in zip(
+        ids.tolist(), route.position_m[ids].tolist(), x_m, y_m, belief.top_mass.tolist(), strict=True
+    ):
+        top.append({"map_image": image, "route_position_m": at_m, "x_m": x, "y_m": y, "mass": mass})
     return {
         "mean_m": belief.mean_m,
         "mode_m": belief.mode_m,
@@ -248,10 +244,7 @@ def render_belief(route: Route, belief: BeliefSummary) -> BeliefAnswer:
         "entropy_bits": belief.entropy_bits,
         "off_route": belief.off_route,
         "histogram": {"edges_m": belief.histogram_edges_m.tolist(), "mass": belief.histogram_mass.tolist()},
-        "top": [
-            {"map_image": image, "route_position_m": at_m, "x_m": x_m, "y_m": y_m, "mass": mass}
-            for image, at_m, x_m, y_m, mass in rows
-        ],
+        "top": top,
     }
 
 
@@ -259,12 +252,9 @@ def _finite(values: NDArray[np.float64] | None, ids: NDArray[np.int64]) -> list[
     """Values at these ids, None where unknown."""
     if values is None:
         return [None] * ids.size
-    return [value if math.isfinite(value) else None for value in values[ids].tolist()]
-
-
-def json_response(answer: Any, status: int = 200, headers: dict[str, str] | None = None) -> Response:
-    """An answer of dictionaries, lists and numbers that the engine computed: not checked a second time."""
-    return Response(to_json(answer), status, headers, JSON)
+    known = values[ids].astype(object)
+    known[~np.isfinite(values[ids])] = None
+    return list(known)
 
 
 # Handlers
@@ -297,7 +287,7 @@ async def post_localization(
     snapshot = active.snapshot
     media_type = media_type_of(request, OBSERVATION_TYPES)
     shortlist_length(snapshot, shortlist)  # a bad query should not cost an upload
-    landmark_models = insisted_on(if_match)
+    landmark_models = None if if_match is None else insisted_on(if_match)
     body = await read_bytes(request)
     watch.lap("receive")
     evaluator = running.evaluators.evaluator(active.record.evaluator)
@@ -319,14 +309,9 @@ async def post_localization(
         return localization
 
     localization = await running.look(evaluator, view, look)
-
-    def write() -> tuple[LocalizationAnswer, Response]:
-        answer = render_localization(localization, watch)
-        return answer, json_response(answer)
-
-    answer, response = await running.written(localization.belief.top.size, write)
+    answer, body = await running.written(localization.belief.top.size, render_localization, localization, watch)
     running.metrics.localized(domain, answer["timings_ms"], answer["belief"]["entropy_bits"])
-    return response
+    return Response(body, media_type=JSON)
 
 
 async def view_in(body: bytes, running: Services, media_type: str, evaluator: Evaluator) -> View:

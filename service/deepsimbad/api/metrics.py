@@ -163,8 +163,12 @@ class Metrics:
         self._requests(method, route, str(status)).inc()
         self._request_seconds(route).observe(seconds)
 
-    def localized(self, domain: str, timings_ms: Mapping[str, float], entropy_bits: float) -> None:
-        """Record one localization."""
+    def localized(
+        self, domain: str, timings_ms: Mapping[str, float], entropy_bits: float, outcome: str | None = None
+    ) -> None:
+        """Record one answer to a view; of a session's with its outcome, as `observed` takes it."""
+        if outcome is not None:
+            self._observations.labels(outcome).inc()
         for stage, milliseconds in timings_ms.items():
             self._seconds_of_stage(stage).observe(milliseconds / 1000)
         self._domains.add(domain)

@@ -17,6 +17,7 @@ from anyio import CapacityLimiter
 from anyio.to_thread import run_sync
 from fastapi import Depends, Header, Path, Query, Request
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic_core import to_json
 
 from deepsimbad.api.keys import KeyRing
 from deepsimbad.api.metrics import Metrics
@@ -78,7 +79,8 @@ class Slots:
 
     def take(self, n: int = 1) -> None:
         """Take room; raises OverloadedError where there is none."""
-        self.check(n)
+        if self.n_taken + n > self.most:
+            self.check(n)
         self.n_taken += n
 
     def give_back(self, n: int = 1) -> None:
@@ -213,9 +215,23 @@ class Services:
         """Run a function of a view on the inference worker, which encodes an image before."""
         return await asyncio.wrap_future(self.worker.look(evaluator, view, run, priority))
 
-    async def written(self, n_listed: int, write: Callable[[], T]) -> T:
-        """What writes an answer, run in a thread where the answer's longest list is long."""
-        return await run_sync(write, limiter=self.long_work) if n_listed > LONG_LIST else write()
+    async def written(self, n_listed: int, render: Callable[..., T], *given: Any) -> tuple[T, bytes]:
+        """An answer, and its JSON: of dictionaries, lists and numbers that we computed, and do not check again.
+
+        Args:
+            n_listed: Length of its longest list; a long one is written beside the event loop.
+            render: Makes the answer.
+            *given: What of.
+        """
+        if n_listed > LONG_LIST:
+            return await run_sync(_write, render, given, limiter=self.long_work)
+        answer = render(*given)
+        return answer, to_json(answer)
+
+
+def _write(render: Callable[..., T], given: tuple[Any, ...]) -> tuple[T, bytes]:
+    answer = render(*given)
+    return answer, to_json(answer)
 
 
 async def services_of(request: Request) -> Services:
@@ -283,9 +299,9 @@ def names(wanted: str | None, etag: str) -> bool:
     return wanted is not None and any(tag.strip().removeprefix("W/") in {etag, "*"} for tag in wanted.split(","))
 
 
-def insisted_on(wanted: str | None) -> frozenset[str] | None:
+def insisted_on(wanted: str) -> frozenset[str] | None:
     """The contents, one of which an If-Match insists on; None: any will do. Weak tags match nothing."""
-    if wanted is None or wanted.strip() == "*":
+    if wanted.strip() == "*":
         return None
     return frozenset(tag for weak, tag in _STRONG.findall(wanted) if not weak)
 

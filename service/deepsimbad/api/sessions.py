@@ -19,7 +19,6 @@ from deepsimbad.api.localizations import (
     RetrievedAnswer,
     Shortlist,
     Timings,
-    json_response,
     npy_response,
     prefers_binary,
     render_belief,
@@ -31,6 +30,7 @@ from deepsimbad.api.openapi import binary, declare_json, problems
 from deepsimbad.api.requests import (
     GREATEST_EXACT_INTEGER,
     GREATEST_ID,
+    JSON,
     USUALLY_AT_ONCE,
     Answer,
     DomainName,
@@ -248,7 +248,8 @@ def _iso(seconds: float) -> str:
 
 async def _answered(running: Services, view: SessionView, status: int = 200, location: str | None = None) -> Response:
     headers = None if location is None else {"Location": location}
-    return await running.written(view.belief.top.size, lambda: json_response(render_session(view), status, headers))
+    _, body = await running.written(view.belief.top.size, render_session, view)
+    return Response(body, status, headers, JSON)
 
 
 # Handlers
@@ -327,22 +328,17 @@ async def post_observation(
             action_std_m,
             shortlist,
             named,
-            insisted_on(if_match),
+            None if if_match is None else insisted_on(if_match),
         )
         view = await running.sessions.observe(session_id, observation, watch, robot_of(request))
     except DeepSimbadError as error:
         running.metrics.observed(error.code)
         raise
-
-    def write() -> tuple[ObservationAnswer, Response]:
-        answer = render_observation(view, watch)
-        return answer, json_response(answer)
-
-    answer, response = await running.written(view.belief.top.size, write)
-    request.state.domain = answer["domain"]
-    running.metrics.observed("repeated" if view.is_repeated else "accepted")
-    running.metrics.localized(answer["domain"], answer["timings_ms"], answer["belief"]["entropy_bits"])
-    return response
+    answer, body = await running.written(view.belief.top.size, render_observation, view, watch)
+    domain = request.scope["state"]["domain"] = answer["domain"]
+    outcome = "repeated" if view.is_repeated else "accepted"
+    running.metrics.localized(domain, answer["timings_ms"], answer["belief"]["entropy_bits"], outcome)
+    return Response(body, media_type=JSON)
 
 
 @router.get("/sessions/{session_id}", response_model=SessionAnswer, responses=problems(404, 410, 422))
@@ -368,8 +364,8 @@ async def get_belief(
     if prefers_binary(request):
         return npy_response(await running.sessions.mass(session_id, robot_of(request)))
     view = await running.sessions.view(session_id, shortlist, robot_of(request))
-    route, belief = view.snapshot.route, view.belief
-    return await running.written(belief.top.size, lambda: json_response(render_belief(route, belief)))
+    _, body = await running.written(view.belief.top.size, render_belief, view.snapshot.route, view.belief)
+    return Response(body, media_type=JSON)
 
 
 @router.get("/sessions/{session_id}/next-best-view", responses=problems(404, 410, 422))
