@@ -15,7 +15,7 @@ from deepsimbad.jobs.runner import InThisProcess
 
 from .conftest import N_LANDMARKS, make_ready_domain, small_settings
 
-MOST_FILES, MOST_FUNCTIONS = 45, 152
+MOST_FILES, MOST_FUNCTIONS = 26, 120
 PROJECT = str(Path(deepsimbad.__file__).parent)
 
 

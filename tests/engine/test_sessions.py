@@ -304,28 +304,23 @@ def test_a_live_view_goes_before_the_replay_of_an_old_observation(
             for seed in range(3):
                 await live.sessions.observe(session_id, ranked(seed, key=f"k{seed}"))
         order: list[str] = []
-        submit, look = live.worker.submit, live.worker.look
+        look, one_replays = live.worker.look, threading.Lock()
 
-        def looking(*given: Any) -> Future[Any]:
-            order.append(Priority.LIVE.name)
-            return look(*given)
-
-        def noting(run: Callable[[], object], priority: Priority = Priority.LIVE) -> Future[object]:
+        def noting(
+            evaluator: Any, view: Any, run: Callable[[Any], Any], priority: Priority = Priority.LIVE
+        ) -> Future[Any]:
             order.append(priority.name)
             if priority is Priority.BATCH:
-                assert not one_replays.locked()
-                one_replays.acquire()
+                assert one_replays.acquire(blocking=False)
 
-            def noted() -> object:
+            def noted(view: Any) -> Any:
                 if priority is Priority.BATCH:
                     one_replays.release()
-                return run()
+                return run(view)
 
-            return submit(noted, priority)
+            return look(evaluator, view, noted, priority)
 
-        one_replays = threading.Lock()
-        live.worker.submit = noting  # type: ignore[method-assign,assignment]
-        live.worker.look = looking  # type: ignore[method-assign,assignment]
+        live.worker.look = noting  # type: ignore[method-assign]
         await live.sessions.observe(sessions[0], ranked(2, key="k2"))
         assert order == ["LIVE"]
         await asyncio.gather(*(live.sessions.observe(one, ranked(1, key="k1")) for one in sessions))

@@ -302,7 +302,8 @@ class Sessions:
             if record.ending is not None:
                 raise _ended(session_id, record.ending)
             live = self._living.setdefault(session_id, LiveSession(record, record.expires_at))  # begun this moment
-        check_owner(live.record, key_id)
+        if key_id is not None:
+            check_owner(live.record, key_id)
         if self._clock() >= live.expires_at and not live.lock.locked():
             await self._end(live, EXPIRED)
         if live.ending is not None:
@@ -343,7 +344,7 @@ class Sessions:
     async def _observe(self, live: LiveSession, observation: Observation, watch: Stopwatch) -> SessionView:
         """Everything in order under the session's lock: decode, describe, compute, write, publish."""
         async with live.lock:
-            state = await self._state(live)
+            state = live.state or await self._state(live)
             engine = state.engine
             shortlist_length(engine.snapshot, observation.n_shortlist)  # a bad one should not move the session
             check_move(engine.snapshot, observation.action_m, observation.action_std_m)
@@ -424,7 +425,7 @@ class Sessions:
 
     async def _set_prior(self, live: LiveSession, position_m: float, std_m: float) -> SessionView:
         async with live.lock:
-            state = await self._state(live)
+            state = live.state or await self._state(live)
             check_prior(state.engine.snapshot.route, position_m, std_m)
             row = PriorRow(state.sequence + 1, self._clock() + self._ttl_s, position_m, std_m)
             moved_on = await self._compute(lambda: state.after(row))

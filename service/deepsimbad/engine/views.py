@@ -79,18 +79,17 @@ class Stopwatch:
         now = perf_counter()
         encode_ms = view.encode_ms if isinstance(view, EncodedImage) else 0.0
         spent_ms = max(0.0, 1000 * (now - self._last) - encode_ms)
-        self._spent_ms[stage] = self._spent_ms.get(stage, 0.0) + spent_ms
+        self._spent_ms[stage] = round(self._spent_ms.get(stage, 0.0) + spent_ms, 3)
         if encode_ms:
-            self._spent_ms["encode"] = encode_ms
+            self._spent_ms["encode"] = round(encode_ms, 3)
         self._last = now
 
     def take(self, timings_ms: Mapping[str, float]) -> None:
         """Take over stages that were measured since the last lap, by whoever did the work."""
-        self._spent_ms.update(timings_ms)
+        for stage, spent_ms in timings_ms.items():
+            self._spent_ms[stage] = round(spent_ms, 3)
         self._last = perf_counter()
 
     def timings_ms(self) -> dict[str, float]:
         """Milliseconds by stage, and their `total` up to now."""
-        spent_ms = {stage: round(spent, 3) for stage, spent in self._spent_ms.items()}
-        spent_ms["total"] = round(1000 * (perf_counter() - self._began), 3)
-        return spent_ms
+        return {**self._spent_ms, "total": round(1000 * (perf_counter() - self._began), 3)}

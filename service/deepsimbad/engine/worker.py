@@ -93,10 +93,14 @@ class InferenceWorker:
             UnavailableError: The worker has been closed.
             OverloadedError: As many wait as may.
         """
-        return self._put(_Work(priority, next(self._arrivals), lambda _: run()))
+        return self.look(None, None, lambda _: run(), priority)
 
     def look(
-        self, evaluator: Evaluator, view: View, run: Callable[[View], T], priority: Priority = Priority.LIVE
+        self,
+        evaluator: Evaluator | None,
+        view: View | None,
+        run: Callable[[Any], T],
+        priority: Priority = Priority.LIVE,
     ) -> Future[T]:
         """Queue a function of a view; an image is encoded before, maybe in one batch with others.
 
@@ -110,15 +114,13 @@ class InferenceWorker:
             Its result or error to come, as `submit`; raises as `submit`.
         """
         encoder = evaluator if isinstance(view, np.ndarray) else None
-        return self._put(_Work(priority, next(self._arrivals), run, view, encoder))
-
-    def _put(self, work: _Work) -> Future[Any]:
+        work = _Work(priority, next(self._arrivals), run, view, encoder)
         with self._lock:
             if not self._open:
                 raise UnavailableError("the service is shutting down")
-            if self.is_full(work.priority):
+            if self._max_waiting is not None and self._n_waiting[priority] >= self._max_waiting:
                 raise queue_is_full()
-            self._n_waiting[work.priority] += 1
+            self._n_waiting[priority] += 1
             self._queue.put(work)
         return work.answer
 
@@ -134,10 +136,17 @@ class InferenceWorker:
 
     def _work(self) -> None:
         while (first := self._queue.get()).priority is not Priority._CLOSE:
-            batch = self._with_company(first)
+            encoder = first.encoder
+            batch = [first] if encoder is None else self._with_company(first, encoder.largest_batch)
             del first
-            if batch and batch[0].encoder is not None:
-                _encode(batch)
+            with self._lock:
+                for work in batch:
+                    self._n_waiting[work.priority] -= 1
+            for work in batch.copy():
+                if not work.answer.set_running_or_notify_cancel():
+                    batch.remove(work)
+            if encoder is not None and batch:
+                _encode(encoder, batch)
             while batch:  # emptied, or the last answer's arrays live until the next query
                 work = batch.pop(0)
                 if work.encoder is None:
@@ -147,10 +156,9 @@ class InferenceWorker:
                     self._scorer.submit(_finish, work).add_done_callback(lambda _: self._unscored.release())
                 del work
 
-    def _with_company(self, first: _Work) -> list[_Work]:
-        """A piece of work with the images that are encoded together with it, taken off the queue, but the cancelled."""
+    def _with_company(self, first: _Work, largest: int) -> list[_Work]:
+        """An image with those that are encoded together with it, taken off the queue."""
         batch = [first]
-        largest = 1 if first.encoder is None else first.encoder.largest_batch
         until = monotonic() + self._longest_wait_s
         while len(batch) < largest:
             left_s = until - monotonic()
@@ -162,17 +170,11 @@ class InferenceWorker:
                 self._queue.put(following)  # in its old place: the order is by priority and arrival
                 break
             batch.append(following)
-        with self._lock:
-            for work in batch:
-                self._n_waiting[work.priority] -= 1
-        return [work for work in batch if work.answer.set_running_or_notify_cancel()]
+        return batch
 
 
-def _encode(batch: list[_Work]) -> None:
+def _encode(encoder: Evaluator, batch: list[_Work]) -> None:
     """Put encodings in the place of the images of a batch; those of an image that cannot be encoded fail alone."""
-    encoder = batch[0].encoder
-    if encoder is None:
-        return
     try:
         for work, encoded in zip(batch, encode_images(encoder, [work.view for work in batch]), strict=True):
             work.view = encoded
@@ -182,7 +184,7 @@ def _encode(batch: list[_Work]) -> None:
             return
         alone = [[work] for work in batch]
         for single in alone:
-            _encode(single)
+            _encode(encoder, single)
         batch[:] = [work for single in alone for work in single]
 
 
