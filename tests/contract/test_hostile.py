@@ -220,7 +220,7 @@ def test_a_batch_that_unpacks_to_much_more(served: Served, n_noughts: int) -> No
     bomb = batch_of(n_noughts)
     assert len(bomb) < MEBIBYTE
     status, problem = ask(served, "POST", BATCH, bomb, Content_Type="application/octet-stream")
-    assert (status, problem["code"]) in {(422, "invalid_batch"), (413, "too_large")}
+    assert (status, problem["code"]) in {(422, "invalid_input"), (413, "too_large")}
 
 
 def test_a_batch_whose_members_lie_about_their_length(served: Served) -> None:

@@ -9,11 +9,12 @@ import threading
 import time
 from collections import Counter as CountOf
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime
 from functools import cache
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 from prometheus_client import (
     CollectorRegistry,
@@ -79,71 +80,42 @@ class Metrics:
     content_type = CONTENT_TYPE_LATEST
 
     def __init__(self) -> None:
-        self._registry = registry = CollectorRegistry()
-        self._requests = cache(
-            Counter(
-                "deepsimbad_requests", "Requests answered.", ["method", "route", "status"], registry=registry
-            ).labels
+        self._registry = CollectorRegistry()
+
+        def counter(name: str, meaning: str, *labels: str) -> Counter:
+            return Counter(f"deepsimbad_{name}", meaning, labels, registry=self._registry)
+
+        def histogram(name: str, meaning: str, buckets: Sequence[float], *labels: str) -> Histogram:
+            return Histogram(f"deepsimbad_{name}", meaning, labels, buckets=buckets, registry=self._registry)
+
+        # Looked up in a cache of our own, series cost half as much.
+        self._requests = cache(counter("requests", "Requests answered.", "method", "route", "status").labels)
+        what = "Time from a request's head to the end of its answer."
+        self._request_seconds = cache(histogram("request_seconds", what, _LATENCY_BUCKETS_S, "route").labels)
+        what = "Time of the stages of one answer to a view, and their total."
+        self._seconds_of_stage = cache(
+            histogram("localization_stage_seconds", what, _LATENCY_BUCKETS_S, "stage").labels
         )
-        self._request_seconds = cache(
-            Histogram(
-                "deepsimbad_request_seconds",
-                "Time from a request's head to the end of its answer.",
-                ["route"],
-                buckets=_LATENCY_BUCKETS_S,
-                registry=registry,
-            ).labels
-        )
-        stage_seconds = Histogram(
-            "deepsimbad_localization_stage_seconds",
-            "Time of the stages of one answer to a view, and their total.",
-            ["stage"],
-            buckets=_LATENCY_BUCKETS_S,
-            registry=registry,
-        )
-        self._seconds_of_stage = cache(stage_seconds.labels)  # a view has a dozen: looked up, they cost twice as much
-        self._entropy_bits = Histogram(
-            "deepsimbad_belief_entropy_bits",
-            "Entropy of the belief after one view: high when the map no longer tells places apart.",
-            ["domain"],
-            buckets=tuple(range(0, 25, 2)),
-            registry=registry,
-        )
-        self._live_anr_percent = Histogram(
-            "deepsimbad_live_anr_percent",
+        what = "Entropy of the belief after one view: high when the map no longer tells places apart."
+        self._entropy_bits = histogram("belief_entropy_bits", what, range(0, 25, 2), "domain")
+        what = (
             "Normalised rank of the true map image in a session's belief, in percent, once the truth was told: 0 is "
-            "perfect, 50 chance.",
-            ["domain"],
-            buckets=_PERCENT_BUCKETS,
-            registry=registry,
+            "perfect, 50 chance."
         )
-        self._observations = Counter(
-            "deepsimbad_observations",
-            "Observations of sessions: accepted, repeated (counted before), or the code of what was wrong.",
-            ["outcome"],
-            registry=registry,
+        self._live_anr_percent = histogram("live_anr_percent", what, _PERCENT_BUCKETS, "domain")
+        what = "Observations of sessions: accepted, repeated (counted before), or the code of what was wrong."
+        self._observations = counter("observations", what, "outcome")
+        what = "Writes that shared one transaction of the sessions' file."
+        self._commit_writes = histogram("session_commit_writes", what, _BATCH_BUCKETS)
+        what = "Requests turned away for what they are or how many, by reason."
+        self._refused = counter("refused_requests", what, "reason")
+        self._job_seconds = histogram(
+            "job_seconds", "Time from a job's start to its end.", _JOB_BUCKETS_S, "kind", "state"
         )
-        self._commit_writes = Histogram(
-            "deepsimbad_session_commit_writes",
-            "Writes that shared one transaction of the sessions' file.",
-            buckets=_BATCH_BUCKETS,
-            registry=registry,
+        self._in_flight = Gauge(
+            "deepsimbad_requests_in_flight", "Requests being answered now.", registry=self._registry
         )
-        self._refused = Counter(
-            "deepsimbad_refused_requests",
-            "Requests turned away for what they are or how many, by reason.",
-            ["reason"],
-            registry=registry,
-        )
-        self._job_seconds = Histogram(
-            "deepsimbad_job_seconds",
-            "Time from a job's start to its end.",
-            ["kind", "state"],
-            buckets=_JOB_BUCKETS_S,
-            registry=registry,
-        )
-        self._in_flight = Gauge("deepsimbad_requests_in_flight", "Requests being answered now.", registry=registry)
-        ProcessCollector(registry=registry)
+        ProcessCollector(registry=self._registry)
         self._state: StateCollector | None = None
         self._domains: set[str] = set()  # that have series here
         self._scrape = threading.Lock()
@@ -261,82 +233,42 @@ class StateCollector(Collector):
     def collect(self) -> Iterator[GaugeMetricFamily]:
         """Every family."""
         watched = self._watched
-        yield _gauge(
-            "deepsimbad_build_info",
-            "Always 1; the labels tell the release.",
-            {(release(), platform.python_version()): 1},
-            ("version", "python"),
-        )
-        yield _gauge("deepsimbad_ready", "1 where /readyz answers 200.", {(): 0 if watched.faults() else 1})
-        yield _gauge(
-            "deepsimbad_inference_queue", "Work waiting for the inference worker.", {(): watched.queue_length()}
-        )
-        yield _gauge("deepsimbad_loaded_maps", "Active maps held in memory.", {(): watched.maps.n_loaded})
-        yield _gauge("deepsimbad_sessions", "Sessions that have not ended.", {(): watched.n_sessions()})
-        try:
+        about = {(release(), platform.python_version()): 1}
+        yield _gauge("build_info", "Always 1; the labels tell the release.", about, "version", "python")
+        yield _gauge("ready", "1 where /readyz answers 200.", {(): not watched.faults()})
+        yield _gauge("inference_queue", "Work waiting for the inference worker.", {(): watched.queue_length()})
+        yield _gauge("loaded_maps", "Active maps held in memory.", {(): watched.maps.n_loaded})
+        yield _gauge("sessions", "Sessions that have not ended.", {(): watched.n_sessions()})
+        with suppress(OSError):
             usage = shutil.disk_usage(watched.data_dir)
-        except OSError:
-            pass
-        else:
-            yield _gauge("deepsimbad_data_dir_free_bytes", "Free where the data directory lies.", {(): usage.free})
-            yield _gauge("deepsimbad_data_dir_size_bytes", "Size of the disk it lies on.", {(): usage.total})
+            yield _gauge("data_dir_free_bytes", "Free where the data directory lies.", {(): usage.free})
+            yield _gauge("data_dir_size_bytes", "Size of the disk it lies on.", {(): usage.total})
         if self._seen is not None:
             yield from self._of_catalog(self._seen)
 
     def _of_catalog(self, state: CatalogState) -> Iterator[GaugeMetricFamily]:
-        now, by_domain = self._watched.wall(), ("domain",)
-        n_jobs, remaps = CountOf(job.state for job in state.jobs), sorted(state.last_remaps().items())
-        snapshots = [mapped.snapshot for mapped in self._watched.maps.loaded()]
+        now, serving = self._watched.wall(), state.serving.items()
+        snapshots = {(mapped.snapshot.domain,): mapped.snapshot for mapped in self._watched.maps.loaded()}
         damaged = self._watched.maps.damaged()
-        yield _gauge(
-            "deepsimbad_jobs",
-            "Jobs the catalog knows, by state.",
-            {(job_state.value,): n_jobs[job_state] for job_state in JobState},
-            ("state",),
-        )
-        yield _gauge("deepsimbad_domains", "Domains there are.", {(): len(state.domains)})
-        yield _gauge(
-            "deepsimbad_active_map_version",
-            "Version of the map that serves.",
-            {(domain,): record.version for domain, record in state.serving.items()},
-            by_domain,
-        )
-        yield _gauge(
-            "deepsimbad_map_age_seconds",
-            "Time since the map that serves was built.",
-            {(name,): max(0.0, now - _seconds(record.created_at)) for name, record in state.serving.items()},
-            by_domain,
-        )
-        yield _gauge(
-            "deepsimbad_map_damaged",
-            "1 where the map that serves could not be loaded.",
-            {(domain,): damaged.get(domain) == record.version for domain, record in state.serving.items()},
-            by_domain,
-        )
-        yield _gauge(
-            "deepsimbad_map_images",
-            "Map images of the map in memory.",
-            {(snapshot.domain,): snapshot.route.n_images for snapshot in snapshots},
-            by_domain,
-        )
-        yield _gauge(
-            "deepsimbad_map_index_bytes",
-            "Bytes of its index in the map file.",
-            {(snapshot.domain,): snapshot.index_bytes for snapshot in snapshots},
-            by_domain,
-        )
-        yield _gauge(
-            "deepsimbad_last_remap",
-            "1 for the outcome of the remap that ended last, else 0.",
-            {(domain, outcome): outcome == _outcome(job) for domain, job in remaps for outcome in REMAP_OUTCOMES},
-            ("domain", "outcome"),
-        )
-        yield _gauge(
-            "deepsimbad_last_remap_timestamp_seconds",
-            "When it ended, seconds since 1970.",
-            {(domain,): _seconds(job.finished_at or "") for domain, job in remaps},
-            by_domain,
-        )
+        n_jobs, remaps = CountOf(job.state for job in state.jobs), sorted(state.last_remaps().items())
+        by_state = {(job_state.value,): n_jobs[job_state] for job_state in JobState}
+        yield _gauge("jobs", "Jobs the catalog knows, by state.", by_state, "state")
+        yield _gauge("domains", "Domains there are.", {(): len(state.domains)})
+        versions = {(domain,): record.version for domain, record in serving}
+        yield _gauge("active_map_version", "Version of the map that serves.", versions, "domain")
+        ages_s = {(domain,): max(0.0, now - _seconds(record.created_at)) for domain, record in serving}
+        yield _gauge("map_age_seconds", "Time since the map that serves was built.", ages_s, "domain")
+        is_damaged = {(domain,): damaged.get(domain) == record.version for domain, record in serving}
+        yield _gauge("map_damaged", "1 where the map that serves could not be loaded.", is_damaged, "domain")
+        n_images = {domain: snapshot.route.n_images for domain, snapshot in snapshots.items()}
+        yield _gauge("map_images", "Map images of the map in memory.", n_images, "domain")
+        n_bytes = {domain: snapshot.index_bytes for domain, snapshot in snapshots.items()}
+        yield _gauge("map_index_bytes", "Bytes of its index in the map file.", n_bytes, "domain")
+        outcomes = {(domain, outcome): outcome == _outcome(job) for domain, job in remaps for outcome in REMAP_OUTCOMES}
+        what = "1 for the outcome of the remap that ended last, else 0."
+        yield _gauge("last_remap", what, outcomes, "domain", "outcome")
+        ended_at = {(domain,): _seconds(job.finished_at or "") for domain, job in remaps}
+        yield _gauge("last_remap_timestamp_seconds", "When it ended, seconds since 1970.", ended_at, "domain")
 
 
 def _outcome(job: JobRecord) -> str:
@@ -348,10 +280,9 @@ def _seconds(iso: str) -> float:
     return datetime.fromisoformat(iso).timestamp()
 
 
-def _gauge(
-    name: str, meaning: str, values: Mapping[tuple[str, ...], float], labels: Sequence[str] = ()
-) -> GaugeMetricFamily:
-    family = GaugeMetricFamily(name, meaning, labels=labels)
+def _gauge(name: str, meaning: str, values: Mapping[Any, float], *labels: str) -> GaugeMetricFamily:
+    """A family of gauges, its values by those of its labels."""
+    family = GaugeMetricFamily(f"deepsimbad_{name}", meaning, labels=labels)
     for label_values, value in values.items():
         family.add_metric(label_values, int(value) if isinstance(value, bool) else value)
     return family

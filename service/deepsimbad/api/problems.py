@@ -3,7 +3,7 @@
 import json
 import logging
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from http import HTTPStatus
 from typing import Any
 
@@ -90,7 +90,7 @@ def problem_response(
     hints: Mapping[str, Any] | None = None,
     headers: Mapping[str, str] | None = None,
 ) -> Response:
-    """Render one problem.
+    """Render one problem; its code, and the limit that was met, are noted for the log.
 
     Args:
         scope: The request's ASGI scope, for `instance` and the request id.
@@ -145,45 +145,28 @@ def unexpected_response(scope: Scope) -> Response:
 
 
 def invalid_request(error: ValidationError, where: str) -> InvalidRequestError:
-    """The tree's error for a body that a model refused.
-
-    Args:
-        error: What pydantic found.
-        where: "body" and the like, the first part of every place.
-    """
-    found = error.errors(include_url=False, include_context=False, include_input=False)
-    return _invalid_request(((where, *one["loc"]), one["msg"], one["type"]) for one in found)
+    """The tree's error for what a model refused; `where` is "body" and the like, the first part of every place."""
+    return _invalid_request(error.errors(include_url=False, include_context=False, include_input=False), where)
 
 
 def install_problem_handlers(app: FastAPI, routes: Sequence[Route] = ()) -> None:
-    """Let every error that leaves a route of `app` be answered as a problem.
+    """Let every error that leaves a route of `app` be answered as a problem; `Allow` is told from its `routes`."""
 
-    Args:
-        app: The application.
-        routes: Its routes, whose methods stand in `Allow` where a path does not answer to one.
-    """
-
-    async def from_tree(request: Request, error: Exception) -> Response:
-        if not isinstance(error, DeepSimbadError):
-            raise error
+    async def from_tree(request: Request, error: Any) -> Response:
         return error_response(request.scope, error)
 
-    async def from_validation(request: Request, error: Exception) -> Response:
-        if not isinstance(error, RequestValidationError):
-            raise error
+    async def from_validation(request: Request, error: Any) -> Response:
         # The stock answer echoes the input, so that NaN in it becomes a 500.
-        found: Sequence[Mapping[str, Any]] = error.errors()
-        named = _invalid_request((tuple(one["loc"]), one["msg"], one["type"]) for one in found)
-        return error_response(request.scope, named)
+        return error_response(request.scope, _invalid_request(error.errors()))
 
-    async def from_http(request: Request, error: Exception) -> Response:
-        if not isinstance(error, HTTPException):
-            raise error
+    async def from_http(request: Request, error: Any) -> Response:
         code = _CODE_OF_STATUS.get(error.status_code, f"http_{error.status_code}")
         detail = f"{request.method} {_instance(request.scope)}: {error.detail}"
         headers = dict(error.headers or {})
         if error.status_code == HTTPStatus.METHOD_NOT_ALLOWED:  # the framework names those of one route
-            headers["Allow"] = _allowed(routes, request.scope["path"]) or headers.get("Allow", "")
+            path = request.scope["path"]
+            methods = {method for route in routes if route.path_regex.match(path) for method in route.methods or ()}
+            headers["Allow"] = ", ".join(sorted(methods)) or headers.get("Allow", "")
         return problem_response(request.scope, error.status_code, code, detail, headers=headers)
 
     app.add_exception_handler(DeepSimbadError, from_tree)
@@ -191,19 +174,12 @@ def install_problem_handlers(app: FastAPI, routes: Sequence[Route] = ()) -> None
     app.add_exception_handler(HTTPException, from_http)
 
 
-def _allowed(routes: Sequence[Route], path: str) -> str:
-    """The methods that a path answers to, as the header `Allow` lists them."""
-    return ", ".join(
-        sorted({method for each in routes if each.path_regex.match(path) for method in each.methods or ()})
-    )
-
-
-def _invalid_request(found: Iterable[tuple[tuple[Any, ...], str, str]]) -> InvalidRequestError:
-    """One error of up to 20 findings, each (place, message, type)."""
-    # pydantic puts its own words before those of our validators
+def _invalid_request(findings: Sequence[Mapping[str, Any]], *where: str) -> InvalidRequestError:
+    """One error of up to 20 findings of pydantic's, which puts its own words before those of our validators."""
     errors = [
-        {"loc": list(loc), "msg": message.removeprefix("Value error, "), "type": kind} for loc, message, kind in found
-    ][:20]
+        {"loc": [*where, *finding["loc"]], "msg": finding["msg"].removeprefix("Value error, "), "type": finding["type"]}
+        for finding in findings[:20]
+    ]
     first = errors[0] if errors else {"loc": [], "msg": "unreadable", "type": "unreadable"}
     place = ".".join(str(part) for part in first["loc"])
     return InvalidRequestError(f"{place}: {first['msg']}", errors=errors)
@@ -218,9 +194,9 @@ def _instance(scope: Scope) -> str:
 def _json_ready(value: Any) -> Any:
     """The value with numpy scalars, tuples and non-finite numbers made sendable."""
     if isinstance(value, Mapping):
-        return {str(name): _json_ready(one) for name, one in value.items()}
+        return {str(name): _json_ready(member) for name, member in value.items()}
     if isinstance(value, (list, tuple, set, frozenset)):
-        return [_json_ready(one) for one in value]
+        return [_json_ready(member) for member in value]
     if hasattr(value, "item"):
         return _json_ready(value.item())
     if isinstance(value, float) and not math.isfinite(value):

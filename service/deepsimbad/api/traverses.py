@@ -1,6 +1,7 @@
 """Traverses of a domain, and their frames: one by one, or many whose encodings are known."""
 
 import logging
+import math
 import struct
 import tempfile
 import zipfile
@@ -210,6 +211,10 @@ async def delete_traverse(domain: DomainName, name: TraverseName, running: Runni
 # Handlers of frames
 
 
+def _metres(description: str) -> Any:
+    return Query(ge=-MAX_POSITION_M, le=MAX_POSITION_M, allow_inf_nan=False, description=description)
+
+
 @router.put(
     "/{name}/frames/{index}",
     status_code=201,
@@ -223,23 +228,15 @@ async def put_frame(
     domain: DomainName,
     name: TraverseName,
     index: Annotated[int, Path(ge=0, le=GREATEST_EXACT_INTEGER, description="Place in the recording, from 0.")],
-    position_m: Annotated[
-        float, Query(ge=-MAX_POSITION_M, le=MAX_POSITION_M, allow_inf_nan=False, description="Metres along the route.")
-    ],
+    position_m: Annotated[float, _metres("Metres along the route.")],
     request: Request,
     response: Response,
     running: Running,
     timestamp_us: Annotated[
         int | None, Query(ge=0, le=GREATEST_EXACT_INTEGER, description="Microseconds since 1970.")
     ] = None,
-    x_m: Annotated[
-        float | None,
-        Query(ge=-MAX_POSITION_M, le=MAX_POSITION_M, allow_inf_nan=False, description="East, in metres."),
-    ] = None,
-    y_m: Annotated[
-        float | None,
-        Query(ge=-MAX_POSITION_M, le=MAX_POSITION_M, allow_inf_nan=False, description="North, in metres."),
-    ] = None,
+    x_m: Annotated[float | None, _metres("East, in metres.")] = None,
+    y_m: Annotated[float | None, _metres("North, in metres.")] = None,
 ) -> FrameAnswer:
     """Store one frame, in any order; the same index again replaces it.
 
@@ -339,13 +336,11 @@ def _check_traverse(running: Services, domain: str, name: str) -> None:
 # A batch is read with distrust: what it declares is judged before anything is unpacked.
 
 MEMBERS = {"encodings": 2, "index": 1, "position_m": 1, "timestamp_us": 1, "x_m": 1, "y_m": 1}
+"""Arrays that a batch may hold, and how many dimensions each has."""
 REQUIRED = ("encodings", "index", "position_m")
-
-_END_OF_DIRECTORY = b"PK\x05\x06"
-_LARGE_DIRECTORY = b"PK\x06\x07"
+_KINDS = {"encodings": "f", "position_m": "fiu", "x_m": "fiu", "y_m": "fiu"}  # numpy's letters; of the others "iu"
+_END_OF_DIRECTORY, _LARGE_DIRECTORY = b"PK\x05\x06", b"PK\x06\x07"
 _MAX_HEADER_BYTES = 4096
-_MAX_RATIO = 100  # of unpacked to packed; encodings shrink by a tenth, only noughts by more than a hundred
-_ANY_RATIO_BYTES = 1 << 24
 
 
 class InvalidBatchError(InvalidInputError):
@@ -371,12 +366,21 @@ def read_batch(file: IO[bytes], max_bytes: int) -> Drive:
     try:
         _check_directory(file)
         with zipfile.ZipFile(file) as archive:
-            arrays = _read_members(archive, max_bytes)
+            arrays = _arrays(archive, max_bytes)
     except DeepSimbadError:
         raise
     except Exception as error:  # zipfile and numpy raise some ten kinds over a file that was meddled with
         raise InvalidBatchError("the batch is not a whole npz file as numpy.savez writes it") from error
-    return _arranged(arrays)
+    n_frames = len(arrays["encodings"])
+    unknown = np.full(n_frames, np.nan)
+    return Drive(
+        index=arrays["index"],
+        position_m=arrays["position_m"],
+        timestamp_us=arrays.get("timestamp_us", np.full(n_frames, UNKNOWN_TIMESTAMP)),
+        x_m=arrays.get("x_m", unknown),
+        y_m=arrays.get("y_m", unknown),
+        encodings=arrays["encodings"],
+    )
 
 
 def _check_directory(file: IO[bytes]) -> None:
@@ -388,36 +392,30 @@ def _check_directory(file: IO[bytes]) -> None:
     if end < 0 or len(tail) - end < 22:
         raise InvalidBatchError("the batch is not a whole npz file (numpy.savez)")
     n_members, directory_bytes = struct.unpack_from("<HL", tail, end + 10)
-    large = tail[max(0, end - 20) : end].startswith(_LARGE_DIRECTORY)
-    if n_members > len(MEMBERS) or directory_bytes > 1 << 14 or large:
+    is_large = tail[max(0, end - 20) : end].startswith(_LARGE_DIRECTORY)
+    if n_members > len(MEMBERS) or directory_bytes > 1 << 14 or is_large:
         raise InvalidBatchError(f"the batch holds more than the arrays {', '.join(MEMBERS)}", allowed=list(MEMBERS))
 
 
-def _read_members(archive: zipfile.ZipFile, max_bytes: int) -> dict[str, NDArray[Any]]:
-    names = [member.filename.removesuffix(".npy") for member in archive.infolist()]
-    unknown = sorted(set(names) - set(MEMBERS))
-    if unknown or len(names) != len(set(names)):
+def _arrays(archive: zipfile.ZipFile, max_bytes: int) -> dict[str, NDArray[Any]]:
+    members = {member.filename.removesuffix(".npy"): member for member in archive.infolist()}
+    if not set(members) <= set(MEMBERS) or len(members) != len(archive.infolist()):
         raise InvalidBatchError(
             f"the batch holds arrays that are not known or stand twice; known are {', '.join(MEMBERS)}",
             allowed=list(MEMBERS),
         )
-    missing = [name for name in REQUIRED if name not in names]
-    if missing:
+    if missing := [name for name in REQUIRED if name not in members]:
         raise InvalidBatchError(f"the batch lacks {', '.join(missing)}", missing=missing)
-    declared = sum(member.file_size for member in archive.infolist())
-    if declared > max_bytes:
+    n_bytes = sum(member.file_size for member in members.values())
+    if n_bytes > max_bytes:
         raise TooLargeError(
-            f"the batch unpacks to {declared} bytes; at most {max_bytes} are taken, send fewer frames at once",
+            f"the batch unpacks to {n_bytes} bytes; at most {max_bytes} are taken, send fewer frames at once",
             max_bytes=max_bytes,
         )
-    packed = sum(member.compress_size for member in archive.infolist())
-    if declared > max(_ANY_RATIO_BYTES, _MAX_RATIO * packed):
-        raise InvalidBatchError(f"the batch unpacks to {declared} bytes from {packed}: these are no encodings")
-    for name, member in zip(names, archive.infolist(), strict=True):
+    arrays = {}
+    for name, member in members.items():
         with archive.open(member) as stream:
             _check_header(name, stream, member.file_size)
-    arrays = {}
-    for name, member in zip(names, archive.infolist(), strict=True):
         with archive.open(member) as stream:
             arrays[name] = np.lib.format.read_array(stream, allow_pickle=False, max_header_size=_MAX_HEADER_BYTES)
             if stream.read(1):  # reading to the end is also what checks the member's checksum
@@ -425,34 +423,17 @@ def _read_members(archive: zipfile.ZipFile, max_bytes: int) -> dict[str, NDArray
     return arrays
 
 
-def _check_header(name: str, stream: IO[bytes], member_bytes: int) -> None:
-    """Refuse a shape or type that is not the array's own, before its numbers are touched."""
+def _check_header(name: str, stream: IO[bytes], n_bytes: int) -> None:
+    """Refuse a shape or type that is not the array's own, before room is made for its numbers."""
     version = np.lib.format.read_magic(stream)
-    readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-    if version not in readers:
+    if version not in {(1, 0), (2, 0)}:
         raise InvalidBatchError(f"{name} has npy version {version}; 1.0 and 2.0 are read")
-    shape, _, dtype = readers[version](stream, max_header_size=_MAX_HEADER_BYTES)
-    kinds = "fiu" if name in {"position_m", "x_m", "y_m"} else "f" if name == "encodings" else "iu"
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, _, dtype = read(stream, max_header_size=_MAX_HEADER_BYTES)
+    kinds = _KINDS.get(name, "iu")
     if dtype.kind not in kinds or dtype.itemsize > 8:
         raise InvalidBatchError(f"{name} holds {dtype}; it must hold {'floats' if 'f' in kinds else 'integers'}")
     if len(shape) != MEMBERS[name]:
         raise InvalidBatchError(f"{name} has shape {list(shape)}; it must have {MEMBERS[name]} dimensions")
-    n_values = 1
-    for length in shape:
-        n_values *= length
-    if stream.tell() + n_values * dtype.itemsize != member_bytes:
-        raise InvalidBatchError(f"{name} does not hold the {n_values} numbers its header says")
-
-
-def _arranged(arrays: dict[str, NDArray[Any]]) -> Drive:
-    """The store's form; it judges the values."""
-    n_frames = len(arrays["encodings"])
-    unknown = np.full(n_frames, np.nan)
-    return Drive(
-        index=arrays["index"],
-        position_m=arrays["position_m"],
-        timestamp_us=arrays.get("timestamp_us", np.full(n_frames, UNKNOWN_TIMESTAMP)),
-        x_m=arrays.get("x_m", unknown),
-        y_m=arrays.get("y_m", unknown),
-        encodings=arrays["encodings"],
-    )
+    if stream.tell() + math.prod(shape) * dtype.itemsize != n_bytes:
+        raise InvalidBatchError(f"{name} does not hold the {math.prod(shape)} numbers its header says")
