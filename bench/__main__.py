@@ -3,16 +3,11 @@
 import sys
 from pathlib import Path
 
-from bench import machine
-from bench.http import http_table
-from bench.landmarks import landmark_table
-from bench.map_file import map_file_table
-from bench.nnql import nnql_table
+from bench.answering import retrieval_table, step_table
+from bench.building import landmark_table, map_file_table, nnql_table
+from bench.common import describe
 from bench.remap import remap_table
-from bench.restart import restart_table
-from bench.retrieval import retrieval_table
-from bench.sessions import session_table
-from bench.step import step_table
+from bench.serving import http_table, restart_table, session_table
 
 RESULTS = Path(__file__).resolve().parent.parent / "docs" / "results" / "bench.md"
 
@@ -32,7 +27,7 @@ TABLES = (
 def main() -> None:
     """Print the tables as they are measured, then write them."""
     lines = ["# Benchmarks", "", "Made by `make bench`. Medians; machines are shared and noisy.", ""]
-    lines += [f"Machine: {machine.describe()}", ""]
+    lines += [f"Machine: {describe()}", ""]
     for table in TABLES:
         for line in table():
             print(line, flush=True)

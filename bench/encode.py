@@ -21,8 +21,7 @@ import cv2
 import numpy as np
 import torch
 
-from bench import machine
-from bench.recordings import RESULTS
+from bench.common import RESULTS, describe
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.compute import Compute, Runtime
 from deepsimbad.evaluators.extractors.base import resized
@@ -294,7 +293,7 @@ def _seconds(command: list[str]) -> float:
 def report() -> Iterator[str]:
     """The lines of the page."""
     bodies = pictures(24)
-    yield from ("# Encoding", "", "Made by `python -m bench.encode`.", "", f"Machine: {machine.describe()}", "")
+    yield from ("# Encoding", "", "Made by `python -m bench.encode`.", "", f"Machine: {describe()}", "")
     yield f"The default extractor, `efficientnet_lite0`; JPEGs of {len(bodies[0]) // 1000} kB."
     yield ""
     yield from by_runtime(bodies)

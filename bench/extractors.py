@@ -18,9 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from bench import machine
+from bench.common import RESULTS, describe, real_recordings
 from bench.nordland import kept_frames, season_folder
-from bench.recordings import RESULTS, real_recordings
 from deepsimbad.cli import run
 from deepsimbad_campus.writer import write_campus
 from deepsimbad_client.recordings.sources import open_source
@@ -124,7 +123,7 @@ def report(splits: list[Split], work: Path) -> Iterator[str]:
         "Made by `DEEPSIMBAD_REAL_DATA=... python -m bench.extractors`, which runs `deepsimbad experiment vpr "
         "--evaluator all` on every split.",
         "",
-        f"Machine: {machine.describe()}",
+        f"Machine: {describe()}",
         "",
         "ANR in percent of `calibrated` / `rrf` / `brute_force`, and R@1 of `brute_force` in percent behind them. One "
         f"session over the test drive, h = 4, r = {N_LANDMARKS} or all candidates, tolerance two frames.",

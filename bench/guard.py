@@ -16,8 +16,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bench import machine
-from bench.recordings import RESULTS, real_recordings
+from bench.common import RESULTS, describe, real_recordings
 from deepsimbad.core.descriptor import rank_landmarks
 from deepsimbad.core.drive import LEAST_CORRELATION, LEAST_PLACES, SIGNIFICANCE, judge
 from deepsimbad.core.landmark_model import select_landmarks
@@ -399,7 +398,7 @@ def report(rows: Sequence[Row]) -> list[str]:
         "pairs of one season in the other half (eight of them, seven at one distance of the two places); so the least "
         "correlation came in, its number from the first half again.",
         "",
-        f"Machine: {machine.describe()}",
+        f"Machine: {describe()}",
     ]
     heads = {
         REPORTED: "## Places that nothing was chosen on",

@@ -21,8 +21,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from bench.common import describe
 from bench.load.trial import Sample
-from bench.machine import describe
 from bench.soak.link import Link
 from bench.soak.world import BASE, DOMAIN, N_LANDMARKS, make_domain
 from deepsimbad_client.http.local_server import LocalServer

@@ -17,9 +17,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bench import machine
+from bench.common import RESULTS, describe, real_recordings
 from bench.netvlad import DRIVES
-from bench.recordings import RESULTS, real_recordings
 from deepsimbad.core.episodes import TestDrive
 from deepsimbad.core.planners import CONSTANT, DEFAULT_PLANNER, RANDOM
 from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
@@ -155,7 +154,7 @@ def page(triplets: list[Triplet], command: str, seconds: float) -> list[str]:
         "",
         f"Made by `{command}` in {seconds:.0f} s; `deepsimbad experiment nbv` gives each triplet alone.",
         "",
-        f"Machine: {machine.describe()}",
+        f"Machine: {describe()}",
         "",
         f"Relevance `{config.relevance.value}`, update `{config.update.value}`, the grid filter; the last column has "
         "the paper's, `rrf` and `additive_relevance`, with a motion error of 0.7 m. `clairvoyant` tries every move on "

@@ -15,8 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from bench import machine
-from bench.recordings import RESULTS, real_recordings
+from bench.common import RESULTS, describe, real_recordings
 from deepsimbad.cli import run
 from deepsimbad.core.building import build_map
 from deepsimbad.core.descriptor import rank_landmarks
@@ -115,7 +114,7 @@ def main() -> None:
         "Made by `python -m bench.netvlad`, which runs `deepsimbad experiment vpr` six times. `calibrated` also learns "
         "from the landmark traverse, here another season of the same route.",
         "",
-        f"Machine: {machine.describe()}",
+        f"Machine: {describe()}",
         "",
         "ANR in percent:",
         "",

@@ -17,9 +17,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from bench import machine
-from bench.recordings import RESULTS
-from bench.timing import Timing, interleaved
+from bench.common import RESULTS, Timing, describe, interleaved
 from deepsimbad.evaluators.compute import Compute, Device, Runtime
 from deepsimbad.evaluators.nets.netvlad import STAGES, NetVlad
 from deepsimbad.evaluators.runtimes import make_run
@@ -162,7 +160,7 @@ def main() -> None:
         "of calls taken in turn. Ratios are medians over turns and hold on a shared machine; times are what it had to "
         "spare.",
         "",
-        f"Machine: {machine.describe()}, torch {torch.__version__}",
+        f"Machine: {describe()}, torch {torch.__version__}",
         "",
     ]
     on_cpu = list(measure(Device.CPU, 1, REPEATS["cpu"]))

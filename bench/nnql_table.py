@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bench import machine, nnql_worlds
+from bench import nnql_worlds
+from bench.common import RESULTS, describe, real_recordings
 from bench.nnql_worlds import (
     HELD_OUT,
     ITSELF,
@@ -28,7 +29,6 @@ from bench.nnql_worlds import (
     Setup,
     Triplet,
 )
-from bench.recordings import RESULTS, real_recordings
 from deepsimbad.core.metrics import mean_interval
 from deepsimbad.core.nnql import NnqlConfig
 
@@ -188,7 +188,7 @@ def main() -> None:
         "",
         "Made by `python -m bench.nnql_table`.",
         "",
-        f"Machine: {machine.describe()}",
+        f"Machine: {describe()}",
         "",
     ]
     with ThreadPoolExecutor(2) as pool:

@@ -16,8 +16,7 @@ from typing import Any
 
 import cv2
 
-from bench import machine
-from bench.recordings import RESULTS, real_recordings
+from bench.common import RESULTS, describe, real_recordings
 from deepsimbad_client import Client
 from deepsimbad_client.http.jobs import remap
 from deepsimbad_client.http.local_server import LocalServer
@@ -154,7 +153,7 @@ def main() -> None:
         "",
         "Made by `python -m bench.nordland`.",
         "",
-        f"Machine: {machine.describe()}",
+        f"Machine: {describe()}",
         "",
         *table(measured),
     ]

@@ -11,9 +11,8 @@ from pathlib import Path
 
 from rich.console import Console
 
-from bench import machine
+from bench.common import RESULTS, describe, real_recordings
 from bench.nordland import DOMAIN, LIST_LENGTH, N_LANDMARKS, drive_folders
-from bench.recordings import RESULTS, real_recordings
 from deepsimbad_client import Client
 from deepsimbad_client.http.jobs import remap
 from deepsimbad_client.http.local_server import LocalServer
@@ -54,7 +53,7 @@ def main() -> None:
         "",
         f"Made by `python -m bench.nordland_active`: {EPISODES} episodes of ten moves, the same starts for all.",
         "",
-        f"Machine: {machine.describe()}",
+        f"Machine: {describe()}",
         "",
         "Landmarks summer 1000..1999, map summer 0..999, robot winter 0..999; the landmark drive never saw the mapped",
         "stretch, so nobody knows which places are telling and the default planner makes the longest move: it equals",

@@ -18,9 +18,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bench import machine
+from bench.common import RESULTS, describe, real_recordings
 from bench.nordland import LANDMARK_FRAMES, MAP_FRAMES, kept_frames
-from bench.recordings import RESULTS, real_recordings
 from deepsimbad.core.building import build_map
 from deepsimbad.core.descriptor import normal_scores, pack_ranked_landmarks, rank_landmarks, ranks_from_ranked_landmarks
 from deepsimbad.core.drive import Drive, SecondSeason
@@ -186,7 +185,7 @@ def main() -> None:
         "",
         "Made by `python -m bench.onboard`.",
         "",
-        f"Machine: {machine.describe()}",
+        f"Machine: {describe()}",
         "",
         "## NetVLAD encodings of Nordland",
         "",

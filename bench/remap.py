@@ -16,13 +16,10 @@ from typing import Any
 
 import numpy as np
 
-from bench.bare_connection import BareConnection
-from bench.camera import jpegs
-from bench.landmarks import N_CANDIDATES
-from bench.limits import Limit, breaches, limit_table
-from bench.live_robots import LiveRobot, Waits, drive
-from bench.seasons import SPACING_M, write_seasons
-from bench.worlds import ENCODING_DIM, N_LANDMARKS, NCLT_IMAGES
+from bench.building import N_CANDIDATES
+from bench.common import Limit, breaches, limit_table
+from bench.robots import BareConnection, LiveRobot, Waits, drive, jpegs
+from bench.worlds import ENCODING_DIM, N_LANDMARKS, NCLT_IMAGES, SPACING_M, write_seasons
 from deepsimbad_client import Client
 from deepsimbad_client.http.local_server import LocalServer
 

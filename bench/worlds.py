@@ -1,15 +1,18 @@
-"""Synthetic maps of any size, in the two extremes that matter for size and speed."""
+"""Synthetic maps of any size, in the two extremes that matter for size and speed, and two seasons of one long route."""
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from deepsimbad.core.descriptor import rank_landmarks
+from deepsimbad.core.drive import Drive
 from deepsimbad.core.map import Map
 from deepsimbad.core.relevance import Relevance
 from deepsimbad.core.statistics import LandmarkStatistics
+from deepsimbad.store.traverses import Traverse
 
 NCLT_IMAGES = 26_208  # one traverse of the paper
 N_LANDMARKS, LIST_LENGTH, ENCODING_DIM = 500, 4, 4096
@@ -65,3 +68,44 @@ def rrf_map(lists: NDArray[np.uint16], **more: Any) -> Map:
     """A map of these lists for the paper's relevance."""
     config = {"relevance": Relevance.RRF.value, "n_landmarks": N_LANDMARKS}
     return Map(config=config, lists=lists, position_m=np.arange(lists.shape[1]) * 0.2, **more)
+
+
+SPACING_M = 0.2
+_BLOCK = 1024
+
+
+def write_seasons(data_dir: Path, domain: str, n_frames: int, n_candidates: int, dim: int) -> None:
+    """Two drives of one wandering route, straight into their files: an upload is not what is measured here.
+
+    Args:
+        data_dir: Where the domain is.
+        domain: It has no traverses yet.
+        n_frames: Of the traverse `training`.
+        n_candidates: Of the traverse `landmarks`, spread over the same route.
+        dim: Of an encoding.
+    """
+    frames_of = np.linspace(0, n_frames - 1, n_candidates).round().astype(np.int64)
+    with (
+        Traverse.create(data_dir, domain, "training") as training,
+        Traverse.create(data_dir, domain, "landmarks") as landmarks,
+    ):
+        rng = np.random.default_rng(0)
+        level = rng.standard_normal(dim, dtype=np.float32)
+        for start in range(0, n_frames, _BLOCK):
+            places = np.empty((min(_BLOCK, n_frames - start), dim), np.float32)
+            for place in places:
+                level = np.float32(0.98) * level + np.float32(0.2) * rng.standard_normal(dim, np.float32)
+                place[:] = level
+            index = np.arange(start, start + len(places))
+            training.put_frames(_season(places, index, index, rng))
+            chosen = np.flatnonzero((frames_of >= start) & (frames_of < start + len(places)))
+            landmarks.put_frames(_season(places[frames_of[chosen] - start], chosen, frames_of[chosen], rng))
+
+
+def _season(
+    places: NDArray[np.float32], index: NDArray[np.int64], frame: NDArray[np.int64], rng: np.random.Generator
+) -> Drive:
+    """The places as one season shows them: unit vectors, as NetVLAD's are."""
+    seen = places + np.float32(0.7) * rng.standard_normal(places.shape, np.float32)
+    seen = (seen / np.linalg.norm(seen, axis=1, keepdims=True)).astype(np.float32)
+    return Drive(index=index, position_m=frame * SPACING_M, encodings=seen)

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
+from bench.common import describe
 from bench.load.drivers import N_IMAGES, SESSION_LENGTH
 from bench.load.trial import N_ROBOTS, Load, load
-from bench.machine import describe
 
 
 def report(found: Load, observe_every_s: float) -> Iterator[str]:

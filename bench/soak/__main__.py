@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.limits import Limit, breaches, limit_table
-from bench.machine import describe
+from bench.common import Limit, breaches, describe, limit_table
 from bench.soak.trial import LONGEST_LIFE_S, Soak, soak
 
 READY_WITHIN_S = 2.0

@@ -6,10 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
-from bench.camera import jpegs
-from bench.limits import Limit, breaches
-from bench.live_robots import LiveRobot, Waits
+from bench.common import Limit, breaches
 from bench.remap import RemapFigures, Remapped, RemapSize, report
+from bench.robots import LiveRobot, Waits, jpegs
 
 STAGES = dict.fromkeys(("read_frames", "select_landmarks", "describe", "train", "check"), 1.0)
 CALM = Waits([0.010] * 100, [], [1])

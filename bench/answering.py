@@ -1,14 +1,28 @@
-"""One query against maps of growing size, beside brute-force L2 of the encodings it replaces."""
+"""One query against maps of growing size, and one step of the active localizer with its planners."""
 
 from collections.abc import Callable, Iterator
+from statistics import median
+from time import perf_counter
 
 import faiss
 import numpy as np
 
-from bench.timing import duration, interleaved
-from bench.worlds import ENCODING_DIM, LIST_LENGTH, N_LANDMARKS, NCLT_IMAGES, rrf_map, scattered_lists, standardised_map
+from bench.common import Timing, duration, interleaved
+from bench.worlds import (
+    ENCODING_DIM,
+    LIST_LENGTH,
+    N_LANDMARKS,
+    NCLT_IMAGES,
+    dense_lists,
+    rrf_map,
+    scattered_lists,
+    standardised_map,
+)
+from deepsimbad.core.belief import FilterKind
 from deepsimbad.core.descriptor import rank_landmarks
+from deepsimbad.core.localizer import ActiveLocalizer, LocalizerConfig
 from deepsimbad.core.map import Map
+from deepsimbad.core.planners import NNQL, TELLING
 from deepsimbad.core.relevance import Query
 from deepsimbad.core.retrieval import relevances, shortlist
 
@@ -28,7 +42,7 @@ def retrieval_table() -> Iterator[str]:
         maps = [standardised, rrf_map(standardised.lists)]
         brute_force = _faiss_index(n_images, rng) if n_images == NCLT_IMAGES else None
         for built in maps:
-            yield _row(built, dissimilarities, brute_force, rng)
+            yield _retrieval_row(built, dissimilarities, brute_force, rng)
     yield ""
     yield (
         f"Brute force is `faiss.IndexFlatL2` over {ENCODING_DIM:,}-d float32 encodings, timed in turn with our query; "
@@ -36,7 +50,7 @@ def retrieval_table() -> Iterator[str]:
     )
 
 
-def _row(
+def _retrieval_row(
     built: Map,
     dissimilarities: np.ndarray,
     brute_force: "faiss.IndexFlatL2 | None",
@@ -75,3 +89,48 @@ def _faiss_index(n_images: int, rng: np.random.Generator) -> "faiss.IndexFlatL2"
     for start in range(0, n_images, 4096):
         index.add(rng.normal(size=(min(4096, n_images - start), ENCODING_DIM)).astype(np.float32))
     return index
+
+
+_STEPS = 300
+_ACTIONS_M = tuple(float(metres) for metres in range(1, 11))
+
+
+def step_table() -> Iterator[str]:
+    """Markdown lines."""
+    yield f"## One step of the active localizer: {NCLT_IMAGES:,} map images, r = {N_LANDMARKS}, h = {LIST_LENGTH}"
+    yield ""
+    yield "| filter | planner | step, encoding apart | planner alone |"
+    yield "|---|---|---|---|"
+    snapshot = _snapshot()
+    rng = np.random.default_rng(0)
+    views = [Query(rng.permutation(N_LANDMARKS).astype(np.float32) + 1) for _ in range(32)]
+    for kind in FilterKind:
+        for planner in (NNQL, TELLING):
+            localizer = ActiveLocalizer(snapshot, LocalizerConfig(filter=kind, planner=planner), perf_counter)
+            yield _step_row(kind, planner, localizer, views)
+    yield ""
+    yield f"{_STEPS} steps of 1 m with a random view each, so that the belief stays wide; 1,000 particles."
+
+
+def _step_row(kind: FilterKind, planner: str, localizer: ActiveLocalizer, views: list[Query]) -> str:
+    state = localizer.start()
+    seconds, planning_ms = [], []
+    for number in range(_STEPS + 10):
+        began = perf_counter()
+        step = localizer.step(state, views[number % len(views)], 1.0)
+        if number >= 10:
+            seconds.append(perf_counter() - began)
+            planning_ms.append(step.timings_ms["plan"])
+        state = step.state
+    return f"| {kind.value} | `{planner}` | {Timing(tuple(seconds))} | {duration(median(planning_ms) / 1000)} |"
+
+
+def _snapshot() -> Map:
+    """A map whose lists drift, with an experience database and telling places of random values."""
+    rng = np.random.default_rng(1)
+    return standardised_map(
+        dense_lists(NCLT_IMAGES).lists,
+        actions_m=np.array(_ACTIONS_M),
+        telling_bits=rng.random(NCLT_IMAGES).astype(np.float32),
+        q_values=rng.random((NCLT_IMAGES, len(_ACTIONS_M))).astype(np.float32),
+    )

@@ -1,22 +1,86 @@
-"""`POST observations` with ready ranks over loopback, durable: one robot, and many at once."""
+"""Answers over loopback: stateless, durable sessions of one robot and of many, and a start after a kill."""
 
 import asyncio
+import http.client
 import json
 import tempfile
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from time import perf_counter
 from typing import Any, Self
+from urllib.parse import urlsplit
 
 import numpy as np
 
-from bench.bare_connection import BareConnection
-from bench.http import make_map
-from bench.timing import Timing
+from bench.common import Timing, timed
+from bench.robots import BareConnection
 from bench.worlds import N_LANDMARKS, NCLT_IMAGES
 from deepsimbad_client import Client
 from deepsimbad_client.http.local_server import LocalServer
+
+_DIM = 64  # short encodings: what is measured never sees them
+
+
+def http_table() -> Iterator[str]:
+    """Markdown lines."""
+    yield f"## HTTP: `POST localizations` on loopback, {NCLT_IMAGES:,} map images, one client"
+    yield ""
+    yield "| body | by | median |"
+    yield "|---|---|---|"
+    rng = np.random.default_rng(0)
+    ranked = rng.permutation(N_LANDMARKS).tolist()
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        LocalServer(Path(folder) / "data") as server,
+        Client(server.url) as client,
+    ):
+        make_map(client, rng)
+        for count in (N_LANDMARKS, 4):
+            sent = ranked[:count]
+            yield f"| {count} ranked landmarks | a bare HTTP/1.1 connection | {_bare(server.url, sent)} |"
+            by_client = timed(partial(client.localize, "bench", ranked_landmarks=sent), 500, 50)
+            yield f"| {count} ranked landmarks | `deepsimbad_client.Client` | {by_client} |"
+        answer = client.localize("bench", ranked_landmarks=ranked)
+    stages = ", ".join(f"{stage} {milliseconds:.3f}" for stage, milliseconds in answer.timings_ms.items())
+    yield ""
+    yield f"Inside the service, in ms: {stages}"
+
+
+def _bare(url: str, ranked: list[int]) -> Timing:
+    body = json.dumps({"ranked_landmarks": ranked}).encode()
+    with closing(http.client.HTTPConnection(urlsplit(url).netloc)) as connection:
+        return timed(lambda: _post(connection, body), 500, 50)
+
+
+def _post(connection: http.client.HTTPConnection, body: bytes) -> None:
+    connection.request("POST", "/v1/domains/bench/localizations", body, {"Content-Type": "application/json"})
+    response = connection.getresponse()
+    answer = response.read()
+    if response.status != http.client.OK:
+        raise RuntimeError(answer.decode())
+
+
+def make_map(client: Client, rng: np.random.Generator) -> None:
+    """Upload a wandering traverse and map it, through the same calls a user has."""
+    wander = np.cumsum(rng.normal(size=(NCLT_IMAGES, _DIM)), axis=0)
+    encodings = (wander / np.linalg.norm(wander, axis=1, keepdims=True)).astype(np.float32)
+    client.admin.put_domain("bench", {"kind": "feature_l2", "extractor": "none"})
+    for name, rows in (("landmarks", encodings[::5]), ("training", encodings)):
+        client.admin.create_traverse("bench", name)
+        client.admin.put_frames(
+            "bench", name, encodings=rows, index=np.arange(len(rows)), position_m=np.arange(len(rows)) * 0.2
+        )
+    job = client.admin.remap(
+        "bench", training_traverse="training", landmark_traverse="landmarks", n_landmarks=N_LANDMARKS
+    )
+    while not job.ended:
+        job = client.admin.job(job.job_id)
+    if job.state != "succeeded":
+        raise RuntimeError(f"the benchmark's map failed: {job.error_text}")
+
 
 ROBOTS = 50
 _ONE_ROBOT_VIEWS, _EACH_ROBOT_VIEWS, _WARM_UP = 300, 40, 20
@@ -32,9 +96,9 @@ def session_table() -> Iterator[str]:
     with tempfile.TemporaryDirectory() as folder, LocalServer(Path(folder) / "data") as server:
         with Client(server.url) as client:
             make_map(client, np.random.default_rng(0))
-        asyncio.run(drive(server.url, 1, _WARM_UP))
+        asyncio.run(drive_sessions(server.url, 1, _WARM_UP))
         for n_robots, n_views in ((1, _ONE_ROBOT_VIEWS), (ROBOTS, _EACH_ROBOT_VIEWS)):
-            driven = asyncio.run(drive(server.url, n_robots, n_views))
+            driven = asyncio.run(drive_sessions(server.url, n_robots, n_views))
             yield (
                 f"| {n_robots} | {driven.timing} | {driven.per_second:.0f} | {driven.n_errors} "
                 f"| {driven.n_counted} of {n_robots * n_views} |"
@@ -67,7 +131,7 @@ class Driven:
         return len(self.timing.seconds) / self.seconds
 
 
-async def drive(url: str, n_robots: int, n_views: int) -> Driven:
+async def drive_sessions(url: str, n_robots: int, n_views: int) -> Driven:
     """Let robots observe at once, each as fast as it is answered."""
     rng = np.random.default_rng(1)
     bodies = [
@@ -131,3 +195,24 @@ class _Robot:
 
     def close(self) -> None:
         self._connection.close()
+
+
+_KILLS = 7
+
+
+def restart_table() -> Iterator[str]:
+    """Markdown lines."""
+    yield f"## Restart: from `kill -9` to a ready service, {NCLT_IMAGES:,} map images"
+    yield ""
+    seconds = []
+    with tempfile.TemporaryDirectory() as folder:
+        data_dir = Path(folder) / "data"
+        with LocalServer(data_dir) as server, Client(server.url) as client:
+            make_map(client, np.random.default_rng(0))
+        for _ in range(_KILLS):
+            server = LocalServer(data_dir)
+            began = perf_counter()
+            server.start()
+            seconds.append(perf_counter() - began)
+            server.kill()
+    yield f"From the start of the process to `/readyz` answering 200: {Timing(tuple(seconds))}."

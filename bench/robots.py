@@ -1,16 +1,70 @@
-"""Robots that ask again and again, and how long they wait: alone, and beside something."""
+"""Robots that ask over one kept connection each, and the pictures that their cameras take."""
 
 import asyncio
 import json
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Self
+from urllib.parse import urlsplit
 
+import cv2
 import numpy as np
 
-from bench.bare_connection import JSON, BareConnection
-from bench.timing import duration
+from bench.common import duration
+from deepsimbad_campus.renderer import Renderer
+from deepsimbad_campus.route import Drive, drive_length_m
+from deepsimbad_campus.season import PAPER_DATES, drive_date
+from deepsimbad_campus.world import World
+
+JSON = "application/json"
+
+
+class BareConnection:
+    """HTTP/1.1 as far as a benchmark needs it: one request at a time, JSON back.
+
+    Args:
+        reader: What comes back.
+        writer: What is sent.
+    """
+
+    def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        self._reader, self._writer = reader, writer
+
+    @classmethod
+    async def to(cls, url: str) -> Self:
+        """Connect."""
+        where = urlsplit(url)
+        return cls(*await asyncio.open_connection(where.hostname, where.port))
+
+    async def request(
+        self, method: str, path: str, body: bytes = b"", key: str = "", media_type: str = JSON
+    ) -> tuple[int, bytes]:
+        """Send a request.
+
+        Args:
+            method: GET, POST, ...
+            path: With its query.
+            body: What is sent.
+            key: The idempotency key; empty: none.
+            media_type: Of the body.
+
+        Returns:
+            Status and body of the answer.
+        """
+        named = f"Idempotency-Key: {key}\r\n" if key else ""
+        head = (
+            f"{method} {path} HTTP/1.1\r\nHost: bench\r\nContent-Type: {media_type}\r\n"
+            f"{named}Content-Length: {len(body)}\r\n\r\n"
+        )
+        self._writer.write(head.encode() + body)
+        answer_head = await self._reader.readuntil(b"\r\n\r\n")
+        length = int(answer_head.lower().partition(b"content-length:")[2].partition(b"\r\n")[0])
+        return int(answer_head[9:12]), await self._reader.readexactly(length)
+
+    def close(self) -> None:
+        """Close it."""
+        self._writer.close()
 
 
 @dataclass(frozen=True)
@@ -105,3 +159,20 @@ async def _session(connection: BareConnection, domain: str) -> str:
     if status != 201:
         raise RuntimeError(f"no session: {answer!r}")
     return str(json.loads(answer)["session_id"])
+
+
+_QUALITY, _SPACING_M = 90, 1.75
+
+
+def jpegs(n_pictures: int) -> list[bytes]:
+    """JPEG files of 1232 x 1616 pixels, upright, one a place along a drive."""
+    date = drive_date(next(iter(PAPER_DATES)))
+    world = World(0, drive_length_m(n_pictures, _SPACING_M))
+    renderer = Renderer(world, Drive(world.route, 0, date, n_pictures, _SPACING_M))
+    return [_jpeg(renderer, frame) for frame in range(n_pictures)]
+
+
+def _jpeg(renderer: Renderer, frame: int) -> bytes:
+    upright = cv2.rotate(renderer.stored(frame), cv2.ROTATE_90_CLOCKWISE)
+    packed = cv2.imencode(".jpg", upright, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1]
+    return np.asarray(packed, np.uint8).tobytes()
