@@ -1,6 +1,5 @@
 """A small service that keeps sessions, behind httpx2's MockTransport, and recordings to drive against it."""
 
-import hashlib
 import json
 import threading
 from collections.abc import Callable
@@ -69,55 +68,47 @@ class FakeService:
             return response
 
     def _route(self, request: httpx2.Request) -> httpx2.Response:
+        body = json.loads(request.content or b"{}")
         match request.method, request.url.path.strip("/").split("/")[1:]:
             case "GET", ["domains", name]:
-                return httpx2.Response(200, json=self._domain(name))
+                known = {"map_version": self.map_version, "n_map_images": N_IMAGES, "route_length_m": N_IMAGES - 1.0}
+                return httpx2.Response(200, json={"name": name, "actions_m": ACTIONS_M, "input_size": None, **known})
             case "POST", ["domains", _, "localizations"]:
-                view = json.loads(request.content)
-                if len(view["encoding"]) != 2:
+                if len(body["encoding"]) != 2:
                     return problem(422, "undecodable_image")
-                mass = self._updated(np.full(N_IMAGES, 1 / N_IMAGES), view)
-                answer = self._answer(mass, None, int(request.url.params["shortlist"]))
-                return httpx2.Response(200, json=answer)
-            case "POST", ["domains", name, "sessions"]:
-                return self._start(name, json.loads(request.content or b"{}"), request.headers["idempotency-key"])
+                mass = self._updated(np.full(N_IMAGES, 1 / N_IMAGES), body)
+                return httpx2.Response(200, json=self._answer(mass, None, int(request.url.params["shortlist"])))
+            case "POST", ["domains", _, "sessions"]:
+                return self._start(body, request.headers["idempotency-key"])
             case verb, ["sessions", session_id, *rest]:
                 session = self.sessions.get(session_id)
                 if session is None:
                     return problem(404, "unknown_session")
                 if session.ended:
                     return problem(410, "ended_session")
-                return self._of_session(verb, rest, session_id, session, request)
+                return self._of_session(verb, rest, session_id, session, request, body)
         return problem(404, "not_found")
 
-    def _domain(self, name: str) -> dict[str, Any]:
-        return {
-            "name": name,
-            "map_version": self.map_version,
-            "n_map_images": N_IMAGES,
-            "route_length_m": N_IMAGES - 1.0,
-            "actions_m": ACTIONS_M,
-            "input_size": None,
-        }
-
-    def _start(self, name: str, body: dict[str, Any], key: str) -> httpx2.Response:
-        if key in self.begun:
-            return httpx2.Response(201, json=self._state(self.begun[key]))
+    def _start(self, body: dict[str, Any], key: str) -> httpx2.Response:
         planner = body.get("planner", "telling")
         if planner == "nonsense":
             return problem(422, "invalid_input")
-        session_id = f"s{len(self.sessions)}"
-        rng = np.random.default_rng(body.get("seed"))
-        self.begun[key] = session_id
-        self.sessions[session_id] = FakeSession(np.full(N_IMAGES, 1 / N_IMAGES), planner, rng)
-        return httpx2.Response(201, json=self._state(session_id))
+        if key not in self.begun:
+            self.begun[key] = f"s{len(self.sessions)}"
+            rng = np.random.default_rng(body.get("seed"))
+            self.sessions[self.begun[key]] = FakeSession(np.full(N_IMAGES, 1 / N_IMAGES), planner, rng)
+        return httpx2.Response(201, json=self._state(self.begun[key]))
 
     def _of_session(
-        self, verb: str, rest: list[str], session_id: str, session: FakeSession, request: httpx2.Request
+        self,
+        verb: str,
+        rest: list[str],
+        session_id: str,
+        session: FakeSession,
+        request: httpx2.Request,
+        body: dict[str, Any],
     ) -> httpx2.Response:
         match verb, rest:
-            case "GET", []:
-                return httpx2.Response(200, json=self._state(session_id))
             case "GET", ["belief"]:
                 packed = BytesIO()
                 np.save(packed, session.mass.astype(np.float32))
@@ -125,30 +116,27 @@ class FakeService:
             case "GET", ["next-best-view"]:
                 return httpx2.Response(200, content=json.dumps(self._plan(session)).encode())
             case "PUT", ["prior"]:
-                prior = json.loads(request.content)
-                if not 0 <= prior["position_m"] < N_IMAGES:
+                if not 0 <= body["position_m"] < N_IMAGES:
                     return problem(422, "invalid_prior")
-                away = (np.arange(N_IMAGES) - prior["position_m"]) / prior["std_m"]
+                away = (np.arange(N_IMAGES) - body["position_m"]) / body["std_m"]
                 session.mass = normal(np.exp(-0.5 * away**2))
-                return httpx2.Response(200, json=self._state(session_id))
             case "DELETE", []:
                 session.ended = True
                 return httpx2.Response(204)
             case "POST", ["observations"]:
-                return self._observe(session, request)
-        return problem(405, "method_not_allowed")
+                return self._observe(session, request, body)
+        return httpx2.Response(200, json=self._state(session_id))
 
-    def _observe(self, session: FakeSession, request: httpx2.Request) -> httpx2.Response:
+    def _observe(self, session: FakeSession, request: httpx2.Request, view: dict[str, Any]) -> httpx2.Response:
         key = request.headers["idempotency-key"]
         self.keys.append(key)
-        digest = hashlib.sha256(bytes(str(request.url), "ascii") + request.content).hexdigest()
+        asked = f"{request.url}{request.content!r}"
         if key in session.answers:
             was, answer = session.answers[key]
-            return httpx2.Response(200, json=answer) if was == digest else problem(422, "idempotency_key_reused")
+            return httpx2.Response(200, json=answer) if was == asked else problem(422, "idempotency_key_reused")
         action_m = float(request.url.params.get("action_m", 0))
         if action_m < 0 or action_m > 10 * ACTIONS_M[-1]:
             return problem(422, "invalid_move")
-        view = json.loads(request.content)
         if len(view["encoding"]) != 2:
             return problem(422, "undecodable_image")
         if session.n_observations:
@@ -160,9 +148,8 @@ class FakeService:
             session.mass = normal(moved)
         session.mass = self._updated(session.mass, view)
         session.n_observations += 1
-        answer = self._answer(session.mass, session, 10)
-        session.answers[key] = (digest, answer)
-        return httpx2.Response(200, json=answer)
+        session.answers[key] = (asked, self._answer(session.mass, session, 10))
+        return httpx2.Response(200, json=session.answers[key][1])
 
     def _updated(self, mass: np.ndarray, view: dict[str, Any]) -> np.ndarray:
         place, spread = view["encoding"]
@@ -171,8 +158,7 @@ class FakeService:
     def _plan(self, session: FakeSession | None) -> dict[str, Any] | None:
         if session is None or not self.plans:
             return None
-        planner = session.planner
-        action_m = 7.0
+        planner, action_m = session.planner, 7.0
         if planner == "random":
             action_m = float(session.rng.choice(ACTIONS_M))
         elif planner.startswith("constant:"):
@@ -182,23 +168,12 @@ class FakeService:
     def _state(self, session_id: str) -> dict[str, Any]:
         session = self.sessions[session_id]
         answer = self._answer(session.mass, session, 10)
-        return {
-            "session_id": session_id,
-            "domain": "route",
-            "map_version": self.map_version,
-            "n_observations": session.n_observations,
-            "expires_at": "2030-01-01T00:00:00Z",
-            "belief": answer["belief"],
-            "next_best_view": answer["next_best_view"],
-        }
+        return answer | {"session_id": session_id, "domain": "route", "expires_at": "2030-01-01T00:00:00Z"}
 
     def _answer(self, mass: np.ndarray, session: FakeSession | None, shortlist: int) -> dict[str, Any]:
         order = np.argsort(-mass, kind="stable")[:shortlist]
-        top = [
-            {"map_image": int(i), "route_position_m": float(i), "x_m": None, "y_m": None, "mass": float(mass[i])}
-            for i in order
-        ]
-        inside = np.flatnonzero(np.cumsum(mass) > 0.025)[0], np.flatnonzero(np.cumsum(mass) >= 0.975)[0]
+        places = [{"map_image": int(i), "route_position_m": float(i)} for i in order]
+        low, high = np.flatnonzero(np.cumsum(mass) > 0.025)[0], np.flatnonzero(np.cumsum(mass) >= 0.975)[0]
         positive = mass[mass > 0]
         return {
             "map_version": self.map_version,
@@ -208,18 +183,16 @@ class FakeService:
                 "mean_m": float(mass @ np.arange(N_IMAGES)),
                 "mode_m": float(mass.argmax()),
                 "std_m": 1.0,
-                "credible_95_m": [float(inside[0]), float(inside[1])],
+                "credible_95_m": [float(low), float(high)],
                 "entropy_bits": float(-(positive * np.log2(positive)).sum()),
                 "off_route": 0.01,
                 "histogram": {
                     "edges_m": np.linspace(0, N_IMAGES - 1, 51).tolist(),
                     "mass": mass.reshape(50, 3).sum(1).tolist(),
                 },
-                "top": top,
+                "top": [place | {"x_m": None, "y_m": None, "mass": mass[place["map_image"]]} for place in places],
             },
-            "retrieval": [
-                {"map_image": int(i), "route_position_m": float(i), "relevance": float(mass[i])} for i in order
-            ],
+            "retrieval": [place | {"relevance": mass[place["map_image"]]} for place in places],
             "next_best_view": self._plan(session),
         }
 
