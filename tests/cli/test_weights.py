@@ -128,36 +128,47 @@ HUB = "torchhub:someone/Places:places"
 IN = ("--weights-dir", "w")
 
 
-def test_the_known_ones_are_listed(deepsimbad, tmp_path):
+@pytest.fixture
+def pull(deepsimbad, files):
+    """Pulls m.onnx from the server."""
+    files.content["/m.onnx"] = CONTENT
+    return lambda *options: deepsimbad("weights", "pull", "onnx:m.onnx", "--url", f"{files.url}/m.onnx", *options, *IN)
+
+
+@pytest.fixture
+def listed(deepsimbad):
+    """The rows of `weights list`."""
+    return lambda: json.loads(deepsimbad("weights", "list", "--json", *IN).out)
+
+
+def test_the_known_ones_are_listed(deepsimbad, listed, tmp_path):
     ran = deepsimbad("weights", "list", *IN)
     assert (ran.code, ran.err) == (0, "")
     for word in ("torchhub:gmberton/MegaLoc:get_trained_model", "8448", "322x322", "GPL-3.0", "529 MB", "netvlad:"):
         assert word in ran.out
     assert not (tmp_path / "w").exists()
-    rows = {row["name"]: row for row in json.loads(deepsimbad("weights", "list", "--json", *IN).out)}
+    rows = {row["name"]: row for row in listed()}
     assert rows["boq"]["extractor"] == "torchhub:amaralibey/Bag-of-Queries:get_trained_boq"
     assert rows["boq"]["packages"] == ["torchvision"]
     assert rows["boq"]["state"] == "-"
     assert rows["efficientnet-lite0"]["state"] == "with its package"
 
 
-def test_what_was_pulled_or_put_there_is_listed(deepsimbad, files, tmp_path):
-    files.content["/m.onnx"] = CONTENT
+def test_what_was_pulled_or_put_there_is_listed(pull, deepsimbad, files, tmp_path, listed):
     (tmp_path / "w").mkdir()
     (tmp_path / "w" / "vgg16_netvlad.pth").write_bytes(b"x")
-    assert deepsimbad("weights", "pull", "onnx:m.onnx", "--url", f"{files.url}/m.onnx", *IN).code == 0
-    rows = {row["extractor"]: row for row in json.loads(deepsimbad("weights", "list", "--json", *IN).out)}
+    assert pull().code == 0
+    rows = {row["extractor"]: row for row in listed()}
     assert rows["netvlad:vgg16_netvlad.pth"]["state"] == "not recorded"
     assert (rows["onnx:m.onnx"]["state"], rows["onnx:m.onnx"]["size_mb"]) == ("pulled", 2.3)
     (tmp_path / "w" / "m.onnx").unlink()
-    rows = {row["extractor"]: row for row in json.loads(deepsimbad("weights", "list", "--json", *IN).out)}
+    rows = {row["extractor"]: row for row in listed()}
     assert rows["onnx:m.onnx"]["state"] == "missing"
     assert "onnx:m.onnx" in deepsimbad("weights", "list", *IN).out
 
 
-def test_a_file_is_pulled_recorded_and_verified(deepsimbad, files, tmp_path):
-    files.content["/m.onnx"] = CONTENT
-    ran = deepsimbad("weights", "pull", "onnx:m.onnx", "--url", f"{files.url}/m.onnx", "--json", *IN)
+def test_a_file_is_pulled_recorded_and_verified(pull, deepsimbad, files, tmp_path):
+    ran = pull("--json")
     assert ran.code == 0, ran.err
     assert json.loads(ran.out) == [{"extractor": "onnx:m.onnx", "path": "w/m.onnx", "sha256": SHA256}]
     assert ran.err.splitlines() == [f"onnx:m.onnx is at w/m.onnx, sha256 {SHA256}"]
@@ -182,19 +193,17 @@ def test_a_file_is_pulled_recorded_and_verified(deepsimbad, files, tmp_path):
     assert not (tmp_path / "w" / "m.onnx").exists()
 
 
-def test_a_download_that_breaks_off_goes_on(deepsimbad, files):
-    files.content["/m.onnx"] = CONTENT
+def test_a_download_that_breaks_off_goes_on(pull, files):
     files.tear["/m.onnx"] = [1000, 500_000]
-    ran = deepsimbad("weights", "pull", "onnx:m.onnx", "--url", f"{files.url}/m.onnx", "--sha256", SHA256[:8], *IN)
+    ran = pull("--sha256", SHA256[:8])
     assert ran.code == 0, ran.err
     assert [wanted for _, wanted in files.asked] == [None, "bytes=1000-", "bytes=501000-"]
 
 
-def _broken_off(deepsimbad, files, tmp_path, *options):
+def _broken_off(pull, files, tmp_path, *options):
     """A part of the file is here, and a try in which nothing came."""
-    files.content["/m.onnx"] = CONTENT
     files.tear["/m.onnx"] = [1000, 0, 0, 0, 0]
-    ran = deepsimbad("weights", "pull", "onnx:m.onnx", "--url", f"{files.url}/m.onnx", *options, *IN)
+    ran = pull(*options)
     assert (ran.code, ran.err.count("\n")) == (1, 1)
     assert "missing_weights" in ran.err
     assert "broke off" in ran.err
@@ -204,42 +213,37 @@ def _broken_off(deepsimbad, files, tmp_path, *options):
     files.asked.clear()
 
 
-@pytest.mark.parametrize("has_etag", [True, False])
-def test_a_later_pull_goes_on_where_the_file_is_the_same(deepsimbad, files, tmp_path, has_etag):
+@pytest.mark.parametrize(
+    ("has_etag", "options", "wanted"),
+    [(True, (), "bytes=1000-"), (False, (), None), (False, ("--sha256", SHA256), "bytes=1000-")],
+)
+def test_a_later_pull_goes_on_where_the_file_is_the_same(pull, files, tmp_path, has_etag, options, wanted):
+    """As the server's tag says, or the digest that is asked for."""
     files.has_etag = has_etag
-    _broken_off(deepsimbad, files, tmp_path)
-    ran = deepsimbad("weights", "pull", "onnx:m.onnx", "--url", f"{files.url}/m.onnx", *IN)
+    _broken_off(pull, files, tmp_path, *options)
+    ran = pull(*options)
     assert ran.code == 0, ran.err
     assert (tmp_path / "w" / "m.onnx").read_bytes() == CONTENT
-    assert files.asked == [("/m.onnx", "bytes=1000-" if has_etag else None)]
+    assert files.asked == [("/m.onnx", wanted)]
     assert sorted(path.name for path in (tmp_path / "w").iterdir()) == ["m.onnx", "weights.lock"]
 
 
-def test_a_digest_stands_for_the_version(deepsimbad, files, tmp_path):
-    files.has_etag = False
-    _broken_off(deepsimbad, files, tmp_path, "--sha256", SHA256)
-    ran = deepsimbad("weights", "pull", "onnx:m.onnx", "--url", f"{files.url}/m.onnx", "--sha256", SHA256, *IN)
-    assert ran.code == 0, ran.err
-    assert files.asked == [("/m.onnx", "bytes=1000-")]
-
-
 @pytest.mark.parametrize("now", [CONTENT[::-1], CONTENT[:10], CONTENT[:1000]])
-def test_a_file_that_has_changed_meanwhile_comes_anew(deepsimbad, files, tmp_path, now):
-    _broken_off(deepsimbad, files, tmp_path)
+def test_a_file_that_has_changed_meanwhile_comes_anew(pull, files, tmp_path, now):
+    _broken_off(pull, files, tmp_path)
     files.content["/m.onnx"] = now
-    assert deepsimbad("weights", "pull", "onnx:m.onnx", "--url", f"{files.url}/m.onnx", *IN).code == 0
+    assert pull().code == 0
     assert (tmp_path / "w" / "m.onnx").read_bytes() == now
 
 
-def test_a_part_that_is_the_whole_file_or_longer(deepsimbad, files, tmp_path):
+def test_a_part_that_is_the_whole_file_or_longer(pull, files, tmp_path):
     """The server says "beyond the end": either nothing is missing, or it is no part of this file."""
-    files.content["/m.onnx"] = CONTENT
     files.has_etag = False
     for there in (CONTENT, CONTENT + b"x"):
         (tmp_path / "w").mkdir(exist_ok=True)
         (tmp_path / "w" / "m.onnx").unlink(missing_ok=True)
         (tmp_path / "w" / "m.onnx.part").write_bytes(there)
-        ran = deepsimbad("weights", "pull", "onnx:m.onnx", "--url", f"{files.url}/m.onnx", "--sha256", SHA256, *IN)
+        ran = pull("--sha256", SHA256)
         assert ran.code == 0, ran.err
         assert (tmp_path / "w" / "m.onnx").read_bytes() == CONTENT
     assert [wanted for _, wanted in files.asked] == [f"bytes={len(CONTENT)}-", f"bytes={len(CONTENT) + 1}-", None]
@@ -249,20 +253,18 @@ def test_a_part_that_is_the_whole_file_or_longer(deepsimbad, files, tmp_path):
     ("status", "headers", "told"),
     [(404, {}, "answered 404"), (503, {}, "answered 503"), (200, {"Content-Type": "text/html"}, "answered a page")],
 )
-def test_what_is_no_file_is_not_kept(deepsimbad, files, tmp_path, status, headers, told):
-    files.content["/m.onnx"] = CONTENT
+def test_what_is_no_file_is_not_kept(pull, files, tmp_path, status, headers, told):
     files.status["/m.onnx"], files.headers = status, headers
-    ran = deepsimbad("weights", "pull", "onnx:m.onnx", "--url", f"{files.url}/m.onnx", *IN)
+    ran = pull()
     assert (ran.code, ran.out, ran.err.count("\n")) == (1, "", 1)
     assert told in ran.err
     assert "put it at w/m.onnx" in ran.err
     assert list((tmp_path / "w").iterdir()) == []
 
 
-def test_more_than_any_file_of_weights_is_not_kept(deepsimbad, files, tmp_path, monkeypatch):
+def test_more_than_any_file_of_weights_is_not_kept(pull, files, tmp_path, monkeypatch):
     monkeypatch.setattr(downloads, "_MOST_BYTES", len(CONTENT) - 1)
-    files.content["/m.onnx"] = CONTENT
-    ran = deepsimbad("weights", "pull", "onnx:m.onnx", "--url", f"{files.url}/m.onnx", *IN)
+    ran = pull()
     assert (ran.code, ran.err.count("\n")) == (1, 1)
     assert "larger than any file of weights" in ran.err
     assert list((tmp_path / "w").iterdir()) == []
@@ -279,7 +281,7 @@ def test_without_a_network_it_says_which_file_to_put_where(deepsimbad, tmp_path,
     assert (ran.code, ran.err) == (0, f"onnx:m.onnx is at w/m.onnx, sha256 {SHA256}\n")
 
 
-def test_a_repository_is_pulled_at_a_commit_and_held_to_it(deepsimbad, repository, tmp_path):
+def test_a_repository_is_pulled_at_a_commit_and_held_to_it(deepsimbad, repository, tmp_path, listed):
     ran = deepsimbad("weights", "pull", HUB, "--yes", "--input-size", "28x28", "--json", *IN)
     assert ran.code == 0, ran.err
     assert f"{HUB} runs the code of github.com/someone/Places on this machine" in ran.err
@@ -293,12 +295,15 @@ def test_a_repository_is_pulled_at_a_commit_and_held_to_it(deepsimbad, repositor
     ran = deepsimbad("weights", "verify", HUB, *IN)
     assert (ran.code, ran.out.count("good: ")) == (0, 2)
     repository.content["/repos/someone/Places/commits/HEAD"] = NEWER.encode()
+    asked = len(repository.asked)
     assert deepsimbad("weights", "pull", HUB, "--yes", *IN).code == 0
+    assert len(repository.asked) == asked, "what is here as recorded is not fetched again"
     assert json.loads((tmp_path / "w" / "weights.lock").read_text())["hub"] == {HUB.lower(): record}
     assert deepsimbad("weights", "pull", HUB, "--yes", "--commit", NEWER, "--argument", "dim=6", *IN).code == 0
     (changed,) = json.loads((tmp_path / "w" / "weights.lock").read_text())["hub"].values()
     assert (changed["commit"], changed["arguments"]) == (NEWER, {"dim": 6})
-    (row,) = [row for row in json.loads(deepsimbad("weights", "list", "--json", *IN).out) if row["state"] == "pulled"]
+    assert not (tmp_path / "w" / "hub" / f"someone_Places_{COMMIT}").exists()
+    (row,) = [row for row in listed() if row["state"] == "pulled"]
     assert (row["name"], row["encoding_dim"], row["input"]) == ("someone/Places", 6, "28x28")
     (tmp_path / "w" / "hub" / f"someone_Places_{NEWER}" / "hubconf.py").write_text("changed")
     ran = deepsimbad("weights", "verify", *IN)

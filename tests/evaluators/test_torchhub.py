@@ -1,7 +1,6 @@
 """Torch hub repositories: pulled from an archive that lies here, then loaded as any domain would."""
 
 import contextlib
-import json
 import sys
 import zipfile
 from dataclasses import replace
@@ -172,16 +171,6 @@ def test_encodings_have_unit_length_and_stand_for_themselves(tmp_path, entry, ar
     np.testing.assert_allclose(given, [extractor.encode([image])[0] for image in scenes()], atol=3e-4)
 
 
-def test_arguments_are_recorded_and_given_at_every_load(tmp_path):
-    first = pulled(tmp_path)
-    record = pulled(tmp_path, arguments={"dim": 5})
-    assert json.loads((tmp_path / LOCK).read_text())["hub"][f"torchhub:{REPOSITORY.lower()}:entry"]["arguments"] == {
-        "dim": 5
-    }
-    assert loaded(tmp_path).encode(scenes()).shape == (3, 5)
-    assert record.weights_sha256 != first.weights_sha256
-
-
 def test_by_itself_it_is_computed_in_float32(tmp_path):
     pulled(tmp_path)
     by_itself, asked = loaded(tmp_path).encode(scenes()), loaded(tmp_path, runtime=Runtime.TORCH).encode(scenes())
@@ -346,22 +335,6 @@ def test_an_archive_of_the_same_commit_must_be_the_same(tmp_path):
     with pytest.raises(InvalidWeightsError, match="should have 00000000"):
         pulled(tmp_path, sha256="00000000")
     assert pulled(tmp_path) == record
-
-
-def test_what_is_here_as_recorded_is_not_fetched_again(tmp_path, monkeypatch):
-    record = pulled(tmp_path)
-    (tmp_path / "hub" / f"{record.folder}.zip").unlink(missing_ok=True)
-    monkeypatch.setattr(downloads, "GITHUB", "http://127.0.0.1:9")
-    assert pull_hub(tmp_path, HubWish(f"torchhub:{REPOSITORY}:entry"), lambda *_: None) == record
-
-
-def test_another_commit_takes_the_place_of_the_first(tmp_path):
-    first = pulled(tmp_path)
-    leave_archive(tmp_path, {"hubconf.py": HUBCONF, "places_model.py": MODEL}, commit="a" * 40)
-    wish = HubWish(f"torchhub:{REPOSITORY}:entry", commit="a" * 40)
-    second = pull_hub(tmp_path, wish, lambda *_: None)
-    assert (second.commit, second.input_size, second.tree_sha256) == ("a" * 40, SIZE, first.tree_sha256)
-    assert [path.name for path in (tmp_path / "hub").iterdir()] == [second.folder]
 
 
 def test_what_python_keeps_of_a_tree_is_neither_read_nor_counted(tmp_path):
