@@ -18,7 +18,7 @@ from deepsimbad.store.layout import catalog_path
 from deepsimbad.store.records import KeptMap, MapState
 
 from .conftest import add_domain, add_map
-from .live_service import Live, ranked, run, running
+from .live_service import Live, running
 
 DOMAIN = "d"
 
@@ -85,30 +85,6 @@ def test_of_sealed_ones_only_those_that_lost_are_beyond() -> None:
     assert beyond(kept((1, "sealed", None), (2, "sealed", None)), 1) == []
 
 
-def test_every_domain_keeps_its_own() -> None:
-    one = kept((1, "retired", "2026-01-01"), (2, "active", None))
-    other = [KeptMap("e", version, state, retired_at) for _, version, state, retired_at in map(tuple_of, one)]
-    assert beyond([*one, *other], 1) == []
-
-
-def tuple_of(one: KeptMap) -> tuple[str, int, MapState, str | None]:
-    return one.domain, one.version, one.state, one.retired_at
-
-
-def test_older_files_go_and_their_rows_stay(mapped: Catalog) -> None:
-    for _ in range(4):
-        next_map(mapped)
-    with running(mapped) as live:
-        assert retention_of(live, keep_maps=2).prune() == 2
-        assert with_files(mapped) == [3, 4, 5]
-        record = mapped.map(DOMAIN, 1)
-        assert (record.state, record.sha256 is not None) == (MapState.RETIRED, True)
-        assert retention_of(live, keep_maps=2).prune() == 0
-    with pytest.raises(RetiredMapError, match="cannot serve again"):
-        mapped.activate(DOMAIN, 1, ANY)
-    assert mapped.domain(DOMAIN).active_version == 5
-
-
 def test_one_domain_alone_can_be_pruned(mapped: Catalog) -> None:
     add_domain(mapped, "e")
     for domain in (DOMAIN, "e"):
@@ -118,35 +94,6 @@ def test_one_domain_alone_can_be_pruned(mapped: Catalog) -> None:
         assert retention_of(live).prune("e") == 1
         assert len(with_files(mapped)) == 4
         assert retention_of(live).prune() == 2
-
-
-def test_a_session_keeps_its_map_until_it_ends(mapped: Catalog) -> None:
-    async def body(live: Live) -> None:
-        session_id = (await live.sessions.begin(live.maps.active(DOMAIN), SessionConfig())).session_id
-        for _ in range(3):
-            next_map(mapped)
-        assert retention_of(live).prune() == 1
-        assert with_files(mapped) == [1, 3, 4]
-        with pytest.raises(MapInUseError, match="a session lives on map 1"):
-            retention_of(live).remove(DOMAIN, 1)
-        assert (await live.sessions.observe(session_id, ranked(1))).snapshot.version == 1
-        await live.sessions.end(session_id)
-        assert retention_of(live).prune() == 1
-        assert with_files(mapped) == [3, 4]
-
-    run(mapped, body)
-
-
-def test_a_session_of_an_earlier_service_keeps_its_map_too(mapped: Catalog) -> None:
-    async def begin(live: Live) -> str:
-        return (await live.sessions.begin(live.maps.active(DOMAIN), SessionConfig())).session_id
-
-    session_id = run(mapped, begin)
-    for _ in range(2):
-        next_map(mapped)
-    with running(mapped) as live:
-        assert retention_of(live).prune() == 0
-        assert asyncio.run(live.sessions.observe(session_id, ranked(1))).snapshot.version == 1
 
 
 def test_what_serves_or_is_being_built_is_not_removed(mapped: Catalog) -> None:
@@ -159,16 +106,6 @@ def test_what_serves_or_is_being_built_is_not_removed(mapped: Catalog) -> None:
         with pytest.raises(UnknownMapVersionError):
             retention_of(live).remove(DOMAIN, 9)
         assert mapped.map_path(DOMAIN, 1).is_file()
-
-
-def test_removed_by_hand_is_removed_once(mapped: Catalog) -> None:
-    sealed = add_map(mapped, DOMAIN)
-    with running(mapped) as live:
-        retention_of(live).remove(DOMAIN, sealed)
-        assert with_files(mapped) == [1]
-        assert mapped.map(DOMAIN, sealed).state is MapState.RETIRED
-        with pytest.raises(RetiredMapError):
-            retention_of(live).remove(DOMAIN, sealed)
 
 
 def test_a_beginning_session_keeps_its_map_from_the_first_moment(mapped: Catalog) -> None:

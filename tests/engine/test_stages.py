@@ -62,21 +62,6 @@ def test_stages_are_told_in_order_and_make_up_the_total(mapped: Catalog) -> None
     assert 0 < sum(timings_ms.values()) <= total + 0.001 * len(STAGES)  # each is rounded
 
 
-def test_a_busy_worker_shows_as_waiting(mapped: Catalog) -> None:
-    async def body(live: Live) -> tuple[dict[str, float], float]:
-        session_id, watch, begins, let_go = await begun(live), Stopwatch(), threading.Event(), threading.Event()
-        live.worker.submit(lambda: (begins.set(), let_go.wait(60)))
-        await until(begins.is_set)
-        posted = asyncio.create_task(live.sessions.observe(session_id, ranked(1), watch))
-        await until(lambda: live.worker.n_waiting, posted)
-        held_ms = await held(let_go)
-        await posted
-        return watch.timings_ms(), held_ms
-
-    timings_ms, held_ms = run(mapped, body)
-    assert timings_ms["wait"] >= held_ms - 0.001
-
-
 def test_a_view_before_this_one_shows_as_waiting_and_a_slow_image_as_decoding(mapped: Catalog) -> None:
     async def body(live: Live) -> tuple[dict[str, float], dict[str, float], float]:
         session_id, before, behind = await begun(live), Stopwatch(), Stopwatch()
@@ -122,12 +107,3 @@ def test_a_repetition_tells_only_what_it_took_itself(mapped: Catalog) -> None:
         return watch.timings_ms()
 
     assert list(run(mapped, body)) == ["wait", "decode", "summarise", "total"]
-
-
-@pytest.mark.parametrize("stages", [(), ("a",), ("a", "b", "a")])
-def test_laps_are_added_up(stages: tuple[str, ...]) -> None:
-    watch = Stopwatch()
-    for stage in stages:
-        watch.lap(stage)
-    watch.take({"c": 0.0})
-    assert list(watch.timings_ms()) == [*dict.fromkeys(stages), "c", "total"]

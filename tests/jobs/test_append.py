@@ -13,10 +13,10 @@ from deepsimbad.core.relevance import Query, Relevance
 from deepsimbad.core.retrieval import relevances
 from deepsimbad.engine.maps import load_snapshot
 from deepsimbad.errors import InvalidEncodingError, InvalidMapConfigError
-from deepsimbad.jobs.import_map import import_map
 from deepsimbad.jobs.progress import Progress
 from deepsimbad.jobs.remap import remap
 from deepsimbad.jobs.remap_config import REMAP_STAGES, RemapConfig
+from deepsimbad.jobs.versions import import_map
 from deepsimbad.store.map_file import read_map
 from deepsimbad.store.traverses import Traverse
 

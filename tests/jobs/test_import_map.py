@@ -27,7 +27,7 @@ from deepsimbad.errors import (
     UnavailableError,
     UnknownMapVersionError,
 )
-from deepsimbad.jobs.import_map import import_map
+from deepsimbad.jobs.versions import import_map
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.catalog_maps import ANY
 from deepsimbad.store.map_file import write_map
@@ -205,7 +205,7 @@ def test_an_import_that_fails_leaves_what_others_began_in_its_domain(
             Traverse.create(here.data_dir, "campus", "mine").close()
         raise UnavailableError("no space is left")
 
-    monkeypatch.setattr("deepsimbad.jobs.import_map.adopt", fail)
+    monkeypatch.setattr("deepsimbad.jobs.versions.adopt", fail)
     with pytest.raises(UnavailableError):
         import_map(here, exported)
     assert [record.name for record in here.domains()] == (["campus"] if is_used else [])
@@ -215,7 +215,7 @@ def test_an_import_that_fails_leaves_what_others_began_in_its_domain(
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from deepsimbad.jobs.import_map import import_map
+from deepsimbad.jobs.versions import import_map
 from deepsimbad.store.catalog import Catalog
 n_calls = 0
 def hook(_frame, event, function):

@@ -4,13 +4,12 @@ import fcntl
 import json
 import logging
 import os
-import resource
 import signal
 import subprocess
 import sys
 import threading
 import time
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -24,10 +23,10 @@ from deepsimbad.errors import (
     TooFewCandidatesError,
     UnavailableError,
 )
-from deepsimbad.evaluators.compute import available_cores
+from deepsimbad.jobs import child, runner
 from deepsimbad.jobs.child import JobPriority
 from deepsimbad.jobs.remap_config import RemapConfig
-from deepsimbad.jobs.runner import REMAP, BrokenJobError, InAnotherProcess, InThisProcess, job_threads
+from deepsimbad.jobs.runner import REMAP, BrokenJobError, InAnotherProcess, InThisProcess
 from deepsimbad.store.durable import lock_folder
 from deepsimbad.store.map_file import read_map
 
@@ -79,6 +78,17 @@ def test_what_breaks_has_its_stack_in_the_notes_alone(catalog, job):
         InAnotherProcess(catalog.data_dir, 1)(replace(job, config={"levitate": True}), nothing, never)
     assert "levitate" not in str(raised.value)
     assert "Traceback" in raised.value.__notes__[0]
+
+
+def test_its_log_lines_are_the_services_with_the_jobs_id(monkeypatch, caplog):
+    messages = []
+    monkeypatch.setattr(child, "_tell", lambda **message: messages.append(json.loads(json.dumps(message))))
+    told = {"name": "deepsimbad.store", "levelno": logging.WARNING, "msg": "%s rots", "args": ("it",), "file": "f"}
+    child._LogToParent().emit(logging.makeLogRecord(told))
+    runner._log_here(messages[0]["log"], "j")
+    record = caplog.records[-1]
+    assert (record.name, record.levelname, record.getMessage()) == ("deepsimbad.store", "WARNING", "it rots")
+    assert (record.__dict__["job_id"], record.__dict__["file"]) == ("j", "f")
 
 
 def about(pid, what):
@@ -144,31 +154,22 @@ def held(catalog, job, caplog, run_job=None):
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="the scheduling classes are Linux's")
-def test_it_yields_to_everyone_and_computes_in_the_threads_it_is_given(catalog, job, caplog):
-    with held(catalog, job, caplog) as doing:
+@pytest.mark.parametrize(
+    ("priority", "kind", "nice"),
+    [("idle", "SCHED_IDLE", 19), ("low", "SCHED_BATCH", 19), ("normal", "SCHED_OTHER", 0)],
+)
+def test_it_yields_as_far_as_it_is_told_and_computes_in_the_threads_it_is_given(
+    catalog, job, caplog, priority, kind, nice
+):
+    with held(catalog, job, caplog, InAnotherProcess(catalog.data_dir, 3, JobPriority(priority))) as doing:
         doing.until_ready()
-        assert os.sched_getscheduler(doing.pid) == os.SCHED_IDLE
-        assert os.getpriority(os.PRIO_PROCESS, doing.pid) == 19
-        environment = about(doing.pid, "environ").read_text(encoding="utf-8").split("\0")
-        given = dict(each.split("=", 1) for each in environment if "=" in each)
-        assert {name: given[name] for name in given if name.endswith("_NUM_THREADS")}.items() >= {
-            ("NUMBA_NUM_THREADS", "3"),
-            ("OMP_NUM_THREADS", "3"),
-            ("OPENBLAS_NUM_THREADS", "3"),
-        }
-        assert int(about(doing.pid, "oom_score_adj").read_text(encoding="ascii")) >= 500
         for task in about(doing.pid, "task").iterdir():
-            assert os.sched_getscheduler(int(task.name)) == os.SCHED_IDLE, "every thread of it"
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="the scheduling classes are Linux's")
-@pytest.mark.parametrize(("priority", "kind", "nice"), [("low", "SCHED_BATCH", 19), ("normal", "SCHED_OTHER", 0)])
-def test_or_less(catalog, job, caplog, priority, kind, nice):
-    run_job = InAnotherProcess(catalog.data_dir, 3, JobPriority(priority))
-    with held(catalog, job, caplog, run_job) as doing:
-        doing.until_ready()
-        assert os.sched_getscheduler(doing.pid) == getattr(os, kind)
-        assert os.getpriority(os.PRIO_PROCESS, doing.pid) == nice
+            assert os.sched_getscheduler(int(task.name)) == getattr(os, kind), "every thread of it"
+            assert os.getpriority(os.PRIO_PROCESS, int(task.name)) == nice
+        assert int(about(doing.pid, "oom_score_adj").read_text(encoding="ascii")) >= 500
+        environment = about(doing.pid, "environ").read_text(encoding="utf-8").split("\0")
+        for library in ("NUMBA", "OMP", "OPENBLAS"):
+            assert f"{library}_NUM_THREADS=3" in environment
 
 
 def test_a_cancel_is_heard(catalog, job, caplog):
@@ -194,8 +195,11 @@ def test_a_cancel_is_enforced(catalog, job, caplog):
 )
 def test_a_death_names_its_signal(catalog, job, caplog, sent, said):
     with held(catalog, job, caplog) as doing:
+        doing.until_ready()
         os.kill(doing.pid, sent)
         error = doing.ended()
+    words = [record.__dict__["line"] for record in caplog.records if record.getMessage() == "the job's process said"]
+    assert any("Fatal Python error" in line for line in words) == (sent is signal.SIGSEGV)
     assert isinstance(error, JobInterruptedError)
     assert said in error.message
     assert error.hints == {"signal": sent.name}
@@ -237,6 +241,7 @@ def test_without_its_parent_it_ends(catalog, job):
 SERVICE = """
 import sys, threading
 from pathlib import Path
+from deepsimbad.jobs import child, runner
 from deepsimbad.jobs.child import JobPriority
 from deepsimbad.jobs.runner import InAnotherProcess
 from deepsimbad.store.catalog import Catalog
@@ -267,27 +272,6 @@ def is_running(pid):
         return about(pid, "stat").read_text(encoding="utf-8").rpartition(")")[2].split()[0] != "Z"
     except FileNotFoundError:
         return False
-
-
-def test_threads_of_jobs():
-    assert job_threads(5) == 5
-    assert 1 <= job_threads(0) <= max(1, available_cores() - 1)
-
-
-def test_a_service_that_holds_many_connections_does_jobs_too(catalog, job, caplog):
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    if hard != resource.RLIM_INFINITY and hard < 2000:
-        pytest.skip("so many files may not be open here")
-    resource.setrlimit(resource.RLIMIT_NOFILE, (max(soft, 2000), hard))
-    with ExitStack() as files:
-        try:
-            for _ in range(1100):
-                files.enter_context(Path(os.devnull).open("rb"))
-            with held(catalog, job, caplog) as doing:
-                doing.cancelled.set()
-                assert isinstance(doing.ended(), CancelledError)
-        finally:
-            resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
 
 
 def test_where_no_process_can_be_started_the_job_fails_by_name(catalog, job, monkeypatch):

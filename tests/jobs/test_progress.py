@@ -85,24 +85,6 @@ def test_a_stage_that_was_not_announced_is_a_mistake():
         Progress({"work": 1.0}).stage("wrok")
 
 
-def test_nobody_need_watch():
-    progress = Progress({"work": 1.0})
-    progress.stage("work")
-    progress.update(1.0)
-
-
-def test_a_stage_that_was_done_before_says_nothing_of_the_pace(clock, seen):
-    progress = Progress({"select": 6.0, "work": 4.0}, seen.append, interval_s=0, clock=clock)
-    progress.stage("select")
-    progress.skip()
-    progress.stage("work")
-    assert (seen[-1].progress, seen[-1].eta_s) == (0.6, None)
-    clock.now_s += 10
-    progress.update(0.25)
-    assert seen[-1].progress == pytest.approx(0.7)
-    assert seen[-1].eta_s == pytest.approx(30.0)
-
-
 def test_a_check_raises_and_reports_nothing(seen):
     asked = iter([False, True])
     progress = Progress({"work": 1.0}, seen.append, lambda: next(asked))

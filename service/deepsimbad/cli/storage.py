@@ -8,7 +8,7 @@ import click
 from deepsimbad.cli.options import data_dir_option, existing_data_dir, given_settings, json_option
 from deepsimbad.cli.terminal import progress_bar, report, write_json
 from deepsimbad.errors import UnavailableError
-from deepsimbad.jobs.import_map import import_map
+from deepsimbad.jobs.versions import import_map
 from deepsimbad.release import release
 from deepsimbad.store.backup import back_up
 from deepsimbad.store.backup import restore as restore_backup

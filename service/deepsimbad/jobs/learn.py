@@ -26,7 +26,7 @@ from deepsimbad.errors import (
     UnknownSessionError,
 )
 from deepsimbad.jobs.progress import Progress
-from deepsimbad.jobs.seal_version import activate_once, seal_version
+from deepsimbad.jobs.versions import activate_once, seal_version
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.map_file import read_map
 from deepsimbad.store.records import MapRecord

@@ -52,16 +52,11 @@ class Progress:
         self._reported_s = float("-inf")
         self._stage_began_s = self._started_s
         self._stage = ""
-        self._skipped = 0.0
 
     def check(self) -> None:
         """Raise CancelledError if the work was cancelled; reports nothing."""
         if self._is_cancelled is not None and self._is_cancelled():
             raise CancelledError(f"cancelled while it was at: {self._stage}" if self._stage else "cancelled")
-
-    def skip(self) -> None:
-        """The present stage was done before: it counts as done, but says nothing of how fast the work goes."""
-        self._skipped += self._weights[self._stage] / sum(self._weights.values())
 
     def stage(self, name: str) -> None:
         """Begin a stage; those before it count as done."""
@@ -93,10 +88,9 @@ class Progress:
         self._on_change(ProgressState(self._stage, done, self._eta_s(now_s, share, weight, done)))
 
     def _eta_s(self, now_s: float, share: float, weight: float, done: float) -> float | None:
-        worked = done - self._skipped
-        if worked <= 0.01:
+        if done <= 0.01:
             return None
-        pace_s = (now_s - self._started_s) / worked
+        pace_s = (now_s - self._started_s) / done
         # A stage may take a multiple of its expected share: its weight does not know how many episodes were asked for.
         if share > 0.01:
             of_stage_s = (now_s - self._stage_began_s) * (1 - share) / share

@@ -25,8 +25,8 @@ from deepsimbad.jobs.build import build, choose_landmarks, measured
 from deepsimbad.jobs.check import CheckFrames, check_map, traverses_in
 from deepsimbad.jobs.progress import Progress
 from deepsimbad.jobs.remap_config import DEFAULT_LIST_LENGTH, DEFAULT_N_LANDMARKS, RemapConfig
-from deepsimbad.jobs.seal_version import activate_once, seal_version
 from deepsimbad.jobs.train import train_nnql
+from deepsimbad.jobs.versions import activate_once, seal_version
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.catalog_maps import ANY
 from deepsimbad.store.map_file import read_map
