@@ -15,7 +15,7 @@ from deepsimbad.engine.views import RankedLandmarks, ReadyEncoding, View
 from deepsimbad.engine.worker import InferenceWorker
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.store.catalog import Catalog
-from deepsimbad.store.session_records import IdempotencyKey
+from deepsimbad.store.journal import IdempotencyKey
 from deepsimbad.store.sessions import SessionStore
 
 from .conftest import DIM, N_LANDMARKS

@@ -34,7 +34,7 @@ from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.feature_l2 import FeatureL2
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.catalog_maps import ANY
-from deepsimbad.store.session_records import SessionRecord
+from deepsimbad.store.journal import SessionRecord
 
 from .conftest import add_domain, add_map
 from .live_service import KEEP_ENDED_S, TTL_S, Clock, Live, encoded, ranked, run

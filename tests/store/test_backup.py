@@ -30,9 +30,9 @@ from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.catalog_maps import ANY
 from deepsimbad.store.data_dir import ServiceLock
 from deepsimbad.store.inspection import Inspection, inspect
+from deepsimbad.store.journal import ObservedRow, SessionRecord
 from deepsimbad.store.map_file import read_map, write_map
 from deepsimbad.store.sealing import seal, verify
-from deepsimbad.store.session_records import ObservedRow, SessionRecord
 from deepsimbad.store.sessions import SessionStore
 from deepsimbad.store.traverses import Traverse
 

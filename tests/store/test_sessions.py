@@ -13,10 +13,16 @@ import pytest
 from sqlite_utils import Database
 
 from deepsimbad.errors import DamagedFileError, InvalidInputError, UnavailableError, UnknownSessionError
-from deepsimbad.store.group_commit import MAX_BATCH
-from deepsimbad.store.journal import pack_ranks, unpack_ranks
-from deepsimbad.store.session_records import IdempotencyKey, ObservedRow, PriorRow, SessionRecord, StateSnapshot
-from deepsimbad.store.sessions import SessionStore
+from deepsimbad.store.journal import (
+    IdempotencyKey,
+    ObservedRow,
+    PriorRow,
+    SessionRecord,
+    StateSnapshot,
+    pack_ranks,
+    unpack_ranks,
+)
+from deepsimbad.store.sessions import MAX_BATCH, SessionStore
 
 RECORD = SessionRecord(0, "s1", "campus", 3, "f" * 64, {"filter": "grid", "seed": 2**53}, 100.0, 200.0, 0, None)
 RANKS = np.array([1, 2.5, 2.5, 4], np.float32)

@@ -13,9 +13,9 @@ from deepsimbad.core.map import Map
 from deepsimbad.store import connection
 from deepsimbad.store.backup import back_up, restore
 from deepsimbad.store.catalog import Catalog
+from deepsimbad.store.journal import ObservedRow, SessionRecord
 from deepsimbad.store.map_file import write_map
 from deepsimbad.store.sealing import export_map, seal
-from deepsimbad.store.session_records import ObservedRow, SessionRecord
 from deepsimbad.store.sessions import SessionStore
 from deepsimbad.store.traverses import Traverse
 

@@ -31,7 +31,7 @@ from deepsimbad.release import release
 from deepsimbad.settings import Settings
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.data_dir import ServiceLock
-from deepsimbad.store.session_records import SessionRecord
+from deepsimbad.store.journal import SessionRecord
 from deepsimbad.store.sessions import SessionStore
 
 log = logging.getLogger(__name__)

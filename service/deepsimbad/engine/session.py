@@ -32,7 +32,7 @@ from deepsimbad.errors import (
     UnknownSessionError,
 )
 from deepsimbad.evaluators.base import Evaluator
-from deepsimbad.store.session_records import IdempotencyKey, JournalRow, PriorRow, SessionRecord, StateSnapshot
+from deepsimbad.store.journal import IdempotencyKey, JournalRow, PriorRow, SessionRecord, StateSnapshot
 from deepsimbad.store.sessions import SessionStore
 
 DEFAULT_START_STD_M = 5.0

@@ -43,8 +43,8 @@ from deepsimbad.errors import (
     TooManySessionsError,
     UnknownSessionError,
 )
+from deepsimbad.store.journal import JournalRow, ListedSession, ObservedRow, PriorRow, SessionRecord
 from deepsimbad.store.records import ListPage
-from deepsimbad.store.session_records import JournalRow, ListedSession, ObservedRow, PriorRow, SessionRecord
 from deepsimbad.store.sessions import SessionStore
 
 T = TypeVar("T")

@@ -28,9 +28,9 @@ from deepsimbad.errors import (
 from deepsimbad.jobs.progress import Progress
 from deepsimbad.jobs.versions import activate_once, seal_version
 from deepsimbad.store.catalog import Catalog
+from deepsimbad.store.journal import ObservedRow, SessionRecord
 from deepsimbad.store.map_file import read_map
 from deepsimbad.store.records import MapRecord
-from deepsimbad.store.session_records import ObservedRow, SessionRecord
 from deepsimbad.store.sessions import SessionStore
 
 EXPERIENCE = "experience"  # the kind of job

@@ -1,16 +1,18 @@
 """The file of live sessions: whatever was acknowledged to a robot survives kill -9 and a power cut."""
 
+import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
-from typing import Any, Self
+from queue import SimpleQueue
+from typing import Any, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from sqlite_utils import Database
 
-from deepsimbad.errors import UnknownSessionError
+from deepsimbad.errors import UnavailableError, UnknownSessionError
 from deepsimbad.store import journal, layout
 from deepsimbad.store.connection import (
     OpenFile,
@@ -22,11 +24,14 @@ from deepsimbad.store.connection import (
 from deepsimbad.store.data_dir import make_data_dir
 from deepsimbad.store.durable import sync
 from deepsimbad.store.faults import storage_faults
-from deepsimbad.store.group_commit import GroupCommit
+from deepsimbad.store.journal import JournalRow, ListedSession, SessionRecord, StateSnapshot
 from deepsimbad.store.records import ListPage, from_json, to_json
-from deepsimbad.store.session_records import JournalRow, ListedSession, SessionRecord, StateSnapshot
 from deepsimbad_migrations.session.migrations import migrations
 
+T = TypeVar("T")
+_Write = tuple[Callable[[Database], Any], "Future[Any]"]
+
+MAX_BATCH = 256  # writes in one transaction
 PURGED_AT_ONCE = 1000  # rows
 _CHECKED_AT_START_BYTES = 64 * 1024 * 1024  # a service shall be ready soon; `deepsimbad check` reads more
 _MAX_NUMBER = 2**63 - 1
@@ -283,3 +288,85 @@ def _get(db: Database, session_id: str) -> SessionRecord:
 def _session(row: tuple[Any, ...]) -> SessionRecord:
     number, session_id, domain, map_version, map_sha256, config, *rest = row
     return SessionRecord(number, session_id, domain, map_version, map_sha256, from_json(config), *rest)
+
+
+class GroupCommit:
+    """One thread that commits what others hand in; a write counts when its future has a result, not earlier.
+
+    Many writers, one disk: whatever waits while a transaction is being synced goes into the next one together.
+
+    Args:
+        transaction: Gives a write transaction.
+        on_commit: Called with the number of writes of every transaction.
+    """
+
+    def __init__(
+        self, transaction: Callable[[], AbstractContextManager[Database]], on_commit: Callable[[int], None]
+    ) -> None:
+        self._transaction = transaction
+        self._on_commit = on_commit
+        self._waiting: SimpleQueue[_Write | None] = SimpleQueue()
+        self._is_open = True
+        self._lock = threading.Lock()
+        self._thread = threading.Thread(target=self._work, name="commits", daemon=True)
+        self._thread.start()
+
+    @property
+    def is_alive(self) -> bool:
+        """Whether the thread is there to commit."""
+        return self._thread.is_alive()
+
+    def submit(self, run: Callable[[Database], T]) -> Future[T]:
+        """Queue a write.
+
+        Args:
+            run: Called inside a transaction, perhaps a second time in another one.
+
+        Returns:
+            Its result to come, once it is on the disk; or its error, and then nothing of it was kept.
+
+        Raises:
+            UnavailableError: The file has been closed.
+        """
+        done: Future[T] = Future()
+        with self._lock:
+            if not self._is_open:
+                raise UnavailableError("the service is shutting down")
+            self._waiting.put((run, done))
+        done.set_running_or_notify_cancel()  # whoever stops waiting does not undo it
+        return done
+
+    def close(self) -> None:
+        """Commit what waits, then end the thread."""
+        with self._lock:
+            if self._is_open:
+                self._is_open = False
+                self._waiting.put(None)
+        self._thread.join()
+
+    def _work(self) -> None:
+        while (write := self._waiting.get()) is not None:
+            batch = [write]
+            while len(batch) < MAX_BATCH and not self._waiting.empty():
+                write = self._waiting.get()
+                if write is None:
+                    break
+                batch.append(write)
+            self._commit(batch)
+            if write is None:
+                return
+
+    def _commit(self, batch: list[_Write]) -> None:
+        try:
+            with self._transaction() as db:
+                results = [run(db) for run, _ in batch]
+        except BaseException as error:
+            if len(batch) == 1:
+                batch[0][1].set_exception(error)
+                return
+            for write in batch:  # one that cannot be written should not take the others with it
+                self._commit([write])
+            return
+        self._on_commit(len(batch))
+        for (_, done), result in zip(batch, results, strict=True):
+            done.set_result(result)
