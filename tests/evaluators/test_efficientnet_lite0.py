@@ -11,7 +11,7 @@ from deepsimbad.evaluators.extractors import efficientnet_lite0 as module
 from deepsimbad.evaluators.nets.efficientnet_lite import EfficientNetLite
 from deepsimbad.evaluators.registry import make_extractor
 from deepsimbad.evaluators.runtimes import has_onnxruntime
-from deepsimbad.evaluators.weights.files import read_state_dict
+from deepsimbad.evaluators.weights.files import fill, load_checkpoint
 
 STAGES = ((1, 3, 1, 1), (2, 3, 2, 6), (2, 5, 2, 6), (3, 3, 2, 6), (3, 5, 1, 6))  # repeats, kernel, stride, expansion
 
@@ -65,7 +65,7 @@ def tensors():
 def test_the_trunk_computes_what_was_published(tensors, size):
     image = np.random.default_rng(0).normal(size=(3, *size))
     trunk = EfficientNetLite(range(11)).eval()
-    read_state_dict(module.weights_file(), trunk)
+    fill(trunk, load_checkpoint(module.weights_file()), "weights")
     with torch.inference_mode():
         maps = trunk(torch.from_numpy(image)[None].float())
     for ours, theirs in zip(maps, reference(image, tensors), strict=True):

@@ -12,6 +12,7 @@ from deepsimbad.evaluators.extractors.efficientnet_lite0 import EfficientNetLite
 from deepsimbad.evaluators.registry import EXTRACTOR_PATTERN
 from deepsimbad.evaluators.weights import downloads, squeezenet_families
 from deepsimbad.evaluators.weights.downloads import pull_file, unpack
+from deepsimbad.evaluators.weights.files import file_sha256
 from deepsimbad.evaluators.weights.library import HUB, KNOWN, canonical, known
 from deepsimbad.evaluators.weights.lock import FileRecord, Lock, tree_sha256
 
@@ -83,12 +84,11 @@ def test_a_lock_is_read_as_it_was_written(tmp_path):
     lock = Lock.read(tmp_path / "new")
     assert lock.files == {"x.onnx": record}
     assert [path.name for path in (tmp_path / "new").iterdir()] == ["weights.lock"]
-    lock.check_file("x.onnx", "1" * 64)
-    lock.check_file("unknown", "2" * 64)
-    with pytest.raises(InvalidWeightsError) as told:
-        lock.check_file("x.onnx", "2" * 64)
-    assert "1" * 64 in told.value.message
-    assert "2" * 64 in told.value.message
+    (tmp_path / "new" / "x.onnx").write_bytes(b"another")
+    (tmp_path / "new" / "mine.onnx").write_bytes(b"mine")
+    assert lock.pinned("mine.onnx")[1] == file_sha256(tmp_path / "new" / "mine.onnx"), "what nobody recorded is taken"
+    with pytest.raises(InvalidWeightsError, match="was recorded with 1111"):
+        lock.pinned("x.onnx")
 
 
 def test_a_file_that_lies_here_is_recorded_as_it_is(tmp_path):

@@ -31,9 +31,9 @@ def backup(file: Path, as_json: bool, data_dir: Path | None) -> None:
     source = existing_data_dir(given_settings(data_dir=data_dir).data_dir)
     with progress_bar({"copy": 1.0}, "backup") as progress:
         progress.stage("copy")
-        made = back_up(source, file, release(), progress.update)
-    counts = f"{made.n_domains} domains, {made.n_maps} maps, {made.n_traverses} traverses"
-    report(as_json, asdict(made), f"{file}: {counts}, {made.bytes} bytes, sha256 {made.sha256}")
+        backed_up = back_up(source, file, release(), progress.update)
+    counts = f"{backed_up.n_domains} domains, {backed_up.n_maps} maps, {backed_up.n_traverses} traverses"
+    report(as_json, asdict(backed_up), f"{file}: {counts}, {backed_up.bytes} bytes, sha256 {backed_up.sha256}")
 
 
 @click.command()
@@ -45,8 +45,9 @@ def restore(file: Path, as_json: bool, data_dir: Path | None) -> None:
     target = given_settings(data_dir=data_dir).data_dir
     with progress_bar({"unpack": 1.0}, "restore") as progress:
         progress.stage("unpack")
-        made = restore_backup(file, target, progress.update)
-    report(as_json, asdict(made), f"{made.data_dir}: {made.n_files} files, {made.bytes} bytes, as of {made.created_at}")
+        restored = restore_backup(file, target, progress.update)
+    line = f"{restored.data_dir}: {restored.n_files} files, {restored.bytes} bytes, as of {restored.created_at}"
+    report(as_json, asdict(restored), line)
 
 
 @click.command()
@@ -58,9 +59,9 @@ def restore(file: Path, as_json: bool, data_dir: Path | None) -> None:
 def export(domain: str, file: Path, version: int | None, as_json: bool, data_dir: Path | None) -> None:
     """Copy a sealed map of DOMAIN into FILE, byte for byte, checked against its digest."""
     with Catalog.open(existing_data_dir(given_settings(data_dir=data_dir).data_dir)) as catalog:
-        made = export_map(catalog, domain, version, file)
-    line = f"map {made.map_version} of {domain} is in {file}: {made.bytes} bytes, sha256 {made.sha256}"
-    report(as_json, asdict(made), line)
+        exported = export_map(catalog, domain, version, file)
+    line = f"map {exported.map_version} of {domain} is in {file}: {exported.bytes} bytes, sha256 {exported.sha256}"
+    report(as_json, asdict(exported), line)
 
 
 @click.command("import")
@@ -78,9 +79,10 @@ def import_(
     The domain is made where it is absent; else it must have the same evaluator, actions and kind of route.
     """
     with Catalog.open(given_settings(data_dir=data_dir).data_dir) as catalog:
-        made = import_map(catalog, file, domain, sha256, activate=activate)
-    state = "active" if made.active else "sealed"
-    report(as_json, asdict(made), f"map {made.map_version} of {made.domain} is {state}: {made.bytes} bytes")
+        imported = import_map(catalog, file, domain, sha256, activate=activate)
+    state = "active" if imported.active else "sealed"
+    line = f"map {imported.map_version} of {imported.domain} is {state}: {imported.bytes} bytes"
+    report(as_json, asdict(imported), line)
 
 
 @click.command()

@@ -200,35 +200,35 @@ def _onnx_run(
     make_module: "Callable[[], nn.Module]", compute: Compute, example: tuple[int, int], exported_as: str
 ) -> _OnnxRun:
     """From the export in the weights' folder; the first time it is made there, which takes some seconds."""
-    kept = compute.weights_dir / "exported" / f"{exported_as}.onnx"
-    content = _whole(kept)
+    file = compute.weights_dir / "exported" / f"{exported_as}.onnx"
+    content = _whole(file)
     if content is not None:
         return _OnnxRun(content, compute)
-    log.info("preparing a network for ONNX Runtime, once", extra={"file": str(kept)})
+    log.info("preparing a network for ONNX Runtime, once", extra={"file": str(file)})
     with tempfile.TemporaryDirectory() as folder:
-        made = Path(folder) / kept.name
-        _export(make_module().eval().requires_grad_(False), made, example)
-        content = made.read_bytes()
+        exported = Path(folder) / file.name
+        _export(make_module().eval().requires_grad_(False), exported, example)
+        content = exported.read_bytes()
     try:
-        kept.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=kept.parent, delete=False) as beside:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=file.parent, delete=False) as beside:
             beside.write(content + hashlib.sha256(content).digest())
-        Path(beside.name).replace(kept)  # whole or not at all, whoever exports beside us
+        Path(beside.name).replace(file)  # whole or not at all, whoever exports beside us
     except OSError as error:
-        log.warning("an export for ONNX Runtime cannot be kept", extra={"file": str(kept), "why": str(error)})
+        log.warning("an export for ONNX Runtime cannot be kept", extra={"file": str(file), "why": str(error)})
     return _OnnxRun(content, compute)
 
 
-def _whole(kept: Path) -> bytes | None:
+def _whole(file: Path) -> bytes | None:
     """An export as it was made; None: there is none, or it was changed since. Its digest stands at its end."""
     try:
-        stored = kept.read_bytes()
+        stored = file.read_bytes()
     except OSError:
         return None
     content, digest = stored[:-_DIGEST_BYTES], stored[-_DIGEST_BYTES:]
     if hashlib.sha256(content).digest() == digest:
         return content
-    log.warning("an export for ONNX Runtime is damaged and is made anew", extra={"file": str(kept)})
+    log.warning("an export for ONNX Runtime is damaged and is made anew", extra={"file": str(file)})
     return None
 
 

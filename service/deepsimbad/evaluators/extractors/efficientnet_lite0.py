@@ -19,7 +19,7 @@ from deepsimbad.evaluators.compute import Compute
 from deepsimbad.evaluators.extractors.base import NetworkExtractor
 from deepsimbad.evaluators.extractors.gradient_grid import GradientGrid
 from deepsimbad.evaluators.runtimes import INSTALL_TORCH, make_run
-from deepsimbad.evaluators.weights.files import encodings_sha256, file_sha256, read_state_dict
+from deepsimbad.evaluators.weights.files import encodings_sha256, file_sha256, fill, load_checkpoint
 
 if TYPE_CHECKING:
     from torch import nn
@@ -84,12 +84,12 @@ def efficientnet_lite0(_argument: str, compute: Compute) -> EfficientNetLite0:
 
 def weights_file() -> Path:
     """The file that the package brings; nothing of the package is run."""
-    found = find_spec(PACKAGE)
-    if found is None or not found.submodule_search_locations:
+    package = find_spec(PACKAGE)
+    if package is None or not package.submodule_search_locations:
         raise MissingPackageError(
             f"the weights of efficientnet_lite0 come with the package {PACKAGE.replace('_', '-')}: {INSTALL_TORCH}"
         )
-    return Path(found.submodule_search_locations[0]) / _FILE
+    return Path(package.submodule_search_locations[0]) / _FILE
 
 
 def _module(weights: Path) -> "nn.Module":
@@ -97,5 +97,5 @@ def _module(weights: Path) -> "nn.Module":
     from deepsimbad.evaluators.nets.spatial_grid import SpatialGrid
 
     trunk = EfficientNetLite(tuple(_TAKEN))
-    read_state_dict(weights, trunk)
+    fill(trunk, load_checkpoint(weights), weights.name)
     return SpatialGrid(trunk.eval().folded(), _CELLS, mean=(127.0,) * 3, std=(128.0,) * 3, is_rgb=True)

@@ -150,8 +150,8 @@ def _of_checkpoint(path: Path) -> NetVladWeights:
     for preset, names in _CHECKPOINTS:
         if names.centres in tensors and (names.whitening is None or f"{names.whitening}.weight" in tensors):
             return _renamed(preset, names, tensors, path.name)
-    known = ", ".join([MATLAB.family, *(preset.family for preset, _ in _CHECKPOINTS)])
-    raise InvalidWeightsError(f"{path.name} is of none of the known families of NetVLAD: {known}", file=path.name)
+    families = ", ".join([MATLAB.family, *(preset.family for preset, _ in _CHECKPOINTS)])
+    raise InvalidWeightsError(f"{path.name} is of none of the known families of NetVLAD: {families}", file=path.name)
 
 
 def _renamed(preset: Preset, names: _Names, tensors: Mapping[str, Any], file: str) -> NetVladWeights:
@@ -251,4 +251,4 @@ def _average_colour(net: Any, file: str) -> list[float]:
         raise InvalidWeightsError(f"{file} has no net.meta.normalization.averageImage", file=file) from error
     if colour.shape != (3,) or not np.isfinite(colour).all():
         raise InvalidWeightsError(f"the averageImage of {file} is no colour", file=file)
-    return [float(each) for each in colour]
+    return [float(value) for value in colour]

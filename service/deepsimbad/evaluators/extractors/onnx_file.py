@@ -91,15 +91,15 @@ class _Shown:
         Raises:
             InvalidWeightsError: An entry is none, or has no such value.
         """
-        told = {key.removeprefix(_PREFIX): text for key, text in metadata.items() if key.startswith(_PREFIX)}
+        entries = {key.removeprefix(_PREFIX): text for key, text in metadata.items() if key.startswith(_PREFIX)}
         values = dict(_DEFAULTS)
-        for name, text in told.items():
+        for name, text in entries.items():
             if name not in _DEFAULTS:
                 raise InvalidWeightsError(f"{file} has the metadata {_PREFIX}{name}, which means nothing", file=file)
             values[name] = _value(file, name, text)
         numbers = {name: np.broadcast_to(np.asarray(values[name], np.float32), 3) for name in ("scale", "mean", "std")}
         is_rgb = values["channels"] == "RGB"
-        for name in {"mean", "std"} - set(told) if not is_rgb else ():
+        for name in {"mean", "std"} - set(entries) if not is_rgb else ():
             numbers[name] = numbers[name][::-1]
         return cls(numbers["scale"], numbers["mean"], numbers["std"], is_rgb, is_nchw=values["layout"] == "NCHW")
 
@@ -159,7 +159,7 @@ class _FileRun:
         """Name, size of a batch (0: any) and (width, height) of the one input."""
         inputs = self._session.get_inputs()
         wanted = "[n, 3, height, width]" if self._shown.is_nchw else "[n, height, width, 3]"
-        found = ", ".join(f"{each.type} {each.shape}" for each in inputs) or "nothing"
+        shown = ", ".join(f"{tensor.type} {tensor.shape}" for tensor in inputs) or "nothing"
         if len(inputs) == 1 and inputs[0].type == "tensor(float)" and len(inputs[0].shape) == 4:
             batch, first, second, third = (size if isinstance(size, int) else None for size in inputs[0].shape)
             channels, height, width = (first, second, third) if self._shown.is_nchw else (third, first, second)
@@ -167,7 +167,7 @@ class _FileRun:
             if channels == 3 and batch in {None, 1} and max(sides) <= _LONGEST_SIDE:
                 return inputs[0].name, batch or 0, sides
         raise InvalidWeightsError(
-            f"{self._file} takes {found}, not one tensor(float) {wanted} with n open or 1", file=self._file
+            f"{self._file} takes {shown}, not one tensor(float) {wanted} with n open or 1", file=self._file
         )
 
     def _failure(self, what: str, error: Exception) -> InvalidWeightsError | OutOfMemoryError:
@@ -189,8 +189,8 @@ def _value(file: str, name: str, text: str) -> Any:
     except (ValueError, RecursionError):
         value = None
     numbers = value if isinstance(value, list) else [value]
-    are_numbers = all(isinstance(each, int | float) and not isinstance(each, bool) for each in numbers)
-    are_usable = are_numbers and all(abs(each) < _LARGEST and (each or name != "std") for each in numbers)
+    are_numbers = all(isinstance(number, int | float) and not isinstance(number, bool) for number in numbers)
+    are_usable = are_numbers and all(abs(number) < _LARGEST and (number or name != "std") for number in numbers)
     if len(numbers) not in {1, 3} or not are_usable:
         raise InvalidWeightsError(f"{file} has {_PREFIX}{name} = {text!r}, not one or three numbers", file=file)
     return numbers

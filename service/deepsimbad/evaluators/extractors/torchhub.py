@@ -358,9 +358,9 @@ def _named_failures(extractor: str, what: str, tree: Path | None = None, watch: 
 
 def _missing_package(error: BaseException, tree: Path | None) -> str | None:
     """The package that an error misses, where that is what it says and the repository should not have it itself."""
-    told = re.match(r"Missing dependencies: (.+)", str(error))  # by torch hub, of a repository's own list
-    if told is not None:
-        return told[1]
+    missing = re.match(r"Missing dependencies: (.+)", str(error))  # by torch hub, of a repository's own list
+    if missing is not None:
+        return missing[1]
     if not isinstance(error, ModuleNotFoundError) or error.name is None:
         return None
     name = error.name.partition(".")[0]

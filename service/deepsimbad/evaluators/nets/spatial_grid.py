@@ -42,4 +42,4 @@ class SpatialGrid(nn.Module):
         images = (images.float() - self.mean) / self.std
         maps = self.trunk(images.to(next(self.trunk.parameters()).dtype))
         cells = [functional.adaptive_avg_pool2d(features.float(), self._cells) for features in maps]
-        return functional.normalize(torch.cat([functional.normalize(each, dim=1).flatten(1) for each in cells], dim=1))
+        return functional.normalize(torch.cat([functional.normalize(cell, dim=1).flatten(1) for cell in cells], dim=1))

@@ -64,21 +64,21 @@ def pull_file(
     """
     name = extractor.partition(":")[2]
     lock, to = Lock.read(folder), folder / name
-    listed = next((each for each in KNOWN if each.file == name), None)
+    listed = next((weights for weights in KNOWN if weights.file == name), None)
     recorded = lock.files.get(name)
     wanted = sha256 or (recorded.sha256 if recorded else None) or (listed.sha256 if listed else None)
     came_from = recorded.url if recorded else None
     if to.is_file():
-        found = found_sha256(to) or ""
-        check_digest(name, found, wanted, f"remove {to}, and pull it again")
+        digest = found_sha256(to) or ""
+        check_digest(name, digest, wanted, f"remove {to}, and pull it again")
     else:
         came_from = url or came_from or (listed.url if listed else None)
         if came_from is None:
             page = listed.page if listed else None
             where = f"get it from {page} and " if page else "say where it is with --url, or "
             raise MissingWeightsError(f"{name} is not known to be at any address: {where}put it at {to}", file=name)
-        found = fetch(came_from, to, tell, wanted)
-    record = FileRecord(found, to.stat().st_size, extractor, came_from)
+        digest = fetch(came_from, to, tell, wanted)
+    record = FileRecord(digest, to.stat().st_size, extractor, came_from)
     lock.with_file(name, record).write()
     return record
 
@@ -158,7 +158,7 @@ def pull_hub(folder: Path, wish: HubWish, tell: Tell) -> HubRecord:
     load_recorded(lock, wish.extractor, record)  # as every later load: from here alone
     lock.write()
     archive.unlink(missing_ok=True)
-    if old is not None and old.folder not in {each.folder for each in lock.hub.values()}:
+    if old is not None and old.folder not in {entry.folder for entry in lock.hub.values()}:
         shutil.rmtree(hub / old.folder, ignore_errors=True)
     return record
 
@@ -299,8 +299,8 @@ class _Download:
 
     def _beyond_the_end(self, answer: httpx2.Response, n_there: int) -> str:
         """Nothing is missing, where the file is as long as what is there; else what is there is of another file."""
-        found = _CONTENT_RANGE.fullmatch(answer.headers.get("content-range", ""))
-        if found is not None and found[2] == str(n_there):
+        extent = _CONTENT_RANGE.fullmatch(answer.headers.get("content-range", ""))
+        if extent is not None and extent[2] == str(n_there):
             return ""
         self._forget()
         return "has become another file"
@@ -308,11 +308,11 @@ class _Download:
     def _keep(self, answer: httpx2.Response, n_there: int) -> str:
         n_in_all = _content_length(answer)
         if answer.status_code == _PART:
-            found = _CONTENT_RANGE.fullmatch(answer.headers.get("content-range", ""))
-            if found is None or found[1] != str(n_there):
+            extent = _CONTENT_RANGE.fullmatch(answer.headers.get("content-range", ""))
+            if extent is None or extent[1] != str(n_there):
                 self._forget()
                 return "answered another part than was asked for"
-            n_in_all = None if found[2] == "*" else int(found[2])
+            n_in_all = None if extent[2] == "*" else int(extent[2])
         else:
             n_there = 0
         self._check_size(n_in_all or 0)
@@ -350,8 +350,8 @@ class _Download:
         return sha256
 
     def _missing(self, why: str) -> MissingWeightsError:
-        kept = "" if not self._part.exists() else f"; the {self._part.stat().st_size} bytes that came are kept"
-        return _missing(self._url, why + kept, self._advice)
+        remains = "" if not self._part.exists() else f"; the {self._part.stat().st_size} bytes that came are kept"
+        return _missing(self._url, why + remains, self._advice)
 
     def _forget(self) -> None:
         self._part.unlink(missing_ok=True)

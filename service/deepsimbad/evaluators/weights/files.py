@@ -71,15 +71,6 @@ def load_checkpoint(path: Path) -> Any:
         ) from error
 
 
-def read_state_dict(path: Path, module: "nn.Module") -> None:
-    """Fill a module's parameters from a checkpoint of the same names; what the module does not have is passed over.
-
-    Raises:
-        InvalidWeightsError: As `load_checkpoint`; or a parameter is missing, of another shape or not finite.
-    """
-    fill(module, load_checkpoint(path), path.name)
-
-
 def fill(module: "nn.Module", tensors: Mapping[str, Any], file: str) -> None:
     """Fill a module's parameters and buffers by name.
 
@@ -111,7 +102,7 @@ def fill(module: "nn.Module", tensors: Mapping[str, Any], file: str) -> None:
         if not torch.isfinite(given).all():
             raise InvalidWeightsError(f"{file} has NaN or infinity in {name}", file=file, name=name)
     # Assigned, not copied: a whitening is half a gigabyte, and the module may have been made without any memory.
-    module.load_state_dict({name: tensors[name].to(each.dtype) for name, each in wanted.items()}, assign=True)
+    module.load_state_dict({name: tensors[name].to(parameter.dtype) for name, parameter in wanted.items()}, assign=True)
 
 
 def _numpy_scalars() -> list[Any]:

@@ -137,7 +137,7 @@ KNOWN: tuple[KnownWeights, ...] = (
 def known(name: str) -> KnownWeights | None:
     """The weights of a short name or of an extractor's name; None: they are not known."""
     wanted = canonical(name)
-    return next((each for each in KNOWN if wanted in {each.name, canonical(each.extractor)}), None)
+    return next((weights for weights in KNOWN if wanted in {weights.name, canonical(weights.extractor)}), None)
 
 
 def canonical(extractor: str) -> str:

@@ -162,7 +162,7 @@ class Lock:
 
     def extractors(self) -> list[str]:
         """The extractors whose weights lie in the folder, as configurations name them."""
-        here = {each.extractor for each in KNOWN if each.file is not None and (self.folder / each.file).is_file()}
+        here = {known.extractor for known in KNOWN if known.file is not None and (self.folder / known.file).is_file()}
         for pattern, kind in _KIND_OF_FILE.items():
             here |= {f"{kind}:{path.name}" for path in self.folder.glob(pattern)}
         return sorted(here) + sorted(self.hub)
@@ -190,19 +190,6 @@ class Lock:
         Path(new.name).chmod(0o644)  # a folder of weights may be shared
         Path(new.name).replace(self.folder / LOCK)
 
-    def check_file(self, name: str, sha256: str) -> None:
-        """Hold a file to its record, where it has one.
-
-        Args:
-            name: In the folder.
-            sha256: What it has now.
-
-        Raises:
-            InvalidWeightsError: It was recorded with another.
-        """
-        if name in self.files:
-            Finding(self.folder / name, self.files[name].sha256, sha256).check()
-
     def pinned(self, name: str) -> tuple[Path, str]:
         """A file of the folder and its SHA-256, which is as recorded where it was pulled.
 
@@ -212,7 +199,8 @@ class Lock:
         """
         path = weights_path(self.folder, name)
         sha256 = file_sha256(path)
-        self.check_file(name, sha256)
+        if name in self.files:
+            Finding(path, self.files[name].sha256, sha256).check()
         return path, sha256
 
     def findings(self, name: str) -> Iterator[Finding]:
@@ -244,7 +232,7 @@ def found_sha256(path: Path) -> str | None:
 def tree_sha256(folder: Path) -> str:
     """One digest of all files in a folder: their paths and contents, in the order of their paths."""
     tree = hashlib.sha256()
-    for path in sorted(folder.rglob("*"), key=lambda each: each.relative_to(folder).as_posix()):
+    for path in sorted(folder.rglob("*"), key=lambda file: file.relative_to(folder).as_posix()):
         inside = path.relative_to(folder)
         if path.is_file() and _NOT_CONTENT not in inside.parts:
             tree.update(f"{file_sha256(path)}  {inside.as_posix()}\n".encode())

@@ -61,9 +61,9 @@ def read_variable(path: Path, name: str) -> Any:
             kind, n_bytes = struct.unpack("<II", tag)
             body = _body(stream, kind, n_bytes, unpacked, path.name)
             unpacked -= len(body)
-            found = _Reader(body, path.name).variable()
-            if found.name == name:
-                return found.value
+            variable = _Reader(body, path.name).variable()
+            if variable.name == name:
+                return variable.value
     raise InvalidWeightsError(f"{path.name} has no variable {name}: it is of another network", file=path.name)
 
 
@@ -134,7 +134,7 @@ class _Reader:
             _refuse(self._file)
         value: Any = None
         if kind == _CELL:
-            value = [each.value for each in self._matrices(at, end, prod(shape), depth)]
+            value = [item.value for item in self._matrices(at, end, prod(shape), depth)]
         elif kind == _STRUCT and prod(shape) == 1:
             value = self._struct(at, end, depth)
         elif kind == _CHAR:
@@ -152,19 +152,19 @@ class _Reader:
             _refuse(self._file)
         fields = [joined[i : i + width].partition(b"\0")[0].decode("latin-1") for i in range(0, len(joined), width)]
         values = self._matrices(at, end, len(fields), depth)
-        return {field: each.value for field, each in zip(fields, values, strict=True)}
+        return {field: item.value for field, item in zip(fields, values, strict=True)}
 
     def _matrices(self, at: int, end: int, count: int, depth: int) -> list[_Variable]:
         if count > _MOST_PARTS:
             _refuse(self._file)
-        found = []
+        matrices = []
         for _ in range(count):
             kind, start, stop, following = self._element(at, end)
             if kind != _MATRIX:
                 _refuse(self._file)
-            found.append(self._matrix(start, stop, depth + 1))
+            matrices.append(self._matrix(start, stop, depth + 1))
             at = following
-        return found
+        return matrices
 
     def _text(self, at: int, end: int) -> str:
         kind, start, stop, _ = self._element(at, end)
