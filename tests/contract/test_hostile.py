@@ -118,35 +118,9 @@ def png_claim(width: int, height: int) -> bytes:
     return b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + header + struct.pack(">I", zlib.crc32(header)) + bytes(100)
 
 
-def jpeg_claim(width: int, height: int) -> bytes:
-    frame = struct.pack(">BHHB", 8, height, width, 3) + bytes([1, 0x22, 0, 2, 0x11, 0, 3, 0x11, 0])
-    return b"\xff\xd8\xff\xc0" + struct.pack(">H", len(frame) + 2) + frame + b"\xff\xda\x00\x02\x00\xff\xd9"
-
-
-def webp_claim(width: int, height: int) -> bytes:
-    extended = bytes(4) + struct.pack("<I", width - 1)[:3] + struct.pack("<I", height - 1)[:3]
-    chunk = b"WEBPVP8X" + struct.pack("<I", 10) + extended
-    return b"RIFF" + struct.pack("<I", len(chunk)) + chunk
-
-
-def tiff_claim(width: int, height: int) -> bytes:
-    fields = [(256, width), (257, height), (273, 8), (277, 1), (278, height), (279, 16)]
-    entries = b"".join(struct.pack("<HHII", tag, 4, 1, value) for tag, value in fields)
-    return b"II*\x00" + struct.pack("<IH", 8, len(fields)) + entries + bytes(4)
-
-
-@pytest.mark.parametrize(
-    ("kind", "body"),
-    [
-        ("png", png_claim(100_000, 100_000)),
-        ("jpeg", jpeg_claim(65_535, 65_535)),
-        ("webp", webp_claim(100_000, 100_000)),
-        ("tiff", tiff_claim(100_000, 100_000)),
-    ],
-)
-def test_images_that_claim_ten_thousand_million_pixels(served: Served, kind: str, body: bytes) -> None:
+def test_an_image_that_claims_ten_thousand_million_pixels(served: Served) -> None:
     for _ in range(20):
-        status, problem = ask(served, "PUT", FRAME, body, Content_Type=f"image/{kind}")
+        status, problem = ask(served, "PUT", FRAME, png_claim(100_000, 100_000), Content_Type="image/png")
         assert (status, problem["code"]) == (413, "image_too_large"), problem
 
 
@@ -332,106 +306,6 @@ def test_garbage_behind_requests(served: Served) -> None:
     assert [answer[:3] for answer in answers] == [b"200"] * 10 + [b"400"]
 
 
-# Names
-
-
-NAMES = [
-    "..",
-    "../../etc/passwd",
-    "%2e%2e%2f%2e%2e%2fetc%2fpasswd",
-    "..%5c..%5cetc",
-    "%252e%252e%252f",
-    "%00",
-    "a%00.sqlite",
-    "%c0%ae%c0%ae%c0%af",
-    "catalog.sqlite%00",
-    "C:%5cx",
-    "%2Fetc%2Fpasswd",
-    "~root",
-    "x';DROP%20TABLE%20domain;--",
-    "%27%20OR%20%271%27=%271",
-    "1%20UNION%20SELECT%20*%20FROM%20api_key",
-    "%25s%25n",
-    "$(id)",
-    "%7B%7B7*7%7D%7D",
-    "%F0%9F%A4%96",
-    "%E2%80%AEgpj",
-    "%EF%BC%90",
-    "%CC%81",
-    "%ED%A0%80",
-    "%FF",
-    "a%0d%0aSet-Cookie:x",
-    "a" * 65,
-    "a" * 10_000,
-    "%20",
-    "-",
-    ".hidden",
-]
-
-
-@pytest.mark.parametrize("name", NAMES, ids=range(len(NAMES)))
-def test_names_in_paths(served: Served, data_dir: Path, name: str) -> None:
-    before = sorted(data_dir.parent.rglob("*"))
-    evaluator = b'{"evaluator": {"kind": "feature_l2"}}'
-    for method, path, body in (
-        ("GET", f"/v1/domains/{name}", b""),
-        ("PUT", f"/v1/admin/domains/{name}", evaluator),
-        ("DELETE", f"/v1/admin/domains/{name}", b""),
-        ("POST", f"/v1/domains/{name}/localizations", b'{"ranked_landmarks": [1]}'),
-        ("GET", f"/v1/admin/domains/ready/traverses/{name}", b""),
-        ("DELETE", f"/v1/admin/domains/ready/traverses/{name}", b""),
-        ("PUT", f"/v1/admin/domains/ready/traverses/{name}/frames/0?position_m=0", b'{"encoding": [1]}'),
-        ("PUT", f"/v1/admin/domains/ready/traverses/drive/frames/{name}?position_m=0", b'{"encoding": [1]}'),
-        ("GET", f"/v1/admin/domains/ready/maps/{name}/file", b""),
-        ("GET", f"/v1/sessions/{name}", b""),
-        ("GET", f"/v1/admin/jobs/{name}", b""),
-        ("GET", f"/v1/admin/jobs/{name}/events", b""),
-        ("GET", f"/v1/admin/jobs?domain={name}", b""),
-        ("GET", f"/v1/admin/jobs?after={name}", b""),
-    ):
-        status, problem = ask(served, method, path, body)
-        assert status in {400, 404, 405, 422}, (method, path, problem)
-        assert str(data_dir) not in json.dumps(problem)
-        assert "sqlite3" not in json.dumps(problem)
-    assert sorted(data_dir.parent.rglob("*")) == before
-
-
-@pytest.mark.parametrize(
-    "name",
-    [
-        "../x",
-        "..",
-        "a/b",
-        "a\\b",
-        "\u0000",
-        "a\u0000b",
-        "x'; DROP TABLE domain;--",
-        "\ud800",
-        "\u202egpj",
-        "🤖",
-        "٣",
-        "\uff41",
-        "a\n",
-        " ",
-        "",
-    ],
-    ids=range(15),
-)
-def test_names_in_bodies(served: Served, data_dir: Path, name: str) -> None:
-    before = sorted(data_dir.parent.rglob("*"))
-    for path, body in (
-        ("/v1/admin/domains/ready/traverses", {"name": name}),
-        ("/v1/admin/domains/ready/remaps", {"training_traverse": name}),
-        ("/v1/admin/domains/ready/remaps", {"training_traverse": "drive", "landmark_traverse": name}),
-        ("/v1/domains/ready/sessions", {"planner": name}),
-    ):
-        status, problem = ask(served, "POST", path, json.dumps(body).encode())
-        assert status == 422, problem
-    status, problem = ask(served, "PUT", "/v1/admin/domains/evil", json.dumps({"evaluator": {"kind": name}}).encode())
-    assert status == 422, problem
-    assert sorted(data_dir.parent.rglob("*")) == before
-
-
 def test_headers_that_are_none_of_ours(served: Served) -> None:
     body = b'{"ranked_landmarks": [1]}'
     for name, value in {
@@ -485,24 +359,3 @@ def test_megabytes_of_json(served: Served, kind: str) -> None:
         assert status == 422, problem
         assert problem["code"] in {"invalid_request", "invalid_ranked_landmarks", "invalid_encoding"}
         assert len(json.dumps(problem)) < 20_000
-
-
-@pytest.mark.parametrize("number", ["9" * 5000, "1e400", "-1e400", "0x10", "NaN", "٣", "1e-400", "1" + "0" * 400])
-def test_numbers_in_queries(served: Served, number: str) -> None:
-    sent = number.encode().decode("latin-1")
-    quoted = "".join(f"%{ord(letter):02x}" if ord(letter) > 126 else letter for letter in sent)
-    frame = f"/v1/admin/domains/ready/traverses/drive/frames/0?timestamp_us={quoted}&position_m=1"
-    assert ask(served, "PUT", frame, b'{"encoding": [1]}')[0] == 422
-    assert ask(served, "POST", f"{READY}?shortlist={quoted}", b'{"ranked_landmarks": [1]}')[0] == 422
-    assert ask(served, "GET", f"/v1/admin/jobs?limit={quoted}")[0] == 422
-
-
-def test_a_body_that_is_an_apology_for_one(served: Served) -> None:
-    """Many small requests that all fail cost no more than those that do not."""
-    with contextlib.ExitStack() as stack:
-        for _ in range(10):
-            connection = stack.enter_context(served.connect())
-            connection.sendall(request("POST", READY, b"{", Connection="") * 50)
-            received = b""
-            while received.count(b"HTTP/1.1 422 ") < 50:
-                received += connection.recv(65536)

@@ -25,7 +25,7 @@ from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.records import KeyScope
 
 from .conftest import N_SEEN, encoded, make_ready_domain, picture, remap, small_settings
-from .test_over_the_wire import free_port
+from .served import free_port
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
