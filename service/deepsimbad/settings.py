@@ -13,7 +13,15 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import Field, ValidationError, field_validator
+from pydantic import (
+    Field,
+    NonNegativeFloat,
+    NonNegativeInt,
+    PositiveFloat,
+    PositiveInt,
+    ValidationError,
+    field_validator,
+)
 from pydantic_settings import BaseSettings, EnvSettingsSource, SettingsConfigDict, TomlConfigSettingsSource
 from pydantic_settings import SettingsError as UndecodableError
 
@@ -40,121 +48,99 @@ class Settings(BaseSettings):
         frozen=True,
         extra="forbid",
         allow_inf_nan=False,
+        use_attribute_docstrings=True,
     )
 
-    data_dir: Annotated[Path, Field(description="Folder of the catalog, traverses and maps.")] = Path("deepsimbad-data")
-    host: Annotated[str, Field(description="Address to listen on.", min_length=1)] = "127.0.0.1"
-    port: Annotated[int, Field(description="Port to listen on; 0 takes a free one.", ge=0, le=65535)] = 8000
-    allow_open: Annotated[
-        bool,
-        Field(description="Serve without keys on an address other machines can reach. Off: refuse to start."),
-    ] = False
-    require_keys: Annotated[
-        bool, Field(description="Refuse to start before a key was created, on a loopback address too.")
-    ] = False
-    log_level: Annotated[
-        str, Field(description="Least level that is logged.", pattern="^(DEBUG|INFO|WARNING|ERROR)$")
-    ] = "INFO"
+    data_dir: Path = Path("deepsimbad-data")
+    """Folder of the catalog, traverses and maps."""
+    host: Annotated[str, Field(min_length=1)] = "127.0.0.1"
+    """Address to listen on."""
+    port: Annotated[int, Field(ge=0, le=65535)] = 8000
+    """Port to listen on; 0 takes a free one."""
+    allow_open: bool = False
+    """Serve without keys on an address other machines can reach. Off: refuse to start."""
+    require_keys: bool = False
+    """Refuse to start before a key was created, on a loopback address too."""
+    log_level: Annotated[str, Field(pattern="^(DEBUG|INFO|WARNING|ERROR)$")] = "INFO"
+    """Least level that is logged."""
 
-    max_image_bytes: Annotated[int, Field(description="Largest image body, in bytes.", ge=1)] = 32 * MEBIBYTE
-    max_json_bytes: Annotated[int, Field(description="Largest JSON body, in bytes.", ge=1)] = 4 * MEBIBYTE
-    max_batch_bytes: Annotated[
-        int, Field(description="Largest batch of frames, in bytes: as sent, and again unpacked.", ge=1)
-    ] = 1024 * MEBIBYTE
-    max_pixels: Annotated[
-        int, Field(description="Most pixels an image's header may claim (width times height).", ge=1)
-    ] = 50_000_000
+    max_image_bytes: PositiveInt = 32 * MEBIBYTE
+    """Largest image body, in bytes."""
+    max_json_bytes: PositiveInt = 4 * MEBIBYTE
+    """Largest JSON body, in bytes."""
+    max_batch_bytes: PositiveInt = 1024 * MEBIBYTE
+    """Largest batch of frames, in bytes: as sent, and again unpacked."""
+    max_pixels: PositiveInt = 50_000_000
+    """Most pixels an image's header may claim (width times height)."""
 
-    max_header_bytes: Annotated[int, Field(description="Most bytes of a request's headers.", ge=1024)] = 64 * 1024
-    max_body_memory_bytes: Annotated[
-        int, Field(description="Bodies held in memory at once, all requests together, in bytes.", ge=1)
-    ] = 512 * MEBIBYTE
-    max_requests: Annotated[int, Field(description="Requests under way at once; more are answered 503.", ge=1)] = 256
-    max_queue: Annotated[
-        int, Field(description="Views waiting for the inference worker; more are answered 503.", ge=1)
-    ] = 128
-    max_uploads: Annotated[int, Field(description="Batches of frames on their way at once.", ge=1)] = 4
-    max_event_streams: Annotated[int, Field(description="Job event streams open at once.", ge=1)] = 64
-    max_connections: Annotated[
-        int, Field(description="Connections, or requests, open at once; with one more all are answered 503.", ge=1)
-    ] = 1024
-    max_domains: Annotated[int, Field(description="Domains that may exist.", ge=1)] = 1000
-    rate_limit_per_s: Annotated[
-        float, Field(description="Requests a second that one key may send, in the long run; 0: any number.", ge=0)
-    ] = 200.0
-    rate_limit_burst: Annotated[
-        int, Field(description="Requests that one key may send at once before its rate counts.", ge=1)
-    ] = 400
-    cors_origins: Annotated[
-        tuple[str, ...], Field(description="Origins whose pages may call the service (CORS), a JSON list; empty: none.")
-    ] = ()
-    tls_certificate: Annotated[
-        Path | None, Field(description="PEM file to serve HTTPS with, its key in it or in `tls_key`; none: HTTP.")
-    ] = None
-    tls_key: Annotated[Path | None, Field(description="PEM file of the certificate's key.")] = None
+    max_header_bytes: Annotated[int, Field(ge=1024)] = 64 * 1024
+    """Most bytes of a request's headers."""
+    max_body_memory_bytes: PositiveInt = 512 * MEBIBYTE
+    """Bodies held in memory at once, all requests together, in bytes."""
+    max_requests: PositiveInt = 256
+    """Requests under way at once; more are answered 503."""
+    max_queue: PositiveInt = 128
+    """Views waiting for the inference worker; more are answered 503."""
+    max_uploads: PositiveInt = 4
+    """Batches of frames on their way at once."""
+    max_event_streams: PositiveInt = 64
+    """Job event streams open at once."""
+    max_connections: PositiveInt = 1024
+    """Connections, or requests, open at once; with one more all are answered 503."""
+    max_domains: PositiveInt = 1000
+    """Domains that may exist."""
+    rate_limit_per_s: NonNegativeFloat = 200.0
+    """Requests a second that one key may send, in the long run; 0: any number."""
+    rate_limit_burst: PositiveInt = 400
+    """Requests that one key may send at once before its rate counts."""
+    cors_origins: tuple[str, ...] = ()
+    """Origins whose pages may call the service (CORS), a JSON list; empty: none."""
+    tls_certificate: Path | None = None
+    """PEM file to serve HTTPS with, its key in it or in `tls_key`; none: HTTP."""
+    tls_key: Path | None = None
+    """PEM file of the certificate's key."""
 
-    keep_alive_s: Annotated[int, Field(description="An idle connection is closed after this.", ge=1)] = 75
-    shutdown_grace_s: Annotated[
-        int, Field(description="Requests under way at shutdown get this long to finish.", ge=0)
-    ] = 10
-    event_poll_s: Annotated[
-        float, Field(description="A job's event stream looks for news this often.", gt=0, le=10)
-    ] = 0.25
+    keep_alive_s: PositiveInt = 75
+    """An idle connection is closed after this."""
+    shutdown_grace_s: NonNegativeInt = 10
+    """Requests under way at shutdown get this long to finish."""
+    event_poll_s: Annotated[float, Field(gt=0, le=10)] = 0.25
+    """A job's event stream looks for news this often."""
 
-    keep_maps: Annotated[
-        int, Field(description="Retired map versions kept a domain, to roll back to; older files are removed.", ge=1)
-    ] = 5
-    max_jobs: Annotated[int, Field(description="Jobs that may wait their turn; one more is answered 429.", ge=1)] = 100
-    job_threads: Annotated[
-        int, Field(description="Threads that a job computes in; 0: one less than there are cores.", ge=0)
-    ] = 0
-    job_priority: Annotated[
-        JobPriority,
-        Field(description="`idle`: jobs run when nothing else on the machine would; `low`, `normal`: beside it."),
-    ] = JobPriority.IDLE
+    keep_maps: PositiveInt = 5
+    """Retired map versions kept a domain, to roll back to; older files are removed."""
+    max_jobs: PositiveInt = 100
+    """Jobs that may wait their turn; one more is answered 429."""
+    job_threads: NonNegativeInt = 0
+    """Threads that a job computes in; 0: one less than there are cores."""
+    job_priority: JobPriority = JobPriority.IDLE
+    """`idle`: jobs run when nothing else on the machine would; `low`, `normal`: beside it."""
 
-    weights_dir: Annotated[
-        Path,
-        Field(description="Folder of networks' weights, and of what is prepared from them.", validate_default=True),
-    ] = DEFAULT_WEIGHTS_DIR
-    network_runtime: Annotated[
-        Runtime,
-        Field(
-            description="What runs networks: `torch`, `torch_bf16`, `onnxruntime`; `auto`: the fastest that is there."
-        ),
-    ] = Runtime.AUTO
-    network_device: Annotated[
-        Device, Field(description="Where: `cpu`, `cuda`; `auto`: CUDA where there is one that works.")
-    ] = Device.AUTO
-    network_threads: Annotated[
-        int, Field(description="Processor threads of a network; 0: as many as there are cores.", ge=0)
-    ] = 0
-    encode_batch: Annotated[
-        int,
-        Field(
-            description="Most images encoded at once; 0: what measures best, on CUDA 32, else 1 to four a core.",
-            ge=0,
-            le=1024,
-        ),
-    ] = 0
-    encode_wait_ms: Annotated[
-        float, Field(description="How long an image waits for others to fill a batch; 0: for none.", ge=0, le=1000)
-    ] = 0.0
+    weights_dir: Annotated[Path, Field(validate_default=True)] = DEFAULT_WEIGHTS_DIR
+    """Folder of networks' weights, and of what is prepared from them."""
+    network_runtime: Runtime = Runtime.AUTO
+    """What runs networks: `torch`, `torch_bf16`, `onnxruntime`; `auto`: the fastest that is there."""
+    network_device: Device = Device.AUTO
+    """Where: `cpu`, `cuda`; `auto`: CUDA where there is one that works."""
+    network_threads: NonNegativeInt = 0
+    """Processor threads of a network; 0: as many as there are cores."""
+    encode_batch: Annotated[int, Field(ge=0, le=1024)] = 0
+    """Most images encoded at once; 0: what measures best, on CUDA 32, else 1 to four a core."""
+    encode_wait_ms: Annotated[float, Field(ge=0, le=1000)] = 0.0
+    """How long an image waits for others to fill a batch; 0: for none."""
 
-    session_ttl_s: Annotated[
-        float, Field(description="A session ends when nothing was observed in it for so long.", gt=0, le=31_536_000)
-    ] = 3600.0
-    max_sessions: Annotated[int, Field(description="Sessions that may live at once.", ge=1)] = 1000
-    max_sessions_per_key: Annotated[int, Field(description="Sessions of one API key that may live at once.", ge=1)] = (
-        100
-    )
-    snapshot_every: Annotated[
-        int, Field(description="Observations of a session between two snapshots of its belief.", ge=1)
-    ] = 32
-    keep_ended_sessions_s: Annotated[
-        float, Field(description="What a session saw is kept for so long after its end, for its truths.", ge=0)
-    ] = 86_400.0
-    session_sweep_s: Annotated[float, Field(description="Expired sessions are looked for this often.", gt=0)] = 30.0
+    session_ttl_s: Annotated[float, Field(gt=0, le=31536000)] = 3600.0
+    """A session ends when nothing was observed in it for so long."""
+    max_sessions: PositiveInt = 1000
+    """Sessions that may live at once."""
+    max_sessions_per_key: PositiveInt = 100
+    """Sessions of one API key that may live at once."""
+    snapshot_every: PositiveInt = 32
+    """Observations of a session between two snapshots of its belief."""
+    keep_ended_sessions_s: NonNegativeFloat = 86_400.0
+    """What a session saw is kept for so long after its end, for its truths."""
+    session_sweep_s: PositiveFloat = 30.0
+    """Expired sessions are looked for this often."""
 
     @field_validator("weights_dir")
     @classmethod
