@@ -143,8 +143,8 @@ def _start(settings: Settings, metrics: Metrics, keys: KeyRing, run_job: RunJob,
         if error.hints.get("reason") != "disk_full":
             raise
         log.warning("nothing was discarded at start", extra={"why": error.message})  # who only reads is answered
-    if (told := fallback()) is not None:
-        log.warning("the default network is not installed", extra={"why": told})
+    if (missing := fallback()) is not None:
+        log.warning("the default network is not installed", extra={"why": missing})
     evaluators = EvaluatorPool(settings.compute())
     evaluators.load_all({record.name: record.evaluator for record in catalog.domains()})
     maps_ = Maps(catalog)
@@ -204,15 +204,8 @@ def _start(settings: Settings, metrics: Metrics, keys: KeyRing, run_job: RunJob,
         log.warning("runs open: no key was ever created, so whoever reaches this address may do all", extra=exposure)
     else:
         log.info("asks for keys", extra=exposure)
-    log.info(
-        "opened",
-        extra={
-            "n_domains": len(catalog.domains()),
-            "n_maps": maps_.n_loaded,
-            "n_sessions": live.n_living,
-            "damaged": list(damaged),
-        },
-    )
+    counts = {"n_domains": len(catalog.domains()), "n_maps": maps_.n_loaded, "n_sessions": live.n_living}
+    log.info("opened", extra={**counts, "damaged": list(damaged)})
     return Services(
         settings=settings,
         metrics=metrics,

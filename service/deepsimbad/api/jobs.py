@@ -205,9 +205,9 @@ async def post_remap(
     job_id = id_under_key(request, REMAP, domain, idempotency_key)
 
     def submit() -> JobAnswer:
-        made = running.runner.made_before(job_id, config)
-        if made is not None:
-            return render_job(made)
+        before = running.runner.made_before(job_id, config)
+        if before is not None:
+            return render_job(before)
         record = running.catalog.domain(domain)
         for name in (config.training_traverse, config.landmark_traverse, config.check_traverse):
             if name is not None:

@@ -252,9 +252,9 @@ def _finite(values: NDArray[np.float64] | None, ids: NDArray[np.int64]) -> list[
     """Values at these ids, None where unknown."""
     if values is None:
         return [None] * ids.size
-    known = values[ids].astype(object)
-    known[~np.isfinite(values[ids])] = None
-    return list(known)
+    chosen = values[ids].astype(object)
+    chosen[~np.isfinite(values[ids])] = None
+    return list(chosen)
 
 
 # Handlers

@@ -75,6 +75,8 @@ class Metrics:
 
     Attributes:
         content_type: Of `render()`.
+        request_began: Counts a request as being answered.
+        committed: Takes the number of writes in one transaction of the sessions' file.
     """
 
     content_type = CONTENT_TYPE_LATEST
@@ -106,7 +108,7 @@ class Metrics:
         what = "Observations of sessions: accepted, repeated (counted before), or the code of what was wrong."
         self._observations = counter("observations", what, "outcome")
         what = "Writes that shared one transaction of the sessions' file."
-        self._commit_writes = histogram("session_commit_writes", what, _BATCH_BUCKETS)
+        self.committed = histogram("session_commit_writes", what, _BATCH_BUCKETS).observe
         what = "Requests turned away for what they are or how many, by reason."
         self._refused = counter("refused_requests", what, "reason")
         self._job_seconds = histogram(
@@ -115,6 +117,7 @@ class Metrics:
         self._in_flight = Gauge(
             "deepsimbad_requests_in_flight", "Requests being answered now.", registry=self._registry
         )
+        self.request_began = self._in_flight.inc
         ProcessCollector(registry=self._registry)
         self._state: StateCollector | None = None
         self._domains: set[str] = set()  # that have series here
@@ -124,10 +127,6 @@ class Metrics:
         """Show this state too, from now on."""
         self._state = StateCollector(state)
         self._registry.register(self._state)
-
-    def request_began(self) -> None:
-        """Count a request as being answered."""
-        self._in_flight.inc()
 
     def request_ended(self, method: str, route: str, status: int, seconds: float) -> None:
         """Count a request as answered."""
@@ -156,10 +155,6 @@ class Metrics:
     def observed(self, outcome: str) -> None:
         """Count an observation of a session: "accepted", "repeated" or an error's code."""
         self._observations.labels(outcome).inc()
-
-    def committed(self, n_writes: int) -> None:
-        """Record one transaction of the sessions' file."""
-        self._commit_writes.observe(n_writes)
 
     def refused(self, reason: str) -> None:
         """Count what was turned away: an error's code, or the setting whose limit was met."""
