@@ -17,11 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.common import RESULTS, describe, real_recordings
-from deepsimbad.core.descriptor import rank_landmarks
+from deepsimbad.core.descriptor import LandmarkStatistics, rank_landmarks
 from deepsimbad.core.drive import LEAST_CORRELATION, LEAST_PLACES, SIGNIFICANCE, judge
 from deepsimbad.core.landmark_model import select_landmarks
 from deepsimbad.core.route import Route, same_places
-from deepsimbad.core.statistics import LandmarkStatistics
 from deepsimbad.evaluators.base import Evaluator, Image
 from deepsimbad.evaluators.feature_l2 import FeatureL2
 from deepsimbad.evaluators.image import decode_image

@@ -3,7 +3,7 @@
     python -m bench.onboard
 
 A robot that encodes on board sends m landmark ids. Landmarks that it does not send are judged by what is usual for
-them and by how they go together (`deepsimbad.core.statistics`); the table shows beside it what came of giving each the
+them and by how they go together (`deepsimbad.core.descriptor`); the table shows beside it what came of giving each the
 mean of the ranks left.
 """
 
@@ -21,14 +21,19 @@ from numpy.typing import NDArray
 from bench.common import RESULTS, describe, real_recordings
 from bench.nordland import LANDMARK_FRAMES, MAP_FRAMES, kept_frames
 from deepsimbad.core.building import build_map
-from deepsimbad.core.descriptor import normal_scores, pack_ranked_landmarks, rank_landmarks, ranks_from_ranked_landmarks
+from deepsimbad.core.descriptor import (
+    LandmarkStatistics,
+    normal_scores,
+    pack_ranked_landmarks,
+    rank_landmarks,
+    ranks_from_ranked_landmarks,
+)
 from deepsimbad.core.drive import Drive, SecondSeason
 from deepsimbad.core.landmark_model import select_landmarks
 from deepsimbad.core.map import Map
 from deepsimbad.core.metrics import RetrievalScorer
 from deepsimbad.core.relevance import Query, Relevance
 from deepsimbad.core.retrieval import relevances, sum_listed
-from deepsimbad.core.statistics import LandmarkStatistics
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.feature_l2 import FeatureL2
 from deepsimbad.evaluators.registry import evaluator_config, make_evaluator

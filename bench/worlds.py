@@ -7,11 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from deepsimbad.core.descriptor import rank_landmarks
+from deepsimbad.core.descriptor import LandmarkStatistics, rank_landmarks
 from deepsimbad.core.drive import Drive
 from deepsimbad.core.map import Map
 from deepsimbad.core.relevance import Relevance
-from deepsimbad.core.statistics import LandmarkStatistics
 from deepsimbad.store.traverses import Traverse
 
 NCLT_IMAGES = 26_208  # one traverse of the paper

@@ -9,12 +9,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from deepsimbad.core.building import DEFAULT_CORRELATION, append_drive, both_seasons, live_prior, nearest_known
-from deepsimbad.core.descriptor import nearest_landmarks, normal_scores, rank_landmarks
+from deepsimbad.core.descriptor import LandmarkStatistics, nearest_landmarks, normal_scores, rank_landmarks
 from deepsimbad.core.drive import SecondSeason, second_season
 from deepsimbad.core.map import UNKNOWN_FRAME
 from deepsimbad.core.relevance import Query, Relevance
 from deepsimbad.core.retrieval import relevances
-from deepsimbad.core.statistics import LandmarkStatistics
 
 from .conftest import a_drive, a_map
 

@@ -7,12 +7,11 @@ from statistics import NormalDist
 import numpy as np
 import pytest
 
-from deepsimbad.core.descriptor import rank_landmarks
+from deepsimbad.core.descriptor import PRIOR_WEIGHT_FRAMES, LandmarkStatistics, rank_landmarks
 from deepsimbad.core.drive import SecondSeason
 from deepsimbad.core.map import Map
 from deepsimbad.core.relevance import Query, Relevance, UpdateRule, evidence
 from deepsimbad.core.retrieval import relevances, shortlist, sum_listed
-from deepsimbad.core.statistics import PRIOR_WEIGHT_FRAMES, LandmarkStatistics
 from deepsimbad.errors import InvalidInputError, InvalidMapConfigError
 
 from .conftest import a_map

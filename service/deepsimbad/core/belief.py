@@ -334,12 +334,16 @@ def summarise(route: Route, mass: NDArray[np.float64], n_top: int, off_route: fl
     top = shortlist(mass, n_top)
     mean_m, std_m = _moments(route, mass)
     edges_m, bins = route.histogram
-    held = mass[mass > 0]
+    held, position_m = mass[mass > 0], route.position_m
+    twice, unrolled_m = mass, position_m
+    if route.closed:
+        twice, unrolled_m = np.r_[mass, mass], np.r_[position_m, position_m + route.length_m]
+    first, last = _shortest_stretch(np.r_[0.0, np.cumsum(twice)], unrolled_m, mass.size)
     return BeliefSummary(
         mean_m=mean_m,
-        mode_m=float(route.position_m[top[0]]),
+        mode_m=float(position_m[top[0]]),
         std_m=std_m,
-        credible_95_m=_credible_stretch(route, mass),
+        credible_95_m=(float(position_m[first]), float(position_m[last % mass.size])),
         entropy_bits=max(0.0, float(-(held * np.log2(held)).sum())),
         off_route=off_route,
         histogram_edges_m=edges_m,
@@ -356,24 +360,19 @@ def _moments(route: Route, mass: NDArray[np.float64]) -> tuple[float, float]:
         turn = 2 * np.pi / route.length_m
         resultant = (mass * np.exp(1j * turn * (position - route.start_m))).sum()
         mean = route.start_m + (np.angle(resultant) / turn) % route.length_m
+        offset = route.offset_m(position, float(mean))
     else:
         mean = (mass * position).sum()
-    offset = route.offset_m(position, float(mean))
+        offset = position - mean
     return float(mean), float(np.sqrt((mass * np.square(offset)).sum()))
-
-
-def _credible_stretch(route: Route, mass: NDArray[np.float64]) -> tuple[float, float]:
-    """Shortest stretch of images whose masses reach 95 %, by sliding its end for every start."""
-    position, n = route.position_m, mass.size
-    twice = np.r_[mass, mass] if route.closed else mass
-    unrolled = np.r_[position, position + route.length_m] if route.closed else position
-    first, last = _shortest_stretch(np.r_[0.0, np.cumsum(twice)], unrolled, n)
-    return float(position[first]), float(position[last % n])
 
 
 @njit(cache=True, nogil=True)
 def _shortest_stretch(before: NDArray[np.float64], position_m: NDArray[np.float64], n_starts: int) -> tuple[int, int]:
-    """First and last image of the stretch; `before` is the mass before every image, and after the last."""
+    """First and last image of the shortest stretch of images whose masses reach 95 %, its end slid for every start.
+
+    `before` is the mass before every image, and after the last.
+    """
     best_first, best_last, shortest_m = 0, position_m.size - 1, np.inf
     last = 0
     for first in range(n_starts):

@@ -21,12 +21,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from deepsimbad.core.descriptor import nearest_landmarks, rank_landmarks
+from deepsimbad.core.descriptor import (
+    CALIBRATED_PRIOR_WEIGHT_FRAMES,
+    LandmarkStatistics,
+    common_factors,
+    nearest_landmarks,
+    rank_landmarks,
+)
 from deepsimbad.core.drive import UNKNOWN_TIMESTAMP, Drive, SecondSeason
 from deepsimbad.core.map import Map
 from deepsimbad.core.nnql import NnqlConfig
 from deepsimbad.core.relevance import Relevance
-from deepsimbad.core.statistics import CALIBRATED_PRIOR_WEIGHT_FRAMES, LandmarkStatistics, common_factors
 from deepsimbad.errors import InvalidMapConfigError
 
 # Without two seasons of one place nothing can be learnt; this is what the development recordings show on average.

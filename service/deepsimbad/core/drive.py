@@ -25,9 +25,8 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from deepsimbad.core.descriptor import normal_scores, rank_landmarks
+from deepsimbad.core.descriptor import LandmarkStatistics, normal_scores, rank_landmarks
 from deepsimbad.core.route import Route, same_places
-from deepsimbad.core.statistics import LandmarkStatistics
 from deepsimbad.errors import InvalidEncodingError, InvalidInputError, InvalidMapConfigError, InvalidRouteError
 
 UNKNOWN_TIMESTAMP = -1

@@ -6,7 +6,6 @@ however often a journal is replayed.
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,12 +18,12 @@ from deepsimbad.core.belief import (
     ParticleFilter,
     motion_std_m,
 )
+from deepsimbad.core.descriptor import LandmarkStatistics
 from deepsimbad.core.map import Map
 from deepsimbad.core.off_route import OFF_ROUTE_AT_START, OffRouteModel, agreement_of
 from deepsimbad.core.planners import DEFAULT_PLANNER, Plan, PlanningView, parse_planner
 from deepsimbad.core.relevance import Query, UpdateRule
 from deepsimbad.core.retrieval import relevances
-from deepsimbad.core.statistics import LandmarkStatistics
 
 _STAGES = ("retrieve", "predict", "update", "plan")
 
@@ -142,8 +141,7 @@ class ActiveLocalizer:
         after = LocalizerState(belief, live, relevance, off_route, number + 1)
         plan = self.plan(after)
         laps.append(self._clock())
-        timings_ms = {stage: 1000 * (end - start) for stage, (start, end) in zip(_STAGES, pairwise(laps), strict=True)}
-        return Step(after, plan, timings_ms)
+        return Step(after, plan, dict(zip(_STAGES, (1000 * np.diff(laps)).tolist(), strict=True)))
 
     def plan(self, state: LocalizerState) -> Plan | None:
         """The next best view from what is known now."""

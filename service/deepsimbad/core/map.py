@@ -12,11 +12,15 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from deepsimbad.core.descriptor import MAX_LANDMARKS
+from deepsimbad.core.descriptor import (
+    CALIBRATED_PRIOR_WEIGHT_FRAMES,
+    MAX_LANDMARKS,
+    PRIOR_WEIGHT_FRAMES,
+    LandmarkStatistics,
+)
 from deepsimbad.core.landmark_model import PortableLandmarks, landmark_model_digest, pack_landmarks
 from deepsimbad.core.relevance import DEFAULT_UPDATE, Relevance, UpdateRule
 from deepsimbad.core.route import Route
-from deepsimbad.core.statistics import CALIBRATED_PRIOR_WEIGHT_FRAMES, PRIOR_WEIGHT_FRAMES, LandmarkStatistics
 from deepsimbad.errors import InvalidMapConfigError, LandmarkModelDiffersError
 
 UNKNOWN_FRAME = 0  # no digest was kept of what an image was made of
@@ -128,9 +132,7 @@ class Map:
             )
             if array.dtype != row.dtype or not fits:
                 raise InvalidMapConfigError(f"{name} is {array.dtype} {array.shape}, not {row.dtype} {list(shape)}")
-        if (
-            self.list_length > self.n_landmarks or int(self.lists.max()) >= self.n_landmarks
-        ):  # scoring does not ask again
+        if self.list_length > self.n_landmarks or self.lists.max() >= self.n_landmarks:  # scoring does not ask again
             raise InvalidMapConfigError(
                 f"lists of {self.list_length} name landmarks that are not among the {self.n_landmarks}"
             )

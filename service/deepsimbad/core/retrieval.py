@@ -8,9 +8,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from deepsimbad.core.descriptor import LandmarkStatistics
 from deepsimbad.core.map import Map
 from deepsimbad.core.relevance import Query, Relevance
-from deepsimbad.core.statistics import LandmarkStatistics
 from deepsimbad.errors import InvalidInputError, InvalidMapConfigError
 
 _BLOCK = 4096  # images whose sums stay in the first-level cache

@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 
 from deepsimbad.core.belief import motion_std_m
 from deepsimbad.core.belief_lattice import Lattice, Moves, moves_along, step_beliefs, uniform_beliefs
+from deepsimbad.core.descriptor import LandmarkStatistics
 from deepsimbad.core.map import Map
 from deepsimbad.core.nnql import NnqlConfig, Transitions, initial_q_values, learn, q_of_nearest
 from deepsimbad.core.relevance import Query, UpdateRule, evidence
 from deepsimbad.core.retrieval import relevances, shortlist
 from deepsimbad.core.route import Route
-from deepsimbad.core.statistics import LandmarkStatistics
 
 EPISODES_A_POINT = 100  # of the learning curve
 _EVALUATION = 0xE7A1  # part of the evaluation's seed, which no batch of training has

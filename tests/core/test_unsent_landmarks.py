@@ -8,13 +8,12 @@ from statistics import NormalDist
 import numpy as np
 import pytest
 
-from deepsimbad.core.descriptor import rank_landmarks, ranks_from_ranked_landmarks
+from deepsimbad.core.descriptor import LandmarkStatistics, common_factors, rank_landmarks, ranks_from_ranked_landmarks
 from deepsimbad.core.drive import SecondSeason
 from deepsimbad.core.landmark_model import select_landmarks
 from deepsimbad.core.metrics import RetrievalScorer
 from deepsimbad.core.relevance import Query, Relevance
 from deepsimbad.core.retrieval import relevances
-from deepsimbad.core.statistics import LandmarkStatistics, common_factors
 from deepsimbad.evaluators.feature_l2 import FeatureL2
 
 from .conftest import a_map
