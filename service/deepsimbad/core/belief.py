@@ -40,14 +40,10 @@ def motion_std_m(action_m: float) -> float:
 
 @dataclass(frozen=True)
 class GridFilter:
-    """Masses of the map images.
-
-    Attributes:
-        mass: [n] float64; sums to 1.
-    """
+    """Masses of the map images."""
 
     route: Route
-    mass: NDArray[np.float64]
+    mass: NDArray[np.float64]  # [n] float64; sums to 1
 
     @classmethod
     def uniform(cls, route: Route) -> Self:
@@ -207,18 +203,12 @@ def _spread(  # noqa: PLR0912 - one pass over a band and its two wrapped ends
 
 @dataclass(frozen=True)
 class ParticleFilter:
-    """Particles. Whatever is random is drawn from (seed, step), so that no generator's state need be kept.
-
-    Attributes:
-        position_m: [m] float64, hypotheses of the route position.
-        weight: [m] float64; sums to 1.
-        seed: Of all draws.
-    """
+    """Particles. Whatever is random is drawn from (seed, step), so that no generator's state need be kept."""
 
     route: Route
-    position_m: NDArray[np.float64]
-    weight: NDArray[np.float64]
-    seed: int
+    position_m: NDArray[np.float64]  # [m] float64, hypotheses of the route position
+    weight: NDArray[np.float64]  # [m] float64; sums to 1
+    seed: int  # of all draws
 
     @classmethod
     def uniform(cls, route: Route, n_particles: int = DEFAULT_N_PARTICLES, seed: int = 0) -> Self:
@@ -304,29 +294,21 @@ BeliefFilter: TypeAlias = GridFilter | ParticleFilter
 
 @dataclass(frozen=True)
 class BeliefSummary:
-    """A belief in a few numbers.
+    """A belief in a few numbers."""
 
-    Attributes:
-        mean_m, std_m: Mean and standard deviation of the position; circular on a closed route.
-        mode_m: Position of the map image with the greatest mass.
-        credible_95_m: The shortest stretch that holds 95 % of the mass; lo > hi crosses a closed route's start.
-        entropy_bits: Entropy over map images.
-        off_route: Probability that the robot is nowhere on the route; None where it is not calibrated.
-        histogram_edges_m, histogram_mass: Equal bins along the route, at most 200; [b + 1] and [b].
-        top: Ids of the map images with the greatest mass, best first.
-        top_mass: Their masses.
-    """
-
+    # mean_m, std_m: Mean and standard deviation of the position; circular on a closed route
     mean_m: float
-    mode_m: float
+    mode_m: float  # position of the map image with the greatest mass
     std_m: float
+    # The shortest stretch that holds 95 % of the mass; lo > hi crosses a closed route's start
     credible_95_m: tuple[float, float]
-    entropy_bits: float
-    off_route: float | None
+    entropy_bits: float  # entropy over map images
+    off_route: float | None  # probability that the robot is nowhere on the route; None where it is not calibrated
+    # histogram_edges_m, histogram_mass: Equal bins along the route, at most 200; [b + 1] and [b]
     histogram_edges_m: NDArray[np.float64]
     histogram_mass: NDArray[np.float64]
-    top: NDArray[np.int64]
-    top_mass: NDArray[np.float64]
+    top: NDArray[np.int64]  # ids of the map images with the greatest mass, best first
+    top_mass: NDArray[np.float64]  # their masses
 
 
 def summarise(route: Route, mass: NDArray[np.float64], n_top: int, off_route: float | None = None) -> BeliefSummary:

@@ -22,36 +22,22 @@ _BLOCK = 2048  # cells whose sums stay in the first-level cache
 
 @dataclass(frozen=True)
 class Moves:
-    """One move of every belief, in cells.
+    """One move of every belief, in cells."""
 
-    Attributes:
-        shift: [e] int64, whole cells; below 0: no move, this is a first view.
-        fraction: [e] float32, the part of a cell moved besides, 0..1.
-        taps: [e, 2w + 1] float32, weights of the move's error.
-    """
-
-    shift: NDArray[np.int64]
-    fraction: NDArray[np.float32]
-    taps: NDArray[np.float32]
+    shift: NDArray[np.int64]  # [e] int64, whole cells; below 0: no move, this is a first view
+    fraction: NDArray[np.float32]  # [e] float32, the part of a cell moved besides, 0..1
+    taps: NDArray[np.float32]  # [e, 2w + 1] float32, weights of the move's error
 
 
 @dataclass(frozen=True)
 class Lattice:
-    """Cells along a route.
+    """Cells along a route."""
 
-    Attributes:
-        step_m: Their length.
-        closed: The last joins the first.
-        image_of_cell: [c] int32, the map image nearest to every cell.
-        cell_of_image: [n] int64.
-        images_in_cell: [c] int32, how many map images have a cell as their nearest.
-    """
-
-    step_m: float
-    closed: bool
-    image_of_cell: NDArray[np.int32]
-    cell_of_image: NDArray[np.int64]
-    images_in_cell: NDArray[np.int32]
+    step_m: float  # their length
+    closed: bool  # the last joins the first
+    image_of_cell: NDArray[np.int32]  # [c] int32, the map image nearest to every cell
+    cell_of_image: NDArray[np.int64]  # [n] int64
+    images_in_cell: NDArray[np.int32]  # [c] int32, how many map images have a cell as their nearest
 
     @classmethod
     def along(cls, route: Route, shortest_action_m: float) -> "Lattice":
@@ -116,9 +102,7 @@ def step_beliefs(
     """Move, blur and update beliefs in place, and rank the truth's.
 
     Args:
-        lattice: Whose cells they are over.
         beliefs: [e, c] weights; come back with any total, which the next step takes into account.
-        moves: Of every belief.
         evidence: [e, n] of every map image.
         true_image: [e] map image nearest to the robot; below 0: unknown.
         additive: Evidence is added to weights of mean 1; else it multiplies them.

@@ -51,9 +51,7 @@ def build_map(
     """Describe every map image by the h landmarks its relevance keeps.
 
     Args:
-        relevance: What the map is built for.
         drive: The training traverse, its dissimilarities measured.
-        closed: Whether the route is a loop.
         second_season: Read by `calibrated` alone.
 
     Returns:

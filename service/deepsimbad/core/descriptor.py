@@ -183,32 +183,23 @@ def _scores_of_half_ranks(n_landmarks: int) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class ViewScores:
-    """What one view says of every landmark.
+    """What one view says of every landmark."""
 
-    Attributes:
-        z: [r] float64, standardised scores, lowest is nearest; expected ones where a landmark was not sent.
-        certainty: [r] float64, 1 less the variance of each, so 1 where it was sent; [1] where all were.
-    """
-
+    # [r] float64, standardised scores, lowest is nearest; expected ones where a landmark was not sent
     z: NDArray[np.float64]
+    # [r] float64, 1 less the variance of each, so 1 where it was sent; [1] where all were
     certainty: NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class LandmarkStatistics:
-    """Running mean and spread of every landmark's normal score, as weighted moments.
+    """Running mean and spread of every landmark's normal score, as weighted moments."""
 
-    Attributes:
-        weight: How many frames the moments are worth.
-        mean: [r] float64, mean normal score.
-        square: [r] float64, mean squared normal score.
-        loadings: [r, q] float32 on common factors, from which landmarks' correlations follow; None: not known, each is
-            taken for itself.
-    """
-
-    weight: float
-    mean: NDArray[np.float64]
-    square: NDArray[np.float64]
+    weight: float  # how many frames the moments are worth
+    mean: NDArray[np.float64]  # [r] float64, mean normal score
+    square: NDArray[np.float64]  # [r] float64, mean squared normal score
+    # [r, q] float32 on common factors, from which landmarks' correlations follow; None: not known, each is taken for
+    # itself
     loadings: NDArray[np.float32] | None = None
 
     @classmethod

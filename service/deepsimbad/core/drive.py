@@ -51,26 +51,18 @@ _Unknown: Any = None  # filled in by __post_init__
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Drive:
-    """Frames of one traverse, in the order they were driven.
+    """Frames of one traverse, in the order they were driven."""
 
-    Attributes:
-        position_m: Route position, [n] float64, at most MAX_POSITION_M either way; need not increase here.
-        encodings: [n, d] float32, finite.
-        index: Place in the whole recording, [n] int64, distinct, from 0.
-        timestamp_us: [n] int64, microseconds, -1 where unknown.
-        x_m: East, [n] float64, at most MAX_POSITION_M either way, NaN where unknown.
-        y_m: North, likewise.
-        weights_sha256: Of the network that encoded images among them; None where none did, or nobody knows.
-        dissimilarities: [n, r] float32 to a map's landmarks, smaller is nearer; None before they are measured.
-    """
-
+    # Route position, [n] float64, at most MAX_POSITION_M either way; need not increase here
     position_m: NDArray[np.float64]
-    encodings: NDArray[np.float32]
-    index: NDArray[np.int64] = _Unknown
-    timestamp_us: NDArray[np.int64] = _Unknown
-    x_m: NDArray[np.float64] = _Unknown
-    y_m: NDArray[np.float64] = _Unknown
+    encodings: NDArray[np.float32]  # [n, d] float32, finite
+    index: NDArray[np.int64] = _Unknown  # place in the whole recording, [n] int64, distinct, from 0
+    timestamp_us: NDArray[np.int64] = _Unknown  # [n] int64, microseconds, -1 where unknown
+    x_m: NDArray[np.float64] = _Unknown  # east, [n] float64, at most MAX_POSITION_M either way, NaN where unknown
+    y_m: NDArray[np.float64] = _Unknown  # north, likewise
+    # Of the network that encoded images among them; None where none did, or nobody knows
     weights_sha256: str | None = None
+    # [n, r] float32 to a map's landmarks, smaller is nearer; None before they are measured
     dissimilarities: NDArray[np.float32] | None = None
 
     def __post_init__(self) -> None:
@@ -195,37 +187,24 @@ def _reals(values: NDArray[np.float64], name: str) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class SecondSeason:
-    """What another drive of the mapped route tells of it.
+    """What another drive of the mapped route tells of it."""
 
-    Attributes:
-        dissimilarities: [m, r] of its frames to the landmarks.
-        places: [k, 2] int64, (map image, its frame) where both saw the same place; some.
-    """
-
-    dissimilarities: NDArray[np.float32]
-    places: NDArray[np.int64]
+    dissimilarities: NDArray[np.float32]  # [m, r] of its frames to the landmarks
+    places: NDArray[np.int64]  # [k, 2] int64, (map image, its frame) where both saw the same place; some
 
 
 @dataclass(frozen=True)
 class SameRoute:
-    """Whether a drive saw the mapped route.
+    """Whether a drive saw the mapped route."""
 
-    Attributes:
-        accepted: It did: the map may learn from it.
-        why: In a sentence, why it was not accepted; None where it was.
-        n_pairs: Frames that have a map image at their position.
-        correlation: Mean correlation of landmarks' scores at equal positions; None where nothing was compared.
-        statistic: Agreement at equal positions, in standard deviations of the agreement over all shifts; None
-            likewise.
-        significance: Chance that drives of two routes agree so well or better; None likewise.
-    """
-
-    accepted: bool
-    why: str | None
-    n_pairs: int
+    accepted: bool  # it did: the map may learn from it
+    why: str | None  # in a sentence, why it was not accepted; None where it was
+    n_pairs: int  # frames that have a map image at their position
+    # Mean correlation of landmarks' scores at equal positions; None where nothing was compared
     correlation: float | None = None
+    # Agreement at equal positions, in standard deviations of the agreement over all shifts; None likewise
     statistic: float | None = None
-    significance: float | None = None
+    significance: float | None = None  # chance that drives of two routes agree so well or better; None likewise
 
     def as_dict(self) -> dict[str, Any]:
         """The JSON form."""

@@ -19,17 +19,11 @@ from deepsimbad.core.route import Route
 
 @dataclass(frozen=True)
 class TestDrive:
-    """What the robot may see, and where it truly is.
+    """What the robot may see, and where it truly is."""
 
-    Attributes:
-        views: The described test frames, in the order they were driven; a batch.
-        route: Their positions.
-        true_image: [m] int64, the map image nearest to every test frame.
-    """
-
-    views: Query
-    route: Route
-    true_image: NDArray[np.int64]
+    views: Query  # the described test frames, in the order they were driven; a batch
+    route: Route  # their positions
+    true_image: NDArray[np.int64]  # [m] int64, the map image nearest to every test frame
 
     def starts(self, travel_m: float, count: int, seed: int) -> NDArray[np.int64]:
         """Frames [count], uniform over those from which so many metres fit."""
@@ -39,15 +33,10 @@ class TestDrive:
 
 @dataclass(frozen=True)
 class Episode:
-    """One episode.
+    """One episode."""
 
-    Attributes:
-        rank_share: [steps] share of map images placed before the truth after each move.
-        travelled_m: [steps] metres moved until then.
-    """
-
-    rank_share: NDArray[np.float64]
-    travelled_m: NDArray[np.float64]
+    rank_share: NDArray[np.float64]  # [steps] share of map images placed before the truth after each move
+    travelled_m: NDArray[np.float64]  # [steps] metres moved until then
 
 
 Chooser: TypeAlias = Callable[[int, Step, float], float]
@@ -56,19 +45,12 @@ Chooser: TypeAlias = Callable[[int, Step, float], float]
 
 @dataclass(frozen=True)
 class EpisodeRunner:
-    """Runs episodes with the localizer that ships.
+    """Runs episodes with the localizer that ships."""
 
-    Attributes:
-        localizer: The algorithm on a map.
-        drive: The test traverse.
-        n_steps: Moves an episode.
-        action_std_m: How far the filter trusts a move; None: as usual.
-    """
-
-    localizer: ActiveLocalizer
-    drive: TestDrive
-    n_steps: int
-    action_std_m: float | None = None
+    localizer: ActiveLocalizer  # the algorithm on a map
+    drive: TestDrive  # the test traverse
+    n_steps: int  # moves an episode
+    action_std_m: float | None = None  # how far the filter trusts a move; None: as usual
 
     def run(self, episode: int, start: int, choose: Chooser) -> Episode:
         """One episode from a test frame."""

@@ -120,19 +120,13 @@ def _squared_distances(candidates: NDArray[np.float32], others: NDArray[np.int64
 
 @dataclass(frozen=True)
 class PortableLandmarks:
-    """A map's landmark model and what a robot must know to rank by it.
+    """A map's landmark model and what a robot must know to rank by it."""
 
-    Attributes:
-        model: The evaluator's named arrays.
-        map_version: Of the map they come from.
-        evaluator: The evaluator's configuration.
-        weights_sha256: Of the weights that the map's images were encoded by; "" where nobody knows or there are none.
-    """
-
-    model: Mapping[str, NDArray[np.generic]]
+    model: Mapping[str, NDArray[np.generic]]  # the evaluator's named arrays
     n_landmarks: int
-    map_version: int
-    evaluator: Mapping[str, Any]
+    map_version: int  # of the map they come from
+    evaluator: Mapping[str, Any]  # the evaluator's configuration
+    # Of the weights that the map's images were encoded by; "" where nobody knows or there are none
     weights_sha256: str = ""
 
 

@@ -30,62 +30,38 @@ _STAGES = ("retrieve", "predict", "update", "plan")
 
 @dataclass(frozen=True)
 class LocalizerConfig:
-    """How a robot is localized.
+    """How a robot is localized."""
 
-    Attributes:
-        filter: The exact grid or the paper's particles.
-        update: How a view counts; None: as the map's relevance wants.
-        planner: By name; None: the default.
-        seed: Of whatever is random.
-        n_particles: Of the particle filter.
-    """
-
-    filter: FilterKind = FilterKind.GRID
-    update: UpdateRule | None = None
-    planner: str | None = None
-    seed: int = 0
-    n_particles: int = DEFAULT_N_PARTICLES
+    filter: FilterKind = FilterKind.GRID  # the exact grid or the paper's particles
+    update: UpdateRule | None = None  # how a view counts; None: as the map's relevance wants
+    planner: str | None = None  # by name; None: the default
+    seed: int = 0  # of whatever is random
+    n_particles: int = DEFAULT_N_PARTICLES  # of the particle filter
 
 
 @dataclass(frozen=True)
 class LocalizerState:
-    """All that is known of one robot. Immutable: a step makes a new one.
+    """All that is known of one robot. Immutable: a step makes a new one."""
 
-    Attributes:
-        belief: Where it is, if it is on the route.
-        live: What is usual for each landmark, from the map's statistics on; None where the relevance has none.
-        relevance: [n] of the last view; None before any.
-        off_route: Probability that it is nowhere on the route; None where the map has not learnt to tell.
-        n_observations: Views so far.
-    """
-
-    belief: BeliefFilter
+    belief: BeliefFilter  # where it is, if it is on the route
+    # What is usual for each landmark, from the map's statistics on; None where the relevance has none
     live: LandmarkStatistics | None
-    relevance: NDArray[np.float32] | None
-    off_route: float | None
-    n_observations: int
+    relevance: NDArray[np.float32] | None  # [n] of the last view; None before any
+    off_route: float | None  # probability that it is nowhere on the route; None where the map has not learnt to tell
+    n_observations: int  # views so far
 
 
 @dataclass(frozen=True)
 class Step:
-    """What one observation came to.
+    """What one observation came to."""
 
-    Attributes:
-        state: The state after it.
-        plan: The recommended next move; None where the planner has nothing to go by.
-        timings_ms: Milliseconds by stage.
-    """
-
-    state: LocalizerState
-    plan: Plan | None
-    timings_ms: dict[str, float]
+    state: LocalizerState  # the state after it
+    plan: Plan | None  # the recommended next move; None where the planner has nothing to go by
+    timings_ms: dict[str, float]  # milliseconds by stage
 
 
 class ActiveLocalizer:
-    """Localizes one robot on one map.
-
-    Args:
-        clock: Seconds, by which the stages of a step are timed.
+    """Localizes one robot on one map; `clock` gives seconds, by which the stages of a step are timed.
 
     Raises:
         InvalidInputError: The domain has no such planner.
@@ -110,7 +86,6 @@ class ActiveLocalizer:
         """One observation.
 
         Args:
-            state: Before it.
             action_m: Metres moved since the last view; ignored for the first.
             action_std_m: How sure that is; None: as odometry usually is.
 

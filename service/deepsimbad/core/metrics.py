@@ -12,20 +12,13 @@ _LEVELS = (2.5, 97.5)
 
 @dataclass(frozen=True)
 class RetrievalScores:
-    """What a set of queries scored.
+    """What a set of queries scored."""
 
-    Attributes:
-        anr: Averaged normalised rank in percent; 0 is perfect, 50 chance.
-        recall_at: R@k in percent by k.
-        n_queries: Queries scored.
-        n_left_out: Queries without a true image among the map's.
-        normalised_ranks: [n_queries] share of map images placed before the truth, 0..1, in query order.
-    """
-
-    anr: float
-    recall_at: dict[int, float]
-    n_queries: int
-    n_left_out: int
+    anr: float  # averaged normalised rank in percent; 0 is perfect, 50 chance
+    recall_at: dict[int, float]  # R@k in percent by k
+    n_queries: int  # queries scored
+    n_left_out: int  # queries without a true image among the map's
+    # [n_queries] share of map images placed before the truth, 0..1, in query order
     normalised_ranks: NDArray[np.float64]
 
 

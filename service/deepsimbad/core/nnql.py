@@ -22,40 +22,26 @@ from deepsimbad.errors import InvalidInputError, InvalidMapConfigError, PastTheE
 
 @dataclass(frozen=True)
 class NnqlConfig:
-    """The hyperparameters, with the paper's values where it gives one (III).
+    """The hyperparameters, with the paper's values where it gives one (III)."""
 
-    Attributes:
-        n_episodes: Training episodes.
-        n_actions_per_episode: Moves of one episode, after its first view.
-        learning_rate: Alpha, the share of the way an entry moves towards its target.
-        discount: Gamma.
-        initial_q: What an entry holds before anything is learnt.
-        reward: For a belief that places the truth well.
-        top_share: Share of the map images among which the true viewpoint's belief must rank to earn the reward.
-        n_neighbours: k, map images that stand for one view.
-        exploration: Epsilon at the first episode: how often a move is drawn at random. Not given in the paper.
-        final_exploration: Epsilon at the last episode; between the two it falls in a straight line.
-        update: How a view changes the belief; None: as the map's relevance does by default.
-        motion_std_m: Standard deviation of a move; None: `filters.motion_std_m`.
-        batch_episodes: Episodes that move in lockstep: each step acts on the same Q-values, then learns from all of
-            them in their order. It decides speed, and hardly the result.
-        seed: Of every draw.
-    """
-
-    n_episodes: int = 10_000
-    n_actions_per_episode: int = 10
-    learning_rate: float = 0.1
-    discount: float = 0.9
-    initial_q: float = 1e-4
-    reward: float = 100.0
+    n_episodes: int = 10_000  # training episodes
+    n_actions_per_episode: int = 10  # moves of one episode, after its first view
+    learning_rate: float = 0.1  # alpha, the share of the way an entry moves towards its target
+    discount: float = 0.9  # gamma
+    initial_q: float = 1e-4  # what an entry holds before anything is learnt
+    reward: float = 100.0  # for a belief that places the truth well
+    # Share of the map images among which the true viewpoint's belief must rank to earn the reward
     top_share: float = 0.10
-    n_neighbours: int = 4
+    n_neighbours: int = 4  # k, map images that stand for one view
+    # Epsilon at the first episode: how often a move is drawn at random. Not given in the paper.
     exploration: float = 1.0
-    final_exploration: float = 0.1
-    update: UpdateRule | None = None
-    motion_std_m: float | None = None
+    final_exploration: float = 0.1  # epsilon at the last episode; between the two it falls in a straight line
+    update: UpdateRule | None = None  # how a view changes the belief; None: as the map's relevance does by default
+    motion_std_m: float | None = None  # standard deviation of a move; None: `filters.motion_std_m`
+    # Episodes that move in lockstep: each step acts on the same Q-values, then learns from all of them in their order.
+    # It decides speed, and hardly the result.
     batch_episodes: int = 100
-    seed: int = 0
+    seed: int = 0  # of every draw
 
     def __post_init__(self) -> None:
         counts = (self.n_actions_per_episode, self.n_neighbours, self.batch_episodes)
@@ -78,21 +64,13 @@ class NnqlConfig:
 
 @dataclass(frozen=True)
 class Transitions:
-    """Moves whose outcome is known, in the order they are learnt.
+    """Moves whose outcome is known, in the order they are learnt."""
 
-    Attributes:
-        nearest: [t, k] int64, map images most relevant to the view before the move.
-        action: [t] int64, place of the move among the domain's actions.
-        reward: [t] float64.
-        next_nearest: [t, k] int64, of the view after the move.
-        next_allowed: [t, a] bool, the moves that are possible from there; none: the route ends.
-    """
-
-    nearest: NDArray[np.int64]
-    action: NDArray[np.int64]
-    reward: NDArray[np.float64]
-    next_nearest: NDArray[np.int64]
-    next_allowed: NDArray[np.bool_]
+    nearest: NDArray[np.int64]  # [t, k] int64, map images most relevant to the view before the move
+    action: NDArray[np.int64]  # [t] int64, place of the move among the domain's actions
+    reward: NDArray[np.float64]  # [t] float64
+    next_nearest: NDArray[np.int64]  # [t, k] int64, of the view after the move
+    next_allowed: NDArray[np.bool_]  # [t, a] bool, the moves that are possible from there; none: the route ends
 
 
 def initial_q_values(n_images: int, n_actions: int, config: NnqlConfig) -> NDArray[np.float32]:
@@ -151,17 +129,11 @@ def _learn(
 
 @dataclass(frozen=True)
 class KnownWalk:
-    """A session's views and moves, and where they truly were.
+    """A session's views and moves, and where they truly were."""
 
-    Attributes:
-        queries: The t described views, in order.
-        action_m: [t] metres moved before every view; the first is not read.
-        true_position_m: [t] route positions; NaN where unknown.
-    """
-
-    queries: Sequence[Query]
-    action_m: NDArray[np.float64]
-    true_position_m: NDArray[np.float64]
+    queries: Sequence[Query]  # the t described views, in order
+    action_m: NDArray[np.float64]  # [t] metres moved before every view; the first is not read
+    true_position_m: NDArray[np.float64]  # [t] route positions; NaN where unknown
 
     def __post_init__(self) -> None:
         if not len(self.queries) == self.action_m.size == self.true_position_m.size:

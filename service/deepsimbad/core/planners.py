@@ -39,16 +39,11 @@ class PlanningView:
 
 @dataclass(frozen=True)
 class Plan:
-    """A recommended move.
+    """A recommended move."""
 
-    Attributes:
-        planner: Who recommends it.
-        action_m: The move.
-        values: [a] what the planner thought of every move, larger is better; None where it did not compare.
-    """
-
-    planner: str
-    action_m: float
+    planner: str  # who recommends it
+    action_m: float  # the move
+    # [a] what the planner thought of every move, larger is better; None where it did not compare
     values: NDArray[np.float64] | None = None
 
 

@@ -28,17 +28,12 @@ DEFAULT_RELEVANCE = Relevance.CALIBRATED
 
 @dataclass(frozen=True)
 class Query:
-    """One described view; or a batch of them, where every array has a leading axis [e] and all landmarks are ranked.
+    """One described view; or a batch of them, where every array has a leading axis [e] and all landmarks are ranked."""
 
-    Attributes:
-        ranks: [r] float32, 1..r, of all landmarks.
-        dissimilarities: [r] float32, smaller is nearer; None when a robot sent ranks alone.
-        encoding: [d] float32; None when a robot sent no encoding.
-    """
-
-    ranks: NDArray[np.float32]
+    ranks: NDArray[np.float32]  # [r] float32, 1..r, of all landmarks
+    # [r] float32, smaller is nearer; None when a robot sent ranks alone
     dissimilarities: NDArray[np.float32] | None = None
-    encoding: NDArray[np.float32] | None = None
+    encoding: NDArray[np.float32] | None = None  # [d] float32; None when a robot sent no encoding
 
     @classmethod
     def uninformative(cls, n_landmarks: int) -> "Query":

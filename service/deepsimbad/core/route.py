@@ -26,16 +26,11 @@ class Places:
 
 @dataclass(frozen=True)
 class Route:
-    """Route positions of the map images, in route order.
+    """Route positions of the map images, in route order."""
 
-    Attributes:
-        position_m: [n] float64, non-decreasing, metres driven along the route.
-        closed: The end joins the start.
-        x_m, y_m: [n] float64 in the recording's plane, NaN where unknown; None where never known.
-    """
-
-    position_m: NDArray[np.float64]
-    closed: bool = False
+    position_m: NDArray[np.float64]  # [n] float64, non-decreasing, metres driven along the route
+    closed: bool = False  # the end joins the start
+    # x_m, y_m: [n] float64 in the recording's plane, NaN where unknown; None where never known
     x_m: NDArray[np.float64] | None = None
     y_m: NDArray[np.float64] | None = None
 

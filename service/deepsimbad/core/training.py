@@ -25,29 +25,18 @@ _CELLS_AT_ONCE = 300_000  # of one thread: its episodes' beliefs and evidence st
 
 @dataclass(frozen=True)
 class TrainingWorld:
-    """A drive along the map's route, on which a robot can be moved.
+    """A drive along the map's route, on which a robot can be moved."""
 
-    Attributes:
-        map: What its frames look at; none of them is an image of it.
-        views: The m described frames, as a batch.
-        rule: How a view's relevance becomes evidence.
-        n_neighbours: k, how many nearest map images a view has.
-        lattice: Of the map's route.
-        true_image: [m] int64, the map image nearest to every frame; -1 where there is none.
-        next_frame: [m, a] int64, the frame nearest to where a move leads; -1 where the drive ends before.
-        start_frames: Where episodes may start.
-        moves: [a] the moves on the lattice.
-    """
-
-    map: Map
-    views: Query
-    rule: UpdateRule
-    n_neighbours: int
-    lattice: Lattice
-    true_image: NDArray[np.int64]
+    map: Map  # what its frames look at; none of them is an image of it
+    views: Query  # the m described frames, as a batch
+    rule: UpdateRule  # how a view's relevance becomes evidence
+    n_neighbours: int  # k, how many nearest map images a view has
+    lattice: Lattice  # of the map's route
+    true_image: NDArray[np.int64]  # [m] int64, the map image nearest to every frame; -1 where there is none
+    # [m, a] int64, the frame nearest to where a move leads; -1 where the drive ends before
     next_frame: NDArray[np.int64]
-    start_frames: NDArray[np.int64]
-    moves: Moves
+    start_frames: NDArray[np.int64]  # where episodes may start
+    moves: Moves  # [a] the moves on the lattice
 
     @classmethod
     def on(
@@ -167,17 +156,11 @@ class Walk:
 
 @dataclass(frozen=True)
 class LearningCurve:
-    """How training went.
+    """How training went."""
 
-    Attributes:
-        reward_share: Share of the moves that earned the reward, by hundred episodes.
-        greedy_reward_share: The same of the learnt values without exploration.
-        random_reward_share: Of random moves from the same starts.
-    """
-
-    reward_share: tuple[float, ...]
-    greedy_reward_share: float
-    random_reward_share: float
+    reward_share: tuple[float, ...]  # share of the moves that earned the reward, by hundred episodes
+    greedy_reward_share: float  # the same of the learnt values without exploration
+    random_reward_share: float  # of random moves from the same starts
 
     def as_dict(self) -> dict[str, Any]:
         """JSON-ready."""

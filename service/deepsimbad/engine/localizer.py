@@ -27,47 +27,29 @@ _LARGEST_DISSIMILARITY = 1e15
 
 @dataclass(frozen=True)
 class Retrieval:
-    """How well every map image answers one view.
+    """How well every map image answers one view."""
 
-    Attributes:
-        ranks: [r] float32, 1..r, the landmarks of the view.
-        relevance: [n] float32, larger is better.
-        timings_ms: Milliseconds by stage.
-    """
-
-    ranks: NDArray[np.float32]
-    relevance: NDArray[np.float32]
-    timings_ms: Mapping[str, float]
+    ranks: NDArray[np.float32]  # [r] float32, 1..r, the landmarks of the view
+    relevance: NDArray[np.float32]  # [n] float32, larger is better
+    timings_ms: Mapping[str, float]  # milliseconds by stage
 
 
 @dataclass(frozen=True)
 class Localization:
-    """The answer to one view.
+    """The answer to one view."""
 
-    Attributes:
-        snapshot: The map that answered.
-        retrieval: Of all map images.
-        shortlist: Ids of the most relevant ones, best first.
-        belief: After this one view, from a uniform prior.
-        plan: The move that would tell most next; None where the map can name none.
-        timings_ms: Milliseconds by stage.
-    """
-
-    snapshot: Map
-    retrieval: Retrieval
-    shortlist: NDArray[np.int64]
-    belief: BeliefSummary
-    plan: Plan | None
-    timings_ms: Mapping[str, float]
+    snapshot: Map  # the map that answered
+    retrieval: Retrieval  # of all map images
+    shortlist: NDArray[np.int64]  # ids of the most relevant ones, best first
+    belief: BeliefSummary  # after this one view, from a uniform prior
+    plan: Plan | None  # the move that would tell most next; None where the map can name none
+    timings_ms: Mapping[str, float]  # milliseconds by stage
 
 
 def localize(snapshot: Map, evaluator: Evaluator, view: View, n_shortlist: int | None = None) -> Localization:
     """Localize one view on its own.
 
     Args:
-        snapshot: The map.
-        evaluator: The domain's.
-        view: What the robot sent.
         n_shortlist: Length of the shortlist and of the belief's top, 1..n; None: 10, or n where that is less.
 
     Raises:

@@ -51,19 +51,13 @@ def views_of(drive: Drive) -> Query:
 
 @dataclass(frozen=True)
 class Built:
-    """A described traverse.
+    """A described traverse."""
 
-    Attributes:
-        map: As it will serve, but for its experience database.
-        rehearsal: The map made without the second season's lists, for learning from that season as from one to come.
-        second: The second drive, measured, where it is of the same route; None: nothing can be learnt from it.
-        same_route: Whether it is, and why not; None where there is no second drive.
-    """
-
-    map: Map
-    rehearsal: Map
+    map: Map  # as it will serve, but for its experience database
+    rehearsal: Map  # the map made without the second season's lists, for learning from that season as from one to come
+    # The second drive, measured, where it is of the same route; None: nothing can be learnt from it
     second: Drive | None = None
-    same_route: SameRoute | None = None
+    same_route: SameRoute | None = None  # whether it is, and why not; None where there is no second drive
 
 
 def build(
@@ -81,12 +75,8 @@ def build(
     """Describe every training frame by its landmarks, and learn from a second season where there is one.
 
     Args:
-        training: The traverse that becomes the map.
-        second: Another drive, of the same route or not.
         same_route: Whether its positions are said to be comparable; None: where both drives know x, y.
         relevance: What the map is built for; only `calibrated` learns from a second season.
-        actions_m: The moves.
-        closed: Whether the route is a loop.
     """
     own = measured(training, evaluator, model, lambda share: on_progress(share if second is None else share / 2))
     season = verdict = other = None

@@ -51,23 +51,14 @@ ON_TRAVERSE, HELD_OUT = "traverse", "held_out"
 
 @dataclass(frozen=True)
 class CheckFrames:
-    """The frames a map is checked on.
+    """The frames a map is checked on."""
 
-    Attributes:
-        kind: ON_TRAVERSE or HELD_OUT.
-        source: The traverse they are of.
-        drive: All frames of it.
-        route: Their positions.
-        chosen: [q] int64, the places in it of those that are asked.
-        withheld: [k] int64, the places in it of those that a map must not have images of.
-    """
-
-    kind: str
-    source: str
-    drive: Drive
-    route: Route
-    chosen: NDArray[np.int64]
-    withheld: NDArray[np.int64]
+    kind: str  # ON_TRAVERSE or HELD_OUT
+    source: str  # the traverse they are of
+    drive: Drive  # all frames of it
+    route: Route  # their positions
+    chosen: NDArray[np.int64]  # [q] int64, the places in it of those that are asked
+    withheld: NDArray[np.int64]  # [k] int64, the places in it of those that a map must not have images of
 
     @classmethod
     def of_traverse(cls, source: str, drive: Drive, closed: bool) -> Self:
@@ -111,10 +102,7 @@ def check_map(
     map serves, or a damaged one, there is nothing to lose and the gate passes. `why` says which it was.
 
     Args:
-        domain: Whose map is checked.
-        new: The new map.
         traverses: What it is made of, by the names of this server.
-        frames: On what.
         gate_margin: Percentage points of ANR the new map may be worse; None: no gate.
 
     Returns:

@@ -53,46 +53,30 @@ DISTANCES_M = (10.0, 20.0, 50.0)
 
 @dataclass(frozen=True)
 class VprConfig:
-    """What is compared, and how it is scored.
-
-    Attributes:
-        tolerance_m: How far from the query a map image may be and still be true.
-        relevances: Which to compare, in the order of the report.
-        seed: Kept with the result; nothing here is random.
-        same_route: Whether positions of landmark and training traverse are comparable; None: where both know x, y.
-    """
+    """What is compared, and how it is scored."""
 
     n_landmarks: int = 300
     list_length: int = 4
-    tolerance_m: float = 2.0
-    relevances: tuple[Relevance, ...] = tuple(Relevance)
-    seed: int = 0
+    tolerance_m: float = 2.0  # how far from the query a map image may be and still be true
+    relevances: tuple[Relevance, ...] = tuple(Relevance)  # which to compare, in the order of the report
+    seed: int = 0  # kept with the result; nothing here is random
+    # Whether positions of landmark and training traverse are comparable; None: where both know x, y
     same_route: bool | None = True
 
 
 @dataclass(frozen=True)
 class VprReport:
-    """Scores by relevance, and what they cost.
-
-    Attributes:
-        scores: By relevance.
-        index_bits_per_map_image: Size on disk of the posting tables, of the map for the relevance that ships (or
-            of the first asked for).
-        seconds: Seconds by stage.
-        same_route: Whether the landmark traverse drove the mapped route.
-        encoding_dim: d.
-        bytes_per_encoding: Of one frame in a traverse's file, places apart.
-        encode_ms: Median from reading an image to its encoding; None where encodings came ready.
-    """
+    """Scores by relevance, and what they cost."""
 
     config: VprConfig
-    scores: dict[Relevance, RetrievalScores]
+    scores: dict[Relevance, RetrievalScores]  # by relevance
+    # Size on disk of the posting tables, of the map for the relevance that ships (or of the first asked for)
     index_bits_per_map_image: float
-    seconds: dict[str, float]
-    same_route: SameRoute
-    encoding_dim: int
-    bytes_per_encoding: int
-    encode_ms: float | None
+    seconds: dict[str, float]  # seconds by stage
+    same_route: SameRoute  # whether the landmark traverse drove the mapped route
+    encoding_dim: int  # d
+    bytes_per_encoding: int  # of one frame in a traverse's file, places apart
+    encode_ms: float | None  # median from reading an image to its encoding; None where encodings came ready
 
     def as_dict(self, sources: dict[str, Any]) -> dict[str, Any]:
         """The stable flat JSON document of design section 7."""
@@ -133,11 +117,7 @@ def run_vpr(
     """Select landmarks, map the training traverse, query every test frame in order as one passive session.
 
     Args:
-        config: What is compared.
-        evaluator: Measures dissimilarities of encodings.
         landmarks: The landmark traverse; where it drove the mapped route, `calibrated` learns from it.
-        training: The mapped traverse.
-        test: The queries, in the order they were driven.
         true_images: For every test frame the map images that count as true.
     """
     seconds: dict[str, float] = {}
@@ -209,28 +189,20 @@ def _score(
 
 @dataclass(frozen=True)
 class NbvConfig:
-    """What is compared.
+    """What is compared."""
 
-    Attributes:
-        n_landmarks, list_length: r and h.
-        relevance, update: Of our set-up; the paper's is measured beside it.
-        actions_m: The moves.
-        n_steps: Moves an episode.
-        training_episodes: Of NNQL.
-        episodes: Test episodes of every planner.
-        seed: Of starts, random moves and training.
-        same_route: Whether positions of landmark and training traverse are comparable; None: where both know x, y.
-    """
-
+    # n_landmarks, list_length: r and h
     n_landmarks: int = 300
     list_length: int = 4
+    # relevance, update: Of our set-up; the paper's is measured beside it
     relevance: Relevance = DEFAULT_RELEVANCE
     update: UpdateRule = DEFAULT_UPDATE[DEFAULT_RELEVANCE]
-    actions_m: tuple[float, ...] = tuple(float(metres) for metres in range(1, 11))
-    n_steps: int = 10
-    training_episodes: int = 10_000
-    episodes: int = 2000
-    seed: int = 0
+    actions_m: tuple[float, ...] = tuple(float(metres) for metres in range(1, 11))  # the moves
+    n_steps: int = 10  # moves an episode
+    training_episodes: int = 10_000  # of NNQL
+    episodes: int = 2000  # test episodes of every planner
+    seed: int = 0  # of starts, random moves and training
+    # Whether positions of landmark and training traverse are comparable; None: where both know x, y
     same_route: bool | None = True
 
 
@@ -244,20 +216,14 @@ class _Setup:
 
 @dataclass(frozen=True)
 class NbvReport:
-    """What every planner scored.
+    """What every planner scored."""
 
-    Attributes:
-        config: What was compared.
-        ours, paper: Rank shares [episodes, steps] by planner, under our set-up and the paper's.
-        travelled_m: Metres [episodes, steps] by planner, under our set-up.
-        same_route: Whether the landmark traverse drove the mapped route; None: nobody looked.
-    """
-
-    config: NbvConfig
+    config: NbvConfig  # what was compared
+    # ours, paper: Rank shares [episodes, steps] by planner, under our set-up and the paper's
     ours: dict[str, NDArray[np.float64]]
     paper: dict[str, NDArray[np.float64]]
-    travelled_m: dict[str, NDArray[np.float64]]
-    same_route: SameRoute | None = None
+    travelled_m: dict[str, NDArray[np.float64]]  # metres [episodes, steps] by planner, under our set-up
+    same_route: SameRoute | None = None  # whether the landmark traverse drove the mapped route; None: nobody looked
 
     @property
     def best_constant(self) -> str:

@@ -39,15 +39,10 @@ LEARN_STAGES = {"read map": 1.0, "learn": 2.0, "seal": 1.0, "activate": 0.1}
 
 @dataclass(frozen=True)
 class ExperienceConfig:
-    """What is to be learnt from: a session whose true positions have been kept.
+    """What is to be learnt from: a session whose true positions have been kept."""
 
-    Attributes:
-        session_id: The session.
-        positions_sha256: Digest of the true positions that came with the request, hexadecimal; they themselves are kept
-            with the session.
-    """
-
-    session_id: str
+    session_id: str  # the session
+    # Digest of the true positions that came with the request, hexadecimal; they themselves are kept with the session
     positions_sha256: str
 
     @classmethod
@@ -72,9 +67,6 @@ def keep_true_positions(
     """Keep where a session's robot truly was; an ended session may still be told of.
 
     Args:
-        store: The sessions.
-        domain: Which the session must be of.
-        session_id: The session.
         positions_m: One for every observation; None where it is unknown.
         received_at: Seconds since 1970.
 
@@ -192,8 +184,6 @@ def learn_online(
     """Seal and activate the next map version: the active one with a better experience database.
 
     Args:
-        domain: Whose active map learns.
-        walks: Sessions on it whose true positions are known.
         progress: Reports the stages of LEARN_STAGES; may cancel.
         config: The hyperparameters; None: the paper's.
         job_id: The job that this is; None: it is none.

@@ -9,17 +9,12 @@ from deepsimbad.errors import CancelledError
 
 @dataclass(frozen=True)
 class ProgressState:
-    """One moment of a job.
+    """One moment of a job."""
 
-    Attributes:
-        stage: The stage under way.
-        progress: Share of all stages done, 0..1.
-        eta_s: Seconds that are probably left: of the stage under way by its own pace, of those after it by the pace of
-            all; None while too little is done to tell.
-    """
-
-    stage: str
-    progress: float
+    stage: str  # the stage under way
+    progress: float  # share of all stages done, 0..1
+    # Seconds that are probably left: of the stage under way by its own pace, of those after it by the pace of all; None
+    # while too little is done to tell
     eta_s: float | None
 
 

@@ -34,26 +34,17 @@ _HARMLESS = {
 
 @dataclass(frozen=True)
 class EncodedRecording:
-    """One recorded drive, encoded.
+    """One recorded drive, encoded."""
 
-    Attributes:
-        drive: Its frames, those that could be used.
-        left_out: Reason -> number of frames that could not.
-        encode_ms: Median from reading an image to its encoding; None where encodings came ready.
-    """
-
-    drive: Drive
-    left_out: dict[str, int] = field(default_factory=dict)
-    encode_ms: float | None = None
+    drive: Drive  # its frames, those that could be used
+    left_out: dict[str, int] = field(default_factory=dict)  # reason -> number of frames that could not
+    encode_ms: float | None = None  # median from reading an image to its encoding; None where encodings came ready
 
 
 def encode_recording(
     recording: Recording, evaluator: Evaluator, max_pixels: int, on_progress: Callable[[float], None]
 ) -> EncodedRecording:
     """Encode a recording's images one by one, or take its ready encodings.
-
-    Args:
-        max_pixels: Limit on an image.
 
     Raises:
         InvalidSourceError: No frame can be used.

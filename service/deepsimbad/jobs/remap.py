@@ -51,7 +51,6 @@ def remap(
     `metrics.check.why` says so.
 
     Args:
-        domain: Whose traverses are mapped.
         progress: Reports the stages of REMAP_STAGES; may cancel.
         job_id: The job that this is: one that was interrupted after it sealed its version makes no other. None: none.
 
@@ -79,40 +78,26 @@ def remap(
 
 @dataclass(frozen=True)
 class _Inputs:
-    """What a remap reads before it begins.
+    """What a remap reads before it begins."""
 
-    Attributes:
-        domain: Whose map is draft.
-        training: The traverse that becomes the map.
-        candidates: The traverse landmarks are selected from; None: those of `base` stay.
-        base: The active map whose landmarks stay; None where they are selected.
-        second: The drive that a calibrated map learns from: the landmark traverse, else what the active map was made
-            of; None where there is none of the same encoder, or where frames are appended.
-        check: The drive that the new map is checked on; None: on frames of `training` that are held out.
-    """
-
-    domain: DomainRecord
-    training: Drive
-    candidates: Drive | None
-    base: Map | None
+    domain: DomainRecord  # whose map is draft
+    training: Drive  # the traverse that becomes the map
+    candidates: Drive | None  # the traverse landmarks are selected from; None: those of `base` stay
+    base: Map | None  # the active map whose landmarks stay; None where they are selected
+    # The drive that a calibrated map learns from: the landmark traverse, else what the active map was made of; None
+    # where there is none of the same encoder, or where frames are appended
     second: Drive | None
-    check: Drive | None
+    check: Drive | None  # the drive that the new map is checked on; None: on frames of `training` that are held out
 
 
 @dataclass(frozen=True)
 class _Draft:
-    """A map that is not yet sealed.
+    """A map that is not yet sealed."""
 
-    Attributes:
-        map: All of it; its version is not known yet.
-        config: As the catalog keeps it.
-        training: How its experience database was learnt; None where it has none.
-        second_season: Whether it learnt from a second drive, and why not; None where there was none.
-    """
-
-    map: Map
-    config: Mapping[str, Any]
-    training: Mapping[str, Any] | None
+    map: Map  # all of it; its version is not known yet
+    config: Mapping[str, Any]  # as the catalog keeps it
+    training: Mapping[str, Any] | None  # how its experience database was learnt; None where it has none
+    # Whether it learnt from a second drive, and why not; None where there was none
     second_season: Mapping[str, Any] | None
 
 
@@ -337,11 +322,6 @@ class _Remap:
 
 def refuse_known_traverse(config: Mapping[str, Any], version: int, name: str) -> None:
     """Refuse to append a traverse that a map holds by name, though it may hold other frames by now.
-
-    Args:
-        config: The map's, as the catalog keeps it.
-        version: The map.
-        name: The traverse.
 
     Raises:
         InvalidMapConfigError: The map is made of a traverse of that name.

@@ -18,40 +18,32 @@ DEFAULT_TRAINING_EPISODES = 10_000
 
 @dataclass(frozen=True)
 class RemapConfig:
-    """Parameters of one remap, kept with the map.
+    """Parameters of one remap, kept with the map."""
 
-    Attributes:
-        training_traverse: The traverse that becomes the map.
-        landmark_traverse: Where landmarks are selected; None keeps those of the active map (the paper's cheap
-            retraining).
-        n_landmarks: r; None means 500 or, of a shorter landmark traverse, every frame; and as many as the active map
-            has where its landmarks stay.
-        relevance: What the map is built for.
-        training_episodes: Of the experience database that NNQL plans by; 0: the map has none.
-        seed: Of everything random in the remap.
-        activate: Serve the new map at once, whatever was activated while it was built: the last word wins. With a gate
-            only in place of the map it was compared with.
-        check_traverse: Drive that the new map and the active one are compared on; None: frames of the training
-            traverse that are held out.
-        gate_margin: By how many percentage points of ANR the new map may be worse than the active one and still take
-            over; None: whatever it is.
-        same_route: Whether positions of the training traverse and of the second drive (the landmark traverse, else what
-            the active map was made of) are comparable; None: only where both know x, y.
-        append: Add the training traverse to a copy of the active map, whose images, landmarks, lists and experience
-            stay; n_landmarks, list_length and relevance are the active map's.
-    """
-
-    training_traverse: str
+    training_traverse: str  # the traverse that becomes the map
+    # Where landmarks are selected; None keeps those of the active map (the paper's cheap retraining)
     landmark_traverse: str | None = None
+    # r; None means 500 or, of a shorter landmark traverse, every frame; and as many as the active map has where its
+    # landmarks stay
     n_landmarks: int | None = None
     list_length: int = DEFAULT_LIST_LENGTH
-    relevance: Relevance = DEFAULT_RELEVANCE
+    relevance: Relevance = DEFAULT_RELEVANCE  # what the map is built for
+    # Of the experience database that NNQL plans by; 0: the map has none
     training_episodes: int = DEFAULT_TRAINING_EPISODES
-    seed: int = 0
+    seed: int = 0  # of everything random in the remap
+    # Serve the new map at once, whatever was activated while it was built: the last word wins. With a gate only in
+    # place of the map it was compared with.
     activate: bool = True
+    # Drive that the new map and the active one are compared on; None: frames of the training traverse that are held out
     check_traverse: str | None = None
+    # By how many percentage points of ANR the new map may be worse than the active one and still take over; None:
+    # whatever it is
     gate_margin: float | None = None
+    # Add the training traverse to a copy of the active map, whose images, landmarks, lists and experience stay;
+    # n_landmarks, list_length and relevance are the active map's
     append: bool = False
+    # Whether positions of the training traverse and of the second drive (the landmark traverse, else what the active
+    # map was made of) are comparable; None: only where both know x, y
     same_route: bool | None = None
 
     def __post_init__(self) -> None:
@@ -89,17 +81,11 @@ class RemapConfig:
 
 @dataclass(frozen=True)
 class RemapSize:
-    """How much a remap has to work on.
+    """How much a remap has to work on."""
 
-    Attributes:
-        n_frames: Frames of the training traverse.
-        n_candidates: Frames that landmarks are selected from; 0: they stay.
-        encoding_dim: Numbers an encoding.
-    """
-
-    n_frames: int
-    n_candidates: int
-    encoding_dim: int
+    n_frames: int  # frames of the training traverse
+    n_candidates: int  # frames that landmarks are selected from; 0: they stay
+    encoding_dim: int  # numbers an encoding
 
     @classmethod
     def of(cls, data_dir: Path, domain: str, config: RemapConfig) -> Self:

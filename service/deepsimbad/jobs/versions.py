@@ -40,11 +40,9 @@ def import_map(
     """Take over a map file that another server exported.
 
     Args:
-        catalog: Of the data directory.
         file: The map file; it stays.
         domain: What the domain is called here; None: as there. It is made if it is absent.
         sha256: The digest in hex that the file must have; None: any.
-        activate: Whether the map shall serve at once.
 
     Raises:
         InvalidArchiveError: The file is no sealed map, is damaged, or has another digest.

@@ -59,7 +59,6 @@ def write_map(path: Path, map_: Map, on_progress: Callable[[float], None] | None
 
     Args:
         path: Where; `Catalog.building_path`.
-        map_: What.
         on_progress: Called with 0..1; what it raises (a cancel) ends the writing.
 
     Raises:
