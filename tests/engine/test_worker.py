@@ -75,14 +75,12 @@ def test_no_more_of_one_priority_wait_than_may() -> None:
         assert begun.wait(30)
         waiting = [worker.submit(lambda: 1, priority) for priority in (Priority.LIVE, Priority.BATCH) for _ in range(2)]
         for priority in (Priority.LIVE, Priority.BATCH):
-            assert worker.is_full(priority)
             with pytest.raises(OverloadedError) as caught:
                 worker.submit(lambda: 1, priority)
             assert caught.value.hints["retry_after_s"] == 1
         gate.set()
         running.result(30)
         assert [answer.result(30) for answer in waiting] == [1] * 4
-        assert not worker.is_full(Priority.LIVE)
         assert worker.submit(lambda: 2).result(30) == 2
     finally:
         gate.set()
@@ -126,7 +124,6 @@ def test_images_that_wait_are_encoded_together_as_many_as_pay(worker: InferenceW
     assert [one.values.tolist() for one in seen] == [[level] for level in range(10)]
     assert eyes.batches == [4, 4, 2]
     assert worker.n_waiting == 0
-    assert not worker.is_full()
 
 
 def test_where_batches_do_not_pay_nobody_waits_for_company() -> None:

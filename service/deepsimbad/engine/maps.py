@@ -107,8 +107,7 @@ class Maps:
         """The domain and its active map; may read files.
 
         Raises:
-            UnknownDomainError: No such domain.
-            NoActiveMapError: It has no map yet.
+            UnknownDomainError, NoActiveMapError: There is no such domain, or it has no map yet.
             DamagedMapError: The map's file is missing, fails its digest or contradicts itself.
             UnavailableError: The disk failed, no memory is left, ...: another try may read it.
         """
@@ -137,11 +136,9 @@ class Maps:
             self._announced.pop(domain, None)
 
     def load_all(self) -> dict[str, DamagedMapError]:
-        """Load the active maps of all domains.
+        """Load the active maps of all domains; answers what is damaged, by domain.
 
-        Returns:
-            What is damaged, by domain; each is logged, and so is what could not be read; neither keeps the service
-            from starting.
+        That is logged, and so is what could not be read; neither keeps the service from starting.
         """
         damaged = {}
         for record in self._catalog.domains():
@@ -167,11 +164,8 @@ class Maps:
                 f"domain {domain} has no active map: upload traverses and start a remap", domain=domain
             )
         damage = self._damaged.get(domain)
-        if (
-            damage is not None
-            and damage.version == version
-            and self._clock() - damage.noticed_at < _DAMAGE_REMEMBERED_S
-        ):
+        is_same = damage is not None and damage.version == version
+        if damage is not None and is_same and self._clock() - damage.noticed_at < _DAMAGE_REMEMBERED_S:
             raise DamagedMapError(damage.error.message, **damage.error.hints) from damage.error
         try:
             return self._once(domain, version, self._catalog.map(domain, version).sha256)
@@ -331,12 +325,7 @@ class Retention:
 
 
 def beyond_keeping(kept: Iterable[KeptMap], keep_maps: int) -> list[KeptMap]:
-    """The versions beyond those that a domain keeps, whoever is pinned to them.
-
-    Args:
-        kept: The versions that have their files, of any domains.
-        keep_maps: How many to keep.
-    """
+    """Of the versions that have their files, of any domains, those beyond what a domain keeps, pinned or not."""
     domains: dict[str, list[KeptMap]] = {}
     for version in kept:
         domains.setdefault(version.domain, []).append(version)

@@ -74,10 +74,6 @@ class InferenceWorker:
         """How many functions wait."""
         return self._queue.qsize()
 
-    def is_full(self, priority: Priority = Priority.LIVE) -> bool:
-        """Whether as many functions of a priority wait as may."""
-        return self._max_waiting is not None and self._n_waiting[priority] >= self._max_waiting
-
     @property
     def is_alive(self) -> bool:
         """Whether the thread is there to run them."""
@@ -119,7 +115,9 @@ class InferenceWorker:
             if not self._open:
                 raise UnavailableError("the service is shutting down")
             if self._max_waiting is not None and self._n_waiting[priority] >= self._max_waiting:
-                raise queue_is_full()
+                raise OverloadedError(
+                    "too many views wait to be looked at: try again in a moment", retry_after_s=1, limit="max_queue"
+                )
             self._n_waiting[priority] += 1
             self._queue.put(work)
         return work.answer
@@ -195,10 +193,3 @@ def _finish(work: _Work) -> None:
         work.answer.set_exception(error)
     else:
         work.answer.set_result(result)
-
-
-def queue_is_full() -> OverloadedError:
-    """What is raised where a function would have to wait behind too many."""
-    return OverloadedError(
-        "too many views wait to be looked at: try again in a moment", retry_after_s=1, limit="max_queue"
-    )
