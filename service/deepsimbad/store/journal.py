@@ -138,8 +138,10 @@ class StateSnapshot:
     arrays: dict[str, NDArray[Any]]
 
 
-def append(db: Database, session: int, row: JournalRow, written_at: float) -> None:
-    """Write a row; an IntegrityError where the sequence number or the key is taken."""
+def append(
+    db: Database, session: int, row: JournalRow, written_at: float, snapshot: StateSnapshot | None = None
+) -> None:
+    """Write a row, and a snapshot; an IntegrityError where the sequence number or the key is taken."""
     if isinstance(row, PriorRow):
         values: tuple[Any, ...] = ("prior", written_at, row.expires_at, *[None] * 7, row.position_m, row.std_m)
     else:
@@ -148,10 +150,13 @@ def append(db: Database, session: int, row: JournalRow, written_at: float) -> No
             *("observation", written_at, row.expires_at),
             *((named.key, named.digest) if named else (None, None)),
             *(row.action_m, row.action_std_m, pack_ranks(row.ranks)),
-            *(_pack_float32(row.dissimilarities), _pack_float32(row.encoding)),
+            None if row.dissimilarities is None else np.ascontiguousarray(row.dissimilarities, "<f4").tobytes(),
+            None if row.encoding is None else np.ascontiguousarray(row.encoding, "<f4").tobytes(),
             *(None, None),
         )
     db.conn.execute(_INSERT, (session, row.sequence, *values))
+    if snapshot is not None:
+        _save_snapshot(db, session, snapshot)
 
 
 def read(db: Database, session: int, after: int = 0, until: int = 2**62) -> list[JournalRow]:
@@ -179,7 +184,7 @@ def _row(row: tuple[Any, ...]) -> JournalRow:
     )
 
 
-def save_snapshot(db: Database, session: int, snapshot: StateSnapshot) -> None:
+def _save_snapshot(db: Database, session: int, snapshot: StateSnapshot) -> None:
     """Put a session's snapshot in place of its earlier one."""
     db.execute("DELETE FROM snapshot WHERE session = ?", [session])
     rows = []
@@ -247,7 +252,3 @@ def unpack_ranks(body: bytes) -> NDArray[np.float32]:
     n_two = len(body) // 2  # more than fit in two bytes each can only be half as many of four
     dtype = "<u2" if n_two <= _MOST_IN_TWO_BYTES else "<u4"
     return np.asarray(np.frombuffer(body, dtype) / 2, np.float32)
-
-
-def _pack_float32(values: NDArray[np.float32] | None) -> bytes | None:
-    return None if values is None else np.ascontiguousarray(values, "<f4").tobytes()

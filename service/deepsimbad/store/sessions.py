@@ -4,6 +4,7 @@ import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from contextlib import AbstractContextManager, contextmanager
+from functools import partial
 from pathlib import Path
 from queue import SimpleQueue
 from typing import Any, Self, TypeVar
@@ -215,15 +216,11 @@ class SessionStore(OpenFile):
     ) -> Future[None]:
         """Write the next row of a session's journal, and with it a snapshot of the state after an earlier row.
 
-        The future raises InvalidInputError where another process has written a row of that sequence number.
+        The future raises InvalidInputError where a row of that sequence number is there.
         """
-
-        def write(db: Database) -> None:
-            journal.append(db, number, row, written_at)
-            if snapshot is not None:
-                journal.save_snapshot(db, number, snapshot)
-
-        return self._commits.submit(write)
+        return self._commits.submit(
+            partial(journal.append, session=number, row=row, written_at=written_at, snapshot=snapshot)
+        )
 
     def history(self, number: int, until: int) -> tuple[StateSnapshot | None, list[JournalRow]]:
         """What makes up the state after a row: the snapshot, if it is from before that row, and the rows since."""
