@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from deepsimbad.core.belief import GridFilter, ParticleFilter, summarise
-from deepsimbad.core.relevance import DEFAULT_UPDATE, Relevance, UpdateRule
+from deepsimbad.core.relevance import UpdateRule
 from deepsimbad.core.route import Route
 from deepsimbad.errors import PastTheEndError
 
@@ -12,16 +12,6 @@ from deepsimbad.errors import PastTheEndError
 @pytest.fixture
 def route():
     return Route(np.arange(100.0))
-
-
-@pytest.mark.parametrize("rule", list(UpdateRule))
-def test_a_view_moves_mass_to_where_it_is_relevant(rule, route):
-    relevance = np.zeros(100, np.float32)
-    relevance[40] = 3.0
-    belief = GridFilter.uniform(route).updated(relevance, rule, step=0)
-    assert belief.mass.sum() == pytest.approx(1)
-    assert belief.mass.argmax() == 40
-    assert (np.delete(belief.mass, 40) < belief.mass[40]).all()
 
 
 @pytest.mark.parametrize("rule", list(UpdateRule))
@@ -43,10 +33,6 @@ def test_reciprocal_rank_shares_the_ranks_of_ties():
     belief = GridFilter.uniform(Route(np.arange(4.0))).updated(relevance, UpdateRule.ADDITIVE_RECIPROCAL_RANK, step=0)
     expected = 1 + 1 / np.array([1, 2.5, 2.5, 4])
     np.testing.assert_allclose(belief.mass, expected / expected.sum())
-
-
-def test_every_relevance_has_a_default_update():
-    assert set(DEFAULT_UPDATE) == set(Relevance)
 
 
 def test_a_view_that_excludes_all_that_is_believed_changes_nothing(route):

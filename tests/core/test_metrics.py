@@ -35,14 +35,6 @@ def test_nothing_scored_is_not_a_number_and_no_warning():
     assert np.isnan(RetrievalScorer().result().anr)
 
 
-def test_chance_is_fifty():
-    rng = np.random.default_rng(0)
-    scorer = RetrievalScorer()
-    for _ in range(2000):
-        scorer.add(rng.random(101), np.array([rng.integers(101)]))
-    assert scorer.result().anr == pytest.approx(50, abs=2)
-
-
 def test_the_interval_of_a_mean_is_about_two_standard_errors():
     values = np.random.default_rng(0).normal(3, 2, 1000)
     low, high = mean_interval(values, seed=0)

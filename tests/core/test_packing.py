@@ -51,13 +51,6 @@ def test_random_lists_stay_below_the_papers_size():
     assert payload_bits / 26_208 < 44  # the paper spends 15h = 60
 
 
-def test_neighbours_that_share_landmarks_cost_less():
-    scattered = _lists(np.random.default_rng(2), 5000, 300, 4)
-    dense = np.repeat(scattered[:, ::10], 10, axis=1)
-    bits = [sum(8 * len(blob) for _, _, blob in pack_index(lists, 300)) for lists in (scattered, dense)]
-    assert bits[1] < bits[0] / 3
-
-
 def test_damage_is_noticed():
     lists = _lists(np.random.default_rng(3), 50, 8, 2)
     postings = list(pack_index(lists, 8))

@@ -58,7 +58,6 @@ class Map:
         metrics: What was measured when it was built.
         landmark_model: The evaluator's named arrays.
         index_bytes: Size of the posting tables in its file; 0 before it has one.
-
         lists: Row j holds every map image's landmark of rank j + 1.
         position_m: Route position of every map image, not decreasing.
         values: The listed dissimilarities (`simbad` alone).
