@@ -1,7 +1,6 @@
 """`deepsimbad experiment`: the paper's experiments on a landmark-training-test triplet of recordings."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import reduce
 from pathlib import Path
 from typing import Any, TypeVar
@@ -43,17 +42,6 @@ _READING_STAGES = {f"read {role}": 2.0 for role in _ROLES}
 _STANDARD_OUTPUT = Path("-")
 
 _Command = TypeVar("_Command", bound=Callable[..., Any])
-
-
-@dataclass(frozen=True)
-class _Triplet:
-    """Three encoded recordings, what measures them, and what was read, for the result's `config`."""
-
-    landmarks: EncodedRecording
-    training: EncodedRecording
-    test: EncodedRecording
-    evaluator: Evaluator
-    sources: dict[str, Any]
 
 
 def _triplet_options(command: _Command) -> _Command:
@@ -130,14 +118,13 @@ def vpr(
     for evaluator in evaluators:
         extractor = evaluator.options["extractor"]
         with progress_bar(_READING_STAGES | vpr_stages(config), extractor) as progress:
-            triplet = _read_triplet(asked, evaluator, progress)
-            training, test = triplet.training.drive, triplet.test
+            measure, (landmarks, training, test), sources = _read_triplet(asked, evaluator, progress)
             if ground_truth is None:
-                truth = true_images_of(test.drive.route(), training.route(), tolerance)
+                truth = true_images_of(test.drive.route(), training.drive.route(), tolerance)
             else:
-                truth = read_ground_truth(ground_truth, test.drive.index, training.index)
-            report = run_vpr(config, triplet.evaluator, triplet.landmarks.drive, training, test, truth, progress)
-        sources = triplet.sources | {"ground_truth": None if ground_truth is None else str(ground_truth)}
+                truth = read_ground_truth(ground_truth, test.drive.index, training.drive.index)
+            report = run_vpr(config, measure, landmarks.drive, training.drive, test, truth, progress)
+        sources["ground_truth"] = None if ground_truth is None else str(ground_truth)
         documents[extractor], reports[extractor] = report.as_dict(sources), report
     if len(reports) > 1:
         _tell({"extractors": documents}, asked["json_file"], lambda: _print_extractors(reports))
@@ -159,54 +146,42 @@ def vpr(
     "--episodes", type=click.IntRange(min=2), default=2000, show_default=True, help="Test episodes of every planner."
 )
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
-def nbv(
-    evaluator: EvaluatorConfig,
-    relevance: str | None,
-    update: str | None,
-    training_episodes: int,
-    episodes: int,
-    seed: int,
-    **asked: Any,
-) -> None:
+def nbv(evaluator: EvaluatorConfig, relevance: str | None, update: str | None, **asked: Any) -> None:
     """Active self-localization (III, Fig. 7): ANR of every planner over episodes of ten moves.
 
     Every planner has the same starts. The paper's set-up (rrf, additive relevance) is measured beside ours.
     """
     chosen = Relevance(relevance) if relevance else DEFAULT_RELEVANCE
     config = NbvConfig(
-        n_landmarks=asked["n_landmarks"],
-        list_length=asked["list_length"],
         relevance=chosen,
         update=UpdateRule(update) if update else DEFAULT_UPDATE[chosen],
-        training_episodes=training_episodes,
-        episodes=episodes,
-        seed=seed,
         same_route=asked["same_route"] is not False,
+        **{name: asked[name] for name in ("n_landmarks", "list_length", "training_episodes", "episodes", "seed")},
     )
     with progress_bar(_READING_STAGES | nbv_stages(config), "experiment") as progress:
-        triplet = _read_triplet(asked, evaluator, progress)
-        drives = (triplet.landmarks.drive, triplet.training.drive, triplet.test.drive)
-        report = run_nbv(config, triplet.evaluator, *drives, progress)
-    document = report.as_dict(triplet.sources)
+        measure, (landmarks, training, test), sources = _read_triplet(asked, evaluator, progress)
+        report = run_nbv(config, measure, landmarks.drive, training.drive, test.drive, progress)
+    document = report.as_dict(sources)
     _tell(document, asked["json_file"], lambda: _print_planners(report, document))
 
 
-def _read_triplet(asked: dict[str, Any], config: EvaluatorConfig, progress: Progress) -> _Triplet:
+def _read_triplet(
+    asked: dict[str, Any], config: EvaluatorConfig, progress: Progress
+) -> tuple[Evaluator, list[EncodedRecording], dict[str, Any]]:
+    """What measures, the three recordings, and what was read, for the result's `config`."""
     settings = given_settings()
-    evaluator = make_evaluator(config, settings.compute())
-    traverses = []
+    evaluator, recordings = make_evaluator(config, settings.compute()), []
     for stage, role in zip(_READING_STAGES, _ROLES, strict=True):
         progress.stage(stage)
         recording = open_source(asked[role], spacing_m=asked["spacing_m"])
-        traverses.append(encode_recording(recording, evaluator, settings.max_pixels, progress.update))
+        recordings.append(encode_recording(recording, evaluator, settings.max_pixels, progress.update))
     sources = {
         **{role: asked[role] for role in _ROLES},
         "evaluator": config.as_dict(),
         "spacing_m": asked["spacing_m"],
-        "left_out": {role: traverse.left_out for role, traverse in zip(_ROLES, traverses, strict=True)},
+        "left_out": {role: recording.left_out for role, recording in zip(_ROLES, recordings, strict=True)},
     }
-    landmarks, training, test = traverses
-    return _Triplet(landmarks, training, test, evaluator, sources)
+    return evaluator, recordings, sources
 
 
 def _tell(document: dict[str, Any], json_file: Path | None, print_for_people: Callable[[], None]) -> None:

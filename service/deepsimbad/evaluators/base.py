@@ -67,13 +67,7 @@ class Evaluator(Protocol):
         """
 
     def encode(self, observations: Sequence[Observation]) -> NDArray[np.float32]:
-        """Encode observations, each by itself: no answer depends on its neighbours in the call, beyond rounding.
-
-        Args:
-            observations: n images, each [height, width, 3] uint8 BGR of any size.
-
-        Returns:
-            [n, d] float32, finite.
+        """Encode n observations to [n, d] float32, finite: no answer depends on its neighbours, beyond rounding.
 
         Raises:
             InvalidImageError: An array that is not such an image.
@@ -82,13 +76,7 @@ class Evaluator(Protocol):
         """
 
     def fit_landmarks(self, encodings: NDArray[np.float32]) -> LandmarkModel:
-        """Turn the selected landmarks into a landmark model.
-
-        Args:
-            encodings: [r, d] float32, in landmark order.
-
-        Returns:
-            Named arrays for `dissimilarities`.
+        """Turn the selected landmarks, [r, d] float32 in landmark order, into the model that `dissimilarities` takes.
 
         Raises:
             InvalidEncodingError: Not [r >= 1, d], or NaN or infinity in it.
@@ -97,23 +85,12 @@ class Evaluator(Protocol):
     def check_model(self, model: LandmarkModel, n_landmarks: int) -> None:
         """Check that a landmark model, of whatever origin, can be compared with.
 
-        Args:
-            model: Named arrays.
-            n_landmarks: r.
-
         Raises:
             InvalidEncodingError: It is not what `fit_landmarks` gives of r landmarks.
         """
 
     def dissimilarities(self, encodings: NDArray[np.float32], model: LandmarkModel) -> NDArray[np.float32]:
-        """Compare scenes with landmarks.
-
-        Args:
-            encodings: [n, d] float32.
-            model: What `fit_landmarks` gave.
-
-        Returns:
-            [n, r] float32, at least 0, finite, smaller is nearer.
+        """Compare scenes, [n, d] float32, with landmarks: [n, r] float32, at least 0, finite, smaller is nearer.
 
         Raises:
             InvalidEncodingError: Wrong length, NaN or infinity, or so large that the dissimilarity overflows.
