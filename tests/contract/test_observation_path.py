@@ -15,7 +15,7 @@ from deepsimbad.jobs.runner import InThisProcess
 
 from .conftest import N_LANDMARKS, make_ready_domain, small_settings
 
-MOST_FILES, MOST_FUNCTIONS = 24, 97
+MOST_FILES, MOST_FUNCTIONS = 23, 97
 PROJECT = str(Path(deepsimbad.__file__).parent)
 
 

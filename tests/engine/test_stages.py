@@ -10,7 +10,8 @@ from typing import Any
 import pytest
 
 from deepsimbad.engine.session import SessionConfig
-from deepsimbad.engine.views import Stopwatch, View
+from deepsimbad.engine.views import View
+from deepsimbad.engine.worker import Stopwatch
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.catalog_maps import ANY

@@ -36,10 +36,9 @@ from deepsimbad.engine.views import (
     PackedRanks,
     RankedLandmarks,
     ReadyEncoding,
-    Stopwatch,
     View,
 )
-from deepsimbad.engine.worker import Priority
+from deepsimbad.engine.worker import Priority, Stopwatch
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.image import MEDIA_TYPES
 

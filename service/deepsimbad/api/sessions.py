@@ -58,7 +58,7 @@ from deepsimbad.api.requests import (
 from deepsimbad.core.belief import FilterKind
 from deepsimbad.core.relevance import UpdateRule
 from deepsimbad.engine.session import DEFAULT_START_STD_M, Observation, SessionConfig, SessionView
-from deepsimbad.engine.views import Stopwatch
+from deepsimbad.engine.worker import Stopwatch
 from deepsimbad.errors import DeepSimbadError
 from deepsimbad.store.journal import IdempotencyKey, ListedSession
 

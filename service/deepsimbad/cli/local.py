@@ -23,7 +23,7 @@ from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Relevance
 from deepsimbad.engine.encoders import EvaluatorPool
 from deepsimbad.engine.localizer import localize as localize_view
 from deepsimbad.engine.maps import Maps
-from deepsimbad.engine.views import Stopwatch
+from deepsimbad.engine.worker import Stopwatch
 from deepsimbad.errors import ImageTooLargeError, InvalidImageError, InvalidSourceError, TooFewCandidatesError
 from deepsimbad.evaluators.compute import available_cores
 from deepsimbad.evaluators.image import decode_image

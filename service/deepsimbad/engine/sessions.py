@@ -34,8 +34,8 @@ from deepsimbad.engine.session import (
     restored,
     view_of,
 )
-from deepsimbad.engine.views import Stopwatch, View
-from deepsimbad.engine.worker import InferenceWorker
+from deepsimbad.engine.views import View
+from deepsimbad.engine.worker import InferenceWorker, Stopwatch
 from deepsimbad.errors import (
     DamagedFileError,
     EndedSessionError,

@@ -1,22 +1,23 @@
 """The one thread in which encoding and scoring run: a robot's live view goes before whatever waits in bulk.
 
-Images of several robots are encoded in one batch where the machine gains by it.
+Images of several robots are encoded in one batch where the machine gains by it. A stopwatch tells where the time of an
+answer goes, waiting among it.
 """
 
 import itertools
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from enum import IntEnum
 from queue import Empty, PriorityQueue
-from time import monotonic
+from time import monotonic, perf_counter
 from typing import Any, TypeVar
 
 import numpy as np
 
 from deepsimbad.engine.encoders import encode_images
-from deepsimbad.engine.views import View
+from deepsimbad.engine.views import EncodedImage, View
 from deepsimbad.errors import OverloadedError, UnavailableError
 from deepsimbad.evaluators.base import Evaluator
 
@@ -193,3 +194,35 @@ def _finish(work: _Work) -> None:
         work.answer.set_exception(error)
     else:
         work.answer.set_result(result)
+
+
+@dataclass
+class Stopwatch:
+    """Where the time of one answer goes, from its making on: each lap names what was done since the one before.
+
+    An answer is in the hands of one thread at a time: laps follow each other, and their sum is never above the total.
+    """
+
+    _began: float = field(default_factory=perf_counter)
+    _last: float = field(default_factory=perf_counter)
+    _spent_ms: dict[str, float] = field(default_factory=dict)
+
+    def lap(self, stage: str, view: View | None = None) -> None:
+        """Count the time since the last lap to a stage; what an image's encoding took within it, to `encode`."""
+        now = perf_counter()
+        encode_ms = view.encode_ms if isinstance(view, EncodedImage) else 0.0
+        spent_ms = max(0.0, 1000 * (now - self._last) - encode_ms)
+        self._spent_ms[stage] = round(self._spent_ms.get(stage, 0.0) + spent_ms, 3)
+        if encode_ms:
+            self._spent_ms["encode"] = round(encode_ms, 3)
+        self._last = now
+
+    def take(self, timings_ms: Mapping[str, float]) -> None:
+        """Take over stages that were measured since the last lap, by whoever did the work."""
+        for stage, spent_ms in timings_ms.items():
+            self._spent_ms[stage] = round(spent_ms, 3)
+        self._last = perf_counter()
+
+    def timings_ms(self) -> dict[str, float]:
+        """Milliseconds by stage, and their `total` up to now."""
+        return {**self._spent_ms, "total": round(1000 * (perf_counter() - self._began), 3)}
