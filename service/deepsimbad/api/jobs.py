@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from deepsimbad.api.localizations import MAX_LANDMARKS
-from deepsimbad.api.openapi import declare_json, problems
+from deepsimbad.api.openapi import declare_json, location, problems
 from deepsimbad.api.requests import (
     GREATEST_EXACT_INTEGER,
     NAME_PATTERN,
@@ -185,10 +185,7 @@ def render_job(record: JobRecord) -> JobAnswer:
 @making.post(
     "/{domain}/remaps",
     status_code=202,
-    responses={
-        202: {"headers": {"Location": {"description": "The job.", "schema": {"type": "string"}}}},
-        **problems(404, 409, 413, 415, 422, 429),
-    },
+    responses={**location(202, "The job."), **problems(404, 409, 413, 415, 422, 429)},
     openapi_extra=declare_json(RemapBody),
 )
 async def post_remap(
@@ -232,10 +229,7 @@ async def post_remap(
 @making.post(
     "/{domain}/experience",
     status_code=202,
-    responses={
-        202: {"headers": {"Location": {"description": "The job.", "schema": {"type": "string"}}}},
-        **problems(404, 409, 410, 413, 415, 422, 429),
-    },
+    responses={**location(202, "The job."), **problems(404, 409, 410, 413, 415, 422, 429)},
     openapi_extra=declare_json(ExperienceBody),
 )
 async def post_experience(

@@ -117,6 +117,11 @@ def binary(description: str) -> dict[str, Any]:
     return {"application/octet-stream": {"schema": {"type": "string", "format": "binary", "description": description}}}
 
 
+def location(status: int, what: str) -> dict[int | str, dict[str, Any]]:
+    """The `responses` of a route whose answer says where what was made is."""
+    return {status: {"headers": {"Location": {"description": what, "schema": {"type": "string"}}}}}
+
+
 def declare_json(model: type[BaseModel]) -> dict[str, Any]:
     """The OpenAPI request body of a route that reads this model, as `openapi_extra`."""
     _declared_bodies[model.__name__] = model

@@ -93,7 +93,7 @@ def problem_response(
     """Render one problem; its code, and the limit that was met, are noted for the log.
 
     Args:
-        scope: The request's ASGI scope, for `instance` and the request id.
+        scope: The request's, for `instance` and the request id.
         status: HTTP status.
         code: Stable word that scripts may test.
         detail: One sentence on this occurrence.

@@ -158,20 +158,6 @@ class Services:
     """The running service.
 
     Attributes:
-        settings: As it was started.
-        metrics: Counters.
-        catalog: What is true of the data directory.
-        maps: Map versions in memory.
-        evaluators: Evaluators in memory.
-        open_traverses: Files kept open while frames arrive.
-        sessions: Live beliefs.
-        session_store: Their file.
-        retention: Which old maps keep their files.
-        truths: What their beliefs were worth.
-        worker: Where encoding and scoring run.
-        decoders: Where images are decoded.
-        runner: Where jobs run.
-        keys: Who may ask.
         faults: What keeps the service from being ready, a sentence each; may wait for the disk.
         uploads: Batches of frames on their way.
         event_streams: Of jobs, open.
@@ -337,18 +323,10 @@ def key_id_of(request: Request) -> str | None:
 
 
 def id_under_key(request: Request, kind: str, domain: str, key: str | None) -> str | None:
-    """The id of what a request makes, which follows from its key; a repetition finds it after a restart too.
+    """The id of what a request makes, which follows from its idempotency key; None without one.
 
-    Whoever holds another API key makes other things, though the words they choose be the same.
-
-    Args:
-        request: Whose API key counts.
-        kind: What is made.
-        domain: Where.
-        key: The sender's word; None: none was given.
-
-    Returns:
-        32 hexadecimal digits; None without a key.
+    A repetition finds it after a restart too. Whoever holds another API key makes other things, though the words they
+    choose be the same.
     """
     if key is None:
         return None

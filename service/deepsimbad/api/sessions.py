@@ -26,7 +26,7 @@ from deepsimbad.api.localizations import (
     render_shortlist,
     view_in,
 )
-from deepsimbad.api.openapi import binary, declare_json, problems
+from deepsimbad.api.openapi import binary, declare_json, location, problems
 from deepsimbad.api.requests import (
     GREATEST_EXACT_INTEGER,
     GREATEST_ID,
@@ -259,10 +259,7 @@ async def _answered(running: Services, view: SessionView, status: int = 200, loc
     "/domains/{domain}/sessions",
     status_code=201,
     response_model=SessionAnswer,
-    responses={
-        201: {"headers": {"Location": {"description": "The session.", "schema": {"type": "string"}}}},
-        **problems(404, 409, 410, 413, 415, 422, 429),
-    },
+    responses={**location(201, "The session."), **problems(404, 409, 410, 413, 415, 422, 429)},
     openapi_extra=declare_json(SessionBody),
 )
 async def post_session(
