@@ -1,13 +1,11 @@
 """What the client reports, the service's own metrics say too; a map made here equals one made over HTTP."""
 
 import json
-import os
-import subprocess
-import sys
 
 import numpy as np
 import pytest
 
+from deepsimbad.cli import run
 from deepsimbad.core.metrics import RetrievalScorer
 from deepsimbad.core.route import true_images_of
 from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
@@ -95,17 +93,9 @@ def test_a_replay_has_the_anr_of_the_experiment(service, tmp_path, relevance):
     settings = {"n_landmarks": 60, "list_length": 4, "relevance": relevance}
     remap(client, domain, "spring", landmark_traverse="autumn", same_route=True, training_episodes=0, **settings)
     summary = summarise(replay(client, open_source(summer), domain, tmp_path / "replay", tolerance_m=2))
-    ran = subprocess.run(
-        [
-            *(sys.executable, "-m", "deepsimbad", "experiment", "vpr", "--landmarks", autumn, "--training", spring),
-            *("--test", summer, "--n-landmarks", "60", "--list-length", "4", "--tolerance", "2"),
-            *("--relevance", relevance, "--json", str(tmp_path / "vpr.json")),
-        ],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert ran.returncode == 0, ran.stderr
+    words = ("experiment", "vpr", "--landmarks", autumn, "--training", spring, "--test", summer, "--n-landmarks", "60")
+    options = ("--list-length", "4", "--tolerance", "2", "--relevance", relevance, "--json", str(tmp_path / "vpr.json"))
+    assert run([*words, *options]) == 0
     experiment = json.loads((tmp_path / "vpr.json").read_text())
     assert 1 < summary["anr"] < 40, "else nothing is shown"
     assert summary["anr"] == pytest.approx(experiment["anr"][relevance], abs=1e-12)
@@ -115,17 +105,8 @@ def test_a_replay_has_the_anr_of_the_experiment(service, tmp_path, relevance):
 
 def test_a_map_made_here_equals_one_made_over_http(campus, service, tmp_path):
     _, data_dir = service
-    made = subprocess.run(
-        [
-            *(sys.executable, "-m", "deepsimbad", "map", "campus", "--data-dir", str(tmp_path)),
-            *("--landmarks", campus["winter"], "--training", campus["spring"], "--n-landmarks", str(N_LANDMARKS)),
-        ],
-        capture_output=True,
-        text=True,
-        env={**os.environ, "COLUMNS": "120"},
-        check=False,
-    )
-    assert made.returncode == 0, made.stderr
+    drives = ("--landmarks", campus["winter"], "--training", campus["spring"], "--n-landmarks", str(N_LANDMARKS))
+    assert run(["map", "campus", "--data-dir", str(tmp_path), *drives]) == 0
     maps = []
     for folder in (data_dir, tmp_path):
         with Catalog.open(folder) as catalog:
