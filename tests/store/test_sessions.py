@@ -297,3 +297,23 @@ def test_closing_commits_what_waits_and_takes_no_more(store: SessionStore, batch
     with pytest.raises(UnavailableError):
         store.try_writing()
     assert not store.is_committing
+
+
+def test_a_write_may_be_on_the_disk_before_its_sender_goes_on(
+    store: SessionStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The sender's thread may be put aside, for as long as a commit takes, right after it handed the write in."""
+    number = store.create(RECORD).result().number
+    waiting = store._commits._waiting
+
+    class Preempted:
+        get, empty = waiting.get, waiting.empty
+
+        def put(self, write: Any) -> None:
+            waiting.put(write)
+            if write is not None:
+                wait([write[1]], timeout=60)
+
+    monkeypatch.setattr(store._commits, "_waiting", Preempted())
+    store.append(number, observed(1), 101.0).result(60)
+    assert store.living()[0].n_events == 1

@@ -326,11 +326,11 @@ class GroupCommit:
             UnavailableError: The file has been closed.
         """
         done: Future[T] = Future()
+        done.set_running_or_notify_cancel()  # whoever stops waiting does not undo it; before the thread can end it
         with self._lock:
             if not self._is_open:
                 raise UnavailableError("the service is shutting down")
             self._waiting.put((run, done))
-        done.set_running_or_notify_cancel()  # whoever stops waiting does not undo it
         return done
 
     def close(self) -> None:
