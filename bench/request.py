@@ -1,0 +1,88 @@
+"""One `POST observations` in process, commit included, beside the same of another checkout, in turn.
+
+python -m bench.request [CHECKOUT]
+"""
+
+import asyncio
+import io
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from statistics import median
+
+import httpx2
+import numpy as np
+
+N_IMAGES, N_LANDMARKS, N_WARM, N_MEASURED, N_TURNS = 2000, 300, 100, 600, 4
+DOMAIN = "/v1/admin/domains/d"
+
+
+def main() -> None:
+    """Print the median of every turn."""
+    here = Path(__file__).resolve().parents[1]
+    for turn in range(N_TURNS):
+        for checkout in [*map(Path, sys.argv[1:]), here]:
+            folders = (checkout.resolve() / name for name in ("service", "client", "migrations"))
+            environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, folders))}
+            command = [sys.executable, __file__, "--measure"]
+            done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)  # noqa: S603 - itself
+            print(f"turn {turn + 1}, {checkout}: {float(done.stdout):.2f} ms")
+
+
+def measure() -> None:
+    """Print milliseconds of an observation, of the packages that are on the path."""
+    print(1000 * median(asyncio.run(_seconds())[N_WARM:]))
+
+
+async def _seconds() -> list[float]:
+    from deepsimbad.api.app import create_app  # noqa: PLC0415 - of the checkout that is on the path
+    from deepsimbad.settings import Settings  # noqa: PLC0415
+
+    rng = np.random.default_rng(0)
+    encodings = np.cumsum(rng.normal(size=(N_IMAGES, 32)), axis=0).astype(np.float32)
+    app = create_app(Settings(data_dir=Path(tempfile.mkdtemp())))
+    transport = httpx2.ASGITransport(app, client=("127.0.0.1", 1))
+    async with (
+        app.router.lifespan_context(app),
+        httpx2.AsyncClient(transport=transport, base_url="http://127.0.0.1", timeout=120) as client,
+    ):
+
+        async def call(method: str, path: str, **more: object) -> dict[str, object]:
+            answer = await client.request(method, path, **more)
+            answer.raise_for_status()
+            return answer.json()
+
+        await call("PUT", DOMAIN, json={"evaluator": {"kind": "feature_l2", "extractor": "none"}})
+        await call("POST", f"{DOMAIN}/traverses", json={"name": "t"})
+        packed = io.BytesIO()
+        index = np.arange(N_IMAGES)
+        np.savez(packed, encodings=encodings, index=index, position_m=1.0 * index)
+        binary = {"Content-Type": "application/octet-stream"}
+        await call("POST", f"{DOMAIN}/traverses/t/frames", content=packed.getvalue(), headers=binary)
+        config = {
+            "training_traverse": "t",
+            "landmark_traverse": "t",
+            "n_landmarks": N_LANDMARKS,
+            "training_episodes": 0,
+        }
+        job = await call("POST", f"{DOMAIN}/remaps", json=config)
+        while job["state"] in {"queued", "running"}:
+            await asyncio.sleep(0.2)
+            job = await call("GET", f"/v1/admin/jobs/{job['job_id']}")
+        session_id = (await call("POST", "/v1/domains/d/sessions", json={}))["session_id"]
+        path = f"/v1/sessions/{session_id}/observations?action_m=1"
+        seconds = []
+        for _ in range(N_WARM + N_MEASURED):
+            body = json.dumps({"ranked_landmarks": rng.permutation(N_LANDMARKS).tolist()})
+            began = time.perf_counter()
+            await call("POST", path, content=body, headers={"Content-Type": "application/json"})
+            seconds.append(time.perf_counter() - began)
+    return seconds
+
+
+if __name__ == "__main__":
+    measure() if "--measure" in sys.argv else main()
