@@ -10,17 +10,12 @@ Array = NDArray[np.float64]
 Image = NDArray[np.uint8]  # [height, width, 3] blue, green, red, where nothing else is said
 Colour = tuple[float, ...]  # blue, green, red, 0..255
 
-UPRIGHT_SIZE = (1232, 1616)
-"""Width and height of a picture the right way up; it is stored turned 90 degrees counter-clockwise."""
-
-CANVAS_SIZE, SEEN_SIZE = (560, 728), (528, 693)
-"""Width and height pictures are drawn at, and of the part that is seen: a little less, so that the robot may nod."""
-
+UPRIGHT_SIZE = (1232, 1616)  # width and height of a picture the right way up; it is stored turned counter-clockwise
+WIDTH, HEIGHT = 560, 728  # of the canvas
+SEEN_SIZE = (528, 693)  # of the part of it that is seen: a little less, so that the robot may nod
 FOCAL_PX, EYE_M, NEAR_M = 300.0, 1.2, 0.35
-WIDTH, HEIGHT = CANVAS_SIZE
 CENTRE_X, HORIZON_Y = WIDTH / 2, HEIGHT * 0.47
 HALF_VIEW = CENTRE_X / FOCAL_PX + 0.02
-
 # Where the canvas's pixels look: [560] columns, sky rows from the top, ground rows from the first below the horizon.
 SLOPE = (np.arange(WIDTH) - CENTRE_X) / FOCAL_PX
 RISE = (HORIZON_Y - np.arange(int(np.ceil(HORIZON_Y)) + 1))[:, None] / FOCAL_PX
@@ -54,8 +49,7 @@ def project(right_ahead: Array, height_m: Array | float = 0.0) -> Array:
 def clip_near(polygon: Array) -> Array:
     """The part of an [n, 2] ground polygon (right, ahead) that lies ahead of the camera; may be empty."""
     ahead, following = polygon[:, 1] - NEAR_M, np.roll(polygon, -1, axis=0)
-    behind_next = following[:, 1] < NEAR_M
-    crossing = (ahead < 0) != behind_next
+    crossing = (ahead < 0) != (following[:, 1] < NEAR_M)
     share = ahead / np.where(crossing, ahead - (following[:, 1] - NEAR_M), 1.0)
     cuts = polygon + share[:, None] * (following - polygon)
     return np.asarray(np.stack([polygon, cuts], axis=1)[np.stack([ahead >= 0, crossing], axis=1)], np.float64)

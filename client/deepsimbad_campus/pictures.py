@@ -23,16 +23,11 @@ SKY_PX_PER_DEG, SKY_TOP_DEG = 4, 68
 def tile_noise(
     rng: np.random.Generator, shape: tuple[int, int], cells: tuple[int, int], octaves: int
 ) -> NDArray[np.float32]:
-    """Fractal noise of mean 0 and standard deviation 1 that repeats without a seam.
+    """[height, width] fractal noise of mean 0 and standard deviation 1 that repeats without a seam.
 
-    Args:
-        rng: Where the numbers come from.
-        shape: (height, width) of the answer in pixels.
-        cells: (rows, columns) of the coarsest grid; each octave doubles it.
-        octaves: How many grids are added, each with half the amplitude of the one before.
+    The coarsest grid has `cells` (rows, columns); each octave doubles it and has half the amplitude of the one before.
     """
-    height, width = shape
-    total = np.zeros(shape, np.float32)
+    (height, width), total = shape, np.zeros(shape, np.float32)
     for octave in range(octaves):
         rows, columns = cells[0] << octave, cells[1] << octave
         if rows > height or columns > width:
@@ -75,9 +70,8 @@ def draw_facade(style: Style, season: Season, drive: int) -> tuple[Image, ...]:
     _edges(picture, is_wall, season.snow > 0.3, rng, scale)
     # Branches and roofs around throw their shadows on it, more near the ground and elsewhere in every drive.
     rng = np.random.default_rng([style.seed, drive, 1])
-    depth = tile_noise(
-        rng, (height, width), (max(1, round(height / (5 * scale))), max(1, round(width / (5 * scale)))), 5
-    )
+    cells = (max(1, round(height / (5 * scale))), max(1, round(width / (5 * scale))))
+    depth = tile_noise(rng, (height, width), cells, 5)
     slope = np.linspace(-1, 1, width)[None, :] * rng.uniform(-0.8, 0.8)
     low = np.linspace(-1.2, 1.2, height)[:, None] + slope
     shade = np.clip((depth + 0.9 * low - rng.uniform(-0.6, 1.0)) / 0.25, 0, 1)[:, :, None]
@@ -146,9 +140,8 @@ def _edges(picture: Image, is_wall: bool, snowy: bool, rng: np.random.Generator,
 def draw_trees(season: Season, seed: int) -> tuple[tuple[Image, ...], ...]:
     """Every species, and a bush, as a season has it; branches stay where they are from season to season.
 
-    Returns:
-        Cut-out pictures, BGRA with colours already multiplied by their opacity, largest first, each half as large; the
-        foot is the middle of the lower edge.
+    Cut-out pictures, BGRA with colours already multiplied by their opacity, and their halvings; the foot is the middle
+    of the lower edge.
     """
     trees = []
     for species in range(BUSH + 1):
@@ -161,8 +154,7 @@ def draw_trees(season: Season, seed: int) -> tuple[tuple[Image, ...], ...]:
 
 
 def _broadleaf(colour: Image, alpha: Image, rng: np.random.Generator, season: Season) -> None:
-    bark = rng.uniform(0.7, 1.2) * np.array([62.0, 74, 86])
-    ends, widths, depths = _branches(rng)
+    bark, (ends, widths, depths) = rng.uniform(0.7, 1.2) * np.array([62.0, 74, 86]), _branches(rng)
     for (x0, y0, x1, y1), width, depth in zip(ends, widths, depths, strict=True):
         start, end, thick = (int(x0), int(y0)), (int(x1), int(y1)), max(1, round(width))
         cv2.line(colour, start, end, ink(bark * (0.8 + 0.08 * depth)), thick, cv2.LINE_AA)
@@ -206,8 +198,8 @@ def _branches(rng: np.random.Generator) -> tuple[Array, Array, Array]:
 
 def _conifer(colour: Image, alpha: Image, rng: np.random.Generator, season: Season) -> None:
     middle, base = TREE_WIDTH // 2, TREE_HEIGHT - 18
-    cv2.rectangle(colour, (middle - 5, base - 20), (middle + 5, TREE_HEIGHT), (50, 62, 74), -1)
-    cv2.rectangle(alpha, (middle - 5, base - 20), (middle + 5, TREE_HEIGHT), 255, -1)
+    for picture, bark in ((colour, (50, 62, 74)), (alpha, (255,))):
+        cv2.rectangle(picture, (middle - 5, base - 20), (middle + 5, TREE_HEIGHT), bark, -1)
     reach, needles = rng.uniform(62, 96), np.array([52.0, 82, 52]) * rng.uniform(0.75, 1.15)
     for k in range(2600):
         down = np.sqrt(rng.random())

@@ -13,16 +13,12 @@ from deepsimbad_campus.camera import FOCAL_PX, GROUND_ROW, HEIGHT, HORIZON_Y, WI
 from deepsimbad_campus.route import Drive, stream
 from deepsimbad_campus.season import Light, season_of
 from deepsimbad_campus.things import Shot
-from deepsimbad_campus.world import BUSH, FIRST_CONIFER, SIGHT_M, Style, World
+from deepsimbad_campus.world import BUSH, FIRST_CONIFER, SIGHT_M, World
 
 GRAIN = 4.0
-FACADES = 96
-"""Pictures of walls kept; about 1 MB each."""
-
+FACADES = 96  # pictures of walls kept; about 1 MB each
 GLARE_PX, DRIFT_DEG_PER_FRAME = 420, 0.06
-BANDS_M = (0.0, 4.0, 10.0, 24.0, 55.0, 1e9)
-"""Distances at which a coarser picture of the ground takes over."""
-
+BANDS_M = (0.0, 4.0, 10.0, 24.0, 55.0, 1e9)  # distances at which a coarser picture of the ground takes over
 LONGEST_SHADOW_M = 45.0
 LABELS = {name: label for label, name in enumerate(("grass", *pictures.PAVING))}
 
@@ -122,7 +118,7 @@ class Renderer:
                 north, east = (feet[1] - feet[0]) / np.hypot(*(feet[1] - feet[0]))
                 gain = shot.light.gain(-east * shot.light.sun[0] + north * shot.light.sun[1])  # its normal points right
                 for ahead, ends, span in things.panels(feet, view):
-                    queue.append((ahead, partial(self._draw_panel, shot, style, gain, ends, span)))
+                    queue.append((ahead, partial(things.draw_panel, shot, self._facade, style, gain, ends, span)))
             for tree in section.trees:
                 stand(tree[0], 5.0, partial(things.draw_tree, shot, self._trees[tree[2]], tree))
             for post in section.posts:
@@ -133,9 +129,6 @@ class Renderer:
             stand(walker[0], 1.0, partial(things.draw_person, shot, walker))
         for _, draw in sorted(queue, key=itemgetter(0), reverse=True):
             draw()
-
-    def _draw_panel(self, shot: Shot, style: Style, gain: Array, feet: Array, span: Array) -> None:
-        things.draw_panel(shot, self._facade(style), style.height_m, gain, feet, span)
 
     def _paint_ground(self, shot: Shot) -> None:
         light, ground, labels, shadows = shot.light, shot.canvas[GROUND_ROW:], self._labels(shot), self._shadows(shot)
@@ -156,9 +149,6 @@ class Renderer:
         right = (ahead * camera.SLOPE).astype(np.float32)
         north = (ahead * cos - right * sin + np.float32(view.north_m % pictures.TILE_M)) * scale
         east = (ahead * sin + right * cos + np.float32(view.east_m % pictures.TILE_M)) * scale
-        if max(np.abs(north).max(), np.abs(east).max()) >= 15_000:  # a remap's are 16 bits wide; the picture repeats
-            side = np.float32(pictures.TILE_PX >> level)
-            north, east = north % side, east % side
         painted = np.zeros((*labels.shape, 3), np.uint8)
         for label in np.flatnonzero(np.bincount(labels.ravel())):
             tile = self._tiles[label][level]
@@ -191,25 +181,23 @@ class Renderer:
         north, east, up = light.sun
         away, ring = -np.array([north, east]) / max(up, 0.05), np.linspace(0, 2 * np.pi, 10, endpoint=False)
         long, circle = np.hypot(*away), np.stack([np.cos(ring), np.sin(ring)], axis=1)
-        along, leaves = away / max(long, 1e-6), light.season.leaf_share
-
-        def shade(outline: Array) -> None:
-            fill(mask, shot.view.to_camera(outline), (255,))
-
+        along, leaves, outlines = away / max(long, 1e-6), light.season.leaf_share, list[Array]()
         for section in self._world.ahead(shot.position_m) if light.sunshine >= 0.15 else ():
             for block in section.blocks:
                 reach = away * block.height_m
                 reach = reach * min(1.0, LONGEST_SHADOW_M / max(np.hypot(*reach), 1e-6))
                 corners = np.concatenate([block.corners(), block.corners() + reach]).astype(np.float32)
-                shade(np.asarray(cv2.convexHull(corners), np.float64)[:, 0])
+                outlines.append(np.asarray(cv2.convexHull(corners), np.float64)[:, 0])
             for place, height, species, _ in section.trees:
                 reach, ahead = away * height * 0.62, shot.view.to_camera(place[None])[0, 1]
                 if species < BUSH and np.hypot(*reach) <= LONGEST_SHADOW_M and -30 < ahead < 70:
                     side = np.array([-along[1], along[0]]) * 0.12
-                    shade(place + np.stack([-side, side, reach + side, reach - side]))
+                    outlines.append(place + np.stack([-side, side, reach + side, reach - side]))
                     bare = leaves < 0.15 and species < FIRST_CONIFER
                     spread = circle * (height * (0.12 if bare else 0.16 + 0.12 * leaves))
-                    shade(place + reach + (spread + np.outer(spread @ along * (1 + 0.5 * long - 1), along)))
+                    outlines.append(place + reach + (spread + np.outer(spread @ along * (1 + 0.5 * long - 1), along)))
+        for outline in outlines:
+            fill(mask, shot.view.to_camera(outline), (255,))
         return mask
 
     def _mark(self, shot: Shot) -> None:

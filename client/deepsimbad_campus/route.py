@@ -14,20 +14,12 @@ from numpy.typing import NDArray
 
 from deepsimbad_campus.camera import Array, View
 
-STEP_M = 0.5
-"""Distance between two samples of the centre line."""
-
-MAX_HEADING_RAD = np.deg2rad(62)
-"""Headings stay within this of the general direction, so the route cannot meet itself again."""
-
-BLOCK = 100
-"""Frames drawn from one block of randomness; a longer drive begins like a shorter one."""
-
+STEP_M = 0.5  # between two samples of the centre line
+MAX_HEADING_RAD = np.deg2rad(62)  # away from the general direction, so that the route cannot meet itself again
+BLOCK = 100  # frames drawn from one block of randomness; a longer drive begins like a shorter one
 INTERVAL_US, TRUTH_STEP_US = 700_000, 10_000
 START_M, WIDEST_M = 2.0, 1.2
-UNCOVERED_FIRST, UNCOVERED_LAST = 2.4, 1.4
-"""Intervals between pictures without ground truth at the beginning and the end."""
-
+UNCOVERED_FIRST, UNCOVERED_LAST = 2.4, 1.4  # intervals between pictures without ground truth at both ends
 NAN_SHARE, NAN_FIRST = 0.004, 3
 
 
@@ -52,19 +44,13 @@ class Stretch(NamedTuple):
     start_m: float
     straight_m: float
     bend_m: float
-
-    @property
-    def end_m(self) -> float:
-        """Route position where the bend ends."""
-        return self.start_m + self.straight_m + self.bend_m
+    end_m: float
 
 
 class Route:
     """The centre line every drive follows, in the local north-east plane: stretches, never crossing themselves.
 
-    Args:
-        seed: Seed of the campus.
-        length_m: At least so long; the beginning of a longer route is the shorter route.
+    It is at least so long; the beginning of a longer route is the shorter route.
     """
 
     def __init__(self, seed: int, length_m: float) -> None:
@@ -79,11 +65,11 @@ class Route:
                 turn = -turn
             turn = float(np.clip(offset + turn, -MAX_HEADING_RAD, MAX_HEADING_RAD) - offset)
             bend = max(6.0, np.ceil(abs(turn) * rng.uniform(9, 20) / STEP_M) * STEP_M)
-            self.stretches.append(Stretch(len(self.stretches), position, straight, bend))
+            end = position + straight + bend
+            self.stretches.append(Stretch(len(self.stretches), position, straight, bend, end))
             headings.append(np.full(int(straight / STEP_M), general + offset))
             headings.append(general + offset + turn * ((np.arange(int(bend / STEP_M)) + 0.5) * STEP_M / bend))
-            offset += turn
-            position += straight + bend
+            offset, position = offset + turn, end
         self._heading = np.concatenate(headings)
         self._north, self._east = (
             np.concatenate([[0.0], np.cumsum(step) * STEP_M]) for step in (np.cos(self._heading), np.sin(self._heading))
@@ -115,11 +101,8 @@ def drive_length_m(n_frames: int, spacing_m: float) -> float:
 class Drive:
     """One drive along the route: where the robot is at every frame and when it stands still.
 
-    Attributes:
-        utime: [n] int64 microseconds, strictly rising.
-        position_m: [n] route positions, never falling.
-        sunniness: [n] how free of clouds the sun is, compared within the drive.
-        exposure: [n] the camera's gain, about 1.
+    `utime` [n] int64 microseconds rises strictly, `position_m` [n] never falls; `sunniness` [n] is how free of clouds
+    the sun is, compared within the drive; `exposure` [n] the camera's gain, about 1.
     """
 
     def __init__(self, route: Route, seed: int, date: datetime.date, n_frames: int, spacing_m: float) -> None:
@@ -156,13 +139,10 @@ class Drive:
         return View(*(float(value[0]) for value in self.poses(self.utime[frame : frame + 1])[1:]))
 
     def ground_truth(self) -> Iterator[Array]:
-        """The poses as NCLT publishes them, at about 100 Hz, with the quirks a reader must survive.
+        """[m, 7] utime (us), x (north), y (east), z (down) in metres, roll, pitch, yaw in radians, a block at a time.
 
-        The first and last few pictures lie outside of the time covered (unless the drive is too short for that), some
-        rows hold NaN, and no row falls exactly on a picture. A block at a time, so that any length fits in memory.
-
-        Yields:
-            [m, 7] utime (microseconds), x (north), y (east), z (down) in metres, roll, pitch, yaw in radians.
+        As NCLT publishes them, at about 100 Hz, with the quirks a reader must survive: the first and last few pictures
+        lie outside of the time covered (unless the drive is too short for that), and some rows hold NaN.
         """
         cut = INTERVAL_US if len(self.utime) >= 8 else 0
         first, last = int(self.utime[0] + cut * UNCOVERED_FIRST), int(self.utime[-1] - cut * UNCOVERED_LAST)

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from deepsimbad_campus.camera import Array, Colour, Image, ink
 from deepsimbad_campus.route import stream
 
+# The four recordings the paper uses.
 PAPER_DATES = {"winter": "2012-01-22", "spring": "2012-03-31", "summer": "2012-08-04", "autumn": "2012-11-17"}
-"""The four recordings the paper uses, by season."""
 
 
 class CampusError(ValueError):
@@ -86,21 +86,16 @@ def season_of(date: datetime.date, seed: int) -> Season:
 class Light:
     """The daylight of one frame: what sun, sky and haze make of a surface's own colour.
 
-    Args:
-        season: The drive's season.
-        sunshine: 0 when a cloud hides the sun, 1 when none does.
-        exposure: The camera's gain for this frame.
+    `sunshine` is 0 when a cloud hides the sun, 1 when none does; `exposure` is the camera's gain.
     """
 
     def __init__(self, season: Season, sunshine: float, exposure: float) -> None:
         self.season, self.sunshine, self.exposure = season, sunshine, exposure
         azimuth, elevation = np.deg2rad(season.sun_azimuth_deg), np.deg2rad(season.sun_elevation_deg)
         flat = np.cos(elevation)
-        self.sun = (flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation))
-        """Unit vector towards the sun: north, east, up."""
+        self.sun = (flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation))  # unit vector: north, east, up
         self.on_ground, self.in_shade = self.gain(self.sun[2]), self.gain(0.0)
-        self.air = np.array(season.horizon) * exposure
-        """[3] what haze looks like."""
+        self.air = np.array(season.horizon) * exposure  # [3] what haze looks like
 
     def gain(self, towards_sun: float) -> Array:
         """[3] factor on a colour for a surface whose normal has this cosine to the sun; 0 is in shade."""

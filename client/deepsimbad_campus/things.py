@@ -1,32 +1,19 @@
 """What stands and moves on the ground, and how it is drawn: walls and trees in perspective, cars, people and posts."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 
-from deepsimbad_campus.camera import (
-    FOCAL_PX,
-    HALF_VIEW,
-    HEIGHT,
-    NEAR_M,
-    WIDTH,
-    Array,
-    Colour,
-    Image,
-    View,
-    project,
-    sixteenths,
-)
+from deepsimbad_campus import camera
+from deepsimbad_campus.camera import FOCAL_PX, HEIGHT, NEAR_M, WIDTH, Array, Colour, Image, View, project, sixteenths
 from deepsimbad_campus.pictures import TREE_HEIGHT, TREE_WIDTH
 from deepsimbad_campus.route import INTERVAL_US, START_M, Drive, Route, stream
 from deepsimbad_campus.season import Light
-from deepsimbad_campus.world import SIGHT_M, Post, Section, Tree
+from deepsimbad_campus.world import SIGHT_M, Post, Section, Style, Tree
 
-CELL_M = 18.0
-"""People come in groups, one group or none for every so many metres of route."""
-
+CELL_M = 18.0  # people come in groups, one group or none for every so many metres of route
 PARKED_SHARE, PEOPLE_SHARE = 0.6, 0.8
 LANE_M, LOOP_M = 1.8, 150.0
 CARS: tuple[Colour, ...] = (
@@ -36,7 +23,6 @@ COATS: tuple[Colour, ...] = (
     (36, 34, 34), (140, 70, 40), (44, 40, 160), (70, 110, 60), (40, 150, 200), (170, 170, 175), (110, 60, 110),
 )  # fmt: skip
 METAL, WOOD, GLASS = (48, 50, 48), (60, 96, 130), (74, 66, 58)
-
 # A car's side, from the rear, [4] metres along and up; the cabin stands on the body.
 BODY = np.array([(-2.1, 0.28), (-2.1, 0.95), (2.05, 0.82), (2.15, 0.28)]).T
 CABIN = np.array([(-1.8, 0.93), (-1.35, 1.48), (0.35, 1.46), (1.05, 0.86)]).T
@@ -97,9 +83,8 @@ def walking(drive: Drive, route: Route, position_m: float, time_s: float) -> Ite
 def panels(feet: Array, view: View) -> Iterator[tuple[float, Array, Array]]:
     """Cut the part of a wall that is in view into panels short enough to be sorted by distance.
 
-    Yields:
-        Distance ahead in metres, [2, 2] (right, ahead) of the panel's left and right foot, and [2] where these lie
-        along the wall, 0 its left and 1 its right edge.
+    Of each its distance ahead in metres, [2, 2] (right, ahead) of its left and right foot, and [2] where these lie
+    along the wall, 0 its left and 1 its right edge.
     """
     (x0, z0), (x1, z1) = ends = view.to_camera(feet)
     if x1 * z0 - x0 * z1 <= 0 or max(z0, z1) < NEAR_M or min(z0, z1) > SIGHT_M:
@@ -111,13 +96,15 @@ def panels(feet: Array, view: View) -> Iterator[tuple[float, Array, Array]]:
     feet = ends[0] + cuts[:, None] * (ends[1] - ends[0])
     ahead = np.maximum(feet[:, 1], 1e-3)
     slope = feet[:, 0] / ahead
-    for k in np.flatnonzero((slope[:-1] < HALF_VIEW) & (slope[1:] > -HALF_VIEW)):
+    for k in np.flatnonzero((slope[:-1] < camera.HALF_VIEW) & (slope[1:] > -camera.HALF_VIEW)):
         yield (ahead[k] + ahead[k + 1]) / 2, feet[k : k + 2], cuts[k : k + 2]
 
 
-def draw_panel(shot: Shot, levels: Sequence[Image], height_m: float, gain: Array, feet: Array, span: Array) -> None:
-    """Draw one panel of a wall, given the wall's picture and its halvings."""
-    low, high = project(feet), project(feet, height_m)
+def draw_panel(
+    shot: Shot, facade: Callable[[Style], Sequence[Image]], style: Style, gain: Array, feet: Array, span: Array
+) -> None:
+    """Draw one panel of a wall; `facade` gives the wall's picture and its halvings."""
+    levels, low, high = facade(style), project(feet), project(feet, style.height_m)
     tall = max(1.0, (low - high)[:, 1].max())
     level = int(np.clip(np.log2(max(levels[0].shape[0] / tall, 1.0)), 0, len(levels) - 1))
     height, width = levels[level].shape[:2]

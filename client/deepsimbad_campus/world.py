@@ -8,15 +8,10 @@ from numpy.typing import NDArray
 from deepsimbad_campus.camera import Array, Colour
 from deepsimbad_campus.route import Route, Stretch, stream
 
-SIGHT_M, BEHIND_M = 130.0, 25.0
-"""Nothing farther along the route than this is drawn."""
-
-NEIGHBOURS = 24
-"""How many of the buildings before are looked at when a new one is placed."""
-
+SIGHT_M, BEHIND_M = 130.0, 25.0  # nothing farther along the route than this is drawn
+NEIGHBOURS = 24  # buildings before that are looked at when a new one is placed
+# Every eight stretches are of these zones, shuffled.
 DECK = ("court", "street", "avenue", "twins", "field", "wall", "parking", "twins")
-"""Every eight stretches are of these zones, shuffled."""
-
 BAY_NUMBERS = 64
 FIRST_CONIFER, BUSH = 11, 14
 MATERIALS = ("brick", "sandstone", "concrete", "plaster", "glass", "brick")
@@ -69,18 +64,11 @@ class Block(NamedTuple):
 class Section:
     """One stretch and all that stands along it; things are placed by metres along and right of its straight part.
 
-    Args:
-        route: The centre line nothing may stand on.
-        stretch: The part of it to furnish.
-        zone: What kind of place it is.
-        rng: The stretch's own randomness.
-        earlier: The buildings placed before; grows.
+    Nothing may stand on the route, nor on the buildings placed before, which grow.
     """
 
-    def __init__(
-        self, route: Route, stretch: Stretch, zone: str, rng: np.random.Generator, earlier: list[Block]
-    ) -> None:
-        self.stretch, self.zone, self._rng, self._earlier = stretch, zone, rng, earlier
+    def __init__(self, route: Route, stretch: Stretch, zone: str, rng: np.random.Generator, built: list[Block]) -> None:
+        self.stretch, self._rng, self._built = stretch, rng, built
         self.blocks: list[Block] = []
         self.facades: list[tuple[Array, Style]] = []  # [2, 2] feet of a wall's left and right edge, seen from outside
         self.trees: list[Tree] = []
@@ -95,16 +83,25 @@ class Section:
         self._line = route.between(stretch.start_m - 160, stretch.end_m + 160)
         self.path_half_width_m = rng.uniform(1.3, 2.2)
         self.path_surface = ("concrete", "asphalt", "paving")[rng.integers(0, 3)]
-        getattr(self, f"_{zone}")(rng, stretch.straight_m)
-        self._surround(rng, stretch.straight_m)
+        length = stretch.straight_m
+        getattr(self, f"_{zone}")(rng, length)
+        # What every stretch has: distant buildings and bushes, trees at its bend, perhaps a crossing path.
+        if zone not in ("field", "wall"):
+            self._row(-1 if rng.random() < 0.5 else 1, (45, 70), 0.5, (9, 26))
+            for _ in range(rng.integers(1, 5)):
+                self._post("bush")
+        for _ in range(rng.integers(2, 6)):
+            self._tree(rng.uniform(length, length + stretch.bend_m), rng.uniform(-25, 25), clearance=4.5)
+        if rng.random() < 0.6:
+            along = rng.uniform(0.2, 0.8) * length
+            self._pave(along, along + rng.uniform(1.6, 4), -40, 40, "concrete")
 
     def _point(self, along: float, right: float) -> Array:
         return np.asarray(self._origin + along * self._axes[0] + right * self._axes[1], np.float64)
 
     def _free(self, place: Array, clearance: float) -> bool:
-        near = self._earlier[-NEIGHBOURS:]
         on_route = np.hypot(*(self._line - place).T).min() < clearance
-        return not (on_route or any(block.contains(place[None], 1.0)[0] for block in near))
+        return not (on_route or any(block.contains(place[None], 1.0)[0] for block in self._built[-NEIGHBOURS:]))
 
     def _build(
         self, along: float, setback: float, size: tuple[float, ...], material: str, seed: int, clearance: float = 4.0
@@ -113,9 +110,9 @@ class Section:
         width, depth, height = size
         centre = self._point(along + width / 2, setback + np.copysign(depth / 2, setback))
         block = Block(centre, self._axes, (width / 2, depth / 2), height)
-        if block.contains(self._line, clearance).any() or any(map(block.meets, self._earlier[-NEIGHBOURS:])):
+        if block.contains(self._line, clearance).any() or any(map(block.meets, self._built[-NEIGHBOURS:])):
             return
-        self._earlier.append(block)
+        self._built.append(block)
         self.blocks.append(block)
         details, corners = np.random.default_rng([seed, 7]), block.corners()
         floors = 0 if material == "wall" else max(1, int(height / details.uniform(3.1, 3.9)))
@@ -127,8 +124,7 @@ class Section:
 
     def _row(self, side: float, setbacks: tuple[float, float], share: float, heights: tuple[float, float]) -> None:
         """Line one side with buildings and gaps."""
-        rng = self._rng
-        along = rng.uniform(0, 6)
+        rng, along = self._rng, self._rng.uniform(0, 6)
         while along < self.stretch.straight_m - 4:
             width = 8.0
             if rng.random() < share:
@@ -166,18 +162,6 @@ class Section:
         corners = ((first, left), (last, left), (last, right), (first, right))
         self.patches.append((np.stack([self._point(*corner) for corner in corners]), surface))
 
-    def _surround(self, rng: np.random.Generator, length: float) -> None:
-        """What every stretch has: distant buildings and bushes, trees at its bend, perhaps a crossing path."""
-        if self.zone not in ("field", "wall"):
-            self._row(-1 if rng.random() < 0.5 else 1, (45, 70), 0.5, (9, 26))
-            for _ in range(rng.integers(1, 5)):
-                self._post("bush")
-        for _ in range(rng.integers(2, 6)):
-            self._tree(rng.uniform(length, length + self.stretch.bend_m), rng.uniform(-25, 25), clearance=4.5)
-        if rng.random() < 0.6:
-            along = rng.uniform(0.2, 0.8) * length
-            self._pave(along, along + rng.uniform(1.6, 4), -40, 40, "concrete")
-
     def _court(self, rng: np.random.Generator, length: float) -> None:
         for side in (-1, 1):
             self._row(side, (7, 14), 0.85, (5, 17))
@@ -206,8 +190,8 @@ class Section:
         species = int(rng.integers(0, 10))
         for along in np.arange(2.0, length, rng.uniform(7, 10)):
             for side in (-1, 1):
-                tall = rng.uniform(9, 11)
-                self._tree(along, side * rng.uniform(4.2, 4.8), species, height=tall)
+                height = rng.uniform(9, 11)
+                self._tree(along, side * rng.uniform(4.2, 4.8), species, height=height)
         for side in (-1, 1):
             self._row(side, (18, 30), 0.35, (6, 15))
         for _ in range(2):
@@ -254,12 +238,7 @@ class Section:
 
 
 class World:
-    """Everything that stays where it is; made whole at once, a few hundred bytes per metre.
-
-    Args:
-        seed: Equal seeds make equal worlds.
-        length_m: Length of the route to furnish; the beginning of a longer world is the shorter world.
-    """
+    """Everything that stays where it is; the beginning of a longer world is the shorter world."""
 
     def __init__(self, seed: int, length_m: float) -> None:
         self.seed = seed

@@ -23,11 +23,7 @@ def test_position_is_arc_length_heading_is_the_way_it_goes_and_right_is_to_the_r
     heading = route.heading(where[:-1] + 0.25)
     assert np.abs((np.arctan2(steps[:, 1], steps[:, 0]) - heading + np.pi) % (2 * np.pi) - np.pi).max() < 0.03
     assert np.ptp(heading) > 0.5  # it bends
-    (here,), (beside,), (angle,) = (
-        route.place(where[20:21]),
-        route.place(where[20:21], 2.0),
-        route.heading(where[20:21]),
-    )
+    (here,), (beside,), (angle,) = route.place(where[20:21]), route.place(where[20:21], 2), route.heading(where[20:21])
     np.testing.assert_allclose(beside - here, [-2 * np.sin(angle), 2 * np.cos(angle)], atol=1e-9)
 
 
@@ -60,7 +56,7 @@ def test_the_robot_stands_still_at_times_and_never_drives_back(route):
     assert drive.view(still)[:3] == drive.view(still + 1)[:3]
 
 
-def test_ground_truth_has_the_quirks_of_the_real_one(route):
+def test_ground_truth_is_where_the_pictures_are_taken_with_the_quirks_of_the_real_one(route):
     drive = Drive(route, 0, WINTER, 250, 1.75)
     rows = np.concatenate(list(drive.ground_truth()))
     clock, unknown = rows[:, 0], np.isnan(rows[:, 1])
@@ -70,17 +66,12 @@ def test_ground_truth_has_the_quirks_of_the_real_one(route):
     assert unknown[:3].all()
     assert 0.001 < unknown.mean() < 0.05
     assert (np.isnan(rows[:, 1:]).all(axis=1) == unknown).all()
-    uncovered = (drive.utime < clock[~unknown][0]) | (drive.utime > clock[~unknown][-1])
+    rows = rows[~unknown]
+    uncovered = (drive.utime < rows[0, 0]) | (drive.utime > rows[-1, 0])
     assert uncovered[[0, -1]].all()
     assert 3 <= uncovered.sum() <= 8
-    assert np.diff(clock[~unknown]).max() < 150_000  # a gap within never uncovers a picture
+    assert np.diff(rows[:, 0]).max() < 150_000  # a gap within never uncovers a picture
     assert len(next(Drive(route, 0, WINTER, 2, 1.75).ground_truth())) > 10  # however short the drive
-
-
-def test_ground_truth_is_where_the_pictures_are_taken(route):
-    drive = Drive(route, 0, WINTER, 250, 1.75)
-    rows = np.concatenate(list(drive.ground_truth()))
-    rows = rows[~np.isnan(rows[:, 1])]
     for frame in range(5, 245, 24):
         view = drive.view(frame)
         north, east = (np.interp(drive.utime[frame], rows[:, 0], rows[:, k]) for k in (1, 2))

@@ -25,22 +25,17 @@ def _files(root):
     return {str(path.relative_to(root)): path.read_bytes() for path in root.rglob("*") if path.is_file()}
 
 
-def test_the_layout_is_that_of_nclt(campus):
+def test_the_layout_and_the_compression_are_those_of_nclt(campus):
     for date in (WINTER, SUMMER):
         pictures = sorted((campus / date / "lb3" / "Cam5").iterdir())
         assert len(pictures) == 12
         assert all(len(path.stem) == 16 and path.suffix == ".tiff" for path in pictures)
+        with Image.open(pictures[3]) as picture:
+            assert (picture.format, picture.size, picture.info["compression"]) == ("TIFF", (1616, 1232), "jpeg")
         truth = (campus / "ground_truth" / f"groundtruth_{date}.csv").read_text().splitlines()
         assert all(len(line.split(",")) == 7 for line in truth)
         assert truth[0].split(",")[1] == "nan"
         assert len(truth[0].split(",")[0]) == 16
-
-
-def test_pictures_are_jpeg_compressed_tiffs_as_the_camera_stores_them(campus):
-    path = sorted((campus / WINTER / "lb3" / "Cam5").iterdir())[3]
-    with Image.open(path) as picture:
-        assert (picture.format, picture.size, picture.info["compression"]) == ("TIFF", (1616, 1232), "jpeg")
-    assert 100_000 < path.stat().st_size < 1_200_000
 
 
 def test_our_reader_reads_it(campus):
@@ -54,8 +49,8 @@ def test_our_reader_reads_it(campus):
 
 
 def test_it_goes_on_where_it_was_cut_short_and_adds_frames_to_equal_bytes(campus, tmp_path):
-    def stop(done, total):
-        if done == 7:
+    def stop(n_written, n_frames):
+        if n_written == 7:
             raise RuntimeError("cut short")
 
     write_campus(tmp_path, ["winter"], 4, seed=1)
@@ -67,21 +62,14 @@ def test_it_goes_on_where_it_was_cut_short_and_adds_frames_to_equal_bytes(campus
     assert 7 <= len(before) < 12
     assert first.items() <= before.items()
     (min(before).parent / f".{min(before).name}.part").write_bytes(b"half a pict")
-    write_campus(tmp_path, ["winter"], 12, seed=1)
+    calls = []
+    write_campus(tmp_path, ["winter"], 12, seed=1, on_progress=lambda *call: calls.append(call))
+    assert calls == [(n_written, 12) for n_written in range(1, 13)]
     assert all(path.stat().st_mtime_ns == at for path, at in before.items())
     assert _files(tmp_path) == {name: body for name, body in _files(campus).items() if WINTER in name}
 
 
-def test_progress_counts_every_picture_of_every_drive(tmp_path):
-    for _ in range(2):
-        calls = []
-        write_campus(tmp_path, ["2012-05-11", "autumn"], 2, on_progress=lambda *call, calls=calls: calls.append(call))
-        assert calls == [(done, 4) for done in range(1, 5)]
-
-
-@pytest.mark.parametrize(
-    "change", [{"seed": 4}, {"n_frames": 2}, {"spacing_m": 1.0}], ids=["seed", "fewer frames", "spacing"]
-)
+@pytest.mark.parametrize("change", [{"seed": 4}, {"n_frames": 2}, {"spacing_m": 1.0}])
 def test_drives_made_otherwise_are_not_mixed(campus, change):
     before = _files(campus)
     with pytest.raises(CampusError, match="choose another folder"):
@@ -89,9 +77,7 @@ def test_drives_made_otherwise_are_not_mixed(campus, change):
     assert _files(campus) == before
 
 
-@pytest.mark.parametrize(
-    "there", [f"{SUMMER}/lb3/Cam5/1344104400000000.tiff", f"ground_truth/groundtruth_{SUMMER}.csv"]
-)
+@pytest.mark.parametrize("there", [f"{SUMMER}/lb3/Cam5/1344.tiff", f"ground_truth/groundtruth_{SUMMER}.csv"])
 def test_a_real_recording_is_never_touched(tmp_path, there):
     (tmp_path / there).parent.mkdir(parents=True)
     (tmp_path / there).write_bytes(b"real")
@@ -108,25 +94,18 @@ def test_a_damaged_order_is_named(tmp_path, text):
         write_campus(tmp_path, ["summer"], 2)
 
 
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        *({"n_frames": 0}, {"spacing_m": 0.0}, {"spacing_m": float("nan")}, {"seed": -1}),
-        *({"seasons": []}, {"seasons": ["winter", "2012-01-22"]}),
-        *({"seasons": [season]} for season in ("", "Winter", "monsoon", "2012-13-01", "22.1.2012")),
-    ],
-)
-def test_impossible_arguments_are_refused_before_anything_is_written(tmp_path, wrong):
+@pytest.mark.parametrize("seasons", [[], ["winter", "2012-01-22"], [""], ["Winter"], ["2012-13-01"], ["22.1.2012"]])
+def test_seasons_that_cannot_be_are_refused_before_anything_is_written(tmp_path, seasons):
     with pytest.raises(CampusError):
-        write_campus(tmp_path, **{"seasons": ["winter"], "n_frames": 1, **wrong})
+        write_campus(tmp_path, seasons, 1)
     assert not list(tmp_path.iterdir())
 
 
 def test_the_command_renders_and_says_what_to_open_or_what_is_wrong(tmp_path):
-    result = CliRunner().invoke(campus_command, [str(tmp_path), "--seasons", "winter, autumn", "--frames", "2"])
+    result = CliRunner().invoke(campus_command, [str(tmp_path), "--seasons", "winter, 2012-05-11", "--frames", "1"])
     assert result.exit_code == 0, result.output
-    assert result.stdout.splitlines() == [f"nclt:{tmp_path}/2012-01-22", f"nclt:{tmp_path}/2012-11-17"]
-    assert len(list(tmp_path.rglob("*.tiff"))) == 4
+    assert result.stdout.splitlines() == [f"nclt:{tmp_path}/2012-01-22", f"nclt:{tmp_path}/2012-05-11"]
+    assert len(list(tmp_path.rglob("*.tiff"))) == 2
     result = CliRunner().invoke(campus_command, [str(tmp_path), "--seasons", "mud"])
     assert result.exit_code == 1
     assert "season 'mud' is neither one of winter" in result.stderr
