@@ -5,14 +5,12 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import httpx2
 import numpy as np
 import pytest
 
 from deepsimbad.core.route import Route
 from deepsimbad_client import Client, errors
 from deepsimbad_client.http.jobs import remap
-from deepsimbad_client.http.upload import upload
 from deepsimbad_client.recordings.recording import Frame, Recording
 from deepsimbad_client.recordings.sources import open_source
 from deepsimbad_client.replay.journal import Journal
@@ -20,28 +18,24 @@ from deepsimbad_client.replay.passive import Replay, Step, replay
 from deepsimbad_client.replay.report import summarise
 from deepsimbad_client.replay.scene import Scene, right_answers
 
-
-def mapped(client: Client, domain: str, encodings: Path) -> None:
-    client.admin.put_domain(domain, {"kind": "feature_l2", "extractor": "none"})
-    upload(client, open_source(str(encodings / "summer.npy")), domain, "summer")
-    remap(client, domain, "summer", landmark_traverse="summer", n_landmarks=50)
+from ..conftest import ENCODINGS, mapped
 
 
-def slow_ranks(client: Client, domain: str, recording: Recording, tolerance_m: float) -> list[float]:
+def slow_ranks(client: Client, recording: Recording, tolerance_m: float) -> list[float]:
     """By the definition, from the answers of another session alone; map image i lies at i metres."""
     ranks = []
-    with client.session(domain) as session:
+    with client.session("route") as session:
         last_m = recording.frames[0].position_m
         for row, frame in enumerate(recording.frames):
             moved_m = max(0.0, frame.position_m - last_m)
             answer = session.observe(**recording.view(row, None), action_m=moved_m, shortlist=120)
             last_m = frame.position_m
             values = {place.map_image: place.relevance for place in answer.retrieval}
-            true = [image for image in values if abs(image - frame.position_m) <= tolerance_m]
             placed = [
                 sum(other > values[image] for other in values.values())
                 + (sum(other == values[image] for other in values.values()) - 1) / 2
-                for image in true
+                for image in values
+                if abs(image - frame.position_m) <= tolerance_m
             ]
             ranks.append(min(placed))
     return ranks
@@ -51,19 +45,16 @@ def essence(steps: list[Step]) -> list[tuple[object, ...]]:
     return [(step.query, step.name, step.rank, step.best_map_image, step.error_m, step.true_route_m) for step in steps]
 
 
-def test_one_session_in_order_is_ranked_by_the_service(service: str, encodings: Path, tmp_path: Path) -> None:
+def test_one_session_in_order_is_ranked_by_the_service(
+    client: Client, link: Any, encodings: Path, tmp_path: Path
+) -> None:
     recording = open_source(f"{encodings / 'winter.npy'}#20:63")
-    posted: list[int] = []
-    with Client(service) as client:
-        mapped(client, "ranked", encodings)
-        count: Any = lambda request: posted.append(len(request.content))  # noqa: E731
-        client._wire.link.http.event_hooks = {"request": [count], "response": []}
-        driven = replay(client, recording, "ranked", tmp_path, tolerance_m=2)
-        assert [step.rank for step in driven.steps] == slow_ranks(client, "ranked", recording, 2)
-        assert len({step.rank for step in driven.steps}) > 3, "else nothing is shown"
-        with pytest.raises(errors.GoneError):
-            client.attach_session(json.loads((tmp_path / "replay.json").read_text())["session_id"])
-    assert max(posted) < 4_000
+    driven = replay(client, recording, "route", tmp_path, tolerance_m=2)
+    assert max(len(request.content) for request in link.requests) < 4_000
+    assert [step.rank for step in driven.steps] == slow_ranks(client, recording, 2)
+    assert len({step.rank for step in driven.steps}) > 3, "else nothing is shown"
+    with pytest.raises(errors.GoneError):
+        client.attach_session(json.loads((tmp_path / "replay.json").read_text())["session_id"])
     for step in driven.steps:
         assert (step.n_true, step.true_route_m, step.forgot) == (5, step.position_m, False)
         assert step.error_m == abs((step.best_map_image or 0) - step.position_m)
@@ -74,90 +65,78 @@ def test_one_session_in_order_is_ranked_by_the_service(service: str, encodings: 
     assert "mass" not in lines[0]
 
 
-@pytest.mark.parametrize("stop", ["between two views", "an answer that was not written down"])
+def n_observations(link: Any) -> int:
+    return sum(request.url.path.endswith("/observations") for request in link.requests)
+
+
+@pytest.mark.parametrize("is_written", [True, False], ids=["between two views", "an answer that was not written down"])
 def test_a_replay_goes_on_where_it_was_stopped(
-    service: str, encodings: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stop: str
+    client: Client, link: Any, encodings: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_written: bool
 ) -> None:
     recording = open_source(f"{encodings / 'winter.npy'}#20:65")
-    posted: list[str] = []
+    whole = replay(client, recording, "route", tmp_path / "whole", concurrency=3)
+    assert [step.index for step in whole.steps] == list(range(20, 65))
+    append = Journal.append
 
-    def count(request: httpx2.Request) -> None:
-        if request.url.path.endswith("/observations"):
-            posted.append(request.url.path)
-
-    domain = f"stopped-{len(stop)}"
-    with Client(service) as client:
-        client._wire.link.http.event_hooks = {"request": [count], "response": []}
-        mapped(client, domain, encodings)
-        whole = replay(client, recording, domain, tmp_path / "whole", concurrency=3)
-        assert [step.index for step in whole.steps] == list(range(20, 65))
-        append = Journal.append
-
-        def append_or_stop(journal: Any, document: Any) -> None:
-            if isinstance(document, dict) and document["query"] == 31 and stop != "between two views":
-                raise KeyboardInterrupt
+    def append_or_stop(journal: Any, document: Any) -> None:
+        is_last = isinstance(document, dict) and document["query"] == 31
+        if is_written or not is_last:
             append(journal, document)
-            if isinstance(document, dict) and document["query"] == 31:
-                raise KeyboardInterrupt
+        if is_last:
+            raise KeyboardInterrupt
 
-        with monkeypatch.context() as patch:
-            patch.setattr(Journal, "append", append_or_stop)
-            with pytest.raises(KeyboardInterrupt):
-                replay(client, recording, domain, tmp_path / "parts", concurrency=3)
-        posted.clear()
-        heard: list[tuple[int, float | None]] = []
-        resumed = replay(
-            *(client, recording, domain, tmp_path / "parts"),
-            on_progress=lambda step, n_done: heard.append((n_done, step.rank)),
-        )
-        assert len(posted) == 45 - (32 if stop == "between two views" else 31)
-        assert essence(resumed.steps) == essence(whole.steps)
-        assert heard == [(at + 1, step.rank) for at, step in enumerate(whole.steps)]
-        posted.clear()
-        assert essence(replay(client, recording, domain, tmp_path / "parts").steps) == essence(whole.steps)
-        assert not posted, "nothing was left to ask"
-        remap(client, domain, "summer")
-        with pytest.raises(errors.ReplayError, match="map_version 1, now 2"):
-            replay(client, recording, domain, tmp_path / "parts")
+    with monkeypatch.context() as patch:
+        patch.setattr(Journal, "append", append_or_stop)
+        with pytest.raises(KeyboardInterrupt):
+            replay(client, recording, "route", tmp_path / "parts", concurrency=3)
+    link.requests.clear()
+    heard: list[tuple[int, float | None]] = []
+    resumed = replay(
+        *(client, recording, "route", tmp_path / "parts"),
+        on_progress=lambda step, n_done: heard.append((n_done, step.rank)),
+    )
+    assert n_observations(link) == 45 - (32 if is_written else 31)
+    assert essence(resumed.steps) == essence(whole.steps)
+    assert heard == [(at + 1, step.rank) for at, step in enumerate(whole.steps)]
+    link.requests.clear()
+    assert essence(replay(client, recording, "route", tmp_path / "parts").steps) == essence(whole.steps)
+    assert not n_observations(link), "nothing was left to ask"
 
 
-def test_a_session_that_ended_meanwhile_is_named(service: str, encodings: Path, tmp_path: Path) -> None:
+def test_a_session_or_a_map_that_is_another_meanwhile_is_named(client: Client, encodings: Path, tmp_path: Path) -> None:
     recording = open_source(f"{encodings / 'winter.npy'}#:50")
 
     def stop(step: Step, n_done: int) -> None:
         raise KeyboardInterrupt
 
-    with Client(service) as client:
-        mapped(client, "ended", encodings)
-        with pytest.raises(KeyboardInterrupt):
-            replay(client, recording, "ended", tmp_path, on_progress=stop)
-        client.attach_session(json.loads((tmp_path / "replay.json").read_text())["session_id"]).delete()
-        with pytest.raises(errors.ReplayError, match=r"ended meanwhile .*restart"):
-            replay(client, recording, "ended", tmp_path)
-        assert len(replay(client, recording, "ended", tmp_path, restart=True).steps) == 50
+    mapped(client, "ended", encodings)
+    with pytest.raises(KeyboardInterrupt):
+        replay(client, recording, "ended", tmp_path, on_progress=stop)
+    client.attach_session(json.loads((tmp_path / "replay.json").read_text())["session_id"]).delete()
+    with pytest.raises(errors.ReplayError, match=r"ended meanwhile .*restart"):
+        replay(client, recording, "ended", tmp_path)
+    assert len(replay(client, recording, "ended", tmp_path, restart=True).steps) == 50
+    remap(client, "ended", "summer", training_episodes=0)
+    with pytest.raises(errors.ReplayError, match="map_version 1, now 2"):
+        replay(client, recording, "ended", tmp_path)
 
 
-def test_jumps_and_drives_backwards_begin_anew(service: str, encodings: Path, tmp_path: Path) -> None:
-    with Client(service) as client:
-        mapped(client, "jumps", encodings)
-        backwards = open_source(f"{encodings / 'winter.npy'}#30:10:-1")
-        driven = replay(client, backwards, "jumps", tmp_path / "back")
-        assert [step.forgot for step in driven.steps] == [False] + [True] * 19
-        assert summarise(driven)["recall_at_5"] > 50
-        whole = open_source(str(encodings / "winter.npy"))
-        views = np.array(whole.encodings)
-        frames = tuple(Frame(i, str(i), 3.0 * i) for i in (0, 1, 38))
-        jumping = Recording("jumping", frames, encodings=views[[0, 3, 114]])
-        driven = replay(client, jumping, "jumps", tmp_path / "jump")
-        assert [step.forgot for step in driven.steps] == [False, False, True]
-        assert [step.true_route_m for step in driven.steps] == [0.0, 3.0, 114.0]
+def test_jumps_and_drives_backwards_begin_anew(client: Client, encodings: Path, tmp_path: Path) -> None:
+    backwards = open_source(f"{encodings / 'winter.npy'}#30:10:-1")
+    driven = replay(client, backwards, "route", tmp_path / "back")
+    assert [step.forgot for step in driven.steps] == [False] + [True] * 19
+    assert summarise(driven)["recall_at_5"] > 50
+    views = np.load(encodings / "winter.npy")
+    frames = tuple(Frame(i, str(i), 3.0 * i) for i in (0, 1, 38))
+    driven = replay(client, Recording("jumping", frames, encodings=views[[0, 3, 114]]), "route", tmp_path / "jump")
+    assert [step.forgot for step in driven.steps] == [False, False, True]
+    assert [step.true_route_m for step in driven.steps] == [0.0, 3.0, 114.0]
 
 
-def test_a_domain_without_a_map_cannot_be_replayed_against(service: str, encodings: Path, tmp_path: Path) -> None:
-    with Client(service) as client:
-        client.admin.put_domain("bare", {"kind": "feature_l2", "extractor": "none"})
-        with pytest.raises(errors.ReplayError, match="remap"):
-            replay(client, open_source(str(encodings / "winter.npy")), "bare", tmp_path)
+def test_a_domain_without_a_map_cannot_be_replayed_against(client: Client, encodings: Path, tmp_path: Path) -> None:
+    client.admin.put_domain("bare", ENCODINGS)
+    with pytest.raises(errors.ReplayError, match="remap"):
+        replay(client, open_source(str(encodings / "winter.npy")), "bare", tmp_path)
 
 
 # The truth
@@ -209,7 +188,7 @@ def journal(folder: Path, identity: dict[str, Any], *, restart: bool = False) ->
     return Journal(folder, "records.jsonl", identity, lambda document: int(document["n"]), "number", restart=restart)
 
 
-def test_a_journal_goes_on_after_a_torn_line(tmp_path: Path) -> None:
+def test_a_journal_goes_on_after_a_torn_line_and_is_not_mixed_with_another_replays(tmp_path: Path) -> None:
     with journal(tmp_path / "new", {"a": 1}) as log:
         log.note(session_id="s1")
         log.append({"n": 1})
@@ -221,34 +200,24 @@ def test_a_journal_goes_on_after_a_torn_line(tmp_path: Path) -> None:
         log.append({"n": 3})
     with journal(tmp_path / "new", {"a": 1}) as log:
         assert log.earlier == [1, 3]
-
-
-def test_a_journal_of_another_replay_is_not_mixed_with_this_one(tmp_path: Path) -> None:
-    with journal(tmp_path, {"map_version": 1, "domain": "d"}) as log:
-        log.append({"n": 1})
-    with pytest.raises(errors.ReplayError, match="map_version 1, now 2"):
-        journal(tmp_path, {"map_version": 2, "domain": "d"})
-    with journal(tmp_path, {"map_version": 2, "domain": "d"}, restart=True) as log:
+    with pytest.raises(errors.ReplayError, match="a 1, now 2"):
+        journal(tmp_path / "new", {"a": 2})
+    with journal(tmp_path / "new", {"a": 2}, restart=True) as log:
         assert log.earlier == []
 
 
-@pytest.mark.parametrize("damage", [b"{}\n", b"\0\0\n", b"[]\n", b"\xff\n"])
-def test_a_damaged_line_is_named(tmp_path: Path, damage: bytes) -> None:
-    with journal(tmp_path, {}):
+@pytest.mark.parametrize(
+    ("name", "damage", "words"),
+    [
+        *(("records.jsonl", line, r"line 1 of .* is no number") for line in (b"{}\n", b"\0\0\n", b"[]\n", b"\xff\n")),
+        *(("replay.json", text, "another replay") for text in (b"", b"\0\0\0", b"[]")),
+    ],
+)
+def test_damage_is_named(tmp_path: Path, name: str, damage: bytes, words: str) -> None:
+    with journal(tmp_path, {"a": 1}):
         pass
-    (tmp_path / "records.jsonl").write_bytes(damage)
-    with pytest.raises(errors.ReplayError, match=r"line 1 of .* is no number"):
-        journal(tmp_path, {})
-
-
-@pytest.mark.parametrize("damage", [b"", b"\0\0\0", b"[]"])
-def test_a_folder_whose_identity_is_damaged(tmp_path: Path, damage: bytes) -> None:
-    (tmp_path / "replay.json").write_bytes(damage)
-    with pytest.raises(errors.ReplayError, match="another replay"):
+    (tmp_path / name).write_bytes(damage)
+    with pytest.raises(errors.ReplayError, match=words):
         journal(tmp_path, {"a": 1})
-
-
-def test_a_folder_that_cannot_be_written(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
     with pytest.raises(errors.ReplayError, match="cannot write"):
-        journal(tmp_path / "file" / "below", {})
+        journal(tmp_path / name / "below", {"a": 1})

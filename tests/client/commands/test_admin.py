@@ -17,7 +17,7 @@ from deepsimbad_client.http.jobs import remap
 from deepsimbad_client.http.upload import upload
 from deepsimbad_client.recordings.sources import open_source
 
-ENCODINGS = {"kind": "feature_l2", "extractor": "none"}
+from ..conftest import ENCODINGS, mapped
 
 
 @pytest.fixture(scope="module")
@@ -26,11 +26,9 @@ def domain(service: str, encodings: Path, tmp_path_factory: pytest.TempPathFacto
     noise = tmp_path_factory.mktemp("noise") / "noise.npy"
     np.save(noise, np.random.default_rng(1).normal(size=(120, 32)).astype(np.float32))
     with Client(service) as client:
-        client.admin.put_domain("season", ENCODINGS)
-        for name in ("landmarks", "summer", "winter"):
-            upload(client, open_source(str(encodings / f"{name}.npy")), "season", name)
-        upload(client, open_source(str(noise)), "season", "noise")
-        remap(client, "season", "summer", landmark_traverse="landmarks", n_landmarks=50, training_episodes=0)
+        mapped(client, "season", encodings)
+        for file in (encodings / "winter.npy", noise):
+            upload(client, open_source(str(file)), "season", file.stem)
     return "season"
 
 

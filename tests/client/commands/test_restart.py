@@ -1,0 +1,74 @@
+"""The demonstration from end to end, and jobs and robots whose service is restarted under them, as a process."""
+
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from deepsimbad_client import Client, RetryPolicy
+from deepsimbad_client.commands import demo as demonstration
+from deepsimbad_client.http.jobs import follow_job
+from deepsimbad_client.http.local_server import LocalServer
+from deepsimbad_client.http.models import Job
+from deepsimbad_client.http.upload import upload
+from deepsimbad_client.recordings.sources import open_source
+
+from ..conftest import ENCODINGS
+
+pytestmark = pytest.mark.slow
+
+
+def test_the_demonstration_on_a_tiny_campus(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(demonstration, "RELEVANCES", demonstration.RELEVANCES[-2:])
+    ended = CliRunner().invoke(demonstration.demo, [str(tmp_path / "demo"), "--frames", "30"], catch_exceptions=False)
+    assert ended.exit_code == 0
+    for words in ("calibrated (default)", "It looks and sees", "Move 1: it goes", "constant:10", "8. Pictures:"):
+        assert words in ended.stdout
+    assert (tmp_path / "demo" / "active" / "belief_by_step.png").exists()
+
+
+@pytest.mark.parametrize("is_killed", [False, True], ids=["stopped", "killed"])
+def test_a_job_and_a_session_outlive_their_service(tmp_path: Path, encodings: Path, is_killed: bool) -> None:
+    heard: list[Job] = []
+    has_begun = threading.Event()
+
+    def hear(job: Job) -> None:
+        heard.append(job)
+        if job.stage is not None:
+            has_begun.set()
+
+    retry = RetryPolicy(attempts=12)
+    with LocalServer(tmp_path / "data") as server, Client(server.url, retry=retry) as client:
+        end = server.kill if is_killed else server.stop
+        client.admin.put_domain("d", ENCODINGS)
+        for name in ("landmarks", "summer"):
+            upload(client, open_source(str(encodings / f"{name}.npy")), "d", name)
+        job = client.admin.remap("d", training_traverse="summer", landmark_traverse="landmarks", n_landmarks=50)
+        ended: list[Job] = []
+        follower = threading.Thread(target=lambda: ended.append(follow_job(client, job.job_id, hear)))
+        follower.start()
+        try:
+            assert has_begun.wait(60), heard
+            last = heard[-1]
+            end()
+            server.start()
+        finally:
+            follower.join(240)
+        (done,) = ended
+        assert done.state == "succeeded"
+        assert (done.result or {})["map_version"] in {1, 2}  # a number that was begun is not used again
+        assert not last.ended
+        assert len(heard) > heard.index(last) + 1
+
+        views = np.load(encodings / "summer.npy")
+        with client.session("d") as session:
+            first = session.observe(encoding=views[20])
+            end()
+            starting = threading.Timer(0.3, server.start)
+            starting.start()
+            second = session.observe(encoding=views[24], action_m=4)  # knocks until somebody answers
+            starting.join()
+            assert (first.n_observations, second.n_observations) == (1, 2)
+            assert second.belief.mode_m == 24

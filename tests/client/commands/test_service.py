@@ -1,0 +1,210 @@
+"""The client against the real service: nothing between them is pretended."""
+
+import asyncio
+import json
+import threading
+from pathlib import Path
+
+import cv2
+import httpx2
+import numpy as np
+import pytest
+
+from deepsimbad.api.app import create_app
+from deepsimbad.settings import Settings
+from deepsimbad_client import AsyncClient, Client, errors
+from deepsimbad_client.commands.group import run
+from deepsimbad_client.http.jobs import follow_job, remap
+from deepsimbad_client.http.upload import UploadReport, in_order, upload
+from deepsimbad_client.recordings.sources import open_source
+from deepsimbad_client.replay.passive import replay
+from deepsimbad_client.replay.report import summarise
+
+from ..conftest import ENCODINGS, mapped
+
+
+def test_an_upload_goes_on_where_it_stopped(client: Client, encodings: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("deepsimbad_client.http.upload.BATCH_BYTES", 10 * 32 * 4)
+
+    def stop(progress: UploadReport) -> None:
+        if progress.n_done >= 20:
+            raise KeyboardInterrupt
+
+    client.admin.put_domain("again", ENCODINGS)
+    with pytest.raises(KeyboardInterrupt):
+        upload(client, open_source(f"{encodings / 'summer.npy'}#10:"), "again", "t", on_progress=stop)
+    assert client.admin.traverse("again", "t").missing == ((0, 9),)
+    report = upload(client, open_source(str(encodings / "summer.npy")), "again", "t")
+    assert (report.n_skipped, report.n_sent) == (20, 100)
+    there = client.admin.traverse("again", "t")
+    assert (there.n_frames, there.missing) == (120, ())
+    resent = upload(client, open_source(str(encodings / "summer.npy")), "again", "t", resend=True)
+    assert (resent.n_skipped, resent.n_sent) == (0, 120)
+
+
+def test_results_come_in_order_and_work_never_runs_far_ahead() -> None:
+    begun: list[int] = []
+    release = threading.Event()
+
+    def work(item: int) -> int:
+        begun.append(item)
+        if item == 0:
+            release.wait(10)
+        return item * item
+
+    results = in_order(work, range(100), 4)
+    release.set()
+    assert next(results) == (0, 0)
+    assert max(begun) < 8
+    assert [result for _, result in results] == [item * item for item in range(1, 100)]
+
+
+def test_a_failure_comes_in_its_turn_and_stops_the_rest() -> None:
+    begun: list[int] = []
+
+    def work(item: int) -> int:
+        begun.append(item)
+        if item == 5:
+            raise errors.ReplayError("five")
+        return item
+
+    with pytest.raises(errors.ReplayError, match="five"):
+        list(in_order(work, range(1000), 2))
+    assert len(begun) < 20
+
+
+def test_images_with_a_broken_one_among_them(client: Client, tmp_path: Path) -> None:
+    folder = tmp_path / "images"
+    folder.mkdir()
+    rng = np.random.default_rng(3)
+    for number in range(8):
+        picture = cv2.resize(rng.integers(0, 255, (6, 8, 3), np.uint8), (320, 240), interpolation=cv2.INTER_CUBIC)
+        cv2.imwrite(str(folder / f"{number}.jpg"), picture)
+    (folder / "3.jpg").write_bytes((folder / "3.jpg").read_bytes()[:-500])
+    client.admin.put_domain("pictures", {"kind": "feature_l2"})
+    report = upload(client, open_source(str(folder)), "pictures", "t", concurrency=3)
+    assert (report.n_sent, report.n_broken.total(), report.broken_names) == (7, 1, ["3.jpg"])
+    remap(client, "pictures", "t", landmark_traverse="t", n_landmarks=5, list_length=2)
+    driven = replay(client, open_source(str(folder)), "pictures", tmp_path / "out", tolerance_m=0, concurrency=2)
+    summary = summarise(driven)
+    assert (summary["n_queries"], sum(summary["n_broken"].values())) == (7, 1)
+    answer = client.localize("pictures", folder / "5.jpg", shortlist=3)
+    assert len(answer.retrieval) == 3
+
+
+def test_errors_arrive_with_their_names(client: Client, encodings: Path) -> None:
+    with pytest.raises(errors.UnknownDomainError) as unknown:
+        client.domain("nowhere")
+    assert unknown.value.request_id
+    client.admin.put_domain("empty", ENCODINGS)
+    with pytest.raises(errors.DomainDiffersError):
+        client.admin.put_domain("empty", ENCODINGS, closed=True)
+    with pytest.raises(errors.NoActiveMapError):
+        client.localize("empty", ranked_landmarks=[0])
+    with pytest.raises(errors.UnknownTraverseError):
+        client.admin.traverse("empty", "none")
+    with pytest.raises(errors.UnknownJobError):
+        client.admin.job("none")
+    upload(client, open_source(str(encodings / "summer.npy")), "empty", "summer")
+    with pytest.raises(errors.JobFailedError, match="landmarks"):
+        remap(client, "empty", "summer", landmark_traverse="summer", n_landmarks=500)
+    client.admin.delete_traverse("empty", "summer")
+    client.admin.delete_domain("empty")
+    with pytest.raises(errors.UnknownDomainError):
+        client.admin.delete_domain("empty")
+
+
+def test_what_became_known_later_improves_the_next_map(client: Client, encodings: Path, views: np.ndarray) -> None:
+    mapped(client, "learning", encodings, training_episodes=20)
+    with client.session("learning") as session:
+        for at in (40, 43, 46):
+            session.observe(encoding=views[at], action_m=3)
+    job = client.admin.feed_experience("learning", session.session_id, [40.0, None, 46.0])
+    assert (follow_job(client, job.job_id).result or {})["map_version"] == 2
+    assert client.domain("learning").map_version == 2
+
+
+def test_the_command_line_end_to_end(
+    service: str, encodings: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("DEEPSIMBAD_URL", service)
+    for name in ("landmarks", "summer"):
+        assert run(["upload", str(encodings / f"{name}.npy"), "--domain", "cli", "--traverse", name, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out.partition("}\n{")[0] + "}")["n_sent"] == 60
+    command = ["remap", "--domain", "cli", "--training", "summer", "--landmarks", "landmarks", "--n-landmarks", "50"]
+    assert run([*command, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["result"]["map_version"] == 1
+    out = tmp_path / "out"
+    command = ["replay", f"{encodings / 'winter.npy'}#:40", "--domain", "cli", "--out", str(out)]
+    assert run([*command, "--json"]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert printed == json.loads((out / "summary.json").read_text())
+    assert len((out / "steps.jsonl").read_text().splitlines()) == 40
+    for picture in ("rank_along_route", "rank_distribution", "belief_along_drive"):
+        assert (out / f"{picture}.png").read_bytes().startswith(b"\x89PNG")
+    assert run([*command, "--json"]) == 0  # a second run has nothing left to ask
+    assert json.loads(capsys.readouterr().out)["anr"] == printed["anr"]
+    assert run([*command, "--tolerance", "9"]) == 1
+    assert "tolerance_m" in capsys.readouterr().err
+    assert run([*command, "--restart", "--no-plots"]) == 0
+    assert "ANR" in capsys.readouterr().out
+    assert run(["domains"]) == 0
+    assert "cli" in capsys.readouterr().out
+    assert run(["jobs"]) == 0
+    assert "succeeded" in capsys.readouterr().out
+    assert run(["remap", "--domain", "cli", "--training", "nothing"]) == 1
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_the_async_client_over_asgi(tmp_path: Path, encodings: Path) -> None:
+    async def scenario() -> None:
+        app = create_app(Settings(data_dir=tmp_path))
+        async with (
+            app.router.lifespan_context(app),
+            AsyncClient("http://service", transport=httpx2.ASGITransport(app)) as client,
+        ):
+            assert (await client.health()).status == "alive"
+            assert (await client.ready()).status == "ready"
+            await client.admin.put_domain("async", ENCODINGS)
+            await client.admin.create_traverse("async", "t")
+            frames = np.load(encodings / "summer.npy")
+            index = np.arange(len(frames))
+            stored = await client.admin.put_frames(
+                "async", "t", encodings=frames, index=index, position_m=index, x_m=index, y_m=0.0 * index
+            )
+            assert stored.n_new == 120
+            job = await client.admin.remap("async", training_traverse="t", landmark_traverse="t", n_landmarks=30)
+            heard = [event async for event in client.admin.job_events(job.job_id)]
+            assert heard[-1].state == "succeeded"
+            asked = [client.localize("async", encoding=frame) for frame in frames[:10]]
+            answers = await asyncio.gather(*asked)
+            assert [answer.retrieval[0].map_image for answer in answers] == list(range(10))
+            assert answers[4].belief.top[0].x_m == 4.0
+            assert (await client.relevances("async", encoding=frames[5])).argmax() == 5
+            with pytest.raises(errors.InvalidInputError):
+                await client.localize("async", encoding=[1.0, 2.0])
+
+    asyncio.run(scenario())
+
+
+def test_places_on_the_command_line(
+    client: Client, encodings: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "look [here]"
+    folder.mkdir()
+    rng = np.random.default_rng(5)
+    for number in range(6):
+        cv2.imwrite(str(folder / f"{number}.png"), cv2.resize(rng.integers(0, 255, (4, 6, 3), np.uint8), (96, 64)))
+    client.admin.put_domain("places", {"kind": "feature_l2"})
+    upload(client, open_source(str(folder)), "places", "t")
+    remap(client, "places", "t", landmark_traverse="t", n_landmarks=6, list_length=2)
+    command = ["localize", "--server", client.url]
+    assert run([*command, "--json", "--domain", "places", str(folder / "4.png"), f"{folder}#1:3"]) == 0
+    placed = json.loads(capsys.readouterr().out)
+    assert [answer["retrieval"][0]["map_image"] for answer in placed] == [4, 1, 2]
+    assert run([*command, "--json", "--domain", "route", f"{encodings / 'summer.npy'}#7:8"]) == 0
+    assert json.loads(capsys.readouterr().out)[0]["retrieval"][0]["map_image"] == 7
+    assert run([*command, "--domain", "places", str(folder / "4.png")]) == 0
+    assert "likeliest [m]" in capsys.readouterr().out
+    assert run([*command, "--domain", "places", str(folder / "9.png")]) == 1
+    assert "no recording" in capsys.readouterr().err

@@ -1,0 +1,114 @@
+"""The real service on a free port of this machine, a link to it that can lose answers, and recordings to send it."""
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import httpx2
+import numpy as np
+import pytest
+import uvicorn
+
+from deepsimbad.api.app import create_app
+from deepsimbad.jobs.runner import InThisProcess
+from deepsimbad.settings import Settings
+from deepsimbad_client import Client, RetryPolicy
+from deepsimbad_client.http.jobs import remap
+from deepsimbad_client.http.upload import upload
+from deepsimbad_client.recordings.sources import open_source
+
+ENCODINGS = {"kind": "feature_l2", "extractor": "none"}
+
+
+@contextmanager
+def serving(data_dir: Path) -> Iterator[str]:
+    app = create_app(Settings(data_dir=data_dir), InThisProcess(data_dir))
+    config = uvicorn.Config(app, host="127.0.0.1", port=0, log_level="warning", ws="none", lifespan="on")
+    server = uvicorn.Server(config)
+    thread = threading.Thread(target=server.run)
+    thread.start()
+    try:
+        deadline = time.monotonic() + 60
+        while not server.started:
+            assert thread.is_alive(), "the service did not start"
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+        port = server.servers[0].sockets[0].getsockname()[1]
+        yield f"http://127.0.0.1:{port}"
+    finally:
+        if (services := getattr(app.state, "services", None)) is not None:
+            services.stopping.set()
+        server.should_exit = True
+        thread.join(20)
+
+
+@pytest.fixture(scope="session")
+def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """The service's address; one for all tests, which use domains of their own."""
+    with serving(tmp_path_factory.mktemp("service")) as url:
+        yield url
+
+
+@pytest.fixture(scope="session")
+def encodings(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three drives of one route as ready encodings: landmarks.npy, summer.npy, winter.npy."""
+    folder = tmp_path_factory.mktemp("encodings")
+    rng = np.random.default_rng(7)
+    places = rng.normal(size=(120, 32))
+    np.save(folder / "landmarks.npy", rng.normal(size=(60, 32)).astype(np.float32))
+    np.save(folder / "summer.npy", (places + 0.1 * rng.normal(size=places.shape)).astype(np.float32))
+    np.save(folder / "winter.npy", (places + 0.6 * rng.normal(size=places.shape)).astype(np.float32))
+    return folder
+
+
+def mapped(client: Client, domain: str, encodings: Path, training_episodes: int = 0) -> None:
+    """Make a domain with one map, of summer, an image every metre."""
+    client.admin.put_domain(domain, ENCODINGS)
+    for name in ("landmarks", "summer"):
+        upload(client, open_source(str(encodings / f"{name}.npy")), domain, name)
+    options = {"n_landmarks": 50, "training_episodes": training_episodes}
+    remap(client, domain, "summer", landmark_traverse="landmarks", **options)
+
+
+class Link(httpx2.HTTPTransport):
+    """To the real service; `lose` is asked of every request that was answered: True, and its answer never arrives."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.requests: list[httpx2.Request] = []
+        self.lose: Callable[[httpx2.Request], bool] = lambda request: False
+
+    def handle_request(self, request: httpx2.Request) -> httpx2.Response:
+        self.requests.append(request)
+        response = super().handle_request(request)
+        if self.lose(request):
+            response.read()
+            raise httpx2.ReadTimeout("lost", request=request)
+        return response
+
+
+@pytest.fixture(scope="session")
+def route(service: str, encodings: Path) -> str:
+    """The address of a service that has mapped the domain `route`, which tests leave as it is."""
+    with Client(service) as client:
+        mapped(client, "route", encodings, training_episodes=50)
+    return service
+
+
+@pytest.fixture
+def link() -> Link:
+    return Link()
+
+
+@pytest.fixture
+def client(route: str, link: Link) -> Iterator[Client]:
+    with Client(route, retry=RetryPolicy(attempts=3), transport=link, sleep=lambda seconds: None) as client:
+        yield client
+
+
+@pytest.fixture
+def views(encodings: Path) -> np.ndarray:
+    """[120, 32] of winter, one every metre."""
+    return np.asarray(np.load(encodings / "winter.npy"))

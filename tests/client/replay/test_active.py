@@ -1,0 +1,228 @@
+"""Active replays against the real service: what is driven, what is scored, and how they go on."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import httpx2
+import numpy as np
+import pytest
+
+from deepsimbad_client import Client, errors
+from deepsimbad_client.commands.group import run
+from deepsimbad_client.recordings.recording import Recording
+from deepsimbad_client.recordings.sources import open_source
+from deepsimbad_client.replay.active import ActiveReplay, Episode, Stage, active_replay
+
+PLANNERS = ("default", "random", "constant:3")
+SESSIONS = "/v1/domains/route/sessions"
+
+
+@pytest.fixture
+def drive(encodings: Path) -> Recording:
+    return open_source(str(encodings / "winter.npy"))
+
+
+@pytest.fixture
+def driven(client: Client, drive: Recording, tmp_path: Path) -> Any:
+    def driven(recording: Recording = drive, folder: str = "out", **options: Any) -> ActiveReplay:
+        wishes: dict[str, Any] = {"planners": PLANNERS, "episodes": 4, "steps": 5, "concurrency": 2, "seed": 5}
+        return active_replay(client, recording, "route", tmp_path / folder, **wishes | options)
+
+    return driven
+
+
+@pytest.fixture
+def stage(client: Client, drive: Recording) -> Stage:
+    return Stage(client, drive, "route")
+
+
+def test_every_planner_starts_from_the_same_places_and_goes_where_it_is_sent(
+    client: Client, driven: Any, link: Any
+) -> None:
+    replay = driven()
+    for value in (lambda episode: episode.steps[0].index, lambda episode: episode.seed):
+        default, random, constant = ([value(episode) for episode in each] for each in replay.episodes.values())
+        assert default == random == constant
+        assert len(set(default)) > 1
+    assert max(episode.steps[0].index for episode in replay.episodes["default"]) + 5 * 10 <= 119
+    begun = [request.url.path for request in link.requests if request.method in {"POST", "DELETE"}]
+    assert begun.count(SESSIONS) == 12
+    assert len([path for path in begun if path.startswith("/v1/sessions/") and path.count("/") == 3]) == 12
+    for episode in replay.episodes["constant:3"]:
+        assert (episode.planner_named, episode.edges_m) == ("constant:3", (0.0, 119.0))
+        first, *moved = episode.steps
+        assert (first.step, first.commanded_m, first.action_m, first.travelled_m) == (0, None, 0.0, 0.0)
+        assert [step.action_m for step in moved] == [3.0] * 5
+        assert [step.position_m for step in moved] == [first.position_m + 3 * n for n in range(1, 6)]
+        assert [step.travelled_m for step in moved] == [3.0, 6.0, 9.0, 12.0, 15.0]
+        assert {step.next_action_m for step in episode.steps} == {3.0}
+
+
+def test_moves_between_sparse_frames_are_told_as_they_were(driven: Any, drive: Recording, link: Any) -> None:
+    every_fourth = drive.sliced(slice(0, None, 4))
+    (episode,) = driven(every_fourth, planners=["constant:7"], episodes=1).episodes["constant:7"]
+    assert [step.action_m for step in episode.steps[1:]] == [8.0] * 5
+    assert {step.commanded_m for step in episode.steps[1:]} == {7.0}
+    posted = [request for request in link.requests if request.url.path.endswith("observations")]
+    assert [request.url.params.get("action_m") for request in posted[1:]] == ["8.0"] * 5
+
+
+def test_ranks_and_errors_against_a_slow_reference(
+    driven: Any, drive: Recording, client: Client, views: np.ndarray
+) -> None:
+    views = views + np.random.default_rng(0).normal(0, 2, views.shape).astype(np.float32)
+    (episode,) = driven(replace(drive, encodings=views), planners=["constant:7"], episodes=1).episodes["constant:7"]
+    ranks = []
+    with client.session("route", planner="constant:7", seed=episode.seed) as session:
+        for step in episode.steps:
+            observed = session.observe(encoding=views[step.index], action_m=step.action_m)
+            mass, true = session.belief_masses(), step.index
+            better = sum(mass[other] > mass[true] for other in range(120))
+            tied = sum(mass[other] == mass[true] for other in range(120)) - 1
+            ranks.append(better + tied / 2)
+            assert step.rank == better + tied / 2
+            assert step.rank_percent == pytest.approx(100 * step.rank / 120)
+            assert (step.true_map_image, step.error_m) == (true, abs(round(observed.belief.mode_m) - true))
+            assert sum(step.mass) == pytest.approx(1, abs=1e-3)
+    assert max(ranks) > 0, "else nothing is shown"
+
+
+def essence(replay: ActiveReplay) -> list[Any]:
+    return [
+        (episode.planner, episode.episode, episode.seed, [(step.index, step.rank, step.mass) for step in episode.steps])
+        for episodes in replay.episodes.values()
+        for episode in episodes
+    ]
+
+
+@pytest.mark.parametrize("stop_after", [1, 5, 11])
+def test_a_replay_goes_on_where_it_was_stopped(driven: Any, tmp_path: Path, link: Any, stop_after: int) -> None:
+    whole = driven(folder="whole", concurrency=1)
+
+    def stop(episode: Episode, n_done: int) -> None:
+        if n_done == stop_after:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        driven(folder="parts", on_progress=stop)
+    file = tmp_path / "parts" / "episodes.jsonl"
+    assert len(file.read_text().splitlines()) == stop_after
+    with file.open("ab") as torn:
+        torn.write(b'{"planner": "default", "epi')
+    heard: list[int] = []
+    resumed = driven(folder="parts", on_progress=lambda _, n_done: heard.append(n_done))
+    assert essence(resumed) == essence(whole)
+    assert heard == list(range(1, 13))
+    lines = [json.loads(line) for line in (tmp_path / "parts" / "steps.jsonl").read_text().splitlines()]
+    assert len(lines) == 12 * 6
+    assert "mass" not in lines[0]
+    assert {line["planner"] for line in lines} == set(PLANNERS)
+
+
+def test_planners_and_episodes_can_be_added(driven: Any, link: Any) -> None:
+    driven(planners=["random"], episodes=2)
+    link.requests.clear()
+    replay = driven(planners=["random", "constant:3"], episodes=3)
+    assert [request.url.path for request in link.requests].count(SESSIONS) == 1 + 3
+    assert [len(episodes) for episodes in replay.episodes.values()] == [3, 3]
+    with pytest.raises(errors.ReplayError, match="seed 5, now 6"):
+        driven(seed=6)
+    assert len(driven(seed=6, episodes=1, restart=True).episodes["default"]) == 1
+
+
+def test_a_recording_too_short_for_its_moves(driven: Any, drive: Recording, client: Client, link: Any) -> None:
+    with pytest.raises(errors.ReplayError, match="fewer steps"):
+        driven(drive.sliced(slice(0, 50)))
+    assert SESSIONS not in [request.url.path for request in link.requests]
+    stage = Stage(client, drive.sliced(slice(0, 51)), "route")
+    assert {stage.start(5, 0, episode)[0] for episode in range(20)} == {0}
+
+
+def test_starts_are_uniform_and_do_not_depend_on_how_many_there_are(stage: Stage) -> None:
+    rows = [stage.start(7, 0, episode)[0] for episode in range(3000)]
+    assert set(rows) == set(range(50))
+    assert max(np.bincount(rows)) < 100
+    assert rows[:5] == [stage.start(7, 0, episode)[0] for episode in range(5)]
+    assert rows[:5] != [stage.start(7, 1, episode)[0] for episode in range(5)]
+
+
+def test_frames_that_cannot_be_used_are_passed_over(
+    driven: Any, drive: Recording, views: np.ndarray, link: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    answered = link.handle_request
+
+    def refuse_zeros(request: httpx2.Request) -> httpx2.Response:
+        is_torn = request.url.path.endswith(("observations", "localizations")) and b":[0.0,0.0," in request.content
+        return httpx2.Response(422, json={"code": "undecodable_image"}) if is_torn else answered(request)
+
+    monkeypatch.setattr(link, "handle_request", refuse_zeros)
+    torn = np.where(np.arange(120)[:, None] % 3, views, 0)
+    replay = driven(replace(drive, encodings=torn), planners=["constant:3"], episodes=3)
+    for episode in replay.episodes["constant:3"]:
+        assert all(step.index % 3 for step in episode.steps)
+        assert all(step.action_m >= 0 for step in episode.steps)
+    with pytest.raises(errors.ReplayError, match="none of the"):
+        driven(replace(drive, encodings=np.zeros_like(views)), folder="none", planners=["constant:3"], episodes=1)
+
+
+def test_without_a_next_best_view_or_with_another_map_there_is_no_replay(
+    driven: Any, link: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    answered, changes = link.handle_request, [("next_best_view", None)]
+
+    def change(request: httpx2.Request) -> httpx2.Response:
+        response = answered(request)
+        if b"map_version" not in response.read():
+            return response
+        return httpx2.Response(response.status_code, json=response.json() | dict(changes))
+
+    monkeypatch.setattr(link, "handle_request", change)
+    with pytest.raises(errors.ReplayError, match="training"):
+        driven()
+
+    def switch(request: httpx2.Request) -> httpx2.Response:
+        if request.url.path.endswith("/observations"):
+            changes[:] = [("map_version", 4)]
+        return change(request)
+
+    changes[:] = []
+    monkeypatch.setattr(link, "handle_request", switch)
+    with pytest.raises(errors.ReplayError, match="changed during the replay"):
+        driven(restart=True)
+
+
+def test_an_unknown_planner_is_the_services_to_refuse(driven: Any) -> None:
+    for planner in ("nonsense", "constant:99"):
+        with pytest.raises(errors.InvalidInputError):
+            driven(planners=[planner])
+
+
+def test_of_many_episodes_few_keep_their_whole_belief(driven: Any) -> None:
+    episodes = driven(planners=["random"], episodes=12, steps=1).episodes["random"]
+    assert [bool(episode.steps[0].mass) for episode in episodes] == [True] * 10 + [False] * 2
+
+
+def test_the_commands_end_to_end(
+    route: str, encodings: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("DEEPSIMBAD_URL", route)
+    out = tmp_path / "out"
+    plain = ["replay", str(encodings / "winter.npy"), "--domain", "route"]
+    command = [*plain, "--out", str(out), "--planner", "default", "--planner", "random", "--steps", "5", "--seed", "1"]
+    assert run([*command, "--episodes", "3", "--json"]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert printed == json.loads((out / "summary.json").read_text())
+    assert set(printed["anr"]) == {"default", "random"}
+    assert len((out / "episodes.jsonl").read_text().splitlines()) == 6
+    assert len((out / "steps.jsonl").read_text().splitlines()) == 6 * 6
+    assert (out / "belief_by_step.png").read_bytes().startswith(b"\x89PNG")
+    assert run([*command, "--episodes", "4", "--no-plots"]) == 0  # two more episodes
+    assert "telling (default)" in capsys.readouterr().out
+    assert len((out / "episodes.jsonl").read_text().splitlines()) == 8
+    assert run([*command[:-1], "2"]) == 1
+    assert "seed 1, now 2" in capsys.readouterr().err
+    assert run([*plain, "--episodes", "3"]) == 2
+    assert run([*plain, "--planner", "random", "--tolerance", "3"]) == 2
+    assert run([*plain, "--planner", "nonsense", "--out", str(tmp_path / "no")]) == 1

@@ -1,0 +1,103 @@
+"""A session in a terminal, and an episode in words."""
+
+import io
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rich.console import Console
+
+from deepsimbad_client import Client, errors
+from deepsimbad_client.commands.group import run
+from deepsimbad_client.recordings.sources import open_source
+from deepsimbad_client.replay.active import Stage
+from deepsimbad_client.replay.watch import BLOCKS, belief_blocks, resampled, watch_episode, watch_session
+
+
+def console(*, terminal: bool) -> tuple[Console, io.StringIO]:
+    written = io.StringIO()
+    return Console(file=written, force_terminal=terminal, width=80, highlight=False, markup=False), written
+
+
+@pytest.fixture
+def stage(client: Client, encodings: Path) -> Stage:
+    return Stage(client, open_source(str(encodings / "winter.npy")), "route")
+
+
+def test_an_episode_off_a_terminal_is_a_line_for_each_view(stage: Stage) -> None:
+    shown, written = console(terminal=False)
+    slept: list[float] = []
+    steps = watch_episode(stage, shown, planner="constant:7", steps=4, seed=2, pause_s=0.5, sleep=slept.append)
+    lines = written.getvalue().splitlines()
+    assert len(lines) == len(steps) == 5
+    assert lines[0].startswith(f"It looks and sees {steps[0].name}. It is likeliest at ")
+    assert "Move 4: it goes 7.0 m (asked: 7 m)" in lines[4]
+    assert all("Truly it is by" in line for line in lines)
+    assert slept == [0.5] * 4
+
+
+def test_an_episode_on_a_terminal_shows_belief_moves_and_truth(stage: Stage) -> None:
+    shown, written = console(terminal=True)
+    steps = watch_episode(stage, shown, planner="default", steps=2, seed=0, pause_s=0, sleep=lambda _: None)
+    for words in ("▲ likeliest", "● truth", "asks for", "m (telling)", "█", f"{steps[-1].true_route_m:.1f} m"):
+        assert words in written.getvalue()
+
+
+def test_another_robots_session_is_watched_until_it_ends_and_left_alone(client: Client, views: np.ndarray) -> None:
+    shown, written = console(terminal=False)
+    robot = client.session("route", keep=True)
+    polls = iter(range(100))
+
+    def meanwhile(seconds: float) -> None:
+        poll = next(polls)
+        if poll in {1, 3}:
+            robot.observe(encoding=views[50 + poll], action_m=2)
+        if poll == 5:
+            robot.delete()
+
+    assert watch_session(client, robot.session_id, shown, every_s=0.1, sleep=meanwhile) == 3
+    with pytest.raises(errors.EndedSessionError):
+        watch_session(client, robot.session_id, shown, every_s=0.1)
+    lines = written.getvalue().splitlines()
+    assert [line.split()[0] for line in lines] == ["0", "1", "2"]
+    assert "asks for" in lines[2]
+
+    def stop(seconds: float) -> None:
+        raise KeyboardInterrupt
+
+    shown, written = console(terminal=True)
+    with client.session("route") as watched:
+        with pytest.raises(KeyboardInterrupt):
+            watch_session(client, watched.session_id, shown, every_s=0.1, sleep=stop)
+        assert watched.state().n_observations == 0
+    assert f"route, map 1: session {watched.session_id[:8]}" in written.getvalue()
+
+
+def test_the_command(
+    route: str, encodings: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("DEEPSIMBAD_URL", route)
+    assert run(["watch", str(encodings / "winter.npy"), "--domain", "route", "--steps", "3", "--pause", "0"]) == 0
+    assert len(capsys.readouterr().out.splitlines()) == 4
+    assert run(["watch"]) == 2
+    assert run(["watch", "--session", "s", "--domain", "route"]) == 2
+    assert run(["watch", "--session", "nowhere"]) == 1
+
+
+@given(st.lists(st.floats(0, 1), min_size=1, max_size=200), st.integers(1, 300))
+def test_a_histogram_keeps_its_mass_in_other_columns(mass: list[float], width: int) -> None:
+    columns = resampled(mass, width)
+    assert columns.shape == (width,)
+    assert columns.sum() == pytest.approx(sum(mass), abs=1e-9)
+    assert (columns >= -1e-12).all()
+    assert len(belief_blocks(mass, width)) == width
+
+
+def test_blocks_are_as_high_as_the_belief() -> None:
+    line = belief_blocks([0.0, 0.001, 0.25, 1.0], 4)
+    assert line[0] == line[1] == " "
+    assert line[3] == BLOCKS[-1]
+    assert BLOCKS.index(line[2]) == 4
+    assert belief_blocks([0.0, 0.0], 3) == "   "
