@@ -90,11 +90,9 @@ def test_every_operation_has_its_call(operation: str, tmp_path: Path) -> None:
     assert re.fullmatch(re.sub("{[^}]*}", "[^/]+", path), request.url.path)
 
 
-def test_no_call_is_of_an_operation_that_is_gone() -> None:
-    assert sorted(ASKED) == OPERATIONS
-
-
-def test_every_option_of_a_remap_can_be_given_in_python_and_on_the_command_line() -> None:
+def test_every_option_of_a_remap_and_a_session_can_be_given() -> None:
+    assert sorted(ASKED) == OPERATIONS, "no call is of an operation that is gone"
+    assert set(SessionBody.model_fields) <= set(inspect.signature(Client.session).parameters)
     members = set(RemapBody.model_fields)
     assert members == {"training_traverse", *RemapOptions.__annotations__}
     options = {
@@ -104,10 +102,6 @@ def test_every_option_of_a_remap_can_be_given_in_python_and_on_the_command_line(
         if isinstance(option, click.Option)
     }
     assert members <= options
-
-
-def test_every_option_of_a_session_can_be_given() -> None:
-    assert set(SessionBody.model_fields) <= set(inspect.signature(Client.session).parameters)
 
 
 @pytest.mark.parametrize(
@@ -144,30 +138,13 @@ def test_the_async_client_obeys_the_same_rules() -> None:
     async def ask(client: AsyncClient) -> None:
         assert (await client.health()).status == "alive"
 
-    assert run_async(
-        Script(httpx2.ConnectError, answer(503, retry_after="4"), answer(200, {"status": "alive"})), ask
-    ) == [
-        1.0,
-        4.0,
-    ]
+    script = Script(httpx2.ConnectError, answer(503, retry_after="4"), answer(200, {"status": "alive"}))
+    assert run_async(script, ask) == [1.0, 4.0]
     with pytest.raises(errors.TransportError):
         run_async(Script(httpx2.ReadError), ask)
 
 
-def test_the_async_client_reads_lists() -> None:
-    async def read(client: AsyncClient) -> None:
-        some = []
-        async for job in client.admin.iter_jobs():
-            some.append(job.job_id)
-            if len(some) == 4:
-                break
-        assert some == ["j0", "j1", "j2", "j3"]
-        assert len(await client.admin.jobs("d")) == len(JOBS)
-
-    run_async(shelf, read)
-
-
-def test_events_of_a_job_in_both_clients() -> None:
+def test_lists_and_events_in_both_clients() -> None:
     done = {**JOB, "state": "succeeded"}
     stream = f": ping\n\nevent: progress\ndata: {json.dumps(JOB)}\n\nevent: done\ndata: {json.dumps(done)}\n\n"
 
@@ -177,10 +154,15 @@ def test_events_of_a_job_in_both_clients() -> None:
     async def listen(client: AsyncClient) -> None:
         assert [job.state async for job in client.admin.job_events("j")] == ["running", "succeeded"]
 
+    async def read(client: AsyncClient) -> None:
+        assert [job.job_id async for job in client.admin.iter_jobs()] == [job["job_id"] for job in JOBS]
+        assert len(await client.admin.jobs("d")) == len(JOBS)
+
     script = events()
     assert [job.state for job in script.client().admin.job_events("j")] == ["running", "succeeded"]
     assert script.requests[0].headers["accept"] == "text/event-stream"
     run_async(events(), listen)
+    run_async(shelf, read)
 
 
 def test_a_stream_that_is_left_early_is_closed() -> None:

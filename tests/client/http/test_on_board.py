@@ -62,22 +62,16 @@ def test_an_observation_is_64_bytes_of_the_nearest(content: bytes, model: dict[s
         assert list(unpack_ranked_landmarks(encoder.ranks(picture(1), m=m).body, N_LANDMARKS)) == order[:m]
 
 
-def test_an_image_may_be_bytes_a_path_or_an_array(content: bytes, tmp_path: Path) -> None:
-    encoder, body = OnBoardEncoder(content), picture(2)
-    path = tmp_path / "view.png"
+def test_an_image_may_be_bytes_a_path_or_an_array_and_a_saved_file_needs_no_network(
+    content: bytes, tmp_path: Path
+) -> None:
+    fetched, body, path = OnBoardEncoder(content), picture(2), tmp_path / "view.png"
     path.write_bytes(body)
-    forms = (body, bytearray(body), path, str(path), decode_image(body, 1 << 20))
-    assert len({encoder.ranks(form).body for form in forms}) == 1
-
-
-def test_a_saved_file_needs_no_network(content: bytes, tmp_path: Path) -> None:
-    fetched = OnBoardEncoder(content)
     fetched.save(tmp_path / "campus.npz")
-    with np.load(tmp_path / "campus.npz", allow_pickle=False) as arrays:
-        assert "prototypes" in arrays.files
     loaded = OnBoardEncoder.load(tmp_path / "campus.npz")
     assert loaded.digest == fetched.digest
-    assert loaded.ranks(picture(3)) == fetched.ranks(picture(3))
+    forms = (body, bytearray(body), path, str(path), decode_image(body, 1 << 20))
+    assert len({encoder.ranks(form).body for form in forms for encoder in (fetched, loaded)}) == 1
     with pytest.raises(errors.NotSavedError):
         fetched.save(tmp_path / "nowhere" / "campus.npz")
     with pytest.raises(errors.SourceError, match="nothing"):
@@ -119,32 +113,27 @@ def test_arguments_that_cannot_be(content: bytes, tmp_path: Path) -> None:
         Client("http://service").localize("campus", picture(1), ranked=encoder.ranks(picture(1)))
 
 
-@pytest.mark.parametrize("content", [b"", b"PK\x03\x04", b"no zip"])
-def test_what_is_no_landmark_model(content: bytes) -> None:
-    with pytest.raises(errors.InvalidLandmarkModelError):
-        OnBoardEncoder(content)
-
-
 def test_models_that_this_version_cannot_rank_by(model: dict[str, np.ndarray]) -> None:
-    for n_landmarks, evaluator in ((N_LANDMARKS, {"kind": "crystal_ball"}), (N_LANDMARKS - 1, GRADIENTS)):
+    unfit = [(N_LANDMARKS, {"kind": "crystal_ball"}), (N_LANDMARKS - 1, GRADIENTS)]
+    packed = [pack_landmarks(PortableLandmarks(model, n, 1, evaluator)) for n, evaluator in unfit]
+    for content in (b"", b"PK\x03\x04", b"no zip", *packed):
         with pytest.raises(errors.InvalidLandmarkModelError):
-            OnBoardEncoder(pack_landmarks(PortableLandmarks(model, n_landmarks, 1, evaluator)))
+            OnBoardEncoder(content)
 
 
-def test_other_weights_are_named(model: dict[str, np.ndarray]) -> None:
+def test_other_weights_and_a_missing_package_are_named(
+    content: bytes, model: dict[str, np.ndarray], monkeypatch: pytest.MonkeyPatch
+) -> None:
     there = "5" * 64
     encoder = OnBoardEncoder(pack_landmarks(PortableLandmarks(model, N_LANDMARKS, 1, GRADIENTS, there)))
     for encode in (encoder.load_extractor, lambda: encoder.ranks(picture(1))):
         with pytest.raises(errors.OtherWeightsError, match=f"none.*{there}"):
             encode()
 
-
-def test_a_missing_package_is_named(content: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
-    encoder = OnBoardEncoder(content)
-
     def missing() -> None:
         raise MissingPackageError("the extractor needs torch")
 
+    encoder = OnBoardEncoder(content)
     monkeypatch.setattr(encoder._evaluator, "load", missing)
     with pytest.raises(errors.MissingExtraError, match=r"pip install 'deep-simbad\[edge\]'"):
         encoder.load_extractor()
@@ -167,44 +156,22 @@ def test_it_is_fetched_for_a_map_and_sent_as_it_is(content: bytes) -> None:
     assert sent.content == seen.body
 
 
-HIDDEN = """
+HIDDEN = {"fastapi", "starlette", "uvicorn", "sqlite_utils", "prometheus_client", "pydantic_settings"}
+CODE = """
 import sys
 class Hide:
     def find_spec(self, name, path=None, target=None):
         if name.partition(".")[0] in {hidden}:
             raise ModuleNotFoundError("hidden: " + name)
 sys.meta_path.insert(0, Hide())
+from deepsimbad_client.http.on_board import OnBoardEncoder
+print(len(OnBoardEncoder.load("campus.npz").ranks("view.png").body))
 """
-
-
-def run_without(hidden: set[str], code: str) -> str:
-    done = subprocess.run(
-        [sys.executable, "-c", HIDDEN.replace("{hidden}", repr(hidden)) + code],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    return done.stdout
-
-
-def test_the_bare_client_says_what_it_lacks() -> None:
-    code = """
-from deepsimbad_client import Client, errors
-try:
-    Client("http://127.0.0.1:9").on_board("campus")
-except errors.MissingExtraError as error:
-    print(error)
-"""
-    assert "pip install 'deep-simbad[edge]'" in run_without({"numpy", "torch", "cv2", "deepsimbad"}, code)
 
 
 def test_encoding_on_board_needs_nothing_of_the_service_but_core_and_evaluators(tmp_path: Path, content: bytes) -> None:
     OnBoardEncoder(content).save(tmp_path / "campus.npz")
     (tmp_path / "view.png").write_bytes(picture(1))
-    code = f"""
-from deepsimbad_client.http.on_board import OnBoardEncoder
-print(len(OnBoardEncoder.load({str(tmp_path / "campus.npz")!r}).ranks({str(tmp_path / "view.png")!r}).body))
-"""
-    hidden = {"fastapi", "starlette", "uvicorn", "sqlite_utils", "prometheus_client", "pydantic_settings"}
-    assert run_without(hidden, code) == "64\n"
+    program = [sys.executable, "-c", CODE.replace("{hidden}", repr(HIDDEN))]
+    ended = subprocess.run(program, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert ended.stdout == "64\n", ended.stderr

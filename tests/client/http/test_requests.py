@@ -17,7 +17,7 @@ import pytest
 from deepsimbad import errors as service_errors
 from deepsimbad_client import Client, errors
 from deepsimbad_client.errors import BY_CODE, BY_STATUS, InvalidArgumentError
-from deepsimbad_client.http.models import Domain, Job, Localization, Traverse
+from deepsimbad_client.http.models import Job, Localization, Traverse
 from deepsimbad_client.http.observation import media_type_of, observation
 from deepsimbad_client.http.retry import RETRIED_STATUSES
 
@@ -95,13 +95,10 @@ def test_a_name_that_could_leave_its_place_in_the_address(name: str) -> None:
         Client("http://service").domain(name)
 
 
-@pytest.mark.parametrize("url", ["service:8000", "ftp://service", "http://", "//service", "http://:::"])
-def test_an_address_that_is_none(url: str) -> None:
-    with pytest.raises(InvalidArgumentError, match="is no address"):
-        Client(url)
-
-
 def test_address_and_key_from_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    for url in ("service:8000", "ftp://service", "http://", "//service", "http://:::"):
+        with pytest.raises(InvalidArgumentError, match="is no address"):
+            Client(url)
     script = Script(answer(200, []))
     with pytest.raises(InvalidArgumentError) as raised:
         script.client(key="geheim\n")
@@ -120,22 +117,20 @@ def test_address_and_key_from_the_environment(monkeypatch: pytest.MonkeyPatch) -
     assert (given.url.host, given.headers["authorization"]) == ("here", "Bearer given")
 
 
-def test_frames_travel_as_npz() -> None:
-    script = Script(answer(200, {"n_new": 2, "n_replaced": 0, "n_frames": 2}))
-    script.client().admin.put_frames("d", "t", encodings=[[1.0], [2.0]], index=[0, 5], position_m=[0, 1.5])
-    with np.load(BytesIO(script.requests[0].content)) as sent:
+def test_arrays_travel_as_npz_and_npy() -> None:
+    packed = BytesIO()
+    np.save(packed, np.array([0.5, -1.0], np.float32))
+    stored = answer(200, {"n_new": 2, "n_replaced": 0, "n_frames": 2})
+    script = Script(stored, httpx2.Response(200, content=packed.getvalue()))
+    client = script.client()
+    client.admin.put_frames("d", "t", encodings=[[1.0], [2.0]], index=[0, 5], position_m=[0, 1.5])
+    assert client.relevances("d", ranked_landmarks=[0]).tolist() == [0.5, -1.0]
+    frames, relevances = script.requests
+    with np.load(BytesIO(frames.content)) as sent:
         assert sorted(sent) == ["encodings", "index", "position_m"]
         assert sent["encodings"].dtype == np.float32
         assert sent["index"].tolist() == [0, 5]
-    assert script.requests[0].headers["content-type"] == "application/octet-stream"
-
-
-def test_relevances_are_an_array() -> None:
-    packed = BytesIO()
-    np.save(packed, np.array([0.5, -1.0], np.float32))
-    script = Script(httpx2.Response(200, content=packed.getvalue()))
-    assert script.client().relevances("d", ranked_landmarks=[0]).tolist() == [0.5, -1.0]
-    assert script.requests[0].headers["accept"] == "application/octet-stream"
+    assert frames.headers["content-type"] == relevances.headers["accept"] == "application/octet-stream"
 
 
 @pytest.mark.parametrize("content", [b"", b"<html>", b"{}", b"\x93NUMPY\x01\x00"])
@@ -144,20 +139,24 @@ def test_something_else_answers_at_this_address(content: bytes) -> None:
     for call in (client.domains, lambda: client.domain("d"), lambda: client.relevances("d", encoding=[1])):
         with pytest.raises(errors.UnexpectedAnswerError, match="http://service/v1"):
             call()
-
-
-def test_a_redirect_is_not_followed_with_the_key() -> None:
-    with pytest.raises(errors.UnexpectedAnswerError, match="http://evil/"):
+    with pytest.raises(errors.UnexpectedAnswerError, match="http://evil/"):  # not followed with the key
         Script(answer(307, location="http://evil/")).client(key="key").domains()
+    with pytest.raises(errors.ServerError) as raised:
+        Script(httpx2.Response(500, content=b"<h1>oops</h1>")).client().health()
+    assert raised.value.code == "http_500"
 
 
-@pytest.mark.parametrize("code", sorted(BY_CODE))
-def test_every_code_has_its_class(code: str) -> None:
-    problem = {"code": code, "detail": "what is wrong", "limit": 5}
-    with pytest.raises(BY_CODE[code], match="what is wrong") as raised:
-        Script(answer(418, problem)).client().health()
-    assert raised.value.code == code
-    assert raised.value.problem["limit"] == 5
+def test_every_code_has_its_class_and_is_the_services() -> None:
+    def words(kind: type[service_errors.DeepSimbadError]) -> set[str]:
+        return {kind.code}.union(*(words(below) for below in kind.__subclasses__()))
+
+    assert len(BY_CODE) > 20
+    assert set(BY_CODE) <= words(service_errors.DeepSimbadError)
+    for code, kind in BY_CODE.items():
+        with pytest.raises(kind, match="what is wrong") as raised:
+            Script(answer(418, {"code": code, "detail": "what is wrong", "limit": 5})).client().health()
+        assert raised.value.code == code
+        assert raised.value.problem["limit"] == 5
 
 
 @pytest.mark.parametrize("status", [status for status in BY_STATUS if status not in RETRIED_STATUSES])
@@ -169,30 +168,11 @@ def test_an_unheard_code_falls_back_on_the_status(status: int) -> None:
     assert "abc" in str(raised.value)
 
 
-def test_the_code_words_are_those_of_the_service() -> None:
-    def words(kind: type[service_errors.DeepSimbadError]) -> set[str]:
-        return {kind.code}.union(*(words(below) for below in kind.__subclasses__()))
-
-    assert len(BY_CODE) > 20
-    assert set(BY_CODE) <= words(service_errors.DeepSimbadError)
-
-
-def test_a_proxys_page_is_an_error_too() -> None:
-    with pytest.raises(errors.ServerError) as raised:
-        Script(httpx2.Response(500, content=b"<h1>oops</h1>")).client().health()
-    assert raised.value.code == "http_500"
-
-
 @pytest.mark.parametrize("index", range(-1, 12))
 def test_what_a_traverse_has(index: int) -> None:
     present = {0, 1, 4, 5, 8}
     traverse = Traverse(name="t", n_frames=len(present), missing=((2, 3), (6, 7)))
     assert traverse.has(index) == (index in present)
-
-
-def test_a_domain_without_a_map() -> None:
-    script = Script(answer(200, {"name": "d", "map_version": None, "evaluator": {"kind": "feature_l2"}}))
-    assert script.client().domain("d") == Domain(name="d", evaluator={"kind": "feature_l2"})
 
 
 def shelf(request: httpx2.Request) -> httpx2.Response:
@@ -221,19 +201,27 @@ def test_a_list_is_read_to_its_end_and_a_page_fetched_when_it_is_wanted() -> Non
         assert len(asked) == 5
 
 
-@pytest.mark.parametrize("document", [{"jobs": JOBS[:2]}, {"jobs": JOBS[:2], "next": None}, JOBS[:2]])
-def test_a_list_that_names_no_next_page_is_whole(document: Any) -> None:
-    """As those of an older service."""
-    assert len(Script(answer(200, document)).client().admin.jobs()) == 2
+@pytest.mark.parametrize(
+    ("document", "is_list"),
+    [
+        *((document, True) for document in ({"jobs": JOBS[:2]}, {"jobs": JOBS[:2], "next": None}, JOBS[:2])),
+        *(
+            (document, False)
+            for document in ({}, {"next": None}, {"jobs": 7, "next": None}, {"jobs": [{}], "next": None})
+        ),
+    ],
+)
+def test_a_list_that_names_no_next_page_is_whole_as_those_of_an_older_service(document: Any, is_list: bool) -> None:
+    ask = Script(answer(200, document)).client().admin.jobs
+    if is_list:
+        assert len(ask()) == 2
+    else:
+        with pytest.raises(errors.UnexpectedAnswerError):
+            ask()
 
 
-@pytest.mark.parametrize("document", [{}, {"next": None}, {"jobs": 7, "next": None}, {"jobs": [{}], "next": None}])
-def test_what_is_no_list_is_said(document: Any) -> None:
-    with pytest.raises(errors.UnexpectedAnswerError):
-        Script(answer(200, document)).client().admin.jobs()
-
-
-def test_every_answer_knows_its_request_which_the_caller_may_name() -> None:
+@pytest.mark.parametrize("is_named", [False, True])
+def test_every_answer_knows_its_request_which_the_caller_may_name(is_named: bool) -> None:
     documents = [
         LOCALIZATION,
         STATE,
@@ -241,16 +229,16 @@ def test_every_answer_knows_its_request_which_the_caller_may_name() -> None:
         {"planner": "telling", "action_m": 2.0},
         JOB,
     ]
-    for names in (None, itertools.count()):
-        script = Script(*(answer(200, document, x_request_id=f"r{n}") for n, document in enumerate(documents)))
-        with script.client(request_id=None if names is None else lambda: f"robot.{next(names)}") as client:  # noqa: B023
-            place = client.localize("d", ranked_landmarks=[0])
-            session = client.session("d", keep=True)
-            answers = [place, session.opened, session.observe(ranked_landmarks=[0]), session.next_best_view()]
-            answers.append(client.admin.job("j"))
-        assert [got.request_id for got in answers if got is not None] == ["r0", "r1", "r2", "r3", "r4"]
-        sent = [request.headers.get("x-request-id") for request in script.requests]
-        assert sent == [None if names is None else f"robot.{n}" for n in range(5)]
+    names = (f"robot.{number}" for number in itertools.count())
+    script = Script(*(answer(200, document, x_request_id=f"r{n}") for n, document in enumerate(documents)))
+    with script.client(request_id=names.__next__ if is_named else None) as client:
+        place = client.localize("d", ranked_landmarks=[0])
+        session = client.session("d", keep=True)
+        answers = [place, session.opened, session.observe(ranked_landmarks=[0]), session.next_best_view()]
+        answers.append(client.admin.job("j"))
+    assert [each.request_id for each in answers if each is not None] == ["r0", "r1", "r2", "r3", "r4"]
+    sent = [request.headers.get("x-request-id") for request in script.requests]
+    assert sent == [f"robot.{n}" if is_named else None for n in range(5)]
     assert Script(answer(200, JOB)).client().admin.job("j").request_id is None
 
 
@@ -281,14 +269,15 @@ def test_a_requests_id_is_no_part_of_what_was_answered() -> None:
     assert Job.model_validate({**JOB, "_request_id": "theirs", "request_id": "theirs"}).request_id is None
 
 
+def python(code: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, "-c", code], check=False, capture_output=True, text=True, timeout=60)
+
+
 def test_importing_the_client_needs_httpx2_and_pydantic_alone() -> None:
-    program = (
+    printed = python(
         "import sys; before = set(sys.modules)\n"
         "import deepsimbad_client\n"
         "print(sorted({name.partition('.')[0] for name in set(sys.modules) - before}))"
-    )
-    printed = subprocess.run(
-        [sys.executable, "-c", program], check=True, capture_output=True, text=True, timeout=60
     ).stdout
     imported = set(ast.literal_eval(printed))
     assert {"httpx2", "pydantic"} <= imported
@@ -297,9 +286,9 @@ def test_importing_the_client_needs_httpx2_and_pydantic_alone() -> None:
 
 @pytest.mark.parametrize("absent", ["click", "rich", "numpy", "cv2", "matplotlib"])
 def test_the_script_without_the_extra_says_what_to_install(absent: str) -> None:
-    program = f"import sys; sys.modules[{absent!r}] = None\nfrom deepsimbad_client.cli import main\nmain()"
-    ended = subprocess.run(
-        [sys.executable, "-c", program, "domains"], check=False, capture_output=True, text=True, timeout=60
+    ended = python(
+        f"import sys; sys.modules[{absent!r}] = None; sys.argv = ['', 'domains']\n"
+        "from deepsimbad_client.cli import main\nmain()"
     )
     assert ended.returncode == 1
     assert ended.stderr == f"{absent} not installed: pip install 'deep-simbad[replay]'\n"

@@ -7,14 +7,12 @@ from typing import Any
 import httpx2
 import pytest
 
-from deepsimbad_client import Client, errors
+from deepsimbad_client import errors
 from deepsimbad_client.http.retry import retry_after_s
 
-from .scripted import POLICY, Script, answer
+from .scripted import JOB, POLICY, Script, answer
 
 OK = {"status": "alive"}
-DOMAIN = {"name": "d"}
-JOB = {"job_id": "1", "domain": "d", "state": "queued"}
 FAILURES = (httpx2.ReadTimeout, httpx2.ReadError, httpx2.WriteError, httpx2.RemoteProtocolError)
 UNTOUCHED = (httpx2.ConnectError, httpx2.ConnectTimeout, 408, 429, 503)
 PROXIES = (502, 504)
@@ -26,34 +24,25 @@ def outcome(kind: Any) -> Any:
 
 
 @pytest.mark.parametrize("kind", RETRIED)
-def test_an_idempotent_call_is_sent_again(kind: Any) -> None:
-    script = Script(outcome(kind), outcome(kind), answer(200, OK))
-    assert script.client().health().status == "alive"
-    assert len(script.requests) == 3
+def test_an_idempotent_call_is_sent_again_with_its_body(kind: Any) -> None:
+    script = Script(outcome(kind), outcome(kind), answer(201, {"index": 3, "n_frames": 1}))
+    image = b"\xff\xd8\xff rest"
+    assert script.client().admin.put_frame("d", "t", 3, image, position_m=1.5).n_frames == 1
     assert script.slept == [1.0, 2.0]
+    assert [request.content for request in script.requests] == [image] * 3
+    last = script.requests[2]
+    assert last.url == "http://service/v1/admin/domains/d/traverses/t/frames/3?position_m=1.5"
+    assert last.headers["content-type"] == "image/jpeg"
 
 
 def test_every_wait_is_told_to_the_log_with_its_reason(caplog: pytest.LogCaptureFixture) -> None:
-    overloaded = {"code": "overloaded", "status": 503}
-    refused = httpx2.Response(
-        503, json=overloaded, headers={"content-type": "application/problem+json", "retry-after": "7"}
-    )
     caplog.set_level("INFO", "deepsimbad_client.http.retry")
+    refused = answer(503, {"code": "overloaded", "status": 503}, retry_after="7")
     Script(httpx2.ConnectError, refused, answer(200, OK)).client().health()
     assert caplog.messages == [
         "GET /healthz at http://service: scripted; trying again in 1.0 s (try 2 of 4)",
         "GET /healthz at http://service: 503 overloaded; trying again in 7.0 s (try 3 of 4)",
     ]
-
-
-def test_an_upload_is_sent_again_with_its_body() -> None:
-    script = Script(httpx2.ReadError, answer(201, {"index": 3, "n_frames": 1}))
-    image = b"\xff\xd8\xff rest"
-    assert script.client().admin.put_frame("d", "t", 3, image, position_m=1.5).n_frames == 1
-    first, second = script.requests
-    assert first.content == second.content == image
-    assert second.url == "http://service/v1/admin/domains/d/traverses/t/frames/3?position_m=1.5"
-    assert second.headers["content-type"] == "image/jpeg"
 
 
 @pytest.mark.parametrize("status", [400, 404, 409, 422, 500, 501])
@@ -76,48 +65,34 @@ def test_a_switch_is_sent_again_only_where_it_was_surely_not_made(kind: Any) -> 
     assert len(script.requests) == (2 if kind in UNTOUCHED else 1)
 
 
-@pytest.mark.parametrize(
-    "ask",
-    [
-        lambda client: client.admin.remap("d", training_traverse="t"),
-        lambda client: client.admin.feed_experience("d", "s", [1.0, None]),
-    ],
-    ids=["remap", "experience"],
-)
 @pytest.mark.parametrize("kind", RETRIED)
-def test_a_job_is_asked_for_until_it_is_known_under_one_key(ask: Callable[[Client], Any], kind: Any) -> None:
-    script = Script(outcome(kind), outcome(kind), answer(202, JOB), answer(202, JOB))
-    client = script.client()
-    assert ask(client).job_id == ask(client).job_id == "1"
-    keys = [request.headers["idempotency-key"] for request in script.requests]
-    assert keys[:2] == keys[1:3]
-    assert keys[2] != keys[3], "another call is another job"
-    assert len({request.content for request in script.requests}) == 1
-
-
-def test_a_job_may_be_named_by_who_asks_for_it() -> None:
-    script = Script(answer(202, JOB), answer(202, JOB))
-    script.client().admin.remap("d", idempotency_key="mine", training_traverse="t")
-    script.client().admin.feed_experience("d", "s", [1.0], idempotency_key="mine too")
-    assert [request.headers["idempotency-key"] for request in script.requests] == ["mine", "mine too"]
-    assert b"mine" not in script.requests[0].content
+def test_a_job_is_asked_for_until_it_is_known_under_one_key(kind: Any) -> None:
+    asks: list[Callable[..., Any]] = [
+        lambda client, **options: client.admin.remap("d", training_traverse="t", **options),
+        lambda client, **options: client.admin.feed_experience("d", "s", [1.0, None], **options),
+    ]
+    for ask in asks:
+        script = Script(outcome(kind), outcome(kind), answer(202, JOB))
+        client = script.client()
+        assert ask(client).job_id == ask(client).job_id == ask(client, idempotency_key="mine").job_id == "j"
+        keys = [request.headers["idempotency-key"] for request in script.requests]
+        assert keys[0] == keys[1] == keys[2] != keys[3], "another call is another job"
+        assert keys[4] == "mine"
+        assert len({request.content for request in script.requests}) == 1
 
 
 def test_the_last_failure_is_raised_after_the_last_try() -> None:
     with pytest.raises(errors.TransportTimeoutError):
         Script(httpx2.ReadTimeout).client().health()
     script = Script(httpx2.ConnectError)
-    with pytest.raises(errors.TransportError, match="GET /healthz at http://service after 4 tries") as raised:
+    with pytest.raises(errors.TransportError, match="GET /healthz at http://service after 4 tries") as failed:
         script.client().health()
-    assert isinstance(raised.value.__cause__, httpx2.ConnectError)
+    assert isinstance(failed.value.__cause__, httpx2.ConnectError)
     assert script.slept == [1.0, 2.0, 3.0]  # doubled, up to the longest
-
-
-def test_the_last_refusal_is_raised_with_what_the_service_said() -> None:
     script = Script(answer(429, {"code": "slow_down", "detail": "too fast"}, retry_after="2"))
-    with pytest.raises(errors.RateLimitedError, match="too fast") as raised:
+    with pytest.raises(errors.RateLimitedError, match="too fast") as refused:
         script.client().health()
-    assert (raised.value.code, raised.value.retry_after_s) == ("slow_down", 2.0)
+    assert (refused.value.code, refused.value.retry_after_s) == ("slow_down", 2.0)
     assert script.slept == [2.0, 2.0, 2.0]
 
 
