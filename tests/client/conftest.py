@@ -2,9 +2,8 @@
 
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import contextmanager
-from pathlib import Path
 
 import httpx2
 import numpy as np
@@ -23,7 +22,7 @@ ENCODINGS = {"kind": "feature_l2", "extractor": "none"}
 
 
 @contextmanager
-def serving(data_dir: Path) -> Iterator[str]:
+def serving(data_dir):
     app = create_app(Settings(data_dir=data_dir), InThisProcess(data_dir))
     config = uvicorn.Config(app, host="127.0.0.1", port=0, log_level="warning", ws="none", lifespan="on")
     server = uvicorn.Server(config)
@@ -45,14 +44,14 @@ def serving(data_dir: Path) -> Iterator[str]:
 
 
 @pytest.fixture(scope="session")
-def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+def service(tmp_path_factory):
     """The service's address; one for all tests, which use domains of their own."""
     with serving(tmp_path_factory.mktemp("service")) as url:
         yield url
 
 
 @pytest.fixture(scope="session")
-def encodings(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def encodings(tmp_path_factory):
     """Three drives of one route as ready encodings: landmarks.npy, summer.npy, winter.npy."""
     folder = tmp_path_factory.mktemp("encodings")
     rng = np.random.default_rng(7)
@@ -63,7 +62,7 @@ def encodings(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def mapped(client: Client, domain: str, encodings: Path, training_episodes: int = 0) -> None:
+def mapped(client, domain, encodings, training_episodes=0):
     """Make a domain with one map, of summer, an image every metre."""
     client.admin.put_domain(domain, ENCODINGS)
     for name in ("landmarks", "summer"):
@@ -75,12 +74,12 @@ def mapped(client: Client, domain: str, encodings: Path, training_episodes: int 
 class Link(httpx2.HTTPTransport):
     """To the real service; `lose` is asked of every request that was answered: True, and its answer never arrives."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__()
         self.requests: list[httpx2.Request] = []
         self.lose: Callable[[httpx2.Request], bool] = lambda request: False
 
-    def handle_request(self, request: httpx2.Request) -> httpx2.Response:
+    def handle_request(self, request):
         self.requests.append(request)
         response = super().handle_request(request)
         if self.lose(request):
@@ -90,7 +89,7 @@ class Link(httpx2.HTTPTransport):
 
 
 @pytest.fixture(scope="session")
-def route(service: str, encodings: Path) -> str:
+def route(service, encodings):
     """The address of a service that has mapped the domain `route`, which tests leave as it is."""
     with Client(service) as client:
         mapped(client, "route", encodings, training_episodes=50)
@@ -98,17 +97,17 @@ def route(service: str, encodings: Path) -> str:
 
 
 @pytest.fixture
-def link() -> Link:
+def link():
     return Link()
 
 
 @pytest.fixture
-def client(route: str, link: Link) -> Iterator[Client]:
+def client(route, link):
     with Client(route, retry=RetryPolicy(attempts=3), transport=link, sleep=lambda seconds: None) as client:
         yield client
 
 
 @pytest.fixture
-def views(encodings: Path) -> np.ndarray:
+def views(encodings):
     """[120, 32] of winter, one every metre."""
     return np.asarray(np.load(encodings / "winter.npy"))

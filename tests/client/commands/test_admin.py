@@ -4,10 +4,7 @@ import hashlib
 import json
 import re
 import sqlite3
-from pathlib import Path
-from typing import Any
 
-import httpx2
 import numpy as np
 import pytest
 
@@ -21,7 +18,7 @@ from ..conftest import ENCODINGS, mapped
 
 
 @pytest.fixture(scope="module")
-def domain(service: str, encodings: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
+def domain(service, encodings, tmp_path_factory):
     """A domain with one map, of summer, and a drive of noise to make worse ones of."""
     noise = tmp_path_factory.mktemp("noise") / "noise.npy"
     np.save(noise, np.random.default_rng(1).normal(size=(120, 32)).astype(np.float32))
@@ -33,18 +30,18 @@ def domain(service: str, encodings: Path, tmp_path_factory: pytest.TempPathFacto
 
 
 @pytest.fixture
-def out(service: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Any:
+def out(service, capsys, monkeypatch):
     """Runs a command that succeeds, and gives what it printed."""
     monkeypatch.setenv("DEEPSIMBAD_URL", service)
 
-    def printed(*command: str) -> str:
+    def printed(*command):
         assert run(list(command)) == 0, capsys.readouterr().err
         return capsys.readouterr().out
 
     return printed
 
 
-def test_a_worse_map_is_sealed_not_served_and_says_why(service: str, domain: str, out: Any) -> None:
+def test_a_worse_map_is_sealed_not_served_and_says_why(service, domain, out):
     remap_noise = ["remap", "--domain", domain, "--training", "noise", "--check", "winter", "--gate", "0.5"]
     told = out(*remap_noise, "--training-episodes", "0")
     assert "sealed but not activated" in told
@@ -69,7 +66,7 @@ def test_a_worse_map_is_sealed_not_served_and_says_why(service: str, domain: str
     assert [version["state"] for version in listed] == ["sealed", "sealed", "active"]
 
 
-def test_a_map_as_good_passes_its_gate_and_a_rollback_undoes_it(service: str, domain: str, out: Any) -> None:
+def test_a_map_as_good_passes_its_gate_and_a_rollback_undoes_it(service, domain, out):
     command = ["remap", "--domain", domain, "--training", "summer", "--check", "winter", "--gate", "5"]
     job = json.loads(out(*command, "--training-episodes", "0", "--json"))
     made = job["result"]["map_version"]
@@ -83,7 +80,7 @@ def test_a_map_as_good_passes_its_gate_and_a_rollback_undoes_it(service: str, do
     assert run(["activate", domain, "999"]) == 1
 
 
-def test_a_drive_is_appended(service: str, domain: str, encodings: Path, out: Any) -> None:
+def test_a_drive_is_appended(service, domain, encodings, out):
     with Client(service) as client:
         before = client.domain(domain)
         job = json.loads(
@@ -96,7 +93,7 @@ def test_a_drive_is_appended(service: str, domain: str, encodings: Path, out: An
     assert run(["remap", "--domain", domain, "--training", "winter", "--append", "--landmarks", "landmarks"]) == 2
 
 
-def test_a_map_is_fetched_and_deleted(service: str, domain: str, tmp_path: Path, out: Any, capsys: Any) -> None:
+def test_a_map_is_fetched_and_deleted(service, domain, tmp_path, out, capsys):
     file = tmp_path / "map.sqlite"
     there = json.loads(out("download", domain, "1", str(file), "--json"))
     assert there["sha256"] == hashlib.sha256(file.read_bytes()).hexdigest()
@@ -119,10 +116,10 @@ def test_a_map_is_fetched_and_deleted(service: str, domain: str, tmp_path: Path,
     assert "removed" in out("maps", domain)
 
 
-def test_a_download_goes_on_where_an_earlier_one_stopped(service: str, domain: str, tmp_path: Path) -> None:
+def test_a_download_goes_on_where_an_earlier_one_stopped(service, domain, tmp_path):
     answered: list[tuple[int, int]] = []
 
-    def note(response: httpx2.Response) -> None:
+    def note(response):
         answered.append((response.status_code, int(response.headers.get("content-length", 0))))
 
     with Client(service) as client:
@@ -141,7 +138,7 @@ def test_a_download_goes_on_where_an_earlier_one_stopped(service: str, domain: s
     assert {path.name for path in tmp_path.iterdir()} == {"whole", "map"}
 
 
-def test_sessions_and_traverses_are_listed_and_ended(service: str, domain: str, out: Any, capsys: Any) -> None:
+def test_sessions_and_traverses_are_listed_and_ended(service, domain, out, capsys):
     with Client(service) as client:
         session = client.session(domain, keep=True)
         session.observe(ranked_landmarks=[1, 2, 3])
@@ -171,7 +168,7 @@ def test_sessions_and_traverses_are_listed_and_ended(service: str, domain: str, 
         client.admin.traverse(domain, "gaps")
 
 
-def test_nothing_is_deleted_where_nobody_can_be_asked(service: str, domain: str, out: Any, capsys: Any) -> None:
+def test_nothing_is_deleted_where_nobody_can_be_asked(service, domain, out, capsys):
     for command in (["delete-domain", domain], ["delete-traverse", domain, "winter"], ["delete-map", domain, "1"]):
         assert run(command) == 2
         assert "--yes" in capsys.readouterr().err
@@ -185,20 +182,20 @@ def test_nothing_is_deleted_where_nobody_can_be_asked(service: str, domain: str,
             client.domain("brief")
 
 
-def test_the_newest_jobs_alone(service: str, domain: str, out: Any) -> None:
+def test_the_newest_jobs_alone(service, domain, out):
     every = json.loads(out("jobs", "--domain", domain, "--json"))
     assert len(every) > 2
     assert json.loads(out("jobs", "--domain", domain, "--last", "2", "--json")) == every[:2]
 
 
-def test_nothing_to_roll_back_to(service: str, capsys: Any, out: Any) -> None:
+def test_nothing_to_roll_back_to(service, capsys, out):
     with Client(service) as client:
         client.admin.put_domain("fresh", ENCODINGS)
     assert run(["rollback", "fresh"]) == 1
     assert "no_earlier_map" in capsys.readouterr().err
 
 
-def test_a_second_season_is_asked_for(service: str, domain: str, out: Any) -> None:
+def test_a_second_season_is_asked_for(service, domain, out):
     command = ["remap", "--domain", domain, "--training", "summer", "--landmarks", "winter", "--no-activate", "--json"]
     quick = ["--n-landmarks", "50", "--training-episodes", "0"]
     said = {"": False, "--same-route": True, "--no-same-route": False}

@@ -13,18 +13,18 @@ from deepsimbad_client.http.models import Domain, Job
 
 
 @pytest.fixture
-def shown(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Any:
+def shown(capsys, monkeypatch):
     """What a pipe gets of a table, by line."""
     monkeypatch.delenv("COLUMNS", raising=False)
 
-    def shown(table: Any) -> list[str]:
+    def shown(table):
         show(table)
         return capsys.readouterr().out.splitlines()
 
     return shown
 
 
-def test_a_table_in_a_pipe_cuts_no_name_and_heeds_columns(shown: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_table_in_a_pipe_cuts_no_name_and_heeds_columns(shown, monkeypatch):
     table = domain_table([Domain(name="a" * 64, evaluator={"kind": "feature_l2"})])
     printed = "".join(shown(table))
     for words in ("a" * 64, "feature_l2", "landmarks"):
@@ -33,7 +33,7 @@ def test_a_table_in_a_pipe_cuts_no_name_and_heeds_columns(shown: Any, monkeypatc
     assert max(map(len, shown(table))) <= 60
 
 
-def test_jobs_are_shown_with_what_they_do_and_the_time_left(shown: Any) -> None:
+def test_jobs_are_shown_with_what_they_do_and_the_time_left(shown):
     states: dict[str, dict[str, Any]] = {
         "waits": {"state": "queued"},
         "began": {"state": "running"},
@@ -50,7 +50,7 @@ def test_jobs_are_shown_with_what_they_do_and_the_time_left(shown: Any) -> None:
 
 
 @pytest.mark.parametrize("is_terminal", [True, False])
-def test_waits_are_shown_to_a_person_and_to_no_script(monkeypatch: pytest.MonkeyPatch, is_terminal: bool) -> None:
+def test_waits_are_shown_to_a_person_and_to_no_script(monkeypatch, is_terminal):
     logger = logging.getLogger("deepsimbad_client.http.retry")
     for attribute in ("level", "handlers", "propagate"):
         monkeypatch.setattr(logger, attribute, getattr(logger, attribute))
@@ -62,7 +62,7 @@ def test_waits_are_shown_to_a_person_and_to_no_script(monkeypatch: pytest.Monkey
     assert ("503 [overloaded]; trying again in 2.0 s" in screen.getvalue()) == is_terminal
 
 
-def test_the_bar_shows_what_happens(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_bar_shows_what_happens(monkeypatch):
     screen = io.StringIO()
     monkeypatch.setattr(console, "REMARKS", Console(file=screen, force_terminal=True, width=100))
     with JobBar("mapping d") as bar:
@@ -90,7 +90,7 @@ def test_the_bar_shows_what_happens(monkeypatch: pytest.MonkeyPatch) -> None:
         assert words in screen.getvalue()
 
 
-def test_a_map_that_does_not_answer_says_why(shown: Any) -> None:
+def test_a_map_that_does_not_answer_says_why(shown):
     lines = shown(domain_table([Domain(name="yard", map_version=3, map_problem="damaged_map"), Domain(name="loop")]))
     (damaged,) = [line for line in lines if "yard" in line]
     assert "3 damaged_map" in damaged
@@ -111,7 +111,7 @@ LOST_GATE = {"gate_margin": 0.0, "passed": False}
         (CHECK | {"anr": None}, None),
     ],
 )
-def test_a_map_is_shown_with_both_figures_where_it_was_compared(shown: Any, check: Any, words: str | None) -> None:
+def test_a_map_is_shown_with_both_figures_where_it_was_compared(shown, check, words):
     is_active = not check or check.get("passed") is not False
     result = {"map_version": 7, "active": is_active, "metrics": {"check": check and {"passed": None, **check}}}
     job = Job(job_id="0" * 32, domain="d", state="succeeded", progress=1.0, result=result)

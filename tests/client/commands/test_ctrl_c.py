@@ -8,7 +8,6 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
 from contextlib import ExitStack, closing
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
@@ -36,11 +35,11 @@ class Endless(BaseHTTPRequestHandler):
     deleted: list[str]
     released: threading.Event
 
-    def do_POST(self) -> None:
+    def do_POST(self):
         self.rfile.read(int(self.headers["content-length"]))
         self._answer(202, JOB)
 
-    def do_GET(self) -> None:
+    def do_GET(self):
         if not self.path.endswith("/events"):
             self._answer(200, TRAVERSE if "traverses" in self.path else JOB)
             return
@@ -53,24 +52,24 @@ class Endless(BaseHTTPRequestHandler):
         self.released.wait(PATIENCE_S)
         self.close_connection = True
 
-    def do_DELETE(self) -> None:
+    def do_DELETE(self):
         self.deleted.append(self.path)
         self.send_response(204)
         self.end_headers()
 
-    def _answer(self, status: int, document: dict[str, Any]) -> None:
+    def _answer(self, status, document):
         body = json.dumps(document).encode()
         self.send_response(status)
         self.send_header("Content-Length", str(len(body)))
         self.end_headers()
         self.wfile.write(body)
 
-    def log_message(self, *words: Any) -> None:
+    def log_message(self, *words):
         del words
 
 
 @pytest.fixture
-def endless() -> Iterator[Any]:
+def endless():
     handler: Any = type("Handler", (Endless,), {"deleted": [], "released": threading.Event()})
     server: Any = ThreadingHTTPServer(("127.0.0.1", 0), handler)
     server.deleted = handler.deleted
@@ -86,7 +85,7 @@ def endless() -> Iterator[Any]:
 class Terminal:
     """A command on a pseudo-terminal that controls it, as a shell's window does."""
 
-    def __init__(self, *command: str) -> None:
+    def __init__(self, *command):
         self.own, theirs = pty.openpty()
         self.process = subprocess.Popen(
             [sys.executable, "-c", TAKE_TERMINAL_AND_RUN, *command],
@@ -99,7 +98,7 @@ class Terminal:
         os.close(theirs)
         self.shown = b""
 
-    def shows(self, words: bytes | None, within_s: float = PATIENCE_S) -> bool:
+    def shows(self, words, within_s=PATIENCE_S):
         """Whether the words come to stand on the screen, or the command ends where there are none to wait for."""
         give_up = time.monotonic() + within_s
         while words is None or words not in self.shown:
@@ -113,7 +112,7 @@ class Terminal:
                 return words is None
         return True
 
-    def press_ctrl_c(self, then: bytes | None) -> None:
+    def press_ctrl_c(self, then):
         """Interrupt until the words stand on the screen, or, with None, until the command ends.
 
         Pressed in the instant before Python waits for input or for bytes, Ctrl-C is only seen when that wait ends: a
@@ -125,7 +124,7 @@ class Terminal:
                 return
         raise AssertionError(self.shown)
 
-    def answer(self, keys: bytes) -> int:
+    def answer(self, keys):
         """Type what the command waits for; returns its exit code."""
         if keys == CTRL_C:
             self.press_ctrl_c(then=None)
@@ -134,14 +133,14 @@ class Terminal:
             assert self.shows(None), self.shown
         return self.process.wait(PATIENCE_S)
 
-    def close(self) -> None:
+    def close(self):
         self.process.kill()
         self.process.wait()
         os.close(self.own)
 
 
 @pytest.fixture
-def terminal(endless: Any) -> Iterator[Any]:
+def terminal(endless):
     with ExitStack() as opened:
         address = f"http://127.0.0.1:{endless.server_port}"
         yield lambda *words: opened.enter_context(closing(Terminal(*words, "--server", address)))
@@ -155,9 +154,7 @@ REMAPPED = ("remap", "--domain", "d", "--training", "t")
     [(REMAPPED, b"n\n", False), (("jobs", "7", "--follow"), b"y\n", True), (REMAPPED, CTRL_C, False)],
     ids=["no", "yes", "once more"],
 )
-def test_ctrl_c_asks_whether_to_cancel(
-    endless: Any, terminal: Any, command: Any, reply: bytes, is_cancelled: bool
-) -> None:
+def test_ctrl_c_asks_whether_to_cancel(endless, terminal, command, reply, is_cancelled):
     window = terminal(*command)
     assert window.shows(b"train planner"), window.shown
     window.press_ctrl_c(then=b"Cancel job 7 on the server too? [y/N]")
@@ -168,7 +165,7 @@ def test_ctrl_c_asks_whether_to_cancel(
 
 
 @pytest.mark.parametrize(("reply", "code", "n_deleted"), [(b"y\n", 0, 1), (b"\n", 130, 0), (CTRL_C, 130, 0)])
-def test_a_deletion_is_asked_about(endless: Any, terminal: Any, reply: bytes, code: int, n_deleted: int) -> None:
+def test_a_deletion_is_asked_about(endless, terminal, reply, code, n_deleted):
     window = terminal("delete-traverse", "d", "t")
     assert window.shows(b"Delete traverse t of domain d with its 12 frames? [y/N]"), window.shown
     assert window.answer(reply) == code

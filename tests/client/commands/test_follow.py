@@ -1,8 +1,6 @@
 """Following a job through whatever happens to the connection."""
 
 import json
-from collections.abc import Callable
-from typing import Any
 
 import httpx2
 import pytest
@@ -17,15 +15,15 @@ from ..http.scripted import answer
 EVENTS = "/v1/admin/jobs/7/events"
 
 
-def job(state: str, progress: float = 0.0, **more: Any) -> dict[str, Any]:
+def job(state, progress=0.0, **more):
     return {"job_id": "7", "domain": "d", "state": state, "progress": progress, **more}
 
 
-def stream(*events: dict[str, Any], breaks_off: bool = False) -> Callable[[], httpx2.Response]:
+def stream(*events, breaks_off=False):
     """What gives some events and ends, or breaks off."""
 
     class Events(httpx2.SyncByteStream):
-        def __iter__(self) -> Any:
+        def __iter__(self):
             for event in events:
                 yield f"event: progress\ndata: {json.dumps(event)}\n\n".encode()
             if breaks_off:
@@ -37,14 +35,14 @@ def stream(*events: dict[str, Any], breaks_off: bool = False) -> Callable[[], ht
 class Service:
     """Answers from two queues, of the stream and of single questions, the last of each for ever."""
 
-    def __init__(self, streams: list[Any], answers: list[Any]) -> None:
+    def __init__(self, streams, answers):
         self.queues = {True: streams, False: answers}
         self.asked: list[str] = []
         self.now = 0.0
         self.heard: list[Job] = []
         self.silences: list[float] = []
 
-    def __call__(self, request: httpx2.Request) -> httpx2.Response:
+    def __call__(self, request):
         self.asked.append(request.url.path)
         queue = self.queues[request.url.path == EVENTS]
         outcome = queue.pop(0) if len(queue) > 1 else queue[0]
@@ -54,10 +52,10 @@ class Service:
             outcome = outcome()
         return outcome if isinstance(outcome, httpx2.Response) else httpx2.Response(200, json=outcome)
 
-    def sleep(self, seconds: float) -> None:
+    def sleep(self, seconds):
         self.now += seconds
 
-    def follow(self, patience_s: float = 60.0) -> Job:
+    def follow(self, patience_s=60.0):
         retry = RetryPolicy(attempts=1)
         client = Client("http://service", retry=retry, transport=httpx2.MockTransport(self), sleep=self.sleep)
         return follow_job(
@@ -94,7 +92,7 @@ QUEUED, RUNNING, SUCCEEDED = job("queued"), job("running", 0.6), job("succeeded"
         *(([answer(status), DONE], [answer(status)], [1.0]) for status in (408, 429, 502, 503)),
     ],
 )
-def test_a_job_is_followed_to_its_end(streams: list[Any], answers: list[Any], heard: list[float]) -> None:
+def test_a_job_is_followed_to_its_end(streams, answers, heard):
     service = Service([*streams], [*answers])
     assert service.follow().state == "succeeded"
     assert [job.progress for job in service.heard] == heard
@@ -110,7 +108,7 @@ def test_a_job_is_followed_to_its_end(streams: list[Any], answers: list[Any], he
         (404, "unknown_job", errors.UnknownJobError, "no job 7"),
     ],
 )
-def test_a_refusal_ends_it(status: int, code: str, error: type[errors.ApiError], words: str) -> None:
+def test_a_refusal_ends_it(status, code, error, words):
     refused = answer(status, {"code": code, "detail": "no job 7"})
     with pytest.raises(error, match=words):
         Service([refused], [refused]).follow()
@@ -119,7 +117,7 @@ def test_a_refusal_ends_it(status: int, code: str, error: type[errors.ApiError],
 @pytest.mark.parametrize(
     ("state", "error"), [("failed", errors.JobFailedError), ("cancelled", errors.JobCancelledError)]
 )
-def test_a_job_without_success_is_an_error(state: str, error: type[errors.JobFailedError]) -> None:
+def test_a_job_without_success_is_an_error(state, error):
     ended = job(state, error={"code": "too_few_candidates", "detail": "only 3 candidates"})
     with pytest.raises(error) as raised:
         Service([stream(ended)], [ended]).follow()
@@ -127,7 +125,7 @@ def test_a_job_without_success_is_an_error(state: str, error: type[errors.JobFai
     assert state != "failed" or "only 3 candidates" in str(raised.value)
 
 
-def test_silence_is_not_waited_out_for_ever() -> None:
+def test_silence_is_not_waited_out_for_ever():
     service = Service([LOST], [LOST])
     with pytest.raises(errors.TransportError):
         service.follow(patience_s=60)
@@ -142,12 +140,10 @@ def test_silence_is_not_waited_out_for_ever() -> None:
         ("succeeded", "job 7 had ended before it could be cancelled"),
     ],
 )
-def test_a_cancel_says_what_came_of_it(
-    state: str, words: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_cancel_says_what_came_of_it(state, words, monkeypatch, capsys):
     asked: list[str] = []
 
-    def respond(request: httpx2.Request) -> httpx2.Response:
+    def respond(request):
         asked.append(request.method)
         return httpx2.Response(204) if request.method == "DELETE" else httpx2.Response(200, json=job(state))
 

@@ -1,7 +1,5 @@
 """A service that asks for keys, as the command line meets it."""
 
-from pathlib import Path
-
 import pytest
 
 from deepsimbad.store.catalog import Catalog
@@ -12,9 +10,7 @@ from deepsimbad_client.commands.group import run
 from ..conftest import serving
 
 
-def test_a_refused_key_is_told_in_one_line_and_what_to_do(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_refused_key_is_told_in_one_line_and_what_to_do(tmp_path, monkeypatch, capsys):
     with Catalog.open(tmp_path) as catalog:
         admin, robot = (catalog.create_key(scope, "", None)[1].text for scope in (KeyScope.ADMIN, KeyScope.LOCALIZE))
     with serving(tmp_path) as url:

@@ -1,7 +1,6 @@
 """The demonstration from end to end, and jobs and robots whose service is restarted under them, as a process."""
 
 import threading
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,7 +19,7 @@ from ..conftest import ENCODINGS
 pytestmark = pytest.mark.slow
 
 
-def test_the_demonstration_on_a_tiny_campus(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_demonstration_on_a_tiny_campus(tmp_path, monkeypatch):
     monkeypatch.setattr(demonstration, "RELEVANCES", demonstration.RELEVANCES[-2:])
     ended = CliRunner().invoke(demonstration.demo, [str(tmp_path / "demo"), "--frames", "30"], catch_exceptions=False)
     assert ended.exit_code == 0
@@ -30,11 +29,11 @@ def test_the_demonstration_on_a_tiny_campus(tmp_path: Path, monkeypatch: pytest.
 
 
 @pytest.mark.parametrize("is_killed", [False, True], ids=["stopped", "killed"])
-def test_a_job_and_a_session_outlive_their_service(tmp_path: Path, encodings: Path, is_killed: bool) -> None:
+def test_a_job_and_a_session_outlive_their_service(tmp_path, encodings, is_killed):
     heard: list[Job] = []
     has_begun = threading.Event()
 
-    def hear(job: Job) -> None:
+    def hear(job):
         heard.append(job)
         if job.stage is not None:
             has_begun.set()

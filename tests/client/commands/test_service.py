@@ -3,7 +3,6 @@
 import asyncio
 import json
 import threading
-from pathlib import Path
 
 import cv2
 import httpx2
@@ -12,10 +11,10 @@ import pytest
 
 from deepsimbad.api.app import create_app
 from deepsimbad.settings import Settings
-from deepsimbad_client import AsyncClient, Client, errors
+from deepsimbad_client import AsyncClient, errors
 from deepsimbad_client.commands.group import run
 from deepsimbad_client.http.jobs import follow_job, remap
-from deepsimbad_client.http.upload import UploadReport, in_order, upload
+from deepsimbad_client.http.upload import in_order, upload
 from deepsimbad_client.recordings.sources import open_source
 from deepsimbad_client.replay.passive import replay
 from deepsimbad_client.replay.report import summarise
@@ -23,10 +22,10 @@ from deepsimbad_client.replay.report import summarise
 from ..conftest import ENCODINGS, mapped
 
 
-def test_an_upload_goes_on_where_it_stopped(client: Client, encodings: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_upload_goes_on_where_it_stopped(client, encodings, monkeypatch):
     monkeypatch.setattr("deepsimbad_client.http.upload.BATCH_BYTES", 10 * 32 * 4)
 
-    def stop(progress: UploadReport) -> None:
+    def stop(progress):
         if progress.n_done >= 20:
             raise KeyboardInterrupt
 
@@ -42,11 +41,11 @@ def test_an_upload_goes_on_where_it_stopped(client: Client, encodings: Path, mon
     assert (resent.n_skipped, resent.n_sent) == (0, 120)
 
 
-def test_results_come_in_order_and_work_never_runs_far_ahead() -> None:
+def test_results_come_in_order_and_work_never_runs_far_ahead():
     begun: list[int] = []
     release = threading.Event()
 
-    def work(item: int) -> int:
+    def work(item):
         begun.append(item)
         if item == 0:
             release.wait(10)
@@ -59,10 +58,10 @@ def test_results_come_in_order_and_work_never_runs_far_ahead() -> None:
     assert [result for _, result in results] == [item * item for item in range(1, 100)]
 
 
-def test_a_failure_comes_in_its_turn_and_stops_the_rest() -> None:
+def test_a_failure_comes_in_its_turn_and_stops_the_rest():
     begun: list[int] = []
 
-    def work(item: int) -> int:
+    def work(item):
         begun.append(item)
         if item == 5:
             raise errors.ReplayError("five")
@@ -73,7 +72,7 @@ def test_a_failure_comes_in_its_turn_and_stops_the_rest() -> None:
     assert len(begun) < 20
 
 
-def test_images_with_a_broken_one_among_them(client: Client, tmp_path: Path) -> None:
+def test_images_with_a_broken_one_among_them(client, tmp_path):
     folder = tmp_path / "images"
     folder.mkdir()
     rng = np.random.default_rng(3)
@@ -92,7 +91,7 @@ def test_images_with_a_broken_one_among_them(client: Client, tmp_path: Path) -> 
     assert len(answer.retrieval) == 3
 
 
-def test_errors_arrive_with_their_names(client: Client, encodings: Path) -> None:
+def test_errors_arrive_with_their_names(client, encodings):
     with pytest.raises(errors.UnknownDomainError) as unknown:
         client.domain("nowhere")
     assert unknown.value.request_id
@@ -114,7 +113,7 @@ def test_errors_arrive_with_their_names(client: Client, encodings: Path) -> None
         client.admin.delete_domain("empty")
 
 
-def test_what_became_known_later_improves_the_next_map(client: Client, encodings: Path, views: np.ndarray) -> None:
+def test_what_became_known_later_improves_the_next_map(client, encodings, views):
     mapped(client, "learning", encodings, training_episodes=20)
     with client.session("learning") as session:
         for at in (40, 43, 46):
@@ -124,9 +123,7 @@ def test_what_became_known_later_improves_the_next_map(client: Client, encodings
     assert client.domain("learning").map_version == 2
 
 
-def test_the_command_line_end_to_end(
-    service: str, encodings: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_command_line_end_to_end(service, encodings, tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("DEEPSIMBAD_URL", service)
     for name in ("landmarks", "summer"):
         assert run(["upload", str(encodings / f"{name}.npy"), "--domain", "cli", "--traverse", name, "--json"]) == 0
@@ -156,8 +153,8 @@ def test_the_command_line_end_to_end(
     assert capsys.readouterr().err.count("\n") == 1
 
 
-def test_the_async_client_over_asgi(tmp_path: Path, encodings: Path) -> None:
-    async def scenario() -> None:
+def test_the_async_client_over_asgi(tmp_path, encodings):
+    async def scenario():
         app = create_app(Settings(data_dir=tmp_path))
         async with (
             app.router.lifespan_context(app),
@@ -187,9 +184,7 @@ def test_the_async_client_over_asgi(tmp_path: Path, encodings: Path) -> None:
     asyncio.run(scenario())
 
 
-def test_places_on_the_command_line(
-    client: Client, encodings: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_places_on_the_command_line(client, encodings, tmp_path, capsys):
     folder = tmp_path / "look [here]"
     folder.mkdir()
     rng = np.random.default_rng(5)

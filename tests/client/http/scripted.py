@@ -1,7 +1,5 @@
 """A service that answers by script, behind httpx2's MockTransport."""
 
-from typing import Any
-
 import httpx2
 
 from deepsimbad_client import Client, RetryPolicy
@@ -28,7 +26,7 @@ LOCALIZATION = {
 }
 
 
-def answer(status: int, document: object = None, **headers: str) -> httpx2.Response:
+def answer(status, document=None, **headers):
     named = {name.replace("_", "-"): value for name, value in headers.items()}
     return httpx2.Response(status, json=document, headers=named)
 
@@ -36,18 +34,18 @@ def answer(status: int, document: object = None, **headers: str) -> httpx2.Respo
 class Script:
     """Gives one outcome after the other, the last of them for ever, and remembers what was asked."""
 
-    def __init__(self, *outcomes: httpx2.Response | type[httpx2.TransportError]) -> None:
+    def __init__(self, *outcomes):
         self.outcomes = list(outcomes)
         self.requests: list[httpx2.Request] = []
         self.slept: list[float] = []
 
-    def __call__(self, request: httpx2.Request) -> httpx2.Response:
+    def __call__(self, request):
         self.requests.append(request)
         outcome = self.outcomes.pop(0) if len(self.outcomes) > 1 else self.outcomes[0]
         if isinstance(outcome, httpx2.Response):
             return outcome
         raise outcome("scripted", request=request)
 
-    def client(self, url: str | None = "http://service/", key: str | None = None, **options: Any) -> Client:
+    def client(self, url="http://service/", key=None, **options):
         given = {"retry": POLICY, "sleep": self.slept.append, "jitter": lambda: 1.0, **options}
         return Client(url, key, transport=httpx2.MockTransport(self), **given)

@@ -1,14 +1,11 @@
 """A map on its way into a file: every byte checked, nothing fetched twice, nothing half in its place."""
 
 import hashlib
-from collections.abc import Iterator
-from pathlib import Path
-from typing import Any
 
 import httpx2
 import pytest
 
-from deepsimbad_client import AsyncClient, Client, RetryPolicy, errors
+from deepsimbad_client import Client, RetryPolicy, errors
 
 from .scripted import Script, answer
 from .test_faces import run_async
@@ -18,21 +15,21 @@ OTHER = BODY[::-1]
 PATH = "/v1/admin/domains/d/maps/3/file"
 
 
-def sha256(body: bytes) -> str:
+def sha256(body):
     return hashlib.sha256(body).hexdigest()
 
 
 class Broken(httpx2.SyncByteStream, httpx2.AsyncByteStream):
     """The beginning of a body, then the end of the link."""
 
-    def __init__(self, body: bytes) -> None:
+    def __init__(self, body):
         self.body = body
 
-    def __iter__(self) -> Iterator[bytes]:
+    def __iter__(self):
         yield self.body
         raise httpx2.ReadError("the link is gone")
 
-    async def __aiter__(self) -> Any:
+    async def __aiter__(self):
         yield self.body
         raise httpx2.ReadError("the link is gone")
 
@@ -44,12 +41,12 @@ class Shelf:
         ranges: What was asked for, "" for the whole.
     """
 
-    def __init__(self, body: bytes = BODY, breaks: tuple[int | None, ...] = (), **headers: str) -> None:
+    def __init__(self, body=BODY, breaks=(), **headers):
         self.body, self.breaks, self.headers = body, list(breaks), headers
         self.ranges: list[str] = []
         self.slept: list[float] = []
 
-    def __call__(self, request: httpx2.Request) -> httpx2.Response:
+    def __call__(self, request):
         assert request.url.path == PATH
         assert request.headers["accept-encoding"] == "identity"
         asked = request.headers.get("range", "")
@@ -69,12 +66,12 @@ class Shelf:
             return httpx2.Response(status, content=content, headers=headers)
         return httpx2.Response(status, stream=Broken(content[:stop]), headers=headers)
 
-    def client(self, attempts: int = 3) -> Client:
+    def client(self, attempts=3):
         retry, transport = RetryPolicy(attempts=attempts), httpx2.MockTransport(self)
         return Client("http://service", retry=retry, transport=transport, sleep=self.slept.append)
 
 
-def test_a_break_goes_on_where_it_was_however_often(tmp_path: Path) -> None:
+def test_a_break_goes_on_where_it_was_however_often(tmp_path):
     shelf, heard = Shelf(breaks=(10_000,) * 8), []
     with shelf.client(attempts=2) as client:  # every try brings something, so it never gives up
         there = client.admin.download_map(
@@ -87,7 +84,7 @@ def test_a_break_goes_on_where_it_was_however_often(tmp_path: Path) -> None:
     assert heard[-1] == (len(BODY), len(BODY))
 
 
-def test_a_later_try_goes_on_too(tmp_path: Path) -> None:
+def test_a_later_try_goes_on_too(tmp_path):
     shelf = Shelf(breaks=(30_000, 0, 0))
     with shelf.client(attempts=2) as client:
         with pytest.raises(errors.TransportError, match=r"maps/3/file"):
@@ -98,7 +95,7 @@ def test_a_later_try_goes_on_too(tmp_path: Path) -> None:
     assert (tmp_path / "m.sqlite").read_bytes() == BODY
 
 
-def test_another_file_by_now_is_fetched_from_its_beginning(tmp_path: Path) -> None:
+def test_another_file_by_now_is_fetched_from_its_beginning(tmp_path):
     with Shelf(breaks=(30_000, 0)).client(attempts=1) as client, pytest.raises(errors.TransportError):
         client.admin.download_map("d", 3, tmp_path / "m.sqlite")
     other = Shelf(OTHER)
@@ -110,7 +107,7 @@ def test_another_file_by_now_is_fetched_from_its_beginning(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("n_there", [len(BODY), len(BODY) + 5])
-def test_a_part_without_a_rest_is_fetched_anew(tmp_path: Path, n_there: int) -> None:
+def test_a_part_without_a_rest_is_fetched_anew(tmp_path, n_there):
     (tmp_path / f"m.sqlite.{sha256(BODY)}.part").write_bytes((BODY + b"12345")[:n_there])
     shelf = Shelf()
     with shelf.client() as client:
@@ -119,7 +116,7 @@ def test_a_part_without_a_rest_is_fetched_anew(tmp_path: Path, n_there: int) -> 
     assert (tmp_path / "m.sqlite").read_bytes() == BODY
 
 
-def test_a_part_that_was_spoilt_is_found_out_and_dropped(tmp_path: Path) -> None:
+def test_a_part_that_was_spoilt_is_found_out_and_dropped(tmp_path):
     (tmp_path / f"m.sqlite.{sha256(BODY)}.part").write_bytes(b"x" * 100)
     with Shelf().client() as client:
         with pytest.raises(errors.DamagedDownloadError, match=sha256(BODY)):
@@ -129,7 +126,7 @@ def test_a_part_that_was_spoilt_is_found_out_and_dropped(tmp_path: Path) -> None
     assert (tmp_path / "m.sqlite").read_bytes() == BODY
 
 
-def test_a_file_of_another_digest_or_none_never_replaces_a_good_one(tmp_path: Path) -> None:
+def test_a_file_of_another_digest_or_none_never_replaces_a_good_one(tmp_path):
     (tmp_path / "m.sqlite").write_bytes(b"good")
     for etag, error in (
         (f'"sha256:{sha256(OTHER)}"', errors.DamagedDownloadError),
@@ -140,7 +137,7 @@ def test_a_file_of_another_digest_or_none_never_replaces_a_good_one(tmp_path: Pa
     assert (tmp_path / "m.sqlite").read_bytes() == b"good"
 
 
-def test_refusals_have_their_names_and_are_waited_out_where_they_pass(tmp_path: Path) -> None:
+def test_refusals_have_their_names_and_are_waited_out_where_they_pass(tmp_path):
     retired = {"code": "retired_map", "detail": "map 3 was removed"}
     script = Script(answer(503, {"code": "overloaded"}, retry_after="7"), answer(410, retired))
     with pytest.raises(errors.RetiredMapError, match="was removed"):
@@ -148,7 +145,7 @@ def test_refusals_have_their_names_and_are_waited_out_where_they_pass(tmp_path: 
     assert script.slept == [7.0]
 
 
-def test_a_place_where_no_file_can_lie_is_refused_before_anything_is_asked(tmp_path: Path) -> None:
+def test_a_place_where_no_file_can_lie_is_refused_before_anything_is_asked(tmp_path):
     shelf = Shelf()
     with shelf.client() as client:
         for path in (tmp_path, tmp_path / "nowhere" / "m"):
@@ -159,10 +156,10 @@ def test_a_place_where_no_file_can_lie_is_refused_before_anything_is_asked(tmp_p
     assert shelf.ranges == [""]
 
 
-def test_the_async_client_fetches_the_same(tmp_path: Path) -> None:
+def test_the_async_client_fetches_the_same(tmp_path):
     shelf = Shelf(breaks=(10_000, 20_000))
 
-    async def fetch(client: AsyncClient) -> None:
+    async def fetch(client):
         there = await client.admin.download_map("d", 3, str(tmp_path / "m.sqlite"))
         assert there.sha256 == sha256(BODY)
 

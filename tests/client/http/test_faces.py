@@ -69,7 +69,7 @@ ASKED: dict[str, Ask] = {
 }
 
 
-def document() -> dict[str, Any]:
+def document():
     return create_app(Settings(data_dir=Path("never-opened"))).openapi()
 
 
@@ -77,7 +77,7 @@ OPERATIONS = sorted(f"{method.upper()} {path}" for path, methods in document()["
 
 
 @pytest.mark.parametrize("operation", OPERATIONS)
-def test_every_operation_has_its_call(operation: str, tmp_path: Path) -> None:
+def test_every_operation_has_its_call(operation, tmp_path):
     assert operation in ASKED, f"{operation} has no call in the client"
     script = Script(httpx2.ConnectError)
     client = script.client()
@@ -90,7 +90,7 @@ def test_every_operation_has_its_call(operation: str, tmp_path: Path) -> None:
     assert re.fullmatch(re.sub("{[^}]*}", "[^/]+", path), request.url.path)
 
 
-def test_every_option_of_a_remap_and_a_session_can_be_given() -> None:
+def test_every_option_of_a_remap_and_a_session_can_be_given():
     assert sorted(ASKED) == OPERATIONS, "no call is of an operation that is gone"
     assert set(SessionBody.model_fields) <= set(inspect.signature(Client.session).parameters)
     members = set(RemapBody.model_fields)
@@ -107,7 +107,7 @@ def test_every_option_of_a_remap_and_a_session_can_be_given() -> None:
 @pytest.mark.parametrize(
     ("blocking", "awaiting"), [(Client, AsyncClient), (Session, AsyncSession), (Admin, AsyncAdmin)]
 )
-def test_both_faces_show_signature_and_docstring(blocking: type, awaiting: type) -> None:
+def test_both_faces_show_signature_and_docstring(blocking, awaiting):
     calls = [name for name, _ in inspect.getmembers(blocking, inspect.isfunction) if name[0] != "_" and name != "close"]
     assert len(calls) > 6
     for name in calls:
@@ -118,14 +118,14 @@ def test_both_faces_show_signature_and_docstring(blocking: type, awaiting: type)
         assert inspect.iscoroutinefunction(theirs) != (name.startswith("iter_") or name == "job_events")
 
 
-def run_async(transport: Callable[[httpx2.Request], httpx2.Response], act: Callable[[AsyncClient], Any]) -> list[float]:
+def run_async(transport, act):
     """Run what is awaited on an async client; returns what it waited between tries."""
     slept: list[float] = []
 
-    async def sleep(seconds: float) -> None:
+    async def sleep(seconds):
         slept.append(seconds)
 
-    async def run() -> None:
+    async def run():
         given = {"retry": POLICY, "sleep": sleep, "jitter": lambda: 1.0}
         async with AsyncClient("http://service", transport=httpx2.MockTransport(transport), **given) as client:
             await act(client)
@@ -134,8 +134,8 @@ def run_async(transport: Callable[[httpx2.Request], httpx2.Response], act: Calla
     return slept
 
 
-def test_the_async_client_obeys_the_same_rules() -> None:
-    async def ask(client: AsyncClient) -> None:
+def test_the_async_client_obeys_the_same_rules():
+    async def ask(client):
         assert (await client.health()).status == "alive"
 
     script = Script(httpx2.ConnectError, answer(503, retry_after="4"), answer(200, {"status": "alive"}))
@@ -144,17 +144,17 @@ def test_the_async_client_obeys_the_same_rules() -> None:
         run_async(Script(httpx2.ReadError), ask)
 
 
-def test_lists_and_events_in_both_clients() -> None:
+def test_lists_and_events_in_both_clients():
     done = {**JOB, "state": "succeeded"}
     stream = f": ping\n\nevent: progress\ndata: {json.dumps(JOB)}\n\nevent: done\ndata: {json.dumps(done)}\n\n"
 
-    def events() -> Script:
+    def events():
         return Script(httpx2.Response(200, content=stream.encode(), headers={"content-type": "text/event-stream"}))
 
-    async def listen(client: AsyncClient) -> None:
+    async def listen(client):
         assert [job.state async for job in client.admin.job_events("j")] == ["running", "succeeded"]
 
-    async def read(client: AsyncClient) -> None:
+    async def read(client):
         assert [job.job_id async for job in client.admin.iter_jobs()] == [job["job_id"] for job in JOBS]
         assert len(await client.admin.jobs("d")) == len(JOBS)
 
@@ -165,21 +165,21 @@ def test_lists_and_events_in_both_clients() -> None:
     run_async(shelf, read)
 
 
-def test_a_stream_that_is_left_early_is_closed() -> None:
+def test_a_stream_that_is_left_early_is_closed():
     class Stream(httpx2.SyncByteStream):
         closed = False
 
-        def __iter__(self) -> Any:
+        def __iter__(self):
             while True:
                 yield f"event: progress\ndata: {json.dumps(JOB)}\n\n".encode()
 
-        def close(self) -> None:
+        def close(self):
             self.closed = True
 
     stream = Stream()
     script = Script(httpx2.Response(200, stream=stream, headers={"content-type": "text/event-stream"}))
 
-    async def leave() -> None:  # under a running loop, what is not closed by hand is closed later
+    async def leave():  # under a running loop, what is not closed by hand is closed later
         events = script.client().admin.job_events("j")
         assert next(events).state == "running"
         assert not stream.closed

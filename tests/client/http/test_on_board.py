@@ -2,7 +2,6 @@
 
 import subprocess
 import sys
-from pathlib import Path
 
 import cv2
 import httpx2
@@ -24,13 +23,13 @@ GRADIENTS = {"kind": "feature_l2", "extractor": "gradient_grid"}
 RANKS = "application/vnd.deepsimbad.ranks"
 
 
-def picture(seed: int) -> bytes:
+def picture(seed):
     coarse = np.random.default_rng(seed).integers(0, 255, (6, 8, 3), np.uint8)
     return bytes(cv2.imencode(".png", cv2.resize(coarse, (160, 120), interpolation=cv2.INTER_CUBIC))[1].tobytes())
 
 
 @pytest.fixture(scope="module")
-def model() -> dict[str, np.ndarray]:
+def model():
     rng = np.random.default_rng(0)
     dim = make_evaluator(evaluator_config(GRADIENTS)).encoding_dim
     landmarks = rng.random((N_LANDMARKS, dim)).astype(np.float32)
@@ -38,18 +37,18 @@ def model() -> dict[str, np.ndarray]:
 
 
 @pytest.fixture(scope="module")
-def content(model: dict[str, np.ndarray]) -> bytes:
+def content(model):
     return pack_landmarks(PortableLandmarks(model, N_LANDMARKS, 4, GRADIENTS))
 
 
-def slow_order(body: bytes, model: dict[str, np.ndarray]) -> list[int]:
+def slow_order(body, model):
     evaluator = make_evaluator(evaluator_config(GRADIENTS))
     encoding = evaluator.encode([decode_image(body, 1 << 20)])[0]
     apart = np.square(model["prototypes"].astype(float) - encoding).sum(axis=1)
     return sorted(range(N_LANDMARKS), key=lambda landmark: (apart[landmark], landmark))
 
 
-def test_an_observation_is_64_bytes_of_the_nearest(content: bytes, model: dict[str, np.ndarray]) -> None:
+def test_an_observation_is_64_bytes_of_the_nearest(content, model):
     encoder = OnBoardEncoder(content)
     assert (encoder.map_version, encoder.n_landmarks) == (4, N_LANDMARKS)
     assert encoder.digest == landmark_model_digest(model)
@@ -62,9 +61,7 @@ def test_an_observation_is_64_bytes_of_the_nearest(content: bytes, model: dict[s
         assert list(unpack_ranked_landmarks(encoder.ranks(picture(1), m=m).body, N_LANDMARKS)) == order[:m]
 
 
-def test_an_image_may_be_bytes_a_path_or_an_array_and_a_saved_file_needs_no_network(
-    content: bytes, tmp_path: Path
-) -> None:
+def test_an_image_may_be_bytes_a_path_or_an_array_and_a_saved_file_needs_no_network(content, tmp_path):
     fetched, body, path = OnBoardEncoder(content), picture(2), tmp_path / "view.png"
     path.write_bytes(body)
     fetched.save(tmp_path / "campus.npz")
@@ -78,13 +75,13 @@ def test_an_image_may_be_bytes_a_path_or_an_array_and_a_saved_file_needs_no_netw
         OnBoardEncoder.load(tmp_path / "nothing.npz")
 
 
-def test_a_picture_of_nothing_says_so(content: bytes) -> None:
+def test_a_picture_of_nothing_says_so(content):
     dark = OnBoardEncoder(content).ranks(np.zeros((60, 80, 3), np.uint8))
     assert dark.content_type == "application/json"
     assert dark.body == b'{"dissimilarities":[' + b",".join([b"0"] * N_LANDMARKS) + b"]}"
 
 
-def test_ready_encodings_are_ranked_too(model: dict[str, np.ndarray]) -> None:
+def test_ready_encodings_are_ranked_too(model):
     ready = {"kind": "feature_l2", "extractor": "none"}
     encoder = OnBoardEncoder(pack_landmarks(PortableLandmarks(model, N_LANDMARKS, 1, ready)))
     encoding = model["prototypes"][7]
@@ -97,7 +94,7 @@ def test_ready_encodings_are_ranked_too(model: dict[str, np.ndarray]) -> None:
         encoder.ranks(encoding=[1.0, 2.0])
 
 
-def test_arguments_that_cannot_be(content: bytes, tmp_path: Path) -> None:
+def test_arguments_that_cannot_be(content, tmp_path):
     encoder = OnBoardEncoder(content)
     for m in (0, -1, N_LANDMARKS + 1):
         with pytest.raises(errors.InvalidArgumentError, match="send 1 to 300"):
@@ -113,7 +110,7 @@ def test_arguments_that_cannot_be(content: bytes, tmp_path: Path) -> None:
         Client("http://service").localize("campus", picture(1), ranked=encoder.ranks(picture(1)))
 
 
-def test_models_that_this_version_cannot_rank_by(model: dict[str, np.ndarray]) -> None:
+def test_models_that_this_version_cannot_rank_by(model):
     unfit = [(N_LANDMARKS, {"kind": "crystal_ball"}), (N_LANDMARKS - 1, GRADIENTS)]
     packed = [pack_landmarks(PortableLandmarks(model, n, 1, evaluator)) for n, evaluator in unfit]
     for content in (b"", b"PK\x03\x04", b"no zip", *packed):
@@ -121,16 +118,14 @@ def test_models_that_this_version_cannot_rank_by(model: dict[str, np.ndarray]) -
             OnBoardEncoder(content)
 
 
-def test_other_weights_and_a_missing_package_are_named(
-    content: bytes, model: dict[str, np.ndarray], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_other_weights_and_a_missing_package_are_named(content, model, monkeypatch):
     there = "5" * 64
     encoder = OnBoardEncoder(pack_landmarks(PortableLandmarks(model, N_LANDMARKS, 1, GRADIENTS, there)))
     for encode in (encoder.load_extractor, lambda: encoder.ranks(picture(1))):
         with pytest.raises(errors.OtherWeightsError, match=f"none.*{there}"):
             encode()
 
-    def missing() -> None:
+    def missing():
         raise MissingPackageError("the extractor needs torch")
 
     encoder = OnBoardEncoder(content)
@@ -139,7 +134,7 @@ def test_other_weights_and_a_missing_package_are_named(
         encoder.load_extractor()
 
 
-def test_it_is_fetched_for_a_map_and_sent_as_it_is(content: bytes) -> None:
+def test_it_is_fetched_for_a_map_and_sent_as_it_is(content):
     problem = {"code": "landmark_model_differs", "detail": "another", "map_version": 9}
     model = httpx2.Response(200, content=content)
     script = Script(model, model, answer(409, problem))
@@ -169,7 +164,7 @@ print(len(OnBoardEncoder.load("campus.npz").ranks("view.png").body))
 """
 
 
-def test_encoding_on_board_needs_nothing_of_the_service_but_core_and_evaluators(tmp_path: Path, content: bytes) -> None:
+def test_encoding_on_board_needs_nothing_of_the_service_but_core_and_evaluators(tmp_path, content):
     OnBoardEncoder(content).save(tmp_path / "campus.npz")
     (tmp_path / "view.png").write_bytes(picture(1))
     program = [sys.executable, "-c", CODE.replace("{hidden}", repr(HIDDEN))]

@@ -6,8 +6,6 @@ import json
 import subprocess
 import sys
 from io import BytesIO
-from pathlib import Path
-from typing import Any
 
 import httpx2
 import numpy as np
@@ -26,7 +24,7 @@ from .scripted import JOB, LOCALIZATION, STATE, Script, answer
 JOBS = [{**JOB, "job_id": f"j{number}"} for number in range(7)]
 
 
-def test_localize_reads_the_whole_answer_and_what_it_does_not_know_yet() -> None:
+def test_localize_reads_the_whole_answer_and_what_it_does_not_know_yet():
     script = Script(answer(200, LOCALIZATION | {"of_the_future": [1]}))
     place = script.client().localize("campus", b"\x89PNG\r\n\x1a\n...", shortlist=4)
     assert (place.map_version, place.belief.credible_95_m, place.retrieval[0].relevance) == (7, (9.0, 1.0), 1.25)
@@ -48,7 +46,7 @@ def test_localize_reads_the_whole_answer_and_what_it_does_not_know_yet() -> None
         ({"encoding": [1.0]}, {"encoding": [1.0]}),
     ],
 )
-def test_what_a_robot_encodes_itself_travels_as_json(form: dict[str, Any], body: dict[str, Any]) -> None:
+def test_what_a_robot_encodes_itself_travels_as_json(form, body):
     script = Script(answer(200, LOCALIZATION))
     script.client().localize("campus", **form)
     assert json.loads(script.requests[0].content) == body
@@ -66,7 +64,7 @@ def test_what_a_robot_encodes_itself_travels_as_json(form: dict[str, Any], body:
         {"ranked_landmarks": [object()]},
     ],
 )
-def test_what_can_never_be_sent_is_refused_here(form: dict[str, Any], tmp_path: Path) -> None:
+def test_what_can_never_be_sent_is_refused_here(form, tmp_path):
     with pytest.raises(InvalidArgumentError):
         observation(**form)
     with pytest.raises(errors.BrokenFrameError, match=r"no\.jpg"):
@@ -85,17 +83,17 @@ def test_what_can_never_be_sent_is_refused_here(form: dict[str, Any], tmp_path: 
         (b"", None),
     ],
 )
-def test_media_type_of(body: bytes, media_type: str | None) -> None:
+def test_media_type_of(body, media_type):
     assert media_type_of(body) == media_type
 
 
 @pytest.mark.parametrize("name", ["", ".", "..", "a/b", "a b", "-a", "é", "a" * 65, "a\n"])
-def test_a_name_that_could_leave_its_place_in_the_address(name: str) -> None:
+def test_a_name_that_could_leave_its_place_in_the_address(name):
     with pytest.raises(InvalidArgumentError, match="letters"):
         Client("http://service").domain(name)
 
 
-def test_address_and_key_from_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_address_and_key_from_the_environment(monkeypatch):
     for url in ("service:8000", "ftp://service", "http://", "//service", "http://:::"):
         with pytest.raises(InvalidArgumentError, match="is no address"):
             Client(url)
@@ -117,7 +115,7 @@ def test_address_and_key_from_the_environment(monkeypatch: pytest.MonkeyPatch) -
     assert (given.url.host, given.headers["authorization"]) == ("here", "Bearer given")
 
 
-def test_arrays_travel_as_npz_and_npy() -> None:
+def test_arrays_travel_as_npz_and_npy():
     packed = BytesIO()
     np.save(packed, np.array([0.5, -1.0], np.float32))
     stored = answer(200, {"n_new": 2, "n_replaced": 0, "n_frames": 2})
@@ -134,7 +132,7 @@ def test_arrays_travel_as_npz_and_npy() -> None:
 
 
 @pytest.mark.parametrize("content", [b"", b"<html>", b"{}", b"\x93NUMPY\x01\x00"])
-def test_something_else_answers_at_this_address(content: bytes) -> None:
+def test_something_else_answers_at_this_address(content):
     client = Script(httpx2.Response(200, content=content)).client()
     for call in (client.domains, lambda: client.domain("d"), lambda: client.relevances("d", encoding=[1])):
         with pytest.raises(errors.UnexpectedAnswerError, match="http://service/v1"):
@@ -146,8 +144,8 @@ def test_something_else_answers_at_this_address(content: bytes) -> None:
     assert raised.value.code == "http_500"
 
 
-def test_every_code_has_its_class_and_is_the_services() -> None:
-    def words(kind: type[service_errors.DeepSimbadError]) -> set[str]:
+def test_every_code_has_its_class_and_is_the_services():
+    def words(kind):
         return {kind.code}.union(*(words(below) for below in kind.__subclasses__()))
 
     assert len(BY_CODE) > 20
@@ -160,7 +158,7 @@ def test_every_code_has_its_class_and_is_the_services() -> None:
 
 
 @pytest.mark.parametrize("status", [status for status in BY_STATUS if status not in RETRIED_STATUSES])
-def test_an_unheard_code_falls_back_on_the_status(status: int) -> None:
+def test_an_unheard_code_falls_back_on_the_status(status):
     with pytest.raises(BY_STATUS[status]) as raised:
         Script(answer(status, {"code": "of_the_future"}, x_request_id="abc")).client().health()
     assert type(raised.value) is BY_STATUS[status]
@@ -169,23 +167,23 @@ def test_an_unheard_code_falls_back_on_the_status(status: int) -> None:
 
 
 @pytest.mark.parametrize("index", range(-1, 12))
-def test_what_a_traverse_has(index: int) -> None:
+def test_what_a_traverse_has(index):
     present = {0, 1, 4, 5, 8}
     traverse = Traverse(name="t", n_frames=len(present), missing=((2, 3), (6, 7)))
     assert traverse.has(index) == (index in present)
 
 
-def shelf(request: httpx2.Request) -> httpx2.Response:
+def shelf(request):
     """Gives out jobs three at a time, whatever length is asked for."""
     first = int(request.url.params.get("after", "jobs-0").removeprefix("jobs-"))
     following = f"jobs-{first + 3}" if first + 3 < len(JOBS) else None
     return httpx2.Response(200, json={"jobs": JOBS[first : first + 3], "next": following})
 
 
-def test_a_list_is_read_to_its_end_and_a_page_fetched_when_it_is_wanted() -> None:
+def test_a_list_is_read_to_its_end_and_a_page_fetched_when_it_is_wanted():
     asked: list[dict[str, str]] = []
 
-    def note(request: httpx2.Request) -> httpx2.Response:
+    def note(request):
         asked.append(dict(request.url.params))
         return shelf(request)
 
@@ -211,7 +209,7 @@ def test_a_list_is_read_to_its_end_and_a_page_fetched_when_it_is_wanted() -> Non
         ),
     ],
 )
-def test_a_list_that_names_no_next_page_is_whole_as_those_of_an_older_service(document: Any, is_list: bool) -> None:
+def test_a_list_that_names_no_next_page_is_whole_as_those_of_an_older_service(document, is_list):
     ask = Script(answer(200, document)).client().admin.jobs
     if is_list:
         assert len(ask()) == 2
@@ -221,7 +219,7 @@ def test_a_list_that_names_no_next_page_is_whole_as_those_of_an_older_service(do
 
 
 @pytest.mark.parametrize("is_named", [False, True])
-def test_every_answer_knows_its_request_which_the_caller_may_name(is_named: bool) -> None:
+def test_every_answer_knows_its_request_which_the_caller_may_name(is_named):
     documents = [
         LOCALIZATION,
         STATE,
@@ -242,7 +240,7 @@ def test_every_answer_knows_its_request_which_the_caller_may_name(is_named: bool
     assert Script(answer(200, JOB)).client().admin.job("j").request_id is None
 
 
-def test_every_try_has_an_id_of_its_own_and_the_error_tells_the_last() -> None:
+def test_every_try_has_an_id_of_its_own_and_the_error_tells_the_last():
     names = itertools.count()
     script = Script(answer(503, {}, x_request_id="t0"), answer(404, {}, x_request_id="t1"))
     with script.client(request_id=lambda: f"t{next(names)}") as client, pytest.raises(errors.NotFoundError) as raised:
@@ -252,14 +250,14 @@ def test_every_try_has_an_id_of_its_own_and_the_error_tells_the_last() -> None:
 
 
 @pytest.mark.parametrize("bad", ["", "a b", "ä", "x\r\ny: z", "x" * 65])
-def test_an_id_that_the_service_would_not_take_is_not_sent(bad: str) -> None:
+def test_an_id_that_the_service_would_not_take_is_not_sent(bad):
     script = Script(answer(200, []))
     with pytest.raises(InvalidArgumentError, match="cannot name a request"):
         script.client(request_id=lambda: bad).domains()
     assert script.requests == []
 
 
-def test_a_requests_id_is_no_part_of_what_was_answered() -> None:
+def test_a_requests_id_is_no_part_of_what_was_answered():
     known, unknown = Localization.model_validate(LOCALIZATION), Localization.model_validate(LOCALIZATION)
     assert known.answering("r1").request_id == "r1"
     assert unknown.request_id is None
@@ -269,11 +267,11 @@ def test_a_requests_id_is_no_part_of_what_was_answered() -> None:
     assert Job.model_validate({**JOB, "_request_id": "theirs", "request_id": "theirs"}).request_id is None
 
 
-def python(code: str) -> subprocess.CompletedProcess[str]:
+def python(code):
     return subprocess.run([sys.executable, "-c", code], check=False, capture_output=True, text=True, timeout=60)
 
 
-def test_importing_the_client_needs_httpx2_and_pydantic_alone() -> None:
+def test_importing_the_client_needs_httpx2_and_pydantic_alone():
     printed = python(
         "import sys; before = set(sys.modules)\n"
         "import deepsimbad_client\n"
@@ -285,7 +283,7 @@ def test_importing_the_client_needs_httpx2_and_pydantic_alone() -> None:
 
 
 @pytest.mark.parametrize("absent", ["click", "rich", "numpy", "cv2", "matplotlib"])
-def test_the_script_without_the_extra_says_what_to_install(absent: str) -> None:
+def test_the_script_without_the_extra_says_what_to_install(absent):
     ended = python(
         f"import sys; sys.modules[{absent!r}] = None; sys.argv = ['', 'domains']\n"
         "from deepsimbad_client.cli import main\nmain()"

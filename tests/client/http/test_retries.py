@@ -19,12 +19,12 @@ PROXIES = (502, 504)
 RETRIED = (*FAILURES, *UNTOUCHED, *PROXIES)
 
 
-def outcome(kind: Any) -> Any:
+def outcome(kind):
     return answer(kind) if isinstance(kind, int) else kind
 
 
 @pytest.mark.parametrize("kind", RETRIED)
-def test_an_idempotent_call_is_sent_again_with_its_body(kind: Any) -> None:
+def test_an_idempotent_call_is_sent_again_with_its_body(kind):
     script = Script(outcome(kind), outcome(kind), answer(201, {"index": 3, "n_frames": 1}))
     image = b"\xff\xd8\xff rest"
     assert script.client().admin.put_frame("d", "t", 3, image, position_m=1.5).n_frames == 1
@@ -35,7 +35,7 @@ def test_an_idempotent_call_is_sent_again_with_its_body(kind: Any) -> None:
     assert last.headers["content-type"] == "image/jpeg"
 
 
-def test_every_wait_is_told_to_the_log_with_its_reason(caplog: pytest.LogCaptureFixture) -> None:
+def test_every_wait_is_told_to_the_log_with_its_reason(caplog):
     caplog.set_level("INFO", "deepsimbad_client.http.retry")
     refused = answer(503, {"code": "overloaded", "status": 503}, retry_after="7")
     Script(httpx2.ConnectError, refused, answer(200, OK)).client().health()
@@ -46,7 +46,7 @@ def test_every_wait_is_told_to_the_log_with_its_reason(caplog: pytest.LogCapture
 
 
 @pytest.mark.parametrize("status", [400, 404, 409, 422, 500, 501])
-def test_other_answers_are_the_last_word(status: int) -> None:
+def test_other_answers_are_the_last_word(status):
     script = Script(answer(status))
     with pytest.raises(errors.ApiError):
         script.client().health()
@@ -54,7 +54,7 @@ def test_other_answers_are_the_last_word(status: int) -> None:
 
 
 @pytest.mark.parametrize("kind", RETRIED)
-def test_a_switch_is_sent_again_only_where_it_was_surely_not_made(kind: Any) -> None:
+def test_a_switch_is_sent_again_only_where_it_was_surely_not_made(kind):
     script = Script(outcome(kind), answer(200, {"version": 2}))
     client = script.client()
     if kind in UNTOUCHED:
@@ -66,7 +66,7 @@ def test_a_switch_is_sent_again_only_where_it_was_surely_not_made(kind: Any) -> 
 
 
 @pytest.mark.parametrize("kind", RETRIED)
-def test_a_job_is_asked_for_until_it_is_known_under_one_key(kind: Any) -> None:
+def test_a_job_is_asked_for_until_it_is_known_under_one_key(kind):
     asks: list[Callable[..., Any]] = [
         lambda client, **options: client.admin.remap("d", training_traverse="t", **options),
         lambda client, **options: client.admin.feed_experience("d", "s", [1.0, None], **options),
@@ -81,7 +81,7 @@ def test_a_job_is_asked_for_until_it_is_known_under_one_key(kind: Any) -> None:
         assert len({request.content for request in script.requests}) == 1
 
 
-def test_the_last_failure_is_raised_after_the_last_try() -> None:
+def test_the_last_failure_is_raised_after_the_last_try():
     with pytest.raises(errors.TransportTimeoutError):
         Script(httpx2.ReadTimeout).client().health()
     script = Script(httpx2.ConnectError)
@@ -100,9 +100,7 @@ def test_the_last_failure_is_raised_after_the_last_try() -> None:
     ("problem", "wait", "error"),
     [({}, "31", errors.UnavailableError), ({"code": "damaged_map"}, "5", errors.DamagedMapError)],
 )
-def test_what_waiting_does_not_cure_is_not_waited_for(
-    problem: dict[str, str], wait: str, error: type[errors.ApiError], caplog: pytest.LogCaptureFixture
-) -> None:
+def test_what_waiting_does_not_cure_is_not_waited_for(problem, wait, error, caplog):
     """A longer wait than the longest allowed, and a map that is damaged."""
     caplog.set_level("INFO", "deepsimbad_client.http.retry")
     script = Script(answer(503, problem, retry_after=wait))
@@ -112,7 +110,7 @@ def test_what_waiting_does_not_cure_is_not_waited_for(
     assert (script.slept, caplog.messages) == ([], [])
 
 
-def test_a_delete_whose_answer_was_lost_is_not_an_error() -> None:
+def test_a_delete_whose_answer_was_lost_is_not_an_error():
     script = Script(httpx2.ReadError, answer(404, {"code": "unknown_domain"}))
     script.client().admin.delete_domain("d")
     script = Script(httpx2.ConnectError, answer(404, {"code": "unknown_domain"}))
@@ -127,9 +125,7 @@ def test_a_delete_whose_answer_was_lost_is_not_an_error() -> None:
         (403, {"code": "forbidden", "detail": "it has localize", "needed": "admin"}, "admin"),
     ],
 )
-def test_a_refused_key_is_not_tried_again_and_the_error_says_how_to_come_by_one(
-    status: int, problem: dict[str, str], scope: str
-) -> None:
+def test_a_refused_key_is_not_tried_again_and_the_error_says_how_to_come_by_one(status, problem, scope):
     script = Script(answer(status, problem, retry_after="1"))
     with pytest.raises(errors.ApiError, match=problem["detail"]) as raised:
         script.client().domain("d")
@@ -138,7 +134,7 @@ def test_a_refused_key_is_not_tried_again_and_the_error_says_how_to_come_by_one(
     assert "$DEEPSIMBAD_API_KEY" in str(raised.value)
 
 
-def test_jitter_spreads_over_the_upper_half() -> None:
+def test_jitter_spreads_over_the_upper_half():
     assert [POLICY.backoff_s(1, jitter) for jitter in (0.0, 0.5, 1.0)] == [0.5, 0.75, 1.0]
 
 
@@ -156,5 +152,5 @@ def test_jitter_spreads_over_the_upper_half() -> None:
         ("٣", None),
     ],
 )
-def test_retry_after(header: str | None, seconds: float | None) -> None:
+def test_retry_after(header, seconds):
     assert retry_after_s(header, datetime(2015, 10, 21, 7, 28, tzinfo=UTC)) == seconds

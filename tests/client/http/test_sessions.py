@@ -2,23 +2,21 @@
 
 import asyncio
 import json
-from collections.abc import Callable
-from typing import Any
 
 import httpx2
 import numpy as np
 import pytest
 
-from deepsimbad_client import AsyncClient, Client, Session, errors
+from deepsimbad_client import AsyncClient, errors
 
 from .scripted import JOB, LOCALIZATION, STATE, Script, answer
 
 
-def n_sessions(client: Client) -> int:
+def n_sessions(client):
     return len(client.admin.sessions("route"))
 
 
-def test_a_session_from_start_to_end(client: Client, views: np.ndarray) -> None:
+def test_a_session_from_start_to_end(client, views):
     with client.session("route", seed=3, planner="constant:4") as session:
         for at in range(40, 70, 4):
             observed = session.observe(encoding=views[at], action_m=np.float32(4))
@@ -46,7 +44,7 @@ def test_a_session_from_start_to_end(client: Client, views: np.ndarray) -> None:
         client.attach_session("nowhere")
 
 
-def test_what_travels(client: Client, link: Any, views: np.ndarray) -> None:
+def test_what_travels(client, link, views):
     wishes = {"planner": "nnql", "belief": "particle", "update": "log_likelihood"}
     client.session("route", keep=True)
     with client.session("route", 12.5, 3, seed=0, **wishes) as session:
@@ -61,7 +59,7 @@ def test_what_travels(client: Client, link: Any, views: np.ndarray) -> None:
     assert len(bare.headers["idempotency-key"]) >= 16
 
 
-def test_an_observation_whose_answer_was_lost_counts_once(client: Client, link: Any, views: np.ndarray) -> None:
+def test_an_observation_whose_answer_was_lost_counts_once(client, link, views):
     lost = iter([False, True, True, False, True, False])
     link.lose = lambda request: "observations" in request.url.path and next(lost)
     with client.session("route") as session:
@@ -72,7 +70,7 @@ def test_an_observation_whose_answer_was_lost_counts_once(client: Client, link: 
     assert (len(keys), len(set(keys))) == (6, 3)
 
 
-def test_what_was_given_up_is_repeated_under_its_key(client: Client, link: Any, views: np.ndarray) -> None:
+def test_what_was_given_up_is_repeated_under_its_key(client, link, views):
     before = n_sessions(client)
     link.lose = lambda request: True
     with pytest.raises(errors.TransportTimeoutError):
@@ -90,7 +88,7 @@ def test_what_was_given_up_is_repeated_under_its_key(client: Client, link: Any, 
             session.observe(encoding=views[51], idempotency_key="first")
 
 
-def test_starts_and_ends_whose_answer_was_lost_begin_and_end_one_session(client: Client, link: Any) -> None:
+def test_starts_and_ends_whose_answer_was_lost_begin_and_end_one_session(client, link):
     before = n_sessions(client)
     for tries in ([True, True, False, True, False], [False, False]):
         lost = iter(tries)
@@ -101,7 +99,7 @@ def test_starts_and_ends_whose_answer_was_lost_begin_and_end_one_session(client:
         assert n_sessions(client) == before
 
 
-def test_the_end_of_a_block_hides_no_error_of_its_own(client: Client, link: Any) -> None:
+def test_the_end_of_a_block_hides_no_error_of_its_own(client, link):
     with client.session("route") as session:
         session.delete()
     with pytest.raises(KeyError), client.session("route"):  # noqa: PT012
@@ -125,9 +123,7 @@ def test_the_end_of_a_block_hides_no_error_of_its_own(client: Client, link: Any)
         (lambda session, view: session.set_prior(float("nan"), 1), errors.InvalidArgumentError),
     ],
 )
-def test_what_is_refused(
-    client: Client, views: np.ndarray, act: Callable[[Session, np.ndarray], object], error: type[Exception]
-) -> None:
+def test_what_is_refused(client, views, act, error):
     with client.session("route", start_position_m=115, start_std_m=2) as session:
         session.observe(encoding=views[110])
         with pytest.raises(error):
@@ -135,7 +131,7 @@ def test_what_is_refused(
         assert session.state().n_observations == 1
 
 
-def test_sessions_that_cannot_begin(client: Client) -> None:
+def test_sessions_that_cannot_begin(client):
     for domain, wishes, error in (
         ("route", {"start_position_m": -500}, errors.InvalidPriorError),
         ("route", {"planner": "nonsense"}, errors.InvalidInputError),
@@ -145,7 +141,7 @@ def test_sessions_that_cannot_begin(client: Client) -> None:
             client.session(domain, **wishes)
 
 
-def test_truths_are_told_and_experience_is_fed_back() -> None:
+def test_truths_are_told_and_experience_is_fed_back():
     places, plain = np.array([1.0, np.nan, 4.5]), [1.0, None, 4.5]
     score = {"n_scored": 2, "n_left_out": 1, "anr": 3.5, "map_version": 4}
     script = Script(answer(201, STATE), answer(200, score), answer(202, JOB))
@@ -162,7 +158,7 @@ def test_truths_are_told_and_experience_is_fed_back() -> None:
     assert experience == ("/v1/admin/domains/d/experience", {"session_id": "s", "true_positions_m": plain})
 
 
-def test_no_next_best_view() -> None:
+def test_no_next_best_view():
     observed, null = answer(200, {**LOCALIZATION, "n_observations": 1}), httpx2.Response(200, content=b"null")
     script = Script(answer(201, STATE), observed, null)
     session = script.client().session("d", keep=True)
@@ -170,8 +166,8 @@ def test_no_next_best_view() -> None:
     assert session.next_best_view() is None
 
 
-def test_many_robots_at_once_on_the_async_client(client: Client, views: np.ndarray) -> None:
-    async def robot(link: AsyncClient, start: int) -> float:
+def test_many_robots_at_once_on_the_async_client(client, views):
+    async def robot(link, start):
         async with await link.session("route", seed=start, planner="constant:5") as session:
             for at in range(start, start + 30, 5):
                 observed = await session.observe(encoding=views[at], action_m=5)
@@ -183,7 +179,7 @@ def test_many_robots_at_once_on_the_async_client(client: Client, views: np.ndarr
             await link.attach_session(session.session_id)
         return abs(observed.belief.mode_m - at)
 
-    async def drive() -> list[float]:
+    async def drive():
         async with AsyncClient(client.url) as link:
             return await asyncio.gather(*(robot(link, start) for start in range(0, 80, 8)))
 

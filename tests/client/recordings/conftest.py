@@ -1,8 +1,5 @@
 """Small recordings written the way the real ones lie on disk, without any of the readers' code."""
 
-from collections.abc import Iterable
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
@@ -14,15 +11,15 @@ class NcltTree:
     date = "2012-01-22"
     start_us = 1_326_030_975_726_043
 
-    def __init__(self, root: Path) -> None:
+    def __init__(self, root):
         self.root = root
 
     @property
-    def source(self) -> str:
+    def source(self):
         return f"nclt:{self.root}/{self.date}"
 
     @staticmethod
-    def tiff(stored: np.ndarray) -> bytes:
+    def tiff(stored):
         """A TIFF with JPEG inside, as NCLT's are; OpenCV makes one only with strips of a multiple of 8 rows."""
         flags = [cv2.IMWRITE_TIFF_COMPRESSION, 7, cv2.IMWRITE_TIFF_ROWSPERSTRIP, 16]
         ok, body = cv2.imencode(".tiff", stored, flags)
@@ -30,7 +27,7 @@ class NcltTree:
         return body.tobytes()
 
     @staticmethod
-    def picture(width: int = 64, height: int = 48) -> np.ndarray:
+    def picture(width=64, height=48):
         """Lying on its side; upright it is blue above, green at the lower left, red at the lower right."""
         upright = np.zeros((width, height, 3), np.uint8)
         upright[: width // 2] = (250, 30, 30)
@@ -38,28 +35,28 @@ class NcltTree:
         upright[width // 2 :, height // 2 :] = (30, 30, 250)
         return cv2.rotate(upright, cv2.ROTATE_90_COUNTERCLOCKWISE)
 
-    def image_file(self, utime: int, body: bytes | None = None, camera: int = 5, above: str = "") -> Path:
+    def image_file(self, utime, body=None, camera=5, above=""):
         folder = self.root / above / self.date / "lb3" / f"Cam{camera}"
         folder.mkdir(parents=True, exist_ok=True)
         path = folder / f"{utime}.tiff"
         path.write_bytes(self.tiff(self.picture()) if body is None else body)
         return path
 
-    def truth(self, lines: Iterable[str], place: str | None = None) -> Path:
+    def truth(self, lines, place=None):
         path = self.root / (place or f"ground_truth/groundtruth_{self.date}.csv")
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text("".join(f"{line}\n" for line in lines))
         return path
 
     @staticmethod
-    def row(utime: int, x: float, y: float, yaw: float = 0.0) -> str:
+    def row(utime, x, y, yaw=0.0):
         return f"{utime},{x:.9f},{y:.9f},-0.5,0.01,0.02,{yaw:.9f}"
 
-    def walk_north(self, seconds: float) -> list[str]:
+    def walk_north(self, seconds):
         """Ground truth of a robot that goes north at 1 m/s, 100 rows a second."""
         return [self.row(self.start_us + 10_000 * i, i / 100, 3.0) for i in range(round(seconds * 100) + 1)]
 
 
 @pytest.fixture
-def nclt_tree(tmp_path: Path) -> NcltTree:
+def nclt_tree(tmp_path):
     return NcltTree(tmp_path / "nclt")

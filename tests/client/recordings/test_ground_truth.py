@@ -9,21 +9,14 @@ from deepsimbad_client.errors import SourceError
 from deepsimbad_client.recordings.ground_truth import DEADBAND_M, arc_length_m, read_ground_truth
 
 
-def test_microseconds_stay_whole(nclt_tree):
-    utimes = [1_326_030_975_726_043, 1_326_030_975_726_044, 1_365_126_879_999_999]
-    truth = read_ground_truth(nclt_tree.truth(nclt_tree.row(t, i, 0) for i, t in enumerate(utimes)))
-    assert truth.time_us.dtype == np.int64
-    assert truth.time_us.tolist() == utimes
-
-
-def test_quirks_are_tolerated_and_counted(nclt_tree):
+def test_quirks_are_tolerated_and_counted_and_microseconds_stay_whole(nclt_tree):
     t = nclt_tree.start_us
     rows = [
         f"{t - 10_000},NaN,NaN,NaN,NaN,NaN,NaN",
-        nclt_tree.row(t + 20_000, 2, 0),
+        nclt_tree.row(t + 20_001, 2, 0),
         nclt_tree.row(t, 0, 0),
-        nclt_tree.row(t + 10_000, 1, 0),
-        nclt_tree.row(t + 10_000, 77, 77),  # the same time again
+        nclt_tree.row(t + 20_000, 1, 0),
+        nclt_tree.row(t + 20_000, 77, 77),  # the same time again
         f"{t + 15_000},1.5,nan,0,0,0,0",
         f"{t + 16_000},inf,0,0,0,0,0",
         "1e300,0,0,0,0,0,0",
@@ -34,20 +27,18 @@ def test_quirks_are_tolerated_and_counted(nclt_tree):
         nclt_tree.truth(["utime,x,y,z,r,p,h", *rows, "", f"{t + 25_000},,,,,,", f"{t + 40_000},4.0,0."], "b.csv")
     )
     for truth, n_skipped in ((clean, 4), (broken, 7)):
-        assert (truth.time_us - t).tolist() == [0, 10_000, 20_000, 30_000]
+        assert truth.time_us.dtype == np.int64
+        assert (truth.time_us - t).tolist() == [0, 20_000, 20_001, 30_000]
         assert truth.x_m.tolist() == [0, 1, 2, 3]
         assert truth.n_skipped_rows == n_skipped
 
 
 @pytest.mark.parametrize("lines", [[], ["hello"], ["1326030975726043,NaN,NaN,NaN,NaN,NaN,NaN"] * 3, ["1,2,3"]])
-def test_a_file_without_usable_rows_is_refused(nclt_tree, lines):
+def test_a_file_without_usable_rows_is_refused_and_a_missing_one_named(nclt_tree, lines):
     with pytest.raises(SourceError, match=r"groundtruth_2012-01-22\.csv: 0 usable rows"):
         read_ground_truth(nclt_tree.truth(lines))
-
-
-def test_a_missing_file_is_named(tmp_path):
     with pytest.raises(SourceError, match=r"nowhere\.csv"):
-        read_ground_truth(tmp_path / "nowhere.csv")
+        read_ground_truth(nclt_tree.root / "nowhere.csv")
 
 
 def test_poses_are_interpolated_linearly_and_headings_the_short_way_round(nclt_tree):
@@ -111,11 +102,6 @@ def test_the_ends_of_a_drive_and_the_sides_of_a_gap_are_not_shifted():
     np.testing.assert_allclose(arc_length_m(x, np.zeros(1000), time_us), x, atol=1e-9)
 
 
-def test_no_pose_and_one_pose():
-    assert arc_length_m(np.zeros(0), np.zeros(0), np.zeros(0, np.int64)).shape == (0,)
-    assert arc_length_m(np.array([7.0]), np.array([8.0]), np.array([5])).tolist() == [0.0]
-
-
 def slow_reference(points, deadband):
     """Walk the definition: the summed anchors before, plus the farthest reached from the present one."""
     anchors, total, out = [0], 0.0, []
@@ -134,5 +120,6 @@ def test_agrees_with_the_definition_and_never_goes_back_nor_beyond_the_path(poin
     travelled = arc_length_m(x, y)
     np.testing.assert_allclose(travelled, slow_reference(points, DEADBAND_M), atol=1e-9)
     assert travelled[0] == 0
+    assert arc_length_m(x[:0], y[:0], np.zeros(0, np.int64)).shape == (0,)
     assert np.all(np.diff(travelled) >= 0)
     assert travelled[-1] <= np.hypot(np.diff(x), np.diff(y)).sum() + 1e-9

@@ -5,7 +5,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from deepsimbad_client.errors import BrokenFrameError
@@ -54,14 +54,11 @@ def test_the_end_of_a_preview_inside_a_jpeg_is_not_its_end():
         decode(with_preview[:-100], HERE)
 
 
-@pytest.mark.parametrize("body", [b"", b"hello", b"\xff\xd8\xff", b"II*\0\xff\xff\xff\xff", b"MM\0*\0\0\0\x08\0\x09"])
-def test_what_is_no_image_is_refused(body):
-    with pytest.raises(BrokenFrameError):
-        decode(body, HERE)
-
-
 @settings(max_examples=25, deadline=None)
 @given(st.binary(max_size=200))
+@example(b"")
+@example(b"II*\0\xff\xff\xff\xff")
+@example(b"MM\0*\0\0\0\x08\0\x09")
 def test_no_bytes_at_all_do_anything_but_decode_or_refuse(tail):
     for head in (b"", b"II*\0\x08\0\0\0", b"MM\0*\0\0\0\x08", b"\xff\xd8\xff"):
         with contextlib.suppress(BrokenFrameError):
@@ -79,15 +76,8 @@ def test_grey_16_bit_and_alpha_become_8_bit_bgr():
 
 def test_names_count_digits_as_numbers():
     names = ["10.png", "2.png", "a10b2.png", "a10b1.png", "a9.png", "1.png", "02.png"]
-    assert sorted(names, key=natural_order) == [
-        "1.png",
-        "02.png",
-        "2.png",
-        "10.png",
-        "a9.png",
-        "a10b1.png",
-        "a10b2.png",
-    ]
+    ordered = ["1.png", "02.png", "2.png", "10.png", "a9.png", "a10b1.png", "a10b2.png"]
+    assert sorted(names, key=natural_order) == ordered
 
 
 @given(st.lists(st.integers(0, 99_999), unique=True, min_size=1))

@@ -2,31 +2,29 @@
 
 import json
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import httpx2
 import numpy as np
 import pytest
 
-from deepsimbad_client import Client, errors
+from deepsimbad_client import errors
 from deepsimbad_client.commands.group import run
-from deepsimbad_client.recordings.recording import Recording
 from deepsimbad_client.recordings.sources import open_source
-from deepsimbad_client.replay.active import ActiveReplay, Episode, Stage, active_replay
+from deepsimbad_client.replay.active import Stage, active_replay
 
 PLANNERS = ("default", "random", "constant:3")
 SESSIONS = "/v1/domains/route/sessions"
 
 
 @pytest.fixture
-def drive(encodings: Path) -> Recording:
+def drive(encodings):
     return open_source(str(encodings / "winter.npy"))
 
 
 @pytest.fixture
-def driven(client: Client, drive: Recording, tmp_path: Path) -> Any:
-    def driven(recording: Recording = drive, folder: str = "out", **options: Any) -> ActiveReplay:
+def driven(client, drive, tmp_path):
+    def driven(recording=drive, folder="out", **options):
         wishes: dict[str, Any] = {"planners": PLANNERS, "episodes": 4, "steps": 5, "concurrency": 2, "seed": 5}
         return active_replay(client, recording, "route", tmp_path / folder, **wishes | options)
 
@@ -34,13 +32,11 @@ def driven(client: Client, drive: Recording, tmp_path: Path) -> Any:
 
 
 @pytest.fixture
-def stage(client: Client, drive: Recording) -> Stage:
+def stage(client, drive):
     return Stage(client, drive, "route")
 
 
-def test_every_planner_starts_from_the_same_places_and_goes_where_it_is_sent(
-    client: Client, driven: Any, link: Any
-) -> None:
+def test_every_planner_starts_from_the_same_places_and_goes_where_it_is_sent(client, driven, link):
     replay = driven()
     for value in (lambda episode: episode.steps[0].index, lambda episode: episode.seed):
         default, random, constant = ([value(episode) for episode in each] for each in replay.episodes.values())
@@ -60,7 +56,7 @@ def test_every_planner_starts_from_the_same_places_and_goes_where_it_is_sent(
         assert {step.next_action_m for step in episode.steps} == {3.0}
 
 
-def test_moves_between_sparse_frames_are_told_as_they_were(driven: Any, drive: Recording, link: Any) -> None:
+def test_moves_between_sparse_frames_are_told_as_they_were(driven, drive, link):
     every_fourth = drive.sliced(slice(0, None, 4))
     (episode,) = driven(every_fourth, planners=["constant:7"], episodes=1).episodes["constant:7"]
     assert [step.action_m for step in episode.steps[1:]] == [8.0] * 5
@@ -69,9 +65,7 @@ def test_moves_between_sparse_frames_are_told_as_they_were(driven: Any, drive: R
     assert [request.url.params.get("action_m") for request in posted[1:]] == ["8.0"] * 5
 
 
-def test_ranks_and_errors_against_a_slow_reference(
-    driven: Any, drive: Recording, client: Client, views: np.ndarray
-) -> None:
+def test_ranks_and_errors_against_a_slow_reference(driven, drive, client, views):
     views = views + np.random.default_rng(0).normal(0, 2, views.shape).astype(np.float32)
     (episode,) = driven(replace(drive, encodings=views), planners=["constant:7"], episodes=1).episodes["constant:7"]
     ranks = []
@@ -89,7 +83,7 @@ def test_ranks_and_errors_against_a_slow_reference(
     assert max(ranks) > 0, "else nothing is shown"
 
 
-def essence(replay: ActiveReplay) -> list[Any]:
+def essence(replay):
     return [
         (episode.planner, episode.episode, episode.seed, [(step.index, step.rank, step.mass) for step in episode.steps])
         for episodes in replay.episodes.values()
@@ -98,10 +92,10 @@ def essence(replay: ActiveReplay) -> list[Any]:
 
 
 @pytest.mark.parametrize("stop_after", [1, 5, 11])
-def test_a_replay_goes_on_where_it_was_stopped(driven: Any, tmp_path: Path, link: Any, stop_after: int) -> None:
+def test_a_replay_goes_on_where_it_was_stopped(driven, tmp_path, link, stop_after):
     whole = driven(folder="whole", concurrency=1)
 
-    def stop(episode: Episode, n_done: int) -> None:
+    def stop(episode, n_done):
         if n_done == stop_after:
             raise KeyboardInterrupt
 
@@ -121,7 +115,7 @@ def test_a_replay_goes_on_where_it_was_stopped(driven: Any, tmp_path: Path, link
     assert {line["planner"] for line in lines} == set(PLANNERS)
 
 
-def test_planners_and_episodes_can_be_added(driven: Any, link: Any) -> None:
+def test_planners_and_episodes_can_be_added(driven, link):
     driven(planners=["random"], episodes=2)
     link.requests.clear()
     replay = driven(planners=["random", "constant:3"], episodes=3)
@@ -132,7 +126,7 @@ def test_planners_and_episodes_can_be_added(driven: Any, link: Any) -> None:
     assert len(driven(seed=6, episodes=1, restart=True).episodes["default"]) == 1
 
 
-def test_a_recording_too_short_for_its_moves(driven: Any, drive: Recording, client: Client, link: Any) -> None:
+def test_a_recording_too_short_for_its_moves(driven, drive, client, link):
     with pytest.raises(errors.ReplayError, match="fewer steps"):
         driven(drive.sliced(slice(0, 50)))
     assert SESSIONS not in [request.url.path for request in link.requests]
@@ -140,7 +134,7 @@ def test_a_recording_too_short_for_its_moves(driven: Any, drive: Recording, clie
     assert {stage.start(5, 0, episode)[0] for episode in range(20)} == {0}
 
 
-def test_starts_are_uniform_and_do_not_depend_on_how_many_there_are(stage: Stage) -> None:
+def test_starts_are_uniform_and_do_not_depend_on_how_many_there_are(stage):
     rows = [stage.start(7, 0, episode)[0] for episode in range(3000)]
     assert set(rows) == set(range(50))
     assert max(np.bincount(rows)) < 100
@@ -148,12 +142,10 @@ def test_starts_are_uniform_and_do_not_depend_on_how_many_there_are(stage: Stage
     assert rows[:5] != [stage.start(7, 1, episode)[0] for episode in range(5)]
 
 
-def test_frames_that_cannot_be_used_are_passed_over(
-    driven: Any, drive: Recording, views: np.ndarray, link: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_frames_that_cannot_be_used_are_passed_over(driven, drive, views, link, monkeypatch):
     answered = link.handle_request
 
-    def refuse_zeros(request: httpx2.Request) -> httpx2.Response:
+    def refuse_zeros(request):
         is_torn = request.url.path.endswith(("observations", "localizations")) and b":[0.0,0.0," in request.content
         return httpx2.Response(422, json={"code": "undecodable_image"}) if is_torn else answered(request)
 
@@ -167,12 +159,10 @@ def test_frames_that_cannot_be_used_are_passed_over(
         driven(replace(drive, encodings=np.zeros_like(views)), folder="none", planners=["constant:3"], episodes=1)
 
 
-def test_without_a_next_best_view_or_with_another_map_there_is_no_replay(
-    driven: Any, link: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_a_next_best_view_or_with_another_map_there_is_no_replay(driven, link, monkeypatch):
     answered, changes = link.handle_request, [("next_best_view", None)]
 
-    def change(request: httpx2.Request) -> httpx2.Response:
+    def change(request):
         response = answered(request)
         if b"map_version" not in response.read():
             return response
@@ -182,7 +172,7 @@ def test_without_a_next_best_view_or_with_another_map_there_is_no_replay(
     with pytest.raises(errors.ReplayError, match="training"):
         driven()
 
-    def switch(request: httpx2.Request) -> httpx2.Response:
+    def switch(request):
         if request.url.path.endswith("/observations"):
             changes[:] = [("map_version", 4)]
         return change(request)
@@ -193,20 +183,18 @@ def test_without_a_next_best_view_or_with_another_map_there_is_no_replay(
         driven(restart=True)
 
 
-def test_an_unknown_planner_is_the_services_to_refuse(driven: Any) -> None:
+def test_an_unknown_planner_is_the_services_to_refuse(driven):
     for planner in ("nonsense", "constant:99"):
         with pytest.raises(errors.InvalidInputError):
             driven(planners=[planner])
 
 
-def test_of_many_episodes_few_keep_their_whole_belief(driven: Any) -> None:
+def test_of_many_episodes_few_keep_their_whole_belief(driven):
     episodes = driven(planners=["random"], episodes=12, steps=1).episodes["random"]
     assert [bool(episode.steps[0].mass) for episode in episodes] == [True] * 10 + [False] * 2
 
 
-def test_the_commands_end_to_end(
-    route: str, encodings: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_commands_end_to_end(route, encodings, tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("DEEPSIMBAD_URL", route)
     out = tmp_path / "out"
     plain = ["replay", str(encodings / "winter.npy"), "--domain", "route"]

@@ -3,13 +3,12 @@
 import json
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 
 from deepsimbad.core.route import Route
-from deepsimbad_client import Client, errors
+from deepsimbad_client import errors
 from deepsimbad_client.http.jobs import remap
 from deepsimbad_client.recordings.recording import Frame, Recording
 from deepsimbad_client.recordings.sources import open_source
@@ -21,7 +20,7 @@ from deepsimbad_client.replay.scene import Scene, right_answers
 from ..conftest import ENCODINGS, mapped
 
 
-def slow_ranks(client: Client, recording: Recording, tolerance_m: float) -> list[float]:
+def slow_ranks(client, recording, tolerance_m):
     """By the definition, from the answers of another session alone; map image i lies at i metres."""
     ranks = []
     with client.session("route") as session:
@@ -41,13 +40,11 @@ def slow_ranks(client: Client, recording: Recording, tolerance_m: float) -> list
     return ranks
 
 
-def essence(steps: list[Step]) -> list[tuple[object, ...]]:
+def essence(steps):
     return [(step.query, step.name, step.rank, step.best_map_image, step.error_m, step.true_route_m) for step in steps]
 
 
-def test_one_session_in_order_is_ranked_by_the_service(
-    client: Client, link: Any, encodings: Path, tmp_path: Path
-) -> None:
+def test_one_session_in_order_is_ranked_by_the_service(client, link, encodings, tmp_path):
     recording = open_source(f"{encodings / 'winter.npy'}#20:63")
     driven = replay(client, recording, "route", tmp_path, tolerance_m=2)
     assert max(len(request.content) for request in link.requests) < 4_000
@@ -65,20 +62,18 @@ def test_one_session_in_order_is_ranked_by_the_service(
     assert "mass" not in lines[0]
 
 
-def n_observations(link: Any) -> int:
+def n_observations(link):
     return sum(request.url.path.endswith("/observations") for request in link.requests)
 
 
 @pytest.mark.parametrize("is_written", [True, False], ids=["between two views", "an answer that was not written down"])
-def test_a_replay_goes_on_where_it_was_stopped(
-    client: Client, link: Any, encodings: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_written: bool
-) -> None:
+def test_a_replay_goes_on_where_it_was_stopped(client, link, encodings, tmp_path, monkeypatch, is_written):
     recording = open_source(f"{encodings / 'winter.npy'}#20:65")
     whole = replay(client, recording, "route", tmp_path / "whole", concurrency=3)
     assert [step.index for step in whole.steps] == list(range(20, 65))
     append = Journal.append
 
-    def append_or_stop(journal: Any, document: Any) -> None:
+    def append_or_stop(journal, document):
         is_last = isinstance(document, dict) and document["query"] == 31
         if is_written or not is_last:
             append(journal, document)
@@ -103,10 +98,10 @@ def test_a_replay_goes_on_where_it_was_stopped(
     assert not n_observations(link), "nothing was left to ask"
 
 
-def test_a_session_or_a_map_that_is_another_meanwhile_is_named(client: Client, encodings: Path, tmp_path: Path) -> None:
+def test_a_session_or_a_map_that_is_another_meanwhile_is_named(client, encodings, tmp_path):
     recording = open_source(f"{encodings / 'winter.npy'}#:50")
 
-    def stop(step: Step, n_done: int) -> None:
+    def stop(step, n_done):
         raise KeyboardInterrupt
 
     mapped(client, "ended", encodings)
@@ -121,7 +116,7 @@ def test_a_session_or_a_map_that_is_another_meanwhile_is_named(client: Client, e
         replay(client, recording, "ended", tmp_path)
 
 
-def test_jumps_and_drives_backwards_begin_anew(client: Client, encodings: Path, tmp_path: Path) -> None:
+def test_jumps_and_drives_backwards_begin_anew(client, encodings, tmp_path):
     backwards = open_source(f"{encodings / 'winter.npy'}#30:10:-1")
     driven = replay(client, backwards, "route", tmp_path / "back")
     assert [step.forgot for step in driven.steps] == [False] + [True] * 19
@@ -133,7 +128,7 @@ def test_jumps_and_drives_backwards_begin_anew(client: Client, encodings: Path, 
     assert [step.true_route_m for step in driven.steps] == [0.0, 3.0, 114.0]
 
 
-def test_a_domain_without_a_map_cannot_be_replayed_against(client: Client, encodings: Path, tmp_path: Path) -> None:
+def test_a_domain_without_a_map_cannot_be_replayed_against(client, encodings, tmp_path):
     client.admin.put_domain("bare", ENCODINGS)
     with pytest.raises(errors.ReplayError, match="remap"):
         replay(client, open_source(str(encodings / "winter.npy")), "bare", tmp_path)
@@ -142,13 +137,13 @@ def test_a_domain_without_a_map_cannot_be_replayed_against(client: Client, encod
 # The truth
 
 
-def scene_of(frames: list[Frame], route: Route) -> Any:
+def scene_of(frames, route):
     """As much of a scene as measures distances."""
     scene = SimpleNamespace(recording=Recording("r", frames), route=route)
     return lambda row: Scene.apart_m(scene, row, np.arange(route.n_images)).tolist()  # type: ignore[arg-type]
 
 
-def test_distance_is_in_the_plane_where_both_sides_know_it_else_along_the_route() -> None:
+def test_distance_is_in_the_plane_where_both_sides_know_it_else_along_the_route():
     x_m, y_m = np.array([0.0, 1.0, np.nan]), np.array([0.0, 0.0, np.nan])
     frames = [Frame(0, "0", 2.0, x_m=0.0, y_m=0.5), Frame(1, "1", 2.0)]
     assert scene_of(frames, Route(np.arange(3.0), False, x_m, y_m))(0) == [0.5, pytest.approx(1.118, abs=1e-3), 0.0]
@@ -156,7 +151,7 @@ def test_distance_is_in_the_plane_where_both_sides_know_it_else_along_the_route(
     assert scene_of([Frame(0, "0", 9.0)], Route(np.arange(10.0), closed=True))(0)[0] == 1.0
 
 
-def test_a_place_driven_the_other_way_is_no_right_answer_and_frames_taken_backwards_look_forwards() -> None:
+def test_a_place_driven_the_other_way_is_no_right_answer_and_frames_taken_backwards_look_forwards():
     there_and_back = np.concatenate([np.arange(0, 10.0), np.arange(9, -1.0, -1)])
     route = Route(np.arange(20.0), False, there_and_back, np.zeros(20))
     frames = [Frame(i, str(i), float(i), x_m=float(i), y_m=0.0) for i in range(10)]
@@ -167,7 +162,7 @@ def test_a_place_driven_the_other_way_is_no_right_answer_and_frames_taken_backwa
 # What is kept, and what it comes to
 
 
-def test_summary_counts_what_it_leaves_out() -> None:
+def test_summary_counts_what_it_leaves_out():
     steps = [
         Step(0, 0, "a", 0.0, None, None, n_true=1, rank=0.0, rank_percent=0.0, error_m=0.0, latency_ms=2.0),
         Step(1, 1, "b", 1.0, None, None, n_true=1, rank=1.0, rank_percent=10.0, error_m=7.0, latency_ms=4.0),
@@ -184,11 +179,11 @@ def test_summary_counts_what_it_leaves_out() -> None:
     json.dumps(empty, allow_nan=False)
 
 
-def journal(folder: Path, identity: dict[str, Any], *, restart: bool = False) -> Journal[int]:
+def journal(folder, identity, *, restart=False):
     return Journal(folder, "records.jsonl", identity, lambda document: int(document["n"]), "number", restart=restart)
 
 
-def test_a_journal_goes_on_after_a_torn_line_and_is_not_mixed_with_another_replays(tmp_path: Path) -> None:
+def test_a_journal_goes_on_after_a_torn_line_and_is_not_mixed_with_another_replays(tmp_path):
     with journal(tmp_path / "new", {"a": 1}) as log:
         log.note(session_id="s1")
         log.append({"n": 1})
@@ -213,7 +208,7 @@ def test_a_journal_goes_on_after_a_torn_line_and_is_not_mixed_with_another_repla
         *(("replay.json", text, "another replay") for text in (b"", b"\0\0\0", b"[]")),
     ],
 )
-def test_damage_is_named(tmp_path: Path, name: str, damage: bytes, words: str) -> None:
+def test_damage_is_named(tmp_path, name, damage, words):
     with journal(tmp_path, {"a": 1}):
         pass
     (tmp_path / name).write_bytes(damage)

@@ -1,32 +1,30 @@
 """A session in a terminal, and an episode in words."""
 
 import io
-from pathlib import Path
 
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
-from deepsimbad_client import Client, errors
+from deepsimbad_client import errors
 from deepsimbad_client.commands.group import run
 from deepsimbad_client.recordings.sources import open_source
 from deepsimbad_client.replay.active import Stage
 from deepsimbad_client.replay.watch import BLOCKS, belief_blocks, resampled, watch_episode, watch_session
 
 
-def console(*, terminal: bool) -> tuple[Console, io.StringIO]:
+def console(*, terminal):
     written = io.StringIO()
     return Console(file=written, force_terminal=terminal, width=80, highlight=False, markup=False), written
 
 
 @pytest.fixture
-def stage(client: Client, encodings: Path) -> Stage:
+def stage(client, encodings):
     return Stage(client, open_source(str(encodings / "winter.npy")), "route")
 
 
-def test_an_episode_off_a_terminal_is_a_line_for_each_view(stage: Stage) -> None:
+def test_an_episode_off_a_terminal_is_a_line_for_each_view(stage):
     shown, written = console(terminal=False)
     slept: list[float] = []
     steps = watch_episode(stage, shown, planner="constant:7", steps=4, seed=2, pause_s=0.5, sleep=slept.append)
@@ -38,19 +36,19 @@ def test_an_episode_off_a_terminal_is_a_line_for_each_view(stage: Stage) -> None
     assert slept == [0.5] * 4
 
 
-def test_an_episode_on_a_terminal_shows_belief_moves_and_truth(stage: Stage) -> None:
+def test_an_episode_on_a_terminal_shows_belief_moves_and_truth(stage):
     shown, written = console(terminal=True)
     steps = watch_episode(stage, shown, planner="default", steps=2, seed=0, pause_s=0, sleep=lambda _: None)
     for words in ("▲ likeliest", "● truth", "asks for", "m (telling)", "█", f"{steps[-1].true_route_m:.1f} m"):
         assert words in written.getvalue()
 
 
-def test_another_robots_session_is_watched_until_it_ends_and_left_alone(client: Client, views: np.ndarray) -> None:
+def test_another_robots_session_is_watched_until_it_ends_and_left_alone(client, views):
     shown, written = console(terminal=False)
     robot = client.session("route", keep=True)
     polls = iter(range(100))
 
-    def meanwhile(seconds: float) -> None:
+    def meanwhile(seconds):
         poll = next(polls)
         if poll in {1, 3}:
             robot.observe(encoding=views[50 + poll], action_m=2)
@@ -64,7 +62,7 @@ def test_another_robots_session_is_watched_until_it_ends_and_left_alone(client: 
     assert [line.split()[0] for line in lines] == ["0", "1", "2"]
     assert "asks for" in lines[2]
 
-    def stop(seconds: float) -> None:
+    def stop(seconds):
         raise KeyboardInterrupt
 
     shown, written = console(terminal=True)
@@ -75,9 +73,7 @@ def test_another_robots_session_is_watched_until_it_ends_and_left_alone(client: 
     assert f"route, map 1: session {watched.session_id[:8]}" in written.getvalue()
 
 
-def test_the_command(
-    route: str, encodings: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_command(route, encodings, capsys, monkeypatch):
     monkeypatch.setenv("DEEPSIMBAD_URL", route)
     assert run(["watch", str(encodings / "winter.npy"), "--domain", "route", "--steps", "3", "--pause", "0"]) == 0
     assert len(capsys.readouterr().out.splitlines()) == 4
@@ -87,7 +83,7 @@ def test_the_command(
 
 
 @given(st.lists(st.floats(0, 1), min_size=1, max_size=200), st.integers(1, 300))
-def test_a_histogram_keeps_its_mass_in_other_columns(mass: list[float], width: int) -> None:
+def test_a_histogram_keeps_its_mass_in_other_columns(mass, width):
     columns = resampled(mass, width)
     assert columns.shape == (width,)
     assert columns.sum() == pytest.approx(sum(mass), abs=1e-9)
@@ -95,7 +91,7 @@ def test_a_histogram_keeps_its_mass_in_other_columns(mass: list[float], width: i
     assert len(belief_blocks(mass, width)) == width
 
 
-def test_blocks_are_as_high_as_the_belief() -> None:
+def test_blocks_are_as_high_as_the_belief():
     line = belief_blocks([0.0, 0.001, 0.25, 1.0], 4)
     assert line[0] == line[1] == " "
     assert line[3] == BLOCKS[-1]
