@@ -2,28 +2,67 @@
 
 import io
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import cv2
 import numpy as np
 import pytest
+from fastapi import FastAPI
 from numpy.typing import NDArray
 from starlette.testclient import TestClient
 
 from deepsimbad.api.app import create_app
+from deepsimbad.api.requests import Services
 from deepsimbad.jobs.runner import InThisProcess
 from deepsimbad.settings import Settings
 
 N_READY, DIM, N_LANDMARKS = 40, 8, 10
 N_SEEN = 12
 NPZ = {"Content-Type": "application/octet-stream"}
+JSON = {"Content-Type": "application/json"}
+JPEG = {"Content-Type": "image/jpeg"}
+TAKES_ENCODINGS = {"evaluator": {"kind": "feature_l2", "extractor": "none"}}
+RANKS = {"ranked_landmarks": list(range(N_LANDMARKS))}
 
 
 def small_settings(data_dir: Path, **more: Any) -> Settings:
     limits = {"max_image_bytes": 200_000, "max_json_bytes": 50_000, "max_batch_bytes": 500_000, "max_pixels": 300_000}
     return Settings(data_dir=data_dir, event_poll_s=0.01, **{**limits, **more})
+
+
+@contextmanager
+def service(data_dir: Path, run_job: Any = None, **settings: Any) -> Iterator[TestClient]:
+    """A service of the test's own, which does its small jobs in this process."""
+    app = create_app(small_settings(data_dir, **settings), run_job or InThisProcess(data_dir))
+    with TestClient(app, raise_server_exceptions=False) as client:
+        yield client
+
+
+def services_of(client: TestClient) -> Services:
+    return cast("FastAPI", client.app).state.services  # type: ignore[no-any-return]
+
+
+def problem(answer: Any, status: int, code: str) -> dict[str, Any]:
+    """The problem document of an answer, after checking what all of them have."""
+    assert answer.status_code == status, answer.text
+    assert answer.headers["content-type"] == "application/problem+json"
+    document: dict[str, Any] = answer.json()
+    assert {"title", "detail", "instance"} <= set(document)
+    about = {"type": f"urn:deepsimbad:problem:{code}", "status": status, "code": code}
+    assert document == {**document, **about, "request_id": answer.headers["x-request-id"]}
+    assert "Traceback" not in answer.text
+    return document
+
+
+def until(met: Callable[[], Any]) -> None:
+    for _ in range(6000):
+        if met():
+            return
+        time.sleep(0.01)
+    raise AssertionError("it did not come about")
 
 
 def npz(**arrays: Any) -> bytes:
@@ -48,12 +87,15 @@ def ready_encodings() -> NDArray[np.float32]:
 
 
 def wait_for(client: TestClient, job_id: str) -> dict[str, Any]:
-    for _ in range(1000):
-        job: dict[str, Any] = client.get(f"/v1/admin/jobs/{job_id}").json()
-        if job["state"] in {"succeeded", "failed", "cancelled"}:
-            return job
-        time.sleep(0.02)
-    raise AssertionError("the job did not end")
+    """A job when it has ended."""
+    job: dict[str, Any] = {}
+
+    def ended() -> bool:
+        job.update(client.get(f"/v1/admin/jobs/{job_id}").json())
+        return job["state"] in {"succeeded", "failed", "cancelled"}
+
+    until(ended)
+    return job
 
 
 def remap(client: TestClient, domain: str, **config: Any) -> dict[str, Any]:
@@ -62,19 +104,46 @@ def remap(client: TestClient, domain: str, **config: Any) -> dict[str, Any]:
     return wait_for(client, answer.json()["job_id"])
 
 
+def upload(client: TestClient, domain: str, name: str, encodings: Any, position_m: Any, **more: Any) -> None:
+    base = f"/v1/admin/domains/{domain}/traverses"
+    assert client.post(base, json={"name": name}).status_code == 201
+    batch = npz(encodings=encodings, index=np.arange(len(encodings)), position_m=position_m, **more)
+    stored = client.post(f"{base}/{name}/frames", content=batch, headers=NPZ)
+    assert stored.status_code == 200, stored.text
+
+
+def upload_pictures(client: TestClient, domain: str, name: str) -> list[int]:
+    """The statuses of the answers."""
+    base = f"/v1/admin/domains/{domain}/traverses"
+    client.post(base, json={"name": name})
+    return [
+        client.put(
+            f"{base}/{name}/frames/{index}?position_m={index}", content=encoded(picture(index)), headers=JPEG
+        ).status_code
+        for index in range(N_SEEN)
+    ]
+
+
 def make_ready_domain(client: TestClient, name: str, **domain: Any) -> None:
-    body = {"evaluator": {"kind": "feature_l2", "extractor": "none"}, **domain}
-    assert client.put(f"/v1/admin/domains/{name}", json=body).status_code == 201
-    assert client.post(f"/v1/admin/domains/{name}/traverses", json={"name": "drive"}).status_code == 201
+    assert client.put(f"/v1/admin/domains/{name}", json={**TAKES_ENCODINGS, **domain}).status_code == 201
     n = np.arange(N_READY)
     x_m = np.where(n == 3, np.nan, 2.0 * n)
-    batch = npz(encodings=ready_encodings(), index=n, position_m=2.0 * n, timestamp_us=n, x_m=x_m, y_m=-1.0 * n)
-    stored = client.post(f"/v1/admin/domains/{name}/traverses/drive/frames", content=batch, headers=NPZ)
-    assert stored.status_code == 200, stored.text
-    job = remap(
-        client, name, training_traverse="drive", landmark_traverse="drive", n_landmarks=N_LANDMARKS, list_length=4
-    )
+    upload(client, name, "drive", ready_encodings(), 2.0 * n, timestamp_us=n, x_m=x_m, y_m=-1.0 * n)
+    drives = {"training_traverse": "drive", "landmark_traverse": "drive"}
+    job = remap(client, name, **drives, n_landmarks=N_LANDMARKS, list_length=4)
     assert job["state"] == "succeeded", job
+
+
+def begin(client: TestClient, domain: str = "ready", **body: Any) -> dict[str, Any]:
+    answer = client.post(f"/v1/domains/{domain}/sessions", json=body)
+    assert answer.status_code == 201, answer.text
+    session: dict[str, Any] = answer.json()
+    assert answer.headers["location"] == path_of(session)
+    return session
+
+
+def path_of(session: dict[str, Any]) -> str:
+    return f"/v1/sessions/{session['session_id']}"
 
 
 @pytest.fixture(scope="session")
@@ -85,22 +154,20 @@ def data_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def client(data_dir: Path) -> Iterator[TestClient]:
     """Shared by all tests of a run: a test that changes a domain makes its own."""
-    app = create_app(small_settings(data_dir), InThisProcess(data_dir))  # small jobs, and many of them
-    with TestClient(app, raise_server_exceptions=False) as client:
+    with service(data_dir) as client:
         make_ready_domain(client, "ready")
         assert client.put("/v1/admin/domains/seen", json={"evaluator": {"kind": "feature_l2"}}).status_code == 201
-        client.post("/v1/admin/domains/seen/traverses", json={"name": "drive"})
-        for index in range(N_SEEN):
-            stored = client.put(
-                f"/v1/admin/domains/seen/traverses/drive/frames/{index}",
-                params={"position_m": index},
-                content=encoded(picture(index)),
-                headers={"Content-Type": "image/jpeg"},
-            )
-            assert stored.status_code == 201, stored.text
-        job = remap(
-            client, "seen", training_traverse="drive", landmark_traverse="drive", n_landmarks=N_SEEN, list_length=3
-        )
+        assert upload_pictures(client, "seen", "drive") == [201] * N_SEEN
+        drives = {"training_traverse": "drive", "landmark_traverse": "drive"}
+        job = remap(client, "seen", **drives, n_landmarks=N_SEEN, list_length=3)
         assert job["state"] == "succeeded", job
         client.put("/v1/admin/domains/unmapped", json={"evaluator": {"kind": "feature_l2"}})
         yield client
+
+
+@pytest.fixture
+def domain(client: TestClient, request: pytest.FixtureRequest) -> str:
+    """A mapped domain of the test's own."""
+    name = request.node.name.partition("[")[0].replace("_", "-")[:60]
+    make_ready_domain(client, name)
+    return name

@@ -1,248 +1,282 @@
-"""The admin calls that make, fill, map and switch a domain."""
+"""The admin calls that make and fill a domain, and the jobs they begin: each once, only so many, told to the end."""
 
 import errno
 import json
+import threading
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import httpx2
 import numpy as np
 import pytest
 from starlette.testclient import TestClient
 
+from deepsimbad.jobs.runner import InThisProcess
 from deepsimbad.store import catalog
 
-from .conftest import DIM, N_READY, NPZ, encoded, make_ready_domain, npz, picture, ready_encodings, remap
+from .conftest import (
+    DIM,
+    JPEG,
+    NPZ,
+    RANKS,
+    TAKES_ENCODINGS,
+    begin,
+    encoded,
+    make_ready_domain,
+    npz,
+    path_of,
+    picture,
+    problem,
+    ready_encodings,
+    remap,
+    service,
+    services_of,
+    upload,
+    wait_for,
+)
 
-EVALUATOR = {"kind": "feature_l2", "extractor": "none"}
+REMAP = {"training_traverse": "drive", "training_episodes": 0}
+KEY = {"Idempotency-Key": "season-4/remap"}
+WITHIN_S = 60
 
 
 def test_a_domain_is_made_once(client: TestClient) -> None:
-    first = client.put("/v1/admin/domains/once", json={"evaluator": EVALUATOR})
-    again = client.put("/v1/admin/domains/once", json={"evaluator": EVALUATOR, "closed": False})
+    first = client.put("/v1/admin/domains/once", json=TAKES_ENCODINGS)
+    again = client.put("/v1/admin/domains/once", json={**TAKES_ENCODINGS, "closed": False})
     assert (first.status_code, again.status_code) == (201, 200)
     assert first.json() == again.json() == client.get("/v1/domains/once").json()
     assert first.json()["actions_m"] == [1, 2, 3, 4, 5, 6, 7, 8, 9, 10]
-
-
-def test_an_options_default_is_the_same_as_the_option_written_out(client: TestClient) -> None:
     made = client.put("/v1/admin/domains/defaults", json={"evaluator": {"kind": "feature_l2"}})
-    again = client.put("/v1/admin/domains/defaults", json={"evaluator": made.json()["evaluator"]})
-    assert again.status_code == 200
+    written_out = {"evaluator": made.json()["evaluator"]}
+    assert client.put("/v1/admin/domains/defaults", json=written_out).status_code == 200
 
 
-def test_a_deleted_domain_is_gone_and_its_name_free(client: TestClient) -> None:
-    make_ready_domain(client, "brief")
-    assert client.post("/v1/domains/brief/localizations", json={"ranked_landmarks": [0]}).status_code == 200
-    gone = client.delete("/v1/admin/domains/brief")
+def test_a_limit_on_domains(tmp_path: Path) -> None:
+    with service(tmp_path, max_domains=2) as client:
+        made = [client.put(f"/v1/admin/domains/{name}", json=TAKES_ENCODINGS) for name in ("a", "b", "c", "b")]
+        assert [answer.status_code for answer in made] == [201, 201, 409, 200]
+        assert problem(made[2], 409, "too_many_domains")["max_domains"] == 2
+        assert client.delete("/v1/admin/domains/a").status_code == 204
+        assert client.put("/v1/admin/domains/c", json=TAKES_ENCODINGS).status_code == 201
+
+
+def test_a_deleted_domain_is_gone_and_its_name_free(client: TestClient, domain: str) -> None:
+    gone = client.delete(f"/v1/admin/domains/{domain}")
     assert (gone.status_code, gone.content) == (204, b"")
-    assert client.post("/v1/domains/brief/localizations", json={"ranked_landmarks": [0]}).status_code == 404
-    make_ready_domain(client, "brief", closed=True)
-    assert client.get("/v1/domains/brief").json()["closed"] is True
+    assert client.post(f"/v1/domains/{domain}/localizations", json=RANKS).status_code == 404
+    make_ready_domain(client, domain, closed=True)
+    assert client.get(f"/v1/domains/{domain}").json()["closed"] is True
 
 
 def test_a_domain_whose_folder_cannot_be_removed_is_gone_with_its_sessions(
-    client: TestClient, monkeypatch: pytest.MonkeyPatch
+    client: TestClient, domain: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(folder: Path) -> None:
         raise OSError(errno.EIO, "Input/output error", str(folder))
 
-    make_ready_domain(client, "stuck")
-    session = client.post("/v1/domains/stuck/sessions", json={}).json()["session_id"]
+    session = path_of(begin(client, domain))
     with monkeypatch.context() as patched:
         patched.setattr(catalog, "bury", fail)
-        assert client.delete("/v1/admin/domains/stuck").status_code == 503
-    assert client.get("/v1/domains/stuck").status_code == 404
-    view = client.post(f"/v1/sessions/{session}/observations", json={"ranked_landmarks": [0]})
-    assert (view.status_code, view.json()["code"]) == (410, "ended_session")
-    assert client.post("/v1/domains/stuck/localizations", json={"ranked_landmarks": [0]}).status_code == 404
-    assert 'domain="stuck"' not in client.get("/metrics").text
+        assert client.delete(f"/v1/admin/domains/{domain}").status_code == 503
+    problem(client.post(f"{session}/observations", json=RANKS), 410, "ended_session")
+    assert client.post(f"/v1/domains/{domain}/localizations", json=RANKS).status_code == 404
+    assert f'domain="{domain}"' not in client.get("/metrics").text
 
 
-def test_traverses_are_listed_and_deleted(client: TestClient) -> None:
-    client.put("/v1/admin/domains/shelf", json={"evaluator": EVALUATOR})
-    base = "/v1/admin/domains/shelf/traverses"
-    made = client.post(base, json={"name": "b"})
-    assert (made.status_code, made.json()) == (201, {"name": "b", "n_frames": 0, "missing": []})
-    assert client.post(base, json={"name": "b"}).status_code == 200
-    client.post(base, json={"name": "a"})
-    assert [one["name"] for one in client.get(base).json()["traverses"]] == ["a", "b"]
-    assert client.delete(f"{base}/a").status_code == 204
-    assert [one["name"] for one in client.get(base).json()["traverses"]] == ["b"]
-    assert client.get(f"{base}/a").status_code == 404
+# Traverses
 
 
-def test_frames_twice_and_out_of_order(client: TestClient) -> None:
-    client.put("/v1/admin/domains/order", json={"evaluator": EVALUATOR})
-    base = "/v1/admin/domains/order/traverses"
-    client.post(base, json={"name": "t"})
-    seen = []
-    for index in (5, 0, 2, 5):
-        answer = client.put(
-            f"{base}/t/frames/{index}",
-            params={"position_m": index, "timestamp_us": index, "x_m": 1, "y_m": 2},
-            json={"encoding": [float(index)] * DIM},
-        )
-        seen.append((answer.status_code, answer.json()))
-    assert seen == [
-        (201, {"index": 5, "n_frames": 1}),
-        (201, {"index": 0, "n_frames": 2}),
-        (201, {"index": 2, "n_frames": 3}),
-        (200, {"index": 5, "n_frames": 3}),
-    ]
-    assert client.get(f"{base}/t").json() == {"name": "t", "n_frames": 3, "missing": [[1, 1], [3, 4]]}
-    batch = npz(encodings=np.ones((3, DIM)), index=np.array([4, 2, 3]), position_m=np.array([4, 2, 3]))
-    answer = client.post(f"{base}/t/frames", content=batch, headers=NPZ)
-    assert (answer.status_code, answer.json()) == (200, {"n_new": 2, "n_replaced": 1, "n_frames": 5})
+@pytest.fixture
+def shelf(client: TestClient, request: pytest.FixtureRequest) -> str:
+    """A domain's traverses, of which there is one, `t`."""
+    base = f"/v1/admin/domains/{request.node.name.replace('_', '-')[:60]}"
+    client.put(base, json=TAKES_ENCODINGS)
+    made = client.post(f"{base}/traverses", json={"name": "t"})
+    assert (made.status_code, made.json()) == (201, {"name": "t", "n_frames": 0, "missing": []})
+    return f"{base}/traverses"
 
 
-def test_a_deleted_traverse_takes_no_more_frames(client: TestClient) -> None:
-    client.put("/v1/admin/domains/again", json={"evaluator": EVALUATOR})
-    base = "/v1/admin/domains/again/traverses"
-    client.post(base, json={"name": "t"})
+def test_traverses_are_made_listed_and_deleted(client: TestClient, shelf: str) -> None:
+    assert client.post(shelf, json={"name": "t"}).status_code == 200
+    client.post(shelf, json={"name": "a"})
+    assert [traverse["name"] for traverse in client.get(shelf).json()["traverses"]] == ["a", "t"]
     frame = {"encoding": [1.0] * DIM}
-    assert client.put(f"{base}/t/frames/0?position_m=1", json=frame).status_code == 201
-    assert client.delete(f"{base}/t").status_code == 204
-    assert client.put(f"{base}/t/frames/0?position_m=1", json=frame).status_code == 404
-    assert client.post(base, json={"name": "t"}).status_code == 201
-    assert client.put(f"{base}/t/frames/0?position_m=1", json={"encoding": [1.0] * 3}).status_code == 201
+    assert client.put(f"{shelf}/t/frames/0?position_m=1", json=frame).status_code == 201
+    answer = client.put(f"{shelf}/t/frames/1?position_m=1", json={"encoding": [1.0]})
+    problem(answer, 422, "invalid_encoding")  # the first frame decides how long they are
+    assert client.delete(f"{shelf}/t").status_code == 204
+    assert client.get(f"{shelf}/t").status_code == 404
+    assert [traverse["name"] for traverse in client.get(shelf).json()["traverses"]] == ["a"]
+    assert client.put(f"{shelf}/t/frames/0?position_m=1", json=frame).status_code == 404
+    assert client.post(shelf, json={"name": "t"}).status_code == 201
+    assert client.put(f"{shelf}/t/frames/0?position_m=1", json={"encoding": [1.0]}).status_code == 201
 
 
-def test_what_a_job_needs_is_not_deleted(client: TestClient) -> None:
-    make_ready_domain(client, "needed")
-    app: Any = client.app
-    catalog = app.state.services.catalog
-    job = catalog.create_job("needed", "remap", {"training_traverse": "drive"})  # one that waits
-    for place in ("/v1/admin/domains/needed/traverses/drive", "/v1/admin/domains/needed"):
-        answer = client.delete(place)
-        assert (answer.status_code, answer.json()["code"]) == (409, "traverse_in_use")
-    assert client.delete(f"/v1/admin/jobs/{job.job_id}").status_code == 204
-    assert client.delete("/v1/admin/domains/needed/traverses/drive").status_code == 204
-    assert client.post("/v1/domains/needed/localizations", json={"ranked_landmarks": [0]}).status_code == 200
-    assert client.delete("/v1/admin/domains/needed").status_code == 204
-
-
-def test_one_encoding_length_a_traverse(client: TestClient) -> None:
-    client.put("/v1/admin/domains/lengths", json={"evaluator": EVALUATOR})
-    base = "/v1/admin/domains/lengths/traverses"
-    client.post(base, json={"name": "t"})
-    assert client.put(f"{base}/t/frames/0?position_m=1", json={"encoding": [1.0, 2.0]}).status_code == 201
-    answer = client.put(f"{base}/t/frames/1?position_m=1", json={"encoding": [1.0]})
-    assert (answer.status_code, answer.json()["code"]) == (422, "invalid_encoding")
+def test_frames_twice_and_out_of_order(client: TestClient, shelf: str) -> None:
+    answers = []
+    for index in (5, 0, 2, 5):
+        where = {"position_m": index, "timestamp_us": index, "x_m": 1, "y_m": 2}
+        answer = client.put(f"{shelf}/t/frames/{index}", params=where, json={"encoding": [float(index)] * DIM})
+        answers.append((answer.status_code, answer.json()["index"], answer.json()["n_frames"]))
+    assert answers == [(201, 5, 1), (201, 0, 2), (201, 2, 3), (200, 5, 3)]
+    assert client.get(f"{shelf}/t").json() == {"name": "t", "n_frames": 3, "missing": [[1, 1], [3, 4]]}
+    batch = npz(encodings=np.ones((3, DIM)), index=np.array([4, 2, 3]), position_m=np.array([4, 2, 3]))
+    answer = client.post(f"{shelf}/t/frames", content=batch, headers=NPZ)
+    assert (answer.status_code, answer.json()) == (200, {"n_new": 2, "n_replaced": 1, "n_frames": 5})
 
 
 @pytest.mark.parametrize("dim", [64, 4096])
 def test_a_domain_of_images_takes_ready_encodings_of_any_one_length(client: TestClient, dim: int) -> None:
-    """By batch and one by one; the first frame of a traverse decides how long they are."""
     name = f"any-{dim}"
-    assert client.put(f"/v1/admin/domains/{name}", json={"evaluator": {"kind": "feature_l2"}}).status_code == 201
-    base = f"/v1/admin/domains/{name}/traverses"
+    client.put(f"/v1/admin/domains/{name}", json={"evaluator": {"kind": "feature_l2"}})
     encodings = np.random.default_rng(dim).integers(-9, 10, (20, dim)).astype(np.float16)
-    assert client.post(base, json={"name": "drive"}).status_code == 201
-    for index in range(2):
-        body = {"encoding": encodings[index].tolist()}
-        assert client.put(f"{base}/drive/frames/{index}?position_m={index}", json=body).status_code == 201
-    n = np.arange(2, 20)
-    stored = client.post(
-        f"{base}/drive/frames", content=npz(encodings=encodings[2:], index=n, position_m=n), headers=NPZ
-    )
-    assert stored.json() == {"n_new": 18, "n_replaced": 0, "n_frames": 20}
-
-    image = client.put(
-        f"{base}/drive/frames/20?position_m=20", content=encoded(picture(1)), headers={"Content-Type": "image/jpeg"}
-    )
-    assert (image.status_code, image.json()["code"]) == (422, "invalid_encoding")
-    assert str(dim) in image.json()["detail"]
-
+    upload(client, name, "drive", encodings, np.arange(20))
+    image = {"content": encoded(picture(1)), "headers": JPEG}
+    answer = client.put(f"/v1/admin/domains/{name}/traverses/drive/frames/20?position_m=20", **image)
+    assert str(dim) in problem(answer, 422, "invalid_encoding")["detail"]
     job = remap(client, name, training_traverse="drive", landmark_traverse="drive", n_landmarks=20)
     assert job["state"] == "succeeded", job
     localizations = f"/v1/domains/{name}/localizations"
     assert client.post(localizations, json={"ranked_landmarks": [7, 3, 11]}).json()["retrieval"]
-    found = client.post(localizations, json={"encoding": encodings[13].tolist()}).json()
-    assert found["retrieval"][0]["map_image"] == 13
-    image = client.post(localizations, content=encoded(picture(1)), headers={"Content-Type": "image/jpeg"})
-    assert (image.status_code, image.json()["code"]) == (422, "invalid_encoding")
-    assert f"landmarks of {dim}" in image.json()["detail"]
+    retrieval = client.post(localizations, json={"encoding": encodings[13].tolist()}).json()["retrieval"]
+    assert retrieval[0]["map_image"] == 13
+    detail = problem(client.post(localizations, **image), 422, "invalid_encoding")["detail"]
+    assert f"landmarks of {dim}" in detail
 
 
 def test_an_image_and_its_encoding_are_the_same_frame(client: TestClient) -> None:
+    frame = "/v1/admin/domains/seen/traverses/drive/frames/3?position_m=3"
+    headers = {"Content-Type": "image/jpeg; charset=binary"}
+    assert client.put(frame, content=encoded(picture(3)), headers=headers).status_code == 200
     dim = client.get("/v1/domains/seen").json()["encoding_dim"]
-    answer = client.put(
-        "/v1/admin/domains/seen/traverses/drive/frames/3?position_m=3",
-        content=encoded(picture(3)),
-        headers={"Content-Type": "image/jpeg; charset=binary"},
-    )
-    assert answer.status_code == 200
-    short = client.put("/v1/admin/domains/seen/traverses/drive/frames/3?position_m=3", json={"encoding": [0.5]})
-    assert short.json()["encoding_dim"] == dim
+    assert client.put(frame, json={"encoding": [0.5]}).json()["encoding_dim"] == dim
 
 
-def test_a_remap_is_followed_by_its_events(client: TestClient) -> None:
-    make_ready_domain(client, "followed")
-    job = client.post(
-        "/v1/admin/domains/followed/remaps", json={"training_traverse": "drive", "relevance": "rrf", "seed": 3}
-    )
-    assert job.status_code == 202
-    assert job.headers["location"] == f"/v1/admin/jobs/{job.json()['job_id']}"
-    with client.stream("GET", f"{job.headers['location']}/events") as stream:
+# Jobs
+
+
+def test_what_a_job_needs_is_not_deleted(client: TestClient, domain: str) -> None:
+    base = f"/v1/admin/domains/{domain}"
+    upload(client, domain, "day", ready_encodings(), np.arange(40))
+    config = {"training_traverse": "drive", "check_traverse": "day"}
+    job = services_of(client).catalog.create_job(domain, "remap", config)  # one that waits
+    for place in (f"{base}/traverses/drive", f"{base}/traverses/day", base):
+        problem(client.delete(place), 409, "traverse_in_use")
+    assert client.delete(f"/v1/admin/jobs/{job.job_id}").status_code == 204
+    assert client.delete(f"{base}/traverses/drive").status_code == 204
+    assert client.post(f"/v1/domains/{domain}/localizations", json=RANKS).status_code == 200
+    assert client.delete(base).status_code == 204
+
+
+def test_a_remap_is_followed_by_its_events(client: TestClient, domain: str) -> None:
+    config = {"training_traverse": "drive", "relevance": "rrf", "seed": 3}
+    answer = client.post(f"/v1/admin/domains/{domain}/remaps", json=config)
+    assert answer.status_code == 202
+    assert answer.headers["location"] == f"/v1/admin/jobs/{answer.json()['job_id']}"
+    with client.stream("GET", f"{answer.headers['location']}/events") as stream:
         assert stream.headers["content-type"].startswith("text/event-stream")
         lines = list(stream.iter_lines())
     events = [line.removeprefix("event: ") for line in lines if line.startswith("event: ")]
-    told = [json.loads(line.removeprefix("data: ")) for line in lines if line.startswith("data: ")]
+    job = [json.loads(line.removeprefix("data: ")) for line in lines if line.startswith("data: ")][-1]
     assert events[-1] == "done"
     assert set(events[:-1]) <= {"progress"}
-    assert told[-1] == client.get(job.headers["location"]).json()
-    assert set(told[-1]) >= {"job_id", "domain", "state", "stage", "progress", "eta_s", "result", "error"}
-    assert told[-1]["state"] == "succeeded"
-    assert told[-1]["progress"] == 1
-    assert told[-1]["error"] is None
-    assert set(told[-1]["result"]) == {"map_version", "active", "metrics"}
-    assert told[-1]["config"]["seed"] == 3
-    assert client.get("/v1/domains/followed").json()["relevance"] == "rrf"
-    listed = client.get("/v1/admin/jobs?domain=followed").json()["jobs"]
-    assert [one["result"]["map_version"] for one in listed] == [2, 1]
-    assert listed[0] in client.get("/v1/admin/jobs").json()["jobs"]
+    assert job == client.get(answer.headers["location"]).json()
+    assert set(job) >= {"job_id", "domain", "state", "stage", "progress", "eta_s", "result", "error"}
+    assert (job["state"], job["progress"], job["error"], job["config"]["seed"]) == ("succeeded", 1, None, 3)
+    assert set(job["result"]) == {"map_version", "active", "metrics"}
+    assert client.get(f"/v1/domains/{domain}").json()["relevance"] == "rrf"
+    jobs = client.get(f"/v1/admin/jobs?domain={domain}").json()["jobs"]
+    assert [job["result"]["map_version"] for job in jobs] == [2, 1]
+    assert jobs[0] in client.get("/v1/admin/jobs").json()["jobs"]
 
 
-def test_versions_are_switched_and_rolled_back(client: TestClient) -> None:
-    make_ready_domain(client, "rolled")
-    place, query = "/v1/admin/domains/rolled", {"ranked_landmarks": [1, 2, 3]}
-    job = remap(client, "rolled", training_traverse="drive", relevance="rrf", activate=False)
-    assert job["result"] == {"map_version": 2, "active": False, "metrics": job["result"]["metrics"]}
+class Held:
+    """Does jobs in this process; while it is held, none begins."""
 
-    def states() -> list[tuple[int, str]]:
-        return [(one["version"], one["state"]) for one in client.get(f"{place}/maps").json()["maps"]]
+    def __init__(self, data_dir: Path) -> None:
+        self.entered, self.free = threading.Event(), threading.Event()
+        self.free.set()
+        self._run_job = InThisProcess(data_dir)
 
-    def answer() -> Any:
-        found = client.post("/v1/domains/rolled/localizations", json=query).json()
-        return found["map_version"], found["retrieval"]
-
-    old = answer()
-    assert states() == [(2, "sealed"), (1, "active")]
-    switched = client.put(f"{place}/active-map", json={"version": 2, "expected": 1})
-    assert (switched.status_code, switched.json()["state"]) == (200, "active")
-    assert states() == [(2, "active"), (1, "retired")]
-    assert answer()[0] == 2
-    lost = client.put(f"{place}/active-map", json={"version": 1, "expected": 1})
-    assert (lost.status_code, lost.json()["code"]) == (409, "lost_activation")
-    assert client.put(f"{place}/active-map", json={"version": 1, "expected": 2}).status_code == 200
-    assert answer() == old
-    assert client.put(f"{place}/active-map", json={"version": 2}).status_code == 200
+    def __call__(self, *job: Any) -> dict[str, Any]:
+        self.entered.set()
+        assert self.free.wait(WITHIN_S)
+        return self._run_job(*job)
 
 
-def test_the_map_lists_what_it_was_built_with(client: TestClient) -> None:
-    newest = client.get("/v1/admin/domains/ready/maps").json()["maps"][-1]
-    assert newest["config"]["n_landmarks"] == 10
-    assert newest["config"]["training_traverse"] == "drive"
-    assert len(newest["sha256"]) == 64
-    assert newest["file_bytes"] > 0
-    assert newest["metrics"]["n_map_images"] == N_READY
+@pytest.fixture
+def held(tmp_path: Path) -> Iterator[tuple[TestClient, Held]]:
+    held = Held(tmp_path)
+    with service(tmp_path, held, max_jobs=2) as client:
+        make_ready_domain(client, "ready")
+        yield client, held
+        held.free.set()
 
 
-def test_a_closed_route_is_a_loop(client: TestClient) -> None:
-    make_ready_domain(client, "loop", closed=True, actions_m=[2.5])
-    found = client.get("/v1/domains/loop").json()
-    assert found["closed"] is True
-    assert found["actions_m"] == [2.5]
-    assert found["route_length_m"] > 2.0 * (N_READY - 1)
-    body = {"encoding": ready_encodings()[0].tolist()}
-    assert client.post("/v1/domains/loop/localizations", json=body).status_code == 200
+def ask(
+    client: TestClient, path: str, body: dict[str, Any], key: dict[str, str] = KEY, domain: str = "ready"
+) -> httpx2.Response:
+    return client.post(f"/v1/admin/domains/{domain}/{path}", json=body, headers=key)
+
+
+def test_a_remap_asked_for_twice_under_one_key_is_one(tmp_path: Path) -> None:
+    with service(tmp_path) as client:
+        make_ready_domain(client, "ready")
+        first = ask(client, "remaps", REMAP)
+        done = wait_for(client, first.json()["job_id"])
+        assert (first.status_code, done["state"]) == (202, "succeeded")
+    with service(tmp_path) as client:  # after a restart too
+        again = ask(client, "remaps", {**REMAP, "seed": 0, "landmark_traverse": None})  # the same, written out
+        assert (again.status_code, again.json()) == (202, done)
+        assert again.headers["location"] == first.headers["location"] == f"/v1/admin/jobs/{done['job_id']}"
+        assert len(client.get("/v1/admin/jobs").json()["jobs"]) == 2
+        problem(ask(client, "remaps", {**REMAP, "seed": 1}), 422, "idempotency_key_reused")
+        make_ready_domain(client, "elsewhere")
+        others = [ask(client, "remaps", REMAP, key) for key in ({}, {}, {"Idempotency-Key": "another"})]
+        others.append(ask(client, "remaps", REMAP, domain="elsewhere"))
+        jobs = [wait_for(client, answer.json()["job_id"]) for answer in others]
+        assert len({done["job_id"], *(job["job_id"] for job in jobs)}) == 5
+        assert jobs[-1]["domain"] == "elsewhere"
+        client.delete("/v1/admin/domains/ready/traverses/drive")
+        assert ask(client, "remaps", REMAP).json() == done, "what was done needs its traverse no more"
+        problem(ask(client, "remaps", REMAP, {}), 404, "unknown_traverse")
+
+
+def test_experience_fed_back_twice_under_one_key_is_learnt_once(client: TestClient, domain: str) -> None:
+    session = begin(client, domain)
+    for image in range(0, 8, 2):
+        body = {"encoding": ready_encodings()[image].tolist()}
+        assert client.post(f"{path_of(session)}/observations?action_m=4", json=body).status_code == 200
+    truths = {"session_id": session["session_id"], "true_positions_m": [0.0, 4.0, None, 12.0]}
+    first = ask(client, "experience", truths, domain=domain)
+    assert first.status_code == 202, first.text
+    done = wait_for(client, first.json()["job_id"])
+    assert ask(client, "experience", truths, domain=domain).json() == done
+    other = {**truths, "true_positions_m": [0.0, 4.0, 8.0, 12.0]}
+    problem(ask(client, "experience", other, domain=domain), 422, "idempotency_key_reused")
+    job = wait_for(client, ask(client, "experience", other, {}, domain).json()["job_id"])
+    assert job["job_id"] != done["job_id"]
+    assert wait_for(client, ask(client, "remaps", REMAP, domain=domain).json()["job_id"])["kind"] == "remap"
+    counted = f'deepsimbad_live_anr_percent_count{{domain="{domain}"}} 4.0'
+    assert counted in client.get("/metrics").text, "every truth counts once"
+
+
+def test_only_so_many_jobs_wait(held: tuple[TestClient, Held]) -> None:
+    client, runner = held
+    runner.entered.clear()
+    runner.free.clear()
+    ask(client, "remaps", REMAP, {})
+    assert runner.entered.wait(WITHIN_S)
+    waiting = [ask(client, "remaps", REMAP, key).json()["job_id"] for key in ({}, KEY)]
+    full = ask(client, "remaps", REMAP, {})
+    about = problem(full, 429, "too_many_jobs")
+    assert (about["limit"], about["max_jobs"], full.headers["retry-after"]) == ("max_jobs", 2, "30")
+    assert ask(client, "remaps", REMAP).json()["job_id"] == waiting[1], "one that is known needs no room"
+    client.delete(f"/v1/admin/jobs/{waiting[0]}")
+    last = ask(client, "remaps", REMAP, {})
+    assert last.status_code == 202, last.text
+    runner.free.set()
+    assert wait_for(client, last.json()["job_id"])["state"] == "succeeded"
+    assert wait_for(client, waiting[0])["state"] == "cancelled"
+    assert client.delete(f"/v1/admin/jobs/{waiting[0]}").status_code == 204, "it stays cancelled"

@@ -1,26 +1,34 @@
-"""No answer tells where files lie, what our code looks like inside, or what a library said."""
+"""No name in a path reaches the file system, and no answer tells where files lie or what our code looks like inside.
 
+Tricky names go through the application as a server hands them on: percent-encoding undone.
+"""
+
+import asyncio
 import json
+import os
+import re
 import shutil
+import sys
+import sysconfig
 from collections.abc import Iterator
 from itertools import product
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote, unquote_to_bytes
 
 import pytest
 from starlette.testclient import TestClient
+from starlette.types import Message, Scope
 
-from deepsimbad.api.app import create_app
-from deepsimbad.jobs.runner import InThisProcess
+from deepsimbad.store.layout import is_name
 
-from .conftest import NPZ, make_ready_domain, npz, small_settings, wait_for
+from .conftest import DIM, JSON, NPZ, begin, make_ready_domain, npz, service, services_of, wait_for
 
-JSON = {"Content-Type": "application/json"}
 NAMES = {"domain": "ready", "name": "drive", "index": "0", "version": "1", "session_id": "none", "job_id": "none"}
 BODIES: tuple[tuple[bytes, dict[str, str]], ...] = (
+    (b"{}", JSON),
     (b"", {}),
     (b"", JSON),
-    (b"{}", JSON),
     (b"[" * 40_000, JSON),
     (b'{"encoding": [1e999, NaN]}', JSON),
     (b'{"name": "../../x", "evaluator": {"kind": "/etc/passwd"}}', JSON),
@@ -32,61 +40,59 @@ BODIES: tuple[tuple[bytes, dict[str, str]], ...] = (
     (b"{}", {**JSON, "Content-Encoding": "gzip"}),
 )
 QUERIES = (
-    "",
-    "position_m=nan",
-    "position_m=0&timestamp_us=99999999999999999999",
-    "shortlist=-1",
-    "after=%00",
-    "limit=x",
+    *("position_m=nan", "position_m=0&timestamp_us=99999999999999999999"),
+    *("shortlist=-1", "after=%00", "limit=x"),
 )
-
-
 INSIDE = ("Traceback", 'File "', "sqlite3.", "OperationalError", "site-packages", " deepsimbad.", "<class", "0x7f")
 
 
-class Telling:
-    """Checks answers, and counts those with an error."""
+class Listener:
+    """A service of its own whose answers are checked, and those with an error counted."""
 
-    def __init__(self, data_dir: Path) -> None:
-        self.n_errors = 0
+    def __init__(self, client: TestClient, data_dir: Path) -> None:
+        self.client, self.data_dir, self.n_errors = client, data_dir, 0
         self._places = (data_dir.name, str(data_dir.resolve().parent), str(Path(__file__).parents[2]))
 
-    def check(self, answer: Any) -> None:
+    def ask(self, method: str, url: str, body: bytes = b"", headers: Any = None) -> Any:
+        answer = self.client.request(method, url, content=body, headers=headers)
         is_error = answer.status_code >= 400
         self.n_errors += is_error
-        told = answer.text + json.dumps(dict(answer.headers))
-        for each in (*self._places, *(INSIDE if is_error else ())):
-            assert each not in told, f"{each}: {answer.request.method} {answer.request.url}: {told[:1000]}"
+        text = answer.text + json.dumps(dict(answer.headers))
+        for word in (*self._places, *(INSIDE if is_error else ())):
+            assert word not in text, f"{word}: {method} {url}: {text[:1000]}"
+        return answer
+
+    def walk(self, bodies: Any = BODIES, queries: Any = QUERIES) -> None:
+        """Every operation, with and without what it needs."""
+        for path, by_method in self.client.get("/openapi.json").json()["paths"].items():
+            for method, operation in by_method.items():
+                tried = [(body, "") for body in (bodies if "requestBody" in operation else bodies[:1])]
+                tried += [(bodies[0], query) for query in queries]
+                for names, (body, query) in product((NAMES, dict.fromkeys(NAMES, "unknown")), tried):
+                    if method != "delete" or names is not NAMES:
+                        self.ask(method.upper(), f"{path.format(**names)}?{query}", *body)
+            self.ask("PATCH", path.format(**NAMES))
 
 
 @pytest.fixture
-def ours(tmp_path: Path) -> Iterator[tuple[TestClient, Path, Telling]]:
+def ours(tmp_path: Path) -> Iterator[Listener]:
     data_dir = tmp_path / "somewhere-secret"
-    app = create_app(small_settings(data_dir), InThisProcess(data_dir))
-    with TestClient(app, raise_server_exceptions=False) as client:
+    with service(data_dir) as client:
         make_ready_domain(client, "ready")
-        yield client, data_dir, Telling(data_dir)
+        yield Listener(client, data_dir)
 
 
-def walk(client: TestClient, telling: Telling) -> None:
-    """Every operation, with and without what it needs."""
-    for path, by_method in client.get("/openapi.json").json()["paths"].items():
-        for method, operation in by_method.items():
-            bodies = BODIES if "requestBody" in operation else BODIES[:1]
-            for names, (body, headers), query in product((NAMES, dict.fromkeys(NAMES, "unknown")), bodies, QUERIES):
-                if method == "delete" and names is NAMES:
-                    continue
-                url = f"{path.format(**names)}?{query}"
-                telling.check(client.request(method.upper(), url, content=body, headers=headers))
-        telling.check(client.request("PATCH", path.format(**NAMES)))
-
-
-def test_mistakes(ours: tuple[TestClient, Path, Telling]) -> None:
-    client, _, telling = ours
-    walk(client, telling)
+def test_mistakes(ours: Listener) -> None:
+    ours.walk()
     for path in ("/no/such/path", "/v1", "/v1/", "/%00", "/docs/x", "/..%2f..%2fetc/passwd"):
-        telling.check(client.get(path))
-    assert telling.n_errors > 500
+        ours.ask("GET", path)
+    assert ours.n_errors > 400
+    services_of(ours.client).catalog.close()
+    services_of(ours.client).session_store.close()
+    shutil.rmtree(ours.data_dir)
+    before = ours.n_errors
+    ours.walk(BODIES[:1], ())
+    assert ours.n_errors > before + 40
 
 
 def damage(path: Path) -> None:
@@ -97,52 +103,144 @@ def damage(path: Path) -> None:
     path.write_bytes(bytes(content))
 
 
-@pytest.mark.parametrize("harm", ["damaged", "missing", "a folder", "empty"])
-def test_harmed_files(ours: tuple[TestClient, Path, Telling], harm: str) -> None:
-    client, data_dir, telling = ours
-    begun = client.post("/v1/domains/ready/sessions", json={}).json()["session_id"]
-    assert client.post("/v1/admin/domains/ready/traverses", json={"name": "other"}).status_code == 201
-    harmed = [*data_dir.glob("domains/*/traverses/*.sqlite"), *data_dir.glob("domains/*/maps/*.sqlite")]
-    assert len(harmed) == 3
-    for path in harmed:
-        if harm == "damaged":
-            damage(path)
-        else:
-            path.unlink()
-        if harm == "a folder":
-            path.mkdir()
-        if harm == "empty":
-            path.touch()
-    frame = json.dumps({"encoding": [0.0] * 8})
-    for method, path, body, headers in (
-        ("GET", "/v1/admin/domains/ready/traverses", "", {}),
-        ("GET", "/v1/admin/domains/ready/traverses/drive", "", {}),
-        ("PUT", "/v1/admin/domains/ready/traverses/other/frames/0?position_m=0", frame, JSON),
-        ("POST", "/v1/admin/domains/ready/traverses/other/frames", npz(encodings=[[0.0] * 8], index=[0]), NPZ),
-        ("PUT", "/v1/admin/domains/ready/active-map", '{"version": 1}', JSON),
-        ("GET", "/v1/admin/domains/ready/maps/1/file", "", {}),
-        ("GET", "/v1/admin/domains/ready/maps", "", {}),
-        ("GET", "/v1/domains/ready", "", {}),
-        ("GET", "/readyz", "", {}),
-        ("GET", "/metrics", "", {}),
-        ("POST", f"/v1/sessions/{begun}/observations", '{"ranked_landmarks": [1]}', JSON),
-        ("POST", "/v1/admin/domains/ready/remaps", '{"training_traverse": "drive"}', JSON),
+@pytest.mark.parametrize(
+    "harm",
+    [damage, Path.unlink, lambda path: (path.unlink(), path.mkdir()), lambda path: (path.unlink(), path.touch())],
+)
+def test_harmed_files(ours: Listener, harm: Any) -> None:
+    session = begin(ours.client)["session_id"]
+    admin = "/v1/admin/domains/ready"
+    assert ours.client.post(f"{admin}/traverses", json={"name": "other"}).status_code == 201
+    paths = [path for kind in ("traverses", "maps") for path in ours.data_dir.glob(f"domains/*/{kind}/*.sqlite")]
+    assert len(paths) == 3
+    for path in paths:
+        harm(path)
+    frame = json.dumps({"encoding": [0.0] * DIM}).encode()
+    for method, url, body, headers in (
+        ("GET", f"{admin}/traverses", b"", {}),
+        ("GET", f"{admin}/traverses/drive", b"", {}),
+        ("PUT", f"{admin}/traverses/other/frames/0?position_m=0", frame, JSON),
+        ("POST", f"{admin}/traverses/other/frames", npz(encodings=[[0.0] * DIM], index=[0]), NPZ),
+        ("PUT", f"{admin}/active-map", b'{"version": 1}', JSON),
+        ("GET", f"{admin}/maps/1/file", b"", {}),
+        ("GET", f"{admin}/maps", b"", {}),
+        ("GET", "/v1/domains/ready", b"", {}),
+        ("GET", "/readyz", b"", {}),
+        ("GET", "/metrics", b"", {}),
+        ("POST", f"/v1/sessions/{session}/observations", b'{"ranked_landmarks": [1]}', JSON),
+        ("POST", f"{admin}/remaps", b'{"training_traverse": "drive"}', JSON),
     ):
-        answer = client.request(method, path, content=body, headers=headers)
-        telling.check(answer)
+        answer = ours.ask(method, url, body, headers)
         if answer.status_code == 202:
-            job = wait_for(client, answer.json()["job_id"])
-            telling.check(client.get(f"/v1/admin/jobs/{job['job_id']}"))
-            telling.check(client.get(f"/v1/admin/jobs/{job['job_id']}/events"))
-    assert telling.n_errors >= 3
+            job = f"/v1/admin/jobs/{wait_for(ours.client, answer.json()['job_id'])['job_id']}"
+            ours.ask("GET", job)
+            ours.ask("GET", f"{job}/events")
+    assert ours.n_errors >= 3
 
 
-@pytest.mark.slow
-def test_a_catalog_and_sessions_that_are_gone(ours: tuple[TestClient, Path, Telling]) -> None:
-    client, data_dir, telling = ours
-    app: Any = client.app
-    app.state.services.catalog.close()
-    app.state.services.session_store.close()
-    shutil.rmtree(data_dir)
-    walk(client, telling)
-    assert telling.n_errors > 500
+# Names in paths
+
+TRICKS = (
+    *("..", "%2e%2e", "..%2f..%2f..%2f..%2fetc%2fpasswd", "%2fetc%2fpasswd", "//etc/passwd", "drive%2f..%2fdrive"),
+    *("ready%2fmaps%2f000001.sqlite", "..%5c..%5cready", "%252e%252e%252fready", "%00", "drive%00", "drive%00.sqlite"),
+    *("%c0%ae%c0%ae%2fready", "%ff%fe", "%ed%a0%80", "%ef%bc%8e%ef%bc%8e", "%e2%80%ae", "drive%0a", "drive%20", "%09"),
+    *("~root", "-rf", ".hidden", "drive;", "drive'--", "$(id)", "{domain}", "*", "a" * 65, "a" * 5000, "%2e" * 3000),
+    *("file:%2f%2f%2fetc%2fpasswd", "/dev/null", "1e3", "0x1", "99999999999999999999", "-1"),
+)
+_TOUCHING = {"open", "sqlite3.connect", "os.listdir", "os.scandir", "os.mkdir", "os.remove", "os.rmdir", "os.rename"}
+
+
+class Watch:
+    """What the process opens, lists, makes or removes while it is on. A hook stays for good, so there is one."""
+
+    def __init__(self) -> None:
+        self.touched: set[str] | None = None
+        sys.addaudithook(self._hear)
+
+    def _hear(self, event: str, arguments: tuple[Any, ...]) -> None:
+        if self.touched is not None and event in _TOUCHING:
+            paths = arguments[:2] if event == "os.rename" else arguments[:1]
+            self.touched |= {os.fsdecode(path) for path in paths if isinstance(path, (str, bytes, os.PathLike))}
+
+
+@pytest.fixture(scope="module")
+def watch() -> Watch:
+    return Watch()
+
+
+def requests(document: dict[str, Any], trick: str) -> Iterator[tuple[str, str, bytes, str]]:
+    """Every operation with the trick as each of its names in turn, the others real, and a body that would be taken."""
+    for path, by_method in document["paths"].items():
+        for method, operation in by_method.items():
+            query = "&".join(
+                f"{parameter['name']}={parameter['example']}"
+                for parameter in operation.get("parameters", ())
+                if parameter["in"] == "query" and parameter["required"]
+            )
+            for tricked in re.findall(r"{(\w+)}", path):
+                if not is_name(unquote(trick)) or tricked in {"index", "version"}:
+                    url = f"{path.format(**{**NAMES, tricked: trick})}?{query}"
+                    yield method.upper(), url, *body_of(operation, document["components"]["schemas"])
+
+
+def body_of(operation: dict[str, Any], schemas: dict[str, Any]) -> tuple[bytes, str]:
+    content = operation.get("requestBody", {"content": {"": {}}})["content"]
+    if "application/json" not in content:
+        return b"an archive", next(iter(content))
+    schema = content["application/json"]["schema"]
+    example: Any = {"encoding": [1.0] * DIM}
+    if "$ref" in schema:
+        (example,) = schemas[schema["$ref"].rpartition("/")[2]]["examples"]
+    return json.dumps(example).encode(), "application/json"
+
+
+async def code_of(app: Any, method: str, url: str, body: bytes, content_type: str) -> str:
+    """The code of the answer's problem."""
+    raw, _, query = url.partition("?")
+    scope: Scope = {
+        "type": "http",
+        "http_version": "1.1",
+        "method": method,
+        "scheme": "http",
+        "root_path": "",
+        "path": unquote_to_bytes(raw).decode("utf-8", "replace"),
+        "raw_path": raw.encode(),
+        "query_string": query.encode(),
+        "headers": [(b"content-type", content_type.encode()), (b"content-length", str(len(body)).encode())],
+        "server": ("test", 80),
+        "client": ("test", 1),
+    }
+    answers: list[Message] = []
+
+    async def receive() -> Message:
+        return {"type": "http.request", "body": body, "more_body": False}
+
+    async def send(message: Message) -> None:
+        answers.append(message)
+
+    await asyncio.wait_for(app(scope, receive, send), 30)
+    if answers[0]["status"] < 400:
+        return "taken"
+    code: str = json.loads(b"".join(message.get("body", b"") for message in answers))["code"]
+    return code
+
+
+@pytest.mark.parametrize("trick", TRICKS, ids=range(len(TRICKS)))
+def test_no_name_reaches_the_file_system(client: TestClient, data_dir: Path, watch: Watch, trick: str) -> None:
+    before = {path: path.stat().st_size for path in data_dir.rglob("*.sqlite")}
+    of_python = [Path(path).resolve() for path in (*sysconfig.get_paths().values(), sys.prefix, sys.base_prefix)]
+    of_python.append(Path(__file__).resolve().parents[2] / "service")
+    asked = list(requests(client.get("/openapi.json").json(), trick))
+    assert len(asked) > 1
+    watch.touched = set()
+    try:
+        for request in asked:
+            code = asyncio.run(code_of(client.app, *request))
+            assert code in {"not_found", "method_not_allowed", "invalid_request"}, (request, code)
+    finally:
+        touched, watch.touched = watch.touched, None
+    ours = {str(path) for path in data_dir.rglob("*")} | {str(data_dir)}
+    for path in {re.sub(r"^file:|\?.*$", "", path) for path in touched}:
+        if not any(folder in Path(path).resolve().parents for folder in of_python):
+            assert path in ours or path.removesuffix("-journal") in ours, path
+    assert {path: path.stat().st_size for path in data_dir.rglob("*.sqlite")} == before

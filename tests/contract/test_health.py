@@ -1,6 +1,9 @@
-"""Liveness, readiness, metrics, documents."""
+"""Liveness, and whether `/readyz` tells the truth, each thing that can break broken in turn; the OpenAPI document."""
 
+import os
+import re
 import threading
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -8,16 +11,122 @@ import pytest
 from starlette.responses import JSONResponse
 from starlette.testclient import TestClient
 
-from deepsimbad.api.app import create_app
+from deepsimbad.api import health
+from deepsimbad.store.layout import catalog_path, sessions_path
 
-from .conftest import make_ready_domain, small_settings
+from .conftest import RANKS, make_ready_domain, problem, service, services_of
 
 
 def test_health_readiness_and_documents(client: TestClient) -> None:
     assert client.get("/healthz").json() == {"status": "alive"}
     assert client.get("/readyz").json() == {"status": "ready", "damaged_maps": []}
-    assert client.get("/docs").status_code == 200
     assert client.get("/openapi.json").json()["openapi"].startswith("3.1")
+    for path in ("/healthz", "/readyz"):  # as load balancers ask
+        answer = client.head(path)
+        assert (answer.status_code, answer.headers["content-type"]) == (200, "application/json"), path
+    answer = client.head("/v1/domains")
+    assert (answer.status_code, answer.headers["allow"]) == (405, "GET")
+
+
+def test_what_was_acknowledged_is_there_after_a_restart(tmp_path: Path) -> None:
+    path = "/v1/domains/kept/localizations"
+    with service(tmp_path) as client:
+        make_ready_domain(client, "kept")
+        before = client.post(path, json=RANKS).json()
+    with service(tmp_path) as client:
+        after = client.post(path, json=RANKS).json()
+    assert {**after, "timings_ms": {}} == {**before, "timings_ms": {}}
+
+
+def test_not_ready_while_stopping(tmp_path: Path) -> None:
+    before = set(threading.enumerate())
+    with service(tmp_path) as client:
+        services_of(client).stopping.set()
+        answer = client.get("/readyz")
+        problem(answer, 503, "unavailable")
+        assert answer.headers["retry-after"]
+        assert client.get("/healthz").status_code == 200
+    left = {thread.name for thread in set(threading.enumerate()) - before}
+    assert not {"inference", "jobs"} & left
+
+
+@pytest.fixture
+def breakable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[TestClient]:
+    monkeypatch.setattr(health, "TRUSTED_S", -1.0)  # look every time
+    with service(tmp_path) as client:
+        yield client
+
+
+def faults(client: TestClient) -> list[str]:
+    answer = client.get("/readyz")
+    shown = re.search(r"^deepsimbad_ready (\S+)$", client.get("/metrics").text, re.MULTILINE)
+    assert shown is not None
+    assert float(shown[1]) == (answer.status_code == 200)
+    assert client.get("/healthz").status_code == 200, "whatever is wrong, the process lives"
+    if answer.status_code == 200:
+        return []
+    about = problem(answer, 503, "unavailable")
+    assert answer.headers["retry-after"]
+    assert about["detail"] == "; ".join(about["faults"])
+    assert str(services_of(client).settings.data_dir) not in answer.text
+    return list(about["faults"])
+
+
+def refuse_writes(client: TestClient, is_on: bool = True) -> None:
+    services_of(client).session_store._writing.conn.execute(f"PRAGMA query_only = {int(is_on)}")
+
+
+def remove(client: TestClient, path_in: Callable[[Path], Path]) -> None:
+    path_in(services_of(client).settings.data_dir).unlink()
+
+
+@pytest.mark.parametrize(
+    ("breaks", "expected"),
+    [
+        (lambda client: services_of(client).worker.close(), "the inference worker has ended: restart the service"),
+        (
+            lambda client: services_of(client).session_store._commits.close(),
+            "the thread that writes sessions has ended: restart the service",
+        ),
+        (lambda client: services_of(client).runner.close(), "the thread that runs jobs has ended: restart the service"),
+        (lambda client: remove(client, catalog_path), "catalog.sqlite was removed under the running service"),
+        (lambda client: remove(client, sessions_path), "sessions.sqlite was removed under the running service"),
+        (refuse_writes, "sessions.sqlite: it may not be written"),
+        (lambda client: services_of(client).catalog._reader.close(), "catalog.sqlite: it is closed"),
+    ],
+)
+def test_what_is_broken_is_told(breakable: TestClient, breaks: Callable[[TestClient], None], expected: str) -> None:
+    assert faults(breakable) == []
+    breaks(breakable)
+    assert expected in faults(breakable)
+
+
+def test_a_disk_almost_full_or_read_only(breakable: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
+    statvfs = os.statvfs
+
+    def read_only(path: Any) -> Any:
+        real = statvfs(path)
+        return os.statvfs_result((*real[:8], real.f_flag | os.ST_RDONLY, real.f_namemax))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(health, "LEAST_FREE_BYTES", 1 << 60)
+        (fault,) = faults(breakable)
+        assert re.fullmatch(r"\d+ MiB are free in the data directory, fewer than 1099511627776", fault)
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "statvfs", read_only)
+        assert faults(breakable) == ["the data directory lies on a read-only file system"]
+    assert faults(breakable) == [], "it is ready again when the fault is gone"
+
+
+def test_whoever_asks_often_is_answered_from_memory(breakable: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Or a stranger could keep the disk busy."""
+    refuse_writes(breakable)
+    assert len(faults(breakable)) == 1
+    refuse_writes(breakable, False)
+    assert faults(breakable) == []
+    monkeypatch.setattr(health, "TRUSTED_S", 1000.0)
+    refuse_writes(breakable)
+    assert breakable.get("/readyz").status_code == 200
 
 
 def test_the_openapi_document_is_written_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -30,54 +139,8 @@ def test_the_openapi_document_is_written_once(tmp_path: Path, monkeypatch: pytes
         return render(self, content)
 
     monkeypatch.setattr(JSONResponse, "render", counting)
-    with TestClient(create_app(small_settings(tmp_path))) as client:
+    with service(tmp_path) as client:
         first = client.get("/openapi.json")
         assert (first.status_code, first.headers["content-type"]) == (200, "application/json")
         assert client.get("/openapi.json").content == first.content
     assert n_written == 1
-
-
-def test_metrics_count_by_route_and_not_by_path(client: TestClient) -> None:
-    client.post("/v1/domains/ready/localizations", json={"ranked_landmarks": [0]})
-    client.get("/v1/domains/some-unknown-name")
-    client.get("/some/unknown/path")
-    answer = client.get("/metrics")
-    assert answer.headers["content-type"].startswith("text/plain")
-    counted = 'deepsimbad_requests_total{method="POST",route="/v1/domains/{domain}/localizations",status="200"}'
-    assert counted in answer.text
-    assert "some-unknown-name" not in answer.text
-    assert "/some/unknown" not in answer.text
-    assert 'deepsimbad_localization_stage_seconds_count{stage="retrieve"}' in answer.text
-    assert 'deepsimbad_belief_entropy_bits_count{domain="ready"}' in answer.text
-
-
-def test_two_applications_do_not_share_metrics(client: TestClient, tmp_path: Path) -> None:
-    with TestClient(create_app(small_settings(tmp_path))) as other:
-        assert "deepsimbad_requests_total{" not in other.get("/metrics").text
-
-
-def test_what_was_acknowledged_is_there_after_a_restart(tmp_path: Path) -> None:
-    query = {"ranked_landmarks": [3, 1, 2]}
-    with TestClient(create_app(small_settings(tmp_path))) as first:
-        make_ready_domain(first, "kept")
-        before = first.post("/v1/domains/kept/localizations", json=query).json()
-        make_ready_domain(first, "lost")
-    (tmp_path / "domains" / "lost" / "maps" / "000001.sqlite").unlink()
-    with TestClient(create_app(small_settings(tmp_path)), raise_server_exceptions=False) as second:
-        assert second.get("/readyz").json()["damaged_maps"] == ["lost"]
-        after = second.post("/v1/domains/kept/localizations", json=query).json()
-        assert {**after, "timings_ms": {}} == {**before, "timings_ms": {}}
-        assert second.post("/v1/domains/lost/localizations", json=query).status_code == 503
-
-
-def test_not_ready_while_stopping(tmp_path: Path) -> None:
-    before = set(threading.enumerate())
-    app: Any = create_app(small_settings(tmp_path))
-    with TestClient(app) as client:
-        app.state.services.stopping.set()
-        answer = client.get("/readyz")
-        assert (answer.status_code, answer.json()["code"]) == (503, "unavailable")
-        assert answer.headers["retry-after"]
-        assert client.get("/healthz").status_code == 200
-    left = {thread.name for thread in set(threading.enumerate()) - before}
-    assert not {"inference", "jobs"} & left

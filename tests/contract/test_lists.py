@@ -5,36 +5,42 @@ from typing import Any
 import pytest
 from starlette.testclient import TestClient
 
-from .conftest import N_LANDMARKS, make_ready_domain, remap
+from .conftest import RANKS, TAKES_ENCODINGS, begin, make_ready_domain, path_of, problem, remap
 
-EVALUATOR = {"kind": "feature_l2", "extractor": "none"}
-RANKS = {"ranked_landmarks": list(range(N_LANDMARKS))}
+LISTS = [
+    ("/v1/admin/domains/full/traverses", "traverses", "name", ["Z", "a", "b-1", "b.2", "drive"]),
+    ("/v1/admin/domains/full/maps", "maps", "version", [3, 2, 1]),
+    ("/v1/admin/jobs?domain=full", "jobs", "job_id", [None] * 3),
+    ("/v1/admin/sessions?domain=full", "sessions", "session_id", [None] * 4),
+]
+OF_FULL = pytest.mark.usefixtures("_full")
 
 
 def page(client: TestClient, path: str, **params: Any) -> dict[str, Any]:
-    answer = client.get(path, params=params)
+    path, _, domain = path.partition("?domain=")
+    answer = client.get(path, params={**params, **({"domain": domain} if domain else {})})
     assert answer.status_code == 200, answer.text
-    found: dict[str, Any] = answer.json()
-    assert len(found) == 2
-    assert "next" in found
-    return found
+    document: dict[str, Any] = answer.json()
+    assert len(document) == 2
+    assert "next" in document
+    return document
 
 
-def entries(client: TestClient, path: str, key: str, limit: int, **params: Any) -> list[dict[str, Any]]:
+def entries(client: TestClient, path: str, key: str, limit: int) -> list[dict[str, Any]]:
     """The whole list, read a page at a time."""
-    found: list[dict[str, Any]] = []
+    rows: list[dict[str, Any]] = []
     after: dict[str, Any] = {}
     while True:
-        answer = page(client, path, limit=limit, **params, **after)
+        answer = page(client, path, limit=limit, **after)
         assert len(answer[key]) <= limit
-        found += answer[key]
+        rows += answer[key]
         if answer["next"] is None:
-            return found
+            return rows
         after = {"after": answer["next"]}
 
 
 @pytest.fixture(scope="module")
-def full(client: TestClient) -> str:
+def _full(client: TestClient) -> None:
     """A domain with five traverses, three jobs, three maps and four sessions."""
     make_ready_domain(client, "full")
     for name in ("b.2", "a", "Z", "b-1"):
@@ -42,111 +48,78 @@ def full(client: TestClient) -> str:
     for _ in range(2):
         assert remap(client, "full", training_traverse="drive", training_episodes=0)["state"] == "succeeded"
     for _ in range(4):
-        client.post("/v1/domains/full/sessions", json={})
-    return "full"
+        begin(client, "full")
 
 
-LISTS = [
-    ("/v1/admin/domains/full/traverses", "traverses", "name", ["Z", "a", "b-1", "b.2", "drive"]),
-    ("/v1/admin/domains/full/maps", "maps", "version", [3, 2, 1]),
-    ("/v1/admin/jobs?domain=full", "jobs", "job_id", None),
-    ("/v1/admin/sessions?domain=full", "sessions", "session_id", None),
-]
-
-
-@pytest.mark.parametrize(("path", "key", "name", "expected"), LISTS, ids=[key for _, key, _, _ in LISTS])
+@OF_FULL
+@pytest.mark.parametrize(("path", "key", "name", "expected"), LISTS)
 def test_pages_of_any_length_make_up_the_list(
-    client: TestClient, full: str, path: str, key: str, name: str, expected: list[Any] | None
+    client: TestClient, path: str, key: str, name: str, expected: list[Any]
 ) -> None:
-    path, _, domain = path.partition("?domain=")
-    params = {"domain": domain} if domain else {}
-    whole = page(client, path, **params)
+    whole = page(client, path)
     assert whole["next"] is None
     names = [entry[name] for entry in whole[key]]
-    assert len(set(names)) == len(names) == {"traverses": 5, "maps": 3, "jobs": 3, "sessions": 4}[key]
-    assert expected is None or names == expected
+    assert len(set(names)) == len(names) == len(expected)
+    assert None in expected or names == expected
     for limit in (1, 2, 3, 5, 1000):
-        assert entries(client, path, key, limit, **params) == whole[key]
+        assert entries(client, path, key, limit) == whole[key]
 
 
-def test_the_last_page_says_so_even_where_it_is_full(client: TestClient, full: str) -> None:
-    assert page(client, "/v1/admin/domains/full/maps", limit=3)["next"] is None
-    assert page(client, "/v1/admin/domains/full/maps", limit=2)["next"] == "maps-2"
-    behind = page(client, "/v1/admin/domains/full/maps", after="maps-1")
-    assert behind == {"maps": [], "next": None}
+@OF_FULL
+def test_the_last_page_says_so_even_where_it_is_full(client: TestClient) -> None:
+    path = "/v1/admin/domains/full/maps"
+    assert page(client, path, limit=3)["next"] is None
+    assert page(client, path, limit=2)["next"] == "maps-2"
+    assert page(client, path, after="maps-1") == {"maps": [], "next": None}
 
 
-def test_what_is_made_meanwhile_moves_nothing(client: TestClient, full: str) -> None:
-    first = page(client, "/v1/admin/sessions", domain="full", limit=2)
-    made = client.post("/v1/domains/full/sessions", json={}).json()["session_id"]
-    rest = page(client, "/v1/admin/sessions", domain="full", after=first["next"])
+@OF_FULL
+def test_what_is_made_or_goes_meanwhile_moves_nothing(client: TestClient) -> None:
+    path = "/v1/admin/sessions?domain=full"
+    first = page(client, path, limit=2)
+    made = begin(client, "full")
+    rest = page(client, path, after=first["next"])
     shown = [session["session_id"] for session in first["sessions"] + rest["sessions"]]
-    assert made not in shown
+    assert made["session_id"] not in shown
     assert len(set(shown)) == len(shown) == 4
-    assert client.delete(f"/v1/sessions/{made}").status_code == 204
+    assert client.delete(path_of(made)).status_code == 204
 
-
-def test_what_stood_at_the_cursor_may_go(client: TestClient) -> None:
-    client.put("/v1/admin/domains/shrinking", json={"evaluator": EVALUATOR})
+    client.put("/v1/admin/domains/shrinking", json=TAKES_ENCODINGS)
     base = "/v1/admin/domains/shrinking/traverses"
     for name in "abcd":
         client.post(base, json={"name": name})
     first = page(client, base, limit=2)
-    client.delete(f"{base}/b")
-    assert [each["name"] for each in page(client, base, after=first["next"])["traverses"]] == ["c", "d"]
+    client.delete(f"{base}/b")  # what stood at the cursor
+    assert [traverse["name"] for traverse in page(client, base, after=first["next"])["traverses"]] == ["c", "d"]
 
 
-def test_a_listed_session_is_the_session(client: TestClient) -> None:
-    make_ready_domain(client, "robots")
-    old = client.post("/v1/domains/robots/sessions", json={}).json()
-    new = client.post("/v1/domains/robots/sessions", json={}).json()
+def test_a_listed_session_is_the_session(client: TestClient, domain: str) -> None:
+    old, new = path_of(begin(client, domain)), path_of(begin(client, domain))
     for _ in range(2):
-        client.post(f"/v1/sessions/{old['session_id']}/observations", json=RANKS)
-    client.put(f"/v1/sessions/{old['session_id']}/prior", json={"position_m": 10, "std_m": 2})
-    state = client.get(f"/v1/sessions/{old['session_id']}").json()
-    listed = page(client, "/v1/admin/sessions", domain="robots")["sessions"]
-    assert [each["session_id"] for each in listed] == [new["session_id"], old["session_id"]]
-    assert listed[1]["created_at"] < listed[1]["expires_at"] == state["expires_at"]
+        client.post(f"{old}/observations", json=RANKS)
+    client.put(f"{old}/prior", json={"position_m": 10, "std_m": 2})
+    state = client.get(old).json()
+    sessions = page(client, f"/v1/admin/sessions?domain={domain}")["sessions"]
+    assert [path_of(session) for session in sessions] == [new, old]
+    assert sessions[1]["created_at"] < sessions[1]["expires_at"] == state["expires_at"]
     for member in ("domain", "map_version", "n_observations"):
-        assert listed[1][member] == state[member]
-    assert (listed[0]["n_observations"], listed[1]["n_observations"]) == (0, 2)
-    assert listed[1] in entries(client, "/v1/admin/sessions", "sessions", 7)
-    client.delete(f"/v1/sessions/{old['session_id']}")
-    assert [each["session_id"] for each in page(client, "/v1/admin/sessions", domain="robots")["sessions"]] == [
-        new["session_id"]
-    ]
+        assert sessions[1][member] == state[member]
+    assert (sessions[0]["n_observations"], sessions[1]["n_observations"]) == (0, 2)
+    assert sessions[1] in entries(client, "/v1/admin/sessions", "sessions", 7)
+    client.delete(old)
+    sessions = page(client, f"/v1/admin/sessions?domain={domain}")["sessions"]
+    assert [path_of(session) for session in sessions] == [new]
 
 
+@OF_FULL
 @pytest.mark.parametrize("path", [path.partition("?")[0] for path, *_ in LISTS])
-@pytest.mark.parametrize(
-    "params",
-    [
-        {"limit": 0},
-        {"limit": 1001},
-        {"limit": "many"},
-        {"after": ""},
-        {"after": "1"},
-        {"after": "jobs-"},
-        {"after": "maps--1"},
-        {"after": "maps-1\n"},
-        {"after": "sessions-9999999999999999999"},
-        {"after": "traverses-../x"},
-        {"after": "traverses-"},
-        {"after": "of-another-list"},
-    ],
-)
-def test_a_cursor_or_limit_that_cannot_be(client: TestClient, full: str, path: str, params: dict[str, Any]) -> None:
-    answer = client.get(path, params=params)
-    assert (answer.status_code, answer.json()["code"]) == (422, "invalid_request")
-    assert next(iter(params)) in answer.json()["detail"]
-
-
-def test_a_cursor_belongs_to_its_list(client: TestClient, full: str) -> None:
-    assert client.get("/v1/admin/jobs", params={"after": "maps-1"}).status_code == 422
-    assert client.get("/v1/admin/domains/full/maps", params={"after": "jobs-1"}).status_code == 422
-
-
-@pytest.mark.parametrize("path", ["/v1/admin/jobs", "/v1/admin/sessions"])
-def test_lists_of_an_unknown_domain(client: TestClient, path: str) -> None:
-    answer = client.get(path, params={"domain": "nowhere"})
-    assert (answer.status_code, answer.json()["code"]) == (404, "unknown_domain")
+def test_a_cursor_or_limit_that_cannot_be(client: TestClient, path: str) -> None:
+    what = path.rpartition("/")[2]
+    other = "jobs-1" if what == "maps" else "maps-1"  # a cursor belongs to its list
+    wrong = ["", "1", f"{what}-", f"{what}-../x", f"{what}-1\n", other]
+    if what != "traverses":  # whose keys are names
+        wrong += [f"{what}--1", f"{what}-9999999999999999999"]
+    for name, values in (("limit", [0, 1001, "many"]), ("after", wrong)):
+        for value in values:
+            answer = client.get(path, params={name: value})
+            assert name in problem(answer, 422, "invalid_request")["detail"], value

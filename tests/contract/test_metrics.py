@@ -1,145 +1,189 @@
-"""`/metrics`: what is shown of maps, jobs, sessions and the disk, and when it goes again."""
+"""`/metrics`: requests, maps, jobs, sessions, the disk, and when they go again; `timings_ms` under the same names."""
 
 import re
 import shutil
+import threading
 from collections.abc import Iterator
 from pathlib import Path
-from typing import cast
+from time import perf_counter, sleep
+from typing import Any
 
-import numpy as np
 import pytest
-from fastapi import FastAPI
 from starlette.testclient import TestClient
 
-from deepsimbad.api.app import create_app
-from deepsimbad.api.requests import Services
-from deepsimbad.jobs.runner import InThisProcess
-from deepsimbad.store.catalog import Catalog
+from .conftest import (
+    JPEG,
+    N_READY,
+    RANKS,
+    begin,
+    encoded,
+    make_ready_domain,
+    path_of,
+    picture,
+    ready_encodings,
+    remap,
+    service,
+    services_of,
+    upload,
+)
 
-from .conftest import N_READY, NPZ, make_ready_domain, npz, ready_encodings, remap, small_settings
-
-Samples = dict[str, float]
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "operations.md"
+COMMON = {"receive", "wait", "decode", "encode", "describe", "retrieve", "plan", "total"}
+STAGES = {"localizations": COMMON | {"shortlist", "belief"}}
+STAGES["observations"] = COMMON | {"predict", "update", "commit", "summarise"}
 
 
 @pytest.fixture
-def service(tmp_path: Path) -> Iterator[TestClient]:
-    with TestClient(
-        create_app(small_settings(tmp_path), InThisProcess(tmp_path)), raise_server_exceptions=False
-    ) as client:
+def own(tmp_path: Path) -> Iterator[TestClient]:
+    with service(tmp_path) as client:
         make_ready_domain(client, "ready")
         yield client
 
 
-def services_of(client: TestClient) -> Services:
-    return cast("FastAPI", client.app).state.services  # type: ignore[no-any-return]
-
-
-def scraped(client: TestClient) -> Samples:
+def scraped(client: TestClient) -> dict[str, float]:
     answer = client.get("/metrics")
     assert answer.status_code == 200, answer.text
+    assert answer.headers["content-type"].startswith("text/plain")
     return {name: float(value) for name, value in re.findall(r"^([^#\s]+) (\S+)$", answer.text, re.MULTILINE)}
 
 
-def drive_backwards(client: TestClient) -> None:
-    """A traverse that no map can be made of."""
-    client.post("/v1/admin/domains/ready/traverses", json={"name": "backwards"})
-    batch = npz(encodings=ready_encodings()[:2], index=np.arange(2), position_m=np.array([1.0, 0.0]))
-    stored = client.post("/v1/admin/domains/ready/traverses/backwards/frames", content=batch, headers=NPZ)
-    assert stored.status_code == 200, stored.text
+def test_metrics_count_by_route_and_not_by_path_each_application_for_itself(client: TestClient, tmp_path: Path) -> None:
+    counted = 'deepsimbad_requests_total{method="POST",route="/v1/domains/{domain}/localizations",status="200"}'
+    before = scraped(client).get(counted, 0)
+    client.post("/v1/domains/ready/localizations", json=RANKS)
+    client.get("/v1/domains/some-unknown-name")
+    client.get("/some/unknown/path")
+    shown = scraped(client)
+    assert shown[counted] == before + 1
+    assert 'deepsimbad_localization_stage_seconds_count{stage="retrieve"}' in shown
+    assert 'deepsimbad_belief_entropy_bits_count{domain="ready"}' in shown
+    assert not [name for name in shown if "unknown-name" in name or "/some/unknown" in name]
+    with service(tmp_path) as other:
+        assert not [name for name in scraped(other) if name.startswith("deepsimbad_requests_total{")]
 
 
-def test_a_domains_map_is_shown(service: TestClient) -> None:
-    found = scraped(service)
-    about = service.get("/v1/domains/ready").json()
-    assert found['deepsimbad_active_map_version{domain="ready"}'] == 1
-    assert found['deepsimbad_map_images{domain="ready"}'] == N_READY
-    bits = about["index_bits_per_map_image"]
-    assert found['deepsimbad_map_index_bytes{domain="ready"}'] == pytest.approx(bits * N_READY / 8)
-    assert 0 <= found['deepsimbad_map_age_seconds{domain="ready"}'] < 3600
-    assert found['deepsimbad_map_damaged{domain="ready"}'] == 0
-    assert found["deepsimbad_domains"] == found["deepsimbad_loaded_maps"] == 1
+def test_a_map_and_the_last_remap(own: TestClient) -> None:
+    shown = scraped(own)
+    assert shown['deepsimbad_active_map_version{domain="ready"}'] == 1
+    assert shown['deepsimbad_map_images{domain="ready"}'] == N_READY
+    bits = own.get("/v1/domains/ready").json()["index_bits_per_map_image"]
+    assert shown['deepsimbad_map_index_bytes{domain="ready"}'] == pytest.approx(bits * N_READY / 8)
+    assert 0 <= shown['deepsimbad_map_age_seconds{domain="ready"}'] < 3600
+    assert shown['deepsimbad_map_damaged{domain="ready"}'] == 0
+    assert shown["deepsimbad_domains"] == shown["deepsimbad_loaded_maps"] == 1
+    assert (shown['deepsimbad_jobs{state="succeeded"}'], shown['deepsimbad_jobs{state="failed"}']) == (1, 0)
+    assert shown['deepsimbad_job_seconds_count{kind="remap",state="succeeded"}'] == 1
+    assert shown['deepsimbad_job_seconds_sum{kind="remap",state="succeeded"}'] > 0
+    assert shown['deepsimbad_last_remap{domain="ready",outcome="succeeded"}'] == 1
+    ended_at = shown['deepsimbad_last_remap_timestamp_seconds{domain="ready"}']
+    upload(own, "ready", "backwards", ready_encodings()[:2], [1.0, 0.0])
+    assert remap(own, "ready", training_traverse="backwards")["state"] == "failed"
+    shown = scraped(own)
+    outcomes = {name: value for name, value in shown.items() if name.startswith("deepsimbad_last_remap{")}
+    failed = 'deepsimbad_last_remap{domain="ready",outcome="failed"}'
+    assert (len(outcomes), [name for name, value in outcomes.items() if value]) == (4, [failed])
+    assert shown['deepsimbad_last_remap_timestamp_seconds{domain="ready"}'] > ended_at
+    assert shown['deepsimbad_job_seconds_count{kind="remap",state="failed"}'] == 1
+    assert shown['deepsimbad_active_map_version{domain="ready"}'] == 1
 
 
-def test_jobs_and_the_last_remap(service: TestClient) -> None:
-    found = scraped(service)
-    assert found['deepsimbad_jobs{state="succeeded"}'] == 1
-    assert found['deepsimbad_jobs{state="failed"}'] == 0
-    assert found['deepsimbad_job_seconds_count{kind="remap",state="succeeded"}'] == 1
-    assert found['deepsimbad_job_seconds_sum{kind="remap",state="succeeded"}'] > 0
-    assert found['deepsimbad_last_remap{domain="ready",outcome="succeeded"}'] == 1
-    ended_at = found['deepsimbad_last_remap_timestamp_seconds{domain="ready"}']
-    drive_backwards(service)
-    assert remap(service, "ready", training_traverse="backwards")["state"] == "failed"
-    found = scraped(service)
-    outcomes = {name: value for name, value in found.items() if name.startswith("deepsimbad_last_remap{")}
-    assert len(outcomes) == 4
-    assert [name for name, value in outcomes.items() if value] == [
-        'deepsimbad_last_remap{domain="ready",outcome="failed"}'
-    ]
-    assert found['deepsimbad_last_remap_timestamp_seconds{domain="ready"}'] > ended_at
-    assert found['deepsimbad_job_seconds_count{kind="remap",state="failed"}'] == 1
-    assert found['deepsimbad_active_map_version{domain="ready"}'] == 1
-
-
-def test_sessions_disk_release_and_process(service: TestClient, tmp_path: Path) -> None:
-    service.post("/v1/domains/ready/sessions", json={})
-    found = scraped(service)
-    assert found["deepsimbad_sessions"] == 1
+def test_sessions_disk_release_and_process(own: TestClient, tmp_path: Path) -> None:
+    begin(own)
+    shown = scraped(own)
+    assert shown["deepsimbad_sessions"] == 1
     usage = shutil.disk_usage(tmp_path)
-    assert found["deepsimbad_data_dir_size_bytes"] == usage.total
-    assert abs(found["deepsimbad_data_dir_free_bytes"] - usage.free) < 1 << 30
-    assert found["deepsimbad_ready"] == 1
-    assert [value for name, value in found.items() if name.startswith("deepsimbad_build_info{")] == [1]
-    assert found["process_resident_memory_bytes"] > 1e6
-    assert found["process_open_fds"] > 3
-    assert not [name for name in found if "_created" in name]
+    assert shown["deepsimbad_data_dir_size_bytes"] == usage.total
+    assert abs(shown["deepsimbad_data_dir_free_bytes"] - usage.free) < 1 << 30
+    assert [value for name, value in shown.items() if name.startswith("deepsimbad_build_info{")] == [1]
+    assert shown["process_resident_memory_bytes"] > 1e6
+    assert shown["process_open_fds"] > 3
+    assert not [name for name in shown if "_created" in name]
+    services_of(own).catalog._db.execute("DROP TABLE job")
+    shown = scraped(own)
+    assert "deepsimbad_sessions" in shown, "what can be read is shown"
+    assert "deepsimbad_domains" not in shown
 
 
-def test_a_damaged_map_is_shown_until_another_serves(tmp_path: Path) -> None:
-    with TestClient(create_app(small_settings(tmp_path), InThisProcess(tmp_path))) as client:
+def test_a_damaged_map_is_shown_until_it_is_back_or_another_serves(tmp_path: Path) -> None:
+    with service(tmp_path) as client:
         make_ready_domain(client, "ready")
         assert remap(client, "ready", training_traverse="drive")["state"] == "succeeded"
-    (tmp_path / "domains/ready/maps/000002.sqlite").unlink()
-    with TestClient(
-        create_app(small_settings(tmp_path), InThisProcess(tmp_path)), raise_server_exceptions=False
-    ) as client:
-        found = scraped(client)
-        assert found['deepsimbad_map_damaged{domain="ready"}'] == 1
-        assert found['deepsimbad_active_map_version{domain="ready"}'] == 2
-        assert 'deepsimbad_map_images{domain="ready"}' not in found
-        assert client.get("/readyz").json() == {"status": "ready", "damaged_maps": ["ready"]}
-        assert client.put("/v1/admin/domains/ready/active-map", json={"version": 1}).status_code == 200
-        assert client.get("/readyz").json() == {"status": "ready", "damaged_maps": []}
-        assert scraped(client)['deepsimbad_map_damaged{domain="ready"}'] == 0
-
-
-def test_a_map_put_back_is_not_damaged_any_more(tmp_path: Path) -> None:
-    with TestClient(create_app(small_settings(tmp_path), InThisProcess(tmp_path))) as client:
-        make_ready_domain(client, "ready")
-    path = tmp_path / "domains/ready/maps/000001.sqlite"
+    path = tmp_path / "domains/ready/maps/000002.sqlite"
     path.rename(tmp_path / "aside")
-    with TestClient(
-        create_app(small_settings(tmp_path), InThisProcess(tmp_path)), raise_server_exceptions=False
-    ) as client:
-        assert client.get("/readyz").json()["damaged_maps"] == ["ready"]
-        (tmp_path / "aside").rename(path)
+    with service(tmp_path) as client:
         maps = services_of(client).maps
+        maps._clock = lambda: 0.0
+
+        def damaged() -> tuple[float, float, list[str]]:
+            shown = scraped(client)
+            ready = client.get("/readyz").json()
+            assert ready["status"] == "ready"
+            version = shown['deepsimbad_active_map_version{domain="ready"}']
+            return version, shown['deepsimbad_map_damaged{domain="ready"}'], ready["damaged_maps"]
+
+        assert damaged() == (2, 1, ["ready"])
+        assert 'deepsimbad_map_images{domain="ready"}' not in scraped(client)
+        (tmp_path / "aside").rename(path)
         maps._clock = lambda: 1e9  # damage is remembered for some seconds
-        assert client.get("/readyz").json()["damaged_maps"] == []
+        assert damaged() == (2, 0, [])
+    path.unlink()
+    with service(tmp_path) as client:
+        assert damaged() == (2, 1, ["ready"])
+        assert client.put("/v1/admin/domains/ready/active-map", json={"version": 1}).status_code == 200
+        assert damaged() == (1, 0, [])
 
 
-def test_a_deleted_domain_takes_its_series_along(service: TestClient) -> None:
-    service.post("/v1/domains/ready/localizations", json={"ranked_landmarks": [0]})
-    assert any('domain="ready"' in name for name in scraped(service))
-    services = services_of(service)
-    assert service.delete("/v1/admin/domains/ready").status_code == 204
-    services.metrics.localized("ready", {"plan": 1.0}, 2.0)  # a view that was on its way
-    assert not [name for name in scraped(service) if 'domain="ready"' in name]
+def test_a_deleted_domain_takes_its_series_along(client: TestClient, domain: str) -> None:
+    client.post(f"/v1/domains/{domain}/localizations", json=RANKS)
+    assert any(f'domain="{domain}"' in name for name in scraped(client))
+    assert client.delete(f"/v1/admin/domains/{domain}").status_code == 204
+    services_of(client).metrics.localized(domain, {"plan": 1.0}, 2.0)  # a view that was on its way
+    assert not [name for name in scraped(client) if f'domain="{domain}"' in name]
 
 
-def test_metrics_are_shown_though_the_catalog_cannot_be_read(service: TestClient) -> None:
-    catalog: Catalog = services_of(service).catalog
-    catalog._db.execute("DROP TABLE job")
-    found = scraped(service)
-    assert "deepsimbad_sessions" in found
-    assert "deepsimbad_domains" not in found
+# Stages
+
+
+@pytest.mark.parametrize("call", STAGES)
+def test_every_stage_is_told_and_counted(client: TestClient, call: str) -> None:
+    path = "/v1/domains/seen" if call == "localizations" else path_of(begin(client, "seen"))
+    names = {stage: f'deepsimbad_localization_stage_seconds_count{{stage="{stage}"}}' for stage in STAGES[call]}
+    before = scraped(client)
+    timings_ms = client.post(f"{path}/{call}", content=encoded(picture(1)), headers=JPEG).json()["timings_ms"]
+    assert set(timings_ms) == STAGES[call]
+    assert min(timings_ms.values()) >= 0
+    total = timings_ms.pop("total")
+    assert 0 < sum(timings_ms.values()) <= total + 0.001 * len(names)  # each is rounded
+    assert min(timings_ms["decode"], timings_ms["describe"]) > 0
+    after = scraped(client)
+    counts = {name: value for name, value in after.items() if "stage_seconds_count" in name}
+    assert {name for name, value in counts.items() if value == before.get(name, 0) + 1} == set(names.values())
+
+
+def test_a_busy_worker_shows_as_waiting(client: TestClient) -> None:
+    worker = services_of(client).worker
+    begun, let_go, answered, held_ms = threading.Event(), threading.Event(), threading.Event(), [0.0]
+
+    def hold() -> None:
+        while not worker.n_waiting and not answered.is_set():
+            sleep(0.001)
+        began = perf_counter()
+        sleep(0.05)
+        held_ms[0] = 1000 * (perf_counter() - began)
+        let_go.set()
+
+    worker.submit(lambda: (begun.set(), let_go.wait(60)))
+    assert begun.wait(60)
+    holder = threading.Thread(target=hold)
+    holder.start()
+    timings_ms: dict[str, Any] = client.post("/v1/domains/ready/localizations", json=RANKS).json()["timings_ms"]
+    answered.set()
+    holder.join()
+    assert timings_ms["wait"] >= held_ms[0] - 0.001
+
+
+def test_every_stage_is_explained_to_operators_and_no_other() -> None:
+    section = PAGE.read_text(encoding="utf-8").split("### DeepSimbadSlow")[1].split("### ")[0]
+    rows = re.findall(r"^\| (`[^|]*) \|", section, re.MULTILINE)
+    explained = {stage for row in rows for stage in re.findall(r"`(\w+)`", row)}
+    assert explained == set.union(*STAGES.values()) - {"total"}

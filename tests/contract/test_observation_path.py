@@ -7,13 +7,10 @@ from types import CodeType
 from typing import Any
 
 import httpx2
-from starlette.testclient import TestClient
 
 import deepsimbad
-from deepsimbad.api.app import create_app
-from deepsimbad.jobs.runner import InThisProcess
 
-from .conftest import N_LANDMARKS, make_ready_domain, small_settings
+from .conftest import RANKS, make_ready_domain, service
 
 MOST_FILES, MOST_FUNCTIONS = 23, 97
 PROJECT = str(Path(deepsimbad.__file__).parent)
@@ -35,13 +32,12 @@ class Profile:
         async with httpx2.AsyncClient(transport=httpx2.ASGITransport(app), base_url="http://robot") as robot:
             begun = await robot.post("/v1/domains/ready/sessions", json={})
             path = f"/v1/sessions/{begun.json()['session_id']}/observations?action_m=2"
-            view = {"ranked_landmarks": list(range(N_LANDMARKS))}
             for _ in range(3):
-                assert (await robot.post(path, json=view)).status_code == 200
+                assert (await robot.post(path, json=RANKS)).status_code == 200
             before, self.is_on = sys.getprofile(), True
             sys.setprofile(self)
             try:
-                answer = await robot.post(path, json=view)
+                answer = await robot.post(path, json=RANKS)
             finally:
                 self.is_on = False
                 sys.setprofile(before)
@@ -52,7 +48,7 @@ def test_an_observation_passes_through_few_files_and_functions(tmp_path: Path) -
     profile = Profile()
     threading.setprofile(profile)
     try:
-        with TestClient(create_app(small_settings(tmp_path), InThisProcess(tmp_path))) as client:
+        with service(tmp_path) as client:
             make_ready_domain(client, "ready")
             assert client.portal is not None
             client.portal.call(profile.of_an_observation, client.app)

@@ -1,7 +1,6 @@
-"""`POST /v1/sessions/{session_id}/truths`: how good the live answers were."""
+"""Where a session truly was: how good its answers were (`truths`), what the next map learns of it (`experience`)."""
 
 import re
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -9,221 +8,260 @@ import numpy as np
 import pytest
 from starlette.testclient import TestClient
 
-from deepsimbad.api.app import create_app
+from deepsimbad.engine.maps import load_snapshot
 from deepsimbad.errors import UnavailableError
-from deepsimbad.jobs.runner import InThisProcess
 
-from .conftest import N_READY, make_ready_domain, ready_encodings, remap, small_settings, wait_for
+from .conftest import (
+    N_LANDMARKS,
+    N_READY,
+    begin,
+    make_ready_domain,
+    path_of,
+    problem,
+    ready_encodings,
+    remap,
+    services_of,
+    wait_for,
+)
 
 STEP_M = 4.0
 NO_RANKS: dict[str, Any] = {"retrieval_ranks": None, "map_version": 1}
+ANEW = {"training_traverse": "drive", "landmark_traverse": "drive"}
 
 
-@pytest.fixture
-def service(tmp_path: Path) -> Iterator[TestClient]:
-    with TestClient(
-        create_app(small_settings(tmp_path), InThisProcess(tmp_path)), raise_server_exceptions=False
-    ) as client:
-        make_ready_domain(client, "ready")
-        yield client
+class Walk:
+    """A session that drives along the map itself, two images a view.
+
+    Attributes:
+        positions_m: Where it was.
+        shares: The rank share of the truth in the belief after every view.
+        retrievals: The relevance of every map image, by view.
+    """
+
+    def __init__(self, client: TestClient, domain: str, n_views: int = 5) -> None:
+        self._client, self._domain = client, domain
+        session = begin(client, domain)
+        self.session_id, self.path = session["session_id"], path_of(session)
+        self.positions_m = [STEP_M * view for view in range(n_views)]
+        self.shares: list[float] = []
+        self.retrievals: list[dict[int, float]] = []
+        for view in range(n_views):
+            body = {"encoding": (ready_encodings()[2 * view] + 0.8).tolist()}
+            url = f"{self.path}/observations?action_m={STEP_M}&shortlist={N_READY}"
+            answer = client.post(url, json=body)
+            assert answer.status_code == 200, answer.text
+            document = answer.json()
+            self.retrievals.append({place["map_image"]: place["relevance"] for place in document["retrieval"]})
+            mass = {place["map_image"]: place["mass"] for place in document["belief"]["top"]}
+            self.shares.append(rank(mass, [2 * view]) / N_READY)
+
+    def told(self, positions_m: list[Any], **more: Any) -> dict[str, Any]:
+        answer = self._client.post(f"{self.path}/truths", json={"true_positions_m": positions_m, **more})
+        assert answer.status_code == 200, answer.text
+        document: dict[str, Any] = answer.json()
+        return document
+
+    def counted(self) -> tuple[int, float]:
+        """How many observations the metric has counted, and their ranks' sum in percent."""
+        pattern = rf'^deepsimbad_live_anr_percent_(count|sum)\{{domain="{self._domain}"\}} (\S+)$'
+        shown = dict(re.findall(pattern, self._client.get("/metrics").text, re.MULTILINE))
+        return int(float(shown.get("count", 0))), float(shown.get("sum", 0))
+
+    def learn(self, positions_m: list[Any] | None = None, domain: str | None = None) -> Any:
+        body = {"session_id": self.session_id, "true_positions_m": positions_m or self.positions_m}
+        return self._client.post(f"/v1/admin/domains/{domain or self._domain}/experience", json=body)
 
 
-def walked(client: TestClient, n_views: int = 5) -> tuple[str, list[float], list[float]]:
-    """A session that drives along the map itself, where it was, and the rank share of the truth after every view."""
-    session_id = client.post("/v1/domains/ready/sessions", json={}).json()["session_id"]
-    shares = []
-    for view in range(n_views):
-        body = {"encoding": (ready_encodings()[2 * view] + 0.8).tolist()}
-        moved = client.post(f"/v1/sessions/{session_id}/observations?action_m={STEP_M}", json=body)
-        assert moved.status_code == 200, moved.text
-        shown = client.get(f"/v1/sessions/{session_id}?shortlist={N_READY}").json()["belief"]["top"]
-        mass = {place["map_image"]: place["mass"] for place in shown}
-        better = sum(other > mass[2 * view] for other in mass.values())
-        tied = sum(other == mass[2 * view] for other in mass.values()) - 1
-        shares.append((better + tied / 2) / N_READY)
-    return session_id, [STEP_M * view for view in range(n_views)], shares
+def rank(scores: dict[int, float], true_images: list[int]) -> float:
+    """Images above the best true one, and half of those beside it."""
+    best = max(scores[image] for image in true_images)
+    return sum(score > best for score in scores.values()) + (list(scores.values()).count(best) - 1) / 2
 
 
-def told(client: TestClient, session_id: str, positions_m: list[Any]) -> Any:
-    answer = client.post(f"/v1/sessions/{session_id}/truths", json={"true_positions_m": positions_m})
-    assert answer.status_code == 200, answer.text
-    return answer.json()
-
-
-def counted(client: TestClient) -> tuple[int, float]:
-    """How many observations the metric has counted, and their ranks' sum in percent."""
-    text = client.get("/metrics").text
-    found = dict(re.findall(r'^deepsimbad_live_anr_percent_(count|sum)\{domain="ready"\} (\S+)$', text, re.MULTILINE))
-    return int(float(found.get("count", 0))), float(found.get("sum", 0))
-
-
-def test_the_answer_is_the_anr_of_the_beliefs_that_were_answered(service: TestClient) -> None:
-    session_id, positions_m, shares = walked(service)
-    assert len(set(shares)) > 1, "else nothing is shown"
-    expected = 100 * float(np.mean(shares))
-    answer = told(service, session_id, positions_m)
-    assert answer == {"n_scored": 5, "n_left_out": 0, "anr": pytest.approx(expected), **NO_RANKS}
-    assert counted(service) == (5, pytest.approx(100 * sum(shares)))
-    some = told(service, session_id, [None, *positions_m[1:3], None, None])
+def test_the_answer_is_the_anr_of_the_beliefs_that_were_answered(client: TestClient, domain: str) -> None:
+    walk = Walk(client, domain)
+    assert len(set(walk.shares)) > 1, "else nothing is shown"
+    shares = walk.shares
+    expected = pytest.approx(100 * float(np.mean(shares)))
+    assert walk.told(walk.positions_m) == {"n_scored": 5, "n_left_out": 0, "anr": expected, **NO_RANKS}
+    assert walk.counted() == (5, pytest.approx(100 * sum(shares)))
+    some = walk.told([None, *walk.positions_m[1:3], None, None])
     assert some == {"n_scored": 2, "n_left_out": 3, "anr": pytest.approx(50 * sum(shares[1:3])), **NO_RANKS}
-    none = told(service, session_id, [None] * 5)
-    assert none == {"n_scored": 0, "n_left_out": 5, "anr": None, **NO_RANKS}
+    assert walk.told([None] * 5) == {"n_scored": 0, "n_left_out": 5, "anr": None, **NO_RANKS}
 
 
-def test_each_view_is_ranked_by_the_map_images_told(service: TestClient) -> None:
+def test_each_view_is_ranked_by_the_map_images_told(client: TestClient, domain: str) -> None:
     """Bit by bit as at once, by ANR's rule, also after the session went on or ended."""
-    session_id = service.post("/v1/domains/ready/sessions", json={}).json()["session_id"]
-    retrievals = []
-    for view in range(6):
-        body = {"encoding": (ready_encodings()[2 * view] + 0.8).tolist()}
-        path = f"/v1/sessions/{session_id}/observations?action_m={STEP_M}&shortlist={N_READY}"
-        retrieval = service.post(path, json=body).json()["retrieval"]
-        retrievals.append({place["map_image"]: place["relevance"] for place in retrieval})
+    walk = Walk(client, domain, 6)
     images = [[2 * view, 2 * view + 1] if view != 1 else [] for view in range(6)]
-
-    def rank(view: int) -> float | None:
-        if not images[view]:
-            return None
-        relevance = retrievals[view]
-        best = max(relevance[image] for image in images[view])
-        return sum(one > best for one in relevance.values()) + (list(relevance.values()).count(best) - 1) / 2
-
-    expected = [rank(view) for view in range(6)]
+    expected = [rank(walk.retrievals[view], images[view]) if images[view] else None for view in range(6)]
     assert len(set(expected)) > 2, "else nothing is shown"
 
     def ranks(first: int, last: int) -> list[float | None]:
-        part = {"true_positions_m": [None] * (last - first), "true_map_images": images[first:last]}
-        answer = service.post(f"/v1/sessions/{session_id}/truths", json={**part, "first_observation": first})
-        assert answer.status_code == 200, answer.text
-        assert answer.json()["n_left_out"] == last - first
-        found: list[float | None] = answer.json()["retrieval_ranks"]
-        return found
+        unknown = [None] * (last - first)
+        answer = walk.told(unknown, true_map_images=images[first:last], first_observation=first)
+        assert answer["n_left_out"] == last - first
+        ranks: list[float | None] = answer["retrieval_ranks"]
+        return ranks
 
     assert ranks(0, 6) == expected
     assert ranks(3, 6) == expected[3:]
-    service.put(f"/v1/sessions/{session_id}/prior", json={"position_m": 3.0, "std_m": 1.0})
+    client.put(f"{walk.path}/prior", json={"position_m": 3.0, "std_m": 1.0})
     body = {"encoding": ready_encodings()[12].tolist()}
-    retrieval = service.post(f"/v1/sessions/{session_id}/observations", json=body).json()["retrieval"]
-    assert retrieval[0]["map_image"] == 12
+    assert client.post(f"{walk.path}/observations", json=body).json()["retrieval"][0]["map_image"] == 12
     images.append([12])
     assert ranks(6, 7) == [0]
-    service.delete(f"/v1/sessions/{session_id}")
+    client.delete(walk.path)
     assert ranks(2, 7) == [*expected[2:], 0]
-    assert counted(service)[0] == 0, "the alarm is of positions alone"
+    assert walk.counted()[0] == 0, "the alarm is of positions alone"
 
 
-def test_a_truth_far_from_the_map_says_nothing_of_it(service: TestClient) -> None:
-    session_id, positions_m, shares = walked(service, 3)
+def test_a_truth_far_from_the_map_says_nothing_of_it(client: TestClient, domain: str) -> None:
+    walk = Walk(client, domain, 3)
     last_m = 2.0 * (N_READY - 1)
-    answer = told(service, session_id, [positions_m[0], 1e9, last_m + 10.5])
-    assert answer == {"n_scored": 1, "n_left_out": 2, "anr": pytest.approx(100 * shares[0]), **NO_RANKS}
-    assert counted(service)[0] == 1
-    assert told(service, session_id, [None, None, last_m + 9.5])["n_scored"] == 1
+    answer = walk.told([walk.positions_m[0], 1e9, last_m + 10.5])
+    assert answer == {"n_scored": 1, "n_left_out": 2, "anr": pytest.approx(100 * walk.shares[0]), **NO_RANKS}
+    assert walk.counted()[0] == 1
+    assert walk.told([None, None, last_m + 9.5])["n_scored"] == 1
 
 
-def test_an_observation_is_counted_once(service: TestClient) -> None:
-    session_id, positions_m, shares = walked(service)
-    told(service, session_id, [*positions_m[:3], None, None])
-    assert counted(service) == (3, pytest.approx(100 * sum(shares[:3])))
-    told(service, session_id, [*positions_m[:3], None, None])
-    assert counted(service)[0] == 3
-    told(service, session_id, positions_m)
-    assert counted(service) == (5, pytest.approx(100 * sum(shares)))
-    service.post(f"/v1/sessions/{session_id}/observations", json={"ranked_landmarks": [1]})
-    told(service, session_id, [*positions_m, 16.0])
-    assert counted(service)[0] == 6
-    assert service.get(f"/v1/sessions/{session_id}").json()["n_observations"] == 6, "telling moves nothing"
-
-
-def test_a_truth_that_is_unknown_for_once_stays_told(service: TestClient) -> None:
-    session_id, positions_m, _ = walked(service)
-    told(service, session_id, positions_m)
-    told(service, session_id, [None] * 5)
-    told(service, session_id, positions_m)
-    assert counted(service)[0] == 5
-
-
-def test_experience_counts_as_well_and_the_same_positions_only_once(service: TestClient) -> None:
-    session_id, positions_m, shares = walked(service)
-    service.delete(f"/v1/sessions/{session_id}")
-    body = {"session_id": session_id, "true_positions_m": positions_m}
-    job = service.post("/v1/admin/domains/ready/experience", json=body).json()
-    assert counted(service) == (5, pytest.approx(100 * sum(shares)))
-    told(service, session_id, positions_m)
-    service.post("/v1/admin/domains/ready/experience", json=body)
-    assert counted(service)[0] == 5
-    assert wait_for(service, job["job_id"])["state"] == "succeeded"
-
-
-def test_experience_that_is_refused_counts_once_as_well(service: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
-    session_id, positions_m, _ = walked(service)
-    body = {"session_id": session_id, "true_positions_m": positions_m}
+def test_an_observation_is_counted_once_whoever_tells(
+    client: TestClient, domain: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    walk = Walk(client, domain)
+    for _ in range(2):
+        walk.told([*walk.positions_m[:3], None, None])
+        assert walk.counted() == (3, pytest.approx(100 * sum(walk.shares[:3])))
+    for positions_m in (walk.positions_m, [None] * 5, walk.positions_m):
+        walk.told(positions_m)
+        assert walk.counted() == (5, pytest.approx(100 * sum(walk.shares)))
+    client.post(f"{walk.path}/observations", json={"ranked_landmarks": [1]})
+    walk.told([*walk.positions_m, 16.0])
+    assert walk.counted()[0] == 6
+    assert client.get(walk.path).json()["n_observations"] == 6, "telling moves nothing"
 
     def refuse(*_: object) -> None:
         raise UnavailableError("no job is taken now")
 
+    walk = Walk(client, domain)
     with monkeypatch.context() as patch:
-        patch.setattr(service.app.state.services.runner, "submit", refuse)  # type: ignore[attr-defined]
-        answer = service.post("/v1/admin/domains/ready/experience", json=body)
-    assert (answer.status_code, answer.json()["code"]) == (503, "unavailable")
-    job = service.post("/v1/admin/domains/ready/experience", json=body).json()
-    assert counted(service)[0] == 5
-    assert wait_for(service, job["job_id"])["state"] == "succeeded"
+        patch.setattr(services_of(client).runner, "submit", refuse)
+        problem(walk.learn(), 503, "unavailable")
+    client.delete(walk.path)
+    jobs = [walk.learn().json() for _ in range(2)]
+    walk.told(walk.positions_m)
+    assert walk.counted()[0] == 11
+    assert [wait_for(client, job["job_id"])["state"] for job in jobs] == ["succeeded"] * 2
 
 
-def test_the_season_may_have_turned_meanwhile(service: TestClient) -> None:
+def test_the_season_may_have_turned_meanwhile(client: TestClient, domain: str) -> None:
     """Another map serves, with other landmarks: the session's own still tells."""
-    session_id, positions_m, shares = walked(service)
-    remap(service, "ready", training_traverse="drive", landmark_traverse="drive", n_landmarks=7)
-    service.delete(f"/v1/sessions/{session_id}")
-    answer = told(service, session_id, positions_m)
-    assert answer["map_version"] == 1
-    assert answer["anr"] == pytest.approx(100 * float(np.mean(shares)))
+    walk = Walk(client, domain)
+    remap(client, domain, **ANEW, n_landmarks=7)
+    client.delete(walk.path)
+    answer = walk.told(walk.positions_m)
+    assert (answer["map_version"], answer["anr"]) == (1, pytest.approx(100 * float(np.mean(walk.shares))))
 
 
-def test_a_deleted_domain_takes_its_series_along(service: TestClient) -> None:
-    session_id, positions_m, _ = walked(service)
-    told(service, session_id, positions_m)
-    assert service.delete("/v1/admin/domains/ready").status_code == 204
-    assert 'domain="ready"' not in service.get("/metrics").text
-    answer = service.post(f"/v1/sessions/{session_id}/truths", json={"true_positions_m": positions_m})
-    assert (answer.status_code, answer.json()["code"]) == (410, "retired_map")
-    assert 'domain="ready"' not in service.get("/metrics").text
+def test_a_deleted_domain_takes_its_series_along(client: TestClient, domain: str) -> None:
+    walk = Walk(client, domain)
+    walk.told(walk.positions_m)
+    assert client.delete(f"/v1/admin/domains/{domain}").status_code == 204
+    assert f'domain="{domain}"' not in client.get("/metrics").text
+    answer = client.post(f"{walk.path}/truths", json={"true_positions_m": walk.positions_m})
+    problem(answer, 410, "retired_map")
+    assert f'domain="{domain}"' not in client.get("/metrics").text
 
 
 @pytest.mark.parametrize(
     ("body", "code"),
     [
-        (b'{"true_positions_m": [1, 2, 3]}', "invalid_input"),
-        (b'{"true_positions_m": [1]}', "invalid_input"),
-        (b'{"true_positions_m": [1, NaN]}', "invalid_input"),
-        (b'{"true_positions_m": [1, 1e999]}', "invalid_input"),
-        (b'{"true_positions_m": []}', "invalid_request"),
-        (b'{"true_positions_m": ["1", 2]}', "invalid_request"),
-        (b'{"true_positions_m": [true, 2]}', "invalid_request"),
-        (b'{"true_positions_m": null}', "invalid_request"),
-        (b'{"true_positions_m": [1, 2], "more": 1}', "invalid_request"),
-        (b'{"true_positions_m": [null, null], "true_map_images": [[1]]}', "invalid_input"),
-        (b'{"true_positions_m": [null, null], "true_map_images": [[1], [1000]]}', "invalid_input"),
-        (b'{"true_positions_m": [null, null], "true_map_images": [[1], [-1]]}', "invalid_request"),
-        (b'{"true_positions_m": [null, null], "true_map_images": [[1], [99999999999999999999]]}', "invalid_request"),
-        (b'{"true_positions_m": [1, 2], "first_observation": 1000000000000}', "invalid_input"),
-        (b'{}', "invalid_request"),
-        (b'[1, 2]', "invalid_request"),
-        (b'', "empty_body"),
+        ('{"true_positions_m": [1, 2, 3]}', "invalid_input"),
+        ('{"true_positions_m": [1]}', "invalid_input"),
+        ('{"true_positions_m": [1, NaN]}', "invalid_input"),
+        ('{"true_positions_m": [1, 1e999]}', "invalid_input"),
+        ('{"true_positions_m": []}', "invalid_request"),
+        ('{"true_positions_m": ["1", 2]}', "invalid_request"),
+        ('{"true_positions_m": [true, 2]}', "invalid_request"),
+        ('{"true_positions_m": null}', "invalid_request"),
+        ('{"true_positions_m": [1, 2], "more": 1}', "invalid_request"),
+        ('{"true_positions_m": [null, null], "true_map_images": [[1]]}', "invalid_input"),
+        ('{"true_positions_m": [null, null], "true_map_images": [[1], [1000]]}', "invalid_input"),
+        ('{"true_positions_m": [null, null], "true_map_images": [[1], [-1]]}', "invalid_request"),
+        ('{"true_positions_m": [null, null], "true_map_images": [[1], [99999999999999999999]]}', "invalid_request"),
+        ('{"true_positions_m": [1, 2], "first_observation": 1000000000000}', "invalid_input"),
+        ("{}", "invalid_request"),
+        ("", "empty_body"),
     ],
-)  # fmt: skip
-def test_truths_that_cannot_be(service: TestClient, body: bytes, code: str) -> None:
-    session_id, _, _ = walked(service, 2)
-    path = f"/v1/sessions/{session_id}/truths"
-    answer = service.post(path, content=body, headers={"Content-Type": "application/json"})
-    assert (answer.status_code, answer.json()["code"]) == (422, code), answer.text
-    assert counted(service)[0] == 0
+)
+def test_truths_that_cannot_be(client: TestClient, body: str, code: str) -> None:
+    walk = Walk(client, "ready", 2)
+    for media_type, status, expected in (
+        ("application/json", 422, code),
+        ("text/plain", 415, "unsupported_media_type"),
+    ):
+        answer = client.post(f"{walk.path}/truths", content=body, headers={"Content-Type": media_type})
+        problem(answer, status, expected)
+    assert walk.counted()[0] == 0
 
 
-def test_nobody_and_other_content(service: TestClient) -> None:
-    answer = service.post("/v1/sessions/nobody/truths", json={"true_positions_m": [1]})
-    assert (answer.status_code, answer.json()["code"]) == (404, "unknown_session")
-    session_id, _, _ = walked(service, 1)
-    answer = service.post(f"/v1/sessions/{session_id}/truths", content=b"x", headers={"Content-Type": "text/plain"})
-    assert answer.status_code == 415
+# Experience
+
+
+def test_the_next_map_learns_from_a_session(client: TestClient, domain: str) -> None:
+    walk = Walk(client, domain, 6)
+    positions_m: list[float | None] = [*walk.positions_m]
+    positions_m[3] = None
+    answer = walk.learn(positions_m)
+    assert answer.status_code == 202, answer.text
+    assert answer.headers["location"].endswith(answer.json()["job_id"])
+    job = wait_for(client, answer.json()["job_id"])
+    assert (job["state"], job["kind"], job["result"]["map_version"]) == ("succeeded", "experience", 2)
+    assert job["result"]["metrics"]["experience"] == {"from_version": 1, "n_walks": 1, "n_moves": 4}
+    before, after = (load_snapshot(services_of(client).catalog, domain, version).q_values for version in (1, 2))
+    assert before is not None
+    changed = np.flatnonzero((before != after).any(axis=0))
+    assert changed.tolist() == [3]  # the move of 4 m alone
+    assert client.get(walk.path).json()["map_version"] == 1
+    # A session on the older version may be fed back too: its landmarks are the same. A prior begins another walk.
+    client.put(f"{walk.path}/prior", json={"position_m": 8, "std_m": 1})
+    for _ in range(2):
+        client.post(f"{walk.path}/observations", json={"ranked_landmarks": [1, 2, 3]})
+    client.delete(walk.path)  # and an ended one as well
+    again = wait_for(client, walk.learn([*walk.positions_m, 8.0, 8.0]).json()["job_id"])["result"]
+    assert (again["map_version"], again["metrics"]["experience"]["n_walks"]) == (3, 2)
+
+
+def test_a_session_whose_map_is_gone_or_differs(client: TestClient, domain: str, data_dir: Path) -> None:
+    walk = Walk(client, domain, 3)
+    maps = f"/v1/admin/domains/{domain}/maps"
+    remap(client, domain, **ANEW, n_landmarks=N_LANDMARKS - 1)
+    problem(walk.learn(), 409, "conflict")
+    remap(client, domain, **ANEW, n_landmarks=N_LANDMARKS)
+    file = data_dir / "domains" / domain / "maps" / "000001.sqlite"
+    file.rename(file.with_suffix(".aside"))
+    services_of(client).maps.forget(domain)
+    assert ".sqlite" not in str(problem(walk.learn(), 503, "damaged_map"))
+    file.with_suffix(".aside").rename(file)
+    client.delete(walk.path)
+    assert client.delete(f"{maps}/1").status_code == 204
+    problem(walk.learn(), 410, "retired_map")
+    walk = Walk(client, domain, 3)
+    assert client.delete(f"/v1/admin/domains/{domain}").status_code == 204
+    make_ready_domain(client, domain, actions_m=[4.0])
+    problem(walk.learn(), 410, "retired_map")
+
+
+def test_what_cannot_be_learnt_from(client: TestClient) -> None:
+    walk = Walk(client, "ready", 3)
+    problem(walk.learn(domain="seen"), 404, "unknown_session")
+    path, session_id = "/v1/admin/domains/ready/experience", walk.session_id
+    for body, status, code in (
+        ('{"session_id": "%s", "true_positions_m": [1]}' % ("0" * 32), 404, "unknown_session"),
+        (f'{{"session_id": "{session_id}", "true_positions_m": [1, 2]}}', 422, "invalid_input"),
+        (f'{{"session_id": "{session_id}", "true_positions_m": [1, NaN, 2]}}', 422, "invalid_input"),
+        (f'{{"session_id": "{session_id}", "true_positions_m": []}}', 422, "invalid_request"),
+        (f'{{"session_id": "{session_id}", "true_positions_m": ["a", 1, 2]}}', 422, "invalid_request"),
+        (f'{{"session_id": "{session_id}"}}', 422, "invalid_request"),
+    ):
+        problem(client.post(path, content=body, headers={"Content-Type": "application/json"}), status, code)

@@ -6,21 +6,15 @@ import sys
 from pathlib import Path
 
 import numpy as np
-from starlette.testclient import TestClient
 
-from deepsimbad.api.app import create_app
-from deepsimbad.jobs.runner import InThisProcess
-
-from .conftest import DIM, NPZ, npz, remap, small_settings
+from .conftest import DIM, TAKES_ENCODINGS, remap, service, upload
 
 FIRST_REQUESTS = """
 import importlib, json, pkgutil, sys
 from pathlib import Path
 from numba.core.dispatcher import Dispatcher
-from starlette.testclient import TestClient
 import deepsimbad.core
-from deepsimbad.api.app import create_app
-from tests.contract.conftest import small_settings
+from tests.contract.conftest import service
 
 def compiled():
     modules = [module for name, module in sys.modules.items() if name.startswith("deepsimbad.")]
@@ -29,7 +23,7 @@ def compiled():
 
 for module in pkgutil.iter_modules(deepsimbad.core.__path__):
     importlib.import_module(f"deepsimbad.core.{module.name}")
-with TestClient(create_app(small_settings(Path(sys.argv[1])))) as client:
+with service(Path(sys.argv[1])) as client:
     ready = compiled()
     ranked = {"ranked_landmarks": list(range(40))}
     view = {"encoding": [0.1] * 8}
@@ -46,19 +40,16 @@ def test_no_kernel_is_compiled_after_the_service_is_ready(tmp_path: Path) -> Non
     """Of a map that learnt from two seasons, as a map by default does."""
     random = np.random.default_rng(3)
     places = random.normal(size=(80, DIM))
-    with TestClient(create_app(small_settings(tmp_path), InThisProcess(tmp_path))) as client:
-        client.put("/v1/admin/domains/ready", json={"evaluator": {"kind": "feature_l2", "extractor": "none"}})
+    with service(tmp_path) as client:
+        client.put("/v1/admin/domains/ready", json=TAKES_ENCODINGS)
         for season in ("summer", "winter"):
             seen = (places + 0.1 * random.normal(size=places.shape)).astype(np.float32)
-            client.post("/v1/admin/domains/ready/traverses", json={"name": season})
-            batch = npz(encodings=seen, index=np.arange(80), position_m=np.arange(80.0))
-            client.post(f"/v1/admin/domains/ready/traverses/{season}/frames", content=batch, headers=NPZ)
+            upload(client, "ready", season, seen, np.arange(80.0))
         drives = {"training_traverse": "summer", "landmark_traverse": "winter", "same_route": True, "n_landmarks": 40}
         job = remap(client, "ready", **drives, training_episodes=20)
         assert job["result"]["metrics"]["second_season"]["accepted"], job
     done = subprocess.run(
         [sys.executable, "-c", FIRST_REQUESTS, str(tmp_path)], capture_output=True, text=True, check=True
     )
-    told = json.loads(done.stdout)
-    assert set(told["statuses"]) == {200}
-    assert told["late"] == []
+    answers = json.loads(done.stdout)
+    assert (set(answers["statuses"]), answers["late"]) == ({200}, [])
