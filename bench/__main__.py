@@ -1,15 +1,12 @@
 """Run every benchmark and write docs/results/bench.md."""
 
-import sys
-from pathlib import Path
+from collections.abc import Iterator
 
 from bench.answering import retrieval_table, step_table
 from bench.building import landmark_table, map_file_table, nnql_table
-from bench.common import describe
+from bench.common import machine, write_page
 from bench.remap import remap_table
 from bench.serving import http_table, restart_table, session_table
-
-RESULTS = Path(__file__).resolve().parent.parent / "docs" / "results" / "bench.md"
 
 TABLES = (
     retrieval_table,
@@ -24,18 +21,13 @@ TABLES = (
 )
 
 
-def main() -> None:
-    """Print the tables as they are measured, then write them."""
-    lines = ["# Benchmarks", "", "Made by `make bench`. Medians; machines are shared and noisy.", ""]
-    lines += [f"Machine: {describe()}", ""]
+def lines() -> Iterator[str]:
+    """The page."""
+    yield from ("# Benchmarks", "", "Made by `make bench`. Medians; machines are shared and noisy.", "", machine())
     for table in TABLES:
-        for line in table():
-            print(line, flush=True)
-            lines.append(line)
-        lines.append("")
-    RESULTS.write_text("\n".join(lines), encoding="utf-8")
-    print(f"\nwritten to {RESULTS}", file=sys.stderr)
+        yield ""
+        yield from table()
 
 
 if __name__ == "__main__":
-    main()
+    write_page("bench.md", lines())

@@ -5,23 +5,22 @@ import resource
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
-from time import perf_counter
+from time import perf_counter, process_time
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from bench.common import duration, timed
+from bench.common import ACTIONS_M, duration, markdown, timed
 from bench.worlds import (
     ENCODING_DIM,
+    N_CANDIDATES,
     N_LANDMARKS,
     NCLT_IMAGES,
-    Lists,
+    SPACING_M,
     dense_lists,
     rrf_map,
     scattered_lists,
@@ -36,86 +35,64 @@ from deepsimbad.core.training import TrainingWorld, train
 from deepsimbad.store.map_file import index_bytes, read_map, table_bytes, write_map
 from deepsimbad.store.sealing import seal
 
-N_CANDIDATES = 26_000
-
 
 def landmark_table() -> Iterator[str]:
     """Markdown lines."""
     yield "## Landmark selection"
     yield ""
-    yield "| candidates | dimensions | landmarks | seconds | peak memory, candidates included |"
-    yield "|---|---|---|---|---|"
-    run = subprocess.run(
-        [sys.executable, "-m", "bench.building", "landmarks"], check=True, capture_output=True, text=True
-    )
-    measured = json.loads(run.stdout)
-    yield (
-        f"| {N_CANDIDATES:,} | {ENCODING_DIM:,} | {N_LANDMARKS} | {measured['seconds']:.1f} "
-        f"| {measured['peak_bytes'] / 1e9:.2f} GB |"
-    )
+    spent = _in_own_process("landmarks")
+    shape = [f"{N_CANDIDATES:,}", f"{ENCODING_DIM:,}", N_LANDMARKS]
+    head = ("candidates", "dimensions", "landmarks", "seconds", "peak memory, candidates included")
+    yield from markdown(head, [[*shape, f"{spent['seconds']:.1f}", f"{spent['peak_mb'] / 1e3:.2f} GB"]])
 
 
-def _select_once() -> None:
-    """Print seconds and peak memory of one selection as JSON."""
-    candidates = np.empty((N_CANDIDATES, ENCODING_DIM), np.float32)
-    rng = np.random.default_rng(0)
-    for start in range(0, N_CANDIDATES, 1000):  # in blocks: the measured peak is the selection's, not the generator's
-        block = rng.standard_normal((1000, ENCODING_DIM), dtype=np.float32)
-        candidates[start : start + 1000] = block / np.linalg.norm(block, axis=1, keepdims=True)
-    select_landmarks(candidates[:2000], 10)  # compile
-    began = perf_counter()
-    select_landmarks(candidates, N_LANDMARKS)
-    seconds = perf_counter() - began
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
-    sys.stdout.write(json.dumps({"seconds": seconds, "peak_bytes": peak}))
+def _in_own_process(what: str) -> dict[str, float]:
+    """What `main` prints: its memory can be read off a process of its own alone."""
+    command = [sys.executable, "-m", "bench.building", what]
+    done = subprocess.run(command, check=True, capture_output=True, text=True)  # noqa: S603 - our own interpreter
+    return dict(json.loads(done.stdout))
 
 
 def map_file_table() -> Iterator[str]:
     """Markdown lines."""
     yield f"## Map file: {NCLT_IMAGES:,} map images, r = {N_LANDMARKS}, h = 4, {ENCODING_DIM:,}-d landmark model"
     yield ""
-    yield "| map images' lists | index, bits a map image | whole file | write | seal | load into memory |"
-    yield "|---|---|---|---|---|---|"
-    sizes: dict[str, int] = {}
-    for lists in (scattered_lists(NCLT_IMAGES), dense_lists(NCLT_IMAGES)):
-        row, sizes = _row(lists)
-        yield row
+    head = ("map images' lists", "index, bits a map image", "whole file", "write", "seal", "load into memory")
+    kinds = {
+        "every image's landmarks drawn at random": _with_model(standardised_map(scattered_lists(NCLT_IMAGES))),
+        "landmarks that drift from image to image": _with_model(standardised_map(dense_lists(NCLT_IMAGES))),
+    }
+    with tempfile.TemporaryDirectory() as folder:
+        building, sealed = Path(folder) / "1.building", Path(folder) / "1.sqlite"
+        yield from markdown(head, (_map_file_row(name, built, building, sealed) for name, built in kinds.items()))
+        sizes = sorted(table_bytes(sealed).items(), key=lambda item: -item[1])
     yield ""
     yield "Bits are the `dbstat` pages of the posting table. Tables of the last file, bytes: " + ", ".join(
-        f"{name} {n_bytes:,}" for name, n_bytes in sorted(sizes.items(), key=lambda item: -item[1]) if n_bytes
+        f"{name} {n_bytes:,}" for name, n_bytes in sizes if n_bytes
     )
 
 
-def _row(lists: Lists) -> tuple[str, dict[str, int]]:
-    contents = contents_of(lists)
-    with tempfile.TemporaryDirectory() as folder:
-        building, sealed = Path(folder) / "1.building", Path(folder) / "1.sqlite"
-        writing = timed(lambda: write_map(building, contents), repeats=3)
+def _map_file_row(name: str, built: Map, building: Path, sealed: Path) -> list[str]:
+    writing = timed(lambda: write_map(building, built), repeats=3)
 
-        def seal_again() -> None:
-            sealed.unlink(missing_ok=True)
-            write_map(building, contents)
-            seal(building, sealed)
+    def write_and_seal() -> None:
+        sealed.unlink(missing_ok=True)
+        write_map(building, built)
+        seal(building, sealed)
 
-        sealing_s = timed(seal_again, repeats=3).median_s - writing.median_s
-        loading = timed(lambda: read_map(sealed), repeats=9)
-        bits = 8 * index_bytes(sealed) / NCLT_IMAGES
-        row = (
-            f"| {lists.name} | {bits:.1f} | {sealed.stat().st_size / 1e6:.1f} MB | {duration(writing.median_s)} "
-            f"| {duration(sealing_s)} | {loading} |"
-        )
-        return row, table_bytes(sealed)
+    sealing_s = timed(write_and_seal, repeats=3).median_s - writing.median_s
+    loading = timed(lambda: read_map(sealed), repeats=9)
+    bits, megabytes = 8 * index_bytes(sealed) / NCLT_IMAGES, sealed.stat().st_size / 1e6
+    times = (duration(writing.median_s), duration(sealing_s), str(loading))
+    return [name, f"{bits:.1f}", f"{megabytes:.1f} MB", *times]
 
 
-def contents_of(lists: Lists, **more: Any) -> Map:
-    """A map of these lists, with a landmark model of the paper's size."""
+def _with_model(built: Map) -> Map:
+    """With a landmark model of the paper's size."""
     prototypes = np.random.default_rng(0).normal(size=(N_LANDMARKS, ENCODING_DIM)).astype(np.float32)
-    known = {"evaluator": {"kind": "feature_l2"}, "actions_m": np.ones(1), "landmark_model": {"prototypes": prototypes}}
-    return standardised_map(lists.lists, **{**known, **more})
-
-
-ACTIONS_M = tuple(float(metres) for metres in range(1, 11))
-SPACING_M = 0.2  # of NCLT's frames at walking speed
+    actions_m = np.ones(1) if built.q_values is None else built.actions_m
+    evaluator = {"kind": "feature_l2"}
+    return replace(built, evaluator=evaluator, actions_m=actions_m, landmark_model={"prototypes": prototypes})
 
 
 def nnql_table() -> Iterator[str]:
@@ -124,70 +101,61 @@ def nnql_table() -> Iterator[str]:
     yield ""
     yield "Training: 10,000 episodes of 10 actions in two threads, every belief over all map images."
     yield ""
-    yield "| relevance, update | time | processor time | peak memory of the whole process |"
-    yield "|---|---|---|---|"
+    head = ("relevance, update", "time", "processor time", "peak memory of the whole process")
+    rows = []
     for relevance in (Relevance.RRF, Relevance.STANDARDISED):
-        command = [sys.executable, "-m", "bench.building", relevance.value]
-        ran = subprocess.run(command, check=True, capture_output=True, text=True)  # noqa: S603 - our own interpreter
-        found = json.loads(ran.stdout)
-        yield (
-            f"| {relevance.value}, {DEFAULT_UPDATE[relevance].value} | {found['seconds']:.1f} s "
-            f"| {found['processor_seconds']:.1f} s "
-            f"| {found['peak_mb']:.0f} MB |"
-        )
+        spent = _in_own_process(relevance.value)
+        times = (f"{spent['seconds']:.1f} s", f"{spent['processor_seconds']:.1f} s", f"{spent['peak_mb']:.0f} MB")
+        rows.append((f"{relevance.value}, {DEFAULT_UPDATE[relevance].value}", *times))
+    yield from markdown(head, rows)
     yield ""
-    q_values = _learnt_values()
-    relevance_row = np.random.default_rng(0).normal(size=NCLT_IMAGES).astype(np.float32)
-    learnt = rrf_map(dense_lists(NCLT_IMAGES).lists, actions_m=np.array(ACTIONS_M), q_values=q_values)
-    view = PlanningView(learnt, np.empty(0), relevance_row, 0, 1)
+    rng = np.random.default_rng(0)  # values as training leaves them: about 950, hardly two alike
+    q_values = (900 + 50 * rng.normal(size=(NCLT_IMAGES, len(ACTIONS_M)))).astype(np.float32)
+    lists, learnt = dense_lists(NCLT_IMAGES), {"actions_m": np.array(ACTIONS_M), "q_values": q_values}
+    view = PlanningView(rrf_map(lists, **learnt), np.empty(0), rng.normal(size=NCLT_IMAGES).astype(np.float32), 0, 1)
     planning = timed(lambda: plan_by_experience(view), repeats=201, warm_up=20)
     yield f"Values of a view's 10 actions, the four nearest of {NCLT_IMAGES:,} map images included: {planning}."
     yield ""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "map"
-        write_map(path, contents_of(dense_lists(NCLT_IMAGES), actions_m=np.array(ACTIONS_M), q_values=q_values))
+        write_map(path, _with_model(standardised_map(lists, **learnt)))
         n_bytes = table_bytes(path)["q_value"] / NCLT_IMAGES
     yield f"The experience database takes {n_bytes:.1f} bytes a map image (`dbstat` pages)."
 
 
-def _world(relevance: Relevance, config: NnqlConfig) -> TrainingWorld:
-    """A live drive whose landmark order resembles the lists of the places it passes."""
-    lists = dense_lists(NCLT_IMAGES).lists
+def main() -> None:
+    """Print what one selection or one training takes, as JSON."""
+    spent: dict[str, Any] = _selection() if sys.argv[1] == "landmarks" else _training(Relevance(sys.argv[1]))
+    print(json.dumps({**spent, "peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6}))
+
+
+def _selection() -> dict[str, float]:
+    candidates = np.empty((N_CANDIDATES, ENCODING_DIM), np.float32)
     rng = np.random.default_rng(0)
-    level = rng.random((NCLT_IMAGES, N_LANDMARKS), np.float32)
+    for start in range(0, N_CANDIDATES, 1000):  # in blocks: the measured peak is the selection's, not the generator's
+        block = rng.standard_normal((1000, ENCODING_DIM), dtype=np.float32)
+        candidates[start : start + 1000] = block / np.linalg.norm(block, axis=1, keepdims=True)
+    select_landmarks(candidates[:2000], 10)  # compiles
+    began = perf_counter()
+    select_landmarks(candidates, N_LANDMARKS)
+    return {"seconds": perf_counter() - began}
+
+
+def _training(relevance: Relevance) -> dict[str, float]:
+    """On a live drive whose landmark order resembles the lists of the places it passes."""
+    config, lists = NnqlConfig(), dense_lists(NCLT_IMAGES)
+    level = np.random.default_rng(0).random((NCLT_IMAGES, N_LANDMARKS), np.float32)
     level[np.arange(NCLT_IMAGES), lists] *= 0.2
     ranks = np.empty_like(level)
     np.put_along_axis(ranks, level.argsort(axis=1), np.arange(1, N_LANDMARKS + 1, dtype=np.float32)[np.newaxis], axis=1)
     make = rrf_map if relevance is Relevance.RRF else standardised_map
     built = make(lists, actions_m=np.array(ACTIONS_M))
-    return TrainingWorld.on(built, Query(ranks), built.route, np.arange(NCLT_IMAGES), config)
-
-
-def _learnt_values() -> NDArray[np.float32]:
-    """Values as training leaves them: about 950, hardly two alike; drawn, for size and speed alone."""
-    return (900 + 50 * np.random.default_rng(0).normal(size=(NCLT_IMAGES, len(ACTIONS_M)))).astype(np.float32)
-
-
-def _train_once(relevance: Relevance) -> None:
-    """Print seconds and peak memory of one training as JSON."""
-    config = NnqlConfig()
-    world = _world(relevance, config)
+    world = TrainingWorld.on(built, Query(ranks), built.route, np.arange(NCLT_IMAGES), config)
     with ThreadPoolExecutor(2) as pool:
         train(world, replace(config, n_episodes=100), lambda _: None, pool)  # compiles
-        began, began_processor = time.perf_counter(), time.process_time()
-        _, curve = train(world, config, lambda _: None, pool)
-        seconds, processor_seconds = time.perf_counter() - began, time.process_time() - began_processor
-    peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
-    spent = {"seconds": seconds, "processor_seconds": processor_seconds, "peak_mb": peak_mb}
-    print(json.dumps({**spent, **curve.as_dict()}))
-
-
-def main() -> None:
-    """Measure once, in a process of its own so that its memory can be read off."""
-    if sys.argv[1] == "landmarks":
-        _select_once()
-    else:
-        _train_once(Relevance(sys.argv[1]))
+        began, began_processor = perf_counter(), process_time()
+        train(world, config, lambda _: None, pool)
+        return {"seconds": perf_counter() - began, "processor_seconds": process_time() - began_processor}
 
 
 if __name__ == "__main__":

@@ -1,44 +1,58 @@
-"""What every measurement needs: the machine, medians, limits, the real recordings."""
+"""What every measurement needs: the machine, medians, limits, the real recordings, the page it writes."""
 
 import math
 import os
 import platform
 import statistics
-from collections.abc import Callable, Iterator, Sequence
+import sys
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
 from time import perf_counter
 
+PROJECT = Path(__file__).resolve().parent.parent
+ACTIONS_M = tuple(float(metres) for metres in range(1, 11))
 
-def describe() -> str:
+
+def machine() -> str:
     """One line: processor, cores, memory, Python and the libraries that matter."""
+    cpuinfo = Path("/proc/cpuinfo")
+    lines = cpuinfo.read_text(encoding="utf-8").splitlines() if cpuinfo.exists() else []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    memory_gib = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
     libraries = ", ".join(f"{name} {version(name)}" for name in ("numpy", "numba", "opencv-python-headless"))
-    today = datetime.now(UTC).date().isoformat()
     return (
-        f"{_processor()}, {len(os.sched_getaffinity(0))} cores, {_memory_gib():.0f} GiB, "
-        f"Python {platform.python_version()}, {libraries}; {today}"
+        f"Machine: {(names or [platform.machine()])[0]}, {len(os.sched_getaffinity(0))} cores, {memory_gib:.0f} GiB, "
+        f"Python {platform.python_version()}, {libraries}; {datetime.now(UTC).date().isoformat()}"
     )
 
 
-def _processor() -> str:
-    cpuinfo = Path("/proc/cpuinfo")
-    for line in cpuinfo.read_text(encoding="utf-8").splitlines() if cpuinfo.exists() else ():
-        if line.startswith("model name"):
-            return line.partition(":")[2].strip()
-    return platform.processor() or platform.machine()
+def write_page(name: str, lines: Iterable[str]) -> None:
+    """Print the lines as they come, then write them as a page of docs/results."""
+    written = []
+    for line in lines:
+        print(line, flush=True)
+        written.append(line)
+    page = PROJECT / "docs" / "results" / name
+    page.write_text("\n".join(written) + "\n", encoding="utf-8")
+    print(f"written to {page}", file=sys.stderr)
 
 
-def _memory_gib() -> float:
-    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
+def markdown(head: Sequence[str], rows: Iterable[Sequence[object]]) -> Iterator[str]:
+    """A table, line by line, as its rows are measured."""
+    yield f"| {' | '.join(head)} |"
+    yield "|---" * len(head) + "|"
+    for row in rows:
+        yield f"| {' | '.join(map(str, row))} |"
 
 
 @dataclass(frozen=True)
 class Timing:
     """Seconds of repeated runs of one thing."""
 
-    seconds: tuple[float, ...]
+    seconds: Sequence[float]
 
     @property
     def median_s(self) -> float:
@@ -63,21 +77,16 @@ def timed(run: Callable[[], object], repeats: int, warm_up: int = 2) -> Timing:
     return interleaved([run], repeats, warm_up)[0]
 
 
-def interleaved(runs: list[Callable[[], object]], repeats: int, warm_up: int = 1) -> list[Timing]:
+def interleaved(runs: Sequence[Callable[[], object]], repeats: int, warm_up: int = 1) -> list[Timing]:
     """Time several calls in turn, so that a machine that slows down slows all of them."""
-    seconds: list[list[float]] = [[] for _ in runs]
-    for repeat in range(warm_up + repeats):
-        for kept, run in zip(seconds, runs, strict=True):
-            began = perf_counter()
-            run()
-            spent = perf_counter() - began
-            if repeat >= warm_up:
-                kept.append(spent)
-    return [Timing(tuple(kept)) for kept in seconds]
+    seconds = [[_seconds(run) for run in runs] for _ in range(warm_up + repeats)][warm_up:]
+    return [Timing(column) for column in zip(*seconds, strict=True)]
 
 
-_PROJECT = Path(__file__).resolve().parent.parent
-RESULTS = _PROJECT / "docs" / "results"
+def _seconds(run: Callable[[], object]) -> float:
+    began = perf_counter()
+    run()
+    return perf_counter() - began
 
 
 def real_recordings() -> Path:
@@ -86,7 +95,7 @@ def real_recordings() -> Path:
     Raises:
         FileNotFoundError: There is none.
     """
-    folder = Path(os.environ.get("DEEPSIMBAD_REAL_DATA", _PROJECT.parent / "shared" / "data"))
+    folder = Path(os.environ.get("DEEPSIMBAD_REAL_DATA", PROJECT.parent / "shared" / "data"))
     if not folder.is_dir():
         raise FileNotFoundError(f"no real recordings at {folder}: set DEEPSIMBAD_REAL_DATA to their folder")
     return folder
@@ -94,34 +103,26 @@ def real_recordings() -> Path:
 
 @dataclass(frozen=True)
 class Limit:
-    """A figure and what it may be at most.
+    """A figure, with its unit in its name, and what it may be at most."""
 
-    Attributes:
-        what: Of which thing, with its unit.
-        found: The figure.
-        at_most: The limit.
-    """
-
-    what: str
-    found: float
+    name: str
+    figure: float
     at_most: float
 
     @property
     def is_kept(self) -> bool:
         """A figure that could not be taken keeps no limit."""
-        return math.isfinite(self.found) and self.found <= self.at_most
+        return math.isfinite(self.figure) and self.figure <= self.at_most
 
     def __str__(self) -> str:
-        return f"{self.what}: {self.found:.3g}, at most {self.at_most:g}"
+        return f"{self.name}: {self.figure:.3g}, at most {self.at_most:g}"
 
 
 def limit_table(limits: Sequence[Limit]) -> Iterator[str]:
     """Markdown lines."""
-    yield "| limit | at most | found | |"
-    yield "|---|---|---|---|"
-    for limit in limits:
-        verdict = "PASS" if limit.is_kept else "**over**"
-        yield f"| {limit.what} | {limit.at_most:g} | {limit.found:.3g} | {verdict} |"
+    verdicts = {True: "PASS", False: "**over**"}
+    rows = [(limit.name, f"{limit.at_most:g}", f"{limit.figure:.3g}", verdicts[limit.is_kept]) for limit in limits]
+    return markdown(("limit", "at most", "found", ""), rows)
 
 
 def breaches(limits: Sequence[Limit]) -> str | None:

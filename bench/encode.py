@@ -6,22 +6,21 @@ Writes docs/results/encode.md. All rows of a table are measured in turn in one p
 the machine does; medians count.
 """
 
-import statistics
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from http.client import HTTPConnection
 from pathlib import Path
 
 import cv2
 import numpy as np
 import torch
 
-from bench.common import RESULTS, describe
+from bench.common import Timing, interleaved, machine, markdown, timed, write_page
+from bench.link import Link
+from bench.robots import LiveRobot, Waits, drive
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.compute import Compute, Runtime
 from deepsimbad.evaluators.extractors.base import resized
@@ -30,10 +29,9 @@ from deepsimbad.evaluators.extractors.gradient_grid import GradientGrid
 from deepsimbad.evaluators.image import decode_image
 from deepsimbad.evaluators.registry import evaluator_config, make_evaluator, make_extractor
 from deepsimbad_client import Client
-from deepsimbad_client.http.jobs import remap
 from deepsimbad_client.http.local_server import LocalServer
 
-ROUNDS = 60
+RUNTIMES = (Runtime.TORCH, Runtime.TORCH_BF16, Runtime.ONNXRUNTIME)
 N_ROBOTS, N_VIEWS = 16, 60
 _DOMAIN = "street"
 
@@ -49,53 +47,33 @@ def pictures(n: int) -> list[bytes]:
     return bodies
 
 
-def medians_ms(work: dict[str, Callable[[], object]], rounds: int = ROUNDS) -> dict[str, float]:
+def medians_ms(work: dict[str, Callable[[], object]], rounds: int = 60) -> dict[str, float]:
     """Milliseconds of each, measured in turn."""
-    taken: dict[str, list[float]] = {name: [] for name in work}
-    for round_ in range(rounds + 5):
-        for name, run in work.items():
-            began = time.perf_counter()
-            run()
-            if round_ >= 5:
-                taken[name].append(1000 * (time.perf_counter() - began))
-    return {name: statistics.median(times) for name, times in taken.items()}
+    timings = interleaved(list(work.values()), rounds, warm_up=5)
+    return {name: 1000 * timing.median_s for name, timing in zip(work, timings, strict=True)}
 
 
 def by_runtime(bodies: list[bytes]) -> Iterator[str]:
     """From JPEG to encoding, whole and in parts."""
-    yield from (
-        "## One image, 640 x 480 JPEG to encoding",
-        "",
-        "| runtime | whole, ms | the network through the extractor, ms | the bare runtime, ms | of its throughput "
-        "| cosine with torch, least |",
-        "|---|---|---|---|---|---|",
-    )
-    images = [decode_image(body, 10**7) for body in bodies]
-    exact = make_evaluator(evaluator_config({"kind": "feature_l2", "extractor": "efficientnet_lite0"}), _torch())
-    wanted = exact.encode(images)
-    for runtime in (Runtime.TORCH, Runtime.TORCH_BF16, Runtime.ONNXRUNTIME):
+    yield from ("## One image, 640 x 480 JPEG to encoding", "")
+    images, rows = [decode_image(body, 10**7) for body in bodies], []
+    exact = make_extractor("efficientnet_lite0", Compute(runtime=Runtime.TORCH)).encode(images)
+    for runtime in RUNTIMES:
         extractor: EfficientNetLite0 = make_extractor("efficientnet_lite0", Compute(runtime=runtime))  # type: ignore[assignment]
         network = extractor._network
-        shown = [network.prepare(image) for image in images]
-        stacked = np.stack(shown[:1])
-        bare = _bare(network.run, stacked)
-        took = medians_ms(
-            {
-                "whole": lambda extractor=extractor: extractor.encode([decode_image(bodies[0], 10**7)]),
-                "network": lambda network=network, shown=shown: network.encode(shown[:1]),
-                "bare": bare,
-            }
-        )
-        cosine = float(np.einsum("nd,nd->n", extractor.encode(images), wanted).min())
-        yield (
-            f"| {runtime.value} | {took['whole']:.1f} | {took['network']:.1f} | {took['bare']:.1f} "
-            f"| {100 * took['bare'] / took['network']:.0f} % | {cosine:.5f} |"
-        )
+        prepared = [network.prepare(images[0])]
+        work = {
+            "whole": lambda extractor=extractor: extractor.encode([decode_image(bodies[0], 10**7)]),
+            "network": lambda network=network, prepared=prepared: network.encode(prepared),
+            "bare": _bare(network.run, np.stack(prepared)),
+        }
+        whole, through, bare = medians_ms(work).values()
+        cosine = float(np.einsum("nd,nd->n", extractor.encode(images), exact).min())
+        share = f"{100 * bare / through:.0f} %"
+        rows.append([runtime.value, f"{whole:.1f}", f"{through:.1f}", f"{bare:.1f}", share, f"{cosine:.5f}"])
+    times = ("whole, ms", "the network through the extractor, ms", "the bare runtime, ms")
+    yield from markdown(("runtime", *times, "of its throughput", "cosine with torch, least"), rows)
     yield ""
-
-
-def _torch() -> Compute:
-    return Compute(runtime=Runtime.TORCH)
 
 
 def _bare(run: object, pixels: np.ndarray) -> Callable[[], object]:
@@ -124,27 +102,20 @@ def in_parts(bodies: list[bytes]) -> Iterator[str]:
             "gradient grid": lambda: gradients.encode([small]),
         }
     )
-    yield from ("| part | ms |", "|---|---|", *(f"| {name} | {ms:.2f} |" for name, ms in took.items()), "")
+    yield from markdown(("part", "ms"), [(name, f"{ms:.2f}") for name, ms in took.items()])
+    yield ""
 
 
 def batches() -> Iterator[str]:
     """What a larger batch is worth on this machine."""
-    yield from (
-        "## Batches",
-        "",
-        "Milliseconds an image, the network through the extractor:",
-        "",
-        "| runtime | 1 | 2 | 4 | 8 | 16 |",
-        "|---|---|---|---|---|---|",
-    )
-    shown = [np.random.default_rng(k).integers(0, 256, (224, 224, 3), np.uint8) for k in range(16)]
-    for runtime in (Runtime.TORCH, Runtime.TORCH_BF16, Runtime.ONNXRUNTIME):
-        networks = {
-            n: make_extractor("efficientnet_lite0", Compute(runtime=runtime, largest_batch=n))._network  # type: ignore[attr-defined]
-            for n in (1, 2, 4, 8, 16)
-        }
-        took = medians_ms({str(n): lambda network=network: network.encode(shown) for n, network in networks.items()}, 8)
-        yield f"| {runtime.value} | " + " | ".join(f"{ms / 16:.1f}" for ms in took.values()) + " |"
+    yield from ("## Batches", "", "Milliseconds an image, the network through the extractor:", "")
+    pixels, rows = [np.random.default_rng(k).integers(0, 256, (224, 224, 3), np.uint8) for k in range(16)], []
+    for runtime in RUNTIMES:
+        computes = [Compute(runtime=runtime, largest_batch=n_images) for n_images in (1, 2, 4, 8, 16)]
+        networks = [make_extractor("efficientnet_lite0", compute)._network for compute in computes]  # type: ignore[attr-defined]
+        runs = [lambda network=network: network.encode(pixels) for network in networks]
+        rows.append([runtime.value, *(f"{1000 * each.median_s / 16:.1f}" for each in interleaved(runs, 8, warm_up=5))])
+    yield from markdown(("runtime", "1", "2", "4", "8", "16"), rows)
     yield from (
         "",
         "ONNX Runtime works on every image with one thread, on as many as there are cores; PyTorch with all threads on "
@@ -158,23 +129,43 @@ def robots(bodies: list[bytes]) -> Iterator[str]:
     """Sixteen robots against one service, beside what the same machine encodes with nothing around it."""
     own = _own_rate(bodies)
     with tempfile.TemporaryDirectory() as folder, LocalServer(Path(folder) / "data") as server:
-        _make_domain(server.url, bodies)
-        alone = _drive(server.url, bodies, 1)
-        together = _drive(server.url, bodies, N_ROBOTS)
-    rate = N_ROBOTS * N_VIEWS / together["seconds"]
-    slowest, fastest = min(together["rates"]), max(together["rates"])
+        with Link(server.url) as link:
+            link.ask("PUT", f"/v1/admin/domains/{_DOMAIN}", {"evaluator": {"kind": "feature_l2"}})
+            dim = link.ask("GET", f"/v1/domains/{_DOMAIN}")["encoding_dim"]
+            encodings = np.random.default_rng(1).normal(size=(1000, dim)).astype(np.float32)
+            link.upload(_DOMAIN, "drive", np.arange(1000.0), encodings)
+            drives = {"training_traverse": "drive", "landmark_traverse": "drive"}
+            link.remap(_DOMAIN, {**drives, "n_landmarks": 300, "training_episodes": 0})
+        crowd = [LiveRobot("", _DOMAIN, bodies[k:] + bodies[:k], "image/jpeg") for k in range(N_ROBOTS)]
+
+        def is_over(waits: Waits) -> bool:
+            return len(waits.seconds) + 1 >= N_VIEWS
+
+        drive(server.url, crowd[:1], is_over)  # warms up
+        (alone,) = drive(server.url, crowd[:1], is_over)
+        began = time.perf_counter()
+        together = drive(server.url, crowd, is_over)
+        rate = N_ROBOTS * N_VIEWS / (time.perf_counter() - began)
+    if failures := [failure for waits in together for failure in waits.failures]:
+        raise RuntimeError(f"not every image was answered: {failures}")
+    rates = [N_VIEWS / sum(waits.seconds) for waits in together]
+    spread = 1000 * np.quantile([second for waits in together for second in waits.seconds], (0.5, 0.99))
+    alone_ms = 1000 * np.quantile(alone.seconds, (0.5, 0.99))
     yield from (
         f"## {N_ROBOTS} robots that post 640 x 480 JPEGs at once",
         "",
         "Each posts its next view when the last was answered, 1,000 map images, localizations with the whole answer.",
         "",
-        "| | |",
-        "|---|---|",
-        f"| the same JPEGs in a loop without a service, decoding a batch ahead | {own:.0f} images a second |",
-        f"| {N_ROBOTS} robots over HTTP | {rate:.0f} answers a second, {100 * rate / own:.0f} % of that |",
-        f"| a robot's own rate, slowest and fastest | {slowest:.1f} and {fastest:.1f} a second |",
-        f"| time of an answer, median and p99 | {together['median']:.0f} and {together['p99']:.0f} ms |",
-        f"| one robot alone, median and p99 | {alone['median']:.1f} and {alone['p99']:.1f} ms |",
+    )
+    rows = {
+        "the same JPEGs in a loop without a service, decoding a batch ahead": f"{own:.0f} images a second",
+        f"{N_ROBOTS} robots over HTTP": f"{rate:.0f} answers a second, {100 * rate / own:.0f} % of that",
+        "a robot's own rate, slowest and fastest": f"{min(rates):.1f} and {max(rates):.1f} a second",
+        "time of an answer, median and p99": f"{spread[0]:.0f} and {spread[1]:.0f} ms",
+        "one robot alone, median and p99": f"{alone_ms[0]:.1f} and {alone_ms[1]:.1f} ms",
+    }
+    yield from markdown(("", ""), rows.items())
+    yield from (
         "",
         "The loop uses both cores as well as it can: while the network works on one image the next is decoded. The "
         "robots, and the HTTP they speak, run on the same two cores as the service.",
@@ -190,127 +181,54 @@ def _own_rate(bodies: list[bytes]) -> float:
     def prepared(k: int) -> np.ndarray:
         return evaluator.prepare(decode_image(bodies[k % len(bodies)], 10**7))
 
-    rates = []
+    def loop() -> None:
+        following = [ahead.submit(prepared, k) for k in range(largest)]
+        for first in range(0, n_images, largest):
+            images = [future.result() for future in following]
+            following = [ahead.submit(prepared, first + k) for k in range(largest)]
+            evaluator.encode(images)
+
     with ThreadPoolExecutor(2) as ahead:
-        for _ in range(3):
-            began = time.perf_counter()
-            following = [ahead.submit(prepared, k) for k in range(largest)]
-            for first in range(0, n_images, largest):
-                images = [each.result() for each in following]
-                following = [ahead.submit(prepared, first + k) for k in range(largest)]
-                evaluator.encode(images)
-            rates.append(n_images / (time.perf_counter() - began))
-    return statistics.median(rates)
-
-
-def _make_domain(url: str, bodies: list[bytes]) -> None:
-    with Client(url) as client:
-        client.admin.put_domain(_DOMAIN, {"kind": "feature_l2"})
-        dim = client.domain(_DOMAIN).encoding_dim or 0
-        rng = np.random.default_rng(1)
-        client.admin.create_traverse(_DOMAIN, "drive")
-        values = rng.normal(size=(1000, dim)).astype(np.float16).astype(np.float32)
-        client.admin.put_frames(_DOMAIN, "drive", encodings=values, index=range(1000), position_m=np.arange(1000.0))
-        remap(client, _DOMAIN, "drive", landmark_traverse="drive", n_landmarks=300, training_episodes=0)
-        client.localize(_DOMAIN, bodies[0])
-
-
-def _drive(url: str, bodies: list[bytes], n_robots: int) -> dict[str, object]:
-    """Robots as threads that do little but wait: plain connections, answers read and not looked into."""
-    taken: list[float] = []
-    rates: list[float] = []
-    lock, start = threading.Lock(), threading.Barrier(n_robots + 1)
-
-    def robot(number: int) -> None:
-        own = []
-        link = HTTPConnection(url.removeprefix("http://"), timeout=120)
-        link.connect()
-        start.wait()
-        began = time.perf_counter()
-        for view in range(N_VIEWS):
-            asked = time.perf_counter()
-            body = bodies[(number + view) % len(bodies)]
-            link.request("POST", f"/v1/domains/{_DOMAIN}/localizations", body, {"Content-Type": "image/jpeg"})
-            answer = link.getresponse()
-            if answer.status != 200:
-                raise RuntimeError(answer.read())
-            answer.read()
-            own.append(1000 * (time.perf_counter() - asked))
-        rate = N_VIEWS / (time.perf_counter() - began)
-        link.close()
-        with lock:
-            taken.extend(own)
-            rates.append(rate)
-
-    threads = [threading.Thread(target=robot, args=(number,)) for number in range(n_robots)]
-    for thread in threads:
-        thread.start()
-    start.wait()
-    began = time.perf_counter()
-    for thread in threads:
-        thread.join()
-    return {
-        "seconds": time.perf_counter() - began,
-        "rates": rates,
-        "median": float(np.median(taken)),
-        "p99": float(np.percentile(taken, 99)),
-    }
+        return n_images / timed(loop, 3, warm_up=0).median_s
 
 
 def starts() -> Iterator[str]:
     """From the command to `/readyz`, with a domain of the default extractor there."""
-    yield from ("## Start", "", "| to `/readyz`, median of five, s | runtime |", "|---|---|")
-    imported = {
-        name: statistics.median(_seconds([sys.executable, "-c", f"import {name}"]) for _ in range(3))
-        for name in ("torch", "onnxruntime", "sys")
-    }
+    yield from ("## Start", "")
+    imported_s, rows = {}, []
+    for name in ("torch", "onnxruntime", "sys"):
+        command = [sys.executable, "-c", f"import {name}"]
+        imported_s[name] = timed(lambda: subprocess.run(command, check=True), 3, warm_up=0).median_s  # noqa: B023, S603
     for runtime in (Runtime.TORCH, Runtime.ONNXRUNTIME):
         with tempfile.TemporaryDirectory() as folder:
-            data, chosen = Path(folder) / "data", {"DEEPSIMBAD_NETWORK_RUNTIME": runtime.value}
-            with LocalServer(data, environment=chosen) as server, Client(server.url) as client:
+            server = LocalServer(Path(folder) / "data", environment={"DEEPSIMBAD_NETWORK_RUNTIME": runtime.value})
+            with server, Client(server.url) as client:
                 client.admin.put_domain(_DOMAIN, {"kind": "feature_l2"})
-            took = []
+            seconds = []
             for _ in range(5):
                 began = time.perf_counter()
-                with LocalServer(data, environment=chosen):
-                    took.append(time.perf_counter() - began)
-        yield f"| {statistics.median(took):.2f} | {runtime.value} |"
+                server.start()
+                seconds.append(time.perf_counter() - began)
+                server.stop()
+        rows.append((f"{Timing(seconds).median_s:.2f}", runtime.value))
+    yield from markdown(("to `/readyz`, median of five, s", "runtime"), rows)
     yield from (
         "",
-        f"Of which importing torch alone takes {imported['torch'] - imported['sys']:.2f} s, ONNX Runtime "
-        f"{imported['onnxruntime'] - imported['sys']:.2f} s. The very first start with ONNX Runtime prepares "
+        f"Of which importing torch alone takes {imported_s['torch'] - imported_s['sys']:.2f} s, ONNX Runtime "
+        f"{imported_s['onnxruntime'] - imported_s['sys']:.2f} s. The very first start with ONNX Runtime prepares "
         "the network besides, some seconds, unless `deepsimbad` did so before on this machine.",
-        "",
     )
-
-
-def _seconds(command: list[str]) -> float:
-    began = time.perf_counter()
-    subprocess.run(command, check=True)  # noqa: S603 - our own interpreter
-    return time.perf_counter() - began
 
 
 def report() -> Iterator[str]:
     """The lines of the page."""
     bodies = pictures(24)
-    yield from ("# Encoding", "", "Made by `python -m bench.encode`.", "", f"Machine: {describe()}", "")
+    yield from ("# Encoding", "", "Made by `python -m bench.encode`.", "", machine(), "")
     yield f"The default extractor, `efficientnet_lite0`; JPEGs of {len(bodies[0]) // 1000} kB."
     yield ""
-    yield from by_runtime(bodies)
-    yield from in_parts(bodies)
-    yield from batches()
-    yield from robots(bodies)
-    yield from starts()
-
-
-def main() -> None:
-    """Measure, print, write docs/results/encode.md."""
-    lines = []
-    for line in report():
-        print(line, flush=True)
-        lines.append(line)
-    (RESULTS / "encode.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    for part in (by_runtime(bodies), in_parts(bodies), batches(), robots(bodies), starts()):
+        yield from part
 
 
 if __name__ == "__main__":
-    main()
+    write_page("encode.md", report())

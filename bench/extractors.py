@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.common import RESULTS, describe, real_recordings
+from bench.common import machine, markdown, real_recordings, write_page
 from bench.nordland import kept_frames, season_folder
 from deepsimbad.cli import run
 from deepsimbad_campus.writer import write_campus
@@ -31,14 +31,7 @@ CAMPUS_TOLERANCE_M = 3.5  # two of its frames
 
 @dataclass(frozen=True)
 class Split:
-    """One landmark-training-test triplet.
-
-    Attributes:
-        group: Row of the table; splits of one group are averaged.
-        landmarks, training, test: SOURCEs.
-        n_landmarks: r.
-        more: Further options.
-    """
+    """One landmark-training-test triplet of SOURCEs; splits of one group are averaged."""
 
     group: str
     landmarks: str
@@ -123,30 +116,31 @@ def report(splits: list[Split], work: Path) -> Iterator[str]:
         "Made by `DEEPSIMBAD_REAL_DATA=... python -m bench.extractors`, which runs `deepsimbad experiment vpr "
         "--evaluator all` on every split.",
         "",
-        f"Machine: {describe()}",
+        machine(),
         "",
         "ANR in percent of `calibrated` / `rrf` / `brute_force`, and R@1 of `brute_force` in percent behind them. One "
         f"session over the test drive, h = 4, r = {N_LANDMARKS} or all candidates, tolerance two frames.",
         "",
-        "| split | " + " | ".join(extractors) + " |",
-        "|---|" + "---|" * len(extractors),
     )
-    ratios: dict[str, list[float]] = {extractor: [] for extractor in extractors}
-    for group, found in grouped.items():
-        cells = []
+    rows, ratios = [], []
+    for group, of_splits in grouped.items():
+        cells, best = [], _mean(of_splits, "gradient_grid", "anr", "calibrated")
         for extractor in extractors:
-            anr = [_mean(found, extractor, "anr", name) for name in ("calibrated", "rrf", "brute_force")]
-            recall = _mean(found, extractor, "recall_at_1", "brute_force")
+            anr = [_mean(of_splits, extractor, "anr", name) for name in ("calibrated", "rrf", "brute_force")]
+            recall = _mean(of_splits, extractor, "recall_at_1", "brute_force")
             cells.append(" / ".join(f"{value:.2f}" for value in anr) + f" ({recall:.0f})")
-            ratios[extractor].append(anr[0] / _mean(found, "gradient_grid", "anr", "calibrated"))
-        yield f"| {group} | " + " | ".join(cells) + " |"
-    means = [f"{np.exp(np.mean(np.log(ratios[extractor]))):.2f}" for extractor in extractors]
-    yield "| geometric mean of `calibrated` against the gradient grid | " + " | ".join(means) + " |"
-    yield from ("", "| extractor | numbers | bytes a frame | ms an image, read and encoded |", "|---|---|---|---|")
+        rows.append([group, *cells])
+        ratios.append([_mean(of_splits, extractor, "anr", "calibrated") / best for extractor in extractors])
+    means = [f"{mean:.2f}" for mean in np.exp(np.log(ratios).mean(axis=0))]
+    rows.append(["geometric mean of `calibrated` against the gradient grid", *means])
+    yield from markdown(("split", *extractors), rows)
+    yield ""
+    costs = []
     for extractor in extractors:
-        one = [document[extractor] for document in grouped["corridor halves"]]
-        took = float(np.median([each["encode_ms"] for each in one]))
-        yield f"| {extractor} | {one[0]['encoding_dim']} | {one[0]['bytes_per_encoding']} | {took:.1f} |"
+        of_splits = [document[extractor] for document in grouped["corridor halves"]]
+        took_ms = float(np.median([document["encode_ms"] for document in of_splits]))
+        costs.append([extractor, of_splits[0]["encoding_dim"], of_splits[0]["bytes_per_encoding"], f"{took_ms:.1f}"])
+    yield from markdown(("extractor", "numbers", "bytes a frame", "ms an image, read and encoded"), costs)
     yield from (
         "",
         "Times are of the corridor's JPEGs, 160 x 120, on a machine that may have had other work; "
@@ -158,8 +152,8 @@ def report(splits: list[Split], work: Path) -> Iterator[str]:
     )
 
 
-def _mean(found: list[dict[str, Any]], extractor: str, figure: str, name: str) -> float:
-    return float(np.mean([document[extractor][figure][name] for document in found]))
+def _mean(of_splits: list[dict[str, Any]], extractor: str, figure: str, name: str) -> float:
+    return float(np.mean([document[extractor][figure][name] for document in of_splits]))
 
 
 def main() -> None:
@@ -174,10 +168,7 @@ def main() -> None:
             (weights / squeezenet.name).symlink_to(squeezenet)
         os.environ["DEEPSIMBAD_WEIGHTS_DIR"] = str(weights)
         splits = [*railway(data, work), *corridor(data), *campus(work / "campus")]
-        lines = list(report(splits, work))
-    print("\n".join(lines))
-    (RESULTS / "extractors.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    print(f"written to {RESULTS / 'extractors.md'}", file=sys.stderr)
+        write_page("extractors.md", report(splits, work))
 
 
 if __name__ == "__main__":

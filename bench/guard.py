@@ -3,25 +3,24 @@
     python -m bench.guard [FOLDER]
 
 FOLDER keeps the encodings for the next run; rendering and encoding take most of the time. The numbers of
-`deepsimbad.core.same_route` were chosen on half of the places, which is reported apart from the other half.
+`deepsimbad.core.drive` were chosen on half of the places, which is reported apart from the other half.
 """
 
 import math
 import sys
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.common import RESULTS, describe, real_recordings
+from bench.common import machine, markdown, real_recordings, write_page
 from deepsimbad.core.descriptor import LandmarkStatistics, rank_landmarks
 from deepsimbad.core.drive import LEAST_CORRELATION, LEAST_PLACES, SIGNIFICANCE, judge
 from deepsimbad.core.landmark_model import select_landmarks
 from deepsimbad.core.route import Route, same_places
-from deepsimbad.evaluators.base import Evaluator, Image
 from deepsimbad.evaluators.feature_l2 import FeatureL2
 from deepsimbad.evaluators.image import decode_image
 from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
@@ -73,19 +72,10 @@ class Drive:
         x_m = None if self.x_m is None else self.x_m + error_m
         return Drive(self.frames, np.maximum.accumulate(self.position_m + error_m), x_m, self.y_m)
 
-    def backwards(self) -> "Drive":
-        """The places in the opposite order."""
-        return Drive(self.frames[::-1], self.position_m[-1] - self.position_m[::-1])
-
     @property
     def n_frames(self) -> int:
         """n."""
         return int(self.frames.size)
-
-    @property
-    def route(self) -> Route:
-        """Its positions."""
-        return Route(self.position_m, x_m=self.x_m, y_m=self.y_m)
 
 
 class World:
@@ -93,28 +83,22 @@ class World:
 
     def __init__(self, encodings: dict[str, NDArray[np.float32]], plane: dict[str, NDArray[np.float64]]) -> None:
         self.encodings = np.concatenate(list(encodings.values())).astype(np.float32)
-        everything = FeatureL2("none")
-        self._dissimilarities = everything.dissimilarities(self.encodings, everything.fit_landmarks(self.encodings))
-        self._drives: dict[str, Drive] = {}
+        evaluator = FeatureL2("none")
+        self._dissimilarities = evaluator.dissimilarities(self.encodings, evaluator.fit_landmarks(self.encodings))
+        self.drives: dict[str, Drive] = {}
         first = 0
         for name, rows in encodings.items():
-            frames = np.arange(first, first + len(rows))
-            known = plane.get(name)
-            self._drives[name] = (
-                Drive(frames, np.arange(len(rows), dtype=np.float64)) if known is None else Drive(frames, *known)
-            )
+            measured = plane.get(name, [np.arange(len(rows), dtype=np.float64)])
+            self.drives[name] = Drive(np.arange(first, first + len(rows)), *measured)
             first += len(rows)
-
-    def drive(self, name: str) -> Drive:
-        """A whole recording."""
-        return self._drives[name]
 
     def verdicts(self, mapped: Drive, other: Drive) -> tuple[bool, bool]:
         """Whether the old and the new rule take both for drives of one route; landmarks are of the other drive."""
         encodings = self.encodings[other.frames]
         landmarks = other.frames[select_landmarks(encodings, min(N_LANDMARKS, other.n_frames))]
         own, second = (self._dissimilarities[np.ix_(drive.frames, landmarks)] for drive in (mapped, other))
-        places = same_places(other.route, mapped.route)
+        here, there = (Route(drive.position_m, x_m=drive.x_m, y_m=drive.y_m) for drive in (mapped, other))
+        places = same_places(there, here)
         return _old_rule(own, second, places), judge(own, second, places, mapped.position_m).accepted
 
 
@@ -128,14 +112,12 @@ def _old_rule(own: NDArray[np.float32], second: NDArray[np.float32], places: NDA
     return float((z[0][places[:, 0]] * z[1][places[:, 1]]).mean()) >= OLD_LEAST_CORRELATION
 
 
-# --- pairs of drives -----------------------------------------------------------------------------------------------
-
 Draw = Callable[[np.random.Generator], tuple[Drive, Drive]]
 
 
 def railway_pairs(world: World, names: Sequence[str], part: str) -> Iterator[tuple[str, bool, Draw]]:
     """(kind, whether it is one route, how to draw a pair) of slices of the railway; one frame counts as a metre."""
-    n = world.drive(names[0]).n_frames
+    n = world.drives[names[0]].n_frames
     low, high = (round(share * n) for share in ROWS[part])
 
     def length(rng: np.random.Generator, most: int) -> int:
@@ -146,45 +128,34 @@ def railway_pairs(world: World, names: Sequence[str], part: str) -> Iterator[tup
         gap = int(rng.integers(n_frames, high - low - n_frames + 1))
         start = int(rng.integers(low, high - n_frames - gap + 1))
         starts = (start, start + gap) if rng.integers(2) else (start + gap, start)
-        drives = [
-            world.drive(name).part(at, at + n_frames).restarted()
-            for name, at in zip((first, second), starts, strict=True)
-        ]
-        return drives[0], drives[1]
+        stops = (starts[0] + n_frames, starts[1] + n_frames)
+        mapped, other = world.drives[first].part(starts[0], stops[0]), world.drives[second].part(starts[1], stops[1])
+        return mapped.restarted(), other.restarted()
 
     def of_two(rng: np.random.Generator) -> tuple[str, str]:
         first, second = rng.choice(len(names), 2, replace=False)
         return names[first], names[second]
 
-    def one_season(rng: np.random.Generator) -> tuple[Drive, Drive]:
-        return apart(rng, *(of_two(rng)[0],) * 2)
-
-    def two_seasons(rng: np.random.Generator) -> tuple[Drive, Drive]:
-        return apart(rng, *of_two(rng))
-
     def same(rng: np.random.Generator) -> tuple[Drive, Drive]:
         n_frames = length(rng, high - low)
         start = int(rng.integers(low, high - n_frames + 1))
-        first, second = (world.drive(name).part(start, start + n_frames) for name in of_two(rng))
+        first, second = (world.drives[name].part(start, start + n_frames) for name in of_two(rng))
         return first, second
 
     def inexact(rng: np.random.Generator) -> tuple[Drive, Drive]:
         first, second = same(rng)
         return first, second.moved(rng.integers(-1, 2, second.n_frames).astype(np.float64))
 
-    def in_part(rng: np.random.Generator) -> tuple[Drive, Drive]:
-        return overlapping(rng, *same(rng))
-
     def reversed_drive(rng: np.random.Generator) -> tuple[Drive, Drive]:
         first, second = same(rng)
-        return first.restarted(), second.backwards()
+        return first.restarted(), Drive(second.frames[::-1], second.position_m[-1] - second.position_m[::-1])
 
-    yield "two places of the railway, one season", False, one_season
-    yield "two places of the railway, two seasons", False, two_seasons
+    yield "two places of the railway, one season", False, lambda rng: apart(rng, *(of_two(rng)[0],) * 2)
+    yield "two places of the railway, two seasons", False, lambda rng: apart(rng, *of_two(rng))
     yield "one stretch of the railway, driven backwards", False, reversed_drive
     yield "one stretch of the railway", True, same
     yield "one stretch of the railway, positions wrong by up to a frame", True, inexact
-    yield "one stretch of the railway, overlap in part", True, in_part
+    yield "one stretch of the railway, overlap in part", True, lambda rng: overlapping(rng, *same(rng))
 
 
 def overlapping(rng: np.random.Generator, mapped: Drive, other: Drive) -> tuple[Drive, Drive]:
@@ -196,14 +167,14 @@ def overlapping(rng: np.random.Generator, mapped: Drive, other: Drive) -> tuple[
 
 def corridor_pairs(world: World, part: str) -> Iterator[tuple[str, bool, Draw]]:
     """The corridor beside the railway."""
-    low, high = (round(share * world.drive("nordland_summer").n_frames) for share in ROWS[part])
+    low, high = (round(share * world.drives["nordland_summer"].n_frames) for share in ROWS[part])
 
     def elsewhere(rng: np.random.Generator) -> tuple[Drive, Drive]:
-        corridor = world.drive(("corridor_ref", "corridor_query")[rng.integers(2)])
+        corridor = world.drives[("corridor_ref", "corridor_query")[rng.integers(2)]]
         n_frames = int(rng.integers(SHORTEST, corridor.n_frames + 1))
         first = int(rng.integers(0, corridor.n_frames - n_frames + 1))
         start = int(rng.integers(low, high - n_frames + 1))
-        railway = world.drive(f"nordland_{SEASONS[rng.integers(2)]}").part(start, start + n_frames)
+        railway = world.drives[f"nordland_{SEASONS[rng.integers(2)]}"].part(start, start + n_frames)
         drives = corridor.part(first, first + n_frames).restarted(), railway.restarted()
         return drives if rng.integers(2) else drives[::-1]
 
@@ -216,7 +187,7 @@ def campus_pairs(world: World, part: str) -> Iterator[tuple[str, bool, Draw]]:
 
     def drive(rng: np.random.Generator, seed: int, season: int | None = None) -> Drive:
         chosen = int(rng.integers(2)) if season is None else season
-        return world.drive(f"campus{seed}_{SEASONS[chosen]}")
+        return world.drives[f"campus{seed}_{SEASONS[chosen]}"]
 
     def two_campuses(rng: np.random.Generator) -> tuple[Drive, Drive]:
         first, second = (drive(rng, int(seed)) for seed in rng.choice(seeds, 2, replace=False))
@@ -262,19 +233,13 @@ def campus_pairs(world: World, part: str) -> Iterator[tuple[str, bool, Draw]]:
     yield "one stretch of a rendered campus, overlap in part", True, in_part
 
 
-# --- what is compared ----------------------------------------------------------------------------------------------
-
-
-def netvlad_world(data: Path) -> World:
-    """The railway in three seasons as ready NetVLAD encodings."""
-    return World({name: np.load(data / "nordland_netvlad64" / f"{name}.npy") for name in NETVLAD}, {})
-
-
-def image_world(folder: Path, extractor: str) -> World:
-    """All images under one extractor, from a folder that `encode` filled."""
-    kept = {path.name.split(".")[0]: np.load(path) for path in sorted(folder.glob(f"*.{extractor}.npz"))}
-    plane = {name: np.stack([each["p"], each["x"], each["y"]]) for name, each in kept.items() if "p" in each.files}
-    return World({name: each["e"] for name, each in kept.items()}, plane)
+def worlds(folder: Path, data: Path) -> Iterator[tuple[str, World]]:
+    """The railway in three seasons as ready NetVLAD encodings, then all images under every extractor."""
+    yield "netvlad", World({name: np.load(data / "nordland_netvlad64" / f"{name}.npy") for name in NETVLAD}, {})
+    for extractor in EXTRACTORS:
+        kept = {path.name.split(".")[0]: np.load(path) for path in sorted(folder.glob(f"*.{extractor}.npz"))}
+        plane = {name: np.stack([rows[axis] for axis in "pxy"]) for name, rows in kept.items() if "p" in rows.files}
+        yield extractor, World({name: rows["e"] for name, rows in kept.items()}, plane)
 
 
 def encode(folder: Path, data: Path) -> None:
@@ -282,100 +247,72 @@ def encode(folder: Path, data: Path) -> None:
     evaluators = {
         name: make_evaluator(evaluator_config({"kind": "feature_l2", "extractor": name})) for name in EXTRACTORS
     }
-    for season in SEASONS:
-        _encode_folder(folder, f"nordland_{season}", data / "nordland" / season, evaluators)
-    for walk in ("ref", "query"):
-        _encode_folder(folder, f"corridor_{walk}", data / "corridor" / walk, evaluators)
+
+    def is_there(name: str) -> bool:
+        return all((folder / f"{name}.{extractor}.npz").exists() for extractor in EXTRACTORS)
+
+    def keep(name: str, bodies: Iterable[bytes], **plane: NDArray[np.float64]) -> None:
+        images = [decode_image(body, MAX_PIXELS) for body in bodies]
+        for extractor, evaluator in evaluators.items():
+            rows = np.concatenate([evaluator.encode(images[first : first + 64]) for first in range(0, len(images), 64)])
+            np.savez(folder / f"{name}.{extractor}.npz", e=rows, **plane)
+
+    folders = {f"nordland_{season}": data / "nordland" / season for season in SEASONS}
+    folders |= {f"corridor_{walk}": data / "corridor" / walk for walk in ("ref", "query")}
+    for name, pictures in folders.items():
+        if not is_there(name):
+            paths = sorted(path for path in pictures.iterdir() if path.suffix in {".png", ".jpg"})
+            keep(name, (path.read_bytes() for path in paths))
     for seed, n_frames in CAMPUS_FRAMES.items():
         names = [f"campus{seed}_{season}" for season in SEASONS]
-        if all((folder / f"{name}.{extractor}.npz").exists() for name in names for extractor in EXTRACTORS):
+        if all(map(is_there, names)):
             continue
         with tempfile.TemporaryDirectory() as root:
             for name, source in zip(names, write_campus(Path(root), SEASONS, n_frames, seed), strict=True):
-                recording = open_source(source)
-                images = [
-                    decode_image(recording.image(frame, (224, 224)).body, MAX_PIXELS) for frame in recording.frames
-                ]
-                places = [(frame.position_m, frame.x_m, frame.y_m) for frame in recording.frames]
-                _encode(folder, name, images, evaluators, np.array(places, np.float64).T)
-
-
-def _encode_folder(folder: Path, name: str, pictures: Path, evaluators: dict[str, Evaluator]) -> None:
-    if not all((folder / f"{name}.{extractor}.npz").exists() for extractor in evaluators):
-        paths = sorted(path for path in pictures.iterdir() if path.suffix in {".png", ".jpg"})
-        _encode(folder, name, [decode_image(path.read_bytes(), MAX_PIXELS) for path in paths], evaluators)
-
-
-def _encode(
-    folder: Path,
-    name: str,
-    images: list[Image],
-    evaluators: dict[str, Evaluator],
-    plane: NDArray[np.float64] | None = None,
-) -> None:
-    for extractor, evaluator in evaluators.items():
-        rows = np.concatenate([evaluator.encode(images[first : first + 64]) for first in range(0, len(images), 64)])
-        known = {} if plane is None else dict(zip("pxy", plane, strict=True))
-        np.savez(folder / f"{name}.{extractor}.npz", e=rows, **known)
-
-
-# --- the report ----------------------------------------------------------------------------------------------------
+                drive = open_source(source)
+                places = np.array([(frame.position_m, frame.x_m, frame.y_m) for frame in drive.frames], np.float64)
+                bodies = (drive.image(frame, (224, 224)).body for frame in drive.frames)
+                keep(name, bodies, **dict(zip("pxy", places.T, strict=True)))
 
 
 @dataclass(frozen=True)
 class Row:
-    """Pairs of one kind: how many, and how many either rule took for one route."""
+    """How many pairs of one kind either rule took for one route."""
 
     kind: str
     encoder: str
     is_one_route: bool
     part: str
-    n_pairs: int
     n_old: int
     n_new: int
 
 
 def measure(world: World, encoder: str, part: str) -> Iterator[Row]:
     """Every kind's row."""
-    kinds = (
-        list(railway_pairs(world, NETVLAD, part))
-        if encoder == "netvlad"
-        else [
-            *railway_pairs(world, [f"nordland_{season}" for season in SEASONS], part),
-            *corridor_pairs(world, part),
-            *campus_pairs(world, part),
-        ]
-    )
+    names = NETVLAD if encoder == "netvlad" else [f"nordland_{season}" for season in SEASONS]
+    kinds = list(railway_pairs(world, names, part))
+    if encoder != "netvlad":
+        kinds += [*corridor_pairs(world, part), *campus_pairs(world, part)]
     for number, (kind, is_one_route, draw) in enumerate(kinds):
         rng = np.random.default_rng([number, list(ROWS).index(part)])
         verdicts = np.array([world.verdicts(*draw(rng)) for _ in range(PAIRS)])
-        row = Row(kind, encoder, is_one_route, part, PAIRS, *verdicts.sum(axis=0).tolist())
-        print(row, file=sys.stderr)
-        yield row
+        yield Row(kind, encoder, is_one_route, part, *verdicts.sum(axis=0).tolist())
 
 
-def interval(n_found: int, n: int) -> tuple[float, float]:
-    """Wilson's 95 % interval of a share."""
-    z, share = 1.96, n_found / n
+def shown(n_accepted: int, n: int) -> str:
+    """A share and Wilson's 95 % interval of it, in percent."""
+    z, share = 1.96, n_accepted / n
     centre = (share + z * z / (2 * n)) / (1 + z * z / n)
     reach = z / (1 + z * z / n) * math.sqrt(share * (1 - share) / n + z * z / (4 * n * n))
-    return max(0.0, centre - reach), min(1.0, centre + reach)
+    return f"{100 * share:.1f} ({100 * max(0.0, centre - reach):.1f} .. {100 * min(1.0, centre + reach):.1f})"
 
 
-def shown(n_found: int, n: int) -> str:
-    """A share and its interval, in percent."""
-    low, high = interval(n_found, n)
-    return f"{100 * n_found / n:.1f} ({100 * low:.1f} .. {100 * high:.1f})"
-
-
-def table(rows: Sequence[Row]) -> list[str]:
+def table(rows: Sequence[Row]) -> Iterator[str]:
     """Markdown lines, with all kinds together last."""
-    lines = ["| pairs | encoder | n | old rule accepts, % | accepts, % |", "|---|---|---|---|---|"]
-    for row in rows:
-        old, new = shown(row.n_old, row.n_pairs), shown(row.n_new, row.n_pairs)
-        lines.append(f"| {row.kind} | {row.encoder} | {row.n_pairs} | {old} | {new} |")
-    n, old, new = (sum(each) for each in zip(*((row.n_pairs, row.n_old, row.n_new) for row in rows), strict=True))
-    return [*lines, f"| **all** | | {n} | {shown(old, n)} | **{shown(new, n)}** |"]
+    cells = [(row.kind, row.encoder, PAIRS, shown(row.n_old, PAIRS), shown(row.n_new, PAIRS)) for row in rows]
+    n, n_old, n_new = PAIRS * len(rows), sum(row.n_old for row in rows), sum(row.n_new for row in rows)
+    everything = ("**all**", "", n, shown(n_old, n), f"**{shown(n_new, n)}**")
+    return markdown(("pairs", "encoder", "n", "old rule accepts, %", "accepts, %"), [*cells, everything])
 
 
 def report(rows: Sequence[Row]) -> list[str]:
@@ -397,7 +334,7 @@ def report(rows: Sequence[Row]) -> list[str]:
         "pairs of one season in the other half (eight of them, seven at one distance of the two places); so the least "
         "correlation came in, its number from the first half again.",
         "",
-        f"Machine: {describe()}",
+        machine(),
     ]
     heads = {
         REPORTED: "## Places that nothing was chosen on",
@@ -413,20 +350,12 @@ def report(rows: Sequence[Row]) -> list[str]:
 def main() -> None:
     """Measure, print, write `docs/results/guard.md`."""
     data = real_recordings()
-    rows: list[Row] = []
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(scratch)
         folder.mkdir(parents=True, exist_ok=True)
         encode(folder, data)
-        for encoder in ("netvlad", *EXTRACTORS):
-            world = netvlad_world(data) if encoder == "netvlad" else image_world(folder, encoder)
-            for part in ROWS:
-                rows += measure(world, encoder, part)
-    lines = report(rows)
-    print("\n".join(lines))
-    RESULTS.mkdir(parents=True, exist_ok=True)
-    (RESULTS / "guard.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    print(f"\nwritten to {RESULTS / 'guard.md'}", file=sys.stderr)
+        rows = [row for name, world in worlds(folder, data) for part in ROWS for row in measure(world, name, part)]
+    write_page("guard.md", report(rows))
 
 
 if __name__ == "__main__":

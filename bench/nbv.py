@@ -9,6 +9,7 @@ import argparse
 import itertools
 import sys
 import time
+from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
@@ -17,7 +18,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.common import RESULTS, describe, real_recordings
+from bench.common import machine, markdown, real_recordings, write_page
 from bench.netvlad import DRIVES
 from deepsimbad.core.episodes import TestDrive
 from deepsimbad.core.planners import CONSTANT, DEFAULT_PLANNER, RANDOM
@@ -27,21 +28,10 @@ from deepsimbad.jobs.progress import Progress
 from deepsimbad.jobs.recordings import encode_recording
 from deepsimbad_client.recordings.sources import open_source
 
-Shares = NDArray[np.float64]
-_RESAMPLES = 2000
-_LEVELS = (2.5, 97.5)
-_PAGE = "nbv-netvlad64.md"
-
 
 @dataclass(frozen=True)
 class Triplet:
-    """One permutation's episodes.
-
-    Attributes:
-        name: landmarks-training-test.
-        report: What every planner scored.
-        starts: [episodes] the test frame every episode began on.
-    """
+    """Episodes of one landmarks-training-test permutation, and the test frame that each began on, [episodes]."""
 
     name: str
     report: NbvReport
@@ -60,128 +50,102 @@ def measure(folder: Path, config: NbvConfig, names: tuple[str, ...]) -> Triplet:
     return Triplet("-".join(names), report, starts)
 
 
-def anr_table(triplets: list[Triplet]) -> list[str]:
+def mean_anr(triplets: list[Triplet], name: str) -> float:
+    """ANR in percent, averaged over the triplets."""
+    return float(np.mean([100 * triplet.report.ours[name].mean() for triplet in triplets]))
+
+
+def anr_table(triplets: list[Triplet], names: list[str]) -> Iterator[str]:
     """ANR by planner: of every triplet and on average, and on average in the paper's set-up."""
-    lines = [f"| planner | mean | {' | '.join(each.name for each in triplets)} | mean, as in the paper |"]
-    lines += ["|---|" + "---|" * (len(triplets) + 2)]
-    for name in sorted(triplets[0].report.ours, key=partial(mean_anr, triplets)):
-        each = [100 * triplet.report.ours[name].mean() for triplet in triplets]
+    rows = []
+    for name in names:
+        ours = [f"{100 * triplet.report.ours[name].mean():.3f}" for triplet in triplets]
         paper = np.mean([100 * triplet.report.paper[name].mean() for triplet in triplets])
         shown = f"**{name}** (default)" if name == DEFAULT_PLANNER else name
-        lines.append(f"| {shown} | **{np.mean(each):.3f}** | {_cells(each, 3)} | {paper:.3f} |")
-    return lines
+        rows.append([shown, f"**{mean_anr(triplets, name):.3f}**", *ours, f"{paper:.3f}"])
+    return markdown(["planner", "mean", *(triplet.name for triplet in triplets), "mean, as in the paper"], rows)
 
 
-def mean_anr(triplets: list[Triplet], name: str, paper: bool = False) -> float:
-    """ANR in percent, averaged over the triplets."""
-    return float(np.mean([100 * (each.report.paper if paper else each.report.ours)[name].mean() for each in triplets]))
-
-
-def difference_table(triplets: list[Triplet]) -> list[str]:
+def difference_table(triplets: list[Triplet], names: list[str]) -> Iterator[str]:
     """The default planner less every rival, episode by episode over all triplets."""
-    rivals = [name for name in triplets[0].report.ours if name not in {DEFAULT_PLANNER, CLAIRVOYANT}]
-    lines = ["| default less | difference | 95 %, episodes drawn | 95 %, starts drawn |", "|---|---|---|---|"]
-    for rival in sorted(rivals, key=partial(mean_anr, triplets)):
-        difference = np.concatenate(
-            [100 * (each.report.ours[DEFAULT_PLANNER] - each.report.ours[rival]).mean(axis=1) for each in triplets]
-        )
-        groups = np.concatenate([1_000_000 * place + each.starts for place, each in enumerate(triplets)])
-        by_episode = interval(difference, np.arange(difference.size))
-        by_start = interval(difference, groups)
-        shown = (f"{low:+.3f} .. {high:+.3f}" for low, high in (by_episode, by_start))
-        lines.append(f"| {rival} | {difference.mean():+.3f} | {' | '.join(shown)} |")
-    return lines
+    groups = np.concatenate([1_000_000 * place + triplet.starts for place, triplet in enumerate(triplets)])
+    rows = []
+    for rival in [name for name in names if name not in {DEFAULT_PLANNER, CLAIRVOYANT}]:
+        apart = [triplet.report.ours[DEFAULT_PLANNER] - triplet.report.ours[rival] for triplet in triplets]
+        difference = np.concatenate([100 * each.mean(axis=1) for each in apart])
+        intervals = (interval(difference, np.arange(difference.size)), interval(difference, groups))
+        rows.append([rival, f"{difference.mean():+.3f}", *(f"{low:+.3f} .. {high:+.3f}" for low, high in intervals)])
+    return markdown(("default less", "difference", "95 %, episodes drawn", "95 %, starts drawn"), rows)
 
 
-def interval(values: Shares, groups: NDArray[np.int64]) -> tuple[float, float]:
+def interval(values: NDArray[np.float64], groups: NDArray[np.int64]) -> tuple[float, float]:
     """95 % bootstrap interval of the mean, drawing whole groups of values."""
     _, group = np.unique(groups, return_inverse=True)
     totals, counts = np.bincount(group, values), np.bincount(group)
     rng = np.random.default_rng(0)
-    means = []
-    for _ in range(_RESAMPLES):
-        drawn = rng.integers(0, totals.size, totals.size)
-        means.append(totals[drawn].sum() / counts[drawn].sum())
-    low, high = np.percentile(means, _LEVELS)
+    draws = (rng.integers(0, totals.size, totals.size) for _ in range(2000))
+    low, high = np.percentile([totals[drawn].sum() / counts[drawn].sum() for drawn in draws], (2.5, 97.5))
     return float(low), float(high)
 
 
-def distance_table(triplets: list[Triplet]) -> list[str]:
+def distance_table(triplets: list[Triplet], names: list[str]) -> Iterator[str]:
     """ANR of the last view before a distance is exceeded, over the episodes that went so far, averaged."""
-    documents = [each.report.as_dict({})["anr_at_distance_m"] for each in triplets]
+    documents = [triplet.report.as_dict({})["anr_at_distance_m"] for triplet in triplets]
     distances = list(documents[0][RANDOM])
-    lines = [
-        "| planner | " + " | ".join(f"{metres} m" for metres in distances) + " |",
-        "|---|" + "---|" * len(distances),
-    ]
-    for name in sorted(triplets[0].report.ours, key=partial(mean_anr, triplets)):
-        cells = []
-        for metres in distances:
-            known = [document[name][metres] for document in documents if document[name][metres] is not None]
-            cells.append(f"{np.mean(known):.2f}" if len(known) == len(documents) else "-")
-        lines.append(f"| {name} | {' | '.join(cells)} |")
-    return lines
+
+    def cell(name: str, metres: str) -> str:
+        figures = [document[name][metres] for document in documents]
+        return "-" if None in figures else f"{np.mean(figures):.2f}"
+
+    rows = [[name, *(cell(name, metres) for metres in distances)] for name in names]
+    return markdown(["planner", *(f"{metres} m" for metres in distances)], rows)
 
 
-def step_table(triplets: list[Triplet]) -> list[str]:
+def step_table(triplets: list[Triplet], names: list[str]) -> Iterator[str]:
     """ANR after every move, averaged over the triplets."""
-    n_steps = triplets[0].report.config.n_steps
-    lines = [f"| planner | {' | '.join(str(step + 1) for step in range(n_steps))} |", "|---|" + "---|" * n_steps]
-    best = min((name for name in triplets[0].report.ours if name.startswith(CONSTANT)), key=partial(mean_anr, triplets))
-    for name in (DEFAULT_PLANNER, best, RANDOM, CLAIRVOYANT):
-        by_step = np.mean([100 * each.report.ours[name].mean(axis=0) for each in triplets], axis=0)
-        lines.append(f"| {name} | {_cells(by_step.tolist(), 2)} |")
-    return lines
+    rows = []
+    for name in (DEFAULT_PLANNER, next(name for name in names if name.startswith(CONSTANT)), RANDOM, CLAIRVOYANT):
+        by_step = np.mean([100 * triplet.report.ours[name].mean(axis=0) for triplet in triplets], axis=0)
+        rows.append([name, *(f"{anr:.2f}" for anr in by_step)])
+    return markdown(["planner", *map(str, range(1, triplets[0].report.config.n_steps + 1))], rows)
 
 
-def _cells(values: list[float], digits: int) -> str:
-    return " | ".join(f"{value:.{digits}f}" for value in values)
-
-
-def page(triplets: list[Triplet], command: str, seconds: float) -> list[str]:
+def page(triplets: list[Triplet], command: str, seconds: float) -> Iterator[str]:
     """All of the page."""
     config = triplets[0].report.config
-    distinct = {np.unique(each.starts).size for each in triplets}
-    return [
-        "# Next-best-view planners on real NetVLAD encodings",
-        "",
+    names = sorted(triplets[0].report.ours, key=partial(mean_anr, triplets))
+    distinct = sorted({np.unique(triplet.starts).size for triplet in triplets})
+    yield from ("# Next-best-view planners on real NetVLAD encodings", "")
+    yield (
         f"Three drives of the Nordland route, 600 places a metre apart, 64 numbers each; r = {config.n_landmarks}, "
         f"h = {config.list_length}, {config.episodes} episodes of {config.n_steps} moves a planner and triplet, "
         f"moves of {min(config.actions_m):g} to {max(config.actions_m):g} m, {config.training_episodes} training "
         "episodes of NNQL at most. The robot moves exactly as far as it is told; the belief of the one map image "
         "nearest to the truth is ranked after every move (ANR in percent: 0 is perfect, 50 chance; the first view does "
-        "not count).",
-        "",
-        f"Made by `{command}` in {seconds:.0f} s; `deepsimbad experiment nbv` gives each triplet alone.",
-        "",
-        f"Machine: {describe()}",
-        "",
+        "not count)."
+    )
+    yield ""
+    yield f"Made by `{command}` in {seconds:.0f} s; `deepsimbad experiment nbv` gives each triplet alone."
+    yield from ("", machine(), "")
+    yield (
         f"Relevance `{config.relevance.value}`, update `{config.update.value}`, the grid filter; the last column has "
         "the paper's, `rrf` and `additive_relevance`, with a motion error of 0.7 m. `clairvoyant` tries every move on "
-        "the test drive itself, which nobody can.",
-        "",
-        *anr_table(triplets),
-        "",
-        "## The default against the others",
-        "",
-        "Paired: the same starts, all six triplets together. There are "
-        f"{'/'.join(map(str, sorted(distinct)))} distinct starts a triplet, and where nothing is drawn equal starts "
-        "have equal episodes. Drawing episodes answers for these starts; drawing starts with all their episodes is "
-        "the wider and more honest interval, and still takes neighbouring starts as independent.",
-        "",
-        *difference_table(triplets),
-        "",
-        "## By move",
-        "",
-        *step_table(triplets),
-        "",
-        "## At equal distance",
-        "",
+        "the test drive itself, which nobody can."
+    )
+    yield from ("", *anr_table(triplets, names), "", "## The default against the others", "")
+    yield (
+        f"Paired: the same starts, all six triplets together. There are {'/'.join(map(str, distinct))} distinct starts "
+        "a triplet, and where nothing is drawn equal starts have equal episodes. Drawing episodes answers for these "
+        "starts; drawing starts with all their episodes is the wider and more honest interval, and still takes "
+        "neighbouring starts as independent."
+    )
+    yield from ("", *difference_table(triplets, names), "", "## By move", "", *step_table(triplets, names))
+    yield from ("", "## At equal distance", "")
+    yield (
         "ANR of the last view before so many metres were exceeded, over the episodes that went so far: short moves "
-        "have seen more views by then. `-`: some triplet has no such episode.",
-        "",
-        *distance_table(triplets),
-    ]
+        "have seen more views by then. `-`: some triplet has no such episode."
+    )
+    yield from ("", *distance_table(triplets, names))
 
 
 def main() -> None:
@@ -194,10 +158,7 @@ def main() -> None:
     with ProcessPoolExecutor(2) as pool:
         triplets = list(pool.map(run, itertools.permutations(DRIVES)))
     command = " ".join(["python -m bench.nbv", *sys.argv[1:]])
-    lines = page(triplets, command, time.perf_counter() - began)
-    print("\n".join(lines))
-    (RESULTS / _PAGE).write_text("\n".join(lines) + "\n", encoding="utf-8")
-    print(f"\nwritten to {RESULTS / _PAGE}", file=sys.stderr)
+    write_page("nbv-netvlad64.md", page(triplets, command, time.perf_counter() - began))
 
 
 if __name__ == "__main__":

@@ -8,8 +8,7 @@ directly on an image that is already normalised; *ours* is what an extractor cal
 """
 
 import itertools
-import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,7 +16,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from bench.common import RESULTS, Timing, describe, interleaved
+from bench.common import Timing, interleaved, machine, markdown, write_page
 from deepsimbad.evaluators.compute import Compute, Device, Runtime
 from deepsimbad.evaluators.nets.netvlad import STAGES, NetVlad
 from deepsimbad.evaluators.runtimes import make_run
@@ -26,8 +25,7 @@ CHANNELS = (64, 64, 128, 128, 256, 256, 256, 512, 512, 512, 512, 512, 512)
 N_CLUSTERS, N_WHITENED = 64, 4096
 WIDTH, HEIGHT = 640, 480
 RUNTIMES = {Runtime.TORCH: torch.float32, Runtime.TORCH_BF16: torch.bfloat16}
-REPEATS = {"cpu": 15, "cuda": 30}
-LARGE_BATCH = 32  # on CUDA
+NAMES = {Runtime.TORCH: "float32", Runtime.TORCH_BF16: "bfloat16"}
 
 
 def made_up() -> NetVlad:
@@ -81,9 +79,13 @@ class Row:
 
     @property
     def share(self) -> float:
-        """Our throughput beside the bare network's, paired call by call: a neighbour's load hits both."""
-        pairs = zip(self.bare.seconds, self.ours.seconds, strict=True)
-        return float(np.median([bare / ours for bare, ours in pairs]))
+        """Our throughput beside the bare network's."""
+        return _ratio(self.bare, self.ours)
+
+
+def _ratio(slow: Timing, fast: Timing) -> float:
+    """Paired call by call: a neighbour's load hits both."""
+    return float(np.median([one / other for one, other in zip(slow.seconds, fast.seconds, strict=True)]))
 
 
 def measure(device: Device, batch: int, repeats: int) -> Iterator[Row]:
@@ -118,61 +120,51 @@ def bare(runtime: Runtime, device: Device, batch: int) -> Callable[[], object]:
     return call
 
 
-def table(rows: list[Row]) -> list[str]:
-    """Markdown lines."""
-    lines = [
-        "| network in | batch | ours, a call | bare layers, a call | ours, images/s | ours of bare's throughput |",
-        "|---|---|---|---|---|---|",
-    ]
-    for row in rows:
-        name = {Runtime.TORCH: "float32", Runtime.TORCH_BF16: "bfloat16"}[row.runtime]
-        lines.append(
-            f"| {name} | {row.batch} | {row.ours} | {row.bare} | {row.batch / row.ours.median_s:.3g} | "
-            f"**{row.share:.0%}** |"
-        )
-    return lines
-
-
-def gains(rows: list[Row]) -> list[str]:
-    """What bfloat16 brings, batch by batch, of calls paired in turn."""
-    lines = []
+def table(rows: Sequence[Row]) -> Iterator[str]:
+    """Markdown lines, and below them what bfloat16 brings, batch by batch, of calls paired in turn."""
+    head = ("network in", "batch", "ours, a call", "bare layers, a call", "ours, images/s", "ours of bare's throughput")
+    yield from markdown(
+        head,
+        [
+            (
+                NAMES[row.runtime],
+                row.batch,
+                row.ours,
+                row.bare,
+                f"{row.batch / row.ours.median_s:.3g}",
+                f"**{row.share:.0%}**",
+            )
+            for row in rows
+        ],
+    )
+    yield ""
     for single, half in zip(rows[::2], rows[1::2], strict=True):
-        figures = {
+        pairs = {
             "ours against ours": (single.ours, half.ours),
             "bare against bare": (single.bare, half.bare),
             "ours against bare layers in float32": (single.bare, half.ours),
         }
-        told = "; ".join(
-            f"{name} **{np.median([a / b for a, b in zip(slow.seconds, fast.seconds, strict=True)]):.2f}** times"
-            for name, (slow, fast) in figures.items()
-        )
-        lines.append(f"bfloat16 beside float32, batch {single.batch}: {told}.")
-    return lines
+        gains = "; ".join(f"{name} **{_ratio(*pair):.2f}** times" for name, pair in pairs.items())
+        yield f"bfloat16 beside float32, batch {single.batch}: {gains}."
+    yield ""
 
 
-def main() -> None:
-    """Measure, print, write `docs/results/netvlad-speed.md`."""
-    lines = [
-        "# Speed of NetVLAD",
-        "",
+def report() -> Iterator[str]:
+    """The lines of the page."""
+    yield "# Speed of NetVLAD"
+    yield ""
+    yield (
         f"The whole network at {WIDTH} x {HEIGHT}: VGG16, {N_CLUSTERS} clusters, whitening to {N_WHITENED:,} numbers. "
         "Made by `python -m bench.netvlad_speed`, which explains what is compared; medians, and in brackets the range, "
         "of calls taken in turn. Ratios are medians over turns and hold on a shared machine; times are what it had to "
-        "spare.",
-        "",
-        f"Machine: {describe()}, torch {torch.__version__}",
-        "",
-    ]
-    on_cpu = list(measure(Device.CPU, 1, REPEATS["cpu"]))
-    lines += [f"## Processor, {torch.get_num_threads()} threads", "", *table(on_cpu), "", *gains(on_cpu), ""]
+        "spare."
+    )
+    yield from ("", f"{machine()}, torch {torch.__version__}", "")
+    yield from (f"## Processor, {torch.get_num_threads()} threads", "", *table(list(measure(Device.CPU, 1, 15))))
     if torch.cuda.is_available():
-        on_cuda = [row for n in (1, LARGE_BATCH) for row in measure(Device.CUDA, n, REPEATS["cuda"])]
-        lines += [f"## {torch.cuda.get_device_name()}", "", *table(on_cuda), "", *gains(on_cuda), ""]
-    print("\n".join(lines))
-    RESULTS.mkdir(parents=True, exist_ok=True)
-    (RESULTS / "netvlad-speed.md").write_text("\n".join(lines), encoding="utf-8")
-    print(f"written to {RESULTS / 'netvlad-speed.md'}", file=sys.stderr)
+        on_cuda = [row for n_images in (1, 32) for row in measure(Device.CUDA, n_images, 30)]
+        yield from (f"## {torch.cuda.get_device_name()}", "", *table(on_cuda))
 
 
 if __name__ == "__main__":
-    main()
+    write_page("netvlad-speed.md", report())

@@ -6,8 +6,7 @@ Every hyperparameter is varied by itself, then a setting is chosen on three trip
 """
 
 import itertools
-import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -17,9 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.common import RESULTS, describe, real_recordings
+from bench.common import ACTIONS_M, machine, markdown, real_recordings, write_page
 from deepsimbad.core.drive import Drive
-from deepsimbad.core.map import Map
 from deepsimbad.core.metrics import mean_interval
 from deepsimbad.core.nnql import NnqlConfig, initial_q_values
 from deepsimbad.core.relevance import Relevance, UpdateRule
@@ -30,20 +28,13 @@ from deepsimbad.jobs.train import train_nnql, world_of
 
 DRIVES = ("nr", "nq", "nq2")
 TRIPLETS = tuple(itertools.permutations(DRIVES))
-ACTIONS_M = tuple(float(metres) for metres in range(1, 11))
 N_LANDMARKS, LIST_LENGTH, N_STARTS = 300, 4, 2000
 LANDMARK_DRIVE, HELD_OUT, ITSELF, TEST_DRIVE = "landmark traverse", "held-out frames", "map images", "test traverse"
 
 
 @dataclass(frozen=True)
 class Setup:
-    """How views are compared and believed.
-
-    Attributes:
-        name: In the report.
-        relevance, update: Of map and belief.
-        motion_std_m: Blur of the belief; None: as the service does.
-    """
+    """How views are compared and believed; the belief's blur as the service does it where none is named."""
 
     name: str
     relevance: Relevance
@@ -80,17 +71,14 @@ class Triplet:
         if live in {LANDMARK_DRIVE, HELD_OUT}:
             second = landmarks if live == LANDMARK_DRIVE else None
             return train_nnql(built.rehearsal, lambda: own, second, config, lambda _: None, 2)[0]
-        map_ = built.map if live == TEST_DRIVE else built.rehearsal
-        world = self._world(map_, own if live == ITSELF else test, config)
-        return train(world, config, lambda _: None, pool)[0]
+        drive, map_ = (test, built.map) if live == TEST_DRIVE else (own, built.rehearsal)
+        return train(world_of(map_, drive, np.arange(drive.n_frames), config), config, lambda _: None, pool)[0]
 
     def test_world(self, config: NnqlConfig) -> TrainingWorld:
         """The test traverse, to be walked on the map that would serve."""
         built, (_, _, test) = self._mapped
-        return self._world(built.map, test, replace(config, motion_std_m=self.setup.motion_std_m))
-
-    def _world(self, map_: Map, live: Drive, config: NnqlConfig) -> TrainingWorld:
-        return world_of(map_, live, np.arange(live.n_frames), replace(config, update=self.setup.update))
+        config = replace(config, update=self.setup.update, motion_std_m=self.setup.motion_std_m)
+        return world_of(built.map, test, np.arange(test.n_frames), config)
 
 
 def score(ranks: NDArray[np.float64], n_images: int) -> NDArray[np.float64]:
@@ -98,9 +86,9 @@ def score(ranks: NDArray[np.float64], n_images: int) -> NDArray[np.float64]:
     return np.asarray(100 * ranks.mean(axis=1) / n_images, np.float64)
 
 
-def starts_of(world: TrainingWorld, seed: int = 0) -> NDArray[np.int64]:
+def starts_of(world: TrainingWorld) -> NDArray[np.int64]:
     """The same starts for every planner."""
-    return np.random.default_rng(seed).choice(world.start_frames, N_STARTS)
+    return np.random.default_rng(0).choice(world.start_frames, N_STARTS)
 
 
 def greedy(
@@ -108,11 +96,6 @@ def greedy(
 ) -> NDArray[np.float64]:
     """Episodes that follow Q-values."""
     return score(walk_greedily(world, starts_of(world), q_values, config, pool), world.n_images)
-
-
-def random(world: TrainingWorld, config: NnqlConfig, pool: Executor) -> NDArray[np.float64]:
-    """Episodes of random moves."""
-    return greedy(world, initial_q_values(world.n_images, world.n_actions, config), config, pool)
 
 
 def constant(world: TrainingWorld, action: int, pool: Executor) -> NDArray[np.float64]:
@@ -137,14 +120,12 @@ class Setting:
     live: str = LANDMARK_DRIVE
     changes: dict[str, Any] = field(default_factory=dict)
 
-    @property
-    def is_possible(self) -> bool:
-        """Whether a robot could have it: nobody knows the test traverse beforehand."""
-        return self.live not in {TEST_DRIVE, ITSELF}
-
 
 def _fixed(epsilon: float) -> dict[str, Any]:
     return {"exploration": epsilon, "final_exploration": epsilon}
+
+
+FAST = {"learning_rate": 0.3}
 
 
 SETTINGS = (
@@ -158,25 +139,22 @@ SETTINGS = (
     *(Setting(f"discount {gamma:g}", changes={"discount": gamma}) for gamma in (0.0, 0.5, 0.7)),
     *(Setting(f"learning rate {alpha:g}", changes={"learning_rate": alpha}) for alpha in (0.03, 0.3, 0.6)),
     Setting("2,000 episodes", changes={"n_episodes": 2000}),
-    Setting("learning rate 0.3, top 1 %", changes={"learning_rate": 0.3, "top_share": 0.01}),
-    Setting(
-        "learning rate 0.3, top 0.5 %, discount 0.5",
-        changes={"learning_rate": 0.3, "top_share": 0.005, "discount": 0.5},
-    ),
-    Setting("learning rate 0.3, exploration 1", changes={"learning_rate": 0.3, **_fixed(1.0)}),
+    Setting("learning rate 0.3, top 1 %", changes={**FAST, "top_share": 0.01}),
+    Setting("learning rate 0.3, top 0.5 %, discount 0.5", changes={**FAST, "top_share": 0.005, "discount": 0.5}),
+    Setting("learning rate 0.3, exploration 1", changes={**FAST, **_fixed(1.0)}),
     Setting(
         "learning rate 0.3, top 1 %, k = 10, exploration 1",
-        changes={"learning_rate": 0.3, "top_share": 0.01, "n_neighbours": 10, **_fixed(1.0)},
+        changes={**FAST, "top_share": 0.01, "n_neighbours": 10, **_fixed(1.0)},
     ),
     Setting(
         "learning rate 0.3, top 0.5 %, k = 30, discount 0.7, exploration 1",
-        changes={"learning_rate": 0.3, "top_share": 0.005, "n_neighbours": 30, "discount": 0.7, **_fixed(1.0)},
+        changes={**FAST, "top_share": 0.005, "n_neighbours": 30, "discount": 0.7, **_fixed(1.0)},
     ),
-    Setting("held-out frames, learning rate 0.3, top 1 %", HELD_OUT, {"learning_rate": 0.3, "top_share": 0.01}),
+    Setting("held-out frames, learning rate 0.3, top 1 %", HELD_OUT, {**FAST, "top_share": 0.01}),
     Setting(
         "held-out frames, learning rate 0.3, top 0.5 %, k = 10, exploration 1",
         HELD_OUT,
-        {"learning_rate": 0.3, "top_share": 0.005, "n_neighbours": 10, **_fixed(1.0)},
+        {**FAST, "top_share": 0.005, "n_neighbours": 10, **_fixed(1.0)},
     ),
 )
 SEEDS = (1, 2, 3, 4)
@@ -200,97 +178,78 @@ def difference(ours: NDArray[np.float64], theirs: NDArray[np.float64]) -> str:
     return f"{mark}{apart.mean():+.3f}{mark} ({low:+.3f} .. {high:+.3f})"
 
 
-def setup_lines(folder: Path, setup: Setup, pool: Executor) -> list[str]:
+def setup_lines(folder: Path, setup: Setup, pool: Executor) -> Iterator[str]:
     """The tables of one set-up."""
-    triplets = [Triplet(folder, names, setup) for names in TRIPLETS]
-    worlds = [triplet.test_world(NnqlConfig()) for triplet in triplets]
-    random = np.stack([random(world, NnqlConfig(), pool) for world in worlds])
+    config, triplets = NnqlConfig(), [Triplet(folder, names, setup) for names in TRIPLETS]
+    names, worlds = ["-".join(triplet.names) for triplet in triplets], [each.test_world(config) for each in triplets]
+    unlearnt = [initial_q_values(world.n_images, world.n_actions, config) for world in worlds]  # random moves
+    random = np.stack([greedy(world, values, config, pool) for world, values in zip(worlds, unlearnt, strict=True)])
     constants = np.stack([[constant(world, action, pool) for world in worlds] for action in range(10)])
-    longest = constants[LONGEST]
-    names = ["-".join(triplet.names) for triplet in triplets]
-    lines = [f"## {setup.name[0].upper()}{setup.name[1:]}", ""]
-    lines += [f"| ANR, percent | mean | {' | '.join(names)} |", "|---|---|" + "---|" * len(names)]
-    lines += [_row("random moves", random)]
-    lines += [_row(f"constant {action + 1} m", constants[action]) for action in (0, 4, LONGEST)]
-    best = constants.mean(axis=2).min(axis=0)
-    lines.append(_row("each triplet's best constant, known only afterwards", best[:, np.newaxis]))
-    lines += ["", "| NNQL | ANR, mean | less random | less constant 10 m |", "|---|---|---|---|"]
-    found = {}
-    for setting in SETTINGS:
-        scores = found[setting.label] = measure(triplets, setting, pool)
-        lines.append(
-            f"| {setting.label} | {scores.mean():.3f} | {difference(scores, random)} | {difference(scores, longest)} |"
-        )
-        print(lines[-1], flush=True)
-    first = found[SETTINGS[0].label]
-    lines += ["", _seeds([first, *(measure(triplets, SETTINGS[0], pool, seed) for seed in SEEDS)], random, longest)]
-    return [*lines, "", *_chosen(found, random, constants, names)]
-
-
-def _seeds(scores: Sequence[NDArray[np.float64]], random: NDArray[np.float64], longest: NDArray[np.float64]) -> str:
-    """How far the training's own draws move a row, which no interval over starts shows."""
-    means = [each.mean() for each in scores]
-    together = np.mean(scores, axis=0)
-    return (
+    longest, best = constants[LONGEST], constants.mean(axis=2).min(axis=0)
+    yield from (f"## {setup.name[0].upper()}{setup.name[1:]}", "")
+    baselines = {
+        "random moves": random,
+        **{f"constant {action + 1} m": constants[action] for action in (0, 4, LONGEST)},
+        "each triplet's best constant, known only afterwards": best[:, np.newaxis],
+    }
+    rows = [
+        [name, f"{scores.mean():.3f}", *(f"{mean:.2f}" for mean in scores.mean(axis=1))]
+        for name, scores in baselines.items()
+    ]
+    yield from markdown(("ANR, percent", "mean", *names), rows)
+    yield ""
+    learnt = {setting.label: measure(triplets, setting, pool) for setting in SETTINGS}
+    differences = [
+        [label, f"{scores.mean():.3f}", difference(scores, random), difference(scores, longest)]
+        for label, scores in learnt.items()
+    ]
+    yield from markdown(("NNQL", "ANR, mean", "less random", "less constant 10 m"), differences)
+    # How far the training's own draws move a row, which no interval over starts shows.
+    seeds = [learnt[SETTINGS[0].label], *(measure(triplets, SETTINGS[0], pool, seed) for seed in SEEDS)]
+    means, together = [scores.mean() for scores in seeds], np.mean(seeds, axis=0)
+    yield ""
+    yield (
         f"The first row with {len(means)} seeds of the training: ANR {np.mean(means):.3f} on average, standard "
         f"deviation {np.std(means, ddof=1):.3f}, from {min(means):.3f} to {max(means):.3f}; their average less random "
         f"{difference(together, random)}, less constant 10 m {difference(together, longest)}."
     )
-
-
-def _chosen(
-    found: dict[str, NDArray[np.float64]], random: NDArray[np.float64], constants: NDArray[np.float64], names: list[str]
-) -> list[str]:
+    yield ""
+    # Nobody knows the test traverse beforehand, so a setting that learns from it is none to choose.
+    possible = [setting.label for setting in SETTINGS if setting.live not in {TEST_DRIVE, ITSELF}]
     chosen, reported = list(CHOSEN_ON), list(REPORTED_ON)
-    possible = [setting.label for setting in SETTINGS if setting.is_possible]
-    best = min(possible, key=lambda label: float(found[label][chosen].mean()))
+    label = min(possible, key=lambda label: float(learnt[label][chosen].mean()))
     action = int(constants[:, chosen].mean(axis=(1, 2)).argmin())
-    scores = found[best][reported]
-    return [
-        f"Best possible setting on {', '.join(names[place] for place in chosen)}: **{best}**, ANR "
-        f"{found[best][chosen].mean():.3f}, against {random[chosen].mean():.3f} of random moves and "
+    scores, rivals = learnt[label], {"random moves": random, f"constant {action + 1} m": constants[action]}
+    yield (
+        f"Best possible setting on {', '.join(names[place] for place in chosen)}: **{label}**, ANR "
+        f"{scores[chosen].mean():.3f}, against {random[chosen].mean():.3f} of random moves and "
         f"{constants[action][chosen].mean():.3f} of constant {action + 1} m, the best there. On the other three, "
-        f"{', '.join(names[place] for place in reported)}:",
-        "",
-        "| | ANR, mean | NNQL less it, 95 % interval |",
-        "|---|---|---|",
-        f"| NNQL with that setting | {scores.mean():.3f} | |",
-        f"| random moves | {random[reported].mean():.3f} | {difference(scores, random[reported])} |",
-        f"| constant {action + 1} m | {constants[action][reported].mean():.3f} "
-        f"| {difference(scores, constants[action][reported])} |",
-    ]
+        f"{', '.join(names[place] for place in reported)}:"
+    )
+    yield ""
+    rows = [["NNQL with that setting", f"{scores[reported].mean():.3f}", ""]]
+    for name, rival in rivals.items():
+        rows.append([name, f"{rival[reported].mean():.3f}", difference(scores[reported], rival[reported])])
+    yield from markdown(("", "ANR, mean", "NNQL less it, 95 % interval"), rows)
+    yield ""
 
 
-def _row(label: str, scores: NDArray[np.float64]) -> str:
-    each = " | ".join(f"{score:.2f}" for score in scores.mean(axis=1))
-    return f"| {label} | {scores.mean():.3f} | {each} |"
-
-
-def main() -> None:
-    """Measure, print, write `docs/results/nnql.md`."""
-    folder = real_recordings() / "nordland_netvlad64"
-    lines = [
-        "# When NNQL beats random and constant moves",
-        "",
+def report(folder: Path) -> Iterator[str]:
+    """The lines of the page."""
+    yield from ("# When NNQL beats random and constant moves", "")
+    yield (
         "Nearest-neighbour Q-learning (II-D) on three drives of the Nordland route, 600 places, 64-d NetVLAD, all six "
         "landmark-training-test triplets; r = 300, h = 4, one place taken as one metre, moves of 1 to 10 m, ten a "
         f"test episode, {N_STARTS:,} starts, the same for every row. Trained with 10,000 episodes. ANR of the belief "
         "after each move, in percent: 0 is perfect, 50 chance, smaller is better. Differences are paired by start and "
         "averaged over the triplets, with their 95 % bootstrap interval over the starts; **bold**: better, and zero "
-        "is outside.",
-        "",
-        "Made by `python -m bench.nnql_table`.",
-        "",
-        f"Machine: {describe()}",
-        "",
-    ]
+        "is outside."
+    )
+    yield from ("", "Made by `python -m bench.nnql_table`.", "", machine(), "")
     with ThreadPoolExecutor(2) as pool:
         for setup in (PAPER, OURS):
-            lines += [*setup_lines(folder, setup, pool), ""]
-    lines += ["## What it shows", "", *CONCLUSIONS]
-    RESULTS.mkdir(parents=True, exist_ok=True)
-    (RESULTS / "nnql.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    print(f"\nwritten to {RESULTS / 'nnql.md'}", file=sys.stderr)
+            yield from setup_lines(folder, setup, pool)
+    yield from ("## What it shows", "", *CONCLUSIONS)
 
 
 CONCLUSIONS = (
@@ -323,4 +282,4 @@ CONCLUSIONS = (
 
 
 if __name__ == "__main__":
-    main()
+    write_page("nnql.md", report(real_recordings() / "nordland_netvlad64"))

@@ -8,15 +8,15 @@ most 8 (of the map's frames in either season, of the landmarks' in summer, the o
 is one metre; a match within two frames is right.
 """
 
-import sys
 import tempfile
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import cv2
 
-from bench.common import RESULTS, describe, real_recordings
+from bench.common import machine, markdown, real_recordings, write_page
 from deepsimbad_client import Client
 from deepsimbad_client.http.jobs import remap
 from deepsimbad_client.http.local_server import LocalServer
@@ -27,21 +27,15 @@ from deepsimbad_client.replay.report import summarise
 
 DOMAIN = "nordland"
 RELEVANCES = ("calibrated", "standardised", "rrf", "bag_of_landmarks", "simbad", "brute_force")
-N_LANDMARKS, LIST_LENGTH, TOLERANCE_M = 300, 4, 2.0
+TOLERANCE_M = 2.0
+REMAP: dict[str, Any] = {"landmark_traverse": "landmarks", "n_landmarks": 300, "list_length": 4}
 MAP_FRAMES, LANDMARK_FRAMES = range(1000), range(1000, 2000)
 _LEAST_GREY_STD = 8.0
 
 
 @dataclass(frozen=True)
 class Measured:
-    """What was measured.
-
-    Attributes:
-        summaries: The client's own summary of every relevance's replay.
-        n_map_frames_left_out: Of frames 0..999.
-        n_landmark_frames_left_out: Of frames 1000..1999.
-        extractor: The domain's, as the service names it.
-    """
+    """The client's own summary of every relevance's replay; what was left out of frames 0..999 and 1000..1999."""
 
     summaries: dict[str, dict[str, Any]]
     n_map_frames_left_out: int
@@ -49,27 +43,26 @@ class Measured:
     extractor: str
 
 
-def shows_something(path: Path) -> bool:
-    """Whether a frame is more than darkness."""
+def kept_frames(seasons: tuple[Path, ...], numbers: range) -> list[int]:
+    """The frames that show something in every one of these seasons."""
+    return [number for number in numbers if all(_shows_something(season / f"{number:05}.png") for season in seasons)]
+
+
+def _shows_something(path: Path) -> bool:
     grey = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
     if grey is None:
         raise FileNotFoundError(f"no image at {path}")
     return float(grey.std()) > _LEAST_GREY_STD
 
 
-def kept_frames(seasons: tuple[Path, ...], numbers: range) -> list[int]:
-    """The frames that show something in every one of these seasons."""
-    return [each for each in numbers if all(shows_something(season / f"{each:05}.png") for season in seasons)]
-
-
 def season_folder(folder: Path, season: Path, numbers: list[int], first: int) -> Path:
     """A folder of links to some frames, with their positions: one metre a frame from `first`."""
     folder.mkdir()
     lines = ["name,position_m"]
-    for each in numbers:
-        name = f"{each:05}.png"
+    for number in numbers:
+        name = f"{number:05}.png"
         (folder / name).symlink_to((season / name).resolve())
-        lines.append(f"{name},{each - first}")
+        lines.append(f"{name},{number - first}")
     (folder / "positions.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
     return folder
 
@@ -95,22 +88,11 @@ def measure(nordland: Path, work: Path, relevances: tuple[str, ...] = RELEVANCES
         relevances: The maps to make, one after the other.
     """
     drives, n_map_left_out, n_landmarks_left_out = drive_folders(nordland, work)
-    live = open_source(str(drives.pop("live")))
-    summaries = {}
+    live, summaries = open_source(str(drives["live"])), {}
     with LocalServer(work / "data") as server, Client(server.url) as client:
-        client.admin.put_domain(DOMAIN, {"kind": "feature_l2"})
-        for name, folder in drives.items():
-            upload(client, open_source(str(folder)), DOMAIN, name)
+        make_domain(client, drives)
         for relevance in relevances:
-            remap(
-                client,
-                DOMAIN,
-                "map",
-                landmark_traverse="landmarks",
-                n_landmarks=N_LANDMARKS,
-                list_length=LIST_LENGTH,
-                relevance=relevance,
-            )
+            remap(client, DOMAIN, "map", relevance=relevance, **REMAP)
             # One query at a time: the time an answer takes is then the service's, not a queue's.
             driven = replay(client, live, DOMAIN, work / relevance, tolerance_m=TOLERANCE_M, concurrency=1)
             summaries[relevance] = summarise(driven)
@@ -119,48 +101,51 @@ def measure(nordland: Path, work: Path, relevances: tuple[str, ...] = RELEVANCES
     return Measured(summaries, n_map_left_out, n_landmarks_left_out, extractor)
 
 
-def table(measured: Measured) -> list[str]:
-    """Markdown lines."""
-    lines = ["| relevance | ANR % | R@1 % | R@5 % | ms a call, median |", "|---|---|---|---|---|"]
-    for name, summary in measured.summaries.items():
-        lines.append(
-            f"| {name} | {summary['anr']:.2f} | {summary['recall_at_1']:.1f} | {summary['recall_at_5']:.1f} "
-            f"| {summary['latency_ms']['median']:.1f} |"
+def make_domain(client: Client, drives: dict[str, Path]) -> None:
+    """The domain, and the traverses `landmarks` and `map`."""
+    client.admin.put_domain(DOMAIN, {"kind": "feature_l2"})
+    for name in ("landmarks", "map"):
+        upload(client, open_source(str(drives[name])), DOMAIN, name)
+
+
+def report(measured: Measured) -> Iterator[str]:
+    """The lines of the page."""
+    yield "# Nordland over HTTP: map summer, drive winter"
+    yield ""
+    yield (
+        "Real images, posted one by one to a running service, each localized on its own (stateless: the map's "
+        "statistics alone). Landmarks come from another part of the route: `calibrated` has no second season to learn "
+        "from."
+    )
+    yield from ("", "Made by `python -m bench.nordland`.", "", machine(), "")
+    rows = [
+        (
+            name,
+            f"{of['anr']:.2f}",
+            f"{of['recall_at_1']:.1f}",
+            f"{of['recall_at_5']:.1f}",
+            f"{of['latency_ms']['median']:.1f}",
         )
+        for name, of in measured.summaries.items()
+    ]
+    yield from markdown(("relevance", "ANR %", "R@1 %", "R@5 %", "ms a call, median"), rows)
+    yield ""
     first = next(iter(measured.summaries.values()))
-    return [
-        *lines,
-        "",
+    yield (
         f"{first['n_queries']} queries against {first['n_map_images']} map images. Left out because an image "
         f"shows nothing (grey levels' standard deviation at most {_LEAST_GREY_STD:g}): "
         f"{measured.n_map_frames_left_out} of frames 0..999, where either season counts, and "
-        f"{measured.n_landmark_frames_left_out} of the landmarks' 1000..1999 in summer. r = {N_LANDMARKS}, "
-        f"h = {LIST_LENGTH}, tolerance {TOLERANCE_M:g} frames, extractor {measured.extractor}. "
-        "ANR: 0 is perfect, 50 chance. Times are of a machine shared with other work.",
-    ]
+        f"{measured.n_landmark_frames_left_out} of the landmarks' 1000..1999 in summer. "
+        f"r = {REMAP['n_landmarks']}, h = {REMAP['list_length']}, tolerance {TOLERANCE_M:g} frames, "
+        f"extractor {measured.extractor}. ANR: 0 is perfect, 50 chance. Times are of a machine shared with other work."
+    )
 
 
 def main() -> None:
     """Measure, print, write `docs/results/nordland-http.md`."""
     with tempfile.TemporaryDirectory() as work:
         measured = measure(real_recordings() / "nordland", Path(work))
-    lines = [
-        "# Nordland over HTTP: map summer, drive winter",
-        "",
-        "Real images, posted one by one to a running service, each localized on its own (stateless: the map's "
-        "statistics alone). Landmarks come from another part of the route: `calibrated` has no second season to learn "
-        "from.",
-        "",
-        "Made by `python -m bench.nordland`.",
-        "",
-        f"Machine: {describe()}",
-        "",
-        *table(measured),
-    ]
-    print("\n".join(lines))
-    RESULTS.mkdir(parents=True, exist_ok=True)
-    (RESULTS / "nordland-http.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    print(f"\nwritten to {RESULTS / 'nordland-http.md'}", file=sys.stderr)
+    write_page("nordland-http.md", report(measured))
 
 
 if __name__ == "__main__":

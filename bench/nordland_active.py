@@ -5,18 +5,17 @@
 Map, landmarks and live drive as in `bench.nordland`; ten moves an episode, the same random starts for every planner.
 """
 
-import sys
+import io
 import tempfile
 from pathlib import Path
 
 from rich.console import Console
 
-from bench.common import RESULTS, describe, real_recordings
-from bench.nordland import DOMAIN, LIST_LENGTH, N_LANDMARKS, drive_folders
+from bench.common import machine, real_recordings, write_page
+from bench.nordland import DOMAIN, REMAP, drive_folders, make_domain
 from deepsimbad_client import Client
 from deepsimbad_client.http.jobs import remap
 from deepsimbad_client.http.local_server import LocalServer
-from deepsimbad_client.http.upload import upload
 from deepsimbad_client.recordings.sources import open_source
 from deepsimbad_client.replay.active import active_replay
 from deepsimbad_client.replay.report import active_tables, summarise_active
@@ -31,21 +30,12 @@ def main() -> None:
         work = Path(folder)
         drives, *_ = drive_folders(real_recordings() / "nordland", work)
         with LocalServer(work / "data") as server, Client(server.url) as client:
-            client.admin.put_domain(DOMAIN, {"kind": "feature_l2"})
-            for name in ("landmarks", "map"):
-                upload(client, open_source(str(drives[name])), DOMAIN, name)
-            remap(
-                client,
-                DOMAIN,
-                "map",
-                landmark_traverse="landmarks",
-                n_landmarks=N_LANDMARKS,
-                list_length=LIST_LENGTH,
-            )
+            make_domain(client, drives)
+            remap(client, DOMAIN, "map", **REMAP)
             live = open_source(str(drives["live"]))
             walked = active_replay(client, live, DOMAIN, work / "walks", planners=PLANNERS, episodes=EPISODES)
             summary = summarise_active(walked)
-    console = Console(width=150, record=True, file=sys.stdout)
+    console = Console(width=150, record=True, file=io.StringIO())
     for table in active_tables(summary):
         console.print(table)
     lines = [
@@ -53,7 +43,7 @@ def main() -> None:
         "",
         f"Made by `python -m bench.nordland_active`: {EPISODES} episodes of ten moves, the same starts for all.",
         "",
-        f"Machine: {describe()}",
+        machine(),
         "",
         "Landmarks summer 1000..1999, map summer 0..999, robot winter 0..999; the landmark drive never saw the mapped",
         "stretch, so nobody knows which places are telling and the default planner makes the longest move: it equals",
@@ -63,9 +53,8 @@ def main() -> None:
         "```",
         console.export_text().rstrip(),
         "```",
-        "",
     ]
-    (RESULTS / "nordland-active.md").write_text("\n".join(lines), encoding="utf-8")
+    write_page("nordland-active.md", lines)
 
 
 if __name__ == "__main__":

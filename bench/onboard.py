@@ -8,7 +8,6 @@ mean of the ranks left.
 """
 
 import itertools
-import sys
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -18,7 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.common import RESULTS, describe, real_recordings
+from bench.common import machine, markdown, real_recordings, write_page
 from bench.nordland import LANDMARK_FRAMES, MAP_FRAMES, kept_frames
 from deepsimbad.core.building import build_map
 from deepsimbad.core.descriptor import (
@@ -139,77 +138,66 @@ def _encoded(evaluator: Evaluator, season: Path, numbers: Sequence[int]) -> NDAr
     return np.concatenate([evaluator.encode(block) for block in blocks])
 
 
-def rows(triplets: Sequence[Drives], n_landmarks: int) -> Iterator[str]:
-    """A Markdown line for every m, each figure the mean over the triplets."""
+def table(triplets: Sequence[Drives]) -> Iterator[str]:
+    """A Markdown line for every r and m, each figure the mean over the triplets."""
+    head = (
+        "r",
+        "m",
+        "bytes",
+        "calibrated, by mean rank",
+        "**calibrated**",
+        "calibrated, views alone",
+        "rrf",
+        "ms a view",
+    )
+    return markdown(head, (row for n_landmarks in N_LANDMARKS for row in _rows(triplets, n_landmarks)))
+
+
+def _rows(triplets: Sequence[Drives], n_landmarks: int) -> Iterator[list[str]]:
     calibrated = [(drives, *drives.views(Relevance.CALIBRATED, n_landmarks)) for drives in triplets]
     rrf = [(drives, *drives.views(Relevance.RRF, n_landmarks)) for drives in triplets]
     columns = ((calibrated, "mean rank"), (calibrated, "session"), (calibrated, "alone"), (rrf, "session"))
-    found = {}
+    whole: list[float] = []
     for m in (n_landmarks, *N_SENT):
-        measured = [[anr(*each, m, how) for each in maps] for maps, how in columns]
-        found[m] = [np.mean([figure for figure, _ in one]) for one in measured]
+        measured = np.array([[anr(*each, m, how) for each in maps] for maps, how in columns])
+        means = measured[:, :, 0].mean(axis=1).tolist()
+        whole = whole or means
         n_bytes = len(pack_ranked_landmarks(range(m), n_landmarks))
-        ms = np.mean([ms for _, ms in measured[1]])
-        within = " **(64 bytes)**" if n_bytes == BUDGET_BYTES else ""
-        costs = " | ".join(
-            f"{value:.2f}" + ("" if m == n_landmarks else f" ({100 * (value / whole - 1):+.0f} %)")
-            for value, whole in zip(found[m], found[n_landmarks], strict=True)
-        )
-        yield f"| {n_landmarks} | {'all' if m == n_landmarks else m}{within} | {n_bytes} | {costs} | {ms:.1f} |"
+        shown = f"{'all' if m == n_landmarks else m}{' **(64 bytes)**' if n_bytes == BUDGET_BYTES else ''}"
+        costs = [
+            f"{value:.2f}" + ("" if m == n_landmarks else f" ({100 * (value / best - 1):+.0f} %)")
+            for value, best in zip(means, whole, strict=True)
+        ]
+        yield [str(n_landmarks), shown, str(n_bytes), *costs, f"{measured[1, :, 1].mean():.1f}"]
 
 
-def table(triplets: Sequence[Drives]) -> list[str]:
-    """Markdown lines for every r and m."""
-    lines = [
-        "| r | m | bytes | calibrated, by mean rank | **calibrated** | calibrated, views alone | rrf | ms a view |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
-    for n_landmarks in N_LANDMARKS:
-        for line in rows(triplets, n_landmarks):
-            print(line, flush=True)
-            lines.append(line)
-    return lines
-
-
-def main() -> None:
-    """Measure, print, write `docs/results/onboard.md`."""
-    recordings = real_recordings()
-    lines = [
-        "# Encoding on board: what an observation of a few bytes costs",
-        "",
+def report(recordings: Path) -> Iterator[str]:
+    """The lines of the page."""
+    yield from ("# Encoding on board: what an observation of a few bytes costs", "")
+    yield (
         "A robot that encodes on board sends its m nearest landmarks as `application/vnd.deepsimbad.ranks`: two bytes "
         "and ceil(log2 r) bits a landmark. ANR in percent (0 is perfect, 50 chance) and, in brackets, how much worse "
         f"that is than sending all ranks. h = {LIST_LENGTH}, tolerance {TOLERANCE} frames; one session over the test "
-        "drive in order, but for `views alone` (each by the map's statistics, as single localizations are answered).",
-        "",
+        "drive in order, but for `views alone` (each by the map's statistics, as single localizations are answered)."
+    )
+    yield ""
+    yield (
         "`calibrated` is the default: of a landmark that was not sent the score is the expected one, given the "
         "landmarks that were, how landmarks went together over the map's drive, and that it is farther than the last "
         "that was sent; its evidence counts by how much of it is known. `by mean rank` gives it the mean of the ranks "
         "left instead, as if that had been measured. `rrf` has no statistics and takes that mean. Times are those of "
-        "`calibrated` in a session, statistics and relevance, on a machine shared with other work.",
-        "",
-        "Made by `python -m bench.onboard`.",
-        "",
-        f"Machine: {describe()}",
-        "",
-        "## NetVLAD encodings of Nordland",
-        "",
-        "Mean over the six landmark-training-test permutations of three drives, 600 places, 64 numbers each.",
-        "",
-        *table(netvlad(recordings / "nordland_netvlad64")),
-        "",
-        "## Images of Nordland, winter on a summer map",
-        "",
+        "`calibrated` in a session, statistics and relevance, on a machine shared with other work."
+    )
+    yield from ("", "Made by `python -m bench.onboard`.", "", machine(), "", "## NetVLAD encodings of Nordland", "")
+    yield "Mean over the six landmark-training-test permutations of three drives, 600 places, 64 numbers each."
+    yield from ("", *table(netvlad(recordings / "nordland_netvlad64")), "")
+    yield from ("## Images of Nordland, winter on a summer map", "")
+    yield (
         "Extractor efficientnet_lite0; landmarks come from another part of the route (summer 1000..1999), so no second "
-        "season is known. Frames that show nothing are left out, as in [nordland-http.md](nordland-http.md).",
-        "",
-        *table(nordland(recordings / "nordland")),
-    ]
-    print("\n".join(lines))
-    RESULTS.mkdir(parents=True, exist_ok=True)
-    (RESULTS / "onboard.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    print(f"\nwritten to {RESULTS / 'onboard.md'}", file=sys.stderr)
+        "season is known. Frames that show nothing are left out, as in [nordland-http.md](nordland-http.md)."
+    )
+    yield from ("", *table(nordland(recordings / "nordland")))
 
 
 if __name__ == "__main__":
-    main()
+    write_page("onboard.md", report(real_recordings()))

@@ -59,16 +59,11 @@ async def _seconds() -> list[float]:
         await call("PUT", DOMAIN, json={"evaluator": {"kind": "feature_l2", "extractor": "none"}})
         await call("POST", f"{DOMAIN}/traverses", json={"name": "t"})
         packed = io.BytesIO()
-        index = np.arange(N_IMAGES)
-        np.savez(packed, encodings=encodings, index=index, position_m=1.0 * index)
+        np.savez(packed, encodings=encodings, index=np.arange(N_IMAGES), position_m=np.arange(float(N_IMAGES)))
         binary = {"Content-Type": "application/octet-stream"}
         await call("POST", f"{DOMAIN}/traverses/t/frames", content=packed.getvalue(), headers=binary)
-        config = {
-            "training_traverse": "t",
-            "landmark_traverse": "t",
-            "n_landmarks": N_LANDMARKS,
-            "training_episodes": 0,
-        }
+        drives = {"training_traverse": "t", "landmark_traverse": "t"}
+        config = {**drives, "n_landmarks": N_LANDMARKS, "training_episodes": 0}
         job = await call("POST", f"{DOMAIN}/remaps", json=config)
         while job["state"] in {"queued", "running"}:
             await asyncio.sleep(0.2)

@@ -1,6 +1,5 @@
 """Synthetic maps of any size, in the two extremes that matter for size and speed, and two seasons of one long route."""
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,32 +13,25 @@ from deepsimbad.core.relevance import Relevance
 from deepsimbad.store.traverses import Traverse
 
 NCLT_IMAGES = 26_208  # one traverse of the paper
-N_LANDMARKS, LIST_LENGTH, ENCODING_DIM = 500, 4, 4096
+N_CANDIDATES, N_LANDMARKS, LIST_LENGTH, ENCODING_DIM = 26_000, 500, 4, 4096
+SPACING_M = 0.2  # of NCLT's frames at walking speed
 
 
-@dataclass(frozen=True)
-class Lists:
-    """Landmark lists [h, n] uint16, and how they came about."""
-
-    name: str
-    lists: NDArray[np.uint16]
-
-
-def scattered_lists(n_images: int, seed: int = 0) -> Lists:
-    """Every image's landmarks drawn anew: nothing to gain from neighbours, the worst case for size."""
-    rng = np.random.default_rng(seed)
+def scattered_lists(n_images: int) -> NDArray[np.uint16]:
+    """[h, n] every image's landmarks drawn anew: nothing to gain from neighbours, the worst case for size."""
+    rng = np.random.default_rng(0)
     lists = np.empty((LIST_LENGTH, n_images), np.uint16)
     lists[0] = rng.integers(0, N_LANDMARKS, n_images)
     for row in range(1, LIST_LENGTH):
         lists[row] = rng.integers(0, N_LANDMARKS, n_images)
         while (clash := (lists[:row] == lists[row]).any(axis=0)).any():
             lists[row, clash] = rng.integers(0, N_LANDMARKS, int(clash.sum()))
-    return Lists("every image's landmarks drawn at random", lists)
+    return lists
 
 
-def dense_lists(n_images: int, seed: int = 0, smoothness: float = 0.99) -> Lists:
-    """Dissimilarities that drift from image to image, as in a recording at 5 Hz: neighbours share landmarks."""
-    rng = np.random.default_rng(seed)
+def dense_lists(n_images: int, smoothness: float = 0.99) -> NDArray[np.uint16]:
+    """[h, n] of dissimilarities that drift, as in a recording at 5 Hz: neighbours share landmarks."""
+    rng = np.random.default_rng(0)
     lists = np.empty((LIST_LENGTH, n_images), np.uint16)
     level = rng.normal(size=N_LANDMARKS).astype(np.float32)
     fresh = np.float32(np.sqrt(1 - smoothness**2))
@@ -47,17 +39,17 @@ def dense_lists(n_images: int, seed: int = 0, smoothness: float = 0.99) -> Lists
         level = np.float32(smoothness) * level + fresh * rng.normal(size=N_LANDMARKS).astype(np.float32)
         nearest = np.argpartition(level, LIST_LENGTH)[:LIST_LENGTH]
         lists[:, image] = nearest[np.argsort(level[nearest])]
-    return Lists("landmarks that drift from image to image", lists)
+    return lists
 
 
-def standardised_map(lists: NDArray[np.uint16], seed: int = 0, **more: Any) -> Map:
+def standardised_map(lists: NDArray[np.uint16], **more: Any) -> Map:
     """A map of these lists, five images a metre, for a relevance of ours; `more` of its fields."""
-    rng = np.random.default_rng(seed)
-    statistics = LandmarkStatistics.of_map(rank_landmarks(rng.random((2000, N_LANDMARKS))))
+    dissimilarities = np.random.default_rng(0).random((2000, N_LANDMARKS))
+    statistics = LandmarkStatistics.of_map(rank_landmarks(dissimilarities))
     return Map(
         config={"relevance": Relevance.STANDARDISED.value, "n_landmarks": N_LANDMARKS},
         lists=lists,
-        position_m=np.arange(lists.shape[1]) * 0.2,
+        position_m=np.arange(lists.shape[1]) * SPACING_M,
         statistics=np.stack([statistics.mean, statistics.std]),
         **more,
     )
@@ -66,10 +58,9 @@ def standardised_map(lists: NDArray[np.uint16], seed: int = 0, **more: Any) -> M
 def rrf_map(lists: NDArray[np.uint16], **more: Any) -> Map:
     """A map of these lists for the paper's relevance."""
     config = {"relevance": Relevance.RRF.value, "n_landmarks": N_LANDMARKS}
-    return Map(config=config, lists=lists, position_m=np.arange(lists.shape[1]) * 0.2, **more)
+    return Map(config=config, lists=lists, position_m=np.arange(lists.shape[1]) * SPACING_M, **more)
 
 
-SPACING_M = 0.2
 _BLOCK = 1024
 
 

@@ -9,20 +9,20 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.common import Limit, breaches, describe, limit_table
+from bench.common import Limit, breaches, limit_table, machine, markdown
 from bench.soak.trial import LONGEST_LIFE_S, Soak, soak
 
 READY_WITHIN_S = 2.0
 
 
-def limits(found: Soak) -> list[Limit]:
+def limits(result: Soak) -> list[Limit]:
     """What must be kept: every single start, the longest too."""
-    return [Limit("ready again after a kill, the longest start, seconds", max(found.ready_s), READY_WITHIN_S)]
+    return [Limit("ready again after a kill, the longest start, seconds", max(result.ready_s), READY_WITHIN_S)]
 
 
-def report(found: Soak) -> Iterator[str]:
+def report(result: Soak) -> Iterator[str]:
     """Markdown lines."""
-    ready, empty = np.array(found.ready_s), np.array(found.empty_ready_s)
+    ready, empty = np.array(result.ready_s), np.array(result.empty_ready_s)
     longest = int(ready.argmax())
     yield "# kill -9 under load"
     yield ""
@@ -30,35 +30,33 @@ def report(found: Soak) -> Iterator[str]:
     yield "traverses are uploaded and deleted, and maps are made, activated and rolled back; then everything that was"
     yield "acknowledged is looked for. A run that misses anything, or finds a damaged file, ends with an error instead."
     yield ""
-    yield f"Machine: {describe()}"
+    yield machine()
     yield ""
-    yield "| | |"
-    yield "|---|---|"
-    yield (
-        f"| kills, each 0 to {LONGEST_LIFE_S:g} s after the service was ready: in turn at any time, during an upload, "
-        f"a remap, an activation, a rollback | {found.n_kills} |"
+    kills = (
+        f"kills, each 0 to {LONGEST_LIFE_S:g} s after the service was ready: in turn at any time, during an upload, "
+        "a remap, an activation, a rollback"
     )
-    for who, count in found.n_acknowledged.items():
-        yield f"| acknowledged writes: {who.lower()} | {count:,} |"
-    yield "| acknowledged writes lost | 0 |"
-    yield "| damaged files (`deepsimbad check`, and bit by bit) | 0 |"
-    yield f"| remaps that succeeded, many of them across kills | {found.n_remaps} |"
-    yield f"| remaps given up, and saying so, after three deaths under them | {found.n_interrupted} |"
-    yield f"| start of the process to `/readyz` 200, embedded extractor loaded | {_spread(ready, 's')} |"
-    yield f"| the same on an empty data directory, right before each of them | {_spread(empty, 's')} |"
-    yield f"| the one divided by the other, start by start | {_spread(ready / empty, 'times')} |"
-    yield f"| right before the longest, on an empty data directory | {empty[longest]:.2f} s |"
+    rows = {
+        kills: len(result.ready_s),
+        **{f"acknowledged writes: {who.lower()}": f"{count:,}" for who, count in result.n_acknowledged.items()},
+        "acknowledged writes lost": 0,
+        "damaged files (`deepsimbad check`, and bit by bit)": 0,
+        "remaps that succeeded, many of them across kills": result.n_remaps,
+        "remaps given up, and saying so, after three deaths under them": result.n_interrupted,
+        "start of the process to `/readyz` 200, embedded extractor loaded": _spread(ready, "s"),
+        "the same on an empty data directory, right before each of them": _spread(empty, "s"),
+        "the one divided by the other, start by start": _spread(ready / empty, "times"),
+        "right before the longest, on an empty data directory": f"{empty[longest]:.2f} s",
+    }
+    yield from markdown(("", ""), rows.items())
     yield ""
     yield "A machine that is busy slows both kinds of start; a ratio that grows is the service's own doing."
     yield ""
-    yield from limit_table(limits(found))
+    yield from limit_table(limits(result))
     yield ""
     yield "What uploader and mapper were about when it died (robots observe all the time):"
     yield ""
-    yield "| | kills |"
-    yield "|---|---|"
-    for what, count in sorted(found.doing.items(), key=lambda each: -each[1]):
-        yield f"| {what} | {count} |"
+    yield from markdown(("", "kills"), sorted(result.doing.items(), key=lambda item: -item[1]))
 
 
 def _spread(figures: NDArray[np.float64], unit: str) -> str:
@@ -76,18 +74,18 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="write the report here as well")
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        found = soak(
+        result = soak(
             Path(folder) / "data",
             given.kills,
             given.seed,
             lambda done: print(f"\r{done} of {given.kills} kills", end="", file=sys.stderr, flush=True),
         )
-    text = "\n".join(report(found)) + "\n"
+    text = "\n".join(report(result)) + "\n"
     print(file=sys.stderr)
     print(text, end="")
     if given.out is not None:
         given.out.write_text(text, encoding="utf-8")
-    sys.exit(breaches(limits(found)))
+    sys.exit(breaches(limits(result)))
 
 
 if __name__ == "__main__":

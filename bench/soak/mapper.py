@@ -5,13 +5,10 @@ from typing import Any
 
 import numpy as np
 
-from bench.soak.actor import Actor, expect
-from bench.soak.link import Link
-from bench.soak.world import BASE, DOMAIN, remap_config
+from bench.link import Link
+from bench.soak.actor import BASE, DOMAIN, Actor, expect, remap_config
 
-_POLL_S = 0.03
-_SWITCHES = 6  # between two remaps, on average
-_FINAL = {"succeeded", "failed", "cancelled"}
+SWITCHES = 6  # between two remaps, on average
 
 
 class Mapper(Actor):
@@ -37,33 +34,22 @@ class Mapper(Actor):
 
     def act(self, link: Link) -> None:
         """Ask for a remap, follow it, or switch versions."""
-        if (
-            self._job is None
-            and not self._asking
-            and len(self._sealed) > 1
-            and self._rng.random() < _SWITCHES / (_SWITCHES + 1)
-        ):
+        if self._job is not None:
+            job = link.ask("GET", f"/v1/admin/jobs/{self._job['job_id']}")
+            self.doing = f"remap: {job['stage'] or job['state']}"
+            if job["state"] in {"queued", "running"}:
+                time.sleep(0.03)
+            else:
+                self._end(link, job)
+        elif not self._asking and len(self._sealed) > 1 and self._rng.random() < SWITCHES / (SWITCHES + 1):
             self._switch(link)
-        elif self._job is None:
-            self._ask(link)
         else:
-            self._follow(link)
-
-    def _ask(self, link: Link) -> None:
-        self.doing, self._asking = "asking for a remap", True
-        landmarks = "summer" if self._rng.random() < 0.5 else None
-        config = remap_config("spring", landmarks, activate=bool(self._rng.random() < 0.7))
-        self._job = link.ask("POST", f"{BASE}/remaps", config)
-        self._asking = False
-        self.n_acknowledged += 1
-
-    def _follow(self, link: Link) -> None:
-        job = link.ask("GET", f"/v1/admin/jobs/{self._job['job_id']}") if self._job else {}
-        self.doing = f"remap: {job['stage'] or job['state']}"
-        if job["state"] in _FINAL:
-            self._end(link, job)
-        else:
-            time.sleep(_POLL_S)
+            self.doing, self._asking = "asking for a remap", True
+            landmarks = "summer" if self._rng.random() < 0.5 else None
+            config = remap_config("spring", landmarks, activate=bool(self._rng.random() < 0.7))
+            self._job = link.ask("POST", f"{BASE}/remaps", config)
+            self._asking = False
+            self.n_acknowledged += 1
 
     def _end(self, link: Link, job: dict[str, Any]) -> None:
         self._job, self._ended[job["job_id"]] = None, job
@@ -82,7 +68,7 @@ class Mapper(Actor):
         self.doing = "activating"
         served = link.ask("GET", f"/v1/domains/{DOMAIN}")["map_version"]
         there = [record["version"] for record in self._learn_versions(link) if record["removed_at"] is None]
-        version = int(self._rng.choice([each for each in there if each != served] or [served]))
+        version = int(self._rng.choice([version for version in there if version != served] or [served]))
         self.doing = "activating" if version > served else "rolling back"
         self._may_serve = {served, version}
         link.ask("PUT", f"{BASE}/active-map", {"version": version, "expected": served})
@@ -101,12 +87,12 @@ class Mapper(Actor):
         expect(served["map_problem"] is None, f"the map does not answer: {served}")
         version = served["map_version"]
         records = {record["version"]: record for record in link.ask("GET", f"{BASE}/maps?limit=1000")["maps"]}
-        newer = {each for each in records if each > max(self._sealed, default=0)}
+        newer = {made for made in records if made > max(self._sealed, default=0)}
         allowed = self._may_serve | (newer if self._job is not None or self._asking else set())
         expect(version in allowed, f"map {version} serves, of {sorted(allowed)}")
         expect(records[version]["state"] == "active", f"map {version} serves but is {records[version]['state']}")
-        for known, digest in self._sealed.items():
-            expect(records.get(known, {}).get("sha256") == digest, f"map {known} is lost or another")
+        for sealed, digest in self._sealed.items():
+            expect(records.get(sealed, {}).get("sha256") == digest, f"map {sealed} is lost or another")
         for job_id, told in list(self._ended.items())[-5:]:
             expect(link.ask("GET", f"/v1/admin/jobs/{job_id}") == told, f"job {job_id} has changed its end")
         if self._asking:  # the job may have been noted without an answer

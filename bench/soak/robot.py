@@ -5,9 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from bench.soak.actor import Actor, expect
-from bench.soak.link import Link
-from bench.soak.world import DOMAIN, N_LANDMARKS
+from bench.link import BINARY, Link
+from bench.soak.actor import DOMAIN, N_LANDMARKS, Actor, expect
 from deepsimbad.core.belief import FilterKind
 from deepsimbad.core.localizer import ActiveLocalizer, LocalizerConfig
 from deepsimbad.engine.localizer import describe
@@ -17,13 +16,6 @@ from deepsimbad.evaluators.feature_l2 import FeatureL2
 from deepsimbad.store.catalog import Catalog
 
 ACTION_M = 1.5
-BINARY = {"Accept": "application/octet-stream"}
-
-
-def ranks(robot: int, view: int) -> list[int]:
-    """What a robot sees at its n-th view."""
-    found: list[int] = np.random.default_rng([robot, view]).permutation(N_LANDMARKS).tolist()
-    return found
 
 
 class Robot(Actor):
@@ -38,13 +30,16 @@ class Robot(Actor):
     rests_s = 0.02
 
     def __init__(self, number: int, kind: FilterKind, session_length: int | None = None) -> None:
-        self.number = number
-        self.kind = kind
+        self.number, self.kind = number, kind
         self._session_length = session_length
-        self._ended: list[str] = []
         self._session_id = ""
         self._n_told = 0
         self._belief: dict[str, Any] = {}
+
+    def ranks(self, view: int) -> list[int]:
+        """What it sees at its n-th view."""
+        permutation: list[int] = np.random.default_rng([self.number, view]).permutation(N_LANDMARKS).tolist()
+        return permutation
 
     def act(self, link: Link) -> None:
         """Begin, observe, or end."""
@@ -57,11 +52,10 @@ class Robot(Actor):
             self.doing = "ending a session"
             ending, self._session_id = self._session_id, ""  # whether it ended or not, it is not used again
             link.ask("DELETE", f"/v1/sessions/{ending}")
-            self._ended.append(ending)
         else:
             self.doing = "observing"
             path = f"/v1/sessions/{self._session_id}/observations?action_m={ACTION_M}"
-            view = {"ranked_landmarks": ranks(self.number, self._n_told)}
+            view = {"ranked_landmarks": self.ranks(self._n_told)}
             answer = link.ask("POST", path, view, {"Idempotency-Key": f"view-{self._n_told}"})
             expect(answer["n_observations"] == self._n_told + 1, f"robot {self.number} was miscounted")
             self._n_told, self._belief = self._n_told + 1, answer["belief"]
@@ -83,13 +77,13 @@ class Robot(Actor):
         if not self._session_id:
             return
         state = link.ask("GET", f"/v1/sessions/{self._session_id}")
-        found: bytes = link.ask("GET", f"/v1/sessions/{self._session_id}/belief", headers=BINARY)
+        belief: bytes = link.ask("GET", f"/v1/sessions/{self._session_id}/belief", headers={"Accept": BINARY})
         with Catalog.open(data_dir) as catalog:
             snapshot = load_snapshot(catalog, DOMAIN, state["map_version"])
         localizer = ActiveLocalizer(snapshot, LocalizerConfig(filter=self.kind, seed=self.number))
         reference = localizer.start()
         for view in range(state["n_observations"]):
-            query = describe(snapshot, FeatureL2("none"), RankedLandmarks(tuple(ranks(self.number, view))))
+            query = describe(snapshot, FeatureL2("none"), RankedLandmarks(tuple(self.ranks(view))))
             reference = localizer.step(reference, query, ACTION_M).state
         expected = reference.belief.mass.astype(np.float32).tobytes()
-        expect(found.endswith(expected), f"robot {self.number}'s belief differs from that of an undisturbed drive")
+        expect(belief.endswith(expected), f"robot {self.number}'s belief differs from that of an undisturbed drive")

@@ -1,6 +1,5 @@
 """The soak itself: start, let everybody act, kill, check, start again."""
 
-import json
 import subprocess
 import sys
 import tempfile
@@ -13,12 +12,11 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.soak.actor import Actor, expect
-from bench.soak.link import Link
+from bench.link import Link
+from bench.soak.actor import Actor, expect, make_domain
 from bench.soak.mapper import Mapper
 from bench.soak.robot import Robot
 from bench.soak.uploader import Uploader
-from bench.soak.world import make_domain
 from deepsimbad.core.belief import FilterKind
 from deepsimbad_client.http.local_server import LocalServer
 
@@ -34,7 +32,6 @@ class Soak:
     """What a soak met with.
 
     Attributes:
-        n_kills: How often the service was killed.
         ready_s: Seconds from each start after a kill to the first `/readyz` that answers 200.
         empty_ready_s: The same of a service on an empty data directory, right before each of them: what the machine
             itself was up to at that moment.
@@ -44,7 +41,6 @@ class Soak:
         n_interrupted: Remaps that gave up after the service had died three times under them.
     """
 
-    n_kills: int = 0
     ready_s: list[float] = field(default_factory=list)
     empty_ready_s: list[float] = field(default_factory=list)
     n_acknowledged: Counter[str] = field(default_factory=Counter)
@@ -63,7 +59,7 @@ def soak(data_dir: Path, n_kills: int, seed: int, on_kill: Callable[[int], None]
         on_kill: Told after each kill how many there were.
     """
     rng = np.random.default_rng(seed)
-    found = Soak()
+    result = Soak()
     server = LocalServer(data_dir, environment=ENVIRONMENT)
     server.start()
     try:
@@ -76,41 +72,36 @@ def soak(data_dir: Path, n_kills: int, seed: int, on_kill: Callable[[int], None]
         actors: list[Actor] = [*robots, uploader, mapper]
         for kill in range(n_kills):
             _live_and_die(server, actors, _AIMS[kill % len(_AIMS)], rng)
-            found.doing.update([uploader.doing, mapper.doing])
-            found.empty_ready_s.append(_ready_on_nothing())
-            found.ready_s.append(_ready(server))
+            result.doing.update([uploader.doing, mapper.doing])
+            with tempfile.TemporaryDirectory() as folder:
+                empty = LocalServer(Path(folder) / "data", environment=ENVIRONMENT)
+                result.empty_ready_s.append(_ready(empty))
+                empty.kill()
+            result.ready_s.append(_ready(server))
             with Link(server.url) as link:
                 expect(link.ask("GET", "/readyz")["damaged_maps"] == [], "a map is damaged")
                 for actor in actors:
                     actor.check(link)
-            found.n_kills += 1
-            on_kill(found.n_kills)
+            on_kill(kill + 1)
         with Link(server.url) as link:
             for robot in robots:
                 robot.check_bits(link, data_dir)
         uploader.check_bits(data_dir)
-        _check_every_file(data_dir)
+        command = [sys.executable, "-m", "deepsimbad", "check", "--json", "--data-dir", str(data_dir)]
+        checked = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603 - our own interpreter
+        expect(checked.returncode == 0, f"deepsimbad check: {checked.stdout} {checked.stderr}")
     finally:
         server.kill()
     for actor in actors:
-        found.n_acknowledged[type(actor).__name__] += actor.n_acknowledged
-    found.n_remaps, found.n_interrupted = mapper.n_remaps, mapper.n_interrupted
-    return found
+        result.n_acknowledged[type(actor).__name__] += actor.n_acknowledged
+    result.n_remaps, result.n_interrupted = mapper.n_remaps, mapper.n_interrupted
+    return result
 
 
 def _ready(server: LocalServer) -> float:
     began = time.perf_counter()
     server.start()
     return time.perf_counter() - began
-
-
-def _ready_on_nothing() -> float:
-    with tempfile.TemporaryDirectory() as folder:
-        server = LocalServer(Path(folder) / "data", environment=ENVIRONMENT)
-        try:
-            return _ready(server)
-        finally:
-            server.kill()
 
 
 def _live_and_die(server: LocalServer, actors: list[Actor], aim: str, rng: np.random.Generator) -> None:
@@ -135,10 +126,3 @@ def _live_and_die(server: LocalServer, actors: list[Actor], aim: str, rng: np.ra
         thread.join()
     if broken:
         raise broken[0]
-
-
-def _check_every_file(data_dir: Path) -> None:
-    command = [sys.executable, "-m", "deepsimbad", "check", "--json", "--data-dir", str(data_dir)]
-    checked = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603 - our own interpreter
-    expect(checked.returncode == 0, f"deepsimbad check: {checked.stdout} {checked.stderr}")
-    json.loads(checked.stdout)

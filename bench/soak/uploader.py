@@ -5,13 +5,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.soak.actor import Actor, expect
-from bench.soak.link import Link, RefusedError
-from bench.soak.world import BASE, DIM, DOMAIN, NPZ, packed
+from bench.link import NPZ, Link, RefusedError, packed
+from bench.soak.actor import BASE, DIM, DOMAIN, Actor, expect
 from deepsimbad.store.traverses import Traverse
 
 BATCH, FRAMES, KEPT = 10, 120, 3
-_NOT_FOUND = 404
 
 
 def encoding(traverse: int, index: int) -> NDArray[np.float32]:
@@ -36,7 +34,12 @@ class Uploader(Actor):
     def act(self, link: Link) -> None:
         """Make a traverse, add frames to it, or delete the oldest."""
         if self._deleting is not None or len(self._told) > KEPT:
-            self._delete(link)
+            self.doing = "deleting a traverse"
+            self._deleting = self._deleting if self._deleting is not None else min(self._told)
+            _is_there(link, "DELETE", self._deleting)  # or was deleted before the service died
+            self._told.pop(self._deleting, None)
+            self._deleted.append(self._deleting)
+            self._deleting = None
         elif not self._is_made:
             self.doing = "making a traverse"
             link.ask("POST", f"{BASE}/traverses", {"name": name_of(self._number)})
@@ -52,30 +55,16 @@ class Uploader(Actor):
         self.doing = "uploading frames"
         path = f"{BASE}/traverses/{name_of(self._number)}/frames"
         is_batch = self._n_sent % (2 * BATCH) == 0
-        index = range(self._n_sent, self._n_sent + (BATCH if is_batch else 1))
-        self._in_flight = set(index)
-        encodings = np.stack([encoding(self._number, each) for each in index])
+        index = np.arange(self._n_sent, self._n_sent + (BATCH if is_batch else 1))
+        self._in_flight = set(index.tolist())
+        encodings = np.stack([encoding(self._number, frame) for frame in index])
         if is_batch:
-            link.ask(
-                "POST", path, packed(encodings=encodings, index=np.array(index), position_m=1.0 * np.array(index)), NPZ
-            )
+            link.ask("POST", path, packed(encodings=encodings, index=index, position_m=1.0 * index), NPZ)
         else:
             link.ask("PUT", f"{path}/{index[0]}?position_m={index[0]}", {"encoding": encodings[0].tolist()})
         self._told[self._number] |= self._in_flight
         self._in_flight = set()
-        self._n_sent = index[-1] + 1
-
-    def _delete(self, link: Link) -> None:
-        self.doing = "deleting a traverse"
-        self._deleting = self._deleting if self._deleting is not None else min(self._told)
-        try:
-            link.ask("DELETE", f"{BASE}/traverses/{name_of(self._deleting)}")
-        except RefusedError as error:  # it was deleted before the service died
-            if error.status != _NOT_FOUND:
-                raise
-        self._told.pop(self._deleting, None)
-        self._deleted.append(self._deleting)
-        self._deleting = None
+        self._n_sent = int(index[-1]) + 1
 
     def check(self, link: Link) -> None:
         """No acknowledged frame is missing, no half batch is there, no deleted traverse is back."""
@@ -88,12 +77,7 @@ class Uploader(Actor):
             gaps = {index for first, last in answer["missing"] for index in range(first, last + 1)}
             expect(not gaps & told, f"{name_of(number)} misses frames {sorted(gaps & told)}")
         for number in self._deleted[-3:]:
-            try:
-                link.ask("GET", f"{BASE}/traverses/{name_of(number)}")
-            except RefusedError as error:
-                expect(error.status == _NOT_FOUND, f"{name_of(number)}: {error}")
-            else:
-                expect(False, f"{name_of(number)} was deleted and is back")
+            expect(not _is_there(link, "GET", number), f"{name_of(number)} was deleted and is back")
 
     def check_bits(self, data_dir: Path) -> None:
         """Every acknowledged frame holds the very numbers that were sent."""
@@ -102,9 +86,19 @@ class Uploader(Actor):
                 continue
             with Traverse.open(data_dir, DOMAIN, name_of(number)) as traverse:
                 frames = traverse.read()
-            found = dict(zip(frames.index.tolist(), frames.encodings, strict=True))
+            encodings = dict(zip(frames.index.tolist(), frames.encodings, strict=True))
             for index in told:
-                expect(np.array_equal(found[index], encoding(number, index)), f"{name_of(number)} frame {index}")
+                expect(np.array_equal(encodings[index], encoding(number, index)), f"{name_of(number)} frame {index}")
+
+
+def _is_there(link: Link, method: str, number: int) -> bool:
+    try:
+        link.ask(method, f"{BASE}/traverses/{name_of(number)}")
+    except RefusedError as error:
+        if error.status != 404:
+            raise
+        return False
+    return True
 
 
 def name_of(number: int) -> str:
