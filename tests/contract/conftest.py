@@ -58,7 +58,7 @@ def problem(answer: Any, status: int, code: str) -> dict[str, Any]:
 
 
 def until(met: Callable[[], Any]) -> None:
-    for _ in range(6000):
+    for _ in range(12_000):
         if met():
             return
         time.sleep(0.01)
