@@ -2,13 +2,10 @@
 
 import asyncio
 import json
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import pytest
-from starlette.types import Message, Receive, Scope, Send
 
 from deepsimbad.api.door import FREE_BYTES, Door
 from deepsimbad.api.keys import KeyRing
@@ -21,60 +18,58 @@ from deepsimbad.store.catalog_keys import ApiKey
 from deepsimbad.store.records import KeyScope
 
 BATCH = "/v1/admin/domains/d/traverses/t/frames"
-LEFT: Message = {"type": "http.disconnect"}
-LIMITS: dict[str, Any] = {"max_requests": 2, "max_body_memory_bytes": 1000}
+LEFT = {"type": "http.disconnect"}
+LIMITS = {"max_requests": 2, "max_body_memory_bytes": 1000}
 
 
 @dataclass
 class Exchange:
     """One request, sent and answered piece by piece as a test wants it."""
 
-    scope: Scope
-    incoming: asyncio.Queue[Message] = field(default_factory=asyncio.Queue)
-    answers: list[Message] = field(default_factory=list)
+    scope: dict
+    incoming: asyncio.Queue = field(default_factory=asyncio.Queue)
+    answers: list = field(default_factory=list)
     may_answer: asyncio.Event = field(default_factory=asyncio.Event)
     may_end: asyncio.Event = field(default_factory=asyncio.Event)
     n_read: int = 0
 
-    async def send(self, message: Message) -> None:
+    async def send(self, message):
         self.answers.append(message)
 
-    def came(self, n_bytes: int, more: bool = False) -> None:
+    def came(self, n_bytes, more=False):
         self.incoming.put_nowait({"type": "http.request", "body": bytes(n_bytes), "more_body": more})
 
     @property
-    def status(self) -> int | None:
+    def status(self):
         return self.answers[0]["status"] if self.answers else None
 
     @property
-    def headers(self) -> dict[str, str]:
+    def headers(self):
         return {name.decode(): value.decode() for name, value in self.answers[0]["headers"]}
 
-    @property
-    def problem(self) -> dict[str, Any]:
-        document: dict[str, Any] = json.loads(b"".join(message.get("body", b"") for message in self.answers))
+    def problem(self, status, code):
+        document = json.loads(b"".join(message.get("body", b"") for message in self.answers))
+        assert (self.status, document["code"]) == (status, code)
         assert self.headers["content-type"] == "application/problem+json"
         assert self.headers["x-request-id"] == document["request_id"]
         return document
 
     @property
-    def limit(self) -> str:
-        assert (self.status, self.problem["code"]) == (503, "overloaded")
+    def limit(self):
         assert self.headers["retry-after"] == "1"
-        return str(self.problem["limit"])
+        return self.problem(503, "overloaded")["limit"]
 
 
-async def application(scope: Scope, receive: Receive, send: Send) -> None:
+async def application(scope, receive, send):
     """Reads the body if there is one, answers when the test lets it."""
-    exchange: Exchange = scope["exchange"]
+    exchange = scope["exchange"]
     try:
-        while True:
-            message = await receive()
-            if message["type"] == "http.disconnect":
-                return
+        while (message := await receive())["type"] != "http.disconnect":
             exchange.n_read += len(message["body"])
             if not message["more_body"]:
                 break
+        else:
+            return
     except (OverloadedError, BodyTooLargeError) as error:
         await error_response(scope, error)(scope, receive, send)
         return
@@ -89,20 +84,18 @@ async def application(scope: Scope, receive: Receive, send: Send) -> None:
 class Asker:
     """The door before the application, and requests through it."""
 
-    def __init__(self, keys: KeyRing | None = None, **settings: Any) -> None:
-        self.ring = keys or KeyRing()
+    def __init__(self, keys=None, **settings):
         if keys is None:
-            self.ring.load(list)
-        self.door = Door(application, Settings(data_dir=Path("none"), **{**LIMITS, **settings}), self.ring, Metrics())
-        self.tasks: list[asyncio.Task[None]] = []
+            keys = KeyRing()
+            keys.load(list)
+        self.door = Door(application, Settings(data_dir=Path("none"), **{**LIMITS, **settings}), keys, Metrics())
+        self.tasks = []
 
-    async def ask(
-        self, path: str = "/v1/domains", method: str = "GET", n_declared: int | None = None, **more: str
-    ) -> Exchange:
+    async def ask(self, path="/v1/domains", method="GET", n_declared=None, **more):
         """Send a head; a request without a body is whole by that."""
         headers = {"host": "127.0.0.1", **({} if n_declared is None else {"content-length": str(n_declared)}), **more}
         sent = [(name.replace("_", "-").encode(), value.encode("latin-1")) for name, value in headers.items()]
-        scope: Scope = {"type": "http", "method": method, "path": path, "raw_path": path.encode(), "headers": sent}
+        scope = {"type": "http", "method": method, "path": path, "raw_path": path.encode(), "headers": sent}
         exchange = scope["exchange"] = Exchange(scope)
         exchange.may_end.set()
         if n_declared is None and not {"transfer_encoding", "content_length"} & set(more):
@@ -111,7 +104,7 @@ class Asker:
         await settle()
         return exchange
 
-    async def answered(self, path: str = "/v1/domains", method: str = "GET", **more: str) -> Exchange:
+    async def answered(self, path="/v1/domains", method="GET", **more):
         """Ask, and let the application answer."""
         exchange = await self.ask(path, method, **more)
         exchange.may_answer.set()
@@ -119,17 +112,17 @@ class Asker:
         return exchange
 
     @property
-    def in_use(self) -> tuple[int, int]:
+    def in_use(self):
         return self.door.under_way.n_taken, self.door.body_bytes.n_taken
 
 
-async def settle() -> None:
+async def settle():
     for _ in range(20):
         await asyncio.sleep(0)
 
 
 @pytest.fixture
-def anyio_backend() -> str:
+def anyio_backend():
     return "asyncio"
 
 
@@ -139,10 +132,12 @@ pytestmark = pytest.mark.anyio
 # How much at once
 
 
-async def test_more_requests_than_may_be_under_way() -> None:
+async def test_more_requests_than_may_be_under_way():
     door = Asker()
     first, second = await door.ask(), await door.ask()
     assert (await door.ask()).limit == "max_requests"
+    for path in ("/healthz", "/readyz", "/metrics"):
+        assert (await door.answered(path)).status == 200, "health is always answered"
     first.may_answer.set()
     await settle()
     assert first.status == 200
@@ -154,20 +149,17 @@ async def test_more_requests_than_may_be_under_way() -> None:
     assert door.in_use == (0, 0)
 
 
-async def test_health_is_always_answered() -> None:
-    door = Asker()
-    await door.ask()
-    await door.ask()
-    for path in ("/healthz", "/readyz", "/metrics"):
-        assert (await door.answered(path)).status == 200
-
-
-async def test_a_body_on_its_way_takes_nobodys_turn() -> None:
+async def test_bodies_on_their_way_and_answers_read_slowly_take_nobodys_turn():
     door = Asker()
     slow = [await door.ask(method="PUT", n_declared=100) for _ in range(10)]
     for exchange in slow:
         exchange.came(10, more=True)
-    assert (await door.answered()).status == 200
+    for _ in range(3):
+        reader = await door.ask()
+        reader.may_end.clear()
+        reader.may_answer.set()
+        await settle()
+        assert (reader.status, door.in_use[0]) == (200, 0)
     for exchange in slow:  # all are whole at once: two are done, the others come back later
         exchange.came(90)
     await settle()
@@ -176,31 +168,16 @@ async def test_a_body_on_its_way_takes_nobodys_turn() -> None:
     assert door.in_use[0] == 2
 
 
-async def test_an_answer_that_is_read_slowly_takes_nobodys_turn() -> None:
-    door = Asker()
-    for _ in range(5):
-        reader = await door.ask()
-        reader.may_end.clear()
-        reader.may_answer.set()
-        await settle()
-        assert reader.status == 200
-    assert door.in_use[0] == 0
-
-
-async def test_bodies_that_fill_the_memory() -> None:
+async def test_bodies_that_fill_the_memory():
     door = Asker(max_requests=10)
     first = await door.ask(method="PUT", transfer_encoding="chunked")
-    first.came(FREE_BYTES, more=True)
-    await settle()
-    assert door.in_use[1] == 0
-    for n_bytes in (300, 300):
+    for n_bytes, n_held in ((FREE_BYTES, 0), (300, 300), (300, 600)):
         first.came(n_bytes, more=True)
-    await settle()
-    assert door.in_use[1] == 600
+        await settle()
+        assert door.in_use[1] == n_held
     # One that says that it will not fit is refused before a byte of it ...
     declared = await door.ask(method="PUT", n_declared=FREE_BYTES + 401)
-    assert declared.limit == "max_body_memory_bytes"
-    assert declared.n_read == 0
+    assert (declared.limit, declared.n_read) == ("max_body_memory_bytes", 0)
     # ... one that fits takes its room as it comes, and small ones always fit.
     fits = await door.ask(method="PUT", n_declared=FREE_BYTES + 400)
     small = await door.ask(method="PUT", n_declared=FREE_BYTES)
@@ -213,25 +190,22 @@ async def test_bodies_that_fill_the_memory() -> None:
     assert chunked.status is None
     chunked.came(1, more=True)
     await settle()
-    assert chunked.limit == "max_body_memory_bytes"
-    assert door.in_use[1] == 600
+    assert (chunked.limit, door.in_use[1]) == ("max_body_memory_bytes", 600)
+    # A batch goes to the disk.
+    batch = await door.ask(BATCH, "POST", n_declared=10_000_000)
+    batch.came(10_000_000)
+    await settle()
+    assert (batch.status, door.in_use[1]) == (None, 600)
     for exchange in (first, fits):
         exchange.incoming.put_nowait(LEFT)
-    small.may_answer.set()
+    for exchange in (small, batch):
+        exchange.may_answer.set()
     await settle()
     assert door.in_use == (0, 0)
 
 
-async def test_a_batch_goes_to_the_disk_and_fills_no_memory() -> None:
-    door = Asker()
-    batch = await door.ask(BATCH, "POST", n_declared=10_000_000)
-    batch.came(10_000_000)
-    await settle()
-    assert (batch.status, door.in_use) == (None, (1, 0))
-
-
 @pytest.mark.filterwarnings("default::ResourceWarning")
-async def test_nothing_is_kept_by_what_breaks_or_is_cancelled() -> None:
+async def test_nothing_is_kept_by_what_breaks_or_is_cancelled():
     door = Asker()
     broken = await door.ask("/breaks", method="PUT", n_declared=FREE_BYTES + 5)
     broken.came(FREE_BYTES + 5)
@@ -239,15 +213,15 @@ async def test_nothing_is_kept_by_what_breaks_or_is_cancelled() -> None:
     await settle()
     door.tasks[1].cancel()
     await asyncio.gather(*door.tasks)
-    assert (broken.status, broken.problem["code"]) == (500, "internal_error")
-    assert (cancelled.status, cancelled.problem["detail"]) == (503, "the service is shutting down")
+    broken.problem(500, "internal_error")
+    assert cancelled.problem(503, "unavailable")["detail"] == "the service is shutting down"
     assert door.in_use == (0, 0)
 
 
 # How long a body may be
 
 
-async def test_a_body_at_the_limit_passes_and_one_over_it_is_refused_at_the_byte_that_shows_it() -> None:
+async def test_a_body_at_the_limit_passes_and_one_over_it_is_refused_at_the_byte_that_shows_it():
     door = Asker(max_json_bytes=100)
     for sizes, status in (([50, 50], 200), ([50, 50, 1, 50], 413)):
         exchange = await door.ask(method="POST", transfer_encoding="chunked")
@@ -257,7 +231,7 @@ async def test_a_body_at_the_limit_passes_and_one_over_it_is_refused_at_the_byte
         await settle()
         assert exchange.status == status
     assert exchange.n_read == 100
-    assert (exchange.problem["code"], exchange.problem["max_bytes"]) == ("body_too_large", 100)
+    assert exchange.problem(413, "body_too_large")["max_bytes"] == 100
 
 
 @pytest.mark.parametrize(
@@ -269,52 +243,48 @@ async def test_a_body_at_the_limit_passes_and_one_over_it_is_refused_at_the_byte
         ("/v1/x", "application/octet-stream", 100),
     ],
 )
-async def test_a_declared_length_over_the_limit_never_reaches_the_application(
-    path: str, content_type: str, limit: int
-) -> None:
+async def test_a_declared_length_over_the_limit_never_reaches_the_application(path, content_type, limit):
     door = Asker(max_json_bytes=100, max_image_bytes=200, max_batch_bytes=300)
     over = await door.ask(path, "POST", n_declared=limit + 1, content_type=content_type)
-    assert (over.status, over.problem["max_bytes"], over.n_read) == (413, limit, 0)
+    assert (over.problem(413, "body_too_large")["max_bytes"], over.n_read) == (limit, 0)
     assert (await door.ask(path, "POST", n_declared=limit, content_type=content_type)).status is None
 
 
 @pytest.mark.parametrize(("length", "status"), [("-1", 422), ("x", 422), ("1e3", 422), ("24 ", None), (" 24\t", None)])
-async def test_a_length_is_a_number_with_legal_white_space(length: str, status: int | None) -> None:
+async def test_a_length_is_a_number_with_legal_white_space(length, status):
     assert (await Asker().ask(method="POST", content_length=length)).status == status
 
 
-@pytest.mark.parametrize("coding", ["gzip", "GZIP", "identity, br"])
-async def test_a_packed_body_is_refused(coding: str) -> None:
-    packed = await Asker().ask(method="POST", n_declared=5, content_encoding=coding)
-    assert (packed.status, packed.problem["allowed"]) == (415, ["identity"])
+@pytest.mark.parametrize(
+    ("coding", "is_taken"), [("GZIP", False), ("identity, br", False), ("identity", True), ("", True)]
+)
+async def test_a_packed_body_is_refused(coding, is_taken):
+    exchange = await Asker().ask(method="POST", n_declared=5, content_encoding=coding)
+    assert exchange.status == (None if is_taken else 415)
+    assert is_taken or exchange.problem(415, "unsupported_media_type")["allowed"] == ["identity"]
     assert (await Asker().answered(content_encoding=coding)).status == 200, "there is no body"
-
-
-@pytest.mark.parametrize("coding", ["identity", ""])
-async def test_a_body_as_it_is_passes(coding: str) -> None:
-    assert (await Asker().ask(method="POST", n_declared=5, content_encoding=coding)).status is None
 
 
 # Who is let in
 
 
 @pytest.fixture
-def catalog(tmp_path: Path) -> Iterator[Catalog]:
+def catalog(tmp_path):
     with Catalog.open(tmp_path) as catalog:
         yield catalog
 
 
-def ring_of(catalog: Catalog) -> KeyRing:
+def ring_of(catalog):
     ring = KeyRing()
     ring.load(catalog.keys)
     return ring
 
 
-def bearer(key: ApiKey) -> str:
+def bearer(key):
     return f"Bearer {key.text}"
 
 
-async def test_scopes(catalog: Catalog) -> None:
+async def test_scopes(catalog):
     _, robot = catalog.create_key(KeyScope.LOCALIZE)
     record, admin = catalog.create_key(KeyScope.ADMIN)
     door = Asker(ring_of(catalog))
@@ -323,11 +293,15 @@ async def test_scopes(catalog: Catalog) -> None:
         assert exchange.status == 200, path
     assert exchange.scope["state"]["key_id"] == record.key_id
     refused = await door.ask("/v1/admin/jobs", authorization=bearer(robot))
-    assert (refused.status, refused.problem["code"], refused.problem["needed"]) == (403, "forbidden", "admin")
+    assert refused.problem(403, "forbidden")["needed"] == "admin"
+    unread = await door.ask("/v1/admin/domains/a", "PUT", n_declared=1000, x_api_key="dsk_x")
+    unread.came(1000)
+    unread.problem(401, "unauthorized")
+    assert (unread.n_read, unread.incoming.qsize(), unread.headers["www-authenticate"]) == (0, 1, "Bearer")
     assert (await door.answered("/healthz")).status == 200
 
 
-async def test_the_log_line_of_a_revoked_key_says_whose(catalog: Catalog) -> None:
+async def test_the_log_line_of_a_revoked_key_says_whose(catalog):
     record, key = catalog.create_key(KeyScope.LOCALIZE)
     ring = ring_of(catalog)
     catalog.revoke_key(record.key_id)
@@ -338,77 +312,46 @@ async def test_the_log_line_of_a_revoked_key_says_whose(catalog: Catalog) -> Non
     assert "key_id" not in forged.scope["state"], "who only knows an id is nobody"
 
 
-async def test_refused_before_the_body(catalog: Catalog) -> None:
-    catalog.create_key(KeyScope.ADMIN)
-    exchange = await Asker(ring_of(catalog)).ask("/v1/admin/domains/a", "PUT", n_declared=1000, x_api_key="dsk_x")
-    exchange.came(1000)
-    assert (exchange.status, exchange.problem["code"], exchange.n_read) == (401, "unauthorized", 0)
-    assert exchange.headers["www-authenticate"] == "Bearer"
-    assert exchange.incoming.qsize() == 1
-
-
-async def test_keys_that_were_never_read_let_nobody_in() -> None:
+async def test_keys_that_were_never_read_let_nobody_in():
     door = Asker(KeyRing())
     exchange = await door.ask()
     assert (exchange.status, exchange.headers["retry-after"]) == (503, "5")
     assert (await door.answered("/healthz")).status == 200
 
 
-async def test_the_rate_is_counted_by_key(catalog: Catalog) -> None:
-    _, key = catalog.create_key(KeyScope.LOCALIZE)
-    _, other = catalog.create_key(KeyScope.LOCALIZE)
+async def test_the_rate_is_counted_by_key(catalog):
+    (_, key), (_, other) = (catalog.create_key(KeyScope.LOCALIZE) for _ in range(2))
     door = Asker(ring_of(catalog), rate_limit_per_s=0.5, rate_limit_burst=2)
-    statuses = [(await door.answered(authorization=bearer(key))).status for _ in range(2)]
+    assert [(await door.answered(authorization=bearer(key))).status for _ in range(3)] == [200, 200, 429]
     over = await door.ask(authorization=bearer(key))
-    assert [*statuses, over.status, over.problem["code"]] == [200, 200, 429, "rate_limited"]
+    over.problem(429, "rate_limited")
     assert over.headers["retry-after"] == "2"
     assert (await door.answered(authorization=bearer(other))).status == 200
     assert (await door.answered("/readyz", authorization=bearer(key))).status == 200
 
 
-async def test_an_open_service_asks_nobody() -> None:
+async def test_an_open_service_asks_nobody():
     for headers in ({}, {"authorization": "Bearer nonsense"}, {"authorization": "Bearer a", "x_api_key": "b"}):
         assert (await Asker(rate_limit_per_s=0.5, rate_limit_burst=1).answered(**headers)).status == 200
 
 
 # Pages of other hosts
 
+OURS = ("127.0.0.1", "127.0.0.1:8000", "localhost:1", "LOCALHOST", "[::1]:80")
+OTHERS = ("robot.lan:8000", "evil.example", "192.168.1.2", "localhost.evil.example", "127.0.0.1.evil.example")
 
-@pytest.mark.parametrize(
-    ("host", "is_ours"),
-    [
-        *(
-            ("127.0.0.1", True),
-            ("127.0.0.1:8000", True),
-            ("localhost:1", True),
-            ("LOCALHOST", True),
-            ("[::1]:80", True),
-        ),
-        *(
-            ("robot.lan:8000", False),
-            ("evil.example", False),
-            ("192.168.1.2", False),
-            ("localhost.evil.example", False),
-        ),
-        *(
-            ("localhost.evil.example", False),
-            ("127.0.0.1.evil.example", False),
-            ("[::1", False),
-            ("127.0.0.1@evil.example", False),
-        ),
-    ],
-)
-async def test_while_no_key_is_asked_only_the_names_of_this_machine_are_answered(host: str, is_ours: bool) -> None:
+
+@pytest.mark.parametrize("host", [*OURS, *OTHERS, "[::1", "127.0.0.1@evil.example"])
+async def test_while_no_key_is_asked_only_the_names_of_this_machine_are_answered(host):
     for path in ("/v1/admin/domains", "/v1/domains", "/metrics"):
         exchange = await Asker().answered(path, host=host)
-        assert exchange.status == (200 if is_ours else 403), path
-        assert is_ours or exchange.problem["code"] == "foreign_host"
+        assert exchange.status == (200 if host in OURS else 403), path
+        assert host in OURS or exchange.problem(403, "foreign_host")
 
 
-async def test_the_name_that_is_listened_on_is_answered_too(catalog: Catalog) -> None:
+async def test_the_name_that_is_listened_on_is_answered_too(catalog):
     assert (await Asker(host="127.0.0.7").answered(host="127.0.0.7:80")).status == 200
-    open_to_all = Asker(host="0.0.0.0", allow_open=True)
-    assert (await open_to_all.answered(host="robot.lan")).status == 200
+    assert (await Asker(host="0.0.0.0", allow_open=True).answered(host="robot.lan")).status == 200
     _, key = catalog.create_key(KeyScope.ADMIN)
     closed = Asker(ring_of(catalog))
     assert (await closed.answered(host="robot.lan", authorization=bearer(key), origin="https://a")).status == 200
@@ -426,9 +369,7 @@ async def test_the_name_that_is_listened_on_is_answered_too(catalog: Catalog) ->
         ("https://evil.example", ("*",), 200),
     ],
 )
-async def test_while_no_key_is_asked_no_foreign_page_is_answered(
-    origin: str, allowed: tuple[str, ...], status: int
-) -> None:
+async def test_while_no_key_is_asked_no_foreign_page_is_answered(origin, allowed, status):
     for settings in ({}, {"host": "0.0.0.0", "allow_open": True}):
         door = Asker(cors_origins=allowed, **settings)
         exchange = await door.answered("/v1/admin/domains/d", "DELETE", host="127.0.0.1:8000", origin=origin)

@@ -14,8 +14,8 @@ from schemathesis.openapi.checks import UseAfterFree
 DIM = 2304  # of the embedded extractor
 
 
-def _images(extension: str) -> st.SearchStrategy[bytes]:
-    def image(seed: int) -> bytes:
+def _images(extension):
+    def image(seed):
         pixels = np.random.default_rng(seed).integers(0, 255, (24, 32, 3), np.uint8)
         return bytes(cv2.imencode(extension, pixels)[1].tobytes())
 
@@ -23,7 +23,7 @@ def _images(extension: str) -> st.SearchStrategy[bytes]:
     return st.one_of(whole, st.binary(max_size=64), st.tuples(whole, st.integers(0, 200)).map(lambda c: c[0][: c[1]]))
 
 
-def _batch(n: int) -> bytes:
+def _batch(n):
     packed = io.BytesIO()
     encodings = np.random.default_rng(n).normal(size=(n, DIM)).astype(np.float32)
     np.savez(packed, encodings=encodings, index=np.arange(n), position_m=np.arange(n, dtype=float))

@@ -9,21 +9,18 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import httpx2
 
 from .conftest import until
 
 
-def free_port() -> int:
+def free_port():
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
+        return probe.getsockname()[1]
 
 
 class Served:
@@ -35,11 +32,11 @@ class Served:
         **settings: By name.
     """
 
-    def __init__(self, data_dir: Path, program: str | None = None, **settings: object) -> None:
+    def __init__(self, data_dir, program=None, **settings):
         self.port = free_port()
         self.url = f"http://127.0.0.1:{self.port}"
         self.log = data_dir.parent / "log"
-        command: Sequence[str] = ["-m", "deepsimbad", "serve", "--create", "--port", str(self.port)]
+        command = ["-m", "deepsimbad", "serve", "--create", "--port", str(self.port)]
         command = [*command, "--data-dir", str(data_dir)]
         if program is not None:
             command = ["-c", program, str(data_dir), str(self.port)]
@@ -49,7 +46,7 @@ class Served:
                 [sys.executable, *command], stderr=stderr, env={**os.environ, **variables}, cwd=self.log.parent
             )
 
-    def __enter__(self) -> "Served":
+    def __enter__(self):
         try:
             until(self._is_ready)
         except BaseException:
@@ -57,21 +54,21 @@ class Served:
             raise
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, *_):
         if self.process.poll() is None:
             self.process.kill()
         self.process.wait()
 
-    def _is_ready(self) -> bool:
+    def _is_ready(self):
         assert self.process.poll() is None, self.log.read_text()
         with contextlib.suppress(httpx2.TransportError):
             return httpx2.get(f"{self.url}/readyz").status_code == 200
         return False
 
-    def connect(self) -> socket.socket:
+    def connect(self):
         return socket.create_connection(("127.0.0.1", self.port), timeout=30)
 
-    def tell(self, message: bytes) -> bytes:
+    def tell(self, message):
         """Send bytes on a new connection; returns all that comes until it is closed."""
         received = bytearray()
         with self.connect() as connection:
@@ -82,11 +79,11 @@ class Served:
                     received += more
         return bytes(received)
 
-    def forget_peak(self) -> None:
+    def forget_peak(self):
         """Let the peak of memory be what it is now."""
         Path(f"/proc/{self.process.pid}/clear_refs").write_text("5")
 
-    def mib(self, name: str = "VmRSS") -> float:
+    def mib(self, name="VmRSS"):
         """Memory held now; `VmHWM`: its peak."""
         for line in Path(f"/proc/{self.process.pid}/status").read_text().splitlines():
             if line.startswith(f"{name}:"):
@@ -94,7 +91,7 @@ class Served:
         raise AssertionError(f"no {name}")
 
     @contextlib.contextmanager
-    def within(self, most_mib: float) -> Iterator[None]:
+    def within(self, most_mib):
         """What is done inside costs no more memory, not for a moment."""
         self.forget_peak()
         before = self.mib()
@@ -102,7 +99,7 @@ class Served:
         assert self.mib("VmHWM") - before < most_mib
 
     @property
-    def n_sockets(self) -> int:
+    def n_sockets(self):
         """Open sockets: connections, and the few of its own."""
         n_open = 0
         for descriptor in Path(f"/proc/{self.process.pid}/fd").iterdir():
@@ -121,17 +118,16 @@ class Robot:
     stopped: threading.Event = field(default_factory=threading.Event)
     turn: threading.Lock = field(default_factory=threading.Lock)  # held by whoever wants it to ask nothing
 
-    def drive(self) -> None:
+    def drive(self):
         connection = http.client.HTTPConnection("127.0.0.1", self.served.port, timeout=30)
 
-        def ask(path: str, body: dict[str, Any]) -> dict[str, Any]:
+        def ask(path, body):
             connection.request("POST", path, json.dumps(body), {"Content-Type": "application/json"})
             answer = connection.getresponse()
             content = answer.read()
             if answer.status >= 300:
                 self.faults.append(f"{answer.status} {content!r}")
-            document: dict[str, Any] = json.loads(content)
-            return document
+            return json.loads(content)
 
         try:
             session_id = ask("/v1/domains/ready/sessions", {})["session_id"]
@@ -146,7 +142,7 @@ class Robot:
         finally:
             connection.close()
 
-    def answered_more(self, n_more: int) -> None:
+    def answered_more(self, n_more):
         """Wait until so many more were answered."""
         wanted = self.n_answered + n_more
         until(lambda: self.faults or self.n_answered >= wanted)

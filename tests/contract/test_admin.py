@@ -3,14 +3,9 @@
 import errno
 import json
 import threading
-from collections.abc import Iterator
-from pathlib import Path
-from typing import Any
 
-import httpx2
 import numpy as np
 import pytest
-from starlette.testclient import TestClient
 
 from deepsimbad.jobs.runner import InThisProcess
 from deepsimbad.store import catalog
@@ -21,19 +16,13 @@ from .conftest import (
     NPZ,
     RANKS,
     TAKES_ENCODINGS,
-    begin,
     encoded,
-    make_ready_domain,
     npz,
     path_of,
     picture,
     problem,
     ready_encodings,
-    remap,
     service,
-    services_of,
-    upload,
-    wait_for,
 )
 
 REMAP = {"training_traverse": "drive", "training_episodes": 0}
@@ -41,7 +30,7 @@ KEY = {"Idempotency-Key": "season-4/remap"}
 WITHIN_S = 60
 
 
-def test_a_domain_is_made_once(client: TestClient) -> None:
+def test_a_domain_is_made_once(client):
     first = client.put("/v1/admin/domains/once", json=TAKES_ENCODINGS)
     again = client.put("/v1/admin/domains/once", json={**TAKES_ENCODINGS, "closed": False})
     assert (first.status_code, again.status_code) == (201, 200)
@@ -52,7 +41,7 @@ def test_a_domain_is_made_once(client: TestClient) -> None:
     assert client.put("/v1/admin/domains/defaults", json=written_out).status_code == 200
 
 
-def test_a_limit_on_domains(tmp_path: Path) -> None:
+def test_a_limit_on_domains(tmp_path):
     with service(tmp_path, max_domains=2) as client:
         made = [client.put(f"/v1/admin/domains/{name}", json=TAKES_ENCODINGS) for name in ("a", "b", "c", "b")]
         assert [answer.status_code for answer in made] == [201, 201, 409, 200]
@@ -61,21 +50,19 @@ def test_a_limit_on_domains(tmp_path: Path) -> None:
         assert client.put("/v1/admin/domains/c", json=TAKES_ENCODINGS).status_code == 201
 
 
-def test_a_deleted_domain_is_gone_and_its_name_free(client: TestClient, domain: str) -> None:
+def test_a_deleted_domain_is_gone_and_its_name_free(client, domain):
     gone = client.delete(f"/v1/admin/domains/{domain}")
     assert (gone.status_code, gone.content) == (204, b"")
     assert client.post(f"/v1/domains/{domain}/localizations", json=RANKS).status_code == 404
-    make_ready_domain(client, domain, closed=True)
+    client.make_ready_domain(domain, closed=True)
     assert client.get(f"/v1/domains/{domain}").json()["closed"] is True
 
 
-def test_a_domain_whose_folder_cannot_be_removed_is_gone_with_its_sessions(
-    client: TestClient, domain: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def fail(folder: Path) -> None:
+def test_a_domain_whose_folder_cannot_be_removed_is_gone_with_its_sessions(client, domain, monkeypatch):
+    def fail(folder):
         raise OSError(errno.EIO, "Input/output error", str(folder))
 
-    session = path_of(begin(client, domain))
+    session = client.session(domain)
     with monkeypatch.context() as patched:
         patched.setattr(catalog, "bury", fail)
         assert client.delete(f"/v1/admin/domains/{domain}").status_code == 503
@@ -88,7 +75,7 @@ def test_a_domain_whose_folder_cannot_be_removed_is_gone_with_its_sessions(
 
 
 @pytest.fixture
-def shelf(client: TestClient, request: pytest.FixtureRequest) -> str:
+def shelf(client, request):
     """A domain's traverses, of which there is one, `t`."""
     base = f"/v1/admin/domains/{request.node.name.replace('_', '-')[:60]}"
     client.put(base, json=TAKES_ENCODINGS)
@@ -97,7 +84,7 @@ def shelf(client: TestClient, request: pytest.FixtureRequest) -> str:
     return f"{base}/traverses"
 
 
-def test_traverses_are_made_listed_and_deleted(client: TestClient, shelf: str) -> None:
+def test_traverses_are_made_listed_and_deleted(client, shelf):
     assert client.post(shelf, json={"name": "t"}).status_code == 200
     client.post(shelf, json={"name": "a"})
     assert [traverse["name"] for traverse in client.get(shelf).json()["traverses"]] == ["a", "t"]
@@ -113,7 +100,7 @@ def test_traverses_are_made_listed_and_deleted(client: TestClient, shelf: str) -
     assert client.put(f"{shelf}/t/frames/0?position_m=1", json={"encoding": [1.0]}).status_code == 201
 
 
-def test_frames_twice_and_out_of_order(client: TestClient, shelf: str) -> None:
+def test_frames_twice_and_out_of_order(client, shelf):
     answers = []
     for index in (5, 0, 2, 5):
         where = {"position_m": index, "timestamp_us": index, "x_m": 1, "y_m": 2}
@@ -127,15 +114,15 @@ def test_frames_twice_and_out_of_order(client: TestClient, shelf: str) -> None:
 
 
 @pytest.mark.parametrize("dim", [64, 4096])
-def test_a_domain_of_images_takes_ready_encodings_of_any_one_length(client: TestClient, dim: int) -> None:
+def test_a_domain_of_images_takes_ready_encodings_of_any_one_length(client, dim):
     name = f"any-{dim}"
     client.put(f"/v1/admin/domains/{name}", json={"evaluator": {"kind": "feature_l2"}})
     encodings = np.random.default_rng(dim).integers(-9, 10, (20, dim)).astype(np.float16)
-    upload(client, name, "drive", encodings, np.arange(20))
+    client.upload(name, "drive", encodings, np.arange(20))
     image = {"content": encoded(picture(1)), "headers": JPEG}
     answer = client.put(f"/v1/admin/domains/{name}/traverses/drive/frames/20?position_m=20", **image)
     assert str(dim) in problem(answer, 422, "invalid_encoding")["detail"]
-    job = remap(client, name, training_traverse="drive", landmark_traverse="drive", n_landmarks=20)
+    job = client.remap(name, landmark_traverse="drive", n_landmarks=20)
     assert job["state"] == "succeeded", job
     localizations = f"/v1/domains/{name}/localizations"
     assert client.post(localizations, json={"ranked_landmarks": [7, 3, 11]}).json()["retrieval"]
@@ -145,7 +132,7 @@ def test_a_domain_of_images_takes_ready_encodings_of_any_one_length(client: Test
     assert f"landmarks of {dim}" in detail
 
 
-def test_an_image_and_its_encoding_are_the_same_frame(client: TestClient) -> None:
+def test_an_image_and_its_encoding_are_the_same_frame(client):
     frame = "/v1/admin/domains/seen/traverses/drive/frames/3?position_m=3"
     headers = {"Content-Type": "image/jpeg; charset=binary"}
     assert client.put(frame, content=encoded(picture(3)), headers=headers).status_code == 200
@@ -156,11 +143,11 @@ def test_an_image_and_its_encoding_are_the_same_frame(client: TestClient) -> Non
 # Jobs
 
 
-def test_what_a_job_needs_is_not_deleted(client: TestClient, domain: str) -> None:
+def test_what_a_job_needs_is_not_deleted(client, domain):
     base = f"/v1/admin/domains/{domain}"
-    upload(client, domain, "day", ready_encodings(), np.arange(40))
+    client.upload(domain, "day", ready_encodings(), np.arange(40))
     config = {"training_traverse": "drive", "check_traverse": "day"}
-    job = services_of(client).catalog.create_job(domain, "remap", config)  # one that waits
+    job = client.services.catalog.create_job(domain, "remap", config)  # one that waits
     for place in (f"{base}/traverses/drive", f"{base}/traverses/day", base):
         problem(client.delete(place), 409, "traverse_in_use")
     assert client.delete(f"/v1/admin/jobs/{job.job_id}").status_code == 204
@@ -169,7 +156,7 @@ def test_what_a_job_needs_is_not_deleted(client: TestClient, domain: str) -> Non
     assert client.delete(base).status_code == 204
 
 
-def test_a_remap_is_followed_by_its_events(client: TestClient, domain: str) -> None:
+def test_a_remap_is_followed_by_its_events(client, domain):
     config = {"training_traverse": "drive", "relevance": "rrf", "seed": 3}
     answer = client.post(f"/v1/admin/domains/{domain}/remaps", json=config)
     assert answer.status_code == 202
@@ -194,37 +181,35 @@ def test_a_remap_is_followed_by_its_events(client: TestClient, domain: str) -> N
 class Held:
     """Does jobs in this process; while it is held, none begins."""
 
-    def __init__(self, data_dir: Path) -> None:
+    def __init__(self, data_dir):
         self.entered, self.free = threading.Event(), threading.Event()
         self.free.set()
         self._run_job = InThisProcess(data_dir)
 
-    def __call__(self, *job: Any) -> dict[str, Any]:
+    def __call__(self, *job):
         self.entered.set()
         assert self.free.wait(WITHIN_S)
         return self._run_job(*job)
 
 
 @pytest.fixture
-def held(tmp_path: Path) -> Iterator[tuple[TestClient, Held]]:
+def held(tmp_path):
     held = Held(tmp_path)
     with service(tmp_path, held, max_jobs=2) as client:
-        make_ready_domain(client, "ready")
+        client.make_ready_domain("ready")
         yield client, held
         held.free.set()
 
 
-def ask(
-    client: TestClient, path: str, body: dict[str, Any], key: dict[str, str] = KEY, domain: str = "ready"
-) -> httpx2.Response:
+def ask(client, path, body, key=KEY, domain="ready"):
     return client.post(f"/v1/admin/domains/{domain}/{path}", json=body, headers=key)
 
 
-def test_a_remap_asked_for_twice_under_one_key_is_one(tmp_path: Path) -> None:
+def test_a_remap_asked_for_twice_under_one_key_is_one(tmp_path):
     with service(tmp_path) as client:
-        make_ready_domain(client, "ready")
+        client.make_ready_domain("ready")
         first = ask(client, "remaps", REMAP)
-        done = wait_for(client, first.json()["job_id"])
+        done = client.wait_for(first.json()["job_id"])
         assert (first.status_code, done["state"]) == (202, "succeeded")
     with service(tmp_path) as client:  # after a restart too
         again = ask(client, "remaps", {**REMAP, "seed": 0, "landmark_traverse": None})  # the same, written out
@@ -232,10 +217,10 @@ def test_a_remap_asked_for_twice_under_one_key_is_one(tmp_path: Path) -> None:
         assert again.headers["location"] == first.headers["location"] == f"/v1/admin/jobs/{done['job_id']}"
         assert len(client.get("/v1/admin/jobs").json()["jobs"]) == 2
         problem(ask(client, "remaps", {**REMAP, "seed": 1}), 422, "idempotency_key_reused")
-        make_ready_domain(client, "elsewhere")
+        client.make_ready_domain("elsewhere")
         others = [ask(client, "remaps", REMAP, key) for key in ({}, {}, {"Idempotency-Key": "another"})]
         others.append(ask(client, "remaps", REMAP, domain="elsewhere"))
-        jobs = [wait_for(client, answer.json()["job_id"]) for answer in others]
+        jobs = [client.wait_for(answer.json()["job_id"]) for answer in others]
         assert len({done["job_id"], *(job["job_id"] for job in jobs)}) == 5
         assert jobs[-1]["domain"] == "elsewhere"
         client.delete("/v1/admin/domains/ready/traverses/drive")
@@ -243,26 +228,26 @@ def test_a_remap_asked_for_twice_under_one_key_is_one(tmp_path: Path) -> None:
         problem(ask(client, "remaps", REMAP, {}), 404, "unknown_traverse")
 
 
-def test_experience_fed_back_twice_under_one_key_is_learnt_once(client: TestClient, domain: str) -> None:
-    session = begin(client, domain)
+def test_experience_fed_back_twice_under_one_key_is_learnt_once(client, domain):
+    session = client.begin(domain)
     for image in range(0, 8, 2):
         body = {"encoding": ready_encodings()[image].tolist()}
         assert client.post(f"{path_of(session)}/observations?action_m=4", json=body).status_code == 200
     truths = {"session_id": session["session_id"], "true_positions_m": [0.0, 4.0, None, 12.0]}
     first = ask(client, "experience", truths, domain=domain)
     assert first.status_code == 202, first.text
-    done = wait_for(client, first.json()["job_id"])
+    done = client.wait_for(first.json()["job_id"])
     assert ask(client, "experience", truths, domain=domain).json() == done
     other = {**truths, "true_positions_m": [0.0, 4.0, 8.0, 12.0]}
     problem(ask(client, "experience", other, domain=domain), 422, "idempotency_key_reused")
-    job = wait_for(client, ask(client, "experience", other, {}, domain).json()["job_id"])
+    job = client.wait_for(ask(client, "experience", other, {}, domain).json()["job_id"])
     assert job["job_id"] != done["job_id"]
-    assert wait_for(client, ask(client, "remaps", REMAP, domain=domain).json()["job_id"])["kind"] == "remap"
+    assert client.wait_for(ask(client, "remaps", REMAP, domain=domain).json()["job_id"])["kind"] == "remap"
     counted = f'deepsimbad_live_anr_percent_count{{domain="{domain}"}} 4.0'
     assert counted in client.get("/metrics").text, "every truth counts once"
 
 
-def test_only_so_many_jobs_wait(held: tuple[TestClient, Held]) -> None:
+def test_only_so_many_jobs_wait(held):
     client, runner = held
     runner.entered.clear()
     runner.free.clear()
@@ -277,6 +262,6 @@ def test_only_so_many_jobs_wait(held: tuple[TestClient, Held]) -> None:
     last = ask(client, "remaps", REMAP, {})
     assert last.status_code == 202, last.text
     runner.free.set()
-    assert wait_for(client, last.json()["job_id"])["state"] == "succeeded"
-    assert wait_for(client, waiting[0])["state"] == "cancelled"
+    assert client.wait_for(last.json()["job_id"])["state"] == "succeeded"
+    assert client.wait_for(waiting[0])["state"] == "cancelled"
     assert client.delete(f"/v1/admin/jobs/{waiting[0]}").status_code == 204, "it stays cancelled"

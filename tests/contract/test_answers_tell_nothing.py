@@ -10,22 +10,18 @@ import re
 import shutil
 import sys
 import sysconfig
-from collections.abc import Iterator
 from itertools import product
 from pathlib import Path
-from typing import Any
 from urllib.parse import unquote, unquote_to_bytes
 
 import pytest
-from starlette.testclient import TestClient
-from starlette.types import Message, Scope
 
 from deepsimbad.store.layout import is_name
 
-from .conftest import DIM, JSON, NPZ, begin, make_ready_domain, npz, service, services_of, wait_for
+from .conftest import DIM, JSON, NPZ, npz, service
 
 NAMES = {"domain": "ready", "name": "drive", "index": "0", "version": "1", "session_id": "none", "job_id": "none"}
-BODIES: tuple[tuple[bytes, dict[str, str]], ...] = (
+BODIES = (
     (b"{}", JSON),
     (b"", {}),
     (b"", JSON),
@@ -49,11 +45,11 @@ INSIDE = ("Traceback", 'File "', "sqlite3.", "OperationalError", "site-packages"
 class Listener:
     """A service of its own whose answers are checked, and those with an error counted."""
 
-    def __init__(self, client: TestClient, data_dir: Path) -> None:
+    def __init__(self, client, data_dir):
         self.client, self.data_dir, self.n_errors = client, data_dir, 0
         self._places = (data_dir.name, str(data_dir.resolve().parent), str(Path(__file__).parents[2]))
 
-    def ask(self, method: str, url: str, body: bytes = b"", headers: Any = None) -> Any:
+    def ask(self, method, url, body=b"", headers=None):
         answer = self.client.request(method, url, content=body, headers=headers)
         is_error = answer.status_code >= 400
         self.n_errors += is_error
@@ -62,7 +58,7 @@ class Listener:
             assert word not in text, f"{word}: {method} {url}: {text[:1000]}"
         return answer
 
-    def walk(self, bodies: Any = BODIES, queries: Any = QUERIES) -> None:
+    def walk(self, bodies=BODIES, queries=QUERIES):
         """Every operation, with and without what it needs."""
         for path, by_method in self.client.get("/openapi.json").json()["paths"].items():
             for method, operation in by_method.items():
@@ -75,27 +71,27 @@ class Listener:
 
 
 @pytest.fixture
-def ours(tmp_path: Path) -> Iterator[Listener]:
+def ours(tmp_path):
     data_dir = tmp_path / "somewhere-secret"
     with service(data_dir) as client:
-        make_ready_domain(client, "ready")
+        client.make_ready_domain("ready")
         yield Listener(client, data_dir)
 
 
-def test_mistakes(ours: Listener) -> None:
+def test_mistakes(ours):
     ours.walk()
     for path in ("/no/such/path", "/v1", "/v1/", "/%00", "/docs/x", "/..%2f..%2fetc/passwd"):
         ours.ask("GET", path)
     assert ours.n_errors > 400
-    services_of(ours.client).catalog.close()
-    services_of(ours.client).session_store.close()
+    ours.client.services.catalog.close()
+    ours.client.services.session_store.close()
     shutil.rmtree(ours.data_dir)
     before = ours.n_errors
     ours.walk(BODIES[:1], ())
     assert ours.n_errors > before + 40
 
 
-def damage(path: Path) -> None:
+def damage(path):
     path.chmod(0o644)
     content = bytearray(path.read_bytes())
     for place in range(100, len(content), 97):
@@ -107,8 +103,8 @@ def damage(path: Path) -> None:
     "harm",
     [damage, Path.unlink, lambda path: (path.unlink(), path.mkdir()), lambda path: (path.unlink(), path.touch())],
 )
-def test_harmed_files(ours: Listener, harm: Any) -> None:
-    session = begin(ours.client)["session_id"]
+def test_harmed_files(ours, harm):
+    session = ours.client.begin()["session_id"]
     admin = "/v1/admin/domains/ready"
     assert ours.client.post(f"{admin}/traverses", json={"name": "other"}).status_code == 201
     paths = [path for kind in ("traverses", "maps") for path in ours.data_dir.glob(f"domains/*/{kind}/*.sqlite")]
@@ -132,7 +128,7 @@ def test_harmed_files(ours: Listener, harm: Any) -> None:
     ):
         answer = ours.ask(method, url, body, headers)
         if answer.status_code == 202:
-            job = f"/v1/admin/jobs/{wait_for(ours.client, answer.json()['job_id'])['job_id']}"
+            job = f"/v1/admin/jobs/{ours.client.wait_for(answer.json()['job_id'])['job_id']}"
             ours.ask("GET", job)
             ours.ask("GET", f"{job}/events")
     assert ours.n_errors >= 3
@@ -153,22 +149,22 @@ _TOUCHING = {"open", "sqlite3.connect", "os.listdir", "os.scandir", "os.mkdir", 
 class Watch:
     """What the process opens, lists, makes or removes while it is on. A hook stays for good, so there is one."""
 
-    def __init__(self) -> None:
-        self.touched: set[str] | None = None
+    def __init__(self):
+        self.touched = None
         sys.addaudithook(self._hear)
 
-    def _hear(self, event: str, arguments: tuple[Any, ...]) -> None:
+    def _hear(self, event, arguments):
         if self.touched is not None and event in _TOUCHING:
             paths = arguments[:2] if event == "os.rename" else arguments[:1]
             self.touched |= {os.fsdecode(path) for path in paths if isinstance(path, (str, bytes, os.PathLike))}
 
 
 @pytest.fixture(scope="module")
-def watch() -> Watch:
+def watch():
     return Watch()
 
 
-def requests(document: dict[str, Any], trick: str) -> Iterator[tuple[str, str, bytes, str]]:
+def requests(document, trick):
     """Every operation with the trick as each of its names in turn, the others real, and a body that would be taken."""
     for path, by_method in document["paths"].items():
         for method, operation in by_method.items():
@@ -183,21 +179,21 @@ def requests(document: dict[str, Any], trick: str) -> Iterator[tuple[str, str, b
                     yield method.upper(), url, *body_of(operation, document["components"]["schemas"])
 
 
-def body_of(operation: dict[str, Any], schemas: dict[str, Any]) -> tuple[bytes, str]:
+def body_of(operation, schemas):
     content = operation.get("requestBody", {"content": {"": {}}})["content"]
     if "application/json" not in content:
         return b"an archive", next(iter(content))
     schema = content["application/json"]["schema"]
-    example: Any = {"encoding": [1.0] * DIM}
+    example = {"encoding": [1.0] * DIM}
     if "$ref" in schema:
         (example,) = schemas[schema["$ref"].rpartition("/")[2]]["examples"]
     return json.dumps(example).encode(), "application/json"
 
 
-async def code_of(app: Any, method: str, url: str, body: bytes, content_type: str) -> str:
+async def code_of(app, method, url, body, content_type):
     """The code of the answer's problem."""
     raw, _, query = url.partition("?")
-    scope: Scope = {
+    scope = {
         "type": "http",
         "http_version": "1.1",
         "method": method,
@@ -210,23 +206,22 @@ async def code_of(app: Any, method: str, url: str, body: bytes, content_type: st
         "server": ("test", 80),
         "client": ("test", 1),
     }
-    answers: list[Message] = []
+    answers = []
 
-    async def receive() -> Message:
+    async def receive():
         return {"type": "http.request", "body": body, "more_body": False}
 
-    async def send(message: Message) -> None:
+    async def send(message):
         answers.append(message)
 
     await asyncio.wait_for(app(scope, receive, send), 30)
     if answers[0]["status"] < 400:
         return "taken"
-    code: str = json.loads(b"".join(message.get("body", b"") for message in answers))["code"]
-    return code
+    return json.loads(b"".join(message.get("body", b"") for message in answers))["code"]
 
 
 @pytest.mark.parametrize("trick", TRICKS, ids=range(len(TRICKS)))
-def test_no_name_reaches_the_file_system(client: TestClient, data_dir: Path, watch: Watch, trick: str) -> None:
+def test_no_name_reaches_the_file_system(client, data_dir, watch, trick):
     before = {path: path.stat().st_size for path in data_dir.rglob("*.sqlite")}
     of_python = [Path(path).resolve() for path in (*sysconfig.get_paths().values(), sys.prefix, sys.base_prefix)]
     of_python.append(Path(__file__).resolve().parents[2] / "service")

@@ -2,12 +2,8 @@
 
 import struct
 import zlib
-from collections.abc import Iterator
-from pathlib import Path
-from typing import Any
 
 import pytest
-from starlette.testclient import TestClient
 
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.catalog_maps import ANY
@@ -20,15 +16,10 @@ from .conftest import (
     N_READY,
     NPZ,
     RANKS,
-    begin,
     encoded,
-    path_of,
     picture,
     problem,
     ready_encodings,
-    remap,
-    services_of,
-    upload,
 )
 
 READY = "/v1/domains/ready"
@@ -40,12 +31,12 @@ ENCODING = {"encoding": [1.0] * DIM}
 
 
 @pytest.fixture(autouse=True)
-def _goes_on(client: TestClient) -> Iterator[None]:
+def _goes_on(client):
     yield
     assert client.post(f"{READY}/localizations", json=RANKS).status_code == 200
 
 
-def ask(client: TestClient, method: str, path: str, body: Any = None) -> Any:
+def ask(client, method, path, body=None):
     """Send JSON, written out where the body is text or bytes."""
     if isinstance(body, (str, bytes)):
         return client.request(method, path, content=body, headers=JSON)
@@ -53,9 +44,9 @@ def ask(client: TestClient, method: str, path: str, body: Any = None) -> Any:
 
 
 @pytest.fixture(scope="module")
-def views(client: TestClient) -> Iterator[dict[str, tuple[str, str]]]:
+def views(client):
     """Both calls that take a domain's views, by its name; nothing moves the sessions."""
-    sessions = {domain: path_of(begin(client, domain)) for domain in ("ready", "seen")}
+    sessions = {domain: client.session(domain) for domain in ("ready", "seen")}
     yield {domain: (f"/v1/domains/{domain}/localizations", f"{path}/observations") for domain, path in sessions.items()}
     assert [client.get(path).json()["n_observations"] for path in sessions.values()] == [0, 0]
 
@@ -63,7 +54,7 @@ def views(client: TestClient) -> Iterator[dict[str, tuple[str, str]]]:
 # Views
 
 
-def claimed_png(width: int, height: int) -> bytes:
+def claimed_png(width, height):
     header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
     chunk = b"IHDR" + header
     return b"\x89PNG\r\n\x1a\n" + struct.pack(">I", len(header)) + chunk + struct.pack(">I", zlib.crc32(chunk))
@@ -90,9 +81,7 @@ TAKEN = {"allowed": [*IMAGES, "application/json", "application/vnd.deepsimbad.ra
         ("ready", encoded(picture(1)), "image/jpeg", 415, "unsupported_media_type", {"allowed": ["application/json"]}),
     ],
 )
-def test_bodies_that_are_no_view(
-    client: TestClient, views: Any, of: str, body: bytes, content_type: str | None, status: int, code: str, hints: Any
-) -> None:
+def test_bodies_that_are_no_view(client, views, of, body, content_type, status, code, hints):
     for path in views[of]:
         answer = client.post(path, content=body, headers={"Content-Type": content_type} if content_type else {})
         told = problem(answer, status, code)
@@ -135,22 +124,22 @@ def test_bodies_that_are_no_view(
         (b"\x00", "invalid_request"),
     ],
 )
-def test_bad_json(client: TestClient, views: Any, body: str | bytes, code: str) -> None:
+def test_bad_json(client, views, body, code):
     for path in views["ready"]:
         told = problem(ask(client, "POST", path, body), 422, code)
         assert code != "invalid_request" or told["errors"][0]["loc"][0] == "body"
         assert body != "{}" or told["detail"].startswith("body: give exactly one of ranked_landmarks, dissimilarities")
 
 
-def test_a_body_in_chunks_is_counted_as_it_comes(client: TestClient) -> None:
+def test_a_body_in_chunks_is_counted_as_it_comes(client):
     chunks = (bytes(1000) for _ in range(10_000))
     problem(client.post(f"{SEEN}/localizations", content=chunks, headers=JPEG), 413, "body_too_large")
     chunks = (bytes(50_000) for _ in range(11))
     problem(client.post(FRAMES, content=chunks, headers=NPZ), 413, "body_too_large")
 
 
-def test_a_map_that_compares_what_was_not_sent(client: TestClient, domain: str) -> None:
-    assert remap(client, domain, training_traverse="drive", relevance="brute_force")["state"] == "succeeded"
+def test_a_map_that_compares_what_was_not_sent(client, domain):
+    assert client.remap(domain, relevance="brute_force")["state"] == "succeeded"
     problem(client.post(f"/v1/domains/{domain}/localizations", json=RANKS), 422, "invalid_input")
 
 
@@ -166,8 +155,8 @@ QUERIES = [
 
 
 @pytest.mark.parametrize(("query", "code"), QUERIES)
-def test_bad_queries_of_views(client: TestClient, query: str, code: str) -> None:
-    path = path_of(begin(client))
+def test_bad_queries_of_views(client, query, code):
+    path = client.session()
     for n_before in (0, 1):
         problem(client.post(f"{path}/observations?{query}", json=RANKS), 422, code)
         assert client.get(path).json()["n_observations"] == n_before
@@ -177,8 +166,8 @@ def test_bad_queries_of_views(client: TestClient, query: str, code: str) -> None
 
 
 @pytest.mark.parametrize("key", ["", " ", "a b", "x" * 256, "\x7f"])
-def test_idempotency_keys_that_cannot_be(client: TestClient, key: str) -> None:
-    session = path_of(begin(client))
+def test_idempotency_keys_that_cannot_be(client, key):
+    session = client.session()
     for path, body in (
         (f"{session}/observations", RANKS),
         (f"{READY}/sessions", {}),
@@ -289,7 +278,7 @@ BODIES = [
 
 
 @pytest.mark.parametrize(("method", "path", "body", "code"), BODIES)
-def test_bad_values(client: TestClient, method: str, path: str, body: Any, code: str) -> None:
+def test_bad_values(client, method, path, body, code):
     problem(ask(client, method, path, body), 422, code)
     assert client.get("/v1/domains/bad").status_code == 404
 
@@ -297,13 +286,13 @@ def test_bad_values(client: TestClient, method: str, path: str, body: Any, code:
 @pytest.mark.parametrize(
     "body", [{"position_m": 1e6, "std_m": 1}, {"position_m": 1, "std_m": 0}, {"position_m": -40, "std_m": 5}]
 )
-def test_bad_priors(client: TestClient, body: dict[str, float]) -> None:
-    path = path_of(begin(client))
+def test_bad_priors(client, body):
+    path = client.session()
     problem(client.put(f"{path}/prior", json=body), 422, "invalid_prior")
     problem(client.put(f"{path}/prior", json={"position_m": 3}), 422, "invalid_request")
 
 
-def test_bodies_of_other_types_are_no_frames(client: TestClient) -> None:
+def test_bodies_of_other_types_are_no_frames(client):
     problem(client.put(FRAME, content=b"x", headers={"Content-Type": "text/plain"}), 415, "unsupported_media_type")
     problem(client.put(FRAME, content=encoded(picture(1)), headers=JPEG), 415, "unsupported_media_type")
     seen = FRAME.replace("ready", "seen")
@@ -315,7 +304,7 @@ def test_bodies_of_other_types_are_no_frames(client: TestClient) -> None:
 
 EVALUATOR = {"evaluator": {"kind": "feature_l2"}}
 REMAP = {"training_traverse": "drive"}
-OF_A_DOMAIN: list[tuple[str, str, Any]] = [
+OF_A_DOMAIN = [
     ("GET", "/v1/domains/nowhere", None),
     ("GET", "/v1/domains/nowhere/landmark-model", None),
     ("GET", "/v1/domains/nowhere/landmark-model?map_version=1", None),
@@ -383,12 +372,12 @@ NOWHERE = [
 
 
 @pytest.mark.parametrize(("method", "path", "body", "status", "code"), NOWHERE)
-def test_what_is_not_there(client: TestClient, method: str, path: str, body: Any, status: int, code: str) -> None:
+def test_what_is_not_there(client, method, path, body, status, code):
     told = problem(ask(client, method, path, body), status, code)
     assert code != "no_active_map" or "remap" in told["detail"]
 
 
-def test_a_method_that_a_path_does_not_know(client: TestClient) -> None:
+def test_a_method_that_a_path_does_not_know(client):
     answer = client.post("/v1/domains")
     problem(answer, 405, "method_not_allowed")
     assert answer.headers["allow"] == "GET"
@@ -397,7 +386,7 @@ def test_a_method_that_a_path_does_not_know(client: TestClient) -> None:
 @pytest.mark.parametrize(
     "name", ["%2e%2e", ".hidden", "a b", "a'--", "é", "x" * 65, "%00", "%F0%9F%A4%96", "-a", "a%0a"]
 )
-def test_names_that_are_none(client: TestClient, name: str) -> None:
+def test_names_that_are_none(client, name):
     problem(client.get(f"/v1/domains/{name}"), 422, "invalid_request")
     problem(client.put(f"/v1/admin/domains/{name}", json=EVALUATOR), 422, "invalid_request")
 
@@ -405,8 +394,8 @@ def test_names_that_are_none(client: TestClient, name: str) -> None:
 # What only a job finds out
 
 
-def test_remaps_that_fail_leave_the_map_that_serves(client: TestClient) -> None:
-    upload(client, "ready", "backwards", ready_encodings()[:2], [5.0, 4.0])
+def test_remaps_that_fail_leave_the_map_that_serves(client):
+    client.upload("ready", "backwards", ready_encodings()[:2], [5.0, 4.0])
     client.post(f"{ADMIN}/traverses", json={"name": "empty"})
     for config, code in (
         ({"training_traverse": "backwards"}, "invalid_route"),
@@ -414,7 +403,7 @@ def test_remaps_that_fail_leave_the_map_that_serves(client: TestClient) -> None:
         ({"training_traverse": "drive", "list_length": N_LANDMARKS + 1}, "invalid_map_config"),
         ({**REMAP, "landmark_traverse": "drive", "n_landmarks": N_READY + 1}, "too_few_candidates"),
     ):
-        job = remap(client, "ready", **config)
+        job = client.remap("ready", **config)
         assert job["state"] == "failed"
         assert code is None or job["error"]["code"] == code
     assert client.get(READY).json()["map_version"] == 1
@@ -424,10 +413,10 @@ def test_remaps_that_fail_leave_the_map_that_serves(client: TestClient) -> None:
     assert "make one first, without append" in problem(appended, 409, "no_active_map")["detail"]
 
 
-def test_a_damaged_map(client: TestClient, domain: str, data_dir: Path) -> None:
+def test_a_damaged_map(client, domain, data_dir):
     place, active = f"/v1/domains/{domain}/localizations", f"/v1/admin/domains/{domain}/active-map"
     assert client.post(place, json=RANKS).status_code == 200
-    remap(client, domain, training_traverse="drive", activate=False)
+    client.remap(domain, activate=False)
     sealed = data_dir / "domains" / domain / "maps" / "000002.sqlite"
     content = bytearray(sealed.read_bytes())
     content[len(content) // 2] ^= 1
@@ -440,7 +429,7 @@ def test_a_damaged_map(client: TestClient, domain: str, data_dir: Path) -> None:
     sealed.write_bytes(content[: len(content) // 3])
     with Catalog.open(data_dir) as catalog:
         catalog.activate(domain, 2, ANY)
-    services_of(client).maps.forget(domain)
+    client.services.maps.forget(domain)
     for _ in range(2):
         answer = client.post(place, json=RANKS)
         assert problem(answer, 503, "damaged_map")["map_version"] == 2
@@ -452,11 +441,11 @@ def test_a_damaged_map(client: TestClient, domain: str, data_dir: Path) -> None:
     assert client.post(place, json=RANKS).status_code == 200
 
 
-def test_our_own_fault_tells_nothing_but_its_id(client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
-    def broken(*_: Any) -> None:
+def test_our_own_fault_tells_nothing_but_its_id(client, monkeypatch):
+    def broken(*_):
         raise RuntimeError("a secret of the inside")
 
-    monkeypatch.setattr(services_of(client).catalog, "newest_maps", broken)
+    monkeypatch.setattr(client.services.catalog, "newest_maps", broken)
     answer = client.get(f"{ADMIN}/maps", headers={"X-Request-ID": "mine-1"})
     assert problem(answer, 500, "internal_error")["request_id"] == "mine-1"
     assert "secret" not in answer.text

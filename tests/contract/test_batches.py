@@ -2,11 +2,9 @@
 
 import io
 import zipfile
-from typing import Any
 
 import numpy as np
 import pytest
-from starlette.testclient import TestClient
 
 from deepsimbad.api.traverses import InvalidBatchError, read_batch
 from deepsimbad.errors import TooLargeError
@@ -23,7 +21,7 @@ GOOD = {
 }
 
 
-def zipped(members: dict[str, bytes]) -> bytes:
+def zipped(members):
     packed = io.BytesIO()
     with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, content in members.items():
@@ -31,23 +29,23 @@ def zipped(members: dict[str, bytes]) -> bytes:
     return packed.getvalue()
 
 
-def npy(array: np.ndarray, **how: Any) -> bytes:
+def npy(array, **how):
     packed = io.BytesIO()
     np.lib.format.write_array(packed, array, **how)
     return packed.getvalue()
 
 
-def npy_header(shape: tuple[int, ...]) -> bytes:
+def npy_header(shape):
     packed = io.BytesIO()
     np.lib.format.write_array_header_1_0(packed, {"descr": "<f4", "fortran_order": False, "shape": shape})
     return packed.getvalue()
 
 
-def with_encodings(content: bytes) -> bytes:
+def with_encodings(content):
     return zipped({**{f"{key}.npy": npy(array) for key, array in GOOD.items()}, "encodings.npy": content})
 
 
-BATCHES: list[tuple[bytes, str]] = [
+BATCHES = [
     (b"not a zip", "invalid_batch"),
     (npz(**GOOD)[:-30], "invalid_batch"),
     (npz(**GOOD)[30:], "invalid_batch"),
@@ -90,13 +88,13 @@ BATCHES: list[tuple[bytes, str]] = [
 
 
 @pytest.mark.parametrize(("body", "code"), BATCHES, ids=range(len(BATCHES)))
-def test_bad_batches(client: TestClient, body: bytes, code: str) -> None:
+def test_bad_batches(client, body, code):
     before = client.get(TRAVERSE).json()
     problem(client.post(FRAMES, content=body, headers=NPZ), 422, code)
     assert client.get(TRAVERSE).json() == before
 
 
-def test_batches_that_are_too_much(client: TestClient) -> None:
+def test_batches_that_are_too_much(client):
     problem(client.post(FRAMES, content=bytes(500_001), headers=NPZ), 413, "body_too_large")
     bomb = with_encodings(npy_header((62_500, DIM)) + bytes(4 * 62_500 * DIM))
     assert len(bomb) < 100_000
@@ -106,7 +104,7 @@ def test_batches_that_are_too_much(client: TestClient) -> None:
 
 
 @pytest.mark.parametrize("save", [np.savez, np.savez_compressed])
-def test_round_trip(save: Any) -> None:
+def test_round_trip(save):
     encodings = np.asfortranarray(np.arange(6.0).reshape(2, 3)).astype(np.float16, order="F")
     frames = {"encodings": encodings, "index": np.array([4, 1]), "position_m": np.array([2.0, 1.0])}
     places = {"timestamp_us": np.array([-1, 5]), "x_m": np.array([np.nan, 1.0]), "y_m": np.array([0, 1])}
@@ -121,7 +119,7 @@ def test_round_trip(save: Any) -> None:
     assert np.isnan([unknown.x_m, unknown.y_m]).all()
 
 
-def test_every_cut_of_a_batch_is_refused_and_any_flipped_byte_is_or_is_harmless() -> None:
+def test_every_cut_of_a_batch_is_refused_and_any_flipped_byte_is_or_is_harmless():
     whole = npz(**GOOD)
     for length in range(0, len(whole), 7):
         with pytest.raises(InvalidBatchError):

@@ -1,17 +1,13 @@
 """What browsers are told: headers on every answer, other origins where set, and a page that needs no other host."""
 
 import re
-from collections.abc import Iterator
-from pathlib import Path
-from typing import Any
 
 import pytest
-from starlette.testclient import TestClient
 
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.records import KeyScope
 
-from .conftest import problem, service, services_of
+from .conftest import problem, service
 
 ORIGIN = "https://map.example.org"
 EVERYWHERE = {
@@ -38,17 +34,15 @@ EVERYWHERE = {
         ("GET", "/v1/domains", 500),
     ],
 )
-def test_every_answer_carries_them_once(
-    client: TestClient, method: str, path: str, status: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.delattr(type(services_of(client).catalog), "domains")  # a fault of our own
+def test_every_answer_carries_them_once(client, method, path, status, monkeypatch):
+    monkeypatch.delattr(type(client.services.catalog), "domains")  # a fault of our own
     answer = client.request(method, path)
     assert answer.status_code == status
     for name, value in EVERYWHERE.items():
         assert answer.headers.get_list(name) == [value], name
 
 
-def test_the_page_of_the_documentation_loads_nothing_from_elsewhere(client: TestClient) -> None:
+def test_the_page_of_the_documentation_loads_nothing_from_elsewhere(client):
     page = client.get("/docs")
     assert page.headers["content-type"].startswith("text/html")
     assert "//" not in page.text
@@ -75,7 +69,7 @@ def test_the_page_of_the_documentation_loads_nothing_from_elsewhere(client: Test
 
 
 @pytest.fixture
-def crossed(tmp_path: Path) -> Iterator[tuple[TestClient, dict[str, str]]]:
+def crossed(tmp_path):
     """A service that lets one origin in, asked by a page of it; the header with a key."""
     with Catalog.open(tmp_path) as catalog:
         _, key = catalog.create_key(KeyScope.ADMIN)
@@ -84,22 +78,22 @@ def crossed(tmp_path: Path) -> Iterator[tuple[TestClient, dict[str, str]]]:
         yield client, {"Authorization": f"Bearer {key.text}"}
 
 
-def preflight(client: TestClient, origin: str) -> Any:
+def preflight(client, origin):
     asked = {"Access-Control-Request-Method": "PUT", "Access-Control-Request-Headers": "authorization,content-type"}
     return client.options("/v1/admin/domains/a", headers={"Origin": origin, **asked})
 
 
-def listed(answer: Any, header: str) -> set[str]:
+def listed(answer, header):
     return set(re.split(r",\s*", answer.headers[header].lower()))
 
 
-def test_without_the_setting_no_origin_is_let_in(client: TestClient) -> None:
+def test_without_the_setting_no_origin_is_let_in(client):
     for answer in (client.get("/v1/domains", headers={"Origin": ORIGIN}), preflight(client, ORIGIN)):
         problem(answer, 403, "foreign_host")
         assert not [name for name in answer.headers if name.startswith("access-control")]
 
 
-def test_a_preflight_needs_no_key_and_the_call_itself_does(crossed: tuple[TestClient, dict[str, str]]) -> None:
+def test_a_preflight_needs_no_key_and_the_call_itself_does(crossed):
     client, key = crossed
     answer = preflight(client, ORIGIN)
     assert answer.status_code == 200
@@ -115,7 +109,7 @@ def test_a_preflight_needs_no_key_and_the_call_itself_does(crossed: tuple[TestCl
     assert {"x-request-id", "retry-after", "location"} <= listed(let_in, "access-control-expose-headers")
 
 
-def test_another_origin_is_not_let_in(crossed: tuple[TestClient, dict[str, str]]) -> None:
+def test_another_origin_is_not_let_in(crossed):
     client, _ = crossed
     for origin in ("https://evil.example.org", f"{ORIGIN}.evil.org", "null", ORIGIN.upper(), ORIGIN.replace("s:", ":")):
         assert preflight(client, origin).status_code == 400

@@ -3,21 +3,17 @@
 import os
 import re
 import threading
-from collections.abc import Callable, Iterator
-from pathlib import Path
-from typing import Any
 
 import pytest
 from starlette.responses import JSONResponse
-from starlette.testclient import TestClient
 
 from deepsimbad.api import health
 from deepsimbad.store.layout import catalog_path, sessions_path
 
-from .conftest import RANKS, make_ready_domain, problem, service, services_of
+from .conftest import RANKS, problem, service
 
 
-def test_health_readiness_and_documents(client: TestClient) -> None:
+def test_health_readiness_and_documents(client):
     assert client.get("/healthz").json() == {"status": "alive"}
     assert client.get("/readyz").json() == {"status": "ready", "damaged_maps": []}
     assert client.get("/openapi.json").json()["openapi"].startswith("3.1")
@@ -28,20 +24,20 @@ def test_health_readiness_and_documents(client: TestClient) -> None:
     assert (answer.status_code, answer.headers["allow"]) == (405, "GET")
 
 
-def test_what_was_acknowledged_is_there_after_a_restart(tmp_path: Path) -> None:
+def test_what_was_acknowledged_is_there_after_a_restart(tmp_path):
     path = "/v1/domains/kept/localizations"
     with service(tmp_path) as client:
-        make_ready_domain(client, "kept")
+        client.make_ready_domain("kept")
         before = client.post(path, json=RANKS).json()
     with service(tmp_path) as client:
         after = client.post(path, json=RANKS).json()
     assert {**after, "timings_ms": {}} == {**before, "timings_ms": {}}
 
 
-def test_not_ready_while_stopping(tmp_path: Path) -> None:
+def test_not_ready_while_stopping(tmp_path):
     before = set(threading.enumerate())
     with service(tmp_path) as client:
-        services_of(client).stopping.set()
+        client.services.stopping.set()
         answer = client.get("/readyz")
         problem(answer, 503, "unavailable")
         assert answer.headers["retry-after"]
@@ -51,13 +47,13 @@ def test_not_ready_while_stopping(tmp_path: Path) -> None:
 
 
 @pytest.fixture
-def breakable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[TestClient]:
+def breakable(tmp_path, monkeypatch):
     monkeypatch.setattr(health, "TRUSTED_S", -1.0)  # look every time
     with service(tmp_path) as client:
         yield client
 
 
-def faults(client: TestClient) -> list[str]:
+def faults(client):
     answer = client.get("/readyz")
     shown = re.search(r"^deepsimbad_ready (\S+)$", client.get("/metrics").text, re.MULTILINE)
     assert shown is not None
@@ -68,43 +64,43 @@ def faults(client: TestClient) -> list[str]:
     about = problem(answer, 503, "unavailable")
     assert answer.headers["retry-after"]
     assert about["detail"] == "; ".join(about["faults"])
-    assert str(services_of(client).settings.data_dir) not in answer.text
+    assert str(client.services.settings.data_dir) not in answer.text
     return list(about["faults"])
 
 
-def refuse_writes(client: TestClient, is_on: bool = True) -> None:
-    services_of(client).session_store._writing.conn.execute(f"PRAGMA query_only = {int(is_on)}")
+def refuse_writes(client, is_on=True):
+    client.services.session_store._writing.conn.execute(f"PRAGMA query_only = {int(is_on)}")
 
 
-def remove(client: TestClient, path_in: Callable[[Path], Path]) -> None:
-    path_in(services_of(client).settings.data_dir).unlink()
+def remove(client, path_in):
+    path_in(client.services.settings.data_dir).unlink()
 
 
 @pytest.mark.parametrize(
     ("breaks", "expected"),
     [
-        (lambda client: services_of(client).worker.close(), "the inference worker has ended: restart the service"),
+        (lambda client: client.services.worker.close(), "the inference worker has ended: restart the service"),
         (
-            lambda client: services_of(client).session_store._commits.close(),
+            lambda client: client.services.session_store._commits.close(),
             "the thread that writes sessions has ended: restart the service",
         ),
-        (lambda client: services_of(client).runner.close(), "the thread that runs jobs has ended: restart the service"),
+        (lambda client: client.services.runner.close(), "the thread that runs jobs has ended: restart the service"),
         (lambda client: remove(client, catalog_path), "catalog.sqlite was removed under the running service"),
         (lambda client: remove(client, sessions_path), "sessions.sqlite was removed under the running service"),
         (refuse_writes, "sessions.sqlite: it may not be written"),
-        (lambda client: services_of(client).catalog._reader.close(), "catalog.sqlite: it is closed"),
+        (lambda client: client.services.catalog._reader.close(), "catalog.sqlite: it is closed"),
     ],
 )
-def test_what_is_broken_is_told(breakable: TestClient, breaks: Callable[[TestClient], None], expected: str) -> None:
+def test_what_is_broken_is_told(breakable, breaks, expected):
     assert faults(breakable) == []
     breaks(breakable)
     assert expected in faults(breakable)
 
 
-def test_a_disk_almost_full_or_read_only(breakable: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_disk_almost_full_or_read_only(breakable, monkeypatch):
     statvfs = os.statvfs
 
-    def read_only(path: Any) -> Any:
+    def read_only(path):
         real = statvfs(path)
         return os.statvfs_result((*real[:8], real.f_flag | os.ST_RDONLY, real.f_namemax))
 
@@ -118,7 +114,7 @@ def test_a_disk_almost_full_or_read_only(breakable: TestClient, monkeypatch: pyt
     assert faults(breakable) == [], "it is ready again when the fault is gone"
 
 
-def test_whoever_asks_often_is_answered_from_memory(breakable: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_whoever_asks_often_is_answered_from_memory(breakable, monkeypatch):
     """Or a stranger could keep the disk busy."""
     refuse_writes(breakable)
     assert len(faults(breakable)) == 1
@@ -129,11 +125,11 @@ def test_whoever_asks_often_is_answered_from_memory(breakable: TestClient, monke
     assert breakable.get("/readyz").status_code == 200
 
 
-def test_the_openapi_document_is_written_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_openapi_document_is_written_once(tmp_path, monkeypatch):
     n_written = 0
     render = JSONResponse.render
 
-    def counting(self: JSONResponse, content: Any) -> bytes:
+    def counting(self, content):
         nonlocal n_written
         n_written += 1
         return render(self, content)

@@ -8,13 +8,11 @@ import struct
 import threading
 import zipfile
 import zlib
-from collections.abc import Iterator
 
-import httpx2
 import numpy as np
 import pytest
 
-from .conftest import make_ready_domain, until
+from .conftest import Caller, until
 from .served import Robot, Served
 
 pytestmark = pytest.mark.slow
@@ -29,11 +27,11 @@ VIEW = b'{"ranked_landmarks": [1, 2]}'
 
 
 @pytest.fixture(scope="module")
-def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+def served(tmp_path_factory):
     limits = {"max_connections": MAX_CONNECTIONS, "max_requests": MAX_REQUESTS, "max_batch_bytes": 64 * MEBIBYTE}
     with Served(tmp_path_factory.mktemp("hostile") / "data", **limits) as served:
-        with httpx2.Client(base_url=served.url, timeout=60) as client:
-            make_ready_domain(client, "ready")
+        with Caller(base_url=served.url, timeout=60) as client:
+            client.make_ready_domain("ready")
             client.put("/v1/admin/domains/seen", json={"evaluator": {"kind": "feature_l2"}})
             client.post("/v1/admin/domains/seen/traverses", json={"name": "t"})
         yield served
@@ -41,7 +39,7 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
 
 
 @pytest.fixture(scope="module")
-def robot(served: Served) -> Iterator[Robot]:
+def robot(served):
     robot = Robot(served)
     thread = threading.Thread(target=robot.drive)
     thread.start()
@@ -55,7 +53,7 @@ def robot(served: Served) -> Iterator[Robot]:
 
 
 @pytest.fixture(autouse=True)
-def _others_are_unaffected(served: Served, robot: Robot) -> Iterator[None]:
+def _others_are_unaffected(served, robot):
     n_sockets = served.n_sockets
     with served.within(MOST_PEAK_MIB):
         yield
@@ -63,18 +61,18 @@ def _others_are_unaffected(served: Served, robot: Robot) -> Iterator[None]:
     until(lambda: served.n_sockets <= n_sockets + 2)
 
 
-def request(method: str, path: str, body: bytes = b"", **headers: str) -> bytes:
+def request(method, path, body=b"", **headers):
     sent = {"Host": "127.0.0.1", "Connection": "close", "Content-Type": "application/json"}
     sent |= {"Content-Length": str(len(body))} | {name.replace("_", "-"): value for name, value in headers.items()}
     lines = [f"{method} {path} HTTP/1.1", *(f"{name}: {value}" for name, value in sent.items() if value), "", ""]
     return "\r\n".join(lines).encode("utf-8", "surrogateescape") + body
 
 
-def statuses(answer: bytes) -> list[int]:
+def statuses(answer):
     return [int(part[:3]) for part in answer.split(b"HTTP/1.1 ")[1:]]
 
 
-def problem(answer: bytes) -> tuple[int, str]:
+def problem(answer):
     """The status and the code of an answer, after checking what all problems have."""
     head, _, content = answer.partition(b"\r\n\r\n")
     document = json.loads(content)
@@ -86,14 +84,14 @@ def problem(answer: bytes) -> tuple[int, str]:
     return int(head[9:12]), document["code"]
 
 
-def ask(served: Served, method: str, path: str, body: bytes = b"", **headers: str) -> tuple[int, str]:
+def ask(served, method, path, body=b"", **headers):
     return problem(served.tell(request(method, path, body, **headers)))
 
 
 # Images
 
 
-def deflate_bomb(n_mebibytes: int) -> bytes:
+def deflate_bomb(n_mebibytes):
     """A zlib stream that is small however much it unpacks to."""
     packer = zlib.compressobj(9)
     start = packer.compress(b"") + packer.flush(zlib.Z_FULL_FLUSH)
@@ -101,29 +99,29 @@ def deflate_bomb(n_mebibytes: int) -> bytes:
     return start + part * n_mebibytes
 
 
-def chunk(name: bytes, content: bytes) -> bytes:
+def chunk(name, content):
     return struct.pack(">I", len(content)) + name + content + struct.pack(">I", zlib.crc32(name + content))
 
 
-def png(pixels: bytes, size: int = 16, remark: bytes = b"") -> bytes:
+def png(pixels, size=16, remark=b""):
     header = chunk(b"IHDR", struct.pack(">IIBBBBB", size, size, 8, 2, 0, 0, 0))
     return b"\x89PNG\r\n\x1a\n" + header + remark + chunk(b"IDAT", pixels) + chunk(b"IEND", b"")
 
 
-def test_an_image_that_claims_ten_thousand_million_pixels(served: Served) -> None:
+def test_an_image_that_claims_ten_thousand_million_pixels(served):
     for _ in range(20):
         answer = ask(served, "PUT", FRAME, png(bytes(100), 100_000), Content_Type="image/png")
         assert answer == (413, "image_too_large")
 
 
-def test_a_png_that_unpacks_to_sixteen_gibibytes(served: Served) -> None:
+def test_a_png_that_unpacks_to_sixteen_gibibytes(served):
     bomb = png(deflate_bomb(16 * 1024))
     assert len(bomb) < 32 * MEBIBYTE
     assert ask(served, "PUT", FRAME, bomb, Content_Type="image/png") == (422, "undecodable_image")
 
 
 @pytest.mark.parametrize("name", [b"zTXt", b"iCCP", b"iTXt"])
-def test_bombs_in_a_pngs_remarks(served: Served, name: bytes) -> None:
+def test_bombs_in_a_pngs_remarks(served, name):
     head = b"a\x00\x01\x00\x00\x00" if name == b"iTXt" else b"a\x00\x00"
     body = png(zlib.compress(bytes(49 * 16)), remark=chunk(name, head + deflate_bomb(2048)))
     answer = served.tell(request("PUT", FRAME, body, Content_Type="image/png"))
@@ -133,13 +131,13 @@ def test_bombs_in_a_pngs_remarks(served: Served, name: bytes) -> None:
 # Packed bodies
 
 
-def test_packed_bodies_are_not_unpacked(served: Served) -> None:
+def test_packed_bodies_are_not_unpacked(served):
     bomb = gzip.compress(bytes(64 * MEBIBYTE))
     for path, coding in ((READY, "gzip"), (READY, "br"), (READY, "gzip, identity"), (BATCH, "gzip")):
         assert ask(served, "POST", path, bomb, Content_Encoding=coding) == (415, "unsupported_media_type")
 
 
-def batch_of(n_noughts: int) -> bytes:
+def batch_of(n_noughts):
     """An npz of so many float32 noughts, of a thousandth of their bytes."""
     packed = io.BytesIO()
     with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
@@ -155,7 +153,7 @@ def batch_of(n_noughts: int) -> bytes:
     return packed.getvalue()
 
 
-def test_batches_that_unpack_to_much_more_or_lie_about_it(served: Served) -> None:
+def test_batches_that_unpack_to_much_more_or_lie_about_it(served):
     kind = {"Content_Type": "application/octet-stream"}
     bombs = [batch_of(n_mebi * MEBIBYTE) for n_mebi in (8, 128)]
     for bomb, expected in zip(bombs, ((422, "invalid_input"), (413, "too_large")), strict=True):
@@ -170,7 +168,7 @@ def test_batches_that_unpack_to_much_more_or_lie_about_it(served: Served) -> Non
 # Slow senders
 
 
-def test_ten_thousand_chunks_of_one_byte(served: Served, robot: Robot) -> None:
+def test_ten_thousand_chunks_of_one_byte(served, robot):
     with served.connect() as drip:
         drip.sendall(request("POST", READY, Content_Length="", Transfer_Encoding="chunked"))
         for n_sent, byte in enumerate(VIEW.ljust(10_000)):
@@ -181,7 +179,7 @@ def test_ten_thousand_chunks_of_one_byte(served: Served, robot: Robot) -> None:
         assert drip.recv(65536).startswith(b"HTTP/1.1 200 ")
 
 
-def test_unfinished_bodies_on_many_connections_take_nobodys_turn(served: Served, robot: Robot) -> None:
+def test_unfinished_bodies_on_many_connections_take_nobodys_turn(served, robot):
     """Far more than may be under way at once."""
     with contextlib.ExitStack() as stack:
         for _ in range(4 * MAX_REQUESTS):
@@ -189,7 +187,7 @@ def test_unfinished_bodies_on_many_connections_take_nobodys_turn(served: Served,
         robot.answered_more(100)
 
 
-def test_with_more_connections_than_may_be_all_are_told_so(served: Served, robot: Robot) -> None:
+def test_with_more_connections_than_may_be_all_are_told_so(served, robot):
     """Plain words of the server: an operator's proxy keeps so many from coming."""
     asked = request("GET", "/healthz")
     with robot.turn, contextlib.ExitStack() as stack:
@@ -228,11 +226,11 @@ POST = b"POST / HTTP/1.1\r\n" + HOST
     ],
     ids=range(17),
 )
-def test_what_is_no_request_is_answered_400_in_plain_words(served: Served, head: bytes) -> None:
+def test_what_is_no_request_is_answered_400_in_plain_words(served, head):
     assert statuses(served.tell(head)) in ([400], [501])
 
 
-def test_bodies_that_end_in_two_ways_or_later_than_they_say(served: Served) -> None:
+def test_bodies_that_end_in_two_ways_or_later_than_they_say(served):
     """Whoever stands between might take the other one, and see another request behind it."""
     endless = served.tell(POST + b"Content-Length: 18446744073709551615\r\nConnection: close\r\n\r\n")
     assert problem(endless) == (413, "body_too_large")
@@ -244,7 +242,7 @@ def test_bodies_that_end_in_two_ways_or_later_than_they_say(served: Served) -> N
     assert statuses(served.tell(good * 10 + b"garbage\r\n\r\n" + good)) == [200] * 10 + [400]
 
 
-def test_headers_that_are_none_of_ours(served: Served) -> None:
+def test_headers_that_are_none_of_ours(served):
     for name, value in {
         "X-Request-ID": "a" * 10_000,
         "Idempotency-Key": "é" * 5000,
@@ -282,7 +280,7 @@ JSON_BODIES = {
 
 
 @pytest.mark.parametrize("kind", JSON_BODIES)
-def test_megabytes_of_json(served: Served, kind: str) -> None:
+def test_megabytes_of_json(served, kind):
     for method, path in (
         ("POST", READY),
         ("PUT", "/v1/admin/domains/evil"),

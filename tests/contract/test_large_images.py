@@ -3,13 +3,11 @@
 import io
 import threading
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 
-import httpx2
 import pytest
 from PIL import Image as Pillow
 
-from .conftest import encoded, make_ready_domain, picture
+from .conftest import Caller, encoded, picture
 from .served import Served
 
 WIDTH, HEIGHT = 10_000, 5_000  # 50,000,000 pixels, the default limit
@@ -21,7 +19,7 @@ FRAMES = "/v1/admin/domains/seen/traverses/t/frames"
 DONE, LOOKED_AT = (201, None), (415, "unsupported_media_type")
 
 
-def large(form: str) -> bytes:
+def large(form):
     stream = io.BytesIO()
     Pillow.new("RGB", (WIDTH, HEIGHT), (30, 60, 90)).save(stream, form, lossless=True)
     assert stream.tell() < 200_000
@@ -29,18 +27,18 @@ def large(form: str) -> bytes:
 
 
 @pytest.mark.slow
-def test_many_just_under_the_limit_at_once(tmp_path: Path) -> None:
+def test_many_just_under_the_limit_at_once(tmp_path):
     """They wait for each other, and some are refused; a robot's own views go on, and memory is that of one of them."""
     bombs = {form: large(form) for form in ("webp", "png")}
     small = encoded(picture(1))
     stopped, n_seen, faults = threading.Event(), 0, []
 
-    def send(path: str, body: bytes, kind: str) -> tuple[int, str | None]:
+    def send(path, body, kind):
         method = "PUT" if path.startswith(FRAMES) else "POST"
         answer = client.request(method, path, content=body, headers={"Content-Type": f"image/{kind}"})
         return answer.status_code, answer.json().get("code")
 
-    def robot() -> None:
+    def robot():
         nonlocal n_seen
         while not stopped.is_set():
             answers = send(f"{FRAMES}/0?position_m=0", small, "jpeg"), send(LOCALIZE, small, "jpeg")
@@ -48,12 +46,12 @@ def test_many_just_under_the_limit_at_once(tmp_path: Path) -> None:
                 faults.append(answers)
             n_seen += 1
 
-    def hostile(number: int) -> tuple[int, str | None]:
+    def hostile(number):
         kind, body = list(bombs.items())[number % 2]
         return send(f"{FRAMES}/{number + 1}?position_m=0" if number % 3 == 0 else LOCALIZE, body, kind)
 
-    with Served(tmp_path / "data") as served, httpx2.Client(base_url=served.url, timeout=120) as client:
-        make_ready_domain(client, "ready")
+    with Served(tmp_path / "data") as served, Caller(base_url=served.url, timeout=120) as client:
+        client.make_ready_domain("ready")
         client.put("/v1/admin/domains/seen", json={"evaluator": {"kind": "feature_l2"}})
         client.post("/v1/admin/domains/seen/traverses", json={"name": "t"})
         assert send(f"{FRAMES}/0?position_m=0", small, "jpeg") == DONE

@@ -1,11 +1,8 @@
 """Lists page by page: every entry once, whatever is made or removed between two pages."""
 
-from typing import Any
-
 import pytest
-from starlette.testclient import TestClient
 
-from .conftest import RANKS, TAKES_ENCODINGS, begin, make_ready_domain, path_of, problem, remap
+from .conftest import RANKS, TAKES_ENCODINGS, path_of, problem
 
 LISTS = [
     ("/v1/admin/domains/full/traverses", "traverses", "name", ["Z", "a", "b-1", "b.2", "drive"]),
@@ -16,20 +13,20 @@ LISTS = [
 OF_FULL = pytest.mark.usefixtures("_full")
 
 
-def page(client: TestClient, path: str, **params: Any) -> dict[str, Any]:
+def page(client, path, **params):
     path, _, domain = path.partition("?domain=")
     answer = client.get(path, params={**params, **({"domain": domain} if domain else {})})
     assert answer.status_code == 200, answer.text
-    document: dict[str, Any] = answer.json()
+    document = answer.json()
     assert len(document) == 2
     assert "next" in document
     return document
 
 
-def entries(client: TestClient, path: str, key: str, limit: int) -> list[dict[str, Any]]:
+def entries(client, path, key, limit):
     """The whole list, read a page at a time."""
-    rows: list[dict[str, Any]] = []
-    after: dict[str, Any] = {}
+    rows = []
+    after = {}
     while True:
         answer = page(client, path, limit=limit, **after)
         assert len(answer[key]) <= limit
@@ -40,22 +37,20 @@ def entries(client: TestClient, path: str, key: str, limit: int) -> list[dict[st
 
 
 @pytest.fixture(scope="module")
-def _full(client: TestClient) -> None:
+def _full(client):
     """A domain with five traverses, three jobs, three maps and four sessions."""
-    make_ready_domain(client, "full")
+    client.make_ready_domain("full")
     for name in ("b.2", "a", "Z", "b-1"):
         client.post("/v1/admin/domains/full/traverses", json={"name": name})
     for _ in range(2):
-        assert remap(client, "full", training_traverse="drive", training_episodes=0)["state"] == "succeeded"
+        assert client.remap("full", training_episodes=0)["state"] == "succeeded"
     for _ in range(4):
-        begin(client, "full")
+        client.begin("full")
 
 
 @OF_FULL
 @pytest.mark.parametrize(("path", "key", "name", "expected"), LISTS)
-def test_pages_of_any_length_make_up_the_list(
-    client: TestClient, path: str, key: str, name: str, expected: list[Any]
-) -> None:
+def test_pages_of_any_length_make_up_the_list(client, path, key, name, expected):
     whole = page(client, path)
     assert whole["next"] is None
     names = [entry[name] for entry in whole[key]]
@@ -66,7 +61,7 @@ def test_pages_of_any_length_make_up_the_list(
 
 
 @OF_FULL
-def test_the_last_page_says_so_even_where_it_is_full(client: TestClient) -> None:
+def test_the_last_page_says_so_even_where_it_is_full(client):
     path = "/v1/admin/domains/full/maps"
     assert page(client, path, limit=3)["next"] is None
     assert page(client, path, limit=2)["next"] == "maps-2"
@@ -74,10 +69,10 @@ def test_the_last_page_says_so_even_where_it_is_full(client: TestClient) -> None
 
 
 @OF_FULL
-def test_what_is_made_or_goes_meanwhile_moves_nothing(client: TestClient) -> None:
+def test_what_is_made_or_goes_meanwhile_moves_nothing(client):
     path = "/v1/admin/sessions?domain=full"
     first = page(client, path, limit=2)
-    made = begin(client, "full")
+    made = client.begin("full")
     rest = page(client, path, after=first["next"])
     shown = [session["session_id"] for session in first["sessions"] + rest["sessions"]]
     assert made["session_id"] not in shown
@@ -93,8 +88,8 @@ def test_what_is_made_or_goes_meanwhile_moves_nothing(client: TestClient) -> Non
     assert [traverse["name"] for traverse in page(client, base, after=first["next"])["traverses"]] == ["c", "d"]
 
 
-def test_a_listed_session_is_the_session(client: TestClient, domain: str) -> None:
-    old, new = path_of(begin(client, domain)), path_of(begin(client, domain))
+def test_a_listed_session_is_the_session(client, domain):
+    old, new = client.session(domain), client.session(domain)
     for _ in range(2):
         client.post(f"{old}/observations", json=RANKS)
     client.put(f"{old}/prior", json={"position_m": 10, "std_m": 2})
@@ -113,7 +108,7 @@ def test_a_listed_session_is_the_session(client: TestClient, domain: str) -> Non
 
 @OF_FULL
 @pytest.mark.parametrize("path", [path.partition("?")[0] for path, *_ in LISTS])
-def test_a_cursor_or_limit_that_cannot_be(client: TestClient, path: str) -> None:
+def test_a_cursor_or_limit_that_cannot_be(client, path):
     what = path.rpartition("/")[2]
     other = "jobs-1" if what == "maps" else "maps-1"  # a cursor belongs to its list
     wrong = ["", "1", f"{what}-", f"{what}-../x", f"{what}-1\n", other]

@@ -4,41 +4,37 @@ import logging
 import re
 import threading
 import time
-from collections.abc import Iterator
-from pathlib import Path
-from typing import Any
 
 import pytest
-from starlette.testclient import TestClient
 
 from deepsimbad.errors import CancelledError
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.records import JobState
 
-from .conftest import JSON, RANKS, begin, make_ready_domain, path_of, remap, service
+from .conftest import JSON, RANKS, path_of, service
 
 ALL = ("request_id", "peer", "method", "path", "status", "key_id", "domain", "session_id", "job_id", "code")
 
 
 @pytest.fixture
-def lines(caplog: pytest.LogCaptureFixture) -> Iterator[pytest.LogCaptureFixture]:
+def lines(caplog):
     with caplog.at_level(logging.INFO, logger="deepsimbad"):
         yield caplog
 
 
-def last(lines: pytest.LogCaptureFixture, *names: str) -> dict[str, Any]:
+def last(lines, *names):
     """Of the last request's line, what it has of these names."""
     line = [vars(record) for record in lines.records if record.name == "deepsimbad.api.door"][-1]
     return {name: line[name] for name in names if name in line}
 
 
-def test_a_line_tells_what_the_request_was_about(client: TestClient, lines: pytest.LogCaptureFixture) -> None:
+def test_a_line_tells_what_the_request_was_about(client, lines):
     answer = client.get("/v1/domains/ready", headers={"X-Request-ID": "mine-1"})
     assert answer.headers["x-request-id"] == "mine-1"
     about = {"request_id": "mine-1", "peer": "testclient", "method": "GET", "path": "/v1/domains/ready", "status": 200}
     assert last(lines, *ALL) == {**about, "domain": "ready"}
     assert last(lines, "ms")["ms"] > 0
-    session = begin(client)
+    session = client.begin()
     path, session_id = path_of(session), session["session_id"]
     client.post(f"{path}/observations", json=RANKS)
     assert last(lines, "session_id", "domain", "code") == {"session_id": session_id, "domain": "ready"}
@@ -50,9 +46,7 @@ def test_a_line_tells_what_the_request_was_about(client: TestClient, lines: pyte
     assert len(last(lines, "path")["path"]) < 300
 
 
-def test_a_refused_request_is_counted_and_its_line_has_the_code(
-    client: TestClient, lines: pytest.LogCaptureFixture
-) -> None:
+def test_a_refused_request_is_counted_and_its_line_has_the_code(client, lines):
     client.post("/v1/domains/ready/localizations", content=b"x" * 60_000, headers=JSON)
     assert last(lines, "status", "code") == {"status": 413, "code": "body_too_large"}
     client.get("/v1/domains/nowhere")
@@ -62,10 +56,10 @@ def test_a_refused_request_is_counted_and_its_line_has_the_code(
     assert "unknown_domain" not in reasons, "a wrong name is no refusal"
 
 
-def test_jobs_and_maps_that_serve_are_told(tmp_path: Path, lines: pytest.LogCaptureFixture) -> None:
+def test_jobs_and_maps_that_serve_are_told(tmp_path, lines):
     with service(tmp_path) as client:
-        make_ready_domain(client, "ready")
-        remap(client, "ready", training_traverse="drive")
+        client.make_ready_domain("ready")
+        client.remap("ready")
         client.put("/v1/admin/domains/ready/active-map", json={"version": 1})
     jobs = [vars(record) for record in lines.records if record.message in {"job started", "job ended"}]
     assert [line["message"] for line in jobs] == ["job started", "job ended"] * 2
@@ -79,14 +73,12 @@ def test_jobs_and_maps_that_serve_are_told(tmp_path: Path, lines: pytest.LogCapt
     ]
 
 
-def test_a_job_that_the_service_stops_with_is_not_told_as_cancelled(
-    tmp_path: Path, lines: pytest.LogCaptureFixture
-) -> None:
+def test_a_job_that_the_service_stops_with_is_not_told_as_cancelled(tmp_path, lines):
     with service(tmp_path) as client:
-        make_ready_domain(client, "ready")
+        client.make_ready_domain("ready")
     began = threading.Event()
 
-    def until_stopped(job: Any, on_progress: Any, is_cancelled: Any) -> dict[str, Any]:
+    def until_stopped(job, on_progress, is_cancelled):
         began.set()
         while not is_cancelled():
             time.sleep(0.01)

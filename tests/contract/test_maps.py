@@ -2,48 +2,39 @@
 
 import base64
 import hashlib
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from starlette.testclient import TestClient
 
 from .conftest import (
     DIM,
     N_READY,
     RANKS,
-    begin,
-    make_ready_domain,
-    path_of,
     problem,
     ready_encodings,
-    remap,
     service,
-    services_of,
     until,
-    upload,
 )
 
 SAME = {"same_route": True}
 
 
-def versions(client: TestClient, domain: str) -> dict[int, dict[str, Any]]:
+def versions(client, domain):
     return {row["version"]: row for row in client.get(f"/v1/admin/domains/{domain}/maps").json()["maps"]}
 
 
-def states(client: TestClient, domain: str) -> dict[int, str]:
+def states(client, domain):
     return {version: row["state"] for version, row in versions(client, domain).items()}
 
 
-def noise(seed: int, n: int = N_READY) -> Any:
+def noise(seed, n=N_READY):
     return np.random.default_rng(seed).normal(size=(n, DIM))
 
 
 # Made and judged
 
 
-def test_the_history_tells_what_a_map_was_built_with_when_and_how_good_it_is(client: TestClient, domain: str) -> None:
+def test_the_history_tells_what_a_map_was_built_with_when_and_how_good_it_is(client, domain):
     first = versions(client, domain)[1]
     assert (first["config"]["n_landmarks"], first["config"]["training_traverse"]) == (10, "drive")
     assert (first["retired_at"], first["removed_at"]) == (None, None)
@@ -51,8 +42,8 @@ def test_the_history_tells_what_a_map_was_built_with_when_and_how_good_it_is(cli
     assert first["metrics"]["n_map_images"] == N_READY
     assert first["metrics"]["check"]["frames"] == "held_out"
     assert first["metrics"]["check"]["anr_active"] is None
-    upload(client, domain, "dense", ready_encodings(), np.arange(N_READY))
-    check = remap(client, domain, training_traverse="dense", relevance="rrf")["result"]["metrics"]["check"]
+    client.upload(domain, "dense", ready_encodings(), np.arange(N_READY))
+    check = client.remap(domain, training_traverse="dense", relevance="rrf")["result"]["metrics"]["check"]
     assert set(check) == {
         *("frames", "traverse", "n_queries", "n_left_out", "tolerance_m", "anr", "anr_active"),
         *("active_version", "gate_margin", "passed", "why"),
@@ -64,12 +55,12 @@ def test_the_history_tells_what_a_map_was_built_with_when_and_how_good_it_is(cli
     assert history[1]["retired_at"] is not None
 
 
-def test_versions_are_switched_and_rolled_back(client: TestClient, domain: str) -> None:
+def test_versions_are_switched_and_rolled_back(client, domain):
     active = f"/v1/admin/domains/{domain}/active-map"
-    job = remap(client, domain, training_traverse="drive", relevance="rrf", activate=False)
+    job = client.remap(domain, relevance="rrf", activate=False)
     assert job["result"] == {"map_version": 2, "active": False, "metrics": job["result"]["metrics"]}
 
-    def answer() -> Any:
+    def answer():
         document = client.post(f"/v1/domains/{domain}/localizations", json={"ranked_landmarks": [1, 2, 3]}).json()
         return document["map_version"], document["retrieval"]
 
@@ -86,24 +77,24 @@ def test_versions_are_switched_and_rolled_back(client: TestClient, domain: str) 
     assert client.put(active, json={"version": 2}).status_code == 200
 
 
-def test_a_worse_map_is_sealed_but_not_activated_and_says_why(client: TestClient, domain: str) -> None:
-    upload(client, domain, "noise", noise(1), 2.0 * np.arange(N_READY))
-    upload(client, domain, "day", ready_encodings() + 0.01, 2.0 * np.arange(N_READY))
+def test_a_worse_map_is_sealed_but_not_activated_and_says_why(client, domain):
+    client.upload(domain, "noise", noise(1), 2.0 * np.arange(N_READY))
+    client.upload(domain, "day", ready_encodings() + 0.01, 2.0 * np.arange(N_READY))
     asked = {"training_traverse": "noise", "check_traverse": "day", "gate_margin": 1}
-    job = remap(client, domain, **asked)
+    job = client.remap(domain, **asked)
     assert (job["state"], job["result"]["active"], job["config"]["gate_margin"]) == ("succeeded", False, 1)
     check = job["result"]["metrics"]["check"]
     assert check["passed"] is False
     assert "more than 1 above" in check["why"]
     assert states(client, domain) == {2: "sealed", 1: "active"}
     assert client.get(f"/v1/domains/{domain}").json()["map_version"] == 1
-    assert remap(client, domain, **asked | {"gate_margin": None})["result"]["active"] is True
+    assert client.remap(domain, **asked | {"gate_margin": None})["result"]["active"] is True
 
 
-def test_frames_are_appended_to_the_map_that_serves(client: TestClient, domain: str) -> None:
-    upload(client, domain, "further", noise(2, 10), 80.0 + np.arange(10))
+def test_frames_are_appended_to_the_map_that_serves(client, domain):
+    client.upload(domain, "further", noise(2, 10), 80.0 + np.arange(10))
     assert client.delete(f"/v1/admin/domains/{domain}/traverses/drive").status_code == 204
-    job = remap(client, domain, training_traverse="further", append=True)
+    job = client.remap(domain, training_traverse="further", append=True)
     assert job["state"] == "succeeded", job
     about = client.get(f"/v1/domains/{domain}").json()
     assert (about["map_version"], about["n_map_images"], about["route_length_m"]) == (2, N_READY + 10, 89.0)
@@ -113,38 +104,38 @@ def test_frames_are_appended_to_the_map_that_serves(client: TestClient, domain: 
     assert versions(client, domain)[2]["config"]["appended"][0]["traverse"] == "further"
 
 
-def test_what_the_map_holds_is_refused_before_it_is_appended_again(client: TestClient, domain: str) -> None:
+def test_what_the_map_holds_is_refused_before_it_is_appended_again(client, domain):
     """With its old images left in the copy the frames would find themselves, and any gate would open."""
     asked = {"training_traverse": "drive", "append": True, "gate_margin": 2}
     answer = client.post(f"/v1/admin/domains/{domain}/remaps", json=asked)
     detail = problem(answer, 422, "invalid_map_config")["detail"]
     assert "map 1, which serves, holds traverse drive already" in detail
-    upload(client, domain, "again", ready_encodings(), np.arange(N_READY))
-    job = remap(client, domain, **asked | {"training_traverse": "again"})
+    client.upload(domain, "again", ready_encodings(), np.arange(N_READY))
+    job = client.remap(domain, **asked | {"training_traverse": "again"})
     assert (job["state"], job["error"]["code"]) == ("failed", "invalid_map_config")
     assert "holds every frame of traverse again already, under another name" in job["error"]["detail"]
     assert list(versions(client, domain)) == [1]
 
 
-def test_a_second_season_is_learnt_from_where_the_route_is_said_to_be_one(client: TestClient, domain: str) -> None:
+def test_a_second_season_is_learnt_from_where_the_route_is_said_to_be_one(client, domain):
     """The drive knows x, y of its own; the other one does not."""
-    upload(client, domain, "again", ready_encodings() + 0.1 * noise(1), 2.0 * np.arange(N_READY))
-    upload(client, domain, "noise", noise(2), 2.0 * np.arange(N_READY))
+    client.upload(domain, "again", ready_encodings() + 0.1 * noise(1), 2.0 * np.arange(N_READY))
+    client.upload(domain, "noise", noise(2), 2.0 * np.arange(N_READY))
     asked = {"training_traverse": "drive", "landmark_traverse": "again", "training_episodes": 0}
-    unsaid, same = (remap(client, domain, **asked, **said)["result"]["metrics"]["second_season"] for said in ({}, SAME))
+    unsaid, same = (client.remap(domain, **asked, **said)["result"]["metrics"]["second_season"] for said in ({}, SAME))
     assert (unsaid["accepted"], same["accepted"]) == (False, True)
     assert "say same_route" in unsaid["why"]
     assert (same["why"], same["n_pairs"]) == (None, N_READY)
     assert 0 <= same["significance"] < 0.001 < same["statistic"]
-    job = remap(client, domain, **asked | SAME | {"landmark_traverse": "noise"})
+    job = client.remap(domain, **asked | SAME | {"landmark_traverse": "noise"})
     season = job["result"]["metrics"]["second_season"]
     assert (season["accepted"], job["config"]["same_route"]) == (False, True)
     assert "agree no better" in season["why"]
     assert versions(client, domain)[4]["metrics"]["second_season"] == season
 
 
-def test_a_closed_route_is_a_loop(client: TestClient) -> None:
-    make_ready_domain(client, "loop", closed=True, actions_m=[2.5])
+def test_a_closed_route_is_a_loop(client):
+    client.make_ready_domain("loop", closed=True, actions_m=[2.5])
     about = client.get("/v1/domains/loop").json()
     assert (about["closed"], about["actions_m"]) == (True, [2.5])
     assert about["route_length_m"] > 2.0 * (N_READY - 1)
@@ -155,11 +146,11 @@ def test_a_closed_route_is_a_loop(client: TestClient) -> None:
 # The file
 
 
-def place_of(domain: str, version: int = 1) -> str:
+def place_of(domain, version=1):
     return f"/v1/admin/domains/{domain}/maps/{version}/file"
 
 
-def test_a_sealed_map_is_one_file_with_its_digest(client: TestClient, data_dir: Path) -> None:
+def test_a_sealed_map_is_one_file_with_its_digest(client, data_dir):
     answer = client.get(place_of("ready"))
     row, body = versions(client, "ready")[1], answer.content
     digest = hashlib.sha256(body).digest()
@@ -184,7 +175,7 @@ def test_a_sealed_map_is_one_file_with_its_digest(client: TestClient, data_dir: 
         ("bytes=-99999999999", 0, None),
     ],
 )
-def test_part_of_it_can_be_asked_for(client: TestClient, asked: str, start: int, stop: int | None) -> None:
+def test_part_of_it_can_be_asked_for(client, asked, start, stop):
     whole = client.get(place_of("ready"))
     part = client.get(place_of("ready"), headers={"Range": asked})
     assert (part.status_code, part.content) == (206, whole.content[start:stop])
@@ -196,13 +187,13 @@ def test_part_of_it_can_be_asked_for(client: TestClient, asked: str, start: int,
 
 
 @pytest.mark.parametrize("asked", ["bytes=0-1,5-9", "lines=0-3", "bytes=-", "bytes=9-3", "bytes", "bytes=a-b"])
-def test_what_is_no_single_range_is_answered_whole(client: TestClient, asked: str) -> None:
+def test_what_is_no_single_range_is_answered_whole(client, asked):
     whole = client.get(place_of("ready"))
     answer = client.get(place_of("ready"), headers={"Range": asked})
     assert (answer.status_code, answer.content) == (200, whole.content)
 
 
-def test_a_range_behind_the_end(client: TestClient) -> None:
+def test_a_range_behind_the_end(client):
     n_bytes = len(client.get(place_of("ready")).content)
     for asked in (f"bytes={n_bytes}-", "bytes=-0"):
         answer = client.get(place_of("ready"), headers={"Range": asked})
@@ -210,7 +201,7 @@ def test_a_range_behind_the_end(client: TestClient) -> None:
         assert answer.headers["content-range"] == f"bytes */{n_bytes}"
 
 
-def test_a_download_goes_on_only_with_the_same_bytes(client: TestClient) -> None:
+def test_a_download_goes_on_only_with_the_same_bytes(client):
     whole = client.get(place_of("ready"))
     etag = whole.headers["etag"]
     for headers, status, content in (
@@ -224,7 +215,7 @@ def test_a_download_goes_on_only_with_the_same_bytes(client: TestClient) -> None
         assert answer.headers.get_list("cache-control") == ["private, no-cache"], "its asker may keep it"
 
 
-def test_a_damaged_file_is_not_sent(client: TestClient, domain: str, data_dir: Path) -> None:
+def test_a_damaged_file_is_not_sent(client, domain, data_dir):
     path = data_dir / "domains" / domain / "maps" / "000001.sqlite"
     path.chmod(0o644)
     body = bytearray(path.read_bytes())
@@ -237,8 +228,8 @@ def test_a_damaged_file_is_not_sent(client: TestClient, domain: str, data_dir: P
     problem(client.get(place_of(domain)), 503, "damaged_map")
 
 
-def test_a_map_that_is_still_being_built(client: TestClient) -> None:
-    catalog = services_of(client).catalog
+def test_a_map_that_is_still_being_built(client):
+    catalog = client.services.catalog
     version = catalog.begin_map("unmapped", {})
     try:
         detail = problem(client.get(place_of("unmapped", version)), 404, "unknown_map_version")["detail"]
@@ -251,10 +242,10 @@ def test_a_map_that_is_still_being_built(client: TestClient) -> None:
 # Removal
 
 
-def test_an_old_version_is_removed_by_hand(client: TestClient, domain: str, data_dir: Path) -> None:
+def test_an_old_version_is_removed_by_hand(client, domain, data_dir):
     place = f"/v1/admin/domains/{domain}"
-    session = path_of(begin(client, domain))
-    remap(client, domain, training_traverse="drive", relevance="rrf")
+    session = client.session(domain)
+    client.remap(domain, relevance="rrf")
     problem(client.delete(f"{place}/maps/2"), 409, "map_in_use")  # it serves
     detail = problem(client.delete(f"{place}/maps/1"), 409, "map_in_use")["detail"]
     assert "a session lives on map 1" in detail
@@ -275,22 +266,22 @@ def test_an_old_version_is_removed_by_hand(client: TestClient, domain: str, data
     assert client.get(f"/v1/domains/{domain}").json()["map_version"] == 2
 
 
-def test_versions_beyond_those_kept_lose_their_files(tmp_path: Path) -> None:
+def test_versions_beyond_those_kept_lose_their_files(tmp_path):
     settings = {"keep_maps": 1, "session_sweep_s": 0.05}
 
-    def files() -> list[int]:
+    def files():
         return sorted(int(path.stem) for path in (tmp_path / "domains" / "route" / "maps").glob("*.sqlite"))
 
     with service(tmp_path, **settings) as client:
-        make_ready_domain(client, "route")
-        session = path_of(begin(client, "route"))
+        client.make_ready_domain("route")
+        session = client.session("route")
         for _ in range(2):
-            remap(client, "route", training_traverse="drive", relevance="rrf")
+            client.remap("route", relevance="rrf")
         assert files() == [1, 2, 3]  # a robot lives on the first, the second is kept to roll back to
         for version in (2, 3):
             active = client.put("/v1/admin/domains/route/active-map", json={"version": version})
             assert active.status_code == 200
-        remap(client, "route", training_traverse="drive", relevance="rrf")
+        client.remap("route", relevance="rrf")
         assert files() == [1, 3, 4]
         removed_at = versions(client, "route")[2]["removed_at"]
         assert removed_at is not None

@@ -3,28 +3,19 @@
 import re
 import shutil
 import threading
-from collections.abc import Iterator
 from pathlib import Path
 from time import perf_counter, sleep
-from typing import Any
 
 import pytest
-from starlette.testclient import TestClient
 
 from .conftest import (
     JPEG,
     N_READY,
     RANKS,
-    begin,
     encoded,
-    make_ready_domain,
-    path_of,
     picture,
     ready_encodings,
-    remap,
     service,
-    services_of,
-    upload,
 )
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "operations.md"
@@ -34,20 +25,20 @@ STAGES["observations"] = COMMON | {"predict", "update", "commit", "summarise"}
 
 
 @pytest.fixture
-def own(tmp_path: Path) -> Iterator[TestClient]:
+def own(tmp_path):
     with service(tmp_path) as client:
-        make_ready_domain(client, "ready")
+        client.make_ready_domain("ready")
         yield client
 
 
-def scraped(client: TestClient) -> dict[str, float]:
+def scraped(client):
     answer = client.get("/metrics")
     assert answer.status_code == 200, answer.text
     assert answer.headers["content-type"].startswith("text/plain")
     return {name: float(value) for name, value in re.findall(r"^([^#\s]+) (\S+)$", answer.text, re.MULTILINE)}
 
 
-def test_metrics_count_by_route_and_not_by_path_each_application_for_itself(client: TestClient, tmp_path: Path) -> None:
+def test_metrics_count_by_route_and_not_by_path_each_application_for_itself(client, tmp_path):
     counted = 'deepsimbad_requests_total{method="POST",route="/v1/domains/{domain}/localizations",status="200"}'
     before = scraped(client).get(counted, 0)
     client.post("/v1/domains/ready/localizations", json=RANKS)
@@ -62,7 +53,7 @@ def test_metrics_count_by_route_and_not_by_path_each_application_for_itself(clie
         assert not [name for name in scraped(other) if name.startswith("deepsimbad_requests_total{")]
 
 
-def test_a_map_and_the_last_remap(own: TestClient) -> None:
+def test_a_map_and_the_last_remap(own):
     shown = scraped(own)
     assert shown['deepsimbad_active_map_version{domain="ready"}'] == 1
     assert shown['deepsimbad_map_images{domain="ready"}'] == N_READY
@@ -76,8 +67,8 @@ def test_a_map_and_the_last_remap(own: TestClient) -> None:
     assert shown['deepsimbad_job_seconds_sum{kind="remap",state="succeeded"}'] > 0
     assert shown['deepsimbad_last_remap{domain="ready",outcome="succeeded"}'] == 1
     ended_at = shown['deepsimbad_last_remap_timestamp_seconds{domain="ready"}']
-    upload(own, "ready", "backwards", ready_encodings()[:2], [1.0, 0.0])
-    assert remap(own, "ready", training_traverse="backwards")["state"] == "failed"
+    own.upload("ready", "backwards", ready_encodings()[:2], [1.0, 0.0])
+    assert own.remap("ready", training_traverse="backwards")["state"] == "failed"
     shown = scraped(own)
     outcomes = {name: value for name, value in shown.items() if name.startswith("deepsimbad_last_remap{")}
     failed = 'deepsimbad_last_remap{domain="ready",outcome="failed"}'
@@ -87,8 +78,8 @@ def test_a_map_and_the_last_remap(own: TestClient) -> None:
     assert shown['deepsimbad_active_map_version{domain="ready"}'] == 1
 
 
-def test_sessions_disk_release_and_process(own: TestClient, tmp_path: Path) -> None:
-    begin(own)
+def test_sessions_disk_release_and_process(own, tmp_path):
+    own.begin()
     shown = scraped(own)
     assert shown["deepsimbad_sessions"] == 1
     usage = shutil.disk_usage(tmp_path)
@@ -98,23 +89,23 @@ def test_sessions_disk_release_and_process(own: TestClient, tmp_path: Path) -> N
     assert shown["process_resident_memory_bytes"] > 1e6
     assert shown["process_open_fds"] > 3
     assert not [name for name in shown if "_created" in name]
-    services_of(own).catalog._db.execute("DROP TABLE job")
+    own.services.catalog._db.execute("DROP TABLE job")
     shown = scraped(own)
     assert "deepsimbad_sessions" in shown, "what can be read is shown"
     assert "deepsimbad_domains" not in shown
 
 
-def test_a_damaged_map_is_shown_until_it_is_back_or_another_serves(tmp_path: Path) -> None:
+def test_a_damaged_map_is_shown_until_it_is_back_or_another_serves(tmp_path):
     with service(tmp_path) as client:
-        make_ready_domain(client, "ready")
-        assert remap(client, "ready", training_traverse="drive")["state"] == "succeeded"
+        client.make_ready_domain("ready")
+        assert client.remap("ready")["state"] == "succeeded"
     path = tmp_path / "domains/ready/maps/000002.sqlite"
     path.rename(tmp_path / "aside")
     with service(tmp_path) as client:
-        maps = services_of(client).maps
+        maps = client.services.maps
         maps._clock = lambda: 0.0
 
-        def damaged() -> tuple[float, float, list[str]]:
+        def damaged():
             shown = scraped(client)
             ready = client.get("/readyz").json()
             assert ready["status"] == "ready"
@@ -133,11 +124,11 @@ def test_a_damaged_map_is_shown_until_it_is_back_or_another_serves(tmp_path: Pat
         assert damaged() == (1, 0, [])
 
 
-def test_a_deleted_domain_takes_its_series_along(client: TestClient, domain: str) -> None:
+def test_a_deleted_domain_takes_its_series_along(client, domain):
     client.post(f"/v1/domains/{domain}/localizations", json=RANKS)
     assert any(f'domain="{domain}"' in name for name in scraped(client))
     assert client.delete(f"/v1/admin/domains/{domain}").status_code == 204
-    services_of(client).metrics.localized(domain, {"plan": 1.0}, 2.0)  # a view that was on its way
+    client.services.metrics.localized(domain, {"plan": 1.0}, 2.0)  # a view that was on its way
     assert not [name for name in scraped(client) if f'domain="{domain}"' in name]
 
 
@@ -145,8 +136,8 @@ def test_a_deleted_domain_takes_its_series_along(client: TestClient, domain: str
 
 
 @pytest.mark.parametrize("call", STAGES)
-def test_every_stage_is_told_and_counted(client: TestClient, call: str) -> None:
-    path = "/v1/domains/seen" if call == "localizations" else path_of(begin(client, "seen"))
+def test_every_stage_is_told_and_counted(client, call):
+    path = "/v1/domains/seen" if call == "localizations" else client.session("seen")
     names = {stage: f'deepsimbad_localization_stage_seconds_count{{stage="{stage}"}}' for stage in STAGES[call]}
     before = scraped(client)
     timings_ms = client.post(f"{path}/{call}", content=encoded(picture(1)), headers=JPEG).json()["timings_ms"]
@@ -160,11 +151,11 @@ def test_every_stage_is_told_and_counted(client: TestClient, call: str) -> None:
     assert {name for name, value in counts.items() if value == before.get(name, 0) + 1} == set(names.values())
 
 
-def test_a_busy_worker_shows_as_waiting(client: TestClient) -> None:
-    worker = services_of(client).worker
+def test_a_busy_worker_shows_as_waiting(client):
+    worker = client.services.worker
     begun, let_go, answered, held_ms = threading.Event(), threading.Event(), threading.Event(), [0.0]
 
-    def hold() -> None:
+    def hold():
         while not worker.n_waiting and not answered.is_set():
             sleep(0.001)
         began = perf_counter()
@@ -176,13 +167,13 @@ def test_a_busy_worker_shows_as_waiting(client: TestClient) -> None:
     assert begun.wait(60)
     holder = threading.Thread(target=hold)
     holder.start()
-    timings_ms: dict[str, Any] = client.post("/v1/domains/ready/localizations", json=RANKS).json()["timings_ms"]
+    timings_ms = client.post("/v1/domains/ready/localizations", json=RANKS).json()["timings_ms"]
     answered.set()
     holder.join()
     assert timings_ms["wait"] >= held_ms[0] - 0.001
 
 
-def test_every_stage_is_explained_to_operators_and_no_other() -> None:
+def test_every_stage_is_explained_to_operators_and_no_other():
     section = PAGE.read_text(encoding="utf-8").split("### DeepSimbadSlow")[1].split("### ")[0]
     rows = re.findall(r"^\| (`[^|]*) \|", section, re.MULTILINE)
     explained = {stage for row in rows for stage in re.findall(r"`(\w+)`", row)}

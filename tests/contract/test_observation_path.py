@@ -3,14 +3,12 @@
 import sys
 import threading
 from pathlib import Path
-from types import CodeType
-from typing import Any
 
 import httpx2
 
 import deepsimbad
 
-from .conftest import RANKS, make_ready_domain, service
+from .conftest import RANKS, service
 
 MOST_FILES, MOST_FUNCTIONS = 23, 97
 PROJECT = str(Path(deepsimbad.__file__).parent)
@@ -19,15 +17,15 @@ PROJECT = str(Path(deepsimbad.__file__).parent)
 class Profile:
     """Notes the project's functions that are called, in every thread that is started after it was hooked in."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.is_on = False
-        self.called: set[CodeType] = set()
+        self.called = set()
 
-    def __call__(self, frame: Any, event: str, _argument: object) -> None:
+    def __call__(self, frame, event, _argument):
         if self.is_on and event == "call" and frame.f_code.co_filename.startswith(PROJECT):
             self.called.add(frame.f_code)
 
-    async def of_an_observation(self, app: Any) -> None:
+    async def of_an_observation(self, app):
         """Hear a session's fourth observation from its request to its answer."""
         async with httpx2.AsyncClient(transport=httpx2.ASGITransport(app), base_url="http://robot") as robot:
             begun = await robot.post("/v1/domains/ready/sessions", json={})
@@ -44,12 +42,12 @@ class Profile:
             assert (answer.status_code, answer.json()["n_observations"]) == (200, 4)
 
 
-def test_an_observation_passes_through_few_files_and_functions(tmp_path: Path) -> None:
+def test_an_observation_passes_through_few_files_and_functions(tmp_path):
     profile = Profile()
     threading.setprofile(profile)
     try:
         with service(tmp_path) as client:
-            make_ready_domain(client, "ready")
+            client.make_ready_domain("ready")
             assert client.portal is not None
             client.portal.call(profile.of_an_observation, client.app)
     finally:

@@ -3,13 +3,9 @@
 import io
 import json
 import zipfile
-from collections.abc import Iterator
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from starlette.testclient import TestClient
 
 from deepsimbad.core.descriptor import pack_ranked_landmarks
 from deepsimbad_client import Client, Observation
@@ -21,13 +17,9 @@ from .conftest import (
     N_READY,
     N_SEEN,
     TAKES_ENCODINGS,
-    begin,
     encoded,
-    make_ready_domain,
-    path_of,
     picture,
     problem,
-    remap,
     service,
 )
 
@@ -39,27 +31,27 @@ BY_HAND = b"\x00\x03" + bytes([0b0111_0010, 0b1001_0000])
 
 
 @pytest.fixture(params=["localizations", "observations"])
-def post(request: pytest.FixtureRequest, client: TestClient) -> Any:
+def post(request, client):
     """Posts a view by either call."""
-    path = READY if request.param == "localizations" else f"{path_of(begin(client))}/observations"
+    path = READY if request.param == "localizations" else f"{client.session()}/observations"
     return lambda **sent: client.post(path, **sent)
 
 
 @pytest.fixture(scope="module")
-def rebuilt(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
+def rebuilt(tmp_path_factory):
     """A service of its own, started again, whose domain `ready` has two maps of different landmarks; 2 serves."""
     folder = tmp_path_factory.mktemp("rebuilt")
     with service(folder) as client:
-        make_ready_domain(client, "ready")
+        client.make_ready_domain("ready")
         first = client.get(MODEL)
-        remap(client, "ready", training_traverse="drive", landmark_traverse="drive", n_landmarks=7)
+        client.remap("ready", landmark_traverse="drive", n_landmarks=7)
     with service(folder) as client:
         again = client.get(MODEL, params={"map_version": 1})
         assert (again.content, again.headers["etag"]) == (first.content, first.headers["etag"])
         yield client
 
 
-def test_the_landmark_model_is_an_npz_of_named_arrays(client: TestClient) -> None:
+def test_the_landmark_model_is_an_npz_of_named_arrays(client):
     answer = client.get(MODEL)
     assert answer.status_code == 200, answer.text
     assert answer.headers["content-type"] == "application/octet-stream"
@@ -74,7 +66,7 @@ def test_the_landmark_model_is_an_npz_of_named_arrays(client: TestClient) -> Non
     assert dates == {(1980, 1, 1, 0, 0, 0)}, "the same landmarks are the same bytes"
 
 
-def test_its_tag_is_the_digest_that_the_domain_tells(client: TestClient) -> None:
+def test_its_tag_is_the_digest_that_the_domain_tells(client):
     answer = client.get(MODEL)
     digest = client.get("/v1/domains/ready").json()["landmark_model_digest"]
     assert answer.headers["etag"] == f'"{digest}"'
@@ -87,13 +79,13 @@ def test_its_tag_is_the_digest_that_the_domain_tells(client: TestClient) -> None
     assert client.get(MODEL, headers={"If-None-Match": '"other"'}).content == answer.content
 
 
-def test_another_version_may_be_asked_for_and_a_session_keeps_its_own(rebuilt: TestClient) -> None:
+def test_another_version_may_be_asked_for_and_a_session_keeps_its_own(rebuilt):
     latest, first = (rebuilt.get(MODEL, params=asked) for asked in ({}, {"map_version": 1}))
     new, old = OnBoardEncoder(latest.content), OnBoardEncoder(first.content)
     assert (new.map_version, new.n_landmarks, old.map_version) == (2, 7, 1)
     assert latest.headers["etag"] != first.headers["etag"]
     rebuilt.put("/v1/admin/domains/ready/active-map", json={"version": 1})
-    path = path_of(begin(rebuilt))
+    path = rebuilt.session()
     rebuilt.put("/v1/admin/domains/ready/active-map", json={"version": 2})
     ranked = old.ranks(encoding=np.arange(8), m=5)
     assert rebuilt.post(f"{path}/observations", content=ranked.body, headers=ranked.headers).status_code == 200
@@ -101,9 +93,9 @@ def test_another_version_may_be_asked_for_and_a_session_keeps_its_own(rebuilt: T
     assert problem(answer, 409, "landmark_model_differs")["map_version"] == 2
 
 
-def test_where_the_map_is_damaged_there_is_no_landmark_model(tmp_path: Path) -> None:
+def test_where_the_map_is_damaged_there_is_no_landmark_model(tmp_path):
     with service(tmp_path) as client:
-        make_ready_domain(client, "ready")
+        client.make_ready_domain("ready")
     (damaged,) = (tmp_path / "domains" / "ready" / "maps").glob("*.sqlite")
     damaged.chmod(0o644)
     damaged.write_bytes(damaged.read_bytes()[:-100])
@@ -112,7 +104,7 @@ def test_where_the_map_is_damaged_there_is_no_landmark_model(tmp_path: Path) -> 
         problem(client.get(MODEL, params={"map_version": 1}), 503, "damaged_map")
 
 
-def test_ranks_by_hand(client: TestClient) -> None:
+def test_ranks_by_hand(client):
     assert pack_ranked_landmarks([7, 2, 9], N_LANDMARKS) == BY_HAND
     packed = client.post(READY, content=BY_HAND, headers=PACKED)
     assert packed.status_code == 200, packed.text
@@ -125,12 +117,12 @@ def test_ranks_by_hand(client: TestClient) -> None:
     [b"\0", b"\0\0", b"\0\x0b" + bytes(6), b"\0\2", b"\0\2\x12\0", b"\0\1\x11", b"\0\1\xa0", b"\0\2\x11"],
     ids=["a byte", "m 0", "m over r", "too short", "too long", "padding", "id over r", "twice"],
 )
-def test_bad_ranks(post: Any, body: bytes) -> None:
+def test_bad_ranks(post, body):
     problem(post(content=body, headers=PACKED), 422, "invalid_ranked_landmarks")
     problem(post(content=b"", headers=PACKED), 422, "empty_body")
 
 
-def test_a_robot_with_other_landmarks_is_told(post: Any, client: TestClient) -> None:
+def test_a_robot_with_other_landmarks_is_told(post, client):
     digest = client.get("/v1/domains/ready").json()["landmark_model_digest"]
     for matching in (f'"{digest}"', "*", f'"other" , "{digest}"'):
         assert post(content=BY_HAND, headers={**PACKED, "If-Match": matching}).status_code == 200
@@ -145,15 +137,15 @@ def test_a_robot_with_other_landmarks_is_told(post: Any, client: TestClient) -> 
         problem(post(content=BY_HAND, headers={**PACKED, "If-Match": nonsense}), 422, "invalid_request")
 
 
-def test_a_view_by_other_landmarks_moves_nothing_and_tells_no_relevances(client: TestClient) -> None:
-    path = path_of(begin(client))
+def test_a_view_by_other_landmarks_moves_nothing_and_tells_no_relevances(client):
+    path = client.session()
     headers = {**PACKED, "Accept": "application/octet-stream", "If-Match": '"other"'}
     for url in (READY, f"{path}/observations"):
         problem(client.post(url, content=BY_HAND, headers=headers), 409, "landmark_model_differs")
     assert client.get(path).json()["n_observations"] == 0
 
 
-def test_on_board_and_by_image_one_answer(client: TestClient, tmp_path: Path) -> None:
+def test_on_board_and_by_image_one_answer(client, tmp_path):
     """The same picture: decoded, encoded and ranked here, and there."""
     robot = Client("http://testserver", transport=client._transport)
     encoder = robot.on_board("seen")
@@ -172,7 +164,7 @@ def test_on_board_and_by_image_one_answer(client: TestClient, tmp_path: Path) ->
         assert here.observe(ranked=encoder.ranks(dark)).belief == there.observe(dark).belief
 
 
-def test_the_client_names_other_landmarks(client: TestClient) -> None:
+def test_the_client_names_other_landmarks(client):
     robot = Client("http://testserver", transport=client._transport)
     ranked = robot.on_board("ready").ranks(encoding=np.arange(8))
     assert robot.localize("ready", ranked=ranked).map_version == 1

@@ -2,10 +2,8 @@
 
 import json
 import re
-from typing import Any
 
 import pytest
-from starlette.testclient import TestClient
 
 from deepsimbad.api.localizations import ObservationBody
 from deepsimbad.api.openapi import BODY_EXAMPLES, ENCODED_ON_BOARD, _declared_bodies
@@ -15,13 +13,12 @@ NAME = "^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$"
 
 
 @pytest.fixture(scope="module")
-def document(client: TestClient) -> dict[str, Any]:
-    document: dict[str, Any] = client.get("/openapi.json").json()
-    return document
+def document(client):
+    return client.get("/openapi.json").json()
 
 
 @pytest.fixture(scope="module")
-def operations(document: dict[str, Any]) -> dict[str, dict[str, Any]]:
+def operations(document):
     return {
         f"{method.upper()} {path}": operation
         for path, methods in document["paths"].items()
@@ -29,7 +26,7 @@ def operations(document: dict[str, Any]) -> dict[str, dict[str, Any]]:
     }
 
 
-def test_what_an_operation_may_answer(operations: dict[str, Any]) -> None:
+def test_what_an_operation_may_answer(operations):
     for name, operation in operations.items():
         answers = operation["responses"]
         errors = {status for status in answers if int(status) >= 400}
@@ -44,7 +41,7 @@ def test_what_an_operation_may_answer(operations: dict[str, Any]) -> None:
             assert "content" not in answers["204"], name
 
 
-def test_parameters_in_paths_carry_pattern_and_example(operations: dict[str, Any]) -> None:
+def test_parameters_in_paths_carry_pattern_and_example(operations):
     for name, operation in operations.items():
         for parameter in operation.get("parameters", []):
             if parameter["in"] == "path":
@@ -52,7 +49,7 @@ def test_parameters_in_paths_carry_pattern_and_example(operations: dict[str, Any
                 assert parameter["name"] in {"index", "version"} or parameter["schema"]["pattern"] == NAME, name
 
 
-def test_every_body_has_an_example_that_is_taken(document: dict[str, Any]) -> None:
+def test_every_body_has_an_example_that_is_taken(document):
     assert set(_declared_bodies) == set(BODY_EXAMPLES)
     for model in _declared_bodies.values():
         (example,) = document["components"]["schemas"][model.__name__]["examples"]
@@ -60,7 +57,7 @@ def test_every_body_has_an_example_that_is_taken(document: dict[str, Any]) -> No
     ObservationBody.model_validate_json(json.dumps(ENCODED_ON_BOARD))
 
 
-def test_links_lead_to_operations_and_give_what_their_paths_need(operations: dict[str, Any]) -> None:
+def test_links_lead_to_operations_and_give_what_their_paths_need(operations):
     by_id = {operation["operationId"]: name for name, operation in operations.items()}
     assert len(by_id) == len(operations)
     reached = set()
@@ -73,7 +70,7 @@ def test_links_lead_to_operations_and_give_what_their_paths_need(operations: dic
     assert {name for name in operations if "{session_id}" in name or "{job_id}" in name} <= reached
 
 
-def test_schemas_are_there_for_every_reader(document: dict[str, Any]) -> None:
+def test_schemas_are_there_for_every_reader(document):
     schemas, text = document["components"]["schemas"], json.dumps(document)
     assert set(re.findall(r"#/components/schemas/(\w+)", text)) <= set(schemas)
     assert "HTTPValidationError" not in schemas

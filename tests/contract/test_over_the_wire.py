@@ -5,7 +5,6 @@ import json
 import signal
 import socket
 import threading
-from collections.abc import Iterator
 
 import httpx2
 import pytest
@@ -19,14 +18,14 @@ HEAD = f"PUT {FRAME} HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Type: image/jpeg\r\n
 
 
 @pytest.fixture(scope="module")
-def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+def server(tmp_path_factory):
     with Served(tmp_path_factory.mktemp("wire") / "data") as served:
         httpx2.put(f"{served.url}/v1/admin/domains/d", json={"evaluator": {"kind": "feature_l2"}})
         httpx2.post(f"{served.url}/v1/admin/domains/d/traverses", json={"name": "t"})
         yield served
 
 
-def send_until_answered(server: Served, head: bytes, piece: bytes, n_pieces: int) -> tuple[bytes, int]:
+def send_until_answered(server, head, piece, n_pieces):
     """Send a body piece by piece and stop at the first byte of an answer.
 
     Returns:
@@ -34,7 +33,7 @@ def send_until_answered(server: Served, head: bytes, piece: bytes, n_pieces: int
     """
     answer, began, n_sent = bytearray(), threading.Event(), 0
 
-    def listen() -> None:
+    def listen():
         try:
             while received := connection.recv(65536):
                 began.set()
@@ -57,7 +56,7 @@ def send_until_answered(server: Served, head: bytes, piece: bytes, n_pieces: int
     return bytes(answer), n_sent
 
 
-def test_a_hundred_megabytes_in_chunks_are_refused_while_they_stream(server: Served) -> None:
+def test_a_hundred_megabytes_in_chunks_are_refused_while_they_stream(server):
     piece = b"10000\r\n" + bytes(65536) + b"\r\n"
     with server.within(100):
         answer, n_sent = send_until_answered(server, HEAD + b"Transfer-Encoding: chunked\r\n\r\n", piece, 1600)
@@ -66,20 +65,20 @@ def test_a_hundred_megabytes_in_chunks_are_refused_while_they_stream(server: Ser
     assert n_sent < 800  # 32 MiB are taken; what lies in the sockets' buffers comes on top
 
 
-def test_a_declared_length_is_refused_before_a_byte_of_it(server: Served) -> None:
+def test_a_declared_length_is_refused_before_a_byte_of_it(server):
     with server.connect() as connection:
         connection.sendall(HEAD + b"Content-Length: %d\r\n\r\n" % (100 * MEBIBYTE))
         assert connection.recv(65536).startswith(b"HTTP/1.1 413 ")
 
 
-def test_a_sender_who_reads_only_after_its_last_byte_still_gets_the_answer(server: Served) -> None:
+def test_a_sender_who_reads_only_after_its_last_byte_still_gets_the_answer(server):
     with server.within(100):
         for content in (bytes(100 * MEBIBYTE), (bytes(65536) for _ in range(1600))):
             answer = httpx2.put(f"{server.url}{FRAME}", content=content, headers=JPEG)
             assert (answer.status_code, answer.json()["code"]) == (413, "body_too_large")
 
 
-def test_a_small_unread_body_leaves_the_connection_open(server: Served) -> None:
+def test_a_small_unread_body_leaves_the_connection_open(server):
     connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=10)
     for _ in range(3):
         connection.request("POST", "/v1/domains/none/localizations", b"x" * 5000, {"Content-Type": "text/plain"})
@@ -90,7 +89,7 @@ def test_a_small_unread_body_leaves_the_connection_open(server: Served) -> None:
     connection.close()
 
 
-def test_a_sender_who_leaves_early_is_no_fault_of_ours_and_it_ends_well_when_asked(server: Served) -> None:
+def test_a_sender_who_leaves_early_is_no_fault_of_ours_and_it_ends_well_when_asked(server):
     with server.connect() as connection:
         connection.sendall(HEAD + b"X-Request-ID: left\r\nContent-Length: 1000\r\n\r\nabc")
     until(lambda: '"left"' in server.log.read_text())

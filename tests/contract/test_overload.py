@@ -1,38 +1,34 @@
 """A service that has too much to do says so at once, and still says how it is."""
 
 import threading
-from collections.abc import Iterator
-from pathlib import Path
-from typing import Any
 
 import pytest
 from anyio.to_thread import current_default_thread_limiter, run_sync
-from starlette.testclient import TestClient
 
-from .conftest import JPEG, NPZ, RANKS, begin, make_ready_domain, path_of, problem, service, services_of
+from .conftest import JPEG, NPZ, RANKS, problem, service
 
 READY = "/v1/domains/ready/localizations"
 
 
 @pytest.fixture
-def busy(tmp_path: Path) -> Iterator[TestClient]:
+def busy(tmp_path):
     with service(tmp_path, max_queue=1, max_requests=3, max_body_memory_bytes=100_000) as client:
-        make_ready_domain(client, "ready")
+        client.make_ready_domain("ready")
         yield client
 
 
-def overloaded(answer: Any, limit: str) -> None:
+def overloaded(answer, limit):
     assert problem(answer, 503, "overloaded")["limit"] == limit
     assert answer.headers["retry-after"] == "1"
 
 
-def is_healthy(client: TestClient) -> bool:
+def is_healthy(client):
     return {client.get(path).status_code for path in ("/healthz", "/readyz", "/metrics")} == {200}
 
 
-def test_a_full_queue(busy: TestClient) -> None:
-    path = path_of(begin(busy))
-    worker, gate, begun = services_of(busy).worker, threading.Event(), threading.Event()
+def test_a_full_queue(busy):
+    path = busy.session()
+    worker, gate, begun = busy.services.worker, threading.Event(), threading.Event()
     worker.submit(lambda: (begun.set(), gate.wait(60)))
     assert begun.wait(60)
     waiting = worker.submit(lambda: None)
@@ -51,11 +47,11 @@ def test_a_full_queue(busy: TestClient) -> None:
     assert busy.get(path).json()["n_observations"] == 0
 
 
-async def n_default_threads() -> int:
+async def n_default_threads():
     return int(current_default_thread_limiter().total_tokens)
 
 
-def test_threads_that_are_all_taken_do_not_keep_health_waiting(busy: TestClient) -> None:
+def test_threads_that_are_all_taken_do_not_keep_health_waiting(busy):
     gate, begun, portal = threading.Event(), threading.Semaphore(0), busy.portal
     assert portal is not None
     holders = [
@@ -73,7 +69,7 @@ def test_threads_that_are_all_taken_do_not_keep_health_waiting(busy: TestClient)
             holder.result(60)
 
 
-def test_a_body_that_does_not_fit_memory(busy: TestClient) -> None:
+def test_a_body_that_does_not_fit_memory(busy):
     body, frames = bytes(180_000), "/v1/admin/domains/ready/traverses/drive/frames"
     for content in (body, (bytes(1000) for _ in range(180))):
         overloaded(busy.put(f"{frames}/0?position_m=1", content=content, headers=JPEG), "max_body_memory_bytes")

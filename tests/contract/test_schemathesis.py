@@ -10,7 +10,6 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import httpx2
 import pytest
@@ -18,7 +17,7 @@ import pytest
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.records import KeyScope
 
-from .conftest import N_SEEN, make_ready_domain, remap, service, upload_pictures
+from .conftest import N_SEEN, service
 from .served import Served
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
@@ -90,19 +89,19 @@ server.serve(Settings(data_dir=data_dir, port=int(sys.argv[2]), event_poll_s=0.0
 """
 
 
-def prepare(data_dir: Path) -> None:
+def prepare(data_dir):
     """Make what the examples of the document are about: a domain mapped twice, its drives."""
     with service(data_dir) as client:
-        make_ready_domain(client, "spare")
+        client.make_ready_domain("spare")
         client.put("/v1/admin/domains/campus", json={"evaluator": {"kind": "feature_l2"}})
         for name in ("2012-05-11", "2012-08-20"):
-            assert upload_pictures(client, "campus", name) == [201] * N_SEEN
+            assert client.upload_pictures("campus", name) == [201] * N_SEEN
             drives = {"training_traverse": name, "landmark_traverse": name}
-            job = remap(client, "campus", **drives, n_landmarks=N_SEEN, list_length=3)
+            job = client.remap("campus", **drives, n_landmarks=N_SEEN, list_length=3)
             assert job["state"] == "succeeded", job
 
 
-def schemathesis(url: str, folder: Path, key: str | None, phases: str, n_examples: int) -> int:
+def schemathesis(url, folder, key, phases, n_examples):
     """Run the command, which must find nothing and leave nothing out; how many cases it tried."""
     folder.mkdir()
     auth = "" if key is None else f'[auth.openapi.bearer]\nbearer = "{key}"\n'
@@ -115,19 +114,19 @@ def schemathesis(url: str, folder: Path, key: str | None, phases: str, n_example
         [*command, f"{url}/openapi.json", *options], cwd=folder, capture_output=True, text=True, check=False
     )
     assert report.exists(), ran.stdout + ran.stderr
-    told: dict[str, Any] = json.loads(report.read_text())
+    told = json.loads(report.read_text())
     assert (told["failures"], told["errors"], told["complete"]) == ([], [], True), ran.stdout
     assert ran.returncode == 0, ran.stdout
     tried = {name: phase["status"] for name, phase in told["phases"].items() if name in phases.split(",")}
     assert tried == dict.fromkeys(phases.split(","), "success")
     n_operations = sum(len(by_method) for by_method in httpx2.get(f"{url}/openapi.json").json()["paths"].values())
     assert told["operations"]["tested"] == told["operations"]["total"] == n_operations
-    n_cases: int = told["test_cases"]["generated"]
+    n_cases = told["test_cases"]["generated"]
     print(f"{folder.name}: {n_cases} cases, {n_operations} operations, {told['running_time']:.0f} s")
     return n_cases
 
 
-def test_a_service_with_keys(tmp_path: Path) -> None:
+def test_a_service_with_keys(tmp_path):
     data_dir = tmp_path / "data"
     prepare(data_dir)
     with Catalog.open(data_dir) as catalog:

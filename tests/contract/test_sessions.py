@@ -3,15 +3,11 @@
 import asyncio
 import io
 import math
-from collections.abc import Callable
 from datetime import UTC, datetime
-from pathlib import Path
-from typing import Any
 
 import httpx2
 import numpy as np
 import pytest
-from starlette.testclient import TestClient
 
 from deepsimbad.api import requests
 from deepsimbad.api.app import create_app
@@ -22,15 +18,11 @@ from .conftest import (
     N_LANDMARKS,
     N_READY,
     RANKS,
-    begin,
     encoded,
-    make_ready_domain,
     path_of,
     picture,
     problem,
-    remap,
     service,
-    services_of,
     small_settings,
     until,
 )
@@ -38,24 +30,22 @@ from .conftest import (
 STATE = {"session_id", "domain", "map_version", "n_observations", "expires_at", "belief", "next_best_view"}
 
 
-def observe(client: TestClient, path: str, action_m: float = 0, **headers: str) -> httpx2.Response:
+def observe(client, path, action_m=0, **headers):
     return client.post(f"{path}/observations?action_m={action_m}", json=RANKS, headers=headers)
 
 
-def test_long_answers_of_every_route_are_written_beside_the_loop(
-    client: TestClient, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_long_answers_of_every_route_are_written_beside_the_loop(client, monkeypatch):
     n_beside = 0
     run_sync = requests.run_sync
 
-    async def counting(run: Callable[..., Any], *arguments: Any, limiter: Any = None) -> Any:
+    async def counting(run, *arguments, limiter=None):
         nonlocal n_beside
-        n_beside += limiter is services_of(client).long_work
+        n_beside += limiter is client.services.long_work
         return await run_sync(run, *arguments, limiter=limiter)
 
     monkeypatch.setattr(requests, "run_sync", counting)
     monkeypatch.setattr(requests, "LONG_LIST", 20)
-    path = path_of(begin(client))
+    path = client.session()
     asked = [
         ("POST", "/v1/domains/ready/localizations", RANKS),
         ("POST", f"{path}/observations", RANKS),
@@ -71,8 +61,8 @@ def test_long_answers_of_every_route_are_written_beside_the_loop(
         assert n_beside == n_expected
 
 
-def test_a_session_from_beginning_to_end(client: TestClient) -> None:
-    session = begin(client)
+def test_a_session_from_beginning_to_end(client):
+    session = client.begin()
     assert set(session) == STATE
     assert (session["domain"], session["map_version"], session["n_observations"]) == ("ready", 1, 0)
     left = datetime.fromisoformat(session["expires_at"]) - datetime.now(UTC)
@@ -113,18 +103,18 @@ def test_a_session_from_beginning_to_end(client: TestClient) -> None:
         assert problem(gone, 410, "ended_session")["ending"] == "deleted"
 
 
-def test_a_start_a_planner_and_a_filter_may_be_chosen(client: TestClient) -> None:
+def test_a_start_a_planner_and_a_filter_may_be_chosen(client):
     body = {"start_position_m": 20, "start_std_m": 1, "seed": 4, "belief": "particle", "planner": "constant:7"}
-    session = begin(client, **body, update="additive_relevance")
+    session = client.begin(**body, update="additive_relevance")
     assert session["belief"]["mean_m"] == pytest.approx(20, abs=0.5)
     assert (session["next_best_view"]["planner"], session["next_best_view"]["action_m"]) == ("constant:7", 7)
-    assert begin(client, **body, update="additive_relevance")["belief"] == session["belief"]
-    nulls = begin(client, **dict.fromkeys(["start_position_m", "start_std_m", "seed", "belief", "planner", "update"]))
-    assert nulls["belief"] == begin(client)["belief"]
+    assert client.begin(**body, update="additive_relevance")["belief"] == session["belief"]
+    nulls = client.begin(**dict.fromkeys(["start_position_m", "start_std_m", "seed", "belief", "planner", "update"]))
+    assert nulls["belief"] == client.begin()["belief"]
 
 
-def test_every_form_of_a_view(client: TestClient) -> None:
-    ready, seen = path_of(begin(client)), path_of(begin(client, "seen"))
+def test_every_form_of_a_view(client):
+    ready, seen = client.session(), client.session("seen")
     for place, body in enumerate(({"dissimilarities": RANKS["ranked_landmarks"]}, {"encoding": [0.5] * DIM}, RANKS)):
         answer = client.post(f"{ready}/observations", json=body)
         assert answer.json()["n_observations"] == place + 1, answer.text
@@ -133,8 +123,8 @@ def test_every_form_of_a_view(client: TestClient) -> None:
 
 
 @pytest.mark.parametrize("belief", ["grid", "particle"])
-def test_a_picture_of_nothing_says_nothing(client: TestClient, belief: str) -> None:
-    path = path_of(begin(client, "seen", belief=belief))
+def test_a_picture_of_nothing_says_nothing(client, belief):
+    path = client.session("seen", belief=belief)
     before = client.post(f"{path}/observations", content=encoded(picture(4)), headers=JPEG).json()["belief"]
     for shade in (0, 90, 255):
         blank = encoded(np.full((120, 160, 3), shade, np.uint8))
@@ -145,8 +135,8 @@ def test_a_picture_of_nothing_says_nothing(client: TestClient, belief: str) -> N
         assert after["mode_m"] == before["mode_m"]
 
 
-def test_wholly_past_the_end(client: TestClient) -> None:
-    path = path_of(begin(client, start_position_m=78, start_std_m=0.5))
+def test_wholly_past_the_end(client):
+    path = client.session(start_position_m=78, start_std_m=0.5)
     observe(client, path)
     assert problem(observe(client, path, 50), 422, "past_the_end")["route_end_m"] == 78
     assert client.get(path).json()["n_observations"] == 1
@@ -155,8 +145,8 @@ def test_wholly_past_the_end(client: TestClient) -> None:
 # Once under one key
 
 
-def test_an_idempotency_key_counts_once(client: TestClient) -> None:
-    path = path_of(begin(client))
+def test_an_idempotency_key_counts_once(client):
+    path = client.session()
     key = {"Idempotency-Key": "view-1"}
     answers = [observe(client, path, 1, **key).json() for _ in range(3)]
     assert [answer["n_observations"] for answer in answers] == [1, 1, 1]
@@ -166,11 +156,11 @@ def test_an_idempotency_key_counts_once(client: TestClient) -> None:
     assert observe(client, path, 1, **key).json()["belief"] == answers[0]["belief"]
 
 
-def test_a_session_begun_twice_under_one_key_is_one(client: TestClient, domain: str) -> None:
+def test_a_session_begun_twice_under_one_key_is_one(client, domain):
     key = {"Idempotency-Key": "a-robot's-start"}
     body = {"seed": 3, "start_position_m": 20}
 
-    def begun(content: dict[str, Any], headers: dict[str, str] = key, of: str = domain) -> httpx2.Response:
+    def begun(content, headers=key, of=domain):
         return client.post(f"/v1/domains/{of}/sessions", json=content, headers=headers)
 
     first, again = begun(body), begun(body)
@@ -192,11 +182,11 @@ def test_a_session_begun_twice_under_one_key_is_one(client: TestClient, domain: 
     problem(begun(body), 410, "ended_session")
 
 
-def test_a_start_repeated_at_once_is_one_session_and_views_at_once_are_all_answered(tmp_path: Path) -> None:
+def test_a_start_repeated_at_once_is_one_session_and_views_at_once_are_all_answered(tmp_path):
     with service(tmp_path) as client:
-        make_ready_domain(client, "d")
+        client.make_ready_domain("d")
 
-    async def at_once() -> None:
+    async def at_once():
         app = create_app(small_settings(tmp_path))
         async with (
             app.router.lifespan_context(app),
@@ -217,11 +207,11 @@ def test_a_start_repeated_at_once_is_one_session_and_views_at_once_are_all_answe
 # How they end
 
 
-def test_limits_expiry_and_metrics(tmp_path: Path) -> None:
+def test_limits_expiry_and_metrics(tmp_path):
     with service(tmp_path, max_sessions=2, session_ttl_s=0.6, session_sweep_s=0.05) as client:
-        make_ready_domain(client, "ready")
-        first = path_of(begin(client))
-        begin(client)
+        client.make_ready_domain("ready")
+        first = client.session()
+        client.begin()
         for _ in range(2):
             observe(client, first, **{"Idempotency-Key": "k"})
         observe(client, first, -1)
@@ -235,18 +225,18 @@ def test_limits_expiry_and_metrics(tmp_path: Path) -> None:
         assert "deepsimbad_session_commit_writes_count" in text
         until(lambda: "deepsimbad_sessions 0.0" in client.get("/metrics").text)
         assert problem(client.get(first), 410, "ended_session")["ending"] == "expired"
-        begin(client)
+        client.begin()
 
 
-def test_a_restart_and_a_retired_map(tmp_path: Path) -> None:
+def test_a_restart_and_a_retired_map(tmp_path):
     key = {"Idempotency-Key": "k"}
-    begin_under_key: dict[str, Any] = {"json": {}, "headers": {"Idempotency-Key": "once"}}
+    begin_under_key = {"json": {}, "headers": {"Idempotency-Key": "once"}}
     with service(tmp_path) as client:
-        make_ready_domain(client, "ready")
+        client.make_ready_domain("ready")
         session = client.post("/v1/domains/ready/sessions", **begin_under_key).json()
         path = path_of(session)
         seen = observe(client, path, **key).json()
-        remap(client, "ready", training_traverse="drive", landmark_traverse="drive", n_landmarks=N_LANDMARKS - 1)
+        client.remap("ready", landmark_traverse="drive", n_landmarks=N_LANDMARKS - 1)
         assert client.get("/v1/domains/ready").json()["map_version"] == 2
         assert observe(client, path).json()["map_version"] == 1
     with service(tmp_path) as client:
@@ -261,6 +251,6 @@ def test_a_restart_and_a_retired_map(tmp_path: Path) -> None:
         assert "begin a new session" in about["detail"]
         assert about["map_version"] == 1
         assert client.delete(path).status_code == 204
-        path = path_of(begin(client))
+        path = client.session()
         assert client.delete("/v1/admin/domains/ready").status_code == 204
         problem(client.get(path), 410, "ended_session")

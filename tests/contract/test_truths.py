@@ -1,12 +1,9 @@
 """Where a session truly was: how good its answers were (`truths`), what the next map learns of it (`experience`)."""
 
 import re
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from starlette.testclient import TestClient
 
 from deepsimbad.engine.maps import load_snapshot
 from deepsimbad.errors import UnavailableError
@@ -14,18 +11,13 @@ from deepsimbad.errors import UnavailableError
 from .conftest import (
     N_LANDMARKS,
     N_READY,
-    begin,
-    make_ready_domain,
     path_of,
     problem,
     ready_encodings,
-    remap,
-    services_of,
-    wait_for,
 )
 
 STEP_M = 4.0
-NO_RANKS: dict[str, Any] = {"retrieval_ranks": None, "map_version": 1}
+NO_RANKS = {"retrieval_ranks": None, "map_version": 1}
 ANEW = {"training_traverse": "drive", "landmark_traverse": "drive"}
 
 
@@ -38,13 +30,13 @@ class Walk:
         retrievals: The relevance of every map image, by view.
     """
 
-    def __init__(self, client: TestClient, domain: str, n_views: int = 5) -> None:
+    def __init__(self, client, domain, n_views=5):
         self._client, self._domain = client, domain
-        session = begin(client, domain)
+        session = client.begin(domain)
         self.session_id, self.path = session["session_id"], path_of(session)
         self.positions_m = [STEP_M * view for view in range(n_views)]
-        self.shares: list[float] = []
-        self.retrievals: list[dict[int, float]] = []
+        self.shares = []
+        self.retrievals = []
         for view in range(n_views):
             body = {"encoding": (ready_encodings()[2 * view] + 0.8).tolist()}
             url = f"{self.path}/observations?action_m={STEP_M}&shortlist={N_READY}"
@@ -55,30 +47,29 @@ class Walk:
             mass = {place["map_image"]: place["mass"] for place in document["belief"]["top"]}
             self.shares.append(rank(mass, [2 * view]) / N_READY)
 
-    def told(self, positions_m: list[Any], **more: Any) -> dict[str, Any]:
+    def told(self, positions_m, **more):
         answer = self._client.post(f"{self.path}/truths", json={"true_positions_m": positions_m, **more})
         assert answer.status_code == 200, answer.text
-        document: dict[str, Any] = answer.json()
-        return document
+        return answer.json()
 
-    def counted(self) -> tuple[int, float]:
+    def counted(self):
         """How many observations the metric has counted, and their ranks' sum in percent."""
         pattern = rf'^deepsimbad_live_anr_percent_(count|sum)\{{domain="{self._domain}"\}} (\S+)$'
         shown = dict(re.findall(pattern, self._client.get("/metrics").text, re.MULTILINE))
         return int(float(shown.get("count", 0))), float(shown.get("sum", 0))
 
-    def learn(self, positions_m: list[Any] | None = None, domain: str | None = None) -> Any:
+    def learn(self, positions_m=None, domain=None):
         body = {"session_id": self.session_id, "true_positions_m": positions_m or self.positions_m}
         return self._client.post(f"/v1/admin/domains/{domain or self._domain}/experience", json=body)
 
 
-def rank(scores: dict[int, float], true_images: list[int]) -> float:
+def rank(scores, true_images):
     """Images above the best true one, and half of those beside it."""
     best = max(scores[image] for image in true_images)
     return sum(score > best for score in scores.values()) + (list(scores.values()).count(best) - 1) / 2
 
 
-def test_the_answer_is_the_anr_of_the_beliefs_that_were_answered(client: TestClient, domain: str) -> None:
+def test_the_answer_is_the_anr_of_the_beliefs_that_were_answered(client, domain):
     walk = Walk(client, domain)
     assert len(set(walk.shares)) > 1, "else nothing is shown"
     shares = walk.shares
@@ -90,19 +81,18 @@ def test_the_answer_is_the_anr_of_the_beliefs_that_were_answered(client: TestCli
     assert walk.told([None] * 5) == {"n_scored": 0, "n_left_out": 5, "anr": None, **NO_RANKS}
 
 
-def test_each_view_is_ranked_by_the_map_images_told(client: TestClient, domain: str) -> None:
+def test_each_view_is_ranked_by_the_map_images_told(client, domain):
     """Bit by bit as at once, by ANR's rule, also after the session went on or ended."""
     walk = Walk(client, domain, 6)
     images = [[2 * view, 2 * view + 1] if view != 1 else [] for view in range(6)]
     expected = [rank(walk.retrievals[view], images[view]) if images[view] else None for view in range(6)]
     assert len(set(expected)) > 2, "else nothing is shown"
 
-    def ranks(first: int, last: int) -> list[float | None]:
+    def ranks(first, last):
         unknown = [None] * (last - first)
         answer = walk.told(unknown, true_map_images=images[first:last], first_observation=first)
         assert answer["n_left_out"] == last - first
-        ranks: list[float | None] = answer["retrieval_ranks"]
-        return ranks
+        return answer["retrieval_ranks"]
 
     assert ranks(0, 6) == expected
     assert ranks(3, 6) == expected[3:]
@@ -116,7 +106,7 @@ def test_each_view_is_ranked_by_the_map_images_told(client: TestClient, domain: 
     assert walk.counted()[0] == 0, "the alarm is of positions alone"
 
 
-def test_a_truth_far_from_the_map_says_nothing_of_it(client: TestClient, domain: str) -> None:
+def test_a_truth_far_from_the_map_says_nothing_of_it(client, domain):
     walk = Walk(client, domain, 3)
     last_m = 2.0 * (N_READY - 1)
     answer = walk.told([walk.positions_m[0], 1e9, last_m + 10.5])
@@ -125,9 +115,7 @@ def test_a_truth_far_from_the_map_says_nothing_of_it(client: TestClient, domain:
     assert walk.told([None, None, last_m + 9.5])["n_scored"] == 1
 
 
-def test_an_observation_is_counted_once_whoever_tells(
-    client: TestClient, domain: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_observation_is_counted_once_whoever_tells(client, domain, monkeypatch):
     walk = Walk(client, domain)
     for _ in range(2):
         walk.told([*walk.positions_m[:3], None, None])
@@ -140,30 +128,30 @@ def test_an_observation_is_counted_once_whoever_tells(
     assert walk.counted()[0] == 6
     assert client.get(walk.path).json()["n_observations"] == 6, "telling moves nothing"
 
-    def refuse(*_: object) -> None:
+    def refuse(*_):
         raise UnavailableError("no job is taken now")
 
     walk = Walk(client, domain)
     with monkeypatch.context() as patch:
-        patch.setattr(services_of(client).runner, "submit", refuse)
+        patch.setattr(client.services.runner, "submit", refuse)
         problem(walk.learn(), 503, "unavailable")
     client.delete(walk.path)
     jobs = [walk.learn().json() for _ in range(2)]
     walk.told(walk.positions_m)
     assert walk.counted()[0] == 11
-    assert [wait_for(client, job["job_id"])["state"] for job in jobs] == ["succeeded"] * 2
+    assert [client.wait_for(job["job_id"])["state"] for job in jobs] == ["succeeded"] * 2
 
 
-def test_the_season_may_have_turned_meanwhile(client: TestClient, domain: str) -> None:
+def test_the_season_may_have_turned_meanwhile(client, domain):
     """Another map serves, with other landmarks: the session's own still tells."""
     walk = Walk(client, domain)
-    remap(client, domain, **ANEW, n_landmarks=7)
+    client.remap(domain, **ANEW, n_landmarks=7)
     client.delete(walk.path)
     answer = walk.told(walk.positions_m)
     assert (answer["map_version"], answer["anr"]) == (1, pytest.approx(100 * float(np.mean(walk.shares))))
 
 
-def test_a_deleted_domain_takes_its_series_along(client: TestClient, domain: str) -> None:
+def test_a_deleted_domain_takes_its_series_along(client, domain):
     walk = Walk(client, domain)
     walk.told(walk.positions_m)
     assert client.delete(f"/v1/admin/domains/{domain}").status_code == 204
@@ -194,7 +182,7 @@ def test_a_deleted_domain_takes_its_series_along(client: TestClient, domain: str
         ("", "empty_body"),
     ],
 )
-def test_truths_that_cannot_be(client: TestClient, body: str, code: str) -> None:
+def test_truths_that_cannot_be(client, body, code):
     walk = Walk(client, "ready", 2)
     for media_type, status, expected in (
         ("application/json", 422, code),
@@ -208,17 +196,17 @@ def test_truths_that_cannot_be(client: TestClient, body: str, code: str) -> None
 # Experience
 
 
-def test_the_next_map_learns_from_a_session(client: TestClient, domain: str) -> None:
+def test_the_next_map_learns_from_a_session(client, domain):
     walk = Walk(client, domain, 6)
-    positions_m: list[float | None] = [*walk.positions_m]
+    positions_m = [*walk.positions_m]
     positions_m[3] = None
     answer = walk.learn(positions_m)
     assert answer.status_code == 202, answer.text
     assert answer.headers["location"].endswith(answer.json()["job_id"])
-    job = wait_for(client, answer.json()["job_id"])
+    job = client.wait_for(answer.json()["job_id"])
     assert (job["state"], job["kind"], job["result"]["map_version"]) == ("succeeded", "experience", 2)
     assert job["result"]["metrics"]["experience"] == {"from_version": 1, "n_walks": 1, "n_moves": 4}
-    before, after = (load_snapshot(services_of(client).catalog, domain, version).q_values for version in (1, 2))
+    before, after = (load_snapshot(client.services.catalog, domain, version).q_values for version in (1, 2))
     assert before is not None
     changed = np.flatnonzero((before != after).any(axis=0))
     assert changed.tolist() == [3]  # the move of 4 m alone
@@ -228,19 +216,19 @@ def test_the_next_map_learns_from_a_session(client: TestClient, domain: str) -> 
     for _ in range(2):
         client.post(f"{walk.path}/observations", json={"ranked_landmarks": [1, 2, 3]})
     client.delete(walk.path)  # and an ended one as well
-    again = wait_for(client, walk.learn([*walk.positions_m, 8.0, 8.0]).json()["job_id"])["result"]
+    again = client.wait_for(walk.learn([*walk.positions_m, 8.0, 8.0]).json()["job_id"])["result"]
     assert (again["map_version"], again["metrics"]["experience"]["n_walks"]) == (3, 2)
 
 
-def test_a_session_whose_map_is_gone_or_differs(client: TestClient, domain: str, data_dir: Path) -> None:
+def test_a_session_whose_map_is_gone_or_differs(client, domain, data_dir):
     walk = Walk(client, domain, 3)
     maps = f"/v1/admin/domains/{domain}/maps"
-    remap(client, domain, **ANEW, n_landmarks=N_LANDMARKS - 1)
+    client.remap(domain, **ANEW, n_landmarks=N_LANDMARKS - 1)
     problem(walk.learn(), 409, "conflict")
-    remap(client, domain, **ANEW, n_landmarks=N_LANDMARKS)
+    client.remap(domain, **ANEW, n_landmarks=N_LANDMARKS)
     file = data_dir / "domains" / domain / "maps" / "000001.sqlite"
     file.rename(file.with_suffix(".aside"))
-    services_of(client).maps.forget(domain)
+    client.services.maps.forget(domain)
     assert ".sqlite" not in str(problem(walk.learn(), 503, "damaged_map"))
     file.with_suffix(".aside").rename(file)
     client.delete(walk.path)
@@ -248,11 +236,11 @@ def test_a_session_whose_map_is_gone_or_differs(client: TestClient, domain: str,
     problem(walk.learn(), 410, "retired_map")
     walk = Walk(client, domain, 3)
     assert client.delete(f"/v1/admin/domains/{domain}").status_code == 204
-    make_ready_domain(client, domain, actions_m=[4.0])
+    client.make_ready_domain(domain, actions_m=[4.0])
     problem(walk.learn(), 410, "retired_map")
 
 
-def test_what_cannot_be_learnt_from(client: TestClient) -> None:
+def test_what_cannot_be_learnt_from(client):
     walk = Walk(client, "ready", 3)
     problem(walk.learn(domain="seen"), 404, "unknown_session")
     path, session_id = "/v1/admin/domains/ready/experience", walk.session_id

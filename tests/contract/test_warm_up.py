@@ -3,11 +3,10 @@
 import json
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 
-from .conftest import DIM, TAKES_ENCODINGS, remap, service, upload
+from .conftest import DIM, TAKES_ENCODINGS, service
 
 FIRST_REQUESTS = """
 import importlib, json, pkgutil, sys
@@ -36,7 +35,7 @@ with service(Path(sys.argv[1])) as client:
 """
 
 
-def test_no_kernel_is_compiled_after_the_service_is_ready(tmp_path: Path) -> None:
+def test_no_kernel_is_compiled_after_the_service_is_ready(tmp_path):
     """Of a map that learnt from two seasons, as a map by default does."""
     random = np.random.default_rng(3)
     places = random.normal(size=(80, DIM))
@@ -44,9 +43,9 @@ def test_no_kernel_is_compiled_after_the_service_is_ready(tmp_path: Path) -> Non
         client.put("/v1/admin/domains/ready", json=TAKES_ENCODINGS)
         for season in ("summer", "winter"):
             seen = (places + 0.1 * random.normal(size=places.shape)).astype(np.float32)
-            upload(client, "ready", season, seen, np.arange(80.0))
+            client.upload("ready", season, seen, np.arange(80.0))
         drives = {"training_traverse": "summer", "landmark_traverse": "winter", "same_route": True, "n_landmarks": 40}
-        job = remap(client, "ready", **drives, training_episodes=20)
+        job = client.remap("ready", **drives, training_episodes=20)
         assert job["result"]["metrics"]["second_season"]["accepted"], job
     done = subprocess.run(
         [sys.executable, "-c", FIRST_REQUESTS, str(tmp_path)], capture_output=True, text=True, check=True

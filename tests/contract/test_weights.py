@@ -2,13 +2,10 @@
 
 import hashlib
 import shutil
-from contextlib import AbstractContextManager
 from pathlib import Path
 
-import httpx2
 import numpy as np
 import pytest
-from starlette.testclient import TestClient
 
 from deepsimbad.engine import encoders
 from deepsimbad.errors import InvalidWeightsError
@@ -18,16 +15,10 @@ from .conftest import (
     N_SEEN,
     RANKS,
     TAKES_ENCODINGS,
-    begin,
     encoded,
-    make_ready_domain,
-    path_of,
     picture,
     problem,
-    remap,
     service,
-    services_of,
-    upload_pictures,
 )
 
 EVALUATOR = {"kind": "feature_l2", "extractor": "onnx:eyes.onnx"}
@@ -36,7 +27,7 @@ VIEW = "/v1/domains/street/localizations"
 DRIVES = {"training_traverse": "drive", "landmark_traverse": "drive", "n_landmarks": N_SEEN}
 
 
-def write_network(path: Path, seed: int) -> str:
+def write_network(path, seed):
     """The means of the three channels and of four parts of the image, mixed at random; its digest."""
     onnx = pytest.importorskip("onnx")
     pytest.importorskip("onnxruntime")
@@ -59,53 +50,53 @@ def write_network(path: Path, seed: int) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-def running(folder: Path) -> AbstractContextManager[TestClient]:
+def running(folder):
     return service(folder / "data", weights_dir=folder / "weights")
 
 
 @pytest.fixture(scope="module")
-def mapped(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def mapped(tmp_path_factory):
     """A domain mapped by weights of its own, beside one that needs none."""
     folder = tmp_path_factory.mktemp("mapped")
     digest = write_network(folder / "weights" / "eyes.onnx", 1)
     with running(folder) as client:
         assert client.put(DOMAIN, json={"evaluator": EVALUATOR}).status_code == 201
-        assert upload_pictures(client, "street", "drive") == [201] * N_SEEN
-        assert remap(client, "street", **DRIVES)["state"] == "succeeded"
+        assert client.upload_pictures("street", "drive") == [201] * N_SEEN
+        assert client.remap("street", **DRIVES)["state"] == "succeeded"
         assert view(client).status_code == 200
         assert client.get("/v1/domains/street").json()["weights_sha256"] == digest
-        make_ready_domain(client, "ready")
+        client.make_ready_domain("ready")
     return folder
 
 
 @pytest.fixture
-def weights(mapped: Path, tmp_path: Path) -> Path:
+def weights(mapped, tmp_path):
     """The file of the weights, in the test's own copy."""
     shutil.copytree(mapped, tmp_path, dirs_exist_ok=True)
     return tmp_path / "weights" / "eyes.onnx"
 
 
-def view(client: TestClient, path: str = VIEW) -> httpx2.Response:
+def view(client, path=VIEW):
     return client.post(path, content=encoded(picture(1)), headers=JPEG)
 
 
-def test_views_and_frames_of_other_weights_are_refused_with_both_digests(tmp_path: Path, weights: Path) -> None:
+def test_views_and_frames_of_other_weights_are_refused_with_both_digests(tmp_path, weights):
     first = hashlib.sha256(weights.read_bytes()).hexdigest()
     second = write_network(weights, 2)
     with running(tmp_path) as client:
-        for path in (VIEW, f"{path_of(begin(client, 'street'))}/observations"):
+        for path in (VIEW, f"{client.session('street')}/observations"):
             about = problem(view(client, path), 409, "weights_differ")
             assert (about["known_weights_sha256"], about["given_weights_sha256"]) == (first, second)
         assert client.post(VIEW, json=RANKS).status_code == 200  # the map itself is as good as before
-        assert set(upload_pictures(client, "street", "drive")) == {409}
-        assert set(upload_pictures(client, "street", "again")) == {201}
+        assert set(client.upload_pictures("street", "drive")) == {409}
+        assert set(client.upload_pictures("street", "again")) == {201}
         again = {"training_traverse": "again"}
         for config in (again, {**DRIVES, **again}):  # the landmarks are the old ones: the active map's, the drive's
-            job = remap(client, "street", **config)
+            job = client.remap("street", **config)
             assert (job["state"], job["error"]["code"]) == ("failed", "weights_differ")
         assert first[:12] in str(job["error"])
         assert second[:12] in str(job["error"])
-        job = remap(client, "street", **DRIVES | again | {"landmark_traverse": "again"})
+        job = client.remap("street", **DRIVES | again | {"landmark_traverse": "again"})
         assert job["state"] == "succeeded", job
         check = job["result"]["metrics"]["check"]
         assert check["anr_active"] is None
@@ -113,13 +104,11 @@ def test_views_and_frames_of_other_weights_are_refused_with_both_digests(tmp_pat
         assert view(client).status_code == 200
 
 
-def test_a_domain_whose_weights_are_gone_says_so_and_the_others_go_on(
-    tmp_path: Path, weights: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_domain_whose_weights_are_gone_says_so_and_the_others_go_on(tmp_path, weights, monkeypatch):
     body = weights.read_bytes()
     weights.unlink()
     with running(tmp_path) as client:
-        path = f"{path_of(begin(client, 'street'))}/observations"
+        path = f"{client.session('street')}/observations"
         for url in (VIEW, path):
             about = problem(view(client, url), 503, "evaluator_unavailable")
             assert "eyes.onnx" in about["detail"]
@@ -135,7 +124,7 @@ def test_a_domain_whose_weights_are_gone_says_so_and_the_others_go_on(
         assert view(client).status_code == 200
 
 
-def test_a_domain_is_not_made_of_weights_that_cannot_be_loaded(tmp_path: Path) -> None:
+def test_a_domain_is_not_made_of_weights_that_cannot_be_loaded(tmp_path):
     (tmp_path / "weights").mkdir()
     with running(tmp_path) as client:
         for extractor, content, code in (
@@ -156,7 +145,7 @@ def test_a_domain_is_not_made_of_weights_that_cannot_be_loaded(tmp_path: Path) -
             assert client.get("/v1/domains/street").status_code == 404
 
 
-def test_what_is_left_out_is_as_the_domain_has_it(client: TestClient) -> None:
+def test_what_is_left_out_is_as_the_domain_has_it(client):
     """The default may have been another one when the domain was made."""
     old = {"kind": "feature_l2", "extractor": "gradient_grid"}
     assert client.put("/v1/admin/domains/old", json={"evaluator": old}).status_code == 201
@@ -165,10 +154,8 @@ def test_what_is_left_out_is_as_the_domain_has_it(client: TestClient) -> None:
     problem(client.put("/v1/admin/domains/old", json=TAKES_ENCODINGS), 409, "domain_differs")
 
 
-def test_weights_that_cannot_be_read_keep_no_service_from_starting(
-    tmp_path: Path, weights: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def refused_by_the_disk(_path: Path) -> bytes:
+def test_weights_that_cannot_be_read_keep_no_service_from_starting(tmp_path, weights, monkeypatch):
+    def refused_by_the_disk(_path):
         raise PermissionError(13, "Permission denied")
 
     monkeypatch.setattr(Path, "read_bytes", refused_by_the_disk)
@@ -179,13 +166,13 @@ def test_weights_that_cannot_be_read_keep_no_service_from_starting(
         assert client.put(DOMAIN, json={"evaluator": EVALUATOR}).status_code == 200  # the same again changes nothing
 
 
-def test_a_network_that_gives_no_encoding_is_not_the_robots_fault(tmp_path: Path, weights: Path) -> None:
-    def broken(_pixels: np.ndarray) -> np.ndarray:
+def test_a_network_that_gives_no_encoding_is_not_the_robots_fault(tmp_path, weights):
+    def broken(_pixels):
         raise InvalidWeightsError("eyes.onnx gives NaN")
 
-    broken.largest_batch = 1  # type: ignore[attr-defined]
+    broken.largest_batch = 1
     with running(tmp_path) as client:
         view(client)
-        extractor = services_of(client).evaluators.evaluator(EVALUATOR)._extractor  # type: ignore[attr-defined]
+        extractor = client.services.evaluators.evaluator(EVALUATOR)._extractor
         object.__setattr__(extractor, "run", broken)
         assert problem(view(client), 503, "evaluator_unavailable")["reason"] == "invalid_weights"
