@@ -9,9 +9,8 @@ from bench.link import BINARY, Link
 from bench.soak.actor import DOMAIN, N_LANDMARKS, Actor, expect
 from deepsimbad.core.belief import FilterKind
 from deepsimbad.core.localizer import ActiveLocalizer, LocalizerConfig
-from deepsimbad.engine.localizer import describe
+from deepsimbad.engine.localizer import RankedLandmarks, describe
 from deepsimbad.engine.maps import load_snapshot
-from deepsimbad.engine.views import RankedLandmarks
 from deepsimbad.evaluators.feature_l2 import FeatureL2
 from deepsimbad.store.catalog import Catalog
 

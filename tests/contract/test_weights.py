@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from deepsimbad.engine import encoders
+from deepsimbad.engine import worker
 from deepsimbad.errors import InvalidWeightsError
 
 from .conftest import (
@@ -120,7 +120,7 @@ def test_a_domain_whose_weights_are_gone_says_so_and_the_others_go_on(tmp_path, 
         assert client.get("/readyz").status_code == 200
         weights.write_bytes(body)  # brought back, without a restart
         problem(view(client), 503, "evaluator_unavailable")
-        monkeypatch.setattr(encoders, "RETRY_AFTER_S", 0.0)  # later
+        monkeypatch.setattr(worker, "RETRY_AFTER_S", 0.0)  # later
         assert view(client).status_code == 200
 
 

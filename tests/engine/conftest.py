@@ -1,9 +1,11 @@
-"""A catalog, and maps made without a job."""
+"""A catalog, maps made without a job, and a service over them that can be restarted."""
 
-from collections.abc import Iterator
+import asyncio
+from collections.abc import Awaitable, Callable, Coroutine, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import pytest
@@ -12,13 +14,37 @@ from deepsimbad.core.building import build_map
 from deepsimbad.core.drive import Drive
 from deepsimbad.core.map import Map
 from deepsimbad.core.relevance import Relevance
+from deepsimbad.engine.localizer import RankedLandmarks, ReadyEncoding, View
+from deepsimbad.engine.maps import Maps
+from deepsimbad.engine.session import Observation, SessionConfig
+from deepsimbad.engine.sessions import Sessions
+from deepsimbad.engine.worker import EvaluatorPool, InferenceWorker
+from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.feature_l2 import FeatureL2
 from deepsimbad.store.catalog import Catalog
+from deepsimbad.store.catalog_maps import ANY
+from deepsimbad.store.journal import IdempotencyKey
 from deepsimbad.store.map_file import write_map
 from deepsimbad.store.sealing import seal
+from deepsimbad.store.sessions import SessionStore
 
+T = TypeVar("T")
 N_IMAGES, N_LANDMARKS, DIM, LIST_LENGTH = 30, 9, 6, 3
 EVALUATOR = {"kind": "feature_l2", "extractor": "none"}
+TTL_S, KEEP_ENDED_S = 100.0, 50_000.0
+
+
+class Clock:
+    def __init__(self) -> None:
+        self.now = 1_000_000.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()
 
 
 def map_contents(
@@ -30,9 +56,8 @@ def map_contents(
     model = evaluator.fit_landmarks(rng.normal(size=(N_LANDMARKS, DIM)).astype(np.float32))
     measured = evaluator.dissimilarities(encodings, model)
     drive = Drive(position_m=np.arange(N_IMAGES) * 1.5, encodings=encodings, dissimilarities=measured)
-    built = build_map(relevance, drive, LIST_LENGTH, closed)
     return replace(
-        built,
+        build_map(relevance, drive, LIST_LENGTH, closed),
         domain=domain,
         version=version,
         created_at="2026-01-01T00:00:00Z",
@@ -43,21 +68,84 @@ def map_contents(
     )
 
 
-def add_map(catalog: Catalog, domain: str, relevance: Relevance = Relevance.STANDARDISED, closed: bool = False) -> int:
-    """Build and seal the next version; not activated."""
+def add_map(catalog: Catalog, domain: str = "d", contents: Map | None = None, activate: bool = True) -> int:
+    """Build and seal the next version."""
     version = catalog.begin_map(domain, {})
     building = catalog.building_path(domain, version)
-    write_map(building, map_contents(domain, version, relevance, closed))
+    write_map(building, map_contents(domain, version) if contents is None else contents)
     digest, n_bytes = seal(building, catalog.map_path(domain, version))
     catalog.seal_map(domain, version, digest, n_bytes, {})
+    if activate:
+        catalog.activate(domain, version, ANY)
     return version
 
 
-def add_domain(catalog: Catalog, name: str, **more: Any) -> None:
-    catalog.create_domain(name, EVALUATOR, more.get("closed", False), (1.0, 2.0))
+def add_domain(catalog: Catalog, name: str, closed: bool = False) -> None:
+    catalog.create_domain(name, EVALUATOR, closed, (1.0, 2.0))
 
 
 @pytest.fixture
 def catalog(tmp_path: Path) -> Iterator[Catalog]:
     with Catalog.open(tmp_path) as opened:
         yield opened
+
+
+@pytest.fixture
+def mapped(catalog: Catalog) -> Catalog:
+    """One domain, d, with its first map."""
+    add_domain(catalog, "d")
+    add_map(catalog)
+    return catalog
+
+
+class Live:
+    """One run of a service over a data directory."""
+
+    def __init__(self, catalog: Catalog, clock: Clock, **options: Any) -> None:
+        self.catalog = catalog
+        self.commits: list[int] = []
+        self.store = SessionStore.open(catalog.data_dir, self.commits.append)
+        self.worker = InferenceWorker()
+        self.maps = Maps(catalog)
+        limits = {"ttl_s": TTL_S, "max_sessions": 20, "max_sessions_per_key": 10, "snapshot_every": 4}
+        options = {**limits, "keep_ended_s": KEEP_ENDED_S, "clock": clock, **options}
+        self.sessions = Sessions(self.store, self.maps, EvaluatorPool(), self.worker, **options)
+
+    async def begin(self, **config: Any) -> str:
+        return (await self.sessions.begin(self.maps.active("d"), SessionConfig(**config))).session_id
+
+
+@contextmanager
+def running(catalog: Catalog, clock: Clock | None = None, **options: Any) -> Iterator[Live]:
+    live = Live(catalog, clock or Clock(), **options)
+    try:
+        yield live
+    finally:
+        live.sessions.close()
+        live.worker.close()
+        live.store.close()
+
+
+def run(
+    catalog: Catalog, body: Callable[[Live], Coroutine[Any, Any, T]], clock: Clock | None = None, **options: Any
+) -> T:
+    """Run a coroutine against a service that is started for it, and stopped after it."""
+    with running(catalog, clock, **options) as live:
+        return asyncio.run(body(live))
+
+
+def viewed(view: View) -> Callable[[Evaluator], Awaitable[View]]:
+    async def give(_evaluator: Evaluator) -> View:
+        return view
+
+    return give
+
+
+def ranked(seed: int, action_m: float = 1.5, key: str | None = None, digest: bytes = b"d") -> Observation:
+    ids = np.random.default_rng(seed).permutation(N_LANDMARKS)[: 1 + seed % N_LANDMARKS]
+    named = None if key is None else IdempotencyKey(key, digest)
+    return Observation(viewed(RankedLandmarks(tuple(ids.tolist()))), action_m, idempotency=named)
+
+
+def encoded(seed: int, action_m: float = 1.5) -> Observation:
+    return Observation(viewed(ReadyEncoding(np.random.default_rng(seed).normal(size=DIM))), action_m)

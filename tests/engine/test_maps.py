@@ -1,97 +1,77 @@
-"""Active maps: loaded when needed, switched at once, never half."""
+"""Maps that serve: loaded when needed, switched at once, never half. Old ones: which keep their files."""
 
+import asyncio
 import errno
-from dataclasses import dataclass
+import logging
+import sqlite3
+import threading
+from contextlib import closing, suppress
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
 
 from deepsimbad.engine import maps as maps_module
-from deepsimbad.engine.maps import Maps
-from deepsimbad.errors import DamagedMapError, NoActiveMapError, UnavailableError, UnknownDomainError
+from deepsimbad.engine.maps import Maps, Retention, beyond_keeping
+from deepsimbad.engine.session import SessionConfig
+from deepsimbad.errors import (
+    DamagedMapError,
+    MapInUseError,
+    NoActiveMapError,
+    RetiredMapError,
+    UnavailableError,
+    UnknownDomainError,
+    UnknownMapVersionError,
+)
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.catalog_maps import ANY
-from deepsimbad.store.map_file import write_map
-from deepsimbad.store.sealing import seal
+from deepsimbad.store.layout import catalog_path
+from deepsimbad.store.records import KeptMap, MapState
 
-from .conftest import N_IMAGES, add_domain, add_map, map_contents
-
-
-@dataclass
-class Clock:
-    now: float = 100.0
-
-    def __call__(self) -> float:
-        return self.now
+from .conftest import N_IMAGES, Clock, Live, add_domain, add_map, map_contents, running
 
 
 @pytest.fixture
-def clock() -> Clock:
-    return Clock()
+def maps(mapped: Catalog, clock: Clock) -> Maps:
+    return Maps(mapped, clock)
 
 
-@pytest.fixture
-def maps(catalog: Catalog, clock: Clock) -> Maps:
-    add_domain(catalog, "d")
-    return Maps(catalog, clock)
-
-
-def test_nothing_to_serve(maps: Maps) -> None:
+def test_nothing_to_serve(catalog: Catalog, maps: Maps) -> None:
     with pytest.raises(UnknownDomainError):
         maps.active("other")
+    add_domain(catalog, "new")
     with pytest.raises(NoActiveMapError, match="remap"):
-        maps.active("d")
-    assert maps.peek("d") is None
+        maps.active("new")
+    assert maps.peek("new") is None
     assert maps.n_loaded == 0
 
 
-def test_the_active_version_is_loaded_once(catalog: Catalog, maps: Maps) -> None:
-    catalog.activate("d", add_map(catalog, "d"), ANY)
-    snapshot = maps.active("d").snapshot
-    assert (snapshot.version, snapshot.n_images) == (1, N_IMAGES)
-    assert snapshot.index_bits_per_map_image > 0
-    assert maps.active("d").snapshot is snapshot
-    assert maps.n_loaded == 1
-
-
 def test_a_switch_is_seen_at_once_when_told_and_soon_when_not(catalog: Catalog, maps: Maps, clock: Clock) -> None:
-    for _ in range(2):
-        add_map(catalog, "d")
-    catalog.activate("d", 1, ANY)
-    held = maps.active("d").snapshot
-    catalog.activate("d", 2, 1)
-    assert maps.active("d").snapshot.version == 1  # trusted for a second
+    first = maps.active("d").snapshot
+    assert (first.version, first.n_images, maps.n_loaded) == (1, N_IMAGES, 1)
+    clock.now += 10
+    assert maps.active("d").snapshot is first  # an unchanged version is not read again
+    add_map(catalog)
+    assert maps.active("d").snapshot is first  # trusted for a second
     assert maps.refresh("d").snapshot.version == 2
-    assert held.version == 1  # whoever held the old one keeps it
     catalog.activate("d", 1, 2)
     clock.now += 1.1
     assert maps.peek("d") is None
     assert maps.active("d").snapshot.version == 1
 
 
-def test_an_unchanged_version_is_not_read_again(catalog: Catalog, maps: Maps, clock: Clock) -> None:
-    catalog.activate("d", add_map(catalog, "d"), ANY)
-    held = maps.active("d").snapshot
-    clock.now += 10
-    assert maps.active("d").snapshot is held
-
-
 def test_a_domain_made_anew_under_an_old_name_gets_its_own_map(catalog: Catalog, maps: Maps, clock: Clock) -> None:
-    catalog.activate("d", add_map(catalog, "d"), ANY)
-    held = maps.active("d").snapshot
+    before = maps.active("d").snapshot
     catalog.delete_domain("d")
     add_domain(catalog, "d", closed=True)
     clock.now += 2
     with pytest.raises(NoActiveMapError):
         maps.active("d")
-    catalog.activate("d", add_map(catalog, "d"), ANY)
-    assert maps.active("d").snapshot is not held
+    add_map(catalog)
+    assert maps.active("d").snapshot is not before
 
 
-def test_damage_is_named_and_remembered_for_a_while(
-    catalog: Catalog, maps: Maps, clock: Clock, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    catalog.activate("d", add_map(catalog, "d"), ANY)
+def test_damage_is_named_and_remembered_for_a_while(catalog: Catalog, maps: Maps, clock: Clock) -> None:
     path = catalog.map_path("d", 1)
     sound = path.read_bytes()
     path.chmod(0o644)
@@ -106,63 +86,199 @@ def test_damage_is_named_and_remembered_for_a_while(
     assert maps.active("d").snapshot.version == 1
 
 
-def test_a_damaged_map_does_not_keep_others_from_loading(catalog: Catalog, maps: Maps) -> None:
-    catalog.activate("d", add_map(catalog, "d"), ANY)
-    add_domain(catalog, "e")
-    catalog.activate("e", add_map(catalog, "e"), ANY)
-    add_domain(catalog, "f")
-    catalog.map_path("d", 1).unlink()
-    assert list(maps.load_all()) == ["d"]
-    assert maps.active("e").snapshot.domain == "e"
-    maps.forget("e")
-    assert maps.n_loaded == 0
-
-
-def test_a_map_that_cannot_be_read_now_is_not_called_damaged(
+def test_a_map_that_cannot_be_read_now_is_not_called_damaged_nor_keeps_others_from_loading(
     catalog: Catalog, maps: Maps, clock: Clock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for domain in ("d", "e"):
-        if domain == "e":
-            add_domain(catalog, "e")
-        catalog.activate(domain, add_map(catalog, domain), ANY)
+    for domain in ("e", "f"):
+        add_domain(catalog, domain)
+        add_map(catalog, domain)
+    add_domain(catalog, "unmapped")
     verify = maps_module.verify
 
     def failing(path: Path, digest: str) -> None:
-        if path == catalog.map_path("d", 1):
+        if path.parent == catalog.map_path("d", 1).parent:
             raise OSError(errno.EIO, "Input/output error")
         verify(path, digest)
 
+    catalog.map_path("e", 1).unlink()
     with monkeypatch.context() as patched:
         patched.setattr(maps_module, "verify", failing)
-        assert maps.load_all() == {}
-        assert maps.peek("e") is not None, "another domain's map is loaded all the same"
+        assert maps.load_all() == ["e"]
+        assert maps.active("f").snapshot.domain == "f"
         with pytest.raises(UnavailableError) as caught:
             maps.active("d")
         assert (caught.value.code, caught.value.hints["reason"]) == ("unavailable", "io_error")
-        assert maps.damaged() == {}
+        assert maps.damaged() == {"e": 1}
     assert maps.active("d").snapshot.version == 1, "and it is not remembered"
-
-
-def test_a_damaged_map_stays_damaged_while_it_cannot_be_read(
-    catalog: Catalog, maps: Maps, clock: Clock, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def failing(path: Path, digest: str) -> None:
-        raise OSError(errno.EIO, "Input/output error")
-
-    catalog.activate("d", add_map(catalog, "d"), ANY)
-    catalog.map_path("d", 1).unlink()
-    assert list(maps.load_all()) == ["d"]
+    maps.forget("d")
+    assert [mapped.record.name for mapped in maps.loaded()] == ["f"]
+    monkeypatch.setattr(maps_module, "verify", lambda path, digest: failing(catalog.map_path("d", 1), digest))
     clock.now += 10
-    monkeypatch.setattr(maps_module, "verify", failing)
-    assert maps.damaged() == {"d": 1}
+    assert maps.damaged() == {"e": 1}, "a damaged one stays so while it cannot be read"
 
 
 def test_domain_and_version_are_the_catalogs_and_not_the_files(catalog: Catalog, maps: Maps) -> None:
     """A map that was moved here from another server keeps its bytes, and with them its old name."""
-    version = catalog.begin_map("d", {})
-    write_map(catalog.building_path("d", version), map_contents("elsewhere", 7))
-    digest, n_bytes = seal(catalog.building_path("d", version), catalog.map_path("d", version))
-    catalog.seal_map("d", version, digest, n_bytes, {})
-    catalog.activate("d", version, ANY)
+    add_map(catalog, contents=map_contents("elsewhere", 7))
     snapshot = maps.active("d").snapshot
-    assert (snapshot.domain, snapshot.version) == ("d", 1)
+    assert (snapshot.domain, snapshot.version) == ("d", 2)
+
+
+def test_which_version_serves_is_logged_when_it_changes(
+    catalog: Catalog, maps: Maps, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO)
+    maps.load_all()
+    add_map(catalog)
+    maps.refresh("d")
+    catalog.activate("d", 1, 2)
+    maps.refresh("d")
+    maps.refresh("d")
+    assert [record.getMessage() for record in caplog.records] == ["map activated", "map rolled back"]
+
+
+# Which are kept
+
+
+def retention_of(live: Live, keep_maps: int = 1) -> Retention:
+    return Retention(live.catalog, live.store, live.maps, keep_maps)
+
+
+def with_files(catalog: Catalog) -> list[int]:
+    """The versions that have a file; the catalog says the same."""
+    versions = [record.version for record in catalog.maps("d") if catalog.map_path("d", record.version).is_file()]
+    assert versions == [record.version for record in catalog.maps("d") if record.removed_at is None]
+    return versions
+
+
+def beyond(history: str, keep_maps: int) -> list[int]:
+    """Of versions 1, 2, ...: s(ealed), a(ctive), or retired in the year of that digit, 0: before times were noted."""
+    states = {"s": MapState.SEALED, "a": MapState.ACTIVE}
+    versions = [
+        KeptMap("d", version, states.get(word, MapState.RETIRED), f"200{word}" if word in "123456789" else None)
+        for version, word in enumerate(history, 1)
+    ]
+    return sorted(version.version for version in beyond_keeping(versions, keep_maps))
+
+
+@pytest.mark.parametrize(
+    ("history", "keep_maps", "expected"),
+    [
+        ("423a0", 2, [2, 5]),  # by when they ceased to serve: 1 was rolled back to, and retired again
+        ("423a0", 3, [5]),
+        ("423a0", 4, []),
+        ("ssas", 2, [1]),  # of sealed ones those alone that lost: a newer one may soon serve
+        ("ssas", 1, [1, 2]),
+        ("ass", 1, []),
+        ("ss", 1, []),
+    ],
+)
+def test_what_is_beyond_keeping(history: str, keep_maps: int, expected: list[int]) -> None:
+    assert beyond(history, keep_maps) == expected
+
+
+def test_the_one_that_served_last_is_the_newest_though_the_clock_was_set_back(mapped: Catalog) -> None:
+    add_map(mapped)
+    with closing(sqlite3.connect(catalog_path(mapped.data_dir))) as db, db:  # as noted by a clock that ran ahead
+        db.execute("UPDATE map SET retired_at = '2999-01-01T00:00:00.000Z' WHERE version = 1")
+    add_map(mapped)
+    assert [version.version for version in beyond_keeping(mapped.kept_maps(), 1)] == [1], "version 2 served last"
+
+
+def test_one_domain_alone_can_be_pruned(mapped: Catalog) -> None:
+    add_domain(mapped, "e")
+    for domain in ("d", "e", "d", "e", "d", "e"):
+        add_map(mapped, domain)
+    with running(mapped) as live:
+        assert retention_of(live).prune("e") == 1
+        assert len(with_files(mapped)) == 4
+        assert retention_of(live).prune() == 2
+
+
+def test_what_serves_or_is_being_built_is_not_removed(mapped: Catalog) -> None:
+    building = mapped.begin_map("d", {})
+    with running(mapped) as live:
+        for version, error in ((1, MapInUseError), (building, MapInUseError), (9, UnknownMapVersionError)):
+            with pytest.raises(error):
+                retention_of(live).remove("d", version)
+        assert mapped.map_path("d", 1).is_file()
+
+
+def test_a_beginning_session_keeps_its_map_from_the_first_moment(mapped: Catalog) -> None:
+    """Begun on what the service last saw serve, though another process has activated another map since."""
+    with running(mapped) as live:
+        stale = live.maps.active("d")
+        add_map(mapped)
+        with live.maps.beginning(stale.snapshot), pytest.raises(MapInUseError):
+            retention_of(live).remove("d", 1)
+        retention_of(live).remove("d", 1)
+        with pytest.raises(UnavailableError, match="try again"):
+            asyncio.run(live.sessions.begin(stale, SessionConfig()))
+        assert live.store.pins() == set()
+        assert asyncio.run(live.sessions.begin(live.maps.refresh("d"), SessionConfig())).snapshot.version == 2
+
+
+def test_sessions_begun_while_maps_are_switched_and_removed(mapped: Catalog) -> None:
+    """Whatever the order of things, the map of every session that was acknowledged is there."""
+    with running(mapped, max_sessions=1000) as live:
+        retention, done = retention_of(live), threading.Event()
+
+        def switching() -> None:
+            try:
+                for before, after in pairwise([1, *(add_map(mapped, activate=False) for _ in range(12))]):
+                    mapped.activate("d", after, before)
+                    with suppress(MapInUseError):
+                        retention.remove("d", before)  # at once, which `prune` never does
+            finally:
+                done.set()
+
+        async def beginning() -> int:
+            n_begun = 0
+            while not done.is_set():
+                stale = live.maps.active("d")
+                try:
+                    await live.sessions.begin(stale, SessionConfig())
+                    n_begun += 1
+                except UnavailableError:
+                    live.maps.refresh("d")
+            return n_begun
+
+        thread = threading.Thread(target=switching)
+        thread.start()
+        n_begun = asyncio.run(beginning())
+        thread.join()
+        assert n_begun > 0
+        assert {version for _, version in live.store.pins()} <= set(with_files(mapped))
+
+
+def test_a_crash_between_the_mark_and_the_file_is_finished_at_the_next_start(
+    mapped: Catalog, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    add_map(mapped)
+
+    def dies(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with running(mapped) as live:
+        with monkeypatch.context() as patched:
+            patched.setattr("deepsimbad.store.catalog_maps.remove_database", dies)
+            with pytest.raises(KeyboardInterrupt):
+                retention_of(live).remove("d", 1)
+        assert mapped.map("d", 1).removed_at is not None
+        assert mapped.map_path("d", 1).is_file()
+        with pytest.raises(RetiredMapError):
+            mapped.activate("d", 1, ANY)
+    assert mapped.discard_unfinished() == ["removed the file of the removed map 1 of domain d"]
+    assert with_files(mapped) == [2]
+
+
+def test_where_sessions_cannot_be_read_nothing_is_removed_and_nobody_stopped(
+    mapped: Catalog, caplog: pytest.LogCaptureFixture
+) -> None:
+    for _ in range(2):
+        add_map(mapped)
+    with running(mapped) as live:
+        live.store.close()
+        assert retention_of(live).prune() == 0
+        assert "old maps could not be looked for" in caplog.text
+    assert with_files(mapped) == [1, 2, 3]

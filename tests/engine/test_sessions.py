@@ -1,4 +1,4 @@
-"""Live sessions: order, durability, repetition, endings. A restart is a second service on the same files."""
+"""Live sessions: order, durability, repetition, endings, timings. A restart is a second service on the same files."""
 
 import asyncio
 import threading
@@ -6,6 +6,7 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import replace
 from pathlib import Path
+from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -16,10 +17,8 @@ from deepsimbad.core.belief import FilterKind
 from deepsimbad.core.localizer import ActiveLocalizer, LocalizerConfig
 from deepsimbad.core.relevance import Relevance
 from deepsimbad.engine import session as session_module
-from deepsimbad.engine.localizer import describe
-from deepsimbad.engine.session import SessionConfig
-from deepsimbad.engine.views import View
-from deepsimbad.engine.worker import Priority
+from deepsimbad.engine.localizer import View, describe
+from deepsimbad.engine.worker import Priority, Stopwatch
 from deepsimbad.errors import (
     EndedSessionError,
     IdempotencyKeyReusedError,
@@ -33,33 +32,16 @@ from deepsimbad.errors import (
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.feature_l2 import FeatureL2
 from deepsimbad.store.catalog import Catalog
-from deepsimbad.store.catalog_maps import ANY
-from deepsimbad.store.journal import SessionRecord
 
-from .conftest import add_domain, add_map
-from .live_service import KEEP_ENDED_S, TTL_S, Clock, Live, encoded, ranked, run
+from .conftest import KEEP_ENDED_S, TTL_S, Clock, Live, add_domain, add_map, encoded, map_contents, ranked, run
 
 Masses = NDArray[np.float64]
-
-
-@pytest.fixture
-def mapped(catalog: Catalog) -> Catalog:
-    add_domain(catalog, "d")
-    catalog.activate("d", add_map(catalog, "d"), ANY)
-    return catalog
-
-
-def of_domain(domain: str) -> Callable[[SessionRecord], bool]:
-    return lambda session: session.domain == domain
-
-
-async def begun(live: Live, **config: Any) -> str:
-    return (await live.sessions.begin(live.maps.active("d"), SessionConfig(**config))).session_id
+STAGES = ["wait", "decode", "describe", "retrieve", "predict", "update", "plan", "commit", "summarise", "total"]
 
 
 def test_a_session_is_the_localizer_step_by_step(mapped: Catalog) -> None:
     async def body(live: Live) -> None:
-        session_id = await begun(live, seed=3)
+        session_id = await live.begin(seed=3)
         snapshot = live.maps.active("d").snapshot
         localizer = ActiveLocalizer(snapshot, LocalizerConfig(seed=3))
         state = localizer.start()
@@ -83,12 +65,12 @@ def test_a_session_is_the_localizer_step_by_step(mapped: Catalog) -> None:
 @pytest.mark.parametrize("relevance", list(Relevance))
 def test_a_belief_goes_on_bit_for_bit_after_a_restart(catalog: Catalog, kind: FilterKind, relevance: Relevance) -> None:
     add_domain(catalog, "d", closed=True)
-    catalog.activate("d", add_map(catalog, "d", relevance, closed=True), ANY)
+    add_map(catalog, contents=map_contents(relevance=relevance, closed=True))
     whole, masses = "", {}
 
     async def unbroken(live: Live) -> None:
         nonlocal whole
-        whole = await begun(live, belief=kind, seed=5, start_position_m=9.0)
+        whole = await live.begin(belief=kind, seed=5, start_position_m=9.0)
         for seed in range(13):
             await live.sessions.observe(whole, encoded(seed))
             if seed == 6:
@@ -102,7 +84,7 @@ def test_a_belief_goes_on_bit_for_bit_after_a_restart(catalog: Catalog, kind: Fi
         async def once(live: Live, seed: int = seed) -> None:
             nonlocal broken
             if seed == 0:
-                broken = await begun(live, belief=kind, seed=5, start_position_m=9.0)
+                broken = await live.begin(belief=kind, seed=5, start_position_m=9.0)
             else:
                 assert (await live.sessions.mass(broken)).tobytes() == masses[seed - 1].tobytes()
             assert (await live.sessions.view(broken)).n_observations == seed
@@ -114,9 +96,9 @@ def test_a_belief_goes_on_bit_for_bit_after_a_restart(catalog: Catalog, kind: Fi
     assert run(catalog, lambda live: live.sessions.mass(broken)).tobytes() == masses[12].tobytes()
 
 
-def test_two_at_once_are_answered_in_order_of_arrival(mapped: Catalog) -> None:
+def test_two_at_once_are_answered_in_order_of_arrival_and_told_how_they_waited(mapped: Catalog) -> None:
     async def body(live: Live) -> tuple[list[int], Masses, Masses]:
-        at_once, one_by_one = await begun(live), await begun(live)
+        at_once, one_by_one = await live.begin(), await live.begin()
         gate = asyncio.Event()
         slow = ranked(0)
 
@@ -124,12 +106,20 @@ def test_two_at_once_are_answered_in_order_of_arrival(mapped: Catalog) -> None:
             await gate.wait()  # its image takes long to decode; it arrived first all the same
             return await slow.view(evaluator)
 
-        first = asyncio.create_task(live.sessions.observe(at_once, replace(slow, view=late)))
-        others = [asyncio.create_task(live.sessions.observe(at_once, ranked(seed))) for seed in range(1, 12)]
+        watches = [Stopwatch() for _ in range(12)]
+        posted = [asyncio.create_task(live.sessions.observe(at_once, replace(slow, view=late), watches[0]))]
+        posted += [
+            asyncio.create_task(live.sessions.observe(at_once, ranked(seed), watches[seed])) for seed in range(1, 12)
+        ]
+        await asyncio.sleep(0)
+        began = perf_counter()
         await asyncio.sleep(0.05)
-        assert not any(task.done() for task in (first, *others))
+        assert not any(task.done() for task in posted)
+        held_ms = 1000 * (perf_counter() - began)
         gate.set()
-        answers = await asyncio.gather(first, *others)
+        answers = await asyncio.gather(*posted)
+        assert watches[0].timings_ms()["decode"] >= held_ms - 0.001
+        assert watches[1].timings_ms()["wait"] >= held_ms - 0.001
         for seed in range(12):
             await live.sessions.observe(one_by_one, ranked(seed))
         numbers = [answer.n_observations for answer in answers]
@@ -144,7 +134,7 @@ def test_many_robots_share_commits_and_lose_nothing(mapped: Catalog) -> None:
     n_robots, n_views = 20, 12
 
     async def drive(live: Live, robot: int) -> tuple[str, list[int]]:
-        session_id = await begun(live, seed=robot)
+        session_id = await live.begin(seed=robot)
         views = [await live.sessions.observe(session_id, ranked(100 * robot + view)) for view in range(n_views)]
         return session_id, [view.n_observations for view in views]
 
@@ -170,25 +160,36 @@ def hold_commits(live: Live) -> threading.Event:
     return let_go
 
 
-def test_nothing_is_seen_before_it_is_on_the_disk(mapped: Catalog) -> None:
+def test_nothing_is_seen_before_it_is_on_the_disk_and_stages_make_up_the_total(mapped: Catalog) -> None:
     async def body(live: Live) -> None:
-        session_id = await begun(live)
+        session_id = await live.begin()
         before = await live.sessions.mass(session_id)
-        let_go = hold_commits(live)
-        posted = asyncio.create_task(live.sessions.observe(session_id, ranked(1)))
-        await asyncio.sleep(0.1)
+        let_go, watch = hold_commits(live), Stopwatch()
+        posted = asyncio.create_task(live.sessions.observe(session_id, ranked(1), watch))
+        while "plan" not in watch.timings_ms():
+            assert not posted.done()
+            await asyncio.sleep(0.001)
+        began = perf_counter()
+        await asyncio.sleep(0.05)
         assert not posted.done()
         assert (await live.sessions.view(session_id)).n_observations == 0
         np.testing.assert_array_equal(await live.sessions.mass(session_id), before)
+        held_ms = 1000 * (perf_counter() - began)
         let_go.set()
         assert (await posted).n_observations == 1
+        timings_ms = watch.timings_ms()
+        assert timings_ms["commit"] >= held_ms - 0.001
+        assert list(timings_ms) == STAGES
+        assert min(timings_ms.values()) >= 0
+        total_ms = timings_ms.pop("total")
+        assert 0 < sum(timings_ms.values()) <= total_ms + 0.001 * len(STAGES)  # each is rounded
 
     run(mapped, body)
 
 
 def test_an_asker_that_goes_away_changes_nothing(mapped: Catalog) -> None:
     async def body(live: Live) -> str:
-        session_id = await begun(live)
+        session_id = await live.begin()
         let_go = hold_commits(live)
         posted = asyncio.create_task(live.sessions.observe(session_id, ranked(1, key="k")))
         await asyncio.sleep(0.05)
@@ -196,8 +197,10 @@ def test_an_asker_that_goes_away_changes_nothing(mapped: Catalog) -> None:
         with pytest.raises(asyncio.CancelledError):
             await posted
         let_go.set()
-        again = await live.sessions.observe(session_id, ranked(1, key="k"))
+        watch = Stopwatch()
+        again = await live.sessions.observe(session_id, ranked(1, key="k"), watch)
         assert again.is_repeated
+        assert list(watch.timings_ms()) == ["wait", "decode", "summarise", "total"]
         assert again.n_observations == 1
         assert (await live.sessions.observe(session_id, ranked(2))).n_observations == 2
         return session_id
@@ -208,14 +211,14 @@ def test_an_asker_that_goes_away_changes_nothing(mapped: Catalog) -> None:
 
 def test_what_cannot_be_written_leaves_the_session_as_it_was(mapped: Catalog) -> None:
     async def body(live: Live) -> None:
-        failed, fine = await begun(live), await begun(live)
+        failed, fine = await live.begin(), await live.begin()
         await live.sessions.observe(failed, ranked(1))
         before = await live.sessions.mass(failed)
         live.store._commits.submit(lambda db: db.execute("PRAGMA query_only = ON")).result()
         with pytest.raises(UnavailableError, match=r"sessions\.sqlite"):
             await live.sessions.observe(failed, ranked(2))
         with pytest.raises(UnavailableError):
-            await begun(live)
+            await live.begin()
         np.testing.assert_array_equal(await live.sessions.mass(failed), before)
         live.store._writing.execute("PRAGMA query_only = OFF")
         for seed in (1, 2, 3):
@@ -230,12 +233,11 @@ def test_what_cannot_be_written_leaves_the_session_as_it_was(mapped: Catalog) ->
 
 def test_the_sessions_of_a_deleted_domain_end_though_robots_end_some_meanwhile(mapped: Catalog) -> None:
     async def body(live: Live) -> None:
-        sessions = [await begun(live) for _ in range(6)]
-        await live.sessions.end_those(of_domain("other"))
+        sessions = [await live.begin() for _ in range(6)]
+        await live.sessions.end_those(lambda session: session.domain == "other")
         assert live.sessions.n_living == 6
-        await asyncio.gather(
-            *(live.sessions.end(one) for one in sessions[::2]), live.sessions.end_those(of_domain("d"))
-        )
+        all_over = live.sessions.end_those(lambda session: session.domain == "d")
+        await asyncio.gather(*(live.sessions.end(session_id) for session_id in sessions[::2]), all_over)
         for session_id in sessions:
             with pytest.raises(EndedSessionError):
                 await live.sessions.observe(session_id, ranked(1))
@@ -249,7 +251,7 @@ def test_a_repeated_observation_counts_once_and_has_its_own_answer(mapped: Catal
 
     async def first(live: Live) -> None:
         nonlocal session_id
-        session_id = await begun(live)
+        session_id = await live.begin()
         answers.extend([await live.sessions.observe(session_id, ranked(seed, key=f"k{seed}")) for seed in range(7)])
         await check(live)
 
@@ -272,10 +274,10 @@ def test_a_repeated_observation_counts_once_and_has_its_own_answer(mapped: Catal
     async def twins(live: Live) -> list[Any]:
         return await asyncio.gather(*(live.sessions.observe(session_id, ranked(8, key="twin")) for _ in range(5)))
 
-    found = run(mapped, twins)
-    assert [one.is_repeated for one in found] == [False, True, True, True, True]
-    assert {one.n_observations for one in found} == {8}
-    assert len({one.belief.mean_m for one in found}) == 1
+    answered = run(mapped, twins)
+    assert [view.is_repeated for view in answered] == [False, True, True, True, True]
+    assert {view.n_observations for view in answered} == {8}
+    assert len({view.belief.mean_m for view in answered}) == 1
 
 
 def test_a_live_view_goes_before_the_replay_of_an_old_observation(
@@ -285,7 +287,7 @@ def test_a_live_view_goes_before_the_replay_of_an_old_observation(
     monkeypatch.setattr(session_module, "_PIECE_S", 0.0)
 
     async def body(live: Live) -> None:
-        sessions = [await begun(live) for _ in range(2)]
+        sessions = [await live.begin() for _ in range(2)]
         for session_id in sessions:
             for seed in range(3):
                 await live.sessions.observe(session_id, ranked(seed, key=f"k{seed}"))
@@ -309,18 +311,16 @@ def test_a_live_view_goes_before_the_replay_of_an_old_observation(
         live.worker.look = noting  # type: ignore[method-assign]
         await live.sessions.observe(sessions[0], ranked(2, key="k2"))
         assert order == ["LIVE"]
-        await asyncio.gather(*(live.sessions.observe(one, ranked(1, key="k1")) for one in sessions))
+        await asyncio.gather(*(live.sessions.observe(session_id, ranked(1, key="k1")) for session_id in sessions))
         # Each is looked up; then its start and its two rows are a piece each.
         assert sorted(order[1:]) == ["BATCH"] * 6 + ["LIVE"] * 2
 
     run(mapped, body)
 
 
-def test_a_session_expires_when_nothing_happens(mapped: Catalog) -> None:
-    clock = Clock()
-
+def test_a_session_expires_when_nothing_happens(mapped: Catalog, clock: Clock) -> None:
     async def body(live: Live) -> tuple[str, str]:
-        idle, busy = await begun(live), await begun(live)
+        idle, busy = await live.begin(), await live.begin()
         clock.now += TTL_S - 1
         await live.sessions.observe(busy, ranked(1))
         await live.sessions.view(idle)  # looking is not happening
@@ -355,7 +355,7 @@ def test_a_session_expires_when_nothing_happens(mapped: Catalog) -> None:
 
 def test_a_deleted_session_is_gone_even_for_who_waited(mapped: Catalog) -> None:
     async def body(live: Live) -> None:
-        session_id = await begun(live)
+        session_id = await live.begin()
         let_go = hold_commits(live)
         ending = asyncio.create_task(live.sessions.end(session_id))
         await asyncio.sleep(0.05)
@@ -373,21 +373,19 @@ def test_a_deleted_session_is_gone_even_for_who_waited(mapped: Catalog) -> None:
     run(mapped, body)
 
 
-def test_only_so_many_live_at_once(mapped: Catalog) -> None:
-    clock = Clock()
-
+def test_only_so_many_live_at_once(mapped: Catalog, clock: Clock) -> None:
     async def body(live: Live) -> None:
-        found = await asyncio.gather(*(begun(live) for _ in range(6)), return_exceptions=True)
-        refused = [one for one in found if isinstance(one, TooManySessionsError)]
-        ids = [one for one in found if isinstance(one, str)]
+        answers = await asyncio.gather(*(live.begin() for _ in range(6)), return_exceptions=True)
+        refused = [answer for answer in answers if isinstance(answer, TooManySessionsError)]
+        ids = [answer for answer in answers if isinstance(answer, str)]
         assert (len(ids), len(refused)) == (4, 2)
         assert 1 <= refused[0].hints["retry_after_s"] <= 60
         await live.sessions.end(ids[0])
-        await begun(live)
+        await live.begin()
         with pytest.raises(TooManySessionsError):
-            await begun(live)
+            await live.begin()
         clock.now += TTL_S + 1
-        await begun(live)  # the expired ones made room
+        await live.begin()  # the expired ones made room
         assert live.sessions.n_living == 1
 
     run(mapped, body, clock, max_sessions=4)
@@ -398,12 +396,12 @@ def test_a_session_keeps_the_map_it_began_on(mapped: Catalog) -> None:
 
     async def body(live: Live) -> None:
         nonlocal first
-        first = await begun(live)
+        first = await live.begin()
         await live.sessions.observe(first, ranked(1))
-        mapped.activate("d", add_map(mapped, "d"), ANY)
+        add_map(mapped)
         live.maps.refresh("d")
         assert (await live.sessions.observe(first, ranked(2))).snapshot.version == 1
-        second = await begun(live)
+        second = await live.begin()
         assert (await live.sessions.view(second)).snapshot.version == 2
 
     run(mapped, body)
@@ -414,19 +412,19 @@ def test_a_session_keeps_the_map_it_began_on(mapped: Catalog) -> None:
 
 
 def test_a_domain_made_anew_has_other_maps(mapped: Catalog) -> None:
-    session_id = run(mapped, begun)
+    session_id = run(mapped, lambda live: live.begin())
     mapped.delete_domain("d")
     with pytest.raises(RetiredMapError):
         run(mapped, lambda live: live.sessions.view(session_id))
     add_domain(mapped, "d")
-    mapped.activate("d", add_map(mapped, "d", Relevance.RRF), ANY)
+    add_map(mapped, contents=map_contents(relevance=Relevance.RRF))
     with pytest.raises(RetiredMapError):
         run(mapped, lambda live: live.sessions.view(session_id))
 
 
 def test_a_prior_replaces_the_belief(mapped: Catalog) -> None:
     async def body(live: Live) -> None:
-        session_id = await begun(live, start_position_m=6.0, start_std_m=0.2)
+        session_id = await live.begin(start_position_m=6.0, start_std_m=0.2)
         for beyond_m in (-4.0, 47.0):
             with pytest.raises(InvalidPriorError):
                 await live.sessions.set_prior(session_id, beyond_m, 1.0)
@@ -441,18 +439,18 @@ def test_a_prior_replaces_the_belief(mapped: Catalog) -> None:
 def test_a_configuration_that_cannot_be_takes_no_room(mapped: Catalog) -> None:
     async def body(live: Live) -> None:
         with pytest.raises(InvalidInputError):
-            await begun(live, planner="clever")
+            await live.begin(planner="clever")
         assert live.sessions.n_living == 0
 
     run(mapped, body, max_sessions=1)
-    run(mapped, begun, max_sessions=1)
+    run(mapped, lambda live: live.begin(), max_sessions=1)
 
 
 def test_a_killed_service_loses_nothing(mapped: Catalog, tmp_path: Path) -> None:
     """The files as they are at that moment, without any closing, are enough."""
 
     async def body(live: Live) -> tuple[str, Masses, dict[str, bytes]]:
-        session_id = await begun(live)
+        session_id = await live.begin()
         for seed in range(9):
             await live.sessions.observe(session_id, ranked(seed))
         files = {path.name: path.read_bytes() for path in tmp_path.glob("sessions.sqlite*")}

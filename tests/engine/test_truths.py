@@ -11,35 +11,26 @@ from numpy.typing import NDArray
 from deepsimbad.core.belief import FilterKind
 from deepsimbad.core.route import Route
 from deepsimbad.engine import session as session_module
-from deepsimbad.engine.session import Observation, SessionConfig
-from deepsimbad.engine.truths import RankedTruths, Truths, true_images
+from deepsimbad.engine.session import Observation
+from deepsimbad.engine.truths import Truths, true_images
 from deepsimbad.engine.worker import Priority
-from deepsimbad.errors import InvalidInputError, RetiredMapError, UnknownSessionError
+from deepsimbad.errors import UnknownSessionError
 from deepsimbad.store.catalog import Catalog
 
-from .conftest import add_domain, add_map
-from .live_service import KEEP_ENDED_S, Clock, Live, encoded, ranked, run
+from .conftest import KEEP_ENDED_S, Clock, Live, add_domain, add_map, encoded, map_contents, ranked, run
 
 NAN = math.nan
 
 
-@pytest.fixture(params=[False, True], ids=["open", "closed"])
-def mapped(request: pytest.FixtureRequest, catalog: Catalog) -> Catalog:
-    add_domain(catalog, "d", closed=request.param)
-    catalog.activate("d", add_map(catalog, "d", closed=request.param), None)
-    return catalog
-
-
-def truths_of(live: Live, clock: Clock | None = None) -> Truths:
-    return Truths(live.store, live.worker, live.sessions, clock or Clock())
+def truths_of(live: Live) -> Truths:
+    return Truths(live.store, live.worker, live.sessions, Clock())
 
 
 async def driven(
     live: Live, observations: Sequence[Observation], priors: Sequence[int] = (), **config: object
 ) -> tuple[str, list[NDArray[np.float64]]]:
     """A session, and its belief as it was answered after every observation."""
-    active = live.maps.active("d")
-    session_id = (await live.sessions.begin(active, SessionConfig(**config))).session_id  # type: ignore[arg-type]
+    session_id = await live.begin(**config)
     masses = []
     for number, observation in enumerate(observations):
         if number in priors:
@@ -57,9 +48,14 @@ def slow_share(mass: NDArray[np.float64], route: Route, position_m: float) -> fl
     return float((better + 0.5 * tied) / route.n_images)
 
 
+@pytest.mark.parametrize("closed", [False, True])
 @pytest.mark.parametrize("belief", list(FilterKind))
-@pytest.mark.parametrize("n_views", [1, 7, 70])  # 70: more than one read of the journal
-def test_every_truth_is_ranked_in_the_belief_of_its_time(mapped: Catalog, belief: FilterKind, n_views: int) -> None:
+@pytest.mark.parametrize("n_views", [1, 70])  # 70: more than one read of the journal
+def test_every_truth_is_ranked_in_the_belief_of_its_time(
+    catalog: Catalog, closed: bool, belief: FilterKind, n_views: int
+) -> None:
+    add_domain(catalog, "d", closed)
+    add_map(catalog, contents=map_contents(closed=closed))
     views = [ranked(seed, 0.5) if seed % 2 else encoded(seed, 0.4) for seed in range(n_views)]
 
     async def body(live: Live) -> None:
@@ -68,89 +64,55 @@ def test_every_truth_is_ranked_in_the_belief_of_its_time(mapped: Catalog, belief
         positions_m: list[float | None] = [0.41 + 0.6 * number for number in range(n_views)]
         if n_views > 3:
             positions_m[2] = None
-        found = await truths_of(live).rank(session_id, positions_m)
+        truths = await truths_of(live).rank(session_id, positions_m)
         expected = [
             NAN if position_m is None else slow_share(mass, route, position_m)
             for mass, position_m in zip(masses, positions_m, strict=True)
         ]
-        np.testing.assert_allclose(found.rank_share, expected, atol=1e-12)
-        assert (found.domain, found.map_version) == ("d", 1)
-        assert found.n_left_out == positions_m.count(None)
-        assert found.n_scored + found.n_left_out == n_views
-        assert found.anr == pytest.approx(100 * np.nanmean(expected))
+        np.testing.assert_allclose(truths.rank_share, expected, atol=1e-12)
+        assert (truths.session.domain, truths.session.map_version) == ("d", 1)
+        assert truths.n_left_out == positions_m.count(None)
+        assert truths.n_scored + truths.n_left_out == n_views
+        assert truths.anr == pytest.approx(100 * np.nanmean(expected))
 
-    run(mapped, body, max_sessions=2)
+    run(catalog, body, max_sessions=2)
 
 
 def test_truths_are_kept_and_what_was_told_before_is_answered(mapped: Catalog) -> None:
     async def body(live: Live) -> None:
         truths = truths_of(live)
         session_id, _ = await driven(live, [ranked(seed, 0.5) for seed in range(4)])
-        ranked_truths, before = await truths.keep(session_id, [1.0, None, 2.0, None])
+        first, before = await truths.keep(session_id, [1.0, None, 2.0, None])
         assert before is None
-        assert ranked_truths.new_since(before).size == 2
+        assert first.new_since(before).size == 2
         again, before = await truths.keep(session_id, [1.0, None, 2.0, None])
-        assert before is not None
         assert again.new_since(before).size == 0
         await live.sessions.observe(session_id, ranked(9, 0.5))
         more, before = await truths.keep(session_id, [1.0, 1.5, 2.0, None, 3.0])
         np.testing.assert_array_equal(more.new_since(before), more.rank_share[[1, 4]])
-        kept = live.store.true_positions(live.store.find(session_id).number)
-        np.testing.assert_array_equal(kept, [1.0, 1.5, 2.0, NAN, 3.0])
-        none, _ = await truths.keep(session_id, [None] * 5)
-        assert (none.n_scored, none.n_left_out, none.anr) == (0, 5, None)
+        unknown, _ = await truths.keep(session_id, [None] * 5)
+        assert (unknown.n_scored, unknown.n_left_out, unknown.anr) == (0, 5, None)
         await truths.keep(session_id, [None, 1.25, None, None, None])
-        kept = live.store.true_positions(live.store.find(session_id).number)
-        np.testing.assert_array_equal(kept, [1.0, 1.25, 2.0, NAN, 3.0])
+        stored = live.store.true_positions(live.store.find(session_id).number)
+        np.testing.assert_array_equal(stored, [1.0, 1.25, 2.0, NAN, 3.0])
 
     run(mapped, body)
 
 
-def test_an_ended_session_may_be_told_of_until_it_is_forgotten(mapped: Catalog) -> None:
-    clock = Clock()
-
+def test_an_ended_session_may_be_told_of_until_it_is_forgotten(mapped: Catalog, clock: Clock) -> None:
     async def body(live: Live) -> None:
         session_id, masses = await driven(live, [ranked(1), ranked(2)])
         await live.sessions.end(session_id)
         route = live.maps.active("d").snapshot.route
-        found = await truths_of(live).rank(session_id, [3.0, 4.6])
+        truths = await truths_of(live).rank(session_id, [3.0, 4.6])
         expected = [slow_share(mass, route, at) for mass, at in zip(masses, (3.0, 4.6), strict=True)]
-        np.testing.assert_allclose(found.rank_share, expected)
+        np.testing.assert_allclose(truths.rank_share, expected)
         clock.now += KEEP_ENDED_S + 1
         await live.sessions.sweep()
         with pytest.raises(UnknownSessionError):
             await truths_of(live).rank(session_id, [3.0, 4.6])
 
     run(mapped, body, clock)
-
-
-@pytest.mark.parametrize("positions_m", [[], [1.0], [1.0] * 3, [1.0, NAN], [math.inf, 1.0]])
-def test_truths_that_cannot_be(mapped: Catalog, positions_m: list[float]) -> None:
-    async def body(live: Live) -> None:
-        session_id, _ = await driven(live, [ranked(1), ranked(2)])
-        truths = truths_of(live)
-        with pytest.raises(InvalidInputError):
-            await truths.keep(session_id, positions_m)
-        assert live.store.true_positions(live.store.find(session_id).number) is None
-        with pytest.raises(UnknownSessionError):
-            await truths.rank("nobody", positions_m)
-
-    run(mapped, body)
-
-
-def test_a_session_whose_map_is_no_more_cannot_be_replayed(mapped: Catalog) -> None:
-    async def begin(live: Live) -> str:
-        return (await driven(live, [ranked(1)]))[0]
-
-    session_id = run(mapped, begin)
-    mapped.activate("d", add_map(mapped, "d"), 1)
-    mapped.map_path("d", 1).unlink()
-
-    async def body(live: Live) -> None:
-        with pytest.raises(RetiredMapError):
-            await truths_of(live).rank(session_id, [1.0])
-
-    run(mapped, body)
 
 
 def test_a_live_view_goes_before_the_rest_of_a_replay(mapped: Catalog, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -179,24 +141,15 @@ def test_a_live_view_goes_before_the_rest_of_a_replay(mapped: Catalog, monkeypat
 
 
 def test_a_truth_on_a_closed_route_may_be_any_number_of_rounds_on() -> None:
-    route = Route(np.arange(4.0), closed=True)
     around = np.array([0.2, 4.2, 8.2, -3.8, 3.8, NAN])
-    assert true_images(route, around).tolist() == [0, 0, 0, 0, 0, 0]
+    assert true_images(Route(np.arange(4.0), closed=True), around).tolist() == [0, 0, 0, 0, 0, 0]
     assert true_images(Route(np.arange(4.0)), np.array([-9.0, 1.4, 77.0])).tolist() == [0, 1, 3]
-
-
-def test_shares_told_before_are_told_apart_by_place() -> None:
-    ranked_truths = RankedTruths("d", 1, np.array([1.0, NAN, 3.0]), np.array([0.1, NAN, 0.3]))
-    assert ranked_truths.new_since(None).tolist() == [0.1, 0.3]
-    assert ranked_truths.new_since(np.array([5.0])).tolist() == [0.3]
-    assert ranked_truths.new_since(np.array([NAN, 2.0, NAN, 4.0])).tolist() == [0.1, 0.3]
 
 
 def test_truths_told_bit_by_bit_follow_a_session_once(mapped: Catalog, monkeypatch: pytest.MonkeyPatch) -> None:
     async def body(live: Live) -> None:
         session_id, _ = await driven(live, [ranked(seed, 0.1) for seed in range(6)])
-        truths = truths_of(live)
-        whole = await truths.rank(session_id, [1.0] * 6)
+        whole = await truths_of(live).rank(session_id, [1.0] * 6)
         journal_part, begun_after = live.store.journal_part, []
 
         def noting(number: int, after: int, until: int) -> object:

@@ -17,13 +17,12 @@ from deepsimbad.api.metrics import Metrics, WatchedState
 from deepsimbad.api.openapi import install_openapi
 from deepsimbad.api.problems import install_problem_handlers
 from deepsimbad.api.requests import Decoders, Services, Slots
-from deepsimbad.engine.encoders import EvaluatorPool
+from deepsimbad.engine.localizer import warm_up
 from deepsimbad.engine.maps import Maps, Retention
 from deepsimbad.engine.sessions import Sessions
 from deepsimbad.engine.traverses import OpenTraverses
 from deepsimbad.engine.truths import Truths
-from deepsimbad.engine.warm_up import warm_up
-from deepsimbad.engine.worker import InferenceWorker
+from deepsimbad.engine.worker import EvaluatorPool, InferenceWorker
 from deepsimbad.errors import DeepSimbadError, UnavailableError
 from deepsimbad.evaluators.registry import fallback
 from deepsimbad.jobs.runner import InAnotherProcess, JobRunner, RunJob, job_threads
@@ -205,7 +204,7 @@ def _start(settings: Settings, metrics: Metrics, keys: KeyRing, run_job: RunJob,
     else:
         log.info("asks for keys", extra=exposure)
     counts = {"n_domains": len(catalog.domains()), "n_maps": maps_.n_loaded, "n_sessions": live.n_living}
-    log.info("opened", extra={**counts, "damaged": list(damaged)})
+    log.info("opened", extra={**counts, "damaged": damaged})
     return Services(
         settings=settings,
         metrics=metrics,

@@ -21,8 +21,8 @@ from deepsimbad.api.requests import (
     names,
     read_json,
 )
-from deepsimbad.engine.encoders import EvaluatorPool, ready
 from deepsimbad.engine.maps import Maps
+from deepsimbad.engine.worker import EvaluatorPool, ready
 from deepsimbad.errors import NoActiveMapError, UnavailableError, UnknownDomainError
 from deepsimbad.evaluators.registry import EXTRACTOR_PATTERN, EvaluatorConfig, EvaluatorKind, evaluator_config
 from deepsimbad.store.records import DomainRecord

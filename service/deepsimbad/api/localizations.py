@@ -29,16 +29,20 @@ from deepsimbad.api.requests import (
 from deepsimbad.core.belief import BeliefSummary
 from deepsimbad.core.planners import Plan
 from deepsimbad.core.route import Route
-from deepsimbad.engine.localizer import Localization, Retrieval, localize, retrieve, shortlist_length
-from deepsimbad.engine.views import (
+from deepsimbad.engine.localizer import (
     Dissimilarities,
+    Localization,
     NothingSeen,
     PackedRanks,
     RankedLandmarks,
     ReadyEncoding,
     View,
+    describe,
+    localize,
+    retrieve,
+    shortlist_length,
 )
-from deepsimbad.engine.worker import Priority, Stopwatch
+from deepsimbad.engine.worker import EncodedImage, Priority, Stopwatch
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.image import MEDIA_TYPES
 
@@ -198,7 +202,7 @@ def render_localization(localization: Localization, watch: Stopwatch) -> Localiz
     """
     snapshot = localization.snapshot
     belief = render_belief(snapshot.route, localization.belief)
-    retrieval = render_shortlist(snapshot.route, localization.shortlist, localization.retrieval.relevance)
+    retrieval = render_shortlist(snapshot.route, localization.shortlist, localization.relevance)
     return {
         "map_version": snapshot.version,
         "timings_ms": watch.timings_ms(),
@@ -293,19 +297,17 @@ async def post_localization(
     view = await view_in(body, running, media_type, evaluator)
     if prefers_binary(request):
 
-        def compare(view: View) -> Retrieval:
+        def compare(view: View) -> NDArray[np.float32]:
             snapshot.check_landmark_model(landmark_models)
-            return retrieve(snapshot, evaluator, view)
+            return retrieve(snapshot, describe(snapshot, evaluator, view))
 
-        return npy_response((await running.look(evaluator, view, compare)).relevance)
+        return npy_response(await running.look(evaluator, view, compare))
     watch.lap("decode")
 
     def look(view: View) -> Localization:
-        watch.lap("wait", view)
+        watch.lap("wait", {"encode": view.encode_ms} if isinstance(view, EncodedImage) else None)
         snapshot.check_landmark_model(landmark_models)
-        localization = localize(snapshot, evaluator, view, shortlist)
-        watch.take(localization.timings_ms)
-        return localization
+        return localize(snapshot, evaluator, view, shortlist, watch)
 
     localization = await running.look(evaluator, view, look)
     answer, body = await running.written(localization.belief.top.size, render_localization, localization, watch)

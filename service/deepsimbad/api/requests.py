@@ -22,13 +22,12 @@ from pydantic_core import to_json
 from deepsimbad.api.keys import KeyRing
 from deepsimbad.api.metrics import Metrics
 from deepsimbad.api.problems import InvalidRequestError, invalid_request
-from deepsimbad.engine.encoders import EvaluatorPool, ready
+from deepsimbad.engine.localizer import View
 from deepsimbad.engine.maps import MappedDomain, Maps, Retention
 from deepsimbad.engine.sessions import Sessions
 from deepsimbad.engine.traverses import OpenTraverses
 from deepsimbad.engine.truths import Truths
-from deepsimbad.engine.views import View
-from deepsimbad.engine.worker import InferenceWorker, Priority
+from deepsimbad.engine.worker import EvaluatorPool, InferenceWorker, Priority, ready
 from deepsimbad.errors import EmptyBodyError, OverloadedError, UnsupportedMediaTypeError
 from deepsimbad.evaluators.base import Evaluator, Image
 from deepsimbad.evaluators.image import KEPT_PIXELS, ImageFile, is_blank

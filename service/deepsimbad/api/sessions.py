@@ -407,7 +407,7 @@ async def post_truths(session_id: SessionId, request: Request, running: Running)
     ranked, before_m = await running.truths.keep(
         session_id, body.true_positions_m, body.true_map_images, body.first_observation, robot_of(request)
     )
-    await run_sync(running.metrics.fed_back, ranked.domain, ranked.new_since(before_m).tolist())
+    await run_sync(running.metrics.fed_back, ranked.session.domain, ranked.new_since(before_m).tolist())
     ranks = ranked.retrieval_rank
     return TruthsAnswer(
         n_scored=ranked.n_scored,
@@ -416,7 +416,7 @@ async def post_truths(session_id: SessionId, request: Request, running: Running)
         retrieval_ranks=None
         if ranks is None
         else [None if math.isnan(rank) else rank for rank in ranks[ranked.first :]],
-        map_version=ranked.map_version,
+        map_version=ranked.session.map_version,
     )
 
 

@@ -39,9 +39,8 @@ from deepsimbad.api.requests import (
     read_json,
 )
 from deepsimbad.core.drive import MAX_POSITION_M, UNKNOWN_TIMESTAMP, Drive
-from deepsimbad.engine.encoders import ready_encodings
-from deepsimbad.engine.views import EncodedImage, View
-from deepsimbad.engine.worker import Priority
+from deepsimbad.engine.localizer import View, ready_encodings
+from deepsimbad.engine.worker import EncodedImage, Priority
 from deepsimbad.errors import (
     ConflictError,
     DeepSimbadError,

@@ -20,10 +20,9 @@ from deepsimbad.cli.options import (
 from deepsimbad.cli.terminal import print_table, progress_bar, write_json
 from deepsimbad.core.drive import Drive
 from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Relevance
-from deepsimbad.engine.encoders import EvaluatorPool
 from deepsimbad.engine.localizer import localize as localize_view
 from deepsimbad.engine.maps import Maps
-from deepsimbad.engine.worker import Stopwatch
+from deepsimbad.engine.worker import EvaluatorPool, Stopwatch
 from deepsimbad.errors import ImageTooLargeError, InvalidImageError, InvalidSourceError, TooFewCandidatesError
 from deepsimbad.evaluators.compute import available_cores
 from deepsimbad.evaluators.image import decode_image
@@ -143,8 +142,7 @@ def localize(domain: str, images: tuple[Path, ...], as_json: bool, data_dir: Pat
             except (InvalidImageError, ImageTooLargeError) as error:
                 raise type(error)(f"{path}: {error.message}", **error.hints) from error
             watch.lap("decode")
-            localization = localize_view(active.snapshot, evaluator, view)
-            watch.take(localization.timings_ms)
+            localization = localize_view(active.snapshot, evaluator, view, watch=watch)
             answers.append(render_localization(localization, watch))
     if as_json:
         write_json([{"image": str(path), **answer} for path, answer in zip(images, answers, strict=True)])

@@ -1,8 +1,7 @@
 """Where a single view places the robot: describe, retrieve, believe (II-C)."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from time import perf_counter
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,23 +14,58 @@ from deepsimbad.core.off_route import OFF_ROUTE_AT_START
 from deepsimbad.core.planners import Plan
 from deepsimbad.core.relevance import Query
 from deepsimbad.core.retrieval import relevances, shortlist
-from deepsimbad.engine.encoders import encode_images, ready_encodings
-from deepsimbad.engine.views import Dissimilarities, EncodedImage, NothingSeen, PackedRanks, RankedLandmarks, View
-from deepsimbad.errors import InvalidDissimilaritiesError, InvalidInputError, WeightsDifferError
-from deepsimbad.evaluators.base import Evaluator
+from deepsimbad.engine.worker import EncodedImage, Stopwatch, encode_images
+from deepsimbad.errors import (
+    InvalidDissimilaritiesError,
+    InvalidEncodingError,
+    InvalidInputError,
+    WeightsDifferError,
+)
+from deepsimbad.evaluators.base import Evaluator, Image
+from deepsimbad.evaluators.feature_l2 import FeatureL2
 from deepsimbad.evaluators.image import is_blank
 
 DEFAULT_SHORTLIST = 10
 _LARGEST_DISSIMILARITY = 1e15
 
+# The forms in which a view reaches the engine
+
 
 @dataclass(frozen=True)
-class Retrieval:
-    """How well every map image answers one view."""
+class RankedLandmarks:
+    """Landmark ids, nearest first, from a robot that encodes on board: the descriptor itself."""
 
-    ranks: NDArray[np.float32]  # [r] float32, 1..r, the landmarks of the view
-    relevance: NDArray[np.float32]  # [n] float32, larger is better
-    timings_ms: Mapping[str, float]  # milliseconds by stage
+    landmark_ids: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class PackedRanks:
+    """Ranked landmarks as `core.descriptor.pack_ranked_landmarks` makes them; how many bits an id has the map tells."""
+
+    body: bytes
+
+
+@dataclass(frozen=True)
+class Dissimilarities:
+    """Dissimilarities to all landmarks: [r] float64 in landmark order, smaller is nearer."""
+
+    values: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ReadyEncoding:
+    """An encoding that was computed elsewhere: [d] float64 as it was sent."""
+
+    values: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class NothingSeen:
+    """An image that shows nothing: one grey wall, the dark."""
+
+
+View: TypeAlias = NothingSeen | Image | EncodedImage | ReadyEncoding | Dissimilarities | RankedLandmarks | PackedRanks
+"""One observation: an image [height, width, 3] uint8 BGR, or what was made of one here or on board."""
 
 
 @dataclass(frozen=True)
@@ -39,57 +73,48 @@ class Localization:
     """The answer to one view."""
 
     snapshot: Map  # the map that answered
-    retrieval: Retrieval  # of all map images
+    relevance: NDArray[np.float32]  # [n] of every map image, larger is better
     shortlist: NDArray[np.int64]  # ids of the most relevant ones, best first
     belief: BeliefSummary  # after this one view, from a uniform prior
     plan: Plan | None  # the move that would tell most next; None where the map can name none
-    timings_ms: Mapping[str, float]  # milliseconds by stage
 
 
-def localize(snapshot: Map, evaluator: Evaluator, view: View, n_shortlist: int | None = None) -> Localization:
+def localize(
+    snapshot: Map, evaluator: Evaluator, view: View, n_shortlist: int | None = None, watch: Stopwatch | None = None
+) -> Localization:
     """Localize one view on its own.
 
     Args:
         n_shortlist: Length of the shortlist and of the belief's top, 1..n; None: 10, or n where that is less.
+        watch: Told of every stage.
 
     Raises:
         InvalidInputError: The view or `n_shortlist` cannot be used with this map.
     """
+    watch = watch or Stopwatch()
     length = shortlist_length(snapshot, n_shortlist)
-    retrieval = retrieve(snapshot, evaluator, view)
-    began = perf_counter()
-    best = shortlist(retrieval.relevance, length)
-    listed = perf_counter()
-    belief = GridFilter.uniform(snapshot.route).updated(retrieval.relevance, snapshot.update_rule, step=0)
+    query = describe(snapshot, evaluator, view)
+    watch.lap("describe")
+    relevance = retrieve(snapshot, query)
+    watch.lap("retrieve")
+    best = shortlist(relevance, length)
+    watch.lap("shortlist")
+    belief = GridFilter.uniform(snapshot.route).updated(relevance, snapshot.update_rule, step=0)
     # One view from a belief that expects nothing says nothing about being off the route.
     off_route = None if snapshot.off_route_model is None else OFF_ROUTE_AT_START
     summary = summarise(snapshot.route, belief.mass, length, off_route)
-    believed = perf_counter()
+    watch.lap("belief")
     plan = None
     if snapshot.bits_ahead is not None or snapshot.q_values is not None:
-        seen = LocalizerState(belief, None, retrieval.relevance, off_route, 1)
+        seen = LocalizerState(belief, None, relevance, off_route, 1)
         plan = ActiveLocalizer(snapshot, LocalizerConfig()).plan(seen)
-    planned = perf_counter()
-    timings_ms = {
-        **retrieval.timings_ms,
-        "shortlist": 1000 * (listed - began),
-        "belief": 1000 * (believed - listed),
-        "plan": 1000 * (planned - believed),
-    }
-    return Localization(snapshot, retrieval, best, summary, plan, timings_ms)
+    watch.lap("plan")
+    return Localization(snapshot, relevance, best, summary, plan)
 
 
-def retrieve(snapshot: Map, evaluator: Evaluator, view: View) -> Retrieval:
-    """The relevance of every map image to one view, by the map's statistics alone."""
-    began = perf_counter()
-    query = describe(snapshot, evaluator, view)
-    described = perf_counter()
-    relevance = np.zeros(snapshot.n_images, np.float32)
-    if query.is_informative:
-        relevance = relevances(snapshot, query)
-    retrieved = perf_counter()
-    timings_ms = {"describe": 1000 * (described - began), "retrieve": 1000 * (retrieved - described)}
-    return Retrieval(query.ranks, relevance, timings_ms)
+def retrieve(snapshot: Map, query: Query) -> NDArray[np.float32]:
+    """[n] relevance of every map image to one view, by the map's statistics alone; 0 where the view shows nothing."""
+    return relevances(snapshot, query) if query.is_informative else np.zeros(snapshot.n_images, np.float32)
 
 
 def describe(snapshot: Map, evaluator: Evaluator, view: View) -> Query:
@@ -99,24 +124,25 @@ def describe(snapshot: Map, evaluator: Evaluator, view: View) -> Query:
         InvalidInputError: The view is not of this map.
         WeightsDifferError: The map's images were encoded by other weights than the view.
     """
+    n_landmarks = snapshot.n_landmarks
     if isinstance(view, RankedLandmarks):
-        return Query(ranks_from_ranked_landmarks(view.landmark_ids, snapshot.n_landmarks))
+        return Query(ranks_from_ranked_landmarks(view.landmark_ids, n_landmarks))
     if isinstance(view, PackedRanks):
-        landmark_ids = unpack_ranked_landmarks(view.body, snapshot.n_landmarks)
-        return Query(ranks_from_ranked_landmarks(landmark_ids, snapshot.n_landmarks))
+        return Query(ranks_from_ranked_landmarks(unpack_ranked_landmarks(view.body, n_landmarks), n_landmarks))
     if isinstance(view, Dissimilarities):
-        if view.values.shape != (snapshot.n_landmarks,):
+        if view.values.shape != (n_landmarks,):
             raise InvalidDissimilaritiesError(
-                f"{view.values.size} dissimilarities; this map has {snapshot.n_landmarks} landmarks",
-                n_landmarks=snapshot.n_landmarks,
+                f"{view.values.size} dissimilarities; this map has {n_landmarks} landmarks", n_landmarks=n_landmarks
             )
         if np.ptp(view.values) == 0:
-            return Query.uninformative(snapshot.n_landmarks)
-        return Query(rank_landmarks(view.values), _as_float32(view.values))
+            return Query.uninformative(n_landmarks)
+        # Ranks are drawn from the full numbers; those that are compared by squares must stay finite.
+        within = np.clip(view.values, -_LARGEST_DISSIMILARITY, _LARGEST_DISSIMILARITY).astype(np.float32)
+        return Query(rank_landmarks(view.values), within)
     if isinstance(view, np.ndarray):
         view = NothingSeen() if is_blank(view) else encode_images(evaluator, [view])[0]
     if isinstance(view, NothingSeen):
-        return Query.uninformative(snapshot.n_landmarks)
+        return Query.uninformative(n_landmarks)
     if isinstance(view, EncodedImage):
         WeightsDifferError.check("the map", snapshot.weights_sha256, "the view", view.weights_sha256)
         encoding = view.values
@@ -124,6 +150,25 @@ def describe(snapshot: Map, evaluator: Evaluator, view: View) -> Query:
         encoding = ready_encodings(view.values[np.newaxis])[0]
     dissimilarities = evaluator.dissimilarities(encoding[None, :], snapshot.landmark_model)[0]
     return Query(rank_landmarks(dissimilarities), dissimilarities, encoding)
+
+
+def ready_encodings(values: NDArray[Any]) -> NDArray[np.float32]:
+    """Check encodings [n, d] that were computed elsewhere, of any one length d; float32, the same array if it was so.
+
+    Raises:
+        InvalidEncodingError: Empty, or NaN, infinity or too large a number somewhere.
+    """
+    if values.ndim != 2 or values.size == 0:
+        raise InvalidEncodingError(f"encodings are [n, d] and not empty, not {list(values.shape)}")
+    with np.errstate(over="ignore"):  # what overflows is refused below
+        encodings = np.ascontiguousarray(values, np.float32)
+    # In blocks, so that a large batch is not accompanied by as many booleans.
+    for first in range(0, len(encodings), 1024):
+        finite = np.isfinite(encodings[first : first + 1024]).all(axis=1)
+        if not finite.all():
+            row = first + int(np.flatnonzero(~finite)[0])
+            raise InvalidEncodingError(f"encoding {row} holds NaN, infinity or a number too large for float32", row=row)
+    return encodings
 
 
 def shortlist_length(snapshot: Map, wanted: int | None) -> int:
@@ -143,6 +188,16 @@ def shortlist_length(snapshot: Map, wanted: int | None) -> int:
     return wanted
 
 
-def _as_float32(values: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Ranks are already drawn from the full numbers; these are compared by squares, which must stay finite."""
-    return np.clip(values, -_LARGEST_DISSIMILARITY, _LARGEST_DISSIMILARITY).astype(np.float32)
+def warm_up() -> None:
+    """Answer one view on a map of two images and move on, which compiles the kernels: a matter of seconds, once."""
+    evaluator = FeatureL2("none")
+    map_ = Map(
+        config={"relevance": "rrf", "n_landmarks": 2},
+        lists=np.array([[0, 1]], np.uint16),
+        position_m=np.array([0.0, 1.0]),
+        actions_m=np.array([1.0]),
+        telling_bits=np.array([1, 2], np.float32),
+        landmark_model=evaluator.fit_landmarks(np.eye(2, dtype=np.float32)),
+    )
+    localize(map_, evaluator, ReadyEncoding(np.ones(2)))
+    GridFilter.uniform(map_.route).predicted(0.5, 0.1, step=1)

@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from itertools import groupby
 from weakref import WeakValueDictionary
 
 from deepsimbad.core.map import Map
@@ -43,13 +44,6 @@ class MappedDomain:
     snapshot: Map
 
 
-@dataclass(frozen=True)
-class _Damage:
-    version: int
-    error: DamagedMapError
-    noticed_at: float
-
-
 class Maps:
     """Map versions, loaded at first need and each once; usable from any thread.
 
@@ -66,7 +60,7 @@ class Maps:
         self._clock = clock
         self._active: dict[str, MappedDomain] = {}
         self._checked_at: dict[str, float] = {}
-        self._damaged: dict[str, _Damage] = {}
+        self._damaged: dict[str, tuple[int, DamagedMapError, float]] = {}  # version, why, and when that was noticed
         self._announced: dict[str, int] = {}
         # By domain, version and digest: a domain that was deleted and made anew has other maps.
         self._held: WeakValueDictionary[tuple[str, int, str | None], Map] = WeakValueDictionary()
@@ -88,11 +82,11 @@ class Maps:
     def damaged(self) -> dict[str, int]:
         """The active versions that cannot be loaded, by domain; each is tried again, which reads its file."""
         still_damaged = {}
-        for domain, damage in sorted(self._damaged.copy().items()):
+        for domain, (version, *_) in sorted(self._damaged.copy().items()):
             try:
                 self.refresh(domain)
             except UnavailableError as error:  # a disk that fails to read it now has not made it whole
-                still_damaged[domain] = int(error.hints.get("map_version", damage.version))
+                still_damaged[domain] = int(error.hints.get("map_version", version))
             except DeepSimbadError:  # deleted, or has no active map any more
                 self._damaged.pop(domain, None)
         return still_damaged
@@ -135,20 +129,20 @@ class Maps:
             self._damaged.pop(domain, None)
             self._announced.pop(domain, None)
 
-    def load_all(self) -> dict[str, DamagedMapError]:
-        """Load the active maps of all domains; answers what is damaged, by domain.
+    def load_all(self) -> list[str]:
+        """Load the active maps of all domains, and answer which domains' are damaged.
 
-        That is logged, and so is what could not be read; neither keeps the service from starting.
+        Those are logged, and so are those that could not be read; neither keeps the service from starting.
         """
-        damaged = {}
+        damaged = []
         for record in self._catalog.domains():
             if record.active_version is None:
                 continue
             self._announced[record.name] = record.active_version  # it served before, which is no news
             try:
                 self.refresh(record.name)
-            except DamagedMapError as error:
-                damaged[record.name] = error
+            except DamagedMapError:
+                damaged.append(record.name)
             except UnavailableError as error:
                 log.warning("an active map could not be read", extra={"domain": record.name, "why": error.message})
         return damaged
@@ -163,22 +157,21 @@ class Maps:
             raise NoActiveMapError(
                 f"domain {domain} has no active map: upload traverses and start a remap", domain=domain
             )
-        damage = self._damaged.get(domain)
-        is_same = damage is not None and damage.version == version
-        if damage is not None and is_same and self._clock() - damage.noticed_at < _DAMAGE_REMEMBERED_S:
-            raise DamagedMapError(damage.error.message, **damage.error.hints) from damage.error
+        if domain in self._damaged:
+            damaged_version, why, noticed_at = self._damaged[domain]
+            if damaged_version == version and self._clock() - noticed_at < _DAMAGE_REMEMBERED_S:
+                raise DamagedMapError(why.message, **why.hints) from why
         try:
-            return self._once(domain, version, self._catalog.map(domain, version).sha256)
+            return self._load(domain, version, self._catalog.map(domain, version).sha256)
         except DamagedMapError as error:
-            self._damaged[domain] = _Damage(version, error, self._clock())
+            self._damaged[domain] = version, error, self._clock()
             log.error("damaged map", extra={"domain": domain, "map_version": version}, exc_info=error)
             raise
 
-    def _once(self, domain: str, version: int, digest: str | None) -> Map:
+    def _load(self, domain: str, version: int, digest: str | None) -> Map:
         snapshot = self._held.get((domain, version, digest))
         if snapshot is None:
-            snapshot = load_snapshot(self._catalog, domain, version)
-            self._held[domain, version, digest] = snapshot
+            snapshot = self._held[domain, version, digest] = load_snapshot(self._catalog, domain, version)
         return snapshot
 
     def _announce(self, domain: str, version: int) -> None:
@@ -208,13 +201,11 @@ class Maps:
         finally:
             with self._counting:
                 self._n_beginning[version] -= 1
-                if not self._n_beginning[version]:
-                    del self._n_beginning[version]
 
     def is_beginning(self, domain: str, version: int) -> bool:
         """Whether a session is about to begin on a version. Waits for nobody who reads a file."""
         with self._counting:
-            return (domain, version) in self._n_beginning
+            return self._n_beginning[domain, version] > 0
 
     def digest(self, snapshot: Map) -> str:
         """The digest of a map that a session begins on, inside `beginning`; may read files.
@@ -243,7 +234,7 @@ class Maps:
             is_removed = its_map.state is not MapState.ACTIVE and not self._catalog.map_path(domain, version).exists()
             if its_map.sha256 != digest or (is_removed and (domain, version, digest) not in self._held):
                 raise retired(domain, version)
-            return MappedDomain(record, self._once(domain, version, digest))
+            return MappedDomain(record, self._load(domain, version, digest))
 
     def snapshot(self, domain: str, version: int) -> Map:
         """A sealed map version that need not serve, as a session may be pinned to one; may read files.
@@ -264,14 +255,9 @@ class Maps:
 class Retention:
     """Removes the files of old map versions; usable from any thread.
 
-    A domain keeps its newest retired versions to roll back to, and every version that a living session is pinned to. Of
-    versions that were sealed but never served it keeps as many; older ones that lost to the version that serves go too.
-
-    Args:
-        catalog: Says which versions there are.
-        sessions: What versions living sessions are pinned to.
-        maps: On which sessions are just beginning.
-        keep_maps: How many retired versions a domain keeps, and how many sealed ones.
+    A domain keeps its newest `keep_maps` retired versions to roll back to, and every version that a living session is
+    pinned to. Of versions that were sealed but never served it keeps as many; older ones that lost to the version that
+    serves go too.
     """
 
     def __init__(self, catalog: Catalog, sessions: SessionStore, maps: Maps, keep_maps: int) -> None:
@@ -287,26 +273,26 @@ class Retention:
         something else to do that must not fail for it.
         """
         try:
-            kept = [version for version in self._catalog.kept_maps() if domain in {None, version.domain}]
-            beyond = beyond_keeping(kept, self._keep_maps)
-            pinned = self._sessions.pins() if beyond else set()
+            versions = [version for version in self._catalog.kept_maps() if domain in {None, version.domain}]
+            beyond = beyond_keeping(versions, self._keep_maps)
+            pins = self._sessions.pins() if beyond else set()
         except DeepSimbadError:
             log.exception("old maps could not be looked for")
             return 0
         n_removed = 0
         for old in beyond:
-            if (old.domain, old.version) in pinned:
+            if (old.domain, old.version) in pins:
                 continue
-            named = {"domain": old.domain, "map_version": old.version}
+            labels = {"domain": old.domain, "map_version": old.version}
             try:
                 self.remove(old.domain, old.version)
             except (MapInUseError, RetiredMapError, NotFoundError):
                 continue  # somebody was faster
             except DeepSimbadError:
-                log.exception("an old map could not be removed", extra=named)
+                log.exception("an old map could not be removed", extra=labels)
             else:
                 n_removed += 1
-                log.info("old map removed", extra=named)
+                log.info("old map removed", extra=labels)
         return n_removed
 
     def remove(self, domain: str, version: int) -> None:
@@ -317,25 +303,22 @@ class Retention:
             RetiredMapError: It was removed before.
             MapInUseError: It serves, is being built, or a living session is pinned to it.
         """
-        self._catalog.remove_map(domain, version, lambda: self._is_pinned(domain, version))
 
-    def _is_pinned(self, domain: str, version: int) -> bool:
-        # A session begins in memory first and is in its file then: asked in this order, it is in one of them.
-        return self._maps.is_beginning(domain, version) or (domain, version) in self._sessions.pins()
+        def is_pinned() -> bool:
+            # A session begins in memory first and is in its file then: asked in this order, it is in one of them.
+            return self._maps.is_beginning(domain, version) or (domain, version) in self._sessions.pins()
+
+        self._catalog.remove_map(domain, version, is_pinned)
 
 
-def beyond_keeping(kept: Iterable[KeptMap], keep_maps: int) -> list[KeptMap]:
-    """Of the versions that have their files, of any domains, those beyond what a domain keeps, pinned or not."""
-    domains: dict[str, list[KeptMap]] = {}
-    for version in kept:
-        domains.setdefault(version.domain, []).append(version)
+def beyond_keeping(versions: Iterable[KeptMap], keep_maps: int) -> list[KeptMap]:
+    """Of the versions that have their files, ordered by domain, those beyond what a domain keeps, pinned or not."""
     beyond: list[KeptMap] = []
-    for versions in domains.values():
-        retired = [version for version in versions if version.state is MapState.RETIRED]
-        retired.sort(key=lambda version: (version.retired_at or "", version.version), reverse=True)
-        sealed = [version for version in versions if version.state is MapState.SEALED]
-        sealed.sort(key=lambda version: version.version, reverse=True)
-        active = max((version.version for version in versions if version.state is MapState.ACTIVE), default=0)
+    for _, of_domain in groupby(versions, lambda version: version.domain):
+        newest_first = sorted(of_domain, key=lambda version: (version.retired_at or "", version.version), reverse=True)
+        retired = [version for version in newest_first if version.state is MapState.RETIRED]
+        sealed = [version for version in newest_first if version.state is MapState.SEALED]
+        active = max((version.version for version in newest_first if version.state is MapState.ACTIVE), default=0)
         beyond += retired[keep_maps:]
         beyond += [version for version in sealed[keep_maps:] if version.version < active]  # a newer one may soon serve
     return beyond
@@ -362,20 +345,18 @@ def load_snapshot(catalog: Catalog, domain: str, version: int) -> Map:
             snapshot = replace(read_map(path), domain=domain, version=version)
             _ = snapshot.relevance  # without one it can answer nothing
             return snapshot
-    except UnavailableError as error:
-        if isinstance(error, DamagedMapError):
-            raise unreadable(catalog, domain, version) from error
-        if catalog.map(domain, version).removed_at is not None:  # just now
-            raise removed(domain, version) from error
-        reason = error.hints.get("reason")
+    except (DeepSimbadError, KeyError, TypeError, ValueError) as error:
+        answer = unreadable(catalog, domain, version)
+        is_damaged = not isinstance(error, UnavailableError) or isinstance(error, DamagedMapError)
+        if isinstance(answer, RetiredMapError) or is_damaged:
+            raise answer from error
+        reason = getattr(error, "hints", {}).get("reason")
         raise UnavailableError(
             f"map {version} of domain {domain} could not be read ({reason}): try again",
             reason=reason,
             domain=domain,
             map_version=version,
         ) from error
-    except (DeepSimbadError, KeyError, TypeError, ValueError) as error:
-        raise unreadable(catalog, domain, version) from error
 
 
 def unreadable(catalog: Catalog, domain: str, version: int) -> DeepSimbadError:

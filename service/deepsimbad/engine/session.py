@@ -8,6 +8,7 @@ import math
 from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
+from functools import cached_property, partial
 from time import perf_counter
 from typing import Any, Self
 
@@ -21,8 +22,7 @@ from deepsimbad.core.planners import Plan
 from deepsimbad.core.relevance import Query, UpdateRule
 from deepsimbad.core.retrieval import shortlist
 from deepsimbad.core.route import Route
-from deepsimbad.engine.localizer import shortlist_length
-from deepsimbad.engine.views import View
+from deepsimbad.engine.localizer import View, shortlist_length
 from deepsimbad.engine.worker import InferenceWorker, Priority
 from deepsimbad.errors import (
     DamagedFileError,
@@ -45,23 +45,14 @@ _PIECE_S = 0.01  # a live view waits no longer for a replay than this and one st
 
 @dataclass(frozen=True)
 class SessionConfig:
-    """How a session begins and goes on; kept with it.
+    """How a session begins and goes on; kept with it."""
 
-    Attributes:
-        start_position_m: Where it begins; None: anywhere on the route.
-        start_std_m: How sure that is.
-        seed: Of whatever is random in it.
-        planner: By name; None: the default.
-        belief: The filter.
-        update: How a view counts; None: as the map's relevance wants.
-    """
-
-    start_position_m: float | None = None
+    start_position_m: float | None = None  # None: anywhere on the route
     start_std_m: float = DEFAULT_START_STD_M
-    seed: int = 0
-    planner: str | None = None
+    seed: int = 0  # of whatever is random in it
+    planner: str | None = None  # by name; None: the default
     belief: FilterKind = FilterKind.GRID
-    update: UpdateRule | None = None
+    update: UpdateRule | None = None  # how a view counts; None: as the map's relevance wants
 
     def as_dict(self) -> dict[str, Any]:
         """JSON-ready."""
@@ -77,59 +68,43 @@ class SessionConfig:
 
 @dataclass(frozen=True)
 class Observation:
-    """A move and the view after it, as a robot reports them.
+    """A move and the view after it, as a robot reports them."""
 
-    Attributes:
-        view: Gives the view, at the size of the evaluator it is given; called when the session's turn has come, so that
-            order is that of arrival.
-        action_m: Metres moved since the last view; ignored for the first one.
-        action_std_m: Their standard deviation; None: the usual one.
-        n_shortlist: Length of the answer's lists; None: the usual one.
-        idempotency: How a repetition is known; None: it is not.
-        landmark_models: Digests of landmark models, by one of which the view was ranked; None: nobody said.
-    """
-
+    # Gives the view, at the size of the evaluator it is given. Called in the session's turn: order is that of arrival
     view: Callable[[Evaluator], Awaitable[View]]
-    action_m: float = 0.0
-    action_std_m: float | None = None
-    n_shortlist: int | None = None
-    idempotency: IdempotencyKey | None = None
-    landmark_models: frozenset[str] | None = None
+    action_m: float = 0.0  # metres moved since the last view; ignored for the first one
+    action_std_m: float | None = None  # None: as usual
+    n_shortlist: int | None = None  # length of the answer's lists; None: the usual one
+    idempotency: IdempotencyKey | None = None  # how a repetition is known; None: it is not
+    landmark_models: frozenset[str] | None = None  # digests, by one of which the view was ranked; None: nobody said
 
 
 @dataclass(frozen=True)
 class SessionEngine:
-    """What moves one session on: its configuration, its map, the domain's evaluator and the algorithm."""
+    """What moves one session on."""
 
     config: SessionConfig
     snapshot: Map
-    evaluator: Evaluator
-    localizer: ActiveLocalizer
+    evaluator: Evaluator  # of its domain
 
-    @classmethod
-    def of(cls, config: SessionConfig, snapshot: Map, evaluator: Evaluator) -> Self:
-        """The engine of a session; raises InvalidInputError where the configuration cannot be."""
+    @cached_property
+    def localizer(self) -> ActiveLocalizer:
+        """The algorithm; raises InvalidInputError where the configuration cannot be."""
+        config = self.config
         algorithm = LocalizerConfig(
             filter=config.belief, update=config.update, planner=config.planner, seed=config.seed
         )
-        return cls(config, snapshot, evaluator, ActiveLocalizer(snapshot, algorithm, perf_counter))
+        return ActiveLocalizer(self.snapshot, algorithm, perf_counter)
 
 
 @dataclass(frozen=True)
 class SessionState:
-    """What a session believes after a row of its journal. Immutable: published by one assignment, read without a lock.
+    """What a session believes after a row of its journal; immutable, published by one assignment, read with no lock."""
 
-    Attributes:
-        engine: What moves it on.
-        sequence: That row's number; 0 before any.
-        belief: The algorithm's state.
-        step: The algorithm's step, where that row was an observation.
-    """
-
-    engine: SessionEngine
-    sequence: int
+    engine: SessionEngine  # moves it on
+    sequence: int  # that row's number; 0 before any
     belief: LocalizerState
-    step: Step | None = None
+    step: Step | None = None  # where that row was an observation
 
     @classmethod
     def start(cls, engine: SessionEngine) -> Self:
@@ -153,6 +128,21 @@ class SessionState:
         """In the store's form."""
         return StateSnapshot(self.sequence, self.engine.localizer.to_arrays(self.belief))
 
+    @classmethod
+    def restored(cls, engine: SessionEngine, snapshot: StateSnapshot | None) -> Self:
+        """What `snapshot` gave, of this session; None: before anything happened. Raises DamagedFileError."""
+        with _journal_faults():
+            if snapshot is None:
+                return cls.start(engine)
+            return cls(engine, snapshot.sequence, engine.localizer.from_arrays(snapshot.arrays))
+
+    def followed(self, row: JournalRow) -> "SessionState":
+        """The state after the journal's next row, the same bits as when it was written; raises DamagedFileError."""
+        if row.sequence != self.sequence + 1:
+            raise DamagedFileError(f"row {self.sequence + 1} of a session's journal is missing")
+        with _journal_faults():
+            return self.after(row)
+
 
 @contextmanager
 def _journal_faults() -> Iterator[None]:
@@ -162,31 +152,6 @@ def _journal_faults() -> Iterator[None]:
         raise
     except (DeepSimbadError, KeyError, TypeError, ValueError, IndexError) as error:
         raise DamagedFileError(f"a session's journal cannot be followed: {error}") from error
-
-
-def restored(engine: SessionEngine, snapshot: StateSnapshot | None) -> SessionState:
-    """The state that a journal is followed from; raises DamagedFileError where it cannot be of this session.
-
-    Args:
-        engine: The session's.
-        snapshot: That state; None: before anything happened.
-    """
-    with _journal_faults():
-        if snapshot is None:
-            return SessionState.start(engine)
-        return SessionState(engine, snapshot.sequence, engine.localizer.from_arrays(snapshot.arrays))
-
-
-def followed(state: SessionState, row: JournalRow) -> SessionState:
-    """The state after a row of the journal, the same bits as when it was written.
-
-    Raises:
-        DamagedFileError: It is not the next one, or cannot be of this session.
-    """
-    if row.sequence != state.sequence + 1:
-        raise DamagedFileError(f"row {state.sequence + 1} of a session's journal is missing")
-    with _journal_faults():
-        return state.after(row)
 
 
 async def replayed_until(
@@ -202,85 +167,60 @@ async def replayed_until(
     That takes as long as its observations took, but in short pieces, a few rows of the journal in memory at a time.
 
     Args:
-        store: The sessions.
-        worker: Where beliefs are computed.
-        record: The session.
-        engine: What moves it on.
-        is_last: Told on the worker of every row and the state after it; whether that is the last one wanted.
+        is_last: Asked on the worker of every row and the state after it.
         snapshot: Where to begin; None: before anything happened.
 
     Raises:
         UnknownSessionError: The journal ends before; it was purged meanwhile.
         DamagedFileError: The journal cannot be of this session.
     """
-    state = await asyncio.wrap_future(worker.submit(lambda: restored(engine, snapshot), Priority.BATCH))
-    while True:
+    state = await asyncio.wrap_future(worker.submit(lambda: SessionState.restored(engine, snapshot), Priority.BATCH))
+    is_done = False
+
+    def piece(rows: Iterator[JournalRow]) -> None:
+        nonlocal state, is_done
+        began = perf_counter()
+        for row in rows:
+            state = state.followed(row)
+            is_done = is_last(row, state)
+            if is_done or perf_counter() - began > _PIECE_S:
+                break
+
+    while not is_done:
         after = state.sequence
         rows = await asyncio.to_thread(store.journal_part, record.number, after, after + _ROWS_AT_ONCE)
         if not rows:
             raise UnknownSessionError(f"there is no session {record.session_id!a}")
-        while rows:
-
-            def piece(state: SessionState = state, rows: list[JournalRow] = rows) -> tuple[SessionState, int, bool]:
-                began, n_rows, is_done = perf_counter(), 0, False
-                for row in rows:
-                    state = followed(state, row)
-                    n_rows += 1
-                    is_done = is_last(row, state)
-                    if is_done or perf_counter() - began > _PIECE_S:
-                        break
-                return state, n_rows, is_done
-
-            state, n_rows, is_done = await asyncio.wrap_future(worker.submit(piece, Priority.BATCH))
-            if is_done:
-                return state
-            rows = rows[n_rows:]
+        run = partial(piece, iter(rows))
+        while not is_done and state.sequence < rows[-1].sequence:
+            await asyncio.wrap_future(worker.submit(run, Priority.BATCH))
+    return state
 
 
 @dataclass
 class LiveSession:
-    """A session that has not ended; touched from the event loop alone.
+    """A session that has not ended; touched from the event loop alone."""
 
-    Attributes:
-        record: As it was begun.
-        expires_at: When it ends unless something happens to it; seconds since 1970.
-        state: What answers, once it is on the disk; None until it is first needed after a start.
-        lock: Held by whoever moves it on; waiting for it is first come, first served.
-        ending: How it ended; whoever waited for the lock meanwhile comes too late.
-    """
-
-    record: SessionRecord
-    expires_at: float
-    state: SessionState | None = None
-    lock: asyncio.Lock = field(default_factory=asyncio.Lock)
-    ending: str | None = None
+    record: SessionRecord  # as it was begun
+    expires_at: float  # unless something happens to it; seconds since 1970
+    state: SessionState | None = None  # what answers, once it is on the disk; None until first needed after a start
+    lock: asyncio.Lock = field(default_factory=asyncio.Lock)  # of whoever moves it on; first come, first served
+    ending: str | None = None  # how it ended; whoever waited for the lock meanwhile comes too late
 
 
 @dataclass(frozen=True)
 class SessionView:
-    """A session as of one row of its journal.
-
-    Attributes:
-        session_id: Which session.
-        expires_at: When it ends unless something happens to it; seconds since 1970.
-        snapshot: The map it is pinned to.
-        n_observations: How many views its belief rests on.
-        belief: The belief in a few numbers.
-        plan: The move to make next; None where the map can name none.
-        relevance: [n] float32 of the last view; None before any.
-        shortlist: Ids of the map images most relevant to the last view, best first.
-        is_repeated: Whether the observation had been counted before.
-    """
+    """A session as of one row of its journal."""
 
     session_id: str
-    expires_at: float
-    snapshot: Map
-    n_observations: int
+    expires_at: float  # unless something happens to it; seconds since 1970
+    snapshot: Map  # the map it is pinned to
+    n_observations: int  # that its belief rests on
     belief: BeliefSummary
-    plan: Plan | None
-    relevance: NDArray[np.float32] | None
-    shortlist: NDArray[np.int64]
-    is_repeated: bool = False
+    plan: Plan | None  # the move to make next; None where the map can name none
+    relevance: NDArray[np.float32] | None  # [n] of the last view; None before any
+    shortlist: NDArray[np.int64]  # ids of the map images most relevant to the last view, best first
+    is_repeated: bool = False  # whether the observation had been counted before
 
 
 def view_of(session_id: str, expires_at: float, state: SessionState, n_shortlist: int | None = None) -> SessionView:
@@ -312,9 +252,8 @@ def check_prior(route: Route, position_m: float | None, std_m: float) -> None:
         )
     if position_m is None:
         return
-    first_m, last_m = route.start_m, float(route.position_m[-1])
-    if route.closed:
-        last_m = route.start_m + route.length_m
+    first_m = route.start_m
+    last_m = first_m + route.length_m if route.closed else float(route.position_m[-1])
     slack_m = _SLACK_STDS * std_m
     if not (math.isfinite(position_m) and first_m - slack_m <= position_m <= last_m + slack_m):
         raise InvalidPriorError(

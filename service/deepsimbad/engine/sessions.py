@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from deepsimbad.core.planners import Plan
 from deepsimbad.core.relevance import Relevance
-from deepsimbad.engine.encoders import EvaluatorPool
-from deepsimbad.engine.localizer import describe, shortlist_length
+from deepsimbad.engine.localizer import View, describe, shortlist_length
 from deepsimbad.engine.maps import MappedDomain, Maps
 from deepsimbad.engine.session import (
     LiveSession,
@@ -29,13 +28,10 @@ from deepsimbad.engine.session import (
     SessionView,
     check_move,
     check_prior,
-    followed,
     replayed_until,
-    restored,
     view_of,
 )
-from deepsimbad.engine.views import View
-from deepsimbad.engine.worker import InferenceWorker, Stopwatch
+from deepsimbad.engine.worker import EncodedImage, EvaluatorPool, InferenceWorker, Stopwatch
 from deepsimbad.errors import (
     DamagedFileError,
     EndedSessionError,
@@ -57,7 +53,8 @@ class Sessions:
     """All sessions of the service; used from one event loop.
 
     A change that was begun is finished even if its asker goes away: it may already be on the disk. One that fails
-    leaves the session as it was.
+    leaves the session as it was. `key_id` is everywhere the API key whose sessions alone are known to the asker; None:
+    all are.
 
     Args:
         store: Where they are kept.
@@ -98,6 +95,7 @@ class Sessions:
         self._clock = clock
         self._beginning: Counter[str | None] = Counter()  # by key
         self._repeating = asyncio.Lock()
+        # What only reads should not keep a robot's next step waiting on the worker.
         self._summaries = ThreadPoolExecutor(1, "summaries")
         self._under_way: set[asyncio.Task[Any]] = set()
         # Only who they are; what they believe is read at first touch, so a start takes no longer for many sessions.
@@ -113,17 +111,11 @@ class Sessions:
         self._summaries.shutdown()
 
     async def begin(
-        self,
-        active: MappedDomain,
-        config: SessionConfig,
-        session_id: str | None = None,
-        key_id: str | None = None,
+        self, active: MappedDomain, config: SessionConfig, session_id: str | None = None, key_id: str | None = None
     ) -> SessionView:
         """Begin a session on a domain's active map.
 
         Args:
-            active: The domain and its map.
-            config: How it begins.
             session_id: Its id, where a repetition of the request would have the same: the session that was begun by
                 the first one is answered then, as it stands. None: a new one.
             key_id: The API key that it belongs to; None: no key is asked.
@@ -146,10 +138,7 @@ class Sessions:
         """Move a session on by a move and the view after it.
 
         Args:
-            session_id: Which session.
-            observation: What its robot reports.
             watch: Told of every stage. `wait` is for its turn: behind what came before it, and then for the worker.
-            key_id: Here and below the API key whose sessions alone are known to the asker; None: all are.
 
         Raises:
             UnknownSessionError, EndedSessionError, RetiredMapError: There is no such session, or no more.
@@ -170,22 +159,22 @@ class Sessions:
     async def view(self, session_id: str, n_shortlist: int | None = None, key_id: str | None = None) -> SessionView:
         """What a session believes now."""
         live, state = await self._read(session_id, key_id)
-        return await self._summarised(session_id, live.expires_at, state, n_shortlist)
+        return await self._summarised(live, live.expires_at, state, n_shortlist)
 
     async def mass(self, session_id: str, key_id: str | None = None) -> NDArray[np.float64]:
         """[n] mass of every map image in a session's belief; sums to 1."""
         _, state = await self._read(session_id, key_id)
-        return await self._compute(lambda: state.belief.belief.mass)
+        return await asyncio.wrap_future(self._worker.submit(lambda: state.belief.belief.mass))
 
     async def next_best_view(
         self, session_id: str, key_id: str | None = None
     ) -> tuple[Plan | None, NDArray[np.float64]]:
         """The move to make next, without a new view (None where the map can name none), and the moves there are."""
         _, state = await self._read(session_id, key_id)
-        engine = state.engine
+        actions_m, localizer = state.engine.snapshot.actions_m, state.engine.localizer
         if state.step is not None:
-            return state.step.plan, engine.snapshot.actions_m
-        return await self._compute(lambda: engine.localizer.plan(state.belief)), engine.snapshot.actions_m
+            return state.step.plan, actions_m
+        return await asyncio.wrap_future(self._worker.submit(lambda: localizer.plan(state.belief))), actions_m
 
     async def newest(self, domain: str | None, before: int | None, limit: int) -> ListPage[ListedSession, int]:
         """A page of the living sessions, of a domain or all, newest first, behind number `before`."""
@@ -205,7 +194,8 @@ class Sessions:
     async def sweep(self) -> None:
         """End what has expired, and forget what ended long ago."""
         await self._finished(self._expire())
-        await self._finished(self._purge())
+        while await asyncio.wrap_future(self._store.purge(self._clock() - self._keep_ended_s)):
+            pass
 
     def engine_of(self, record: SessionRecord) -> SessionEngine:
         """What moves a session on, whether it lives or has ended; may read files.
@@ -219,7 +209,7 @@ class Sessions:
             config = SessionConfig.from_dict(record.config)
         except (KeyError, TypeError, ValueError) as error:
             raise DamagedFileError(f"session {record.session_id} cannot be read: {error}") from error
-        return SessionEngine.of(config, mapped.snapshot, self._evaluators.evaluator(mapped.record.evaluator))
+        return SessionEngine(config, mapped.snapshot, self._evaluators.evaluator(mapped.record.evaluator))
 
     # Beginning
 
@@ -234,17 +224,18 @@ class Sessions:
     async def _begin(
         self, active: MappedDomain, config: SessionConfig, session_id: str, key_id: str | None
     ) -> SessionView:
-        await self._check_room(key_id)
+        if self._crowd(key_id) is not None:
+            await self._expire()
+        if (crowd := self._crowd(key_id)) is not None:
+            raise crowd
         self._beginning[key_id] += 1
         try:
             snapshot = active.snapshot
             with self._maps.beginning(snapshot):
                 digest = await asyncio.to_thread(self._maps.digest, snapshot)
-                evaluator = self._evaluators.evaluator(active.record.evaluator)
+                engine = SessionEngine(config, snapshot, self._evaluators.evaluator(active.record.evaluator))
+                state = await asyncio.wrap_future(self._worker.submit(lambda: SessionState.start(engine)))
                 now = self._clock()
-                expires_at = now + self._ttl_s
-                state = await self._compute(lambda: SessionState.start(SessionEngine.of(config, snapshot, evaluator)))
-                answer = self._summarised(session_id, expires_at, state)
                 new = SessionRecord(
                     number=0,
                     session_id=session_id,
@@ -253,7 +244,7 @@ class Sessions:
                     map_sha256=digest,
                     config=config.as_dict(),
                     created_at=now,
-                    expires_at=expires_at,
+                    expires_at=now + self._ttl_s,
                     n_events=0,
                     ending=None,
                     key_id=key_id,
@@ -262,27 +253,25 @@ class Sessions:
             if replace(record, number=0) != new:  # the same request was on its way twice, and the other was quicker
                 return await self._begun_before(session_id, config)
             # A repetition may have found it on the disk already.
-            self._living.setdefault(session_id, LiveSession(record, expires_at, state))
-            return await answer
+            live = self._living.setdefault(session_id, LiveSession(record, record.expires_at, state))
+            return await self._summarised(live, record.expires_at, state)
         finally:
             self._beginning[key_id] -= 1
 
-    async def _check_room(self, key_id: str | None) -> None:
-        """Raise TooManySessionsError where as many live as may, of all or of one key."""
-        for is_last_try in (False, True):
-            of_key = [live for live in self._living.values() if live.record.key_id == key_id]
-            if self.n_living + self._beginning.total() >= self._max_sessions:
-                rivals, limit, most = list(self._living.values()), "max_sessions", self._max_sessions
-            elif key_id is not None and len(of_key) + self._beginning[key_id] >= self._max_sessions_per_key:
-                rivals, limit, most = of_key, "max_sessions_per_key", self._max_sessions_per_key
-            else:
-                return
-            if not is_last_try:
-                await self._expire()
+    def _crowd(self, key_id: str | None) -> TooManySessionsError | None:
+        """What is said where as many sessions live as may, of all or of one key."""
+        rivals = list(self._living.values())
+        limit, most, whose = "max_sessions", self._max_sessions, "sessions"
+        if len(rivals) + self._beginning.total() < most:
+            if key_id is None:
+                return None
+            rivals = [live for live in rivals if live.record.key_id == key_id]
+            limit, most, whose = "max_sessions_per_key", self._max_sessions_per_key, "sessions of this key"
+            if len(rivals) + self._beginning[key_id] < most:
+                return None
         soonest_s = min((live.expires_at for live in rivals), default=0.0) - self._clock()
-        whose = "sessions" if limit == "max_sessions" else "sessions of this key"
         hints = {limit: most, "limit": limit, "retry_after_s": max(1, min(_LONGEST_RETRY_S, math.ceil(soonest_s)))}
-        raise TooManySessionsError(
+        return TooManySessionsError(
             f"{most} {whose} live, and no more may: delete one that is done with, or wait", **hints
         )
 
@@ -310,12 +299,12 @@ class Sessions:
             raise _ended(session_id, live.ending)
         return live
 
-    async def _read(self, session_id: str, key_id: str | None = None) -> tuple[LiveSession, SessionState]:
+    async def _read(self, session_id: str, key_id: str | None) -> tuple[LiveSession, SessionState]:
         live = await self._find(session_id, key_id)
-        if live.state is not None:
-            return live, live.state
-        async with live.lock:
-            return live, await self._state(live)
+        if live.state is None:
+            async with live.lock:
+                return live, await self._state(live)
+        return live, live.state
 
     async def _state(self, live: LiveSession) -> SessionState:
         """What a session answers from, read from the disk where need be; the caller holds the session's lock.
@@ -334,9 +323,9 @@ class Sessions:
     def _from_disk(self, record: SessionRecord) -> SessionState:
         engine = self.engine_of(record)
         snapshot, rows = self._store.history(record.number, self._store.find(record.session_id).n_events)
-        state = restored(engine, snapshot)
+        state = SessionState.restored(engine, snapshot)
         for row in rows:
-            state = followed(state, row)
+            state = state.followed(row)
         return state
 
     # Moving on
@@ -354,17 +343,11 @@ class Sessions:
             step = partial(self._step, live, state, observation, self._clock() + self._ttl_s, watch)
             stepped = await asyncio.wrap_future(self._worker.look(engine.evaluator, view, step))
             if isinstance(stepped, int):
-                repeated = await self._repeated(live, state, stepped, observation.n_shortlist)
-                watch.lap("summarise")
-                return repeated
-            row, moved_on = stepped
-            # The disk and the summary take their time together.
-            answer = self._summarised(live.record.session_id, row.expires_at, moved_on, observation.n_shortlist)
-            await self._commit(live, state, row, moved_on)
-            watch.lap("commit")
-            view_after = await answer
-            watch.lap("summarise")  # what it took beyond the disk
-            return view_after
+                answer = await self._repeated(live, state, stepped, observation.n_shortlist)
+            else:
+                answer = await self._commit(live, state, *stepped, observation.n_shortlist, watch)
+            watch.lap("summarise")  # of a new one what it took beyond the disk
+            return answer
 
     def _step(
         self,
@@ -376,7 +359,7 @@ class Sessions:
         view: View,
     ) -> tuple[ObservedRow, SessionState] | int:
         """On the worker: the next row and what it leads to; or the row's number, if it was counted before."""
-        watch.lap("wait", view)
+        watch.lap("wait", {"encode": view.encode_ms} if isinstance(view, EncodedImage) else None)
         idempotency, snapshot = observation.idempotency, state.engine.snapshot
         if idempotency is not None:
             earlier = self._store.named(live.record.number, idempotency.key)
@@ -386,7 +369,8 @@ class Sessions:
                 )
             if earlier is not None:
                 return earlier[0]
-        snapshot.check_landmark_model(observation.landmark_models)
+        if observation.landmark_models is not None:
+            snapshot.check_landmark_model(observation.landmark_models)
         query = describe(snapshot, state.engine.evaluator, view)
         watch.lap("describe")
         relevance = snapshot.relevance
@@ -402,7 +386,7 @@ class Sessions:
         )
         moved_on = state.after(row)
         if moved_on.step is not None:
-            watch.take(moved_on.step.timings_ms)
+            watch.lap("plan", {stage: ms for stage, ms in moved_on.step.timings_ms.items() if stage != "plan"})
         return row, moved_on
 
     async def _repeated(
@@ -420,21 +404,27 @@ class Sessions:
                     lambda row, _: row.sequence == sequence,
                     before,
                 )
-        answer = await self._summarised(live.record.session_id, live.expires_at, state, n_shortlist)
-        return replace(answer, is_repeated=True)
+        return replace(await self._summarised(live, live.expires_at, state, n_shortlist), is_repeated=True)
 
     async def _set_prior(self, live: LiveSession, position_m: float, std_m: float) -> SessionView:
         async with live.lock:
             state = live.state or await self._state(live)
             check_prior(state.engine.snapshot.route, position_m, std_m)
             row = PriorRow(state.sequence + 1, self._clock() + self._ttl_s, position_m, std_m)
-            moved_on = await self._compute(lambda: state.after(row))
-            answer = self._summarised(live.record.session_id, row.expires_at, moved_on)
-            await self._commit(live, state, row, moved_on)
-            return await answer
+            moved_on = await asyncio.wrap_future(self._worker.submit(lambda: state.after(row)))
+            return await self._commit(live, state, row, moved_on, None, Stopwatch())
 
-    async def _commit(self, live: LiveSession, before: SessionState, row: JournalRow, after: SessionState) -> None:
-        """Write a row, then publish what it leads to."""
+    async def _commit(
+        self,
+        live: LiveSession,
+        before: SessionState,
+        row: JournalRow,
+        after: SessionState,
+        n_shortlist: int | None,
+        watch: Stopwatch,
+    ) -> SessionView:
+        """Write a row, then publish what it leads to; the disk and the summary take their time together."""
+        answer = self._summarised(live, row.expires_at, after, n_shortlist)
         snapshot = None
         if before.sequence > 0 and before.sequence % self._snapshot_every == 0:
             # Of the state before the row, so that a restart replays at least the last row and has its whole step.
@@ -445,6 +435,8 @@ class Sessions:
             live.state = None  # what the file holds is the truth: it is read again at the next touch
             raise
         live.expires_at, live.state = row.expires_at, after
+        watch.lap("commit")
+        return await answer
 
     # Ending
 
@@ -462,20 +454,13 @@ class Sessions:
             if live.ending is None and self._clock() >= live.expires_at and not live.lock.locked():
                 await self._end(live, EXPIRED)
 
-    async def _purge(self) -> None:
-        while await asyncio.wrap_future(self._store.purge(self._clock() - self._keep_ended_s)):
-            pass
-
     # Threads and tasks
 
     def _summarised(
-        self, session_id: str, expires_at: float, state: SessionState, n_shortlist: int | None = None
+        self, live: LiveSession, expires_at: float, state: SessionState, n_shortlist: int | None = None
     ) -> asyncio.Future[SessionView]:
-        """A summary to come, from a thread of its own: what only reads should not keep a robot's next step waiting."""
-        return asyncio.wrap_future(self._summaries.submit(view_of, session_id, expires_at, state, n_shortlist))
-
-    async def _compute(self, run: Callable[[], T]) -> T:
-        return await asyncio.wrap_future(self._worker.submit(run))
+        summary = self._summaries.submit(view_of, live.record.session_id, expires_at, state, n_shortlist)
+        return asyncio.wrap_future(summary)
 
     async def _finished(self, change: Coroutine[Any, Any, T]) -> T:
         task = asyncio.ensure_future(change)

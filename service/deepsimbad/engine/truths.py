@@ -20,29 +20,22 @@ from deepsimbad.store.journal import JournalRow, ObservedRow, SessionRecord, Sta
 from deepsimbad.store.sessions import SessionStore
 
 _FARTHEST_M = 10.0  # a truth farther from every map image is of no place of the map: another road, another frame
-_FOLLOWED = 16  # sessions, 0.5 MB each at 26,000 map images
+_RESUMABLE = 16  # sessions, 0.5 MB each at 26,000 map images
 
 
 @dataclass(frozen=True)
 class RankedTruths:
-    """Where a session's belief placed the truth.
+    """Where a session's belief placed the truth."""
 
-    Attributes:
-        domain, map_version: Of the session.
-        position_m: [n_observations] the truth along the route; NaN where unknown.
-        rank_share: [n_observations] share of the map images that the belief placed before the true one, 0..1; NaN where
-            the truth is unknown, or farther than 10 m from the map.
-        retrieval_rank: [n_observations] rank from 0 of the best-placed true image by each view's own relevance; NaN
-            where no true image was told; None where none was of any view.
-        first: The first observation that was told of.
-    """
-
-    domain: str
-    map_version: int
-    position_m: NDArray[np.float64]
+    session: SessionRecord
+    position_m: NDArray[np.float64]  # [n_observations] the truth along the route; NaN where unknown
+    # [n_observations] share of the map images that the belief placed before the true one, 0..1; NaN where the truth is
+    # unknown, or farther than 10 m from the map
     rank_share: NDArray[np.float64]
+    # [n_observations] rank from 0 of the best-placed true image by each view's own relevance; NaN where no true image
+    # was told; None where none was of any view
     retrieval_rank: NDArray[np.float64] | None = None
-    first: int = 0
+    first: int = 0  # observation that was told of
 
     @property
     def n_scored(self) -> int:
@@ -65,10 +58,10 @@ class RankedTruths:
         Args:
             before_m: What had been told: positions of the first so many observations, NaN where unknown; None: nothing.
         """
-        known = ~np.isnan(self.rank_share)
+        is_new = ~np.isnan(self.rank_share)
         if before_m is not None:
-            known[: before_m.size] &= np.isnan(before_m[: known.size])
-        return self.rank_share[known]
+            is_new[: before_m.size] &= np.isnan(before_m[: is_new.size])
+        return self.rank_share[is_new]
 
 
 def checked_truths(positions_m: Sequence[float | None], n_observations: int, first: int = 0) -> NDArray[np.float64]:
@@ -77,7 +70,7 @@ def checked_truths(positions_m: Sequence[float | None], n_observations: int, fir
     Raises:
         InvalidInputError: As many positions as observations there are not, or one is not finite.
     """
-    if any(one is not None and not math.isfinite(one) for one in positions_m):
+    if any(position_m is not None and not math.isfinite(position_m) for position_m in positions_m):
         raise InvalidInputError("a true position is NaN or infinite; give null where it is unknown")
     if first + len(positions_m) != n_observations:
         from_the_first = f" from observation {first} on" if first else ""
@@ -85,23 +78,7 @@ def checked_truths(positions_m: Sequence[float | None], n_observations: int, fir
             f"{len(positions_m)} true positions{from_the_first} for {n_observations} observations: give one for each",
             n_observations=n_observations,
         )
-    return np.array([math.nan] * first + [math.nan if one is None else one for one in positions_m], np.float64)
-
-
-def checked_images(
-    true_map_images: Sequence[Sequence[int]] | None, n_observations: int, first: int, n_images: int
-) -> dict[int, NDArray[np.int64]]:
-    """The map images that show the place of an observation, by its number, of those that have any.
-
-    Raises:
-        InvalidInputError: As many lists as positions there are not, or one holds what is no map image.
-    """
-    if true_map_images is not None and first + len(true_map_images) != n_observations:
-        raise InvalidInputError(f"{len(true_map_images)} lists of true map images: give one for each true position")
-    if any(not 0 <= image < n_images for images in true_map_images or () for image in images):
-        raise InvalidInputError(f"map images are 0 to {n_images - 1}", minimum=0, maximum=n_images - 1)
-    listed = enumerate(true_map_images or (), first)
-    return {number: np.array(images, np.int64) for number, images in listed if images}
+    return np.array([math.nan] * first + list(positions_m), np.float64)  # None becomes NaN
 
 
 class Truths:
@@ -125,7 +102,7 @@ class Truths:
         self._worker = worker
         self._sessions = sessions
         self._clock = clock
-        self._followed: dict[int, tuple[int, StateSnapshot | None]] = {}  # how far, by session: truths come bit by bit
+        self._reached: dict[int, tuple[int, StateSnapshot]] = {}  # how far, by session: truths come bit by bit
 
     async def rank(
         self,
@@ -153,7 +130,32 @@ class Truths:
             InvalidInputError: As many as observations there are not, a position is not finite, or no map image is one.
             DamagedMapError, DamagedFileError: The map or the session cannot be read.
         """
-        return (await self._ranked(session_id, positions_m, true_map_images, first, key_id))[1]
+
+        def prepared() -> tuple[SessionRecord, SessionEngine, NDArray[np.float64]]:
+            record = self._store.find(session_id)
+            check_owner(record, key_id)
+            truth_m = checked_truths(positions_m, self._store.n_observations(record.number), first)
+            return record, self._sessions.engine_of(record), truth_m
+
+        record, engine, truth_m = await asyncio.to_thread(prepared)
+        route = engine.snapshot.route
+        images = _checked_images(true_map_images, truth_m.size, first, route.n_images)
+        nearest = true_images(route, truth_m)
+        share, retrieval = np.full((2, truth_m.size), np.nan)
+
+        def rank(number: int, state: LocalizerState) -> None:
+            if not math.isnan(truth_m[number]):
+                mass = state.belief.mass
+                share[number] = rank_of_truth(mass, nearest[number : number + 1]) / mass.size
+            if number in images and state.relevance is not None:
+                retrieval[number] = rank_of_truth(state.relevance, images[number])
+
+        numbers = np.union1d(np.flatnonzero(~np.isnan(truth_m)), list(images)).astype(int)
+        if numbers.size:
+            await self._follow(record, engine, numbers[0], numbers[-1], rank)
+        apart_m = np.abs(route.offset_m(route.position_m[nearest], truth_m))
+        share[~(apart_m <= _FARTHEST_M)] = np.nan  # unknown ones too
+        return RankedTruths(record, truth_m, share, None if true_map_images is None else retrieval, first)
 
     async def keep(
         self,
@@ -168,46 +170,9 @@ class Truths:
         Returns:
             The ranked truths, and the positions that had been kept before, if any.
         """
-        record, ranked = await self._ranked(session_id, positions_m, true_map_images, first, key_id)
-        kept = self._store.save_true_positions(record.number, ranked.position_m, self._clock())
-        return ranked, await asyncio.wrap_future(kept)
-
-    async def _ranked(
-        self,
-        session_id: str,
-        positions_m: Sequence[float | None],
-        true_map_images: Sequence[Sequence[int]] | None,
-        first: int,
-        key_id: str | None,
-    ) -> tuple[SessionRecord, RankedTruths]:
-        record, engine, known = await asyncio.to_thread(self._prepared, session_id, positions_m, first, key_id)
-        route = engine.snapshot.route
-        images = checked_images(true_map_images, known.size, first, route.n_images)
-        nearest = true_images(route, known)
-        share, retrieval = np.full((2, known.size), np.nan)
-
-        def rank(number: int, state: LocalizerState) -> None:
-            if not math.isnan(known[number]):
-                mass = state.belief.mass
-                share[number] = rank_of_truth(mass, nearest[number : number + 1]) / mass.size
-            if number in images and state.relevance is not None:
-                retrieval[number] = rank_of_truth(state.relevance, images[number])
-
-        wanted = np.union1d(np.flatnonzero(~np.isnan(known)), list(images)).astype(int)
-        if wanted.size:
-            await self._follow(record, engine, wanted[0], wanted[-1], rank)
-        apart_m = np.abs(route.offset_m(route.position_m[nearest], known))
-        share[~(apart_m <= _FARTHEST_M)] = np.nan  # unknown ones too
-        asked = None if true_map_images is None else retrieval
-        return record, RankedTruths(record.domain, record.map_version, known, share, asked, first)
-
-    def _prepared(
-        self, session_id: str, positions_m: Sequence[float | None], first: int, key_id: str | None
-    ) -> tuple[SessionRecord, SessionEngine, NDArray[np.float64]]:
-        record = self._store.find(session_id)
-        check_owner(record, key_id)
-        known = checked_truths(positions_m, self._store.n_observations(record.number), first)
-        return record, self._sessions.engine_of(record), known
+        ranked = await self.rank(session_id, positions_m, true_map_images, first, key_id)
+        before = self._store.save_true_positions(ranked.session.number, ranked.position_m, self._clock())
+        return ranked, await asyncio.wrap_future(before)
 
     async def _follow(
         self,
@@ -218,7 +183,6 @@ class Truths:
         rank: Callable[[int, LocalizerState], None],
     ) -> None:
         """Tell `rank` of the state after every observation from one to another."""
-        n_before, snapshot = self._followed.pop(record.number, (0, None))
 
         def is_last(row: JournalRow, state: SessionState) -> bool:
             number = state.belief.n_observations - 1
@@ -226,21 +190,32 @@ class Truths:
                 rank(number, state.belief)
             return number == last
 
-        snapshot = snapshot if n_before <= first else None
-        state = await replayed_until(self._store, self._worker, record, engine, is_last, snapshot)
-        self._followed[record.number] = (state.belief.n_observations, state.snapshot())
-        while len(self._followed) > _FOLLOWED:
-            del self._followed[next(iter(self._followed))]
+        n_before, snapshot = self._reached.pop(record.number, (0, None))
+        state = await replayed_until(
+            self._store, self._worker, record, engine, is_last, snapshot if n_before <= first else None
+        )
+        self._reached[record.number] = state.belief.n_observations, state.snapshot()
+        while len(self._reached) > _RESUMABLE:
+            del self._reached[next(iter(self._reached))]
+
+
+def _checked_images(
+    true_map_images: Sequence[Sequence[int]] | None, n_observations: int, first: int, n_images: int
+) -> dict[int, NDArray[np.int64]]:
+    """The map images that show the place of an observation, by its number, of those that have any.
+
+    Raises:
+        InvalidInputError: As many lists as positions there are not, or one holds what is no map image.
+    """
+    if true_map_images is not None and first + len(true_map_images) != n_observations:
+        raise InvalidInputError(f"{len(true_map_images)} lists of true map images: give one for each true position")
+    if any(not 0 <= image < n_images for images in true_map_images or () for image in images):
+        raise InvalidInputError(f"map images are 0 to {n_images - 1}", minimum=0, maximum=n_images - 1)
+    listed = enumerate(true_map_images or (), first)
+    return {number: np.array(images, np.int64) for number, images in listed if images}
 
 
 def true_images(route: Route, position_m: NDArray[np.float64]) -> NDArray[np.int64]:
-    """[n] the map image nearest to each position along the route; of an unknown position any.
-
-    Args:
-        route: Of the map.
-        position_m: [n] NaN where unknown; on a closed route any number of rounds.
-    """
-    known = np.where(np.isnan(position_m), route.start_m, position_m)
-    if route.closed and route.length_m > 0:
-        known = route.start_m + (known - route.start_m) % route.length_m
-    return route.nearest_image(known).astype(np.int64)
+    """[n] the map image nearest to each position, on a closed route any number of rounds on; where unknown any."""
+    somewhere_m = np.where(np.isnan(position_m), route.start_m, position_m)
+    return route.nearest_image(route.wrapped(somewhere_m)).astype(np.int64)

@@ -1,29 +1,118 @@
-"""The one thread in which encoding and scoring run: a robot's live view goes before whatever waits in bulk.
-
-Images of several robots are encoded in one batch where the machine gains by it. A stopwatch tells where the time of an
-answer goes, waiting among it.
-"""
+"""Where views are encoded and scored: the evaluators of all domains, the thread that runs them, and its stopwatch."""
 
 import itertools
+import json
+import logging
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from enum import IntEnum
 from queue import Empty, PriorityQueue
 from time import monotonic, perf_counter
 from typing import Any, TypeVar
+from weakref import WeakKeyDictionary
 
 import numpy as np
+from numpy.typing import NDArray
 
-from deepsimbad.engine.encoders import encode_images
-from deepsimbad.engine.views import EncodedImage, View
-from deepsimbad.errors import OverloadedError, UnavailableError
-from deepsimbad.evaluators.base import Evaluator
+from deepsimbad.errors import (
+    DeepSimbadError,
+    EvaluatorUnavailableError,
+    InvalidInputError,
+    InvalidWeightsError,
+    OverloadedError,
+    UnavailableError,
+)
+from deepsimbad.evaluators.base import Evaluator, Image
+from deepsimbad.evaluators.compute import Compute
+from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
 
 T = TypeVar("T")
 
+log = logging.getLogger(__name__)
+
+RETRY_AFTER_S = 30.0  # an extractor that cannot be loaded is not tried again before: to read its weights takes seconds
 _MOST_UNSCORED = 8  # encoded images whose answers are not yet made
+_failures: WeakKeyDictionary[Evaluator, tuple[float, InvalidInputError]] = WeakKeyDictionary()
+
+
+class EvaluatorPool:
+    """Evaluators by configuration, made at first need: one copy of a network, whoever uses it."""
+
+    def __init__(self, compute: Compute | None = None) -> None:
+        self._compute = compute or Compute()
+        self._evaluators: dict[str, Evaluator] = {}
+        self._lock = threading.Lock()
+
+    def evaluator(self, raw_config: Mapping[str, Any]) -> Evaluator:
+        """The evaluator of a configuration, loaded or not: ranked landmarks and ready encodings need no network.
+
+        Raises:
+            InvalidInputError: There is none of that kind or name.
+        """
+        config = evaluator_config(raw_config)
+        key = json.dumps(config.as_dict(), sort_keys=True)
+        with self._lock:
+            if key not in self._evaluators:
+                self._evaluators[key] = make_evaluator(config, self._compute)
+            return self._evaluators[key]
+
+    def load_all(self, configs: Mapping[str, Mapping[str, Any]]) -> None:
+        """Load the evaluators of all domains, by their names; one that cannot be keeps no other from serving."""
+        for domain, raw_config in configs.items():
+            try:
+                self.evaluator(raw_config).load()
+            except DeepSimbadError as error:
+                log.error("an extractor cannot be loaded", extra={"domain": domain, "why": error.message})
+
+
+def ready(evaluator: Evaluator) -> Evaluator:
+    """The evaluator of a domain that exists, loaded; the first time that takes a moment.
+
+    Raises:
+        EvaluatorUnavailableError: It cannot be loaded, or could not some seconds ago; no robot's view is at fault.
+        OutOfMemoryError: There is too little memory for it.
+    """
+    failed_at, failure = _failures.get(evaluator, (0.0, None))
+    if failure is None or monotonic() - failed_at >= RETRY_AFTER_S:
+        try:
+            evaluator.load()
+        except InvalidInputError as error:
+            failure = error
+            _failures[evaluator] = (monotonic(), error)
+        else:
+            _failures.pop(evaluator, None)
+            return evaluator
+    raise EvaluatorUnavailableError(
+        f"the domain's extractor cannot be loaded: {failure.message}", reason=failure.code, **failure.hints
+    ) from failure
+
+
+@dataclass(frozen=True)
+class EncodedImage:
+    """An image that the domain's evaluator has encoded."""
+
+    values: NDArray[np.float32]  # [d]
+    weights_sha256: str | None  # of the network that did; None where none did
+    encode_ms: float  # how long it took, with those of the same batch
+
+
+def encode_images(evaluator: Evaluator, images: Sequence[Image]) -> list[EncodedImage]:
+    """Encode images at once.
+
+    Raises:
+        UnsupportedMediaTypeError: The evaluator takes ready encodings alone.
+        OutOfMemoryError: There is too little memory for it.
+        EvaluatorUnavailableError: Its network gives something else than encodings.
+    """
+    began = perf_counter()
+    try:
+        encodings = evaluator.encode(images)
+    except InvalidWeightsError as error:  # the network is at fault, not what a robot sent
+        raise EvaluatorUnavailableError(error.message, reason=error.code, **error.hints) from error
+    encode_ms = 1000 * (perf_counter() - began)
+    return [EncodedImage(encoding, evaluator.weights_sha256, encode_ms) for encoding in encodings]
 
 
 class Priority(IntEnum):
@@ -43,21 +132,29 @@ class _Work:
     encoder: Evaluator | None = field(default=None, compare=False)  # of an image
     answer: Future[Any] = field(default_factory=Future, compare=False)
 
+    def finish(self) -> None:
+        try:
+            result = self.run(self.view)
+        except BaseException as error:
+            self.answer.set_exception(error)
+        else:
+            self.answer.set_result(result)
+
 
 class InferenceWorker:
     """Runs submitted functions one at a time, live ones first.
 
     One thread, because encoders and scoring already use the cores they need: two at once would only make both late.
-    A batch must be submitted in pieces short enough that a live view can wait for one. What is made of encoded images
-    runs in a thread beside it, so that the next images are encoded meanwhile.
+    A batch must be submitted in pieces short enough that a live view can wait for one. Images that wait are encoded
+    together where the machine gains by it; what is made of them runs in a thread beside it, so that the next images
+    are encoded meanwhile.
 
     Args:
-        name: Of the thread.
         max_waiting: How many functions of one priority may wait; None: any number.
         longest_wait_s: How long an image may wait for others to fill a batch, where one larger than 1 gains anything.
     """
 
-    def __init__(self, name: str = "inference", max_waiting: int | None = None, longest_wait_s: float = 0.0) -> None:
+    def __init__(self, max_waiting: int | None = None, longest_wait_s: float = 0.0) -> None:
         self._max_waiting = max_waiting
         self._longest_wait_s = longest_wait_s
         self._n_waiting = dict.fromkeys(Priority, 0)
@@ -66,8 +163,8 @@ class InferenceWorker:
         self._open = True
         self._lock = threading.Lock()
         self._unscored = threading.Semaphore(_MOST_UNSCORED)
-        self._scorer = ThreadPoolExecutor(1, f"{name} of images")
-        self._thread = threading.Thread(target=self._work, name=name, daemon=True)
+        self._scorer = ThreadPoolExecutor(1, "inference of images")
+        self._thread = threading.Thread(target=self._work, name="inference", daemon=True)
         self._thread.start()
 
     @property
@@ -81,23 +178,11 @@ class InferenceWorker:
         return self._thread.is_alive()
 
     def submit(self, run: Callable[[], T], priority: Priority = Priority.LIVE) -> Future[T]:
-        """Queue a function.
-
-        Returns:
-            Its result or error to come; cancelling it before it began takes it off the queue.
-
-        Raises:
-            UnavailableError: The worker has been closed.
-            OverloadedError: As many wait as may.
-        """
+        """Queue a function; as `look`."""
         return self.look(None, None, lambda _: run(), priority)
 
     def look(
-        self,
-        evaluator: Evaluator | None,
-        view: View | None,
-        run: Callable[[Any], T],
-        priority: Priority = Priority.LIVE,
+        self, evaluator: Evaluator | None, view: object, run: Callable[[Any], T], priority: Priority = Priority.LIVE
     ) -> Future[T]:
         """Queue a function of a view; an image is encoded before, maybe in one batch with others.
 
@@ -105,10 +190,13 @@ class InferenceWorker:
             evaluator: Encodes an image.
             view: An image, or what needs no encoding.
             run: Given an `EncodedImage` in the place of an image, other views as they are.
-            priority: Who goes first.
 
         Returns:
-            Its result or error to come, as `submit`; raises as `submit`.
+            Its result or error to come; cancelling it before it began takes it off the queue.
+
+        Raises:
+            UnavailableError: The worker has been closed.
+            OverloadedError: As many wait as may.
         """
         encoder = evaluator if isinstance(view, np.ndarray) else None
         work = _Work(priority, next(self._arrivals), run, view, encoder)
@@ -141,18 +229,16 @@ class InferenceWorker:
             with self._lock:
                 for work in batch:
                     self._n_waiting[work.priority] -= 1
-            for work in batch.copy():
-                if not work.answer.set_running_or_notify_cancel():
-                    batch.remove(work)
+            batch = [work for work in batch if work.answer.set_running_or_notify_cancel()]
             if encoder is not None and batch:
-                _encode(encoder, batch)
+                batch = _encoded(encoder, batch)
             while batch:  # emptied, or the last answer's arrays live until the next query
                 work = batch.pop(0)
                 if work.encoder is None:
-                    _finish(work)
+                    work.finish()
                 else:
                     self._unscored.acquire()  # where scoring is slower, images wait in the queue, which is counted
-                    self._scorer.submit(_finish, work).add_done_callback(lambda _: self._unscored.release())
+                    self._scorer.submit(work.finish).add_done_callback(lambda _: self._unscored.release())
                 del work
 
     def _with_company(self, first: _Work, largest: int) -> list[_Work]:
@@ -172,28 +258,18 @@ class InferenceWorker:
         return batch
 
 
-def _encode(encoder: Evaluator, batch: list[_Work]) -> None:
-    """Put encodings in the place of the images of a batch; those of an image that cannot be encoded fail alone."""
+def _encoded(encoder: Evaluator, batch: list[_Work]) -> list[_Work]:
+    """The batch with encodings in the place of its images; those that cannot be encoded fail, and alone."""
     try:
-        for work, encoded in zip(batch, encode_images(encoder, [work.view for work in batch]), strict=True):
-            work.view = encoded
+        images = encode_images(encoder, [work.view for work in batch])
     except BaseException as error:
-        if len(batch) == 1:
-            batch.pop().answer.set_exception(error)
-            return
-        alone = [[work] for work in batch]
-        for single in alone:
-            _encode(encoder, single)
-        batch[:] = [work for single in alone for work in single]
-
-
-def _finish(work: _Work) -> None:
-    try:
-        result = work.run(work.view)
-    except BaseException as error:
-        work.answer.set_exception(error)
-    else:
-        work.answer.set_result(result)
+        if len(batch) > 1:
+            return [encoded for work in batch for encoded in _encoded(encoder, [work])]
+        batch[0].answer.set_exception(error)
+        return []
+    for work, image in zip(batch, images, strict=True):
+        work.view = image
+    return batch
 
 
 @dataclass
@@ -207,21 +283,14 @@ class Stopwatch:
     _last: float = field(default_factory=perf_counter)
     _spent_ms: dict[str, float] = field(default_factory=dict)
 
-    def lap(self, stage: str, view: View | None = None) -> None:
-        """Count the time since the last lap to a stage; what an image's encoding took within it, to `encode`."""
+    def lap(self, stage: str, parts_ms: Mapping[str, float] | None = None) -> None:
+        """Count the time since the last lap to a stage, but for the parts of it, measured apart, to theirs."""
         now = perf_counter()
-        encode_ms = view.encode_ms if isinstance(view, EncodedImage) else 0.0
-        spent_ms = max(0.0, 1000 * (now - self._last) - encode_ms)
-        self._spent_ms[stage] = round(self._spent_ms.get(stage, 0.0) + spent_ms, 3)
-        if encode_ms:
-            self._spent_ms["encode"] = round(encode_ms, 3)
+        parts_ms = dict(parts_ms or {})
+        parts_ms[stage] = max(0.0, 1000 * (now - self._last) - sum(parts_ms.values()))
+        for name, spent_ms in parts_ms.items():
+            self._spent_ms[name] = round(self._spent_ms.get(name, 0.0) + spent_ms, 3)
         self._last = now
-
-    def take(self, timings_ms: Mapping[str, float]) -> None:
-        """Take over stages that were measured since the last lap, by whoever did the work."""
-        for stage, spent_ms in timings_ms.items():
-            self._spent_ms[stage] = round(spent_ms, 3)
-        self._last = perf_counter()
 
     def timings_ms(self) -> dict[str, float]:
         """Milliseconds by stage, and their `total` up to now."""
