@@ -15,13 +15,13 @@ CALM = Waits([0.010] * 100, [], [1])
 
 
 @pytest.fixture
-def figures() -> RemapFigures:
+def figures():
     robots = [LiveRobot("ranks", "bench", [b"{}"]), LiveRobot("pictures", "camera", [b""], "image/jpeg")]
     during = Waits([0.012] * 100, [], [1, 2])
     return RemapFigures(RemapSize(), Remapped(50.0, STAGES), Remapped(110.0, STAGES), robots, [CALM] * 2, [during] * 2)
 
 
-def test_kept_limits_are_all_passed(figures: RemapFigures) -> None:
+def test_kept_limits_are_all_passed(figures):
     lines = list(report(figures))
     assert [line for line in lines if line.endswith("| PASS |")] == [
         "| remap, seconds | 60 | 50 | PASS |",
@@ -47,17 +47,17 @@ def test_kept_limits_are_all_passed(figures: RemapFigures) -> None:
         ({"during": [CALM, Waits([0.01], ["503 overloaded"], [1])]}, "pictures: failures: 1, at most 0"),
     ],
 )
-def test_what_is_over_is_said(figures: RemapFigures, changes: dict[str, object], over: str) -> None:
+def test_what_is_over_is_said(figures, changes, over):
     broken = replace(figures, **changes)
     assert len([line for line in report(broken) if line.endswith("| **over** |")]) == 1
     assert breaches(broken.limits()) == f"over the limit: {over}"
 
 
-def test_a_figure_that_could_not_be_taken_is_over() -> None:
+def test_a_figure_that_could_not_be_taken_is_over():
     assert breaches([Limit("ratio", float("nan"), 3.0)]) == "over the limit: ratio: nan, at most 3"
 
 
-def test_pictures_are_of_nclts_size() -> None:
+def test_pictures_are_of_nclts_size():
     (body,) = jpegs(1)
     picture = cv2.imdecode(np.frombuffer(body, np.uint8), cv2.IMREAD_COLOR)
     assert picture is not None

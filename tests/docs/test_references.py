@@ -5,7 +5,6 @@ import re
 import shlex
 import tomllib
 from functools import cache
-from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
@@ -17,7 +16,8 @@ from deepsimbad.settings import CONFIG_VARIABLE, Settings, load_settings, variab
 from deepsimbad_client.commands.group import cli as deepsimbad_client
 from deepsimbad_client.http.wire import KEY_VARIABLE, URL_VARIABLE
 
-PROJECT = Path(__file__).resolve().parents[2]
+from .conftest import PROJECT, Page
+
 METHODS = "GET|POST|PUT|DELETE"
 OTHER_VARIABLES = {URL_VARIABLE, KEY_VARIABLE, CONFIG_VARIABLE, "DEEPSIMBAD_REAL_DATA", "DEEPSIMBAD_SITE"}
 
@@ -26,10 +26,7 @@ def settings_by_variable():
     return {variable_of(name): field for name, field in Settings.model_fields.items()}
 
 
-@pytest.fixture(scope="module")
-def settings_page(pages):
-    (page,) = [page for page in pages if page.path == PROJECT / "docs" / "settings.md"]
-    return page
+SETTINGS_PAGE = Page(PROJECT / "docs" / "settings.md")
 
 
 @pytest.fixture(scope="module")
@@ -50,41 +47,37 @@ def test_every_make_target_named_is_there(pages):
     assert named <= targets
 
 
-def test_every_call_named_is_in_the_openapi_document(pages, calls):
+def test_every_call_named_is_served_and_every_call_is_in_the_table(pages, calls):
     named = {
         (method, unnamed(path))
         for page in pages
         for method, path in re.findall(rf"\b({METHODS}) (/[\w./{{}}-]*)", page.text)
     }
-    assert len(named) > 15
     assert named <= calls, f"not served: {sorted(named - calls)}"
-
-
-def test_every_call_is_in_the_table(calls):
     text = (PROJECT / "docs" / "http.md").read_text()
-    named = {(method, unnamed(path)) for method, path in re.findall(rf"`({METHODS}) (/[^`]*)`", text)}
-    assert calls <= named, f"not described: {sorted(calls - named)}"
+    described = {(method, unnamed(path)) for method, path in re.findall(rf"`({METHODS}) (/[^`]*)`", text)}
+    assert calls <= described, f"not described: {sorted(calls - described)}"
 
 
-def test_every_variable_named_is_a_setting_and_every_setting_is_named(pages, settings_page):
+def test_every_variable_named_is_a_setting_and_every_setting_is_named(pages):
     named = {word for page in pages for word in re.findall(r"DEEPSIMBAD_[A-Z_]+", page.text)}
     assert named == set(settings_by_variable()) | OTHER_VARIABLES
     assert set(settings_by_variable()) <= set(
-        re.findall(r"^\| `(DEEPSIMBAD_[A-Z_]+)`", settings_page.text, re.MULTILINE)
+        re.findall(r"^\| `(DEEPSIMBAD_[A-Z_]+)`", SETTINGS_PAGE.text, re.MULTILINE)
     )
 
 
 @pytest.mark.parametrize("variable", sorted(settings_by_variable()))
-def test_the_table_of_settings_tells_default_and_meaning(settings_page, variable):
+def test_the_table_of_settings_tells_default_and_meaning(variable):
     field = settings_by_variable()[variable]
-    (row,) = [line for line in settings_page.text.splitlines() if line.startswith(f"| `{variable}`")]
+    (row,) = [line for line in SETTINGS_PAGE.text.splitlines() if line.startswith(f"| `{variable}`")]
     _, _, default, meaning, _ = (cell.strip() for cell in row.split("|"))
     assert default == f"`{shown_setting(field.default)}`"
     assert meaning == field.description
 
 
-def test_the_settings_file_shown_is_one(settings_page, tmp_path):
-    (example,) = settings_page.blocks("toml")
+def test_the_settings_file_shown_is_one(tmp_path):
+    (example,) = SETTINGS_PAGE.blocks("toml")
     (tmp_path / "shown.toml").write_text(example)
     settings = load_settings(tmp_path / "shown.toml")
     assert settings.keep_maps == tomllib.loads(example)["keep_maps"]
@@ -113,38 +106,22 @@ def test_every_command_named_exists_and_has_the_options_shown(pages):
     assert n_options > 20
 
 
-def test_every_module_that_is_to_be_run_is_there(pages):
-    named = {module for page in pages for text in page.commands() for module in re.findall(r"python -m ([\w.]+)", text)}
-    assert {"bench.nordland", "bench.netvlad"} <= named
-    for module in named:
-        assert importlib.util.find_spec(module), module
-
-
-def test_every_extra_that_is_to_be_installed_is_declared(pages):
-    declared = tomllib.loads((PROJECT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
-    named = {extra for page in pages for text in page.commands() for extra in re.findall(r"'\.\[(\w+)\]'", text)}
-    assert {"service", "replay"} <= named <= set(declared)
-
-
-def test_every_link_leads_somewhere(pages):
-    n_links = 0
+def test_every_module_extra_link_and_file_named_is_there(pages):
+    project = tomllib.loads((PROJECT / "pyproject.toml").read_text())["project"]
+    commands = [text for page in pages for text in page.commands()]
+    modules = {module for text in commands for module in re.findall(r"python -m ([\w.]+)", text)}
+    assert {"bench.nordland", "bench.netvlad"} <= modules
+    assert [module for module in modules if importlib.util.find_spec(module) is None] == []
+    extras = {extra for text in commands for extra in re.findall(r"'\.\[(\w+)\]'", text)}
+    assert {"service", "replay"} <= extras <= set(project["optional-dependencies"])
+    files = []
     for page in pages:
-        for target in re.findall(r"\]\(([^)#]+)\)", page.prose):
-            if not re.match(r"https?://", target):
-                assert (page.path.parent / target).exists(), f"{page.path.name} links to {target}"
-                n_links += 1
-    assert n_links > 10
-
-
-def test_every_source_file_named_is_there(pages):
-    named = {
-        (page.path.name, path)
-        for page in pages
-        for path in re.findall(r"\b((?:service|client|migrations|tests|bench|docs)/[\w./-]+)", page.text)
-    }
-    assert len(named) > 15
-    for page, path in named:
-        assert (PROJECT / path.rstrip(".")).exists(), f"{page} names {path}"
+        links = [link for link in re.findall(r"\]\(([^)#]+)\)", page.prose) if not re.match(r"https?://", link)]
+        paths = re.findall(r"\b((?:service|client|migrations|tests|bench|docs)/[\w./-]+)", page.text)
+        files += [(page.path.name, page.path.parent / link) for link in links]
+        files += [(page.path.name, PROJECT / path.rstrip(".")) for path in paths]
+    assert len(files) > 25
+    assert [(page, path) for page, path in files if not path.exists()] == []
 
 
 def test_the_readmes_figures_are_the_measured_ones(readme):
@@ -174,7 +151,7 @@ def test_the_planners_shown_are_the_measured_ones():
         assert tuple(shown) == measured[name.replace(":", "_")], name
 
 
-def test_every_decision_has_a_number_of_its_own_and_its_parts():
+def test_every_decision_has_a_number_of_its_own_and_its_parts_and_pictures_are_few_and_small():
     records = sorted((PROJECT / "docs" / "decisions").glob("*.md"))
     assert len({int(path.name[:4]) for path in records}) == len(records) >= 6
     for path in records:
@@ -184,8 +161,4 @@ def test_every_decision_has_a_number_of_its_own_and_its_parts():
         assert parts[0] == "Context", path.name
         assert "Decision" in parts, path.name
         assert len(parts) >= 3, f"{path.name} says nothing of what follows"
-
-
-def test_pictures_are_few_and_small():
-    pictures = list((PROJECT / "docs" / "images").iterdir())
-    assert sum(path.stat().st_size for path in pictures) < 400_000
+    assert sum(path.stat().st_size for path in (PROJECT / "docs" / "images").iterdir()) < 400_000

@@ -5,19 +5,16 @@ are moved below the folder; what a stage copies comes from the context as `.dock
 """
 
 import fnmatch
-import json
 import os
 import re
 import shlex
 import shutil
 import subprocess
 from collections.abc import Mapping
-from pathlib import Path, PurePosixPath
+from pathlib import PurePosixPath
 from typing import NamedTuple
 
-WORDS = frozenset(
-    "ARG FROM WORKDIR COPY RUN LABEL ENV USER VOLUME EXPOSE HEALTHCHECK ENTRYPOINT CMD".split()  # noqa: SIM905
-)
+WORDS = "ARG FROM WORKDIR COPY RUN LABEL ENV USER VOLUME EXPOSE HEALTHCHECK ENTRYPOINT CMD".split()  # noqa: SIM905
 
 
 class Instruction(NamedTuple):
@@ -27,25 +24,20 @@ class Instruction(NamedTuple):
     options: Mapping[str, str]
     rest: str
 
-    def exec_form(self) -> list[str]:
-        """The words of the JSON form; an AssertionError where it is the shell's."""
-        words = json.loads(self.rest)
-        assert isinstance(words, list), self
-        return words
-
 
 class Stage(list[Instruction]):
     """One stage of the build."""
 
-    def every(self, word: str) -> list[Instruction]:
+    def every(self, word):
         return [instruction for instruction in self if instruction.word == word]
 
-    def one(self, word: str) -> Instruction:
+    def one(self, word):
+        """The rest of the only instruction of that word."""
         (instruction,) = self.every(word)
-        return instruction
+        return instruction.rest
 
 
-def stages_of(path: Path) -> dict[str, Stage]:
+def stages_of(path):
     """A Dockerfile's stages by name, in order; what stands before the first has an empty name."""
     lines = [line for line in path.read_text(encoding="utf-8").splitlines() if not line.lstrip().startswith("#")]
     stages = {"": Stage()}
@@ -55,105 +47,84 @@ def stages_of(path: Path) -> dict[str, Stage]:
         while (option := re.match(r"--([a-z-]+)=(\S+)\s+", rest := rest.strip())) is not None:
             options[option[1]], rest = option[2], rest[option.end() :]
         if word == "FROM":
-            stages[re.fullmatch(r"\S+ AS (\S+)", rest)[1]] = Stage()  # type: ignore[index]
+            stages[re.fullmatch(r"\S+ AS (\S+)", rest)[1]] = Stage()
         elif word:
             assert word in WORDS, f"{word} is not known here"
             stages[next(reversed(stages))].append(Instruction(word, options, rest))
     return stages
 
 
-def pairs(text: str) -> dict[str, str]:
+def pairs(text):
     """What an ARG or ENV sets."""
     return dict(pair.split("=", 1) if "=" in pair else (pair, "") for pair in shlex.split(text))
 
 
-def context_of(project: Path, into: Path) -> Path:
+def context_of(project, into):
     """The build context: the files that `.dockerignore` lets through."""
     rules = [line for line in (project / ".dockerignore").read_text().splitlines() if line and line[0] != "#"]
     assert rules[0] == "*", "everything is left out but what is named"
     dropped = [rule.removeprefix("**/") for rule in rules[1:] if not rule.startswith("!")]
     into.mkdir(parents=True)
     for name in (rule[1:] for rule in rules if rule.startswith("!")):
-        source = project / name
-        assert source.exists(), f".dockerignore keeps {name}, which is not there"
-        if source.is_dir():
-            shutil.copytree(source, into / name, ignore=shutil.ignore_patterns(*dropped))
+        if (project / name).is_dir():
+            shutil.copytree(project / name, into / name, ignore=shutil.ignore_patterns(*dropped))
         elif not any(fnmatch.fnmatch(name, rule) for rule in dropped):
-            shutil.copy2(source, into / name)
+            shutil.copy2(project / name, into / name)
     return into
 
 
 class Build:
     """Does stages, one after the other, below a folder that stands for the image's root.
 
-    Args:
-        stages: What to do.
-        context: The build context.
-        folder: Where.
-        moved: Absolute paths of the image that are moved below the folder.
-        environment: What every command sees besides the stage's own.
-        given: Build arguments, in the place of their defaults.
+    The absolute paths of the image that are `moved` lie below the folder; every command sees the `environment` besides
+    the stage's own; build arguments that are `given` stand in the place of their defaults.
     """
 
-    def __init__(
-        self,
-        stages: Mapping[str, Stage],
-        context: Path,
-        folder: Path,
-        moved: list[str],
-        environment: Mapping[str, str],
-        given: Mapping[str, str],
-    ) -> None:
+    def __init__(self, stages, context, folder, moved, environment, given):
         self._stages, self._context, self._folder = stages, context, folder
         self._environment, self._given = environment, given
         self._moved = re.compile(rf"(?<![\w.-])(?=(?:{'|'.join(map(re.escape, moved))})(?![\w-]))")
-        self.root, self.env = folder / "root", dict[str, str]()
+        self.root, self.env = folder / "root", {}
 
-    def here(self, text: str) -> str:
+    def here(self, text):
         """The text with the image's paths moved."""
         return self._moved.sub(str(self.root), text)
 
-    def do(self, name: str) -> None:
+    def do(self, name):
         """Do a stage; from then on `root` is what it left and `env` what it set."""
         (place := self._folder / f"stage-{name}").mkdir()
         self.root.unlink(missing_ok=True)
         self.root.symlink_to(place)
         self.env, workdir = {}, place
         for instruction in self._stages[name]:
-            if instruction.word == "ARG":
-                self.env |= {name: self._given.get(name, value) for name, value in pairs(instruction.rest).items()}
-            elif instruction.word == "ENV":
-                self.env |= pairs(self.here(instruction.rest))
-            elif instruction.word == "WORKDIR":
-                workdir = self.root / PurePosixPath(instruction.rest).relative_to("/")
-                workdir.mkdir(parents=True, exist_ok=True)
-            elif instruction.word == "COPY":
-                self._copy(instruction, workdir)
-            elif instruction.word == "RUN":
-                done = subprocess.run(
-                    ["/bin/sh", "-c", self.here(instruction.rest)],
-                    cwd=workdir,
-                    env={**self._environment, **self.env},
-                    capture_output=True,
-                    text=True,
-                    check=False,
-                )
-                assert done.returncode == 0, f"{instruction.rest}\n{done.stdout}\n{done.stderr}"
+            match instruction.word:
+                case "ARG":
+                    self.env |= {name: self._given.get(name, value) for name, value in pairs(instruction.rest).items()}
+                case "ENV":
+                    self.env |= pairs(self.here(instruction.rest))
+                case "WORKDIR":
+                    workdir = self.root / PurePosixPath(instruction.rest).relative_to("/")
+                    workdir.mkdir(parents=True, exist_ok=True)
+                case "COPY":
+                    self._copy(instruction, workdir)
+                case "RUN":
+                    command, options = self.here(instruction.rest), {"capture_output": True, "text": True}
+                    options |= {"cwd": workdir, "env": {**self._environment, **self.env}}
+                    ended = subprocess.run(["/bin/sh", "-c", command], check=False, **options)
+                    assert ended.returncode == 0, f"{instruction.rest}\n{ended.stdout}\n{ended.stderr}"
 
-    def _copy(self, instruction: Instruction, workdir: Path) -> None:
+    def _copy(self, instruction, workdir):
         *sources, target = instruction.rest.split()
         options = instruction.options
         origin = self._folder / f"stage-{options['from']}" if "from" in options else self._context
         into = self.root / target.lstrip("/") if target.startswith("/") else workdir / target
-        for source in sources:
-            path = origin / source.lstrip("/")
-            assert path.exists(), f"COPY {source}: not there"
+        for path in (origin / source.lstrip("/") for source in sources):
             if path.is_dir():  # a folder's contents, as Docker does it
                 # A second name in the place of a second copy of 1.8 GB; what gets another owner is copied.
                 copy = shutil.copy2 if "chown" in options else os.link
                 shutil.copytree(path, into, symlinks=True, dirs_exist_ok=True, copy_function=copy)
             else:
-                assert target.endswith("/"), f"COPY {source} into a folder"
+                assert target.endswith("/"), f"COPY {path.name} into a folder"
                 into.mkdir(parents=True, exist_ok=True)
                 shutil.copy2(path, into / path.name)
         if "chown" in options and os.geteuid() == 0:

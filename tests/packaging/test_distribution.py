@@ -30,7 +30,7 @@ def run(*command, **options):
 
 
 @pytest.fixture(scope="module")
-def wheel(tmp_path_factory) -> Path:
+def wheel(tmp_path_factory):
     """The wheel, built from the sdist."""
     folder = tmp_path_factory.mktemp("dist")
     run(sys.executable, "-m", "build", "--outdir", folder, PROJECT)
@@ -43,7 +43,7 @@ def wheel(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def bare(wheel, tmp_path_factory) -> Path:
+def bare(wheel, tmp_path_factory):
     """The folder of programs of a fresh environment that holds the bare wheel."""
     folder = tmp_path_factory.mktemp("bare") / "env"
     venv.create(folder, with_pip=True)
@@ -72,7 +72,7 @@ def test_the_wheel_holds_all_packages_typed_and_licensed(wheel):
     assert "License-Expression: MIT" in metadata
     assert "deepsimbad = deepsimbad.__main__:main" in entry_points
     assert "deepsimbad-client = deepsimbad_client.cli:main" in entry_points
-    stray = [name for name in names if not name.startswith((*(f"{each}/" for each in PACKAGES), "deep_simbad-"))]
+    stray = [name for name in names if not name.startswith((*(f"{package}/" for package in PACKAGES), "deep_simbad-"))]
     assert stray == [], "nothing else is shipped"
 
 

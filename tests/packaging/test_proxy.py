@@ -4,7 +4,6 @@ import shutil
 import socket
 import subprocess
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import httpx2
@@ -21,7 +20,7 @@ pytestmark = [
 
 
 @pytest.fixture(scope="module")
-def port(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
+def port(tmp_path_factory):
     """Of the proxy, whose patience is cut to seconds."""
     folder = tmp_path_factory.mktemp("proxy")
     text = CADDYFILE.read_text()
@@ -56,7 +55,7 @@ def port(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
             process.wait(30)
 
 
-def told(port: int, *pieces: bytes) -> bytes:
+def received(port, *pieces):
     """What comes until the connection is closed."""
     with socket.create_connection(("127.0.0.1", port), timeout=60) as connection:
         try:
@@ -64,35 +63,35 @@ def told(port: int, *pieces: bytes) -> bytes:
                 connection.sendall(piece)
         except OSError:  # refused while it was sent
             pass
-        received = b""
+        answer = b""
         try:
             while more := connection.recv(65536):
-                received += more
+                answer += more
         except ConnectionError:
             pass
-        return received
+        return answer
 
 
-def head(port: int, line: str, *headers: str) -> bytes:
+def head(port, line, *headers):
     return "\r\n".join([f"{line} HTTP/1.1", f"Host: 127.0.0.1:{port}", *headers, "", ""]).encode()
 
 
-def test_the_configuration_is_valid_and_written_as_its_tool_writes_it() -> None:
+def test_the_configuration_is_valid_and_written_as_its_tool_writes_it():
     for arguments in (("validate", "--adapter", "caddyfile", "--config", CADDYFILE), ("fmt", CADDYFILE)):
         ran = subprocess.run([str(CADDY), *arguments], capture_output=True, text=True, check=False)
         assert ran.returncode == 0, ran.stderr
     assert ran.stdout == CADDYFILE.read_text()
 
 
-def test_what_the_service_answers_passes_through(port: int) -> None:
+def test_what_the_service_answers_passes_through(port):
     with httpx2.Client(base_url=f"http://127.0.0.1:{port}") as client:
         answer = client.get("/v1/domains", headers={"X-Request-ID": "mine"})
         assert (answer.status_code, answer.headers["x-request-id"]) == (200, "mine")
         problem = client.get("/v1/domains/unknown")
         assert (problem.status_code, problem.headers["content-type"]) == (404, "application/problem+json")
         assert client.get("/metrics").status_code == 404
-        made = client.put("/v1/admin/domains/d", json={"evaluator": {"kind": "feature_l2", "extractor": "none"}})
-        assert made.status_code == 201
+        created = client.put("/v1/admin/domains/d", json={"evaluator": {"kind": "feature_l2", "extractor": "none"}})
+        assert created.status_code == 201
         large = client.put(
             "/v1/admin/domains/d", content=bytes(5_000_000), headers={"Content-Type": "application/json"}
         )
@@ -102,23 +101,23 @@ def test_what_the_service_answers_passes_through(port: int) -> None:
 @pytest.mark.parametrize(
     "begun", [b"", b"GET / HTTP/1.1\r\n", b"GET / HTTP/1.1\r\nHost: x\r\nA: b\r\n"], ids=["silent", "line", "header"]
 )
-def test_a_head_that_never_ends_is_ended(port: int, begun: bytes) -> None:
+def test_a_head_that_never_ends_is_ended(port, begun):
     began = time.monotonic()
-    assert b"200 OK" not in told(port, begun)
+    assert b"200 OK" not in received(port, begun)
     assert time.monotonic() - began < 30
 
 
-def test_a_body_that_never_ends_is_ended(port: int) -> None:
+def test_a_body_that_never_ends_is_ended(port):
     path = "POST /v1/domains/d/localizations"
-    answer = told(port, head(port, path, "Content-Type: application/json", "Content-Length: 1000") + b"{")
+    answer = received(port, head(port, path, "Content-Type: application/json", "Content-Length: 1000") + b"{")
     assert not answer.startswith(b"HTTP/1.1 2")
 
 
-def test_a_body_that_is_too_long_is_ended_however_it_comes(port: int) -> None:
+def test_a_body_that_is_too_long_is_ended_however_it_comes(port):
     sent = head(port, "PUT /v1/admin/domains/d", "Content-Type: image/png", "Transfer-Encoding: chunked")
-    answer = told(port, sent, *[b"100000\r\n" + bytes(1 << 20) + b"\r\n"] * 40)
+    answer = received(port, sent, *[b"100000\r\n" + bytes(1 << 20) + b"\r\n"] * 40)
     assert not answer.startswith(b"HTTP/1.1 2")
 
 
-def test_a_head_that_is_too_long_is_refused(port: int) -> None:
-    assert told(port, head(port, "GET /v1/domains", "A: " + "a" * 200_000)).startswith(b"HTTP/1.1 431 ")
+def test_a_head_that_is_too_long_is_refused(port):
+    assert received(port, head(port, "GET /v1/domains", "A: " + "a" * 200_000)).startswith(b"HTTP/1.1 431 ")

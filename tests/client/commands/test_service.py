@@ -1,17 +1,13 @@
 """The client against the real service: nothing between them is pretended."""
 
-import asyncio
 import json
 import threading
 
 import cv2
-import httpx2
 import numpy as np
 import pytest
 
-from deepsimbad.api.app import create_app
-from deepsimbad.settings import Settings
-from deepsimbad_client import AsyncClient, errors
+from deepsimbad_client import errors
 from deepsimbad_client.commands.group import run
 from deepsimbad_client.http.jobs import follow_job, remap
 from deepsimbad_client.http.upload import in_order, upload
@@ -151,37 +147,6 @@ def test_the_command_line_end_to_end(service, encodings, tmp_path, capsys, monke
     assert "succeeded" in capsys.readouterr().out
     assert run(["remap", "--domain", "cli", "--training", "nothing"]) == 1
     assert capsys.readouterr().err.count("\n") == 1
-
-
-def test_the_async_client_over_asgi(tmp_path, encodings):
-    async def scenario():
-        app = create_app(Settings(data_dir=tmp_path))
-        async with (
-            app.router.lifespan_context(app),
-            AsyncClient("http://service", transport=httpx2.ASGITransport(app)) as client,
-        ):
-            assert (await client.health()).status == "alive"
-            assert (await client.ready()).status == "ready"
-            await client.admin.put_domain("async", ENCODINGS)
-            await client.admin.create_traverse("async", "t")
-            frames = np.load(encodings / "summer.npy")
-            index = np.arange(len(frames))
-            stored = await client.admin.put_frames(
-                "async", "t", encodings=frames, index=index, position_m=index, x_m=index, y_m=0.0 * index
-            )
-            assert stored.n_new == 120
-            job = await client.admin.remap("async", training_traverse="t", landmark_traverse="t", n_landmarks=30)
-            heard = [event async for event in client.admin.job_events(job.job_id)]
-            assert heard[-1].state == "succeeded"
-            asked = [client.localize("async", encoding=frame) for frame in frames[:10]]
-            answers = await asyncio.gather(*asked)
-            assert [answer.retrieval[0].map_image for answer in answers] == list(range(10))
-            assert answers[4].belief.top[0].x_m == 4.0
-            assert (await client.relevances("async", encoding=frames[5])).argmax() == 5
-            with pytest.raises(errors.InvalidInputError):
-                await client.localize("async", encoding=[1.0, 2.0])
-
-    asyncio.run(scenario())
 
 
 def test_places_on_the_command_line(client, encodings, tmp_path, capsys):

@@ -234,7 +234,7 @@ def test_every_answer_knows_its_request_which_the_caller_may_name(is_named):
         session = client.session("d", keep=True)
         answers = [place, session.opened, session.observe(ranked_landmarks=[0]), session.next_best_view()]
         answers.append(client.admin.job("j"))
-    assert [each.request_id for each in answers if each is not None] == ["r0", "r1", "r2", "r3", "r4"]
+    assert [reply.request_id for reply in answers if reply is not None] == ["r0", "r1", "r2", "r3", "r4"]
     sent = [request.headers.get("x-request-id") for request in script.requests]
     assert sent == [f"robot.{n}" if is_named else None for n in range(5)]
     assert Script(answer(200, JOB)).client().admin.job("j").request_id is None
@@ -258,12 +258,12 @@ def test_an_id_that_the_service_would_not_take_is_not_sent(bad):
 
 
 def test_a_requests_id_is_no_part_of_what_was_answered():
-    known, unknown = Localization.model_validate(LOCALIZATION), Localization.model_validate(LOCALIZATION)
-    assert known.answering("r1").request_id == "r1"
-    assert unknown.request_id is None
-    assert known == unknown
-    assert known.model_dump() == unknown.model_dump()
-    assert "r1" not in known.model_dump_json() + repr(known)
+    named, unnamed = Localization.model_validate(LOCALIZATION), Localization.model_validate(LOCALIZATION)
+    assert named.answering("r1").request_id == "r1"
+    assert unnamed.request_id is None
+    assert named == unnamed
+    assert named.model_dump() == unnamed.model_dump()
+    assert "r1" not in named.model_dump_json() + repr(named)
     assert Job.model_validate({**JOB, "_request_id": "theirs", "request_id": "theirs"}).request_id is None
 
 

@@ -66,7 +66,7 @@ def test_an_observation_whose_answer_was_lost_counts_once(client, link, views):
         for at in (50, 53, 57):
             session.observe(encoding=views[at], action_m=3)
         assert session.state().n_observations == 3
-    keys = [each.headers["idempotency-key"] for each in link.requests if "observations" in each.url.path]
+    keys = [request.headers["idempotency-key"] for request in link.requests if "observations" in request.url.path]
     assert (len(keys), len(set(keys))) == (6, 3)
 
 

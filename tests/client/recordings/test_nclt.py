@@ -74,8 +74,8 @@ def test_what_has_no_ground_truth_or_no_file_is_left_out_and_counted(nclt_tree):
     (nclt_tree.root / "2012-01-22/lb3/Cam5/thumb.tiff").write_bytes(b"")
     (nclt_tree.root / "2012-01-22/lb3/Cam5/README.txt").write_bytes(b"")
     recording = open_source(nclt_tree.source)
-    kept = [round((frame.timestamp_us - nclt_tree.start_us) / 1e6, 1) for frame in recording.frames]
-    assert kept == [1.0, 1.2, 1.4, 3.0, 3.2, 3.4]
+    seconds = [round((frame.timestamp_us - nclt_tree.start_us) / 1e6, 1) for frame in recording.frames]
+    assert seconds == [1.0, 1.2, 1.4, 3.0, 3.2, 3.4]
     assert recording.left_out == {
         "before or after the ground truth": 5 + 2,
         "gap in the ground truth": 7,

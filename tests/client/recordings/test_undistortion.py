@@ -74,9 +74,9 @@ def test_a_table_is_parsed_once_and_again_when_the_file_or_the_cache_changes(tab
     assert len(parsed) == 1
     np.testing.assert_array_equal(first.u, second.u)
     np.testing.assert_array_equal(first.v, second.v)
-    (kept,) = (tmp_path / "xdg" / "deep-simbad").iterdir()
-    assert kept.suffix == ".npz", "nothing half-written stays behind"
-    kept.write_bytes(kept.read_bytes()[:50])
+    (cached,) = (tmp_path / "xdg" / "deep-simbad").iterdir()
+    assert cached.suffix == ".npz", "nothing half-written stays behind"
+    cached.write_bytes(cached.read_bytes()[:50])
     (tmp_path / "file").write_text("in the way")
     with caplog.at_level(logging.WARNING):
         np.testing.assert_array_equal(load_undistortion(table).u, first.u)

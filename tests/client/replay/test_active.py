@@ -39,7 +39,7 @@ def stage(client, drive):
 def test_every_planner_starts_from_the_same_places_and_goes_where_it_is_sent(client, driven, link):
     replay = driven()
     for value in (lambda episode: episode.steps[0].index, lambda episode: episode.seed):
-        default, random, constant = ([value(episode) for episode in each] for each in replay.episodes.values())
+        default, random, constant = ([value(episode) for episode in episodes] for episodes in replay.episodes.values())
         assert default == random == constant
         assert len(set(default)) > 1
     assert max(episode.steps[0].index for episode in replay.episodes["default"]) + 5 * 10 <= 119

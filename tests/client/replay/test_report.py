@@ -17,7 +17,7 @@ from deepsimbad_client.replay.report import Resampling, active_tables, at_distan
 
 def step(number, rank, action_m, travelled_m):
     place, error_m = 10.0 + travelled_m, None if rank is None else 2 * rank
-    known: dict[str, Any] = {
+    values = {
         "step": number,
         "action_m": action_m,
         "travelled_m": travelled_m,
@@ -36,7 +36,7 @@ def step(number, rank, action_m, travelled_m):
         "mode_y_m": 0.0,
     }
     unknown = dict.fromkeys(field.name for field in fields(EpisodeStep))
-    return EpisodeStep(**unknown | known | {"mass": (0.25, 0.5, 0.125, 0.125)})
+    return EpisodeStep(**unknown | values | {"mass": (0.25, 0.5, 0.125, 0.125)})
 
 
 def episode(planner, number, ranks, action_m):
