@@ -33,26 +33,16 @@ _JOBS = "/v1/admin/jobs"
 class RemapOptions(TypedDict, total=False):
     """What a remap may be told; what is absent or None is left to the service's default."""
 
-    landmark_traverse: str | None
-    """Where landmarks are chosen; absent: the active map's landmarks stay."""
-    n_landmarks: int | None
-    """r, how many landmarks."""
-    list_length: int | None
-    """h, how many of them a map image keeps."""
-    relevance: str | None
-    """How a map image is compared with a query."""
-    training_episodes: int | None
-    """Length of the planner's training."""
-    seed: int | None
-    """Of whatever is random."""
-    activate: bool | None
-    """Whether the new map serves at once."""
-    check_traverse: str | None
-    """The drive that the new map and the active one are compared on."""
-    gate_margin: float | None
-    """By how many percentage points of ANR the new map may be worse and still be activated."""
-    append: bool | None
-    """Whether the traverse is added to a copy of the active map."""
+    landmark_traverse: str | None  # Where landmarks are chosen; absent: the active map's landmarks stay
+    n_landmarks: int | None  # r, how many landmarks
+    list_length: int | None  # h, how many of them a map image keeps
+    relevance: str | None  # How a map image is compared with a query
+    training_episodes: int | None  # Length of the planner's training
+    seed: int | None  # Of whatever is random
+    activate: bool | None  # Whether the new map serves at once
+    check_traverse: str | None  # The drive that the new map and the active one are compared on
+    gate_margin: float | None  # By how many percentage points of ANR the new map may be worse and still be activated
+    append: bool | None  # Whether the traverse is added to a copy of the active map
     same_route: bool | None
     """Whether the training and the landmark traverse count their positions along one route; absent: only where both
     know x, y. `second_season` of the job says whether the map learnt from both."""
@@ -76,11 +66,9 @@ class AdminCalls(Face):
     ) -> Domain:
         """Make a domain; the same again changes nothing.
 
-        `evaluator` is `{"kind": ..., ...}`, how observations are compared with landmarks; `closed` says that the
-        route's end is its start; `actions_m` are the moves a robot may be told to make, absent: the service's default.
-
-        Raises:
-            DomainDiffersError: A domain of that name exists with another configuration.
+        `evaluator` is `{"kind": ..., ...}`, how observations are compared with landmarks; `closed` says that
+        the route's end is its start; `actions_m` are the moves a robot may be told to make, absent: the
+        service's default. Raises DomainDiffersError (A domain of that name exists with another configuration).
         """
         actions = None if actions_m is None else [float(action) for action in actions_m]
         document = {"evaluator": dict(evaluator), "closed": closed, "actions_m": actions}
@@ -182,12 +170,9 @@ class AdminCalls(Face):
     ) -> Job:
         """Submit a remap and return its job at once; `deepsimbad_client.http.jobs.remap` also follows it.
 
-        A lost answer is asked for again and makes no second job. `training_traverse` becomes the map; for the options
-        see `RemapOptions`. The `idempotency_key` names this request, so that it can be repeated after a
-        `TransportError`; absent: a new one.
-
-        Raises:
-            TooManyJobsError: As many jobs wait as may.
+        A lost answer is asked for again and makes no second job. `training_traverse` becomes the map; for the
+        options see `RemapOptions`. The `idempotency_key` names this request, so that it can be repeated after a
+        `TransportError`; absent: a new one. Raises TooManyJobsError (as many jobs wait as may).
         """
         document = {"training_traverse": training_traverse, **options}
         call = Call.with_json("POST", f"{_domain(domain)}/remaps", document, headers=once(idempotency_key))
@@ -199,11 +184,9 @@ class AdminCalls(Face):
     ) -> Job:
         """Teach the next map: where a session's robot truly was at each of its observations, known only afterwards.
 
-        The job makes the next map version; the session may have ended a while ago. A position along the map's route for
-        each observation, in order, is None or NaN where unknown; the key is as that of `remap`.
-
-        Raises:
-            TooManyJobsError: As many jobs wait as may.
+        The job makes the next map version; the session may have ended a while ago. A position along the map's
+        route for each observation, in order, is None or NaN where unknown; the key is as that of `remap`.
+        Raises TooManyJobsError (as many jobs wait as may).
         """
         document = {"session_id": session_id, "true_positions_m": known_positions(true_positions_m)}
         call = Call.with_json("POST", f"{_domain(domain)}/experience", document, headers=once(idempotency_key))
@@ -228,8 +211,7 @@ class AdminCalls(Face):
     async def job_events(self, job_id: str) -> AsyncGenerator[Job, None]:
         """Yield the job each time it has moved, the last time ended; one connection, not renewed when it breaks.
 
-        Raises:
-            TransportError: The connection failed or broke off.
+        Raises TransportError (the connection failed or broke off).
         """
         call = Call("GET", f"{_job(job_id)}/events", headers={"Accept": "text/event-stream"}, repeat=Repeat.NEVER)
         async with aclosing(self._wire.events(call)) as events:
@@ -258,9 +240,7 @@ class AdminCalls(Face):
     async def activate(self, domain: str, version: int, *, expected: int | None = None) -> MapVersion:
         """Serve another version, forward or back, if `expected` (absent: whichever) is the active one now.
 
-        Raises:
-            LostActivationError: Another version than the expected one was active.
-            RetiredMapError: The version's file was removed.
+        Raises LostActivationError, RetiredMapError.
         """
         # After a lost answer, a repetition of a conditional switch would report its own success as a lost race.
         call = Call.with_json(
@@ -275,9 +255,7 @@ class AdminCalls(Face):
     async def rollback(self, domain: str) -> MapVersion:
         """Serve the version again that served before the active one; once more, and the present one is back.
 
-        Raises:
-            NoEarlierMapError: No other version has served, or their files were removed.
-            LostActivationError: Another version was activated meanwhile.
+        Raises NoEarlierMapError, LostActivationError.
         """
         maps = await AdminCalls.maps(self, domain)
         active = next((version.version for version in maps if version.state == "active"), None)
@@ -296,8 +274,7 @@ class AdminCalls(Face):
     async def delete_map(self, domain: str, version: int) -> None:
         """Remove the file of a version; its place in the history stays.
 
-        Raises:
-            MapInUseError: It serves, is being built, or a living session keeps it.
+        Raises MapInUseError (it serves, is being built, or a living session keeps it).
         """
         await self._wire.send(Call.delete(f"{_domain(domain)}/maps/{int(version)}"))
 
@@ -312,14 +289,10 @@ class AdminCalls(Face):
     ) -> MapFile:
         """Fetch the sealed file of a version, to keep or to import it elsewhere.
 
-        It is written beside `path`, checked against the digest that the service names, and then renamed. A download
-        that was interrupted goes on where it stopped, this time or the next. `on_progress` is told of the bytes there
-        and the bytes in all (None: not known).
-
-        Raises:
-            RetiredMapError: Its file was removed.
-            DamagedDownloadError: What came has another digest than the service named.
-            NotSavedError: It cannot be written.
+        It is written beside `path`, checked against the digest that the service names, and then renamed. A
+        download that was interrupted goes on where it stopped, this time or the next. `on_progress` is told of
+        the bytes there and the bytes in all (None: not known). Raises RetiredMapError, DamagedDownloadError,
+        NotSavedError.
         """
         # As its bytes are: compressed on the way, its parts could not be put together.
         headers = {"Accept": "application/vnd.sqlite3, application/octet-stream", "Accept-Encoding": "identity"}

@@ -58,8 +58,7 @@ class Call:
     def with_json(cls, method: str, path: str, document: Mapping[str, Any], **more: Any) -> "Call":
         """A call whose body is a document, absent (None) values left out; `more` are its other attributes.
 
-        Raises:
-            InvalidArgumentError: It holds NaN or something JSON cannot say.
+        Raises InvalidArgumentError (it holds NaN or something JSON cannot say).
         """
         try:
             body = json.dumps({key: value for key, value in document.items() if value is not None}, allow_nan=False)
@@ -80,11 +79,7 @@ def once(idempotency_key: str | None) -> dict[str, str]:
 
 
 def in_path(kind: str, name: str) -> str:
-    """A name that may stand in an address.
-
-    Raises:
-        InvalidArgumentError: It is none, with what a name may hold.
-    """
+    """A name that may stand in an address. Raises InvalidArgumentError (it is none, with what a name may hold)."""
     if NAME.fullmatch(name) is None:
         raise InvalidArgumentError(
             f"{name!r} cannot name a {kind}: use 1 to 64 letters, digits, '.', '_' and '-', the first a letter or digit"
@@ -103,12 +98,7 @@ def session_path(session_id: str) -> str:
 
 
 def raise_for_problem(response: httpx2.Response) -> None:
-    """Turn an error answer into its named error.
-
-    Raises:
-        ApiError: The subclass that the problem's code or the status names.
-        UnexpectedAnswerError: A redirect, which the contract does not know.
-    """
+    """Turn an error answer into its named error. Raises ApiError, UnexpectedAnswerError."""
     status = response.status_code
     if response.is_success:
         return
@@ -143,8 +133,7 @@ def model_of(kind: type[Model], response: httpx2.Response) -> Model:
 def page_of(kind: type[Model], key: str, response: httpx2.Response) -> tuple[tuple[Model, ...], str | None]:
     """One page of a list, bare or under `key`, and what the next is asked for by (None: the list ends).
 
-    Raises:
-        UnexpectedAnswerError: It is none.
+    Raises UnexpectedAnswerError (it is none).
     """
     request_id = response.headers.get(REQUEST_ID)
     adapter: TypeAdapter[tuple[Model, ...]] = TypeAdapter(tuple[kind, ...])  # type: ignore[valid-type]
@@ -159,12 +148,7 @@ def page_of(kind: type[Model], key: str, response: httpx2.Response) -> tuple[tup
 
 
 def float_array(response: httpx2.Response) -> "NDArray[np.float32]":
-    """The [n] float32 of an npy body.
-
-    Raises:
-        MissingExtraError: numpy is not installed.
-        UnexpectedAnswerError: It is another body.
-    """
+    """The [n] float32 of an npy body. Raises MissingExtraError, UnexpectedAnswerError."""
     try:
         values = require_numpy().load(BytesIO(response.content), allow_pickle=False)
     except (ValueError, EOFError, OSError) as error:

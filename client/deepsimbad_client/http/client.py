@@ -102,16 +102,11 @@ class SessionCalls(Face):
     ) -> SessionAnswer:
         """Tell what the robot sees now, after the metres it has moved; give exactly one form of the view.
 
-        The forms of a view and `shortlist` are those of `Client.localize`. `action_m` are the metres really moved since
-        the last view (absent: stood still; ignored for the first view), `action_std_m` how well they are known (absent:
-        the service's usual odometry). A lost answer is asked for again and counts once. To repeat an observation
-        yourself after a `TransportError`, choose its `idempotency_key`, and send the same again under it.
-
-        Raises:
-            InvalidMoveError: The move is negative or too long; `PastTheEndError`: past the end of the route.
-            LandmarkModelDiffersError: `ranked` was made with other landmarks than those of the session's map.
-            InvalidInputError: The service cannot use the view; its detail says why.
-            GoneError: The session has ended, or its map was removed.
+        The forms of a view and `shortlist` are those of `Client.localize`. `action_m` are the metres really
+        moved since the last view (absent: stood still; ignored for the first view), `action_std_m` how well
+        they are known (absent: the service's usual odometry). A lost answer is asked for again and counts once.
+        To repeat an observation yourself after a `TransportError`, choose its `idempotency_key`, and send the
+        same again under it. Raises InvalidMoveError, LandmarkModelDiffersError, InvalidInputError, GoneError.
         """
         view = observation(image, content_type, ranked_landmarks, dissimilarities, encoding, ranked)
         moved = {"action_m": action_m, "action_std_m": action_std_m}
@@ -148,8 +143,7 @@ class SessionCalls(Face):
     async def set_prior(self, position_m: float, std_m: float) -> SessionState:
         """Forget the belief for one around a position: the robot was carried, or got a fix.
 
-        Raises:
-            InvalidPriorError: The position is far off the route, or the deviation cannot be one.
+        Raises InvalidPriorError (the position is far off the route, or the deviation cannot be one).
         """
         prior = {"position_m": float(position_m), "std_m": float(std_m)}
         return model_of(SessionState, await self._wire.send(Call.with_json("PUT", f"{self._path}/prior", prior)))
@@ -167,12 +161,11 @@ class SessionCalls(Face):
         The service raises its alarm by this; the map learns nothing from it (`Admin.feed_experience`). The same truths
         again count once.
 
-        A position along the map's route for each observation, in order, is None where unknown. `true_map_images` are,
-        for each of the same observations, the map images that show its place: the answer's `retrieval_ranks` then tell
-        where each view by itself placed the best of them. Truths may be told bit by bit, from `first_observation` on.
-
-        Raises:
-            InvalidInputError: As many positions as observations there are not.
+        A position along the map's route for each observation, in order, is None where unknown.
+        `true_map_images` are, for each of the same observations, the map images that show its place: the
+        answer's `retrieval_ranks` then tell where each view by itself placed the best of them. Truths may be
+        told bit by bit, from `first_observation` on. Raises InvalidInputError (as many positions as
+        observations there are not).
         """
         return await _truths(self._wire, self._path, true_positions_m, true_map_images, first_observation)
 
@@ -224,11 +217,7 @@ class ClientCalls(Face, Generic[AnySession]):
 
     @shared
     async def ready(self) -> Health:
-        """Whether it can answer now; asked once.
-
-        Raises:
-            UnavailableError: Not yet; its detail says why.
-        """
+        """Whether it can answer now; asked once. Raises UnavailableError: not yet; its detail says why."""
         return model_of(Health, await self._wire.send(Call("GET", "/readyz", repeat=Repeat.NEVER)))
 
     @shared
@@ -243,24 +232,15 @@ class ClientCalls(Face, Generic[AnySession]):
 
     @shared
     async def domain(self, name: str) -> Domain:
-        """One domain and its active map.
-
-        Raises:
-            UnknownDomainError: There is none of that name.
-        """
+        """One domain and its active map. Raises UnknownDomainError (there is none of that name)."""
         return model_of(Domain, await self._wire.send(Call("GET", domain_path(name))))
 
     @shared
     async def on_board(self, domain: str, *, map_version: int | None = None) -> "OnBoardEncoder":
         """Fetch a map's landmarks once, to rank them here and send a few bytes a view (needs `deep-simbad[edge]`).
 
-        `map_version` is one that a session keeps; absent: the active map.
-
-        Raises:
-            UnknownDomainError, UnknownMapVersionError: There is none.
-            NoActiveMapError: The domain has no map yet.
-            RetiredMapError: That version was removed.
-            MissingExtraError: The packages of `deep-simbad[edge]` are not installed.
+        `map_version` is one that a session keeps; absent: the active map. Raises UnknownDomainError,
+        UnknownMapVersionError, NoActiveMapError, RetiredMapError, MissingExtraError.
         """
         encoder = require_on_board()
         call = Call("GET", f"{domain_path(domain)}/landmark-model", {"map_version": map_version}, BINARY)
@@ -291,11 +271,7 @@ class ClientCalls(Face, Generic[AnySession]):
             ranked: What an `OnBoardEncoder` made of an image, a few bytes.
             shortlist: Length of `retrieval` and `belief.top`; absent: the service's default.
 
-        Raises:
-            UnknownDomainError: No such domain.
-            NoActiveMapError: The domain has no map yet.
-            LandmarkModelDiffersError: `ranked` was made with other landmarks than the map's; fetch them by `on_board`.
-            InvalidInputError: The service cannot use the view; its detail says why.
+        Raises UnknownDomainError, NoActiveMapError, LandmarkModelDiffersError, InvalidInputError.
         """
         view = observation(image, content_type, ranked_landmarks, dissimilarities, encoding, ranked)
         path = f"{domain_path(domain)}/localizations"
@@ -341,17 +317,12 @@ class ClientCalls(Face, Generic[AnySession]):
         Use it as `with client.session(...) as session`, or `async with await client.session(...) as session`. A lost
         answer is asked for again and begins no second session.
 
-        `start_position_m` is about where it starts along the route (absent: anywhere), `start_std_m` how well that is
-        known. The `planner` chooses the next view (`nnql`, `random`, `constant:3`, ...), `belief` is `particle` or
-        `grid`, `update` says how a view changes it, `seed` all that is drawn at random; what is absent is the
-        service's default. With `keep` it outlives its `with` block. The `idempotency_key` names this beginning, so that
-        it can be repeated after a `TransportError`.
-
-        Raises:
-            UnknownDomainError: No such domain.
-            NoActiveMapError: The domain has no map yet.
-            InvalidPriorError: The start is far off the route.
-            TooManySessionsError: The service holds as many as it may.
+        `start_position_m` is about where it starts along the route (absent: anywhere), `start_std_m` how well
+        that is known. The `planner` chooses the next view (`nnql`, `random`, `constant:3`, ...), `belief` is
+        `particle` or `grid`, `update` says how a view changes it, `seed` all that is drawn at random; what is
+        absent is the service's default. With `keep` it outlives its `with` block. The `idempotency_key` names
+        this beginning, so that it can be repeated after a `TransportError`. Raises UnknownDomainError,
+        NoActiveMapError, InvalidPriorError, TooManySessionsError.
         """
         document = {
             "start_position_m": start_position_m,
@@ -366,13 +337,7 @@ class ClientCalls(Face, Generic[AnySession]):
 
     @shared
     async def attach_session(self, session_id: str, *, keep: bool = True) -> AnySession:
-        """Find a session again that was kept.
-
-        Raises:
-            UnknownSessionError: No such session.
-            EndedSessionError: It expired or was deleted.
-            RetiredMapError: Its map was removed.
-        """
+        """Find a session again that was kept. Raises UnknownSessionError, EndedSessionError, RetiredMapError."""
         response = await self._wire.send(Call("GET", session_path(session_id)))
         return self._session(self._wire, model_of(SessionState, response), keep=keep)
 
@@ -380,9 +345,7 @@ class ClientCalls(Face, Generic[AnySession]):
     async def truths(self, session_id: str, true_positions_m: Numbers) -> TruthScore:
         """Tell where a session's robot truly was, as `Session.truths` does; the session may have ended a while ago.
 
-        Raises:
-            UnknownSessionError: No such session, or it ended long ago.
-            InvalidInputError: As many positions as observations there are not.
+        Raises UnknownSessionError, InvalidInputError.
         """
         return await _truths(self._wire, session_path(session_id), true_positions_m)
 

@@ -48,10 +48,8 @@ class MapDownload:
     What has come waits in `<name>.<sha256>.part`: the name tells a later try, in this process or another, of which file
     it is the beginning.
 
-    `call` asks for the file from its first byte on; `on_progress` is told of the bytes there and in all, where known.
-
-    Raises:
-        InvalidArgumentError: No file can lie at that path.
+    `call` asks for the file from its first byte on; `on_progress` is told of the bytes there and in all, where
+    known. Raises InvalidArgumentError (no file can lie at that path).
     """
 
     def __init__(
@@ -72,10 +70,7 @@ class MapDownload:
     async def run(self) -> MapFile:
         """Receive the file until all of it is there; as long as something comes now and then it never gives up.
 
-        Raises:
-            TransportError, ApiError, UnexpectedAnswerError: As `Wire.send`.
-            DamagedDownloadError: It has another digest than the service named; it is removed.
-            NotSavedError: The file cannot be written.
+        Raises TransportError, ApiError, UnexpectedAnswerError, DamagedDownloadError, NotSavedError.
         """
         attempts = self._wire.attempts(self._call)
         wait_s: float | None = 0.0

@@ -26,14 +26,9 @@ def remap(
 ) -> Job:
     """Make a new map of a domain of `training_traverse` and what `RemapOptions` names, and follow its job to its end.
 
-    The `result` of the job holds `map_version`, `active` and `metrics`. Where the new map lost against the active one
-    by more than the gate's margin, `active` is false and `check["why"]` says so. `on_progress` and `patience_s` are as
-    in `follow_job`.
-
-    Raises:
-        JobFailedError: The service could not make the map.
-        ApiError: The service refused the request.
-        TransportError: Nothing was heard for `patience_s`.
+    The `result` of the job holds `map_version`, `active` and `metrics`. Where the new map lost against the active
+    one by more than the gate's margin, `active` is false and `check["why"]` says so. `on_progress` and `patience_s`
+    are as in `follow_job`. Raises JobFailedError, ApiError, TransportError.
     """
     job = client.admin.remap(domain, training_traverse=training_traverse, **options)
     if on_progress is not None:
@@ -57,14 +52,9 @@ def follow_job(
     and listens anew; where there is no stream at all, goes on asking. A service that was restarted takes the job up
     again: it is queued once more, and its progress may be less than it was.
 
-    `on_progress` is told of the job each time something is heard of it, `on_silence` the seconds since then each time
-    the service has not answered; longer than `patience_s` it is not waited for.
-
-    Raises:
-        JobFailedError: It failed.
-        JobCancelledError: It was cancelled.
-        TransportError: Nothing was heard for `patience_s`; the job itself may go on.
-        ApiError: The service does not know the job, or refuses to tell.
+    `on_progress` is told of the job each time something is heard of it, `on_silence` the seconds since then each
+    time the service has not answered; longer than `patience_s` it is not waited for. Raises JobFailedError,
+    JobCancelledError, TransportError, ApiError.
     """
     last_heard, wait_s, streams = clock(), POLL_S, True
     while True:

@@ -50,8 +50,8 @@ class LocalServer:
     def start(self) -> None:
         """Start it and wait until it is ready.
 
-        Raises:
-            DeepSimbadClientError: It ended, or was not ready within a minute; the log's last lines are in the message.
+        Raises DeepSimbadClientError: it ended, or was not ready within a minute; the log's last lines are in
+        the message.
         """
         command = [sys.executable, "-m", "deepsimbad", "serve", "--create", "--data-dir", str(self._data_dir)]
         self.log_path.parent.mkdir(parents=True, exist_ok=True)

@@ -43,8 +43,7 @@ class Domain(Answer):
 
     name: str
     map_version: int | None = None
-    map_problem: str | None = None
-    """Code of what keeps the active map from answering; its figures are None then."""
+    map_problem: str | None = None  # Code of what keeps the active map from answering; its figures are None then
     route_length_m: float | None = None
     n_map_images: int | None = None
     n_landmarks: int | None = None
@@ -56,8 +55,7 @@ class Domain(Answer):
     """Length of an image's encoding; None: no images are taken. Ready ones may have any one length."""
     relevance: str | None = None
     index_bits_per_map_image: float | None = None
-    landmark_model_digest: str | None = None
-    """SHA-256 of the landmarks that `Client.on_board` fetches."""
+    landmark_model_digest: str | None = None  # SHA-256 of the landmarks that `Client.on_board` fetches
     actions_m: tuple[float, ...] = ()
     closed: bool = False
 
@@ -65,8 +63,7 @@ class Domain(Answer):
 class Histogram(Answer):
     """Belief mass in equal stretches of the route."""
 
-    edges_m: tuple[float, ...]
-    """One longer than `mass`."""
+    edges_m: tuple[float, ...]  # One longer than `mass`
     mass: tuple[float, ...]
 
 
@@ -86,8 +83,7 @@ class Belief(Answer):
     mean_m: float
     mode_m: float
     std_m: float
-    credible_95_m: tuple[float, float]
-    """(lo, hi); on a closed route lo > hi crosses the start."""
+    credible_95_m: tuple[float, float]  # (lo, hi); on a closed route lo > hi crosses the start
     entropy_bits: float
     off_route: float | None = None
     histogram: Histogram
@@ -252,15 +248,11 @@ class MapVersion(Answer):
     """One map in a domain's history; what a service of an older release does not say is None."""
 
     version: int
-    state: str | None = None
-    """building, sealed (never served), active or retired."""
+    state: str | None = None  # building, sealed (never served), active or retired
     created_at: str | None = None
-    activated_at: str | None = None
-    """When it last began to serve."""
-    retired_at: str | None = None
-    """When it last ceased to."""
-    removed_at: str | None = None
-    """When its file was removed; it cannot be served any more."""
+    activated_at: str | None = None  # When it last began to serve
+    retired_at: str | None = None  # When it last ceased to
+    removed_at: str | None = None  # When its file was removed; it cannot be served any more
     sha256: str | None = None
     file_bytes: int | None = None
     config: dict[str, Any] | None = None

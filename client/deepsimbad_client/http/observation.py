@@ -18,10 +18,8 @@ _SIGNATURES = {
     "image/webp": rb"(?s:RIFF....WEBP)",
 }
 
-Image = bytes | bytearray | memoryview | str | PathLike[str]
-"""An encoded image, or the path of one."""
-Numbers = Iterable[Any]
-"""Any sequence of numbers, numpy arrays among them."""
+Image = bytes | bytearray | memoryview | str | PathLike[str]  # An encoded image, or the path of one
+Numbers = Iterable[Any]  # Any sequence of numbers, numpy arrays among them
 
 
 @dataclass(frozen=True)
@@ -60,9 +58,7 @@ def observation(
 ) -> Observation:
     """Make the body of one observation from exactly one of its forms, which are those of `Client.localize`.
 
-    Raises:
-        InvalidArgumentError: None or several given, not an image, or NaN among the numbers.
-        BrokenFrameError: The image file cannot be read.
+    Raises InvalidArgumentError, BrokenFrameError.
     """
     numbers = {"ranked_landmarks": ranked_landmarks, "dissimilarities": dissimilarities, "encoding": encoding}
     forms = [(name, values) for name, values in numbers.items() if values is not None]

@@ -59,8 +59,7 @@ class OnBoardEncoder:
         landmarks: The landmark model, the map's version and the evaluator's configuration.
         digest: SHA-256 that names the landmarks; sent with every observation, so that no other map answers it.
 
-    Raises:
-        InvalidLandmarkModelError: It is none, or of an evaluator that this version does not know.
+    Raises InvalidLandmarkModelError (it is none, or of an evaluator that this version does not know).
     """
 
     def __init__(self, content: bytes, compute: Compute | None = None) -> None:
@@ -73,12 +72,7 @@ class OnBoardEncoder:
 
     @classmethod
     def load(cls, path: str | PathLike[str], compute: Compute | None = None) -> "OnBoardEncoder":
-        """From a file that `save` wrote.
-
-        Raises:
-            SourceError: It cannot be read.
-            InvalidLandmarkModelError: It is no landmark model.
-        """
+        """From a file that `save` wrote. Raises SourceError, InvalidLandmarkModelError."""
         try:
             content = Path(path).read_bytes()
         except OSError as error:
@@ -105,10 +99,7 @@ class OnBoardEncoder:
     def load_extractor(self) -> None:
         """Load what encodes images now, and not with the first one.
 
-        Raises:
-            MissingExtraError: A package is missing; the message says how to install it.
-            OtherWeightsError: The weights here are not those that the map's images were encoded by.
-            InvalidLandmarkModelError: The extractor cannot be loaded.
+        Raises MissingExtraError, OtherWeightsError, InvalidLandmarkModelError.
         """
         _ = self._loaded
 
@@ -137,10 +128,8 @@ class OnBoardEncoder:
             encoding: A ready encoding, where the domain takes them.
             m: How many landmarks to send, 1..r; absent: what 64 bytes hold. r sends all that the service would see.
 
-        Raises:
-            InvalidArgumentError: None or both given, or an `m`, image or encoding that cannot be.
-            BrokenFrameError: The image cannot be read or decoded.
-            MissingExtraError, OtherWeightsError, InvalidLandmarkModelError: As `load_extractor`.
+        Raises InvalidArgumentError, BrokenFrameError, MissingExtraError, OtherWeightsError,
+        InvalidLandmarkModelError.
         """
         n_sent = ranked_landmarks_within(DEFAULT_BODY_BYTES, self.n_landmarks) if m is None else m
         if not 1 <= n_sent <= self.n_landmarks:

@@ -27,19 +27,16 @@ REFUSED_STATUSES = frozenset({408, 429, 503})
 """
 UNTOUCHED_FAILURES = (httpx2.ConnectError, httpx2.ConnectTimeout, httpx2.PoolTimeout)
 """Failures in which the service never saw the request."""
-LASTING_CODES = frozenset({"damaged_map", "damaged_file"})
-"""Problems behind a 503 that waiting cannot cure."""
+LASTING_CODES = frozenset({"damaged_map", "damaged_file"})  # Problems behind a 503 that waiting cannot cure
 
 
 class Repeat(Enum):
     """Which failures make a call safe to send again; its value is the statuses that do."""
 
-    ALWAYS = RETRIED_STATUSES
-    """Idempotent: reads, stateless localizations, puts, deletes, frame batches."""
+    ALWAYS = RETRIED_STATUSES  # Idempotent: reads, stateless localizations, puts, deletes, frame batches
     IF_UNTOUCHED = REFUSED_STATUSES
     """Acts once: only when the service surely did not act (no connection, 408, 429, 503)."""
-    NEVER = frozenset[int]()
-    """The caller has its own way to go on."""
+    NEVER = frozenset[int]()  # The caller has its own way to go on
 
 
 @dataclass(frozen=True)
@@ -107,11 +104,7 @@ class Attempts:
     answer_lost: bool = False
 
     def after_failure(self, error: httpx2.TransportError) -> float:
-        """Seconds to wait before the next try.
-
-        Raises:
-            TransportError: When there is none.
-        """
+        """Seconds to wait before the next try. Raises TransportError (when there is none)."""
         self.n_sent += 1
         untouched = isinstance(error, UNTOUCHED_FAILURES)
         safe = self.repeat is Repeat.ALWAYS or (self.repeat is Repeat.IF_UNTOUCHED and untouched)

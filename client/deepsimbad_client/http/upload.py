@@ -20,8 +20,7 @@ from deepsimbad_client.http.client import Client
 from deepsimbad_client.http.models import Traverse
 from deepsimbad_client.recordings.recording import Frame, Recording
 
-BATCH_BYTES = 8 * 2**20
-"""Size of a batch of ready encodings: worth its round trip, and lost cheaply on a thin link."""
+BATCH_BYTES = 8 * 2**20  # Size of a batch of ready encodings: worth its round trip, and lost cheaply on a thin link
 CONCURRENCY = 4
 NAMED_BROKEN_FRAMES = 20
 UNUSABLE_IMAGE_CODES = frozenset({"undecodable_image", "truncated_image", "empty_body"})
@@ -80,13 +79,8 @@ def upload(
     Images go one by one, a few at once, resized to what the domain asks for; ready encodings go in batches. A frame
     that cannot be read here, or decoded there, is counted and passed over.
 
-    The domain must exist, the traverse is made. What is there already is sent again with `resend` alone. `on_progress`
-    is told how far it is after every frame or batch.
-
-    Raises:
-        SourceError: The recording has no frames, or none of them could be sent.
-        ApiError: The service refused more than a frame.
-        TransportError: The service did not answer.
+    The domain must exist, the traverse is made. What is there already is sent again with `resend` alone.
+    `on_progress` is told how far it is after every frame or batch. Raises SourceError, ApiError, TransportError.
     """
     if not recording.frames:
         raise SourceError(f"{recording.name} has no frames to send")

@@ -31,8 +31,7 @@ KEY_VARIABLE = "DEEPSIMBAD_API_KEY"
 DEFAULT_URL = "http://127.0.0.1:8000"
 THIN_LINK_TIMEOUT = httpx2.Timeout(connect=10.0, read=60.0, write=60.0, pool=120.0)
 """Generous where bytes move slowly, short where nobody is there: read and write count from the last byte moved."""
-PAGE_LENGTH = 200
-"""Worth its round trip, and soon there on a thin link."""
+PAGE_LENGTH = 200  # Worth its round trip, and soon there on a thin link
 _CONNECTIONS = httpx2.Limits(max_connections=64, max_keepalive_connections=32, keepalive_expiry=30.0)
 _REQUEST_ID = re.compile(r"[A-Za-z0-9._-]{1,64}")
 
@@ -40,8 +39,7 @@ _REQUEST_ID = re.compile(r"[A-Za-z0-9._-]{1,64}")
 def speaking_to(url: str | None, api_key: str | None, timeout: httpx2.Timeout) -> dict[str, Any]:
     """What an httpx2 client is made with; absent address and key are those of the environment.
 
-    Raises:
-        InvalidArgumentError: It is no http(s) address, or no header can carry the key.
+    Raises InvalidArgumentError: it is no http(s) address, or no header can carry the key.
     """
     url = (url or os.environ.get(URL_VARIABLE) or DEFAULT_URL).rstrip("/")
     try:
@@ -193,13 +191,7 @@ class Wire:
         )
 
     async def send(self, call: Call) -> httpx2.Response:
-        """Send a call until it is answered or hopeless.
-
-        Raises:
-            TransportError: No answer came.
-            ApiError: The service refused.
-            UnexpectedAnswerError: Something else answers at this address.
-        """
+        """Send a call until it is answered or hopeless. Raises TransportError, ApiError, UnexpectedAnswerError."""
         attempts = self.attempts(call)
         while True:
             try:
@@ -226,12 +218,7 @@ class Wire:
                 return
 
     async def events(self, call: Call) -> AsyncGenerator[httpx2.ServerSentEvent, None]:
-        """Yield the events of a stream, listened to once.
-
-        Raises:
-            TransportError: The connection failed or broke off.
-            ApiError: The service refused.
-        """
+        """Yield the events of a stream, listened to once. Raises TransportError, ApiError."""
         what = f"{call} at {self.url}"
         try:
             async with self.link.stream(self.request(call)) as response:

@@ -86,8 +86,7 @@ class FolderRecording(Recording):
 def read_folder(folder: Path, spacing_m: float) -> FolderRecording:
     """Open a folder of images; without a positions.csv frame i is `i * spacing_m` metres along the route.
 
-    Raises:
-        SourceError: No images, or a positions.csv that cannot be understood; the message names the line.
+    Raises SourceError: no images, or a positions.csv that cannot be understood; the message names the line.
     """
     try:
         names = sorted((path.name for path in folder.iterdir() if _is_image(path)), key=natural_order)

@@ -27,8 +27,7 @@ from numpy.typing import NDArray
 from deepsimbad_client.errors import SourceError
 
 N_COLUMNS = 7
-MAX_GAP_S = 1.0
-"""Between ground-truth rows farther apart than this nothing is interpolated: the robot may have turned."""
+MAX_GAP_S = 1.0  # Between ground-truth rows farther apart than this nothing is interpolated: the robot may have turned
 DEADBAND_M = 0.25
 SMOOTHING_HALF_WIDTH_US = 250_000
 
@@ -95,10 +94,8 @@ def read_ground_truth(path: Path) -> GroundTruth:
     """Read a ground-truth file in whatever state it is.
 
     Rows with NaN, missing values or words (a header someone added) are skipped and counted; rows out of order are
-    sorted; of rows with one time the first stays.
-
-    Raises:
-        SourceError: The file cannot be read, or fewer than two usable rows are in it.
+    sorted; of rows with one time the first stays. Raises SourceError (the file cannot be read, or fewer than two
+    usable rows are in it).
     """
     try:
         rows = _rows(path)

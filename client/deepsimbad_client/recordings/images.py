@@ -30,11 +30,7 @@ def natural_order(name: str) -> tuple[list[tuple[int, str]], str]:
 
 
 def read_file(path: Path) -> bytes:
-    """Read a frame's file.
-
-    Raises:
-        BrokenFrameError: It is missing, unreadable or empty.
-    """
+    """Read a frame's file. Raises BrokenFrameError (it is missing, unreadable or empty)."""
     try:
         body = path.read_bytes()
     except OSError as error:
@@ -52,8 +48,7 @@ def decode(body: bytes, path: Path, *, as_stored: bool = False) -> Image:
         path: Its path, for the error alone.
         as_stored: Leave the pixels as they lie in the file; else the file's own orientation tag is obeyed.
 
-    Raises:
-        BrokenFrameError: Not an image, damaged, or its end is missing.
+    Raises BrokenFrameError (not an image, damaged, or its end is missing).
     """
     if _ends_early(body):
         raise BrokenFrameError(f"{path} is truncated: its end is missing", "undecodable")

@@ -37,8 +37,7 @@ from deepsimbad_client.recordings.recording import EncodedImage, Frame, Recordin
 
 FRONT_CAMERA = 5
 N_CAMERAS = 6
-STORED_SIZE = (1616, 1232)
-"""(width, height) of the dataset's own images as stored; smaller copies are read too."""
+STORED_SIZE = (1616, 1232)  # (width, height) of the dataset's own images as stored; smaller copies are read too
 
 N_SIZE_PROBES = 9
 SUFFIXES = frozenset({".tiff", ".tif"})
@@ -88,8 +87,7 @@ class NcltRecording(Recording):
     def upright(self, frame: Frame) -> Image:
         """Read a frame, undistorted where asked, turned upright: 1232 wide, 1616 high in the dataset itself.
 
-        Raises:
-            BrokenFrameError: Missing, undecodable, or not of the size of the others.
+        Raises BrokenFrameError (missing, undecodable, or not of the size of the others).
         """
         stored = self._stored(frame.name)
         size, expected = (stored.shape[1], stored.shape[0]), self.stored_size
@@ -147,8 +145,7 @@ def read_nclt(
         max_gap_s: Images between two ground-truth rows farther apart than this are left out.
         cache_dir: Where parsed undistortion tables are kept; None: the user's cache folder.
 
-    Raises:
-        SourceError: No images, no ground truth, or no image that has ground truth.
+    Raises SourceError (no images, no ground truth, or no image that has ground truth).
     """
     if not 0 <= camera < N_CAMERAS:
         raise SourceError(f"camera {camera}: NCLT has cameras 0 to {N_CAMERAS - 1}; 5 looks forward")
@@ -244,10 +241,8 @@ def load_undistortion(path: Path, cache_dir: Path | None = None) -> Undistortion
     """Load a table, from the cache where this very file was parsed before.
 
     Parsed tables are kept in `cache_dir`, else in `deep-simbad` in the user's cache folder ($XDG_CACHE_HOME, else
-    ~/.cache). A cache that cannot be written is done without.
-
-    Raises:
-        SourceError: The file cannot be read or is not a complete table.
+    ~/.cache). A cache that cannot be written is done without. Raises SourceError (the file cannot be read or is not
+    a complete table).
     """
     try:
         about = path.stat()

@@ -56,10 +56,7 @@ class Recording:
             frame: One of `frames`.
             input_size: (width, height) the domain asks for; a larger image is resized to exactly this. None: never.
 
-        Raises:
-            BrokenFrameError: This file cannot be used; the others can. Its `reason` is the word to count it under,
-                beside `left_out`.
-            SourceError: The recording holds no images.
+        Raises BrokenFrameError, SourceError.
         """
         raise SourceError(f"{self.name} holds ready encodings, not images")
 
@@ -73,8 +70,7 @@ class Recording:
     def sliced(self, part: slice) -> Self:
         """Python's slice of the frames, which keep their indices and positions; what was left out stays counted.
 
-        Raises:
-            SourceError: The slice leaves nothing, or its step is 0.
+        Raises SourceError (the slice leaves nothing, or its step is 0).
         """
         if part.step == 0:
             raise SourceError(f"the slice of {self.name} has step 0: use 1 for every frame")

@@ -37,8 +37,7 @@ def open_source(
         camera: NCLT's camera, 0..5.
         undistortion: NCLT's undistortion table or the folder of them; None: not undistorted.
 
-    Raises:
-        SourceError: There is no such recording, or it cannot be used; the message says why.
+    Raises SourceError: there is no such recording, or it cannot be used; the message says why.
     """
     if not (math.isfinite(spacing_m) and spacing_m > 0):
         raise SourceError(f"a spacing of {spacing_m} m: frames must be more than 0 m apart")
@@ -51,10 +50,8 @@ def split_slice(source: str) -> tuple[str, slice | None]:
     """Split SOURCE into the recording and the slice of its frames.
 
     A `#` in a file's own name does no harm: only an ending shaped like a slice is taken for one, and one that is
-    not, where no such file exists either, is an error rather than silently the whole recording.
-
-    Raises:
-        SourceError: What follows the `#` is neither.
+    not, where no such file exists either, is an error rather than silently the whole recording. Raises SourceError
+    (what follows the `#` is neither).
     """
     place, mark, ending = source.rpartition("#")
     if not mark:
@@ -88,10 +85,8 @@ def _open_whole(place: str, spacing_m: float, camera: int, undistortion: Path | 
 def read_encodings(path: Path, spacing_m: float) -> Recording:
     """Read a file of ready encodings [n, d]; row i is `i * spacing_m` metres along the route.
 
-    A csv is numbers between commas; one line of words at its top is taken for a header.
-
-    Raises:
-        SourceError: Not a table of finite numbers.
+    A csv is numbers between commas; one line of words at its top is taken for a header. Raises SourceError (not a
+    table of finite numbers).
     """
     try:
         raw = _read_npy(path) if path.suffix.lower() == ".npy" else _read_csv(path)

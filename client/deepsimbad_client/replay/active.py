@@ -22,8 +22,7 @@ EPISODES = 20
 STEPS = 10
 EPISODES_WITH_MASS = 10
 """Of so many the belief along the route is kept for pictures; of thousands it would fill the memory."""
-TRUTH_WITHIN_M = 10.0
-"""A frame farther than this from every map image is off the map and has no right answer."""
+TRUTH_WITHIN_M = 10.0  # A frame farther than this from every map image is off the map and has no right answer
 _LONGEST_ACTION_M = 10.0
 _MASS_DIGITS = 5
 
@@ -122,10 +121,7 @@ def active_replay(
         on_progress: Told of every episode, and how many there are so far.
         clock: Seconds that never go backwards.
 
-    Raises:
-        ReplayError: No active map, one that changed meanwhile, a recording too short, or a folder of another replay.
-        ApiError: The service refused, for example an unknown planner.
-        TransportError: The service did not answer.
+    Raises ReplayError, ApiError, TransportError.
     """
     started = clock()
     stage = Stage(client, recording, domain, clock)
@@ -181,8 +177,7 @@ def active_replay(
 class Stage:
     """A recording driven as an active robot drives: where it may start, what it comes to when it moves, what it sees.
 
-    Raises:
-        ReplayError: The domain has no active map, or the recording cannot be driven along.
+    Raises ReplayError (the domain has no active map, or the recording cannot be driven along).
     """
 
     def __init__(
@@ -232,10 +227,7 @@ class Stage:
         Yields:
             `steps` + 1 views, the first without a move.
 
-        Raises:
-            ReplayError: No frame can be used, or the planner names no next move.
-            ApiError: The service refused more than a frame.
-            TransportError: The service did not answer.
+        Raises ReplayError, ApiError, TransportError.
         """
         broken: frozenset[int] = frozenset()
         here_m, travelled_m, commanded_m = float(self.position_m[row]), 0.0, None

@@ -29,8 +29,7 @@ class Journal(Generic[Record]):
         document: The identity, and what was noted beside it.
         earlier: The records of an earlier run, in order.
 
-    Raises:
-        ReplayError: The folder holds another replay, or cannot be written.
+    Raises ReplayError (the folder holds another replay, or cannot be written).
     """
 
     def __init__(

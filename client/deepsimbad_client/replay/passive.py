@@ -18,10 +18,8 @@ from deepsimbad_client.replay.journal import Journal, write_lines
 from deepsimbad_client.replay.scene import Scene, Seen
 
 TOLERANCE_M = 2.0
-VIEWS_A_TRUTH, IMAGES_A_TRUTH = 20, 50_000
-"""So many views' truths are told at once, or of so many right map images."""
-MOST_ROWS = 400
-"""Of so many views the belief is kept for a picture; of a long drive every few."""
+VIEWS_A_TRUTH, IMAGES_A_TRUTH = 20, 50_000  # So many views' truths are told at once, or of so many right map images
+MOST_ROWS = 400  # Of so many views the belief is kept for a picture; of a long drive every few
 _MASS_DIGITS = 5
 
 
@@ -94,10 +92,7 @@ def replay(
         on_progress: Told of every step, those of an earlier run first, and how many there are so far.
         clock: Seconds that never go backwards.
 
-    Raises:
-        ReplayError: No active map, one that changed meanwhile, a folder of another replay, or a session that ended.
-        ApiError: The service refused more than a frame.
-        TransportError: The service did not answer.
+    Raises ReplayError, ApiError, TransportError.
     """
     started = clock()
     scene = Scene.of(client, recording, domain, tolerance_m, clock)

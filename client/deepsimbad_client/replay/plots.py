@@ -23,8 +23,7 @@ INK, QUIET, GRID = "#22303c", "#8a97a3", "#e3e8ec"
 DOT, LINE, CHANCE, TRUTH = "#7fa3cf", "#1f4e8c", "#d1495b", "#35d0ba"
 PLANNER_COLOURS = (LINE, CHANCE, "#e0a030", "#5b9a6b", "#8a5fa8", "#4aa3b5", "#a3684a", QUIET)
 EDGE = withStroke(linewidth=3, foreground=INK)
-LEAST_PERCENT = 0.01
-"""Ranks are drawn on a logarithmic axis; a perfect 0 stands at its foot."""
+LEAST_PERCENT = 0.01  # Ranks are drawn on a logarithmic axis; a perfect 0 stands at its foot
 PERCENT_TICKS = (0.01, 0.1, 1, 10, 50, 100)
 STRIPS = 3
 VIEWS = (

@@ -20,8 +20,7 @@ from deepsimbad_client.http.models import Domain, Localization, SessionAnswer
 from deepsimbad_client.http.upload import UNUSABLE_IMAGE_CODES
 from deepsimbad_client.recordings.recording import Recording
 
-DEFAULT_PLANNER = "default"
-"""Asks the service for the planner that ships."""
+DEFAULT_PLANNER = "default"  # Asks the service for the planner that ships
 
 
 @dataclass(frozen=True)
@@ -50,9 +49,8 @@ class Scene:
         """Learn what is needed of a domain.
 
         A right answer may be `within_m`, in the plane where both sides know x and y, else along the route.
-
-        Raises:
-            ReplayError: It has no active map, one that changed meanwhile, or the recording has no frame of use.
+        Raises ReplayError: it has no active map, one that changed meanwhile, or the recording has no frame of
+        use.
         """
         if not recording.frames:
             raise ReplayError(f"{recording.name} has no frames to replay")
@@ -78,12 +76,7 @@ class Scene:
         }
 
     def session(self, planner: str = DEFAULT_PLANNER, seed: int | None = None, *, keep: bool = False) -> Session:
-        """Begin a session.
-
-        Raises:
-            ReplayError: The active map is another than the one that was described.
-            ApiError: The service refused, for example an unknown planner.
-        """
+        """Begin a session. Raises ReplayError, ApiError."""
         wanted = None if planner == DEFAULT_PLANNER else planner
         session = self.client.session(self.domain.name, seed=seed, planner=wanted, keep=keep)
         if session.map_version != self.domain.map_version:

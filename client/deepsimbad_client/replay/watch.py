@@ -17,8 +17,7 @@ from deepsimbad_client.http.models import Belief, NextBestView, SessionState
 from deepsimbad_client.replay.active import EpisodeStep, Stage
 
 BLOCKS = " ▁▂▃▄▅▆▇█"
-_LEAST_SHOWN = 0.004
-"""A column with a smaller share of the fullest one stays empty."""
+_LEAST_SHOWN = 0.004  # A column with a smaller share of the fullest one stays empty
 
 
 def watch_episode(
@@ -73,9 +72,7 @@ def watch_session(
     Returns:
         How many changes were seen.
 
-    Raises:
-        UnknownSessionError: There is no such session.
-        GoneError: It had ended before.
+    Raises UnknownSessionError, GoneError.
     """
     session = client.attach_session(session_id)
     state, shown, n_changes = session.opened, None, 0
