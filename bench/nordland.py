@@ -18,7 +18,7 @@ import cv2
 
 from bench.common import machine, markdown, real_recordings, write_page
 from deepsimbad_client import Client
-from deepsimbad_client.http.jobs import remap
+from deepsimbad_client.http.admin import remap
 from deepsimbad_client.http.local_server import LocalServer
 from deepsimbad_client.http.upload import upload
 from deepsimbad_client.recordings.sources import open_source

@@ -14,7 +14,7 @@ from rich.console import Console
 from bench.common import machine, real_recordings, write_page
 from bench.nordland import DOMAIN, REMAP, drive_folders, make_domain
 from deepsimbad_client import Client
-from deepsimbad_client.http.jobs import remap
+from deepsimbad_client.http.admin import remap
 from deepsimbad_client.http.local_server import LocalServer
 from deepsimbad_client.recordings.sources import open_source
 from deepsimbad_client.replay.active import active_replay

@@ -6,6 +6,7 @@
 """
 
 from deepsimbad_client.errors import ApiError, DeepSimbadClientError
+from deepsimbad_client.http.call import Observation
 from deepsimbad_client.http.client import AsyncClient, AsyncSession, Client, Session
 from deepsimbad_client.http.download import MapFile
 from deepsimbad_client.http.models import (
@@ -20,8 +21,7 @@ from deepsimbad_client.http.models import (
     Traverse,
     TruthScore,
 )
-from deepsimbad_client.http.observation import Observation
-from deepsimbad_client.http.retry import RetryPolicy
+from deepsimbad_client.http.wire import RetryPolicy
 
 __all__ = [
     "ApiError",

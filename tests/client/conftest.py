@@ -14,7 +14,7 @@ from deepsimbad.api.app import create_app
 from deepsimbad.jobs.runner import InThisProcess
 from deepsimbad.settings import Settings
 from deepsimbad_client import Client, RetryPolicy
-from deepsimbad_client.http.jobs import remap
+from deepsimbad_client.http.admin import remap
 from deepsimbad_client.http.upload import upload
 from deepsimbad_client.recordings.sources import open_source
 

@@ -15,7 +15,7 @@ from deepsimbad.store.map_file import read_map
 from deepsimbad_campus.season import PAPER_DATES
 from deepsimbad_campus.writer import write_campus
 from deepsimbad_client import Client
-from deepsimbad_client.http.jobs import remap
+from deepsimbad_client.http.admin import remap
 from deepsimbad_client.http.local_server import LocalServer
 from deepsimbad_client.http.upload import upload
 from deepsimbad_client.recordings.sources import open_source

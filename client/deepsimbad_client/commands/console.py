@@ -50,7 +50,7 @@ class Remarks(logging.Handler):
 def show_waits() -> None:
     """Tell a person at a terminal why nothing happens while a call waits to be sent again."""
     if REMARKS.is_terminal:
-        retries = logging.getLogger("deepsimbad_client.http.retry")
+        retries = logging.getLogger("deepsimbad_client.http.wire")
         retries.setLevel(logging.INFO)
         retries.handlers = [Remarks()]
         retries.propagate = False

@@ -18,8 +18,8 @@ from deepsimbad_campus.season import CampusError
 from deepsimbad_campus.writer import write_campus
 from deepsimbad_client.commands.console import EpisodeBar, FrameBar, JobBar, ReplayBar, UploadBar
 from deepsimbad_client.errors import DeepSimbadClientError
+from deepsimbad_client.http.admin import remap
 from deepsimbad_client.http.client import Client
-from deepsimbad_client.http.jobs import remap
 from deepsimbad_client.http.local_server import LocalServer
 from deepsimbad_client.http.upload import upload
 from deepsimbad_client.recordings.recording import Recording

@@ -1,14 +1,13 @@
 """`deepsimbad-client remap` and `jobs`."""
 
-from itertools import islice
 from typing import Any
 
 import click
 
 from deepsimbad_client.commands import confirmed, domain_option, json_flag, of_domain, serving, show_list
 from deepsimbad_client.commands.console import REMARKS, JobBar, as_json, gate_verdict, job_table, show
+from deepsimbad_client.http.admin import follow_job
 from deepsimbad_client.http.client import Client
-from deepsimbad_client.http.jobs import follow_job
 from deepsimbad_client.http.models import Job
 
 
@@ -91,7 +90,7 @@ def jobs(
     if job_id is None:
         if follow or cancel:
             raise click.UsageError("--follow and --cancel need a JOB_ID")
-        listed = tuple(islice(client.admin.iter_jobs(domain), last))
+        listed = client.admin.jobs(domain)[:last]
         show_list(listed, job_table(listed), json_output)
         return
     if cancel:

@@ -1,5 +1,6 @@
 """What an administrator asks for, on the blocking and the async client: domains, traverses, jobs, maps, sessions."""
 
+import time
 from collections.abc import AsyncGenerator, Callable, Mapping, Sequence
 from contextlib import aclosing, suppress
 from io import BytesIO
@@ -8,52 +9,61 @@ from typing import TYPE_CHECKING, Any, TypedDict, Unpack
 
 from pydantic import ValidationError
 
-from deepsimbad_client.errors import NoEarlierMapError
-from deepsimbad_client.http.call import Call, in_path, model_of, once, require_numpy, session_path
-from deepsimbad_client.http.download import MapDownload, MapFile
-from deepsimbad_client.http.models import (
-    Domain,
-    FramesStored,
-    FrameStored,
-    Job,
-    ListedSession,
-    MapVersion,
-    Traverse,
+from deepsimbad_client.errors import (
+    ApiError,
+    JobCancelledError,
+    JobFailedError,
+    NoEarlierMapError,
+    NotSavedError,
+    TransportError,
 )
-from deepsimbad_client.http.observation import Image, Numbers, known_positions, observation
-from deepsimbad_client.http.retry import Repeat
+from deepsimbad_client.http.call import (
+    RETRIED_STATUSES,
+    Call,
+    Image,
+    Numbers,
+    Repeat,
+    in_path,
+    known_positions,
+    model_of,
+    observation,
+    once,
+    require_numpy,
+    session_path,
+)
+from deepsimbad_client.http.download import MapFile, OnBytes, download
+from deepsimbad_client.http.models import Domain, FramesStored, FrameStored, Job, ListedSession, MapVersion, Traverse
 from deepsimbad_client.http.wire import Awaiting, Blocking, Face, shared, shared_stream
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
+    from deepsimbad_client.http.client import Client
+
+PATIENCE_S = 600.0
+POLL_S = 1.0
+LONGEST_POLL_S = 15.0
 _JOBS = "/v1/admin/jobs"
 
 
 class RemapOptions(TypedDict, total=False):
     """What a remap may be told; what is absent or None is left to the service's default."""
 
-    landmark_traverse: str | None  # Where landmarks are chosen; absent: the active map's landmarks stay
-    n_landmarks: int | None  # r, how many landmarks
+    landmark_traverse: str | None  # where landmarks are chosen; absent: the active map's landmarks stay
+    n_landmarks: int | None  # r
     list_length: int | None  # h, how many of them a map image keeps
-    relevance: str | None  # How a map image is compared with a query
-    training_episodes: int | None  # Length of the planner's training
-    seed: int | None  # Of whatever is random
-    activate: bool | None  # Whether the new map serves at once
-    check_traverse: str | None  # The drive that the new map and the active one are compared on
-    gate_margin: float | None  # By how many percentage points of ANR the new map may be worse and still be activated
-    append: bool | None  # Whether the traverse is added to a copy of the active map
-    same_route: bool | None
-    """Whether the training and the landmark traverse count their positions along one route; absent: only where both
-    know x, y. `second_season` of the job says whether the map learnt from both."""
+    relevance: str | None  # how a map image is compared with a query
+    training_episodes: int | None  # length of the planner's training
+    seed: int | None  # of whatever is random
+    activate: bool | None  # whether the new map serves at once
+    check_traverse: str | None  # the drive that the new map and the active one are compared on
+    gate_margin: float | None  # percentage points of ANR by which the new map may be worse and still be activated
+    append: bool | None  # whether the traverse is added to a copy of the active map
+    same_route: bool | None  # whether both drives count their positions along one route; absent: where both know x, y
 
 
 class AdminCalls(Face):
-    """The calls that need a key of scope `admin`.
-
-    Lists come page by page. `jobs` and its like fetch every page at once; `iter_jobs` and its like fetch a page when
-    its first entry is wanted.
-    """
+    """The calls that need a key of scope `admin`."""
 
     @shared
     async def put_domain(
@@ -64,11 +74,10 @@ class AdminCalls(Face):
         closed: bool = False,
         actions_m: Sequence[float] | None = None,
     ) -> Domain:
-        """Make a domain; the same again changes nothing.
+        """Make a domain; the same again changes nothing, another configuration raises ConflictError.
 
-        `evaluator` is `{"kind": ..., ...}`, how observations are compared with landmarks; `closed` says that
-        the route's end is its start; `actions_m` are the moves a robot may be told to make, absent: the
-        service's default. Raises DomainDiffersError (A domain of that name exists with another configuration).
+        `evaluator` is `{"kind": ..., ...}`, how observations are compared with landmarks; `closed` says that the
+        route's end is its start; `actions_m` are the moves a robot may be told to make, absent: the service's default.
         """
         actions = None if actions_m is None else [float(action) for action in actions_m]
         document = {"evaluator": dict(evaluator), "closed": closed, "actions_m": actions}
@@ -89,12 +98,7 @@ class AdminCalls(Face):
     @shared
     async def traverses(self, domain: str) -> tuple[Traverse, ...]:
         """Every traverse of a domain, by name."""
-        return tuple([traverse async for traverse in AdminCalls.iter_traverses(self, domain)])
-
-    @shared_stream
-    def iter_traverses(self, domain: str) -> AsyncGenerator[Traverse, None]:
-        """Yield every traverse of a domain, by name, a page at a time."""
-        return self._wire.pages(Traverse, "traverses", f"{_domain(domain)}/traverses")
+        return await self._wire.model_list(Traverse, "traverses", f"{_domain(domain)}/traverses")
 
     @shared
     async def traverse(self, domain: str, name: str) -> Traverse:
@@ -125,7 +129,7 @@ class AdminCalls(Face):
 
         `index` is its place in the recording, from 0; `position_m` its distance along the route.
         """
-        view = observation(image, content_type, encoding=encoding)
+        view = observation(image, content_type=content_type, encoding=encoding)
         place = {"position_m": position_m, "timestamp_us": timestamp_us, "x_m": x_m, "y_m": y_m}
         call = Call("PUT", f"{_traverse(domain, traverse)}/frames/{int(index)}", place, view.headers, view.body)
         return model_of(FrameStored, await self._wire.send(call))
@@ -168,11 +172,10 @@ class AdminCalls(Face):
         idempotency_key: str | None = None,
         **options: Unpack[RemapOptions],
     ) -> Job:
-        """Submit a remap and return its job at once; `deepsimbad_client.http.jobs.remap` also follows it.
+        """Submit a remap of `training_traverse` and return its job at once; `remap` of this module also follows it.
 
-        A lost answer is asked for again and makes no second job. `training_traverse` becomes the map; for the
-        options see `RemapOptions`. The `idempotency_key` names this request, so that it can be repeated after a
-        `TransportError`; absent: a new one. Raises TooManyJobsError (as many jobs wait as may).
+        A lost answer is asked for again and makes no second job. The `idempotency_key` names this request, so that it
+        can be repeated after a `TransportError`; absent: a new one. Raises TooManyJobsError.
         """
         document = {"training_traverse": training_traverse, **options}
         call = Call.with_json("POST", f"{_domain(domain)}/remaps", document, headers=once(idempotency_key))
@@ -184,9 +187,8 @@ class AdminCalls(Face):
     ) -> Job:
         """Teach the next map: where a session's robot truly was at each of its observations, known only afterwards.
 
-        The job makes the next map version; the session may have ended a while ago. A position along the map's
-        route for each observation, in order, is None or NaN where unknown; the key is as that of `remap`.
-        Raises TooManyJobsError (as many jobs wait as may).
+        The job makes the next map version; the session may have ended a while ago. A position along the map's route for
+        each observation, in order, is None or NaN where unknown; the key is as that of `remap`.
         """
         document = {"session_id": session_id, "true_positions_m": known_positions(true_positions_m)}
         call = Call.with_json("POST", f"{_domain(domain)}/experience", document, headers=once(idempotency_key))
@@ -195,12 +197,7 @@ class AdminCalls(Face):
     @shared
     async def jobs(self, domain: str | None = None) -> tuple[Job, ...]:
         """Jobs, newest first, of one domain or all."""
-        return tuple([job async for job in AdminCalls.iter_jobs(self, domain)])
-
-    @shared_stream
-    def iter_jobs(self, domain: str | None = None) -> AsyncGenerator[Job, None]:
-        """Yield jobs, newest first, of one domain or all, a page at a time."""
-        return self._wire.pages(Job, "jobs", _JOBS, domain=domain)
+        return await self._wire.model_list(Job, "jobs", _JOBS, domain=domain)
 
     @shared
     async def job(self, job_id: str) -> Job:
@@ -229,18 +226,13 @@ class AdminCalls(Face):
     @shared
     async def maps(self, domain: str) -> tuple[MapVersion, ...]:
         """A domain's history of maps, newest version first."""
-        return tuple([version async for version in AdminCalls.iter_maps(self, domain)])
-
-    @shared_stream
-    def iter_maps(self, domain: str) -> AsyncGenerator[MapVersion, None]:
-        """Yield a domain's history of maps, newest version first, a page at a time."""
-        return self._wire.pages(MapVersion, "maps", f"{_domain(domain)}/maps")
+        return await self._wire.model_list(MapVersion, "maps", f"{_domain(domain)}/maps")
 
     @shared
     async def activate(self, domain: str, version: int, *, expected: int | None = None) -> MapVersion:
         """Serve another version, forward or back, if `expected` (absent: whichever) is the active one now.
 
-        Raises LostActivationError, RetiredMapError.
+        Raises LostActivationError (another one was active), RetiredMapError (the version's file was removed).
         """
         # After a lost answer, a repetition of a conditional switch would report its own success as a lost race.
         call = Call.with_json(
@@ -255,7 +247,7 @@ class AdminCalls(Face):
     async def rollback(self, domain: str) -> MapVersion:
         """Serve the version again that served before the active one; once more, and the present one is back.
 
-        Raises NoEarlierMapError, LostActivationError.
+        Raises NoEarlierMapError, LostActivationError (another version was activated meanwhile).
         """
         maps = await AdminCalls.maps(self, domain)
         active = next((version.version for version in maps if version.state == "active"), None)
@@ -272,42 +264,31 @@ class AdminCalls(Face):
 
     @shared
     async def delete_map(self, domain: str, version: int) -> None:
-        """Remove the file of a version; its place in the history stays.
-
-        Raises MapInUseError (it serves, is being built, or a living session keeps it).
-        """
+        """Remove the file of a version; its place in the history stays. Raises MapInUseError."""
         await self._wire.send(Call.delete(f"{_domain(domain)}/maps/{int(version)}"))
 
     @shared
     async def download_map(
-        self,
-        domain: str,
-        version: int,
-        path: str | Path,
-        *,
-        on_progress: Callable[[int, int | None], None] | None = None,
+        self, domain: str, version: int, path: str | Path, *, on_progress: OnBytes | None = None
     ) -> MapFile:
         """Fetch the sealed file of a version, to keep or to import it elsewhere.
 
-        It is written beside `path`, checked against the digest that the service names, and then renamed. A
-        download that was interrupted goes on where it stopped, this time or the next. `on_progress` is told of
-        the bytes there and the bytes in all (None: not known). Raises RetiredMapError, DamagedDownloadError,
-        NotSavedError.
+        It is written beside `path`, checked against the digest that the service names, and then renamed. A download
+        that was interrupted goes on where it stopped, this time or the next. Raises RetiredMapError,
+        DamagedDownloadError, NotSavedError.
         """
         # As its bytes are: compressed on the way, its parts could not be put together.
         headers = {"Accept": "application/vnd.sqlite3, application/octet-stream", "Accept-Encoding": "identity"}
         call = Call("GET", f"{_domain(domain)}/maps/{int(version)}/file", headers=headers)
-        return await MapDownload(self._wire, call, Path(path), on_progress).run()
+        try:
+            return await download(self._wire, call, Path(path), on_progress)
+        except OSError as error:
+            raise NotSavedError(f"{path} cannot be written: {error.strerror or error}") from error
 
     @shared
     async def sessions(self, domain: str | None = None) -> tuple[ListedSession, ...]:
         """Living sessions, newest first, of one domain or all; `Client.attach_session` looks into one or ends it."""
-        return tuple([session async for session in AdminCalls.iter_sessions(self, domain)])
-
-    @shared_stream
-    def iter_sessions(self, domain: str | None = None) -> AsyncGenerator[ListedSession, None]:
-        """Yield living sessions, newest first, of one domain or all, a page at a time."""
-        return self._wire.pages(ListedSession, "sessions", "/v1/admin/sessions", domain=domain)
+        return await self._wire.model_list(ListedSession, "sessions", "/v1/admin/sessions", domain=domain)
 
     @shared
     async def delete_session(self, session_id: str) -> None:
@@ -333,3 +314,82 @@ def _traverse(domain: str, name: str) -> str:
 
 def _job(job_id: str) -> str:
     return f"{_JOBS}/{in_path('job', job_id)}"
+
+
+def remap(
+    client: "Client",
+    domain: str,
+    training_traverse: str,
+    *,
+    on_progress: Callable[[Job], None] | None = None,
+    patience_s: float = PATIENCE_S,
+    **options: Unpack[RemapOptions],
+) -> Job:
+    """Make a new map of `training_traverse` and what `RemapOptions` names, and follow its job to its end.
+
+    The `result` of the job holds `map_version`, `active` and `metrics`. Where the new map lost against the active one
+    by more than the gate's margin, `active` is false and `check["why"]` says so. The rest is as in `follow_job`.
+    """
+    job = client.admin.remap(domain, training_traverse=training_traverse, **options)
+    if on_progress is not None:
+        on_progress(job)
+    return follow_job(client, job.job_id, on_progress, patience_s=patience_s)
+
+
+def follow_job(
+    client: "Client",
+    job_id: str,
+    on_progress: Callable[[Job], None] | None = None,
+    *,
+    on_silence: Callable[[float], None] | None = None,
+    patience_s: float = PATIENCE_S,
+    sleep: Callable[[float], None] = time.sleep,
+    clock: Callable[[], float] = time.monotonic,
+) -> Job:
+    """Follow a job until it has succeeded, through lost connections and restarted services.
+
+    Listens to its event stream; where that breaks off, asks for the job now and then until the service answers again
+    and listens anew; where there is no stream at all, goes on asking. `on_progress` is told of the job each time
+    something is heard of it, `on_silence` the seconds since then each time the service has not answered; longer than
+    `patience_s` it is not waited for. Raises JobFailedError, JobCancelledError, TransportError (nothing was heard for
+    `patience_s`; the job itself may go on), ApiError.
+    """
+    last_heard, wait_s, streams = clock(), POLL_S, True
+
+    def ended(job: Job) -> bool:
+        nonlocal last_heard, wait_s
+        last_heard, wait_s = clock(), POLL_S
+        if on_progress is not None:
+            on_progress(job)
+        if job.state == "cancelled":
+            raise JobCancelledError(f"job {job.job_id} was cancelled", job)
+        if job.ended and job.state != "succeeded":
+            raise JobFailedError(f"job {job.job_id} failed: {job.error_text or 'the service gave no reason'}", job)
+        return job.ended
+
+    while True:
+        try:
+            for job in client.admin.job_events(job_id) if streams else ():
+                if ended(job):
+                    return job
+        except TransportError:
+            pass
+        except ApiError as error:
+            streams = _passes(error)
+        try:
+            job = client.admin.job(job_id)
+        except (TransportError, ApiError) as error:
+            if not _passes(error) or clock() - last_heard > patience_s:
+                raise
+            if on_silence is not None:
+                on_silence(clock() - last_heard)
+            wait_s = min(2 * wait_s, LONGEST_POLL_S)
+        else:
+            if ended(job):
+                return job
+        sleep(wait_s)
+
+
+def _passes(error: TransportError | ApiError) -> bool:
+    """Whether the service may answer again later."""
+    return isinstance(error, TransportError) or error.status >= 500 or error.status in RETRIED_STATUSES

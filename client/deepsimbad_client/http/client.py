@@ -5,7 +5,7 @@ import math
 import random
 import time
 from collections.abc import Awaitable, Callable, Sequence
-from typing import TYPE_CHECKING, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeVar, Unpack
 
 import httpx2
 
@@ -14,12 +14,17 @@ from deepsimbad_client.http.admin import Admin, AsyncAdmin
 from deepsimbad_client.http.call import (
     BINARY,
     Call,
+    Image,
+    Numbers,
+    Repeat,
+    ViewForm,
     domain_path,
     float_array,
+    known_positions,
     model_of,
+    observation,
     once,
     page_of,
-    require_on_board,
     session_path,
 )
 from deepsimbad_client.http.models import (
@@ -31,8 +36,6 @@ from deepsimbad_client.http.models import (
     SessionState,
     TruthScore,
 )
-from deepsimbad_client.http.observation import Image, Numbers, Observation, known_positions, observation
-from deepsimbad_client.http.retry import Repeat, RetryPolicy
 from deepsimbad_client.http.wire import (
     THIN_LINK_TIMEOUT,
     Awaiting,
@@ -40,6 +43,7 @@ from deepsimbad_client.http.wire import (
     Blocking,
     BlockingLink,
     Face,
+    RetryPolicy,
     Wire,
     finished,
     shared,
@@ -92,13 +96,9 @@ class SessionCalls(Face):
         *,
         action_m: float | None = None,
         action_std_m: float | None = None,
-        content_type: str | None = None,
-        ranked_landmarks: Numbers | None = None,
-        dissimilarities: Numbers | None = None,
-        encoding: Numbers | None = None,
-        ranked: Observation | None = None,
         shortlist: int | None = None,
         idempotency_key: str | None = None,
+        **view: Unpack[ViewForm],
     ) -> SessionAnswer:
         """Tell what the robot sees now, after the metres it has moved; give exactly one form of the view.
 
@@ -108,7 +108,7 @@ class SessionCalls(Face):
         To repeat an observation yourself after a `TransportError`, choose its `idempotency_key`, and send the
         same again under it. Raises InvalidMoveError, LandmarkModelDiffersError, InvalidInputError, GoneError.
         """
-        view = observation(image, content_type, ranked_landmarks, dissimilarities, encoding, ranked)
+        body = observation(image, **view)
         moved = {"action_m": action_m, "action_std_m": action_std_m}
         for name, value in moved.items():
             if value is not None and not math.isfinite(value):
@@ -118,8 +118,8 @@ class SessionCalls(Face):
             f"{self._path}/observations",
             params={name: None if value is None else float(value) for name, value in moved.items()}
             | {"shortlist": shortlist},
-            headers=view.headers | once(idempotency_key),
-            body=view.body,
+            headers=body.headers | once(idempotency_key),
+            body=body.body,
         )
         return model_of(SessionAnswer, await self._wire.send(call))
 
@@ -167,7 +167,9 @@ class SessionCalls(Face):
         told bit by bit, from `first_observation` on. Raises InvalidInputError (as many positions as
         observations there are not).
         """
-        return await _truths(self._wire, self._path, true_positions_m, true_map_images, first_observation)
+        images = None if true_map_images is None else [[int(image) for image in images] for images in true_map_images]
+        more = {"true_map_images": images, "first_observation": first_observation or None}
+        return await _truths(self._wire, self._path, true_positions_m, **more)
 
     @shared
     async def delete(self) -> None:
@@ -242,9 +244,10 @@ class ClientCalls(Face, Generic[AnySession]):
         `map_version` is one that a session keeps; absent: the active map. Raises UnknownDomainError,
         UnknownMapVersionError, NoActiveMapError, RetiredMapError, MissingExtraError.
         """
-        encoder = require_on_board()
+        from deepsimbad_client.http.on_board import OnBoardEncoder  # noqa: PLC0415 - needs further packages
+
         call = Call("GET", f"{domain_path(domain)}/landmark-model", {"map_version": map_version}, BINARY)
-        return encoder((await self._wire.send(call)).content)
+        return OnBoardEncoder((await self._wire.send(call)).content)
 
     @shared
     async def localize(
@@ -252,51 +255,32 @@ class ClientCalls(Face, Generic[AnySession]):
         domain: str,
         image: Image | None = None,
         *,
-        content_type: str | None = None,
-        ranked_landmarks: Numbers | None = None,
-        dissimilarities: Numbers | None = None,
-        encoding: Numbers | None = None,
-        ranked: Observation | None = None,
         shortlist: int | None = None,
+        **view: Unpack[ViewForm],
     ) -> Localization:
         """Where one view probably is; give exactly one form of it.
 
-        Args:
-            domain: Where to look.
-            image: An encoded image (JPEG, PNG, TIFF, WebP) or its path, sent as it is.
-            content_type: The image's media type; absent: read from its first bytes.
-            ranked_landmarks: Landmark ids, nearest first, 1..r of them.
-            dissimilarities: r finite numbers in landmark order, smaller is nearer.
-            encoding: A ready encoding, where the domain takes them.
-            ranked: What an `OnBoardEncoder` made of an image, a few bytes.
-            shortlist: Length of `retrieval` and `belief.top`; absent: the service's default.
-
-        Raises UnknownDomainError, NoActiveMapError, LandmarkModelDiffersError, InvalidInputError.
+        `image` is an encoded one (JPEG, PNG, TIFF, WebP) or its path, sent as it is; the other forms are those of
+        `ViewForm`. `shortlist` is the length of `retrieval` and `belief.top`. Raises UnknownDomainError,
+        NoActiveMapError, LandmarkModelDiffersError (`ranked` was made with other landmarks than the map's),
+        InvalidInputError.
         """
-        view = observation(image, content_type, ranked_landmarks, dissimilarities, encoding, ranked)
+        body = observation(image, **view)
         path = f"{domain_path(domain)}/localizations"
-        call = Call("POST", path, {"shortlist": shortlist}, view.headers, view.body)
+        call = Call("POST", path, {"shortlist": shortlist}, body.headers, body.body)
         return model_of(Localization, await self._wire.send(call))
 
     @shared
     async def relevances(
-        self,
-        domain: str,
-        image: Image | None = None,
-        *,
-        content_type: str | None = None,
-        ranked_landmarks: Numbers | None = None,
-        dissimilarities: Numbers | None = None,
-        encoding: Numbers | None = None,
-        ranked: Observation | None = None,
+        self, domain: str, image: Image | None = None, **view: Unpack[ViewForm]
     ) -> "NDArray[np.float32]":
         """How well every map image answers one view: [n] float32, larger is better (needs numpy).
 
         Takes the same forms of a view, and raises the same errors, as `localize`.
         """
-        view = observation(image, content_type, ranked_landmarks, dissimilarities, encoding, ranked)
+        body = observation(image, **view)
         path = f"{domain_path(domain)}/localizations"
-        return float_array(await self._wire.send(Call("POST", path, headers=view.headers | BINARY, body=view.body)))
+        return float_array(await self._wire.send(Call("POST", path, headers=body.headers | BINARY, body=body.body)))
 
     @shared
     async def session(
@@ -391,7 +375,7 @@ class Client(ClientCalls[Session], Blocking):
         jitter: Callable[[], float] = random.random,
     ) -> None:
         http = httpx2.Client(**speaking_to(url, api_key, timeout), transport=transport)
-        super().__init__(Wire(BlockingLink(http, sleep), retry or RetryPolicy(), request_id, jitter))
+        super().__init__(Wire(BlockingLink(http, sleep), retry, request_id, jitter))
         self.admin = Admin(self._wire)
 
     def close(self) -> None:
@@ -420,7 +404,7 @@ class AsyncClient(ClientCalls[AsyncSession], Awaiting):
         jitter: Callable[[], float] = random.random,
     ) -> None:
         http = httpx2.AsyncClient(**speaking_to(url, api_key, timeout), transport=transport)
-        super().__init__(Wire(AwaitingLink(http, sleep), retry or RetryPolicy(), request_id, jitter))
+        super().__init__(Wire(AwaitingLink(http, sleep), retry, request_id, jitter))
         self.admin = AsyncAdmin(self._wire)
 
     async def aclose(self) -> None:
@@ -428,17 +412,6 @@ class AsyncClient(ClientCalls[AsyncSession], Awaiting):
         await self._leave(None)
 
 
-async def _truths(
-    wire: Wire,
-    path: str,
-    true_positions_m: Numbers,
-    true_map_images: Sequence[Sequence[int]] | None = None,
-    first_observation: int = 0,
-) -> TruthScore:
-    images = None if true_map_images is None else [[int(image) for image in images] for images in true_map_images]
-    document = {
-        "true_positions_m": known_positions(true_positions_m),
-        "true_map_images": images,
-        "first_observation": first_observation or None,
-    }
+async def _truths(wire: Wire, path: str, true_positions_m: Numbers, **more: Any) -> TruthScore:
+    document = {"true_positions_m": known_positions(true_positions_m), **more}
     return model_of(TruthScore, await wire.send(Call.with_json("POST", f"{path}/truths", document)))

@@ -21,7 +21,7 @@ from deepsimbad_client.errors import (
     OtherWeightsError,
     SourceError,
 )
-from deepsimbad_client.http.observation import Image, Numbers, Observation, image_bytes, observation
+from deepsimbad_client.http.call import Image, Numbers, Observation, image_bytes, observation
 
 INSTALL = "pip install 'deep-simbad[edge]'"
 

@@ -1,25 +1,36 @@
 """How calls are sent until they are answered: written once, for the blocking and the async client alike.
 
-The clients and all that is here are written as coroutines over a `Link`, the few things that differ between blocking
+The clients and all that is here are written as coroutines over a link, the few things that differ between blocking
 and awaiting. A `BlockingLink` never suspends, so `finished` runs such a coroutine to its end in place; `shared` and
 `shared_stream` do that to the calls of a `Blocking` client and leave them to be awaited on an `Awaiting` one.
 """
-# ruff: noqa: D102 - the methods of both links are described by `Link`
+# ruff: noqa: D102 - what a link's methods do, httpx2's own of these names do
 
 import asyncio
+import logging
 import os
 import re
 from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Callable, Coroutine, Iterator
-from contextlib import AbstractAsyncContextManager, aclosing, asynccontextmanager, closing
+from contextlib import aclosing, asynccontextmanager, closing
+from dataclasses import dataclass
 from functools import wraps
 from types import TracebackType
-from typing import Any, Concatenate, Generic, ParamSpec, Protocol, Self, TypeVar, overload
+from typing import Any, Concatenate, Generic, ParamSpec, Self, TypeVar, overload
 
 import httpx2
 
 from deepsimbad_client.errors import InvalidArgumentError, TransportError, TransportTimeoutError
-from deepsimbad_client.http.call import REQUEST_ID, Call, Model, page_of, raise_for_problem
-from deepsimbad_client.http.retry import Attempts, RetryPolicy
+from deepsimbad_client.http.call import (
+    REFUSED_STATUSES,
+    REQUEST_ID,
+    Call,
+    Model,
+    Repeat,
+    page_of,
+    problem_of,
+    raise_for_problem,
+    retry_after_s,
+)
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -29,17 +40,21 @@ Awaited = TypeVar("Awaited")
 URL_VARIABLE = "DEEPSIMBAD_URL"
 KEY_VARIABLE = "DEEPSIMBAD_API_KEY"
 DEFAULT_URL = "http://127.0.0.1:8000"
+# Generous where bytes move slowly, short where nobody is there: read and write count from the last byte moved.
 THIN_LINK_TIMEOUT = httpx2.Timeout(connect=10.0, read=60.0, write=60.0, pool=120.0)
-"""Generous where bytes move slowly, short where nobody is there: read and write count from the last byte moved."""
-PAGE_LENGTH = 200  # Worth its round trip, and soon there on a thin link
+PAGE_LENGTH = 200
+UNTOUCHED_FAILURES = (httpx2.ConnectError, httpx2.ConnectTimeout, httpx2.PoolTimeout)  # no service saw the request
+LASTING_CODES = frozenset({"damaged_map", "damaged_file"})  # behind a 503 that waiting cannot cure
 _CONNECTIONS = httpx2.Limits(max_connections=64, max_keepalive_connections=32, keepalive_expiry=30.0)
 _REQUEST_ID = re.compile(r"[A-Za-z0-9._-]{1,64}")
+
+logger = logging.getLogger(__name__)
 
 
 def speaking_to(url: str | None, api_key: str | None, timeout: httpx2.Timeout) -> dict[str, Any]:
     """What an httpx2 client is made with; absent address and key are those of the environment.
 
-    Raises InvalidArgumentError: it is no http(s) address, or no header can carry the key.
+    Raises InvalidArgumentError (no http(s) address, or a key that no header can carry).
     """
     url = (url or os.environ.get(URL_VARIABLE) or DEFAULT_URL).rstrip("/")
     try:
@@ -56,33 +71,65 @@ def speaking_to(url: str | None, api_key: str | None, timeout: httpx2.Timeout) -
     return {"base_url": url, "headers": headers, "timeout": timeout, "limits": _CONNECTIONS}
 
 
-class Link(Protocol):
-    """What differs between blocking and awaiting."""
+@dataclass(frozen=True)
+class RetryPolicy:
+    """How patient a client is: waits double from `base_s` on, the upper half of each drawn at random."""
 
-    @property
-    def http(self) -> httpx2.Client | httpx2.AsyncClient:
-        """What sends."""
+    attempts: int = 5  # times a request is sent in all; 1 never repeats
+    base_s: float = 0.25
+    max_backoff_s: float = 8.0
+    max_retry_after_s: float = 60.0  # a service that asks for more is not asked again: its error is raised at once
 
-    async def send(self, request: httpx2.Request) -> httpx2.Response:
-        """Send once and read the answer."""
+    def backoff_s(self, n_sent: int, jitter: float) -> float:
+        """Wait after the `n_sent`-th try; `jitter` in 0..1."""
+        return min(self.base_s * 2.0 ** (n_sent - 1), self.max_backoff_s) * (0.5 + 0.5 * jitter)
 
-    def stream(self, request: httpx2.Request) -> AbstractAsyncContextManager[httpx2.Response]:
-        """Send once; of a refusal the whole answer is read, of another the content is still to come."""
 
-    def pieces(self, response: httpx2.Response) -> AsyncIterator[bytes]:
-        """The content of a streamed answer, as it comes."""
+@dataclass
+class Attempts:
+    """The tries of one request: told what happened, it says what to do; nothing here waits or sends."""
 
-    def events(self, response: httpx2.Response) -> AsyncIterator[httpx2.ServerSentEvent]:
-        """The events of a streamed answer, as they come."""
+    policy: RetryPolicy
+    repeat: Repeat
+    what: str  # the request in words, for errors
+    jitter: Callable[[], float]  # draws in 0..1
+    n_sent: int = 0
+    answer_lost: bool = False  # an earlier try may have been acted on without our hearing of it
 
-    async def aside(self, work: Callable[[], T]) -> T:
-        """Do what takes the processor or the disk a while, where nothing else waits for it."""
+    def after_failure(self, error: httpx2.TransportError) -> float:
+        """Seconds to wait before the next try; raises TransportError when there is none."""
+        self.n_sent += 1
+        untouched = isinstance(error, UNTOUCHED_FAILURES)
+        safe = self.repeat is Repeat.ALWAYS or (self.repeat is Repeat.IF_UNTOUCHED and untouched)
+        hopeless = isinstance(error, httpx2.UnsupportedProtocol | httpx2.LocalProtocolError)
+        reason = str(error) or type(error).__name__
+        if safe and not hopeless and self.n_sent < self.policy.attempts:
+            self.answer_lost |= not untouched
+            return self._announced(self.policy.backoff_s(self.n_sent, self.jitter()), reason)
+        kind = TransportTimeoutError if isinstance(error, httpx2.TimeoutException) else TransportError
+        tries = f"{self.n_sent} tries" if self.n_sent > 1 else "one try"
+        there = "; is the service running there?" if untouched else ""
+        raise kind(f"no answer to {self.what} after {tries}: {reason}{there}") from error
 
-    async def sleep(self, seconds: float) -> None:
-        """Wait."""
+    def after_answer(self, response: httpx2.Response) -> float | None:
+        """Seconds to wait before the next try; None when this answer is the last word."""
+        self.n_sent += 1
+        status, code = response.status_code, problem_of(response).get("code")
+        if status not in self.repeat.value or self.n_sent >= self.policy.attempts or code in LASTING_CODES:
+            return None
+        wait_s = retry_after_s(response.headers.get("retry-after"))
+        if wait_s is None:
+            self.answer_lost |= status not in REFUSED_STATUSES
+            wait_s = self.policy.backoff_s(self.n_sent, self.jitter())
+        elif wait_s > self.policy.max_retry_after_s:
+            return None
+        return self._announced(wait_s, f"{status} {code or ''}".rstrip())
 
-    async def close(self) -> None:
-        """Close the connections."""
+    def _announced(self, wait_s: float, reason: str) -> float:
+        """The wait, told to whoever listens to this module's logger: a client that only waits looks dead."""
+        coming = f"try {self.n_sent + 1} of {self.policy.attempts}"
+        logger.info("%s: %s; trying again in %.1f s (%s)", self.what, reason, wait_s, coming)
+        return wait_s
 
 
 class BlockingLink:
@@ -121,11 +168,11 @@ class BlockingLink:
 
 
 class AwaitingLink:
-    """Awaits."""
+    """Awaits; what takes the disk a while is done aside."""
 
     def __init__(self, http: httpx2.AsyncClient, sleep: Callable[[float], Awaitable[None]]) -> None:
         self.http = http
-        self._sleep = sleep
+        self.sleep = sleep
 
     async def send(self, request: httpx2.Request) -> httpx2.Response:
         return await self.http.send(request)
@@ -146,29 +193,23 @@ class AwaitingLink:
     async def aside(self, work: Callable[[], T]) -> T:
         return await asyncio.to_thread(work)
 
-    async def sleep(self, seconds: float) -> None:
-        await self._sleep(seconds)
-
     async def close(self) -> None:
         await self.http.aclose()
 
 
 class Wire:
-    """Sends calls over a link; connections are reused.
-
-    Args:
-        link: Blocking or awaiting.
-        retry: How patient.
-        request_id: Names every request that is sent; None: the service names them.
-        jitter: Draws in 0..1.
-    """
+    """Sends calls over a link; `request_id` names every request that is sent (None: the service names them)."""
 
     def __init__(
-        self, link: Link, retry: RetryPolicy, request_id: Callable[[], str] | None, jitter: Callable[[], float]
+        self,
+        link: BlockingLink | AwaitingLink,
+        retry: RetryPolicy | None,
+        request_id: Callable[[], str] | None,
+        jitter: Callable[[], float],
     ) -> None:
         self.link = link
         self.url = str(link.http.base_url).rstrip("/")
-        self._retry = retry
+        self._retry = retry or RetryPolicy()
         self._request_id = request_id
         self._jitter = jitter
 
@@ -177,7 +218,7 @@ class Wire:
         return Attempts(self._retry, call.repeat, f"{call} at {self.url}", self._jitter)
 
     def request(self, call: Call) -> httpx2.Request:
-        """A call as an HTTP request, under an id of the caller's where he gives them; raises InvalidArgumentError."""
+        """A call as an HTTP request; raises InvalidArgumentError (the caller's id cannot name it)."""
         headers = dict(call.headers)
         if self._request_id is not None:
             headers[REQUEST_ID] = self._request_id()
@@ -191,7 +232,7 @@ class Wire:
         )
 
     async def send(self, call: Call) -> httpx2.Response:
-        """Send a call until it is answered or hopeless. Raises TransportError, ApiError, UnexpectedAnswerError."""
+        """Send a call until it is answered or hopeless; raises TransportError, ApiError, UnexpectedAnswerError."""
         attempts = self.attempts(call)
         while True:
             try:
@@ -206,19 +247,19 @@ class Wire:
                 return response
             await self.link.sleep(wait_s)
 
-    async def pages(self, kind: type[Model], key: str, path: str, **params: str | None) -> AsyncGenerator[Model, None]:
-        """Yield every entry of a list; a page is fetched when its first entry is wanted."""
+    async def model_list(self, kind: type[Model], key: str, path: str, **params: str | None) -> tuple[Model, ...]:
+        """Every entry of a list, page after page."""
+        entries: list[Model] = []
         after = None
         while True:
             call = Call("GET", path, {**params, "limit": PAGE_LENGTH, "after": after})
             models, after = page_of(kind, key, await self.send(call))
-            for model in models:
-                yield model
+            entries += models
             if after is None:
-                return
+                return tuple(entries)
 
     async def events(self, call: Call) -> AsyncGenerator[httpx2.ServerSentEvent, None]:
-        """Yield the events of a stream, listened to once. Raises TransportError, ApiError."""
+        """Yield the events of a stream, listened to once; raises TransportError, ApiError."""
         what = f"{call} at {self.url}"
         try:
             async with self.link.stream(self.request(call)) as response:

@@ -25,7 +25,7 @@ from pathlib import Path
 import numpy as np
 
 from deepsimbad_client.errors import SourceError
-from deepsimbad_client.http.observation import media_type_of
+from deepsimbad_client.http.call import media_type_of
 from deepsimbad_client.recordings.ground_truth import arc_length_m
 from deepsimbad_client.recordings.images import (
     IMAGE_SUFFIXES,

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from PIL.TiffImagePlugin import TiffImageFile
 
 from deepsimbad_client.errors import BrokenFrameError
-from deepsimbad_client.http.observation import media_type_of
+from deepsimbad_client.http.call import media_type_of
 from deepsimbad_client.recordings.recording import EncodedImage
 
 Image = NDArray[np.uint8]  # [height, width, 3] BGR

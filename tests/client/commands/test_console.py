@@ -51,7 +51,7 @@ def test_jobs_are_shown_with_what_they_do_and_the_time_left(shown):
 
 @pytest.mark.parametrize("is_terminal", [True, False])
 def test_waits_are_shown_to_a_person_and_to_no_script(monkeypatch, is_terminal):
-    logger = logging.getLogger("deepsimbad_client.http.retry")
+    logger = logging.getLogger("deepsimbad_client.http.wire")
     for attribute in ("level", "handlers", "propagate"):
         monkeypatch.setattr(logger, attribute, getattr(logger, attribute))
     screen = io.StringIO()

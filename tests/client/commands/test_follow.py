@@ -7,7 +7,7 @@ import pytest
 
 from deepsimbad_client import Client, RetryPolicy, commands, errors
 from deepsimbad_client.commands.group import run
-from deepsimbad_client.http.jobs import follow_job
+from deepsimbad_client.http.admin import follow_job
 from deepsimbad_client.http.models import Job
 
 from ..http.scripted import answer

@@ -8,7 +8,7 @@ from click.testing import CliRunner
 
 from deepsimbad_client import Client, RetryPolicy
 from deepsimbad_client.commands import demo as demonstration
-from deepsimbad_client.http.jobs import follow_job
+from deepsimbad_client.http.admin import follow_job
 from deepsimbad_client.http.local_server import LocalServer
 from deepsimbad_client.http.models import Job
 from deepsimbad_client.http.upload import upload

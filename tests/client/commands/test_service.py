@@ -9,7 +9,7 @@ import pytest
 
 from deepsimbad_client import errors
 from deepsimbad_client.commands.group import run
-from deepsimbad_client.http.jobs import follow_job, remap
+from deepsimbad_client.http.admin import follow_job, remap
 from deepsimbad_client.http.upload import in_order, upload
 from deepsimbad_client.recordings.sources import open_source
 from deepsimbad_client.replay.passive import replay

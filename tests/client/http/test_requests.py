@@ -15,9 +15,8 @@ import pytest
 from deepsimbad import errors as service_errors
 from deepsimbad_client import Client, errors
 from deepsimbad_client.errors import BY_CODE, BY_STATUS, InvalidArgumentError
+from deepsimbad_client.http.call import RETRIED_STATUSES, media_type_of, observation
 from deepsimbad_client.http.models import Job, Localization, Traverse
-from deepsimbad_client.http.observation import media_type_of, observation
-from deepsimbad_client.http.retry import RETRIED_STATUSES
 
 from .scripted import JOB, LOCALIZATION, STATE, Script, answer
 
@@ -180,7 +179,7 @@ def shelf(request):
     return httpx2.Response(200, json={"jobs": JOBS[first : first + 3], "next": following})
 
 
-def test_a_list_is_read_to_its_end_and_a_page_fetched_when_it_is_wanted():
+def test_a_list_is_read_to_its_end():
     asked: list[dict[str, str]] = []
 
     def note(request):
@@ -191,12 +190,6 @@ def test_a_list_is_read_to_its_end_and_a_page_fetched_when_it_is_wanted():
         assert [job.job_id for job in client.admin.jobs("d")] == [job["job_id"] for job in JOBS]
         assert [page.get("after") for page in asked] == [None, "jobs-3", "jobs-6"]
         assert {page["domain"] for page in asked} == {"d"}
-        jobs = client.admin.iter_jobs()
-        assert len(asked) == 3
-        assert [next(jobs).job_id for _ in range(3)] == ["j0", "j1", "j2"]
-        assert len(asked) == 4
-        assert next(jobs).job_id == "j3"
-        assert len(asked) == 5
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ import httpx2
 import pytest
 
 from deepsimbad_client import errors
-from deepsimbad_client.http.retry import retry_after_s
+from deepsimbad_client.http.call import retry_after_s
 
 from .scripted import JOB, POLICY, Script, answer
 
@@ -36,7 +36,7 @@ def test_an_idempotent_call_is_sent_again_with_its_body(kind):
 
 
 def test_every_wait_is_told_to_the_log_with_its_reason(caplog):
-    caplog.set_level("INFO", "deepsimbad_client.http.retry")
+    caplog.set_level("INFO", "deepsimbad_client.http.wire")
     refused = answer(503, {"code": "overloaded", "status": 503}, retry_after="7")
     Script(httpx2.ConnectError, refused, answer(200, OK)).client().health()
     assert caplog.messages == [
@@ -102,7 +102,7 @@ def test_the_last_failure_is_raised_after_the_last_try():
 )
 def test_what_waiting_does_not_cure_is_not_waited_for(problem, wait, error, caplog):
     """A longer wait than the longest allowed, and a map that is damaged."""
-    caplog.set_level("INFO", "deepsimbad_client.http.retry")
+    caplog.set_level("INFO", "deepsimbad_client.http.wire")
     script = Script(answer(503, problem, retry_after=wait))
     with pytest.raises(error) as raised:
         script.client().domain("d")
