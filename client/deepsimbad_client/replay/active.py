@@ -1,22 +1,19 @@
 """Drive a recording as an active robot: ask where to look next, go there, look, and be scored against the truth."""
 
-import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from deepsimbad.core.metrics import rank_of_truth
-from deepsimbad.core.route import Route
 from deepsimbad_client.errors import ReplayError
 from deepsimbad_client.http.client import Client, Session
 from deepsimbad_client.http.upload import CONCURRENCY, in_order
 from deepsimbad_client.recordings.recording import Recording
-from deepsimbad_client.replay.journal import Journal, write_lines
-from deepsimbad_client.replay.scene import DEFAULT_PLANNER, Scene, Seen, changed_map
+from deepsimbad_client.replay.scene import DEFAULT_PLANNER, MASS_DIGITS, Journal, Scene, Seen, changed_map, write_lines
 
 EPISODES = 20
 STEPS = 10
@@ -24,7 +21,6 @@ EPISODES_WITH_MASS = 10
 """Of so many the belief along the route is kept for pictures; of thousands it would fill the memory."""
 TRUTH_WITHIN_M = 10.0  # A frame farther than this from every map image is off the map and has no right answer
 _LONGEST_ACTION_M = 10.0
-_MASS_DIGITS = 5
 
 
 @dataclass(frozen=True)
@@ -46,8 +42,6 @@ class EpisodeStep:
     rank: float | None  # map images that the belief places before it, ties half
     rank_percent: float | None  # the same in percent of the map's images
     mode_m: float  # the likeliest place along the map's route
-    mode_x_m: float | None
-    mode_y_m: float | None
     low_m: float  # 95 % of the belief lie from here
     high_m: float  # to here
     error_m: float | None  # from the truth to the likeliest place
@@ -77,13 +71,8 @@ class ActiveReplay:
     folder: Path  # of its files
     planners: tuple[str, ...]  # as they were asked for; the first is the one the others are compared with
     episodes: dict[str, list[Episode]]  # for each planner, in order; the same numbers for all
-    route: Route  # the map's images
     identity: dict[str, Any]  # what was replayed against what
     seconds: float  # how long this run took
-
-
-class _Stopped(Exception):  # noqa: N818 - never leaves this module
-    """The replay ends before this episode does."""
 
 
 def active_replay(
@@ -99,7 +88,6 @@ def active_replay(
     seed: int = 0,
     restart: bool = False,
     on_progress: Callable[[Episode, int], None] | None = None,
-    clock: Callable[[], float] = time.perf_counter,
 ) -> ActiveReplay:
     """Drive episodes from random starts and compare what planners come to know.
 
@@ -107,71 +95,47 @@ def active_replay(
     to the commanded place and tells the service the metres really moved. Interrupted at any moment, the same call goes
     on after the last episode written down; more planners and more episodes can be added to a folder later.
 
-    Args:
-        client: The client.
-        recording: What there is to see, in travel order.
-        domain: A domain with an active map.
-        folder: Where `replay.json`, `episodes.jsonl` and `steps.jsonl` go.
-        planners: Names the service knows (`nnql`, `random`, `constant:3`, ...); `default` is the one that ships.
-        episodes: How many for each planner.
-        steps: Moves in an episode.
-        concurrency: Episodes under way at once.
-        seed: Of the starts and the sessions.
-        restart: Throw away what an earlier replay left in the folder.
-        on_progress: Told of every episode, and how many there are so far.
-        clock: Seconds that never go backwards.
+    Of `planners` (names the service knows: `nnql`, `random`, `constant:3`, ...) `default` is the one that ships. Into
+    `folder` go `replay.json`, `episodes.jsonl` and `steps.jsonl`; `restart` throws away what an earlier replay left
+    there. `concurrency` episodes are under way at once, and `on_progress` is told of every one, and how many there are.
 
     Raises ReplayError, ApiError, TransportError.
     """
-    started = clock()
-    stage = Stage(client, recording, domain, clock)
+    started = time.perf_counter()
+    stage = Stage(client, recording, domain)
     starts = [stage.start(steps, seed, episode) for episode in range(episodes)]
     planners = tuple(dict.fromkeys(planners))
-    identity = {
-        "kind": "active",
-        **stage.scene.identity,
-        "steps": steps,
-        "seed": seed,
-        "truth_within_m": TRUTH_WITHIN_M,
-    }
-    stopping = threading.Event()
+    identity = {"kind": "active", **stage.scene.identity, "steps": steps, "seed": seed}
+    identity |= {"truth_within_m": TRUTH_WITHIN_M}
     with Journal(folder, "episodes.jsonl", identity, _episode, "episode", restart=restart) as journal:
         wanted = [(planner, episode) for episode in range(episodes) for planner in planners]
         done = {(episode.planner, episode.episode): episode for episode in journal.earlier}
-        n_shown = 0
-
-        def show(episode: Episode) -> None:
-            nonlocal n_shown
-            n_shown += 1
-            if on_progress is not None:
-                on_progress(episode, n_shown)
+        earlier = [key for key in wanted if key in done]
 
         def drive(key: tuple[str, int]) -> Episode:
-            return stage.drive(*key, *starts[key[1]], steps, stopping)
+            return stage.drive(*key, *starts[key[1]], steps)
 
+        if on_progress is not None:
+            for n_done, key in enumerate(earlier, 1):
+                on_progress(done[key], n_done)
         todo = [key for key in wanted if key not in done]
-        for key in wanted:
-            if key in done:
-                show(done[key])
-        for key, episode in in_order(drive, todo, concurrency, on_end=stopping.set):
+        for n_done, (key, episode) in enumerate(in_order(drive, todo, concurrency), len(earlier) + 1):
             journal.append(asdict(episode))
             done[key] = episode
-            show(episode)
+            if on_progress is not None:
+                on_progress(episode, n_done)
         if client.domain(domain).map_version != stage.scene.domain.map_version:
             raise changed_map(domain)
     by_planner = {name: [done[name, number] for number in range(episodes)] for name in planners}
-    write_lines(
-        folder / "steps.jsonl",
-        (
-            {"planner": episode.planner, "episode": episode.episode}
-            | {name: value for name, value in asdict(step).items() if name != "mass"}
-            for name in planners
-            for episode in by_planner[name]
-            for step in episode.steps
-        ),
+    lines = (
+        {"planner": name, "episode": episode.episode, **asdict(step)}
+        for name in planners
+        for episode in by_planner[name]
+        for step in episode.steps
     )
+    write_lines(folder / "steps.jsonl", lines)
     identity |= {"planners": list(planners), "n_episodes": episodes}
-    return ActiveReplay(folder, planners, by_planner, stage.scene.route, identity, clock() - started)
+    return ActiveReplay(folder, planners, by_planner, identity, time.perf_counter() - started)
 
 
 class Stage:
@@ -180,10 +144,8 @@ class Stage:
     Raises ReplayError (the domain has no active map, or the recording cannot be driven along).
     """
 
-    def __init__(
-        self, client: Client, recording: Recording, domain: str, clock: Callable[[], float] = time.perf_counter
-    ) -> None:
-        self.scene = Scene.of(client, recording, domain, TRUTH_WITHIN_M, clock)
+    def __init__(self, client: Client, recording: Recording, domain: str) -> None:
+        self.scene = Scene.of(client, recording, domain, TRUTH_WITHIN_M)
         self.position_m = self.scene.position_m
         if (np.diff(self.position_m) < 0).any():
             raise ReplayError(f"the positions of {recording.name} go backwards: a robot cannot drive along it")
@@ -222,12 +184,8 @@ class Stage:
     def play(self, session: Session, row: int, steps: int) -> Iterator[tuple[Seen, EpisodeStep]]:
         """Drive one episode: look, ask for the next-best view, move there, look again; judge every view.
 
-        A frame that cannot be used is passed over for the nearest that can.
-
-        Yields:
-            `steps` + 1 views, the first without a move.
-
-        Raises ReplayError, ApiError, TransportError.
+        Yields `steps` + 1 views, the first without a move; a frame that cannot be used is passed over for the nearest
+        that can. Raises ReplayError (no frame can be used, or no next move is named), ApiError, TransportError.
         """
         broken: frozenset[int] = frozenset()
         here_m, travelled_m, commanded_m = float(self.position_m[row]), 0.0, None
@@ -255,14 +213,12 @@ class Stage:
             here_m, commanded_m = float(self.position_m[row]), plan.action_m
             row = self.nearest(here_m + commanded_m, broken, here_m if commanded_m > 0 else -np.inf)
 
-    def drive(self, planner: str, number: int, row: int, seed: int, steps: int, stopping: threading.Event) -> Episode:
-        """One whole episode in a session of its own; cut off when `stopping` is set."""
+    def drive(self, planner: str, number: int, row: int, seed: int, steps: int) -> Episode:
+        """One whole episode in a session of its own."""
         views: list[EpisodeStep] = []
         named, edges_m = planner, (0.0, 0.0)
         with self.scene.session(planner, seed) as session:
             for seen, step in self.play(session, row, steps):
-                if stopping.is_set():
-                    raise _Stopped
                 views.append(step if number < EPISODES_WITH_MASS else replace(step, mass=()))
                 edges = seen.answer.belief.histogram.edges_m
                 edges_m = (edges[0], edges[-1])
@@ -277,7 +233,6 @@ class Stage:
         rank = None if true is None else rank_of_truth(session.belief_masses(), np.array([true]))
         belief, plan = seen.answer.belief, seen.answer.next_best_view
         mode = int(np.abs(route.position_m - belief.mode_m).argmin())
-        mode_x_m, mode_y_m = scene.place(mode)
         return EpisodeStep(
             **moves,
             index=frame.index,
@@ -291,8 +246,6 @@ class Stage:
             rank=rank,
             rank_percent=None if rank is None else 100 * rank / route.n_images,
             mode_m=belief.mode_m,
-            mode_x_m=mode_x_m,
-            mode_y_m=mode_y_m,
             low_m=belief.credible_95_m[0],
             high_m=belief.credible_95_m[1],
             error_m=None if true is None else float(scene.apart_m(row, np.array([mode]))[0]),
@@ -300,16 +253,11 @@ class Stage:
             off_route=belief.off_route,
             next_action_m=None if plan is None else plan.action_m,
             latency_ms=seen.latency_ms,
-            mass=tuple(round(share, _MASS_DIGITS) for share in belief.histogram.mass),
+            mass=tuple(round(share, MASS_DIGITS) for share in belief.histogram.mass),
         )
 
 
-_FIELDS = frozenset(field.name for field in fields(EpisodeStep))
-
-
 def _episode(document: dict[str, Any]) -> Episode:
-    steps = tuple(
-        EpisodeStep(**{key: step[key] for key in _FIELDS} | {"mass": tuple(step["mass"])}) for step in document["steps"]
-    )
+    steps = tuple(EpisodeStep(**step | {"mass": tuple(step["mass"])}) for step in document["steps"])
     low_m, high_m = document["edges_m"]
     return Episode(**document | {"edges_m": (low_m, high_m), "steps": steps})

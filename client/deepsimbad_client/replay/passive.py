@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -14,13 +14,11 @@ from deepsimbad_client.errors import GoneError, ReplayError, UnknownSessionError
 from deepsimbad_client.http.client import Client, Session
 from deepsimbad_client.http.upload import CONCURRENCY, in_order
 from deepsimbad_client.recordings.recording import Recording
-from deepsimbad_client.replay.journal import Journal, write_lines
-from deepsimbad_client.replay.scene import Scene, Seen
+from deepsimbad_client.replay.scene import MASS_DIGITS, Journal, Scene, Seen, write_lines
 
 TOLERANCE_M = 2.0
 VIEWS_A_TRUTH, IMAGES_A_TRUTH = 20, 50_000  # So many views' truths are told at once, or of so many right map images
 MOST_ROWS = 400  # Of so many views the belief is kept for a picture; of a long drive every few
-_MASS_DIGITS = 5
 
 
 @dataclass(frozen=True)
@@ -49,7 +47,6 @@ class Step:
     mass: tuple[float, ...] = ()  # the belief in equal stretches of the map's route, of every few views
 
 
-_FIELDS = frozenset(field.name for field in fields(Step))
 _Record = Step | list[float | None]  # a view, or the ranks of views before it in order
 
 
@@ -74,28 +71,21 @@ def replay(
     concurrency: int = CONCURRENCY,
     restart: bool = False,
     on_progress: Callable[[Step, int], None] | None = None,
-    clock: Callable[[], float] = time.perf_counter,
 ) -> Replay:
     """Ask the service for the place of every frame in order, in one session, and compare with the truth.
 
     Statistics are the session's: what it learnt of the frames before helps with each. Interrupted at any moment, the
     same call goes on after the last answer written down, while the session lives.
 
-    Args:
-        client: The client.
-        recording: The queries.
-        domain: A domain with an active map.
-        folder: Where `replay.json`, `views.jsonl` (the journal) and `steps.jsonl` (all steps, at the end) go.
-        tolerance_m: How far a right answer may be, in the plane where both sides know x and y, else along the route.
-        concurrency: Images made ready at once; they are posted in order all the same.
-        restart: Throw away what an earlier replay left in the folder.
-        on_progress: Told of every step, those of an earlier run first, and how many there are so far.
-        clock: Seconds that never go backwards.
+    A right answer lies within `tolerance_m`, in the plane where both sides know x and y, else along the route. Into
+    `folder` go `replay.json`, `views.jsonl` (the journal) and `steps.jsonl` (all steps, at the end); `restart` throws
+    away what an earlier replay left there. `concurrency` images are made ready at once, and posted in order all the
+    same. `on_progress` is told of every step, those of an earlier run first, and how many there are so far.
 
     Raises ReplayError, ApiError, TransportError.
     """
-    started = clock()
-    scene = Scene.of(client, recording, domain, tolerance_m, clock)
+    started = time.perf_counter()
+    scene = Scene.of(client, recording, domain, tolerance_m)
     identity = {"kind": "passive", **scene.identity, "tolerance_m": tolerance_m}
     with Journal(folder, "views.jsonl", identity, _record, "view", restart=restart) as journal:
         drive = _Drive(scene, journal, on_progress)
@@ -103,9 +93,8 @@ def replay(
             drive.observe(row, view)
         drive.tell_truths()
         drive.end()
-    lines = [asdict(step) for step in drive.steps]
-    write_lines(folder / "steps.jsonl", ({name: line[name] for name in line if name != "mass"} for line in lines))
-    return Replay(folder, drive.steps, scene.route, identity, clock() - started)
+    write_lines(folder / "steps.jsonl", (asdict(step) for step in drive.steps))
+    return Replay(folder, drive.steps, scene.route, identity, time.perf_counter() - started)
 
 
 class _Drive:
@@ -180,7 +169,7 @@ class _Drive:
             error_m=float(scene.apart_m(row, np.array([best.map_image]))[0]),
             forgot=seen.forgot,
             latency_ms=seen.latency_ms,
-            mass=tuple(round(share, _MASS_DIGITS) for share in mass),
+            mass=tuple(round(share, MASS_DIGITS) for share in mass),
         )
 
     def tell_truths(self) -> None:
@@ -216,4 +205,4 @@ class _Drive:
 def _record(document: Any) -> _Record:
     if isinstance(document, list):
         return [None if rank is None else float(rank) for rank in document]
-    return Step(**{key: document[key] for key in _FIELDS} | {"mass": tuple(document["mass"])})
+    return Step(**document | {"mass": tuple(document["mass"])})

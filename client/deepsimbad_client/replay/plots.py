@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -14,7 +14,6 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullLocator
 from numpy.typing import NDArray
 
-from deepsimbad.core.route import Route
 from deepsimbad_client.replay.active import ActiveReplay, Episode
 from deepsimbad_client.replay.passive import Replay, Step
 from deepsimbad_client.replay.report import shown_name
@@ -43,7 +42,6 @@ def draw_passive(replay: Replay, folder: Path) -> list[Path]:
     title = f"{replay.identity['recording']}  against  {replay.identity['domain']}"
     drawn = [
         _rank_along_route(scored, title, folder / "rank_along_route.png"),
-        _rank_distribution(scored, title, folder / "rank_distribution.png"),
         _belief_along_drive(replay, title, folder / "belief_along_drive.png"),
     ]
     if replay.route.x_m is not None and any(step.x_m is not None for step in scored):
@@ -54,16 +52,9 @@ def draw_passive(replay: Replay, folder: Path) -> list[Path]:
 def draw_active(replay: ActiveReplay, summary: Mapping[str, Any], folder: Path) -> list[Path]:
     """Draw every picture that an active replay has numbers for; returns the PNG files."""
     title = f"{replay.identity['recording']}  against  {replay.identity['domain']}"
-    episodes = replay.episodes[replay.planners[0]]
-    drawn = [_belief_strips(episodes[:STRIPS], title, folder / "belief_by_step.png")]
+    drawn = [_belief_strips(replay.episodes[replay.planners[0]][:STRIPS], title, folder / "belief_by_step.png")]
     if any(value is not None for value in summary["anr"].values()):
-        for figures, heading in (("by_step", "From move to move"), ("by_distance", "At equal distance travelled")):
-            drawn.append(_compared(summary, figures, heading, title, folder / f"{figures}.png"))
-    placed = [episode for episode in episodes if any(step.x_m is not None for step in episode.steps)]
-    if replay.route.x_m is not None and placed:
-        # The walk that was hardest to find out about is the one worth a picture.
-        worst = max(placed, key=lambda episode: sum(step.error_m or 0.0 for step in episode.steps))
-        drawn.append(_walk_map(worst, replay.route, title, folder / "walk.png"))
+        drawn.append(_compared(summary, title, folder / "by_step.png"))
     return drawn
 
 
@@ -79,7 +70,11 @@ def _rank_along_route(scored: Sequence[Step], title: str, path: Path) -> Path:
     smooth = np.array([np.median(ordered[max(0, at - half) : at + half + 1]) for at in range(len(ordered))])
     label = f"median of {window} neighbours"
     axes.plot(position_m[order], np.maximum(smooth, LEAST_PERCENT), color=LINE, lw=2, label=label)
-    _percent_axis(axes, "y")
+    axes.set_yscale("log")
+    axes.set_ylim(LEAST_PERCENT * 0.7, 140)
+    axes.yaxis.set_major_locator(FixedLocator(PERCENT_TICKS))
+    axes.yaxis.set_minor_locator(NullLocator())
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: "0" if value <= LEAST_PERCENT else f"{value:g}"))
     axes.axhline(50, color=CHANCE, lw=1.2, ls=(0, (5, 3)), label="chance (50 %)")
     anr = float(percent.mean())
     axes.axhline(max(anr, LEAST_PERCENT), color=INK, lw=1.2, ls=(0, (1, 2)), label=f"ANR {anr:.2f} %")
@@ -87,33 +82,6 @@ def _rank_along_route(scored: Sequence[Step], title: str, path: Path) -> Path:
     axes.set_ylabel("map images placed before the truth [%]")
     axes.margins(x=0.01)
     _legend(axes, -0.16, 4)
-    return _saved(figure, path)
-
-
-def _rank_distribution(scored: Sequence[Step], title: str, path: Path) -> Path:
-    """How many queries came how near the top: a histogram and, over it, the share up to each rank."""
-    percent = np.maximum(np.array([step.rank_percent for step in scored], np.float64), LEAST_PERCENT)
-    figure, axes = _figure(title, "How near the top the true place comes", (8.6, 4.6))
-    bins = np.geomspace(LEAST_PERCENT, 100, 33)
-    axes.hist(percent, bins=bins.tolist(), color=DOT, edgecolor="white", lw=0.6)
-    axes.set_ylabel("queries", color=DOT)
-    axes.set_xlabel("map images placed before the truth [%]  (0 stands at the left edge)")
-    _percent_axis(axes, "x")
-    share = axes.twinx()
-    ordered = np.sort(percent)
-    cumulative = 100 * np.arange(1, len(ordered) + 1) / len(ordered)
-    share.step(np.append(ordered, 100), np.append(cumulative, 100), where="post", color=LINE, lw=2)
-    share.set_ylim(0, 103)
-    share.set_ylabel("queries up to this rank [%]", color=LINE)
-    _quiet(share)
-    share.spines["right"].set_visible(True)
-    share.spines["right"].set_color(GRID)
-    share.grid(visible=False)
-    for mark in (1, 10):
-        reached = 100 * float((percent <= mark).mean())
-        share.plot([mark, mark], [0, reached], color=INK, lw=0.9, ls=(0, (2, 2)))
-        text = f"{reached:.0f} % within the first {mark} %"
-        share.annotate(text, (mark, reached), xytext=(7, -13), textcoords="offset points", fontsize=9, color=INK)
     return _saved(figure, path)
 
 
@@ -136,7 +104,7 @@ def _belief_along_drive(replay: Replay, title: str, path: Path) -> Path:
     axes.set_ylim(last, rows[0].query)
     axes.set_xlabel("along the map's route [m]")
     axes.set_ylabel("query")
-    _colour_bar(figure, axes, picture, "belief of an equal stretch of the route")
+    figure.colorbar(picture, ax=axes, pad=0.02, shrink=0.85, label="belief of an equal stretch of the route")
     _legend(axes, -0.08, 1)
     return _saved(figure, path)
 
@@ -146,7 +114,12 @@ def _route_map(replay: Replay, scored: Sequence[Step], title: str, path: Path) -
     placed = [step for step in scored if step.x_m is not None and step.y_m is not None]
     x, y, error = np.array([(step.x_m, step.y_m, step.error_m) for step in placed], float).T
     tolerance = float(replay.identity["tolerance_m"])
-    figure, axes = _from_above(replay.route, title, "Where the best match misses")
+    figure, axes = _figure(title, "Where the best match misses", (8.6, 7.2))
+    map_x, map_y = np.asarray(replay.route.x_m), np.asarray(replay.route.y_m)
+    axes.plot(map_x, map_y, color="#d0d8de", lw=5, solid_capstyle="round", zorder=1, label="map")
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.set_xlabel("x [m]")
+    axes.set_ylabel("y [m]")
     far = [step for step in placed if (step.error_m or 0) > 5 * tolerance and step.best_x_m is not None]
     segments = [[(step.x_m, step.y_m), (step.best_x_m, step.best_y_m)] for step in far]
     lines = LineCollection(segments, colors=CHANCE, linewidths=0.5, alpha=0.3, zorder=2)  # type: ignore[arg-type]
@@ -156,9 +129,9 @@ def _route_map(replay: Replay, scored: Sequence[Step], title: str, path: Path) -
     last = np.argsort(error)  # the worst are drawn last
     colour = np.maximum(error[last], 1e-3)
     dots = axes.scatter(x[last], y[last], c=colour, s=16, cmap="viridis_r", norm=norm, lw=0, zorder=3)
-    bar = _colour_bar(figure, axes, dots, "error of the best match [m]", extend="both")
-    bar.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    bar.yaxis.set_minor_locator(NullLocator())
+    bar = figure.colorbar(dots, ax=axes, pad=0.02, shrink=0.85, extend="both", label="error of the best match [m]")
+    bar.ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    bar.ax.yaxis.set_minor_locator(NullLocator())
     _legend(axes, -0.08, 2)
     return _saved(figure, path)
 
@@ -199,63 +172,34 @@ def _strip(axes: Axes, episode: Episode) -> None:
             axes.annotate(f"+{step.next_action_m:g} m", at, xycoords="axes fraction", **style)
 
 
-def _compared(summary: Mapping[str, Any], figures: str, heading: str, title: str, path: Path) -> Path:
-    """Planners with their 95 % bands, a panel for each figure; the first planner is drawn on top.
-
-    From move to move, or against the metres travelled: a planner that moves far has no advantage there.
-    """
-    by_distance = figures == "by_distance"
-    views = VIEWS[:2] if by_distance else VIEWS
-    figure = _blank((4.5 * len(views) + 0.3, 4.9))
-    panels = list(figure.subplots(1, len(views)))
+def _compared(summary: Mapping[str, Any], title: str, path: Path) -> Path:
+    """Planners from move to move with their 95 % bands, a panel for each figure; the first is drawn on top."""
+    figure = _blank((4.5 * len(VIEWS) + 0.3, 4.9))
+    panels = list(figure.subplots(1, len(VIEWS)))
     first, *others = summary["config"]["planners"]
-    for axes, (name, interval, label) in zip(panels, views, strict=True):
+    for axes, (name, interval, label) in zip(panels, VIEWS, strict=True):
         _quiet(axes)
         for place, planner in [*enumerate(others, 1), (0, first)]:
-            row, colour = summary[figures][planner], PLANNER_COLOURS[place % len(PLANNER_COLOURS)]
-            at = row["travelled_m"] if by_distance else range(len(row[name]))
-            points = zip(at, row[name], row[interval], strict=True)
-            drawn = [(x, y, *(ends or (y, y))) for x, y, ends in points if y is not None]
-            if not drawn:
+            row, colour = summary["by_step"][planner], PLANNER_COLOURS[place % len(PLANNER_COLOURS)]
+            points = enumerate(zip(row[name], row[interval], strict=True))
+            bands = [(step, mean, *(ends or (mean, mean))) for step, (mean, ends) in points if mean is not None]
+            if not bands:
                 continue
-            x, y, low, high = np.array(drawn).T
-            axes.fill_between(x, low, high, color=colour, alpha=0.16, lw=0)
+            step, mean, low, high = np.array(bands).T
+            axes.fill_between(step, low, high, color=colour, alpha=0.16, lw=0)
             width, dot = (2.4, 4) if planner == first else (1.6, 3)
             named = shown_name(planner, summary["planner_named"][planner])
-            axes.plot(x, y, color=colour, lw=width, marker="o", ms=dot, label=named)
+            axes.plot(step, mean, color=colour, lw=width, marker="o", ms=dot, label=named)
         axes.set_ylabel(label, color=INK)
-        axes.set_xlabel("metres travelled" if by_distance else "moves made")
+        axes.set_xlabel("moves made")
         axes.set_ylim(bottom=0)
-        if not by_distance:
-            axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    if not by_distance:
-        panels[2].set_ylim(0, 103)
-    _head(panels[0], title, heading)
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    panels[2].set_ylim(0, 103)
+    _head(panels[0], title, "From move to move")
     handles, labels = panels[0].get_legend_handles_labels()
     handles, labels = handles[-1:] + handles[:-1], labels[-1:] + labels[:-1]
     n_columns = min(6, max(1, len(labels)))
     figure.legend(handles, labels, loc="outside lower center", ncol=n_columns, frameon=False, fontsize=9)
-    return _saved(figure, path)
-
-
-def _walk_map(episode: Episode, route: Route, title: str, path: Path) -> Path:
-    """The route from above with one episode's walk on it, joined to where the belief put it."""
-    steps = [step for step in episode.steps if step.x_m is not None and step.y_m is not None]
-    x, y, doubt = np.array([(step.x_m, step.y_m, step.entropy_bits) for step in steps], float).T
-    figure, axes = _from_above(route, title, f"A walk and where it was believed to be (episode {episode.episode})")
-    believed = [step for step in steps if step.mode_x_m is not None]
-    wrong = [[(step.x_m, step.y_m), (step.mode_x_m, step.mode_y_m)] for step in believed]
-    axes.add_collection(LineCollection(wrong, colors=CHANCE, linewidths=1, alpha=0.6, zorder=2))  # type: ignore[arg-type]
-    axes.plot([], [], color=CHANCE, lw=1, label="from the truth to the likeliest place")
-    axes.plot(x, y, color=LINE, lw=1, zorder=3)
-    dots = axes.scatter(x, y, c=doubt, s=70, cmap="viridis_r", edgecolors="white", lw=1, zorder=4)
-    if believed:
-        mode_x, mode_y = np.array([(step.mode_x_m, step.mode_y_m) for step in believed], float).T
-        axes.scatter(mode_x, mode_y, marker="x", s=26, color=CHANCE, lw=1.2, zorder=3)
-    for at, text in ((0, "start"), (-1, f"after {steps[-1].step} moves")):
-        axes.annotate(text, (x[at], y[at]), xytext=(8, 8), textcoords="offset points", fontsize=9, color=INK)
-    _colour_bar(figure, axes, dots, "doubt left in the belief [bits]")
-    _legend(axes, -0.08, 2)
     return _saved(figure, path)
 
 
@@ -265,16 +209,6 @@ def _belief_image(axes: Axes, rows: Sequence[Sequence[float]], extent: tuple[flo
     picture = axes.imshow(masses, aspect="auto", cmap="magma", norm=norm, interpolation="nearest", extent=extent)
     axes.grid(visible=False)
     return picture
-
-
-def _from_above(route: Route, title: str, heading: str) -> tuple[Figure, Axes]:
-    figure, axes = _figure(title, heading, (8.6, 7.2))
-    x_m, y_m = np.asarray(route.x_m), np.asarray(route.y_m)
-    axes.plot(x_m, y_m, color="#d0d8de", lw=5, solid_capstyle="round", zorder=1, label="map")
-    axes.set_aspect("equal", adjustable="datalim")
-    axes.set_xlabel("x [m]")
-    axes.set_ylabel("y [m]")
-    return figure, axes
 
 
 def _figure(title: str, heading: str, size: tuple[float, float]) -> tuple[Figure, Axes]:
@@ -309,26 +243,6 @@ def _quiet(axes: Axes) -> None:
 
 def _legend(axes: Axes, below: float, n_columns: int) -> None:
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, below), ncol=n_columns, frameon=False, fontsize=9)
-
-
-def _colour_bar(figure: Figure, axes: Axes, of: Any, label: str, **options: Any) -> Axes:
-    bar = figure.colorbar(of, ax=axes, pad=0.02, shrink=0.85, **options)
-    bar.set_label(label, color=INK)
-    bar.outline.set_visible(False)
-    return bar.ax
-
-
-def _percent_axis(axes: Axes, which: Literal["x", "y"]) -> None:
-    if which == "x":
-        axes.set_xscale("log")
-        axes.set_xlim(LEAST_PERCENT * 0.85, 118)
-    else:
-        axes.set_yscale("log")
-        axes.set_ylim(LEAST_PERCENT * 0.7, 140)
-    axis = axes.xaxis if which == "x" else axes.yaxis
-    axis.set_major_locator(FixedLocator(PERCENT_TICKS))
-    axis.set_minor_locator(NullLocator())
-    axis.set_major_formatter(FuncFormatter(lambda value, _: "0" if value <= LEAST_PERCENT else f"{value:g}"))
 
 
 def _saved(figure: Figure, path: Path) -> Path:

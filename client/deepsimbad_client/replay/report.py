@@ -3,7 +3,7 @@
 import json
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,6 @@ NEAR_M = (5.0, 10.0)
 N_RESAMPLES = 2000
 _TAILS = (2.5, 97.5)
 _DIGITS = 4
-_MOST_DISTANCES = 10
 
 Reals = NDArray[np.float64]
 
@@ -96,12 +95,7 @@ def table(summary: dict[str, Any]) -> Table:
 
 
 class Resampling:
-    """Bootstrap: the same episodes drawn again and again with replacement, for every planner alike (paired by start).
-
-    Args:
-        n_episodes: e.
-        seed: Of the draws.
-    """
+    """Bootstrap: the same episodes drawn again with replacement, for every planner alike (paired by start)."""
 
     def __init__(self, n_episodes: int, seed: int = 0) -> None:
         rng = np.random.default_rng([seed, n_episodes])
@@ -130,22 +124,6 @@ def figures(episodes: Sequence[Episode], name: str) -> Reals:
     return np.array([[getattr(step, name) for step in episode.steps] for episode in episodes], np.float64)
 
 
-def at_distance(episodes: Sequence[Episode], name: str, metres: float) -> Reals:
-    """One figure as it stood when each episode had travelled so far: [episodes], NaN for one that ended before."""
-    values, travelled_m = figures(episodes, name), figures(episodes, "travelled_m")
-    last = (travelled_m <= metres).sum(1) - 1
-    reached = travelled_m[:, -1] >= metres
-    return np.where(reached, values[np.arange(len(values)), last], np.nan)
-
-
-def distances_m(replay: ActiveReplay) -> list[float]:
-    """Metres travelled at which planners are compared: as far as half of the episodes of any planner come."""
-    ends_m = [figures(episodes, "travelled_m")[:, -1] for episodes in replay.episodes.values()]
-    furthest = max(float(np.median(end_m)) for end_m in ends_m)
-    apart = max(1.0, float(np.ceil(furthest / _MOST_DISTANCES)))
-    return [float(metres) for metres in np.arange(0, furthest + 1e-9, apart)]
-
-
 def summarise_active(replay: ActiveReplay) -> dict[str, Any]:
     """Figures of an active replay, JSON-ready; those that nothing was counted for are None.
 
@@ -155,7 +133,6 @@ def summarise_active(replay: ActiveReplay) -> dict[str, Any]:
     """
     first, *others = replay.planners
     resampling = Resampling(len(replay.episodes[first]), int(replay.identity["seed"]))
-    grid_m = distances_m(replay)
 
     def of_planners(figure: Callable[[list[Episode]], Any]) -> dict[str, Any]:
         return {name: figure(episodes) for name, episodes in replay.episodes.items()}
@@ -173,14 +150,13 @@ def summarise_active(replay: ActiveReplay) -> dict[str, Any]:
         "interval_95": {name: resampling.interval(ranks) for name, ranks in moved.items()},
         "against": against,
         "by_step": of_planners(lambda episodes: _by_step(episodes, resampling)),
-        "by_distance": of_planners(lambda episodes: _by_distance(episodes, grid_m, resampling)),
         "travelled_m": of_planners(lambda episodes: _mean(figures(episodes, "travelled_m")[:, -1])),
         "planner_named": of_planners(lambda episodes: episodes[0].planner_named),
         "n_episodes": len(replay.episodes[first]),
         "n_frames": {name: _finite(ranks).size for name, ranks in moved.items()},
         "n_left_out": {name: int(np.isnan(ranks).sum()) for name, ranks in moved.items()},
         "n_forgot": of_planners(lambda episodes: int(figures(episodes, "forgot").sum())),
-        "n_map_images": replay.route.n_images,
+        "n_map_images": replay.identity["n_map_images"],
         "latency_ms": of_planners(lambda episodes: _middle(figures(episodes, "latency_ms"))),
         "config": dict(replay.identity),
         "seconds": round(replay.seconds, 3),
@@ -188,7 +164,7 @@ def summarise_active(replay: ActiveReplay) -> dict[str, Any]:
 
 
 def active_tables(summary: dict[str, Any]) -> list[Table]:
-    """Planners against each other, where they know to be after their last move, and at equal distance travelled."""
+    """Planners against each other, and where they know to be after their last move."""
     config = summary["config"]
     names = config["planners"]
     first = names[0]
@@ -203,9 +179,6 @@ def active_tables(summary: dict[str, Any]) -> list[Table]:
     localized = _table(
         f"after {config['steps']} moves", "planner", ["median error", "within 5 m", "within 10 m", "moved", "forgot"]
     )
-    metres = summary["by_distance"][first]["travelled_m"]
-    picked = sorted({round(at) for at in np.linspace(0, len(metres) - 1, min(6, len(metres)))}) if metres else []
-    by_distance = _table("ANR % at equal distance travelled", "planner", [f"{metres[at]:g} m" for at in picked])
     for name in names:
         against = summary["against"].get(name, {"anr": None, "interval_95": None})
         gain = _shown(None if against["anr"] is None else -against["anr"], "z.2f")
@@ -225,9 +198,7 @@ def active_tables(summary: dict[str, Any]) -> list[Table]:
             _shown(summary["travelled_m"][name], ".0f", " m"),
             str(summary["n_forgot"][name]),
         )
-        values = summary["by_distance"][name]["anr"]
-        by_distance.add_row(named[name], *(_shown(values[at], ".1f") for at in picked))
-    return [compared, localized, by_distance]
+    return [compared, localized]
 
 
 def shown_name(asked: str, named: str) -> str:
@@ -237,53 +208,22 @@ def shown_name(asked: str, named: str) -> str:
 
 def _by_step(episodes: Sequence[Episode], resampling: Resampling) -> dict[str, list[Any]]:
     error_m = figures(episodes, "error_m")
-    shares = {
-        f"within_{near_m:g}_m": 100 * np.where(np.isfinite(error_m), error_m <= near_m, np.nan) for near_m in NEAR_M
-    }
+    near = {near_m: 100 * np.where(np.isfinite(error_m), error_m <= near_m, np.nan) for near_m in NEAR_M}
+    banded = {"anr": figures(episodes, "rank_percent"), "error": error_m}
+    banded |= {f"within_{near_m:g}_m": share for near_m, share in near.items()}
     by_step: dict[str, list[Any]] = {
-        "travelled_m": _means(figures(episodes, "travelled_m").T),
-        **_banded("anr", figures(episodes, "rank_percent").T, resampling),
-        **_banded("error_m", error_m.T, resampling, "error_interval_95"),
+        "travelled_m": _means(figures(episodes, "travelled_m")),
         "median_error_m": [_middle(column) for column in error_m.T],
-        "entropy_bits": _means(figures(episodes, "entropy_bits").T),
+        "entropy_bits": _means(figures(episodes, "entropy_bits")),
     }
-    for name, share in shares.items():
-        by_step |= _banded(name, share.T, resampling)
+    for name, values in banded.items():
+        by_step["error_m" if name == "error" else name] = _means(values)
+        by_step[f"{name}_interval_95"] = [resampling.interval(column) for column in values.T]
     return by_step
 
 
-def _by_distance(episodes: Sequence[Episode], grid_m: Sequence[float], resampling: Resampling) -> dict[str, list[Any]]:
-    """Beyond where half of the episodes come nothing is told: those that do are no fair sample."""
-    ends_m = figures(episodes, "travelled_m")[:, -1]
-
-    def columns(name: str) -> list[Reals]:
-        unknown = np.full(len(episodes), np.nan)
-        fair = [2 * int((ends_m >= metres).sum()) >= len(episodes) for metres in grid_m]
-        return [
-            at_distance(episodes, name, metres) if is_fair else unknown
-            for metres, is_fair in zip(grid_m, fair, strict=True)
-        ]
-
-    ranks, errors_m = columns("rank_percent"), columns("error_m")
-    return {
-        "travelled_m": list(grid_m),
-        **_banded("anr", ranks, resampling),
-        **_banded("error_m", errors_m, resampling, "error_interval_95"),
-        "n_episodes": [_finite(column).size for column in ranks],
-    }
-
-
-def _banded(
-    name: str, columns: Iterable[Reals], resampling: Resampling, interval: str | None = None
-) -> dict[str, list[Any]]:
-    """The mean of each column, and its 95 % interval."""
-    columns = list(columns)
-    interval = interval or f"{name}_interval_95"
-    return {name: _means(columns), interval: [resampling.interval(column) for column in columns]}
-
-
-def _means(columns: Iterable[Reals]) -> list[float | None]:
-    return [_mean(column) for column in columns]
+def _means(values: Reals) -> list[float | None]:
+    return [_mean(column) for column in values.T]
 
 
 def _mean(values: Reals) -> float | None:

@@ -1,8 +1,13 @@
-"""What a replay plays on: a domain's map, a recording to drive along, and the truth by core's own rules."""
+"""What a replay plays on, a domain's map, a recording and the truth by core's own rules, and the folder it fills."""
 
-from collections.abc import Callable
+import json
+import os
+import time
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any, Self
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Generic, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +25,10 @@ from deepsimbad_client.http.models import Domain, Localization, SessionAnswer
 from deepsimbad_client.http.upload import UNUSABLE_IMAGE_CODES
 from deepsimbad_client.recordings.recording import Recording
 
+Record = TypeVar("Record")
+
+MASS_DIGITS = 5
+_IDENTITY_FILE = "replay.json"
 DEFAULT_PLANNER = "default"  # Asks the service for the planner that ships
 
 
@@ -42,10 +51,9 @@ class Scene:
     position_m: NDArray[np.float64]  # [m] along the recording's own route
     route: Route  # the map's images
     right: list[NDArray[np.int64]]  # for each frame the map images that are right answers
-    clock: Callable[[], float]  # seconds that never go backwards
 
     @classmethod
-    def of(cls, client: Client, recording: Recording, domain: str, within_m: float, clock: Callable[[], float]) -> Self:
+    def of(cls, client: Client, recording: Recording, domain: str, within_m: float) -> Self:
         """Learn what is needed of a domain.
 
         A right answer may be `within_m`, in the plane where both sides know x and y, else along the route.
@@ -59,7 +67,7 @@ class Scene:
             raise ReplayError(f"domain {domain} has no active map to replay against: remap it first")
         position_m = np.array([frame.position_m for frame in recording.frames], np.float64)
         route = _map_route(client, described, recording)
-        return cls(client, described, recording, position_m, route, right_answers(recording, route, within_m), clock)
+        return cls(client, described, recording, position_m, route, right_answers(recording, route, within_m))
 
     @property
     def identity(self) -> dict[str, Any]:
@@ -100,7 +108,7 @@ class Scene:
         Returns:
             The answer, or why the service cannot use the view.
         """
-        began, forgot = self.clock(), False
+        began, forgot = time.perf_counter(), False
         try:
             try:
                 answer = session.observe(**view, **options, action_m=action_m)
@@ -113,7 +121,7 @@ class Scene:
             if error.code not in UNUSABLE_IMAGE_CODES:
                 raise
             return f"refused by the service as {error.code}"
-        return Seen(answer, round(1000 * (self.clock() - began), 3), forgot)
+        return Seen(answer, round(1000 * (time.perf_counter() - began), 3), forgot)
 
     def apart_m(self, row: int, images: NDArray[np.int64]) -> NDArray[np.float64]:
         """[k] distance from a frame to map images, in the plane where both know it, else along the route."""
@@ -175,3 +183,97 @@ def _map_route(client: Client, domain: Domain, recording: Recording) -> Route:
         plane = (x_m, y_m) if np.isfinite(x_m).any() else (None, None)
         return Route(position_m, domain.closed, *plane)
     raise ReplayError(f"none of the {len(recording.frames)} frames of {recording.name} can be used")
+
+
+class Journal(Generic[Record]):
+    """`replay.json` says what is replayed; a file of JSON lines holds the records, appended as they come.
+
+    An earlier replay of the same `identity` goes on, unless `restart` throws it away: `document` is its identity and
+    what was noted beside it, `earlier` its records in order, as `read` makes them of a line's document. Raises
+    ReplayError (the folder holds another replay, or cannot be written).
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        file_name: str,
+        identity: Mapping[str, Any],
+        read: Callable[[dict[str, Any]], Record],
+        what: str,
+        *,
+        restart: bool = False,
+    ) -> None:
+        self.folder = folder
+        self.document: dict[str, Any] = dict(identity)
+        self.earlier: list[Record] = []
+        self._file = folder / file_name
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            if not restart and (folder / _IDENTITY_FILE).exists():
+                self.document = self._same_replay(identity)
+                self.earlier = self._records(read, what)
+            else:
+                self._file.unlink(missing_ok=True)
+                self.note()
+            self._stream = self._file.open("ab")
+        except OSError as error:
+            raise ReplayError(f"cannot write to {folder}: {error.strerror or error}") from error
+
+    def note(self, **facts: Any) -> None:
+        """Keep facts about this replay beside its identity."""
+        self.document |= facts
+        written = self.folder / f"{_IDENTITY_FILE}.tmp"
+        written.write_text(json.dumps(self.document, indent=2) + "\n")
+        written.replace(self.folder / _IDENTITY_FILE)
+
+    def append(self, document: object) -> None:
+        """Write a record down; it is in the hands of the operating system when this returns."""
+        self._stream.write(json.dumps(document, allow_nan=False).encode() + b"\n")
+        self._stream.flush()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self._stream.close()
+
+    def _same_replay(self, identity: Mapping[str, Any]) -> dict[str, Any]:
+        try:
+            earlier = json.loads((self.folder / _IDENTITY_FILE).read_bytes())
+        except ValueError:
+            earlier = {}
+        earlier = earlier if isinstance(earlier, dict) else {}
+        differing = [key for key in identity if earlier.get(key) != identity[key]]
+        if differing:
+            was = ", ".join(f"{key} {earlier.get(key)!r}, now {identity[key]!r}" for key in differing)
+            raise ReplayError(f"{self.folder} holds another replay ({was}): name another folder, or restart this one")
+        return earlier
+
+    def _records(self, read: Callable[[dict[str, Any]], Record], what: str) -> list[Record]:
+        """Read the whole lines; a torn last one, left by a crash, is cut off."""
+        if not self._file.exists():
+            return []
+        content = self._file.read_bytes()
+        whole = content[: content.rfind(b"\n") + 1]
+        if len(whole) != len(content):
+            os.truncate(self._file, len(whole))
+        records = []
+        for number, line in enumerate(whole.splitlines(), start=1):
+            try:
+                records.append(read(json.loads(line)))
+            except (ValueError, TypeError, AttributeError, KeyError) as error:
+                raise ReplayError(
+                    f"line {number} of {self._file} is no {what}: restart the replay or repair it"
+                ) from error
+        return records
+
+
+def write_lines(path: Path, documents: Iterable[dict[str, Any]]) -> None:
+    """Write a file of JSON lines, without the beliefs' masses."""
+    lines = ({name: document[name] for name in document if name != "mass"} for document in documents)
+    path.write_text("".join(json.dumps(line, allow_nan=False) + "\n" for line in lines))

@@ -133,7 +133,7 @@ def test_the_command_line_end_to_end(service, encodings, tmp_path, capsys, monke
     printed = json.loads(capsys.readouterr().out)
     assert printed == json.loads((out / "summary.json").read_text())
     assert len((out / "steps.jsonl").read_text().splitlines()) == 40
-    for picture in ("rank_along_route", "rank_distribution", "belief_along_drive"):
+    for picture in ("rank_along_route", "belief_along_drive"):
         assert (out / f"{picture}.png").read_bytes().startswith(b"\x89PNG")
     assert run([*command, "--json"]) == 0  # a second run has nothing left to ask
     assert json.loads(capsys.readouterr().out)["anr"] == printed["anr"]

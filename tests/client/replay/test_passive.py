@@ -12,10 +12,9 @@ from deepsimbad_client import errors
 from deepsimbad_client.http.admin import remap
 from deepsimbad_client.recordings.recording import Frame, Recording
 from deepsimbad_client.recordings.sources import open_source
-from deepsimbad_client.replay.journal import Journal
 from deepsimbad_client.replay.passive import Replay, Step, replay
 from deepsimbad_client.replay.report import summarise
-from deepsimbad_client.replay.scene import Scene, right_answers
+from deepsimbad_client.replay.scene import Journal, Scene, right_answers
 
 from ..conftest import ENCODINGS, mapped
 

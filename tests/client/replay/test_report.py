@@ -1,7 +1,7 @@
 """Figures, intervals and tables of active replays, against slow references."""
 
 import json
-from dataclasses import fields, replace
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from deepsimbad.core.route import Route
 from deepsimbad_client.replay.active import ActiveReplay, Episode, EpisodeStep
 from deepsimbad_client.replay.plots import draw_active
-from deepsimbad_client.replay.report import Resampling, active_tables, at_distance, summarise_active
+from deepsimbad_client.replay.report import Resampling, active_tables, summarise_active
 
 
 def step(number, rank, action_m, travelled_m):
@@ -32,8 +31,6 @@ def step(number, rank, action_m, travelled_m):
         "error_m": error_m,
         "entropy_bits": 5.0 - number,
         "mode_m": place + (error_m or 0),
-        "mode_x_m": place + (error_m or 0),
-        "mode_y_m": 0.0,
     }
     unknown = dict.fromkeys(field.name for field in fields(EpisodeStep))
     return EpisodeStep(**unknown | values | {"mass": (0.25, 0.5, 0.125, 0.125)})
@@ -51,10 +48,15 @@ def replay_of(**ranks):
         name: [episode(name, number, row, moves[name]) for number, row in enumerate(rows)]
         for name, rows in ranks.items()
     }
-    along = np.arange(100.0)
-    route = Route(along, False, along.copy(), np.zeros(100))
-    identity: dict[str, Any] = {"recording": "drive", "domain": "route", "map_version": 1, "steps": 2, "seed": 0}
-    return ActiveReplay(Path(), tuple(ranks), episodes, route, identity | {"planners": list(ranks)}, 1.0)
+    identity: dict[str, Any] = {
+        "recording": "drive",
+        "domain": "route",
+        "map_version": 1,
+        "steps": 2,
+        "seed": 0,
+        "n_map_images": 100,
+    }
+    return ActiveReplay(Path(), tuple(ranks), episodes, identity | {"planners": list(ranks)}, 1.0)
 
 
 @pytest.fixture
@@ -78,28 +80,6 @@ def test_figures_by_hand(two_planners):
     assert ours["travelled_m"] == [0.0, 2.0, 4.0]
     assert summary["planner_named"] == {"default": "telling", "random": "random"}
     json.dumps(summary, allow_nan=False)
-
-
-def test_at_equal_distance_what_was_known_by_then():
-    replay = replay_of(default=[[50.0, 10.0, 2.0]], random=[[50.0, 8.0, 6.0]])
-    assert at_distance(replay.episodes["default"], "rank_percent", 3.9).tolist() == [10.0]
-    assert at_distance(replay.episodes["default"], "rank_percent", 4.0).tolist() == [2.0]
-    assert np.isnan(at_distance(replay.episodes["default"], "rank_percent", 4.1)).all()
-    assert at_distance(replay.episodes["random"], "rank_percent", 4.1).tolist() == [50.0]
-    by_distance = summarise_active(replay)["by_distance"]
-    assert by_distance["random"]["travelled_m"] == [float(metres) for metres in range(11)]
-    assert by_distance["random"]["anr"] == [50.0] * 5 + [8.0] * 5 + [6.0]
-    assert by_distance["default"]["anr"] == [50.0, 50.0, 10.0, 10.0, 2.0] + [None] * 6
-
-
-def test_beyond_where_half_of_the_episodes_come_nothing_is_told():
-    short = [episode("default", number, [9.0, 1.0, 1.0], 1.0) for number in range(3)]
-    far = episode("default", 3, [9.0, 1.0, 1.0], 5.0)
-    by_distance = summarise_active(replace(replay_of(default=[[0.0, 0.0, 0.0]]), episodes={"default": [*short, far]}))[
-        "by_distance"
-    ]["default"]
-    assert by_distance["travelled_m"] == [0.0, 1.0, 2.0]
-    assert by_distance["n_episodes"] == [4, 4, 4]
 
 
 def test_intervals_against_a_bootstrap_by_hand():
@@ -135,7 +115,7 @@ def test_nothing_known_is_none_and_never_nan(tmp_path):
     assert summary["against"]["random"] == {"anr": None, "interval_95": None}
     for table in active_tables(summary):
         Console(quiet=True).print(table)
-    assert len(draw_active(replay, summary, tmp_path)) == 2
+    assert len(draw_active(replay, summary, tmp_path)) == 1
 
 
 def test_tables_name_every_planner_and_every_picture_is_drawn(two_planners, tmp_path, capsys):
@@ -144,10 +124,10 @@ def test_tables_name_every_planner_and_every_picture_is_drawn(two_planners, tmp_
     for table in active_tables(summary):
         console.print(table)
     printed = capsys.readouterr().out
-    assert printed.count("telling (default)") == 3
-    assert printed.count("random") == 3
+    assert printed.count("telling (default)") == 2
+    assert printed.count("random") == 2
     assert "3.00" in printed  # how much better the first is
     assert "…" not in printed
     drawn = draw_active(two_planners, summary, tmp_path)
-    assert [path.name for path in drawn] == ["belief_by_step.png", "by_step.png", "by_distance.png", "walk.png"]
+    assert [path.name for path in drawn] == ["belief_by_step.png", "by_step.png"]
     assert all(path.read_bytes().startswith(b"\x89PNG") for path in drawn)
