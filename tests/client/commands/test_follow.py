@@ -1,7 +1,9 @@
 """Following a job through whatever happens to the connection."""
 
 import json
+import sys
 
+import click
 import httpx2
 import pytest
 
@@ -132,6 +134,72 @@ def test_silence_is_not_waited_out_for_ever():
     assert 60 < service.now < 120
 
 
+@pytest.fixture
+def responding(monkeypatch):
+    """Lets commands talk to a service of one function; returns what they asked, as "VERB path"."""
+
+    def responding(respond):
+        asked = []
+
+        def handle(request):
+            asked.append(f"{request.method} {request.url.path}")
+            return httpx2.Response(204) if request.method == "DELETE" else respond(request)
+
+        transport = httpx2.MockTransport(handle)
+        monkeypatch.setattr(commands, "Client", lambda url, key: Client(url, key, transport=transport))
+        return asked
+
+    return responding
+
+
+@pytest.fixture
+def confirming(monkeypatch):
+    """A person at a terminal who answers so, or presses Ctrl-C; returns what they were asked."""
+
+    def confirming(reply):
+        questions = []
+
+        def confirm(question, **options):
+            questions.append(question)
+            assert options["default"] is False, "Enter alone changes nothing"
+            if reply is None or (options.get("abort") and not reply):
+                raise click.Abort
+            return reply
+
+        monkeypatch.setattr(sys.stdin, "isatty", lambda: True)
+        monkeypatch.setattr(click, "confirm", confirm)
+        return questions
+
+    return confirming
+
+
+REMAP = ("remap", "--domain", "d", "--training", "t")
+
+
+@pytest.mark.parametrize("command", [REMAP, ("jobs", "7", "--follow")])
+@pytest.mark.parametrize("reply", [True, False, None])
+def test_ctrl_c_asks_whether_to_cancel(command, reply, responding, confirming, capsys):
+    def respond(request):
+        if request.url.path == EVENTS:
+            raise KeyboardInterrupt
+        return httpx2.Response(202, json=job("running"))
+
+    asked, questions = responding(respond), confirming(reply)
+    assert run([*command, "--server", "http://service"]) == 130
+    assert questions == ["Cancel job 7 on the server too?"]
+    assert asked.count("DELETE /v1/admin/jobs/7") == (reply is True)
+    assert ("job 7 is being cancelled" if reply else "deepsimbad-client jobs 7 --follow") in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("reply", "code"), [(True, 0), (False, 130), (None, 130)])
+def test_a_deletion_is_asked_about(reply, code, responding, confirming):
+    asked = responding(lambda request: httpx2.Response(200, json={"name": "t", "n_frames": 12}))
+    questions = confirming(reply)
+    assert run(["delete-traverse", "d", "t", "--server", "http://service"]) == code
+    assert questions == ["Delete traverse t of domain d with its 12 frames?"]
+    assert asked.count("DELETE /v1/admin/domains/d/traverses/t") == (reply is True)
+
+
 @pytest.mark.parametrize(
     ("state", "words"),
     [
@@ -140,16 +208,10 @@ def test_silence_is_not_waited_out_for_ever():
         ("succeeded", "job 7 had ended before it could be cancelled"),
     ],
 )
-def test_a_cancel_says_what_came_of_it(state, words, monkeypatch, capsys):
-    asked: list[str] = []
-
-    def respond(request):
-        asked.append(request.method)
-        return httpx2.Response(204) if request.method == "DELETE" else httpx2.Response(200, json=job(state))
-
-    monkeypatch.setattr(commands, "Client", lambda url, key: Client(url, key, transport=httpx2.MockTransport(respond)))
+def test_a_cancel_says_what_came_of_it(state, words, responding, capsys):
+    asked = responding(lambda request: httpx2.Response(200, json=job(state)))
     assert run(["jobs", "7", "--cancel", "--json", "--server", "http://service"]) == 0
     shown = capsys.readouterr()
-    assert asked == ["DELETE", "GET"]
+    assert asked == ["DELETE /v1/admin/jobs/7", "GET /v1/admin/jobs/7"]
     assert shown.err == f"{words}\n"
     assert json.loads(shown.out)["state"] == state
