@@ -66,103 +66,96 @@ class Shelf:
             return httpx2.Response(status, content=content, headers=headers)
         return httpx2.Response(status, stream=Broken(content[:stop]), headers=headers)
 
-    def client(self, attempts=3):
+    def fetch(self, file, attempts=3, **options):
         retry, transport = RetryPolicy(attempts=attempts), httpx2.MockTransport(self)
-        return Client("http://service", retry=retry, transport=transport, sleep=self.slept.append)
+        with Client("http://service", retry=retry, transport=transport, sleep=self.slept.append) as client:
+            return client.admin.download_map("d", 3, file, **options)
 
 
-def test_a_break_goes_on_where_it_was_however_often(tmp_path):
+@pytest.fixture
+def file(tmp_path):
+    return tmp_path / "m.sqlite"
+
+
+def part_of(file, body):
+    return file.with_name(f"{file.name}.{sha256(body)}.part")
+
+
+def test_a_break_goes_on_where_it_was_however_often(file):
     shelf, heard = Shelf(breaks=(10_000,) * 8), []
-    with shelf.client(attempts=2) as client:  # every try brings something, so it never gives up
-        there = client.admin.download_map(
-            *("d", 3, tmp_path / "m.sqlite"), on_progress=lambda *progress: heard.append(progress)
-        )
-    assert (there.path, there.sha256, there.file_bytes) == (tmp_path / "m.sqlite", sha256(BODY), len(BODY))
-    assert there.path.read_bytes() == BODY
+    # Every try brings something, so it never gives up.
+    fetched = shelf.fetch(file, attempts=2, on_progress=lambda *progress: heard.append(progress))
+    assert (fetched.path, fetched.sha256, fetched.file_bytes) == (file, sha256(BODY), len(BODY))
+    assert file.read_bytes() == BODY
     assert shelf.ranges == ["", *(f"bytes={n}0000-" for n in range(1, 9))]
-    assert list(tmp_path.iterdir()) == [there.path]
+    assert list(file.parent.iterdir()) == [file]
     assert heard[-1] == (len(BODY), len(BODY))
 
 
-def test_a_later_try_goes_on_too(tmp_path):
+@pytest.mark.parametrize("body", [BODY, OTHER], ids=["the same", "another by now"])
+def test_a_later_try_goes_on_too_or_begins_anew_where_the_file_is_another(file, body):
     shelf = Shelf(breaks=(30_000, 0, 0))
-    with shelf.client(attempts=2) as client:
-        with pytest.raises(errors.TransportError, match=r"maps/3/file"):
-            client.admin.download_map("d", 3, tmp_path / "m.sqlite")
-        assert not (tmp_path / "m.sqlite").exists()
-        client.admin.download_map("d", 3, tmp_path / "m.sqlite")
-    assert shelf.ranges[-1] == "bytes=30000-"
-    assert (tmp_path / "m.sqlite").read_bytes() == BODY
-
-
-def test_another_file_by_now_is_fetched_from_its_beginning(tmp_path):
-    with Shelf(breaks=(30_000, 0)).client(attempts=1) as client, pytest.raises(errors.TransportError):
-        client.admin.download_map("d", 3, tmp_path / "m.sqlite")
-    other = Shelf(OTHER)
-    with other.client() as client:
-        client.admin.download_map("d", 3, tmp_path / "m.sqlite")
-    assert other.ranges == ["bytes=30000-"]
-    assert (tmp_path / "m.sqlite").read_bytes() == OTHER
-    assert len(list(tmp_path.iterdir())) == 1
+    with pytest.raises(errors.TransportError, match=r"maps/3/file"):
+        shelf.fetch(file, attempts=2)
+    assert not file.exists()
+    shelf.body = body
+    shelf.fetch(file)
+    assert "bytes=30000-" in shelf.ranges
+    assert file.read_bytes() == body
+    assert list(file.parent.iterdir()) == [file]
 
 
 @pytest.mark.parametrize("n_there", [len(BODY), len(BODY) + 5])
-def test_a_part_without_a_rest_is_fetched_anew(tmp_path, n_there):
-    (tmp_path / f"m.sqlite.{sha256(BODY)}.part").write_bytes((BODY + b"12345")[:n_there])
+def test_a_part_without_a_rest_is_fetched_anew(file, n_there):
+    part_of(file, BODY).write_bytes((BODY + b"12345")[:n_there])
     shelf = Shelf()
-    with shelf.client() as client:
-        client.admin.download_map("d", 3, tmp_path / "m.sqlite")
+    shelf.fetch(file)
     assert shelf.ranges == [f"bytes={n_there}-", ""]
-    assert (tmp_path / "m.sqlite").read_bytes() == BODY
+    assert file.read_bytes() == BODY
 
 
-def test_a_part_that_was_spoilt_is_found_out_and_dropped(tmp_path):
-    (tmp_path / f"m.sqlite.{sha256(BODY)}.part").write_bytes(b"x" * 100)
-    with Shelf().client() as client:
-        with pytest.raises(errors.DamagedDownloadError, match=sha256(BODY)):
-            client.admin.download_map("d", 3, tmp_path / "m.sqlite")
-        assert list(tmp_path.iterdir()) == []
-        client.admin.download_map("d", 3, tmp_path / "m.sqlite")
-    assert (tmp_path / "m.sqlite").read_bytes() == BODY
+def test_a_part_that_was_spoilt_is_found_out_and_dropped(file):
+    part_of(file, BODY).write_bytes(b"x" * 100)
+    with pytest.raises(errors.DamagedDownloadError, match=sha256(BODY)):
+        Shelf().fetch(file)
+    assert list(file.parent.iterdir()) == []
 
 
-def test_a_file_of_another_digest_or_none_never_replaces_a_good_one(tmp_path):
-    (tmp_path / "m.sqlite").write_bytes(b"good")
-    for etag, error in (
-        (f'"sha256:{sha256(OTHER)}"', errors.DamagedDownloadError),
-        ('W/"1"', errors.UnexpectedAnswerError),
-    ):
-        with Shelf(etag=etag).client() as client, pytest.raises(error):
-            client.admin.download_map("d", 3, tmp_path / "m.sqlite")
-    assert (tmp_path / "m.sqlite").read_bytes() == b"good"
+@pytest.mark.parametrize(
+    ("etag", "error"),
+    [(f'"sha256:{sha256(OTHER)}"', errors.DamagedDownloadError), ('W/"1"', errors.UnexpectedAnswerError)],
+)
+def test_a_file_of_another_digest_or_none_never_replaces_a_good_one(file, etag, error):
+    file.write_bytes(b"good")
+    with pytest.raises(error):
+        Shelf(etag=etag).fetch(file)
+    assert file.read_bytes() == b"good"
 
 
-def test_refusals_have_their_names_and_are_waited_out_where_they_pass(tmp_path):
+def test_refusals_have_their_names_and_are_waited_out_where_they_pass(file):
     retired = {"code": "retired_map", "detail": "map 3 was removed"}
     script = Script(answer(503, {"code": "overloaded"}, retry_after="7"), answer(410, retired))
     with pytest.raises(errors.RetiredMapError, match="was removed"):
-        script.client().admin.download_map("d", 3, tmp_path / "m")
+        script.client().admin.download_map("d", 3, file)
     assert script.slept == [7.0]
 
 
-def test_a_place_where_no_file_can_lie_is_refused_before_anything_is_asked(tmp_path):
+def test_a_place_where_no_file_can_lie_is_refused_before_anything_is_asked(file):
     shelf = Shelf()
-    with shelf.client() as client:
-        for path in (tmp_path, tmp_path / "nowhere" / "m"):
-            with pytest.raises(errors.InvalidArgumentError):
-                client.admin.download_map("d", 3, path)
-        with pytest.raises(errors.NotSavedError, match="name too long"):
-            client.admin.download_map("d", 3, tmp_path / ("m" * 250))
-    assert shelf.ranges == [""]
+    for path in (file.parent, file.parent / "nowhere" / "m"):
+        with pytest.raises(errors.InvalidArgumentError):
+            shelf.fetch(path)
+    assert shelf.ranges == []
+    with pytest.raises(errors.NotSavedError, match="name too long"):
+        shelf.fetch(file.parent / ("m" * 250))
 
 
-def test_the_async_client_fetches_the_same(tmp_path):
+def test_the_async_client_fetches_the_same(file):
     shelf = Shelf(breaks=(10_000, 20_000))
 
     async def fetch(client):
-        there = await client.admin.download_map("d", 3, str(tmp_path / "m.sqlite"))
-        assert there.sha256 == sha256(BODY)
+        assert (await client.admin.download_map("d", 3, str(file))).sha256 == sha256(BODY)
 
     assert len(run_async(shelf, fetch)) == 2
-    assert (tmp_path / "m.sqlite").read_bytes() == BODY
+    assert file.read_bytes() == BODY
     assert shelf.ranges == ["", "bytes=10000-", "bytes=30000-"]
