@@ -32,8 +32,7 @@ from deepsimbad.core.nnql import NnqlConfig
 from deepsimbad.core.planners import PlanningView, plan_by_experience
 from deepsimbad.core.relevance import DEFAULT_UPDATE, Query, Relevance
 from deepsimbad.core.training import TrainingWorld, train
-from deepsimbad.store.map_file import index_bytes, read_map, table_bytes, write_map
-from deepsimbad.store.sealing import seal
+from deepsimbad.store.map_file import index_bytes, read_map, seal, table_bytes, write_map
 
 
 def landmark_table() -> Iterator[str]:

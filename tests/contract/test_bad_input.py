@@ -5,8 +5,7 @@ import zlib
 
 import pytest
 
-from deepsimbad.store.catalog import Catalog
-from deepsimbad.store.catalog_maps import ANY
+from deepsimbad.store.catalog import ANY, Catalog
 
 from .conftest import (
     DIM,

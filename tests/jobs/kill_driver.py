@@ -25,11 +25,9 @@ from deepsimbad.jobs.remap import remap
 from deepsimbad.jobs.remap_config import REMAP_STAGES, RemapConfig
 from deepsimbad.jobs.runner import InThisProcess, JobRunner
 from deepsimbad.store.catalog import Catalog
-from deepsimbad.store.journal import ObservedRow, SessionRecord
-from deepsimbad.store.map_file import read_map
+from deepsimbad.store.map_file import read_map, verify
 from deepsimbad.store.records import JobState, MapState
-from deepsimbad.store.sealing import verify
-from deepsimbad.store.sessions import SessionStore
+from deepsimbad.store.sessions import ObservedRow, SessionRecord, SessionStore
 from deepsimbad.store.traverses import Traverse
 
 DOMAIN, SESSION = "route", "s" * 32

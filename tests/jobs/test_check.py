@@ -23,7 +23,7 @@ from deepsimbad.jobs.progress import Progress
 from deepsimbad.jobs.remap import remap
 from deepsimbad.jobs.remap_config import REMAP_STAGES, RemapConfig
 from deepsimbad.store import map_file
-from deepsimbad.store.catalog_maps import ANY
+from deepsimbad.store.catalog import ANY
 from deepsimbad.store.records import MapState
 from deepsimbad.store.traverses import Traverse
 

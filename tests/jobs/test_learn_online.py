@@ -11,9 +11,8 @@ from deepsimbad.jobs.learn import LEARN_STAGES, learn_online
 from deepsimbad.jobs.progress import Progress
 from deepsimbad.jobs.remap import remap
 from deepsimbad.jobs.remap_config import RemapConfig
-from deepsimbad.store.map_file import read_map
+from deepsimbad.store.map_file import read_map, verify
 from deepsimbad.store.records import MapState
-from deepsimbad.store.sealing import verify
 
 DOMAIN = "route"
 

@@ -20,10 +20,9 @@ from deepsimbad.errors import (
 from deepsimbad.jobs.progress import Progress
 from deepsimbad.jobs.remap import remap
 from deepsimbad.jobs.remap_config import REMAP_STAGES, RemapConfig, RemapSize, remap_stages
-from deepsimbad.store.catalog_maps import ANY
-from deepsimbad.store.map_file import read_map
+from deepsimbad.store.catalog import ANY
+from deepsimbad.store.map_file import read_map, verify
 from deepsimbad.store.records import MapState
-from deepsimbad.store.sealing import verify
 from deepsimbad.store.traverses import Traverse
 
 DOMAIN = "route"

@@ -13,10 +13,9 @@ from sqlite_utils import Database, Migrations
 
 import deepsimbad_migrations
 from deepsimbad.store.catalog import Catalog
-from deepsimbad.store.journal import PriorRow
 from deepsimbad.store.map_file import read_map
 from deepsimbad.store.records import JobState
-from deepsimbad.store.sessions import SessionStore
+from deepsimbad.store.sessions import PriorRow, SessionStore
 from deepsimbad.store.traverses import Traverse
 
 SETS = {

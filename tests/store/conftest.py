@@ -26,7 +26,7 @@ def campus(catalog: Catalog) -> Catalog:
     return catalog
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def make_map() -> Callable[..., Map]:
     def make(n: int = 60, r: int = 20, h: int = 4, seed: int = 0, **changes: Any) -> Map:
         generator = np.random.default_rng(seed)
@@ -54,7 +54,7 @@ def make_map() -> Callable[..., Map]:
     return make
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def make_frames() -> Callable[..., Drive]:
     def make(index: list[int] | np.ndarray, dim: int = 8, seed: int = 0) -> Drive:
         index = np.asarray(index)

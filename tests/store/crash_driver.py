@@ -16,9 +16,8 @@ import numpy as np
 from deepsimbad.core.drive import Drive
 from deepsimbad.core.map import Map
 from deepsimbad.store.catalog import Catalog
-from deepsimbad.store.map_file import read_map, write_map
+from deepsimbad.store.map_file import read_map, seal, verify, write_map
 from deepsimbad.store.records import JobState, MapState
-from deepsimbad.store.sealing import seal, verify
 from deepsimbad.store.traverses import Traverse
 
 FILE_STEPS = {"rename", "unlink", "fsync", "mkdir", "rmdir", "chmod", "flock", "open", "close"}

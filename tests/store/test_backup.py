@@ -7,7 +7,8 @@ import shutil
 import sqlite3
 import stat
 import tarfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -24,16 +25,13 @@ from deepsimbad.errors import (
     DataDirInUseError,
     InvalidArchiveError,
     InvalidInputError,
+    UnavailableError,
 )
-from deepsimbad.store.backup import back_up, migrations_of, restore
-from deepsimbad.store.catalog import Catalog
-from deepsimbad.store.catalog_maps import ANY
-from deepsimbad.store.data_dir import ServiceLock
-from deepsimbad.store.inspection import Inspection, inspect
-from deepsimbad.store.journal import ObservedRow, SessionRecord
-from deepsimbad.store.map_file import read_map, write_map
-from deepsimbad.store.sealing import seal, verify
-from deepsimbad.store.sessions import SessionStore
+from deepsimbad.store.backup import Inspection, back_up, inspect, migrations_of, restore
+from deepsimbad.store.catalog import ANY, Catalog
+from deepsimbad.store.durable import service_lock
+from deepsimbad.store.map_file import read_map, seal, verify, write_map
+from deepsimbad.store.sessions import ObservedRow, SessionRecord, SessionStore
 from deepsimbad.store.traverses import Traverse
 
 MakeMap = Callable[..., Map]
@@ -44,6 +42,16 @@ def silent(_: float) -> None:
     pass
 
 
+def contents_of(folder: Path) -> dict[Path, bytes]:
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def altered(path: Path, *statements: str) -> None:
+    with closing(sqlite3.connect(path)) as connection, connection:
+        for statement in statements:
+            connection.execute(statement)
+
+
 def add_map(catalog: Catalog, make_map: MakeMap, domain: str = "campus") -> int:
     version = catalog.begin_map(domain, {})
     write_map(catalog.building_path(domain, version), make_map(version=version, seed=version, domain=domain))
@@ -52,39 +60,41 @@ def add_map(catalog: Catalog, make_map: MakeMap, domain: str = "campus") -> int:
     return version
 
 
-def add_session(store: SessionStore, catalog: Catalog, name: str, version: int) -> SessionRecord:
-    digest = catalog.map("campus", version).sha256 or ""
-    record = SessionRecord(0, name, "campus", version, digest, {}, 0.0, 9e9, 0, None)
-    return store.create(record).result()
-
-
-def observe(store: SessionStore, number: int, sequence: int) -> None:
-    store.append(number, ObservedRow(sequence, 9e9, 1.0, None, np.arange(1, 21, dtype=np.float32)), 0.0).result()
-
-
-@pytest.fixture
-def furnished(campus: Catalog, make_map: MakeMap, make_frames: MakeFrames) -> Catalog:
-    """Two maps, one active, and one being built; two traverses; a domain with nothing in it; a session."""
-    for _ in range(2):
-        add_map(campus, make_map)
-    campus.activate("campus", 1, ANY)
-    campus.activate("campus", 2, 1)
-    campus.building_path("campus", campus.begin_map("campus", {})).write_bytes(b"half")
-    campus.create_domain("empty", {}, False, [1])
-    for seed, name in enumerate(("summer", "winter")):
-        with Traverse.create(campus.data_dir, "campus", name) as traverse:
-            traverse.put_frames(make_frames(np.arange(50), seed=seed))
-    with SessionStore.open(campus.data_dir) as store:
-        session = add_session(store, campus, "robot", 1)
+@pytest.fixture(scope="module")
+def original(tmp_path_factory: pytest.TempPathFactory, make_map: MakeMap, make_frames: MakeFrames) -> Path:
+    """Two maps, one active, one being built; two traverses; an empty domain; a session. A backup of it beside it."""
+    data_dir = tmp_path_factory.mktemp("original") / "data"
+    with Catalog.open(data_dir) as catalog, SessionStore.open(data_dir) as store:
+        for name in ("campus", "empty"):
+            catalog.create_domain(name, {}, False, [1, 2, 3])
+        for _ in range(2):
+            add_map(catalog, make_map)
+        catalog.activate("campus", 1, ANY)
+        catalog.activate("campus", 2, 1)
+        catalog.building_path("campus", catalog.begin_map("campus", {})).write_bytes(b"half")
+        for seed, name in enumerate(("summer", "winter")):
+            with Traverse.create(data_dir, "campus", name) as traverse:
+                traverse.put_frames(make_frames(np.arange(50), seed=seed))
+        digest = catalog.map("campus", 1).sha256 or ""
+        number = store.create(SessionRecord(0, "robot", "campus", 1, digest, {}, 0.0, 9e9, 0, None)).result().number
         for sequence in range(1, 4):
-            observe(store, session.number, sequence)
-    return campus
+            row = ObservedRow(sequence, 9e9, 1.0, None, np.arange(1, 21, dtype=np.float32))
+            store.append(number, row, 0.0).result()
+    back_up(data_dir, data_dir.with_name("backup.tar"), "1.2", silent)
+    return data_dir
 
 
 @pytest.fixture
-def archive(furnished: Catalog, tmp_path: Path) -> Path:
-    back_up(furnished.data_dir, tmp_path / "backup.tar", "1.2", silent)
-    return tmp_path / "backup.tar"
+def furnished(original: Path, tmp_path: Path) -> Iterator[Catalog]:
+    shutil.copytree(original, tmp_path / "data")
+    (tmp_path / "data").chmod(0o700)
+    with Catalog.open(tmp_path / "data") as catalog:
+        yield catalog
+
+
+@pytest.fixture
+def archive(original: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copy(original.with_name("backup.tar"), tmp_path))
 
 
 def test_everything_comes_back(furnished: Catalog, archive: Path, tmp_path: Path) -> None:
@@ -119,25 +129,22 @@ def test_it_is_a_tar_file_with_a_manifest(archive: Path) -> None:
         manifest = json.loads(packed.read())
     assert names[:2] == ["sessions.sqlite", "catalog.sqlite"], "sessions are copied before what they speak of"
     assert names[-1] == "manifest.json"
-    assert [one["name"] for one in manifest["files"]] == names[:-1]
+    assert [member["name"] for member in manifest["files"]] == names[:-1]
     assert {"format", "format_version", "release", "created_at"} < set(manifest)
     assert stat.S_IMODE(archive.stat().st_mode) == 0o600
 
 
-def test_the_data_directory_is_left_as_it_was(furnished: Catalog, tmp_path: Path) -> None:
+def test_the_data_directory_is_left_as_it_was_and_no_file_is_replaced(furnished: Catalog, tmp_path: Path) -> None:
     furnished.close()
-    before = {path: path.read_bytes() for path in furnished.data_dir.rglob("*") if path.is_file()}
-    back_up(furnished.data_dir, tmp_path / "backup.tar", "0", silent)
-    assert {path: path.read_bytes() for path in furnished.data_dir.rglob("*") if path.is_file()} == before
-
-
-def test_a_file_is_never_replaced(furnished: Catalog, tmp_path: Path) -> None:
+    before = contents_of(furnished.data_dir)
     (tmp_path / "mine").write_text("precious")
-    with pytest.raises(ConflictError, match="never replaces"):
-        back_up(furnished.data_dir, tmp_path / "mine", "0", silent)
+    for file, error in ((tmp_path / "mine", ConflictError), (tmp_path / "nowhere" / "x", InvalidInputError)):
+        with pytest.raises(error):
+            back_up(furnished.data_dir, file, "0", silent)
+    back_up(furnished.data_dir, tmp_path / "backup.tar", "0", silent)
+    assert inspect(furnished.data_dir, silent) == Inspection(6, ())
+    assert contents_of(furnished.data_dir) == before
     assert (tmp_path / "mine").read_text() == "precious"
-    with pytest.raises(InvalidInputError, match="no folder"):
-        back_up(furnished.data_dir, tmp_path / "nowhere" / "x", "0", silent)
 
 
 def test_a_cancelled_backup_or_restore_leaves_nothing(furnished: Catalog, archive: Path, tmp_path: Path) -> None:
@@ -158,10 +165,10 @@ def test_what_is_damaged_is_named_and_not_backed_up(furnished: Catalog, tmp_path
     whole = path.read_bytes()
     path.chmod(0o644)
     path.write_bytes(whole[:5000] + bytes([whole[5000] ^ 1]) + whole[5001:])
-    with pytest.raises(DamagedMapError, match="map 1 of domain campus is damaged"):
+    with pytest.raises(DamagedMapError, match=r"map 1 of domain campus .* SHA-256 differs"):
         back_up(furnished.data_dir, tmp_path / "backup.tar", "0", silent)
     path.unlink()
-    with pytest.raises(DamagedMapError, match="map 1 of domain campus is missing"):
+    with pytest.raises(DamagedMapError, match=r"map 1 of domain campus .*000001\.sqlite is missing"):
         back_up(furnished.data_dir, tmp_path / "backup.tar", "0", silent)
     path.write_bytes(whole)
     traverse = furnished.data_dir / "domains/campus/traverses/winter.sqlite"
@@ -187,7 +194,7 @@ def test_a_backup_that_was_changed_or_cut_short_is_refused(archive: Path, tmp_pa
         with pytest.raises(InvalidArchiveError):
             restore(archive, tmp_path / "there", silent)
     archive.unlink()
-    with pytest.raises(InvalidArchiveError, match="No such file"):
+    with pytest.raises(InvalidArchiveError):
         restore(archive, tmp_path / "there", silent)
     assert not (tmp_path / "there").exists()
 
@@ -233,9 +240,8 @@ def test_a_name_that_leads_elsewhere_is_refused(tmp_path: Path, name: str) -> No
 
 @pytest.mark.parametrize("kind", [tarfile.SYMTYPE, tarfile.LNKTYPE, tarfile.FIFOTYPE, tarfile.DIRTYPE, tarfile.CHRTYPE])
 def test_anything_but_a_plain_file_is_refused(tmp_path: Path, kind: bytes) -> None:
-    path = forged(tmp_path, ["catalog.sqlite"], {}, kind)
-    with pytest.raises(InvalidArchiveError, match="is no plain file"):
-        restore(path, tmp_path / "there", silent)
+    with pytest.raises(InvalidArchiveError, match="has no place in it"):
+        restore(forged(tmp_path, ["catalog.sqlite"], {}, kind), tmp_path / "there", silent)
 
 
 def test_what_is_no_backup_is_refused(tmp_path: Path) -> None:
@@ -286,14 +292,9 @@ def repacked(archive: Path, name: str, change: Callable[[Path], None]) -> None:
 def test_a_backup_that_would_run_what_its_maker_wrote_is_refused(
     archive: Path, tmp_path: Path, name: str, table: str, what: str
 ) -> None:
-    def change(path: Path) -> None:
-        with sqlite3.connect(path) as db:
-            db.execute(f"CREATE {what.format(table)}")
-        db.close()
-
     repacked(archive, name, lambda path: None)
     restore(archive, tmp_path / "sound", silent)
-    repacked(archive, name, change)
+    repacked(archive, name, lambda path: altered(path, f"CREATE {what.format(table)}"))
     with pytest.raises(DamagedFileError, match="no release writes"):
         restore(archive, tmp_path / "there", silent)
     assert not (tmp_path / "there").exists()
@@ -312,12 +313,18 @@ def test_only_an_empty_folder_is_restored_into(archive: Path, furnished: Catalog
     with pytest.raises(ConflictError, match="not empty"):
         restore(archive, furnished.data_dir, silent)
     there = tmp_path / "there"
-    with ServiceLock.take(there, "127.0.0.1:8000"), pytest.raises(DataDirInUseError):
+    with service_lock(there, "127.0.0.1:8000"), pytest.raises(DataDirInUseError):
         restore(archive, there, silent)
-    restore(archive, there, silent)  # only the lock of a service that has ended lies in it
+    (there / "service.lock").touch()  # of a service that was killed
+    restore(archive, there, silent)
     (tmp_path / "file").write_text("x")
-    with pytest.raises(ConflictError, match="no folder"):
+    with pytest.raises(UnavailableError, match="should be"):
         restore(archive, tmp_path / "file", silent)
+    (tmp_path / "real").mkdir()
+    (tmp_path / "link").symlink_to(tmp_path / "real")
+    restore(archive, tmp_path / "link", silent)
+    assert (tmp_path / "link").is_symlink()
+    assert (tmp_path / "real" / "catalog.sqlite").exists()
 
 
 def at_half(act: Callable[[], None]) -> Callable[[float], None]:
@@ -331,23 +338,18 @@ def at_half(act: Callable[[], None]) -> Callable[[float], None]:
     return progress
 
 
-@pytest.mark.parametrize("is_there", [True, False])
-def test_no_service_starts_in_a_folder_that_is_restored_into(archive: Path, tmp_path: Path, is_there: bool) -> None:
-    there = tmp_path / "there"
-    if is_there:
-        there.mkdir()
-    refused = []
+def test_no_service_starts_in_a_folder_that_is_restored_into(archive: Path, tmp_path: Path) -> None:
+    there, refused = tmp_path / "there", []
 
     def start() -> None:
-        with pytest.raises(DataDirInUseError):
-            ServiceLock.take(there, "127.0.0.1:8000")
+        with pytest.raises(DataDirInUseError), service_lock(there, "127.0.0.1:8000"):
+            pass
         refused.append(True)
 
     restore(archive, there, at_half(start))
     assert refused
-    with Catalog.open(there) as catalog:
+    with service_lock(there, "127.0.0.1:8000"), Catalog.open(there) as catalog:
         assert len(catalog.domains()) == 2
-    ServiceLock.take(there, "127.0.0.1:8000").release()
 
 
 def test_a_folder_that_a_command_began_to_use_meanwhile_is_left_alone(archive: Path, tmp_path: Path) -> None:
@@ -379,14 +381,6 @@ def test_a_restore_that_was_killed_is_begun_anew(archive: Path, tmp_path: Path) 
         restore(archive, there, silent)
 
 
-def test_a_link_to_a_folder_is_followed(archive: Path, tmp_path: Path) -> None:
-    (tmp_path / "real").mkdir()
-    (tmp_path / "link").symlink_to(tmp_path / "real")
-    restore(archive, tmp_path / "link", silent)
-    assert (tmp_path / "link").is_symlink()
-    assert (tmp_path / "real" / "catalog.sqlite").exists()
-
-
 def test_a_folder_that_is_made_is_its_owners_alone_and_one_that_was_there_keeps_its_rights(
     archive: Path, furnished: Catalog, tmp_path: Path
 ) -> None:
@@ -395,66 +389,33 @@ def test_a_folder_that_is_made_is_its_owners_alone_and_one_that_was_there_keeps_
     for there in (tmp_path / "above" / "there", tmp_path / "mine"):
         restore(archive, there, silent)
         Catalog.open(there).close()
-    for folder, mode in (
-        (tmp_path / "above" / "there", 0o700),
-        (furnished.data_dir, 0o700),
-        (tmp_path / "mine", 0o750),
-    ):
-        assert stat.S_IMODE(folder.stat().st_mode) == mode
-    above = stat.S_IMODE((tmp_path / "above").stat().st_mode)
-    assert above != 0o700, "who may enter the folders above it is not ours to say"
+    folders = (tmp_path / "above" / "there", furnished.data_dir, tmp_path / "mine")
+    assert [stat.S_IMODE(folder.stat().st_mode) for folder in folders] == [0o700, 0o700, 0o750]
 
 
-def test_a_map_that_is_removed_meanwhile_is_in_neither_copy(furnished: Catalog, tmp_path: Path) -> None:
+def test_what_comes_and_goes_meanwhile_is_copied_as_it_is_now(furnished: Catalog, tmp_path: Path) -> None:
     n_pieces = 0
 
-    def remove(_: float) -> None:
+    def change(_: float) -> None:
         nonlocal n_pieces
         n_pieces += 1
         if n_pieces == 2:  # sessions and catalog are copied
             furnished.remove_map("campus", 1, lambda: False)
-
-    report = back_up(furnished.data_dir, tmp_path / "backup.tar", "0", remove)
-    assert (report.n_maps, report.n_traverses) == (1, 2)
-    restore(tmp_path / "backup.tar", tmp_path / "there", silent)
-    with Catalog.open(tmp_path / "there") as catalog:
-        assert catalog.map("campus", 1).removed_at is not None
-        assert not catalog.map_path("campus", 1).exists()
-
-
-def test_a_domain_that_is_made_anew_meanwhile_is_copied_as_it_is_now(furnished: Catalog, tmp_path: Path) -> None:
-    n_pieces = 0
-
-    def replace(_: float) -> None:
-        nonlocal n_pieces
-        n_pieces += 1
-        if n_pieces == 2:
             furnished.delete_domain("empty")
             furnished.create_domain("empty", {}, True, [5])
             Traverse.create(furnished.data_dir, "empty", "t").close()
 
-    back_up(furnished.data_dir, tmp_path / "backup.tar", "0", replace)
+    report = back_up(furnished.data_dir, tmp_path / "backup.tar", "0", change)
+    assert (report.n_maps, report.n_traverses) == (1, 3)
     restore(tmp_path / "backup.tar", tmp_path / "there", silent)
     with Catalog.open(tmp_path / "there") as catalog:
+        assert catalog.map("campus", 1).removed_at is not None
+        assert not catalog.map_path("campus", 1).exists()
         assert catalog.domain("empty").closed
         assert Traverse.list(tmp_path / "there", "empty") == ["t"]
 
 
 # Check
-
-
-def inspected(data_dir: Path) -> Inspection:
-    return inspect(data_dir, lambda _: None)
-
-
-def test_all_is_well_and_nothing_is_changed(furnished: Catalog) -> None:
-    furnished.close()
-    before = {path: path.read_bytes() for path in furnished.data_dir.rglob("*") if path.is_file()}
-    shares: list[float] = []
-    assert inspect(furnished.data_dir, shares.append) == Inspection(6, ())
-    assert shares == sorted(shares)
-    assert shares[-1] == 1.0
-    assert {path: path.read_bytes() for path in furnished.data_dir.rglob("*") if path.is_file()} == before
 
 
 def test_a_file_that_others_write_to_is_read_as_it_stands(furnished: Catalog, make_frames: MakeFrames) -> None:
@@ -463,7 +424,7 @@ def test_a_file_that_others_write_to_is_read_as_it_stands(furnished: Catalog, ma
         furnished.remove_map("campus", 1, lambda: False)
         traverse.put_frames(make_frames(np.arange(300, 400)))
         assert (furnished.data_dir / "catalog.sqlite-wal").stat().st_size > 0
-        assert inspected(furnished.data_dir) == Inspection(5, ())
+        assert inspect(furnished.data_dir, silent) == Inspection(5, ())
 
 
 @pytest.mark.parametrize(
@@ -487,15 +448,7 @@ def test_what_is_damaged_is_named_and_the_rest_is_read_all_the_same(furnished: C
     ):
         path.chmod(0o644)
         path.write_bytes(damage)
-        assert {finding.file for finding in inspected(furnished.data_dir).damaged} == {name}, damage[:16]
+        assert {finding.file for finding in inspect(furnished.data_dir, silent).damaged} == {name}, damage[:16]
     path.unlink()
     is_known = name == "catalog.sqlite" or "maps" in name
-    assert {finding.file for finding in inspected(furnished.data_dir).damaged} == ({name} if is_known else set())
-
-
-def test_a_cancel_ends_it(furnished: Catalog) -> None:
-    def cancel(_: float) -> None:
-        raise CancelledError("cancelled")
-
-    with pytest.raises(CancelledError):
-        inspect(furnished.data_dir, cancel)
+    assert {finding.file for finding in inspect(furnished.data_dir, silent).damaged} == ({name} if is_known else set())

@@ -30,9 +30,8 @@ from deepsimbad.errors import (
     UnknownMapVersionError,
 )
 from deepsimbad.store import durable
-from deepsimbad.store.catalog import Catalog
+from deepsimbad.store.catalog import ANY, Catalog
 from deepsimbad.store.catalog_keys import ApiKey
-from deepsimbad.store.catalog_maps import ANY
 from deepsimbad.store.records import JobState, KeyScope, MapState, now
 from deepsimbad.store.traverses import Traverse
 
@@ -239,7 +238,7 @@ def test_a_catalog_that_cannot_be_used_says_so(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("not a folder")
     with pytest.raises(UnavailableError) as caught:
         Catalog.open(tmp_path / "file" / "data")
-    assert caught.value.hints["reason"] == "io_error"
+    assert caught.value.hints["reason"] == "no_folder"
     garbage = tmp_path / "garbage"
     garbage.mkdir()
     (garbage / "catalog.sqlite").write_bytes(b"this is no database at all" * 100)

@@ -18,8 +18,7 @@ from deepsimbad.errors import (
 )
 from deepsimbad.store import arrays, map_file
 from deepsimbad.store.catalog import Catalog
-from deepsimbad.store.map_file import _fitting_page_size, index_bytes, read_map, table_bytes, write_map
-from deepsimbad.store.sealing import seal
+from deepsimbad.store.map_file import _fitting_page_size, index_bytes, read_map, seal, table_bytes, write_map
 
 MakeMap = Callable[..., Map]
 

@@ -9,8 +9,7 @@ import pytest
 
 from deepsimbad.core.map import Map
 from deepsimbad.errors import ConflictError, DamagedMapError, UnavailableError
-from deepsimbad.store.map_file import read_map, write_map
-from deepsimbad.store.sealing import seal, verify
+from deepsimbad.store.map_file import read_map, seal, verify, write_map
 
 MakeMap = Callable[..., Map]
 
@@ -93,7 +92,7 @@ def test_a_disk_that_takes_no_more_is_named_and_leaves_nothing(make_map: MakeMap
 import resource, sys
 from pathlib import Path
 from deepsimbad.errors import UnavailableError
-from deepsimbad.store.sealing import seal
+from deepsimbad.store.map_file import seal
 folder = Path(sys.argv[1])
 resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
 try:

@@ -13,16 +13,15 @@ import pytest
 from sqlite_utils import Database
 
 from deepsimbad.errors import DamagedFileError, InvalidInputError, UnavailableError, UnknownSessionError
-from deepsimbad.store.journal import (
+from deepsimbad.store.connection import MAX_BATCH
+from deepsimbad.store.sessions import (
     IdempotencyKey,
     ObservedRow,
     PriorRow,
     SessionRecord,
+    SessionStore,
     StateSnapshot,
-    pack_ranks,
-    unpack_ranks,
 )
-from deepsimbad.store.sessions import MAX_BATCH, SessionStore
 
 RECORD = SessionRecord(0, "s1", "campus", 3, "f" * 64, {"filter": "grid", "seed": 2**53}, 100.0, 200.0, 0, None)
 RANKS = np.array([1, 2.5, 2.5, 4], np.float32)
@@ -79,12 +78,15 @@ def test_rows_come_back_bit_for_bit(store: SessionStore) -> None:
 
 
 @pytest.mark.parametrize("n_landmarks", [1, 2, 500, 32_767, 32_768, 65_535])
-def test_ranks_of_any_map_fit(n_landmarks: int) -> None:
+def test_ranks_of_any_map_fit(store: SessionStore, n_landmarks: int) -> None:
     ranks = np.random.default_rng(1).permutation(n_landmarks).astype(np.float32) + 1
     ranks[: n_landmarks // 2] = (n_landmarks + 1) / 2
-    packed = pack_ranks(ranks)
-    assert len(packed) == n_landmarks * (2 if n_landmarks < 32_768 else 4)
-    np.testing.assert_array_equal(unpack_ranks(packed), ranks)
+    number = store.create(RECORD).result().number
+    store.append(number, observed(1, ranks=ranks), 1.0).result()
+    (row,) = store.journal(number)
+    np.testing.assert_array_equal(row.ranks, ranks)
+    (n_bytes,) = store._db.execute("SELECT length(ranks) FROM journal").fetchone()
+    assert n_bytes == n_landmarks * (2 if n_landmarks < 32_768 else 4)
 
 
 def test_a_sequence_number_or_key_is_taken_once(store: SessionStore) -> None:

@@ -13,10 +13,8 @@ from deepsimbad.core.map import Map
 from deepsimbad.store import connection
 from deepsimbad.store.backup import back_up, restore
 from deepsimbad.store.catalog import Catalog
-from deepsimbad.store.journal import ObservedRow, SessionRecord
-from deepsimbad.store.map_file import write_map
-from deepsimbad.store.sealing import export_map, seal
-from deepsimbad.store.sessions import SessionStore
+from deepsimbad.store.map_file import export_map, seal, write_map
+from deepsimbad.store.sessions import ObservedRow, SessionRecord, SessionStore
 from deepsimbad.store.traverses import Traverse
 
 MakeMap = Callable[..., Map]
@@ -125,7 +123,7 @@ def test_activation_and_removal(tape: Tape, tmp_path: Path, make_map: MakeMap) -
 
 def test_an_acknowledged_observation(tape: Tape, tmp_path: Path) -> None:
     with SessionStore.open(tmp_path) as store:
-        assert committed_for_good(store._writing.conn)
+        assert committed_for_good(store._db.conn)
         session = store.create(SessionRecord(0, "a" * 32, "campus", 1, "0" * 64, {}, 1.0, 9.0, 0, None)).result()
         row = ObservedRow(1, 9.0, 1.0, None, np.array([1, 2], np.float32))
 

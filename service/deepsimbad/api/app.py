@@ -29,9 +29,8 @@ from deepsimbad.jobs.runner import InAnotherProcess, JobRunner, RunJob, job_thre
 from deepsimbad.release import release
 from deepsimbad.settings import Settings
 from deepsimbad.store.catalog import Catalog
-from deepsimbad.store.data_dir import ServiceLock
-from deepsimbad.store.journal import SessionRecord
-from deepsimbad.store.sessions import SessionStore
+from deepsimbad.store.durable import service_lock
+from deepsimbad.store.sessions import SessionRecord, SessionStore
 
 log = logging.getLogger(__name__)
 
@@ -131,7 +130,7 @@ async def _end_of_nobody(services: Services) -> None:
 
 def _start(settings: Settings, metrics: Metrics, keys: KeyRing, run_job: RunJob, parts: ExitStack) -> Services:
     """Open everything; `parts` closes it again, last opened first."""
-    parts.enter_context(ServiceLock.take(settings.data_dir, f"{settings.host}:{settings.port}"))
+    parts.enter_context(service_lock(settings.data_dir, f"{settings.host}:{settings.port}"))
     catalog = parts.enter_context(Catalog.open(settings.data_dir))
     keys.load(catalog.keys)
     settings.check_exposure(len(keys.by_id))

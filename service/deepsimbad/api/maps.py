@@ -34,8 +34,8 @@ from deepsimbad.api.requests import (
 )
 from deepsimbad.engine.maps import load_snapshot, unreadable
 from deepsimbad.errors import ConflictError, DamagedMapError, UnknownMapVersionError
-from deepsimbad.store.catalog_maps import ANY, removed
-from deepsimbad.store.faults import storage_faults
+from deepsimbad.store.catalog import ANY, removed
+from deepsimbad.store.durable import storage_faults
 from deepsimbad.store.records import MapRecord, MapState
 
 router = APIRouter(prefix="/v1/admin/domains", tags=["admin: maps"])

@@ -60,7 +60,7 @@ from deepsimbad.core.relevance import UpdateRule
 from deepsimbad.engine.session import DEFAULT_START_STD_M, Observation, SessionConfig, SessionView
 from deepsimbad.engine.worker import Stopwatch
 from deepsimbad.errors import DeepSimbadError
-from deepsimbad.store.journal import IdempotencyKey, ListedSession
+from deepsimbad.store.sessions import IdempotencyKey, ListedSession
 
 router = APIRouter(prefix="/v1", tags=["sessions"])
 listing = APIRouter(prefix="/v1/admin/sessions", tags=["admin: sessions"])

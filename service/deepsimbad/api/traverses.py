@@ -52,7 +52,7 @@ from deepsimbad.errors import (
 )
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.image import MEDIA_TYPES
-from deepsimbad.store.faults import storage_faults
+from deepsimbad.store.durable import storage_faults
 from deepsimbad.store.records import ListPage
 from deepsimbad.store.traverses import Traverse
 

@@ -10,12 +10,11 @@ from deepsimbad.cli.terminal import progress_bar, report, write_json
 from deepsimbad.errors import UnavailableError
 from deepsimbad.jobs.versions import import_map
 from deepsimbad.release import release
-from deepsimbad.store.backup import back_up
+from deepsimbad.store.backup import back_up, inspect
 from deepsimbad.store.backup import restore as restore_backup
 from deepsimbad.store.catalog import Catalog
-from deepsimbad.store.inspection import inspect
 from deepsimbad.store.layout import catalog_path, domains_folder
-from deepsimbad.store.sealing import export_map
+from deepsimbad.store.map_file import export_map
 
 DAMAGE_FOUND = 1
 
@@ -60,8 +59,15 @@ def export(domain: str, file: Path, version: int | None, as_json: bool, data_dir
     """Copy a sealed map of DOMAIN into FILE, byte for byte, checked against its digest."""
     with Catalog.open(existing_data_dir(given_settings(data_dir=data_dir).data_dir)) as catalog:
         exported = export_map(catalog, domain, version, file)
-    line = f"map {exported.map_version} of {domain} is in {file}: {exported.bytes} bytes, sha256 {exported.sha256}"
-    report(as_json, asdict(exported), line)
+    n_bytes, digest = exported.file_bytes, exported.sha256
+    document = {
+        "domain": domain,
+        "map_version": exported.version,
+        "file": str(file),
+        "bytes": n_bytes,
+        "sha256": digest,
+    }
+    report(as_json, document, f"map {exported.version} of {domain} is in {file}: {n_bytes} bytes, sha256 {digest}")
 
 
 @click.command("import")

@@ -22,12 +22,10 @@ from deepsimbad.errors import (
     UnknownDomainError,
     UnknownMapVersionError,
 )
-from deepsimbad.store.catalog import Catalog
-from deepsimbad.store.catalog_maps import removed
-from deepsimbad.store.faults import storage_faults
-from deepsimbad.store.map_file import read_map
+from deepsimbad.store.catalog import Catalog, removed
+from deepsimbad.store.durable import storage_faults
+from deepsimbad.store.map_file import read_map, verify
 from deepsimbad.store.records import DomainRecord, KeptMap, MapState
-from deepsimbad.store.sealing import verify
 from deepsimbad.store.sessions import SessionStore
 
 log = logging.getLogger(__name__)

@@ -32,8 +32,7 @@ from deepsimbad.errors import (
     UnknownSessionError,
 )
 from deepsimbad.evaluators.base import Evaluator
-from deepsimbad.store.journal import IdempotencyKey, JournalRow, PriorRow, SessionRecord, StateSnapshot
-from deepsimbad.store.sessions import SessionStore
+from deepsimbad.store.sessions import IdempotencyKey, JournalRow, PriorRow, SessionRecord, SessionStore, StateSnapshot
 
 DEFAULT_START_STD_M = 5.0
 LONGEST_MOVE_ACTIONS = 10.0  # a robot may report a move of up to so many of the domain's longest action
@@ -188,7 +187,7 @@ async def replayed_until(
 
     while not is_done:
         after = state.sequence
-        rows = await asyncio.to_thread(store.journal_part, record.number, after, after + _ROWS_AT_ONCE)
+        rows = await asyncio.to_thread(store.journal, record.number, after, after + _ROWS_AT_ONCE)
         if not rows:
             raise UnknownSessionError(f"there is no session {record.session_id!a}")
         run = partial(piece, iter(rows))

@@ -39,9 +39,8 @@ from deepsimbad.errors import (
     TooManySessionsError,
     UnknownSessionError,
 )
-from deepsimbad.store.journal import JournalRow, ListedSession, ObservedRow, PriorRow, SessionRecord
 from deepsimbad.store.records import ListPage
-from deepsimbad.store.sessions import SessionStore
+from deepsimbad.store.sessions import JournalRow, ListedSession, ObservedRow, PriorRow, SessionRecord, SessionStore
 
 T = TypeVar("T")
 

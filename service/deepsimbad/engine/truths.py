@@ -16,8 +16,7 @@ from deepsimbad.engine.session import SessionEngine, SessionState, replayed_unti
 from deepsimbad.engine.sessions import Sessions, check_owner
 from deepsimbad.engine.worker import InferenceWorker
 from deepsimbad.errors import InvalidInputError
-from deepsimbad.store.journal import JournalRow, ObservedRow, SessionRecord, StateSnapshot
-from deepsimbad.store.sessions import SessionStore
+from deepsimbad.store.sessions import JournalRow, ObservedRow, SessionRecord, SessionStore, StateSnapshot
 
 _FARTHEST_M = 10.0  # a truth farther from every map image is of no place of the map: another road, another frame
 _RESUMABLE = 16  # sessions, 0.5 MB each at 26,000 map images

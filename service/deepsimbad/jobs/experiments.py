@@ -41,8 +41,7 @@ from deepsimbad.jobs.progress import Progress
 from deepsimbad.jobs.recordings import EncodedRecording
 from deepsimbad.jobs.train import train_nnql
 from deepsimbad.store.arrays import is_halvable
-from deepsimbad.store.map_file import index_bytes, write_map
-from deepsimbad.store.sealing import seal
+from deepsimbad.store.map_file import index_bytes, seal, write_map
 
 _QUERIES_A_BLOCK = 64  # of brute force: large enough for a matrix product, small enough for memory
 CLAIRVOYANT = "clairvoyant"

@@ -28,10 +28,9 @@ from deepsimbad.errors import (
 from deepsimbad.jobs.progress import Progress
 from deepsimbad.jobs.versions import activate_once, seal_version
 from deepsimbad.store.catalog import Catalog
-from deepsimbad.store.journal import ObservedRow, SessionRecord
 from deepsimbad.store.map_file import read_map
 from deepsimbad.store.records import MapRecord
-from deepsimbad.store.sessions import SessionStore
+from deepsimbad.store.sessions import ObservedRow, SessionRecord, SessionStore
 
 EXPERIENCE = "experience"  # the kind of job
 LEARN_STAGES = {"read map": 1.0, "learn": 2.0, "seal": 1.0, "activate": 0.1}

@@ -27,8 +27,7 @@ from deepsimbad.jobs.progress import Progress
 from deepsimbad.jobs.remap_config import DEFAULT_LIST_LENGTH, DEFAULT_N_LANDMARKS, RemapConfig
 from deepsimbad.jobs.train import train_nnql
 from deepsimbad.jobs.versions import activate_once, seal_version
-from deepsimbad.store.catalog import Catalog
-from deepsimbad.store.catalog_maps import ANY
+from deepsimbad.store.catalog import ANY, Catalog
 from deepsimbad.store.map_file import read_map
 from deepsimbad.store.records import DomainRecord, MapRecord
 from deepsimbad.store.traverses import Traverse

@@ -10,13 +10,11 @@ from typing import Any
 from deepsimbad.core.map import Map
 from deepsimbad.errors import DamagedMapError, DeepSimbadError, InvalidArchiveError
 from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
-from deepsimbad.store.catalog import Catalog
-from deepsimbad.store.catalog_maps import ANY, AnyVersion
+from deepsimbad.store.catalog import ANY, AnyVersion, Catalog
 from deepsimbad.store.durable import sha256_of
 from deepsimbad.store.layout import is_name
-from deepsimbad.store.map_file import index_bytes, read_map, write_map
+from deepsimbad.store.map_file import adopt, index_bytes, read_map, seal, write_map
 from deepsimbad.store.records import MapRecord
-from deepsimbad.store.sealing import adopt, seal
 
 # Traverses of the server where it was made: one of the same name here would be another drive.
 _NAMES_THERE = ("training_traverse", "landmark_traverse", "check_traverse")

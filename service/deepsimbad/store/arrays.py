@@ -2,6 +2,7 @@
 
 import math
 import zlib
+from collections import Counter
 from collections.abc import Mapping
 from typing import Any
 
@@ -13,7 +14,6 @@ from deepsimbad.errors import InvalidInputError
 from deepsimbad.store.records import from_json, to_json
 
 PART_BYTES = 16 * 2**20  # far below SQLite's limit for a value, and all that is held beside the array itself
-_KINDS = "fiu"
 _CODES = np.dtype("<u2")
 
 
@@ -31,14 +31,9 @@ class Checksum:
 
 
 def save_arrays(db: Database, table: str, arrays: Mapping[str, NDArray[Any]], checksum: Checksum) -> None:
-    """Write named arrays into an array table.
-
-    Raises:
-        InvalidInputError: An array does not hold plain numbers.
-    """
-    for name in sorted(arrays):
-        array = np.asarray(arrays[name])
-        if array.dtype.kind not in _KINDS:
+    """Write named arrays into an array table; raises InvalidInputError where one does not hold plain numbers."""
+    for name, array in sorted(arrays.items()):
+        if array.dtype.kind not in "fiu":
             raise InvalidInputError(f"array {name} of {table} holds {array.dtype}, not numbers")
         dtype = np.dtype("<f2") if is_halvable(array) else array.dtype.newbyteorder("<")
         shape, numbers = to_json(list(array.shape)), np.ascontiguousarray(array).reshape(-1)
@@ -57,27 +52,21 @@ def load_arrays(db: Database, table: str, checksum: Checksum) -> dict[str, NDArr
     """
     arrays: dict[str, NDArray[Any]] = {}
     n_filled: dict[str, int] = {}
+    sizes: Counter[str] = Counter()
+    for row in db.table(table).rows_where(select="name, length(body) AS n_bytes"):
+        sizes[row["name"]] += row["n_bytes"]
     for row in db.table(table).rows_where(order_by="name, part"):
         name, dtype, body = row["name"], np.dtype(row["dtype"]), row["body"]
         checksum.add(table, name, row["part"], row["dtype"], row["shape"], body)
-        dimensions = tuple(from_json(row["shape"]))
-        if dtype.kind not in _KINDS:
-            raise ValueError(f"array {name} of {table} holds {dtype}, not numbers")
-        if len(body) == math.prod(dimensions) * dtype.itemsize:
-            arrays[name] = np.frombuffer(body, dtype).reshape(dimensions)
-            n_filled[name] = len(body)
-            continue
         if name not in arrays:
-            stored = next(db.table(table).rows_where("name = ?", [name], select="sum(length(body)) AS n_bytes"))
-            if math.prod(dimensions) * dtype.itemsize != stored["n_bytes"]:  # room for it may be all there is
-                raise ValueError(f"array {name} of {table} is not whole")
+            dimensions = tuple(from_json(row["shape"]))
+            if dtype.kind not in "fiu" or math.prod(dimensions) * dtype.itemsize != sizes[name]:  # before room is made
+                raise ValueError(f"array {name} of {table} is not whole, or holds no numbers")
             arrays[name], n_filled[name] = np.empty(dimensions, dtype), 0
         octets = arrays[name].reshape(-1).view(np.uint8)
         octets[n_filled[name] : n_filled[name] + len(body)] = np.frombuffer(body, np.uint8)
         n_filled[name] += len(body)
     for name, array in arrays.items():
-        if n_filled[name] != array.nbytes:
-            raise ValueError(f"array {name} of {table} is not whole")
         if array.dtype == np.float16:
             arrays[name] = array.astype(np.float32)
         arrays[name].setflags(write=False)
@@ -97,10 +86,7 @@ def is_halvable(numbers: NDArray[Any]) -> bool:
 def save_packed(db: Database, table: str, arrays: Mapping[str, NDArray[Any]], checksum: Checksum) -> None:
     """Write at most one array at two bytes a number: the nearest of 65,536 equal steps from its lowest to its highest.
 
-    High bytes lie before low ones, so that values which are alike compress.
-
-    Raises:
-        InvalidInputError: A value is NaN or infinite.
+    High bytes lie before low ones, so that values which are alike compress. Raises InvalidInputError on NaN.
     """
     for name, array in arrays.items():
         if not np.isfinite(array).all():
@@ -129,14 +115,12 @@ def load_packed(db: Database, table: str, checksum: Checksum) -> dict[str, NDArr
     lowest, step, body = row["lowest"], row["step"], row["body"]
     checksum.add(table, row["name"], row["part"], row["dtype"], row["shape"], repr(lowest), repr(step), body)
     shape = tuple(from_json(row["shape"]))
-    if len(rows) > 1 or row["dtype"] != _CODES.str:
-        raise ValueError(f"{table} holds what no release wrote")
     n_bytes = math.prod(shape) * _CODES.itemsize
     try:
         planes = zlib.decompressobj().decompress(body, n_bytes + 1)
     except zlib.error as error:
         raise ValueError(f"{table} is damaged: {error}") from error
-    if len(planes) != n_bytes:
-        raise ValueError(f"{table} is not whole")
+    if len(rows) > 1 or row["dtype"] != _CODES.str or len(planes) != n_bytes:
+        raise ValueError(f"{table} holds what no release wrote")
     codes = np.frombuffer(planes, np.uint8).reshape(_CODES.itemsize, -1)[::-1].T.copy().view(_CODES).reshape(shape)
     return {row["name"]: (lowest + step * codes).astype(np.float32)}

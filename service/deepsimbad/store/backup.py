@@ -1,9 +1,8 @@
-"""A copy of a whole data directory in one tar file, taken beside a service that goes on writing; and back.
+"""A whole data directory: copied into one tar file beside a service that goes on writing, restored, and inspected.
 
 The last member, the manifest, holds the size and the SHA-256 of every other one. Any tar program can unpack it.
 """
 
-import hashlib
 import io
 import json
 import os
@@ -15,17 +14,22 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 from sqlite_utils import Database, Migrations
 
-from deepsimbad.errors import ConflictError, DamagedMapError, InvalidArchiveError, UnavailableError
+from deepsimbad.errors import (
+    ConflictError,
+    DamagedMapError,
+    DeepSimbadError,
+    InvalidArchiveError,
+    UnavailableError,
+)
 from deepsimbad.store import layout
 from deepsimbad.store.connection import check_integrity, in_todays_schema, look_at, pending_migrations
-from deepsimbad.store.data_dir import PRIVATE, ServiceLock
-from deepsimbad.store.durable import sha256_of, sync, written_aside
-from deepsimbad.store.faults import storage_faults
+from deepsimbad.store.durable import PRIVATE, service_lock, sha256_of, storage_faults, sync, written_aside
 from deepsimbad.store.layout import NAME_PATTERN
+from deepsimbad.store.map_file import read_map, verify
 from deepsimbad.store.records import now
 from deepsimbad_migrations.catalog.migrations import migrations as of_catalog
 from deepsimbad_migrations.map.migrations import migrations as of_map
@@ -46,6 +50,7 @@ _MEMBERS: dict[str, Migrations] = {
     rf"domains/{NAME_PATTERN}/maps/\d{{6,16}}\.sqlite": of_map,
 }
 _MOST_TRIES = 10
+_MOST_LINES = 20
 _STAGING = ".restoring"
 
 Listed = frozenset[tuple[str, int, str]]
@@ -76,9 +81,39 @@ class RestoreReport:
     release: str
 
 
+@dataclass(frozen=True)
+class Finding:
+    """One problem: the file, from the data directory on, and what is wrong with it."""
+
+    file: str
+    what: str
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """How many files were read, and which are damaged or missing."""
+
+    n_files: int
+    damaged: tuple[Finding, ...]
+
+
 def migrations_of(name: str) -> Migrations | None:
     """The schema of a file, by its name in a data directory; None: a backup holds no such file."""
     return next((migrations for pattern, migrations in _MEMBERS.items() if re.fullmatch(pattern, name)), None)
+
+
+def _listed_in(path: Path) -> Listed:
+    """Read a catalog; raises DamagedFileError."""
+
+    def read(db: Database) -> Listed:
+        with in_todays_schema(db, of_catalog, path) as current:
+            maps = current.execute(
+                "SELECT domain, version, sha256 FROM map WHERE state != 'building' AND removed_at IS NULL"
+            ).fetchall()
+            return frozenset([*maps, *current.execute("SELECT name, 0, created_at FROM domain").fetchall()])
+
+    with storage_faults(path):
+        return look_at(path, read)
 
 
 def back_up(data_dir: Path, file: Path, release: str, on_progress: Progress) -> BackupReport:
@@ -100,16 +135,32 @@ def back_up(data_dir: Path, file: Path, release: str, on_progress: Progress) -> 
         DamagedFileError, DamagedMapError: What is damaged, by name.
         UnavailableError: The disk is full, ...
     """
+    catalog = layout.catalog_path(data_dir)
     with storage_faults(file), written_aside(file, "a backup") as new:
         for _ in range(_MOST_TRIES):
-            backup, created_at, problem = _Backup(data_dir, new, on_progress), now(), None
-            try:
-                backup.run({**_FORMAT, "release": release, "created_at": created_at})
-            except UnavailableError as error:
-                problem = error
-                if error.hints.get("reason") == "disk_full":
-                    problem = UnavailableError(f"{file}: no space is left to write it", reason="disk_full")
-            if backup.is_of_today():  # else a damaged or missing file may be one that went meanwhile
+            created_at, problem = now(), None
+            members: list[dict[str, Any]] = []
+            with tarfile.open(new, "w:", format=tarfile.PAX_FORMAT) as tar:
+                new.chmod(0o600)  # it holds the hashes of keys and where robots were
+                if layout.sessions_path(data_dir).exists():
+                    members.append(_add_copy(tar, data_dir, layout.sessions_path(data_dir), new.parent))
+                members.append(_add_copy(tar, data_dir, catalog, new.parent))
+                listed = _listed_in(new.parent / _CATALOG)
+                try:
+                    for n_done, (domain, version, digest) in enumerate(sorted(listed)):
+                        on_progress(n_done / len(listed))
+                        if version > 0:
+                            members.append(_add_map(tar, data_dir, domain, version, digest))
+                        else:
+                            members += _add_traverses(tar, data_dir, domain, new.parent)
+                except UnavailableError as error:
+                    problem = error
+                about = {**_FORMAT, "release": release, "created_at": created_at, "files": members}
+                manifest = json.dumps(about, indent=1).encode()
+                info = tarfile.TarInfo(_MANIFEST)
+                info.size, info.mode, info.mtime = len(manifest), 0o600, int(time.time())
+                tar.addfile(info, io.BytesIO(manifest))
+            if listed <= _listed_in(catalog):  # else a damaged or missing file may be one that went meanwhile
                 break
         else:
             raise UnavailableError("maps come and go faster than they can be copied: try again", reason="busy")
@@ -117,92 +168,55 @@ def back_up(data_dir: Path, file: Path, release: str, on_progress: Progress) -> 
             raise problem
         on_progress(1.0)
         digest, n_bytes = sha256_of(new), new.stat().st_size
-    n_maps = sum(version > 0 for _, version, _ in backup.listed)
-    n_traverses = sum("/traverses/" in member["name"] for member in backup.members)
-    return BackupReport(str(file), n_bytes, digest, created_at, len(backup.listed) - n_maps, n_maps, n_traverses)
+    n_maps = sum(version > 0 for _, version, _ in listed)
+    n_traverses = sum("/traverses/" in member["name"] for member in members)
+    return BackupReport(str(file), n_bytes, digest, created_at, len(listed) - n_maps, n_maps, n_traverses)
 
 
-class _Backup:
-    """One try: the catalog may move on meanwhile, and the files with it."""
+def _add_copy(tar: tarfile.TarFile, data_dir: Path, path: Path, folder: Path) -> dict[str, Any]:
+    """Copy a SQLite file as of one moment into a folder, check the copy and add it."""
+    copy = folder / path.name
 
-    def __init__(self, data_dir: Path, file: Path, on_progress: Progress) -> None:
-        self.listed: Listed = frozenset()
-        self.members: list[dict[str, Any]] = []
-        self._data_dir = data_dir
-        self._file = file
-        self._copy = file.with_name("copy.sqlite")
-        self._counter = _Counter(sum(_sizes(data_dir)), on_progress)
+    def write(db: Database) -> None:
+        copy.unlink(missing_ok=True)
+        db.execute("VACUUM INTO ?", [str(copy)])
 
-    def run(self, about: dict[str, Any]) -> None:
-        with tarfile.open(self._file, "w:", format=tarfile.PAX_FORMAT) as tar:
-            self._file.chmod(0o600)  # it holds the hashes of keys and where robots were
-            if layout.sessions_path(self._data_dir).exists():
-                self._add_copy(tar, _SESSIONS)
-            self._add_copy(tar, _CATALOG)
-            for domain, version, digest in sorted(self.listed):
-                if version > 0:
-                    self._add_map(tar, domain, version, digest)
-                    continue
-                folder = layout.traverses_folder(self._data_dir, domain)
-                for path in sorted(folder.glob("*.sqlite")) if folder.is_dir() else []:
-                    try:
-                        self._add_copy(tar, path.relative_to(self._data_dir).as_posix())
-                    except UnavailableError:
-                        if path.exists():
-                            raise  # else it was deleted meanwhile, and needs no copy
-            manifest = json.dumps({**about, "files": self.members}, indent=1).encode()
-            tar.addfile(_info(_MANIFEST, len(manifest)), io.BytesIO(manifest))
-
-    def is_of_today(self) -> bool:
-        """Whether everything that the copied catalog lists is still there."""
-        path = layout.catalog_path(self._data_dir)
-        with storage_faults(path):
-            return self.listed <= look_at(path, lambda db: listed_in(db, path))
-
-    def _add_copy(self, tar: tarfile.TarFile, name: str) -> None:
-        """Copy a SQLite file as of one moment, and check the copy."""
-        path = self._data_dir / name
-
-        def copy(db: Database) -> None:
-            self._copy.unlink(missing_ok=True)
-            db.execute("VACUUM INTO ?", [str(self._copy)])
-
-        with storage_faults(path):
-            look_at(path, copy)
-            look_at(self._copy, lambda db: check_integrity(db, path))
-            if name == _CATALOG:
-                self.listed = look_at(self._copy, lambda db: listed_in(db, path))
-        self._add(tar, name, self._copy)
-
-    def _add_map(self, tar: tarfile.TarFile, domain: str, version: int, digest: str) -> None:
-        path = layout.map_path(self._data_dir, domain, version)
-        is_there = path.exists()
-        if is_there:
-            self._add(tar, path.relative_to(self._data_dir).as_posix(), path)
-        if not is_there or self.members[-1]["sha256"] != digest:
-            why = "is damaged: its SHA-256 differs" if is_there else "is missing"
-            raise DamagedMapError(
-                f"map {version} of domain {domain} {why}: nothing was backed up. Restore its file, or activate "
-                "another version and delete this one",
-                domain=domain,
-                map_version=version,
-            )
-
-    def _add(self, tar: tarfile.TarFile, name: str, path: Path) -> None:
-        with path.open("rb") as stream:
-            source = _Hashing(stream, self._counter)
-            n_bytes = path.stat().st_size
-            tar.addfile(_info(name, n_bytes), source)
-            self.members.append({"name": name, "bytes": n_bytes, "sha256": source.digest.hexdigest()})
+    with storage_faults(path):
+        look_at(path, write)
+        look_at(copy, lambda db: check_integrity(db, path))
+    return _add(tar, path.relative_to(data_dir).as_posix(), copy)
 
 
-def listed_in(db: Database, path: Path) -> Listed:
-    """Read a catalog; raises DamagedFileError."""
-    with in_todays_schema(db, of_catalog, path) as current:
-        maps = current.execute(
-            "SELECT domain, version, sha256 FROM map WHERE state != 'building' AND removed_at IS NULL"
-        ).fetchall()
-        return frozenset([*maps, *current.execute("SELECT name, 0, created_at FROM domain").fetchall()])
+def _add_traverses(tar: tarfile.TarFile, data_dir: Path, domain: str, folder: Path) -> Iterator[dict[str, Any]]:
+    for path in sorted(layout.traverses_folder(data_dir, domain).glob("*.sqlite")):
+        try:
+            yield _add_copy(tar, data_dir, path, folder)
+        except UnavailableError:
+            if path.exists():
+                raise  # else it was deleted meanwhile, and needs no copy
+        (folder / path.name).unlink(missing_ok=True)
+
+
+def _add_map(tar: tarfile.TarFile, data_dir: Path, domain: str, version: int, digest: str) -> dict[str, Any]:
+    path = layout.map_path(data_dir, domain, version)
+    try:
+        verify(path, digest)
+    except DamagedMapError as error:
+        raise DamagedMapError(
+            f"map {version} of domain {domain} is damaged or missing ({error.message}): nothing was backed up. Restore "
+            "its file, or activate another version and delete this one",
+            domain=domain,
+            map_version=version,
+        ) from error
+    return _add(tar, path.relative_to(data_dir).as_posix(), path)
+
+
+def _add(tar: tarfile.TarFile, name: str, path: Path) -> dict[str, Any]:
+    info = tarfile.TarInfo(name)
+    info.size, info.mode, info.mtime = path.stat().st_size, 0o600, int(time.time())
+    with path.open("rb") as stream:
+        tar.addfile(info, stream)
+    return {"name": name, "bytes": info.size, "sha256": sha256_of(path)}
 
 
 def restore(file: Path, data_dir: Path, on_progress: Progress) -> RestoreReport:
@@ -221,50 +235,47 @@ def restore(file: Path, data_dir: Path, on_progress: Progress) -> RestoreReport:
         UnavailableError: The disk is full, ...
     """
     data_dir = Path(os.path.realpath(data_dir))
-    with storage_faults(data_dir), _opened(file) as tar:
-        about, members = _manifest(tar, file)
-        n_bytes = sum(member["bytes"] for member in members)
-        counter = _Counter(n_bytes, on_progress)
-        with _staging(data_dir) as staging:
-            for member in members:
-                _unpack(tar, file, member, staging, counter)
-            _complete(staging)
-            _publish(staging, data_dir)
-    on_progress(1.0)
-    return RestoreReport(str(data_dir), len(members), n_bytes, str(about.get("created_at")), str(about.get("release")))
-
-
-@contextmanager
-def _opened(file: Path) -> Iterator[tarfile.TarFile]:
     try:
         tar = tarfile.open(file, "r:")  # noqa: SIM115 - closed below
-    except OSError as error:
-        raise InvalidArchiveError(f"{file} cannot be read: {error.strerror}", file=str(file)) from error
-    except tarfile.TarError as error:
-        raise _wrong(file, f"it is no backup: {error}") from error
-    with tar:
-        yield tar
+    except (OSError, tarfile.TarError) as error:
+        raise _wrong(file, f"it cannot be read, or is no backup: {error}") from error
+    with tar, storage_faults(data_dir):
+        about, members = _manifest(tar, file)
+        with _staging(data_dir) as staging:
+            for n_done, member in enumerate(members):
+                on_progress(n_done / len(members))
+                _unpack(tar, file, member, staging)
+            for domain in {domain for domain, _, _ in _listed_in(staging / _CATALOG)}:  # those without files too
+                layout.traverses_folder(staging, domain).mkdir(parents=True, exist_ok=True)
+                layout.maps_folder(staging, domain).mkdir(parents=True, exist_ok=True)
+            for folder, _, _ in os.walk(staging, topdown=False):
+                sync(Path(folder))
+            _publish(staging, data_dir)
+    on_progress(1.0)
+    n_bytes = sum(member["bytes"] for member in members)
+    return RestoreReport(str(data_dir), len(members), n_bytes, str(about.get("created_at")), str(about.get("release")))
 
 
 def _manifest(tar: tarfile.TarFile, file: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """What a backup says of itself and of its members, which are those that it holds."""
     try:
-        infos = [info for info in tar.getmembers() if info.name != _OF_OLDER_RELEASES]
+        infos = [info for info in tar.getmembers() if info.name not in {_MANIFEST, _OF_OLDER_RELEASES}]
         stream = tar.extractfile(_MANIFEST)
         about = json.load(stream) if stream else {}
-        members = [{"name": one["name"], "bytes": int(one["bytes"]), "sha256": one["sha256"]} for one in about["files"]]
+        members = [
+            {"name": member["name"], "bytes": int(member["bytes"]), "sha256": member["sha256"]}
+            for member in about["files"]
+        ]
     except (tarfile.TarError, OSError, AttributeError, KeyError, TypeError, ValueError, RecursionError) as error:
         raise _wrong(file, f"it is no backup, or was cut short or changed: {error}") from error
     if about.get("format") != _FORMAT["format"] or _CATALOG not in {member["name"] for member in members}:
-        raise InvalidArchiveError(f"{file} is no backup of a data directory", file=str(file))
+        raise _wrong(file, "it is no backup of a data directory")
     if about.get("format_version") != _FORMAT["format_version"]:
-        raise InvalidArchiveError(f"{file} was written by a newer release: upgrade this one", file=str(file))
-    for info in infos:
-        if info.type != tarfile.REGTYPE or info.sparse is not None:  # no links, devices or folders
-            raise _wrong(file, f"{info.name!a} is no plain file")
-        if info.name != _MANIFEST and migrations_of(info.name) is None:
+        raise _wrong(file, "it was written by a newer release: upgrade this one")
+    for info in infos:  # no links, devices, folders or files of other names
+        if info.type != tarfile.REGTYPE or info.sparse is not None or migrations_of(info.name) is None:
             raise _wrong(file, f"{info.name!a} has no place in it")
-    sizes = sorted((info.name, info.size) for info in infos if info.name != _MANIFEST)
+    sizes = sorted((info.name, info.size) for info in infos)
     if sizes != sorted((member["name"], member["bytes"]) for member in members):
         raise _wrong(file, "its manifest does not list what is in it")
     return about, members
@@ -274,10 +285,8 @@ def _manifest(tar: tarfile.TarFile, file: Path) -> tuple[dict[str, Any], list[di
 def _staging(data_dir: Path) -> Iterator[Path]:
     """A folder to unpack into, inside the data directory, which is made or found empty, and held meanwhile."""
     is_new = not data_dir.exists()
-    if not is_new and not data_dir.is_dir():
-        raise ConflictError(f"{data_dir} is no folder")
     try:
-        with ServiceLock.take(data_dir, "restoring a backup"):
+        with service_lock(data_dir, "restoring a backup"):
             staging = data_dir / _STAGING
             present = {path.name: path for path in data_dir.iterdir() if path != layout.service_lock_path(data_dir)}
             if _STAGING in present and _CATALOG not in present:  # a restore that was cut short
@@ -299,39 +308,25 @@ def _staging(data_dir: Path) -> Iterator[Path]:
                 data_dir.rmdir()
 
 
-def _unpack(tar: tarfile.TarFile, file: Path, member: dict[str, Any], staging: Path, counter: "_Counter") -> None:
+def _unpack(tar: tarfile.TarFile, file: Path, member: dict[str, Any], staging: Path) -> None:
     """Copy a member into a new file; raises InvalidArchiveError where it is not what the manifest says."""
     name = member["name"]
     target = staging / name
     target.parent.mkdir(parents=True, exist_ok=True)
-    stream = tar.extractfile(name)
+    stream, migrations = tar.extractfile(name), migrations_of(name)
     assert stream is not None
-    source = _Hashing(stream, counter)
+    assert migrations is not None
     with target.open("xb") as into:
         try:
-            shutil.copyfileobj(source, into)
+            shutil.copyfileobj(stream, into)
         except tarfile.TarError as error:
             raise _wrong(file, "it was cut short") from error
-    if source.digest.hexdigest() != member["sha256"]:
+    if sha256_of(target) != member["sha256"]:
         raise _wrong(file, f"{name} does not match its SHA-256")
-    migrations = migrations_of(name)
-    assert migrations is not None
     with storage_faults(target):
         look_at(target, lambda db: pending_migrations(db, migrations, target))
     target.chmod(0o444 if target.parent.name == "maps" else 0o644)
     sync(target)
-
-
-def _complete(staging: Path) -> None:
-    """Make the folders that hold no file yet, and sync all of them."""
-    catalog = staging / _CATALOG
-    with storage_faults(catalog):
-        listed = look_at(catalog, lambda db: listed_in(db, catalog))
-    for domain in {domain for domain, _, _ in listed}:
-        layout.traverses_folder(staging, domain).mkdir(parents=True, exist_ok=True)
-        layout.maps_folder(staging, domain).mkdir(parents=True, exist_ok=True)
-    for folder, _, _ in os.walk(staging, topdown=False):
-        sync(Path(folder))
 
 
 def _publish(staging: Path, data_dir: Path) -> None:
@@ -346,46 +341,66 @@ def _publish(staging: Path, data_dir: Path) -> None:
     sync(data_dir.parent)
 
 
-class _Counter:
-    """Tells how far the work is, by bytes."""
-
-    def __init__(self, n_expected: int, on_progress: Progress) -> None:
-        self._n_expected = max(1, n_expected)
-        self._on_progress = on_progress
-        self._n_done = 0
-
-    def add(self, n_bytes: int) -> None:
-        self._n_done += n_bytes
-        self._on_progress(min(1.0, self._n_done / self._n_expected))
-
-
-class _Hashing:
-    """A stream whose digest is that of what was read of it."""
-
-    def __init__(self, stream: IO[bytes], counter: _Counter) -> None:
-        self._stream = stream
-        self._counter = counter
-        self.digest = hashlib.sha256()
-
-    def read(self, n_bytes: int = -1) -> bytes:
-        piece = self._stream.read(n_bytes)
-        self.digest.update(piece)
-        self._counter.add(len(piece))
-        return piece
-
-
-def _info(name: str, n_bytes: int) -> tarfile.TarInfo:
-    info = tarfile.TarInfo(name)
-    info.size, info.mode, info.mtime = n_bytes, 0o600, int(time.time())
-    return info
-
-
-def _sizes(data_dir: Path) -> Iterator[int]:
-    for pattern in ("*.sqlite*", "domains/*/*/*.sqlite*"):
-        for path in data_dir.glob(pattern):
-            with suppress(FileNotFoundError):
-                yield path.stat().st_size
-
-
 def _wrong(file: Path, why: str) -> InvalidArchiveError:
     return InvalidArchiveError(f"{file} cannot be restored: {why}", file=str(file))
+
+
+def inspect(data_dir: Path, on_progress: Progress) -> Inspection:
+    """Read every file and compare it with what the catalog says of it, beside a running service or without one.
+
+    Nothing is changed. What looks wrong is looked at a second time against the catalog as it is then, since files come
+    and go meanwhile.
+    """
+    files = _files(data_dir)
+    problems = {}
+    for n_read, (path, digest) in enumerate(files.items(), start=1):
+        problems[path] = _problems(data_dir, path, digest)
+        on_progress(n_read / len(files))
+    again = _files(data_dir) if any(problems.values()) else {}
+    damaged = [
+        Finding(path.relative_to(data_dir).as_posix(), line)
+        for path in again
+        if problems.get(path)
+        for line in _problems(data_dir, path, again[path])
+        if line in problems[path]
+    ]
+    return Inspection(len(files), tuple(damaged))
+
+
+def _files(data_dir: Path) -> dict[Path, str | None]:
+    """What there is to read, as of now, and the digests of sealed maps."""
+    catalog, sessions = layout.catalog_path(data_dir), layout.sessions_path(data_dir)
+    files: dict[Path, str | None] = {catalog: None}
+    if sessions.exists():
+        files[sessions] = None
+    files |= dict.fromkeys(sorted(data_dir.glob("domains/*/traverses/*.sqlite")), None)
+    with suppress(DeepSimbadError):
+        for domain, version, digest in sorted(_listed_in(catalog)):
+            if version > 0:
+                files[layout.map_path(data_dir, domain, version)] = digest
+    return files
+
+
+def _problems(data_dir: Path, path: Path, digest: str | None) -> list[str]:
+    """What is wrong with a file: its digest and content where it is a sealed map, else pages, references and schema."""
+
+    def look(db: Database) -> list[str]:
+        lines = [line for (line,) in db.execute(f"PRAGMA integrity_check({_MOST_LINES})") if line != "ok"]
+        for table, row, parent, _ in db.execute("PRAGMA foreign_key_check").fetchmany(_MOST_LINES):
+            lines.append(f"row {row} of {table} refers to a row of {parent} that is not there")
+        migrations = migrations_of(path.relative_to(data_dir).as_posix())
+        if migrations is None:
+            lines.append("no traverse has such a name")
+        else:
+            pending_migrations(db, migrations, path)
+        return [" ".join(line.split()) for line in lines]
+
+    try:
+        if digest is None:
+            with storage_faults(path):
+                return look_at(path, look)
+        verify(path, digest)
+        read_map(path)
+    except DeepSimbadError as error:
+        return [error.message]
+    return []

@@ -8,8 +8,8 @@ from typing import Any
 from sqlite_utils import Database
 
 from deepsimbad.errors import JobInterruptedError, UnknownJobError
-from deepsimbad.store.catalog_file import CatalogFile, get_domain
-from deepsimbad.store.records import JobRecord, JobState, ListPage, from_json, now, to_json
+from deepsimbad.store.connection import OpenFile
+from deepsimbad.store.records import JobRecord, JobState, ListPage, from_json, get_domain, now, to_json
 
 MAX_STARTS = 3  # of a job whose service died each time: it may be what kills it
 _SELECT = """
@@ -22,7 +22,7 @@ _JOB_ID = re.compile(r"[0-9a-f]{32}")
 _WAITING_AGAIN = {"state": JobState.QUEUED, "stage": None, "progress": 0, "eta_s": None}
 
 
-class JobCatalog(CatalogFile):
+class JobCatalog(OpenFile):
     """The jobs of all domains."""
 
     def create_job(self, domain: str, kind: str, config: dict[str, Any], job_id: str | None = None) -> JobRecord:
@@ -32,19 +32,13 @@ class JobCatalog(CatalogFile):
             get_domain(db, domain)
             row = {"job_id": job_id, "domain": domain, "kind": kind, "config": to_json(config)}
             db.table("job").insert({**row, "state": JobState.QUEUED, "created_at": now()})
-            return get_job(db, job_id)
+            return _get_job(db, job_id)
 
     def update_job(self, job_id: str, **fields: Any) -> JobRecord:
         """Change state, stage, progress, eta_s, result or error of a job; one that has ended stays as it is.
 
-        The times of start and end follow from the state.
-
-        Returns:
-            The job as it now stands.
-
-        Raises:
-            UnknownJobError: There is no such job.
-            InvalidInputError: A field cannot hold the value.
+        The times of start and end follow from the state. Raises UnknownJobError, and InvalidInputError where a field
+        cannot hold the value.
         """
         with self._writing() as db:
             return _update(db, job_id, fields)
@@ -52,7 +46,7 @@ class JobCatalog(CatalogFile):
     def start_job(self, job_id: str) -> JobRecord:
         """Let a queued job run; one that is not queued any more stays as it is. Raises UnknownJobError."""
         with self._writing() as db:
-            job = get_job(db, job_id)
+            job = _get_job(db, job_id)
             if job.state is not JobState.QUEUED:
                 return job
             return _update(db, job_id, {"state": JobState.RUNNING, "n_starts": job.n_starts + 1})
@@ -60,33 +54,28 @@ class JobCatalog(CatalogFile):
     def cancel_queued_job(self, job_id: str) -> JobRecord:
         """Cancel a job that has not begun; any other stays as it is. Raises UnknownJobError."""
         with self._writing() as db:
-            if get_job(db, job_id).state is JobState.QUEUED:
+            if _get_job(db, job_id).state is JobState.QUEUED:
                 ended = {"state": JobState.CANCELLED, "eta_s": None, "finished_at": now()}
                 db.table("job").update(job_id, ended)  # it never started
-            return get_job(db, job_id)
+            return _get_job(db, job_id)
 
     def give_back_job(self, job_id: str) -> JobRecord:
-        """Let a running job wait for the next service, as this one stops; that start counts for nothing.
-
-        Raises:
-            UnknownJobError: There is no such job.
-        """
+        """Let a running job wait for the next service, as this one stops; that start counts for nothing."""
         with self._writing() as db:
-            job = get_job(db, job_id)
+            job = _get_job(db, job_id)
             if job.state is JobState.RUNNING:
                 db.table("job").update(job_id, {**_WAITING_AGAIN, "n_starts": job.n_starts - 1})
-            return get_job(db, job_id)
+            return _get_job(db, job_id)
 
     def take_over_jobs(self) -> list[str]:
         """Let the jobs that ran when the last service died wait again; one that died at every start fails.
 
-        Returns:
-            One line for each.
+        Returns one line for each.
         """
         lines = []
         with self._writing() as db:
             rows = db.execute("SELECT job_id FROM job WHERE state = 'running' ORDER BY rowid").fetchall()
-            for job in [get_job(db, job_id) for (job_id,) in rows]:
+            for job in [_get_job(db, job_id) for (job_id,) in rows]:
                 if job.n_starts < MAX_STARTS:
                     db.table("job").update(job.job_id, _WAITING_AGAIN)
                     lines.append(f"job {job.job_id} was interrupted and waits again")
@@ -105,17 +94,7 @@ class JobCatalog(CatalogFile):
     def job(self, job_id: str) -> JobRecord:
         """One job; raises UnknownJobError."""
         with self._reading() as db:
-            return get_job(db, job_id)
-
-    def jobs(self, domain: str | None = None) -> list[JobRecord]:
-        """Every job, or every job of a domain, oldest first; raises UnknownDomainError."""
-        with self._reading() as db:
-            if domain is not None:
-                get_domain(db, domain)
-            return [
-                _job(row)
-                for row in db.execute(f"{_SELECT} WHERE domain = coalesce(?, domain) ORDER BY rowid", [domain])
-            ]
+            return _get_job(db, job_id)
 
     def newest_jobs(self, domain: str | None, before: int | None, limit: int) -> ListPage[JobRecord, int]:
         """A page of jobs, newest first, behind the key `before`; raises UnknownDomainError."""
@@ -128,9 +107,12 @@ class JobCatalog(CatalogFile):
             )
             return ListPage.of(((row[-1], _job(row)) for row in rows), limit)
 
+    def jobs(self, domain: str | None = None) -> list[JobRecord]:
+        """Every job, or every job of a domain, oldest first; raises UnknownDomainError."""
+        return list(reversed(self.newest_jobs(domain, None, _MAX_ROWID - 1).records))
 
-def get_job(db: Database, job_id: str) -> JobRecord:
-    """One job; raises UnknownJobError."""
+
+def _get_job(db: Database, job_id: str) -> JobRecord:
     row = None
     if _JOB_ID.fullmatch(job_id) is not None:
         row = db.execute(f"{_SELECT} WHERE job_id = ?", [job_id]).fetchone()
@@ -140,7 +122,7 @@ def get_job(db: Database, job_id: str) -> JobRecord:
 
 
 def _update(db: Database, job_id: str, fields: dict[str, Any]) -> JobRecord:
-    job = get_job(db, job_id)
+    job = _get_job(db, job_id)
     if job.state.is_final or not fields:
         return job
     values = {name: to_json(value) if isinstance(value, dict) else value for name, value in fields.items()}
@@ -152,7 +134,7 @@ def _update(db: Database, job_id: str, fields: dict[str, Any]) -> JobRecord:
     if state.is_final:
         values["finished_at"] = now()
     db.table("job").update(job_id, values)
-    return get_job(db, job_id)
+    return _get_job(db, job_id)
 
 
 def _job(row: tuple[Any, ...]) -> JobRecord:

@@ -12,7 +12,7 @@ from typing import Any, Self
 from sqlite_utils import Database
 
 from deepsimbad.errors import InvalidInputError, UnknownKeyError
-from deepsimbad.store.catalog_file import CatalogFile
+from deepsimbad.store.connection import OpenFile
 from deepsimbad.store.layout import checked_name
 from deepsimbad.store.records import KeyRecord, KeyScope, after, now
 
@@ -59,7 +59,7 @@ class ApiKey:
         return f"ApiKey({self.key_id})"
 
 
-class KeyCatalog(CatalogFile):
+class KeyCatalog(OpenFile):
     """The keys. Rows are never deleted: whether a key was ever created decides whether the service runs open."""
 
     def create_key(

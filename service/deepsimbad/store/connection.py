@@ -3,19 +3,21 @@
 import sqlite3
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from concurrent.futures import Future
+from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
-from typing import Self, TypeVar
+from queue import SimpleQueue
+from typing import Any, Self, TypeVar
 
 from sqlite_utils import Database, Migrations
 
-from deepsimbad.errors import DamagedFileError, DamagedMapError
-from deepsimbad.store.faults import storage_faults
+from deepsimbad.errors import DamagedFileError, UnavailableError
+from deepsimbad.store.durable import storage_faults
 
-BUSY_TIMEOUT_S = 10.0
+T = TypeVar("T")
+
+MAX_BATCH = 256  # writes in one transaction
 _STRANGE_SCHEMA = "SELECT 1 FROM sqlite_schema WHERE type NOT IN ('table', 'index') OR rootpage = 0 LIMIT 1"
-
-_Answer = TypeVar("_Answer")
 
 
 def open_database(path: Path, *, read_only: bool = False, create: bool = False, immutable: bool = False) -> Database:
@@ -27,20 +29,12 @@ def open_database(path: Path, *, read_only: bool = False, create: bool = False, 
         create: Make the file where it is missing; else a missing file is an error.
         immutable: Read a sealed file: no locks, no journal, no side files. Never for a file that may change: the newest
             rows would silently be missing.
-
-    Raises:
-        sqlite3.Error: As SQLite says it; callers stand inside `storage_faults`.
     """
-    if immutable:
-        mode = "mode=ro&immutable=1"
-    elif read_only:
-        mode = "mode=ro"
-    else:
-        mode = "mode=rwc" if create else "mode=rw"
+    mode = "ro&immutable=1" if immutable else "ro" if read_only else "rwc" if create else "rw"
     connection = sqlite3.connect(
-        f"{path.resolve().as_uri()}?{mode}",
+        f"{path.resolve().as_uri()}?mode={mode}",
         uri=True,
-        timeout=BUSY_TIMEOUT_S,
+        timeout=10.0,
         isolation_level=None,  # no transaction begins behind our back
         check_same_thread=False,
     )
@@ -54,18 +48,11 @@ def open_database(path: Path, *, read_only: bool = False, create: bool = False, 
         raise
 
 
-def look_at(path: Path, ask: Callable[[Database], _Answer]) -> _Answer:
-    """Ask a file something without writing anything, whether others write to it meanwhile or not.
+def look_at(path: Path, ask: Callable[[Database], T]) -> T:
+    """Ask a file something, twice if need be, without writing anything, whether others write to it meanwhile or not.
 
     A file whose log is empty is read as one that does not change, which works on a read-only disk too, and is read
     again where it has changed meanwhile.
-
-    Args:
-        path: The file.
-        ask: Called with the open file; a second time if need be, so it should begin from the beginning.
-
-    Raises:
-        sqlite3.Error: As SQLite says it; callers stand inside `storage_faults`.
     """
     before = _state(path)
     if before[-1] == 0:
@@ -88,12 +75,6 @@ def _state(path: Path) -> tuple[int, ...]:
     return file.st_ino, file.st_size, file.st_mtime_ns, log.stat().st_size if log.exists() else 0
 
 
-def use_write_ahead_log(db: Database) -> None:
-    """Let readers go on during writes; an acknowledged commit survives a power cut too (synchronous FULL)."""
-    db.conn.execute("PRAGMA journal_mode = WAL")
-    db.conn.execute("PRAGMA synchronous = FULL")
-
-
 @contextmanager
 def write_transaction(db: Database) -> Iterator[Database]:
     """One transaction that holds the write lock from its beginning and is undone on any error.
@@ -110,59 +91,42 @@ def write_transaction(db: Database) -> Iterator[Database]:
         raise
 
 
-def check_integrity(
-    db: Database, path: Path, damaged: type[DamagedFileError | DamagedMapError] = DamagedFileError
-) -> None:
-    """Check every page and index of the file; raises DamagedFileError (or `damaged`)."""
+def check_integrity(db: Database, path: Path) -> None:
+    """Check every page and index of the file; raises DamagedFileError."""
     (verdict,) = db.execute("PRAGMA integrity_check(1)").fetchone()
     if verdict != "ok":
-        raise damaged(f"{path.name} is damaged: {' '.join(str(verdict).split())}", file=path.name)
+        raise DamagedFileError(f"{path.name} is damaged: {' '.join(str(verdict).split())}", file=path.name)
 
 
-def pending_migrations(
-    db: Database,
-    migrations: Migrations,
-    path: Path,
-    damaged: type[DamagedFileError | DamagedMapError] = DamagedFileError,
-) -> bool:
+def pending_migrations(db: Database, migrations: Migrations, path: Path) -> bool:
     """Whether the file has an older schema than ours; an empty file has the oldest.
 
     Raises:
-        DamagedFileError: (or `damaged`) The file is of another kind, a newer release wrote it, or it holds triggers,
-            views or virtual tables, which no release writes: using it would run what its maker wrote.
+        DamagedFileError: The file is of another kind, a newer release wrote it, or it holds triggers, views or virtual
+            tables, which no release writes: using it would run what its maker wrote.
     """
     if db.execute(_STRANGE_SCHEMA).fetchone() is not None:
-        raise damaged(f"{path.name} is damaged: it holds what no release writes", file=path.name)
+        raise DamagedFileError(f"{path.name} is damaged: it holds what no release writes", file=path.name)
     try:
         pending = {migration.name for migration in migrations.pending(db)}
         applied = {migration.name for migration in migrations.applied(db)}
     except (AttributeError, LookupError, TypeError, ValueError) as error:  # a bookkeeping table of another shape
-        raise damaged(f"{path.name} is damaged: its schema cannot be read", file=path.name) from error
+        raise DamagedFileError(f"{path.name} is damaged: its schema cannot be read", file=path.name) from error
     if not applied and db.table_names():
-        raise damaged(f"{path.name} is a SQLite file of another kind", file=path.name)
+        raise DamagedFileError(f"{path.name} is a SQLite file of another kind", file=path.name)
     with Database(memory=True, execute_plugins=False) as nothing:
-        known = {migration.name for migration in migrations.pending(nothing)}
-    if applied - known:
-        raise damaged(
-            f"{path.name} was written by a newer release (schema {max(applied - known)}): upgrade this one",
-            file=path.name,
+        newer = applied - {migration.name for migration in migrations.pending(nothing)}
+    if newer:
+        raise DamagedFileError(
+            f"{path.name} was written by a newer release (schema {max(newer)}): upgrade this one", file=path.name
         )
     return bool(pending)
 
 
 @contextmanager
-def in_todays_schema(
-    db: Database,
-    migrations: Migrations,
-    path: Path,
-    damaged: type[DamagedFileError | DamagedMapError] = DamagedFileError,
-) -> Iterator[Database]:
-    """The file as it is where its schema is today's, else a copy in memory that is brought to it.
-
-    Raises:
-        DamagedFileError: (or `damaged`) As `pending_migrations`.
-    """
-    if not pending_migrations(db, migrations, path, damaged):
+def in_todays_schema(db: Database, migrations: Migrations, path: Path) -> Iterator[Database]:
+    """The file as it is where its schema is today's, else a copy in memory brought to it; as `pending_migrations`."""
+    if not pending_migrations(db, migrations, path):
         yield db
         return
     with Database(sqlite3.connect(":memory:", isolation_level=None), execute_plugins=False) as copy:
@@ -171,27 +135,22 @@ def in_todays_schema(
         yield copy
 
 
-def migrate(db: Database, migrations: Migrations, path: Path) -> None:
-    """Bring the file to today's schema, in one transaction; two processes that try at once both succeed.
-
-    Raises:
-        DamagedFileError: As `pending_migrations`.
-    """
-    if pending_migrations(db, migrations, path):
-        with write_transaction(db):
-            migrations.apply(db)
-
-
 def open_working_file(path: Path, migrations: Migrations, *, create: bool = False, is_checked: bool = True) -> Database:
-    """Open a file to work on: with a write-ahead log, of today's schema, and whole unless that is not to be checked."""
+    """Open a file to work on, brought to today's schema, whole unless that is not to be checked.
+
+    With a write-ahead log readers go on during writes, and an acknowledged commit survives a power cut.
+    """
     db = open_database(path, create=create)
     try:
         if not create and not db.table_names():
             raise DamagedFileError(f"{path.name} is damaged: it is empty", file=path.name)
         if is_checked:
             check_integrity(db, path)
-        use_write_ahead_log(db)
-        migrate(db, migrations, path)
+        db.conn.execute("PRAGMA journal_mode = WAL")
+        db.conn.execute("PRAGMA synchronous = FULL")
+        if pending_migrations(db, migrations, path):
+            with write_transaction(db):  # two processes that try at once both succeed
+                migrations.apply(db)
     except BaseException:
         db.close()
         raise
@@ -204,17 +163,29 @@ class OpenFile:
     Args:
         path: The file, for messages.
         db: The same, open.
+        reader: The same, open a second time, so that who reads never waits for who writes.
     """
 
-    def __init__(self, path: Path, db: Database) -> None:
+    def __init__(self, path: Path, db: Database, reader: Database | None = None) -> None:
         self._path = path
         self._db = db
         self._lock = threading.RLock()
+        self._reader = reader or db
+        self._reader_lock = threading.RLock() if reader else self._lock
         self._inode = path.stat().st_ino
 
     def close(self) -> None:
-        """Close the file."""
-        with self._lock:
+        """Close the file; where readers have their own connection its log, empty, stays.
+
+        On a full disk the next start could make no new one.
+        """
+        with self._lock, self._reader_lock:
+            if self._reader is not self._db:
+                self._reader.close()
+                with suppress(sqlite3.Error), open_database(self._path, read_only=True) as last:
+                    self._db.conn.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+                    last.execute("SELECT 1 FROM sqlite_schema LIMIT 1").fetchall()  # a reader that is last leaves it
+                    self._db.close()
             self._db.close()
 
     def __enter__(self) -> Self:
@@ -225,13 +196,26 @@ class OpenFile:
 
     @contextmanager
     def _reading(self) -> Iterator[Database]:
-        """One consistent state of the file."""
-        with self._lock, storage_faults(self._path), self._db.atomic() as db:
+        """One consistent state of the file, of what was committed before."""
+        with self._reader_lock, storage_faults(self._path), self._reader.atomic() as db:
             yield db
+
+    @contextmanager
+    def _writing(self) -> Iterator[Database]:
+        with self._lock, storage_faults(self._path), write_transaction(self._db) as db:
+            self.check_is_there()
+            yield db
+
+    def check(self) -> None:
+        """Raise what keeps the file from being read."""
+        with self._reading() as db:
+            for table in db.table_names():
+                next(db.table(table).rows_where(limit=1), None)
+        self.check_is_there()
 
     @property
     def is_deleted(self) -> bool:
-        """Whether the file is gone, or another lies in its place."""
+        """Whether the file is gone, or another lies in its place; an open one goes on without its name."""
         with storage_faults(self._path):
             try:
                 return self._path.stat().st_ino != self._inode
@@ -239,15 +223,80 @@ class OpenFile:
                 return True
 
     def check_is_there(self) -> None:
-        """Raise DamagedFileError where the file is gone: an open one goes on without its name, until it is closed."""
+        """Raise DamagedFileError where the file is gone."""
         if self.is_deleted:
             raise DamagedFileError(f"{self._path.name} was removed under the running service", file=self._path.name)
 
 
-def close_with_log(db: Database, path: Path) -> None:
-    """Close a file's last writer so that its log, empty, stays: on a full disk the next start could make no new one."""
-    with suppress(sqlite3.Error), open_database(path, read_only=True) as last:
-        db.conn.execute("PRAGMA wal_checkpoint(TRUNCATE)")
-        last.execute("SELECT 1 FROM sqlite_schema LIMIT 1").fetchall()  # a reader that is the last leaves it
-        db.close()
-    db.close()
+class GroupCommit:
+    """One thread that commits what others hand in; a write counts when its future has a result, not earlier.
+
+    Many writers, one disk: whatever waits while a transaction is being synced goes into the next one together.
+
+    Args:
+        transaction: Gives a write transaction.
+        on_commit: Called with the number of writes of every transaction.
+    """
+
+    def __init__(
+        self, transaction: Callable[[], AbstractContextManager[Database]], on_commit: Callable[[int], None]
+    ) -> None:
+        self._transaction = transaction
+        self._on_commit = on_commit
+        self._waiting: SimpleQueue[tuple[Callable[[Database], Any], Future[Any]] | None] = SimpleQueue()
+        self._is_open = True
+        self._lock = threading.Lock()
+        self.thread = threading.Thread(target=self._work, name="commits", daemon=True)
+        self.thread.start()
+
+    def submit(self, run: Callable[[Database], T]) -> Future[T]:
+        """Queue a write that is made inside a transaction, perhaps a second time in another one.
+
+        Returns:
+            Its result to come, once it is on the disk; or its error, and then nothing of it was kept.
+
+        Raises:
+            UnavailableError: The file has been closed.
+        """
+        done: Future[T] = Future()
+        done.set_running_or_notify_cancel()  # whoever stops waiting does not undo it; before the thread can end it
+        with self._lock:
+            if not self._is_open:
+                raise UnavailableError("the service is shutting down")
+            self._waiting.put((run, done))
+        return done
+
+    def close(self) -> None:
+        """Commit what waits, then end the thread."""
+        with self._lock:
+            if self._is_open:
+                self._is_open = False
+                self._waiting.put(None)
+        self.thread.join()
+
+    def _work(self) -> None:
+        while (write := self._waiting.get()) is not None:
+            batch = [write]
+            while len(batch) < MAX_BATCH and not self._waiting.empty():
+                write = self._waiting.get()
+                if write is None:
+                    break
+                batch.append(write)
+            self._commit(batch)
+            if write is None:
+                return
+
+    def _commit(self, batch: list[tuple[Callable[[Database], Any], Future[Any]]]) -> None:
+        try:
+            with self._transaction() as db:
+                results = [run(db) for run, _ in batch]
+        except BaseException as error:
+            if len(batch) == 1:
+                batch[0][1].set_exception(error)
+                return
+            for write in batch:  # one that cannot be written should not take the others with it
+                self._commit([write])
+            return
+        self._on_commit(len(batch))
+        for (_, done), result in zip(batch, results, strict=True):
+            done.set_result(result)

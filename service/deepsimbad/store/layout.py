@@ -1,4 +1,4 @@
-"""Where everything lies under the data directory, and which names may become paths."""
+"""Where everything lies under the data directory, and which names may become paths; paths raise InvalidInputError."""
 
 import re
 from pathlib import Path
@@ -6,22 +6,16 @@ from pathlib import Path
 from deepsimbad.errors import InvalidInputError
 
 NAME_PATTERN = r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}"
-_NAME = re.compile(NAME_PATTERN)
-SEALING_SUFFIX = ".sealing"  # of a map that is being sealed
 _MAX_VERSION = 2**53
 
 
 def is_name(name: str) -> bool:
-    """Whether the name of a domain or traverse is one that may exist."""
-    return _NAME.fullmatch(name) is not None
+    """Whether a domain or traverse may have the name."""
+    return re.fullmatch(NAME_PATTERN, name) is not None
 
 
 def checked_name(name: str, what: str) -> str:
-    """The name itself, safe to become part of a path.
-
-    Raises:
-        InvalidInputError: The name does not match `NAME_PATTERN`.
-    """
+    """The name itself, safe to become part of a path; raises InvalidInputError."""
     if not is_name(name):
         raise InvalidInputError(
             f"a {what} is named by 1 to 64 letters, digits, '.', '_' or '-', the first a letter or digit",
@@ -51,32 +45,27 @@ def domains_folder(data_dir: Path) -> Path:
 
 
 def domain_folder(data_dir: Path, domain: str) -> Path:
-    """The folder of one domain; raises InvalidInputError."""
+    """The folder of one domain."""
     return domains_folder(data_dir) / checked_name(domain, "domain")
 
 
 def traverses_folder(data_dir: Path, domain: str) -> Path:
-    """The folder of a domain's traverses; raises InvalidInputError."""
+    """The folder of a domain's traverses."""
     return domain_folder(data_dir, domain) / "traverses"
 
 
 def traverse_path(data_dir: Path, domain: str, name: str) -> Path:
-    """The file of one traverse; raises InvalidInputError."""
+    """The file of one traverse."""
     return traverses_folder(data_dir, domain) / f"{checked_name(name, 'traverse')}.sqlite"
 
 
 def maps_folder(data_dir: Path, domain: str) -> Path:
-    """The folder of a domain's maps; raises InvalidInputError."""
+    """The folder of a domain's maps."""
     return domain_folder(data_dir, domain) / "maps"
 
 
 def map_path(data_dir: Path, domain: str, version: int) -> Path:
-    """The sealed file of one map version; raises InvalidInputError."""
+    """The sealed file of one map version."""
     if not 1 <= version <= _MAX_VERSION:
         raise InvalidInputError(f"map versions count from 1; {version} is none")
     return maps_folder(data_dir, domain) / f"{version:06d}.sqlite"
-
-
-def building_path(data_dir: Path, domain: str, version: int) -> Path:
-    """The file a map version is built in before it is sealed; raises InvalidInputError."""
-    return map_path(data_dir, domain, version).with_suffix(".building")

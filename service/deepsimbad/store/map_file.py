@@ -1,8 +1,9 @@
-"""One map version as a self-contained file: its description, posting lists, and named arrays.
+"""One map version as a self-contained file: its description, posting lists, and named arrays; sealing and export.
 
 What the arrays mean is not known here: `core.map` names them, a table holds each.
 """
 
+import shutil
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,30 +14,28 @@ from sqlite_utils import Database
 
 from deepsimbad.core.map import Map
 from deepsimbad.core.packing import pack_index, unpack_index
-from deepsimbad.errors import DamagedMapError, InvalidMapConfigError, InvalidRouteError
+from deepsimbad.errors import (
+    ConflictError,
+    DamagedFileError,
+    DamagedMapError,
+    InvalidMapConfigError,
+    InvalidRouteError,
+    NoActiveMapError,
+    UnknownMapVersionError,
+)
 from deepsimbad.store.arrays import Checksum, load_arrays, load_packed, save_arrays, save_packed
-from deepsimbad.store.connection import in_todays_schema, open_database
-from deepsimbad.store.durable import remove_database
-from deepsimbad.store.faults import storage_faults
-from deepsimbad.store.records import from_json, to_json
+from deepsimbad.store.catalog import Catalog, removed
+from deepsimbad.store.connection import check_integrity, in_todays_schema, open_database
+from deepsimbad.store.durable import remove_database, sha256_of, storage_faults, sync, written_aside
+from deepsimbad.store.records import MapRecord, from_json, to_json
 from deepsimbad_migrations.map.migrations import migrations
 
 _AS_JSON = frozenset({"config", "evaluator", "actions_m", "metrics"})  # columns of `map`
 _DESCRIPTION = (  # the columns of `map` in the order of the checksum
-    "domain",
-    "version",
-    "created_at",
-    "config",
-    "evaluator",
-    "closed",
-    "actions_m",
-    "metrics",
-    "n_map_images",
-    "n_landmarks",
-    "list_length",
+    *("domain", "version", "created_at", "config", "evaluator", "closed", "actions_m", "metrics"),
+    *("n_map_images", "n_landmarks", "list_length"),
 )
 _WAL_HEADER = bytes([2, 2])  # read and write version at offset 18 of a file that may have a write-ahead log
-
 _PAGE_SIZES = (4096, 8192, 16384, 32768, 65536)
 _ROW_OVERHEAD = 12  # cell pointer, cell and record headers, landmark and rank of one posting row
 
@@ -52,22 +51,22 @@ _TABLE_OF = {
 _TABLES = ("calibration", "landmark_statistics", "listed_dissimilarity", "map_image_encoding", _PACKED_TABLE, "route")
 
 
-def write_map(path: Path, map_: Map, on_progress: Callable[[float], None] | None = None) -> None:
-    """Write a new, unsealed map file; one of the same name is replaced.
+def write_map(path: Path, map_: Map, on_progress: Callable[[float], None] = lambda _: None) -> None:
+    """Write a new, unsealed map file; one of the same name is replaced, and a failure leaves none.
 
-    It is not synced: only `sealing.seal` makes it durable. A failure leaves no file.
+    It is not synced: only `seal` makes it durable.
 
     Args:
         path: Where; `Catalog.building_path`.
+        map_: All of it.
         on_progress: Called with 0..1; what it raises (a cancel) ends the writing.
 
     Raises:
         InvalidInputError: A Q-value is NaN or infinite.
         UnavailableError: The disk is full, read-only, ...
     """
-    report = on_progress or (lambda _: None)
     postings = list(pack_index(map_.lists, map_.n_landmarks))
-    report(0.3)
+    on_progress(0.3)
     with storage_faults(path, DamagedMapError):
         remove_database(path)
         try:
@@ -77,18 +76,15 @@ def write_map(path: Path, map_: Map, on_progress: Callable[[float], None] | None
                 db.execute("PRAGMA synchronous = OFF")
                 migrations.apply(db)
                 with db.atomic():
-                    _write(db, map_, postings, report)
+                    _write(db, map_, postings, on_progress)
         except BaseException:
             remove_database(path)
             raise
-    report(1.0)
+    on_progress(1.0)
 
 
 def _write(
-    db: Database,
-    map_: Map,
-    postings: list[tuple[int, int, bytes]],
-    report: Callable[[float], None],
+    db: Database, map_: Map, postings: list[tuple[int, int, bytes]], on_progress: Callable[[float], None]
 ) -> None:
     checksum = Checksum()
     description = {
@@ -99,18 +95,14 @@ def _write(
     for posting in postings:
         checksum.add(*posting)
     db.conn.executemany("INSERT INTO posting (landmark, rank, image_ids) VALUES (?, ?, ?)", postings)
-    report(0.5)
+    on_progress(0.5)
     save_arrays(db, _MODEL_TABLE, map_.landmark_model, checksum)
     arrays = {name: array for name, array in map_.arrays().items() if name != "lists"}
     for table in _TABLES:
-        of_table = {name: array for name, array in arrays.items() if _table_of(name) == table}
+        of_table = {name: array for name, array in arrays.items() if _TABLE_OF.get(name, "calibration") == table}
         (save_packed if table == _PACKED_TABLE else save_arrays)(db, table, of_table, checksum)
-        report(0.7)
+        on_progress(0.7)
     db.table("map").insert({"id": 1, **description, "checksum": checksum.value})
-
-
-def _table_of(name: str) -> str:
-    return _TABLE_OF.get(name, "calibration")
 
 
 def read_map(path: Path) -> Map:
@@ -163,20 +155,33 @@ def table_bytes(path: Path) -> dict[str, int]:
         return _bytes_by_table(db)
 
 
+def _bytes_by_table(db: Database) -> dict[str, int]:
+    rows = db.execute(
+        """
+        SELECT coalesce(tbl_name, dbstat.name), sum(pgsize)
+        FROM dbstat LEFT JOIN sqlite_schema USING (name) GROUP BY 1
+        """
+    )
+    return dict(rows.fetchall())
+
+
 @contextmanager
 def _opened(path: Path) -> Iterator[Database]:
     """A map file open for reading, of today's schema."""
     if not path.is_file():
         raise DamagedMapError(f"{path.name} is missing", file=path.name)
-    with storage_faults(path, DamagedMapError):
-        with path.open("rb") as stream:
-            if stream.read(20)[18:] == _WAL_HEADER:  # its newest rows may lie beside it
-                raise DamagedMapError(f"{path.name} was opened for writing after it was sealed", file=path.name)
-        with open_database(path, immutable=True) as db:
-            if not db.table_names():
-                raise DamagedMapError(f"{path.name} is damaged: it is empty", file=path.name)
-            with in_todays_schema(db, migrations, path, DamagedMapError) as current:
-                yield current
+    try:
+        with storage_faults(path, DamagedMapError):
+            with path.open("rb") as stream:
+                if stream.read(20)[18:] == _WAL_HEADER:  # its newest rows may lie beside it
+                    raise DamagedMapError(f"{path.name} was opened for writing after it was sealed", file=path.name)
+            with open_database(path, immutable=True) as db:
+                if not db.table_names():
+                    raise DamagedMapError(f"{path.name} is damaged: it is empty", file=path.name)
+                with in_todays_schema(db, migrations, path) as current:
+                    yield current
+    except DamagedFileError as error:
+        raise DamagedMapError(error.message, **error.hints) from error
 
 
 def _fitting_page_size(blob_lengths: Sequence[int]) -> int:
@@ -197,17 +202,6 @@ def _fitting_page_size(blob_lengths: Sequence[int]) -> int:
     return min(_PAGE_SIZES, key=cost)
 
 
-def _bytes_by_table(db: Database) -> dict[str, int]:
-    """Page bytes by table, its indexes included, as SQLite's `dbstat` counts them."""
-    rows = db.execute(
-        """
-        SELECT coalesce(tbl_name, dbstat.name), sum(pgsize)
-        FROM dbstat LEFT JOIN sqlite_schema USING (name) GROUP BY 1
-        """
-    )
-    return dict(rows.fetchall())
-
-
 def _spill(payload: int, page_size: int) -> tuple[int, int]:
     """The bytes of an index leaf's payload that stay in its page, and its overflow pages (SQLite file format, 1.6)."""
     most, least = ((page_size - 12) * share // 255 - 23 for share in (64, 32))
@@ -217,3 +211,115 @@ def _spill(payload: int, page_size: int) -> tuple[int, int]:
     if local > most:
         local = least
     return local, -(-(payload - local) // (page_size - 4))
+
+
+def seal(building_path: Path, final_path: Path) -> tuple[str, int]:
+    """Seal a built map: check it, compact it, sync it, name it, make it read-only; the building file is gone then.
+
+    The final name appears in one rename, after everything under it is on the disk; a crash before leaves no such file.
+
+    Returns:
+        (SHA-256 in hex, bytes) of the sealed file.
+
+    Raises:
+        DamagedMapError: What was built cannot be read back.
+        ConflictError: A file of the final name is there.
+        UnavailableError: The disk is full, read-only, ...
+    """
+    with _taking_its_name(final_path) as sealing_path:
+        with open_database(building_path) as db:
+            check_integrity(db, building_path)
+            db.conn.execute("VACUUM INTO ?", [str(sealing_path)])
+        read_map(sealing_path)
+        digest, n_bytes = sha256_of(sealing_path), sealing_path.stat().st_size
+    with storage_faults(building_path):
+        remove_database(building_path)
+    return digest, n_bytes
+
+
+def adopt(source: Path, final_path: Path, sha256: str) -> int:
+    """Let the copy of a file that was sealed elsewhere take a final name, as `seal` does; returns its bytes.
+
+    Raises:
+        DamagedMapError: The copy does not match its digest.
+        ConflictError: A file of the final name is there.
+        UnavailableError: The disk is full, read-only, ...
+    """
+    with _taking_its_name(final_path) as sealing_path:
+        shutil.copyfile(source, sealing_path)
+        verify(sealing_path, sha256)
+    return final_path.stat().st_size
+
+
+@contextmanager
+def _taking_its_name(final_path: Path) -> Iterator[Path]:
+    """Where to write what, at the end of the block, is made read-only, synced and given its final name, or removed."""
+    sealing_path = final_path.with_suffix(".sealing")
+    with storage_faults(final_path, DamagedMapError):
+        if final_path.exists():
+            raise ConflictError(f"{final_path.name} is sealed already; a sealed map never changes")
+        remove_database(sealing_path)
+        try:
+            yield sealing_path
+            sealing_path.chmod(0o444)
+            sync(sealing_path)
+            sealing_path.rename(final_path)
+        except BaseException as error:
+            remove_database(sealing_path)
+            if isinstance(error, DamagedFileError):
+                raise DamagedMapError(error.message, **error.hints) from error
+            raise
+        sync(final_path.parent)
+
+
+def verify(path: Path, sha256: str) -> None:
+    """Check a sealed file against the digest the catalog keeps.
+
+    Raises:
+        DamagedMapError: The file is missing or not the one that was sealed.
+        UnavailableError: The disk failed, ...
+    """
+    if not path.is_file():
+        raise DamagedMapError(f"{path.name} is missing", file=path.name)
+    with storage_faults(path, DamagedMapError):
+        digest = sha256_of(path)
+    if digest != sha256:
+        raise DamagedMapError(
+            f"{path.name} is not the file that was sealed: its SHA-256 differs", file=path.name, sha256=digest
+        )
+
+
+def export_map(catalog: Catalog, domain: str, version: int | None, file: Path) -> MapRecord:
+    """Copy a sealed map, the active one where no version is named, byte for byte into a new file.
+
+    Raises:
+        UnknownDomainError, UnknownMapVersionError, NoActiveMapError: There is no such map.
+        RetiredMapError: Its file was removed.
+        DamagedMapError: Its file is not what was sealed; nothing is written.
+        ConflictError: There is a file of that name.
+        InvalidInputError: There is no folder for it.
+        UnavailableError: The disk is full, ...
+    """
+    if version is None:
+        version = catalog.domain(domain).active_version
+        if version is None:
+            raise NoActiveMapError(f"domain {domain} has no active map: name another with --version", domain=domain)
+    record = catalog.map(domain, version)
+    if record.removed_at is not None:
+        raise removed(domain, version)
+    if record.sha256 is None:
+        raise UnknownMapVersionError(f"map {version} of domain {domain} is still being built", version=version)
+    source = catalog.map_path(domain, version)
+    try:
+        with storage_faults(file), written_aside(file, "an export") as new:
+            verify(source, record.sha256)
+            shutil.copyfile(source, new)
+            verify(new, record.sha256)
+            new.chmod(0o444)
+    except DamagedMapError as error:
+        raise DamagedMapError(
+            f"map {version} of domain {domain} is damaged and was not exported: {error.message}",
+            domain=domain,
+            map_version=version,
+        ) from error
+    return record

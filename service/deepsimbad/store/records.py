@@ -1,4 +1,7 @@
-"""What the catalog knows of domains, map versions, jobs and API keys; how lists, JSON and times are written."""
+"""What the catalog knows of domains, map versions, jobs and API keys; how lists, JSON and times are written.
+
+Times are ISO 8601 in UTC, to the millisecond; None: not yet, or never.
+"""
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
@@ -7,7 +10,10 @@ from datetime import UTC, datetime, timedelta
 from enum import StrEnum
 from typing import Any, Generic, TypeVar
 
-from deepsimbad.errors import InvalidInputError
+from sqlite_utils import Database
+
+from deepsimbad.errors import InvalidInputError, UnknownDomainError
+from deepsimbad.store.layout import is_name
 
 Record = TypeVar("Record")
 Key = TypeVar("Key", int, str)
@@ -50,16 +56,7 @@ class KeyScope(StrEnum):
 
 @dataclass(frozen=True)
 class DomainRecord:
-    """One domain.
-
-    Attributes:
-        name: Matches `layout.NAME_PATTERN`.
-        evaluator: The evaluator's configuration, as it was given.
-        closed: Whether the route is a loop.
-        actions_m: Moves a robot may be asked to make, in metres.
-        active_version: The map version that serves, if any.
-        created_at: ISO 8601, UTC.
-    """
+    """One domain: `evaluator` as it was given, `closed` where the route is a loop, moves in metres."""
 
     name: str
     evaluator: dict[str, Any]
@@ -69,12 +66,35 @@ class DomainRecord:
     created_at: str
 
 
+def read_domains(db: Database, name: str | None = None) -> list[DomainRecord]:
+    """Every domain by name, or the one of that name if there is one."""
+    if name is not None and not is_name(name):  # such a name cannot exist, and need not be valid Unicode either
+        return []
+    rows = db.execute(
+        """
+        SELECT domain.name, evaluator, closed, actions_m, active.version, domain.created_at
+        FROM domain LEFT JOIN map AS active ON active.domain = domain.name AND active.state = 'active'
+        WHERE domain.name = coalesce(?, domain.name) ORDER BY domain.name
+        """,
+        [name],
+    )
+    return [
+        DomainRecord(name, from_json(evaluator), bool(closed), tuple(from_json(actions_m)), *rest)
+        for name, evaluator, closed, actions_m, *rest in rows
+    ]
+
+
+def get_domain(db: Database, name: str) -> DomainRecord:
+    """The domain of that name; raises UnknownDomainError."""
+    for record in read_domains(db, name):
+        return record
+    present = [row[0] for row in db.execute("SELECT name FROM domain ORDER BY name LIMIT 20")]
+    raise UnknownDomainError(f"there is no domain {name!a}", known=present)
+
+
 @dataclass(frozen=True)
 class MapRecord:
-    """One map version of a domain; `sha256` and `file_bytes` are None while it is being built.
-
-    Times are ISO 8601 in UTC: when it last began to serve, last ceased to, and when its file was removed.
-    """
+    """One map version of a domain; when it last began to serve, last ceased to, and when its file was removed."""
 
     version: int
     state: MapState
@@ -90,7 +110,7 @@ class MapRecord:
 
 @dataclass(frozen=True)
 class KeptMap:
-    """A sealed map version that still has its file; `retired_at` as in `MapRecord`."""
+    """A sealed map version that still has its file."""
 
     domain: str
     version: int
@@ -100,7 +120,7 @@ class KeptMap:
 
 @dataclass(frozen=True)
 class JobRecord:
-    """One job; times are ISO 8601 in UTC, `progress` runs from 0 to 1.
+    """One job; `progress` runs from 0 to 1.
 
     `n_starts` counts how often work on it began, but for the starts that an orderly stop of the service ended.
     """
@@ -123,18 +143,7 @@ class JobRecord:
 
 @dataclass(frozen=True)
 class KeyRecord:
-    """One API key, without its secret.
-
-    Attributes:
-        key_id: Twelve hexadecimal digits, a part of the key.
-        name: What its maker calls it; may be empty.
-        scope: What it opens.
-        secret_sha256: Digest of the secret, hexadecimal.
-        domains: Those that it opens; None: all, also those to come.
-        created_at: ISO 8601, UTC, as the other times.
-        expires_at: From when on it opens nothing; None: never.
-        revoked_at: Since when it opens nothing; None: it was not revoked.
-    """
+    """One API key, without its secret, of which it holds the SHA-256 in hex; `domains` None opens all."""
 
     key_id: str
     name: str
@@ -152,14 +161,10 @@ class KeyRecord:
 
 @dataclass(frozen=True)
 class ListPage(Generic[Record, Key]):
-    """Some records in the list's order.
+    """Some records in the list's order, and the key of the last of them where more follow.
 
     A page is found by the key of the record before it, never by a count: whatever is made or removed meanwhile, no
     record that stays is shown twice or left out.
-
-    Attributes:
-        records: At most as many as were asked for.
-        last_key: The key of the last of them where more follow; None: this is the end.
     """
 
     records: tuple[Record, ...]
@@ -174,13 +179,9 @@ class ListPage(Generic[Record, Key]):
 
 
 def to_json(value: Mapping[str, Any] | Sequence[Any]) -> str:
-    """The one text of a JSON value: sorted keys, no spaces, no NaN, so that equal values are equal texts.
-
-    Raises:
-        InvalidInputError: The value has no JSON form.
-    """
+    """The one text of a JSON value, so that equal values are equal texts; raises InvalidInputError."""
     try:
-        return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False, ensure_ascii=True)
+        return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False)
     except (TypeError, ValueError, RecursionError) as error:
         raise InvalidInputError(f"not a JSON value: {error}") from error
 
@@ -191,11 +192,7 @@ def from_json(text: str | None) -> Any:
 
 
 def now(behind: str | None = None) -> str:
-    """The present moment in UTC as ISO 8601, to the millisecond; texts sort as times do.
-
-    Args:
-        behind: A moment that it must follow, though the clock was set back since.
-    """
+    """The present moment; texts sort as times do. It follows the moment `behind`, though the clock was set back."""
     moment = _text(datetime.now(UTC))
     if behind is None or moment > behind:
         return moment
@@ -203,7 +200,7 @@ def now(behind: str | None = None) -> str:
 
 
 def after(wait: timedelta) -> str:
-    """The moment that follows now by `wait`, as `now` writes it; raises InvalidInputError past the year 9999."""
+    """The moment that follows now by `wait`; raises InvalidInputError past the year 9999."""
     try:
         return _text(datetime.now(UTC) + wait)
     except OverflowError as error:

@@ -1,41 +1,27 @@
-"""The file of live sessions: whatever was acknowledged to a robot survives kill -9 and a power cut."""
+"""The file of live sessions and their journals: whatever was acknowledged survives kill -9 and a power cut."""
 
-import threading
-from collections.abc import Callable, Iterator
+import math
+from collections.abc import Callable
 from concurrent.futures import Future
-from contextlib import AbstractContextManager, contextmanager
-from functools import partial
+from dataclasses import dataclass
 from pathlib import Path
-from queue import SimpleQueue
-from typing import Any, Self, TypeVar
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from sqlite_utils import Database
 
-from deepsimbad.errors import UnavailableError, UnknownSessionError
-from deepsimbad.store import journal, layout
-from deepsimbad.store.connection import (
-    OpenFile,
-    close_with_log,
-    open_database,
-    open_working_file,
-    write_transaction,
-)
-from deepsimbad.store.data_dir import make_data_dir
-from deepsimbad.store.durable import sync
-from deepsimbad.store.faults import storage_faults
-from deepsimbad.store.journal import JournalRow, ListedSession, SessionRecord, StateSnapshot
+from deepsimbad.errors import DamagedFileError, UnknownSessionError
+from deepsimbad.store import layout
+from deepsimbad.store.connection import GroupCommit, OpenFile, open_database, open_working_file
+from deepsimbad.store.durable import make_data_dir, storage_faults, sync
 from deepsimbad.store.records import ListPage, from_json, to_json
 from deepsimbad_migrations.session.migrations import migrations
 
-T = TypeVar("T")
-_Write = tuple[Callable[[Database], Any], "Future[Any]"]
-
-MAX_BATCH = 256  # writes in one transaction
 PURGED_AT_ONCE = 1000  # rows
 _CHECKED_AT_START_BYTES = 64 * 1024 * 1024  # a service shall be ready soon; `deepsimbad check` reads more
 _MAX_NUMBER = 2**63 - 1
+_MOST_IN_TWO_BYTES = 0xFFFF // 2
 _SELECT = """
     SELECT session.number, session_id, domain, map_version, map_sha256, config, created_at,
            coalesce(latest.expires_at, session.expires_at), coalesce(latest.sequence, 0), ending, key_id
@@ -43,6 +29,86 @@ _SELECT = """
       ON latest.session = session.number
      AND latest.sequence = (SELECT max(sequence) FROM journal WHERE session = session.number)
 """
+_INSERT_ROW = """
+    INSERT INTO journal (session, sequence, kind, written_at, expires_at, idempotency_key, request_digest,
+                         action_m, action_std_m, ranks, dissimilarities, encoding, position_m, std_m)
+    VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)
+"""
+
+
+@dataclass(frozen=True)
+class SessionRecord:
+    """One session; times are seconds since 1970.
+
+    `number` is its key in the file, `session_id` outside; it keeps the map that it began on. `n_events` counts the rows
+    of its journal, `ending` is "deleted" or "expired" once it has ended, `key_id` that of the API key it began with.
+    """
+
+    number: int
+    session_id: str
+    domain: str
+    map_version: int
+    map_sha256: str
+    config: dict[str, Any]
+    created_at: float
+    expires_at: float
+    n_events: int
+    ending: str | None
+    key_id: str | None = None
+
+
+@dataclass(frozen=True)
+class ListedSession:
+    """A session in a list, and how many views its journal holds."""
+
+    session: SessionRecord
+    n_observations: int
+
+
+@dataclass(frozen=True)
+class IdempotencyKey:
+    """The sender's word by which a request that comes again is known, and the digest of that request."""
+
+    key: str
+    digest: bytes
+
+
+@dataclass(frozen=True)
+class ObservedRow:
+    """A move and the view after it, as the filter took them; `sequence` counts from 1.
+
+    Where the map's relevance compares `dissimilarities` or the `encoding`, they are there.
+    """
+
+    sequence: int
+    expires_at: float  # of the session, after it
+    action_m: float
+    action_std_m: float | None  # None: the usual one
+    ranks: NDArray[np.float32]  # [r], whole or half; all alike where the view had nothing to rank by
+    dissimilarities: NDArray[np.float32] | None = None  # [r], smaller is nearer
+    encoding: NDArray[np.float32] | None = None  # [d]
+    idempotency: IdempotencyKey | None = None
+
+
+@dataclass(frozen=True)
+class PriorRow:
+    """The belief was replaced by one around a position."""
+
+    sequence: int
+    expires_at: float
+    position_m: float
+    std_m: float
+
+
+JournalRow = ObservedRow | PriorRow
+
+
+@dataclass(frozen=True)
+class StateSnapshot:
+    """All of a session's state after the row of its journal that `sequence` names."""
+
+    sequence: int
+    arrays: dict[str, NDArray[Any]]
 
 
 class SessionStore(OpenFile):
@@ -53,15 +119,13 @@ class SessionStore(OpenFile):
 
     Args:
         path: The file.
-        reading: The open file, for reads.
-        writing: The open file a second time, for writes.
+        db: The open file.
         on_commit: Called with the number of writes of every transaction.
     """
 
-    def __init__(self, path: Path, reading: Database, writing: Database, on_commit: Callable[[int], None]) -> None:
-        super().__init__(path, reading)
-        self._writing = writing
-        self._commits = GroupCommit(self._transaction, on_commit)
+    def __init__(self, path: Path, db: Database, on_commit: Callable[[int], None]) -> None:
+        super().__init__(path, db, open_database(path))
+        self._commits = GroupCommit(self._writing, on_commit)
 
     @classmethod
     def open(cls, data_dir: Path, on_commit: Callable[[int], None] = lambda _: None) -> Self:
@@ -70,29 +134,14 @@ class SessionStore(OpenFile):
         make_data_dir(data_dir)
         with storage_faults(path):
             is_small = not path.exists() or path.stat().st_size <= _CHECKED_AT_START_BYTES
-            writing = open_working_file(path, migrations, create=True, is_checked=is_small)
+            db = open_working_file(path, migrations, create=True, is_checked=is_small)
             sync(data_dir)
-            return cls(path, open_database(path), writing, on_commit)
+            return cls(path, db, on_commit)
 
     def close(self) -> None:
         """Commit what waits, then close the file."""
         self._commits.close()
-        with self._lock:
-            super().close()
-            close_with_log(self._writing, self._path)
-
-    @contextmanager
-    def _transaction(self) -> Iterator[Database]:
-        with storage_faults(self._path):
-            self.check_is_there()
-            with write_transaction(self._writing) as db:
-                yield db
-
-    def check(self) -> None:
-        """Raise what keeps the file from being read."""
-        with self._reading() as db:
-            db.execute("SELECT number FROM session LIMIT 1").fetchall()
-        self.check_is_there()
+        super().close()
 
     def try_writing(self) -> Future[None]:
         """Write something to the disk that means nothing."""
@@ -106,9 +155,7 @@ class SessionStore(OpenFile):
     @property
     def is_committing(self) -> bool:
         """Whether the thread that writes is alive."""
-        return self._commits.is_alive
-
-    # Sessions
+        return self._commits.thread.is_alive()
 
     def create(self, record: SessionRecord) -> Future[SessionRecord]:
         """Keep a new session; answers with the number that it got, or the session that has this id already."""
@@ -162,7 +209,7 @@ class SessionStore(OpenFile):
                 """,
                 [_MAX_NUMBER if before is None else before, domain, at, limit + 1],
             ).fetchall()
-            listed = [ListedSession(_session(row), journal.n_observations(db, row[0])) for row in rows]
+            listed = [ListedSession(_session(row), _n_observations(db, row[0])) for row in rows]
             return ListPage.of(((entry.session.number, entry) for entry in listed), limit)
 
     def end(self, number: int, ending: str, ended_at: float) -> Future[bool]:
@@ -209,68 +256,100 @@ class SessionStore(OpenFile):
 
         return self._commits.submit(write)
 
-    # What happened to them
-
     def append(
         self, number: int, row: JournalRow, written_at: float, snapshot: StateSnapshot | None = None
     ) -> Future[None]:
         """Write the next row of a session's journal, and with it a snapshot of the state after an earlier row.
 
-        The future raises InvalidInputError where a row of that sequence number is there.
+        The future raises InvalidInputError where a row of that sequence number, or idempotency key, is there.
         """
-        return self._commits.submit(
-            partial(journal.append, session=number, row=row, written_at=written_at, snapshot=snapshot)
-        )
+
+        def write(db: Database) -> None:
+            db.conn.execute(_INSERT_ROW, (number, row.sequence, *_columns(row, written_at)))
+            if snapshot is None:
+                return
+            db.execute("DELETE FROM snapshot WHERE session = ?", [number])
+            for name, array in snapshot.arrays.items():
+                numbers = np.ascontiguousarray(array, array.dtype.newbyteorder("<"))
+                shape = to_json(list(array.shape))
+                db.conn.execute(
+                    "INSERT INTO snapshot (session, name, sequence, dtype, shape, body) VALUES (?, ?, ?, ?, ?, ?)",
+                    (number, name, snapshot.sequence, numbers.dtype.str, shape, numbers.tobytes()),
+                )
+
+        return self._commits.submit(write)
 
     def history(self, number: int, until: int) -> tuple[StateSnapshot | None, list[JournalRow]]:
         """What makes up the state after a row: the snapshot, if it is from before that row, and the rows since."""
-        with self._reading() as db:
-            snapshot = journal.read_snapshot(db, number, until)
-            return snapshot, journal.read(db, number, snapshot.sequence if snapshot else 0, until)
+        snapshot = self.snapshot_before(number, until)
+        return snapshot, self.journal(number, snapshot.sequence if snapshot else 0, until)
 
     def snapshot_before(self, number: int, until: int) -> StateSnapshot | None:
-        """A session's snapshot, if it is from before a row."""
+        """A session's snapshot, if it is from before a row; raises DamagedFileError."""
         with self._reading() as db:
-            return journal.read_snapshot(db, number, until)
+            rows = db.execute(
+                "SELECT name, sequence, dtype, shape, body FROM snapshot WHERE session = ? AND sequence < ?",
+                [number, until],
+            ).fetchall()
+        arrays = {}
+        for name, _, dtype, shape, body in rows:
+            dimensions = tuple(from_json(shape))
+            if len(body) != math.prod(dimensions) * np.dtype(dtype).itemsize:
+                raise DamagedFileError(f"the snapshot of a session is damaged: array {name} is not whole")
+            arrays[name] = np.frombuffer(body, dtype).reshape(dimensions)
+        return StateSnapshot(rows[0][1], arrays) if rows else None
 
-    def journal(self, number: int) -> list[JournalRow]:
-        """All that happened to a session, in order."""
+    def journal(self, number: int, after: int = 0, until: int = 2**62) -> list[JournalRow]:
+        """What happened to a session, in order: the rows after one, up to and with another."""
         with self._reading() as db:
-            return journal.read(db, number)
-
-    def journal_part(self, number: int, after: int, until: int) -> list[JournalRow]:
-        """The rows after one, up to and with another, in order."""
-        with self._reading() as db:
-            return journal.read(db, number, after, until)
+            rows = db.execute(
+                """
+                SELECT sequence, kind, expires_at, idempotency_key, request_digest, action_m, action_std_m, ranks,
+                       dissimilarities, encoding, position_m, std_m
+                FROM journal WHERE session = ? AND sequence > ? AND sequence <= ? ORDER BY sequence
+                """,
+                [number, after, until],
+            )
+            return [_row(row) for row in rows]
 
     def named(self, number: int, key: str) -> tuple[int, bytes] | None:
         """Sequence number and request digest of the observation with this idempotency key."""
-        with self._lock, storage_faults(self._path):  # one statement needs no transaction, and this is on the hot path
-            row: tuple[int, bytes] | None = self._db.conn.execute(
+        with self._reader_lock, storage_faults(self._path):  # one statement, on the hot path, needs no transaction
+            row: tuple[int, bytes] | None = self._reader.conn.execute(
                 "SELECT sequence, request_digest FROM journal WHERE session = ? AND idempotency_key = ?", (number, key)
             ).fetchone()
             return row
 
-    # Experience
-
     def n_observations(self, number: int) -> int:
         """How many observations a session's journal holds."""
         with self._reading() as db:
-            return journal.n_observations(db, number)
+            return _n_observations(db, number)
 
     def save_true_positions(
         self, number: int, position_m: NDArray[np.float64], received_at: float
     ) -> Future[NDArray[np.float64] | None]:
-        """Keep where the robot truly was at every observation of a session, as far as it is known.
+        """Keep where the robot truly was at every observation of a session; answers with what was kept before.
 
-        Answers with what was kept before; NaN, unknown now, leaves it.
+        A position replaces an earlier one of its observation; NaN, unknown now, leaves it.
         """
-        return self._commits.submit(lambda db: journal.save_true_positions(db, number, position_m, received_at))
+
+        def write(db: Database) -> NDArray[np.float64] | None:
+            before, merged = _true_positions(db, number), position_m.copy()
+            if before is not None:
+                both = merged[: before.size]
+                np.copyto(both, before[: both.size], where=np.isnan(both))
+            db.execute(
+                "INSERT OR REPLACE INTO true_positions (session, received_at, position_m) VALUES (?, ?, ?)",
+                [number, received_at, np.ascontiguousarray(merged, "<f8").tobytes()],
+            )
+            return before
+
+        return self._commits.submit(write)
 
     def true_positions(self, number: int) -> NDArray[np.float64] | None:
-        """What was fed back of a session, one position for every observation."""
+        """What was fed back of a session, one position in metres for every observation; NaN where unknown."""
         with self._reading() as db:
-            return journal.true_positions(db, number)
+            return _true_positions(db, number)
 
 
 def _get(db: Database, session_id: str) -> SessionRecord:
@@ -287,83 +366,42 @@ def _session(row: tuple[Any, ...]) -> SessionRecord:
     return SessionRecord(number, session_id, domain, map_version, map_sha256, from_json(config), *rest)
 
 
-class GroupCommit:
-    """One thread that commits what others hand in; a write counts when its future has a result, not earlier.
+def _n_observations(db: Database, number: int) -> int:
+    return int(db.table("journal").count_where("session = ? AND kind = 'observation'", [number]))
 
-    Many writers, one disk: whatever waits while a transaction is being synced goes into the next one together.
 
-    Args:
-        transaction: Gives a write transaction.
-        on_commit: Called with the number of writes of every transaction.
-    """
+def _true_positions(db: Database, number: int) -> NDArray[np.float64] | None:
+    row = db.execute("SELECT position_m FROM true_positions WHERE session = ?", [number]).fetchone()
+    return None if row is None else np.frombuffer(row[0], "<f8")
 
-    def __init__(
-        self, transaction: Callable[[], AbstractContextManager[Database]], on_commit: Callable[[int], None]
-    ) -> None:
-        self._transaction = transaction
-        self._on_commit = on_commit
-        self._waiting: SimpleQueue[_Write | None] = SimpleQueue()
-        self._is_open = True
-        self._lock = threading.Lock()
-        self._thread = threading.Thread(target=self._work, name="commits", daemon=True)
-        self._thread.start()
 
-    @property
-    def is_alive(self) -> bool:
-        """Whether the thread is there to commit."""
-        return self._thread.is_alive()
+def _columns(row: JournalRow, written_at: float) -> tuple[Any, ...]:
+    """A row from its kind on, as `_INSERT_ROW` takes it."""
+    if isinstance(row, PriorRow):
+        return ("prior", written_at, row.expires_at, *[None] * 7, row.position_m, row.std_m)
+    # Twice the ranks, which are whole or half numbers: 2 bytes each where they fit.
+    ranks = np.rint(2.0 * row.ranks.astype(np.float64)).astype("<u2" if row.ranks.size <= _MOST_IN_TWO_BYTES else "<u4")
+    views = (row.dissimilarities, row.encoding)
+    return (
+        *("observation", written_at, row.expires_at),
+        *((row.idempotency.key, row.idempotency.digest) if row.idempotency else (None, None)),
+        *(row.action_m, row.action_std_m, ranks.tobytes()),
+        *(None if view is None else np.ascontiguousarray(view, "<f4").tobytes() for view in views),
+        *(None, None),
+    )
 
-    def submit(self, run: Callable[[Database], T]) -> Future[T]:
-        """Queue a write.
 
-        Args:
-            run: Called inside a transaction, perhaps a second time in another one.
-
-        Returns:
-            Its result to come, once it is on the disk; or its error, and then nothing of it was kept.
-
-        Raises:
-            UnavailableError: The file has been closed.
-        """
-        done: Future[T] = Future()
-        done.set_running_or_notify_cancel()  # whoever stops waiting does not undo it; before the thread can end it
-        with self._lock:
-            if not self._is_open:
-                raise UnavailableError("the service is shutting down")
-            self._waiting.put((run, done))
-        return done
-
-    def close(self) -> None:
-        """Commit what waits, then end the thread."""
-        with self._lock:
-            if self._is_open:
-                self._is_open = False
-                self._waiting.put(None)
-        self._thread.join()
-
-    def _work(self) -> None:
-        while (write := self._waiting.get()) is not None:
-            batch = [write]
-            while len(batch) < MAX_BATCH and not self._waiting.empty():
-                write = self._waiting.get()
-                if write is None:
-                    break
-                batch.append(write)
-            self._commit(batch)
-            if write is None:
-                return
-
-    def _commit(self, batch: list[_Write]) -> None:
-        try:
-            with self._transaction() as db:
-                results = [run(db) for run, _ in batch]
-        except BaseException as error:
-            if len(batch) == 1:
-                batch[0][1].set_exception(error)
-                return
-            for write in batch:  # one that cannot be written should not take the others with it
-                self._commit([write])
-            return
-        self._on_commit(len(batch))
-        for (_, done), result in zip(batch, results, strict=True):
-            done.set_result(result)
+def _row(row: tuple[Any, ...]) -> JournalRow:
+    sequence, kind, expires_at, key, digest, action_m, action_std_m, ranks, *views, position_m, std_m = row
+    if kind == "prior":
+        return PriorRow(sequence, expires_at, position_m, std_m)
+    # More than fit in two bytes each can only be half as many of four.
+    doubled = np.frombuffer(ranks, "<u2" if len(ranks) // 2 <= _MOST_IN_TWO_BYTES else "<u4")
+    dissimilarities, encoding = (None if view is None else np.frombuffer(view, "<f4") for view in views)
+    return ObservedRow(
+        *(sequence, expires_at, action_m, action_std_m),
+        np.asarray(doubled / 2, np.float32),
+        dissimilarities,
+        encoding,
+        None if key is None else IdempotencyKey(key, digest),
+    )

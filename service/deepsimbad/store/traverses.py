@@ -5,7 +5,7 @@ import os
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,13 +23,11 @@ from deepsimbad.errors import (
 from deepsimbad.store import layout
 from deepsimbad.store.arrays import is_halvable
 from deepsimbad.store.connection import OpenFile, open_database, open_working_file, write_transaction
-from deepsimbad.store.durable import lock_folder, remove_database, sync
-from deepsimbad.store.faults import storage_faults
+from deepsimbad.store.durable import lock_folder, remove_database, storage_faults, sync
 from deepsimbad.store.records import now
 from deepsimbad_migrations.traverse.migrations import migrations
 
 IndexRanges = list[tuple[int, int]]  # the class has a `list` of its own
-_NEW_SUFFIX = ".new"  # a file being made; never a traverse's own ending
 _DTYPE_OF_BYTES = {2.0: "<f2", 4.0: "<f4"}  # by the bytes of one number
 
 
@@ -38,11 +36,6 @@ class Traverse(OpenFile):
 
     A put that returned survives kill -9 and a power cut; one that did not is there whole or not at all. Every method
     raises UnavailableError or DamagedFileError where the file cannot be used, beside what it names itself.
-
-    Args:
-        name: Its name within the domain.
-        path: Its file.
-        db: The open file.
     """
 
     def __init__(self, name: str, path: Path, db: Database) -> None:
@@ -62,19 +55,14 @@ class Traverse(OpenFile):
         with storage_faults(path), _locked_folder(path.parent, domain):
             if path.exists():
                 raise ConflictError(f"domain {domain} has a traverse {name}: delete it first, or choose another name")
-            new = path.with_suffix(_NEW_SUFFIX)
-            # A log that outlived its file would be replayed into the new one.
+            new = path.with_suffix(".new")
             remove_database(new)
-            remove_database(path)
-            try:
-                with open_database(new, create=True) as db, db.atomic():
-                    migrations.apply(db)
-                    db.execute("INSERT INTO traverse (id, created_at) VALUES (1, ?)", [now()])
-                sync(new)
-                new.rename(path)
-            except BaseException:
-                remove_database(new)
-                raise
+            remove_database(path)  # a log that outlived its file would be replayed into the new one
+            with open_database(new, create=True) as db, db.atomic():
+                migrations.apply(db)
+                db.execute("INSERT INTO traverse (id, created_at) VALUES (1, ?)", [now()])
+            sync(new)
+            new.rename(path)
             sync(path.parent)
         return cls.open(data_dir, domain, name)
 
@@ -84,7 +72,7 @@ class Traverse(OpenFile):
         path = layout.traverse_path(data_dir, domain, name)
         if not path.is_file():
             raise UnknownTraverseError(f"domain {domain} has no traverse {name}", known=cls.list(data_dir, domain)[:20])
-        with _named(name), storage_faults(path):
+        with storage_faults(path):
             return cls(name, path, open_working_file(path, migrations, is_checked=False))
 
     @classmethod
@@ -115,18 +103,10 @@ class Traverse(OpenFile):
                 return []
             return sorted(path.stem for path in folder.iterdir() if path.suffix == ".sqlite")
 
-    @contextmanager
-    def _reading(self) -> Iterator[Database]:
-        with _named(self.name), super()._reading() as db:
-            yield db
-
-    @contextmanager
-    def _writing(self) -> Iterator[Database]:
-        with _named(self.name), self._lock, storage_faults(self._path), write_transaction(self._db) as db:
-            # Deletion holds the same write lock: a frame is never acknowledged into a file that is gone.
-            if self.is_deleted:
-                raise UnknownTraverseError(f"traverse {self.name} was deleted")
-            yield db
+    def check_is_there(self) -> None:
+        """Raise UnknownTraverseError where it was deleted: no frame is acknowledged into a file that is gone."""
+        if self.is_deleted:
+            raise UnknownTraverseError(f"traverse {self.name} was deleted")
 
     def put_frame(
         self,
@@ -167,31 +147,36 @@ class Traverse(OpenFile):
         if frames.n_frames == 0:
             return 0, 0
         with self._writing() as db:
-            n_before = _count(db)
-            dim = frames.encodings.shape[1]
-            db.execute("UPDATE traverse SET encoding_dim = ? WHERE encoding_dim IS NULL", [dim])
-            present_dim, weights_sha256 = _described(db)
-            if dim != present_dim:
+            n_before, dim = _count(db), frames.encodings.shape[1]
+            present_dim, weights_sha256 = self._described(db)
+            if present_dim not in {None, dim}:
                 raise InvalidEncodingError(
                     f"encodings of this traverse hold {present_dim} numbers, these {dim}", encoding_dim=present_dim
                 )
             WeightsDifferError.check("the traverse", weights_sha256, "a frame", frames.weights_sha256)
-            if frames.weights_sha256 is not None:
-                db.execute("UPDATE traverse SET weights_sha256 = ?", [frames.weights_sha256])
-            db.conn.executemany(
+            db.execute(
+                "UPDATE traverse SET encoding_dim = ?, weights_sha256 = coalesce(?, weights_sha256)",
+                [dim, frames.weights_sha256],
+            )
+            places = (frames.index, frames.position_m, frames.timestamp_us, frames.x_m, frames.y_m)
+            db.conn.executemany(  # NaN becomes NULL
                 """
-                INSERT INTO frame (frame_index, position_m, timestamp_us, x_m, y_m) VALUES (?, ?, ?, ?, ?)
+                INSERT INTO frame (frame_index, position_m, timestamp_us, x_m, y_m)
+                VALUES (?, ?, nullif(?, -1), ?, ?)
                 ON CONFLICT (frame_index) DO UPDATE SET position_m = excluded.position_m,
                     timestamp_us = excluded.timestamp_us, x_m = excluded.x_m, y_m = excluded.y_m
                 """,
-                _places(frames),
+                zip(*(numbers.tolist() for numbers in places), strict=True),
             )
             db.conn.executemany(
                 """
                 INSERT INTO encoding (frame_index, body) VALUES (?, ?)
                 ON CONFLICT (frame_index) DO UPDATE SET body = excluded.body
                 """,
-                _bodies(frames),
+                (
+                    (index, encoding.astype("<f2" if is_halvable(encoding) else "<f4").tobytes())
+                    for index, encoding in zip(frames.index.tolist(), frames.encodings, strict=True)
+                ),
             )
             n_new = _count(db) - n_before
         return n_new, frames.n_frames - n_new
@@ -206,7 +191,7 @@ class Traverse(OpenFile):
     def encoding_dim(self) -> int | None:
         """The length of the encodings; None before the first frame."""
         with self._reading() as db:
-            return _described(db)[0]
+            return self._described(db)[0]
 
     @property
     def missing(self) -> IndexRanges:
@@ -224,7 +209,7 @@ class Traverse(OpenFile):
     def read(self) -> Drive:
         """All frames in index order; one array of encodings, no copy beside it."""
         with self._reading() as db:
-            n, (dim, weights_sha256) = _count(db), _described(db)
+            n, (dim, weights_sha256) = _count(db), self._described(db)
             places = np.empty((n, 3))
             index, timestamp_us = np.empty(n, np.int64), np.empty(n, np.int64)
             encodings = np.empty((n, dim or 0), np.float32)
@@ -240,8 +225,8 @@ class Traverse(OpenFile):
                 dtype = _DTYPE_OF_BYTES.get(len(body or b"") / (dim or 1))  # a single number would be broadcast
                 if dtype is None:
                     raise DamagedFileError(
-                        f"it is damaged: the encoding of frame {frame_index} has another length; delete it and "
-                        "upload it again"
+                        f"traverse {self.name} is damaged: the encoding of frame {frame_index} has another length; "
+                        "delete it and upload it again"
                     )
                 index[row], timestamp_us[row], places[row] = frame_index, moment_us, place  # None becomes NaN
                 encodings[row] = np.frombuffer(body, dtype)
@@ -251,44 +236,19 @@ class Traverse(OpenFile):
             weights_sha256=weights_sha256,
         )  # fmt: skip
 
+    def _described(self, db: Database) -> tuple[int | None, str | None]:
+        """The length of the encodings, and by which weights images were encoded; None where there are none yet."""
+        row: tuple[int | None, str | None] | None = db.execute(
+            "SELECT encoding_dim, weights_sha256 FROM traverse"
+        ).fetchone()
+        if row is None:
+            raise DamagedFileError(f"traverse {self.name} is damaged: it does not describe itself; upload it again")
+        return row
+
 
 def _count(db: Database) -> int:
     (n_frames,) = db.execute("SELECT count(*) FROM frame").fetchone()
     return int(n_frames)
-
-
-def _described(db: Database) -> tuple[int | None, str | None]:
-    """The length of the encodings, and by which weights images were encoded; None where there are none yet."""
-    row: tuple[int | None, str | None] | None = db.execute(
-        "SELECT encoding_dim, weights_sha256 FROM traverse"
-    ).fetchone()
-    if row is None:
-        raise DamagedFileError("it is damaged: it does not describe itself; delete it and upload it again")
-    return row
-
-
-def _places(frames: Drive) -> Iterator[tuple[Any, ...]]:
-    """Index, position, time, x and y of every frame; unknown ones are None."""
-    for row, index in enumerate(frames.index):
-        timestamp_us = int(frames.timestamp_us[row])
-        x_m, y_m = (None if np.isnan(value) else float(value) for value in (frames.x_m[row], frames.y_m[row]))
-        known_us = None if timestamp_us == UNKNOWN_TIMESTAMP else timestamp_us
-        yield int(index), float(frames.position_m[row]), known_us, x_m, y_m
-
-
-def _bodies(frames: Drive) -> Iterator[tuple[int, bytes]]:
-    for row, index in enumerate(frames.index):
-        encoding = frames.encodings[row]
-        yield int(index), encoding.astype("<f2" if is_halvable(encoding) else "<f4").tobytes()
-
-
-@contextmanager
-def _named(name: str) -> Iterator[None]:
-    """Say of damage which traverse it is in: whoever learns of it, in a job's row perhaps, knows no file's name."""
-    try:
-        yield
-    except DamagedFileError as error:
-        raise DamagedFileError(f"traverse {name}: {error.message}", **{**error.hints, "traverse": name}) from error
 
 
 @contextmanager
