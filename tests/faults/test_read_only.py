@@ -50,15 +50,13 @@ def read_only(data_dir: Path) -> Iterator[Path]:
 def test_the_service_does_not_start(read_only: Path) -> None:
     ran = unprivileged("serve", "--port", 0, "--data-dir", read_only)
     assert (ran.code, ran.out) == (1, "")
-    last = ran.err.splitlines()[-1]
-    assert last.startswith(f"deepsimbad: unavailable: the data directory {read_only} cannot be used: "), ran
-    assert "Permission denied" in last
+    assert ran.err.splitlines()[-1] == f"deepsimbad: unavailable: {read_only.name}: it may not be written"
 
 
 def test_a_data_directory_that_cannot_be_made_is_named(read_only: Path) -> None:
     ran = unprivileged("serve", "--create", "--port", 0, "--data-dir", read_only / "new")
     assert ran.code == 1
-    assert f"the data directory {read_only / 'new'} cannot be made: Permission denied" in ran.err.splitlines()[-1]
+    assert ran.err.splitlines()[-1] == "deepsimbad: unavailable: new: it may not be written"
 
 
 @pytest.mark.parametrize(

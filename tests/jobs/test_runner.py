@@ -156,8 +156,8 @@ def test_a_job_that_meets_damage_says_in_which_traverse(catalog, drives):
     path.write_bytes(b"no database" * 1000)
     with running(catalog) as runner:
         job = ended(catalog, runner.submit(DOMAIN, CONFIG).job_id)
-    assert (job.state, job.error["code"], job.error["traverse"]) == (JobState.FAILED, "damaged_file", "other")
-    assert job.error["message"].startswith("traverse other: other.sqlite is damaged")
+    assert (job.state, job.error["code"], job.error["file"]) == (JobState.FAILED, "damaged_file", "other.sqlite")
+    assert job.error["message"].startswith("other.sqlite is damaged")
 
 
 def test_a_queued_job_is_cancelled_at_once_and_never_runs(catalog, drives):
