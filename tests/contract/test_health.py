@@ -69,7 +69,7 @@ def faults(client):
 
 
 def refuse_writes(client, is_on=True):
-    client.services.session_store._writing.conn.execute(f"PRAGMA query_only = {int(is_on)}")
+    client.services.session_store._db.conn.execute(f"PRAGMA query_only = {int(is_on)}")
 
 
 def remove(client, path_in):

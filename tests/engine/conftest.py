@@ -21,12 +21,9 @@ from deepsimbad.engine.sessions import Sessions
 from deepsimbad.engine.worker import EvaluatorPool, InferenceWorker
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.feature_l2 import FeatureL2
-from deepsimbad.store.catalog import Catalog
-from deepsimbad.store.catalog_maps import ANY
-from deepsimbad.store.journal import IdempotencyKey
-from deepsimbad.store.map_file import write_map
-from deepsimbad.store.sealing import seal
-from deepsimbad.store.sessions import SessionStore
+from deepsimbad.store.catalog import ANY, Catalog
+from deepsimbad.store.map_file import seal, write_map
+from deepsimbad.store.sessions import IdempotencyKey, SessionStore
 
 T = TypeVar("T")
 N_IMAGES, N_LANDMARKS, DIM, LIST_LENGTH = 30, 9, 6, 3

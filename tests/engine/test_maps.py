@@ -23,8 +23,7 @@ from deepsimbad.errors import (
     UnknownDomainError,
     UnknownMapVersionError,
 )
-from deepsimbad.store.catalog import Catalog
-from deepsimbad.store.catalog_maps import ANY
+from deepsimbad.store.catalog import ANY, Catalog
 from deepsimbad.store.layout import catalog_path
 from deepsimbad.store.records import KeptMap, MapState
 
@@ -261,7 +260,7 @@ def test_a_crash_between_the_mark_and_the_file_is_finished_at_the_next_start(
 
     with running(mapped) as live:
         with monkeypatch.context() as patched:
-            patched.setattr("deepsimbad.store.catalog_maps.remove_database", dies)
+            patched.setattr("deepsimbad.store.catalog.remove_database", dies)
             with pytest.raises(KeyboardInterrupt):
                 retention_of(live).remove("d", 1)
         assert mapped.map("d", 1).removed_at is not None

@@ -220,7 +220,7 @@ def test_what_cannot_be_written_leaves_the_session_as_it_was(mapped: Catalog) ->
         with pytest.raises(UnavailableError):
             await live.begin()
         np.testing.assert_array_equal(await live.sessions.mass(failed), before)
-        live.store._writing.execute("PRAGMA query_only = OFF")
+        live.store._db.execute("PRAGMA query_only = OFF")
         for seed in (1, 2, 3):
             await live.sessions.observe(fine, ranked(seed))
         for seed in (2, 3):

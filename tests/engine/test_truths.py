@@ -150,13 +150,13 @@ def test_truths_told_bit_by_bit_follow_a_session_once(mapped: Catalog, monkeypat
     async def body(live: Live) -> None:
         session_id, _ = await driven(live, [ranked(seed, 0.1) for seed in range(6)])
         whole = await truths_of(live).rank(session_id, [1.0] * 6)
-        journal_part, begun_after = live.store.journal_part, []
+        journal, begun_after = live.store.journal, []
 
         def noting(number: int, after: int, until: int) -> object:
             begun_after.append(after)
-            return journal_part(number, after, until)
+            return journal(number, after, until)
 
-        monkeypatch.setattr(live.store, "journal_part", noting)
+        monkeypatch.setattr(live.store, "journal", noting)
         again = truths_of(live)
         await again.rank(session_id, [1.0] * 3 + [None] * 3)
         part = await again.rank(session_id, [1.0] * 3, first=3)
