@@ -11,7 +11,7 @@ from anyio import CapacityLimiter
 
 from deepsimbad.api import requests
 from deepsimbad.api.problems import InvalidRequestError
-from deepsimbad.api.requests import LONG_LIST, MAX_NUMBERS, Decoders, Services, parse_json
+from deepsimbad.api.requests import MAX_NUMBERS, Decoders, parse_json
 from deepsimbad.api.traverses import EncodingBody
 from deepsimbad.engine.worker import Priority
 from deepsimbad.errors import ImageTooLargeError, OverloadedError, UnsupportedMediaTypeError
@@ -113,12 +113,6 @@ async def test_a_refused_image_takes_no_place_and_what_shows_nothing_is_known_as
 @pytest.fixture
 def running():
     return SimpleNamespace(long_work=CapacityLimiter(1))  # as much of the service as these need
-
-
-@pytest.mark.parametrize("n_listed", [0, LONG_LIST, LONG_LIST + 1])
-async def test_a_long_answer_is_written_in_a_thread(running, n_listed):
-    thread, _ = await Services.written(running, n_listed, threading.get_ident)
-    assert (thread == threading.get_ident()) == (n_listed <= LONG_LIST)
 
 
 @pytest.mark.parametrize("n_blanks", [0, 1 << 16])

@@ -1,6 +1,7 @@
 """A running service with two mapped domains: `ready` takes encodings alone, `seen` takes images."""
 
 import io
+import json
 import time
 from contextlib import contextmanager
 
@@ -20,6 +21,7 @@ NPZ = {"Content-Type": "application/octet-stream"}
 JSON = {"Content-Type": "application/json"}
 JPEG = {"Content-Type": "image/jpeg"}
 TAKES_ENCODINGS = {"evaluator": {"kind": "feature_l2", "extractor": "none"}}
+NAMES = {"domain": "ready", "name": "drive", "index": "0", "version": "1", "session_id": "none", "job_id": "none"}
 RANKS = {"ranked_landmarks": list(range(N_LANDMARKS))}
 
 
@@ -67,6 +69,20 @@ def encoded(image, extension=".jpg"):
 
 def ready_encodings():
     return np.random.default_rng(5).normal(size=(N_READY, DIM)).astype(np.float32)
+
+
+def operations(document):
+    """Method, path, a body that would be taken and its type, of all that the OpenAPI document lists."""
+    for path, by_method in document["paths"].items():
+        for method, operation in by_method.items():
+            required = [each for each in operation.get("parameters", ()) if each["in"] == "query" and each["required"]]
+            query = "&".join(f"{parameter['name']}={parameter['example']}" for parameter in required)
+            content = operation.get("requestBody", {"content": {"": {}}})["content"]
+            example = {"encoding": [1.0] * DIM}
+            if "$ref" in (schema := content.get("application/json", {}).get("schema", {})):
+                (example,) = document["components"]["schemas"][schema["$ref"].rpartition("/")[2]]["examples"]
+            kind = "application/json" if "application/json" in content else next(iter(content))
+            yield method.upper(), f"{path}?{query}", json.dumps(example).encode(), kind
 
 
 class Caller(httpx2.Client):

@@ -1,5 +1,6 @@
 """Every bad input gets a problem document that tells what to do, changes nothing, and the service goes on."""
 
+import json
 import struct
 import zlib
 
@@ -13,9 +14,11 @@ from .conftest import (
     JSON,
     N_LANDMARKS,
     N_READY,
+    NAMES,
     NPZ,
     RANKS,
     encoded,
+    operations,
     picture,
     problem,
     ready_encodings,
@@ -26,7 +29,9 @@ SEEN = "/v1/domains/seen"
 ADMIN = "/v1/admin/domains/ready"
 FRAMES = f"{ADMIN}/traverses/drive/frames"
 FRAME = f"{FRAMES}/0?position_m=1"
-ENCODING = {"encoding": [1.0] * DIM}
+BAD = "/v1/admin/domains/bad"
+KIND = {"kind": "feature_l2"}
+REMAP = {"training_traverse": "drive"}
 
 
 @pytest.fixture(autouse=True)
@@ -177,109 +182,69 @@ def test_idempotency_keys_that_cannot_be(client, key):
     assert client.get(session).json()["n_observations"] == 0
 
 
-BODIES = [
-    *(
-        ("POST", f"{READY}/sessions", body, code)
-        for body, code in (
-            (b"", "empty_body"),
-            ('{"start_position_m": NaN}', "invalid_prior"),
-            ('{"start_position_m": 1e999}', "invalid_prior"),
-            ({"start_position_m": 500}, "invalid_prior"),
-            ({"start_position_m": 10, "start_std_m": 0}, "invalid_prior"),
-            ({"start_std_m": 0}, "invalid_prior"),
-            ({"start_position_m": "here"}, "invalid_request"),
-            ({"seed": -1}, "invalid_request"),
-            ({"seed": 1.5}, "invalid_request"),
-            ({"belief": "guess"}, "invalid_request"),
-            ({"update": "guess"}, "invalid_request"),
-            ({"planner": ""}, "invalid_request"),
-            ({"planner": "clever"}, "invalid_input"),
-            ({"planner": "constant:3.5"}, "invalid_input"),
-            ({"colour": 1}, "invalid_request"),
-        )
-    ),
-    *(
-        ("PUT", "/v1/admin/domains/bad", body, code)
-        for body, code in (
-            ({}, "invalid_request"),
-            ({"evaluator": {}}, "invalid_input"),
-            ({"evaluator": {"kind": "siamese"}}, "invalid_input"),
-            ({"evaluator": {"kind": "feature_l2", "extractor": "magic"}}, "invalid_input"),
-            ({"evaluator": {"kind": "feature_l2", "colour": "red"}}, "invalid_input"),
-            ({"evaluator": {"kind": ["feature_l2"]}}, "invalid_input"),
-            ({"evaluator": {"kind": "feature_l2"}, "closed": "perhaps"}, "invalid_request"),
-            ({"evaluator": {"kind": "feature_l2"}, "color": 1}, "invalid_request"),
-            ({"evaluator": {"kind": "feature_l2"}, "actions_m": []}, "invalid_request"),
-            ({"evaluator": {"kind": "feature_l2"}, "actions_m": [2, 1]}, "invalid_request"),
-            ({"evaluator": {"kind": "feature_l2"}, "actions_m": [1, 1]}, "invalid_request"),
-            ({"evaluator": {"kind": "feature_l2"}, "actions_m": list(range(1, 100))}, "invalid_request"),
-            *(
-                ('{"evaluator": {"kind": "feature_l2"}, "actions_m": [' + wrong + "]}", "invalid_request")
-                for wrong in ("0", "NaN", "1e999", "-1", "1e9", "null", "true", '"1"')
-            ),
-            ('{"evaluator": {"kind": "feature_l2", "x": %s}}' % ("[" * 9000 + "]" * 9000), "invalid_request"),
-            ('{"evaluator": {"kind": "feature_l2", "\\ud800": 1}}', "invalid_request"),
-        )
-    ),
-    *(
-        ("POST", f"{ADMIN}/traverses", body, "invalid_request")
-        for body in ({}, {"name": ""}, {"name": "../x"}, {"name": 3}, {"name": "a\n"}, {"nom": "t"})
-    ),
-    *(
-        ("PUT", f"{FRAMES}/0?{query}", ENCODING, "invalid_request")
-        for query in (
-            "",
-            *(f"position_m={wrong}" for wrong in ("nan", "inf", "-Infinity", "1e999", "x", "1e200")),
-            *(f"position_m=1&{wrong}" for wrong in ("x_m=-1e200", "y_m=1.1e9", "x_m=nan", "y_m=inf")),
-            *(f"position_m=1&timestamp_us={wrong}" for wrong in ("-1", "1.5", 10**30)),
-        )
-    ),
-    *(
-        ("PUT", f"{FRAMES}/{index}?position_m=1", ENCODING, "invalid_request")
-        for index in ("-1", "1.5", "x", 10**30, "%00")
-    ),
-    ("PUT", FRAME, {"encoding": [1.0]}, "invalid_encoding"),
-    ("PUT", FRAME, '{"encoding": [NaN]}', "invalid_encoding"),
-    ("PUT", FRAME, {"ranked_landmarks": [1]}, "invalid_request"),
-    ("PUT", FRAME, b"", "empty_body"),
-    (
-        "PUT",
-        "/v1/admin/domains/seen/traverses/drive/frames/0?position_m=1",
-        {"encoding": [1.0, 2.0]},
-        "invalid_encoding",
-    ),
-    *(
-        ("POST", f"{ADMIN}/remaps", {"training_traverse": "drive", **wrong}, code)
-        for wrong, code in (
-            ({"list_length": 0}, "invalid_request"),
-            ({"n_landmarks": 0}, "invalid_request"),
-            ({"n_landmarks": 65_536}, "invalid_request"),
-            ({"n_landmarks": 10, "list_length": 11}, "invalid_map_config"),
-            ({"relevance": "magic"}, "invalid_request"),
-            ({"seed": -1}, "invalid_request"),
-            ({"seed": 1.5}, "invalid_request"),
-            ({"training_episodes": -1}, "invalid_request"),
-            ({"activate": "yes"}, "invalid_request"),
-            ({"landmark_traverse": "../drive"}, "invalid_request"),
-            ({"check_traverse": "../drive"}, "invalid_request"),
-            ({"check_traverse": "drive"}, "invalid_map_config"),
-            ({"append": True, "landmark_traverse": "drive"}, "invalid_map_config"),
-            ({"append": 1}, "invalid_request"),
-            ({"gate_margin": -1}, "invalid_request"),
-            ({"gate_margin": "1"}, "invalid_request"),
-            ({"same_route": "yes"}, "invalid_request"),
-            ({"same_route": 1}, "invalid_request"),
-            ({"unknown": 1}, "invalid_request"),
-        )
-    ),
-    *(("PUT", f"{ADMIN}/active-map", {"version": wrong}, "invalid_request") for wrong in (0, "1")),
-]
-
-
-@pytest.mark.parametrize(("method", "path", "body", "code"), BODIES)
-def test_bad_values(client, method, path, body, code):
-    problem(ask(client, method, path, body), 422, code)
+def test_bodies_that_cannot_be(client):
+    for method, path, code, bodies in (
+        ("POST", f"{READY}/sessions", "invalid_prior", ('{"start_position_m": NaN}', '{"start_position_m": 1e999}')),
+        ("POST", f"{READY}/sessions", "invalid_prior", ({"start_position_m": 500}, {"start_std_m": 0})),
+        ("POST", f"{READY}/sessions", "invalid_input", ({"planner": "clever"}, {"planner": "constant:3.5"})),
+        ("POST", f"{READY}/sessions", "empty_body", (b"",)),
+        (
+            "PUT",
+            BAD,
+            "invalid_request",
+            ({}, '{"evaluator": {"\\ud800": 1}}', '{"evaluator": {"x": %s}}' % ("[" * 9000)),
+        ),
+        ("PUT", BAD, "invalid_input", ({"evaluator": {}}, {"evaluator": {"kind": "siamese"}})),
+        ("PUT", BAD, "invalid_input", ({"evaluator": {**KIND, "extractor": "magic"}}, {"evaluator": {**KIND, "a": 1}})),
+        ("PUT", BAD, "invalid_request", ({"evaluator": KIND, "actions_m": list(range(1, 100))},)),
+        ("PUT", FRAME, "invalid_encoding", ({"encoding": [1.0]}, '{"encoding": [NaN]}')),
+        ("PUT", FRAME, "invalid_request", ({"ranked_landmarks": [1]},)),
+        ("PUT", FRAME, "empty_body", (b"",)),
+        ("PUT", FRAME.replace("ready", "seen"), "invalid_encoding", ({"encoding": [1.0, 2.0]},)),
+        ("POST", f"{ADMIN}/remaps", "invalid_map_config", ({**REMAP, "n_landmarks": 10, "list_length": 11},)),
+        ("POST", f"{ADMIN}/remaps", "invalid_map_config", ({**REMAP, "check_traverse": "drive"},)),
+        ("POST", f"{ADMIN}/remaps", "invalid_map_config", ({**REMAP, "append": True, "landmark_traverse": "drive"},)),
+    ):
+        for body in bodies:
+            problem(ask(client, method, path, body), 422, code)
     assert client.get("/v1/domains/bad").status_code == 404
+
+
+STRANGE = {"unknown": "1"}
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "base", "wrong"),
+    [
+        ("POST", f"{READY}/sessions", {}, STRANGE | {"start_position_m": '"here"', "seed": "-1 1.5", "planner": '""'}),
+        ("POST", f"{READY}/sessions", {}, dict.fromkeys(["belief", "update"], '"guess"')),
+        ("PUT", BAD, {"evaluator": KIND}, STRANGE | {"closed": '"perhaps"', "actions_m": "[] [2,1] [1,1]"}),
+        ("PUT", BAD, {"evaluator": KIND}, {"actions_m": '[0] [NaN] [1e999] [-1] [1e9] [null] [true] ["1"]'}),
+        ("POST", f"{ADMIN}/traverses", {}, STRANGE | {"name": '"" "../x" 3 "a\\n"'}),
+        ("POST", f"{ADMIN}/remaps", REMAP, STRANGE | {"list_length": "0", "n_landmarks": "0 65536", "seed": "-1 1.5"}),
+        ("POST", f"{ADMIN}/remaps", REMAP, {"training_episodes": "-1", "activate": '"yes"', "relevance": '"magic"'}),
+        ("POST", f"{ADMIN}/remaps", REMAP, dict.fromkeys(["landmark_traverse", "check_traverse"], '"../drive"')),
+        ("POST", f"{ADMIN}/remaps", REMAP, {"append": "1", "gate_margin": '-1 "1"', "same_route": '"yes" 1'}),
+        ("PUT", f"{ADMIN}/active-map", {}, STRANGE | {"version": '0 "1"'}),
+    ],
+)
+def test_members_that_cannot_be(client, method, path, base, wrong):
+    """JSON values by the member's name."""
+    for member, values in wrong.items():
+        for value in values.split():
+            body = json.dumps(base)[:-1] + (", " if base else "") + f'"{member}": {value}}}'
+            problem(ask(client, method, path, body), 422, "invalid_request")
+    assert client.get("/v1/domains/bad").status_code == 404
+
+
+def test_places_of_frames_that_cannot_be(client):
+    queries = [f"position_m={wrong}" for wrong in ("nan", "inf", "-Infinity", "1e999", "x", "1e200")]
+    queries += [f"position_m=1&{wrong}" for wrong in ("x_m=-1e200", "y_m=1.1e9", "x_m=nan", "y_m=inf")]
+    queries += [f"position_m=1&timestamp_us={wrong}" for wrong in ("-1", "1.5", 10**30)]
+    paths = [f"0?{query}" for query in ("", *queries)]
+    paths += [f"{index}?position_m=1" for index in ("-1", "1.5", "x", 10**30, "%00")]
+    for path in paths:
+        problem(client.put(f"{FRAMES}/{path}", json={"encoding": [1.0] * DIM}), 422, "invalid_request")
 
 
 @pytest.mark.parametrize(
@@ -301,56 +266,31 @@ def test_bodies_of_other_types_are_no_frames(client):
 
 # Names and states
 
-EVALUATOR = {"evaluator": {"kind": "feature_l2"}}
-REMAP = {"training_traverse": "drive"}
-OF_A_DOMAIN = [
-    ("GET", "/v1/domains/nowhere", None),
-    ("GET", "/v1/domains/nowhere/landmark-model", None),
-    ("GET", "/v1/domains/nowhere/landmark-model?map_version=1", None),
-    ("POST", "/v1/domains/nowhere/localizations", RANKS),
-    ("POST", "/v1/domains/nowhere/sessions", {}),
-    ("DELETE", "/v1/admin/domains/nowhere", None),
-    ("GET", "/v1/admin/domains/nowhere/traverses", None),
-    ("POST", "/v1/admin/domains/nowhere/traverses", {"name": "t"}),
-    ("GET", "/v1/admin/domains/nowhere/traverses/t", None),
-    ("DELETE", "/v1/admin/domains/nowhere/traverses/t", None),
-    ("POST", "/v1/admin/domains/nowhere/remaps", REMAP),
-    ("POST", "/v1/admin/domains/nowhere/experience", {"session_id": "x", "true_positions_m": [1]}),
-    ("GET", "/v1/admin/domains/nowhere/maps", None),
-    ("GET", "/v1/admin/domains/nowhere/maps/1/file", None),
-    ("DELETE", "/v1/admin/domains/nowhere/maps/1", None),
-    ("PUT", "/v1/admin/domains/nowhere/active-map", {"version": 1}),
-    ("GET", "/v1/admin/jobs?domain=nowhere", None),
-    ("GET", "/v1/admin/sessions?domain=nowhere", None),
-]
+
+def test_whatever_is_asked_of_a_domain_session_or_job_that_nobody_knows(client):
+    """Each with a body that would be taken."""
+    document = client.get("/openapi.json").json()
+    n_asked = 0
+    for method, path, body, content_type in operations(document):
+        for name in ("domain", "session_id", "job_id"):
+            if f"{{{name}}}" in path and (method, path) != ("PUT", "/v1/admin/domains/{domain}?"):
+                url = path.format(**NAMES | {name: "nobody"})
+                answer = client.request(method, url, content=body, headers={"Content-Type": content_type})
+                problem(answer, 404, f"unknown_{name.removesuffix('_id')}")
+                n_asked += 1
+    assert n_asked > 25
+
+
 NOWHERE = [
-    *((*call, 404, "unknown_domain") for call in OF_A_DOMAIN),
+    ("GET", "/v1/admin/jobs?domain=nowhere", None, 404, "unknown_domain"),
+    ("GET", "/v1/admin/sessions?domain=nowhere", None, 404, "unknown_domain"),
     ("GET", f"{ADMIN}/traverses/none", None, 404, "unknown_traverse"),
     ("DELETE", f"{ADMIN}/traverses/none", None, 404, "unknown_traverse"),
     ("PUT", f"{ADMIN}/traverses/none/frames/0?position_m=1", {"encoding": [1]}, 404, "unknown_traverse"),
     ("POST", f"{ADMIN}/remaps", {"training_traverse": "none"}, 404, "unknown_traverse"),
     ("POST", f"{ADMIN}/remaps", {**REMAP, "check_traverse": "none"}, 404, "unknown_traverse"),
-    ("GET", "/v1/admin/jobs/none", None, 404, "unknown_job"),
-    ("GET", "/v1/admin/jobs/none/events", None, 404, "unknown_job"),
-    ("DELETE", "/v1/admin/jobs/none", None, 404, "unknown_job"),
-    ("GET", "/v1/admin/jobs/a b", None, 422, "invalid_request"),
-    *(
-        (method, f"/v1/sessions/{session_id}{path}", body, 404, "unknown_session")
-        for session_id in ("0" * 32, "x")
-        for method, path, body in (
-            ("GET", "", None),
-            ("DELETE", "", None),
-            ("GET", "/belief", None),
-            ("GET", "/next-best-view", None),
-            ("PUT", "/prior", {"position_m": 1, "std_m": 1}),
-            ("POST", "/observations", RANKS),
-            ("POST", "/truths", {"true_positions_m": [1]}),
-        )
-    ),
-    ("GET", "/v1/sessions/%20", None, 422, "invalid_request"),
     ("GET", f"{ADMIN}/maps/9/file", None, 404, "unknown_map_version"),
     ("GET", f"{ADMIN}/maps/0/file", None, 422, "invalid_request"),
-    ("GET", f"{ADMIN}/maps/one/file", None, 422, "invalid_request"),
     ("DELETE", f"{ADMIN}/maps/9", None, 404, "unknown_map_version"),
     ("DELETE", f"{ADMIN}/maps/x", None, 422, "invalid_request"),
     ("GET", f"{READY}/landmark-model?map_version=99", None, 404, "unknown_map_version"),
@@ -358,7 +298,7 @@ NOWHERE = [
     ("PUT", f"{ADMIN}/active-map", {"version": 99, "expected": 1}, 404, "unknown_map_version"),
     ("PUT", f"{ADMIN}/active-map", {"version": 1, "expected": 99}, 409, "lost_activation"),
     ("PUT", f"{ADMIN}/active-map", {"version": 1, "expected": None}, 409, "lost_activation"),
-    ("PUT", ADMIN, {**EVALUATOR, "closed": True}, 409, "domain_differs"),
+    ("PUT", ADMIN, {"evaluator": KIND, "closed": True}, 409, "domain_differs"),
     ("POST", "/v1/domains/unmapped/localizations", RANKS, 409, "no_active_map"),
     ("POST", "/v1/domains/unmapped/sessions", {}, 409, "no_active_map"),
     ("GET", "/v1/domains/unmapped/landmark-model", None, 409, "no_active_map"),
@@ -387,7 +327,7 @@ def test_a_method_that_a_path_does_not_know(client):
 )
 def test_names_that_are_none(client, name):
     problem(client.get(f"/v1/domains/{name}"), 422, "invalid_request")
-    problem(client.put(f"/v1/admin/domains/{name}", json=EVALUATOR), 422, "invalid_request")
+    problem(client.put(f"/v1/admin/domains/{name}", json={"evaluator": KIND}), 422, "invalid_request")
 
 
 # What only a job finds out

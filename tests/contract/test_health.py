@@ -5,7 +5,6 @@ import re
 import threading
 
 import pytest
-from starlette.responses import JSONResponse
 
 from deepsimbad.api import health
 from deepsimbad.store.layout import catalog_path, sessions_path
@@ -123,20 +122,3 @@ def test_whoever_asks_often_is_answered_from_memory(breakable, monkeypatch):
     monkeypatch.setattr(health, "TRUSTED_S", 1000.0)
     refuse_writes(breakable)
     assert breakable.get("/readyz").status_code == 200
-
-
-def test_the_openapi_document_is_written_once(tmp_path, monkeypatch):
-    n_written = 0
-    render = JSONResponse.render
-
-    def counting(self, content):
-        nonlocal n_written
-        n_written += 1
-        return render(self, content)
-
-    monkeypatch.setattr(JSONResponse, "render", counting)
-    with service(tmp_path) as client:
-        first = client.get("/openapi.json")
-        assert (first.status_code, first.headers["content-type"]) == (200, "application/json")
-        assert client.get("/openapi.json").content == first.content
-    assert n_written == 1

@@ -114,12 +114,6 @@ def test_a_robot_localizes_with_its_key_and_the_log_names_it_without_the_secret(
     assert secret not in json.dumps([vars(record) for record in caplog.records], default=str)
 
 
-def test_a_large_body_without_a_key_is_answered_and_not_read(keyed):
-    pieces = (bytes(10_000) for _ in range(100))
-    path = "/v1/admin/domains/ready/traverses/drive/frames/0?position_m=0"
-    problem(keyed.client.put(path, content=pieces), 401, "unauthorized")
-
-
 def test_a_key_may_be_for_some_domains_alone(keyed):
     ready, other = (
         {"X-API-Key": new_key(keyed.data_dir, KeyScope.LOCALIZE, domains=domains)}

@@ -2,14 +2,8 @@
 
 import logging
 import re
-import threading
-import time
 
 import pytest
-
-from deepsimbad.errors import CancelledError
-from deepsimbad.store.catalog import Catalog
-from deepsimbad.store.records import JobState
 
 from .conftest import JSON, RANKS, path_of, service
 
@@ -71,24 +65,3 @@ def test_jobs_and_maps_that_serve_are_told(tmp_path, lines):
         ("map activated", "ready", 2, 1),
         ("map rolled back", "ready", 1, 2),
     ]
-
-
-def test_a_job_that_the_service_stops_with_is_not_told_as_cancelled(tmp_path, lines):
-    with service(tmp_path) as client:
-        client.make_ready_domain("ready")
-    began = threading.Event()
-
-    def until_stopped(job, on_progress, is_cancelled):
-        began.set()
-        while not is_cancelled():
-            time.sleep(0.01)
-        raise CancelledError("stopped")
-
-    lines.clear()
-    with service(tmp_path, until_stopped) as client:
-        job_id = client.post("/v1/admin/domains/ready/remaps", json={"training_traverse": "drive"}).json()["job_id"]
-        assert began.wait(20)
-    jobs = [record.message for record in lines.records if record.message.startswith("job ")]
-    assert jobs == ["job started", "job stopped"]
-    with Catalog.open(tmp_path) as catalog:
-        assert catalog.job(job_id).state is JobState.QUEUED, "the next service goes on with it"

@@ -2,9 +2,7 @@
 
 import re
 import shutil
-import threading
 from pathlib import Path
-from time import perf_counter, sleep
 
 import pytest
 
@@ -149,28 +147,6 @@ def test_every_stage_is_told_and_counted(client, call):
     after = scraped(client)
     counts = {name: value for name, value in after.items() if "stage_seconds_count" in name}
     assert {name for name, value in counts.items() if value == before.get(name, 0) + 1} == set(names.values())
-
-
-def test_a_busy_worker_shows_as_waiting(client):
-    worker = client.services.worker
-    begun, let_go, answered, held_ms = threading.Event(), threading.Event(), threading.Event(), [0.0]
-
-    def hold():
-        while not worker.n_waiting and not answered.is_set():
-            sleep(0.001)
-        began = perf_counter()
-        sleep(0.05)
-        held_ms[0] = 1000 * (perf_counter() - began)
-        let_go.set()
-
-    worker.submit(lambda: (begun.set(), let_go.wait(60)))
-    assert begun.wait(60)
-    holder = threading.Thread(target=hold)
-    holder.start()
-    timings_ms = client.post("/v1/domains/ready/localizations", json=RANKS).json()["timings_ms"]
-    answered.set()
-    holder.join()
-    assert timings_ms["wait"] >= held_ms[0] - 0.001
 
 
 def test_every_stage_is_explained_to_operators_and_no_other():

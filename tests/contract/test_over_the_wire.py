@@ -3,8 +3,6 @@
 import http.client
 import json
 import signal
-import socket
-import threading
 
 import httpx2
 import pytest
@@ -23,46 +21,6 @@ def server(tmp_path_factory):
         httpx2.put(f"{served.url}/v1/admin/domains/d", json={"evaluator": {"kind": "feature_l2"}})
         httpx2.post(f"{served.url}/v1/admin/domains/d/traverses", json={"name": "t"})
         yield served
-
-
-def send_until_answered(server, head, piece, n_pieces):
-    """Send a body piece by piece and stop at the first byte of an answer.
-
-    Returns:
-        The answer, and how many pieces had been sent when it began.
-    """
-    answer, began, n_sent = bytearray(), threading.Event(), 0
-
-    def listen():
-        try:
-            while received := connection.recv(65536):
-                began.set()
-                answer.extend(received)
-        except OSError:
-            pass
-
-    with server.connect() as connection:
-        connection.sendall(head)
-        listener = threading.Thread(target=listen)
-        listener.start()
-        try:
-            while n_sent < n_pieces and not began.is_set():
-                connection.sendall(piece)
-                n_sent += 1
-        except OSError:
-            pass
-        connection.shutdown(socket.SHUT_WR)
-        listener.join(30)
-    return bytes(answer), n_sent
-
-
-def test_a_hundred_megabytes_in_chunks_are_refused_while_they_stream(server):
-    piece = b"10000\r\n" + bytes(65536) + b"\r\n"
-    with server.within(100):
-        answer, n_sent = send_until_answered(server, HEAD + b"Transfer-Encoding: chunked\r\n\r\n", piece, 1600)
-    assert answer.startswith(b"HTTP/1.1 413 "), answer[:200]
-    assert json.loads(answer.partition(b"\r\n\r\n")[2])["code"] == "body_too_large"
-    assert n_sent < 800  # 32 MiB are taken; what lies in the sockets' buffers comes on top
 
 
 def test_a_declared_length_is_refused_before_a_byte_of_it(server):

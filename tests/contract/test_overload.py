@@ -5,7 +5,7 @@ import threading
 import pytest
 from anyio.to_thread import current_default_thread_limiter, run_sync
 
-from .conftest import JPEG, NPZ, RANKS, problem, service
+from .conftest import RANKS, problem, service
 
 READY = "/v1/domains/ready/localizations"
 
@@ -67,10 +67,3 @@ def test_threads_that_are_all_taken_do_not_keep_health_waiting(busy):
         gate.set()
         for holder in holders:
             holder.result(60)
-
-
-def test_a_body_that_does_not_fit_memory(busy):
-    body, frames = bytes(180_000), "/v1/admin/domains/ready/traverses/drive/frames"
-    for content in (body, (bytes(1000) for _ in range(180))):
-        overloaded(busy.put(f"{frames}/0?position_m=1", content=content, headers=JPEG), "max_body_memory_bytes")
-    problem(busy.post(frames, content=body, headers=NPZ), 422, "invalid_batch")  # it went to the disk
