@@ -13,9 +13,10 @@ from deepsimbad.api.metrics import Metrics
 from deepsimbad.api.problems import error_response
 from deepsimbad.errors import BodyTooLargeError, OverloadedError
 from deepsimbad.settings import Settings
-from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.catalog_keys import ApiKey
 from deepsimbad.store.records import KeyScope
+
+from .conftest import ring_of
 
 BATCH = "/v1/admin/domains/d/traverses/t/frames"
 LEFT = {"type": "http.disconnect"}
@@ -119,11 +120,6 @@ class Asker:
 async def settle():
     for _ in range(20):
         await asyncio.sleep(0)
-
-
-@pytest.fixture
-def anyio_backend():
-    return "asyncio"
 
 
 pytestmark = pytest.mark.anyio
@@ -266,18 +262,6 @@ async def test_a_packed_body_is_refused(coding, is_taken):
 
 
 # Who is let in
-
-
-@pytest.fixture
-def catalog(tmp_path):
-    with Catalog.open(tmp_path) as catalog:
-        yield catalog
-
-
-def ring_of(catalog):
-    ring = KeyRing()
-    ring.load(catalog.keys)
-    return ring
 
 
 def bearer(key):

@@ -9,9 +9,10 @@ import pytest
 from deepsimbad.api import keys
 from deepsimbad.api.keys import KEPT_S, KeyRing, RateLimit, needed_scope, presented_key
 from deepsimbad.errors import RateLimitedError, UnauthorizedError, UnavailableError
-from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.catalog_keys import ApiKey
 from deepsimbad.store.records import KeyScope
+
+from .conftest import ring_of
 
 KEY = ApiKey.new().text.encode()
 BEARER, BASIC, OWN = (
@@ -19,18 +20,6 @@ BEARER, BASIC, OWN = (
     (b"authorization", b"Basic dXNlcjpwYXNz"),
     (b"x-api-key", KEY),
 )
-
-
-@pytest.fixture
-def catalog(tmp_path):
-    with Catalog.open(tmp_path) as opened:
-        yield opened
-
-
-def ring_of(catalog, clock=time.monotonic):
-    ring = KeyRing(clock)
-    ring.load(catalog.keys)
-    return ring
 
 
 # Headers

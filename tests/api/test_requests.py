@@ -25,11 +25,6 @@ EYES = FeatureL2("gradient_grid")
 pytestmark = pytest.mark.anyio
 
 
-@pytest.fixture
-def anyio_backend():
-    return "asyncio"
-
-
 async def until(met):
     for _ in range(6000):
         if met():
