@@ -7,7 +7,7 @@ from datetime import timedelta
 import pytest
 
 from deepsimbad.api import keys
-from deepsimbad.api.keys import KEPT_S, KeyRing, RateLimit, needed_scope, presented_key
+from deepsimbad.api.keys import KEPT_S, KeyRing, RateLimit, presented_key
 from deepsimbad.errors import RateLimitedError, UnauthorizedError, UnavailableError
 from deepsimbad.store.catalog_keys import ApiKey
 from deepsimbad.store.records import KeyScope
@@ -51,18 +51,6 @@ def test_a_request_carries_one_key(headers, why):
         return
     with pytest.raises(UnauthorizedError, match=why):
         presented_key({"headers": headers})
-
-
-@pytest.mark.parametrize(
-    ("needed", "paths"),
-    [
-        (None, ("/healthz", "/", "/v1x")),
-        (KeyScope.LOCALIZE, ("/v1", "/v1/", "/v1/domains", "/v1/administrators")),
-        (KeyScope.ADMIN, ("/v1/admin", "/v1/admin/", "/v1/admin/jobs")),
-    ],
-)
-def test_what_a_path_needs(needed, paths):
-    assert {needed_scope(path) for path in paths} == {needed}
 
 
 # The ring
@@ -151,31 +139,6 @@ def test_a_catalog_that_cannot_be_read_lets_what_was_known_count_for_a_while(cat
     for unread in (ring, KeyRing()):
         with pytest.raises(UnavailableError):
             _ = unread.is_open
-
-
-def test_it_follows_the_catalog(catalog, monkeypatch):
-    monkeypatch.setattr(keys, "REREAD_S", 0.001)
-    n_read = 0
-
-    def read():
-        nonlocal n_read
-        n_read += 1
-        if n_read == 3:
-            raise RuntimeError("something that nobody foresaw")
-        return catalog.keys()
-
-    async def until_closed():
-        ring = KeyRing()
-        ring.load(read)
-        following = asyncio.create_task(ring.follow())
-        while n_read < 5:
-            await asyncio.sleep(0.001)
-        catalog.create_key(KeyScope.ADMIN)
-        while ring.is_open:
-            await asyncio.sleep(0.001)
-        following.cancel()
-
-    asyncio.run(asyncio.wait_for(until_closed(), 30))
 
 
 # Rates

@@ -14,11 +14,7 @@ from .conftest import DIM, JSON, NPZ, npz, problem
 TRAVERSE = "/v1/admin/domains/ready/traverses/drive"
 FRAMES = f"{TRAVERSE}/frames"
 
-GOOD = {
-    "encodings": np.ones((2, DIM), np.float32),
-    "index": np.array([0, 1]),
-    "position_m": np.array([0.0, 1.0]),
-}
+GOOD = {"encodings": np.ones((2, DIM), np.float32), "index": np.array([0, 1]), "position_m": np.array([0.0, 1.0])}
 
 
 def zipped(members):

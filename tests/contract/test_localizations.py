@@ -5,17 +5,7 @@ import io
 import numpy as np
 import pytest
 
-from .conftest import (
-    DIM,
-    N_LANDMARKS,
-    N_READY,
-    N_SEEN,
-    RANKS,
-    TAKES_ENCODINGS,
-    encoded,
-    picture,
-    ready_encodings,
-)
+from .conftest import DIM, N_LANDMARKS, N_READY, N_SEEN, RANKS, TAKES_ENCODINGS, encoded, picture, ready_encodings
 
 READY = "/v1/domains/ready/localizations"
 

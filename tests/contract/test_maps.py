@@ -5,15 +5,7 @@ import hashlib
 
 import numpy as np
 
-from .conftest import (
-    DIM,
-    N_READY,
-    RANKS,
-    problem,
-    ready_encodings,
-    service,
-    until,
-)
+from .conftest import DIM, N_READY, RANKS, problem, ready_encodings, service, until
 
 SAME = {"same_route": True}
 

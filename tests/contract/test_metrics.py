@@ -6,15 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from .conftest import (
-    JPEG,
-    N_READY,
-    RANKS,
-    encoded,
-    picture,
-    ready_encodings,
-    service,
-)
+from .conftest import JPEG, N_READY, RANKS, encoded, picture, ready_encodings, service
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "operations.md"
 COMMON = {"receive", "wait", "decode", "encode", "describe", "retrieve", "plan", "total"}

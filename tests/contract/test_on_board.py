@@ -12,16 +12,7 @@ from deepsimbad_client import Client, Observation
 from deepsimbad_client.errors import LandmarkModelDiffersError
 from deepsimbad_client.http.on_board import OnBoardEncoder
 
-from .conftest import (
-    N_LANDMARKS,
-    N_READY,
-    N_SEEN,
-    TAKES_ENCODINGS,
-    encoded,
-    picture,
-    problem,
-    service,
-)
+from .conftest import N_LANDMARKS, N_READY, N_SEEN, TAKES_ENCODINGS, encoded, picture, problem, service
 
 PACKED = {"Content-Type": "application/vnd.deepsimbad.ranks"}
 READY = "/v1/domains/ready/localizations"

@@ -10,16 +10,7 @@ import pytest
 from deepsimbad.engine import worker
 from deepsimbad.errors import InvalidWeightsError
 
-from .conftest import (
-    JPEG,
-    N_SEEN,
-    RANKS,
-    TAKES_ENCODINGS,
-    encoded,
-    picture,
-    problem,
-    service,
-)
+from .conftest import JPEG, N_SEEN, RANKS, TAKES_ENCODINGS, encoded, picture, problem, service
 
 EVALUATOR = {"kind": "feature_l2", "extractor": "onnx:eyes.onnx"}
 DOMAIN = "/v1/admin/domains/street"
@@ -132,7 +123,6 @@ def test_a_domain_is_not_made_of_weights_that_cannot_be_loaded(tmp_path):
             ("onnx:broken.onnx", b"no model", "invalid_weights"),
             ("netvlad:absent.mat", None, "missing_weights"),
             ("netvlad:broken.pth.tar", b"no model", "invalid_weights"),
-            ("squeezenet:broken.npz", b"PK\x03\x04", "invalid_weights"),
             ("torchhub:nobody/nothing:entry", None, "missing_weights"),
             ("netvlad:../../etc/passwd", None, "invalid_input"),
         ):
