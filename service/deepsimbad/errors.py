@@ -18,249 +18,169 @@ class DeepSimbadError(Exception):
 
     code: ClassVar[str] = "error"
 
+    def __init_subclass__(cls, *, code: str) -> None:
+        cls.code = code
+
     def __init__(self, message: str, **hints: Any) -> None:
         super().__init__(message)
         self.message = message
         self.hints = hints
 
 
-class InvalidInputError(DeepSimbadError):
+class InvalidInputError(DeepSimbadError, code="invalid_input"):
     """A value that can never be accepted as it stands."""
 
-    code = "invalid_input"
 
-
-class EmptyBodyError(InvalidInputError):
+class EmptyBodyError(InvalidInputError, code="empty_body"):
     """An observation or frame without content."""
 
-    code = "empty_body"
 
-
-class InvalidImageError(InvalidInputError):
+class InvalidImageError(InvalidInputError, code="undecodable_image"):
     """Bytes that are not an image we can decode."""
 
-    code = "undecodable_image"
 
-
-class TruncatedImageError(InvalidImageError):
+class TruncatedImageError(InvalidImageError, code="truncated_image"):
     """An image whose end is missing."""
 
-    code = "truncated_image"
 
-
-class InvalidEncodingError(InvalidInputError):
+class InvalidEncodingError(InvalidInputError, code="invalid_encoding"):
     """An encoding of the wrong length, or with NaN or infinity in it."""
 
-    code = "invalid_encoding"
 
-
-class InvalidDissimilaritiesError(InvalidInputError):
+class InvalidDissimilaritiesError(InvalidInputError, code="invalid_dissimilarities"):
     """Dissimilarities that are not r finite numbers."""
 
-    code = "invalid_dissimilarities"
 
-
-class InvalidRankedLandmarksError(InvalidInputError):
+class InvalidRankedLandmarksError(InvalidInputError, code="invalid_ranked_landmarks"):
     """Ranked landmarks that are not 1..r distinct ids in range."""
 
-    code = "invalid_ranked_landmarks"
 
-
-class InvalidRouteError(InvalidInputError):
+class InvalidRouteError(InvalidInputError, code="invalid_route"):
     """Route positions that are NaN or go backwards."""
 
-    code = "invalid_route"
 
-
-class InvalidMoveError(InvalidInputError):
+class InvalidMoveError(InvalidInputError, code="invalid_move"):
     """A move that is NaN, negative or longer than a robot may report."""
 
-    code = "invalid_move"
 
-
-class PastTheEndError(InvalidMoveError):
+class PastTheEndError(InvalidMoveError, code="past_the_end"):
     """A move that leads past the end of an open route wherever the robot may be."""
 
-    code = "past_the_end"
 
-
-class InvalidPriorError(InvalidInputError):
+class InvalidPriorError(InvalidInputError, code="invalid_prior"):
     """A start or prior far off the route, or without a usable deviation."""
 
-    code = "invalid_prior"
 
-
-class IdempotencyKeyReusedError(InvalidInputError):
+class IdempotencyKeyReusedError(InvalidInputError, code="idempotency_key_reused"):
     """An idempotency key that came before with another request."""
 
-    code = "idempotency_key_reused"
 
-
-class InvalidMapConfigError(InvalidInputError):
+class InvalidMapConfigError(InvalidInputError, code="invalid_map_config"):
     """Map parameters that contradict each other or the recordings."""
 
-    code = "invalid_map_config"
 
-
-class TooFewCandidatesError(InvalidMapConfigError):
+class TooFewCandidatesError(InvalidMapConfigError, code="too_few_candidates"):
     """Fewer landmark candidates than landmarks asked for."""
 
-    code = "too_few_candidates"
 
-
-class InvalidSourceError(InvalidInputError):
+class InvalidSourceError(InvalidInputError, code="invalid_source"):
     """A recording that cannot be read."""
 
-    code = "invalid_source"
 
-
-class InvalidWeightsError(InvalidInputError):
+class InvalidWeightsError(InvalidInputError, code="invalid_weights"):
     """A file of weights that is truncated, of another family, of other shapes, unsafe, or fails its digest."""
 
-    code = "invalid_weights"
 
-
-class MissingWeightsError(InvalidInputError):
+class MissingWeightsError(InvalidInputError, code="missing_weights"):
     """A file of weights that is not there; the message says where to put it."""
 
-    code = "missing_weights"
 
-
-class MissingPackageError(InvalidInputError):
+class MissingPackageError(InvalidInputError, code="missing_package"):
     """A package that an extractor needs and that is not installed; the message says how to install it."""
 
-    code = "missing_package"
 
-
-class SettingsError(InvalidInputError):
+class SettingsError(InvalidInputError, code="invalid_settings"):
     """A setting that cannot be used."""
 
-    code = "invalid_settings"
 
-
-class InvalidArchiveError(InvalidInputError):
+class InvalidArchiveError(InvalidInputError, code="invalid_archive"):
     """A backup or exported map that is not one, is incomplete or fails its digest."""
 
-    code = "invalid_archive"
 
-
-class NotFoundError(DeepSimbadError):
+class NotFoundError(DeepSimbadError, code="not_found"):
     """A name or id that nothing answers to."""
 
-    code = "not_found"
 
-
-class UnknownDomainError(NotFoundError):
+class UnknownDomainError(NotFoundError, code="unknown_domain"):
     """No such domain."""
 
-    code = "unknown_domain"
 
-
-class UnknownTraverseError(NotFoundError):
+class UnknownTraverseError(NotFoundError, code="unknown_traverse"):
     """No such traverse in the domain."""
 
-    code = "unknown_traverse"
 
-
-class UnknownJobError(NotFoundError):
+class UnknownJobError(NotFoundError, code="unknown_job"):
     """No such job."""
 
-    code = "unknown_job"
 
-
-class UnknownMapVersionError(NotFoundError):
+class UnknownMapVersionError(NotFoundError, code="unknown_map_version"):
     """No such map version in the domain."""
 
-    code = "unknown_map_version"
 
-
-class UnknownSessionError(NotFoundError):
+class UnknownSessionError(NotFoundError, code="unknown_session"):
     """No such session."""
 
-    code = "unknown_session"
 
-
-class UnknownKeyError(NotFoundError):
+class UnknownKeyError(NotFoundError, code="unknown_key"):
     """No such API key."""
 
-    code = "unknown_key"
 
-
-class GoneError(DeepSimbadError):
+class GoneError(DeepSimbadError, code="gone"):
     """Something that was there and is no more."""
 
-    code = "gone"
 
-
-class EndedSessionError(GoneError):
+class EndedSessionError(GoneError, code="ended_session"):
     """A session that expired or was deleted."""
 
-    code = "ended_session"
 
-
-class RetiredMapError(GoneError):
+class RetiredMapError(GoneError, code="retired_map"):
     """A map version whose file was removed, or a session on one."""
 
-    code = "retired_map"
 
-
-class BusyError(DeepSimbadError):
+class BusyError(DeepSimbadError, code="busy"):
     """More than the service takes at once; the same request may succeed later."""
 
-    code = "busy"
 
-
-class TooManySessionsError(BusyError):
+class TooManySessionsError(BusyError, code="too_many_sessions"):
     """The limit on live sessions is reached."""
 
-    code = "too_many_sessions"
 
-
-class TooManyJobsError(BusyError):
+class TooManyJobsError(BusyError, code="too_many_jobs"):
     """The limit on waiting jobs is reached."""
 
-    code = "too_many_jobs"
 
-
-class RateLimitedError(BusyError):
+class RateLimitedError(BusyError, code="rate_limited"):
     """More requests in a row than one key may send."""
 
-    code = "rate_limited"
 
-
-class ConflictError(DeepSimbadError):
+class ConflictError(DeepSimbadError, code="conflict"):
     """The request is sound but the present state forbids it."""
 
-    code = "conflict"
 
-
-class NoActiveMapError(ConflictError):
+class NoActiveMapError(ConflictError, code="no_active_map"):
     """The domain has no active map yet."""
 
-    code = "no_active_map"
 
-
-class DomainDiffersError(ConflictError):
+class DomainDiffersError(ConflictError, code="domain_differs"):
     """A domain of that name exists with another configuration."""
 
-    code = "domain_differs"
 
-
-class WeightsDifferError(ConflictError):
+class WeightsDifferError(ConflictError, code="weights_differ"):
     """A view, frame or traverse encoded by other weights than the map or traverse it should join."""
-
-    code = "weights_differ"
 
     @classmethod
     def check(cls, what: str, known: str | None, given_to: str, given: str | None) -> None:
-        """Refuse to bring together encodings of two networks; what nobody knows is believed.
-
-        Args:
-            what: Whose weights are known, as a sentence would name it.
-            known: Their SHA-256; None: unknown, or there are none.
-            given_to: What should join it.
-            given: The SHA-256 of its weights.
-        """
+        """Refuse to bring together encodings of two networks, by the SHA-256 of their weights; None is believed."""
         if known is not None and given is not None and known != given:
             raise cls(
                 f"{given_to} comes from other weights ({given[:12]}...) than {what} ({known[:12]}...): their encodings "
@@ -270,139 +190,93 @@ class WeightsDifferError(ConflictError):
             )
 
 
-class LandmarkModelDiffersError(ConflictError):
+class LandmarkModelDiffersError(ConflictError, code="landmark_model_differs"):
     """A view ranked by another landmark model than that of the map that should answer."""
 
-    code = "landmark_model_differs"
 
-
-class TraverseInUseError(ConflictError):
+class TraverseInUseError(ConflictError, code="traverse_in_use"):
     """A running job still reads the traverse or domain."""
 
-    code = "traverse_in_use"
 
-
-class LostActivationError(ConflictError):
+class LostActivationError(ConflictError, code="lost_activation"):
     """The active map was not the expected one when the swap was tried."""
 
-    code = "lost_activation"
 
-
-class MapInUseError(ConflictError):
+class MapInUseError(ConflictError, code="map_in_use"):
     """The map version serves, or a session is pinned to it."""
 
-    code = "map_in_use"
 
-
-class TooManyDomainsError(ConflictError):
+class TooManyDomainsError(ConflictError, code="too_many_domains"):
     """The limit on domains is reached."""
 
-    code = "too_many_domains"
 
-
-class DataDirInUseError(ConflictError):
+class DataDirInUseError(ConflictError, code="data_dir_in_use"):
     """Another service runs on the data directory."""
 
-    code = "data_dir_in_use"
 
-
-class TooLargeError(DeepSimbadError):
+class TooLargeError(DeepSimbadError, code="too_large"):
     """More than a limit allows."""
 
-    code = "too_large"
 
-
-class BodyTooLargeError(TooLargeError):
+class BodyTooLargeError(TooLargeError, code="body_too_large"):
     """A request body over the byte limit."""
 
-    code = "body_too_large"
 
-
-class ImageTooLargeError(TooLargeError):
+class ImageTooLargeError(TooLargeError, code="image_too_large"):
     """An image whose header claims more pixels than the limit."""
 
-    code = "image_too_large"
 
-
-class UnsupportedMediaTypeError(DeepSimbadError):
+class UnsupportedMediaTypeError(DeepSimbadError, code="unsupported_media_type"):
     """A missing or unsupported content type."""
 
-    code = "unsupported_media_type"
 
-
-class AccessError(DeepSimbadError):
+class AccessError(DeepSimbadError, code="access"):
     """A request that may not be made so."""
 
-    code = "access"
 
-
-class UnauthorizedError(AccessError):
+class UnauthorizedError(AccessError, code="unauthorized"):
     """No API key, or one that is unknown, revoked or expired."""
 
-    code = "unauthorized"
 
-
-class ForbiddenError(AccessError):
+class ForbiddenError(AccessError, code="forbidden"):
     """An API key without the scope that the call needs."""
 
-    code = "forbidden"
 
-
-class ForeignHostError(ForbiddenError):
+class ForeignHostError(ForbiddenError, code="foreign_host"):
     """A call that a page of another host may have sent to a service that asks for no key."""
 
-    code = "foreign_host"
 
-
-class UnreadableRequestError(DeepSimbadError):
+class UnreadableRequestError(DeepSimbadError, code="unreadable_request"):
     """A request that can be read in two ways."""
 
-    code = "unreadable_request"
 
-
-class UnavailableError(DeepSimbadError):
+class UnavailableError(DeepSimbadError, code="unavailable"):
     """The service cannot answer now; the data is safe."""
 
-    code = "unavailable"
 
-
-class OverloadedError(UnavailableError):
+class OverloadedError(UnavailableError, code="overloaded"):
     """More requests at once than the service answers in good time."""
 
-    code = "overloaded"
 
-
-class OutOfMemoryError(UnavailableError):
+class OutOfMemoryError(UnavailableError, code="out_of_memory"):
     """Too little memory is left for a network; the view is not at fault."""
 
-    code = "out_of_memory"
 
-
-class EvaluatorUnavailableError(UnavailableError):
+class EvaluatorUnavailableError(UnavailableError, code="evaluator_unavailable"):
     """A domain's extractor that cannot be loaded: its weights or a package are missing, or memory is short."""
 
-    code = "evaluator_unavailable"
 
-
-class DamagedMapError(UnavailableError):
+class DamagedMapError(UnavailableError, code="damaged_map"):
     """A map file that fails its digest or cannot be read."""
 
-    code = "damaged_map"
 
-
-class DamagedFileError(UnavailableError):
+class DamagedFileError(UnavailableError, code="damaged_file"):
     """A catalog or traverse file that cannot be read, or that a newer release wrote."""
 
-    code = "damaged_file"
 
-
-class JobInterruptedError(UnavailableError):
+class JobInterruptedError(UnavailableError, code="job_interrupted"):
     """The process that ran the job ended before the job did."""
 
-    code = "job_interrupted"
 
-
-class CancelledError(DeepSimbadError):
+class CancelledError(DeepSimbadError, code="cancelled"):
     """The work was cancelled on request."""
-
-    code = "cancelled"

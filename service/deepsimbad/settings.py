@@ -7,11 +7,9 @@ import ipaddress
 import os
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
 from difflib import get_close_matches
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 from pydantic import (
     Field,
@@ -32,15 +30,13 @@ from deepsimbad.jobs.child import JobPriority
 MEBIBYTE = 1024 * 1024
 CONFIG_VARIABLE = "DEEPSIMBAD_CONFIG"
 CONFIG_FILE = Path("deepsimbad.toml")
+# The client's, the tests'.
+_OTHER_VARIABLES = {CONFIG_VARIABLE, "DEEPSIMBAD_URL", "DEEPSIMBAD_API_KEY", "DEEPSIMBAD_REAL_DATA"}
 _ORIGIN = re.compile(r"\*|[a-z][a-z0-9+.-]*://[^/\s*?#@]+")
 
 
 class Settings(BaseSettings):
-    """Settings of the service. Each has an environment variable: `DEEPSIMBAD_` and its name in capitals.
-
-    Arguments given to the constructor go before the environment, the environment before the defaults;
-    `load_settings` reads a settings file as well.
-    """
+    """Settings of the service. Each has an environment variable: `DEEPSIMBAD_` and its name in capitals."""
 
     model_config = SettingsConfigDict(
         env_prefix="DEEPSIMBAD_",
@@ -161,20 +157,11 @@ class Settings(BaseSettings):
             self.network_runtime, self.network_device, self.network_threads, self.encode_batch, self.weights_dir
         )
 
-    @property
-    def is_loopback(self) -> bool:
-        """Whether only this machine can reach the service."""
-        return is_loopback(self.host)
-
     def check_exposure(self, n_keys: int) -> None:
-        """Refuse to be reachable from other machines while the service asks for no key.
+        """Refuse to be reachable from other machines while the service asks for no key; raises SettingsError.
 
         Args:
             n_keys: Keys that were ever created, revoked ones too.
-
-        Raises:
-            SettingsError: There is none, and `require_keys` is on; or `host` is not a loopback address and
-                `allow_open` is off.
         """
         if n_keys == 0 and self.require_keys:
             raise SettingsError(
@@ -182,7 +169,7 @@ class Settings(BaseSettings):
                 "--scope admin`; if there were keys, this is not their data directory",
                 setting="require_keys",
             )
-        if n_keys == 0 and not self.is_loopback and not self.allow_open:
+        if n_keys == 0 and not is_loopback(self.host) and not self.allow_open:
             raise SettingsError(
                 f"refusing to serve without keys on {self.host}, which other machines can reach: make a key with "
                 "`deepsimbad keys create --scope admin`, listen on 127.0.0.1, or set DEEPSIMBAD_ALLOW_OPEN=true if "
@@ -199,36 +186,12 @@ def is_loopback(host: str) -> bool:
         return False
 
 
-# Where settings come from
-
-
-class Origin(StrEnum):
-    """What decided a setting, strongest first."""
-
-    FLAG = "flag"
-    ENVIRONMENT = "environment"
-    FILE = "file"
-    DEFAULT = "default"
-
-
-@dataclass(frozen=True)
-class TracedSettings:
-    """Settings, and where each comes from.
-
-    Attributes:
-        settings: The settings.
-        origins: What decided each, by name.
-        file: The settings file that was read, if any.
-    """
+class TracedSettings(NamedTuple):
+    """Settings, what decided each (flag, environment, file or default), and the settings file that was read, if any."""
 
     settings: Settings
-    origins: Mapping[str, Origin]
+    origins: Mapping[str, str]
     file: Path | None
-
-
-def load_settings(config: Path | None = None, **given: object) -> Settings:
-    """As `trace_settings`, without the origins."""
-    return trace_settings(config, **given).settings
 
 
 def trace_settings(config: Path | None = None, **given: object) -> TracedSettings:
@@ -242,44 +205,53 @@ def trace_settings(config: Path | None = None, **given: object) -> TracedSetting
         SettingsError: The file cannot be read, a name is unknown or a value cannot be used.
     """
     file = _settings_file(config)
-    sources: dict[Origin, dict[str, Any]] = {
-        Origin.FLAG: {name: value for name, value in given.items() if value is not None},
-        Origin.ENVIRONMENT: _environment(),
-        Origin.FILE: {} if file is None else _read(file),
-        Origin.DEFAULT: {name: field.default for name, field in Settings.model_fields.items()},
+    places = {
+        "flag": "the command line",
+        "environment": "the environment",
+        "file": str(file),
+        "default": "the defaults",
+    }
+
+    def unusable(name: str, origin: str, why: str) -> SettingsError:
+        variable = f" ({variable_of(name)})" if origin == "environment" else ""
+        what = f"setting {name!r} of {places[origin]}{variable} cannot be used: {why}"
+        return SettingsError(what, setting=name)
+
+    try:
+        environment = EnvSettingsSource(Settings)()
+    except UndecodableError as error:
+        name = next((name for name in Settings.model_fields if f'"{name}"' in str(error)), "?")
+        raise unusable(name, "environment", "not a JSON list") from error
+    sources: dict[str, dict[str, Any]] = {  # strongest first
+        "flag": {name: value for name, value in given.items() if value is not None},
+        "environment": environment,
+        "file": {} if file is None else _read(file),
+        "default": {name: field.default for name, field in Settings.model_fields.items()},
     }
     for origin, values in sources.items():
-        for name in values:
-            if name not in Settings.model_fields:
-                raise _unknown(name, _place(origin, name, file))
-    origins = {name: next(origin for origin in Origin if name in sources[origin]) for name in Settings.model_fields}
-    values = {name: sources[origin][name] for name, origin in origins.items() if origin is not Origin.DEFAULT}
+        for name in sorted(values.keys() - Settings.model_fields):
+            near = get_close_matches(name.lower(), Settings.model_fields, 1)
+            meant = f": did you mean {near[0]!r}?" if near else "; `deepsimbad settings` lists those there are"
+            raise SettingsError(f"there is no setting {name!r}, which stands in {places[origin]}{meant}", setting=name)
+    origins = {name: next(origin for origin in sources if name in sources[origin]) for name in Settings.model_fields}
     try:
-        settings = Settings(**values)
+        settings = Settings(**{name: sources[origin][name] for name, origin in origins.items() if origin != "default"})
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False)[0]
         name = str(first["loc"][0]) if first["loc"] else "?"
-        place = _place(origins.get(name, Origin.DEFAULT), name, file)
-        raise SettingsError(f"setting {name!r} of {place} cannot be used: {first['msg']}", setting=name) from error
+        raise unusable(name, origins.get(name, "default"), first["msg"]) from error
     return TracedSettings(settings, origins, file)
 
 
 def unknown_variables() -> list[str]:
     """The variables of the environment that look like settings and are none: perhaps mistyped."""
-    others = {
-        CONFIG_VARIABLE,
-        "DEEPSIMBAD_URL",
-        "DEEPSIMBAD_API_KEY",
-        "DEEPSIMBAD_REAL_DATA",
-    }  # the client's, the tests'
-    meant = {variable_of(name) for name in Settings.model_fields} | others
-    prefix = Settings.model_config["env_prefix"]
-    return sorted(name for name in os.environ if name.startswith(prefix) and name not in meant)
+    known = {variable_of(name) for name in Settings.model_fields} | _OTHER_VARIABLES
+    return sorted(name for name in os.environ if name.startswith("DEEPSIMBAD_") and name not in known)
 
 
 def variable_of(name: str) -> str:
     """The environment variable of a setting."""
-    return f"{Settings.model_config['env_prefix']}{name.upper()}"
+    return f"DEEPSIMBAD_{name.upper()}"
 
 
 def _settings_file(config: Path | None) -> Path | None:
@@ -303,28 +275,3 @@ def _read(file: Path) -> dict[str, Any]:
         raise SettingsError(f"settings file {file} cannot be read: {error.strerror}", file=str(file)) from error
     except ValueError as error:  # not TOML, or not UTF-8
         raise SettingsError(f"settings file {file} is not TOML: {error}", file=str(file)) from error
-
-
-def _environment() -> dict[str, Any]:
-    try:
-        return EnvSettingsSource(Settings)()
-    except UndecodableError as error:
-        name = next((name for name in Settings.model_fields if f'"{name}"' in str(error)), "?")
-        place = _place(Origin.ENVIRONMENT, name, None)
-        raise SettingsError(f"setting {name!r} of {place} cannot be used: not a JSON list", setting=name) from error
-
-
-def _place(origin: Origin, name: str, file: Path | None) -> str:
-    places = {
-        Origin.FLAG: "the command line",
-        Origin.ENVIRONMENT: f"the environment ({variable_of(name)})",
-        Origin.FILE: str(file),
-        Origin.DEFAULT: "the defaults",
-    }
-    return places[origin]
-
-
-def _unknown(name: str, place: str) -> SettingsError:
-    near = get_close_matches(name.lower(), Settings.model_fields, 1)
-    meant = f": did you mean {near[0]!r}?" if near else "; `deepsimbad settings` lists those there are"
-    return SettingsError(f"there is no setting {name!r}, which stands in {place}{meant}", setting=name)

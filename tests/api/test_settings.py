@@ -10,7 +10,7 @@ from starlette.testclient import TestClient
 from deepsimbad.api.app import create_app
 from deepsimbad.api.server import serve
 from deepsimbad.errors import SettingsError
-from deepsimbad.settings import Origin, Settings, load_settings, trace_settings, unknown_variables
+from deepsimbad.settings import Settings, trace_settings, unknown_variables
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.records import KeyScope
 
@@ -37,7 +37,7 @@ def _empty_environment(monkeypatch, tmp_path):
 )
 def test_a_wrong_setting_is_named(given, name):
     with pytest.raises(SettingsError, match=rf"{name}.*the command line") as caught:
-        load_settings(**given)
+        trace_settings(**given)
     assert caught.value.hints == {"setting": name}
 
 
@@ -49,12 +49,12 @@ def test_flags_go_before_the_environment_before_the_file_before_defaults(monkeyp
     traced = trace_settings(Path("some.toml"), port=4, data_dir=None)
     assert set(traced.origins) == set(Settings.model_fields)
     assert {name: (getattr(traced.settings, name), origin) for name, origin in traced.origins.items()}.items() >= {
-        "port": (4, Origin.FLAG),
-        "host": ("10.0.0.2", Origin.ENVIRONMENT),
-        "max_pixels": (2, Origin.FILE),
-        "cors_origins": (("https://a",), Origin.FILE),
-        "data_dir": (Path("deepsimbad-data"), Origin.DEFAULT),
-        "tls_key": (None, Origin.DEFAULT),
+        "port": (4, "flag"),
+        "host": ("10.0.0.2", "environment"),
+        "max_pixels": (2, "file"),
+        "cors_origins": (("https://a",), "file"),
+        "data_dir": (Path("deepsimbad-data"), "default"),
+        "tls_key": (None, "default"),
     }.items()
     with pytest.raises(ValidationError, match="frozen"):
         traced.settings.port = 1
@@ -64,16 +64,16 @@ def test_the_file_is_that_of_the_flag_the_environment_or_here(monkeypatch):
     assert trace_settings().file is None
     for number, name in enumerate(("deepsimbad.toml", "environment.toml", "flag.toml"), 1):
         Path(name).write_text(f"port = {number}")
-    assert load_settings().port == 1
+    assert trace_settings().settings.port == 1
     monkeypatch.setenv("DEEPSIMBAD_CONFIG", "environment.toml")
-    assert load_settings().port == 2
-    assert load_settings(Path("flag.toml")).port == 3
+    assert trace_settings().settings.port == 2
+    assert trace_settings(Path("flag.toml")).settings.port == 3
     monkeypatch.setenv("DEEPSIMBAD_CONFIG", "gone.toml")
     with pytest.raises(SettingsError, match=r"no settings file gone\.toml, which DEEPSIMBAD_CONFIG names"):
-        load_settings()
+        trace_settings()
     Path("folder.toml").mkdir()
     with pytest.raises(SettingsError, match="no settings file"):
-        load_settings(Path("folder.toml"))
+        trace_settings(Path("folder.toml"))
 
 
 @pytest.mark.parametrize(
@@ -90,7 +90,7 @@ def test_the_file_is_that_of_the_flag_the_environment_or_here(monkeypatch):
 def test_a_wrong_file_is_named_with_what_is_wrong(content, why):
     Path("bad.toml").write_bytes(content)
     with pytest.raises(SettingsError, match=why):
-        load_settings(Path("bad.toml"))
+        trace_settings(Path("bad.toml"))
 
 
 def test_wrong_variables_are_named(monkeypatch):
@@ -101,7 +101,7 @@ def test_wrong_variables_are_named(monkeypatch):
     for variable, value in (("DEEPSIMBAD_CORS_ORIGINS", "https://not.json"), ("DEEPSIMBAD_PORT", "many")):
         monkeypatch.setenv(variable, value)
         with pytest.raises(SettingsError, match=rf"of the environment \({variable}\) cannot be used"):
-            load_settings()
+            trace_settings()
         monkeypatch.delenv(variable)
 
 

@@ -6,7 +6,7 @@ import re
 import pytest
 
 from deepsimbad.api.localizations import ObservationBody
-from deepsimbad.api.openapi import BODY_EXAMPLES, ENCODED_ON_BOARD, _declared_bodies
+from deepsimbad.api.problems import BODY_EXAMPLES, ENCODED_ON_BOARD, _declared_bodies
 
 PROBLEM = {"application/problem+json": {"schema": {"$ref": "#/components/schemas/Problem"}}}
 NAME = "^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$"

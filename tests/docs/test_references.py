@@ -12,7 +12,7 @@ from click.testing import CliRunner
 from deepsimbad.api.app import create_app
 from deepsimbad.cli import deepsimbad
 from deepsimbad.cli.serve import shown as shown_setting
-from deepsimbad.settings import CONFIG_VARIABLE, Settings, load_settings, variable_of
+from deepsimbad.settings import CONFIG_VARIABLE, Settings, trace_settings, variable_of
 from deepsimbad_client.commands.group import cli as deepsimbad_client
 from deepsimbad_client.http.wire import KEY_VARIABLE, URL_VARIABLE
 
@@ -79,7 +79,7 @@ def test_the_table_of_settings_tells_default_and_meaning(variable):
 def test_the_settings_file_shown_is_one(tmp_path):
     (example,) = SETTINGS_PAGE.blocks("toml")
     (tmp_path / "shown.toml").write_text(example)
-    settings = load_settings(tmp_path / "shown.toml")
+    settings = trace_settings(tmp_path / "shown.toml").settings
     assert settings.keep_maps == tomllib.loads(example)["keep_maps"]
 
 

@@ -1,22 +1,33 @@
-"""The application: its parts, in the order in which they start and stop."""
+"""The application: its parts, in the order in which they start and stop; whether it is ready; the page of its calls."""
 
 import asyncio
 import logging
-from collections.abc import AsyncIterator, Callable
-from contextlib import AbstractAsyncContextManager, ExitStack, asynccontextmanager
+import math
+import os
+import shutil
+import threading
+import time
+from collections.abc import AsyncIterator, Callable, Mapping
+from concurrent.futures import TimeoutError as TookTooLong
+from contextlib import ExitStack, asynccontextmanager
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Literal
 
 from anyio.to_thread import run_sync
-from fastapi import FastAPI
+from fastapi import APIRouter, FastAPI, Response
+from fastapi import Path as PathParameter
+from prometheus_client.exposition import CONTENT_TYPE_LATEST
+from pydantic import Field
+from starlette.responses import FileResponse
 from starlette.routing import Route
 
-from deepsimbad.api import domains, health, jobs, localizations, maps, sessions, traverses
-from deepsimbad.api.door import Door
-from deepsimbad.api.health import ReadinessCheck
+from deepsimbad.api import domains, jobs, localizations, maps, sessions, traverses
+from deepsimbad.api.door import STOPPING, Door
 from deepsimbad.api.keys import KeyRing
-from deepsimbad.api.metrics import Metrics, WatchedState
-from deepsimbad.api.openapi import install_openapi
-from deepsimbad.api.problems import install_problem_handlers
-from deepsimbad.api.requests import Decoders, Services, Slots
+from deepsimbad.api.metrics import Metrics, StateCollector
+from deepsimbad.api.problems import install_openapi, install_problem_handlers, problems
+from deepsimbad.api.requests import Answer, Decoders, Running, Services, Slots
 from deepsimbad.engine.localizer import warm_up
 from deepsimbad.engine.maps import Maps, Retention
 from deepsimbad.engine.sessions import Sessions
@@ -27,24 +38,20 @@ from deepsimbad.errors import DeepSimbadError, UnavailableError
 from deepsimbad.evaluators.registry import fallback
 from deepsimbad.jobs.runner import InAnotherProcess, JobRunner, RunJob, job_threads
 from deepsimbad.release import release
-from deepsimbad.settings import Settings
+from deepsimbad.settings import MEBIBYTE, Settings
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.durable import service_lock
 from deepsimbad.store.sessions import SessionRecord, SessionStore
 
+router = APIRouter(tags=["health"])
 log = logging.getLogger(__name__)
 
+LEAST_FREE_BYTES = 16 * MEBIBYTE  # with less, the next map or the write-ahead log may not fit
+TRUSTED_S = 1.0  # anybody may ask whether it is ready, and every look writes to the disk
+_WRITE_TIMEOUT_S = 2.0
 _ROUTERS = (
-    health.router,
-    domains.router,
-    localizations.router,
-    sessions.router,
-    domains.admin,
-    traverses.router,
-    jobs.making,
-    jobs.router,
-    maps.router,
-    sessions.listing,
+    *(router, domains.router, localizations.router, sessions.router, domains.admin),
+    *(traverses.router, jobs.making, jobs.router, maps.router, sessions.listing),
 )
 _DESCRIPTION = (
     "Where on a prelearned route a robot is, from what it sees; every error is an RFC 9457 problem document. "
@@ -59,33 +66,13 @@ def create_app(settings: Settings, run_job: RunJob | None = None) -> FastAPI:
         settings: All it is told; it reads no environment.
         run_job: Does jobs; None: each in a process of its own (decision 0011).
     """
-    n_threads = job_threads(settings.job_threads)
-    run_job = run_job or InAnotherProcess(settings.data_dir, n_threads, settings.job_priority)
+    if run_job is None:
+        run_job = InAnotherProcess(settings.data_dir, job_threads(settings.job_threads), settings.job_priority)
     metrics = Metrics()
     keys = KeyRing()
-    app = FastAPI(
-        title="Deep SIMBAD",
-        version=release(),
-        description=_DESCRIPTION,
-        lifespan=_lifespan(settings, metrics, keys, run_job),
-        redirect_slashes=False,
-        openapi_url=None,  # `install_openapi` answers it
-        docs_url=None,  # the framework's page loads its script from another host
-        redoc_url=None,
-    )
-    for router in _ROUTERS:
-        app.include_router(router)
-    install_problem_handlers(app, [route for router in _ROUTERS for route in router.routes if isinstance(route, Route)])
-    install_openapi(app)
-    app.add_middleware(Door, settings=settings, keys=keys, metrics=metrics)
-    return app
 
-
-def _lifespan(
-    settings: Settings, metrics: Metrics, keys: KeyRing, run_job: RunJob
-) -> Callable[[FastAPI], AbstractAsyncContextManager[None]]:
     @asynccontextmanager
-    async def run(app: FastAPI) -> AsyncIterator[None]:
+    async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         with ExitStack() as parts:
             try:
                 services = await run_sync(_start, settings, metrics, keys, run_job, parts)
@@ -93,39 +80,49 @@ def _lifespan(
                 app.state.startup_error = error  # the server only reports that there was one
                 raise
             app.state.services = services
-            sweeping = asyncio.create_task(_sweep(services, settings.session_sweep_s))
-            following = asyncio.create_task(keys.follow())
+            tasks = [asyncio.create_task(keys.follow()), asyncio.create_task(_sweep(services))]
             yield
-            sweeping.cancel()
-            following.cancel()
+            for task in tasks:
+                task.cancel()
             services.stopping.set()
             # Jobs and the worker are waited for, which must not hold up the loop that their answers go through.
             await run_sync(parts.close)
 
-    return run
+    app = FastAPI(
+        title="Deep SIMBAD",
+        version=release(),
+        description=_DESCRIPTION,
+        lifespan=lifespan,
+        redirect_slashes=False,
+        openapi_url=None,  # `install_openapi` answers it
+        docs_url=None,  # the framework's page loads its script from another host
+        redoc_url=None,
+    )
+    for part in _ROUTERS:
+        app.include_router(part)
+    install_problem_handlers(app, [route for part in _ROUTERS for route in part.routes if isinstance(route, Route)])
+    install_openapi(app)
+    app.add_middleware(Door, settings=settings, keys=keys, metrics=metrics)
+    return app
 
 
-async def _sweep(services: Services, every_s: float) -> None:
-    """End sessions as they expire, so that their memory is free though nobody asks."""
+async def _sweep(services: Services) -> None:
+    """End sessions as they expire or lose their key or domain, so that their memory is free though nobody asks."""
     while True:
-        await asyncio.sleep(every_s)
+        await asyncio.sleep(services.settings.session_sweep_s)
         try:
             await services.sessions.sweep()
-            await _end_of_nobody(services)
+            # A command beside the service may have deleted domains.
+            domain_names = {record.name for record in await run_sync(services.catalog.domains)}
+
+            def is_over(session: SessionRecord, domain_names: set[str] = domain_names) -> bool:
+                has_no_key = session.key_id is not None and not services.keys.still_opens(session.key_id)
+                return has_no_key or session.domain not in domain_names
+
+            await services.sessions.end_those(is_over)
             await run_sync(services.retention.prune)
         except DeepSimbadError:
             log.exception("expired sessions could not be ended")
-
-
-async def _end_of_nobody(services: Services) -> None:
-    """End the sessions whose key was revoked, or whose domain a command beside the service has deleted."""
-    domains = {record.name for record in await run_sync(services.catalog.domains)}
-
-    def is_over(session: SessionRecord) -> bool:
-        has_no_key = session.key_id is not None and not services.keys.still_opens(session.key_id)
-        return has_no_key or session.domain not in domains
-
-    await services.sessions.end_those(is_over)
 
 
 def _start(settings: Settings, metrics: Metrics, keys: KeyRing, run_job: RunJob, parts: ExitStack) -> Services:
@@ -178,26 +175,14 @@ def _start(settings: Settings, metrics: Metrics, keys: KeyRing, run_job: RunJob,
 
     runner = JobRunner(catalog, run_job, switched, settings.max_jobs, metrics.job_ended)
     parts.callback(runner.close)
-    readiness = ReadinessCheck(
-        catalog,
-        store,
-        [
-            ("the inference worker", lambda: worker.is_alive),
-            ("the thread that writes sessions", lambda: store.is_committing),
-            ("the thread that runs jobs", lambda: runner.is_alive),
-        ],
-    )
-    metrics.watch(
-        WatchedState(
-            data_dir=settings.data_dir,
-            catalog=catalog,
-            maps=maps_,
-            faults=readiness.faults,
-            queue_length=lambda: worker.n_waiting,
-            n_sessions=lambda: live.n_living,
-        )
-    )
-    exposure = {"host": settings.host, "port": settings.port, "n_keys": keys.n_usable}
+    threads = {
+        "the inference worker": lambda: worker.is_alive,
+        "the thread that writes sessions": lambda: store.is_committing,
+        "the thread that runs jobs": lambda: runner.is_alive,
+    }
+    readiness = ReadinessCheck(catalog, store, threads)
+    metrics.watch(StateCollector(catalog, maps_, readiness.faults, worker, live))
+    exposure = {"host": settings.host, "port": settings.port, "n_keys": sum(map(keys.still_opens, keys.by_id))}
     if not keys.by_id:
         log.warning("runs open: no key was ever created, so whoever reaches this address may do all", extra=exposure)
     else:
@@ -223,3 +208,162 @@ def _start(settings: Settings, metrics: Metrics, keys: KeyRing, run_job: RunJob,
         uploads=Slots(settings.max_uploads, "batches of frames are on their way", "max_uploads"),
         event_streams=Slots(settings.max_event_streams, "event streams are open", "max_event_streams"),
     )
+
+
+# Whether it is ready
+
+
+class Health(Answer):
+    """The process lives."""
+
+    status: Literal["alive"]
+
+
+class Readiness(Answer):
+    """The service answers queries."""
+
+    status: Literal["ready"]
+    damaged_maps: Annotated[
+        list[str], Field(description="Domains whose active map cannot be loaded; all others are served.")
+    ]
+
+
+class MetricsResponse(Response):
+    """Prometheus' text format."""
+
+    media_type = "text/plain"
+
+
+class ReadinessCheck:
+    """What keeps the service from doing what it is there for, told by trying, at most once a second; from any thread.
+
+    Args:
+        catalog: Read.
+        sessions: Read and written.
+        threads: What must be alive, by a name that a person understands.
+    """
+
+    def __init__(self, catalog: Catalog, sessions: SessionStore, threads: Mapping[str, Callable[[], bool]]) -> None:
+        self._catalog = catalog
+        self._sessions = sessions
+        self._threads = threads
+        self._lock = threading.Lock()
+        self._looked_at = -math.inf
+        self._faults: tuple[str, ...] = ()
+
+    def faults(self) -> tuple[str, ...]:
+        """One sentence for everything that is wrong; none where the service is ready. May wait for the disk."""
+        with self._lock:
+            if time.monotonic() - self._looked_at > TRUSTED_S:
+                self._faults = tuple(dict.fromkeys(self._look()))
+                self._looked_at = time.monotonic()
+            return self._faults
+
+    def _look(self) -> list[str]:
+        faults = [
+            f"{name} has ended: restart the service" for name, is_alive in self._threads.items() if not is_alive()
+        ]
+
+        def write() -> None:
+            self._sessions.try_writing().result(_WRITE_TIMEOUT_S)
+
+        for look in (self._catalog.check, self._sessions.check, write):
+            try:
+                look()
+            except DeepSimbadError as error:
+                faults.append(error.message)
+            except TookTooLong:
+                faults.append(f"sessions.sqlite: a write takes longer than {_WRITE_TIMEOUT_S:g} s")
+        return [*faults, *_disk_faults(self._catalog.data_dir)]
+
+
+def _disk_faults(data_dir: Path) -> list[str]:
+    try:
+        n_free = shutil.disk_usage(data_dir).free
+        is_read_only = bool(os.statvfs(data_dir).f_flag & os.ST_RDONLY)
+    except OSError as error:
+        return [f"the data directory cannot be looked at: {error.strerror}"]
+    faults = ["the data directory lies on a read-only file system"] if is_read_only else []
+    if n_free < LEAST_FREE_BYTES:
+        n_free_mib, least_mib = n_free / MEBIBYTE, LEAST_FREE_BYTES // MEBIBYTE
+        faults.append(f"{n_free_mib:.0f} MiB are free in the data directory, fewer than {least_mib}")
+    return faults
+
+
+@router.head("/healthz", include_in_schema=False)
+@router.get("/healthz", responses=problems())
+async def healthz() -> Health:
+    """The process lives; a supervisor restarts it where this stays unanswered."""
+    return Health(status="alive")
+
+
+@router.head("/readyz", include_in_schema=False)
+@router.get("/readyz", responses=problems())
+async def readyz(running: Running) -> Readiness:
+    """What serves is there: threads that work, a catalog and sessions that can be read and written, room on the disk.
+
+    Else 503, and `faults` says what is wrong; while shutting down too. A damaged map keeps its own domain alone from
+    being served, and is told here.
+    """
+    if running.stopping.is_set():
+        raise UnavailableError(STOPPING.message, faults=[STOPPING.message])
+    faults = await run_sync(running.faults, limiter=running.health)
+    if faults:
+        raise UnavailableError("; ".join(faults), faults=list(faults))
+    damaged = await run_sync(running.maps.damaged, limiter=running.health)
+    return Readiness(status="ready", damaged_maps=list(damaged))
+
+
+@router.get("/metrics", response_class=MetricsResponse, responses=problems())
+async def metrics(running: Running) -> Response:
+    """What Prometheus scrapes."""
+    content = await run_sync(running.metrics.render, limiter=running.health)
+    return Response(content, media_type=CONTENT_TYPE_LATEST)
+
+
+# The page that shows the OpenAPI document, and all it needs: a robot's network reaches no other host.
+_PAGE = """<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
+<title>Deep SIMBAD</title>
+<link rel="stylesheet" href="docs/swagger-ui.css"><link rel="icon" href="data:,">
+</head>
+<body><div id="page"></div><script src="docs/swagger-ui-bundle.js"></script><script src="docs/start.js"></script></body>
+</html>
+"""
+# The validator is another host's; a key that was typed in is forgotten with the page.
+_START = """SwaggerUIBundle({
+  url: "openapi.json",
+  dom_id: "#page",
+  deepLinking: true,
+  persistAuthorization: false,
+  validatorUrl: null,
+});
+"""
+# Styles stand in the page's elements, so they cannot be forbidden there; scripts come from here alone.
+_POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data:; font-src data:; "
+    "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+)
+_KEPT = {"Cache-Control": "public, max-age=3600"}
+
+
+@router.get("/docs", include_in_schema=False)
+async def page() -> Response:
+    """Every call, to read and to try."""
+    return Response(_PAGE, media_type="text/html", headers={"Content-Security-Policy": _POLICY})
+
+
+@router.get("/docs/start.js", include_in_schema=False)
+async def start() -> Response:
+    """What draws the page."""
+    return Response(_START, media_type="text/javascript", headers=_KEPT)
+
+
+@router.get("/docs/{asset}", include_in_schema=False)
+async def asset(
+    name: Annotated[Literal["swagger-ui-bundle.js", "swagger-ui.css"], PathParameter(alias="asset")],
+) -> Response:
+    """Swagger UI, from the package that brings it."""
+    return FileResponse(Path(str(resources.files("fastapi_offline") / "static")) / name, headers=_KEPT)

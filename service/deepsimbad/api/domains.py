@@ -8,7 +8,7 @@ from anyio.to_thread import run_sync
 from fastapi import APIRouter, Query, Request, Response
 from pydantic import Field, model_validator
 
-from deepsimbad.api.openapi import binary, declare_json, problems
+from deepsimbad.api.problems import binary, declare_json, problems
 from deepsimbad.api.requests import (
     BINARY,
     GREATEST_ID,

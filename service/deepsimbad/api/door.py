@@ -8,6 +8,7 @@ import logging
 import re
 import secrets
 import time
+from contextlib import ExitStack
 from functools import lru_cache
 from urllib.parse import urlsplit
 
@@ -63,8 +64,7 @@ STOPPING = UnavailableError("the service is shutting down")
 _REQUEST_ID = re.compile(rb"[A-Za-z0-9._-]{1,64}")
 _BATCH_PATH = re.compile(r"/v1/admin/domains/[^/]+/traverses/[^/]+/frames")
 _METHODS = {"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"}
-_NAMED = ("domain", "session_id", "job_id")  # parameters of paths
-_NOTED = ("key_id", "domain", "code", "limit")  # by whoever learnt it
+_NOTED = ("key_id", "domain", "code", "limit", "session_id", "job_id")  # by whoever learnt it, or in the path
 _LONGEST_PATH = 256  # of a path in the log: the sender chooses it
 _LONGEST_LENGTH = 20  # digits
 _SENDER_LEFT = 499  # as proxies log it; never sent
@@ -89,7 +89,6 @@ class Door:
                 expose_headers=_CORS_SHOWN,
             )
         self.settings = settings
-        self.is_loopback = settings.is_loopback
         self.keys = keys
         self.metrics = metrics
         self.rate_limit = RateLimit(settings.rate_limit_per_s, settings.rate_limit_burst)
@@ -136,10 +135,11 @@ class _Request:
         self._receive = receive
         self._send = send
         self._began = time.perf_counter()
-        self._was_counted = self._is_counted = False
+        self._was_counted = False
+        self._turn = ExitStack()  # closed twice it ends once
         self._is_batch = scope["method"] == "POST" and _BATCH_PATH.fullmatch(scope["path"]) is not None
         self._n_bytes = self._n_held = 0  # of the body, so far
-        self._most_bytes = 0
+        self._most_bytes = door.settings.max_json_bytes
         self._headers = dict(scope["headers"])
         request_id = self._headers.get(b"x-request-id", b"")
         if not _REQUEST_ID.fullmatch(request_id):
@@ -168,7 +168,7 @@ class _Request:
         origin = self._headers.get(b"origin", b"").decode("latin-1")
         if origin and origin.partition("://")[2] != host and not {origin, "*"} & set(settings.cors_origins):
             what = f"a page of {origin[:100]!r} may not call it"
-        elif host and self._door.is_loopback and not _is_ours(host, settings.host, reached):
+        elif host and is_loopback(settings.host) and not _is_ours(host, settings.host, reached):
             what = f"it is not asked by the name {host[:100]!r}"
         else:
             return
@@ -177,10 +177,10 @@ class _Request:
     def _check_size(self) -> None:
         """Judge how the body will come, and whether there is room for it."""
         settings, headers = self._door.settings, self._headers
-        is_image = headers.get(b"content-type", b"").lower().startswith(b"image/")
-        self._most_bytes = settings.max_image_bytes if is_image else settings.max_json_bytes
         if self._is_batch:
             self._most_bytes = settings.max_batch_bytes
+        elif headers.get(b"content-type", b"").lower().startswith(b"image/"):
+            self._most_bytes = settings.max_image_bytes
         declared = headers.get(b"content-length", b"0").strip()
         if not declared.isdigit() or len(declared) > _LONGEST_LENGTH:
             raise InvalidInputError("Content-Length is not a number")
@@ -225,14 +225,14 @@ class _Request:
     async def send(self, message: Message) -> None:
         """Give a part of the answer on; its first ends the request's turn."""
         if message["type"] == "http.response.start":
-            self._uncount()
+            self._turn.close()
             self.status = message["status"]
             message["headers"] = list({**self._own_headers, **dict(message.get("headers", ()))}.items())
         await self._send(message)
 
     def end(self) -> None:
         """The answer has gone, or nobody waits for it: give back what was taken, and tell of it."""
-        self._uncount()
+        self._turn.close()
         self._door.body_bytes.give_back(self._n_held)
         seconds = time.perf_counter() - self._began
         scope, metrics = self._scope, self._door.metrics
@@ -256,22 +256,13 @@ class _Request:
 
     def about(self) -> dict[str, str]:
         """Whose request it is, what it is about and the code of what was wrong, as far as each is known."""
-        named, noted = self._scope.get("path_params") or {}, self._scope["state"]
-        about = {}
-        for source, names in ((noted, _NOTED), (named, _NAMED)):
-            for name in names:
-                if name in source:
-                    about[name] = source[name]
-        return about
+        noted = self._scope["state"] | (self._scope.get("path_params") or {})
+        return {name: noted[name] for name in _NOTED if name in noted}
 
     def _count(self) -> None:
         self._door.under_way.take()
-        self._was_counted = self._is_counted = True
-
-    def _uncount(self) -> None:
-        if self._is_counted:
-            self._is_counted = False
-            self._door.under_way.give_back()
+        self._was_counted = True
+        self._turn.callback(self._door.under_way.give_back)
 
     def _too_large(self, what: str) -> BodyTooLargeError:
         most = self._most_bytes

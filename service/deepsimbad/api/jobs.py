@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from deepsimbad.api.localizations import MAX_LANDMARKS
-from deepsimbad.api.openapi import declare_json, location, problems
+from deepsimbad.api.problems import declare_json, location, problems
 from deepsimbad.api.requests import (
     GREATEST_EXACT_INTEGER,
     NAME_PATTERN,

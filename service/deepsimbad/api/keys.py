@@ -27,21 +27,15 @@ _HOW = "send a key as `Authorization: Bearer <key>` or `X-API-Key: <key>`; `deep
 
 
 class KeyRing:
-    """The keys as the catalog had them a moment ago. Asking it costs no I/O; `follow` keeps it up to date.
+    """The keys as the catalog had them a moment ago; `by_id` holds all that were ever created.
 
-    Where no key was ever created the service is open. Once a key was seen it is closed for good, whatever is read.
-
-    Args:
-        clock: Seconds that never go back.
-
-    Attributes:
-        by_id: All that were ever created.
+    Where there is none the service is open. Once a key was seen it is closed for good, whatever is read.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
-        self._read: Callable[[], Sequence[KeyRecord]] | None = None
-        self._read_at: float | None = None
+        self._read: Callable[[], Sequence[KeyRecord]] = tuple
+        self._read_at = -math.inf
         self.by_id: dict[str, KeyRecord] = {}
 
     def load(self, read: Callable[[], Sequence[KeyRecord]]) -> None:
@@ -57,8 +51,6 @@ class KeyRing:
 
     async def reread(self) -> None:
         """Read the keys again; where that fails those known stay, for a while."""
-        if self._read is None:
-            return
         try:
             records = await run_sync(self._read)
         except Exception as error:  # whatever it is, the next try may succeed
@@ -77,7 +69,7 @@ class KeyRing:
     @property
     def is_open(self) -> bool:
         """Whether no key is asked; raises UnavailableError where the keys have not been known for too long."""
-        if self._read_at is None or self._clock() - self._read_at > KEPT_S:
+        if self._clock() - self._read_at > KEPT_S:
             raise UnavailableError("the keys cannot be read, so nobody can be let in; try again")
         return not self.by_id
 
@@ -88,18 +80,8 @@ class KeyRing:
         record = self.by_id.get(key_id)
         return record is not None and record.is_usable(now())
 
-    @property
-    def n_usable(self) -> int:
-        """How many keys open something now."""
-        at = now()
-        return sum(record.is_usable(at) for record in self.by_id.values())
-
     def holder(self, presented: str) -> KeyRecord:
-        """The key that was presented.
-
-        Raises:
-            UnauthorizedError: It is none, is unknown, revoked or expired.
-        """
+        """The key that was presented; raises UnauthorizedError for one that is none, unknown, revoked or expired."""
         key = ApiKey.parse(presented)
         if key is None:
             raise UnauthorizedError(f"the key is malformed: {_HOW}")
@@ -114,18 +96,12 @@ class KeyRing:
         return record
 
     def admit(self, scope: Scope, needed: KeyScope, rate_limit: "RateLimit") -> None:
-        """Let a request in, and note whose it is, for the log and for what asks whose it is.
-
-        Raises:
-            UnauthorizedError: Its key is none of ours any more.
-            RateLimitedError: Its key asks too often.
-            ForbiddenError: Its key has not the scope, or not the domain.
-        """
+        """Let a request in, and note whose it is; raises UnauthorizedError, RateLimitedError, ForbiddenError."""
         noted = scope["state"]
         try:
             key = self.holder(presented_key(scope))
         except UnauthorizedError as error:
-            noted |= {name: value for name, value in error.hints.items() if name == "key_id"}  # revoked or expired
+            noted |= error.hints  # whose key was revoked or has expired
             raise
         noted |= {"key_id": key.key_id, "key_scope": key.scope, "domains": key.domains}
         rate_limit.take(key.key_id)
@@ -149,20 +125,14 @@ def needed_scope(path: str) -> KeyScope | None:
 
 def presented_key(scope: Scope) -> str:
     """The one key in a request's headers; raises UnauthorizedError where there is none, or more than one."""
-    bearer: list[bytes] = []
-    own: list[bytes] = []
-    n_authorizations = 0
-    for name, value in scope["headers"]:
-        if name == b"authorization":
-            n_authorizations += 1
-            scheme, _, credentials = value.partition(b" ")
-            if scheme.lower() == b"bearer":  # another scheme is someone else's, a proxy's say
-                bearer.append(credentials.strip(b" "))
-        elif name == b"x-api-key":
-            own.append(value.strip(b" "))
+    headers: list[tuple[bytes, bytes]] = scope["headers"]
+    authorizations = [value.partition(b" ") for name, value in headers if name == b"authorization"]
+    # Another scheme is someone else's, a proxy's say.
+    bearer = [text.strip(b" ") for scheme, _, text in authorizations if scheme.lower() == b"bearer"]
+    own = [value.strip(b" ") for name, value in headers if name == b"x-api-key"]
     if not bearer and not own:
         raise UnauthorizedError(f"no key came: {_HOW}")
-    if n_authorizations > 1 or len(own) > 1 or len({*bearer, *own}) > 1:
+    if len(authorizations) > 1 or len(own) > 1 or len({*bearer, *own}) > 1:
         raise UnauthorizedError("more than one key came: send one")
     try:
         return (bearer or own)[0].decode("ascii")
@@ -171,38 +141,28 @@ def presented_key(scope: Scope) -> str:
 
 
 class RateLimit:
-    """A bucket of `burst` tokens for each key, filled by `per_s` tokens a second; a request takes one.
+    """A bucket of `burst` tokens for each key, filled by `per_s` tokens a second (0: no limit); a request takes one.
 
     Memory is bounded: the bucket that was used longest ago makes room, and whoever owned it begins with a full one.
-
-    Args:
-        per_s: Requests a second in the long run; 0: any number.
-        burst: Requests at once.
-        clock: Seconds that never go back.
     """
 
     def __init__(self, per_s: float, burst: int, clock: Callable[[], float] = time.monotonic) -> None:
         self._per_s = per_s
         self._burst = float(burst)
         self._clock = clock
-        self._buckets: OrderedDict[str, tuple[float, float]] = OrderedDict()  # tokens, and when there were so many
-
-    @property
-    def n_buckets(self) -> int:
-        """Keys that are remembered."""
-        return len(self._buckets)
+        self.buckets: OrderedDict[str, tuple[float, float]] = OrderedDict()  # tokens, and when there were so many
 
     def take(self, key_id: str) -> None:
         """Count a request of a key; raises RateLimitedError, which counts nothing."""
         if self._per_s == 0:
             return
         at = self._clock()
-        tokens, since = self._buckets.pop(key_id, (self._burst, at))
+        tokens, since = self.buckets.pop(key_id, (self._burst, at))
         tokens = min(self._burst, tokens + (at - since) * self._per_s)
         is_allowed = tokens >= 1
-        self._buckets[key_id] = (tokens - 1 if is_allowed else tokens, at)
-        if len(self._buckets) > MAX_BUCKETS:
-            self._buckets.popitem(last=False)
+        self.buckets[key_id] = (tokens - 1 if is_allowed else tokens, at)
+        if len(self.buckets) > MAX_BUCKETS:
+            self.buckets.popitem(last=False)
         if not is_allowed:
             wait_s = max(1, math.ceil((1 - tokens) / self._per_s))
             raise RateLimitedError(

@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 from pydantic import FailFast, Field, StrictFloat, StrictInt
 from typing_extensions import TypedDict
 
-from deepsimbad.api.openapi import binary, declare, problems
-from deepsimbad.api.problems import InvalidRequestError
+from deepsimbad.api.problems import InvalidRequestError, binary, declare, problems
 from deepsimbad.api.requests import (
     BINARY,
     GREATEST_ID,

@@ -15,7 +15,7 @@ from pydantic import Field
 from starlette.exceptions import HTTPException
 from starlette.responses import FileResponse, Response, StreamingResponse
 
-from deepsimbad.api.openapi import declare_json, problems
+from deepsimbad.api.problems import declare_json, problems
 from deepsimbad.api.requests import (
     GREATEST_ID,
     KEPT,

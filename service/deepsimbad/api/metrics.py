@@ -10,11 +10,9 @@ import time
 from collections import Counter as CountOf
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from datetime import datetime
 from functools import cache
-from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 from prometheus_client import (
     CollectorRegistry,
@@ -26,10 +24,11 @@ from prometheus_client import (
     generate_latest,
 )
 from prometheus_client.core import GaugeMetricFamily
-from prometheus_client.exposition import CONTENT_TYPE_LATEST
 from prometheus_client.registry import Collector
 
 from deepsimbad.engine.maps import Maps
+from deepsimbad.engine.sessions import Sessions
+from deepsimbad.engine.worker import InferenceWorker
 from deepsimbad.errors import DeepSimbadError
 from deepsimbad.jobs.runner import REMAP
 from deepsimbad.release import release
@@ -47,39 +46,13 @@ _JOB_BUCKETS_S = (1, 2, 5, 10, 20, 30, 60, 120, 300, 600, 1800, 3600, 7200)
 _BATCH_BUCKETS = (1, 2, 4, 8, 16, 32, 64, 128, 256)
 
 
-@dataclass(frozen=True)
-class WatchedState:
-    """Where gauges are read at the moment of a scrape.
-
-    Attributes:
-        data_dir: The data directory.
-        catalog: Domains, maps and jobs.
-        maps: Those in memory.
-        faults: What keeps the service from being ready.
-        queue_length: Of the inference worker.
-        n_sessions: That have not ended.
-        wall: Seconds since 1970.
-    """
-
-    data_dir: Path
-    catalog: Catalog
-    maps: Maps
-    faults: Callable[[], Sequence[str]]
-    queue_length: Callable[[], int]
-    n_sessions: Callable[[], int]
-    wall: Callable[[], float] = time.time
-
-
 class Metrics:
     """The service's counters, all named `deepsimbad_...`.
 
     Attributes:
-        content_type: Of `render()`.
         request_began: Counts a request as being answered.
         committed: Takes the number of writes in one transaction of the sessions' file.
     """
-
-    content_type = CONTENT_TYPE_LATEST
 
     def __init__(self) -> None:
         self._registry = CollectorRegistry()
@@ -95,15 +68,11 @@ class Metrics:
         what = "Time from a request's head to the end of its answer."
         self._request_seconds = cache(histogram("request_seconds", what, _LATENCY_BUCKETS_S, "route").labels)
         what = "Time of the stages of one answer to a view, and their total."
-        self._seconds_of_stage = cache(
-            histogram("localization_stage_seconds", what, _LATENCY_BUCKETS_S, "stage").labels
-        )
+        self._stage_seconds = cache(histogram("localization_stage_seconds", what, _LATENCY_BUCKETS_S, "stage").labels)
         what = "Entropy of the belief after one view: high when the map no longer tells places apart."
         self._entropy_bits = histogram("belief_entropy_bits", what, range(0, 25, 2), "domain")
-        what = (
-            "Normalised rank of the true map image in a session's belief, in percent, once the truth was told: 0 is "
-            "perfect, 50 chance."
-        )
+        what = "Normalised rank of the true map image in a session's belief, in percent, once the truth was told: "
+        what += "0 is perfect, 50 chance."
         self._live_anr_percent = histogram("live_anr_percent", what, _PERCENT_BUCKETS, "domain")
         what = "Observations of sessions: accepted, repeated (counted before), or the code of what was wrong."
         self._observations = counter("observations", what, "outcome")
@@ -111,9 +80,8 @@ class Metrics:
         self.committed = histogram("session_commit_writes", what, _BATCH_BUCKETS).observe
         what = "Requests turned away for what they are or how many, by reason."
         self._refused = counter("refused_requests", what, "reason")
-        self._job_seconds = histogram(
-            "job_seconds", "Time from a job's start to its end.", _JOB_BUCKETS_S, "kind", "state"
-        )
+        what = "Time from a job's start to its end."
+        self._job_seconds = histogram("job_seconds", what, _JOB_BUCKETS_S, "kind", "state")
         self._in_flight = Gauge(
             "deepsimbad_requests_in_flight", "Requests being answered now.", registry=self._registry
         )
@@ -123,10 +91,10 @@ class Metrics:
         self._domains: set[str] = set()  # that have series here
         self._scrape = threading.Lock()
 
-    def watch(self, state: WatchedState) -> None:
+    def watch(self, state: "StateCollector") -> None:
         """Show this state too, from now on."""
-        self._state = StateCollector(state)
-        self._registry.register(self._state)
+        self._state = state
+        self._registry.register(state)
 
     def request_ended(self, method: str, route: str, status: int, seconds: float) -> None:
         """Count a request as answered."""
@@ -141,7 +109,7 @@ class Metrics:
         if outcome is not None:
             self._observations.labels(outcome).inc()
         for stage, milliseconds in timings_ms.items():
-            self._seconds_of_stage(stage).observe(milliseconds / 1000)
+            self._stage_seconds(stage).observe(milliseconds / 1000)
         self._domains.add(domain)
         self._entropy_bits.labels(domain).observe(entropy_bits)
 
@@ -173,96 +141,98 @@ class Metrics:
     def render(self) -> bytes:
         """The text exposition; reads files."""
         with self._scrape:
-            state = None if self._state is None else self._state.look()
-            if state is not None:  # a view that was on its way brought a deleted domain back
-                for domain in self._domains.difference(record.name for record in state.domains):
+            domain_names = None if self._state is None else self._state.look()
+            if domain_names is not None:  # a view that was on its way brought a deleted domain back
+                for domain in self._domains - domain_names:
                     self.forget_domain(domain)
             return generate_latest(self._registry)
 
 
-@dataclass(frozen=True)
-class CatalogState:
-    """What the catalog says: domains, every job, oldest first, and the active map of each domain that has one."""
-
-    domains: Sequence[DomainRecord]
-    jobs: Sequence[JobRecord]
-    serving: Mapping[str, MapRecord]
-
-    @classmethod
-    def of(cls, catalog: Catalog) -> Self:
-        """Read it; raises DeepSimbadError."""
-        domains = catalog.domains()
-        versions = {domain.name: domain.active_version for domain in domains}
-        serving = {name: catalog.map(name, version) for name, version in versions.items() if version is not None}
-        return cls(domains, catalog.jobs(), serving)
-
-    def last_remaps(self) -> Mapping[str, JobRecord]:
-        """The remap of each domain that ended last.
-
-        They are done one after the other as they came, whatever the clock was set to; one that was cancelled while it
-        waited, out of that order, tells of nothing that was done and counts only beside others such.
-        """
-        ended = [job for job in self.jobs if job.kind == REMAP and job.finished_at is not None]
-        return {job.domain: job for job in sorted(ended, key=lambda job: job.n_starts > 0)}
-
-
 class StateCollector(Collector):
-    """Gives what `look` saw; series of deleted domains end by themselves, since nothing is kept from scrape to scrape.
+    """Gives what `look` saw, and nothing of the scrape before, so that series of deleted domains end.
 
     Args:
-        watched: Where it is read.
+        catalog: Domains, maps and jobs.
+        maps: Those in memory.
+        faults: What keeps the service from being ready.
+        worker: Whose queue is shown.
+        sessions: Those that have not ended.
     """
 
-    def __init__(self, watched: WatchedState) -> None:
-        self._watched = watched
-        self._seen: CatalogState | None = None
+    def __init__(
+        self,
+        catalog: Catalog,
+        maps: Maps,
+        faults: Callable[[], Sequence[str]],
+        worker: InferenceWorker,
+        sessions: Sessions,
+    ) -> None:
+        self._catalog = catalog
+        self._maps = maps
+        self._faults = faults
+        self._worker = worker
+        self._sessions = sessions
+        self._domains: Sequence[DomainRecord] | None = None
+        self._jobs: Sequence[JobRecord] = ()
+        self._serving: Mapping[str, MapRecord] = {}
 
-    def look(self) -> CatalogState | None:
-        """Read the catalog for the next `collect`; None where it cannot be read."""
+    def look(self) -> set[str] | None:
+        """Read the catalog for the next `collect`; the names of its domains, None where it cannot be read."""
         try:
-            self._seen = CatalogState.of(self._watched.catalog)
+            domains, self._jobs = self._catalog.domains(), self._catalog.jobs()
+            versions = {domain.name: domain.active_version for domain in domains}
+            self._serving = {
+                name: self._catalog.map(name, version) for name, version in versions.items() if version is not None
+            }
         except DeepSimbadError:  # `deepsimbad_ready` tells; what needs no catalog is shown all the same
-            self._seen = None
-        return self._seen
+            self._domains = None
+            return None
+        self._domains = domains
+        return set(versions)
 
     def collect(self) -> Iterator[GaugeMetricFamily]:
         """Every family."""
-        watched = self._watched
         about = {(release(), platform.python_version()): 1}
         yield _gauge("build_info", "Always 1; the labels tell the release.", about, "version", "python")
-        yield _gauge("ready", "1 where /readyz answers 200.", {(): not watched.faults()})
-        yield _gauge("inference_queue", "Work waiting for the inference worker.", {(): watched.queue_length()})
-        yield _gauge("loaded_maps", "Active maps held in memory.", {(): watched.maps.n_loaded})
-        yield _gauge("sessions", "Sessions that have not ended.", {(): watched.n_sessions()})
+        yield _gauge("ready", "1 where /readyz answers 200.", {(): not self._faults()})
+        yield _gauge("inference_queue", "Work waiting for the inference worker.", {(): self._worker.n_waiting})
+        yield _gauge("loaded_maps", "Active maps held in memory.", {(): self._maps.n_loaded})
+        yield _gauge("sessions", "Sessions that have not ended.", {(): self._sessions.n_living})
         with suppress(OSError):
-            usage = shutil.disk_usage(watched.data_dir)
+            usage = shutil.disk_usage(self._catalog.data_dir)
             yield _gauge("data_dir_free_bytes", "Free where the data directory lies.", {(): usage.free})
             yield _gauge("data_dir_size_bytes", "Size of the disk it lies on.", {(): usage.total})
-        if self._seen is not None:
-            yield from self._of_catalog(self._seen)
+        if self._domains is not None:
+            yield _gauge("domains", "Domains there are.", {(): len(self._domains)})
+            yield from self._of_maps()
+            yield from self._of_jobs()
 
-    def _of_catalog(self, state: CatalogState) -> Iterator[GaugeMetricFamily]:
-        now, serving = self._watched.wall(), state.serving.items()
-        snapshots = {(mapped.snapshot.domain,): mapped.snapshot for mapped in self._watched.maps.loaded()}
-        damaged = self._watched.maps.damaged()
-        n_jobs, remaps = CountOf(job.state for job in state.jobs), sorted(state.last_remaps().items())
-        by_state = {(job_state.value,): n_jobs[job_state] for job_state in JobState}
-        yield _gauge("jobs", "Jobs the catalog knows, by state.", by_state, "state")
-        yield _gauge("domains", "Domains there are.", {(): len(state.domains)})
+    def _of_maps(self) -> Iterator[GaugeMetricFamily]:
+        serving, damaged = self._serving.items(), self._maps.damaged()
         versions = {(domain,): record.version for domain, record in serving}
         yield _gauge("active_map_version", "Version of the map that serves.", versions, "domain")
-        ages_s = {(domain,): max(0.0, now - _seconds(record.created_at)) for domain, record in serving}
+        ages_s = {(domain,): max(0.0, time.time() - _seconds(record.created_at)) for domain, record in serving}
         yield _gauge("map_age_seconds", "Time since the map that serves was built.", ages_s, "domain")
         is_damaged = {(domain,): damaged.get(domain) == record.version for domain, record in serving}
         yield _gauge("map_damaged", "1 where the map that serves could not be loaded.", is_damaged, "domain")
+        snapshots = {(mapped.snapshot.domain,): mapped.snapshot for mapped in self._maps.loaded()}
         n_images = {domain: snapshot.route.n_images for domain, snapshot in snapshots.items()}
         yield _gauge("map_images", "Map images of the map in memory.", n_images, "domain")
         n_bytes = {domain: snapshot.index_bytes for domain, snapshot in snapshots.items()}
         yield _gauge("map_index_bytes", "Bytes of its index in the map file.", n_bytes, "domain")
-        outcomes = {(domain, outcome): outcome == _outcome(job) for domain, job in remaps for outcome in REMAP_OUTCOMES}
+
+    def _of_jobs(self) -> Iterator[GaugeMetricFamily]:
+        n_jobs = CountOf(job.state for job in self._jobs)
+        by_state = {(state.value,): n_jobs[state] for state in JobState}
+        yield _gauge("jobs", "Jobs the catalog knows, by state.", by_state, "state")
+        # They are done one after the other as they came, whatever the clock was set to; one that was cancelled while it
+        # waited, out of that order, tells of nothing that was done and counts only beside others such.
+        ended = [job for job in self._jobs if job.kind == REMAP and job.finished_at is not None]
+        last = sorted({job.domain: job for job in sorted(ended, key=lambda job: job.n_starts > 0)}.items())
+        outcomes = {(domain, outcome): outcome == _outcome(job) for domain, job in last for outcome in REMAP_OUTCOMES}
         what = "1 for the outcome of the remap that ended last, else 0."
         yield _gauge("last_remap", what, outcomes, "domain", "outcome")
-        ended_at = {(domain,): _seconds(job.finished_at or "") for domain, job in remaps}
+        ended_at = {(domain,): _seconds(job.finished_at or "") for domain, job in last}
         yield _gauge("last_remap_timestamp_seconds", "When it ended, seconds since 1970.", ended_at, "domain")
 
 

@@ -1,20 +1,27 @@
-"""Errors as RFC 9457 problem details: the one table from the error tree to HTTP statuses."""
+"""Errors as RFC 9457 problem details: the one table from the error tree to HTTP statuses; the OpenAPI document.
+
+The framework derives the document, and `install_openapi` adds what it cannot know: these problems, bodies that
+handlers read themselves, keys, links and examples.
+"""
 
 import json
 import logging
 import math
+import re
 from collections.abc import Mapping, Sequence
 from http import HTTPStatus
-from typing import Any
+from typing import Annotated, Any
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
-from pydantic import ValidationError
+from fastapi.openapi.utils import get_openapi
+from pydantic import BaseModel, ConfigDict, Field
 from starlette.exceptions import HTTPException
-from starlette.responses import Response
+from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 from starlette.types import Scope
 
+from deepsimbad.api.keys import needed_scope
 from deepsimbad.errors import (
     AccessError,
     BusyError,
@@ -66,18 +73,14 @@ _TITLE_OF_CODE = {
 _CODE_OF_STATUS = {404: "not_found", 405: "method_not_allowed", 416: "range_not_satisfiable"}
 
 
-class InvalidRequestError(InvalidInputError):
+class InvalidRequestError(InvalidInputError, code="invalid_request"):
     """A value of the request cannot be accepted."""
-
-    code = "invalid_request"
 
 
 def status_of(error: DeepSimbadError) -> int:
-    """The HTTP status of an error of the tree: that of the nearest branch in the table, else 500."""
-    for base in type(error).__mro__:
-        if base in STATUS_OF_BRANCH:
-            return int(STATUS_OF_BRANCH[base])
-    return int(HTTPStatus.INTERNAL_SERVER_ERROR)
+    """The HTTP status of an error of the tree."""
+    bases = type(error).__mro__
+    return int(next((STATUS_OF_BRANCH[base] for base in bases if base in STATUS_OF_BRANCH), 500))
 
 
 def problem_response(
@@ -90,17 +93,7 @@ def problem_response(
     hints: Mapping[str, Any] | None = None,
     headers: Mapping[str, str] | None = None,
 ) -> Response:
-    """Render one problem; its code, and the limit that was met, are noted for the log.
-
-    Args:
-        scope: The request's, for `instance` and the request id.
-        status: HTTP status.
-        code: Stable word that scripts may test.
-        detail: One sentence on this occurrence.
-        title: One sentence on this kind of problem; None looks it up by code, then by status.
-        hints: Further members that help (limits, allowed values).
-        headers: Further headers, `Allow` and the like.
-    """
+    """Render one problem, with hints as further members; its code and the limit met are noted for the log."""
     document = {name: _json_ready(value) for name, value in (hints or {}).items()}
     document |= {
         "type": f"urn:deepsimbad:problem:{code}",
@@ -144,9 +137,19 @@ def unexpected_response(scope: Scope) -> Response:
     return problem_response(scope, HTTPStatus.INTERNAL_SERVER_ERROR, "internal_error", detail)
 
 
-def invalid_request(error: ValidationError, where: str) -> InvalidRequestError:
-    """The tree's error for what a model refused; `where` is "body" and the like, the first part of every place."""
-    return _invalid_request(error.errors(include_url=False, include_context=False, include_input=False), where)
+def invalid_request(findings: Sequence[Any], *where: str) -> InvalidRequestError:
+    """The tree's error, of up to 20 findings, for what pydantic refused; `where` begins every place ("body")."""
+    errors = [  # pydantic puts its own words before those of our validators
+        {"loc": [*where, *finding["loc"]], "msg": finding["msg"].removeprefix("Value error, "), "type": finding["type"]}
+        for finding in findings[:20]
+    ]
+    place = ".".join(str(part) for part in errors[0]["loc"])
+    return InvalidRequestError(f"{place}: {errors[0]['msg']}", errors=errors)
+
+
+def invalid_body(what: str, kind: str = "value_error") -> InvalidRequestError:
+    """The same for what no model tells."""
+    return InvalidRequestError(f"body: {what}", errors=[{"loc": ["body"], "msg": what, "type": kind}])
 
 
 def install_problem_handlers(app: FastAPI, routes: Sequence[Route] = ()) -> None:
@@ -157,7 +160,7 @@ def install_problem_handlers(app: FastAPI, routes: Sequence[Route] = ()) -> None
 
     async def from_validation(request: Request, error: Any) -> Response:
         # The stock answer echoes the input, so that NaN in it becomes a 500.
-        return error_response(request.scope, _invalid_request(error.errors()))
+        return error_response(request.scope, invalid_request(error.errors()))
 
     async def from_http(request: Request, error: Any) -> Response:
         code = _CODE_OF_STATUS.get(error.status_code, f"http_{error.status_code}")
@@ -172,17 +175,6 @@ def install_problem_handlers(app: FastAPI, routes: Sequence[Route] = ()) -> None
     app.add_exception_handler(DeepSimbadError, from_tree)
     app.add_exception_handler(RequestValidationError, from_validation)
     app.add_exception_handler(HTTPException, from_http)
-
-
-def _invalid_request(findings: Sequence[Mapping[str, Any]], *where: str) -> InvalidRequestError:
-    """One error of up to 20 findings of pydantic's, which puts its own words before those of our validators."""
-    errors = [
-        {"loc": [*where, *finding["loc"]], "msg": finding["msg"].removeprefix("Value error, "), "type": finding["type"]}
-        for finding in findings[:20]
-    ]
-    first = errors[0] if errors else {"loc": [], "msg": "unreadable", "type": "unreadable"}
-    place = ".".join(str(part) for part in first["loc"])
-    return InvalidRequestError(f"{place}: {first['msg']}", errors=errors)
 
 
 def _instance(scope: Scope) -> str:
@@ -202,3 +194,210 @@ def _json_ready(value: Any) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return str(value)
     return value if isinstance(value, (str, int, float, bool, type(None))) else str(value)
+
+
+# The document
+
+_REFERENCE = "#/components/schemas/{model}"
+_DESCRIPTIONS = {
+    401: "No key, or one that is unknown, revoked or expired; a service without keys asks for none",
+    403: "A key without the scope that the call needs",
+    404: "An unknown name or id",
+    409: "The present state forbids it",
+    410: "A session that has ended, or a map that is no more",
+    413: "More bytes or pixels than a limit allows",
+    415: "A missing or unsupported Content-Type; `allowed` lists what is taken",
+    416: "A range outside the file",
+    422: "A value that can never be accepted; `errors` or the other members say which",
+    429: "More than the service takes at once, or from one key; try again after Retry-After seconds",
+    500: "The service failed; the fault is its own",
+    503: "The service cannot answer now; try again after Retry-After seconds",
+}
+_RETRY_AFTER = {"Retry-After": {"description": "Seconds to wait.", "schema": {"type": "integer", "minimum": 1}}}
+_CHALLENGE = {"WWW-Authenticate": {"description": "How to authenticate.", "schema": {"const": "Bearer"}}}
+_HEADERS = {401: _CHALLENGE, 429: _RETRY_AFTER, 503: _RETRY_AFTER}
+# What an answer gives to the calls whose path needs just these: call, status, parameters.
+_LINKS = (
+    ("PUT /v1/admin/domains/{domain}", "201", {"domain": "$request.path.domain"}),
+    (
+        "POST /v1/admin/domains/{domain}/traverses",
+        "201",
+        {"domain": "$request.path.domain", "name": "$response.body#/name"},
+    ),
+    ("POST /v1/admin/domains/{domain}/remaps", "202", {"job_id": "$response.body#/job_id"}),
+    ("POST /v1/admin/domains/{domain}/experience", "202", {"job_id": "$response.body#/job_id"}),
+    ("POST /v1/domains/{domain}/sessions", "201", {"session_id": "$response.body#/session_id"}),
+)
+_SECURITY_SCHEMES = {
+    "bearer": {
+        "type": "http",
+        "scheme": "bearer",
+        "description": "A key of `deepsimbad keys create`. A service on which no key was ever created asks for none.",
+    },
+    "api_key": {
+        "type": "apiKey",
+        "in": "header",
+        "name": "X-API-Key",
+        "description": "The same key, where a proxy needs `Authorization` for itself.",
+    },
+}
+# What a first request may look like.
+BODY_EXAMPLES: Mapping[str, Any] = {
+    "DomainBody": {"evaluator": {"kind": "feature_l2"}, "closed": False},
+    "TraverseBody": {"name": "2012-08-20"},
+    "RemapBody": {"training_traverse": "2012-08-20", "landmark_traverse": "2012-05-11", "gate_margin": 2.0},
+    "ActiveMapBody": {"version": 1, "expected": 2},
+    "SessionBody": {"start_position_m": 4.5, "start_std_m": 10.0},
+    "PriorBody": {"position_m": 8.0, "std_m": 3.0},
+    "TruthsBody": {"true_positions_m": [4.5, 7.5, None]},
+    "ExperienceBody": {"session_id": "5f0c2f7e8a7b4a0c9d3e1b2a4c6d8e0f", "true_positions_m": [4.5, 7.5, None]},
+}
+ENCODED_ON_BOARD = {"ranked_landmarks": [7, 2, 9, 0]}
+_PARAMETER_EXAMPLES: Mapping[str, Any] = {
+    "domain": "campus",
+    "name": "2012-08-20",
+    "version": 1,
+    "map_version": 1,
+    "index": 0,
+    "position_m": 12.5,
+    "session_id": "5f0c2f7e8a7b4a0c9d3e1b2a4c6d8e0f",
+    "job_id": "8a7b4a0c9d3e1b2a4c6d8e0f5f0c2f7e",
+    "timestamp_us": 1_345_480_000_000_000,
+    "x_m": 101.5,
+    "y_m": -42.25,
+    "action_m": 3.0,
+    "action_std_m": 0.3,
+    "shortlist": 10,
+    "limit": 100,
+    "Idempotency-Key": "robot-7/421",
+    "If-Match": "*",
+}
+_declared_bodies: dict[str, type[BaseModel]] = {}
+
+
+class Problem(BaseModel):
+    """An error, as RFC 9457 problem details. Further members hold what helps: limits, allowed values."""
+
+    model_config = ConfigDict(extra="allow")
+
+    type: Annotated[str, Field(description="`urn:deepsimbad:problem:` and the code.")]
+    title: Annotated[str, Field(description="One sentence on this kind of problem.")]
+    status: Annotated[int, Field(description="The HTTP status.", ge=400, le=599)]
+    detail: Annotated[str, Field(description="One sentence on this occurrence.")]
+    instance: Annotated[str, Field(description="The path that was asked.")]
+    code: Annotated[str, Field(description="A stable word that scripts may test.", pattern="^[a-z0-9_]+$")]
+    request_id: Annotated[str | None, Field(description="By which the server's log can be searched.")]
+
+
+def problems(*statuses: int) -> dict[int | str, dict[str, Any]]:
+    """The `responses` of a route that may answer with these problems; 500 and 503 are always among them."""
+    return {status: _problem(status) for status in (*statuses, 500, 503)}
+
+
+def binary(description: str) -> dict[str, Any]:
+    """The content of an answer of bytes."""
+    return {"application/octet-stream": {"schema": {"type": "string", "format": "binary", "description": description}}}
+
+
+def location(status: int, what: str) -> dict[int | str, dict[str, Any]]:
+    """The `responses` of a route whose answer says where what was made is."""
+    return {status: {"headers": {"Location": {"description": what, "schema": {"type": "string"}}}}}
+
+
+def declare_json(model: type[BaseModel]) -> dict[str, Any]:
+    """The OpenAPI request body of a route that reads this model, as `openapi_extra`."""
+    _declared_bodies[model.__name__] = model
+    return declare({"application/json": {"$ref": _REFERENCE.format(model=model.__name__)}})
+
+
+def declare(content: dict[str, Any]) -> dict[str, Any]:
+    """The OpenAPI request body with these media types and schemas, as `openapi_extra`."""
+    described = {media_type: {"schema": schema} for media_type, schema in content.items()}
+    return {"requestBody": {"required": True, "content": described}}
+
+
+def install_openapi(app: FastAPI) -> None:
+    """Complete the document of `app` with the models that routes only refer to, and with what comes before routes."""
+
+    def document() -> dict[str, Any]:
+        if app.openapi_schema is None:
+            app.openapi_schema = get_openapi(
+                title=app.title, version=app.version, description=app.description, routes=app.routes
+            )
+            _complete(app.openapi_schema)
+        return app.openapi_schema
+
+    app.openapi = document  # type: ignore[method-assign]
+    answers: list[Response] = []
+
+    async def answer(_: Request) -> Response:
+        if not answers:  # written once: anybody may ask, without a key
+            answers.append(JSONResponse(document()))
+        return answers[0]
+
+    app.add_route("/openapi.json", answer, include_in_schema=False)
+
+
+def _complete(document: dict[str, Any]) -> None:
+    components = document["components"]
+    schemas = components["schemas"]
+    models: tuple[type[BaseModel], ...] = (Problem, *_declared_bodies.values())
+    for model in models:
+        schema = model.model_json_schema(ref_template=_REFERENCE)
+        schemas.update(schema.pop("$defs", {}))
+        schemas[model.__name__] = schema
+    components["securitySchemes"] = _SECURITY_SCHEMES
+    _write_pairs_plainly(schemas)
+    operations = {
+        f"{method.upper()} {path}": operation
+        for path, by_method in document["paths"].items()
+        for method, operation in by_method.items()
+    }
+    for name, operation in operations.items():
+        needed = needed_scope(name.partition(" ")[2])
+        if needed is not None:
+            operation["security"] = [{scheme: [needed.value]} for scheme in _SECURITY_SCHEMES]
+            for refusal in (401, 403, 429):
+                operation["responses"].setdefault(str(refusal), _problem(refusal))
+        operation["responses"] = dict(sorted(operation["responses"].items()))
+    _link(operations)
+    for name, example in BODY_EXAMPLES.items():
+        schemas[name]["examples"] = [example]
+    for operation in operations.values():
+        for parameter in operation.get("parameters", ()):
+            if parameter["name"] in _PARAMETER_EXAMPLES:
+                parameter["example"] = _PARAMETER_EXAMPLES[parameter["name"]]
+        for content in operation.get("requestBody", {}).get("content", {}).values():
+            if "oneOf" in content["schema"]:  # what a robot that encodes on board may send
+                content["example"] = ENCODED_ON_BOARD
+
+
+def _link(operations: Mapping[str, dict[str, Any]]) -> None:
+    """Say of the answers that make something which calls take it."""
+    for source, status, parameters in _LINKS:
+        links = operations[source]["responses"][status].setdefault("links", {})
+        for target, operation in operations.items():
+            if target != source and set(re.findall(r"\{(\w+)\}", target)) == set(parameters):
+                name = operation["operationId"]
+                links[name] = {"operationId": name, "parameters": dict(parameters)}
+
+
+def _problem(status: int) -> dict[str, Any]:
+    declared: dict[str, Any] = {
+        "description": _DESCRIPTIONS[status],
+        "content": {MEDIA_TYPE: {"schema": {"$ref": _REFERENCE.format(model="Problem")}}},
+    }
+    return declared | ({"headers": _HEADERS[status]} if status in _HEADERS else {})
+
+
+def _write_pairs_plainly(schema: Any) -> None:
+    """Write arrays of so many items of one kind with `items`: many readers of such documents know no `prefixItems`."""
+    if isinstance(schema, dict):
+        kinds = schema.get("prefixItems")
+        if isinstance(kinds, list) and all(kind == kinds[0] for kind in kinds):
+            schema["items"] = schema.pop("prefixItems")[0]
+        for part in schema.values():
+            _write_pairs_plainly(part)
+    elif isinstance(schema, list):
+        for part in schema:
+            _write_pairs_plainly(part)

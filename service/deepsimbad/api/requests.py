@@ -21,7 +21,7 @@ from pydantic_core import to_json
 
 from deepsimbad.api.keys import KeyRing
 from deepsimbad.api.metrics import Metrics
-from deepsimbad.api.problems import InvalidRequestError, invalid_request
+from deepsimbad.api.problems import InvalidRequestError, invalid_body, invalid_request
 from deepsimbad.engine.localizer import View
 from deepsimbad.engine.maps import MappedDomain, Maps, Retention
 from deepsimbad.engine.sessions import Sessions
@@ -53,13 +53,7 @@ _MAX_PARTS = 1000  # members, texts, lists: far more than any body here has
 
 
 class Slots:
-    """Room for so many of something at once.
-
-    Args:
-        most: How many.
-        what: Their name in a sentence.
-        setting: What allows more.
-    """
+    """Room for `most` of something at once: `what` as a sentence names it, `setting` allows more."""
 
     def __init__(self, most: int, what: str, setting: str) -> None:
         self.most = most
@@ -78,8 +72,7 @@ class Slots:
 
     def take(self, n: int = 1) -> None:
         """Take room; raises OverloadedError where there is none."""
-        if self.n_taken + n > self.most:
-            self.check(n)
+        self.check(n)
         self.n_taken += n
 
     def give_back(self, n: int = 1) -> None:
@@ -101,9 +94,6 @@ class Decoders:
 
     An image of more than `KEPT_PIXELS` takes most of a second and memory for all its pixels until it is reduced. So
     there is one of those at a time, and usual images never wait for one; where eight wait, more are refused.
-
-    Args:
-        max_pixels: Most pixels that an image's header may claim.
     """
 
     LARGE_WAITING = 8
@@ -115,15 +105,11 @@ class Decoders:
         self._large = CapacityLimiter(1)
 
     async def decoded(self, body: bytes, evaluator: Evaluator, priority: Priority) -> tuple[Image, bool]:
-        """The image in a body at the size that its evaluator encodes, and whether it shows nothing.
-
-        Returns:
-            [height, width, 3] uint8 BGR, and the answer.
+        """The image in a body, [height, width, 3] uint8 BGR at its evaluator's size, and whether it shows nothing.
 
         Raises:
             InvalidImageError, ImageTooLargeError, EmptyBodyError, OutOfMemoryError: As `ImageFile`.
-            UnsupportedMediaTypeError: The evaluator takes ready encodings alone.
-            EvaluatorUnavailableError: It cannot be loaded any more.
+            UnsupportedMediaTypeError, EvaluatorUnavailableError: The evaluator takes no images, or cannot be loaded.
             OverloadedError: The image is large, and as many large ones wait as may.
         """
         threads = self._threads[priority]
@@ -158,12 +144,9 @@ class Services:
 
     Attributes:
         faults: What keeps the service from being ready, a sentence each; may wait for the disk.
-        uploads: Batches of frames on their way.
-        event_streams: Of jobs, open.
         stopping: Set when shutdown begins; streams end on it.
         batches: The thread that reads batches into memory.
-        long_work: The thread that reads long bodies and writes long answers: it holds the interpreter, and two would
-            end no sooner.
+        long_work: The thread that reads long bodies and writes long answers: two would end no sooner.
         health: Threads for questions about health, which should not wait behind what they ask about.
     """
 
@@ -201,22 +184,16 @@ class Services:
         return await asyncio.wrap_future(self.worker.look(evaluator, view, run, priority))
 
     async def written(self, n_listed: int, render: Callable[..., T], *given: Any) -> tuple[T, bytes]:
-        """An answer, and its JSON: of dictionaries, lists and numbers that we computed, and do not check again.
+        """What `render` makes of what is given, and its JSON, without checking again what we computed.
 
-        Args:
-            n_listed: Length of its longest list; a long one is written beside the event loop.
-            render: Makes the answer.
-            *given: What of.
+        An answer whose longest list, of `n_listed`, is long is written beside the event loop.
         """
-        if n_listed > LONG_LIST:
-            return await run_sync(_write, render, given, limiter=self.long_work)
-        answer = render(*given)
-        return answer, to_json(answer)
 
+        def write() -> tuple[T, bytes]:
+            answer = render(*given)
+            return answer, to_json(answer)
 
-def _write(render: Callable[..., T], given: tuple[Any, ...]) -> tuple[T, bytes]:
-    answer = render(*given)
-    return answer, to_json(answer)
+        return await run_sync(write, limiter=self.long_work) if n_listed > LONG_LIST else write()
 
 
 async def services_of(request: Request) -> Services:
@@ -234,8 +211,7 @@ DomainName = Annotated[str, Path(alias="domain", pattern=NAME_PATTERN, descripti
 SessionId = Annotated[str, Path(pattern=NAME_PATTERN, description="A session's id.")]
 OfDomain = Annotated[str | None, Query(pattern=NAME_PATTERN, description="Only this domain's; absent: all.")]
 
-# A page of a list begins at a cursor, which names the list and the key of the last thing shown. It stays good whatever
-# is made or removed meanwhile, and says nothing that the list itself does not.
+# A page of a list begins at a cursor, which names the list and the key of the last thing shown.
 USUALLY_AT_ONCE = 100
 Limit = Annotated[int, Query(ge=1, le=1000, description="Most entries of the answer.")]
 Next = Annotated[str | None, Field(description="Ask for the list `after` this for its next page; null: it ends here.")]
@@ -247,13 +223,8 @@ def after(what: str, key_pattern: str = "[0-9]{1,18}$") -> Any:
     return Query(alias="after", pattern=f"^{what}-{key_pattern}", description=description)
 
 
-def key_of(cursor: str | None) -> str | None:
-    """The key that a list goes on behind; None: from its beginning."""
-    return None if cursor is None else cursor.partition("-")[2]
-
-
 def number_of(cursor: str | None) -> int | None:
-    """As `key_of`, of a list of numbers."""
+    """The key that a list of numbers goes on behind; None: from its beginning."""
     return None if cursor is None else int(cursor.partition("-")[2])
 
 
@@ -322,11 +293,7 @@ def key_id_of(request: Request) -> str | None:
 
 
 def id_under_key(request: Request, kind: str, domain: str, key: str | None) -> str | None:
-    """The id of what a request makes, which follows from its idempotency key; None without one.
-
-    A repetition finds it after a restart too. Whoever holds another API key makes other things, though the words they
-    choose be the same.
-    """
+    """The id of what a request makes, which follows from its idempotency key and its API key; None without one."""
     if key is None:
         return None
     return hashlib.sha256(f"{kind}\n{key_id_of(request) or ''}\n{domain}\n{key}".encode()).hexdigest()[:32]
@@ -351,17 +318,11 @@ Body = TypeVar("Body", bound=JsonBody)
 
 
 def media_type_of(request: Request, allowed: tuple[str, ...]) -> str:
-    """The body's media type, without parameters.
-
-    Raises:
-        UnsupportedMediaTypeError: There is none, or it is not one of those allowed.
-    """
+    """The body's media type, without parameters; raises UnsupportedMediaTypeError for none, or one not allowed."""
     header = request.headers.get("content-type")
     media_type = (header or "").partition(";")[0].strip().lower()
     if media_type not in allowed:
-        what = (
-            "the request has no Content-Type" if header is None else f"Content-Type {media_type[:100]!r} is not taken"
-        )
+        what = f"Content-Type {media_type[:100]!r} is not taken" if header else "the request has no Content-Type"
         raise UnsupportedMediaTypeError(f"{what}; send one of {', '.join(allowed)}", allowed=list(allowed))
     return media_type
 
@@ -375,12 +336,7 @@ async def read_bytes(request: Request) -> bytes:
 
 
 async def read_json(request: Request, kind: type[Body]) -> Body:
-    """A JSON body.
-
-    Raises:
-        UnsupportedMediaTypeError: Its Content-Type is not JSON.
-        InvalidInputError: It is empty, not JSON, or not such a body.
-    """
+    """A JSON body; raises UnsupportedMediaTypeError and InvalidInputError."""
     media_type_of(request, (JSON,))
     return await parse_json(await read_bytes(request), kind, request.app.state.services)
 
@@ -396,15 +352,14 @@ def _parsed(body: bytes, kind: type[Body]) -> Body:
     # All but numbers costs the parser a hundred times its bytes, and an error of its own where it is wrong: megabytes
     # of it would take seconds and gigabytes.
     if len(body) > _MAX_PARTS and any(body.count(mark) > _MAX_PARTS for mark in (b":", b'"', b"{", b"[")):
-        what = f"more than {_MAX_PARTS} members, texts or lists, which no body here has"
-        raise InvalidRequestError(f"body: {what}", errors=[{"loc": ["body"], "msg": what, "type": "too_many_parts"}])
+        raise invalid_body(f"more than {_MAX_PARTS} members, texts or lists, which no body here has", "too_many_parts")
     # The parser lets no other thread run until it has read all: millions of numbers would hold the event loop up.
     if body.count(b",") >= MAX_NUMBERS:
-        what = f"more than {MAX_NUMBERS} numbers"
-        raise InvalidRequestError(f"body: {what}", errors=[{"loc": ["body"], "msg": what, "type": "too_many_numbers"}])
+        raise invalid_body(f"more than {MAX_NUMBERS} numbers", "too_many_numbers")
     try:
         return kind.model_validate_json(body)
     except ValidationError as error:
-        raise invalid_request(error, "body") from error
+        findings = error.errors(include_url=False, include_context=False, include_input=False)
+        raise invalid_request(findings, "body") from error
     except (RecursionError, OverflowError, ValueError) as error:
         raise InvalidRequestError("body: not JSON that can be read") from error

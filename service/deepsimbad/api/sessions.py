@@ -26,7 +26,7 @@ from deepsimbad.api.localizations import (
     render_shortlist,
     view_in,
 )
-from deepsimbad.api.openapi import binary, declare_json, location, problems
+from deepsimbad.api.problems import binary, declare_json, location, problems
 from deepsimbad.api.requests import (
     GREATEST_EXACT_INTEGER,
     GREATEST_ID,

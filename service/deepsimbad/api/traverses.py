@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pydantic import FailFast, Field, StrictFloat
 
 from deepsimbad.api.localizations import IMAGE_SCHEMA, only
-from deepsimbad.api.openapi import declare, declare_json, problems
+from deepsimbad.api.problems import declare, declare_json, problems
 from deepsimbad.api.requests import (
     BINARY,
     GREATEST_EXACT_INTEGER,
@@ -32,7 +32,6 @@ from deepsimbad.api.requests import (
     Services,
     after,
     cursor_of,
-    key_of,
     media_type_of,
     parse_json,
     read_bytes,
@@ -159,11 +158,11 @@ async def list_traverses(
 ) -> TraverseList:
     """The traverses of a domain, by name."""
     data_dir = running.settings.data_dir
-    first = key_of(cursor)
+    first = "" if cursor is None else cursor.removeprefix("traverses-")
 
     def described() -> TraverseList:
         running.catalog.domain(domain)
-        names = [name for name in Traverse.list(data_dir, domain) if first is None or name > first]
+        names = [name for name in Traverse.list(data_dir, domain) if name > first]
         page = ListPage.of(((name, name) for name in names), limit)
         answers = []
         for name in page.records:  # a file each, so that those of other pages stay closed
@@ -342,7 +341,7 @@ _END_OF_DIRECTORY, _LARGE_DIRECTORY = b"PK\x05\x06", b"PK\x06\x07"
 _MAX_HEADER_BYTES = 4096
 
 
-class InvalidBatchError(InvalidInputError):
+class InvalidBatchError(InvalidInputError, code="invalid_batch"):
     """A batch of frames that is not an npz file of the arrays asked for."""
 
     code = "invalid_batch"

@@ -12,7 +12,7 @@ from rich.table import Table
 from deepsimbad.cli.options import data_dir_option, given_settings, json_option, traced_settings
 from deepsimbad.cli.terminal import print_table, write_json
 from deepsimbad.errors import DeepSimbadError
-from deepsimbad.settings import Origin, unknown_variables, variable_of
+from deepsimbad.settings import unknown_variables, variable_of
 from deepsimbad.store.catalog import Catalog
 
 log = logging.getLogger(__name__)
@@ -70,7 +70,7 @@ def settings(as_json: bool, data_dir: Path | None, host: str | None, port: int |
     values: dict[str, Any] = traced.settings.model_dump(mode="json")
     if as_json:
         document = {
-            name: {"value": value, "origin": traced.origins[name].value, "variable": variable_of(name)}
+            name: {"value": value, "origin": traced.origins[name], "variable": variable_of(name)}
             for name, value in values.items()
         }
         write_json({"file": None if traced.file is None else str(traced.file), "settings": document})
@@ -78,7 +78,7 @@ def settings(as_json: bool, data_dir: Path | None, host: str | None, port: int |
     table = Table("setting", "value", "from")
     for name, value in values.items():
         origin = traced.origins[name]
-        place = str(traced.file) if origin is Origin.FILE else origin.value
+        place = str(traced.file) if origin == "file" else origin
         table.add_row(name, escape(shown(value)), escape(place))
     print_table(table)
 
