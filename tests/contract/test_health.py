@@ -6,7 +6,7 @@ import threading
 
 import pytest
 
-from deepsimbad.api import health
+from deepsimbad.api import app as application
 from deepsimbad.store.layout import catalog_path, sessions_path
 
 from .conftest import RANKS, problem, service
@@ -47,7 +47,7 @@ def test_not_ready_while_stopping(tmp_path):
 
 @pytest.fixture
 def breakable(tmp_path, monkeypatch):
-    monkeypatch.setattr(health, "TRUSTED_S", -1.0)  # look every time
+    monkeypatch.setattr(application, "TRUSTED_S", -1.0)  # look every time
     with service(tmp_path) as client:
         yield client
 
@@ -104,7 +104,7 @@ def test_a_disk_almost_full_or_read_only(breakable, monkeypatch):
         return os.statvfs_result((*real[:8], real.f_flag | os.ST_RDONLY, real.f_namemax))
 
     with monkeypatch.context() as patch:
-        patch.setattr(health, "LEAST_FREE_BYTES", 1 << 60)
+        patch.setattr(application, "LEAST_FREE_BYTES", 1 << 60)
         (fault,) = faults(breakable)
         assert re.fullmatch(r"\d+ MiB are free in the data directory, fewer than 1099511627776", fault)
     with monkeypatch.context() as patch:
@@ -119,6 +119,6 @@ def test_whoever_asks_often_is_answered_from_memory(breakable, monkeypatch):
     assert len(faults(breakable)) == 1
     refuse_writes(breakable, False)
     assert faults(breakable) == []
-    monkeypatch.setattr(health, "TRUSTED_S", 1000.0)
+    monkeypatch.setattr(application, "TRUSTED_S", 1000.0)
     refuse_writes(breakable)
     assert breakable.get("/readyz").status_code == 200
