@@ -17,14 +17,13 @@ from deepsimbad.api.requests import (
     DomainName,
     JsonBody,
     Running,
-    Services,
     names,
     read_json,
 )
 from deepsimbad.engine.maps import Maps
 from deepsimbad.engine.worker import EvaluatorPool, ready
 from deepsimbad.errors import NoActiveMapError, UnavailableError, UnknownDomainError
-from deepsimbad.evaluators.registry import EXTRACTOR_PATTERN, EvaluatorConfig, EvaluatorKind, evaluator_config
+from deepsimbad.evaluators.registry import EXTRACTOR_PATTERN, EvaluatorKind, evaluator_config
 from deepsimbad.store.records import DomainRecord
 
 router = APIRouter(prefix="/v1/domains", tags=["domains"])
@@ -69,25 +68,12 @@ class DomainAnswer(Answer):
 
     name: str
     evaluator: Annotated[dict[str, Any], Field(description="Its `kind` and options, defaults filled in.")]
-    evaluator_problem: Annotated[
-        str | None, Field(description="Code of what keeps the extractor from being loaded; images are then a 503.")
-    ]
+    evaluator_problem: Annotated[str | None, Field(description="Code of what keeps it from being loaded.")]
     input_size: Annotated[
-        tuple[int, int] | None,
-        Field(
-            description="[width, height] in pixels to resize an image to; null: images are taken as they are, or not "
-            "at all where `encoding_dim` is null too."
-        ),
+        tuple[int, int] | None, Field(description="[width, height] in pixels to resize an image to; null: to none.")
     ]
-    encoding_dim: Annotated[
-        int | None,
-        Field(
-            description="Length of an image's encoding; null: no images are taken. Ready ones may have any one length."
-        ),
-    ]
-    weights_sha256: Annotated[
-        str | None, Field(description="SHA-256 of the file of weights that images are encoded by; null: of none.")
-    ]
+    encoding_dim: Annotated[int | None, Field(description="Of an image's encoding; null: no images are taken.")]
+    weights_sha256: Annotated[str | None, Field(description="Of the file that images are encoded by; null: of none.")]
     closed: Annotated[bool, Field(description="Whether the end of the route joins its start.")]
     actions_m: Annotated[list[float], Field(description="The moves a planner may choose, in metres.")]
     created_at: str
@@ -99,9 +85,7 @@ class DomainAnswer(Answer):
     n_landmarks: int | None
     list_length: int | None
     index_bits_per_map_image: float | None
-    landmark_model_digest: Annotated[
-        str | None, Field(description="SHA-256 of the landmarks that a robot may rank itself: see `landmark-model`.")
-    ]
+    landmark_model_digest: Annotated[str | None, Field(description="SHA-256 of what `landmark-model` answers.")]
 
 
 class DomainList(Answer):
@@ -183,9 +167,8 @@ async def get_domain(domain: DomainName, running: Running) -> DomainAnswer:
     responses={
         200: {
             "content": binary(
-                "numpy npz without pickles: the landmark model's arrays by name, and 0-d arrays `map_version`, "
-                "`n_landmarks`, `evaluator` (its configuration as JSON) and `weights_sha256` (empty where there are "
-                "none)"
+                "npz of the landmark model's arrays by name, and 0-d arrays `map_version`, `n_landmarks`, `evaluator` "
+                "(its configuration as JSON) and `weights_sha256` (empty where there are none)"
             ),
             "headers": {"ETag": {"description": "The landmark model's digest, quoted.", "schema": {"type": "string"}}},
         },
@@ -198,8 +181,7 @@ async def get_landmark_model(
     request: Request,
     running: Running,
     map_version: Annotated[
-        int | None,
-        Query(ge=1, le=GREATEST_ID, description="A version that a session is pinned to; absent: the active one."),
+        int | None, Query(ge=1, le=GREATEST_ID, description="One a session is pinned to; absent: the active one.")
     ] = None,
 ) -> Response:
     """The landmarks of a map, for a robot that encodes on board and sends ranks.
@@ -232,10 +214,17 @@ async def get_landmark_model(
 async def put_domain(domain: DomainName, request: Request, response: Response, running: Running) -> DomainAnswer:
     """Make a domain; the same again changes nothing, a different one is a 409."""
     body = await read_json(request, DomainBody)
-    evaluator_config(body.evaluator)
+    evaluator = evaluator_config(body.evaluator)
 
     def make() -> tuple[DomainAnswer, bool]:
-        evaluator = _completed(body.evaluator, running, domain)
+        nonlocal evaluator
+        try:
+            present = running.catalog.domain(domain).evaluator
+        except UnknownDomainError:
+            running.evaluators.evaluator(evaluator.as_dict()).load()  # one that cannot be loaded should not be stored
+        else:
+            if present.get("kind") == body.evaluator["kind"]:  # what was left out is as it is, whatever the default now
+                evaluator = evaluator_config({**present, **body.evaluator})
         record, created = running.catalog.create_domain(
             domain, dict(evaluator.as_dict()), body.closed, body.actions_m, running.settings.max_domains
         )
@@ -252,35 +241,11 @@ async def put_domain(domain: DomainName, request: Request, response: Response, r
 async def delete_domain(domain: DomainName, running: Running) -> None:
     """Remove a domain with its traverses and maps, and end its sessions; a job that still works on it is a 409."""
     await run_sync(running.open_traverses.forget, domain)
-    deleted = False
     try:
         await run_sync(running.catalog.delete_domain, domain)
-        deleted = True
     finally:  # where only its folder could not be removed, the domain is gone all the same
-        if deleted or await run_sync(_is_gone, running, domain):
+        if domain not in {record.name for record in await run_sync(running.catalog.domains)}:
             running.maps.forget(domain)
             await running.sessions.end_those(lambda session: session.domain == domain)
             running.metrics.forget_domain(domain)
     log.info("domain deleted", extra={"domain": domain})
-
-
-def _completed(given: dict[str, Any], running: Services, domain: str) -> EvaluatorConfig:
-    """The configuration of a domain that is made now, loaded once; where it exists, what was left out is as it has it.
-
-    The default may have changed since it was made.
-    """
-    try:
-        present = running.catalog.domain(domain).evaluator
-    except UnknownDomainError:
-        config = evaluator_config(given)
-        running.evaluators.evaluator(config.as_dict()).load()  # one that cannot be loaded should not be stored
-        return config
-    return evaluator_config({**present, **given} if present.get("kind") == given["kind"] else given)
-
-
-def _is_gone(running: Services, domain: str) -> bool:
-    try:
-        running.catalog.domain(domain)
-    except UnknownDomainError:
-        return True
-    return False

@@ -6,11 +6,9 @@ import time
 from collections.abc import AsyncIterator
 from typing import Annotated, Any, Literal
 
-import numpy as np
 from anyio.to_thread import run_sync
 from fastapi import APIRouter, Depends, Path, Request, Response
 from fastapi.sse import EventSourceResponse, ServerSentEvent
-from numpy.typing import NDArray
 from pydantic import Field
 
 from deepsimbad.api.localizations import MAX_LANDMARKS
@@ -22,7 +20,7 @@ from deepsimbad.api.requests import (
     Answer,
     DomainName,
     JsonBody,
-    KeyOfJob,
+    KeyOfCreation,
     Limit,
     Name,
     Next,
@@ -59,8 +57,7 @@ class RemapBody(JsonBody):
 
     training_traverse: Annotated[Name, Field(description="Its frames become the map images.")]
     landmark_traverse: Annotated[
-        Name | None,
-        Field(description="Landmarks are selected among its frames; null keeps the active map's landmarks."),
+        Name | None, Field(description="Landmarks are selected among its frames; null keeps the active map's.")
     ] = None
     n_landmarks: Annotated[
         Annotated[int, Field(strict=True, ge=1, le=MAX_LANDMARKS)] | None,
@@ -74,37 +71,24 @@ class RemapBody(JsonBody):
         int, Field(strict=True, ge=0, le=10_000_000, description="Of what the planner `nnql` knows; 0: nothing.")
     ] = DEFAULT_TRAINING_EPISODES
     seed: Annotated[int, Field(strict=True, ge=0, le=GREATEST_EXACT_INTEGER)] = 0
-    activate: Annotated[
-        bool, Field(strict=True, description="Switch to the new map when it is sealed, whatever serves by then.")
-    ] = True
+    activate: Annotated[bool, Field(strict=True, description="Switch to the new map when it is sealed.")] = True
     check_traverse: Annotated[
         Name | None,
-        Field(
-            description="Drive that the new map and the active one are compared on; "
-            "null: every tenth frame of the training traverse, held out."
-        ),
+        Field(description="Drive that both maps are compared on; null: every tenth training frame, held out."),
     ] = None
     gate_margin: Annotated[
         Annotated[float, Field(strict=True, ge=0, le=100, allow_inf_nan=False)] | None,
-        Field(
-            description="Percentage points of ANR by which the new map may be worse than the active one; "
-            "one that is worse is sealed but not activated. null: no gate."
-        ),
+        Field(description="Percentage points of ANR that an activated map may be worse by; null: no gate."),
     ] = None
     append: Annotated[
         bool,
-        Field(
-            strict=True,
-            description="Add the training traverse to a copy of the active map, whose images and landmarks stay; "
-            "landmark_traverse must be null.",
-        ),
+        Field(strict=True, description="Add the traverse to a copy of the active map; landmark_traverse must be null."),
     ] = False
     same_route: Annotated[
         Annotated[bool, Field(strict=True)] | None,
         Field(
-            description="Whether the training traverse and the one that the map would learn a second season from (the "
-            "landmark traverse, else what the active map was made of) count positions along one route; null: only "
-            "where both know x, y. Where their views disagree nothing is learnt, and metrics.second_season says why."
+            description="Whether the two traverses count positions along one route, so that a second season can be "
+            "learnt; null: only where both know x, y. metrics.second_season says what became of it."
         ),
     ] = None
 
@@ -131,7 +115,7 @@ class JobError(Answer):
     """Why a job failed."""
 
     code: str
-    detail: str
+    detail: Annotated[str, Field(validation_alias="message")]
 
 
 class JobAnswer(Answer):
@@ -159,26 +143,6 @@ class JobList(Answer):
     next: Next
 
 
-def render_job(record: JobRecord) -> JobAnswer:
-    """A job."""
-    error = record.error
-    return JobAnswer(
-        job_id=record.job_id,
-        domain=record.domain,
-        kind=record.kind,
-        state=record.state.value,
-        stage=record.stage,
-        progress=record.progress,
-        eta_s=record.eta_s,
-        result=None if record.result is None else JobResult(**record.result),
-        error=None if error is None else JobError(code=error["code"], detail=error["message"]),
-        config=record.config,
-        created_at=record.created_at,
-        started_at=record.started_at,
-        finished_at=record.finished_at,
-    )
-
-
 # Handlers
 
 
@@ -189,7 +153,7 @@ def render_job(record: JobRecord) -> JobAnswer:
     openapi_extra=declare_json(RemapBody),
 )
 async def post_remap(
-    domain: DomainName, request: Request, response: Response, running: Running, idempotency_key: KeyOfJob = None
+    domain: DomainName, request: Request, response: Response, running: Running, idempotency_key: KeyOfCreation = None
 ) -> JobAnswer:
     """Build the next map of a domain as a job; what serves stays until the new map is sealed.
 
@@ -204,22 +168,18 @@ async def post_remap(
     def submit() -> JobAnswer:
         before = running.runner.made_before(job_id, config)
         if before is not None:
-            return render_job(before)
+            return JobAnswer.model_validate(before)
         record = running.catalog.domain(domain)
         for name in (config.training_traverse, config.landmark_traverse, config.check_traverse):
             if name is not None:
                 Traverse.open(running.settings.data_dir, domain, name).close()
         if config.landmark_traverse is None and record.active_version is None:
-            wanted = (
-                "that could be appended to; make one first, without append"
-                if config.append
-                else "whose landmarks could stay; give a landmark_traverse"
-            )
-            raise NoActiveMapError(f"domain {domain} has no active map {wanted}", domain=domain)
+            what = "to append to or keep the landmarks of: give a landmark_traverse, and do not append"
+            raise NoActiveMapError(f"domain {domain} has no active map {what}", domain=domain)
         if config.append and record.active_version is not None:
             active = running.catalog.map(domain, record.active_version)
             refuse_known_traverse(active.config, active.version, config.training_traverse)
-        return render_job(running.runner.submit(domain, config, job_id))
+        return JobAnswer.model_validate(running.runner.submit(domain, config, job_id))
 
     job = await run_sync(submit)
     response.headers["Location"] = f"/v1/admin/jobs/{job.job_id}"
@@ -233,7 +193,7 @@ async def post_remap(
     openapi_extra=declare_json(ExperienceBody),
 )
 async def post_experience(
-    domain: DomainName, request: Request, response: Response, running: Running, idempotency_key: KeyOfJob = None
+    domain: DomainName, request: Request, response: Response, running: Running, idempotency_key: KeyOfCreation = None
 ) -> JobAnswer:
     """Let the next map version learn from a session, whose true positions are known by now, as a job.
 
@@ -244,30 +204,22 @@ async def post_experience(
     config = ExperienceConfig.of(body.session_id, body.true_positions_m)
     job_id = id_under_key(request, EXPERIENCE, domain, idempotency_key)
 
-    def keep() -> NDArray[np.float64] | None:
-        return keep_true_positions(
-            running.session_store, running.catalog, domain, body.session_id, body.true_positions_m, time.time()
-        )
-
     async def learn() -> JobRecord:
-        before_m = await run_sync(keep)
+        truths = (domain, body.session_id, body.true_positions_m, time.time())
+        before_m = await run_sync(keep_true_positions, running.session_store, running.catalog, *truths)
         try:
             return await run_sync(running.runner.submit, domain, config, job_id)
         finally:  # what was kept counts now or never, though the job be refused
-            await count(before_m)
-
-    async def count(before_m: NDArray[np.float64] | None) -> None:
-        try:
-            ranked = await running.truths.rank(body.session_id, body.true_positions_m)
-        except DeepSimbadError as error:  # the job is on its way all the same
-            about = {"domain": domain, "session_id": body.session_id}
-            log.warning("truths could not be ranked: %s", error, extra=about)
-        else:
-            await run_sync(running.metrics.fed_back, domain, ranked.new_since(before_m).tolist())
+            try:
+                ranked = await running.truths.rank(body.session_id, body.true_positions_m)
+                await run_sync(running.metrics.fed_back, domain, ranked.new_since(before_m).tolist())
+            except DeepSimbadError as error:  # the job is on its way all the same
+                about = {"domain": domain, "session_id": body.session_id}
+                log.warning("truths could not be ranked: %s", error, extra=about)
 
     job = await run_sync(running.runner.made_before, job_id, config) or await learn()
     response.headers["Location"] = f"/v1/admin/jobs/{job.job_id}"
-    return render_job(job)
+    return JobAnswer.model_validate(job)
 
 
 async def _job(job_id: JobId, running: Running) -> JobRecord:
@@ -290,13 +242,15 @@ async def list_jobs(
 ) -> JobList:
     """Jobs, newest first."""
     page = await run_sync(running.catalog.newest_jobs, domain, number_of(cursor), limit)
-    return JobList(jobs=[render_job(record) for record in page.records], next=cursor_of("jobs", page.last_key))
+    return JobList(
+        jobs=[JobAnswer.model_validate(record) for record in page.records], next=cursor_of("jobs", page.last_key)
+    )
 
 
 @router.get("/{job_id}", responses=problems(404, 422))
 async def get_job(job: Annotated[JobRecord, Depends(_job)]) -> JobAnswer:
     """One job."""
-    return render_job(job)
+    return JobAnswer.model_validate(job)
 
 
 @router.get(
@@ -320,7 +274,9 @@ async def get_job_events(
     while not running.stopping.is_set() and running.keys.still_opens(key_id):
         if job != sent:
             sent = job
-            yield ServerSentEvent(data=render_job(job), event="done" if job.state.is_final else "progress")
+            yield ServerSentEvent(
+                data=JobAnswer.model_validate(job), event="done" if job.state.is_final else "progress"
+            )
         if job.state.is_final:
             return
         await asyncio.sleep(running.settings.event_poll_s)

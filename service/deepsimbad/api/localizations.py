@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pydantic import FailFast, Field, StrictFloat, StrictInt
 from typing_extensions import TypedDict
 
-from deepsimbad.api.problems import InvalidRequestError, binary, declare, problems
+from deepsimbad.api.problems import binary, declare, invalid_body, problems
 from deepsimbad.api.requests import (
     BINARY,
     GREATEST_ID,
@@ -54,10 +54,7 @@ MAX_LANDMARKS = 0xFFFF
 
 
 class ObservationBody(JsonBody):
-    """What a robot made of a view on board: exactly one of the three.
-
-    NaN and infinity pass here, and are refused by what knows the right code for them.
-    """
+    """What a robot made of a view on board: exactly one of the three. The engine refuses NaN and infinity."""
 
     ranked_landmarks: Annotated[tuple[StrictInt, ...], FailFast()] = ()
     dissimilarities: Annotated[tuple[StrictFloat, ...], FailFast()] = ()
@@ -66,8 +63,7 @@ class ObservationBody(JsonBody):
     def view(self) -> RankedLandmarks | Dissimilarities | ReadyEncoding:
         """The engine's form; raises InvalidRequestError."""
         if len(self.model_fields_set) != 1:
-            what = "give exactly one of ranked_landmarks, dissimilarities, encoding"
-            raise InvalidRequestError(f"body: {what}", errors=[{"loc": ["body"], "msg": what, "type": "value_error"}])
+            raise invalid_body("give exactly one of ranked_landmarks, dissimilarities, encoding")
         if "ranked_landmarks" in self.model_fields_set:
             return RankedLandmarks(self.ranked_landmarks)
         if "dissimilarities" in self.model_fields_set:
@@ -87,8 +83,7 @@ _OBSERVATION_SCHEMA = {
         only(
             "ranked_landmarks",
             {"type": "integer", "minimum": 0, "maximum": MAX_LANDMARKS - 1},
-            "Distinct landmark ids from 0, nearest first, 1..r of them; of the rest no more is known than that they "
-            "are farther, and that landmarks go together as they did along the map's own drive.",
+            "Distinct landmark ids from 0, nearest first, 1..r of them; the rest are farther.",
         ),
         only("dissimilarities", {"type": "number"}, "r finite numbers in landmark order, smaller is nearer."),
         only("encoding", {"type": "number"}, "A ready encoding, as long as those the map was made of."),
@@ -104,12 +99,7 @@ OBSERVATION_BODY = declare(
     {**dict.fromkeys(MEDIA_TYPES, IMAGE_SCHEMA), JSON: _OBSERVATION_SCHEMA, RANKS: _RANKS_SCHEMA}
 )
 Shortlist = Annotated[
-    int | None,
-    Query(
-        ge=1,
-        le=GREATEST_ID,
-        description="Length of `retrieval` and `top`, up to the number of map images; absent: 10 or all.",
-    ),
+    int | None, Query(ge=1, le=GREATEST_ID, description="Length of `retrieval` and `top`; absent: 10 or all.")
 ]
 
 # Answers: plain dictionaries, because there are some forty in one of them, made for every view
@@ -139,13 +129,10 @@ class BeliefAnswer(TypedDict):
     mode_m: Annotated[float, Field(description="Position of the likeliest map image.")]
     std_m: float
     credible_95_m: Annotated[
-        tuple[float, float],
-        Field(description="Shortest stretch with 95 % of the mass; lo > hi crosses a closed route's start."),
+        tuple[float, float], Field(description="Shortest stretch with 95 % of the mass; lo > hi crosses the start.")
     ]
     entropy_bits: Annotated[float, Field(description="Over map images.", ge=0)]
-    off_route: Annotated[
-        float | None, Field(description="Probability that the robot is nowhere on the route; null: unknown.")
-    ]
+    off_route: Annotated[float | None, Field(description="Probability to be nowhere on the route; null: unknown.")]
     histogram: HistogramAnswer
     top: Annotated[list[PlaceAnswer], Field(description="Likeliest map images, best first.")]
 
@@ -193,21 +180,14 @@ class LocalizationAnswer(TypedDict):
 
 
 def render_localization(localization: Localization, watch: Stopwatch) -> LocalizationAnswer:
-    """The answer to one view.
-
-    Args:
-        localization: What the engine found.
-        watch: Runs since the request arrived.
-    """
-    snapshot = localization.snapshot
-    belief = render_belief(snapshot.route, localization.belief)
-    retrieval = render_shortlist(snapshot.route, localization.shortlist, localization.relevance)
+    """The answer to one view; the watch runs since the request arrived."""
+    snapshot, relevance = localization.snapshot, localization.relevance
     return {
         "map_version": snapshot.version,
-        "timings_ms": watch.timings_ms(),
-        "belief": belief,
-        "retrieval": retrieval,
+        "belief": render_belief(snapshot.route, localization.belief),
+        "retrieval": render_shortlist(snapshot.route, localization.shortlist, relevance),
         "next_best_view": render_plan(localization.plan, snapshot.actions_m),
+        "timings_ms": watch.timings_ms(),
     }
 
 
@@ -278,11 +258,9 @@ async def post_localization(
     shortlist: Shortlist = None,
     if_match: LandmarkModelTag = None,
 ) -> Response:
-    """Localize one view.
+    """Localize one view: an image, whatever image type the header names, or what a robot made of it on board.
 
-    The body is the image itself, or what a robot that encodes on board made of it. An image's real format is read
-    from its bytes, whichever of the image types the header names. With `Accept: application/octet-stream` the answer
-    is the relevance of every map image.
+    With `Accept: application/octet-stream` the answer is the relevance of every map image.
     """
     watch = Stopwatch()
     active = await running.active(domain)

@@ -36,7 +36,7 @@ from deepsimbad.engine.maps import load_snapshot, unreadable
 from deepsimbad.errors import ConflictError, DamagedMapError, UnknownMapVersionError
 from deepsimbad.store.catalog import ANY, removed
 from deepsimbad.store.durable import storage_faults
-from deepsimbad.store.records import MapRecord, MapState
+from deepsimbad.store.records import MapState
 
 router = APIRouter(prefix="/v1/admin/domains", tags=["admin: maps"])
 log = logging.getLogger(__name__)
@@ -64,10 +64,7 @@ class ActiveMapBody(JsonBody):
     version: Annotated[int, Field(strict=True, ge=1, le=GREATEST_ID)]
     expected: Annotated[
         Annotated[int, Field(strict=True, ge=1, le=GREATEST_ID)] | None,
-        Field(
-            description="The version thought active; null: none. Another one being active is a 409. "
-            "Absent: switch whichever is active."
-        ),
+        Field(description="The version thought active, null: none; another is a 409. Absent: whichever it is."),
     ] = None
 
 
@@ -93,32 +90,15 @@ class MapList(Answer):
     next: Next
 
 
-def render_map(record: MapRecord) -> MapAnswer:
-    """A map version."""
-    return MapAnswer(
-        version=record.version,
-        state=record.state.value,
-        created_at=record.created_at,
-        activated_at=record.activated_at,
-        retired_at=record.retired_at,
-        removed_at=record.removed_at,
-        sha256=record.sha256,
-        file_bytes=record.file_bytes,
-        config=record.config,
-        metrics=record.metrics,
-    )
-
-
 @router.get("/{domain}/maps", responses=problems(404, 422))
 async def list_maps(
-    domain: DomainName,
-    running: Running,
-    limit: Limit = USUALLY_AT_ONCE,
-    cursor: MapsAfter = None,
+    domain: DomainName, running: Running, limit: Limit = USUALLY_AT_ONCE, cursor: MapsAfter = None
 ) -> MapList:
     """The history of a domain's map, newest version first."""
     page = await run_sync(running.catalog.newest_maps, domain, number_of(cursor), limit)
-    return MapList(maps=[render_map(record) for record in page.records], next=cursor_of("maps", page.last_key))
+    return MapList(
+        maps=[MapAnswer.model_validate(record) for record in page.records], next=cursor_of("maps", page.last_key)
+    )
 
 
 @router.put(
@@ -139,7 +119,7 @@ async def put_active_map(domain: DomainName, request: Request, running: Running)
         record = running.catalog.activate(domain, body.version, expected)
         running.maps.refresh(domain)
         running.retention.prune(domain)
-        return render_map(record)
+        return MapAnswer.model_validate(record)
 
     return await run_sync(switch)  # what switches it logs it too, whoever asked
 
@@ -194,12 +174,7 @@ async def get_map_file(domain: DomainName, version: MapVersion, request: Request
 
 
 def check_digest(path: Path, sha256: str) -> None:
-    """Read a file against its digest.
-
-    Raises:
-        DamagedMapError: It is missing, or not the one that was sealed.
-        UnavailableError: The disk failed, ...
-    """
+    """Read a file against its digest; raises DamagedMapError, and UnavailableError where the disk fails."""
     if not path.is_file():
         raise DamagedMapError(f"{path.name} is missing", file=path.name)
     with storage_faults(path, DamagedMapError), path.open("rb") as stream:
@@ -210,8 +185,7 @@ def check_digest(path: Path, sha256: str) -> None:
 def one_range(headers: Headers, n_bytes: int) -> Headers:
     """A request's headers without a Range that is none, or more than one: those are answered with the whole file.
 
-    Raises:
-        HTTPException: 416, a range that begins behind the end.
+    Raises HTTPException, 416, for one that begins behind the end.
     """
     wanted = next((value.decode("latin-1").replace(" ", "") for name, value in headers if name == b"range"), "")
     match = _RANGE.fullmatch(wanted)

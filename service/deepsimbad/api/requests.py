@@ -272,12 +272,9 @@ def idempotency_header(what_again: str) -> Any:
     return Header(alias="Idempotency-Key", description=f"The same key with the same {what_again}")
 
 
-KeyOfJob = Annotated[
+KeyOfCreation = Annotated[
     KeyWord | None,
-    idempotency_header(
-        "body again makes no second job: the first one is answered, as it stands. Choose one that nobody else will, "
-        "such as a UUID."
-    ),
+    idempotency_header("body again makes nothing more: the first one is answered, as it stands. Choose a UUID."),
 ]
 
 
@@ -311,7 +308,7 @@ class JsonBody(BaseModel):
 class Answer(BaseModel):
     """Root of the answers. Every field is always present; what is not known is null."""
 
-    model_config = ConfigDict(frozen=True)
+    model_config = ConfigDict(frozen=True, from_attributes=True)
 
 
 Body = TypeVar("Body", bound=JsonBody)

@@ -11,7 +11,6 @@ import time
 from functools import lru_cache
 from itertools import islice
 from types import FrameType
-from typing import Any
 
 import uvicorn
 from fastapi import FastAPI
@@ -119,8 +118,7 @@ def serve(settings: Settings, create: bool = False) -> None:
         create: Whether a data directory that is not there is made.
 
     Raises:
-        SettingsError: The address could be reached from other machines, and the service has no keys; the data
-            directory is not there; or the certificate or its key cannot be used.
+        SettingsError: It would be open to other machines, the data directory is not there, or TLS files are unusable.
         DeepSimbadError: What kept it from starting, by name.
     """
     if not catalog_path(settings.data_dir).is_file():  # then there is no key, and no need to make the folder first
@@ -132,14 +130,13 @@ def serve(settings: Settings, create: bool = False) -> None:
             setting="data_dir",
         )
     configure_logging(settings.log_level)
-    log.info(
-        "starting",
-        extra={
-            "version": release(),
-            "data_dir": str(settings.data_dir.resolve()),
-            "settings": _changed(settings),
-        },
-    )
+    changed = {  # none of them is a secret
+        name: getattr(settings, name)
+        for name, field in Settings.model_fields.items()
+        if name != "data_dir" and getattr(settings, name) != field.default
+    }
+    where = str(settings.data_dir.resolve())
+    log.info("starting", extra={"version": release(), "data_dir": where, "settings": changed})
     app = create_app(settings)
     config = uvicorn.Config(
         app,
@@ -203,12 +200,3 @@ def _bound(host: str, port: int) -> list[socket.socket]:
             opened.close()
         raise UnavailableError(f"cannot listen on {host}:{port}: {error.strerror or error}") from error
     return sockets
-
-
-def _changed(settings: Settings) -> dict[str, Any]:
-    """The settings that are not as they come; none of them is a secret."""
-    return {
-        name: getattr(settings, name)
-        for name, field in Settings.model_fields.items()
-        if name != "data_dir" and getattr(settings, name) != field.default
-    }

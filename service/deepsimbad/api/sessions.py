@@ -35,6 +35,7 @@ from deepsimbad.api.requests import (
     Answer,
     DomainName,
     JsonBody,
+    KeyOfCreation,
     KeyWord,
     LandmarkModelTag,
     Limit,
@@ -73,24 +74,19 @@ MAX_OBSERVATIONS_FED_BACK = 100_000
 class SessionBody(JsonBody):
     """How a session begins. NaN and infinity are refused by what knows the route."""
 
-    start_position_m: Annotated[
-        StrictFloat | None, Field(description="Where on the route it begins; null: anywhere.")
-    ] = None
+    start_position_m: Annotated[StrictFloat | None, Field(description="Where it begins; null: anywhere.")] = None
     start_std_m: Annotated[
         StrictFloat | None, Field(description=f"How sure that is, a standard deviation; null: {DEFAULT_START_STD_M:g}.")
     ] = None
     seed: Annotated[
-        Annotated[int, Field(strict=True, ge=0, le=GREATEST_EXACT_INTEGER)] | None,
-        Field(description="Of whatever is random in it; null: 0."),
+        Annotated[int, Field(strict=True, ge=0, le=GREATEST_EXACT_INTEGER)] | None, Field(description="null: 0.")
     ] = None
     planner: Annotated[
         Annotated[str, Field(min_length=1, max_length=64)] | None,
-        Field(description="Who recommends moves: `telling`, `nnql`, `random`, `constant:<m>`; null: the default."),
+        Field(description="`telling`, `nnql`, `random` or `constant:<m>`; null: the default."),
     ] = None
     belief: Annotated[FilterKind | None, Field(description="The filter; null: grid.")] = None
-    update: Annotated[
-        UpdateRule | None, Field(description="How a view counts; null: as the map's relevance wants.")
-    ] = None
+    update: Annotated[UpdateRule | None, Field(description="null: as the map's relevance wants.")] = None
 
     def config(self) -> SessionConfig:
         """The engine's form."""
@@ -112,8 +108,7 @@ class TruePositions(JsonBody):
         Field(
             min_length=1,
             max_length=MAX_OBSERVATIONS_FED_BACK,
-            description="One route position for every observation of the session; null where it is unknown, which "
-            "takes back nothing told before.",
+            description="One route position an observation; null: unknown, which takes back nothing told before.",
         ),
         FailFast(),
     ]
@@ -126,14 +121,12 @@ class TruthsBody(TruePositions):
         list[list[Annotated[StrictInt, Field(ge=0, le=GREATEST_ID)]]] | None,
         Field(
             max_length=MAX_OBSERVATIONS_FED_BACK,
-            description="For each of the same observations the map images that show its place: each view's own "
-            "retrieval is then ranked by them. null: it is not.",
+            description="For each of the same observations the map images that show its place, to rank its retrieval.",
         ),
         FailFast(),
     ] = None
     first_observation: Annotated[
-        int,
-        Field(strict=True, ge=0, description="The observation, from 0, that the first of the lists belongs to."),
+        int, Field(strict=True, ge=0, description="The observation, from 0, that the first of the lists belongs to.")
     ] = 0
 
 
@@ -185,20 +178,11 @@ class TruthsAnswer(Answer):
     n_left_out: Annotated[int, Field(description="Observations whose true position is unknown.", ge=0)]
     anr: Annotated[
         float | None,
-        Field(
-            description="Averaged normalised rank of the true map image in the belief, in percent: 0 is perfect, 50 "
-            "chance; null where no true position is known.",
-            ge=0,
-            le=100,
-        ),
+        Field(description="ANR of the belief, in percent: 0 is perfect, 50 chance; null: none is known.", ge=0, le=100),
     ]
     retrieval_ranks: Annotated[
         list[float | None] | None,
-        Field(
-            description="For each observation told of, how many map images its own view placed before the best of its "
-            "`true_map_images`, others tied with that one counted half; null where there is none, null for all where "
-            "none were told."
-        ),
+        Field(description="How many map images each view placed before the best of its `true_map_images`, ties half."),
     ]
     map_version: Annotated[int, Field(description="The map that the session is pinned to.")]
 
@@ -218,28 +202,16 @@ def render_session(view: SessionView) -> SessionAnswer:
 
 
 def render_observation(view: SessionView, watch: Stopwatch) -> ObservationAnswer:
-    """A session after an observation.
-
-    Args:
-        view: The session.
-        watch: Runs since the request arrived.
-    """
+    """A session after an observation; the watch runs since the request arrived."""
     retrieval = [] if view.relevance is None else render_shortlist(view.snapshot.route, view.shortlist, view.relevance)
     return {**render_session(view), "retrieval": retrieval, "timings_ms": watch.timings_ms()}
 
 
 def render_listed(listed: ListedSession) -> ListedSessionAnswer:
     """A session in a list."""
-    session = listed.session
-    return ListedSessionAnswer(
-        session_id=session.session_id,
-        domain=session.domain,
-        map_version=session.map_version,
-        key_id=session.key_id,
-        n_observations=listed.n_observations,
-        created_at=_iso(session.created_at),
-        expires_at=_iso(session.expires_at),
-    )
+    answer = vars(listed.session) | {"n_observations": listed.n_observations}
+    times = {name: _iso(answer[name]) for name in ("created_at", "expires_at")}
+    return ListedSessionAnswer.model_validate(answer | times)
 
 
 def _iso(seconds: float) -> str:
@@ -266,13 +238,7 @@ async def post_session(
     domain: DomainName,
     request: Request,
     running: Running,
-    idempotency_key: Annotated[
-        KeyWord | None,
-        idempotency_header(
-            "body again begins no second session: the first one is answered, as it stands. Choose one that nobody "
-            "else will, such as a UUID."
-        ),
-    ] = None,
+    idempotency_key: KeyOfCreation = None,
 ) -> Response:
     """Begin a session on the domain's active map, which it keeps whatever is activated later."""
     active = await running.active(domain)
@@ -319,14 +285,9 @@ async def post_observation(
         if idempotency_key is not None:
             query = f"{media_type}\n{action_m!r}\n{action_std_m!r}\n".encode()
             named = IdempotencyKey(idempotency_key, hashlib.sha256(query + body).digest())
-        observation = Observation(
-            partial(view_in, body, running, media_type),
-            action_m,
-            action_std_m,
-            shortlist,
-            named,
-            None if if_match is None else insisted_on(if_match),
-        )
+        decode = partial(view_in, body, running, media_type)
+        models = None if if_match is None else insisted_on(if_match)
+        observation = Observation(decode, action_m, action_std_m, shortlist, named, models)
         view = await running.sessions.observe(session_id, observation, watch, robot_of(request))
     except DeepSimbadError as error:
         running.metrics.observed(error.code)
@@ -397,25 +358,22 @@ async def delete_session(session_id: SessionId, request: Request, running: Runni
     openapi_extra=declare_json(TruthsBody),
 )
 async def post_truths(session_id: SessionId, request: Request, running: Running) -> TruthsAnswer:
-    """Rank the truth in the belief as it was after every observation.
+    """Rank the truth in the belief as it was after every observation, and keep the positions to learn from.
 
     The session may have ended, up to a day ago unless the settings say otherwise. The answer's ANR is that of this
-    session; the metric `deepsimbad_live_anr_percent` counts every observation once, whoever tells of it how often. The
-    positions are kept, so that a map can learn from them.
+    session; the metric `deepsimbad_live_anr_percent` counts every observation once.
     """
     body = await read_json(request, TruthsBody)
     ranked, before_m = await running.truths.keep(
         session_id, body.true_positions_m, body.true_map_images, body.first_observation, robot_of(request)
     )
     await run_sync(running.metrics.fed_back, ranked.session.domain, ranked.new_since(before_m).tolist())
-    ranks = ranked.retrieval_rank
+    ranks = None if ranked.retrieval_rank is None else ranked.retrieval_rank[ranked.first :].tolist()
     return TruthsAnswer(
         n_scored=ranked.n_scored,
         n_left_out=ranked.n_left_out,
         anr=ranked.anr,
-        retrieval_ranks=None
-        if ranks is None
-        else [None if math.isnan(rank) else rank for rank in ranks[ranked.first :]],
+        retrieval_ranks=None if ranks is None else [None if math.isnan(rank) else rank for rank in ranks],
         map_version=ranked.session.map_version,
     )
 

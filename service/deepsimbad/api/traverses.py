@@ -38,7 +38,7 @@ from deepsimbad.api.requests import (
     read_json,
 )
 from deepsimbad.core.drive import MAX_POSITION_M, UNKNOWN_TIMESTAMP, Drive
-from deepsimbad.engine.localizer import View, ready_encodings
+from deepsimbad.engine.localizer import ready_encodings
 from deepsimbad.engine.worker import EncodedImage, Priority
 from deepsimbad.errors import (
     ConflictError,
@@ -49,7 +49,6 @@ from deepsimbad.errors import (
     TraverseInUseError,
     UnknownTraverseError,
 )
-from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.image import MEDIA_TYPES
 from deepsimbad.store.durable import storage_faults
 from deepsimbad.store.records import ListPage
@@ -122,10 +121,7 @@ def _describe(traverse: Traverse) -> TraverseAnswer:
 @router.post(
     "",
     status_code=201,
-    responses={
-        200: {"model": TraverseAnswer, "description": "It was there already"},
-        **problems(404, 413, 415, 422),
-    },
+    responses={200: {"model": TraverseAnswer, "description": "It was there already"}, **problems(404, 413, 415, 422)},
     openapi_extra=declare_json(TraverseBody),
 )
 async def post_traverse(domain: DomainName, request: Request, response: Response, running: Running) -> TraverseAnswer:
@@ -151,10 +147,7 @@ async def post_traverse(domain: DomainName, request: Request, response: Response
 
 @router.get("", responses=problems(404, 422))
 async def list_traverses(
-    domain: DomainName,
-    running: Running,
-    limit: Limit = USUALLY_AT_ONCE,
-    cursor: TraversesAfter = None,
+    domain: DomainName, running: Running, limit: Limit = USUALLY_AT_ONCE, cursor: TraversesAfter = None
 ) -> TraverseList:
     """The traverses of a domain, by name."""
     data_dir = running.settings.data_dir
@@ -246,7 +239,14 @@ async def put_frame(
     media_type = media_type_of(request, FRAME_TYPES)
     body = await read_bytes(request)
     evaluator = running.evaluators.evaluator(evaluator_config)
-    encoding, weights_sha256 = await _encoded(body, running, media_type, evaluator)
+    weights_sha256 = None
+    if media_type == JSON:
+        values = np.array((await parse_json(body, EncodingBody, running)).encoding, np.float64)
+        encoding = (await run_sync(ready_encodings, values[np.newaxis]))[0]
+    else:
+        image, _ = await running.decoders.decoded(body, evaluator, Priority.BATCH)
+        encoded = cast("EncodedImage", await running.look(evaluator, image, lambda view: view, Priority.BATCH))
+        encoding, weights_sha256 = encoded.values, encoded.weights_sha256
 
     def store() -> tuple[bool, int]:
         with running.open_traverses.lend(domain, name) as traverse:
@@ -258,23 +258,6 @@ async def put_frame(
     return FrameAnswer(index=index, n_frames=n_frames)
 
 
-async def _encoded(
-    body: bytes, running: Services, media_type: str, evaluator: Evaluator
-) -> tuple[NDArray[np.float32], str | None]:
-    """The encoding of the frame in a body, and by which weights it was made."""
-    if media_type == JSON:
-        values = np.array((await parse_json(body, EncodingBody, running)).encoding, np.float64)
-        return (await run_sync(ready_encodings, values[np.newaxis]))[0], None
-    image, _ = await running.decoders.decoded(body, evaluator, Priority.BATCH)
-    encoded = await running.look(evaluator, image, _as_encoded, Priority.BATCH)
-    return encoded.values, encoded.weights_sha256
-
-
-def _as_encoded(view: View) -> EncodedImage:
-    """What the inference worker makes of an image."""
-    return cast("EncodedImage", view)
-
-
 @router.post(
     "/{name}/frames",
     responses=problems(404, 413, 415, 422),
@@ -284,8 +267,7 @@ def _as_encoded(view: View) -> EncodedImage:
                 "type": "string",
                 "format": "binary",
                 "description": "npz (numpy.savez) of `encodings` [n, d] float, `index` [n] integer, `position_m` [n], "
-                "and where known `timestamp_us` [n] integer (-1: unknown), `x_m` and `y_m` [n] (NaN: unknown). Metres, "
-                "at most 1e9 either way.",
+                "and where known `timestamp_us` [n] integer (-1: unknown), `x_m` and `y_m` [n] (NaN: unknown).",
             }
         }
     ),
@@ -306,23 +288,16 @@ async def post_frames(domain: DomainName, name: TraverseName, request: Request, 
 
     data_dir = running.settings.data_dir  # the system's folder for such files is often memory
     with running.uploads.taken(), storage_faults(data_dir), tempfile.TemporaryFile(dir=data_dir) as spool:
-        await _spool_body(request, spool)
+        chunk = bytearray()
+        async for piece in request.stream():
+            chunk += piece
+            if len(chunk) >= _SPOOL_CHUNK_BYTES:
+                await run_sync(spool.write, bytes(chunk))
+                chunk.clear()
+        await run_sync(spool.write, bytes(chunk))
+        if spool.tell() == 0:
+            raise EmptyBodyError("the body is empty: send an npz file (numpy.savez)")
         return await run_sync(store, spool, limiter=running.batches)
-
-
-async def _spool_body(request: Request, spool: IO[bytes]) -> None:
-    """Write a body to disk as it streams in, a chunk in memory."""
-    chunk = bytearray()
-    n_bytes = 0
-    async for piece in request.stream():
-        chunk += piece
-        n_bytes += len(piece)
-        if len(chunk) >= _SPOOL_CHUNK_BYTES:
-            await run_sync(spool.write, bytes(chunk))
-            chunk.clear()
-    if n_bytes == 0:
-        raise EmptyBodyError("the body is empty: send an npz file (numpy.savez)")
-    await run_sync(spool.write, bytes(chunk))
 
 
 def _check_traverse(running: Services, domain: str, name: str) -> None:
@@ -348,18 +323,11 @@ class InvalidBatchError(InvalidInputError, code="invalid_batch"):
 
 
 def read_batch(file: IO[bytes], max_bytes: int) -> Drive:
-    """Read the arrays of a batch.
-
-    Args:
-        file: The npz file, at any position.
-        max_bytes: The most its arrays may hold together, unpacked.
-
-    Returns:
-        The frames, their values not yet judged; `encodings` may still be of another float type.
+    """Read the arrays of an npz file, whose values are not yet judged; `encodings` may still be of another float type.
 
     Raises:
         InvalidBatchError: Not such a file; pickled objects are never read.
-        TooLargeError: The arrays are larger than `max_bytes`.
+        TooLargeError: The arrays are larger than `max_bytes`, unpacked.
     """
     try:
         _check_directory(file)
@@ -398,36 +366,28 @@ def _check_directory(file: IO[bytes]) -> None:
 def _arrays(archive: zipfile.ZipFile, max_bytes: int) -> dict[str, NDArray[Any]]:
     members = {member.filename.removesuffix(".npy"): member for member in archive.infolist()}
     if not set(members) <= set(MEMBERS) or len(members) != len(archive.infolist()):
-        raise InvalidBatchError(
-            f"the batch holds arrays that are not known or stand twice; known are {', '.join(MEMBERS)}",
-            allowed=list(MEMBERS),
-        )
+        what = f"the batch holds arrays that are not known or stand twice; known are {', '.join(MEMBERS)}"
+        raise InvalidBatchError(what, allowed=list(MEMBERS))
     if missing := [name for name in REQUIRED if name not in members]:
         raise InvalidBatchError(f"the batch lacks {', '.join(missing)}", missing=missing)
     n_bytes = sum(member.file_size for member in members.values())
     if n_bytes > max_bytes:
-        raise TooLargeError(
-            f"the batch unpacks to {n_bytes} bytes; at most {max_bytes} are taken, send fewer frames at once",
-            max_bytes=max_bytes,
-        )
+        what = f"the batch unpacks to {n_bytes} bytes; at most {max_bytes} are taken, send fewer frames at once"
+        raise TooLargeError(what, max_bytes=max_bytes)
     arrays = {}
     for name, member in members.items():
         with archive.open(member) as stream:
-            _check_header(name, stream, member.file_size)
-        with archive.open(member) as stream:
-            arrays[name] = np.lib.format.read_array(stream, allow_pickle=False, max_header_size=_MAX_HEADER_BYTES)
-            if stream.read(1):  # reading to the end is also what checks the member's checksum
-                raise InvalidBatchError(f"{name} is longer than its header says")
+            arrays[name] = _read_array(name, stream, member.file_size)
     return arrays
 
 
-def _check_header(name: str, stream: IO[bytes], n_bytes: int) -> None:
-    """Refuse a shape or type that is not the array's own, before room is made for its numbers."""
+def _read_array(name: str, stream: IO[bytes], n_bytes: int) -> NDArray[Any]:
+    """One array of the batch; room for its numbers is made when its shape and type are known to be right."""
     version = np.lib.format.read_magic(stream)
     if version not in {(1, 0), (2, 0)}:
         raise InvalidBatchError(f"{name} has npy version {version}; 1.0 and 2.0 are read")
     read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    shape, _, dtype = read(stream, max_header_size=_MAX_HEADER_BYTES)
+    shape, is_by_columns, dtype = read(stream, max_header_size=_MAX_HEADER_BYTES)
     kinds = _KINDS.get(name, "iu")
     if dtype.kind not in kinds or dtype.itemsize > 8:
         raise InvalidBatchError(f"{name} holds {dtype}; it must hold {'floats' if 'f' in kinds else 'integers'}")
@@ -435,3 +395,5 @@ def _check_header(name: str, stream: IO[bytes], n_bytes: int) -> None:
         raise InvalidBatchError(f"{name} has shape {list(shape)}; it must have {MEMBERS[name]} dimensions")
     if stream.tell() + math.prod(shape) * dtype.itemsize != n_bytes:
         raise InvalidBatchError(f"{name} does not hold the {math.prod(shape)} numbers its header says")
+    values = np.frombuffer(stream.read(), dtype)  # reading to the end is also what checks the member's checksum
+    return values.reshape(shape, order="F" if is_by_columns else "C")
