@@ -109,7 +109,7 @@ class Door:
         except ClientDisconnect:  # nobody is left to be answered
             request.status = request.status or _SENDER_LEFT
         except Exception:
-            log.exception("request failed", extra={"request_id": scope["state"]["request_id"], **request.about()})
+            log.exception("request failed", extra={"request_id": scope["state"]["request_id"]})
             if request.status == 0:
                 await unexpected_response(scope)(scope, receive, request.send)
         finally:
@@ -240,7 +240,8 @@ class _Request:
         route = getattr(scope.get("route"), "path", UNROUTED)
         method = scope["method"] if scope["method"] in _METHODS else "OTHER"
         metrics.request_ended(method, route, self.status, seconds)
-        about = self.about()
+        noted = scope["state"] | (scope.get("path_params") or {})
+        about = {name: noted[name] for name in _NOTED if name in noted}
         if about.get("code") in REFUSALS:
             metrics.refused(about.get("limit", about["code"]))
         if log.isEnabledFor(logging.INFO):
@@ -253,11 +254,6 @@ class _Request:
                 "ms": round(seconds * 1000, 2),
             }
             log.info("request", extra=line | about)
-
-    def about(self) -> dict[str, str]:
-        """Whose request it is, what it is about and the code of what was wrong, as far as each is known."""
-        noted = self._scope["state"] | (self._scope.get("path_params") or {})
-        return {name: noted[name] for name in _NOTED if name in noted}
 
     def _count(self) -> None:
         self._door.under_way.take()

@@ -16,21 +16,18 @@ from deepsimbad.api.problems import declare_json, location, problems
 from deepsimbad.api.requests import (
     GREATEST_EXACT_INTEGER,
     NAME_PATTERN,
-    USUALLY_AT_ONCE,
     Answer,
     DomainName,
     JsonBody,
     KeyOfCreation,
-    Limit,
     Name,
     Next,
     OfDomain,
+    Page,
     Running,
-    after,
-    cursor_of,
     id_under_key,
     key_id_of,
-    number_of,
+    page_of,
     read_json,
 )
 from deepsimbad.api.sessions import TruePositions
@@ -234,17 +231,10 @@ async def _stream(running: Running) -> AsyncIterator[None]:
 
 
 @router.get("", responses=problems(404, 422))
-async def list_jobs(
-    running: Running,
-    domain: OfDomain = None,
-    limit: Limit = USUALLY_AT_ONCE,
-    cursor: Annotated[str | None, after("jobs")] = None,
-) -> JobList:
+async def list_jobs(running: Running, page: Annotated[Page, page_of("jobs")], domain: OfDomain = None) -> JobList:
     """Jobs, newest first."""
-    page = await run_sync(running.catalog.newest_jobs, domain, number_of(cursor), limit)
-    return JobList(
-        jobs=[JobAnswer.model_validate(record) for record in page.records], next=cursor_of("jobs", page.last_key)
-    )
+    listed = await run_sync(running.catalog.newest_jobs, domain, page.number, page.limit)
+    return JobList.model_validate({"jobs": listed.records, "next": page.next(listed.last_key)})
 
 
 @router.get("/{job_id}", responses=problems(404, 422))

@@ -60,16 +60,6 @@ class ObservationBody(JsonBody):
     dissimilarities: Annotated[tuple[StrictFloat, ...], FailFast()] = ()
     encoding: Annotated[tuple[StrictFloat, ...], FailFast()] = ()
 
-    def view(self) -> RankedLandmarks | Dissimilarities | ReadyEncoding:
-        """The engine's form; raises InvalidRequestError."""
-        if len(self.model_fields_set) != 1:
-            raise invalid_body("give exactly one of ranked_landmarks, dissimilarities, encoding")
-        if "ranked_landmarks" in self.model_fields_set:
-            return RankedLandmarks(self.ranked_landmarks)
-        if "dissimilarities" in self.model_fields_set:
-            return Dissimilarities(np.array(self.dissimilarities, np.float64))
-        return ReadyEncoding(np.array(self.encoding, np.float64))
-
 
 def only(name: str, items: dict[str, Any], description: str) -> dict[str, Any]:
     """The schema of an object with one list of numbers."""
@@ -295,7 +285,14 @@ async def post_localization(
 async def view_in(body: bytes, running: Services, media_type: str, evaluator: Evaluator) -> View:
     """The observation in a body that has been read; an image at its evaluator's size."""
     if media_type == JSON:
-        return (await parse_json(body, ObservationBody, running)).view()
+        given = await parse_json(body, ObservationBody, running)
+        if len(given.model_fields_set) != 1:
+            raise invalid_body("give exactly one of ranked_landmarks, dissimilarities, encoding")
+        if "ranked_landmarks" in given.model_fields_set:
+            return RankedLandmarks(given.ranked_landmarks)
+        if "dissimilarities" in given.model_fields_set:
+            return Dissimilarities(np.array(given.dissimilarities, np.float64))
+        return ReadyEncoding(np.array(given.encoding, np.float64))
     if media_type == RANKS:
         return PackedRanks(body)
     image, is_blank = await running.decoders.decoded(body, evaluator, Priority.LIVE)

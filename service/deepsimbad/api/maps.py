@@ -1,7 +1,6 @@
 """A domain's map versions: their history, switching between them, their files."""
 
 import base64
-import hashlib
 import logging
 import re
 from http import HTTPStatus
@@ -19,23 +18,20 @@ from deepsimbad.api.problems import declare_json, problems
 from deepsimbad.api.requests import (
     GREATEST_ID,
     KEPT,
-    USUALLY_AT_ONCE,
     Answer,
     DomainName,
     JsonBody,
-    Limit,
     Next,
+    Page,
     Running,
-    after,
-    cursor_of,
     names,
-    number_of,
+    page_of,
     read_json,
 )
 from deepsimbad.engine.maps import load_snapshot, unreadable
 from deepsimbad.errors import ConflictError, DamagedMapError, UnknownMapVersionError
 from deepsimbad.store.catalog import ANY, removed
-from deepsimbad.store.durable import storage_faults
+from deepsimbad.store.map_file import verify
 from deepsimbad.store.records import MapState
 
 router = APIRouter(prefix="/v1/admin/domains", tags=["admin: maps"])
@@ -44,7 +40,6 @@ log = logging.getLogger(__name__)
 Headers = list[tuple[bytes, bytes]]
 MEDIA_TYPE = "application/vnd.sqlite3"
 MapVersion = Annotated[int, PathParameter(ge=1, le=GREATEST_ID, description="A map version's number.")]
-MapsAfter = Annotated[str | None, after("maps")]
 _RANGE = re.compile(r"bytes=(\d{0,18})-(\d{0,18})")
 
 _TEXT = {"type": "string"}
@@ -91,14 +86,10 @@ class MapList(Answer):
 
 
 @router.get("/{domain}/maps", responses=problems(404, 422))
-async def list_maps(
-    domain: DomainName, running: Running, limit: Limit = USUALLY_AT_ONCE, cursor: MapsAfter = None
-) -> MapList:
+async def list_maps(domain: DomainName, running: Running, page: Annotated[Page, page_of("maps")]) -> MapList:
     """The history of a domain's map, newest version first."""
-    page = await run_sync(running.catalog.newest_maps, domain, number_of(cursor), limit)
-    return MapList(
-        maps=[MapAnswer.model_validate(record) for record in page.records], next=cursor_of("maps", page.last_key)
-    )
+    listed = await run_sync(running.catalog.newest_maps, domain, page.number, page.limit)
+    return MapList.model_validate({"maps": listed.records, "next": page.next(listed.last_key)})
 
 
 @router.put(
@@ -158,7 +149,7 @@ async def get_map_file(domain: DomainName, version: MapVersion, request: Request
             raise UnknownMapVersionError(f"map {version} of domain {domain} is still being built", version=version)
         path = running.catalog.map_path(domain, version)
         try:
-            check_digest(path, record.sha256)
+            verify(path, record.sha256)
         except DamagedMapError as error:
             raise unreadable(running.catalog, domain, version) from error
         return path, record.sha256, path.stat().st_size
@@ -171,15 +162,6 @@ async def get_map_file(domain: DomainName, version: MapVersion, request: Request
     repr_digest = base64.b64encode(bytes.fromhex(sha256)).decode()
     headers = {**KEPT, "ETag": etag, "Repr-Digest": f"sha-256=:{repr_digest}:"}
     return FileResponse(path, headers=headers, media_type=MEDIA_TYPE, filename=f"{domain}-{version:06d}.sqlite")
-
-
-def check_digest(path: Path, sha256: str) -> None:
-    """Read a file against its digest; raises DamagedMapError, and UnavailableError where the disk fails."""
-    if not path.is_file():
-        raise DamagedMapError(f"{path.name} is missing", file=path.name)
-    with storage_faults(path, DamagedMapError), path.open("rb") as stream:
-        if hashlib.file_digest(stream, "sha256").hexdigest() != sha256:
-            raise DamagedMapError(f"{path.name} is not the file that was sealed: its SHA-256 differs", file=path.name)
 
 
 def one_range(headers: Headers, n_bytes: int) -> Headers:

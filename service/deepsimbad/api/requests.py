@@ -11,7 +11,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Annotated, Any, TypeVar, cast
+from typing import Annotated, Any, NamedTuple, TypeVar, cast
 
 from anyio import CapacityLimiter
 from anyio.to_thread import run_sync
@@ -72,7 +72,8 @@ class Slots:
 
     def take(self, n: int = 1) -> None:
         """Take room; raises OverloadedError where there is none."""
-        self.check(n)
+        if self.n_taken + n > self.most:
+            self.check(n)
         self.n_taken += n
 
     def give_back(self, n: int = 1) -> None:
@@ -188,12 +189,11 @@ class Services:
 
         An answer whose longest list, of `n_listed`, is long is written beside the event loop.
         """
-
-        def write() -> tuple[T, bytes]:
-            answer = render(*given)
-            return answer, to_json(answer)
-
-        return await run_sync(write, limiter=self.long_work) if n_listed > LONG_LIST else write()
+        if n_listed > LONG_LIST:
+            answer = await run_sync(render, *given, limiter=self.long_work)
+            return answer, await run_sync(to_json, answer, limiter=self.long_work)
+        answer = render(*given)
+        return answer, to_json(answer)
 
 
 async def services_of(request: Request) -> Services:
@@ -211,26 +211,39 @@ DomainName = Annotated[str, Path(alias="domain", pattern=NAME_PATTERN, descripti
 SessionId = Annotated[str, Path(pattern=NAME_PATTERN, description="A session's id.")]
 OfDomain = Annotated[str | None, Query(pattern=NAME_PATTERN, description="Only this domain's; absent: all.")]
 
-# A page of a list begins at a cursor, which names the list and the key of the last thing shown.
-USUALLY_AT_ONCE = 100
-Limit = Annotated[int, Query(ge=1, le=1000, description="Most entries of the answer.")]
 Next = Annotated[str | None, Field(description="Ask for the list `after` this for its next page; null: it ends here.")]
 
 
-def after(what: str, key_pattern: str = "[0-9]{1,18}$") -> Any:
-    """The parameter `after` of a list."""
-    description = "`next` of the page before; absent: the first page."
-    return Query(alias="after", pattern=f"^{what}-{key_pattern}", description=description)
+class Page(NamedTuple):
+    """Which page of a list is asked for: at most `limit` entries behind the one of this key; None: the first."""
+
+    list_name: str
+    limit: int
+    key: str | None
+
+    @property
+    def number(self) -> int | None:
+        """The key, of a list of numbers."""
+        return None if self.key is None else int(self.key)
+
+    def next(self, last_key: int | str | None) -> Next:
+        """The cursor of the page behind a key: the list's name and the key; None where there is none."""
+        return None if last_key is None else f"{self.list_name}-{last_key}"
 
 
-def number_of(cursor: str | None) -> int | None:
-    """The key that a list of numbers goes on behind; None: from its beginning."""
-    return None if cursor is None else int(cursor.partition("-")[2])
+def page_of(list_name: str, key_pattern: str = "[0-9]{1,18}$") -> Any:
+    """The parameters `limit` and `after` of a list, as a `Page`."""
+    cursor = f"^{list_name}-{key_pattern}"
 
+    async def asked(
+        limit: Annotated[int, Query(ge=1, le=1000, description="Most entries of the answer.")] = 100,
+        after: Annotated[
+            str | None, Query(pattern=cursor, description="`next` of the page before; absent: the first page.")
+        ] = None,
+    ) -> Page:
+        return Page(list_name, limit, None if after is None else after.removeprefix(f"{list_name}-"))
 
-def cursor_of(what: str, last_key: int | str | None) -> Next:
-    """What `next` says: the cursor of the page behind a key; None where there is none."""
-    return None if last_key is None else f"{what}-{last_key}"
+    return Depends(asked)
 
 
 # Entity tags: which content a request has, or insists on (RFC 9110, 13.1)

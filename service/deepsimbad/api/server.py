@@ -172,31 +172,11 @@ def serve(settings: Settings, create: bool = False) -> None:
         return not (hasattr(app.state, "startup_error") and record.getMessage().startswith("Traceback"))
 
     logging.getLogger("uvicorn.error").addFilter(is_news)
-    sockets = _bound(settings.host, settings.port)
     try:
-        _Server(config, app).run(sockets)
+        _Server(config, app).run()
     except SystemExit as ended:  # how uvicorn says that it could not start
+        why = ended.__context__
+        if isinstance(why, OSError):
+            raise UnavailableError(f"cannot listen on {settings.host}:{settings.port}: {why.strerror or why}") from why
         unforeseen = UnavailableError("the service could not start: the log says why")
         raise getattr(app.state, "startup_error", unforeseen) from ended
-    finally:
-        for bound in sockets:
-            bound.close()
-
-
-def _bound(host: str, port: int) -> list[socket.socket]:
-    """Sockets bound to all addresses of a host, which do not listen yet."""
-    sockets: list[socket.socket] = []
-    try:
-        for family, kind, protocol, _, address in dict.fromkeys(
-            socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
-        ):
-            sockets.append(socket.socket(family, kind, protocol))
-            sockets[-1].setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            if family == socket.AF_INET6:  # its IPv4 side, where there is one, has a socket of its own
-                sockets[-1].setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
-            sockets[-1].bind(address)
-    except OSError as error:
-        for opened in sockets:
-            opened.close()
-        raise UnavailableError(f"cannot listen on {host}:{port}: {error.strerror or error}") from error
-    return sockets

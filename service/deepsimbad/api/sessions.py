@@ -31,27 +31,24 @@ from deepsimbad.api.requests import (
     GREATEST_EXACT_INTEGER,
     GREATEST_ID,
     JSON,
-    USUALLY_AT_ONCE,
     Answer,
     DomainName,
     JsonBody,
     KeyOfCreation,
     KeyWord,
     LandmarkModelTag,
-    Limit,
     Next,
     OfDomain,
+    Page,
     Running,
     Services,
     SessionId,
-    after,
-    cursor_of,
     id_under_key,
     idempotency_header,
     insisted_on,
     key_id_of,
     media_type_of,
-    number_of,
+    page_of,
     read_bytes,
     read_json,
     robot_of,
@@ -380,15 +377,10 @@ async def post_truths(session_id: SessionId, request: Request, running: Running)
 
 @listing.get("", responses=problems(404, 422))
 async def list_sessions(
-    running: Running,
-    domain: OfDomain = None,
-    limit: Limit = USUALLY_AT_ONCE,
-    cursor: Annotated[str | None, after("sessions")] = None,
+    running: Running, page: Annotated[Page, page_of("sessions")], domain: OfDomain = None
 ) -> SessionList:
     """Living sessions, newest first; whoever may list them may also ask and end them by their ids."""
     if domain is not None:
         await run_sync(running.catalog.domain, domain)
-    page = await running.sessions.newest(domain, number_of(cursor), limit)
-    return SessionList(
-        sessions=[render_listed(listed) for listed in page.records], next=cursor_of("sessions", page.last_key)
-    )
+    listed = await running.sessions.newest(domain, page.number, page.limit)
+    return SessionList(sessions=[render_listed(session) for session in listed.records], next=page.next(listed.last_key))

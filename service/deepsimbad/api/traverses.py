@@ -5,6 +5,7 @@ import math
 import struct
 import tempfile
 import zipfile
+from contextlib import suppress
 from dataclasses import replace
 from typing import IO, Annotated, Any, cast
 
@@ -21,18 +22,16 @@ from deepsimbad.api.requests import (
     GREATEST_EXACT_INTEGER,
     JSON,
     NAME_PATTERN,
-    USUALLY_AT_ONCE,
     Answer,
     DomainName,
     JsonBody,
-    Limit,
     Name,
     Next,
+    Page,
     Running,
     Services,
-    after,
-    cursor_of,
     media_type_of,
+    page_of,
     parse_json,
     read_bytes,
     read_json,
@@ -58,7 +57,6 @@ router = APIRouter(prefix="/v1/admin/domains/{domain}/traverses", tags=["admin: 
 log = logging.getLogger(__name__)
 
 TraverseName = Annotated[str, Path(alias="name", pattern=NAME_PATTERN, description="A traverse's name.")]
-TraversesAfter = Annotated[str | None, after("traverses", NAME_PATTERN.removeprefix("^"))]
 FRAME_TYPES = (*MEDIA_TYPES, JSON)
 _SPOOL_CHUNK_BYTES = 1 << 20
 
@@ -111,10 +109,6 @@ class BatchAnswer(Answer):
     n_frames: Annotated[int, Field(description="Of the traverse, now.")]
 
 
-def _describe(traverse: Traverse) -> TraverseAnswer:
-    return TraverseAnswer(name=traverse.name, n_frames=traverse.n_frames, missing=traverse.missing)
-
-
 # Handlers of traverses
 
 
@@ -133,10 +127,10 @@ async def post_traverse(domain: DomainName, request: Request, response: Response
         running.catalog.domain(domain)
         try:
             with Traverse.create(data_dir, domain, body.name) as traverse:
-                return _describe(traverse), True
+                return TraverseAnswer.model_validate(traverse), True
         except ConflictError:
             with Traverse.open(data_dir, domain, body.name) as traverse:
-                return _describe(traverse), False
+                return TraverseAnswer.model_validate(traverse), False
 
     answer, created = await run_sync(make)
     response.status_code = 201 if created else 200
@@ -147,24 +141,22 @@ async def post_traverse(domain: DomainName, request: Request, response: Response
 
 @router.get("", responses=problems(404, 422))
 async def list_traverses(
-    domain: DomainName, running: Running, limit: Limit = USUALLY_AT_ONCE, cursor: TraversesAfter = None
+    domain: DomainName,
+    running: Running,
+    page: Annotated[Page, page_of("traverses", NAME_PATTERN.removeprefix("^"))],
 ) -> TraverseList:
     """The traverses of a domain, by name."""
     data_dir = running.settings.data_dir
-    first = "" if cursor is None else cursor.removeprefix("traverses-")
 
     def described() -> TraverseList:
         running.catalog.domain(domain)
-        names = [name for name in Traverse.list(data_dir, domain) if name > first]
-        page = ListPage.of(((name, name) for name in names), limit)
+        names = [name for name in Traverse.list(data_dir, domain) if name > (page.key or "")]
+        listed = ListPage.of(((name, name) for name in names), page.limit)
         answers = []
-        for name in page.records:  # a file each, so that those of other pages stay closed
-            try:
-                with Traverse.open(data_dir, domain, name) as traverse:
-                    answers.append(_describe(traverse))
-            except UnknownTraverseError:  # deleted since it was listed
-                continue
-        return TraverseList(traverses=answers, next=cursor_of("traverses", page.last_key))
+        for name in listed.records:  # a file each, so that those of other pages stay closed
+            with suppress(UnknownTraverseError), Traverse.open(data_dir, domain, name) as traverse:
+                answers.append(TraverseAnswer.model_validate(traverse))
+        return TraverseList(traverses=answers, next=page.next(listed.last_key))
 
     return await run_sync(described)
 
@@ -176,7 +168,7 @@ async def get_traverse(domain: DomainName, name: TraverseName, running: Running)
     def described() -> TraverseAnswer:
         running.catalog.domain(domain)
         with Traverse.open(running.settings.data_dir, domain, name) as traverse:
-            return _describe(traverse)
+            return TraverseAnswer.model_validate(traverse)
 
     return await run_sync(described)
 
