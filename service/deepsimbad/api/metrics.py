@@ -10,6 +10,7 @@ import time
 from collections import Counter as CountOf
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass, field
 from datetime import datetime
 from functools import cache
 from typing import Any
@@ -148,33 +149,21 @@ class Metrics:
             return generate_latest(self._registry)
 
 
+@dataclass(eq=False)
 class StateCollector(Collector):
     """Gives what `look` saw, and nothing of the scrape before, so that series of deleted domains end.
 
-    Args:
-        catalog: Domains, maps and jobs.
-        maps: Those in memory.
-        faults: What keeps the service from being ready.
-        worker: Whose queue is shown.
-        sessions: Those that have not ended.
+    `_faults` tells what keeps the service from being ready.
     """
 
-    def __init__(
-        self,
-        catalog: Catalog,
-        maps: Maps,
-        faults: Callable[[], Sequence[str]],
-        worker: InferenceWorker,
-        sessions: Sessions,
-    ) -> None:
-        self._catalog = catalog
-        self._maps = maps
-        self._faults = faults
-        self._worker = worker
-        self._sessions = sessions
-        self._domains: Sequence[DomainRecord] | None = None
-        self._jobs: Sequence[JobRecord] = ()
-        self._serving: Mapping[str, MapRecord] = {}
+    _catalog: Catalog
+    _maps: Maps
+    _faults: Callable[[], Sequence[str]]
+    _worker: InferenceWorker
+    _sessions: Sessions
+    _domains: Sequence[DomainRecord] | None = None
+    _jobs: Sequence[JobRecord] = ()
+    _serving: Mapping[str, MapRecord] = field(default_factory=dict)
 
     def look(self) -> set[str] | None:
         """Read the catalog for the next `collect`; the names of its domains, None where it cannot be read."""

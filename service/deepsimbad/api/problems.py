@@ -216,14 +216,11 @@ _DESCRIPTIONS = {
 _RETRY_AFTER = {"Retry-After": {"description": "Seconds to wait.", "schema": {"type": "integer", "minimum": 1}}}
 _CHALLENGE = {"WWW-Authenticate": {"description": "How to authenticate.", "schema": {"const": "Bearer"}}}
 _HEADERS = {401: _CHALLENGE, 429: _RETRY_AFTER, 503: _RETRY_AFTER}
+_DOMAIN = {"domain": "$request.path.domain"}
 # What an answer gives to the calls whose path needs just these: call, status, parameters.
 _LINKS = (
-    ("PUT /v1/admin/domains/{domain}", "201", {"domain": "$request.path.domain"}),
-    (
-        "POST /v1/admin/domains/{domain}/traverses",
-        "201",
-        {"domain": "$request.path.domain", "name": "$response.body#/name"},
-    ),
+    ("PUT /v1/admin/domains/{domain}", "201", _DOMAIN),
+    ("POST /v1/admin/domains/{domain}/traverses", "201", _DOMAIN | {"name": "$response.body#/name"}),
     ("POST /v1/admin/domains/{domain}/remaps", "202", {"job_id": "$response.body#/job_id"}),
     ("POST /v1/admin/domains/{domain}/experience", "202", {"job_id": "$response.body#/job_id"}),
     ("POST /v1/domains/{domain}/sessions", "201", {"session_id": "$response.body#/session_id"}),
