@@ -39,6 +39,7 @@ def keyed(tmp_path_factory):
         client.make_ready_domain("ready")
         keyed = Keyed(data_dir, client)
         until(lambda: client.get("/v1/domains").status_code == 401)
+        until(lambda: client.get("/v1/domains", headers=keyed.robot).status_code == 200)  # made after the other key
         yield keyed
 
 

@@ -171,7 +171,7 @@ async def post_remap(
             if name is not None:
                 Traverse.open(running.settings.data_dir, domain, name).close()
         if config.landmark_traverse is None and record.active_version is None:
-            what = "to append to or keep the landmarks of: give a landmark_traverse, and do not append"
+            what = "to take landmarks or images from: make one first, without append and with a landmark_traverse"
             raise NoActiveMapError(f"domain {domain} has no active map {what}", domain=domain)
         if config.append and record.active_version is not None:
             active = running.catalog.map(domain, record.active_version)
