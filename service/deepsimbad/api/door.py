@@ -168,7 +168,7 @@ class _Request:
         origin = self._headers.get(b"origin", b"").decode("latin-1")
         if origin and origin.partition("://")[2] != host and not {origin, "*"} & set(settings.cors_origins):
             what = f"a page of {origin[:100]!r} may not call it"
-        elif host and is_loopback(settings.host) and not _is_ours(host, settings.host, reached):
+        elif host and not _is_ours(host, settings.host, reached) and is_loopback(settings.host):
             what = f"it is not asked by the name {host[:100]!r}"
         else:
             return
@@ -240,8 +240,10 @@ class _Request:
         route = getattr(scope.get("route"), "path", UNROUTED)
         method = scope["method"] if scope["method"] in _METHODS else "OTHER"
         metrics.request_ended(method, route, self.status, seconds)
-        noted = scope["state"] | (scope.get("path_params") or {})
-        about = {name: noted[name] for name in _NOTED if name in noted}
+        noted, about = scope["state"] | (scope.get("path_params") or {}), {}
+        for name in _NOTED:
+            if name in noted:
+                about[name] = noted[name]
         if about.get("code") in REFUSALS:
             metrics.refused(about.get("limit", about["code"]))
         if log.isEnabledFor(logging.INFO):

@@ -203,10 +203,14 @@ def render_plan(plan: Plan | None, actions_m: NDArray[np.float64]) -> NextBestVi
 def render_belief(route: Route, belief: BeliefSummary) -> BeliefAnswer:
     """A belief, with the coordinates of its likeliest places."""
     ids, top = belief.top, list[PlaceAnswer]()
-    x_m, y_m = _finite(route.x_m, ids), _finite(route.y_m, ids)
-    for image, at_m, x, y, mass in zip(
-        ids.tolist(), route.position_m[ids].tolist(), x_m, y_m, belief.top_mass.tolist(), strict=True
-    ):
+    coordinates: list[list[float | None]] = []
+    for metres in (route.x_m, route.y_m):
+        values = np.full(ids.size, np.nan) if metres is None else metres[ids]
+        shown = values.astype(object)
+        shown[~np.isfinite(values)] = None
+        coordinates.append(shown.tolist())
+    positions, masses = route.position_m[ids].tolist(), belief.top_mass.tolist()
+    for image, at_m, x, y, mass in zip(ids.tolist(), positions, *coordinates, masses, strict=True):
         top.append({"map_image": image, "route_position_m": at_m, "x_m": x, "y_m": y, "mass": mass})
     return {
         "mean_m": belief.mean_m,
@@ -218,15 +222,6 @@ def render_belief(route: Route, belief: BeliefSummary) -> BeliefAnswer:
         "histogram": {"edges_m": belief.histogram_edges_m.tolist(), "mass": belief.histogram_mass.tolist()},
         "top": top,
     }
-
-
-def _finite(values: NDArray[np.float64] | None, ids: NDArray[np.int64]) -> list[float | None]:
-    """Values at these ids, None where unknown."""
-    if values is None:
-        return [None] * ids.size
-    chosen = values[ids].astype(object)
-    chosen[~np.isfinite(values[ids])] = None
-    return list(chosen)
 
 
 # Handlers
