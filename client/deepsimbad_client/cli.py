@@ -12,7 +12,7 @@ def main() -> None:
     if missing:
         sys.stderr.write(f"{', '.join(missing)} not installed: pip install 'deep-simbad[replay]'\n")
         sys.exit(1)
-    from deepsimbad_client.commands.group import run  # noqa: PLC0415 - only now is it known to be there
+    from deepsimbad_client.commands import run  # noqa: PLC0415 - only now is it known to be there
 
     sys.exit(run())
 

@@ -1,9 +1,4 @@
-"""Every error the client raises, in one tree.
-
-Three branches: what a recording on disk cannot give (`SourceError`), what the network did not deliver
-(`TransportError`), and what the service answered (`ApiError`, one class per branch of the service's own tree,
-chosen by the problem's stable `code` word and, for a code this version has not heard of, by the HTTP status).
-"""
+"""Every error the client raises, in one tree: of recordings, of the network, of the service's answers."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -44,12 +39,7 @@ class SourceError(DeepSimbadClientError, code="invalid_source"):
 
 
 class BrokenFrameError(SourceError, code="broken_frame"):
-    """One frame of a recording that cannot be read; the rest of the recording is fine.
-
-    Args:
-        message: Which file, and what is wrong with it.
-        reason: The words to count it under, beside a recording's `left_out`.
-    """
+    """One frame of a recording that cannot be read; `reason` is the words to count it under, beside `left_out`."""
 
     def __init__(self, message: str, reason: str = "undecodable") -> None:
         super().__init__(message)
@@ -85,12 +75,7 @@ class NoEarlierMapError(DeepSimbadClientError, code="no_earlier_map"):
 
 
 class JobFailedError(DeepSimbadClientError, code="job_failed"):
-    """A job ended without success.
-
-    Args:
-        message: What the service said of it.
-        job: The job as the service last described it (a `deepsimbad_client.http.models.Job`).
-    """
+    """A job ended without success; `job` is the `Job` as the service last described it."""
 
     def __init__(self, message: str, job: Any) -> None:
         super().__init__(message)
@@ -108,12 +93,8 @@ BY_STATUS: "dict[int, type[ApiError]]" = {}
 class ApiError(DeepSimbadClientError):
     """The service answered with an error (RFC 9457 problem details).
 
-    Attributes:
-        status: The HTTP status.
-        code: The problem's stable code word; `http_<status>` when the answer held none.
-        problem: The whole problem document, with whatever limits and allowed values it names.
-        request_id: The service's id of this request, to quote to its operator.
-        retry_after_s: Seconds the service asked to wait before trying again.
+    `code` is the problem's stable code word (`http_<status>` when the answer held none), `problem` the whole document,
+    `request_id` what its operator finds the request by, `retry_after_s` the seconds it asked to wait.
     """
 
     _advice = ""
@@ -154,10 +135,6 @@ class ApiError(DeepSimbadClientError):
         return f"{self.message} ({self.status} {self.code}{request}){advice}"
 
 
-class BadRequestError(ApiError, status=400):
-    """400: the request could not be read at all."""
-
-
 _KEY_ADVICE = (
     "`deepsimbad keys create --scope {}` makes one where the service runs; give it in $DEEPSIMBAD_API_KEY or --api-key"
 )
@@ -187,10 +164,6 @@ class UnknownJobError(NotFoundError, code="unknown_job"):
     """No such job."""
 
 
-class UnknownMapVersionError(NotFoundError, code="unknown_map_version"):
-    """No such map version in the domain."""
-
-
 class UnknownSessionError(NotFoundError, code="unknown_session"):
     """No such session, or one that ended long ago."""
 
@@ -212,26 +185,11 @@ class LandmarkModelDiffersError(
     code="landmark_model_differs",
     advice="`client.on_board(domain, map_version={map_version})` fetches it",
 ):
-    """The view was ranked by another landmark model than that of the map that should answer: fetch that one.
-
-    `problem` holds both digests, and the `map_version` to ask for.
-    """
-
-
-class TraverseInUseError(ConflictError, code="traverse_in_use"):
-    """A running job still reads the traverse or domain."""
+    """The view was ranked by another landmark model than the answering map's: fetch the `map_version` of `problem`."""
 
 
 class LostActivationError(ConflictError, code="lost_activation"):
     """The active map was not the expected one when the swap was tried."""
-
-
-class MapInUseError(ConflictError, code="map_in_use"):
-    """The map version serves, is being built, or a living session keeps it."""
-
-
-class TooManyDomainsError(ConflictError, code="too_many_domains"):
-    """The service holds as many domains as it may."""
 
 
 class GoneError(ApiError, status=410):
@@ -244,14 +202,6 @@ class EndedSessionError(GoneError, code="ended_session"):
 
 class RetiredMapError(GoneError, code="retired_map"):
     """The map that the session began on is no more: start another session on the present one."""
-
-
-class TooLargeError(ApiError, status=413):
-    """413: more bytes or pixels than a limit allows."""
-
-
-class UnsupportedMediaTypeError(ApiError, status=415):
-    """415: a missing or unsupported content type."""
 
 
 class InvalidInputError(ApiError, status=422):
@@ -282,20 +232,12 @@ class TooManySessionsError(RateLimitedError, code="too_many_sessions"):
     """The service holds as many live sessions as it may."""
 
 
-class TooManyJobsError(RateLimitedError, code="too_many_jobs"):
-    """As many jobs wait for their turn as may."""
-
-
 class ServerError(ApiError):
     """5xx: the service failed."""
 
 
 class UnavailableError(ServerError, status=503):
     """503: the service cannot answer now; its data is safe."""
-
-
-class OverloadedError(UnavailableError, code="overloaded"):
-    """More requests at once than the service answers in good time; `retry_after_s` says when to come again."""
 
 
 class DamagedMapError(UnavailableError, code="damaged_map"):

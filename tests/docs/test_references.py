@@ -13,7 +13,7 @@ from deepsimbad.api.app import create_app
 from deepsimbad.cli import deepsimbad
 from deepsimbad.cli.serve import shown as shown_setting
 from deepsimbad.settings import CONFIG_VARIABLE, Settings, trace_settings, variable_of
-from deepsimbad_client.commands.group import cli as deepsimbad_client
+from deepsimbad_client.commands import cli as deepsimbad_client
 from deepsimbad_client.http.wire import KEY_VARIABLE, URL_VARIABLE
 
 from .conftest import PROJECT, Page

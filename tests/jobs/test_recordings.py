@@ -13,7 +13,7 @@ from deepsimbad.errors import ImageTooLargeError, InvalidRouteError, InvalidSour
 from deepsimbad.evaluators.image import decode_image
 from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
 from deepsimbad.jobs.recordings import encode_recording, read_ground_truth
-from deepsimbad_client.recordings.recording import Frame
+from deepsimbad_client.recordings import Frame
 from deepsimbad_client.recordings.sources import open_source
 
 MAX_PIXELS = 1_000_000

@@ -1,84 +1,81 @@
-"""The commands of `deepsimbad-client`, and what they share: options, and how results are printed."""
+"""The commands of `deepsimbad-client`, and what becomes of their errors.
 
+Exit codes: 0 done, 1 a named error (one line on standard error), 2 wrong usage, 130 cancelled. Results go to standard
+output, progress and remarks to standard error.
+"""
+
+import os
 import sys
-from collections.abc import Callable, Sequence
-from functools import wraps
-from pathlib import Path
-from typing import Any
+from collections.abc import Sequence
+from importlib import import_module
 
 import click
-from pydantic import BaseModel
-from rich.table import Table
 
-from deepsimbad_client.commands.console import as_json, show
-from deepsimbad_client.http.client import Client
-from deepsimbad_client.http.upload import CONCURRENCY
-from deepsimbad_client.http.wire import DEFAULT_URL, KEY_VARIABLE, URL_VARIABLE
+from deepsimbad_client.commands import admin, recordings
+from deepsimbad_client.commands.console import show_waits
+from deepsimbad_client.errors import DeepSimbadClientError
 
-Command = Callable[..., None]
-
-
-def serving(command: Command) -> Command:
-    """Options of every command that talks to a service, and the `client` made of them."""
-
-    @click.option(
-        "--server", envvar=URL_VARIABLE, default=DEFAULT_URL, show_default=True, show_envvar=True, metavar="URL"
-    )
-    @click.option(
-        "--api-key",
-        envvar=KEY_VARIABLE,
-        help=f"Better kept in ${KEY_VARIABLE}: a command line can be read by others.",
-    )
-    @wraps(command)
-    def connected(server: str, api_key: str | None, **options: Any) -> None:
-        with Client(server, api_key) as client:
-            command(client=client, **options)
-
-    return connected
+DONE, FAILED, CANCELLED = 0, 1, 130
+ELSEWHERE = {"campus": "deepsimbad_campus.__main__:campus_command"}
+"""Commands that are imported when they are asked for."""
 
 
-def reading(command: Command) -> Command:
-    """Options of every command that reads a recording."""
-    spacing = click.option(
-        "--spacing-m",
-        type=float,
-        default=1.0,
-        show_default=True,
-        help="Metres between frames where the source does not say where they are.",
-    )
-    undistortion = click.option(
-        "--undistortion",
-        type=click.Path(exists=True, path_type=Path),
-        help="NCLT's undistortion maps (U2D_Cam*.txt or their folder); absent: images stay as they are.",
-    )
-    return spacing(undistortion(command))
+class LazyGroup(click.Group):
+    """A group that imports some of its commands late."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """Names of all commands."""
+        return sorted([*super().list_commands(ctx), *ELSEWHERE])
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """One command; None where this installation does not have it."""
+        if cmd_name not in ELSEWHERE:
+            return super().get_command(ctx, cmd_name)
+        module, _, attribute = ELSEWHERE[cmd_name].partition(":")
+        try:
+            command = getattr(import_module(module), attribute)
+        except (ModuleNotFoundError, AttributeError):
+            return None
+        return command if isinstance(command, click.Command) else None
 
 
-at_once = click.option(
-    "--concurrency",
-    type=click.IntRange(1, 64),
-    default=CONCURRENCY,
-    show_default=True,
-    help="Requests under way at once.",
+@click.group(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
+@click.version_option(package_name="deep-simbad", message="%(version)s")
+def cli() -> None:
+    """Send recordings to a Deep SIMBAD service, map them, and see how well it localizes.
+
+    SOURCE is nclt:ROOT/DATE, a folder of images in name order (with an optional positions.csv), or a .npy or .csv of
+    ready encodings; it may end in #START:STOP[:STEP], Python's slice of its frames.
+    """
+
+
+COMMANDS = (
+    *(recordings.upload, recordings.localize, recordings.replay, recordings.watch, admin.remap, admin.jobs),
+    *(admin.domains, admin.traverses, admin.sessions, admin.maps, admin.activate, admin.rollback, admin.download),
+    *(admin.delete_domain, admin.delete_traverse, admin.delete_map, admin.delete_session),
 )
-json_flag = click.option("--json", "json_output", is_flag=True, help="Print one JSON document.")
-domain_option = click.option("--domain", required=True, metavar="NAME")
-of_domain = click.option("--domain", metavar="NAME", help="Only this domain's.")
+for command in COMMANDS:
+    cli.add_command(command)
 
 
-def show_list(models: Sequence[BaseModel], table: Table, json_output: bool) -> None:
-    """Print a list, for a script or for a person."""
-    if json_output:
-        click.echo(as_json([model.model_dump(mode="json") for model in models]))
-    else:
-        show(table)
-
-
-def confirmed(question: str) -> bool:
-    """Ask on a terminal; where there is none, or on Ctrl-C, the answer is no."""
-    if not sys.stdin.isatty():
-        return False
+def run(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line; returns its exit code."""
+    show_waits()
     try:
-        return click.confirm(question, default=False, err=True)
-    except click.Abort:
-        return False
+        code = cli.main(
+            None if arguments is None else list(arguments), prog_name="deepsimbad-client", standalone_mode=False
+        )
+    except DeepSimbadClientError as error:
+        one_line = " ".join(str(error).split())
+        sys.stderr.write(f"deepsimbad-client: {error.code}: {one_line}\n")
+        return FAILED
+    except click.ClickException as error:
+        error.show()
+        return error.exit_code
+    except (click.Abort, KeyboardInterrupt):
+        sys.stderr.write("deepsimbad-client: cancelled\n")
+        return CANCELLED
+    except BrokenPipeError:  # whoever read our output has read enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return FAILED
+    return code if isinstance(code, int) else DONE

@@ -1,12 +1,17 @@
-"""How the commands show things: progress on standard error, results on standard output; times are UTC."""
+"""What the commands share: options, and how they show things; progress goes to standard error, times are UTC."""
 
 import json
 import logging
 import os
-from collections.abc import Iterable, Mapping, Sequence
+import sys
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from datetime import timedelta
+from functools import wraps
+from pathlib import Path
 from typing import Any
 
+import click
+from pydantic import BaseModel
 from rich.console import Console
 from rich.progress import (
     BarColumn,
@@ -20,8 +25,10 @@ from rich.progress import (
 )
 from rich.table import Table
 
+from deepsimbad_client.http.client import Client
 from deepsimbad_client.http.models import Domain, Job, ListedSession, Localization, MapVersion, Traverse
-from deepsimbad_client.http.upload import UploadReport
+from deepsimbad_client.http.upload import CONCURRENCY, UploadReport
+from deepsimbad_client.http.wire import DEFAULT_URL, KEY_VARIABLE, URL_VARIABLE
 from deepsimbad_client.replay.active import Episode
 from deepsimbad_client.replay.passive import Step
 
@@ -29,6 +36,56 @@ REMARKS = Console(stderr=True, highlight=False, markup=False)
 """Progress and remarks; names may hold brackets, so nothing is read as markup."""
 PIPE_COLUMNS = 160
 _GAPS_SHOWN = 8
+
+Command = Callable[..., None]
+
+
+def serving(command: Command) -> Command:
+    """Options of every command that talks to a service, and the `client` made of them."""
+
+    @click.option(
+        "--server", envvar=URL_VARIABLE, default=DEFAULT_URL, show_default=True, show_envvar=True, metavar="URL"
+    )
+    @click.option(
+        "--api-key",
+        envvar=KEY_VARIABLE,
+        help=f"Better kept in ${KEY_VARIABLE}: a command line can be read by others.",
+    )
+    @wraps(command)
+    def connected(server: str, api_key: str | None, **options: Any) -> None:
+        with Client(server, api_key) as client:
+            command(client=client, **options)
+
+    return connected
+
+
+def reading(command: Command) -> Command:
+    """Options of every command that reads a recording."""
+    spacing = click.option(
+        "--spacing-m",
+        type=float,
+        default=1.0,
+        show_default=True,
+        help="Metres between frames where the source does not say where they are.",
+    )
+    undistortion = click.option(
+        "--undistortion",
+        type=click.Path(exists=True, path_type=Path),
+        help="NCLT's undistortion maps (U2D_Cam*.txt or their folder); absent: images stay as they are.",
+    )
+    return spacing(undistortion(command))
+
+
+at_once = click.option(
+    "--concurrency",
+    type=click.IntRange(1, 64),
+    default=CONCURRENCY,
+    show_default=True,
+    help="Requests under way at once.",
+)
+json_flag = click.option("--json", "json_output", is_flag=True, help="Print one JSON document.")
+domain_option = click.option("--domain", required=True, metavar="NAME")
+of_domain = click.option("--domain", metavar="NAME", help="Only this domain's.")
 
 
 def show(table: Table) -> None:
@@ -316,3 +373,21 @@ def _size(n_bytes: int | None) -> str:
 def _minute(time: str | float | None) -> str:
     """A time as the service tells it, UTC, to the minute."""
     return "-" if time is None else str(time)[:16].replace("T", " ")
+
+
+def show_list(models: Sequence[BaseModel], table: Table, json_output: bool) -> None:
+    """Print a list, for a script or for a person."""
+    if json_output:
+        click.echo(as_json([model.model_dump(mode="json") for model in models]))
+    else:
+        show(table)
+
+
+def confirmed(question: str) -> bool:
+    """Ask on a terminal; where there is none, or on Ctrl-C, the answer is no."""
+    if not sys.stdin.isatty():
+        return False
+    try:
+        return click.confirm(question, default=False, err=True)
+    except click.Abort:
+        return False

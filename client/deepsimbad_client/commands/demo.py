@@ -22,7 +22,7 @@ from deepsimbad_client.http.admin import remap
 from deepsimbad_client.http.client import Client
 from deepsimbad_client.http.local_server import LocalServer
 from deepsimbad_client.http.upload import upload
-from deepsimbad_client.recordings.recording import Recording
+from deepsimbad_client.recordings import Recording
 from deepsimbad_client.recordings.sources import open_source
 from deepsimbad_client.replay.active import Stage, active_replay
 from deepsimbad_client.replay.passive import Replay, replay

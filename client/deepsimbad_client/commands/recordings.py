@@ -1,4 +1,4 @@
-"""`deepsimbad-client upload` and `localize`."""
+"""What is done with a recording: `upload`, `localize`, `replay` and `watch`."""
 
 import json
 from collections.abc import Iterable, Iterator
@@ -6,15 +6,33 @@ from pathlib import Path
 from typing import Any
 
 import click
+from rich.console import Console
 
-from deepsimbad_client.commands import at_once, domain_option, json_flag, reading, serving
-from deepsimbad_client.commands.console import REMARKS, UploadBar, as_json, place_table, show
+from deepsimbad_client.commands.console import (
+    REMARKS,
+    EpisodeBar,
+    ReplayBar,
+    UploadBar,
+    as_json,
+    at_once,
+    domain_option,
+    json_flag,
+    place_table,
+    reading,
+    serving,
+    show,
+)
 from deepsimbad_client.errors import UnknownDomainError
 from deepsimbad_client.http.client import Client
 from deepsimbad_client.http.upload import upload as upload_recording
-from deepsimbad_client.recordings.folder import FolderRecording
-from deepsimbad_client.recordings.recording import Frame, Recording
-from deepsimbad_client.recordings.sources import ENCODING_SUFFIXES, open_source
+from deepsimbad_client.recordings import Frame, Recording
+from deepsimbad_client.recordings.sources import ENCODING_SUFFIXES, FolderRecording, open_source
+from deepsimbad_client.replay.active import EPISODES, STEPS, Stage, active_replay
+from deepsimbad_client.replay.passive import TOLERANCE_M
+from deepsimbad_client.replay.passive import replay as passive_replay
+from deepsimbad_client.replay.report import active_tables, summarise, summarise_active, table, write_summary
+from deepsimbad_client.replay.scene import DEFAULT_PLANNER
+from deepsimbad_client.replay.watch import watch_episode, watch_session
 
 IMAGE_EVALUATOR = {"kind": "feature_l2"}
 ENCODING_EVALUATOR = {"kind": "feature_l2", "extractor": "none"}
@@ -113,18 +131,161 @@ def _make_domain_if_missing(
     try:
         client.domain(name)
     except UnknownDomainError:
-        config = _evaluator(evaluator) or (IMAGE_EVALUATOR if recording.encodings is None else ENCODING_EVALUATOR)
+        config = IMAGE_EVALUATOR if recording.encodings is None else ENCODING_EVALUATOR
+        if evaluator is not None:
+            try:
+                config = dict(json.loads(evaluator))
+            except (TypeError, ValueError) as error:
+                example = 'give a JSON object such as {"kind": "feature_l2"}'
+                raise click.BadParameter(example, param_hint="--evaluator") from error
         client.admin.put_domain(name, config, closed=closed)
         REMARKS.print(f"made domain {name} ({json.dumps(config)})", soft_wrap=True)
 
 
-def _evaluator(text: str | None) -> dict[str, Any] | None:
-    if text is None:
-        return None
-    try:
-        config = json.loads(text)
-    except ValueError:
-        config = None
-    if not isinstance(config, dict):
-        raise click.BadParameter('give a JSON object such as {"kind": "feature_l2"}', param_hint="--evaluator")
-    return config
+@click.command()
+@click.argument("source")
+@domain_option
+@click.option(
+    "--out",
+    type=click.Path(file_okay=False, path_type=Path),
+    help="Folder of the results; absent: replays/DOMAIN-RECORDING, with -active behind it for an active replay.",
+)
+@click.option(
+    "--tolerance",
+    "tolerance_m",
+    type=click.FloatRange(min=0),
+    help=f"Metres that a right answer of a passive replay may be off.  [default: {TOLERANCE_M:g}]",
+)
+@click.option(
+    "--planner",
+    "planners",
+    multiple=True,
+    metavar="NAME",
+    help="Drive actively, NAME choosing the moves: default, nnql, random, constant:3, ...; repeat it to compare "
+    "planners from the same starts.",
+)
+@click.option("--episodes", type=click.IntRange(min=1), help=f"Of every planner.  [default: {EPISODES}]")
+@click.option("--steps", type=click.IntRange(min=1), help=f"Moves in an episode.  [default: {STEPS}]")
+@click.option("--seed", type=click.IntRange(min=0), help="Of the starts and the sessions.  [default: 0]")
+@click.option("--restart", is_flag=True, help="Throw away what an earlier replay left in the folder.")
+@click.option("--plots/--no-plots", default=True, show_default=True)
+@at_once
+@reading
+@json_flag
+@serving
+def replay(
+    client: Client,
+    source: str,
+    domain: str,
+    out: Path | None,
+    tolerance_m: float | None,
+    planners: tuple[str, ...],
+    episodes: int | None,
+    steps: int | None,
+    seed: int | None,
+    restart: bool,
+    plots: bool,
+    concurrency: int,
+    spacing_m: float,
+    undistortion: Path | None,
+    json_output: bool,
+) -> None:
+    """Localize every frame of a recording, score the answers; with --planner, drive along it as an active robot.
+
+    An active robot starts at a random frame, looks, asks for the next-best view, goes to the recorded frame nearest to
+    it, and looks again. Writes steps.jsonl, summary.json and pictures; interrupted, the same command goes on where it
+    stopped.
+    """
+    active_only = {"--episodes": episodes, "--steps": steps, "--seed": seed}
+    if not planners and any(value is not None for value in active_only.values()):
+        raise click.UsageError(f"{', '.join(active_only)} belong to an active replay: give --planner too")
+    if planners and tolerance_m is not None:
+        raise click.UsageError("--tolerance belongs to a passive replay: an active one ranks the nearest map image")
+    recording = open_source(source, spacing_m=spacing_m, undistortion=undistortion)
+    folder = out or Path("replays") / f"{domain}-{recording.name}{'-active' if planners else ''}"
+    name = f"{recording.name} against {domain}"
+    common: dict[str, Any] = {"concurrency": concurrency, "restart": restart}
+    if planners:
+        episodes = EPISODES if episodes is None else episodes
+        with EpisodeBar(name, len(dict.fromkeys(planners)) * episodes) as bar:
+            driven = active_replay(
+                *(client, recording, domain, folder),
+                planners=planners,
+                episodes=episodes,
+                steps=STEPS if steps is None else steps,
+                seed=seed or 0,
+                on_progress=bar,
+                **common,
+            )
+        summary = summarise_active(driven)
+        tables = active_tables(summary)
+    else:
+        with ReplayBar(name, len(recording.frames)) as bar:
+            replayed = passive_replay(
+                *(client, recording, domain, folder),
+                tolerance_m=TOLERANCE_M if tolerance_m is None else tolerance_m,
+                on_progress=bar,
+                **common,
+            )
+        summary = summarise(replayed)
+        tables = [table(summary)]
+    write_summary(summary, folder)
+    if plots:
+        from deepsimbad_client.replay.plots import draw_active, draw_passive  # noqa: PLC0415 - matplotlib takes its time
+
+        if planners:
+            draw_active(driven, summary, folder)
+        else:
+            draw_passive(replayed, folder)
+    if json_output:
+        click.echo(as_json(summary))
+    else:
+        for shown in tables:
+            show(shown)
+    REMARKS.print(f"results in {folder}", soft_wrap=True)
+
+
+@click.command()
+@click.argument("source", required=False)
+@click.option("--domain", metavar="NAME", help="Where SOURCE is driven.")
+@click.option("--session", "session_id", metavar="ID", help="Watch a session that another robot drives instead.")
+@click.option("--planner", default=DEFAULT_PLANNER, show_default=True, metavar="NAME", help="Who chooses the moves.")
+@click.option("--steps", type=click.IntRange(min=1), default=STEPS, show_default=True, help="Moves to make.")
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Another start.")
+@click.option(
+    "--pause",
+    "pause_s",
+    type=click.FloatRange(min=0),
+    default=1.0,
+    show_default=True,
+    help="Seconds between views, or between looks at --session.",
+)
+@reading
+@serving
+def watch(
+    client: Client,
+    source: str | None,
+    domain: str | None,
+    session_id: str | None,
+    planner: str,
+    steps: int,
+    seed: int,
+    pause_s: float,
+    spacing_m: float,
+    undistortion: Path | None,
+) -> None:
+    """Show one session live: what it believes along the route, its last move and the next.
+
+    Drives SOURCE from a random start, or with --session looks on while another robot drives, until the session ends.
+    """
+    console = Console(highlight=False, markup=False)
+    if session_id is not None:
+        if source is not None or domain is not None:
+            raise click.UsageError("--session names all there is to watch: leave SOURCE and --domain out")
+        watch_session(client, session_id, console, every_s=max(pause_s, 0.05))
+        return
+    if source is None or domain is None:
+        raise click.UsageError("give SOURCE and --domain, or --session")
+    recording = open_source(source, spacing_m=spacing_m, undistortion=undistortion)
+    stage = Stage(client, recording, domain)
+    watch_episode(stage, console, planner=planner, steps=steps, seed=seed, pause_s=pause_s)

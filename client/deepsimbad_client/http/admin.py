@@ -175,7 +175,7 @@ class AdminCalls(Face):
         """Submit a remap of `training_traverse` and return its job at once; `remap` of this module also follows it.
 
         A lost answer is asked for again and makes no second job. The `idempotency_key` names this request, so that it
-        can be repeated after a `TransportError`; absent: a new one. Raises TooManyJobsError.
+        can be repeated after a `TransportError`; absent: a new one.
         """
         document = {"training_traverse": training_traverse, **options}
         call = Call.with_json("POST", f"{_domain(domain)}/remaps", document, headers=once(idempotency_key))
@@ -264,7 +264,7 @@ class AdminCalls(Face):
 
     @shared
     async def delete_map(self, domain: str, version: int) -> None:
-        """Remove the file of a version; its place in the history stays. Raises MapInUseError."""
+        """Remove the file of a version; its place in the history stays.."""
         await self._wire.send(Call.delete(f"{_domain(domain)}/maps/{int(version)}"))
 
     @shared

@@ -18,7 +18,7 @@ from deepsimbad_client.errors import (
 )
 from deepsimbad_client.http.client import Client
 from deepsimbad_client.http.models import Traverse
-from deepsimbad_client.recordings.recording import Frame, Recording
+from deepsimbad_client.recordings import Frame, Recording
 
 BATCH_BYTES = 8 * 2**20  # Size of a batch of ready encodings: worth its round trip, and lost cheaply on a thin link
 CONCURRENCY = 4

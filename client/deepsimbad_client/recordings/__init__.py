@@ -1,1 +1,170 @@
-"""Recordings as they lie on disk: frames in travel order with what is known of where each was taken."""
+"""Recordings as they lie on disk: what every reader gives, and how image files are read and made ready to post."""
+
+import dataclasses
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from io import BytesIO
+from pathlib import Path
+from typing import Any, Self
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from PIL.TiffImagePlugin import TiffImageFile
+
+from deepsimbad_client.errors import BrokenFrameError, SourceError
+from deepsimbad_client.http.call import media_type_of
+
+Image = NDArray[np.uint8]  # [height, width, 3] BGR
+
+IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", ".pgm", ".ppm"})
+JPEG_QUALITY = 92
+
+_DIGITS = re.compile(r"(\d+)")
+_STRIPS, _TILES = (273, 279), (324, 325)  # TIFF's tags of where each lies in the file, and how long it is
+_START_OF_SCAN, _END_OF_JPEG = b"\xff\xda", b"\xff\xd9"
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """One moment of a recording; None: not known."""
+
+    index: int  # place in the whole recording, from 0; kept when the recording is sliced
+    name: str  # the file's name, or the row's for ready encodings
+    position_m: float  # along the route
+    timestamp_us: int | None = None  # Unix microseconds
+    x_m: float | None = None  # first ground coordinate (NCLT: north)
+    y_m: float | None = None  # second ground coordinate (NCLT: east)
+    heading_rad: float | None = None  # in (-pi, pi], turning from x towards y
+
+
+@dataclass(frozen=True, slots=True)
+class EncodedImage:
+    """An image ready to be posted: the bytes of the file and what they are."""
+
+    body: bytes
+    content_type: str
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """Frames in travel order, with either ready encodings or, in the readers' own classes, images."""
+
+    name: str  # a short one for people: the date, the folder or the file
+    frames: Sequence[Frame]  # those that can be used
+    left_out: Mapping[str, int] = field(default_factory=dict)  # reason -> number of frames that are not in `frames`
+    encodings: NDArray[np.float32] | None = None  # [n, d], row i of frame i; None where the frames are images
+
+    def image(self, frame: Frame, input_size: tuple[int, int] | None) -> EncodedImage:  # noqa: ARG002
+        """Read one frame's image, ready to post; one larger than `input_size` (width, height) is resized to exactly it.
+
+        Raises BrokenFrameError (this file cannot be used; the others can), SourceError (there are no images at all).
+        """
+        raise SourceError(f"{self.name} holds ready encodings, not images")
+
+    def view(self, row: int, input_size: tuple[int, int] | None) -> dict[str, Any]:
+        """What is seen from `frames[row]`, as arguments of a client's calls; raises as `image` does."""
+        if self.encodings is not None:
+            return {"encoding": self.encodings[row]}
+        image = self.image(self.frames[row], input_size)
+        return {"image": image.body, "content_type": image.content_type}
+
+    def sliced(self, part: slice) -> Self:
+        """Python's slice of the frames, which keep their indices and positions; what was left out stays counted.
+
+        Raises SourceError (the slice leaves nothing, or its step is 0).
+        """
+        if part.step == 0:
+            raise SourceError(f"the slice of {self.name} has step 0: use 1 for every frame")
+        frames = self.frames[part]
+        if not frames:
+            ends = [part.start, part.stop] + ([] if part.step is None else [part.step])
+            text = "#" + ":".join("" if end is None else str(end) for end in ends)
+            raise SourceError(f"the slice {text} leaves none of the {len(self.frames)} frames of {self.name}")
+        encodings = None if self.encodings is None else self.encodings[part]
+        return dataclasses.replace(self, frames=frames, encodings=encodings)
+
+
+def finite_number(text: str) -> float | None:
+    """The number that a cell of a table holds; None: no finite one."""
+    try:
+        value = float(text)
+    except ValueError:
+        return None
+    return value if math.isfinite(value) else None
+
+
+def natural_order(name: str) -> tuple[list[tuple[int, str]], str]:
+    """Sort key for file names: digits count as numbers, so 2.png comes before 10.png; padded names sort as usual."""
+    parts = _DIGITS.split(name)
+    return [(int(part), "") if place % 2 else (-1, part) for place, part in enumerate(parts)], name
+
+
+def read_file(path: Path) -> bytes:
+    """Read a frame's file. Raises BrokenFrameError (it is missing, unreadable or empty)."""
+    try:
+        body = path.read_bytes()
+    except OSError as error:
+        raise BrokenFrameError(f"cannot read {path}: {error.strerror or error}", "unreadable file") from error
+    if not body:
+        raise BrokenFrameError(f"{path} is empty", "empty file")
+    return body
+
+
+def decode(body: bytes, path: Path, *, as_stored: bool = False) -> Image:
+    """Decode an image to 8-bit BGR; grey becomes grey BGR, 16 bits become 8, alpha is dropped.
+
+    `as_stored` leaves the pixels as they lie in the file; else its own orientation tag is obeyed. Raises
+    BrokenFrameError (not an image, damaged, or its end is missing).
+    """
+    if _ends_early(body):
+        raise BrokenFrameError(f"{path} is truncated: its end is missing", "undecodable")
+    flags = cv2.IMREAD_COLOR | (cv2.IMREAD_IGNORE_ORIENTATION if as_stored else 0)
+    try:
+        image = cv2.imdecode(np.frombuffer(body, dtype=np.uint8), flags)
+    except cv2.error as error:
+        raise BrokenFrameError(f"{path} cannot be decoded: {error.err or error}", "undecodable") from error
+    if image is None:
+        raise BrokenFrameError(f"{path} is not an image that can be decoded", "undecodable")
+    return np.asarray(image, dtype=np.uint8)
+
+
+def is_larger(image: Image, input_size: tuple[int, int] | None) -> bool:
+    """Whether an image is wider or higher than (width, height)."""
+    return input_size is not None and (image.shape[1] > input_size[0] or image.shape[0] > input_size[1])
+
+
+def as_jpeg(image: Image, input_size: tuple[int, int] | None) -> EncodedImage:
+    """Make an image ready to post: resized to exactly `input_size` where it is larger, as JPEG of quality 92."""
+    if input_size is not None and is_larger(image, input_size):
+        image = np.asarray(cv2.resize(image, input_size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    _, body = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+    return EncodedImage(body.tobytes(), "image/jpeg")
+
+
+def _ends_early(body: bytes) -> bool:
+    """Whether the end of an image is missing: decoders fill the rest with grey or black and say nothing."""
+    match media_type_of(body):
+        case "image/jpeg":
+            # A preview inside the header has an end of its own; the one that counts follows the last scan.
+            return body.rfind(_END_OF_JPEG) < body.rfind(_START_OF_SCAN) or _END_OF_JPEG not in body
+        case "image/png":
+            return b"IEND" not in body
+        case "image/webp":
+            return len(body) < 8 + int.from_bytes(body[4:8], "little")
+        case "image/tiff":
+            return _tiff_ends_early(body)
+        case _:
+            return False
+
+
+def _tiff_ends_early(body: bytes) -> bool:
+    """Whether the first picture of a TIFF points past the end of the file; what cannot be told the decoder will say."""
+    try:
+        tags = TiffImageFile(BytesIO(body)).tag_v2
+        pieces = [zip(tags[at], tags[length], strict=False) for at, length in (_STRIPS, _TILES) if at in tags]
+    except Exception:  # Pillow raises a dozen kinds
+        return False
+    return any(at + length > len(body) for piece in pieces for at, length in piece)

@@ -12,7 +12,7 @@ from deepsimbad.core.metrics import rank_of_truth
 from deepsimbad_client.errors import ReplayError
 from deepsimbad_client.http.client import Client, Session
 from deepsimbad_client.http.upload import CONCURRENCY, in_order
-from deepsimbad_client.recordings.recording import Recording
+from deepsimbad_client.recordings import Recording
 from deepsimbad_client.replay.scene import DEFAULT_PLANNER, MASS_DIGITS, Journal, Scene, Seen, changed_map, write_lines
 
 EPISODES = 20

@@ -13,7 +13,7 @@ from deepsimbad.core.route import Route
 from deepsimbad_client.errors import GoneError, ReplayError, UnknownSessionError
 from deepsimbad_client.http.client import Client, Session
 from deepsimbad_client.http.upload import CONCURRENCY, in_order
-from deepsimbad_client.recordings.recording import Recording
+from deepsimbad_client.recordings import Recording
 from deepsimbad_client.replay.scene import MASS_DIGITS, Journal, Scene, Seen, write_lines
 
 TOLERANCE_M = 2.0

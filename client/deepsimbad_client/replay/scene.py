@@ -23,7 +23,7 @@ from deepsimbad_client.errors import (
 from deepsimbad_client.http.client import Client, Session
 from deepsimbad_client.http.models import Domain, Localization, SessionAnswer
 from deepsimbad_client.http.upload import UNUSABLE_IMAGE_CODES
-from deepsimbad_client.recordings.recording import Recording
+from deepsimbad_client.recordings import Recording
 
 Record = TypeVar("Record")
 

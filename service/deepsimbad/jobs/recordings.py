@@ -20,7 +20,7 @@ from deepsimbad.errors import InvalidSourceError
 from deepsimbad.evaluators.base import Evaluator, Image
 from deepsimbad.evaluators.image import decode_image
 from deepsimbad_client.errors import BrokenFrameError
-from deepsimbad_client.recordings.recording import Recording
+from deepsimbad_client.recordings import Recording
 
 _HARMLESS = {
     ("numpy._core.multiarray", "_reconstruct"),

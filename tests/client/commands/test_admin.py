@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from deepsimbad_client import Client, errors
-from deepsimbad_client.commands.group import run
+from deepsimbad_client.commands import run
 from deepsimbad_client.http.upload import upload
 from deepsimbad_client.recordings.sources import open_source
 

@@ -7,8 +7,8 @@ import click
 import httpx2
 import pytest
 
-from deepsimbad_client import Client, RetryPolicy, commands, errors
-from deepsimbad_client.commands.group import run
+from deepsimbad_client import Client, RetryPolicy, errors
+from deepsimbad_client.commands import console, run
 from deepsimbad_client.http.admin import follow_job
 from deepsimbad_client.http.models import Job
 
@@ -146,7 +146,7 @@ def responding(monkeypatch):
             return httpx2.Response(204) if request.method == "DELETE" else respond(request)
 
         transport = httpx2.MockTransport(handle)
-        monkeypatch.setattr(commands, "Client", lambda url, key: Client(url, key, transport=transport))
+        monkeypatch.setattr(console, "Client", lambda url, key: Client(url, key, transport=transport))
         return asked
 
     return responding
@@ -203,9 +203,9 @@ def test_a_deletion_is_asked_about(reply, code, responding, confirming):
 @pytest.mark.parametrize(
     ("state", "words"),
     [
-        ("running", "job 7 is being cancelled; see how it ends with: deepsimbad-client jobs 7 --follow"),
+        ("running", "job 7 is being cancelled"),
         ("cancelled", "job 7 is cancelled"),
-        ("succeeded", "job 7 had ended before it could be cancelled"),
+        ("succeeded", "job 7 had ended as succeeded before it could be cancelled"),
     ],
 )
 def test_a_cancel_says_what_came_of_it(state, words, responding, capsys):

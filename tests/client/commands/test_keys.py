@@ -5,7 +5,7 @@ import pytest
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.records import KeyScope
 from deepsimbad_client import Client, errors
-from deepsimbad_client.commands.group import run
+from deepsimbad_client.commands import run
 
 from ..conftest import mapped, serving
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from deepsimbad_client import errors
-from deepsimbad_client.commands.group import run
+from deepsimbad_client.commands import run
 from deepsimbad_client.http.admin import follow_job, remap
 from deepsimbad_client.http.upload import in_order, upload
 from deepsimbad_client.recordings.sources import open_source

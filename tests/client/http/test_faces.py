@@ -17,7 +17,7 @@ from deepsimbad.api.jobs import RemapBody
 from deepsimbad.api.sessions import SessionBody
 from deepsimbad.settings import Settings
 from deepsimbad_client import AsyncClient, AsyncSession, Client, Session, errors
-from deepsimbad_client.commands.group import cli
+from deepsimbad_client.commands import cli
 from deepsimbad_client.http.admin import Admin, AsyncAdmin, RemapOptions
 from deepsimbad_client.http.models import SessionState
 

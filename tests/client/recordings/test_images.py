@@ -9,7 +9,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from deepsimbad_client.errors import BrokenFrameError
-from deepsimbad_client.recordings.images import decode, natural_order
+from deepsimbad_client.recordings import decode, natural_order
 
 NOISE = np.random.default_rng(0).integers(0, 255, (40, 60, 3), np.uint8)
 HERE = Path("frame")

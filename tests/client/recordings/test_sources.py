@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from deepsimbad_client.errors import SourceError
-from deepsimbad_client.recordings.recording import Frame, Recording
+from deepsimbad_client.recordings import Frame, Recording
 from deepsimbad_client.recordings.sources import open_source, split_slice
 
 bounds = st.none() | st.integers(-30, 30)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from deepsimbad_client import errors
-from deepsimbad_client.commands.group import run
+from deepsimbad_client.commands import run
 from deepsimbad_client.recordings.sources import open_source
 from deepsimbad_client.replay.active import Stage, active_replay
 

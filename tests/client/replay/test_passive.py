@@ -10,7 +10,7 @@ import pytest
 from deepsimbad.core.route import Route
 from deepsimbad_client import errors
 from deepsimbad_client.http.admin import remap
-from deepsimbad_client.recordings.recording import Frame, Recording
+from deepsimbad_client.recordings import Frame, Recording
 from deepsimbad_client.recordings.sources import open_source
 from deepsimbad_client.replay.passive import Replay, Step, replay
 from deepsimbad_client.replay.report import summarise

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from deepsimbad_client import errors
-from deepsimbad_client.commands.group import run
+from deepsimbad_client.commands import run
 from deepsimbad_client.recordings.sources import open_source
 from deepsimbad_client.replay.active import Stage
 from deepsimbad_client.replay.watch import BLOCKS, belief_blocks, resampled, watch_episode, watch_session
