@@ -188,6 +188,10 @@ class LandmarkModelDiffersError(
     """The view was ranked by another landmark model than the answering map's: fetch the `map_version` of `problem`."""
 
 
+class TraverseInUseError(ConflictError, code="traverse_in_use"):
+    """A running job still reads the traverse or domain."""
+
+
 class LostActivationError(ConflictError, code="lost_activation"):
     """The active map was not the expected one when the swap was tried."""
 

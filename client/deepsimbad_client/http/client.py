@@ -242,7 +242,7 @@ class ClientCalls(Face, Generic[AnySession]):
         """Fetch a map's landmarks once, to rank them here and send a few bytes a view (needs `deep-simbad[edge]`).
 
         `map_version` is one that a session keeps; absent: the active map. Raises UnknownDomainError,
-        UnknownMapVersionError, NoActiveMapError, RetiredMapError, MissingExtraError.
+        NotFoundError, NoActiveMapError, RetiredMapError, MissingExtraError.
         """
         from deepsimbad_client.http.on_board import OnBoardEncoder  # noqa: PLC0415 - needs further packages
 
