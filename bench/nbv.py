@@ -23,9 +23,9 @@ from bench.netvlad import DRIVES
 from deepsimbad.core.episodes import TestDrive
 from deepsimbad.core.planners import CONSTANT, DEFAULT_PLANNER, RANDOM
 from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
+from deepsimbad.jobs.build import encode_recording
 from deepsimbad.jobs.experiments import CLAIRVOYANT, NbvConfig, NbvReport, nbv_stages, run_nbv
 from deepsimbad.jobs.progress import Progress
-from deepsimbad.jobs.recordings import encode_recording
 from deepsimbad_client.recordings.sources import open_source
 
 

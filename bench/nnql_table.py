@@ -23,8 +23,7 @@ from deepsimbad.core.nnql import NnqlConfig, initial_q_values
 from deepsimbad.core.relevance import Relevance, UpdateRule
 from deepsimbad.core.training import TrainingWorld, Walk, train, walk_greedily
 from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
-from deepsimbad.jobs.build import Built, build, choose_landmarks, measured
-from deepsimbad.jobs.train import train_nnql, world_of
+from deepsimbad.jobs.build import Built, build, choose_landmarks, measured, train_nnql, world_of
 
 DRIVES = ("nr", "nq", "nq2")
 TRIPLETS = tuple(itertools.permutations(DRIVES))

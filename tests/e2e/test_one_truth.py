@@ -9,7 +9,7 @@ from deepsimbad.cli import run
 from deepsimbad.core.metrics import RetrievalScorer
 from deepsimbad.core.route import true_images_of
 from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
-from deepsimbad.jobs.recordings import encode_recording
+from deepsimbad.jobs.build import encode_recording
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.map_file import read_map
 from deepsimbad_campus.season import PAPER_DATES

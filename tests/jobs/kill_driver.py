@@ -19,11 +19,10 @@ import numpy as np
 from deepsimbad.core.descriptor import rank_landmarks
 from deepsimbad.core.drive import Drive
 from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
-from deepsimbad.jobs.learn import ExperienceConfig
 from deepsimbad.jobs.progress import Progress
-from deepsimbad.jobs.remap import remap
-from deepsimbad.jobs.remap_config import REMAP_STAGES, RemapConfig
+from deepsimbad.jobs.remap import REMAP_STAGES, RemapConfig, remap
 from deepsimbad.jobs.runner import InThisProcess, JobRunner
+from deepsimbad.jobs.versions import ExperienceConfig
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.map_file import read_map, verify
 from deepsimbad.store.records import JobState, MapState

@@ -14,8 +14,7 @@ from deepsimbad.core.retrieval import relevances
 from deepsimbad.engine.maps import load_snapshot
 from deepsimbad.errors import InvalidEncodingError, InvalidMapConfigError
 from deepsimbad.jobs.progress import Progress
-from deepsimbad.jobs.remap import remap
-from deepsimbad.jobs.remap_config import REMAP_STAGES, RemapConfig
+from deepsimbad.jobs.remap import REMAP_STAGES, RemapConfig, remap
 from deepsimbad.jobs.versions import import_map
 from deepsimbad.store.map_file import read_map
 from deepsimbad.store.traverses import Traverse

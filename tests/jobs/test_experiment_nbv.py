@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from deepsimbad.errors import CancelledError, InvalidMapConfigError
+from deepsimbad.jobs.build import encode_recording
 from deepsimbad.jobs.experiments import NbvConfig, NbvReport, nbv_stages, run_nbv
 from deepsimbad.jobs.progress import Progress
-from deepsimbad.jobs.recordings import encode_recording
 from deepsimbad_client.recordings.sources import open_source
 
 QUICK = NbvConfig(n_landmarks=40, actions_m=(1.0, 2.0, 4.0), n_steps=4, training_episodes=60, episodes=60)

@@ -7,11 +7,10 @@ from deepsimbad.core.descriptor import rank_landmarks
 from deepsimbad.core.nnql import KnownWalk
 from deepsimbad.core.relevance import Query
 from deepsimbad.errors import CancelledError, NoActiveMapError, UnknownDomainError
-from deepsimbad.jobs.learn import LEARN_STAGES, learn_online
 from deepsimbad.jobs.progress import Progress
-from deepsimbad.jobs.remap import remap
-from deepsimbad.jobs.remap_config import RemapConfig
-from deepsimbad.store.map_file import read_map, verify
+from deepsimbad.jobs.remap import RemapConfig, remap
+from deepsimbad.jobs.versions import LEARN_STAGES, learn_online
+from deepsimbad.store.map_file import read_map
 from deepsimbad.store.records import MapState
 
 DOMAIN = "route"

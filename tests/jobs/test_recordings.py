@@ -12,7 +12,8 @@ from deepsimbad.core.drive import UNKNOWN_TIMESTAMP
 from deepsimbad.errors import ImageTooLargeError, InvalidRouteError, InvalidSourceError
 from deepsimbad.evaluators.image import decode_image
 from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
-from deepsimbad.jobs.recordings import encode_recording, read_ground_truth
+from deepsimbad.jobs.build import encode_recording
+from deepsimbad.jobs.experiments import read_ground_truth
 from deepsimbad_client.recordings import Frame
 from deepsimbad_client.recordings.sources import open_source
 

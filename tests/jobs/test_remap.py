@@ -18,10 +18,9 @@ from deepsimbad.errors import (
     UnknownTraverseError,
 )
 from deepsimbad.jobs.progress import Progress
-from deepsimbad.jobs.remap import remap
-from deepsimbad.jobs.remap_config import REMAP_STAGES, RemapConfig, RemapSize, remap_stages
-from deepsimbad.store.catalog import ANY
-from deepsimbad.store.map_file import read_map, verify
+from deepsimbad.jobs.remap import REMAP_STAGES, RemapConfig, remap, remap_stages, stages_in
+from deepsimbad.store.catalog_maps import ANY
+from deepsimbad.store.map_file import read_map
 from deepsimbad.store.records import MapState
 from deepsimbad.store.traverses import Traverse
 
@@ -282,63 +281,41 @@ def test_where_landmarks_stay_the_active_maps_drive_is_judged(catalog, route, ev
 # --- what is asked for ----------------------------------------------------------------------------------------------
 
 CONFIG = RemapConfig("drive", "other")
-SIZE = RemapSize(12_000, 12_000, 512)
+SIZE = (12_000, 12_000, 512)
 
 
 def test_the_stages_stay_the_same_and_none_weighs_nothing():
-    for config in (
-        CONFIG,
-        replace(CONFIG, training_episodes=0),
-        replace(CONFIG, relevance="brute_force"),
-        RemapConfig("drive", append=True),
-    ):
-        for size in (SIZE, RemapSize(0, 0, 0)):
-            stages = remap_stages(config, size)
+    for asked in (CONFIG, replace(CONFIG, training_episodes=0), RemapConfig("drive", append=True)):
+        for size in (SIZE, (0, 0, 0)):
+            stages = remap_stages(asked, *size)
             assert list(stages) == list(REMAP_STAGES)
             assert min(stages.values()) > 0
 
 
-def test_training_weighs_by_its_episodes_up_to_what_a_small_map_takes():
-    def trained(n_episodes, size=SIZE):
-        return remap_stages(replace(CONFIG, training_episodes=n_episodes), size)["train"]
+def test_stages_weigh_by_what_they_have_to_do():
+    def trained(n_episodes, n_frames=12_000, **changes):
+        asked = replace(CONFIG, training_episodes=n_episodes, **changes)
+        return remap_stages(asked, n_frames, 12_000, 512)["train"]
 
     assert trained(300_000) == pytest.approx(30 * trained(10_000), rel=0.01)
-    assert trained(10_000_000) == trained(25 * 12_000)
-    small = RemapSize(100, 100, 512)
-    assert trained(300_000, small) == trained(2_500, small)
-
-
-def test_landmarks_that_stay_cost_nothing_and_what_is_appended_is_not_trained():
-    kept = remap_stages(RemapConfig("drive"), replace(SIZE, n_candidates=0))
-    assert kept["select landmarks"] < 0.1 < remap_stages(CONFIG, SIZE)["select landmarks"]
-    appended = remap_stages(RemapConfig("drive", append=True), replace(SIZE, n_candidates=0))
-    assert appended["train"] < 0.1 < kept["train"]
-
-
-@pytest.mark.parametrize("n_episodes", [0, 10_000, 300_000])
-def test_the_time_left_is_right_from_describe_on_where_stages_take_what_they_weigh(n_episodes):
-    config = replace(CONFIG, training_episodes=n_episodes)
-    now_s, seen = [0.0], []
-    stages = remap_stages(config, SIZE)
-    progress = Progress(stages, seen.append, interval_s=0, clock=lambda: now_s[0])
-    for stage, seconds in stages.items():
-        progress.stage(stage)
-        for percent in range(1, 101):
-            now_s[0] += 3 * seconds / 100  # on a slower machine
-            progress.update(percent / 100)
-            if seen[-1].eta_s is not None:
-                assert seen[-1].eta_s == pytest.approx(3 * sum(stages.values()) - now_s[0], abs=0.01)
-    assert next(state.stage for state in seen if state.eta_s is not None) in list(stages)[:3]
+    assert trained(10_000_000) == trained(25 * 12_000), "a map takes so many"
+    assert trained(300_000, 100) == trained(2_500, 100)
+    assert trained(10_000, append=True, landmark_traverse=None) < 0.1 < trained(10_000)
+    assert trained(10_000, relevance=Relevance.BRUTE_FORCE) < 0.1
+    kept = remap_stages(RemapConfig("drive"), 12_000, 0, 512)
+    assert kept["select landmarks"] < 0.1 < remap_stages(CONFIG, *SIZE)["select landmarks"]
 
 
 def test_the_size_is_that_of_the_traverses(catalog, drive):
     drive("drive", 12)
     drive("other", 30)
     drive("empty", 0)
-    data_dir = catalog.data_dir
-    assert RemapSize.of(data_dir, "route", CONFIG) == RemapSize(12, 30, 6)
-    assert RemapSize.of(data_dir, "route", RemapConfig("drive")) == RemapSize(12, 0, 6)
-    assert RemapSize.of(data_dir, "route", RemapConfig("empty", "drive")) == RemapSize(0, 12, 0)
+    for asked, size in (
+        (CONFIG, (12, 30, 6)),
+        (RemapConfig("drive"), (12, 0, 6)),
+        (RemapConfig("empty", "drive"), (0, 12, 0)),
+    ):
+        assert stages_in(catalog.data_dir, DOMAIN, asked) == remap_stages(asked, *size)
 
 
 @pytest.mark.parametrize(

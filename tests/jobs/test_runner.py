@@ -14,7 +14,7 @@ from deepsimbad.errors import (
     UnknownDomainError,
     UnknownJobError,
 )
-from deepsimbad.jobs.remap_config import RemapConfig
+from deepsimbad.jobs.remap import RemapConfig
 from deepsimbad.jobs.runner import InThisProcess, JobRunner
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.records import JobState

@@ -11,10 +11,9 @@ from deepsimbad.core.nnql import NnqlConfig
 from deepsimbad.core.relevance import Relevance
 from deepsimbad.core.training import TrainingWorld
 from deepsimbad.errors import CancelledError
+from deepsimbad.jobs.build import HELD_OUT, SECOND_DRIVE, train_nnql
 from deepsimbad.jobs.progress import Progress
-from deepsimbad.jobs.remap import remap
-from deepsimbad.jobs.remap_config import REMAP_STAGES, RemapConfig
-from deepsimbad.jobs.train import HELD_OUT, SECOND_DRIVE, train_nnql
+from deepsimbad.jobs.remap import REMAP_STAGES, RemapConfig, remap
 from deepsimbad.store.map_file import read_map
 
 DOMAIN = "route"

@@ -33,10 +33,9 @@ from deepsimbad.api.requests import (
 from deepsimbad.api.sessions import TruePositions
 from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Relevance
 from deepsimbad.errors import DeepSimbadError, NoActiveMapError, UnknownJobError
-from deepsimbad.jobs.learn import EXPERIENCE, ExperienceConfig, keep_true_positions
-from deepsimbad.jobs.remap import refuse_known_traverse
-from deepsimbad.jobs.remap_config import DEFAULT_LIST_LENGTH, DEFAULT_TRAINING_EPISODES, RemapConfig
+from deepsimbad.jobs.remap import DEFAULT_LIST_LENGTH, DEFAULT_TRAINING_EPISODES, RemapConfig, refuse_known_traverse
 from deepsimbad.jobs.runner import REMAP
+from deepsimbad.jobs.versions import EXPERIENCE, ExperienceConfig, keep_true_positions
 from deepsimbad.store.records import JobRecord
 from deepsimbad.store.traverses import Traverse
 

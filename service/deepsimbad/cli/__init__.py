@@ -9,9 +9,8 @@ from collections.abc import Sequence
 import click
 
 from deepsimbad.cli.experiment import experiment
-from deepsimbad.cli.keys import keys
 from deepsimbad.cli.local import delete, info, localize, map_
-from deepsimbad.cli.serve import init, serve, settings
+from deepsimbad.cli.serve import init, keys, serve, settings
 from deepsimbad.cli.storage import backup, check, export, import_, restore
 from deepsimbad.cli.weights import weights
 from deepsimbad.errors import CancelledError, DeepSimbadError, UnavailableError

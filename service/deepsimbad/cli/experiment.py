@@ -8,33 +8,36 @@ from typing import Any, TypeVar
 import click
 from rich.table import Table
 
-from deepsimbad.cli.options import (
+from deepsimbad.cli.terminal import (
     RELEVANCES,
     config_option,
     evaluator_option,
     evaluators_option,
     given_settings,
+    print_table,
+    progress_bar,
     spacing_option,
+    write_json,
 )
-from deepsimbad.cli.terminal import print_table, progress_bar, write_json
 from deepsimbad.core.planners import DEFAULT_PLANNER
 from deepsimbad.core.relevance import DEFAULT_RELEVANCE, DEFAULT_UPDATE, Relevance, UpdateRule
 from deepsimbad.core.route import true_images_of
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.registry import EvaluatorConfig, make_evaluator
+from deepsimbad.jobs.build import EncodedRecording, encode_recording
 from deepsimbad.jobs.experiments import (
     NbvConfig,
     NbvReport,
     VprConfig,
     VprReport,
     nbv_stages,
+    read_ground_truth,
     run_nbv,
     run_vpr,
     vpr_stages,
 )
 from deepsimbad.jobs.progress import Progress
-from deepsimbad.jobs.recordings import EncodedRecording, encode_recording, read_ground_truth
-from deepsimbad.jobs.remap_config import DEFAULT_TRAINING_EPISODES
+from deepsimbad.jobs.remap import DEFAULT_TRAINING_EPISODES
 from deepsimbad_client.recordings.sources import open_source
 
 _ROLES = ("landmarks", "training", "test")

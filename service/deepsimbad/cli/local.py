@@ -8,17 +8,18 @@ from rich.table import Table
 
 from deepsimbad.api.domains import describe_domain
 from deepsimbad.api.localizations import render_localization
-from deepsimbad.cli.options import (
+from deepsimbad.cli.terminal import (
     RELEVANCES,
     data_dir_option,
     evaluator_option,
     existing_data_dir,
     given_settings,
     json_option,
+    print_table,
+    progress_bar,
     spacing_option,
+    write_json,
 )
-from deepsimbad.cli.terminal import print_table, progress_bar, write_json
-from deepsimbad.core.drive import Drive
 from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Relevance
 from deepsimbad.engine.localizer import localize as localize_view
 from deepsimbad.engine.maps import Maps
@@ -27,14 +28,14 @@ from deepsimbad.errors import ImageTooLargeError, InvalidImageError, InvalidSour
 from deepsimbad.evaluators.compute import available_cores
 from deepsimbad.evaluators.image import decode_image
 from deepsimbad.evaluators.registry import EvaluatorConfig, make_evaluator
-from deepsimbad.jobs.recordings import encode_recording
-from deepsimbad.jobs.remap import remap
-from deepsimbad.jobs.remap_config import (
+from deepsimbad.jobs.build import encode_recording
+from deepsimbad.jobs.remap import (
     DEFAULT_LIST_LENGTH,
     DEFAULT_N_LANDMARKS,
     DEFAULT_TRAINING_EPISODES,
     REMAP_STAGES,
     RemapConfig,
+    remap,
 )
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.layout import checked_name
@@ -78,7 +79,6 @@ def map_(
     closed: bool,
     spacing_m: float,
     as_json: bool,
-    data_dir: Path | None,
     **options: Any,
 ) -> None:
     """Map a route from two recordings: one gives the landmarks, the other becomes the map.
@@ -90,13 +90,11 @@ def map_(
         training_traverse="training", landmark_traverse="landmarks", relevance=Relevance(relevance), **options
     )
     checked_name(domain, "domain")
-    settings = given_settings(data_dir=data_dir)
+    settings = given_settings()
     measure = make_evaluator(evaluator, settings.compute())
     # A mistake in what was typed should cost no minutes of encoding, and leave no domain behind.
-    recordings = {
-        role: open_source(source, spacing_m=spacing_m)
-        for role, source in (("landmarks", landmarks), ("training", training))
-    }
+    sources = {"landmarks": landmarks, "training": training}
+    recordings = {role: open_source(source, spacing_m=spacing_m) for role, source in sources.items()}
     n_candidates, n_landmarks = len(recordings["landmarks"].frames), config.n_landmarks
     if n_landmarks is not None and n_candidates < n_landmarks:
         raise TooFewCandidatesError(
@@ -108,7 +106,10 @@ def map_(
             for role, recording in recordings.items():
                 progress.stage(f"read {role}")
                 encoded = encode_recording(recording, measure, settings.max_pixels, progress.update)
-                _store(catalog.data_dir, domain, role, encoded.drive)
+                if role in Traverse.list(catalog.data_dir, domain):
+                    Traverse.delete(catalog.data_dir, domain, role)
+                with Traverse.create(catalog.data_dir, domain, role) as traverse:
+                    traverse.put_frames(encoded.drive)
             result = remap(catalog, domain, config, measure, progress, n_threads=available_cores())
     if as_json:
         write_json({"domain": domain, **result})
@@ -124,10 +125,10 @@ def map_(
 @click.argument("images", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.option("--json", "as_json", is_flag=True, help="Print the full answers as one JSON list.")
 @data_dir_option
-def localize(domain: str, images: tuple[Path, ...], as_json: bool, data_dir: Path | None) -> None:
+def localize(domain: str, images: tuple[Path, ...], as_json: bool) -> None:
     """Say where on the route each image was probably taken."""
-    settings = given_settings(data_dir=data_dir)
-    with Catalog.open(existing_data_dir(settings.data_dir)) as catalog:
+    settings = given_settings()
+    with Catalog.open(existing_data_dir()) as catalog:
         active = Maps(catalog).active(domain)
         evaluator = EvaluatorPool(settings.compute()).evaluator(active.record.evaluator)
         answers = []
@@ -160,9 +161,9 @@ def localize(domain: str, images: tuple[Path, ...], as_json: bool, data_dir: Pat
 @click.argument("domain")
 @click.confirmation_option("--yes", prompt="Delete the domain with its recordings and maps?")
 @data_dir_option
-def delete(domain: str, data_dir: Path | None) -> None:
+def delete(domain: str) -> None:
     """Delete a domain with everything it holds."""
-    with Catalog.open(existing_data_dir(given_settings(data_dir=data_dir).data_dir)) as catalog:
+    with Catalog.open(existing_data_dir()) as catalog:
         catalog.delete_domain(domain)
     click.echo(f"domain {domain} is deleted")
 
@@ -171,10 +172,10 @@ def delete(domain: str, data_dir: Path | None) -> None:
 @click.argument("domain")
 @json_option
 @data_dir_option
-def info(domain: str, as_json: bool, data_dir: Path | None) -> None:
+def info(domain: str, as_json: bool) -> None:
     """Describe a domain and its active map."""
-    settings = given_settings(data_dir=data_dir)
-    with Catalog.open(existing_data_dir(settings.data_dir)) as catalog:
+    settings = given_settings()
+    with Catalog.open(existing_data_dir()) as catalog:
         answer = describe_domain(catalog.domain(domain), EvaluatorPool(settings.compute()), Maps(catalog))
     if as_json:
         write_json(answer.model_dump())
@@ -183,11 +184,3 @@ def info(domain: str, as_json: bool, data_dir: Path | None) -> None:
     for name, value in answer.model_dump().items():
         table.add_row(name, "-" if value is None else str(value))
     print_table(table)
-
-
-def _store(data_dir: Path, domain: str, role: str, frames: Drive) -> None:
-    """Keep what was read as the domain's traverse of that role, in place of an earlier one."""
-    if role in Traverse.list(data_dir, domain):
-        Traverse.delete(data_dir, domain, role)
-    with Traverse.create(data_dir, domain, role) as traverse:
-        traverse.put_frames(frames)

@@ -5,8 +5,15 @@ from pathlib import Path
 
 import click
 
-from deepsimbad.cli.options import data_dir_option, existing_data_dir, given_settings, json_option
-from deepsimbad.cli.terminal import progress_bar, report, write_json
+from deepsimbad.cli.terminal import (
+    data_dir_option,
+    existing_data_dir,
+    given_settings,
+    json_option,
+    progress_bar,
+    report,
+    write_json,
+)
 from deepsimbad.errors import UnavailableError
 from deepsimbad.jobs.versions import import_map
 from deepsimbad.release import release
@@ -16,8 +23,6 @@ from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.layout import catalog_path, domains_folder
 from deepsimbad.store.map_file import export_map
 
-DAMAGE_FOUND = 1
-
 _file_argument = click.argument("file", type=click.Path(path_type=Path))
 
 
@@ -25,9 +30,9 @@ _file_argument = click.argument("file", type=click.Path(path_type=Path))
 @_file_argument
 @json_option
 @data_dir_option
-def backup(file: Path, as_json: bool, data_dir: Path | None) -> None:
+def backup(file: Path, as_json: bool) -> None:
     """Copy everything (domains, maps, traverses, sessions, keys) into FILE, beside a running service or not."""
-    source = existing_data_dir(given_settings(data_dir=data_dir).data_dir)
+    source = existing_data_dir()
     with progress_bar({"copy": 1.0}, "backup") as progress:
         progress.stage("copy")
         backed_up = back_up(source, file, release(), progress.update)
@@ -39,9 +44,9 @@ def backup(file: Path, as_json: bool, data_dir: Path | None) -> None:
 @_file_argument
 @json_option
 @data_dir_option
-def restore(file: Path, as_json: bool, data_dir: Path | None) -> None:
+def restore(file: Path, as_json: bool) -> None:
     """Make a data directory of the backup FILE. It must be absent or empty, and no service may run on it."""
-    target = given_settings(data_dir=data_dir).data_dir
+    target = given_settings().data_dir
     with progress_bar({"unpack": 1.0}, "restore") as progress:
         progress.stage("unpack")
         restored = restore_backup(file, target, progress.update)
@@ -55,9 +60,9 @@ def restore(file: Path, as_json: bool, data_dir: Path | None) -> None:
 @click.option("--version", type=int, help="Which version.  [default: the active one]")
 @json_option
 @data_dir_option
-def export(domain: str, file: Path, version: int | None, as_json: bool, data_dir: Path | None) -> None:
+def export(domain: str, file: Path, version: int | None, as_json: bool) -> None:
     """Copy a sealed map of DOMAIN into FILE, byte for byte, checked against its digest."""
-    with Catalog.open(existing_data_dir(given_settings(data_dir=data_dir).data_dir)) as catalog:
+    with Catalog.open(existing_data_dir()) as catalog:
         exported = export_map(catalog, domain, version, file)
     n_bytes, digest = exported.file_bytes, exported.sha256
     document = {
@@ -77,14 +82,12 @@ def export(domain: str, file: Path, version: int | None, as_json: bool, data_dir
 @click.option("--activate/--no-activate", default=True, show_default=True, help="Whether it shall serve at once.")
 @json_option
 @data_dir_option
-def import_(
-    file: Path, domain: str | None, sha256: str | None, activate: bool, as_json: bool, data_dir: Path | None
-) -> None:
+def import_(file: Path, domain: str | None, sha256: str | None, activate: bool, as_json: bool) -> None:
     """Take over an exported map as its domain's next version; a running service serves it within a second or so.
 
     The domain is made where it is absent; else it must have the same evaluator, actions and kind of route.
     """
-    with Catalog.open(given_settings(data_dir=data_dir).data_dir) as catalog:
+    with Catalog.open(given_settings().data_dir) as catalog:
         imported = import_map(catalog, file, domain, sha256, activate=activate)
     state = "active" if imported.active else "sealed"
     line = f"map {imported.map_version} of {imported.domain} is {state}: {imported.bytes} bytes"
@@ -95,12 +98,12 @@ def import_(
 @json_option
 @data_dir_option
 @click.pass_context
-def check(context: click.Context, as_json: bool, data_dir: Path | None) -> None:
+def check(context: click.Context, as_json: bool) -> None:
     """Verify every file, beside a running service or without one: one line a problem, exit code 1 if one is damaged.
 
     Nothing is changed.
     """
-    folder = given_settings(data_dir=data_dir).data_dir
+    folder = given_settings().data_dir
     if not catalog_path(folder).exists() and not domains_folder(folder).exists():
         raise UnavailableError(f"there is nothing to check in {folder}: name its folder with --data-dir")
     with progress_bar({"read": 1.0}, "check") as progress:
@@ -113,4 +116,4 @@ def check(context: click.Context, as_json: bool, data_dir: Path | None) -> None:
             click.echo(f"damaged: {finding.file}: {finding.what}")
         click.echo(f"{seen.n_files} files read, {len(seen.damaged)} problems", err=True)
     if seen.damaged:
-        context.exit(DAMAGE_FOUND)
+        context.exit(1)

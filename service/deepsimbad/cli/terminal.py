@@ -1,13 +1,13 @@
-"""What a person sees: progress on standard error, tables and JSON on standard output."""
+"""What the commands share: options and settings that come in; progress, tables and JSON that go out."""
 
 import json
 import math
 import signal
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import click
 from rich.console import Console
@@ -15,17 +15,130 @@ from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeRemaini
 from rich.progress import Progress as Bars
 from rich.table import Table
 
+from deepsimbad.core.relevance import Relevance
+from deepsimbad.errors import UnknownDomainError
+from deepsimbad.evaluators.registry import (
+    EXTRACTOR_FORMS,
+    EvaluatorConfig,
+    EvaluatorKind,
+    ExtractorName,
+    default_extractor,
+    evaluator_config,
+    fallback,
+)
+from deepsimbad.evaluators.weights.lock import Lock
 from deepsimbad.jobs.progress import Progress, ProgressState
+from deepsimbad.settings import Settings, TracedSettings, trace_settings
+from deepsimbad.store.layout import catalog_path
+
+_Command = TypeVar("_Command", bound=Callable[..., Any])
+
+RELEVANCES = click.Choice([relevance.value for relevance in Relevance])
+json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON document.")
+json_list_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON list.")
+spacing_option = click.option(
+    "--spacing-m",
+    type=click.FloatRange(min=0, min_open=True),
+    default=1.0,
+    show_default=True,
+    help="Metres between frames of a source without positions.",
+)
+
+
+def remember(context: click.Context, parameter: click.Parameter, value: object) -> None:
+    """A callback: keeps a setting's flag for `given_settings`."""
+    context.meta[f"deepsimbad.{parameter.name}"] = value
+
+
+config_option = click.option(
+    "--config",
+    type=click.Path(path_type=Path),
+    expose_value=False,
+    callback=remember,
+    help="TOML file of settings.  [default: $DEEPSIMBAD_CONFIG, else ./deepsimbad.toml if it is there]",
+)
+
+
+def data_dir_option(command: _Command) -> _Command:
+    """`--data-dir`, else as settings say, else ./deepsimbad-data; with `--config`."""
+    return click.option(
+        "--data-dir",
+        type=click.Path(file_okay=False, path_type=Path),
+        expose_value=False,
+        callback=remember,
+        help="Folder of domains and maps.  [default: $DEEPSIMBAD_DATA_DIR, else ./deepsimbad-data]",
+    )(config_option(command))
+
+
+def traced_settings(**flags: object) -> TracedSettings:
+    """The settings of the command that runs, each with its origin: flags, environment, settings file, defaults.
+
+    Args:
+        **flags: Settings by name, beside those remembered; None counts as not given.
+
+    Raises:
+        SettingsError: The file cannot be read, a name is unknown or a value cannot be used.
+    """
+    meta = click.get_current_context().meta
+    flags |= {name: meta.get(f"deepsimbad.{name}") for name in ("data_dir", "weights_dir")}
+    return trace_settings(meta.get("deepsimbad.config"), **flags)
+
+
+def given_settings(**flags: object) -> Settings:
+    """As `traced_settings`, the settings alone."""
+    return traced_settings(**flags).settings
+
+
+def existing_data_dir() -> Path:
+    """The data directory, where it holds a catalog: a question must not make the folder it asks about.
+
+    Raises:
+        UnknownDomainError: It holds none.
+    """
+    data_dir = given_settings().data_dir
+    if not catalog_path(data_dir).is_file():
+        raise UnknownDomainError(
+            f"there are no domains in {data_dir}: name their folder with --data-dir, or make one with `deepsimbad map`"
+        )
+    return data_dir
+
+
+def _evaluator(_context: click.Context, _parameter: click.Parameter, value: str) -> EvaluatorConfig:
+    kind, _, extractor = value.partition(":")
+    if not extractor and (remark := fallback()) is not None:
+        click.echo(remark, err=True)
+    return evaluator_config({"kind": kind, **({"extractor": extractor} if extractor else {})})
+
+
+def _evaluators(context: click.Context, parameter: click.Parameter, value: str) -> tuple[EvaluatorConfig, ...]:
+    if value != "all":
+        return (_evaluator(context, parameter, value),)
+    pulled = Lock.read(given_settings().weights_dir).extractors()
+    extractors = dict.fromkeys([default_extractor().value, ExtractorName.GRADIENT_GRID.value, *pulled])
+    return tuple(evaluator_config({"kind": EvaluatorKind.FEATURE_L2.value, "extractor": name}) for name in extractors)
+
+
+_NAMES = ", ".join(f"{EvaluatorKind.FEATURE_L2}:{extractor}" for extractor in EXTRACTOR_FORMS)
+evaluator_option = click.option(  # given on as an EvaluatorConfig
+    "--evaluator",
+    default=EvaluatorKind.FEATURE_L2.value,
+    show_default=True,
+    callback=_evaluator,
+    help=f"How images are compared with landmarks: a kind, or one of {_NAMES}.",
+)
+evaluators_option = click.option(  # or `all`; given on as EvaluatorConfigs
+    "--evaluator",
+    "evaluators",
+    default=EvaluatorKind.FEATURE_L2.value,
+    show_default=True,
+    callback=_evaluators,
+    help="How images are compared with landmarks: as KIND or KIND:EXTRACTOR; all: by every extractor that is here.",
+)
 
 
 @contextmanager
 def progress_bar(stages: Mapping[str, float], title: str) -> Iterator[Progress]:
-    """A progress bar over weighted stages; Ctrl-C cancels at the next report.
-
-    Args:
-        stages: Every stage with its weight.
-        title: What is being done.
-    """
+    """A progress bar over weighted stages; Ctrl-C cancels at the next report."""
     interrupted = False
 
     def interrupt(*_: object) -> None:
@@ -50,11 +163,9 @@ def progress_bar(stages: Mapping[str, float], title: str) -> Iterator[Progress]:
 
 
 def print_table(table: Table, *remarks: str, numbers: bool = False) -> None:
-    """A table on standard output, whole where that is no terminal, and what there is to say below it.
+    """A table on standard output, whole where that is no terminal, and remarks in lines below it.
 
     Args:
-        table: It.
-        remarks: Lines.
         numbers: Whether all columns but the first hold numbers.
     """
     for column in table.columns[1:] if numbers else ():

@@ -16,15 +16,20 @@ from rich.markup import escape
 from rich.progress import BarColumn, DownloadColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from rich.table import Column, Table
 
-from deepsimbad.cli.options import data_dir_option, given_settings
-from deepsimbad.cli.terminal import print_table, write_json
+from deepsimbad.cli.terminal import (
+    data_dir_option,
+    given_settings,
+    json_list_option,
+    json_option,
+    print_table,
+    remember,
+    write_json,
+)
 from deepsimbad.errors import InvalidInputError, MissingWeightsError
 from deepsimbad.evaluators.registry import EXTRACTOR_FORMS, EXTRACTOR_PATTERN
 from deepsimbad.evaluators.weights.downloads import HubWish, Tell, pull_file, pull_hub
 from deepsimbad.evaluators.weights.library import HUB, KNOWN, Argument, canonical, known
 from deepsimbad.evaluators.weights.lock import HUB_FOLDER, Lock
-
-DIFFERENCE_FOUND = 1
 
 _Command = TypeVar("_Command", bound=Callable[..., Any])
 _SHA256 = re.compile(r"[0-9a-fA-F]{8,64}")
@@ -37,6 +42,8 @@ def _folder_options(command: _Command) -> _Command:
     return click.option(
         "--weights-dir",
         type=click.Path(file_okay=False, path_type=Path),
+        expose_value=False,
+        callback=remember,
         help="Folder of weights.  [default: $DEEPSIMBAD_WEIGHTS_DIR, else ~/.cache/deepsimbad/weights]",
     )(data_dir_option(command))
 
@@ -47,11 +54,11 @@ def weights() -> None:
 
 
 @weights.command("list")
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON list.")
+@json_list_option
 @_folder_options
-def list_(as_json: bool, data_dir: Path | None, weights_dir: Path | None) -> None:
+def list_(as_json: bool) -> None:
     """List the weights that are known, and what else was pulled, with how a configuration names them."""
-    lock = Lock.read(given_settings(data_dir=data_dir, weights_dir=weights_dir).weights_dir)
+    lock = Lock.read(given_settings().weights_dir)
     rows = list(_rows(lock))
     if as_json:
         write_json(rows)
@@ -75,15 +82,13 @@ def list_(as_json: bool, data_dir: Path | None, weights_dir: Path | None) -> Non
 @click.option("--yes", is_flag=True, help="Run the repository's code without asking.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON list of what was recorded.")
 @_folder_options
-def pull(
-    names: tuple[str, ...], yes: bool, as_json: bool, data_dir: Path | None, weights_dir: Path | None, **asked: Any
-) -> None:
+def pull(names: tuple[str, ...], yes: bool, as_json: bool, **asked: Any) -> None:
     """Bring weights here and record their digests. NAME is of `weights list`, or an extractor's, as netvlad:FILE.
 
     A download that broke off goes on where it stopped. Of a torch hub repository the archive at a commit is fetched and
     its code is run once, so that its own downloads come too: you are asked before.
     """
-    folder = given_settings(data_dir=data_dir, weights_dir=weights_dir).weights_dir
+    folder = given_settings().weights_dir
     extractors = [_extractor(name) for name in names]
     hub = [extractor for extractor in extractors if extractor.startswith(HUB)]
     url, sha256, commit, arguments = (asked[name] for name in ("url", "sha256", "commit", "arguments"))
@@ -114,14 +119,12 @@ def pull(
 
 @weights.command()
 @click.argument("names", metavar="[NAME...]", nargs=-1)
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON document.")
+@json_option
 @_folder_options
 @click.pass_context
-def verify(
-    context: click.Context, names: tuple[str, ...], as_json: bool, data_dir: Path | None, weights_dir: Path | None
-) -> None:
+def verify(context: click.Context, names: tuple[str, ...], as_json: bool) -> None:
     """Compute the digests of what was pulled anew: one line each, exit code 1 if one differs or is missing."""
-    lock = Lock.read(given_settings(data_dir=data_dir, weights_dir=weights_dir).weights_dir)
+    lock = Lock.read(given_settings().weights_dir)
     findings = [finding for name in _recorded(lock, names) for finding in lock.findings(name)]
     are_good = all(finding.is_good for finding in findings)
     if as_json:
@@ -133,7 +136,7 @@ def verify(
         recorded = "" if finding.is_good else f" (recorded: {finding.recorded})"
         click.echo(f"{state}: {finding.path}: {finding.found or 'not there'}{recorded}")
     if not are_good:
-        context.exit(DIFFERENCE_FOUND)
+        context.exit(1)
 
 
 def _extractor(name: str) -> str:

@@ -1,7 +1,11 @@
-"""From drives to a map: landmarks chosen, every training frame described, a second season learnt from (II-B, II-C)."""
+"""From recordings to a map: encoded, landmarks chosen, every frame described, experience learnt (II-B to II-D)."""
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
+from dataclasses import asdict, dataclass, field, replace
+from statistics import median
 from typing import Any
 
 import numpy as np
@@ -9,25 +13,107 @@ from numpy.typing import NDArray
 
 from deepsimbad.core.building import build_map
 from deepsimbad.core.descriptor import rank_landmarks
-from deepsimbad.core.drive import Drive, SameRoute, second_season
+from deepsimbad.core.drive import UNKNOWN_TIMESTAMP, Drive, SameRoute, second_season
 from deepsimbad.core.landmark_model import select_landmarks
 from deepsimbad.core.map import Map
+from deepsimbad.core.nnql import NnqlConfig, initial_q_values
 from deepsimbad.core.off_route import OffRouteModel
 from deepsimbad.core.planners import telling_bits
 from deepsimbad.core.relevance import Query, Relevance
-from deepsimbad.evaluators.base import Evaluator, LandmarkModel
+from deepsimbad.core.route import same_places
+from deepsimbad.core.training import LearningCurve, TrainingWorld, train
+from deepsimbad.errors import InvalidSourceError
+from deepsimbad.evaluators.base import Evaluator, Image, LandmarkModel
+from deepsimbad.evaluators.image import decode_image
+from deepsimbad_client.errors import BrokenFrameError
+from deepsimbad_client.recordings.recording import Recording
 
 _FRAMES_A_BLOCK = 1024
+EPISODES_A_MAP_IMAGE = 25  # more would visit every entry of a small map again and again
+SECOND_DRIVE, HELD_OUT = "landmark_traverse", "held_out_frames"
+
+
+@dataclass(frozen=True)
+class EncodedRecording:
+    """One recorded drive, encoded."""
+
+    drive: Drive  # its frames, those that could be used
+    left_out: dict[str, int] = field(default_factory=dict)  # reason -> number of frames that could not
+    encode_ms: float | None = None  # median from reading an image to its encoding; None where encodings came ready
+
+
+def encode_recording(
+    recording: Recording, evaluator: Evaluator, max_pixels: int, on_progress: Callable[[float], None]
+) -> EncodedRecording:
+    """Encode a recording's images as the service would, or take its ready encodings.
+
+    The client's own readers prepare the images (decision 0003), so one that is uploaded has the same numbers.
+
+    Raises:
+        InvalidSourceError: No frame can be used.
+        InvalidRouteError: The positions go backwards or are NaN.
+    """
+    frames, left_out = list(recording.frames), dict(recording.left_out)
+    encodings, encode_ms, weights_sha256 = recording.encodings, None, None
+    if encodings is None:
+        places, encodings, encode_ms = _encode_images(recording, evaluator, max_pixels, left_out, on_progress)
+        frames, weights_sha256 = [frames[place] for place in places], evaluator.weights_sha256
+    if not frames:
+        raise InvalidSourceError(f"{recording.name} has no frame that can be used: {left_out}")
+
+    def known(values: list[float | None]) -> NDArray[np.float64]:
+        return np.array([np.nan if value is None else value for value in values], np.float64)
+
+    times_us = [UNKNOWN_TIMESTAMP if frame.timestamp_us is None else frame.timestamp_us for frame in frames]
+    drive = Drive(
+        index=np.array([frame.index for frame in frames], np.int64),
+        position_m=np.array([frame.position_m for frame in frames], np.float64),
+        timestamp_us=np.array(times_us, np.int64),
+        x_m=known([frame.x_m for frame in frames]),
+        y_m=known([frame.y_m for frame in frames]),
+        encodings=encodings,
+        weights_sha256=weights_sha256,
+    )
+    drive.route()
+    return EncodedRecording(drive, left_out, encode_ms)
+
+
+def _encode_images(
+    recording: Recording,
+    evaluator: Evaluator,
+    max_pixels: int,
+    left_out: dict[str, int],
+    on_progress: Callable[[float], None],
+) -> tuple[list[int], NDArray[np.float32], float | None]:
+    """Places of the frames that could be read, their encodings, the median of milliseconds; broken ones are counted."""
+    if not evaluator.takes_images or evaluator.encoding_dim is None:
+        raise InvalidSourceError("this evaluator takes ready encodings alone; give a .npy or .csv file")
+    encodings = np.empty((len(recording.frames), evaluator.encoding_dim), np.float32)
+    places: list[int] = []
+    waiting: list[Image] = []  # as many as are best encoded at once
+    took_ms: list[float] = []
+    began = time.perf_counter()
+    for place, frame in enumerate(recording.frames):
+        try:
+            body = recording.image(frame, evaluator.input_size).body
+        except BrokenFrameError as error:
+            left_out[error.reason] = left_out.get(error.reason, 0) + 1
+        else:
+            began = began if waiting else time.perf_counter()
+            waiting.append(evaluator.prepare(decode_image(body, max_pixels)))
+            places.append(place)
+        if waiting and (len(waiting) >= evaluator.largest_batch or place == len(recording.frames) - 1):
+            encodings[len(places) - len(waiting) : len(places)] = evaluator.encode(waiting)
+            took_ms += [1000 * (time.perf_counter() - began) / len(waiting)] * len(waiting)
+            waiting.clear()
+        on_progress((place + 1) / len(recording.frames))
+    return places, encodings[: len(places)], median(took_ms) if took_ms else None
 
 
 def choose_landmarks(
     candidates: NDArray[np.float32], n_landmarks: int, evaluator: Evaluator, on_progress: Callable[[float], None]
 ) -> LandmarkModel:
-    """Select r of the landmark traverse's encodings and fit the evaluator's model to them.
-
-    Args:
-        candidates: [m, d] encodings.
-    """
+    """Select r of the landmark traverse's encodings [m, d], and fit the evaluator's model to them."""
     return evaluator.fit_landmarks(candidates[select_landmarks(candidates, n_landmarks, on_progress)])
 
 
@@ -101,3 +187,70 @@ def build(
     on_progress(1.0)
     model_array = None if off_route is None else np.array([off_route.slope, off_route.intercept])
     return Built(replace(map_, telling_bits=bits, off_route_model=model_array), rehearsal, other, verdict)
+
+
+def train_nnql(
+    map_: Map,
+    own: Callable[[], Drive],
+    second: Drive | None,
+    config: NnqlConfig,
+    on_progress: Callable[[float], None],
+    n_threads: int = 1,
+) -> tuple[NDArray[np.float32], dict[str, Any]]:
+    """Learn a map's Q-values; how many threads there are changes nothing of them.
+
+    A map image that looks for itself finds itself at once, and nothing would be learnt. So the live images are those of
+    a second drive of the route; else the training traverse is halved: its odd frames are driven through a map of the
+    even ones, which teaches the even ones' Q-values, and then the other way round.
+
+    Args:
+        map_: The map; its lists must not have been made with knowledge of the second drive.
+        own: Gives the map's own traverse, measured; asked only where there is no second drive.
+        second: Another drive of the same route, measured.
+        config: The hyperparameters; small maps take fewer episodes than it says.
+
+    Returns:
+        Q-values [n, a] float32; and the learning curve and what it was learnt on, JSON-ready.
+    """
+    started = time.perf_counter()
+    n_episodes = min(config.n_episodes, EPISODES_A_MAP_IMAGE * map_.n_images)
+    q_values = initial_q_values(map_.n_images, map_.actions_m.size, config)
+    curves: list[LearningCurve] = []
+    with ThreadPoolExecutor(n_threads) if n_threads > 1 else nullcontext() as pool:
+        if second is not None:
+            used = replace(config, n_episodes=n_episodes)
+            places = same_places(second.route(map_.closed), map_.route)
+            true_image = np.full(second.n_frames, -1, np.int64)
+            true_image[places[:, 1]] = places[:, 0]
+            q_values, curve = train(world_of(map_, second, true_image, used), used, on_progress, pool)
+            curves.append(curve)
+        elif n_episodes:
+            used = replace(config, n_episodes=max(1, n_episodes // 2))
+            for fold, (images, half, live) in enumerate(_halves(map_, own())):
+                world = world_of(half, live, np.asarray(half.route.nearest_image(live.position_m), np.int64), used)
+
+                def report(share: float, fold: int = fold) -> None:
+                    on_progress((fold + share) / 2)
+
+                q_values[images], curve = train(world, used, report, pool)
+                curves.append(curve)
+    return q_values, {
+        "live_images": HELD_OUT if second is None else SECOND_DRIVE,
+        "n_episodes": n_episodes,
+        "curves": [curve.as_dict() for curve in curves],
+        "hyperparameters": asdict(config),
+        "seconds": time.perf_counter() - started,
+    }
+
+
+def world_of(map_: Map, live: Drive, true_image: NDArray[np.int64], config: NnqlConfig) -> TrainingWorld:
+    """A world of one measured drive; `true_image` [m] is the map image of every frame's place, -1: none."""
+    return TrainingWorld.on(map_, views_of(live), live.route(map_.closed), true_image, config)
+
+
+def _halves(map_: Map, own: Drive) -> Iterator[tuple[NDArray[np.int64], Map, Drive]]:
+    """Every second image, the map of these, and the images between as live views; then the other way round."""
+    every = np.arange(map_.n_images)
+    for images, frames in ((every[::2], every[1::2]), (every[1::2], every[::2])):
+        if images.size and frames.size:
+            yield images, map_.at(images), own.at(frames)

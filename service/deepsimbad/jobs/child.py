@@ -24,6 +24,7 @@ _LOWEST_NICE = 19
 _PR_SET_PDEATHSIG = 1
 _KILL_ME_FIRST = 500  # of 1000: where memory runs out, the kernel shall end the job rather than the service
 _ORPHANED = 3  # exit code
+_writing = threading.Lock()
 
 
 class JobPriority(StrEnum):
@@ -34,25 +35,20 @@ class JobPriority(StrEnum):
     NORMAL = "normal"
 
 
-def take_priority(priority: JobPriority) -> None:
+def _take_priority(priority: JobPriority) -> None:
     """Let this process, and the threads it starts from now on, run so; what a system does not have is left out.
 
-    Idle takes the machine only while nobody else wants it. Low, batch work at nice 19, still keeps about a seventieth
-    of a contended core, so that it goes on where others never rest, and, worse for them, is not preempted by a thread
-    that wakes up. An idle-class thread is preempted at once, and the kernel (since 5.4) counts a core that runs
-    nothing else as free when it places a waking thread.
+    Idle takes the machine only while nobody else wants it: an idle-class thread is preempted at once, and the kernel
+    (since 5.4) counts its core as free when it places a waking thread. Low still keeps about a seventieth of a
+    contended core, so that it goes on where others never rest, and is not preempted by a thread that wakes up.
     """
     if priority is JobPriority.NORMAL:
         return
     with suppress(OSError):
         os.nice(_LOWEST_NICE)
-    if hasattr(os, "SCHED_IDLE"):
-        with suppress(OSError):
-            kind = os.SCHED_IDLE if priority is JobPriority.IDLE else os.SCHED_BATCH
-            os.sched_setscheduler(0, kind, os.sched_param(0))
-
-
-_writing = threading.Lock()
+    with suppress(OSError, AttributeError):
+        kind = os.SCHED_IDLE if priority is JobPriority.IDLE else os.SCHED_BATCH
+        os.sched_setscheduler(0, kind, os.sched_param(0))
 
 
 def _tell(**message: Any) -> None:
@@ -85,7 +81,7 @@ def main() -> None:
     """Do the job that standard input names."""
     for signal_number in (signal.SIGINT, signal.SIGTERM):  # meant for the service, which then stops its job itself
         signal.signal(signal_number, signal.SIG_IGN)
-    take_priority(JobPriority(sys.argv[1]))
+    _take_priority(JobPriority(sys.argv[1]))
     with suppress(OSError):
         Path("/proc/self/oom_score_adj").write_text(str(_KILL_ME_FIRST), encoding="ascii")
     faulthandler.enable()

@@ -3,8 +3,8 @@
 The first compares every relevance, the second every planner from the same starts, ours beside the paper's.
 """
 
+import pickle
 import tempfile
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -33,20 +33,16 @@ from deepsimbad.core.planners import CONSTANT, DEFAULT_PLANNER, NNQL, RANDOM
 from deepsimbad.core.relevance import DEFAULT_RELEVANCE, DEFAULT_UPDATE, Query, Relevance, UpdateRule
 from deepsimbad.core.retrieval import relevances
 from deepsimbad.core.route import same_places
-from deepsimbad.errors import InvalidMapConfigError
-from deepsimbad.evaluators.base import Evaluator, LandmarkModel
+from deepsimbad.errors import InvalidMapConfigError, InvalidSourceError
+from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.compute import available_cores
-from deepsimbad.jobs.build import build, choose_landmarks, measured, views_of
+from deepsimbad.jobs.build import EncodedRecording, build, choose_landmarks, measured, train_nnql, views_of
 from deepsimbad.jobs.progress import Progress
-from deepsimbad.jobs.recordings import EncodedRecording
-from deepsimbad.jobs.train import train_nnql
 from deepsimbad.store.arrays import is_halvable
 from deepsimbad.store.map_file import index_bytes, seal, write_map
 
 _QUERIES_A_BLOCK = 64  # of brute force: large enough for a matrix product, small enough for memory
 CLAIRVOYANT = "clairvoyant"
-PAPER = (Relevance.RRF, UpdateRule.ADDITIVE_RELEVANCE)
-PAPER_ACTION_STD_M = 0.7  # the reference figures' blur for the paper's set-up
 DISTANCES_M = (10.0, 20.0, 50.0)
 
 
@@ -68,10 +64,10 @@ class VprReport:
     """Scores by relevance, and what they cost."""
 
     config: VprConfig
-    scores: dict[Relevance, RetrievalScores]  # by relevance
+    scores: dict[Relevance, RetrievalScores]
     # Size on disk of the posting tables, of the map for the relevance that ships (or of the first asked for)
     index_bits_per_map_image: float
-    seconds: dict[str, float]  # seconds by stage
+    seconds: dict[str, float]  # by stage
     same_route: SameRoute  # whether the landmark traverse drove the mapped route
     encoding_dim: int  # d
     bytes_per_encoding: int  # of one frame in a traverse's file, places apart
@@ -119,19 +115,8 @@ def run_vpr(
         landmarks: The landmark traverse; where it drove the mapped route, `calibrated` learns from it.
         true_images: For every test frame the map images that count as true.
     """
-    seconds: dict[str, float] = {}
-    started = time.perf_counter()
-
-    def lap(stage: str) -> None:
-        nonlocal started
-        now = time.perf_counter()
-        seconds[stage.replace(" ", "_")] = now - started
-        started = now
-
     progress.stage("select landmarks")
     model = choose_landmarks(landmarks.encodings, config.n_landmarks, evaluator, progress.update)
-    lap("select landmarks")
-
     progress.stage("describe")
     measure = partial(measured, evaluator=evaluator, model=model)
     own = measure(training)
@@ -139,15 +124,14 @@ def run_vpr(
     views = views_of(measure(test.drive))
     progress.update(0.6)
     season, _, verdict = second_season(own, False, landmarks, config.same_route, measure)
-    lap("describe")
-
     scores: dict[Relevance, RetrievalScores] = {}
     maps: dict[Relevance, Map] = {}
     for name in config.relevances:
         progress.stage(f"query by {name.value}")
         maps[name] = build_map(name, own, config.list_length, second_season=season)
         scores[name] = _score(maps[name], views, true_images, progress.update)
-        lap(f"query by {name.value}")
+    stages = {stage.replace(" ", "_") for stage in vpr_stages(config)}
+    seconds = {stage: took for stage, took in progress.seconds().items() if stage in stages}
     sized = maps.get(DEFAULT_RELEVANCE, maps[config.relevances[0]])
     return VprReport(
         config,
@@ -190,11 +174,9 @@ def _score(
 class NbvConfig:
     """What is compared."""
 
-    # n_landmarks, list_length: r and h
-    n_landmarks: int = 300
-    list_length: int = 4
-    # relevance, update: Of our set-up; the paper's is measured beside it
-    relevance: Relevance = DEFAULT_RELEVANCE
+    n_landmarks: int = 300  # r
+    list_length: int = 4  # h
+    relevance: Relevance = DEFAULT_RELEVANCE  # of our set-up, as update; the paper's is measured beside it
     update: UpdateRule = DEFAULT_UPDATE[DEFAULT_RELEVANCE]
     actions_m: tuple[float, ...] = tuple(float(metres) for metres in range(1, 11))  # the moves
     n_steps: int = 10  # moves an episode
@@ -206,21 +188,12 @@ class NbvConfig:
 
 
 @dataclass(frozen=True)
-class _Setup:
-    name: str
-    relevance: Relevance
-    update: UpdateRule
-    action_std_m: float | None
-
-
-@dataclass(frozen=True)
 class NbvReport:
     """What every planner scored."""
 
-    config: NbvConfig  # what was compared
-    # ours, paper: Rank shares [episodes, steps] by planner, under our set-up and the paper's
-    ours: dict[str, NDArray[np.float64]]
-    paper: dict[str, NDArray[np.float64]]
+    config: NbvConfig
+    ours: dict[str, NDArray[np.float64]]  # rank shares [episodes, steps] by planner, under our set-up
+    paper: dict[str, NDArray[np.float64]]  # and under the paper's
     travelled_m: dict[str, NDArray[np.float64]]  # metres [episodes, steps] by planner, under our set-up
     same_route: SameRoute | None = None  # whether the landmark traverse drove the mapped route; None: nobody looked
 
@@ -231,19 +204,18 @@ class NbvReport:
 
     def as_dict(self, sources: dict[str, Any]) -> dict[str, Any]:
         """The stable flat JSON document of design section 7; percent."""
-        seed, default = self.config.seed, _means(self.ours, DEFAULT_PLANNER)
+        by_episode = {name: shares.mean(axis=1) for name, shares in self.ours.items()}
+
+        def interval(shares: NDArray[np.float64]) -> list[float]:
+            return [100 * end for end in mean_interval(shares, self.config.seed)]
+
         return {
             "anr": {name: _percent(shares) for name, shares in self.ours.items()},
             "default": DEFAULT_PLANNER,
             "anr_paper": {name: _percent(shares) for name, shares in self.paper.items()},
-            "interval_95": {
-                name: [100 * end for end in mean_interval(shares.mean(axis=1), seed)]
-                for name, shares in self.ours.items()
-            },
+            "interval_95": {name: interval(shares) for name, shares in by_episode.items()},
             "difference_95": {
-                f"{DEFAULT_PLANNER} - {rival}": [
-                    100 * end for end in mean_interval(default - _means(self.ours, rival), seed)
-                ]
+                f"{DEFAULT_PLANNER} - {rival}": interval(by_episode[DEFAULT_PLANNER] - by_episode[rival])
                 for rival in (RANDOM, self.best_constant)
             },
             "best_constant": self.best_constant,
@@ -282,83 +254,57 @@ def run_nbv(
     if starts.size == 0:
         raise InvalidMapConfigError(f"the test traverse is shorter than an episode of {travel_m:g} m")
 
+    setups = (
+        ("ours", config.relevance, config.update, None),
+        # With the blur that the reference figures of the paper's set-up have, metres.
+        ("paper", Relevance.RRF, UpdateRule.ADDITIVE_RELEVANCE, 0.7),
+    )
     results: dict[str, dict[str, list[Episode]]] = {}
     same_route = None
-    setups = (
-        _Setup("ours", config.relevance, config.update, None),
-        _Setup("paper", *PAPER, PAPER_ACTION_STD_M),
-    )
-    for setup in setups:
-        map_, same_route = _mapped(config, setup, evaluator, model, landmarks, training, progress)
-        results[setup.name] = {}
+    for setup, relevance, update, action_std_m in setups:
+        progress.stage(f"map ({setup})")
+        built = build(
+            training,
+            landmarks,
+            config.same_route,
+            evaluator,
+            model,
+            relevance,
+            config.list_length,
+            config.actions_m,
+            False,
+            progress.update,
+        )
+        same_route = built.same_route
+        progress.stage(f"train ({setup})")
+        nnql = NnqlConfig(
+            config.training_episodes, config.n_steps, update=update, motion_std_m=action_std_m, seed=config.seed
+        )
+        own = partial(measured, training, evaluator, model)
+        q_values, _ = train_nnql(built.rehearsal, own, built.second, nnql, progress.update, available_cores())
+        map_ = replace(built.map, q_values=q_values)
+        results[setup] = {}
         for name in _names(config):
-            progress.stage(f"{name} ({setup.name})")
-            localizer = ActiveLocalizer(map_, LocalizerConfig(update=setup.update, planner=_planner(name, config)))
-            runner = EpisodeRunner(localizer, drive, config.n_steps, setup.action_std_m)
+            progress.stage(f"{name} ({setup})")
+            # The localizer plans by itself alone; what only an experiment has is a chooser, and planning costs nothing.
+            planner = name if name in {NNQL, DEFAULT_PLANNER} else f"{CONSTANT}:{config.actions_m[0]:g}"
+            localizer = ActiveLocalizer(map_, LocalizerConfig(update=update, planner=planner))
+            runner = EpisodeRunner(localizer, drive, config.n_steps, action_std_m)
             chooser = _chooser(name, runner, config)
-            results[setup.name][name] = _episodes(runner, starts, chooser, name == RANDOM, progress.update)
+            results[setup][name] = _episodes(runner, starts, chooser, name == RANDOM, progress.update)
     ours = results["ours"]
     return NbvReport(
         config,
-        {name: _stack(episodes) for name, episodes in ours.items()},
-        {name: _stack(episodes) for name, episodes in results["paper"].items()},
+        {name: np.stack([episode.rank_share for episode in episodes]) for name, episodes in ours.items()},
+        {name: np.stack([episode.rank_share for episode in episodes]) for name, episodes in results["paper"].items()},
         {name: np.stack([episode.travelled_m for episode in episodes]) for name, episodes in ours.items()},
         same_route,
     )
 
 
-def _mapped(
-    config: NbvConfig,
-    setup: _Setup,
-    evaluator: Evaluator,
-    model: LandmarkModel,
-    landmarks: Drive,
-    training: Drive,
-    progress: Progress,
-) -> tuple[Map, SameRoute | None]:
-    """The map with its experience database, as a remap makes it, and whether it learnt from the landmark traverse."""
-    progress.stage(f"map ({setup.name})")
-    built = build(
-        training,
-        landmarks,
-        config.same_route,
-        evaluator,
-        model,
-        setup.relevance,
-        config.list_length,
-        config.actions_m,
-        False,
-        progress.update,
-    )
-    progress.stage(f"train ({setup.name})")
-    q_values, _ = train_nnql(
-        built.rehearsal,
-        partial(measured, training, evaluator, model),
-        built.second,
-        NnqlConfig(
-            config.training_episodes,
-            config.n_steps,
-            update=setup.update,
-            motion_std_m=setup.action_std_m,
-            seed=config.seed,
-        ),
-        progress.update,
-        available_cores(),
-    )
-    return replace(built.map, q_values=q_values), built.same_route
-
-
 def _names(config: NbvConfig) -> list[str]:
-    return [RANDOM, *(_constant(action_m) for action_m in config.actions_m), CLAIRVOYANT, NNQL, DEFAULT_PLANNER]
-
-
-def _constant(action_m: float) -> str:
-    return f"{CONSTANT}_{action_m:g}"
-
-
-def _planner(name: str, config: NbvConfig) -> str:
-    """The localizer's own planner; those that only an experiment has are choosers, and it then costs nothing."""
-    return name if name in {NNQL, DEFAULT_PLANNER} else f"{CONSTANT}:{config.actions_m[0]:g}"
+    constants = (f"{CONSTANT}_{action_m:g}" for action_m in config.actions_m)
+    return [RANDOM, *constants, CLAIRVOYANT, NNQL, DEFAULT_PLANNER]
 
 
 def _chooser(name: str, runner: EpisodeRunner, config: NbvConfig) -> Chooser:
@@ -384,12 +330,9 @@ def _episodes(
     driven: dict[int, Episode] = {}
     episodes = []
     for number, start in enumerate(starts.tolist()):
-        if draws:
-            episodes.append(runner.run(number, start, choose))
-        else:
-            if start not in driven:
-                driven[start] = runner.run(number, start, choose)
-            episodes.append(driven[start])
+        if draws or start not in driven:
+            driven[start] = runner.run(number, start, choose)
+        episodes.append(driven[start])
         on_progress((number + 1) / starts.size)
     return episodes
 
@@ -401,15 +344,6 @@ def _nearest_images(test: Drive, training: Drive) -> NDArray[np.int64]:
     pairs = same_places(test.route(), route, tolerance_m=np.inf)
     nearest[pairs[:, 1]] = pairs[:, 0]
     return nearest
-
-
-def _stack(episodes: Sequence[Episode]) -> NDArray[np.float64]:
-    return np.stack([episode.rank_share for episode in episodes])
-
-
-def _means(shares: dict[str, NDArray[np.float64]], name: str) -> NDArray[np.float64]:
-    """[episodes] mean over a planner's steps."""
-    return np.asarray(shares[name].mean(axis=1))
 
 
 def _percent(shares: NDArray[np.float64]) -> float:
@@ -425,3 +359,64 @@ def _at_distances(shares: NDArray[np.float64], travelled_m: NDArray[np.float64])
         last = shares[np.arange(len(shares)), np.maximum(n_within - 1, 0)]
         anr[f"{distance_m:g}"] = _percent(last[reached]) if reached.any() else None
     return anr
+
+
+class _ArraysOnly(pickle.Unpickler):
+    """Unpickles arrays and lists of numbers; a file that names anything else runs nothing."""
+
+    HARMLESS = frozenset({"numpy ndarray", "numpy dtype"}) | {
+        f"numpy.{core}.multiarray {name}" for core in ("core", "_core") for name in ("_reconstruct", "scalar")
+    }
+
+    def find_class(self, module: str, name: str) -> Any:
+        if f"{module} {name}" not in self.HARMLESS:
+            raise pickle.UnpicklingError(f"it names {module}.{name}")
+        return super().find_class(module, name)
+
+
+def read_ground_truth(
+    path: Path, test_index: NDArray[np.int64], training_index: NDArray[np.int64]
+) -> list[NDArray[np.int64]]:
+    """Read a `.npy` of accepted matches.
+
+    Args:
+        path: An array [q, 2] whose rows are (test frame, list of training frames), as VPR-Bench writes it; or [q]
+            of lists, or [q, k] of numbers padded with -1, in test frame order.
+        test_index: [m] places of the test frames in their recording.
+        training_index: [n] the same of the training frames.
+
+    Returns:
+        For every test frame the map images, as places among the training frames; empty where none is accepted.
+
+    Raises:
+        InvalidSourceError: Not such a file.
+    """
+    rows = _load(path)
+    try:
+        if rows.dtype == object and rows.ndim == 2 and rows.shape[1] == 2:
+            accepted = {int(query): [int(t) for t in np.atleast_1d(truth)] for query, truth in rows}
+        else:
+            accepted = {query: [int(t) for t in np.atleast_1d(truth)] for query, truth in enumerate(rows)}
+    except (TypeError, ValueError) as error:
+        raise InvalidSourceError(f"{path} holds no lists of frame numbers: {error}") from error
+    place_of = {int(index): place for place, index in enumerate(training_index)}
+    return [
+        np.array(sorted(place_of[t] for t in accepted.get(int(index), ()) if t in place_of), np.int64)
+        for index in test_index
+    ]
+
+
+def _load(path: Path) -> NDArray[Any]:
+    try:
+        with path.open("rb") as file:
+            major, _ = np.lib.format.read_magic(file)
+            header = np.lib.format.read_array_header_1_0 if major == 1 else np.lib.format.read_array_header_2_0
+            _, _, dtype = header(file)
+            if dtype.hasobject:
+                return np.asarray(_ArraysOnly(file).load())
+            file.seek(0)
+            return np.asarray(np.lib.format.read_array(file, allow_pickle=False))
+    except OSError as error:
+        raise InvalidSourceError(f"cannot read {path}: {error.strerror or error}") from error
+    except (ValueError, EOFError, pickle.UnpicklingError, AttributeError, IndexError) as error:
+        raise InvalidSourceError(f"{path} is no ground truth file: {error}") from error

@@ -1,36 +1,145 @@
 """Remapping a domain: from stored traverses to a sealed, active map version (design section 5).
 
 A remap makes a map of its own, or appends a drive to a copy of the active one: then no frame that is in the map is
-encoded or described again, and how landmarks are to be trusted, and how a robot off the route is known, stay as two
-seasons taught them.
+encoded or described again, and what two seasons taught stays.
 """
 
-import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, replace
 from functools import cache, partial
-from typing import Any
+from pathlib import Path
+from typing import Any, Self, TypeAlias
 
 import numpy as np
 
 from deepsimbad.core.building import append_drive
+from deepsimbad.core.descriptor import MAX_LANDMARKS
 from deepsimbad.core.drive import UNKNOWN_TIMESTAMP, Drive
 from deepsimbad.core.map import Map
 from deepsimbad.core.nnql import NnqlConfig
 from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Relevance
 from deepsimbad.errors import InvalidEncodingError, InvalidMapConfigError, LostActivationError, WeightsDifferError
 from deepsimbad.evaluators.base import Evaluator
-from deepsimbad.jobs.build import build, choose_landmarks, measured
+from deepsimbad.jobs.build import EPISODES_A_MAP_IMAGE, build, choose_landmarks, measured, train_nnql
 from deepsimbad.jobs.check import CheckFrames, check_map, traverses_in
 from deepsimbad.jobs.progress import Progress
-from deepsimbad.jobs.remap_config import DEFAULT_LIST_LENGTH, DEFAULT_N_LANDMARKS, RemapConfig
-from deepsimbad.jobs.train import train_nnql
 from deepsimbad.jobs.versions import activate_once, seal_version
 from deepsimbad.store.catalog import ANY, Catalog
 from deepsimbad.store.map_file import read_map
 from deepsimbad.store.records import DomainRecord, MapRecord
 from deepsimbad.store.traverses import Traverse
+
+DEFAULT_N_LANDMARKS = 500
+DEFAULT_LIST_LENGTH = 4
+DEFAULT_TRAINING_EPISODES = 10_000
+
+
+@dataclass(frozen=True)
+class RemapConfig:
+    """Parameters of one remap, kept with the map."""
+
+    training_traverse: str  # the traverse that becomes the map
+    # Where landmarks are selected; None keeps those of the active map (the paper's cheap retraining)
+    landmark_traverse: str | None = None
+    # r; None means 500 or, of a shorter landmark traverse, every frame; and as many as the active map has where its
+    # landmarks stay
+    n_landmarks: int | None = None
+    list_length: int = DEFAULT_LIST_LENGTH
+    relevance: Relevance = DEFAULT_RELEVANCE  # what the map is built for
+    # Of the experience database that NNQL plans by; 0: the map has none
+    training_episodes: int = DEFAULT_TRAINING_EPISODES
+    seed: int = 0  # of everything random in the remap
+    # Serve the new map at once, whatever was activated while it was built: the last word wins. With a gate only in
+    # place of the map it was compared with.
+    activate: bool = True
+    # Drive that the new map and the active one are compared on; None: frames of the training traverse that are held out
+    check_traverse: str | None = None
+    # By how many percentage points of ANR the new map may be worse than the active one and still take over; None:
+    # whatever it is
+    gate_margin: float | None = None
+    # Add the training traverse to a copy of the active map, whose images, landmarks, lists and experience stay;
+    # n_landmarks, list_length and relevance are the active map's
+    append: bool = False
+    # Whether positions of the training traverse and of the second drive (the landmark traverse, else what the active
+    # map was made of) are comparable; None: only where both know x, y
+    same_route: bool | None = None
+
+    def __post_init__(self) -> None:
+        n_landmarks = self.n_landmarks
+        if n_landmarks is not None and not 1 <= n_landmarks <= MAX_LANDMARKS:
+            raise InvalidMapConfigError(f"n_landmarks must be within 1 and {MAX_LANDMARKS}", n_landmarks=n_landmarks)
+        if self.list_length < 1 or (n_landmarks is not None and self.list_length > n_landmarks):
+            raise InvalidMapConfigError(
+                f"list_length {self.list_length} must be at least 1 and at most n_landmarks",
+                list_length=self.list_length,
+                n_landmarks=n_landmarks,
+            )
+        if self.training_episodes < 0 or self.seed < 0:
+            raise InvalidMapConfigError("training_episodes and seed must not be negative")
+        if self.gate_margin is not None and not (math.isfinite(self.gate_margin) and self.gate_margin >= 0):
+            raise InvalidMapConfigError("gate_margin is in percentage points of ANR, finite and not negative")
+        if self.check_traverse == self.training_traverse:
+            raise InvalidMapConfigError(
+                "a map finds the frames it was made of at once: give another check_traverse, or none to hold frames out"
+            )
+        if self.append and self.landmark_traverse is not None:
+            raise InvalidMapConfigError(
+                "what is appended is described by the active map's landmarks: landmark_traverse must be null"
+            )
+
+    def as_dict(self) -> dict[str, Any]:
+        """The JSON form."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, stored: dict[str, Any]) -> Self:
+        """Back from the JSON form."""
+        return cls(**{**stored, "relevance": Relevance(stored["relevance"])})
+
+
+def remap_stages(config: RemapConfig, n_frames: int, n_candidates: int, encoding_dim: int) -> dict[str, float]:
+    """Every stage in order, with the seconds it takes on one core of 2026; what counts is their ratio.
+
+    Measured with 2,000 to 26,000 frames of 64 to 4,096 numbers (docs/results/bench.md has one of them).
+
+    Args:
+        n_candidates: Frames that landmarks are selected from; 0: they stay.
+    """
+    n, m, dim = n_frames, n_candidates, encoding_dim
+    n_landmarks = config.n_landmarks or min(DEFAULT_N_LANDMARKS, m or DEFAULT_N_LANDMARKS)
+    n_episodes = min(config.training_episodes, EPISODES_A_MAP_IMAGE * n)
+    if config.append or config.relevance is Relevance.BRUTE_FORCE:
+        n_episodes = 0
+    return {
+        "read frames": 0.05 + 1e-8 * (n + m) * dim,
+        "select landmarks": 0.05 + m**2 * (5e-9 + 5e-12 * dim),
+        "describe": 0.1 + 1e-6 * n * n_landmarks,
+        "train": 0.01 + n_episodes * (4e-4 + 8e-8 * n),
+        "check": 0.1 + 5e-6 * n,
+        "seal": 0.3,
+        "activate": 0.02,
+    }
+
+
+# Of a remap whose size is not known beforehand.
+REMAP_STAGES = remap_stages(RemapConfig("drive", "another"), 5_000, 5_000, 1_000)
+
+
+def stages_in(data_dir: Path, domain: str, config: RemapConfig) -> dict[str, float]:
+    """The stages of a remap of a domain's traverses, of which no encoding is read.
+
+    Raises:
+        UnknownTraverseError: There is none such.
+        DamagedFileError, UnavailableError: One cannot be read.
+    """
+    with Traverse.open(data_dir, domain, config.training_traverse) as training:
+        n_frames, dim = training.n_frames, training.encoding_dim or 0
+    n_candidates = 0
+    if config.landmark_traverse is not None:
+        with Traverse.open(data_dir, domain, config.landmark_traverse) as landmarks:
+            n_candidates = landmarks.n_frames
+    return remap_stages(config, n_frames, n_candidates, dim)
 
 
 def remap(
@@ -79,7 +188,7 @@ def remap(
 class _Inputs:
     """What a remap reads before it begins."""
 
-    domain: DomainRecord  # whose map is draft
+    domain: DomainRecord  # whose map it is
     training: Drive  # the traverse that becomes the map
     candidates: Drive | None  # the traverse landmarks are selected from; None: those of `base` stay
     base: Map | None  # the active map whose landmarks stay; None where they are selected
@@ -89,15 +198,9 @@ class _Inputs:
     check: Drive | None  # the drive that the new map is checked on; None: on frames of `training` that are held out
 
 
-@dataclass(frozen=True)
-class _Draft:
-    """A map that is not yet sealed."""
-
-    map: Map  # all of it; its version is not known yet
-    config: Mapping[str, Any]  # as the catalog keeps it
-    training: Mapping[str, Any] | None  # how its experience database was learnt; None where it has none
-    # Whether it learnt from a second drive, and why not; None where there was none
-    second_season: Mapping[str, Any] | None
+# A map that is not yet sealed, its version unknown; its configuration as the catalog keeps it; and of its metrics
+# `training`, how its experience was learnt, and `second_season`, whether it learnt from one, both None where it did not
+_Draft: TypeAlias = tuple[Map, dict[str, Any], dict[str, Any]]
 
 
 @dataclass(frozen=True)
@@ -110,32 +213,37 @@ class _Remap:
     evaluator: Evaluator
     progress: Progress
     n_threads: int
-    seconds: dict[str, float] = field(default_factory=dict)
 
     def sealed(self, job_id: str | None) -> MapRecord:
         """The next version, sealed; what is decided of it later must stand in its metrics."""
-        with self._stage("read frames"):
-            inputs = self._read()
-        draft = self._appended(inputs, inputs.base) if inputs.base and self.config.append else self._mapped(inputs)
-        with self._stage("check"):
-            check = self._checked(inputs, draft)
-        self.progress.stage("seal")
-        metrics = {
-            "n_map_images": draft.map.n_images,
-            "seconds": self.seconds,
-            "training": draft.training,
-            "second_season": draft.second_season,
-            "check": check,
-        }
-        return seal_version(self.catalog, self.domain, draft.map, draft.config, metrics, self.progress.update, job_id)
-
-    @contextmanager
-    def _stage(self, name: str) -> Iterator[None]:
-        """Report a stage and time it."""
-        self.progress.stage(name)
-        began = time.perf_counter()
-        yield
-        self.seconds[name.replace(" ", "_")] = time.perf_counter() - began
+        config, progress = self.config, self.progress
+        progress.stage("read frames")
+        inputs = self._read()
+        if inputs.base is not None and config.append:
+            map_, record_config, learnt = self._appended(inputs, inputs.base)
+        else:
+            map_, record_config, learnt = self._mapped(inputs)
+        progress.stage("check")
+        frames = CheckFrames.of(
+            config.check_traverse or config.training_traverse,
+            inputs.check or inputs.training,
+            inputs.domain.closed,
+            held_out=inputs.check is None,
+        )
+        check = check_map(
+            self.catalog,
+            self.domain,
+            map_,
+            traverses_in(record_config),
+            frames,
+            config.gate_margin,
+            self.evaluator,
+            progress.update,
+        )
+        seconds = {name: took for name, took in progress.seconds().items() if name.replace("_", " ") in REMAP_STAGES}
+        metrics = {"n_map_images": map_.n_images, "seconds": seconds, **learnt, "check": check}
+        progress.stage("seal")
+        return seal_version(self.catalog, self.domain, map_, record_config, metrics, progress.update, job_id)
 
     def _read(self) -> _Inputs:
         """Read what is needed, every traverse once.
@@ -218,38 +326,38 @@ class _Remap:
     def _mapped(self, inputs: _Inputs) -> _Draft:
         """The training traverse as a map of its own."""
         config, domain, training = self.config, inputs.domain, inputs.training
-        with self._stage("select landmarks"):
-            if inputs.base is not None:
-                model = inputs.base.landmark_model
-            else:
-                candidates = (inputs.candidates or training).encodings
-                n_landmarks = config.n_landmarks or min(DEFAULT_N_LANDMARKS, len(candidates))
-                model = choose_landmarks(candidates, n_landmarks, self.evaluator, self.progress.update)
-        with self._stage("describe"):
-            built = build(
-                training,
-                inputs.second,
-                config.same_route,
-                self.evaluator,
-                model,
-                config.relevance,
-                config.list_length,
-                domain.actions_m,
-                domain.closed,
-                self.progress.update,
-            )
+        self.progress.stage("select landmarks")
+        if inputs.base is not None:
+            model = inputs.base.landmark_model
+        else:
+            candidates = (inputs.candidates or training).encodings
+            n_landmarks = config.n_landmarks or min(DEFAULT_N_LANDMARKS, len(candidates))
+            model = choose_landmarks(candidates, n_landmarks, self.evaluator, self.progress.update)
+        self.progress.stage("describe")
+        built = build(
+            training,
+            inputs.second,
+            config.same_route,
+            self.evaluator,
+            model,
+            config.relevance,
+            config.list_length,
+            domain.actions_m,
+            domain.closed,
+            self.progress.update,
+        )
         q_values = learning = None
         # The baseline that compares whole encodings would need hours for it, and serves no robot.
         if config.training_episodes and config.relevance is not Relevance.BRUTE_FORCE:
-            with self._stage("train"):
-                q_values, learning = train_nnql(
-                    built.rehearsal,
-                    partial(measured, training, self.evaluator, model),
-                    built.second,
-                    NnqlConfig(n_episodes=config.training_episodes, seed=config.seed),
-                    self.progress.update,
-                    self.n_threads,
-                )
+            self.progress.stage("train")
+            q_values, learning = train_nnql(
+                built.rehearsal,
+                partial(measured, training, self.evaluator, model),
+                built.second,
+                NnqlConfig(n_episodes=config.training_episodes, seed=config.seed),
+                self.progress.update,
+                self.n_threads,
+            )
         asked = config.as_dict()
         landmarks_from = inputs.base or inputs.candidates
         weights_sha256 = training.weights_sha256 or (landmarks_from and landmarks_from.weights_sha256)
@@ -265,24 +373,24 @@ class _Remap:
             q_values=q_values,
         )
         second_season = None if built.same_route is None else built.same_route.as_dict()
-        return _Draft(map_, asked, learning, second_season)
+        return map_, asked, {"training": learning, "second_season": second_season}
 
     def _appended(self, inputs: _Inputs, before: Map) -> _Draft:
         """A copy of the active map with the training traverse among its images."""
         config, drive = self.config, inputs.training
         record = self.catalog.map(self.domain, inputs.domain.active_version or 0)
-        with self._stage("describe"):
-            refuse_known_traverse(record.config, record.version, config.training_traverse)
-            if before.frame_digest is not None and np.isin(drive.digests(), before.frame_digest).all():
-                raise InvalidMapConfigError(
-                    f"map {record.version}, which serves, holds every frame of traverse {config.training_traverse} "
-                    "already, under another name: nothing is appended twice. Append another drive, or activate a map "
-                    "without this one first",
-                    traverse=config.training_traverse,
-                    map_version=record.version,
-                )
-            _check_alike(before, config)
-            map_ = append_drive(before, measured(drive, self.evaluator, before.landmark_model, self.progress.update))
+        self.progress.stage("describe")
+        refuse_known_traverse(record.config, record.version, config.training_traverse)
+        if before.frame_digest is not None and np.isin(drive.digests(), before.frame_digest).all():
+            raise InvalidMapConfigError(
+                f"map {record.version}, which serves, holds every frame of traverse {config.training_traverse} "
+                "already, under another name: nothing is appended twice. Append another drive, or activate a map "
+                "without this one first",
+                traverse=config.training_traverse,
+                map_version=record.version,
+            )
+        _check_alike(before, config)
+        map_ = append_drive(before, measured(drive, self.evaluator, before.landmark_model, self.progress.update))
         asked = config.as_dict()
         added = {"traverse": config.training_traverse, "n_frames": drive.n_frames, "to_version": record.version}
         # The catalog's configuration: the file of an imported map names traverses of another server.
@@ -295,28 +403,8 @@ class _Remap:
         weights_sha256 = drive.weights_sha256 or before.weights_sha256
         if weights_sha256 is not None:
             config_after["weights_sha256"] = weights_sha256
-        metrics = record.metrics
-        map_ = replace(map_, config=config_after)
-        return _Draft(map_, config_after, metrics.get("training"), metrics.get("second_season"))
-
-    def _checked(self, inputs: _Inputs, draft: _Draft) -> dict[str, Any]:
-        """How the new map compares with the active one."""
-        config, closed = self.config, inputs.domain.closed
-        if config.check_traverse is not None and inputs.check is not None:
-            frames = CheckFrames.of_traverse(config.check_traverse, inputs.check, closed)
-        else:
-            frames = CheckFrames.held_out(config.training_traverse, inputs.training, closed)
-        traverses = traverses_in(draft.config)
-        return check_map(
-            self.catalog,
-            self.domain,
-            draft.map,
-            traverses,
-            frames,
-            config.gate_margin,
-            self.evaluator,
-            self.progress.update,
-        )
+        learnt = {name: record.metrics.get(name) for name in ("training", "second_season")}
+        return replace(map_, config=config_after), config_after, learnt
 
 
 def refuse_known_traverse(config: Mapping[str, Any], version: int, name: str) -> None:

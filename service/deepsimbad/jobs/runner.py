@@ -33,17 +33,15 @@ from deepsimbad.errors import (
 from deepsimbad.evaluators.compute import available_cores
 from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
 from deepsimbad.jobs.child import JobPriority
-from deepsimbad.jobs.learn import EXPERIENCE, LEARN_STAGES, ExperienceConfig, learn_online, serve_learnt, walks_of
 from deepsimbad.jobs.progress import Progress, ProgressState
-from deepsimbad.jobs.remap import remap
-from deepsimbad.jobs.remap_config import REMAP_STAGES, RemapConfig, RemapSize, remap_stages
+from deepsimbad.jobs.remap import REMAP_STAGES, RemapConfig, remap, stages_in
+from deepsimbad.jobs.versions import EXPERIENCE, LEARN_STAGES, ExperienceConfig, learn_online, serve_learnt, walks_of
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.records import JobRecord, JobState
 from deepsimbad.store.sessions import SessionStore
 
 _log = logging.getLogger(__name__)
 REMAP = "remap"  # the kind of job
-_KINDS = (REMAP, EXPERIENCE)
 _MAX_WAITING = 100
 _RETRY_AFTER_S = 30  # a place is free when a job has ended, which takes longer than a query
 _WRITTEN_AGAIN_S = 1.0
@@ -104,11 +102,9 @@ class JobRunner:
         return self._thread.is_alive()
 
     def submit(self, domain: str, config: RemapConfig | ExperienceConfig, job_id: str | None = None) -> JobRecord:
-        """Queue a remap, or the learning of what a session taught.
+        """Queue a remap, or the learning of what a session taught, as the domain's next map.
 
         Args:
-            domain: Whose next map it makes.
-            config: What is asked for.
             job_id: Its id, where a repetition of the request would have the same: the job that was made by the first
                 one is returned then, as it stands. None: a new one.
 
@@ -190,22 +186,23 @@ class JobRunner:
             return
         if job.state is not JobState.RUNNING:  # cancelled while it waited
             return
-        named = {"job_id": job_id, "domain": job.domain, "kind": job.kind}
-        _log.info("job started", extra={**named, "n_starts": job.n_starts})
+        about: dict[str, Any] = {"job_id": job_id, "domain": job.domain, "kind": job.kind}
+        _log.info("job started", extra={**about, "n_starts": job.n_starts})
         began = time.perf_counter()
         ending = self._ending(job, self._cancelled[job_id])
         seconds = time.perf_counter() - began
-        told = {**named, "seconds": round(seconds, 2)}
+        about["seconds"] = round(seconds, 2)
         if ending is None:
             self._catalog.give_back_job(job_id)
-            _log.info("job stopped", extra=told)
+            _log.info("job stopped", extra=about)
             return
         self._written(lambda: self._catalog.update_job(job_id, eta_s=None, **ending))
         state = ending["state"].value
-        error, result = ending.get("error"), ending.get("result")
-        told |= {"code": error["code"], "why": error["message"]} if error else {}
-        told |= {"map_version": result["map_version"], "active": result["active"]} if result else {}
-        _log.info("job ended", extra={**told, "state": state})
+        if "error" in ending:
+            about |= {"code": ending["error"]["code"], "why": ending["error"]["message"]}
+        else:
+            about |= {name: ending["result"][name] for name in ("map_version", "active")}
+        _log.info("job ended", extra={**about, "state": state})
         self._on_ended(job.kind, state, seconds)
 
     def _ending(self, job: JobRecord, cancelled: threading.Event) -> dict[str, Any] | None:
@@ -218,26 +215,24 @@ class JobRunner:
                 _log.warning("progress not recorded", extra={"job_id": job.job_id, "why": error.message})
 
         try:
-            return self._succeeded(
-                job, self._run_job(job, record, lambda: cancelled.is_set() or self._closing.is_set())
-            )
+            result = self._run_job(job, record, lambda: cancelled.is_set() or self._closing.is_set())
+            return self._succeeded(job, result)
         except DeepSimbadError as error:
-            state = JobState.CANCELLED if isinstance(error, CancelledError) else JobState.FAILED
-            failed = {"state": state, "error": {"code": error.code, "message": error.message, **error.hints}}
+            is_cancelled, has_died = isinstance(error, CancelledError), isinstance(error, JobInterruptedError)
             about = {"job_id": job.job_id, "why": error.message}
-            if isinstance(error, JobInterruptedError):
+            if has_died:
                 _log.error("a job's process died", extra=about)
-            elif state is JobState.FAILED:
+            elif not is_cancelled:
                 _log.warning("a job failed", extra={**about, "code": error.code})
             self._written(self._clear_away)
-            if isinstance(error, CancelledError) and not cancelled.is_set():
+            if is_cancelled and not cancelled.is_set():
                 return None
-            if isinstance(error, CancelledError | JobInterruptedError):  # perhaps behind its last step
-                sealed = self._catalog.map_of_job(job.domain, job.job_id)
-                if sealed is not None and sealed.activated_at is not None:
-                    result = {"map_version": sealed.version, "active": True, "metrics": sealed.metrics}
-                    return self._succeeded(job, result)
-            return failed
+            sealed = self._catalog.map_of_job(job.domain, job.job_id) if is_cancelled or has_died else None
+            if sealed is None or sealed.activated_at is None:
+                state = JobState.CANCELLED if is_cancelled else JobState.FAILED
+                return {"state": state, "error": {"code": error.code, "message": error.message, **error.hints}}
+            # It was behind its last step.
+            return self._succeeded(job, {"map_version": sealed.version, "active": True, "metrics": sealed.metrics})
         except Exception:
             _log.exception("a job broke", extra={"job_id": job.job_id})
             broken = {"code": "internal_error", "message": "the job broke; the service's log tells where"}
@@ -273,50 +268,42 @@ class JobRunner:
 
 @dataclass(frozen=True)
 class InThisProcess:
-    """Does jobs in the caller's thread: in a job's own process, for commands and tests.
+    """Does jobs in the caller's thread, as `RunJob`: in a job's own process, and for tests."""
 
-    Attributes:
-        data_dir: The data directory; the catalog and the sessions are opened anew.
-        n_threads: Threads to compute in.
-    """
-
-    data_dir: Path
-    n_threads: int = 1
+    data_dir: Path  # the catalog and the sessions in it are opened anew
+    n_threads: int = 1  # to compute in
 
     def __call__(
         self, job: JobRecord, on_progress: Callable[[ProgressState], None], is_cancelled: Callable[[], bool]
     ) -> dict[str, Any]:
-        """As `RunJob`."""
-        if job.kind not in _KINDS:
-            raise InvalidInputError(f"this release does no job of the kind {job.kind!a}", known=_KINDS)
-        progress = Progress(self._stages(job), on_progress, is_cancelled)
+        """Do a job."""
+        if job.kind not in {REMAP, EXPERIENCE}:
+            raise InvalidInputError(f"this release does no job of the kind {job.kind!a}", known=(REMAP, EXPERIENCE))
         try:
+            if job.kind == EXPERIENCE:
+                return self._learn(job, Progress(LEARN_STAGES, on_progress, is_cancelled))
+            config = RemapConfig.from_dict(job.config)
+            try:
+                stages = stages_in(self.data_dir, job.domain, config)
+            except DeepSimbadError:  # the stage that needs the traverse will say so
+                stages = REMAP_STAGES
+            progress = Progress(stages, on_progress, is_cancelled)
             with Catalog.open(self.data_dir) as catalog:
                 progress.check()
-                if job.kind == EXPERIENCE:
-                    return self._learn(catalog, job, progress)
                 evaluator = make_evaluator(evaluator_config(catalog.domain(job.domain).evaluator))
-                config = RemapConfig.from_dict(job.config)
                 return remap(catalog, job.domain, config, evaluator, progress, self.n_threads, job.job_id)
         except MemoryError as error:
             raise OutOfMemoryError("too little memory is left for the job") from error
 
-    def _stages(self, job: JobRecord) -> dict[str, float]:
-        if job.kind == EXPERIENCE:
-            return LEARN_STAGES
-        config = RemapConfig.from_dict(job.config)
-        try:
-            return remap_stages(config, RemapSize.of(self.data_dir, job.domain, config))
-        except DeepSimbadError:  # the stage that needs the traverse will say so
-            return REMAP_STAGES
-
-    def _learn(self, catalog: Catalog, job: JobRecord, progress: Progress) -> dict[str, Any]:
-        sealed = catalog.map_of_job(job.domain, job.job_id)
-        if sealed is not None:  # what it learnt is in there; a second time would count double
-            return serve_learnt(catalog, job.domain, sealed, progress)
-        with SessionStore.open(self.data_dir) as sessions:
-            walks = walks_of(sessions, catalog, job.domain, job.config["session_id"])
-        return learn_online(catalog, job.domain, walks, progress, job_id=job.job_id)
+    def _learn(self, job: JobRecord, progress: Progress) -> dict[str, Any]:
+        with Catalog.open(self.data_dir) as catalog:
+            progress.check()
+            sealed = catalog.map_of_job(job.domain, job.job_id)
+            if sealed is not None:  # what it learnt is in there; a second time would count double
+                return serve_learnt(catalog, job.domain, sealed, progress)
+            with SessionStore.open(self.data_dir) as sessions:
+                walks = walks_of(sessions, catalog, job.domain, job.config["session_id"])
+            return learn_online(catalog, job.domain, walks, progress, job.job_id)
 
 
 class BrokenJobError(Exception):
@@ -325,38 +312,32 @@ class BrokenJobError(Exception):
 
 @dataclass(frozen=True)
 class InAnotherProcess:
-    """Does every job in a child process that gives way to this one and dies with it.
+    """Does every job in a child process that gives way to this one and dies with it, as `RunJob`.
 
     Call it from a thread that lives as long as the child may: Linux ties the child to the thread that started it.
-
-    Attributes:
-        data_dir: The data directory.
-        n_threads: Threads the child computes in.
-        priority: How far the child gives way to everything else.
-        stops_within_s: A child that does not stop so soon after a cancel is killed, which harms nothing either.
     """
 
     data_dir: Path
-    n_threads: int
+    n_threads: int  # the child computes in
     priority: JobPriority = JobPriority.IDLE
-    stops_within_s: float = 3.0
+    stops_within_s: float = (
+        3.0  # a child that does not stop so soon after a cancel is killed, which harms nothing either
+    )
 
     def __call__(
         self, job: JobRecord, on_progress: Callable[[ProgressState], None], is_cancelled: Callable[[], bool]
     ) -> dict[str, Any]:
-        """As `RunJob`."""
+        """Do a job."""
         child = self._start(job)
         _log.info("a job's process started", extra={"job_id": job.job_id, "pid": child.pid})
         with child:
             try:
-                for message in _messages(child, is_cancelled, self.stops_within_s):
+                for message in self._messages(child, is_cancelled):
                     match message:
                         case {"progress": progress}:
                             on_progress(ProgressState(**progress))
                         case {"log": record}:
                             _log_here(record, job.job_id)
-                        case {"said": line}:
-                            _log.warning("the job's process said", extra={"job_id": job.job_id, "line": line})
                         case {"error": {"code": code, "message": text, "hints": hints}}:
                             raise _error_class(code)(text, **hints)
                         case {"broken": stack}:
@@ -365,6 +346,8 @@ class InAnotherProcess:
                             raise broken
                         case {"result": result}:
                             return dict(result)
+                        case line:  # what a library printed, or the half of a line that its death cut off
+                            _log.warning("the job's process said", extra={"job_id": job.job_id, "line": line})
                 raise _death(child.wait(), is_cancelled())
             finally:
                 _end(child)
@@ -393,41 +376,35 @@ class InAnotherProcess:
         _send(child, json.dumps(order).encode())
         return child
 
+    def _messages(self, child: "subprocess.Popen[bytes]", is_cancelled: Callable[[], bool]) -> Iterator[Any]:
+        """A child's messages, and other lines as text, until it says no more; a cancel is handed on, and enforced."""
+        lines: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
 
-def _messages(
-    child: "subprocess.Popen[bytes]", is_cancelled: Callable[[], bool], stops_within_s: float
-) -> Iterator[dict[str, Any]]:
-    """What a child says, until it says no more; a cancel is handed on, and enforced where it is not obeyed."""
-    lines: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
+        def read() -> None:
+            for line in child.stdout or ():
+                lines.put(line)
+            lines.put(None)
 
-    def read() -> None:
-        for line in child.stdout or ():
-            lines.put(line)
-        lines.put(None)
-
-    threading.Thread(target=read, name="a job's words", daemon=True).start()
-    kill_at: float | None = None
-    line: bytes | None = b""
-    while line is not None:
-        try:
-            line = lines.get(timeout=_LOOK_AGAIN_S)
-        except queue.Empty:
-            line = b""
-        if line and line.strip():
-            yield _message(line)
-        if kill_at is None and is_cancelled():
-            _send(child, b"cancel")
-            kill_at = time.monotonic() + stops_within_s
-        elif kill_at is not None and time.monotonic() > kill_at:
-            child.kill()
-
-
-def _message(line: bytes) -> dict[str, Any]:
-    try:
-        message = json.loads(line)
-    except ValueError:  # what a library printed, or the half of a line that its death cut off
-        message = None
-    return message if isinstance(message, dict) else {"said": line.decode("utf-8", "replace").rstrip()}
+        threading.Thread(target=read, name="a job's words", daemon=True).start()
+        kill_at: float | None = None
+        line: bytes | None = b""
+        while line is not None:
+            try:
+                line = lines.get(timeout=_LOOK_AGAIN_S)
+            except queue.Empty:
+                line = b""
+            if line and line.strip():
+                text = line.decode("utf-8", "replace").rstrip()
+                try:
+                    message = json.loads(text)
+                except ValueError:
+                    message = None
+                yield message if isinstance(message, dict) else text
+            if kill_at is None and is_cancelled():
+                _send(child, b"cancel")
+                kill_at = time.monotonic() + self.stops_within_s
+            elif kill_at is not None and time.monotonic() > kill_at:
+                child.kill()
 
 
 def _send(child: "subprocess.Popen[bytes]", line: bytes) -> None:
