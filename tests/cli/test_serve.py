@@ -41,26 +41,32 @@ def assert_it_cannot_start(err, code, why):
     assert line == f"deepsimbad: {code}: {' '.join(logged['why'].split())}"
 
 
-@pytest.mark.parametrize(("by", "code"), [(signal.SIGTERM, 0), (signal.SIGINT, 130)])
-def test_it_serves_until_it_is_stopped(process, tmp_path, by, code):
-    port = free_port()
-    running = process("serve", "--create", "--port", port, "--data-dir", tmp_path / "here")
+@pytest.mark.parametrize(("by", "code", "is_made"), [(signal.SIGTERM, 0, False), (signal.SIGINT, 130, True)])
+def test_it_serves_until_it_is_stopped(deepsimbad, process, tmp_path, by, code, is_made):
+    """In a directory that it makes, told by flags; in one that was made before, told by the environment."""
+    port, folder = free_port(), tmp_path / "here"
+    if is_made:
+        for _ in range(2):
+            assert deepsimbad("init", "--data-dir", folder).code == 0
+        named = {"DEEPSIMBAD_PORT": str(port), "DEEPSIMBAD_HOST": "127.0.0.1", "DEEPSIMBAD_DATA_DIR": str(folder)}
+        running = process("serve", **named)
+    else:
+        running = process("serve", "--create", "--port", port, "--data-dir", folder)
     assert wait_until_ready(port, running) == 200
     running.send_signal(by)
     out, err = running.communicate(timeout=60)
     assert running.returncode == code, err
     assert out == "", "logs go to standard error"
-    assert (tmp_path / "here" / "catalog.sqlite").exists()
-    assert stat.S_IMODE((tmp_path / "here").stat().st_mode) == 0o700
+    assert (folder / "catalog.sqlite").exists()
+    assert stat.S_IMODE(folder.stat().st_mode) == 0o700
 
 
-def test_host_and_port_come_from_the_environment_too(process, tmp_path):
-    port = free_port()
-    running = process("serve", "--create", DEEPSIMBAD_PORT=str(port), DEEPSIMBAD_HOST="127.0.0.1")
-    assert wait_until_ready(port, running) == 200
-    running.terminate()
-    running.communicate(timeout=60)
-    assert (tmp_path / "deepsimbad-data").is_dir()
+def test_a_data_directory_must_be_there(process, tmp_path):
+    running = process("serve", "--port", 0)
+    _, err = running.communicate(timeout=60)
+    assert running.returncode == 1
+    assert_it_cannot_start(err, "invalid_settings", "there is no data directory deepsimbad-data")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_other_machines_are_refused_while_there_are_no_keys(process):
@@ -69,22 +75,6 @@ def test_other_machines_are_refused_while_there_are_no_keys(process):
     assert (running.returncode, out) == (1, "")
     assert_it_cannot_start(err, "invalid_settings", "DEEPSIMBAD_ALLOW_OPEN")
     assert len(err.splitlines()) == 2
-
-
-def test_a_data_directory_must_be_there(deepsimbad, process, tmp_path):
-    running = process("serve", "--port", 0)
-    _, err = running.communicate(timeout=60)
-    assert running.returncode == 1
-    assert_it_cannot_start(err, "invalid_settings", "there is no data directory deepsimbad-data")
-    assert list(tmp_path.iterdir()) == []
-    for _ in range(2):
-        assert deepsimbad("init", "--data-dir", tmp_path / "made").code == 0
-    assert stat.S_IMODE((tmp_path / "made").stat().st_mode) == 0o700
-    port = free_port()
-    running = process("serve", "--port", port, "--data-dir", tmp_path / "made")
-    assert wait_until_ready(port, running) == 200
-    running.terminate()
-    running.communicate(timeout=60)
 
 
 def test_settings_that_cannot_be_used_are_logged_too(process, tmp_path):

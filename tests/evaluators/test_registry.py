@@ -63,7 +63,7 @@ def test_where_a_package_of_the_network_is_absent_the_gradient_grid_takes_its_pl
     monkeypatch.setattr(registry, "has_torch", lambda: package != "torch")
     default_extractor.cache_clear()
     try:
-        assert evaluator_config({"kind": "feature_l2"}).options["extractor"] == extractor
+        assert evaluator_config({"kind": "feature_l2"}).extractor == extractor
     finally:
         default_extractor.cache_clear()
 
@@ -76,7 +76,7 @@ def test_where_a_package_of_the_network_is_absent_the_gradient_grid_takes_its_pl
     ],
 )
 def test_extractors_are_named_by_what_they_are_and_their_file(extractor):
-    assert evaluator_config({"kind": "feature_l2", "extractor": extractor}).options["extractor"] == extractor
+    assert evaluator_config({"kind": "feature_l2", "extractor": extractor}).extractor == extractor
 
 
 @pytest.mark.parametrize(

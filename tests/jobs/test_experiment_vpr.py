@@ -1,7 +1,6 @@
 """The single-view experiment against a slow reference written from the definitions, on random and on real data."""
 
 import itertools
-from functools import cache
 from pathlib import Path
 from statistics import NormalDist
 
@@ -10,7 +9,6 @@ import pytest
 
 from deepsimbad.core.relevance import Relevance
 from deepsimbad.core.route import true_images_of
-from deepsimbad.errors import CancelledError, TooFewCandidatesError
 from deepsimbad.jobs.build import encode_recording
 from deepsimbad.jobs.experiments import VprConfig, run_vpr, vpr_stages
 from deepsimbad.jobs.progress import Progress
@@ -212,112 +210,19 @@ def test_nothing_of_later_queries_counts(season, tmp_path, evaluator, name):
     assert half.scores[name].normalised_ranks.tolist() == whole[:30].tolist()
 
 
-def test_the_report_is_flat_and_says_what_was_asked(season, tmp_path, evaluator):
-    config = VprConfig(n_landmarks=20, relevances=(Relevance.RRF, Relevance.SIMBAD))
-    document = experiment(saved(tmp_path, season), evaluator, config).as_dict({"training": "here"})
-    assert set(document["anr"]) == set(document["recall_at_1"]) == set(document["recall_at_5"]) == {"rrf", "simbad"}
-    assert document["default"] == "calibrated"
-    assert document["n_queries"] == 52
-    assert document["n_left_out"] == 8
-    assert document["index_bits_per_map_image"] > 0
-    assert document["config"]["n_landmarks"] == 20
-    assert document["config"]["training"] == "here"
-    assert set(document["seconds"]) == {"select_landmarks", "describe", "query_by_rrf", "query_by_simbad"}
-
-
-def test_every_stage_is_reported_and_the_whole_can_be_cancelled(season, tmp_path, evaluator):
-    config = VprConfig(n_landmarks=20)
-    told = []
-    experiment(saved(tmp_path, season), evaluator, config, Progress(vpr_stages(config), told.append))
-    assert list(dict.fromkeys(state.stage for state in told)) == list(vpr_stages(config))
-    stop = Progress(vpr_stages(config), None, lambda: True)
-    with pytest.raises(CancelledError):
-        experiment(saved(tmp_path, season), evaluator, config, stop)
-
-
-def test_too_few_candidates_are_named(season, tmp_path, evaluator):
-    with pytest.raises(TooFewCandidatesError):
-        experiment(saved(tmp_path, season), evaluator, VprConfig(n_landmarks=41))
-
-
 # --- real data -----------------------------------------------------------------------------------------------------
-
-TRIPLETS = tuple(itertools.permutations(("nr", "nq", "nq2")))
-
-
-def fast_squared(rows, others):
-    """As `squared_distances`, for 600 rows."""
-    return np.stack([((others - row) ** 2).sum(axis=1) for row in rows])
-
-
-def reference_anr(name, candidates, mapped, queries, n_landmarks=300, h=4, tolerance=2.0):
-    """The same definitions a map image row at a time, because 600 x 600 x 6 loops would take hours."""
-    apart = fast_squared(candidates, candidates)
-    np.fill_diagonal(apart, np.inf)
-    landmarks = candidates[np.argsort(-apart.min(axis=1), kind="stable")[:n_landmarks]]
-    map_d, query_d = fast_squared(mapped, landmarks), fast_squared(queries, landmarks)
-    map_ranks, query_ranks = (np.argsort(np.argsort(d, 1, kind="stable"), 1) + 1.0 for d in (map_d, query_d))
-    score = np.array([np.nan] + [NormalDist().inv_cdf((v - 0.5) / n_landmarks) for v in range(1, n_landmarks + 1)])
-    map_scores, query_scores = score[map_ranks.astype(int)], score[query_ranks.astype(int)]
-    if name == "calibrated":
-        other_ranks = np.argsort(np.argsort(fast_squared(candidates, landmarks), 1, kind="stable"), 1) + 1
-        return slow_anr(slow_calibrated(map_scores, score[other_ranks], query_scores, h), tolerance)[0]
-    mean, std = map_scores.mean(axis=0), map_scores.std(axis=0)
-    by_z = np.argsort((map_scores - mean) / std, axis=1, kind="stable")[:, :h]
-    by_rank = np.argsort(map_ranks, axis=1)[:, :h]
-    map_hot = np.where(map_ranks <= h, map_d, 0.0)
-    n, total, square = 50.0, 50.0 * mean, 50.0 * (map_scores**2).mean(axis=0)
-    found = []
-    for q, query in enumerate(queries):
-        n, total, square = n + 1, total + query_scores[q], square + query_scores[q] ** 2
-        if name == "standardised":
-            z = (query_scores[q] - total / n) / np.sqrt(square / n - (total / n) ** 2)
-            found.append(-z[by_z].sum(axis=1))
-        elif name == "rrf":
-            found.append(sum(1 / (j + 1) / query_ranks[q][by_rank[:, j]] for j in range(h)))
-        elif name == "bag_of_landmarks":
-            found.append((query_ranks[q][by_rank] <= h).sum(axis=1))
-        elif name == "simbad":
-            hot = np.where(query_ranks[q] <= h, query_d[q], 0.0)
-            found.append(-np.sqrt(((map_hot - hot) ** 2).sum(axis=1)))
-        else:
-            found.append(-np.sqrt(((mapped - query) ** 2).sum(axis=1)))
-    return slow_anr(np.array(found), tolerance)[0]
-
-
-@cache
-def real_anr(folder: Path, evaluator) -> dict[str, list[float]]:
-    """ANR by relevance of the six permutations."""
-    anr = {name.value: [] for name in Relevance}
-    for triplet in TRIPLETS:
-        sources = {
-            role: str(folder / f"{name}.npy")
-            for role, name in zip(("landmarks", "training", "test"), triplet, strict=True)
-        }
-        for name, scores in experiment(sources, evaluator, VprConfig()).scores.items():
-            anr[name.value].append(scores.anr)
-    return anr
-
-
-@pytest.mark.slow
-@pytest.mark.real_data
-@pytest.mark.parametrize("name", [relevance.value for relevance in Relevance])
-def test_real_netvlad_agrees_with_the_reference(real_data, evaluator, name):
-    folder = real_data / "nordland_netvlad64"
-    found = real_anr(folder, evaluator)[name]
-    rows = {each: np.load(folder / f"{each}.npy").astype(np.float64) for each in ("nr", "nq", "nq2")}
-    expected = [reference_anr(name, *(rows[each] for each in triplet)) for triplet in TRIPLETS]
-    assert found == pytest.approx(expected, abs=0.01)
 
 
 @pytest.mark.slow
 @pytest.mark.real_data
 def test_real_netvlad_comes_to_the_figures_asked_for(real_data, evaluator):
-    mean = {name: np.mean(each) for name, each in real_anr(real_data / "nordland_netvlad64", evaluator).items()}
-    assert mean["standardised"] <= 2.8
-    assert mean["rrf"] <= 4.8
-    assert max(mean["standardised"], mean["rrf"]) < min(mean["simbad"], mean["bag_of_landmarks"])
-    assert mean["calibrated"] <= 2.3
-    published = {"brute_force": 3.64, "rrf": 4.71, "bag_of_landmarks": 14.3, "simbad": 12.5, "standardised": 2.67}
-    published["calibrated"] = 2.20
-    assert mean == pytest.approx(published, rel=0.01)
+    """Mean ANR over the six permutations, as published; one of them is pinned to the last digit elsewhere."""
+    found = {name: [] for name in Relevance}
+    for triplet in itertools.permutations(("nr", "nq", "nq2")):
+        roles = zip(("landmarks", "training", "test"), triplet, strict=True)
+        sources = {role: str(real_data / "nordland_netvlad64" / f"{season}.npy") for role, season in roles}
+        for name, scores in experiment(sources, evaluator, VprConfig()).scores.items():
+            found[name].append(scores.anr)
+    published = {"brute_force": 3.64, "rrf": 4.71, "bag_of_landmarks": 14.3, "simbad": 12.5}
+    published |= {"standardised": 2.67, "calibrated": 2.20}
+    assert {name.value: np.mean(anr) for name, anr in found.items()} == pytest.approx(published, rel=0.01)

@@ -6,10 +6,7 @@ import signal
 import sqlite3
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
 from contextlib import closing
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -35,14 +32,13 @@ from deepsimbad.store.traverses import Traverse
 
 EVALUATOR = {"kind": "feature_l2", "extractor": "none"}
 ACTIONS_M = (1.0, 2.0)
-Add = Callable[..., int]
 CALIBRATED = {"relevance": "calibrated", "n_landmarks": 9}
 TRUST = {"correlation": np.full(9, 0.6), "listed_score": np.ones((3, 9))}
 
 
-def contents(domain: str, version: int, **changes: Any) -> Map:
+def contents(domain, version, **changes):
     rng = np.random.default_rng(version)
-    parts: dict[str, Any] = {
+    parts = {
         "config": {"relevance": "rrf", "n_landmarks": 9, "training_traverse": "summer", "landmark_traverse": "winter"},
         "evaluator": EVALUATOR,
         "closed": False,
@@ -55,7 +51,7 @@ def contents(domain: str, version: int, **changes: Any) -> Map:
     return Map(domain=domain, version=version, created_at="2026-01-01T00:00:00Z", **{**parts, **changes})
 
 
-def add(catalog: Catalog, domain: str, **changes: Any) -> int:
+def add(catalog, domain, **changes):
     """Build, seal and activate the next version."""
     version = catalog.begin_map(domain, {})
     write_map(catalog.building_path(domain, version), contents(domain, version, **changes))
@@ -66,7 +62,7 @@ def add(catalog: Catalog, domain: str, **changes: Any) -> int:
 
 
 @pytest.fixture
-def there(tmp_path: Path) -> Iterator[Catalog]:
+def there(tmp_path):
     """A server whose domain has two maps, the second active."""
     with Catalog.open(tmp_path / "there") as catalog:
         catalog.create_domain("campus", EVALUATOR, False, ACTIONS_M)
@@ -76,19 +72,19 @@ def there(tmp_path: Path) -> Iterator[Catalog]:
 
 
 @pytest.fixture
-def here(tmp_path: Path) -> Iterator[Catalog]:
+def here(tmp_path):
     """A server with nothing on it."""
     with Catalog.open(tmp_path / "here") as catalog:
         yield catalog
 
 
 @pytest.fixture
-def exported(there: Catalog, tmp_path: Path) -> Path:
+def exported(there, tmp_path):
     export_map(there, "campus", None, tmp_path / "campus.map")
     return tmp_path / "campus.map"
 
 
-def test_the_bytes_travel_unchanged(there: Catalog, here: Catalog, tmp_path: Path) -> None:
+def test_the_bytes_travel_unchanged(there, here, tmp_path):
     file = tmp_path / "first.map"
     sent = export_map(there, "campus", 1, file)
     assert file.read_bytes() == there.map_path("campus", 1).read_bytes()
@@ -103,7 +99,7 @@ def test_the_bytes_travel_unchanged(there: Catalog, here: Catalog, tmp_path: Pat
     assert (snapshot.domain, snapshot.version, snapshot.n_images) == ("garden", 1, 30)
 
 
-def test_the_active_version_and_the_old_name_unless_told(exported: Path, here: Catalog) -> None:
+def test_the_active_version_and_the_old_name_unless_told(exported, here):
     assert import_map(here, exported).domain == "campus"
     again = import_map(here, exported, activate=False)
     assert (again.map_version, again.active, again.domain_is_new) == (2, False, False)
@@ -112,7 +108,7 @@ def test_the_active_version_and_the_old_name_unless_told(exported: Path, here: C
     assert here.map("campus", 1).config["imported"]["version"] == 2
 
 
-def test_an_export_is_refused_by_name(there: Catalog, tmp_path: Path) -> None:
+def test_an_export_is_refused_by_name(there, tmp_path):
     there.create_domain("empty", {}, False, [1])
     building = there.begin_map("campus", {})
     there.remove_map("campus", 1, lambda: False)
@@ -141,21 +137,22 @@ def test_an_export_is_refused_by_name(there: Catalog, tmp_path: Path) -> None:
     assert (tmp_path / "mine").read_text() == "precious"
 
 
-def test_a_domain_that_differs_is_left_alone(exported: Path, here: Catalog) -> None:
-    others: list[dict[str, Any]] = [
-        {"evaluator": {"kind": "feature_l2", "extractor": "gradient_grid"}},
-        {"closed": True},
-        {"actions_m": (1.0, 3.0)},
-    ]
-    for number, changes in enumerate(others):
-        parts: dict[str, Any] = {"evaluator": EVALUATOR, "closed": False, "actions_m": ACTIONS_M} | changes
-        here.create_domain(f"d{number}", parts["evaluator"], parts["closed"], parts["actions_m"])
-        with pytest.raises(DomainDiffersError):
-            import_map(here, exported, f"d{number}")
-        assert here.maps(f"d{number}") == []
+@pytest.mark.parametrize(
+    "parts",
+    [
+        ({"kind": "feature_l2", "extractor": "gradient_grid"}, False, ACTIONS_M),
+        (EVALUATOR, True, ACTIONS_M),
+        (EVALUATOR, False, (1.0, 3.0)),
+    ],
+)
+def test_a_domain_that_differs_is_left_alone(exported, here, parts):
+    here.create_domain("other", *parts)
+    with pytest.raises(DomainDiffersError):
+        import_map(here, exported, "other")
+    assert here.maps("other") == []
 
 
-def test_every_flipped_byte_that_matters_is_refused(exported: Path, here: Catalog, tmp_path: Path) -> None:
+def test_every_flipped_byte_that_matters_is_refused(exported, here, tmp_path):
     """With the digest every byte matters; without it what the file's own checksum covers does."""
     whole = exported.read_bytes()
     digest = hashlib.sha256(whole).hexdigest()
@@ -182,7 +179,7 @@ def test_every_flipped_byte_that_matters_is_refused(exported: Path, here: Catalo
     assert here.domains() == []
 
 
-def test_a_map_of_an_evaluator_that_is_not_here_is_refused(there: Catalog, here: Catalog, tmp_path: Path) -> None:
+def test_a_map_of_an_evaluator_that_is_not_here_is_refused(there, here, tmp_path):
     there.create_domain("new", {"kind": "telepathy"}, False, ACTIONS_M)
     add(there, "new", evaluator={"kind": "telepathy"})
     export_map(there, "new", None, tmp_path / "new.map")
@@ -195,10 +192,8 @@ def test_a_map_of_an_evaluator_that_is_not_here_is_refused(there: Catalog, here:
 
 
 @pytest.mark.parametrize("is_used", [False, True])
-def test_an_import_that_fails_leaves_what_others_began_in_its_domain(
-    exported: Path, here: Catalog, monkeypatch: pytest.MonkeyPatch, is_used: bool
-) -> None:
-    def fail(*_: object) -> int:
+def test_an_import_that_fails_leaves_what_others_began_in_its_domain(exported, here, monkeypatch, is_used):
+    def fail(*_):
         if is_used:
             Traverse.create(here.data_dir, "campus", "mine").close()
         raise UnavailableError("no space is left")
@@ -245,7 +240,7 @@ import_map(catalog, Path(sys.argv[2]))
         {"telling_bits": np.full(30, np.inf, np.float32)},
     ],
 )
-def test_a_map_that_could_answer_nothing_is_refused(here: Catalog, tmp_path: Path, changes: dict[str, Any]) -> None:
+def test_a_map_that_could_answer_nothing_is_refused(here, tmp_path, changes):
     """A file with a right digest may still be one that no release wrote."""
     write_map(tmp_path / "building", contents("campus", 1, **changes))
     seal(tmp_path / "building", tmp_path / "crafted.sqlite")
@@ -262,7 +257,7 @@ def test_a_map_that_could_answer_nothing_is_refused(here: Catalog, tmp_path: Pat
         "CREATE VIRTUAL TABLE texts USING fts5(body)",
     ],
 )
-def test_a_map_whose_schema_would_run_something_is_refused(exported: Path, here: Catalog, statement: str) -> None:
+def test_a_map_whose_schema_would_run_something_is_refused(exported, here, statement):
     with closing(sqlite3.connect(exported)) as db:
         db.execute(statement)
     with pytest.raises(InvalidArchiveError, match="what no release writes"):
@@ -270,7 +265,7 @@ def test_a_map_whose_schema_would_run_something_is_refused(exported: Path, here:
     assert here.domains() == []
 
 
-def test_an_import_that_is_killed_leaves_nothing_of_its_map(exported: Path, tmp_path: Path) -> None:
+def test_an_import_that_is_killed_leaves_nothing_of_its_map(exported, tmp_path):
     n_killed = 0
     for step in range(1, 30):
         data_dir = tmp_path / f"killed-{step}"

@@ -218,13 +218,8 @@ def test_what_stops_the_service_does_not_stop_its_job_first(catalog, job, caplog
 
 
 def test_without_its_parent_it_ends(catalog, job):
-    order = {
-        "job": asdict(job),
-        "data_dir": str(catalog.data_dir),
-        "n_threads": 1,
-        "parent_pid": os.getpid(),
-        "log_level": logging.INFO,
-    }
+    order = {"job": asdict(job), "data_dir": str(catalog.data_dir), "n_threads": 1, "log_level": logging.INFO}
+    order["parent_pid"] = os.getpid()
     with no_map_begins(catalog):
         for changed, closes in (({}, True), ({"parent_pid": 1}, False)):
             with subprocess.Popen(COMMAND, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL) as child:

@@ -6,7 +6,7 @@ import pytest
 from deepsimbad.core.descriptor import rank_landmarks
 from deepsimbad.core.nnql import KnownWalk
 from deepsimbad.core.relevance import Query
-from deepsimbad.errors import CancelledError, NoActiveMapError, UnknownDomainError
+from deepsimbad.errors import CancelledError
 from deepsimbad.jobs.progress import Progress
 from deepsimbad.jobs.remap import RemapConfig, remap
 from deepsimbad.jobs.versions import LEARN_STAGES, learn_online
@@ -60,10 +60,3 @@ def test_a_cancel_leaves_nothing(catalog, walk):
         learn_online(catalog, DOMAIN, [walk], Progress(LEARN_STAGES, is_cancelled=lambda: next(asked)))
     assert [each.version for each in catalog.maps(DOMAIN)] == [1]
     assert catalog.domain(DOMAIN).active_version == 1
-
-
-def test_without_a_map_nothing_can_learn(catalog):
-    with pytest.raises(NoActiveMapError):
-        learn_online(catalog, DOMAIN, [], Progress(LEARN_STAGES))
-    with pytest.raises(UnknownDomainError):
-        learn_online(catalog, "nowhere", [], Progress(LEARN_STAGES))

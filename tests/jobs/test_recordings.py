@@ -35,13 +35,11 @@ def folder(tmp_path):
     return tmp_path
 
 
-def ignore(_share):
-    pass
-
-
 def test_images_are_encoded_as_the_service_would_encode_what_is_posted(folder, judge):
-    recording = open_source(str(folder), spacing_m=2.5)
-    encoded = encode_recording(recording, judge, MAX_PIXELS, ignore)
+    recording, shares = open_source(str(folder), spacing_m=2.5), []
+    encoded = encode_recording(recording, judge, MAX_PIXELS, shares.append)
+    assert shares == [place / 6 for place in range(1, 7)], "every frame is reported, broken or not"
+    assert list(encoded.left_out.values()) == [1]
     assert encoded.drive.index.tolist() == [0, 1, 3, 4, 5]
     assert encoded.drive.position_m.tolist() == [0.0, 2.5, 7.5, 10.0, 12.5]
     assert encoded.drive.route().position_m.tolist() == [0.0, 2.5, 7.5, 10.0, 12.5]
@@ -50,49 +48,36 @@ def test_images_are_encoded_as_the_service_would_encode_what_is_posted(folder, j
         assert np.array_equal(encoded.drive.encodings[row], judge.encode([decode_image(posted, MAX_PIXELS)])[0])
 
 
-def test_broken_frames_are_counted_by_reason(folder, judge):
-    encoded = encode_recording(open_source(str(folder)), judge, MAX_PIXELS, ignore)
-    assert sum(encoded.left_out.values()) == 1
-    (reason,) = encoded.left_out
-    assert reason
-
-
 def test_the_readers_own_count_is_kept(folder, judge):
     (folder / "positions.csv").write_text("name,position_m\n0.png,0\n1.png,1\n2.png,2\n9.png,9\n")
     recording = open_source(str(folder))
-    encoded = encode_recording(recording, judge, MAX_PIXELS, ignore)
+    encoded = encode_recording(recording, judge, MAX_PIXELS, lambda _: None)
     assert encoded.drive.index.tolist() == [0, 1]
     assert encoded.left_out["not in positions.csv"] == 3
     assert encoded.left_out["in positions.csv without an image"] == 1
     assert sum(encoded.left_out.values()) == 5
 
 
-def test_every_frame_is_reported_broken_or_not(folder, judge):
-    shares = []
-    encode_recording(open_source(str(folder)), judge, MAX_PIXELS, shares.append)
-    assert shares == [place / 6 for place in range(1, 7)]
-
-
 def test_a_recording_of_broken_frames_alone_is_named(folder, judge):
     with pytest.raises(InvalidSourceError, match="no frame that can be used"):
-        encode_recording(open_source(f"{folder}#2:3"), judge, MAX_PIXELS, ignore)
+        encode_recording(open_source(f"{folder}#2:3"), judge, MAX_PIXELS, lambda _: None)
 
 
 def test_an_image_over_the_limit_is_an_error_not_a_broken_frame(folder, judge):
     with pytest.raises(ImageTooLargeError):
-        encode_recording(open_source(str(folder)), judge, 100, ignore)
+        encode_recording(open_source(str(folder)), judge, 100, lambda _: None)
 
 
 def test_images_need_an_extractor(folder):
     ready = make_evaluator(evaluator_config({"kind": "feature_l2", "extractor": "none"}))
     with pytest.raises(InvalidSourceError, match="ready encodings alone"):
-        encode_recording(open_source(str(folder)), ready, MAX_PIXELS, ignore)
+        encode_recording(open_source(str(folder)), ready, MAX_PIXELS, lambda _: None)
 
 
 def test_ready_encodings_are_taken_as_they_are(tmp_path, judge):
     rows = np.random.default_rng(0).normal(size=(9, 5)).astype(np.float32)
     np.save(tmp_path / "drive.npy", rows)
-    encoded = encode_recording(open_source(f"{tmp_path / 'drive.npy'}#2:9:3"), judge, MAX_PIXELS, ignore)
+    encoded = encode_recording(open_source(f"{tmp_path / 'drive.npy'}#2:9:3"), judge, MAX_PIXELS, lambda _: None)
     assert np.array_equal(encoded.drive.encodings, rows[2:9:3])
     assert encoded.drive.index.tolist() == [2, 5, 8]
     assert encoded.drive.position_m.tolist() == [2.0, 5.0, 8.0]
@@ -119,7 +104,7 @@ class Placed:
 
 
 def test_ground_coordinates_and_times_are_kept(judge):
-    encoded = encode_recording(Placed(0, 1, 2), judge, MAX_PIXELS, ignore)
+    encoded = encode_recording(Placed(0, 1, 2), judge, MAX_PIXELS, lambda _: None)
     assert encoded.drive.timestamp_us.tolist() == [0, 1, 2]
     np.testing.assert_array_equal(encoded.drive.route().x_m, [0.0, np.nan, 2.0])
     np.testing.assert_array_equal(encoded.drive.route().y_m, [2.0, 2.0, 2.0])
@@ -127,42 +112,26 @@ def test_ground_coordinates_and_times_are_kept(judge):
 
 def test_positions_that_go_backwards_are_named(judge):
     with pytest.raises(InvalidRouteError, match="frame 2"):
-        encode_recording(Placed(0, 2, 1), judge, MAX_PIXELS, ignore)
+        encode_recording(Placed(0, 2, 1), judge, MAX_PIXELS, lambda _: None)
 
 
 # --- ground truth --------------------------------------------------------------------------------------------------
 
 
-def lists(found):
-    return [ids.tolist() for ids in found]
-
-
-def saved(path, array, **how):
-    np.save(path, array, **how)
-    return path
-
-
-def vpr_bench(rows):
-    """[q, 2] object array of (query, list), as VPR-Bench writes it."""
-    array = np.empty((len(rows), 2), object)
-    for row, (query, truth) in zip(array, rows, strict=True):
-        row[0], row[1] = query, truth
+def objects(*rows):
+    """Rows of an object array: lists, or (query, list), as VPR-Bench writes them."""
+    array = np.empty((len(rows), 2) if isinstance(rows[0], tuple) else len(rows), object)
+    for place, row in enumerate(rows):
+        array[place] = row
     return array
-
-
-def rows_of(*lists):
-    """[q] object array of lists."""
-    rows = np.empty(len(lists), object)
-    rows[:] = lists
-    return rows
 
 
 @pytest.mark.parametrize(
     ("array", "test_index", "training_index", "expected"),
     [
-        (vpr_bench([(0, [2, 1]), (1, np.array([0])), (2, [])]), [0, 1, 2], [0, 1, 2], [[1, 2], [0], []]),
-        (vpr_bench([(7, [3]), (2, [1])]), [2, 5, 7], [0, 1, 2, 3], [[1], [], [3]]),
-        (rows_of([1], [0, 2]), [0, 1], [0, 1, 2], [[1], [0, 2]]),
+        (objects((0, [2, 1]), (1, np.array([0])), (2, [])), [0, 1, 2], [0, 1, 2], [[1, 2], [0], []]),
+        (objects((7, [3]), (2, [1])), [2, 5, 7], [0, 1, 2, 3], [[1], [], [3]]),
+        (objects([1], [0, 2]), [0, 1], [0, 1, 2], [[1], [0, 2]]),
         (np.array([[1, -1], [0, 2], [-1, -1]]), [0, 1, 2], [0, 1, 2], [[1], [0, 2], []]),
         (np.array([[10], [11], [12], [13]]), [1, 3], [11, 12, 13], [[0], [2]]),
         (np.array([[0, 99]]), [0], [0, 1], [[0]]),
@@ -170,8 +139,9 @@ def rows_of(*lists):
     ids=["pairs", "any order, with gaps", "in frame order", "padded", "places in the recording", "not mapped"],
 )
 def test_every_form_of_ground_truth(tmp_path, array, test_index, training_index, expected):
-    path = saved(tmp_path / "truth.npy", array, allow_pickle=True)
-    assert lists(read_ground_truth(path, np.array(test_index), np.array(training_index))) == expected
+    np.save(tmp_path / "truth.npy", array, allow_pickle=True)
+    truths = read_ground_truth(tmp_path / "truth.npy", np.array(test_index), np.array(training_index))
+    assert [truth.tolist() for truth in truths] == expected
 
 
 class Malice:
@@ -183,8 +153,8 @@ class Malice:
 
 
 def test_a_malicious_pickle_runs_nothing(tmp_path):
-    marker = tmp_path / "it ran"
-    path = saved(tmp_path / "truth.npy", vpr_bench([(0, Malice(marker))]), allow_pickle=True)
+    path, marker = tmp_path / "truth.npy", tmp_path / "it ran"
+    np.save(path, objects((0, Malice(marker))), allow_pickle=True)
     with pytest.raises(InvalidSourceError, match="mkdir"):
         read_ground_truth(path, np.arange(1), np.arange(1))
     assert not marker.exists()
@@ -192,44 +162,26 @@ def test_a_malicious_pickle_runs_nothing(tmp_path):
     assert marker.exists(), "the pickle would have run"
 
 
-def test_a_bare_pickle_is_no_ground_truth(tmp_path):
-    path = tmp_path / "truth.npy"
-    path.write_bytes(pickle.dumps([[0]]))
-    with pytest.raises(InvalidSourceError, match="no ground truth file"):
-        read_ground_truth(path, np.arange(1), np.arange(1))
-
-
-@pytest.mark.parametrize("body", [b"", b"words", b"\x93NUMPY\x01\x00"])
-def test_what_is_no_array_is_named(tmp_path, body):
-    path = tmp_path / "truth.npy"
-    path.write_bytes(body)
+@pytest.mark.parametrize(
+    "write",
+    [
+        lambda path: path.write_bytes(b""),
+        lambda path: path.write_bytes(b"words"),
+        lambda path: path.write_bytes(b"\x93NUMPY\x01\x00"),
+        lambda path: path.write_bytes(pickle.dumps([[0]])),
+        lambda path: np.save(path, objects((0, ["a place"])), allow_pickle=True),
+        lambda path: path.mkdir(),
+    ],
+)
+def test_what_is_no_ground_truth_is_named(tmp_path, write):
+    write(tmp_path / "truth.npy")
     with pytest.raises(InvalidSourceError, match=r"truth\.npy"):
-        read_ground_truth(path, np.arange(1), np.arange(1))
-
-
-def test_a_truncated_array_is_named(tmp_path):
-    path = saved(tmp_path / "truth.npy", vpr_bench([(0, [1, 2, 3])] * 5), allow_pickle=True)
-    path.write_bytes(path.read_bytes()[:-20])
-    with pytest.raises(InvalidSourceError):
-        read_ground_truth(path, np.arange(1), np.arange(1))
-
-
-def test_words_in_place_of_frame_numbers_are_named(tmp_path):
-    path = saved(tmp_path / "truth.npy", vpr_bench([(0, ["a place"])]), allow_pickle=True)
-    with pytest.raises(InvalidSourceError):
-        read_ground_truth(path, np.arange(1), np.arange(1))
-
-
-def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(InvalidSourceError, match="cannot read"):
-        read_ground_truth(tmp_path / "nowhere.npy", np.arange(1), np.arange(1))
+        read_ground_truth(tmp_path / "truth.npy", np.arange(1), np.arange(1))
 
 
 @pytest.mark.real_data
 def test_the_corridor_of_vpr_bench(real_data):
     path = real_data / "corridor" / "ground_truth_new.npy"
-    found = read_ground_truth(path, np.arange(111), np.arange(111))
+    truths = read_ground_truth(path, np.arange(111), np.arange(111))
     expected = {int(query): sorted(truth) for query, truth in np.load(path, allow_pickle=True)}
-    assert len(found) == 111
-    assert lists(found) == [expected[query] for query in range(111)]
-    assert all(len(ids) for ids in found)
+    assert [truth.tolist() for truth in truths] == [expected[query] for query in range(111)]

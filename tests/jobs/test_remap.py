@@ -13,9 +13,6 @@ from deepsimbad.errors import (
     InvalidEncodingError,
     InvalidMapConfigError,
     InvalidRouteError,
-    TooFewCandidatesError,
-    UnknownDomainError,
-    UnknownTraverseError,
 )
 from deepsimbad.jobs.progress import Progress
 from deepsimbad.jobs.remap import REMAP_STAGES, RemapConfig, remap, remap_stages, stages_in
@@ -92,12 +89,6 @@ def test_kept_landmarks_have_the_number_they_have(catalog, drive, evaluator, qui
     assert [record.version for record in catalog.maps(DOMAIN)] == [1]
 
 
-def test_a_first_map_needs_landmarks_from_somewhere(catalog, drive, evaluator, quiet):
-    drive("drive", 12)
-    with pytest.raises(InvalidMapConfigError, match="give a landmark_traverse"):
-        remap(catalog, DOMAIN, config(landmark_traverse=None, n_landmarks=None), evaluator, quiet)
-
-
 @pytest.mark.parametrize(("position_m", "frame"), [([0.0, 1.0, 0.5, 2.0, 3.0], 2), ([0.0, 1.0, 2.0, 3.0, 2.999], 4)])
 def test_positions_that_go_backwards_leave_nothing_behind(catalog, drive, evaluator, quiet, position_m, frame):
     drive("other", 30, seed=1)
@@ -118,23 +109,6 @@ def test_a_traverse_without_frames_is_named(catalog, drive, evaluator, quiet, ro
     assert catalog.maps(DOMAIN) == []
 
 
-def test_unknown_names_are_named(catalog, drive, evaluator, quiet):
-    drive("drive", 5)
-    with pytest.raises(UnknownTraverseError, match="other"):
-        remap(catalog, DOMAIN, config(), evaluator, quiet)
-    with pytest.raises(UnknownDomainError, match="elsewhere"):
-        remap(catalog, "elsewhere", config(), evaluator, Progress(REMAP_STAGES))
-
-
-def test_fewer_candidates_than_landmarks(catalog, drive, evaluator, quiet):
-    drive("other", 7, seed=1)
-    drive("drive", 5)
-    with pytest.raises(TooFewCandidatesError) as raised:
-        remap(catalog, DOMAIN, config(), evaluator, quiet)
-    assert raised.value.hints == {"n_candidates": 7, "n_landmarks": 8}
-    assert catalog.maps(DOMAIN) == []
-
-
 def test_traverses_of_two_encoders_are_named(catalog, drive, evaluator, quiet):
     drive("winter", 8, d=4)
     drive("summer", 8)
@@ -149,13 +123,6 @@ def test_the_active_maps_landmarks_may_come_from_another_encoder(catalog, drive,
     remap(catalog, DOMAIN, RemapConfig("summer", "summer", n_landmarks=5), evaluator, quiet)
     with pytest.raises(InvalidEncodingError, match="4 numbers cannot be compared with landmarks of 6"):
         remap(catalog, DOMAIN, RemapConfig("winter"), evaluator, quiet)
-
-
-def test_a_map_of_one_image(catalog, drive, evaluator, quiet):
-    drive("other", 30, seed=1)
-    drive("drive", 1)
-    assert remap(catalog, DOMAIN, config(), evaluator, quiet)["metrics"]["n_map_images"] == 1
-    assert read_map(catalog.map_path(DOMAIN, 1)).lists.shape == (4, 1)
 
 
 @pytest.mark.parametrize(

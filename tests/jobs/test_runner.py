@@ -9,10 +9,7 @@ import pytest
 from deepsimbad.errors import (
     IdempotencyKeyReusedError,
     JobInterruptedError,
-    TooManyJobsError,
     UnavailableError,
-    UnknownDomainError,
-    UnknownJobError,
 )
 from deepsimbad.jobs.remap import RemapConfig
 from deepsimbad.jobs.runner import InThisProcess, JobRunner
@@ -77,14 +74,6 @@ def test_a_job_succeeds_and_its_map_is_announced(catalog, drives):
     assert activated == [DOMAIN]
 
 
-def test_a_map_that_is_not_activated_is_not_announced(catalog, drives):
-    activated = []
-    with running(catalog, on_activated=activated.append) as runner:
-        job = ended(catalog, runner.submit(DOMAIN, RemapConfig("drive", "other", 8, activate=False)).job_id)
-    assert job.state is JobState.SUCCEEDED
-    assert activated == []
-
-
 def test_jobs_run_in_the_order_they_came(catalog, drives):
     gate = Gate(catalog.data_dir)
     with running(catalog, gate) as runner:
@@ -94,26 +83,6 @@ def test_jobs_run_in_the_order_they_came(catalog, drives):
         gate.open.set()
         results = [ended(catalog, job.job_id).result["map_version"] for job in jobs]
     assert results == [1, 2, 3]
-
-
-def test_only_so_many_jobs_wait_and_a_cancelled_one_makes_room(catalog, drives):
-    gate = Gate(catalog.data_dir)
-    runner = JobRunner(catalog, gate, lambda domain: None, max_waiting=2)
-    try:
-        runner.submit(DOMAIN, CONFIG)
-        assert gate.entered.wait(WITHIN_S)
-        waiting = [runner.submit(DOMAIN, CONFIG) for _ in range(2)]
-        with pytest.raises(TooManyJobsError, match="2 jobs wait already") as refused:
-            runner.submit(DOMAIN, CONFIG)
-        assert (refused.value.hints["limit"], refused.value.hints["max_jobs"]) == ("max_jobs", 2)
-        assert len(catalog.jobs()) == 3
-        runner.cancel(waiting[0].job_id)
-        last = runner.submit(DOMAIN, CONFIG)
-        gate.open.set()
-        assert ended(catalog, last.job_id).state is JobState.SUCCEEDED
-    finally:
-        gate.open.set()
-        runner.close()
 
 
 def test_a_job_of_one_id_is_made_once_whoever_asks_and_whenever(catalog, drives):
@@ -215,21 +184,6 @@ def test_a_job_that_breaks_tells_no_inner_detail_and_the_runner_goes_on(catalog,
     assert job.error["code"] == "internal_error"
     assert "secret" not in str(job.error)
     assert "secret" in caplog.text, "the log has it"
-
-
-def test_unknown_names(catalog):
-    with running(catalog) as runner:
-        with pytest.raises(UnknownDomainError):
-            runner.submit("elsewhere", CONFIG)
-        with pytest.raises(UnknownJobError):
-            runner.cancel("nothing")
-
-
-def test_cancelling_what_has_ended_changes_nothing(catalog, drives):
-    with running(catalog) as runner:
-        job = ended(catalog, runner.submit(DOMAIN, CONFIG).job_id)
-        assert runner.cancel(job.job_id).state is JobState.SUCCEEDED
-    assert catalog.job(job.job_id).state is JobState.SUCCEEDED
 
 
 def test_closing_leaves_what_runs_and_what_waits_to_the_next_service(catalog, drives):

@@ -140,11 +140,3 @@ def test_a_remap_stores_what_it_learnt(catalog, drive, evaluator, quiet):
     assert np.array_equal(read_map(catalog.map_path(DOMAIN, again["map_version"])).q_values, q_values)
     other_seed = remap(catalog, DOMAIN, remap_config(seed=1), evaluator, Progress(REMAP_STAGES))
     assert not np.array_equal(read_map(catalog.map_path(DOMAIN, other_seed["map_version"])).q_values, q_values)
-
-
-def test_a_remap_without_episodes_has_no_experience(catalog, drive, evaluator, quiet):
-    drive("other", 30, seed=1)
-    drive("drive", 12)
-    result = remap(catalog, DOMAIN, remap_config(training_episodes=0), evaluator, quiet)
-    assert result["metrics"]["training"] is None
-    assert read_map(catalog.map_path(DOMAIN, 1)).q_values is None

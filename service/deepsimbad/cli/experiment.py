@@ -19,6 +19,7 @@ from deepsimbad.cli.terminal import (
     spacing_option,
     write_json,
 )
+from deepsimbad.core.metrics import RetrievalScores
 from deepsimbad.core.planners import DEFAULT_PLANNER
 from deepsimbad.core.relevance import DEFAULT_RELEVANCE, DEFAULT_UPDATE, Relevance, UpdateRule
 from deepsimbad.core.route import true_images_of
@@ -43,7 +44,6 @@ from deepsimbad_client.recordings.sources import open_source
 _ROLES = ("landmarks", "training", "test")
 _READING_STAGES = {f"read {role}": 2.0 for role in _ROLES}
 _STANDARD_OUTPUT = Path("-")
-
 _Command = TypeVar("_Command", bound=Callable[..., Any])
 
 
@@ -119,7 +119,7 @@ def vpr(
     documents: dict[str, Any] = {}
     reports: dict[str, VprReport] = {}
     for evaluator in evaluators:
-        extractor = evaluator.options["extractor"]
+        extractor = evaluator.extractor
         with progress_bar(_READING_STAGES | vpr_stages(config), extractor) as progress:
             measure, (landmarks, training, test), sources = _read_triplet(asked, evaluator, progress)
             if ground_truth is None:
@@ -206,8 +206,7 @@ def _print_extractors(reports: dict[str, VprReport]) -> None:
             f"{score.anr:.2f} / {score.recall_at[1]:.0f} / {score.recall_at[5]:.0f}" for score in report.scores.values()
         )
         table.add_row(extractor, str(report.encoding_dim), str(report.bytes_per_encoding), time_ms, *cells)
-    first = next(iter(scores.values()))
-    print_table(table, f"{first.n_queries} queries scored, {first.n_left_out} left out (no true image)", numbers=True)
+    print_table(table, _queries(scores), numbers=True)
 
 
 def _print_relevances(report: VprReport) -> None:
@@ -215,14 +214,13 @@ def _print_relevances(report: VprReport) -> None:
     for name, score in report.scores.items():
         shown = f"{name.value} (default)" if name is DEFAULT_RELEVANCE else name.value
         table.add_row(shown, f"{score.anr:.2f}", f"{score.recall_at[1]:.1f}", f"{score.recall_at[5]:.1f}")
-    first = next(iter(report.scores.values()))
-    print_table(
-        table,
-        f"{first.n_queries} queries scored, {first.n_left_out} left out (no true image); "
-        f"index {report.index_bits_per_map_image:.1f} bits a map image",
-        *_no_second_season(report.same_route.why),
-        numbers=True,
-    )
+    bits = f"index {report.index_bits_per_map_image:.1f} bits a map image"
+    print_table(table, f"{_queries(report.scores)}; {bits}", *_no_second_season(report.same_route.why), numbers=True)
+
+
+def _queries(scores: dict[Relevance, RetrievalScores]) -> str:
+    first = next(iter(scores.values()))
+    return f"{first.n_queries} queries scored, {first.n_left_out} left out (no true image)"
 
 
 def _print_planners(report: NbvReport, document: dict[str, Any]) -> None:

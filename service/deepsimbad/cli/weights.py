@@ -224,7 +224,7 @@ def _rows(lock: Lock) -> Iterator[dict[str, Any]]:
             is_there = find_spec(weights_.package.replace("-", "_")) is not None
             row["state"] = "with its package" if is_there else "no package"
         yield row
-    known_files, known_hub = {known.file for known in KNOWN}, {canonical(known.extractor) for known in KNOWN}
+    known_files, known_hub = {listed.file for listed in KNOWN}, {canonical(listed.extractor) for listed in KNOWN}
     yield from (_row(lock, name, file.extractor) for name, file in lock.files.items() if name not in known_files)
     yield from (_row(lock, hub.repository, name) for name, hub in lock.hub.items() if name not in known_hub)
 

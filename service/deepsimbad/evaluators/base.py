@@ -1,8 +1,7 @@
 """The contract every evaluator keeps (II-A).
 
-The paper asks of an evaluator one thing only: a dissimilarity between a scene and a landmark. We split it in
-two steps, `encode` and `dissimilarities`, so that each observation is encoded once however often the landmarks
-change.
+The paper asks of an evaluator one thing only: a dissimilarity between a scene and a landmark. We split it in two steps,
+`encode` and `dissimilarities`, so that each image is encoded once however often the landmarks change.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -17,17 +16,16 @@ from deepsimbad.errors import OutOfMemoryError
 Image: TypeAlias = NDArray[np.uint8]
 """[height, width, 3] BGR, upright, as `evaluators.image.decode_image` gives it."""
 
-Observation: TypeAlias = Image
-"""What an evaluator is shown."""
-
 LandmarkModel: TypeAlias = Mapping[str, NDArray[np.generic]]
 """All an evaluator must remember of the landmarks, as named arrays the store saves without understanding."""
 
 
 class Evaluator(Protocol):
-    """Measures how far a scene is from each landmark.
+    """Measures how far a scene is from each landmark; immutable, and called from several threads.
 
-    Evaluators are immutable after construction and may be called from several threads.
+    What needs the network raises MissingPackageError, MissingWeightsError, InvalidWeightsError or OutOfMemoryError;
+    what is given images, UnsupportedMediaTypeError where ready encodings alone are taken, and InvalidImageError of an
+    array that is no image.
     """
 
     @property
@@ -48,32 +46,16 @@ class Evaluator(Protocol):
 
     @property
     def largest_batch(self) -> int:
-        """How many observations are best encoded at once."""
+        """How many images are best encoded at once."""
 
     def load(self) -> None:
-        """Load what encoding needs, now rather than at first need.
+        """Load what encoding needs, now rather than at first need."""
 
-        Raises:
-            MissingPackageError, MissingWeightsError, InvalidWeightsError: It cannot be loaded.
-            OutOfMemoryError: There is too little memory for it.
-        """
+    def prepare(self, image: Image) -> Image:
+        """Bring an image to the size it is encoded at; `encode` does so itself with one that was not."""
 
-    def prepare(self, observation: Observation) -> Observation:
-        """Bring an observation to the size it is encoded at; `encode` does so itself with one that was not.
-
-        Raises:
-            InvalidImageError: An array that is not such an image.
-            UnsupportedMediaTypeError: The evaluator takes ready encodings alone.
-        """
-
-    def encode(self, observations: Sequence[Observation]) -> NDArray[np.float32]:
-        """Encode n observations to [n, d] float32, finite: no answer depends on its neighbours, beyond rounding.
-
-        Raises:
-            InvalidImageError: An array that is not such an image.
-            UnsupportedMediaTypeError: The evaluator takes ready encodings alone.
-            OutOfMemoryError: There is too little memory for it.
-        """
+    def encode(self, images: Sequence[Image]) -> NDArray[np.float32]:
+        """Encode n images to [n, d] float32, finite: no answer depends on its neighbours, beyond rounding."""
 
     def fit_landmarks(self, encodings: NDArray[np.float32]) -> LandmarkModel:
         """Turn the selected landmarks, [r, d] float32 in landmark order, into the model that `dissimilarities` takes.
@@ -83,11 +65,7 @@ class Evaluator(Protocol):
         """
 
     def check_model(self, model: LandmarkModel, n_landmarks: int) -> None:
-        """Check that a landmark model, of whatever origin, can be compared with.
-
-        Raises:
-            InvalidEncodingError: It is not what `fit_landmarks` gives of r landmarks.
-        """
+        """Raise InvalidEncodingError where a model, of whatever origin, is not what `fit_landmarks` gives of r."""
 
     def dissimilarities(self, encodings: NDArray[np.float32], model: LandmarkModel) -> NDArray[np.float32]:
         """Compare scenes, [n, d] float32, with landmarks: [n, r] float32, at least 0, finite, smaller is nearer.
@@ -107,11 +85,7 @@ def is_lack_of_memory(error: BaseException) -> bool:
 
 @contextmanager
 def named_lack_of_memory(work: str) -> Iterator[None]:
-    """What anybody says of too little memory, as one error: nobody's image is at fault. All else passes.
-
-    Args:
-        work: What is done with the image.
-    """
+    """What anybody says of too little memory to `work` an image, as one error. All else passes."""
     try:
         yield
     except Exception as error:

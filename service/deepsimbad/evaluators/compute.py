@@ -9,21 +9,16 @@ from pathlib import Path
 class Runtime(StrEnum):
     """What runs a network. All agree to 1e-3 in cosine."""
 
-    AUTO = "auto"
-    """The fastest of what is installed, by docs/results/encode.md."""
-    TORCH = "torch"
-    """PyTorch in float32."""
+    AUTO = "auto"  # the fastest of what is installed, by docs/results/encode.md
+    TORCH = "torch"  # in float32
     TORCH_BF16 = "torch_bf16"
-    """PyTorch in bfloat16."""
-    ONNXRUNTIME = "onnxruntime"
-    """ONNX Runtime in float32; networks that it does not know are run by PyTorch."""
+    ONNXRUNTIME = "onnxruntime"  # in float32; networks that it does not know are run by PyTorch
 
 
 class Device(StrEnum):
     """Where a network runs."""
 
-    AUTO = "auto"
-    """CUDA where there is one that works, else the processor."""
+    AUTO = "auto"  # CUDA where there is one that works, else the processor
     CPU = "cpu"
     CUDA = "cuda"
 
@@ -40,18 +35,11 @@ def available_cores() -> int:
 
 @dataclass(frozen=True)
 class Compute:
-    """How networks are computed.
-
-    Attributes:
-        runtime: What runs them.
-        device: Where.
-        n_threads: Processor threads a network may use; 0: as many as there are cores.
-        largest_batch: Most images that are encoded at once; 0: what measures best on the device.
-        weights_dir: Folder of files of weights, named by configurations without their folder.
-    """
+    """How networks are computed."""
 
     runtime: Runtime = Runtime.AUTO
     device: Device = Device.AUTO
-    n_threads: int = 0
-    largest_batch: int = 0
+    n_threads: int = 0  # processor threads a network may use; 0: as many as there are cores
+    largest_batch: int = 0  # most images that are encoded at once; 0: what measures best on the device
+    # Folder of files of weights, named by configurations without their folder
     weights_dir: Path = field(default_factory=DEFAULT_WEIGHTS_DIR.expanduser)

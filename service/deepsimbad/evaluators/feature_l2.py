@@ -8,7 +8,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from deepsimbad.errors import InvalidEncodingError, InvalidImageError, UnsupportedMediaTypeError
-from deepsimbad.evaluators.base import LandmarkModel, Observation, named_lack_of_memory
+from deepsimbad.evaluators.base import Image, LandmarkModel, named_lack_of_memory
 from deepsimbad.evaluators.compute import Compute
 from deepsimbad.evaluators.extractors.base import Extractor
 from deepsimbad.evaluators.registry import ExtractorName, make_extractor
@@ -67,24 +67,24 @@ class FeatureL2:
                 self._loaded = make_extractor(self._name, self._compute)
             return self._loaded
 
-    def prepare(self, observation: Observation) -> Observation:
+    def prepare(self, image: Image) -> Image:
         """See `Evaluator.prepare`."""
-        self._check((observation,))
+        self._check((image,))
         with named_lack_of_memory("prepare"):
-            return self._extractor.prepare(observation)
+            return self._extractor.prepare(image)
 
-    def encode(self, observations: Sequence[Observation]) -> NDArray[np.float32]:
+    def encode(self, images: Sequence[Image]) -> NDArray[np.float32]:
         """See `Evaluator.encode`."""
-        self._check(observations)
+        self._check(images)
         with named_lack_of_memory("encode"):
-            return self._extractor.encode(observations)
+            return self._extractor.encode(images)
 
-    def _check(self, observations: Sequence[Observation]) -> None:
+    def _check(self, images: Sequence[Image]) -> None:
         if not self.takes_images:
             raise UnsupportedMediaTypeError(
                 "this domain has no extractor and takes ready encodings alone", allowed=["application/json"]
             )
-        for image in observations:
+        for image in images:
             if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 or image.size == 0:
                 raise InvalidImageError(f"an image is [height, width, 3] uint8, not {list(image.shape)} {image.dtype}")
 

@@ -51,15 +51,10 @@ _TIFF_MAX_SAMPLES = 5  # CMYK and alpha
 
 @dataclass(frozen=True)
 class ImageFile:
-    """A file that is whole and claims no more pixels than it may.
+    """A file that is whole and claims no more pixels than it may."""
 
-    Attributes:
-        picture: The file, without what a decoder need not see.
-        n_pixels: Of the largest surface that its header makes a decoder allocate.
-    """
-
-    picture: bytes
-    n_pixels: int
+    picture: bytes  # the file, without what a decoder need not see
+    n_pixels: int  # of the largest surface that its header makes a decoder allocate
 
     @classmethod
     def read(cls, body: bytes, max_pixels: int) -> "ImageFile":

@@ -1,13 +1,12 @@
 """Which evaluators and extractors exist, by name; nothing is imported before it is asked for."""
 
 import re
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass
 from enum import StrEnum
 from functools import cache
 from importlib import import_module
 from importlib.util import find_spec
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, cast
 
 from deepsimbad.errors import InvalidInputError, InvalidWeightsError, MissingPackageError
@@ -51,31 +50,18 @@ EXTRACTOR_FORMS, _PATTERNS = (
     for part in (0, 1)
 )
 EXTRACTOR_PATTERN = f"^({'|'.join(_PATTERNS)})$"
-# "module:maker" of `(argument, compute) -> Extractor`, and of `(**options, compute) -> Evaluator`.
-_PACKAGE = "deepsimbad.evaluators.extractors"
-_EXTRACTORS: Mapping[ExtractorName, str] = {
-    ExtractorName.EFFICIENTNET_LITE0: f"{_PACKAGE}.efficientnet_lite0:efficientnet_lite0",
-    ExtractorName.GRADIENT_GRID: f"{_PACKAGE}.gradient_grid:gradient_grid",
-    ExtractorName.SQUEEZENET: f"{_PACKAGE}.squeezenet:squeezenet",
-    ExtractorName.NETVLAD: f"{_PACKAGE}.netvlad:netvlad",
-    ExtractorName.TORCHHUB: f"{_PACKAGE}.torchhub:torchhub",
-    ExtractorName.ONNX: f"{_PACKAGE}.onnx_file:onnx_file",
-}
-_EVALUATORS: Mapping[EvaluatorKind, str] = {EvaluatorKind.FEATURE_L2: "deepsimbad.evaluators.feature_l2:FeatureL2"}
-# Per kind: its options. Unknown options are errors: a typing mistake is never silent.
-_OPTIONS: Mapping[EvaluatorKind, tuple[str, ...]] = {EvaluatorKind.FEATURE_L2: ("extractor",)}
 
 
 @dataclass(frozen=True)
 class EvaluatorConfig:
-    """A checked evaluator configuration, its options complete, stored with the domain and every map."""
+    """A checked evaluator configuration, complete, stored with the domain and every map."""
 
     kind: EvaluatorKind
-    options: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
+    extractor: str  # of EXTRACTOR_FORMS
 
     def as_dict(self) -> dict[str, str]:
         """The canonical JSON form: equal configurations give equal dicts."""
-        return {"kind": self.kind.value, **dict(sorted(self.options.items()))}
+        return {"kind": self.kind.value, "extractor": self.extractor}
 
 
 @cache
@@ -96,10 +82,7 @@ def fallback() -> str | None:
 
 
 def evaluator_config(raw: Mapping[str, Any]) -> EvaluatorConfig:
-    """Check a configuration that came from outside.
-
-    Args:
-        raw: `{"kind": "feature_l2", "extractor": NAME}`; options may be left out.
+    """Check a configuration that came from outside: `{"kind": "feature_l2", "extractor": NAME}`, or the kind alone.
 
     Raises:
         InvalidInputError: Unknown kind, unknown option or unknown value; the hints hold what is allowed.
@@ -107,10 +90,9 @@ def evaluator_config(raw: Mapping[str, Any]) -> EvaluatorConfig:
     kinds = [kind.value for kind in EvaluatorKind]
     if raw.get("kind") not in kinds:
         raise InvalidInputError(f"the evaluator's kind must be one of {', '.join(kinds)}", field="kind", allowed=kinds)
-    kind = EvaluatorKind(raw["kind"])
-    allowed = ["kind", *_OPTIONS[kind]]
+    kind, allowed = EvaluatorKind(raw["kind"]), ["kind", "extractor"]
     unknown = sorted(str(key) for key in raw if key not in allowed)
-    if unknown:
+    if unknown:  # a typing mistake is never silent
         raise InvalidInputError(f"{kind.value} has no option {', '.join(unknown)}", unknown=unknown, allowed=allowed)
     extractor = raw.get("extractor", default_extractor().value)
     if not isinstance(extractor, str) or re.fullmatch(EXTRACTOR_PATTERN, extractor) is None:
@@ -119,17 +101,14 @@ def evaluator_config(raw: Mapping[str, Any]) -> EvaluatorConfig:
             field="extractor",
             allowed=list(EXTRACTOR_FORMS),
         )
-    return EvaluatorConfig(kind, MappingProxyType({"extractor": extractor}))
+    return EvaluatorConfig(kind, extractor)
 
 
 def make_evaluator(config: EvaluatorConfig, compute: Compute | None = None) -> Evaluator:
-    """Build the evaluator a configuration names; its extractor is loaded at first need, or by `Evaluator.load`.
+    """Build the evaluator a configuration names; its extractor is loaded at first need, or by `Evaluator.load`."""
+    from deepsimbad.evaluators.feature_l2 import FeatureL2  # numba and cv2, for those who measure alone
 
-    Args:
-        config: As `evaluator_config` gives it.
-        compute: How its network, if it has one, is computed; None: by the defaults.
-    """
-    return cast("Evaluator", _load(_EVALUATORS[config.kind])(**config.options, compute=compute))
+    return FeatureL2(config.extractor, compute)
 
 
 def make_extractor(text: str, compute: Compute) -> "Extractor":
@@ -141,14 +120,11 @@ def make_extractor(text: str, compute: Compute) -> "Extractor":
     """
     name, _, argument = text.partition(":")
     try:
-        return cast("Extractor", _load(_EXTRACTORS[ExtractorName(name)])(argument, compute))
+        maker = "onnx_file" if name == ExtractorName.ONNX else ExtractorName(name).value
+        module = import_module(f"deepsimbad.evaluators.extractors.{maker}")
+        return cast("Extractor", getattr(module, maker)(argument, compute))
     except OSError as error:
         raise InvalidWeightsError(f"the weights of {text} cannot be read: {error}") from error
     except ImportError as error:
         advice = f": {INSTALL_TORCH}" if error.name == "torch" else ""
         raise MissingPackageError(f"a package that {name} needs cannot be imported: {error}{advice}") from error
-
-
-def _load(target: str) -> Callable[..., Any]:
-    module, _, attribute = target.partition(":")
-    return cast("Callable[..., Any]", getattr(import_module(module), attribute))

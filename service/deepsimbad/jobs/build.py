@@ -61,16 +61,13 @@ def encode_recording(
     if not frames:
         raise InvalidSourceError(f"{recording.name} has no frame that can be used: {left_out}")
 
-    def known(values: list[float | None]) -> NDArray[np.float64]:
-        return np.array([np.nan if value is None else value for value in values], np.float64)
-
     times_us = [UNKNOWN_TIMESTAMP if frame.timestamp_us is None else frame.timestamp_us for frame in frames]
     drive = Drive(
         index=np.array([frame.index for frame in frames], np.int64),
         position_m=np.array([frame.position_m for frame in frames], np.float64),
         timestamp_us=np.array(times_us, np.int64),
-        x_m=known([frame.x_m for frame in frames]),
-        y_m=known([frame.y_m for frame in frames]),
+        x_m=np.array([np.nan if frame.x_m is None else frame.x_m for frame in frames], np.float64),
+        y_m=np.array([np.nan if frame.y_m is None else frame.y_m for frame in frames], np.float64),
         encodings=encodings,
         weights_sha256=weights_sha256,
     )
