@@ -10,7 +10,7 @@ from deepsimbad.errors import CancelledError
 from deepsimbad.jobs.progress import Progress
 from deepsimbad.jobs.remap import RemapConfig, remap
 from deepsimbad.jobs.versions import LEARN_STAGES, learn_online
-from deepsimbad.store.map_file import read_map
+from deepsimbad.store.map_file import read_map, verify
 from deepsimbad.store.records import MapState
 
 DOMAIN = "route"

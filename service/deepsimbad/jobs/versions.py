@@ -29,15 +29,12 @@ from deepsimbad.errors import (
 )
 from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
 from deepsimbad.jobs.progress import Progress
-from deepsimbad.store.catalog import Catalog
-from deepsimbad.store.catalog_maps import ANY, AnyVersion
+from deepsimbad.store.catalog import ANY, AnyVersion, Catalog
 from deepsimbad.store.durable import sha256_of
-from deepsimbad.store.journal import ObservedRow, SessionRecord
 from deepsimbad.store.layout import is_name
 from deepsimbad.store.map_file import adopt, index_bytes, read_map, seal, write_map
 from deepsimbad.store.records import MapRecord
-from deepsimbad.store.sealing import adopt, seal
-from deepsimbad.store.sessions import SessionStore
+from deepsimbad.store.sessions import ObservedRow, SessionRecord, SessionStore
 
 EXPERIENCE = "experience"  # the kind of job
 LEARN_STAGES = {"read map": 1.0, "learn": 2.0, "seal": 1.0, "activate": 0.1}
