@@ -26,7 +26,7 @@ from deepsimbad.errors import InvalidSourceError
 from deepsimbad.evaluators.base import Evaluator, Image, LandmarkModel
 from deepsimbad.evaluators.image import decode_image
 from deepsimbad_client.errors import BrokenFrameError
-from deepsimbad_client.recordings.recording import Recording
+from deepsimbad_client.recordings import Recording
 
 _FRAMES_A_BLOCK = 1024
 EPISODES_A_MAP_IMAGE = 25  # more would visit every entry of a small map again and again
