@@ -9,17 +9,7 @@ from fastapi import APIRouter, Query, Request, Response
 from pydantic import Field, model_validator
 
 from deepsimbad.api.problems import binary, declare_json, problems
-from deepsimbad.api.requests import (
-    BINARY,
-    GREATEST_ID,
-    KEPT,
-    Answer,
-    DomainName,
-    JsonBody,
-    Running,
-    names,
-    read_json,
-)
+from deepsimbad.api.requests import BINARY, GREATEST_ID, KEPT, Answer, DomainName, JsonBody, Running, names, read_json
 from deepsimbad.engine.maps import Maps
 from deepsimbad.engine.worker import EvaluatorPool, ready
 from deepsimbad.errors import NoActiveMapError, UnavailableError, UnknownDomainError

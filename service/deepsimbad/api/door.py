@@ -240,10 +240,10 @@ class _Request:
         route = getattr(scope.get("route"), "path", UNROUTED)
         method = scope["method"] if scope["method"] in _METHODS else "OTHER"
         metrics.request_ended(method, route, self.status, seconds)
-        noted, about = scope["state"] | (scope.get("path_params") or {}), {}
+        state, about = scope["state"] | (scope.get("path_params") or {}), {}
         for name in _NOTED:
-            if name in noted:
-                about[name] = noted[name]
+            if name in state:
+                about[name] = state[name]
         if about.get("code") in REFUSALS:
             metrics.refused(about.get("limit", about["code"]))
         if log.isEnabledFor(logging.INFO):

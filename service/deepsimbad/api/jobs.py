@@ -232,8 +232,8 @@ async def _stream(running: Running) -> AsyncIterator[None]:
 @router.get("", responses=problems(404, 422))
 async def list_jobs(running: Running, page: Annotated[Page, page_of("jobs")], domain: OfDomain = None) -> JobList:
     """Jobs, newest first."""
-    listed = await run_sync(running.catalog.newest_jobs, domain, page.number, page.limit)
-    return JobList.model_validate({"jobs": listed.records, "next": page.next(listed.last_key)})
+    newest = await run_sync(running.catalog.newest_jobs, domain, page.number, page.limit)
+    return JobList.model_validate({"jobs": newest.records, "next": page.next(newest.last_key)})
 
 
 @router.get("/{job_id}", responses=problems(404, 422))
@@ -258,11 +258,11 @@ async def get_job_events(
 
     The stream may end earlier, when the service shuts down or the key is revoked: ask for the job again.
     """
-    sent: JobRecord | None = None
+    shown: JobRecord | None = None
     key_id = key_id_of(request)
     while not running.stopping.is_set() and running.keys.still_opens(key_id):
-        if job != sent:
-            sent = job
+        if job != shown:
+            shown = job
             yield ServerSentEvent(
                 data=JobAnswer.model_validate(job), event="done" if job.state.is_final else "progress"
             )

@@ -97,20 +97,20 @@ class KeyRing:
 
     def admit(self, scope: Scope, needed: KeyScope, rate_limit: "RateLimit") -> None:
         """Let a request in, and note whose it is; raises UnauthorizedError, RateLimitedError, ForbiddenError."""
-        noted = scope["state"]
+        state = scope["state"]
         try:
             key = self.holder(presented_key(scope))
         except UnauthorizedError as error:
-            noted |= error.hints  # whose key was revoked or has expired
+            state |= error.hints  # whose key was revoked or has expired
             raise
-        noted |= {"key_id": key.key_id, "key_scope": key.scope, "domains": key.domains}
+        state |= {"key_id": key.key_id, "key_scope": key.scope, "domains": key.domains}
         rate_limit.take(key.key_id)
         if not key.scope.includes(needed):
             raise ForbiddenError(
                 f"this call needs a key of scope {needed}; this one has {key.scope}", needed=needed.value
             )
-        asked = _OF_DOMAIN.match(scope["path"])
-        if key.domains is not None and asked is not None and asked[1] not in key.domains:
+        of_domain = _OF_DOMAIN.match(scope["path"])
+        if key.domains is not None and of_domain is not None and of_domain[1] not in key.domains:
             raise ForbiddenError("this key is for other domains", domains=list(key.domains))
 
 

@@ -280,14 +280,14 @@ async def post_localization(
 async def view_in(body: bytes, running: Services, media_type: str, evaluator: Evaluator) -> View:
     """The observation in a body that has been read; an image at its evaluator's size."""
     if media_type == JSON:
-        given = await parse_json(body, ObservationBody, running)
-        if len(given.model_fields_set) != 1:
+        observation = await parse_json(body, ObservationBody, running)
+        if len(observation.model_fields_set) != 1:
             raise invalid_body("give exactly one of ranked_landmarks, dissimilarities, encoding")
-        if "ranked_landmarks" in given.model_fields_set:
-            return RankedLandmarks(given.ranked_landmarks)
-        if "dissimilarities" in given.model_fields_set:
-            return Dissimilarities(np.array(given.dissimilarities, np.float64))
-        return ReadyEncoding(np.array(given.encoding, np.float64))
+        if "ranked_landmarks" in observation.model_fields_set:
+            return RankedLandmarks(observation.ranked_landmarks)
+        if "dissimilarities" in observation.model_fields_set:
+            return Dissimilarities(np.array(observation.dissimilarities, np.float64))
+        return ReadyEncoding(np.array(observation.encoding, np.float64))
     if media_type == RANKS:
         return PackedRanks(body)
     image, is_blank = await running.decoders.decoded(body, evaluator, Priority.LIVE)
@@ -296,15 +296,15 @@ async def view_in(body: bytes, running: Services, media_type: str, evaluator: Ev
 
 def prefers_binary(request: Request) -> bool:
     """Whether `Accept` asks for the npy rather than for JSON."""
-    wanted = {}
+    quality_of = {}
     for part in request.headers.get("accept", "").split(","):
         media_type, *parameters = (piece.strip().lower() for piece in part.split(";"))
         quality = next((piece[2:] for piece in parameters if piece.startswith("q=")), "1")
         try:
-            wanted[media_type] = float(quality)
+            quality_of[media_type] = float(quality)
         except ValueError:
-            wanted[media_type] = 0.0
-    return wanted.get(BINARY, 0.0) > wanted.get(JSON, 0.0)
+            quality_of[media_type] = 0.0
+    return quality_of.get(BINARY, 0.0) > quality_of.get(JSON, 0.0)
 
 
 def npy_response(values: NDArray[np.floating]) -> Response:

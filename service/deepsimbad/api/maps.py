@@ -88,8 +88,8 @@ class MapList(Answer):
 @router.get("/{domain}/maps", responses=problems(404, 422))
 async def list_maps(domain: DomainName, running: Running, page: Annotated[Page, page_of("maps")]) -> MapList:
     """The history of a domain's map, newest version first."""
-    listed = await run_sync(running.catalog.newest_maps, domain, page.number, page.limit)
-    return MapList.model_validate({"maps": listed.records, "next": page.next(listed.last_key)})
+    newest = await run_sync(running.catalog.newest_maps, domain, page.number, page.limit)
+    return MapList.model_validate({"maps": newest.records, "next": page.next(newest.last_key)})
 
 
 @router.put(
@@ -169,8 +169,8 @@ def one_range(headers: Headers, n_bytes: int) -> Headers:
 
     Raises HTTPException, 416, for one that begins behind the end.
     """
-    wanted = next((value.decode("latin-1").replace(" ", "") for name, value in headers if name == b"range"), "")
-    match = _RANGE.fullmatch(wanted)
+    range_header = next((value.decode("latin-1").replace(" ", "") for name, value in headers if name == b"range"), "")
+    match = _RANGE.fullmatch(range_header)
     first, last = match.groups() if match else ("", "")
     if (first and last and int(first) > int(last)) or not (first or last):
         return [(name, value) for name, value in headers if name != b"range"]

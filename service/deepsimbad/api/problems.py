@@ -104,17 +104,17 @@ def problem_response(
         "code": code,
         "request_id": scope.get("state", {}).get("request_id"),
     }
-    noted = scope.setdefault("state", {})  # for the log
-    noted["code"] = code
+    state = scope.setdefault("state", {})  # for the log
+    state["code"] = code
     if isinstance(document.get("limit"), str):
-        noted["limit"] = document["limit"]
-    sent = dict(headers or {})
+        state["limit"] = document["limit"]
+    sent_headers = dict(headers or {})
     if status == HTTPStatus.UNAUTHORIZED:
-        sent.setdefault("WWW-Authenticate", "Bearer")
+        sent_headers.setdefault("WWW-Authenticate", "Bearer")
     if status in {HTTPStatus.SERVICE_UNAVAILABLE, HTTPStatus.TOO_MANY_REQUESTS}:
-        sent.setdefault("Retry-After", str(RETRY_AFTER_S))
+        sent_headers.setdefault("Retry-After", str(RETRY_AFTER_S))
     # json escapes everything outside ASCII, so text that cannot be encoded (lone surrogates) still travels.
-    return Response(json.dumps(document).encode("ascii"), status, headers=sent, media_type=MEDIA_TYPE)
+    return Response(json.dumps(document).encode("ascii"), status, headers=sent_headers, media_type=MEDIA_TYPE)
 
 
 def error_response(scope: Scope, error: DeepSimbadError) -> Response:

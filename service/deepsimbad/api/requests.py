@@ -235,7 +235,7 @@ def page_of(list_name: str, key_pattern: str = "[0-9]{1,18}$") -> Any:
     """The parameters `limit` and `after` of a list, as a `Page`."""
     cursor = f"^{list_name}-{key_pattern}"
 
-    async def asked(
+    async def page(
         limit: Annotated[int, Query(ge=1, le=1000, description="Most entries of the answer.")] = 100,
         after: Annotated[
             str | None, Query(pattern=cursor, description="`next` of the page before; absent: the first page.")
@@ -243,7 +243,7 @@ def page_of(list_name: str, key_pattern: str = "[0-9]{1,18}$") -> Any:
     ) -> Page:
         return Page(list_name, limit, None if after is None else after.removeprefix(f"{list_name}-"))
 
-    return Depends(asked)
+    return Depends(page)
 
 
 # Entity tags: which content a request has, or insists on (RFC 9110, 13.1)
@@ -263,16 +263,16 @@ LandmarkModelTag = Annotated[
 ]
 
 
-def names(wanted: str | None, etag: str) -> bool:
+def names(header: str | None, etag: str) -> bool:
     """Whether an If-None-Match names this content; weak tags do."""
-    return wanted is not None and any(tag.strip().removeprefix("W/") in {etag, "*"} for tag in wanted.split(","))
+    return header is not None and any(tag.strip().removeprefix("W/") in {etag, "*"} for tag in header.split(","))
 
 
-def insisted_on(wanted: str) -> frozenset[str] | None:
+def insisted_on(header: str) -> frozenset[str] | None:
     """The contents, one of which an If-Match insists on; None: any will do. Weak tags match nothing."""
-    if wanted.strip() == "*":
+    if header.strip() == "*":
         return None
-    return frozenset(tag for weak, tag in _STRONG.findall(wanted) if not weak)
+    return frozenset(tag for weak, tag in _STRONG.findall(header) if not weak)
 
 
 # Requests that make something, and make it once however often they are sent

@@ -232,10 +232,7 @@ async def _answered(running: Services, view: SessionView, status: int = 200, loc
     openapi_extra=declare_json(SessionBody),
 )
 async def post_session(
-    domain: DomainName,
-    request: Request,
-    running: Running,
-    idempotency_key: KeyOfCreation = None,
+    domain: DomainName, request: Request, running: Running, idempotency_key: KeyOfCreation = None
 ) -> Response:
     """Begin a session on the domain's active map, which it keeps whatever is activated later."""
     active = await running.active(domain)
@@ -350,9 +347,7 @@ async def delete_session(session_id: SessionId, request: Request, running: Runni
 
 
 @router.post(
-    "/sessions/{session_id}/truths",
-    responses=problems(404, 410, 413, 415, 422),
-    openapi_extra=declare_json(TruthsBody),
+    "/sessions/{session_id}/truths", responses=problems(404, 410, 413, 415, 422), openapi_extra=declare_json(TruthsBody)
 )
 async def post_truths(session_id: SessionId, request: Request, running: Running) -> TruthsAnswer:
     """Rank the truth in the belief as it was after every observation, and keep the positions to learn from.
@@ -382,5 +377,5 @@ async def list_sessions(
     """Living sessions, newest first; whoever may list them may also ask and end them by their ids."""
     if domain is not None:
         await run_sync(running.catalog.domain, domain)
-    listed = await running.sessions.newest(domain, page.number, page.limit)
-    return SessionList(sessions=[render_listed(session) for session in listed.records], next=page.next(listed.last_key))
+    newest = await running.sessions.newest(domain, page.number, page.limit)
+    return SessionList(sessions=[render_listed(session) for session in newest.records], next=page.next(newest.last_key))

@@ -141,9 +141,7 @@ async def post_traverse(domain: DomainName, request: Request, response: Response
 
 @router.get("", responses=problems(404, 422))
 async def list_traverses(
-    domain: DomainName,
-    running: Running,
-    page: Annotated[Page, page_of("traverses", NAME_PATTERN.removeprefix("^"))],
+    domain: DomainName, running: Running, page: Annotated[Page, page_of("traverses", NAME_PATTERN.removeprefix("^"))]
 ) -> TraverseList:
     """The traverses of a domain, by name."""
     data_dir = running.settings.data_dir
