@@ -19,7 +19,7 @@ from fastapi import APIRouter, FastAPI, Response
 from fastapi import Path as PathParameter
 from prometheus_client.exposition import CONTENT_TYPE_LATEST
 from pydantic import Field
-from starlette.responses import FileResponse
+from starlette.responses import FileResponse, PlainTextResponse
 from starlette.routing import Route
 
 from deepsimbad.api import domains, jobs, localizations, maps, sessions, traverses
@@ -223,15 +223,7 @@ class Readiness(Answer):
     """The service answers queries."""
 
     status: Literal["ready"]
-    damaged_maps: Annotated[
-        list[str], Field(description="Domains whose active map cannot be loaded; all others are served.")
-    ]
-
-
-class MetricsResponse(Response):
-    """Prometheus' text format."""
-
-    media_type = "text/plain"
+    damaged_maps: Annotated[list[str], Field(description="Domains whose active map cannot be loaded.")]
 
 
 class ReadinessCheck:
@@ -314,7 +306,7 @@ async def readyz(running: Running) -> Readiness:
     return Readiness(status="ready", damaged_maps=list(damaged))
 
 
-@router.get("/metrics", response_class=MetricsResponse, responses=problems())
+@router.get("/metrics", response_class=PlainTextResponse, responses=problems())
 async def metrics(running: Running) -> Response:
     """What Prometheus scrapes."""
     content = await run_sync(running.metrics.render, limiter=running.health)
