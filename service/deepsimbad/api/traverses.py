@@ -367,17 +367,21 @@ def _arrays(archive: zipfile.ZipFile, max_bytes: int) -> dict[str, NDArray[Any]]
     arrays = {}
     for name, member in members.items():
         with archive.open(member) as stream:
-            arrays[name] = _read_array(name, stream, member.file_size)
+            _check_header(name, stream, member.file_size)
+        with archive.open(member) as stream:  # from its beginning; a piece at a time, into the array's own memory
+            arrays[name] = np.lib.format.read_array(stream, allow_pickle=False, max_header_size=_MAX_HEADER_BYTES)
+            if stream.read(1):  # reading to the end is also what checks the member's checksum
+                raise InvalidBatchError(f"{name} is longer than its header says")
     return arrays
 
 
-def _read_array(name: str, stream: IO[bytes], n_bytes: int) -> NDArray[Any]:
-    """One array of the batch; room for its numbers is made when its shape and type are known to be right."""
+def _check_header(name: str, stream: IO[bytes], n_bytes: int) -> None:
+    """Refuse a shape or type that is not the array's own, before room is made for its numbers."""
     version = np.lib.format.read_magic(stream)
     if version not in {(1, 0), (2, 0)}:
         raise InvalidBatchError(f"{name} has npy version {version}; 1.0 and 2.0 are read")
     read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    shape, is_by_columns, dtype = read(stream, max_header_size=_MAX_HEADER_BYTES)
+    shape, _, dtype = read(stream, max_header_size=_MAX_HEADER_BYTES)
     kinds = _KINDS.get(name, "iu")
     if dtype.kind not in kinds or dtype.itemsize > 8:
         raise InvalidBatchError(f"{name} holds {dtype}; it must hold {'floats' if 'f' in kinds else 'integers'}")
@@ -385,5 +389,3 @@ def _read_array(name: str, stream: IO[bytes], n_bytes: int) -> NDArray[Any]:
         raise InvalidBatchError(f"{name} has shape {list(shape)}; it must have {MEMBERS[name]} dimensions")
     if stream.tell() + math.prod(shape) * dtype.itemsize != n_bytes:
         raise InvalidBatchError(f"{name} does not hold the {math.prod(shape)} numbers its header says")
-    values = np.frombuffer(stream.read(), dtype)  # reading to the end is also what checks the member's checksum
-    return values.reshape(shape, order="F" if is_by_columns else "C")
