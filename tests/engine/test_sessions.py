@@ -2,10 +2,7 @@
 
 import asyncio
 import threading
-from collections.abc import Callable
-from concurrent.futures import Future
 from dataclasses import replace
-from pathlib import Path
 from time import perf_counter
 from typing import Any
 
@@ -16,13 +13,11 @@ from numpy.typing import NDArray
 from deepsimbad.core.belief import FilterKind
 from deepsimbad.core.localizer import ActiveLocalizer, LocalizerConfig
 from deepsimbad.core.relevance import Relevance
-from deepsimbad.engine import session as session_module
 from deepsimbad.engine.localizer import View, describe
-from deepsimbad.engine.worker import Priority, Stopwatch
+from deepsimbad.engine.worker import Stopwatch
 from deepsimbad.errors import (
     EndedSessionError,
     IdempotencyKeyReusedError,
-    InvalidInputError,
     InvalidPriorError,
     RetiredMapError,
     TooManySessionsError,
@@ -128,29 +123,6 @@ def test_two_at_once_are_answered_in_order_of_arrival_and_told_how_they_waited(m
     numbers, at_once, one_by_one = run(mapped, body)
     assert numbers == list(range(1, 13))
     np.testing.assert_array_equal(at_once, one_by_one)
-
-
-def test_many_robots_share_commits_and_lose_nothing(mapped: Catalog) -> None:
-    n_robots, n_views = 20, 12
-
-    async def drive(live: Live, robot: int) -> tuple[str, list[int]]:
-        session_id = await live.begin(seed=robot)
-        views = [await live.sessions.observe(session_id, ranked(100 * robot + view)) for view in range(n_views)]
-        return session_id, [view.n_observations for view in views]
-
-    async def body(live: Live) -> list[str]:
-        driven = await asyncio.gather(*(drive(live, robot) for robot in range(n_robots)))
-        assert all(numbers == list(range(1, n_views + 1)) for _, numbers in driven)
-        assert sum(live.commits) == n_robots * (1 + n_views)
-        assert len(live.commits) < sum(live.commits)
-        return [session_id for session_id, _ in driven]
-
-    ids = run(mapped, body)
-
-    async def again(live: Live) -> list[int]:
-        return [(await live.sessions.view(session_id)).n_observations for session_id in ids]
-
-    assert run(mapped, again) == [n_views] * n_robots
 
 
 def hold_commits(live: Live) -> threading.Event:
@@ -280,44 +252,6 @@ def test_a_repeated_observation_counts_once_and_has_its_own_answer(mapped: Catal
     assert len({view.belief.mean_m for view in answered}) == 1
 
 
-def test_a_live_view_goes_before_the_replay_of_an_old_observation(
-    mapped: Catalog, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Old observations are repeated one at a time, in pieces on the worker; the last one as it stands."""
-    monkeypatch.setattr(session_module, "_PIECE_S", 0.0)
-
-    async def body(live: Live) -> None:
-        sessions = [await live.begin() for _ in range(2)]
-        for session_id in sessions:
-            for seed in range(3):
-                await live.sessions.observe(session_id, ranked(seed, key=f"k{seed}"))
-        order: list[str] = []
-        look, one_replays = live.worker.look, threading.Lock()
-
-        def noting(
-            evaluator: Any, view: Any, run: Callable[[Any], Any], priority: Priority = Priority.LIVE
-        ) -> Future[Any]:
-            order.append(priority.name)
-            if priority is Priority.BATCH:
-                assert one_replays.acquire(blocking=False)
-
-            def noted(view: Any) -> Any:
-                if priority is Priority.BATCH:
-                    one_replays.release()
-                return run(view)
-
-            return look(evaluator, view, noted, priority)
-
-        live.worker.look = noting  # type: ignore[method-assign]
-        await live.sessions.observe(sessions[0], ranked(2, key="k2"))
-        assert order == ["LIVE"]
-        await asyncio.gather(*(live.sessions.observe(session_id, ranked(1, key="k1")) for session_id in sessions))
-        # Each is looked up; then its start and its two rows are a piece each.
-        assert sorted(order[1:]) == ["BATCH"] * 6 + ["LIVE"] * 2
-
-    run(mapped, body)
-
-
 def test_a_session_expires_when_nothing_happens(mapped: Catalog, clock: Clock) -> None:
     async def body(live: Live) -> tuple[str, str]:
         idle, busy = await live.begin(), await live.begin()
@@ -434,32 +368,3 @@ def test_a_prior_replaces_the_belief(mapped: Catalog) -> None:
         assert (await live.sessions.set_prior(session_id, -2.0, 1.0)).belief.mode_m == 0.0  # a little beside is allowed
 
     run(mapped, body)
-
-
-def test_a_configuration_that_cannot_be_takes_no_room(mapped: Catalog) -> None:
-    async def body(live: Live) -> None:
-        with pytest.raises(InvalidInputError):
-            await live.begin(planner="clever")
-        assert live.sessions.n_living == 0
-
-    run(mapped, body, max_sessions=1)
-    run(mapped, lambda live: live.begin(), max_sessions=1)
-
-
-def test_a_killed_service_loses_nothing(mapped: Catalog, tmp_path: Path) -> None:
-    """The files as they are at that moment, without any closing, are enough."""
-
-    async def body(live: Live) -> tuple[str, Masses, dict[str, bytes]]:
-        session_id = await live.begin()
-        for seed in range(9):
-            await live.sessions.observe(session_id, ranked(seed))
-        files = {path.name: path.read_bytes() for path in tmp_path.glob("sessions.sqlite*")}
-        return session_id, await live.sessions.mass(session_id), files
-
-    session_id, mass, files = run(mapped, body)
-    for path in tmp_path.glob("sessions.sqlite*"):
-        path.unlink()
-    for name, content in files.items():
-        if not name.endswith("-shm"):
-            (tmp_path / name).write_bytes(content)
-    np.testing.assert_array_equal(run(mapped, lambda live: live.sessions.mass(session_id)), mass)

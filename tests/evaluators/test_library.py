@@ -18,28 +18,28 @@ from deepsimbad.evaluators.weights.lock import FileRecord, Lock, tree_sha256
 
 
 def test_every_row_can_be_named_in_a_configuration():
-    names = [each.name for each in KNOWN] + [canonical(each.extractor) for each in KNOWN]
+    names = [weights.name for weights in KNOWN] + [canonical(weights.extractor) for weights in KNOWN]
     assert len(set(names)) == len(names)
-    for each in KNOWN:
-        assert re.fullmatch(EXTRACTOR_PATTERN, each.extractor), each.name
-        assert known(each.name) is known(each.extractor) is each
+    for weights in KNOWN:
+        assert re.fullmatch(EXTRACTOR_PATTERN, weights.extractor), weights.name
+        assert known(weights.name) is known(weights.extractor) is weights
+    assert known("torchhub:GMBERTON/megaloc:get_trained_model") is known("megaloc")
+    assert known("torchhub:gmberton/MegaLoc:Get_trained_model") is None
+    assert known("nothing") is None
 
 
 def test_every_row_says_what_can_be_known_of_it():
-    for each in KNOWN:
-        assert each.page is None or each.page.startswith("https://")
-        assert each.url is None or (each.url.startswith("https://") and each.file)
-        assert each.sha256 is None or re.fullmatch("[0-9a-f]{8,64}", each.sha256)
-        assert (each.commit is None) or (each.extractor.startswith(HUB) and re.fullmatch("[0-9a-f]{40}", each.commit))
-        assert each.url or each.page or each.package, f"{each.name}: nobody learns where it is"
-        if each.extractor.startswith(HUB):
-            assert each.encoding_dim
-            assert each.input_size
-
-
-def test_what_stands_on_dinov2_is_shown_sides_of_its_patches():
-    for name in ("megaloc", "boq", "salad", "selavpr++"):
-        assert all(side % 14 == 0 for side in known(name).input_size), name
+    for weights in KNOWN:
+        assert weights.page is None or weights.page.startswith("https://")
+        assert weights.url is None or (weights.url.startswith("https://") and weights.file)
+        assert weights.sha256 is None or re.fullmatch("[0-9a-f]{8,64}", weights.sha256)
+        assert (weights.commit is None) or (
+            weights.extractor.startswith(HUB) and re.fullmatch("[0-9a-f]{40}", weights.commit)
+        )
+        assert weights.url or weights.page or weights.package, f"{weights.name}: nobody learns where it is"
+        if weights.extractor.startswith(HUB):
+            assert weights.encoding_dim
+            assert weights.input_size
 
 
 def test_what_is_stated_of_our_own_extractors_is_so():
@@ -56,12 +56,6 @@ def test_what_is_stated_of_our_own_extractors_is_so():
         ("openibl", netvlad.OPENIBL),
     ):
         assert known(name).input_size == preset.input_size, name
-
-
-def test_repositories_are_known_in_capitals_or_not():
-    assert known("torchhub:GMBERTON/megaloc:get_trained_model") is known("megaloc")
-    assert known("torchhub:gmberton/MegaLoc:Get_trained_model") is None
-    assert known("nothing") is None
 
 
 def test_a_tree_is_its_paths_and_contents(tmp_path):

@@ -172,11 +172,7 @@ def ready_encodings(values: NDArray[Any]) -> NDArray[np.float32]:
 
 
 def shortlist_length(snapshot: Map, wanted: int | None) -> int:
-    """How many map images a shortlist holds.
-
-    Raises:
-        InvalidInputError: More than the map has, or fewer than one.
-    """
+    """How many map images a shortlist holds; raises InvalidInputError."""
     if wanted is None:
         return min(DEFAULT_SHORTLIST, snapshot.n_images)
     if not 1 <= wanted <= snapshot.n_images:

@@ -111,11 +111,7 @@ class SessionState:
         return cls(engine, 0, engine.localizer.start(engine.config.start_position_m, engine.config.start_std_m))
 
     def after(self, row: JournalRow) -> "SessionState":
-        """The state after one more row.
-
-        Raises:
-            InvalidInputError: The row cannot follow (a move past the end, a view that the map cannot compare).
-        """
+        """The state after one more row; raises InvalidInputError."""
         if isinstance(row, PriorRow):
             belief = self.engine.localizer.with_prior(self.belief, row.position_m, row.std_m)
             return SessionState(self.engine, row.sequence, belief)
@@ -263,11 +259,7 @@ def check_prior(route: Route, position_m: float | None, std_m: float) -> None:
 
 
 def check_move(snapshot: Map, action_m: float, action_std_m: float | None) -> None:
-    """Refuse a move that no robot of the domain makes.
-
-    Raises:
-        InvalidMoveError: Not finite, negative, or longer than ten of the longest action.
-    """
+    """Refuse a move that no robot of the domain makes; raises InvalidMoveError."""
     longest_m = LONGEST_MOVE_ACTIONS * float(snapshot.actions_m.max())
     for name, metres in (("action_m", action_m), ("action_std_m", action_std_m)):
         if metres is not None and not (math.isfinite(metres) and 0 <= metres <= longest_m):

@@ -54,18 +54,6 @@ class Sessions:
     A change that was begun is finished even if its asker goes away: it may already be on the disk. One that fails
     leaves the session as it was. `key_id` is everywhere the API key whose sessions alone are known to the asker; None:
     all are.
-
-    Args:
-        store: Where they are kept.
-        maps: What they are pinned to.
-        evaluators: Of all domains.
-        worker: Where views are described and beliefs computed.
-        ttl_s: A session ends when nothing happened to it for so long.
-        max_sessions: How many may live at once.
-        max_sessions_per_key: How many of one API key.
-        snapshot_every: Rows of a journal between two snapshots: how much is replayed after a start.
-        keep_ended_s: An ended session is known, with what it saw, for so long.
-        clock: Seconds since 1970.
     """
 
     def __init__(
@@ -75,11 +63,11 @@ class Sessions:
         evaluators: EvaluatorPool,
         worker: InferenceWorker,
         *,
-        ttl_s: float,
-        max_sessions: int,
+        ttl_s: float,  # a session ends when nothing happened to it for so long
+        max_sessions: int,  # that live at once
         max_sessions_per_key: int,
-        snapshot_every: int,
-        keep_ended_s: float,
+        snapshot_every: int,  # rows of a journal: how much is replayed after a start
+        keep_ended_s: float,  # an ended session is known, with what it saw, for so long
         clock: Callable[[], float] = time.time,
     ) -> None:
         self._store = store
@@ -136,8 +124,7 @@ class Sessions:
     ) -> SessionView:
         """Move a session on by a move and the view after it.
 
-        Args:
-            watch: Told of every stage. `wait` is for its turn: behind what came before it, and then for the worker.
+        The stage `wait` is for its turn: behind what came before it, and then for the worker.
 
         Raises:
             UnknownSessionError, EndedSessionError, RetiredMapError: There is no such session, or no more.

@@ -29,11 +29,7 @@ class OpenTraverses:
 
     @contextmanager
     def lend(self, domain: str, name: str) -> Iterator[Traverse]:
-        """A traverse for the length of the block; several blocks may hold it at once.
-
-        Raises:
-            UnknownTraverseError: There is none, or it was deleted meanwhile.
-        """
+        """A traverse for the length of the block; several blocks may hold it at once; raises UnknownTraverseError."""
         key = domain, name
         with self._lock:
             if key in self._open and self._open[key].traverse.is_deleted:  # by another process, and perhaps made anew

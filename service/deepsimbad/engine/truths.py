@@ -81,14 +81,7 @@ def checked_truths(positions_m: Sequence[float | None], n_observations: int, fir
 
 
 class Truths:
-    """Replays sessions, living ones and those that ended and are still known; used from an event loop.
-
-    Args:
-        store: The sessions.
-        worker: Where beliefs are computed.
-        sessions: They know what a session is moved on by.
-        clock: Seconds since 1970.
-    """
+    """Replays sessions, living ones and those that ended and are still known; used from an event loop."""
 
     def __init__(
         self,

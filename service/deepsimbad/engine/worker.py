@@ -184,12 +184,7 @@ class InferenceWorker:
     def look(
         self, evaluator: Evaluator | None, view: object, run: Callable[[Any], T], priority: Priority = Priority.LIVE
     ) -> Future[T]:
-        """Queue a function of a view; an image is encoded before, maybe in one batch with others.
-
-        Args:
-            evaluator: Encodes an image.
-            view: An image, or what needs no encoding.
-            run: Given an `EncodedImage` in the place of an image, other views as they are.
+        """Queue a function of a view, given an `EncodedImage` in the place of an image, other views as they are.
 
         Returns:
             Its result or error to come; cancelling it before it began takes it off the queue.

@@ -10,9 +10,8 @@ import logging
 import os
 import tempfile
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -52,11 +51,7 @@ class Run(Protocol):
     largest_batch: int
 
     def __call__(self, pixels: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """[n, height, width, 3] uint8 BGR to [n, d] float32; n is at most `largest_batch`.
-
-        Raises:
-            OutOfMemoryError: There is no memory left for even one image.
-        """
+        """[n, height, width, 3] uint8 BGR to [n, d] float32; n is at most `largest_batch`; raises OutOfMemoryError."""
 
 
 def has_torch() -> bool:
@@ -237,23 +232,15 @@ def _export(module: "nn.Module", to: Path, example: tuple[int, int]) -> None:
 
     width, height = example
     pixels = torch.zeros((2, height, width, 3), dtype=torch.uint8)
-    batch = torch.export.Dim("n", min=1)
-    with _quiet_export():
-        torch.onnx.export(
-            module, (pixels,), to, dynamo=True, external_data=False, verbose=False,
-            input_names=[_INPUT], dynamic_shapes=({0: batch},),
-        )  # fmt: skip
-
-
-@contextmanager
-def _quiet_export() -> Iterator[None]:
-    """The exporter tells the logs about parts of torchvision that nobody here has."""
-    exporter = logging.getLogger("torch.onnx")
+    exporter = logging.getLogger("torch.onnx")  # it tells about parts of torchvision that nobody here has
     level = exporter.level
     exporter.setLevel(logging.ERROR)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            yield
+            torch.onnx.export(
+                module, (pixels,), to, dynamo=True, external_data=False, verbose=False,
+                input_names=[_INPUT], dynamic_shapes=({0: torch.export.Dim("n", min=1)},),
+            )  # fmt: skip
     finally:
         exporter.setLevel(level)

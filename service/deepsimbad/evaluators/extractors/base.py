@@ -51,24 +51,16 @@ class Extractor(Protocol):
 
 @dataclass(frozen=True)
 class NetworkExtractor:
-    """An extractor whose work is a network's.
+    """An extractor whose work is a network's."""
 
-    Attributes:
-        run: The network, ready.
-        encoding_dim: d.
-        weights_sha256: As `encodings_sha256` gives it.
-        input_size: (width, height) every image is brought to; None: see `longest_side`.
-        longest_side: Where images keep their aspect, the most pixels of their longer side; larger ones are reduced.
-        side_multiple: Where images keep their aspect, width and height are brought down to multiples of this.
-        shortest_side: Where images keep their aspect, the fewest pixels of either side; smaller ones are enlarged.
-    """
-
-    run: Run
-    encoding_dim: int
-    weights_sha256: str | None
-    input_size: tuple[int, int] | None
+    run: Run  # the network, ready
+    encoding_dim: int  # d
+    weights_sha256: str | None  # as `encodings_sha256` gives it
+    input_size: tuple[int, int] | None  # (width, height) every image is brought to; None: see `longest_side`
+    # where images keep their aspect, the most pixels of their longer side; larger ones are reduced
     longest_side: int = 1024
-    side_multiple: int = 1
+    side_multiple: int = 1  # where images keep their aspect, width and height are brought down to multiples of this
+    # where images keep their aspect, the fewest pixels of either side; smaller ones are enlarged
     shortest_side: int = 1
 
     @property

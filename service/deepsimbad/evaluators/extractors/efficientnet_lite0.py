@@ -42,11 +42,7 @@ class EfficientNetLite0:
 
     def __init__(self, network: NetworkExtractor) -> None:
         self._network, self._gradients = network, GradientGrid()
-
-    @property
-    def weights_sha256(self) -> str | None:
-        """See `Extractor`."""
-        return self._network.weights_sha256
+        self.weights_sha256 = network.weights_sha256
 
     @property
     def largest_batch(self) -> int:
@@ -69,12 +65,7 @@ class EfficientNetLite0:
 
 
 def efficientnet_lite0(_argument: str, compute: Compute) -> EfficientNetLite0:
-    """As the registry makes it.
-
-    Raises:
-        MissingPackageError: The package that brings the weights is not installed.
-        InvalidWeightsError: Its file is damaged.
-    """
+    """As the registry makes it; raises as `Evaluator.load`."""
     path = weights_file()
     sha256 = file_sha256(path)
     run = make_run(lambda: _module(path), compute, (_SIDE, _SIDE), f"efficientnet_lite0-{_RECIPE}-{sha256[:16]}")

@@ -33,17 +33,7 @@ _IMAGENET_DEVIATION = (0.229 * 255, 0.224 * 255, 0.225 * 255)
 
 
 def netvlad(file: str, compute: Compute) -> NetworkExtractor:
-    """As the registry makes it.
-
-    Args:
-        file: Name of a file in the weights' folder.
-        compute: How it is computed; ONNX Runtime is not for it.
-
-    Raises:
-        MissingWeightsError: There is no such file.
-        InvalidWeightsError: It is damaged, unsafe or of no known family.
-        OutOfMemoryError: There is too little memory for it.
-    """
+    """As the registry makes it, never by ONNX Runtime; raises as `Evaluator.load`."""
     path, sha256 = Lock.read(compute.weights_dir).pinned(file)
     weights = read_netvlad(path)
     preset = weights.preset
@@ -56,23 +46,14 @@ def netvlad(file: str, compute: Compute) -> NetworkExtractor:
 
 @dataclass(frozen=True)
 class Preset:
-    """What goes with the weights of a family.
+    """What goes with the weights of a family."""
 
-    Attributes:
-        family: Its name.
-        cluster_major: See `NetVlad`.
-        mean: Of RGB, of pixels 0..255, taken away from them; None: the file holds it.
-        deviation: What they are then divided by.
-        input_size: (width, height) in pixels; None: the aspect is kept.
-        longest_side: Where the aspect is kept, the most pixels of the longer side.
-    """
-
-    family: str
-    cluster_major: bool
-    mean: tuple[float, float, float] | None
-    deviation: tuple[float, float, float]
-    input_size: tuple[int, int] | None
-    longest_side: int = 1024
+    family: str  # its name
+    cluster_major: bool  # see `NetVlad`
+    mean: tuple[float, float, float] | None  # of RGB, of pixels 0..255, taken away from them; None: the file holds it
+    deviation: tuple[float, float, float]  # what they are then divided by
+    input_size: tuple[int, int] | None  # (width, height) in pixels; None: the aspect is kept
+    longest_side: int = 1024  # where the aspect is kept, the most pixels of the longer side
 
 
 @dataclass(frozen=True)
@@ -116,11 +97,7 @@ class NetVladWeights:
         return self.tensors["centres"].numel() if whitening is None else len(whitening)
 
     def module(self) -> NetVlad:
-        """The network of these weights, of the widths they have.
-
-        Raises:
-            InvalidWeightsError: Shapes do not fit each other, or NaN or infinity among the numbers.
-        """
+        """The network of these weights, of the widths they have; raises InvalidWeightsError."""
         channels = [len(self.tensors[f"trunk.convolutions.{i}.bias"]) for i in range(N_CONVOLUTIONS)]
         n_whitened = self.encoding_dim if "whitening.bias" in self.tensors else None
         with torch.device("meta"):  # the file's tensors become the parameters: nothing is made to be overwritten
@@ -130,11 +107,7 @@ class NetVladWeights:
 
 
 def read_netvlad(path: Path) -> NetVladWeights:
-    """Read a file of any family.
-
-    Raises:
-        InvalidWeightsError: Truncated, of no known family, with names or shapes that the family does not have, unsafe.
-    """
+    """Read a file of any family; raises InvalidWeightsError."""
     with path.open("rb") as stream:
         is_matlab = stream.read(len(MAGIC)) == MAGIC
     return _of_matlab(path) if is_matlab else _of_checkpoint(path)

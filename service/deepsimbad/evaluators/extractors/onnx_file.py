@@ -9,7 +9,7 @@ entries of its metadata (`metadata_props`). `deepsimbad.scale` is what pixels 0.
 import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,9 +21,6 @@ from deepsimbad.evaluators.extractors.base import NetworkExtractor
 from deepsimbad.evaluators.runtimes import INSTALL_FAST, has_onnxruntime, onnx_session
 from deepsimbad.evaluators.weights.files import encodings_sha256
 from deepsimbad.evaluators.weights.lock import Lock
-
-if TYPE_CHECKING:
-    from onnx import AttributeProto, GraphProto, ModelProto, TensorProto
 
 _RECIPE = 1  # see `encodings_sha256`
 _SIDE = 224  # pixels of a side that the file leaves open
@@ -42,19 +39,7 @@ _CHOICES = {"channels": ("RGB", "BGR"), "layout": ("NCHW", "NHWC")}
 
 
 def onnx_file(argument: str, compute: Compute) -> NetworkExtractor:
-    """As the registry makes it.
-
-    Args:
-        argument: Name of the file in the weights' folder.
-        compute: How many threads and images at once; ONNX Runtime on the processor runs it, whatever else is wished.
-
-    Raises:
-        MissingPackageError: ONNX Runtime is not installed.
-        MissingWeightsError: The file is not there.
-        InvalidWeightsError: It is damaged, keeps data elsewhere, needs operators of others, takes no images or gives no
-            encodings, or is not the one that was recorded.
-        OutOfMemoryError: There is too little memory for it.
-    """
+    """As the registry makes it, on the processor whatever else is wished; raises as `Evaluator.load`."""
     if not has_onnxruntime():
         raise MissingPackageError(f"onnx:{argument} needs ONNX Runtime: {INSTALL_FAST}")
     path, sha256 = Lock.read(compute.weights_dir).pinned(argument)
@@ -68,29 +53,17 @@ def onnx_file(argument: str, compute: Compute) -> NetworkExtractor:
 
 @dataclass(frozen=True)
 class _Shown:
-    """How a file wants its images.
+    """How a file wants its images."""
 
-    Attributes:
-        scale: [3] float32, what pixels are multiplied by first.
-        mean: [3] float32, taken off then.
-        std: [3] float32, what the rest is divided by.
-        is_rgb: Whether R comes first.
-        is_nchw: Whether channels come before rows and columns.
-    """
-
-    scale: NDArray[np.float32]
-    mean: NDArray[np.float32]
-    std: NDArray[np.float32]
-    is_rgb: bool
-    is_nchw: bool
+    scale: NDArray[np.float32]  # [3] float32, what pixels are multiplied by first
+    mean: NDArray[np.float32]  # [3] float32, taken off then
+    std: NDArray[np.float32]  # [3] float32, what the rest is divided by
+    is_rgb: bool  # whether R comes first
+    is_nchw: bool  # whether channels come before rows and columns
 
     @classmethod
     def read(cls, file: str, metadata: Mapping[str, str]) -> "_Shown":
-        """From a file's metadata, complete with the defaults.
-
-        Raises:
-            InvalidWeightsError: An entry is none, or has no such value.
-        """
+        """From a file's metadata, complete with the defaults; raises InvalidWeightsError."""
         entries = {key.removeprefix(_PREFIX): text for key, text in metadata.items() if key.startswith(_PREFIX)}
         values = dict(_DEFAULTS)
         for name, text in entries.items():
@@ -131,11 +104,7 @@ class _FileRun:
         self.largest_batch = batch or compute.largest_batch or 1
 
     def __call__(self, pixels: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """See `Run`.
-
-        Raises:
-            InvalidWeightsError: The model gives something else than encodings, or NaN or infinity.
-        """
+        """See `Run`; raises InvalidWeightsError."""
         try:
             given = self._session.run([self._output], {self._input: self._shown.of(pixels)})[0]
         except Exception as error:
@@ -206,33 +175,20 @@ def _check_content(file: str, content: bytes) -> None:
         raise InvalidWeightsError(f"{file} is no whole ONNX file", file=file) from error
     if not model.graph.output:
         raise InvalidWeightsError(f"{file} is no whole ONNX file: it gives nothing", file=file)
-    if any(tensor.data_location == onnx.TensorProto.EXTERNAL for tensor in _tensors_of(model)):
+    tensors = (part for part in _parts(model) if isinstance(part, onnx.TensorProto))
+    if any(tensor.data_location == onnx.TensorProto.EXTERNAL for tensor in tensors):
         raise InvalidWeightsError(
             f"{file} keeps its numbers in another file: save it again with all of them inside", file=file
         )
 
 
-def _tensors_of(model: "ModelProto") -> "Iterator[TensorProto]":
-    yield from _tensors(model.graph)
-    for function in model.functions:
-        for node in function.node:
-            for attribute in node.attribute:
-                yield from _attribute_tensors(attribute)
-
-
-def _tensors(graph: "GraphProto") -> "Iterator[TensorProto]":
-    yield from graph.initializer
-    for sparse in graph.sparse_initializer:
-        yield from (sparse.values, sparse.indices)
-    for node in graph.node:
-        for attribute in node.attribute:
-            yield from _attribute_tensors(attribute)
-
-
-def _attribute_tensors(attribute: "AttributeProto") -> "Iterator[TensorProto]":
-    yield from (attribute.t, *attribute.tensors)
-    for inner in (attribute.g, *attribute.graphs):
-        yield from _tensors(inner)
+def _parts(message: Any) -> Iterator[Any]:
+    """A message of a protocol buffer, and all those within it."""
+    yield message
+    for field, value in message.ListFields():
+        if field.message_type is not None:
+            for part in [value] if hasattr(value, "ListFields") else value:
+                yield from _parts(part)
 
 
 def _first_line(error: Exception) -> str:

@@ -24,17 +24,7 @@ _RECIPE = 1  # see `encodings_sha256`
 
 
 def squeezenet(file: str, compute: Compute) -> NetworkExtractor:
-    """As the registry makes it.
-
-    Args:
-        file: Name of a file in the weights' folder, of Caffe's npz or of torchvision's checkpoint.
-        compute: How it is computed.
-
-    Raises:
-        MissingPackageError: PyTorch is not installed.
-        MissingWeightsError: There is no such file.
-        InvalidWeightsError: It is damaged, unsafe or of another network.
-    """
+    """As the registry makes it; a file in the weights' folder; raises as `Evaluator.load`."""
     if not has_torch():
         raise MissingPackageError(f"squeezenet needs PyTorch: {INSTALL_TORCH}")
     from deepsimbad.evaluators.weights.squeezenet_families import preset_of

@@ -49,18 +49,7 @@ Download = Callable[[str, Path], None]
 
 
 def torchhub(argument: str, compute: Compute) -> NetworkExtractor:
-    """As the registry makes it.
-
-    Args:
-        argument: OWNER/REPO:ENTRY.
-        compute: How it is computed; by itself in float32, in which everybody writes and tries such models.
-
-    Raises:
-        MissingWeightsError: It was not pulled, or a file of it is gone.
-        InvalidWeightsError: It is not as it was pulled, or gives no encodings.
-        MissingPackageError: Its code needs a package that is not installed.
-        OutOfMemoryError: There is too little memory for it.
-    """
+    """As the registry makes it, by itself in float32, as such models are written; raises as `Evaluator.load`."""
     extractor, lock = f"{HUB}{argument}", Lock.read(compute.weights_dir)
     record = lock.hub_record(extractor)
     if record is None:
@@ -98,11 +87,7 @@ class HubModule(nn.Module):
         self.register_buffer("std", torch.tensor(_STD).view(1, 3, 1, 1))
 
     def forward(self, pixels: Tensor) -> Tensor:
-        """See the class.
-
-        Raises:
-            InvalidWeightsError: The trunk gives something else, or NaN or infinity.
-        """
+        """See the class; raises InvalidWeightsError."""
         images = (pixels.permute(0, 3, 1, 2).flip(1).float() / 255.0 - self.mean) / self.std
         parameter = next(self.trunk.parameters(), None)
         given = self.trunk(images if parameter is None else images.to(parameter.dtype))
@@ -143,38 +128,23 @@ def parameters_sha256(module: nn.Module) -> str:
 
 @dataclass(frozen=True)
 class LoadedEntry:
-    """A model that an entry gave.
+    """A model that an entry gave."""
 
-    Attributes:
-        trunk: The model.
-        encoding_dim: d of what it gives.
-        read_beside: What else in the hub's folder it read: checkpoints, and other repositories' trees.
-    """
-
-    trunk: nn.Module
-    encoding_dim: int
-    read_beside: list[str]
+    trunk: nn.Module  # the model
+    encoding_dim: int  # d of what it gives
+    read_beside: list[str]  # what else in the hub's folder it read: checkpoints, and other repositories' trees
 
 
 @dataclass(frozen=True)
 class HubEntry:
-    """An entry of a repository that lies here.
+    """An entry of a repository that lies here."""
 
-    Attributes:
-        extractor: torchhub:OWNER/REPO:ENTRY.
-        hub: The hub's folder.
-        tree: Of the repository, in it.
-        arguments: For the entry.
-        input_size: (width, height) of its images.
-        encoding_dim: d it must give; None: any.
-    """
-
-    extractor: str
-    hub: Path
-    tree: Path
-    arguments: Mapping[str, Argument]
-    input_size: tuple[int, int]
-    encoding_dim: int | None
+    extractor: str  # torchhub:OWNER/REPO:ENTRY
+    hub: Path  # the hub's folder
+    tree: Path  # of the repository, in it
+    arguments: Mapping[str, Argument]  # for the entry
+    input_size: tuple[int, int]  # (width, height) of its images
+    encoding_dim: int | None  # d it must give; None: any
 
     def load(self, download: Download | None) -> LoadedEntry:
         """Run it, and show the model that it gives two images.
@@ -239,8 +209,10 @@ class _Watch:
         """An audit hook's news of this thread."""
         if event == "open" and isinstance(arguments[0], str):
             self.opened.add(arguments[0])
-        elif not self.may_ask and (event in _NETWORK_EVENTS or (event == "socket.connect" and _leads_out(arguments))):
-            self.refuse(str(arguments[1] if event == "socket.connect" else arguments[0]))
+        elif not self.may_ask and event in _NETWORK_EVENTS:
+            self.refuse(str(arguments[0]))
+        elif not self.may_ask and event == "socket.connect" and isinstance(arguments[1], tuple):
+            self.refuse(str(arguments[1]))  # a text would be a socket of this machine
 
     def refuse(self, address: str) -> None:
         """Let a request fail as it does where there is no network."""
@@ -255,10 +227,6 @@ class _Watch:
         files = {"/".join(parts) for parts in within if parts[0] == CHECKPOINTS}
         trees = {parts[0] for parts in within if (hub / parts[0] / "hubconf.py").is_file()} - {tree.name}
         return sorted(files | trees)
-
-
-def _leads_out(arguments: tuple[Any, ...]) -> bool:
-    return isinstance(arguments[1], tuple)  # a text is a socket of this machine
 
 
 _loading = threading.Lock()  # what follows is the whole process's

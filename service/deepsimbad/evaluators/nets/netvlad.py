@@ -76,11 +76,7 @@ class Vgg16(nn.Module):
     """
 
     def __init__(self, channels: Sequence[int]) -> None:
-        """Leave the parameters as torch makes them.
-
-        Args:
-            channels: Width of each of the thirteen convolutions.
-        """
+        """Leave the parameters as torch makes them."""
         super().__init__()
         widths = list(pairwise((3, *channels)))
         self.convolutions = nn.ModuleList(

@@ -52,9 +52,7 @@ def pull_file(
     """Bring a file of weights into the folder and record it; one that lies there already is only recorded.
 
     Args:
-        folder: Of the weights.
         extractor: NAME:FILE, which names the file.
-        tell: Told of what has come.
         url: Where it is; None: where the library knows it to be.
         sha256: Its digest, in hex; None: as recorded, else as the library knows it, else whatever comes the first time.
 
@@ -85,30 +83,18 @@ def pull_file(
 
 @dataclass(frozen=True)
 class HubWish:
-    """What somebody wants of a torch hub repository; what is None is as recorded, as the library knows it, or else.
+    """What somebody wants of a torch hub repository; what is None is as recorded, as the library knows it, or else."""
 
-    Attributes:
-        extractor: torchhub:OWNER/REPO:ENTRY.
-        commit: Of the repository; else the one its default branch is at now.
-        sha256: Of the repository's archive; else any.
-        arguments: For the entry, added to those that the library knows.
-        input_size: (width, height) in pixels; else `HUB_INPUT_SIZE`.
-    """
-
-    extractor: str
-    commit: str | None = None
-    sha256: str | None = None
+    extractor: str  # torchhub:OWNER/REPO:ENTRY
+    commit: str | None = None  # of the repository; else the one its default branch is at now
+    sha256: str | None = None  # of the repository's archive; else any
+    # for the entry, added to those that the library knows
     arguments: Mapping[str, Argument] = field(default_factory=dict)
-    input_size: tuple[int, int] | None = None
+    input_size: tuple[int, int] | None = None  # (width, height) in pixels; else `HUB_INPUT_SIZE`
 
 
 def pull_hub(folder: Path, wish: HubWish, tell: Tell) -> HubRecord:
     """Bring a repository here, run its entry once so that its own downloads come too, and record all of it.
-
-    Args:
-        folder: Of the weights.
-        wish: What is wanted. The same again as recorded must come to the same digests.
-        tell: Told of what has come.
 
     Raises:
         MissingWeightsError: Something cannot be fetched; the message says where to put it.
@@ -170,9 +156,7 @@ def fetch(url: str, to: Path, tell: Tell, sha256: str | None = None, advice: str
     try goes on where this one stopped.
 
     Args:
-        url: Of the file.
         to: Where it shall lie; what lies there is replaced.
-        tell: Told of what has come.
         sha256: Its digest in hex, or the first digits of it; None: not known.
         advice: What to do where it cannot be fetched; empty: to put the file where it shall lie.
 
@@ -188,11 +172,7 @@ def fetch(url: str, to: Path, tell: Tell, sha256: str | None = None, advice: str
 
 
 def resolve_commit(repository: str, advice: str) -> str:
-    """The commit that a repository's default branch is at now.
-
-    Raises:
-        MissingWeightsError: GitHub cannot be asked.
-    """
+    """The commit that a repository's default branch is at now; raises MissingWeightsError."""
     url = f"{GITHUB_API}/repos/{repository}/commits/HEAD"
     try:
         answer = httpx2.get(
@@ -237,11 +217,7 @@ def matches(sha256: str, wanted: str | None) -> bool:
 
 
 def check_digest(name: str, sha256: str, wanted: str | None, then: str) -> None:
-    """Refuse another digest than the one wanted.
-
-    Raises:
-        InvalidWeightsError: It is another.
-    """
+    """Refuse another digest than the one wanted; raises InvalidWeightsError."""
     if not matches(sha256, wanted):
         raise InvalidWeightsError(
             f"{name} has sha256 {sha256} and should have {wanted}: {then}", file=name, found=sha256, wanted=wanted

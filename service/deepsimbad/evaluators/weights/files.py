@@ -19,11 +19,7 @@ _MOST_RATIO = 20  # weights hardly compress: more is a file made to fill the mem
 
 
 def weights_path(folder: Path, name: str) -> Path:
-    """The file of a name in the weights' folder.
-
-    Raises:
-        MissingWeightsError: It is not there.
-    """
+    """The file of a name in the weights' folder; raises MissingWeightsError."""
     path = folder / name
     if not path.is_file():
         raise MissingWeightsError(
@@ -41,10 +37,8 @@ def file_sha256(path: Path) -> str:
 def encodings_sha256(weights_sha256: str, recipe: int) -> str:
     """What encodings are told apart by: their weights, and what is done with them.
 
-    Args:
-        weights_sha256: Of the weights.
-        recipe: Counts up with whatever else changes an encoding (layers, grid, size, normalisation). The first adds
-            nothing, so what was encoded before recipes were counted stays comparable.
+    `recipe` counts up with whatever else changes an encoding (layers, grid, size, normalisation). The first adds
+    nothing, so what was encoded before recipes were counted stays comparable.
     """
     return weights_sha256 if recipe == 1 else hashlib.sha256(f"{weights_sha256} {recipe}".encode()).hexdigest()
 
@@ -115,11 +109,7 @@ def _numpy_scalars() -> list[Any]:
 
 
 def check_size(path: Path) -> None:
-    """Refuse a file that would fill the memory when unpacked, before anything is.
-
-    Raises:
-        InvalidWeightsError: It would, or is no whole archive.
-    """
+    """Refuse a file that would fill the memory when unpacked, before anything is; raises InvalidWeightsError."""
     packed = path.stat().st_size
     unpacked = packed
     if zipfile.is_zipfile(path):

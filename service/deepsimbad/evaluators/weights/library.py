@@ -19,37 +19,21 @@ _NO_ARGUMENTS: Mapping[str, Argument] = MappingProxyType({})
 
 @dataclass(frozen=True)
 class KnownWeights:
-    """A file of weights, or an entry of a torch hub repository.
+    """A file of weights, or an entry of a torch hub repository."""
 
-    Attributes:
-        name: Short name, which `deepsimbad weights pull` takes.
-        extractor: How a configuration names it.
-        encoding_dim: d; None: not stated here.
-        input_size: (width, height) in pixels images are brought to; None: they keep their aspect.
-        licence: Of the weights, as their authors state it; None: they state none.
-        url: Of the file; None: it cannot be fetched by a plain download, or is a repository's.
-        page: Where a person gets it.
-        sha256: Of the file, in hex, or as many of its first digits as are known.
-        size_mb: In millions of bytes, all that is downloaded together, roughly.
-        commit: Of the repository.
-        arguments: What its entry is given.
-        packages: What it needs beside the service's own packages, as pip names them.
-        package: The package that brings it; nothing has to be pulled.
-    """
-
-    name: str
-    extractor: str
-    encoding_dim: int | None
-    input_size: tuple[int, int] | None
-    licence: str | None
-    url: str | None = None
-    page: str | None = None
-    sha256: str | None = None
-    size_mb: int | None = None
-    commit: str | None = None
-    arguments: Mapping[str, Argument] = field(default_factory=lambda: _NO_ARGUMENTS)
-    packages: tuple[str, ...] = ()
-    package: str | None = None
+    name: str  # short name, which `deepsimbad weights pull` takes
+    extractor: str  # how a configuration names it
+    encoding_dim: int | None  # d; None: not stated here
+    input_size: tuple[int, int] | None  # (width, height) in pixels images are brought to; None: they keep their aspect
+    licence: str | None  # of the weights, as their authors state it; None: they state none
+    url: str | None = None  # of the file; None: it cannot be fetched by a plain download, or is a repository's
+    page: str | None = None  # where a person gets it
+    sha256: str | None = None  # of the file, in hex, or as many of its first digits as are known
+    size_mb: int | None = None  # in millions of bytes, all that is downloaded together, roughly
+    commit: str | None = None  # of the repository
+    arguments: Mapping[str, Argument] = field(default_factory=lambda: _NO_ARGUMENTS)  # what its entry is given
+    packages: tuple[str, ...] = ()  # what it needs beside the service's own packages, as pip names them
+    package: str | None = None  # the package that brings it; nothing has to be pulled
 
     @property
     def file(self) -> str | None:

@@ -26,45 +26,27 @@ _Side = Annotated[int, Field(ge=1, le=8192)]
 
 @dataclass(frozen=True)
 class FileRecord:
-    """A file of weights.
+    """A file of weights."""
 
-    Attributes:
-        sha256: Its digest.
-        n_bytes: Its size.
-        extractor: How a configuration names it.
-        url: Where it was downloaded; None: it was put there by hand.
-    """
-
-    sha256: _Sha256
-    n_bytes: int
-    extractor: str
-    url: str | None = None
+    sha256: _Sha256  # its digest
+    n_bytes: int  # its size
+    extractor: str  # how a configuration names it
+    url: str | None = None  # where it was downloaded; None: it was put there by hand
 
 
 @dataclass(frozen=True)
 class HubRecord:
-    """An entry of a torch hub repository, as it was pulled.
+    """An entry of a torch hub repository, as it was pulled."""
 
-    Attributes:
-        repository: OWNER/REPO, as it was asked for.
-        commit: Of it.
-        archive_sha256: Of the archive that held it.
-        tree_sha256: Of what was unpacked; see `tree_sha256`.
-        arguments: What the entry is given.
-        input_size: (width, height) images are brought to.
-        encoding_dim: d of what it gives.
-        parameters_sha256: Of the parameters it was loaded with, whatever file they come from.
-        beside: Digests of what else in the hub's folder loading it reads: checkpoints, and other repositories' trees.
-    """
-
-    repository: str
-    commit: _Commit
-    archive_sha256: _Sha256
-    tree_sha256: _Sha256
-    arguments: Mapping[str, Argument]
-    input_size: tuple[_Side, _Side]
-    encoding_dim: Annotated[int, Field(ge=1)]
-    parameters_sha256: _Sha256
+    repository: str  # OWNER/REPO, as it was asked for
+    commit: _Commit  # of it
+    archive_sha256: _Sha256  # of the archive that held it
+    tree_sha256: _Sha256  # of what was unpacked; see `tree_sha256`
+    arguments: Mapping[str, Argument]  # what the entry is given
+    input_size: tuple[_Side, _Side]  # (width, height) images are brought to
+    encoding_dim: Annotated[int, Field(ge=1)]  # d of what it gives
+    parameters_sha256: _Sha256  # of the parameters it was loaded with, whatever file they come from
+    # digests of what else in the hub's folder loading it reads: checkpoints, and other repositories' trees
     beside: Mapping[str, _Sha256]
 
     @property
@@ -92,17 +74,11 @@ _DOCUMENT: TypeAdapter[_Document] = TypeAdapter(_Document)
 
 @dataclass(frozen=True)
 class Finding:
-    """A file or tree that was looked at.
+    """A file or tree that was looked at."""
 
-    Attributes:
-        path: Where.
-        recorded: Its digest in the lock.
-        found: Its digest now; None: it is not there.
-    """
-
-    path: Path
-    recorded: str
-    found: str | None
+    path: Path  # where
+    recorded: str  # its digest in the lock
+    found: str | None  # its digest now; None: it is not there
 
     @property
     def is_good(self) -> bool:
@@ -131,25 +107,15 @@ _KIND_OF_FILE = {"*.onnx": "onnx", "*.mat": "netvlad", "*.pth.tar": "netvlad", "
 
 @dataclass(frozen=True)
 class Lock:
-    """The records of one weights' folder.
+    """The records of one weights' folder."""
 
-    Attributes:
-        folder: The folder.
-        files: By the name in the folder.
-        hub: By the extractor's canonical name.
-    """
-
-    folder: Path
-    files: Mapping[str, FileRecord]
-    hub: Mapping[str, HubRecord]
+    folder: Path  # the folder
+    files: Mapping[str, FileRecord]  # by the name in the folder
+    hub: Mapping[str, HubRecord]  # by the extractor's canonical name
 
     @classmethod
     def read(cls, folder: Path) -> "Lock":
-        """The folder's records; none where it has no lock yet.
-
-        Raises:
-            InvalidWeightsError: The lock cannot be read.
-        """
+        """The folder's records; none where it has no lock yet; raises InvalidWeightsError."""
         try:
             document = _DOCUMENT.validate_json((folder / LOCK).read_bytes())
         except FileNotFoundError:
@@ -204,11 +170,7 @@ class Lock:
         return path, sha256
 
     def findings(self, name: str) -> Iterator[Finding]:
-        """Everything that belongs to a record, looked at one after another.
-
-        Args:
-            name: Of a file, or of an extractor.
-        """
+        """Everything that belongs to a record, looked at one after another."""
         if name in self.files:
             yield Finding(self.folder / name, self.files[name].sha256, found_sha256(self.folder / name))
             return

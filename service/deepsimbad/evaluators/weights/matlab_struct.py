@@ -35,10 +35,6 @@ _STORED: dict[int, str] = {
 def read_variable(path: Path, name: str) -> Any:
     """A variable of a file.
 
-    Args:
-        path: The file.
-        name: Of the variable.
-
     Returns:
         Structs as dicts, cells as lists (column by column), numbers as arrays in MATLAB's order of axes, texts as str;
         None for what is none of these (objects, functions, complex and sparse matrices, arrays of structs): it is

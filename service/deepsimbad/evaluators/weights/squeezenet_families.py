@@ -27,21 +27,13 @@ _TORCHVISION_LAYERS = dict(zip(_FIRES, (3, 4, 5, 7, 8, 9, 10, 12), strict=True))
 
 @dataclass(frozen=True)
 class Preset:
-    """What goes with the weights of a family.
+    """What goes with the weights of a family."""
 
-    Attributes:
-        family: Its name.
-        is_rgb: Whether the network takes red first.
-        mean: In that order, of pixels 0..255, taken away from them.
-        std: What they are then divided by.
-        side: Width and height in pixels.
-    """
-
-    family: str
-    is_rgb: bool
-    mean: tuple[float, float, float]
-    std: tuple[float, float, float]
-    side: int
+    family: str  # its name
+    is_rgb: bool  # whether the network takes red first
+    mean: tuple[float, float, float]  # in that order, of pixels 0..255, taken away from them
+    std: tuple[float, float, float]  # what they are then divided by
+    side: int  # width and height in pixels
 
 
 CAFFE = Preset("caffe", is_rgb=False, mean=(104.0, 117.0, 123.0), std=(1.0, 1.0, 1.0), side=227)
@@ -60,22 +52,14 @@ class SqueezeNetWeights:
     file: str
 
     def trunk(self, taken: tuple[int, ...]) -> SqueezeNet:
-        """The network of these weights up to the last fire module taken.
-
-        Raises:
-            InvalidWeightsError: A parameter is missing, of another shape or not finite.
-        """
+        """The network of these weights up to the last fire module taken; raises InvalidWeightsError."""
         trunk = SqueezeNet(taken)
         fill(trunk, self.tensors, self.file)
         return trunk
 
 
 def read_squeezenet(path: Path) -> SqueezeNetWeights:
-    """Read a file of either family.
-
-    Raises:
-        InvalidWeightsError: Truncated, of another network, too large unpacked, or with code in it.
-    """
+    """Read a file of either family; raises InvalidWeightsError."""
     return _of_caffe(path) if _is_npz(path) else _of_torchvision(path)
 
 
