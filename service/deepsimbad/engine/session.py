@@ -27,7 +27,6 @@ from deepsimbad.engine.worker import InferenceWorker, Priority
 from deepsimbad.errors import (
     DamagedFileError,
     DeepSimbadError,
-    InvalidMoveError,
     InvalidPriorError,
     UnknownSessionError,
 )
@@ -35,7 +34,6 @@ from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.store.sessions import IdempotencyKey, JournalRow, PriorRow, SessionRecord, SessionStore, StateSnapshot
 
 DEFAULT_START_STD_M = 5.0
-LONGEST_MOVE_ACTIONS = 10.0  # a robot may report a move of up to so many of the domain's longest action
 _SLACK_STDS = 3.0  # a prior may lie beyond the route by so many of its deviations
 _LARGEST_STD_M = 1e6
 _ROWS_AT_ONCE = 64  # of a journal in memory: 130 kB with 500 landmarks
@@ -218,12 +216,12 @@ class SessionView:
     is_repeated: bool = False  # whether the observation had been counted before
 
 
-def view_of(session_id: str, expires_at: float, state: SessionState, n_shortlist: int | None = None) -> SessionView:
+def view_of(live: LiveSession, expires_at: float, state: SessionState, n_shortlist: int | None = None) -> SessionView:
     """Summarise a state, with lists of the usual length or another; milliseconds of work."""
     snapshot, belief, step = state.engine.snapshot, state.belief, state.step
     length = shortlist_length(snapshot, n_shortlist)
     return SessionView(
-        session_id=session_id,
+        session_id=live.record.session_id,
         expires_at=expires_at,
         snapshot=snapshot,
         n_observations=belief.n_observations,
@@ -256,15 +254,3 @@ def check_prior(route: Route, position_m: float | None, std_m: float) -> None:
             route_start_m=first_m,
             route_end_m=last_m,
         )
-
-
-def check_move(snapshot: Map, action_m: float, action_std_m: float | None) -> None:
-    """Refuse a move that no robot of the domain makes; raises InvalidMoveError."""
-    longest_m = LONGEST_MOVE_ACTIONS * float(snapshot.actions_m.max())
-    for name, metres in (("action_m", action_m), ("action_std_m", action_std_m)):
-        if metres is not None and not (math.isfinite(metres) and 0 <= metres <= longest_m):
-            raise InvalidMoveError(
-                f"{name} is {metres}: give metres from 0 to {longest_m:g}, ten of the domain's longest action",
-                minimum=0.0,
-                maximum=longest_m,
-            )

@@ -26,7 +26,6 @@ from deepsimbad.engine.session import (
     SessionEngine,
     SessionState,
     SessionView,
-    check_move,
     check_prior,
     replayed_until,
     view_of,
@@ -36,6 +35,7 @@ from deepsimbad.errors import (
     DamagedFileError,
     EndedSessionError,
     IdempotencyKeyReusedError,
+    InvalidMoveError,
     TooManySessionsError,
     UnknownSessionError,
 )
@@ -45,6 +45,7 @@ from deepsimbad.store.sessions import JournalRow, ListedSession, ObservedRow, Pr
 T = TypeVar("T")
 
 DELETED, EXPIRED = "deleted", "expired"
+LONGEST_MOVE_ACTIONS = 10.0  # a robot may report a move of up to so many of the domain's longest action
 _LONGEST_RETRY_S = 60
 
 
@@ -145,7 +146,7 @@ class Sessions:
     async def view(self, session_id: str, n_shortlist: int | None = None, key_id: str | None = None) -> SessionView:
         """What a session believes now."""
         live, state = await self._read(session_id, key_id)
-        return await self._summarised(live, live.expires_at, state, n_shortlist)
+        return await asyncio.wrap_future(self._summaries.submit(view_of, live, live.expires_at, state, n_shortlist))
 
     async def mass(self, session_id: str, key_id: str | None = None) -> NDArray[np.float64]:
         """[n] mass of every map image in a session's belief; sums to 1."""
@@ -240,7 +241,7 @@ class Sessions:
                 return await self._begun_before(session_id, config)
             # A repetition may have found it on the disk already.
             live = self._living.setdefault(session_id, LiveSession(record, record.expires_at, state))
-            return await self._summarised(live, record.expires_at, state)
+            return await asyncio.wrap_future(self._summaries.submit(view_of, live, record.expires_at, state))
         finally:
             self._beginning[key_id] -= 1
 
@@ -322,7 +323,14 @@ class Sessions:
             state = live.state or await self._state(live)
             engine = state.engine
             shortlist_length(engine.snapshot, observation.n_shortlist)  # a bad one should not move the session
-            check_move(engine.snapshot, observation.action_m, observation.action_std_m)
+            longest_m = LONGEST_MOVE_ACTIONS * float(engine.snapshot.actions_m.max())
+            for name, metres in (("action_m", observation.action_m), ("action_std_m", observation.action_std_m)):
+                if metres is not None and not (math.isfinite(metres) and 0 <= metres <= longest_m):
+                    raise InvalidMoveError(
+                        f"{name} is {metres}: give metres from 0 to {longest_m:g}, ten of the domain's longest action",
+                        minimum=0.0,
+                        maximum=longest_m,
+                    )
             watch.lap("wait")
             view = await observation.view(engine.evaluator)
             watch.lap("decode")
@@ -372,7 +380,7 @@ class Sessions:
         )
         moved_on = state.after(row)
         if moved_on.step is not None:
-            watch.lap("plan", {stage: ms for stage, ms in moved_on.step.timings_ms.items() if stage != "plan"})
+            watch.lap("plan", moved_on.step.timings_ms)
         return row, moved_on
 
     async def _repeated(
@@ -390,7 +398,8 @@ class Sessions:
                     lambda row, _: row.sequence == sequence,
                     before,
                 )
-        return replace(await self._summarised(live, live.expires_at, state, n_shortlist), is_repeated=True)
+        answer = await asyncio.wrap_future(self._summaries.submit(view_of, live, live.expires_at, state, n_shortlist))
+        return replace(answer, is_repeated=True)
 
     async def _set_prior(self, live: LiveSession, position_m: float, std_m: float) -> SessionView:
         async with live.lock:
@@ -410,7 +419,7 @@ class Sessions:
         watch: Stopwatch,
     ) -> SessionView:
         """Write a row, then publish what it leads to; the disk and the summary take their time together."""
-        answer = self._summarised(live, row.expires_at, after, n_shortlist)
+        answer = asyncio.wrap_future(self._summaries.submit(view_of, live, row.expires_at, after, n_shortlist))
         snapshot = None
         if before.sequence > 0 and before.sequence % self._snapshot_every == 0:
             # Of the state before the row, so that a restart replays at least the last row and has its whole step.
@@ -440,13 +449,7 @@ class Sessions:
             if live.ending is None and self._clock() >= live.expires_at and not live.lock.locked():
                 await self._end(live, EXPIRED)
 
-    # Threads and tasks
-
-    def _summarised(
-        self, live: LiveSession, expires_at: float, state: SessionState, n_shortlist: int | None = None
-    ) -> asyncio.Future[SessionView]:
-        summary = self._summaries.submit(view_of, live.record.session_id, expires_at, state, n_shortlist)
-        return asyncio.wrap_future(summary)
+    # Tasks
 
     async def _finished(self, change: Coroutine[Any, Any, T]) -> T:
         task = asyncio.ensure_future(change)

@@ -224,7 +224,9 @@ class InferenceWorker:
             with self._lock:
                 for work in batch:
                     self._n_waiting[work.priority] -= 1
-            batch = [work for work in batch if work.answer.set_running_or_notify_cancel()]
+            for work in batch.copy():
+                if not work.answer.set_running_or_notify_cancel():
+                    batch.remove(work)
             if encoder is not None and batch:
                 batch = _encoded(encoder, batch)
             while batch:  # emptied, or the last answer's arrays live until the next query
@@ -279,9 +281,10 @@ class Stopwatch:
     _spent_ms: dict[str, float] = field(default_factory=dict)
 
     def lap(self, stage: str, parts_ms: Mapping[str, float] | None = None) -> None:
-        """Count the time since the last lap to a stage, but for the parts of it, measured apart, to theirs."""
+        """Count the time since the last lap to a stage, but for its other parts, measured apart, to theirs."""
         now = perf_counter()
         parts_ms = dict(parts_ms or {})
+        parts_ms.pop(stage, None)
         parts_ms[stage] = max(0.0, 1000 * (now - self._last) - sum(parts_ms.values()))
         for name, spent_ms in parts_ms.items():
             self._spent_ms[name] = round(self._spent_ms.get(name, 0.0) + spent_ms, 3)
