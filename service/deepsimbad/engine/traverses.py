@@ -32,8 +32,11 @@ class OpenTraverses:
         """A traverse for the length of the block; several blocks may hold it at once; raises UnknownTraverseError."""
         key = domain, name
         with self._lock:
-            if key in self._open and self._open[key].traverse.is_deleted:  # by another process, and perhaps made anew
-                self._drop(key)
+            if key in self._open:
+                try:
+                    self._open[key].traverse.check_is_there()
+                except UnknownTraverseError:  # another process deleted it, and perhaps made it anew
+                    self._drop(key)
             if key not in self._open:
                 self._open[key] = _Loan(Traverse.open(self._data_dir, domain, name))
             self._open.move_to_end(key)

@@ -11,7 +11,7 @@ from typing import Any, Self, TypeVar
 
 from sqlite_utils import Database, Migrations
 
-from deepsimbad.errors import DamagedFileError, UnavailableError
+from deepsimbad.errors import DamagedFileError, DeepSimbadError, UnavailableError
 from deepsimbad.store.durable import storage_faults
 
 T = TypeVar("T")
@@ -213,19 +213,18 @@ class OpenFile:
                 next(db.table(table).rows_where(limit=1), None)
         self.check_is_there()
 
-    @property
-    def is_deleted(self) -> bool:
-        """Whether the file is gone, or another lies in its place; an open one goes on without its name."""
+    def check_is_there(self) -> None:
+        """Raise `_gone` where the file is gone, or another lies in its place; an open one goes on without its name."""
         with storage_faults(self._path):
             try:
-                return self._path.stat().st_ino != self._inode
+                is_there = self._path.stat().st_ino == self._inode
             except FileNotFoundError:
-                return True
+                is_there = False
+        if not is_there:
+            raise self._gone()
 
-    def check_is_there(self) -> None:
-        """Raise DamagedFileError where the file is gone."""
-        if self.is_deleted:
-            raise DamagedFileError(f"{self._path.name} was removed under the running service", file=self._path.name)
+    def _gone(self) -> DeepSimbadError:
+        return DamagedFileError(f"{self._path.name} was removed under the running service", file=self._path.name)
 
 
 class GroupCommit:
@@ -289,7 +288,9 @@ class GroupCommit:
     def _commit(self, batch: list[tuple[Callable[[Database], Any], Future[Any]]]) -> None:
         try:
             with self._transaction() as db:
-                results = [run(db) for run, _ in batch]
+                results = []
+                for run, _ in batch:
+                    results.append(run(db))
         except BaseException as error:
             if len(batch) == 1:
                 batch[0][1].set_exception(error)

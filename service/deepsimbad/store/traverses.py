@@ -103,10 +103,8 @@ class Traverse(OpenFile):
                 return []
             return sorted(path.stem for path in folder.iterdir() if path.suffix == ".sqlite")
 
-    def check_is_there(self) -> None:
-        """Raise UnknownTraverseError where it was deleted: no frame is acknowledged into a file that is gone."""
-        if self.is_deleted:
-            raise UnknownTraverseError(f"traverse {self.name} was deleted")
+    def _gone(self) -> UnknownTraverseError:
+        return UnknownTraverseError(f"traverse {self.name} was deleted")
 
     def put_frame(
         self,
