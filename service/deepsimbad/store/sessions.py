@@ -381,12 +381,13 @@ def _columns(row: JournalRow, written_at: float) -> tuple[Any, ...]:
         return ("prior", written_at, row.expires_at, *[None] * 7, row.position_m, row.std_m)
     # Twice the ranks, which are whole or half numbers: 2 bytes each where they fit.
     ranks = np.rint(2.0 * row.ranks.astype(np.float64)).astype("<u2" if row.ranks.size <= _MOST_IN_TWO_BYTES else "<u4")
-    views = (row.dissimilarities, row.encoding)
+    compared, encoding = row.dissimilarities, row.encoding
     return (
         *("observation", written_at, row.expires_at),
         *((row.idempotency.key, row.idempotency.digest) if row.idempotency else (None, None)),
         *(row.action_m, row.action_std_m, ranks.tobytes()),
-        *(None if view is None else np.ascontiguousarray(view, "<f4").tobytes() for view in views),
+        None if compared is None else np.ascontiguousarray(compared, "<f4").tobytes(),
+        None if encoding is None else np.ascontiguousarray(encoding, "<f4").tobytes(),
         *(None, None),
     )
 
