@@ -6,7 +6,7 @@
 """
 
 from deepsimbad_client.errors import ApiError, DeepSimbadClientError
-from deepsimbad_client.http.call import Observation
+from deepsimbad_client.http import Observation
 from deepsimbad_client.http.client import AsyncClient, AsyncSession, Client, Session
 from deepsimbad_client.http.download import MapFile
 from deepsimbad_client.http.models import (

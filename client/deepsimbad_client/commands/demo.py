@@ -24,11 +24,11 @@ from deepsimbad_client.http.local_server import LocalServer
 from deepsimbad_client.http.upload import upload
 from deepsimbad_client.recordings import Recording
 from deepsimbad_client.recordings.sources import open_source
+from deepsimbad_client.replay import DEFAULT_PLANNER
 from deepsimbad_client.replay.active import Stage, active_replay
 from deepsimbad_client.replay.passive import Replay, replay
 from deepsimbad_client.replay.plots import draw_active, draw_passive
 from deepsimbad_client.replay.report import active_tables, summarise, summarise_active, write_summary
-from deepsimbad_client.replay.scene import DEFAULT_PLANNER
 from deepsimbad_client.replay.watch import in_words
 
 DOMAIN = "campus"

@@ -27,11 +27,11 @@ from deepsimbad_client.http.client import Client
 from deepsimbad_client.http.upload import upload as upload_recording
 from deepsimbad_client.recordings import Frame, Recording
 from deepsimbad_client.recordings.sources import ENCODING_SUFFIXES, FolderRecording, open_source
+from deepsimbad_client.replay import DEFAULT_PLANNER
 from deepsimbad_client.replay.active import EPISODES, STEPS, Stage, active_replay
 from deepsimbad_client.replay.passive import TOLERANCE_M
 from deepsimbad_client.replay.passive import replay as passive_replay
 from deepsimbad_client.replay.report import active_tables, summarise, summarise_active, table, write_summary
-from deepsimbad_client.replay.scene import DEFAULT_PLANNER
 from deepsimbad_client.replay.watch import watch_episode, watch_session
 
 IMAGE_EVALUATOR = {"kind": "feature_l2"}

@@ -1,1 +1,286 @@
-"""The wire: calls of the contract, the blocking and the async client, uploads."""
+"""What one request of the contract says, and how its answer is read; nothing here sends."""
+
+import json
+import math
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from email.utils import parsedate_to_datetime
+from enum import Enum
+from io import BytesIO
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypedDict, TypeVar, Unpack
+from urllib.parse import quote
+from uuid import uuid4
+
+import httpx2
+from pydantic import TypeAdapter, ValidationError
+
+from deepsimbad_client.errors import (
+    BrokenFrameError,
+    InvalidArgumentError,
+    MissingExtraError,
+    UnexpectedAnswerError,
+    api_error_class,
+)
+from deepsimbad_client.http.models import Answer
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+Model = TypeVar("Model", bound=Answer)
+Image = bytes | bytearray | memoryview | str | PathLike[str]  # an encoded image, or the path of one
+Numbers = Iterable[Any]  # any sequence of numbers, numpy arrays among them
+
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
+REQUEST_ID = "X-Request-ID"
+BINARY = {"Accept": "application/octet-stream"}
+RETRIED_STATUSES = frozenset({408, 429, 502, 503, 504})
+# Turned away before it was acted on, 408 because not all of it came. 502 and 504 come from a proxy that cannot know.
+REFUSED_STATUSES = frozenset({408, 429, 503})
+_SIGNATURES = {
+    "image/jpeg": rb"\xff\xd8\xff",
+    "image/png": rb"\x89PNG\r\n\x1a\n",
+    "image/tiff": rb"II[*+]\x00|MM\x00[*+]",
+    "image/webp": rb"(?s:RIFF....WEBP)",
+}
+
+
+class Repeat(Enum):
+    """When a call is safe to send again; its value is the statuses that say so."""
+
+    ALWAYS = RETRIED_STATUSES  # idempotent
+    IF_UNTOUCHED = REFUSED_STATUSES  # acts once: only when the service surely did not act
+    NEVER = frozenset[int]()  # the caller has its own way to go on
+
+
+@dataclass(frozen=True)
+class Call:
+    """One request; absent (None) values of `params` are left out, and floats keep every digit."""
+
+    method: str
+    path: str  # below the server's address, already quoted
+    params: Mapping[str, float | str | None] = field(default_factory=dict)
+    headers: Mapping[str, str] = field(default_factory=dict)
+    body: bytes | None = None
+    repeat: Repeat = Repeat.ALWAYS
+    gone_is_done: bool = False  # a 404 or 410 after a try whose answer was lost means that try did it (deletes)
+
+    def __str__(self) -> str:
+        return f"{self.method} {self.path}"
+
+    @classmethod
+    def with_json(cls, method: str, path: str, document: Mapping[str, Any], **more: Any) -> "Call":
+        """A call whose body is a document, absent (None) values left out; raises InvalidArgumentError for NaN."""
+        try:
+            body = json.dumps({key: value for key, value in document.items() if value is not None}, allow_nan=False)
+        except (TypeError, ValueError) as error:
+            raise InvalidArgumentError(f"cannot be sent as JSON: {error}") from error
+        more["headers"] = {"Content-Type": "application/json", **more.get("headers", {})}
+        return cls(method, path, body=body.encode(), **more)
+
+    @classmethod
+    def delete(cls, path: str) -> "Call":
+        """A call that deletes, and is done where nothing is left to delete after its answer was lost."""
+        return cls("DELETE", path, gone_is_done=True)
+
+
+def once(idempotency_key: str | None) -> dict[str, str]:
+    """The header by which a request acts once however often it is sent; absent: a new key."""
+    return {"Idempotency-Key": idempotency_key or uuid4().hex}
+
+
+def in_path(kind: str, name: str) -> str:
+    """A name that may stand in an address; raises InvalidArgumentError."""
+    if NAME.fullmatch(name) is None:
+        raise InvalidArgumentError(
+            f"{name!r} cannot name a {kind}: use 1 to 64 letters, digits, '.', '_' and '-', the first a letter or digit"
+        )
+    return quote(name, safe="")
+
+
+def domain_path(name: str) -> str:
+    """Where the calls of a robot in a domain begin."""
+    return f"/v1/domains/{in_path('domain', name)}"
+
+
+def session_path(session_id: str) -> str:
+    """Where the calls of a session begin."""
+    return f"/v1/sessions/{in_path('session', session_id)}"
+
+
+@dataclass(frozen=True)
+class Observation:
+    """The body of one observation, ready to post."""
+
+    body: bytes
+    content_type: str
+    landmark_model: str | None = None  # digest of the landmarks it was ranked by, which the answering map must have
+
+    @property
+    def headers(self) -> dict[str, str]:
+        """What a request says of it."""
+        matching = {} if self.landmark_model is None else {"If-Match": f'"{self.landmark_model}"'}
+        return {"Content-Type": self.content_type, **matching}
+
+
+class ViewForm(TypedDict, total=False):
+    """The forms of a view beside an image, of which exactly one is given."""
+
+    content_type: str | None  # the image's media type; absent: read from its first bytes
+    ranked_landmarks: Numbers | None  # landmark ids, nearest first, 1..r of them
+    dissimilarities: Numbers | None  # r finite numbers in landmark order, smaller is nearer
+    encoding: Numbers | None  # a ready encoding, where the domain takes them
+    ranked: Observation | None  # what an `OnBoardEncoder` made of an image, a few bytes
+
+
+def media_type_of(body: bytes) -> str | None:
+    """The media type an image's first bytes show, or None for a format the service does not take."""
+    return next((kind for kind, pattern in _SIGNATURES.items() if re.match(pattern, body)), None)
+
+
+def observation(image: Image | None = None, **view: Unpack[ViewForm]) -> Observation:
+    """Make the body of one observation; raises InvalidArgumentError, BrokenFrameError (the file cannot be read)."""
+    content_type = view.pop("content_type", None)
+    forms = {name: form for name, form in view.items() if form is not None}
+    if len(forms) + (image is not None) != 1:
+        raise InvalidArgumentError("give exactly one of image, ranked, ranked_landmarks, dissimilarities and encoding")
+    if image is not None:
+        body = image_bytes(image)
+        media_type = content_type or media_type_of(body)
+        if media_type is None:
+            what = "the file" if isinstance(image, str | PathLike) else "the bytes"
+            raise InvalidArgumentError(f"{what} given as image is not a JPEG, PNG, TIFF or WebP")
+        return Observation(body, media_type)
+    ((name, form),) = forms.items()
+    if isinstance(form, Observation):
+        return form
+    try:
+        text = json.dumps({name: _plain(form)}, allow_nan=False, separators=(",", ":"))
+    except (TypeError, ValueError) as error:
+        raise InvalidArgumentError(f"{name} must be plain numbers without NaN or infinity: {error}") from error
+    return Observation(text.encode(), "application/json")
+
+
+def image_bytes(image: Image) -> bytes:
+    """The bytes of an encoded image, or of the file at a path; raises BrokenFrameError."""
+    if not isinstance(image, str | PathLike):
+        return bytes(image)
+    try:
+        return Path(image).read_bytes()
+    except OSError as error:
+        raise BrokenFrameError(f"cannot read {image}: {error.strerror or error}") from error
+
+
+def known_positions(true_positions_m: Numbers) -> list[float | None]:
+    """Positions as JSON takes them: NaN becomes None."""
+    return [None if isinstance(value, float) and math.isnan(value) else value for value in _plain(true_positions_m)]
+
+
+def _plain(values: Any) -> list[Any]:
+    return list(values.tolist() if hasattr(values, "tolist") else values)
+
+
+def problem_of(response: httpx2.Response) -> dict[str, Any]:
+    """The problem document (RFC 9457) of an error answer; empty where it holds none, as a proxy's own page."""
+    try:
+        document = json.loads(response.content)
+    except ValueError:
+        return {}
+    return document if isinstance(document, dict) else {}
+
+
+def retry_after_s(header: str | None, now: datetime | None = None) -> float | None:
+    """Seconds that a `Retry-After` header asks for (seconds or an HTTP date); None when it says nothing usable."""
+    header = (header or "").strip()
+    if header.isascii() and header.isdigit():
+        return float(header)
+    try:
+        date = parsedate_to_datetime(header)
+    except ValueError:
+        return None
+    date = date if date.tzinfo else date.replace(tzinfo=UTC)
+    return max(0.0, (date - (now or datetime.now(UTC))).total_seconds())
+
+
+def raise_for_problem(response: httpx2.Response) -> None:
+    """Turn an error answer into its ApiError, and a redirect into an UnexpectedAnswerError."""
+    status = response.status_code
+    if response.is_success:
+        return
+    if status < 400:
+        raise UnexpectedAnswerError(
+            f"{response.request.url} answered {status} and points to {response.headers.get('location', 'nowhere')}: "
+            "give the service's own address as the server"
+        )
+    problem = problem_of(response)
+    code = str(problem.get("code") or "")
+    detail = problem.get("detail") or problem.get("title")
+    request_id = response.headers.get(REQUEST_ID) or problem.get("request_id")
+    raise api_error_class(status, code)(
+        str(detail or f"the service answered {status} {response.reason_phrase}".rstrip()),
+        status=status,
+        code=code,
+        problem=problem,
+        request_id=str(request_id) if request_id else None,
+        retry_after_s=retry_after_s(response.headers.get("retry-after")),
+    )
+
+
+def model_of(kind: type[Model], response: httpx2.Response) -> Model:
+    """The model that an answer holds; raises UnexpectedAnswerError."""
+    try:
+        return kind.model_validate_json(response.content).answering(response.headers.get(REQUEST_ID))
+    except ValidationError as error:
+        raise _unexpected(response, error) from error
+
+
+def page_of(kind: type[Model], key: str, response: httpx2.Response) -> tuple[tuple[Model, ...], str | None]:
+    """One page of a list, bare or under `key`, and what the next is asked for by (None: the list ends).
+
+    Raises UnexpectedAnswerError.
+    """
+    adapter: TypeAdapter[tuple[Model, ...]] = TypeAdapter(tuple[kind, ...])  # type: ignore[valid-type]
+    try:
+        document = json.loads(response.content)
+        following = document.get("next") if isinstance(document, dict) else None
+        models = adapter.validate_python(document[key] if isinstance(document, dict) else document)
+    except (ValueError, KeyError) as error:
+        raise _unexpected(response, error) from error
+    request_id = response.headers.get(REQUEST_ID)
+    return tuple(model.answering(request_id) for model in models), None if following is None else str(following)
+
+
+def float_array(response: httpx2.Response) -> "NDArray[np.float32]":
+    """The [n] float32 of an npy body; raises MissingExtraError, UnexpectedAnswerError."""
+    try:
+        values = require_numpy().load(BytesIO(response.content), allow_pickle=False)
+    except (ValueError, EOFError, OSError) as error:
+        raise _unexpected(response, error) from error
+    if values.ndim != 1:
+        raise _unexpected(response, ValueError(f"an array of shape {values.shape}"))
+    floats: NDArray[np.float32] = values.astype("<f4", copy=False)
+    return floats
+
+
+def require_numpy() -> Any:
+    """Import numpy where a call cannot do without; raises MissingExtraError."""
+    try:
+        import numpy as np  # noqa: PLC0415 - the client alone must work without it
+    except ImportError as error:
+        raise MissingExtraError("arrays need numpy: pip install 'deep-simbad[replay]'") from error
+    return np
+
+
+def _unexpected(response: httpx2.Response, error: Exception) -> UnexpectedAnswerError:
+    reason = str(error)
+    if isinstance(error, ValidationError):
+        first = error.errors()[0]
+        reason = f"{'.'.join(str(part) for part in first['loc']) or 'body'}: {first['msg']}"
+    return UnexpectedAnswerError(
+        f"{response.request.url} did not answer as this client's contract says ({reason}): "
+        "is this a Deep SIMBAD service, and of this version?"
+    )

@@ -17,7 +17,7 @@ from deepsimbad_client.errors import (
     NotSavedError,
     TransportError,
 )
-from deepsimbad_client.http.call import (
+from deepsimbad_client.http import (
     RETRIED_STATUSES,
     Call,
     Image,

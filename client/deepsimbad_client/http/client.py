@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar, Unpack
 import httpx2
 
 from deepsimbad_client.errors import DeepSimbadClientError, GoneError, InvalidArgumentError
-from deepsimbad_client.http.admin import Admin, AsyncAdmin
-from deepsimbad_client.http.call import (
+from deepsimbad_client.http import (
     BINARY,
     Call,
     Image,
@@ -27,6 +26,7 @@ from deepsimbad_client.http.call import (
     page_of,
     session_path,
 )
+from deepsimbad_client.http.admin import Admin, AsyncAdmin
 from deepsimbad_client.http.models import (
     Domain,
     Health,
@@ -60,12 +60,7 @@ AnySession = TypeVar("AnySession", bound="SessionCalls")
 
 
 class SessionCalls(Face):
-    """The calls of a session.
-
-    Attributes:
-        opened: What the service said when the session was made or found.
-        keep: Whether it outlives its `with` block.
-    """
+    """The calls of a session: `opened` is what the service said of it, `keep` whether it outlives its `with` block."""
 
     def __init__(self, wire: Wire, opened: SessionState, *, keep: bool) -> None:
         super().__init__(wire)
@@ -192,9 +187,8 @@ class SessionCalls(Face):
 class Session(SessionCalls, Blocking):
     """One robot's belief, kept by the service and moved on by every observation.
 
-    Made by `Client.session` or `Client.attach_session`. It is a context manager: the session ends with the block unless
-    `keep` says otherwise. One session belongs to one robot: views sent by two threads at once count in the order of
-    their arrival.
+    A context manager: the session ends with the block unless `keep` says otherwise. Views sent by two threads at once
+    count in the order of their arrival.
     """
 
 
@@ -342,8 +336,7 @@ class Client(ClientCalls[Session], Blocking):
 
     Connection errors and the answers 408, 429, 502, 503 and 504 are retried with exponential backoff and jitter, or
     after the service's own `Retry-After`, where repeating is safe: every call here but `admin.activate` with
-    `expected`, which is sent again only when the service surely did not act on it. A refused key (401, 403) is never
-    tried again.
+    `expected`, which is sent again only when the service surely did not act on it.
 
     Args:
         url: The service's address; absent: `$DEEPSIMBAD_URL`, else http://127.0.0.1:8000.
@@ -355,9 +348,6 @@ class Client(ClientCalls[Session], Blocking):
         transport: Another httpx2 transport (tests, proxies, Unix sockets).
         sleep: Waits between tries.
         jitter: Draws in 0..1 that spread the waits.
-
-    Attributes:
-        admin: The calls that need a key of scope `admin`.
     """
 
     _session = Session
@@ -384,10 +374,7 @@ class Client(ClientCalls[Session], Blocking):
 
 
 class AsyncClient(ClientCalls[AsyncSession], Awaiting):
-    """A `Client` whose calls are awaited.
-
-    Args and attributes are those of `Client`, but that `transport` and `sleep` await too.
-    """
+    """A `Client` whose calls are awaited, `transport` and `sleep` too."""
 
     _session = AsyncSession
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import httpx2
 
 from deepsimbad_client.errors import DamagedDownloadError, InvalidArgumentError, UnexpectedAnswerError
-from deepsimbad_client.http.call import Call, raise_for_problem
+from deepsimbad_client.http import Call, raise_for_problem
 from deepsimbad_client.http.wire import Wire
 
 PART, BEYOND_THE_END = 206, 416

@@ -19,15 +19,9 @@ _STOPPED_WITHIN_S = 15.0
 
 
 class LocalServer:
-    """`deepsimbad serve` on a free loopback port, up between `with` and the end of its block.
+    """`deepsimbad serve` at `url`, a free loopback port, up between `with` and the end of its block.
 
-    Args:
-        data_dir: Its data directory; kept afterwards.
-        log_path: Where its log goes; absent: `server.log` beside the data directory.
-        environment: Variables set besides the present ones.
-
-    Attributes:
-        url: Its address.
+    Its log goes to `log_path`, absent: `server.log` beside the data directory, which is kept.
     """
 
     def __init__(self, data_dir: Path, log_path: Path | None = None, environment: dict[str, str] | None = None) -> None:
@@ -48,11 +42,7 @@ class LocalServer:
         self.stop()
 
     def start(self) -> None:
-        """Start it and wait until it is ready.
-
-        Raises DeepSimbadClientError: it ended, or was not ready within a minute; the log's last lines are in
-        the message.
-        """
+        """Start it and wait until it is ready; raises DeepSimbadClientError with the log's last lines."""
         command = [sys.executable, "-m", "deepsimbad", "serve", "--create", "--data-dir", str(self._data_dir)]
         self.log_path.parent.mkdir(parents=True, exist_ok=True)
         with self.log_path.open("ab") as log:

@@ -21,7 +21,7 @@ from deepsimbad_client.errors import (
     OtherWeightsError,
     SourceError,
 )
-from deepsimbad_client.http.call import Image, Numbers, Observation, image_bytes, observation
+from deepsimbad_client.http import Image, Numbers, Observation, image_bytes, observation
 
 INSTALL = "pip install 'deep-simbad[edge]'"
 
@@ -46,20 +46,12 @@ _MAX_PIXELS = 1 << 30  # the picture is the robot's own
 
 
 class OnBoardEncoder:
-    """Makes observations of a few bytes out of images, by a map's own landmarks.
+    """Makes observations of a few bytes out of images, by a map's own `landmarks`; usable from several threads.
 
     Given by `Client.on_board`, or loaded from a file that `save` wrote, without a network. It is made in milliseconds;
-    the extractor is loaded with the first image, or by `load_extractor`. Usable from several threads.
-
-    Args:
-        content: The landmark model, as the service sends it.
-        compute: On what a network runs; absent: the fastest that is installed, on a GPU if there is one.
-
-    Attributes:
-        landmarks: The landmark model, the map's version and the evaluator's configuration.
-        digest: SHA-256 that names the landmarks; sent with every observation, so that no other map answers it.
-
-    Raises InvalidLandmarkModelError (it is none, or of an evaluator that this version does not know).
+    the extractor is loaded with the first image, or by `load_extractor`. `content` is the landmark model as the service
+    sends it, `compute` on what a network runs (absent: the fastest that is installed); `digest` names the landmarks and
+    is sent with every observation, so that no other map answers it. Raises InvalidLandmarkModelError.
     """
 
     def __init__(self, content: bytes, compute: Compute | None = None) -> None:
@@ -121,15 +113,9 @@ class OnBoardEncoder:
     ) -> Observation:
         """What `Client.localize` and `Session.observe` take as `ranked`; give exactly one form of the view.
 
-        A picture that shows nothing (the dark, a wall) has no nearest landmarks: it travels as JSON that says so.
-
-        Args:
-            image: An encoded image (JPEG, PNG, TIFF, WebP), its path, or [height, width, 3] uint8 BGR.
-            encoding: A ready encoding, where the domain takes them.
-            m: How many landmarks to send, 1..r; absent: what 64 bytes hold. r sends all that the service would see.
-
-        Raises InvalidArgumentError, BrokenFrameError, MissingExtraError, OtherWeightsError,
-        InvalidLandmarkModelError.
+        `image` is an encoded one, its path, or [height, width, 3] uint8 BGR; `m` of 1..r landmarks are sent, absent:
+        what 64 bytes hold. A picture that shows nothing travels as JSON that says so. Raises InvalidArgumentError,
+        BrokenFrameError, and as `load_extractor`.
         """
         n_sent = ranked_landmarks_within(DEFAULT_BODY_BYTES, self.n_landmarks) if m is None else m
         if not 1 <= n_sent <= self.n_landmarks:

@@ -31,26 +31,15 @@ Result = TypeVar("Result")
 
 @dataclass
 class UploadReport:
-    """What has become of a recording's frames.
+    """What has become of a recording's frames."""
 
-    Attributes:
-        n_frames: Frames of the recording that could be sent.
-        n_sent: Frames sent by this run.
-        n_skipped: Frames the service had already.
-        n_broken: Frames that could not be sent, by reason; the rest of the recording is not held up by them.
-        broken_names: The first of them by name.
-        left_out: Frames that the reader had left out before, by reason.
-        bytes_sent: Bytes of images and encodings sent.
-        seconds: How long it took.
-    """
-
-    n_frames: int
-    n_sent: int = 0
-    n_skipped: int = 0
-    n_broken: Counter[str] = field(default_factory=Counter)
-    broken_names: list[str] = field(default_factory=list)
-    left_out: dict[str, int] = field(default_factory=dict)
-    bytes_sent: int = 0
+    n_frames: int  # that could be sent
+    n_sent: int = 0  # by this run
+    n_skipped: int = 0  # which the service had already
+    n_broken: Counter[str] = field(default_factory=Counter)  # could not be sent, by reason; the others go on
+    broken_names: list[str] = field(default_factory=list)  # the first of them
+    left_out: dict[str, int] = field(default_factory=dict)  # by the reader before, by reason
+    bytes_sent: int = 0  # of images and encodings
     seconds: float = 0.0
 
     @property
@@ -72,7 +61,6 @@ def upload(
     concurrency: int = CONCURRENCY,
     resend: bool = False,
     on_progress: Callable[[UploadReport], None] | None = None,
-    clock: Callable[[], float] = time.monotonic,
 ) -> UploadReport:
     """Send the frames of a recording that the service does not have yet.
 
@@ -84,7 +72,7 @@ def upload(
     """
     if not recording.frames:
         raise SourceError(f"{recording.name} has no frames to send")
-    started = clock()
+    started = time.monotonic()
     input_size = client.domain(domain).input_size
     stored = _open_traverse(client, domain, traverse)
     report = UploadReport(len(recording.frames), left_out=dict(recording.left_out))
@@ -117,7 +105,7 @@ def upload(
                 if len(report.broken_names) < NAMED_BROKEN_FRAMES:
                     report.broken_names.append(frame.name)
             tell()
-    report.seconds = clock() - started
+    report.seconds = time.monotonic() - started
     if report.n_sent + report.n_skipped == 0:
         reasons = ", ".join(f"{count} {reason}" for reason, count in report.n_broken.items())
         raise SourceError(f"none of the {report.n_frames} frames of {recording.name} could be sent: {reasons}")
@@ -128,12 +116,10 @@ def in_order(
     work: Callable[[Item], Result],
     items: Iterable[Item],
     concurrency: int,
-    on_end: Callable[[], None] | None = None,
 ) -> Iterator[tuple[Item, Result]]:
     """Yield (item, work(item)) in the items' order, with at most `concurrency` at work and as many waiting.
 
     The first failure is raised in its turn; what has not begun by then never begins. So it is when the caller stops.
-    `on_end` is called then, before what is still at work is waited for: long work can look whether it should go on.
     """
     executor = ThreadPoolExecutor(max_workers=concurrency, thread_name_prefix="deepsimbad-client")
     pending: deque[tuple[Item, Future[Result]]] = deque()
@@ -147,8 +133,6 @@ def in_order(
             first, future = pending.popleft()
             yield first, future.result()
     finally:
-        if on_end is not None:
-            on_end()
         executor.shutdown(wait=True, cancel_futures=True)
 
 

@@ -20,7 +20,7 @@ from typing import Any, Concatenate, Generic, ParamSpec, Self, TypeVar, overload
 import httpx2
 
 from deepsimbad_client.errors import InvalidArgumentError, TransportError, TransportTimeoutError
-from deepsimbad_client.http.call import (
+from deepsimbad_client.http import (
     REFUSED_STATUSES,
     REQUEST_ID,
     Call,

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from PIL.TiffImagePlugin import TiffImageFile
 
 from deepsimbad_client.errors import BrokenFrameError, SourceError
-from deepsimbad_client.http.call import media_type_of
+from deepsimbad_client.http import media_type_of
 
 Image = NDArray[np.uint8]  # [height, width, 3] BGR
 

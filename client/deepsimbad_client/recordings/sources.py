@@ -36,7 +36,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepsimbad_client.errors import SourceError
-from deepsimbad_client.http.call import media_type_of
+from deepsimbad_client.http import media_type_of
 from deepsimbad_client.recordings import (
     IMAGE_SUFFIXES,
     EncodedImage,

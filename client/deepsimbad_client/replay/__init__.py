@@ -1,1 +1,276 @@
-"""Recordings driven against a live service, judged by the truth, told and drawn."""
+"""What a replay plays on, a domain's map, a recording and the truth by core's own rules, and the folder it fills."""
+
+import json
+import os
+import time
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Generic, Self, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deepsimbad.core.route import Route, true_images_of
+from deepsimbad_client.errors import (
+    BrokenFrameError,
+    IdempotencyKeyReusedError,
+    InvalidInputError,
+    InvalidMoveError,
+    ReplayError,
+)
+from deepsimbad_client.http.client import Client, Session
+from deepsimbad_client.http.models import Domain, Localization, SessionAnswer
+from deepsimbad_client.http.upload import UNUSABLE_IMAGE_CODES
+from deepsimbad_client.recordings import Recording
+
+Record = TypeVar("Record")
+
+MASS_DIGITS = 5
+_IDENTITY_FILE = "replay.json"
+DEFAULT_PLANNER = "default"  # Asks the service for the planner that ships
+
+
+@dataclass(frozen=True)
+class Seen:
+    """The service's answer to one view."""
+
+    answer: SessionAnswer
+    latency_ms: float  # from posting the view to the answer
+    forgot: bool  # the belief had no room for the move, so the session was set back to knowing nothing
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A recording before a domain's active map."""
+
+    client: Client
+    domain: Domain  # as the service described it; it has an active map
+    recording: Recording
+    position_m: NDArray[np.float64]  # [m] along the recording's own route
+    route: Route  # the map's images
+    right: list[NDArray[np.int64]]  # for each frame the map images that are right answers
+
+    @classmethod
+    def of(cls, client: Client, recording: Recording, domain: str, within_m: float) -> Self:
+        """Learn what is needed of a domain.
+
+        A right answer may be `within_m`, in the plane where both sides know x and y, else along the route.
+        Raises ReplayError: it has no active map, one that changed meanwhile, or the recording has no frame of
+        use.
+        """
+        if not recording.frames:
+            raise ReplayError(f"{recording.name} has no frames to replay")
+        described = client.domain(domain)
+        if described.map_version is None or described.n_map_images is None:
+            raise ReplayError(f"domain {domain} has no active map to replay against: remap it first")
+        position_m = np.array([frame.position_m for frame in recording.frames], np.float64)
+        route = _map_route(client, described, recording)
+        return cls(client, described, recording, position_m, route, right_answers(recording, route, within_m))
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """What must be the same for a replay to go on."""
+        frames = self.recording.frames
+        return {
+            "domain": self.domain.name,
+            "map_version": self.domain.map_version,
+            "n_map_images": self.route.n_images,
+            "recording": self.recording.name,
+            "n_frames": len(frames),
+            "first_index": frames[0].index,
+            "last_index": frames[-1].index,
+        }
+
+    def session(self, planner: str = DEFAULT_PLANNER, seed: int | None = None, *, keep: bool = False) -> Session:
+        """Begin a session. Raises ReplayError, ApiError."""
+        wanted = None if planner == DEFAULT_PLANNER else planner
+        session = self.client.session(self.domain.name, seed=seed, planner=wanted, keep=keep)
+        if session.map_version != self.domain.map_version:
+            session.delete()
+            raise changed_map(self.domain.name)
+        return session
+
+    def view(self, row: int) -> dict[str, Any] | str:
+        """What is seen from a frame, as arguments of `Session.observe`, or why the frame is broken."""
+        try:
+            return self.recording.view(row, self.domain.input_size)
+        except BrokenFrameError as error:
+            return error.reason
+
+    def look(self, session: Session, view: dict[str, Any], action_m: float | None, **options: Any) -> Seen | str:
+        """Tell a session of a move and the view after it; returns the answer, or why the service cannot use the view.
+
+        A belief that is wrong may leave no room for the move that was really made, and a recording may jump or go
+        backwards; the robot then starts anew from knowing nothing. `options` are those of `Session.observe`.
+        """
+        began, forgot = time.perf_counter(), False
+        try:
+            try:
+                answer = session.observe(**view, **options, action_m=action_m)
+            except (InvalidMoveError, IdempotencyKeyReusedError):  # the key's: told before as what follows
+                middle_m = float(np.median(self.route.position_m))
+                session.set_prior(middle_m, 100 * max(self.route.length_m, 1.0))
+                forgot = True
+                answer = session.observe(**view, **options)
+        except InvalidInputError as error:
+            if error.code not in UNUSABLE_IMAGE_CODES:
+                raise
+            return f"refused by the service as {error.code}"
+        return Seen(answer, round(1000 * (time.perf_counter() - began), 3), forgot)
+
+    def apart_m(self, row: int, images: NDArray[np.int64]) -> NDArray[np.float64]:
+        """[k] distance from a frame to map images, in the plane where both know it, else along the route."""
+        frame, route = self.recording.frames[row], self.route
+        along = np.abs(route.offset_m(route.position_m[images], frame.position_m))
+        if frame.x_m is None or frame.y_m is None or route.x_m is None or route.y_m is None:
+            return along
+        plane = np.hypot(route.x_m[images] - frame.x_m, route.y_m[images] - frame.y_m)
+        return np.where(np.isfinite(plane), plane, along)
+
+    def nearest_right(self, row: int) -> int | None:
+        """The right answer nearest to a frame; None where the map does not hold its place."""
+        right = self.right[row]
+        return int(right[self.apart_m(row, right).argmin()]) if right.size else None
+
+    def place(self, image: int) -> tuple[float | None, float | None]:
+        """A map image's x and y; None where unknown."""
+        axes = (self.route.x_m, self.route.y_m)
+        x_m, y_m = (np.nan if axis is None else float(axis[image]) for axis in axes)
+        return (None if np.isnan(x_m) else x_m, None if np.isnan(y_m) else y_m)
+
+
+def changed_map(domain: str) -> ReplayError:
+    """The error for a map that was switched while a replay ran."""
+    return ReplayError(f"the active map of {domain} changed during the replay: restart it against the new one")
+
+
+def right_answers(recording: Recording, route: Route, within_m: float) -> list[NDArray[np.int64]]:
+    """Right answers to each frame; of frames taken backwards as well, which still look forwards."""
+    columns = [[frame.position_m, frame.x_m, frame.y_m] for frame in recording.frames]
+    position_m, x_m, y_m = np.array(columns, np.float64).T
+    order = np.argsort(position_m, kind="stable")
+    knows_plane = bool(np.isfinite(x_m).any() and np.isfinite(y_m).any())
+    plane = (x_m[order], y_m[order]) if knows_plane else (None, None)
+    images = true_images_of(Route(position_m[order], False, *plane), route, within_m)
+    return [images[place] for place in np.argsort(order)]
+
+
+def _map_route(client: Client, domain: Domain, recording: Recording) -> Route:
+    """Learn where every map image lies from one answer that lists them all."""
+    for row in range(len(recording.frames)):
+        try:
+            view = recording.view(row, domain.input_size)
+            answer: Localization = client.localize(domain.name, shortlist=domain.n_map_images, **view)
+        except BrokenFrameError:
+            continue
+        except InvalidInputError as error:
+            if error.code not in UNUSABLE_IMAGE_CODES:
+                raise
+            continue
+        if answer.map_version != domain.map_version or len(answer.retrieval) != domain.n_map_images:
+            raise changed_map(domain.name)
+        position_m, x_m, y_m = np.full((3, len(answer.retrieval)), np.nan)
+        for entry in answer.retrieval:
+            position_m[entry.map_image] = entry.route_position_m
+        for place in answer.belief.top:
+            if place.x_m is not None and place.y_m is not None:
+                x_m[place.map_image], y_m[place.map_image] = place.x_m, place.y_m
+        plane = (x_m, y_m) if np.isfinite(x_m).any() else (None, None)
+        return Route(position_m, domain.closed, *plane)
+    raise ReplayError(f"none of the {len(recording.frames)} frames of {recording.name} can be used")
+
+
+class Journal(Generic[Record]):
+    """`replay.json` says what is replayed; a file of JSON lines holds the records, appended as they come.
+
+    An earlier replay of the same `identity` goes on, unless `restart` throws it away: `document` is its identity and
+    what was noted beside it, `earlier` its records in order, as `read` makes them of a line's document. Raises
+    ReplayError (the folder holds another replay, or cannot be written).
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        file_name: str,
+        identity: Mapping[str, Any],
+        read: Callable[[dict[str, Any]], Record],
+        what: str,
+        *,
+        restart: bool = False,
+    ) -> None:
+        self.folder = folder
+        self.document: dict[str, Any] = dict(identity)
+        self.earlier: list[Record] = []
+        self._file = folder / file_name
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            if not restart and (folder / _IDENTITY_FILE).exists():
+                self.document = self._same_replay(identity)
+                self.earlier = self._records(read, what)
+            else:
+                self._file.unlink(missing_ok=True)
+                self.note()
+            self._stream = self._file.open("ab")
+        except OSError as error:
+            raise ReplayError(f"cannot write to {folder}: {error.strerror or error}") from error
+
+    def note(self, **facts: Any) -> None:
+        """Keep facts about this replay beside its identity."""
+        self.document |= facts
+        written = self.folder / f"{_IDENTITY_FILE}.tmp"
+        written.write_text(json.dumps(self.document, indent=2) + "\n")
+        written.replace(self.folder / _IDENTITY_FILE)
+
+    def append(self, document: object) -> None:
+        """Write a record down; it is in the hands of the operating system when this returns."""
+        self._stream.write(json.dumps(document, allow_nan=False).encode() + b"\n")
+        self._stream.flush()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self._stream.close()
+
+    def _same_replay(self, identity: Mapping[str, Any]) -> dict[str, Any]:
+        try:
+            earlier = json.loads((self.folder / _IDENTITY_FILE).read_bytes())
+        except ValueError:
+            earlier = {}
+        earlier = earlier if isinstance(earlier, dict) else {}
+        differing = [key for key in identity if earlier.get(key) != identity[key]]
+        if differing:
+            was = ", ".join(f"{key} {earlier.get(key)!r}, now {identity[key]!r}" for key in differing)
+            raise ReplayError(f"{self.folder} holds another replay ({was}): name another folder, or restart this one")
+        return earlier
+
+    def _records(self, read: Callable[[dict[str, Any]], Record], what: str) -> list[Record]:
+        """Read the whole lines; a torn last one, left by a crash, is cut off."""
+        if not self._file.exists():
+            return []
+        content = self._file.read_bytes()
+        whole = content[: content.rfind(b"\n") + 1]
+        if len(whole) != len(content):
+            os.truncate(self._file, len(whole))
+        records = []
+        for number, line in enumerate(whole.splitlines(), start=1):
+            try:
+                records.append(read(json.loads(line)))
+            except (ValueError, TypeError, AttributeError, KeyError) as error:
+                raise ReplayError(
+                    f"line {number} of {self._file} is no {what}: restart the replay or repair it"
+                ) from error
+        return records
+
+
+def write_lines(path: Path, documents: Iterable[dict[str, Any]]) -> None:
+    """Write a file of JSON lines, without the beliefs' masses."""
+    lines = ({name: document[name] for name in document if name != "mass"} for document in documents)
+    path.write_text("".join(json.dumps(line, allow_nan=False) + "\n" for line in lines))

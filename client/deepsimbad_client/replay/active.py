@@ -13,7 +13,7 @@ from deepsimbad_client.errors import ReplayError
 from deepsimbad_client.http.client import Client, Session
 from deepsimbad_client.http.upload import CONCURRENCY, in_order
 from deepsimbad_client.recordings import Recording
-from deepsimbad_client.replay.scene import DEFAULT_PLANNER, MASS_DIGITS, Journal, Scene, Seen, changed_map, write_lines
+from deepsimbad_client.replay import DEFAULT_PLANNER, MASS_DIGITS, Journal, Scene, Seen, changed_map, write_lines
 
 EPISODES = 20
 STEPS = 10

@@ -14,7 +14,7 @@ from deepsimbad_client.errors import GoneError, ReplayError, UnknownSessionError
 from deepsimbad_client.http.client import Client, Session
 from deepsimbad_client.http.upload import CONCURRENCY, in_order
 from deepsimbad_client.recordings import Recording
-from deepsimbad_client.replay.scene import MASS_DIGITS, Journal, Scene, Seen, write_lines
+from deepsimbad_client.replay import MASS_DIGITS, Journal, Scene, Seen, write_lines
 
 TOLERANCE_M = 2.0
 VIEWS_A_TRUTH, IMAGES_A_TRUTH = 20, 50_000  # So many views' truths are told at once, or of so many right map images

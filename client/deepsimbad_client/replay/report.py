@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.table import Table
 
+from deepsimbad_client.replay import DEFAULT_PLANNER
 from deepsimbad_client.replay.active import ActiveReplay, Episode
 from deepsimbad_client.replay.passive import Replay
-from deepsimbad_client.replay.scene import DEFAULT_PLANNER
 
 NEAR_M = (5.0, 10.0)
 N_RESAMPLES = 2000
@@ -127,9 +127,8 @@ def figures(episodes: Sequence[Episode], name: str) -> Reals:
 def summarise_active(replay: ActiveReplay) -> dict[str, Any]:
     """Figures of an active replay, JSON-ready; those that nothing was counted for are None.
 
-    `anr` is the averaged normalised rank in percent over all frames after each action, the first view left out: 0 is
-    perfect, 50 chance. `against` holds how much better (negative) the first planner is than each other, with the 95 %
-    interval of that difference over the same starts.
+    `anr` is in percent over all frames after each action, the first view left out; `against` holds how much better
+    (negative) the first planner is than each other.
     """
     first, *others = replay.planners
     resampling = Resampling(len(replay.episodes[first]), int(replay.identity["seed"]))

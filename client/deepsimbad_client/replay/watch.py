@@ -67,12 +67,9 @@ def watch_session(
     every_s: float,
     sleep: Callable[[float], None] = time.sleep,
 ) -> int:
-    """Show a session that another robot drives, until it ends; it is left as it is. Asks every `every_s` seconds.
+    """Show a session that another robot drives, until it ends; it is left as it is. Returns how many changes were seen.
 
-    Returns:
-        How many changes were seen.
-
-    Raises UnknownSessionError, GoneError.
+    Raises UnknownSessionError, GoneError (it had ended before).
     """
     session = client.attach_session(session_id)
     state, shown, n_changes = session.opened, None, 0

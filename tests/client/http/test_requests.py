@@ -15,7 +15,7 @@ import pytest
 from deepsimbad import errors as service_errors
 from deepsimbad_client import Client, errors
 from deepsimbad_client.errors import BY_CODE, BY_STATUS, InvalidArgumentError
-from deepsimbad_client.http.call import RETRIED_STATUSES, media_type_of, observation
+from deepsimbad_client.http import RETRIED_STATUSES, media_type_of, observation
 from deepsimbad_client.http.models import Job, Localization, Traverse
 
 from .scripted import JOB, LOCALIZATION, STATE, Script, answer

@@ -8,7 +8,7 @@ import httpx2
 import pytest
 
 from deepsimbad_client import errors
-from deepsimbad_client.http.call import retry_after_s
+from deepsimbad_client.http import retry_after_s
 
 from .scripted import JOB, POLICY, Script, answer
 

@@ -12,9 +12,9 @@ from deepsimbad_client import errors
 from deepsimbad_client.http.admin import remap
 from deepsimbad_client.recordings import Frame, Recording
 from deepsimbad_client.recordings.sources import open_source
+from deepsimbad_client.replay import Journal, Scene, right_answers
 from deepsimbad_client.replay.passive import Replay, Step, replay
 from deepsimbad_client.replay.report import summarise
-from deepsimbad_client.replay.scene import Journal, Scene, right_answers
 
 from ..conftest import ENCODINGS, mapped
 
