@@ -5,14 +5,14 @@ import threading
 import pytest
 from anyio.to_thread import current_default_thread_limiter, run_sync
 
-from .conftest import RANKS, problem, service
+from .conftest import DIM, NPZ, RANKS, npz, problem, service
 
 READY = "/v1/domains/ready/localizations"
 
 
 @pytest.fixture
 def busy(tmp_path):
-    with service(tmp_path, max_queue=1, max_requests=3, max_body_memory_bytes=100_000) as client:
+    with service(tmp_path, max_queue=1, max_event_streams=1, max_uploads=1) as client:
         client.make_ready_domain("ready")
         yield client
 
@@ -67,3 +67,15 @@ def test_threads_that_are_all_taken_do_not_keep_health_waiting(busy):
         gate.set()
         for holder in holders:
             holder.result(60)
+
+
+def test_only_so_many_streams_and_uploads_at_once(busy):
+    job, running = busy.get("/v1/admin/jobs").json()["jobs"][0]["job_id"], busy.services
+    frames = "/v1/admin/domains/ready/traverses/drive/frames"
+    batch = {"content": npz(encodings=[[0.0] * DIM], index=[0], position_m=[0.0]), "headers": NPZ}
+    with running.event_streams.taken(), running.uploads.taken():
+        overloaded(busy.get(f"/v1/admin/jobs/{job}/events"), "max_event_streams")
+        overloaded(busy.post(frames, **batch), "max_uploads")
+    for _ in range(2):  # what has ended makes room
+        assert busy.get(f"/v1/admin/jobs/{job}/events").status_code == 200
+        assert busy.post(frames, **batch).status_code == 200

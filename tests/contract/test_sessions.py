@@ -151,7 +151,10 @@ def test_an_idempotency_key_counts_once(client):
     answers = [observe(client, path, 1, **key).json() for _ in range(3)]
     assert [answer["n_observations"] for answer in answers] == [1, 1, 1]
     assert answers[0]["belief"] == answers[1]["belief"] == answers[2]["belief"]
-    problem(observe(client, path, 2, **key), 422, "idempotency_key_reused")
+    others = ("action_m=2", RANKS), ("action_m=1&action_std_m=2", RANKS), ("action_m=1", {"ranked_landmarks": [1]})
+    for query, body in others:
+        other = client.post(f"{path}/observations?{query}", json=body, headers=key)
+        problem(other, 422, "idempotency_key_reused")
     assert observe(client, path).json()["n_observations"] == 2
     assert observe(client, path, 1, **key).json()["belief"] == answers[0]["belief"]
 
