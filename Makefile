@@ -8,8 +8,9 @@ PIP_INSTALL = $(BIN)/python -m pip install --quiet --disable-pip-version-check -
 PYTHON ?= $(shell for p in python3.11 python3.12 python3.13 python3 python; do \
   $$p -c 'import sys, venv, ensurepip; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && { echo $$p; break; }; done)
 BIN := .venv/bin
+PYTEST = $(BIN)/pytest -n auto --dist loadfile --no-loadscope-reorder
 
-.PHONY: help install demo test check lint bench soak load clean
+.PHONY: help install demo test pytest check lint bench soak load clean
 
 help: ## this list
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 10
@@ -34,10 +35,13 @@ lint: install
 	$(BIN)/lint-imports
 
 check: lint ## every check but the slow ones
-	$(BIN)/pytest -n auto --dist loadfile -m "not slow"
+	$(PYTEST) -m "not slow"
 
-test: lint ## every check
-	$(BIN)/pytest -n auto --dist loadfile
+test: install ## every check
+	@$(MAKE) --no-print-directory -j2 lint pytest
+
+pytest: install
+	$(PYTEST)
 
 bench: install ## the benchmark tables under docs/results/
 	$(PIP_INSTALL) --editable '.[bench]'

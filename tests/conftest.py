@@ -1,11 +1,14 @@
 """Fixtures shared by every test."""
 
+import fcntl
 import os
 import signal
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
+
+from deepsimbad_campus.writer import write_campus
 
 # Compilation on a first call is no slowness of the code under test, and a run is the same everywhere.
 settings.register_profile("project", deadline=None, derandomize=True, print_blob=True)
@@ -33,3 +36,26 @@ def real_data() -> Path:
     if not folder.is_dir():
         pytest.skip(f"no real recordings at {folder}: set DEEPSIMBAD_REAL_DATA to their folder")
     return folder
+
+
+@pytest.fixture(scope="session")
+def rendered(tmp_path_factory) -> Path:
+    """36 frames of a campus in all seasons, in NCLT's layout: rendered once for all test processes, never changed."""
+    base = tmp_path_factory.getbasetemp()
+    shared = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+    with (shared / "campus.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        write_campus(shared / "campus", n_frames=36)  # what is there already is left as it is
+    return shared / "campus"
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_auto_num_workers() -> int:
+    """One process more than cores: many tests wait for a service that they have begun."""
+    return len(os.sched_getaffinity(0)) + 1
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Files with slow tests come first, so that no process is left alone with one at the end."""
+    slow = {item.path for item in items if item.get_closest_marker("slow")}
+    items.sort(key=lambda item: item.path not in slow)

@@ -9,11 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from deepsimbad_campus.writer import write_campus
 from deepsimbad_client.http.local_server import LocalServer
 
 PROJECT = Path(__file__).resolve().parents[2]
-SEASONS = ("winter", "spring", "summer", "autumn")
 FENCE = re.compile(r"^```(\w+)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 NOT_RUN = ("make ", "pip install ")  # compared in test_references instead
 EXPECTED_TO_FAIL = "problem.json"
@@ -104,10 +102,8 @@ def pages():
 
 
 @pytest.fixture(scope="session")
-def nclt(tmp_path_factory):
+def nclt(rendered):
     """A folder in NCLT's layout."""
     if shutil.which("curl") is None or shutil.which("bash") is None:
         pytest.skip("the examples need curl and bash")
-    folder = tmp_path_factory.mktemp("nclt")
-    write_campus(folder, SEASONS, 36, 4)
-    return folder
+    return rendered

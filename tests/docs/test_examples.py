@@ -6,6 +6,7 @@ is another. In the pages the folder of NCLT is a rendered campus in its layout, 
 
 import hashlib
 import json
+import os
 import shutil
 import time
 from contextlib import ExitStack
@@ -44,6 +45,7 @@ def furnished(folder, nclt):
 def first_hour(readme, nclt, tmp_path_factory):
     """README, from top to bottom."""
     place = Workplace(furnished(tmp_path_factory.mktemp("first_hour"), nclt))
+    shutil.copytree(nclt, place.folder / "nclt", copy_function=os.link)  # `campus` adds the frames that are missing
     with ExitStack() as stack:
         place.follow(readme, stack)
         yield place

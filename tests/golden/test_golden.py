@@ -18,6 +18,11 @@ from pathlib import Path
 import httpx2
 import numpy as np
 import pytest
+from click.testing import CliRunner
+
+from deepsimbad.cli import deepsimbad as commands
+from deepsimbad.cli import run
+from deepsimbad_client.commands.group import cli
 
 GOLDEN = Path(__file__).parent
 COMMANDS = [
@@ -30,12 +35,8 @@ CLIENT_COMMANDS = """activate campus delete-domain delete-map delete-session del
 localize maps remap replay rollback sessions traverses upload watch""".split()  # noqa: SIM905 - as one writes it
 
 
-def deepsimbad(*arguments, module="deepsimbad", cwd=None):
-    environment = {**os.environ, "COLUMNS": "120"}
-    command = [sys.executable, "-m", module, *map(str, arguments)]
-    ran = subprocess.run(command, capture_output=True, text=True, cwd=cwd, env=environment, check=False)
-    assert ran.returncode == 0, ran.stderr
-    return ran.stdout
+def deepsimbad(*arguments):
+    assert run([str(argument) for argument in arguments]) == 0
 
 
 def check(name, value):
@@ -210,10 +211,14 @@ def test_answers_and_a_replayed_journal(drives, tmp_path):
 
 
 def test_help():
-    texts = {" ".join(["deepsimbad", *words]): deepsimbad(*words, "--help") for words in COMMANDS}
-    client = "from deepsimbad_client.cli import main; main()"
-    for words in [[], *([name] for name in CLIENT_COMMANDS)]:
-        command = [sys.executable, "-c", client, *words, "--help"]
-        ran = subprocess.run(command, capture_output=True, text=True, env={**os.environ, "COLUMNS": "120"}, check=True)
-        texts[" ".join(["deepsimbad-client", *words])] = ran.stdout.replace("Usage: -c", "Usage: deepsimbad-client")
+    texts = {}
+    programs = (
+        ("python -m deepsimbad", commands, 78, COMMANDS),
+        ("deepsimbad-client", cli, 98, [[], *([name] for name in CLIENT_COMMANDS)]),
+    )
+    for program, group, width, called in programs:
+        for words in called:
+            ended = CliRunner().invoke(group, [*words, "--help"], prog_name=program, terminal_width=width)
+            assert ended.exit_code == 0, ended.output
+            texts[" ".join([program.removeprefix("python -m "), *words])] = ended.output
     check("help", texts)

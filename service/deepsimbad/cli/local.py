@@ -6,8 +6,6 @@ from typing import Any
 import click
 from rich.table import Table
 
-from deepsimbad.api.domains import describe_domain
-from deepsimbad.api.localizations import render_localization
 from deepsimbad.cli.terminal import (
     RELEVANCES,
     data_dir_option,
@@ -127,6 +125,8 @@ def map_(
 @data_dir_option
 def localize(domain: str, images: tuple[Path, ...], as_json: bool) -> None:
     """Say where on the route each image was probably taken."""
+    from deepsimbad.api.localizations import render_localization  # noqa: PLC0415 - as below
+
     settings = given_settings()
     with Catalog.open(existing_data_dir()) as catalog:
         active = Maps(catalog).active(domain)
@@ -174,6 +174,8 @@ def delete(domain: str) -> None:
 @data_dir_option
 def info(domain: str, as_json: bool) -> None:
     """Describe a domain and its active map."""
+    from deepsimbad.api.domains import describe_domain  # noqa: PLC0415 - takes FastAPI, as no other command but `serve`
+
     settings = given_settings()
     with Catalog.open(existing_data_dir()) as catalog:
         answer = describe_domain(catalog.domain(domain), EvaluatorPool(settings.compute()), Maps(catalog))
