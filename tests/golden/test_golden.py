@@ -22,7 +22,7 @@ from click.testing import CliRunner
 
 from deepsimbad.cli import deepsimbad as commands
 from deepsimbad.cli import run
-from deepsimbad_client.commands.group import cli
+from deepsimbad_client.commands import cli
 
 GOLDEN = Path(__file__).parent
 COMMANDS = [
