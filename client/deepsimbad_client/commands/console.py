@@ -336,10 +336,10 @@ def _outcome(job: Job) -> str:
         return "waiting for its turn" if job.state == "queued" else f"{job.stage_name}, {100 * job.progress:.0f} %"
     if job.error_text or not job.result:
         return job.error_text
-    made = f"map {job.result.get('map_version')}{_compared(job.check)}"
+    outcome = f"map {job.result.get('map_version')}{_compared(job.check)}"
     if job.result.get("active", True):
-        return made
-    return f"{made}, sealed but not activated{': its gate was lost' if job.check.get('passed') is False else ''}"
+        return outcome
+    return f"{outcome}, sealed but not activated{': its gate was lost' if job.check.get('passed') is False else ''}"
 
 
 def _compared(check: Mapping[str, Any]) -> str:

@@ -108,8 +108,8 @@ class Attempts:
             return self._announced(self.policy.backoff_s(self.n_sent, self.jitter()), reason)
         kind = TransportTimeoutError if isinstance(error, httpx2.TimeoutException) else TransportError
         tries = f"{self.n_sent} tries" if self.n_sent > 1 else "one try"
-        there = "; is the service running there?" if untouched else ""
-        raise kind(f"no answer to {self.what} after {tries}: {reason}{there}") from error
+        advice = "; is the service running there?" if untouched else ""
+        raise kind(f"no answer to {self.what} after {tries}: {reason}{advice}") from error
 
     def after_answer(self, response: httpx2.Response) -> float | None:
         """Seconds to wait before the next try; None when this answer is the last word."""

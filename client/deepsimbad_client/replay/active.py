@@ -91,15 +91,12 @@ def active_replay(
 ) -> ActiveReplay:
     """Drive episodes from random starts and compare what planners come to know.
 
-    Every planner starts from the same places with the same session seeds. Each step takes the recorded frame nearest
-    to the commanded place and tells the service the metres really moved. Interrupted at any moment, the same call goes
-    on after the last episode written down; more planners and more episodes can be added to a folder later.
-
-    Of `planners` (names the service knows: `nnql`, `random`, `constant:3`, ...) `default` is the one that ships. Into
-    `folder` go `replay.json`, `episodes.jsonl` and `steps.jsonl`; `restart` throws away what an earlier replay left
-    there. `concurrency` episodes are under way at once, and `on_progress` is told of every one, and how many there are.
-
-    Raises ReplayError, ApiError, TransportError.
+    Every planner starts from the same places with the same session seeds; each step takes the recorded frame nearest
+    to the commanded place and tells the service the metres really moved. Of `planners` (names the service knows)
+    `default` is the one that ships. `folder` takes `replay.json`, `episodes.jsonl` and `steps.jsonl`; interrupted at
+    any moment, the same call goes on after the last episode written down, and more planners and episodes can be added
+    later; `restart` throws away what is there. `concurrency` episodes are under way at once, and `on_progress` is told
+    of every one, and how many there are. Raises ReplayError, ApiError, TransportError.
     """
     started = time.perf_counter()
     stage = Stage(client, recording, domain)
@@ -139,10 +136,7 @@ def active_replay(
 
 
 class Stage:
-    """A recording driven as an active robot drives: where it may start, what it comes to when it moves, what it sees.
-
-    Raises ReplayError (the domain has no active map, or the recording cannot be driven along).
-    """
+    """A recording driven as an active robot drives: where it may start, where it comes to, what it sees."""
 
     def __init__(self, client: Client, recording: Recording, domain: str) -> None:
         self.scene = Scene.of(client, recording, domain, TRUTH_WITHIN_M)
@@ -151,10 +145,10 @@ class Stage:
             raise ReplayError(f"the positions of {recording.name} go backwards: a robot cannot drive along it")
 
     def start(self, steps: int, seed: int, episode: int) -> tuple[int, int]:
-        """Draw where an episode starts, uniform over the frames from which all its moves fit, and a seed for it.
+        """Draw the row where an episode starts, uniform over those from which all its moves fit, and a session's seed.
 
-        The draw depends on `seed` and `episode` alone, so every planner starts from the same places. Raises
-        ReplayError where the recording is too short for that many moves.
+        The draw depends on `seed` and `episode` alone, so every planner starts from the same places. Raises ReplayError
+        (the recording is too short).
         """
         longest_m = max(self.scene.domain.actions_m, default=_LONGEST_ACTION_M)
         room_m = float(self.position_m[-1]) - steps * longest_m

@@ -74,15 +74,11 @@ def replay(
 ) -> Replay:
     """Ask the service for the place of every frame in order, in one session, and compare with the truth.
 
-    Statistics are the session's: what it learnt of the frames before helps with each. Interrupted at any moment, the
-    same call goes on after the last answer written down, while the session lives.
-
-    A right answer lies within `tolerance_m`, in the plane where both sides know x and y, else along the route. Into
-    `folder` go `replay.json`, `views.jsonl` (the journal) and `steps.jsonl` (all steps, at the end); `restart` throws
-    away what an earlier replay left there. `concurrency` images are made ready at once, and posted in order all the
-    same. `on_progress` is told of every step, those of an earlier run first, and how many there are so far.
-
-    Raises ReplayError, ApiError, TransportError.
+    A right answer lies within `tolerance_m`, in the plane where both sides know x and y, else along the route.
+    `folder` takes `replay.json`, `views.jsonl` (the journal) and `steps.jsonl` (all steps, at the end); interrupted at
+    any moment, the same call goes on after the last answer written down, while the session lives; `restart` throws away
+    what is there. `concurrency` images are made ready at once, and posted in order all the same. `on_progress` is told
+    of every step, those of an earlier run first, and how many there are. Raises ReplayError, ApiError, TransportError.
     """
     started = time.perf_counter()
     scene = Scene.of(client, recording, domain, tolerance_m)
