@@ -98,7 +98,13 @@ def _windows(
         top = floor * f + floor * 0.2
         y0, y1 = round(top), round(top + floor * share_y)
         if style.door and (f, b) == (style.floors - 1, door_bay):
-            _door(picture, (x0 + x1) // 2, rng, scale)
+            middle, half = (x0 + x1) // 2, round(rng.uniform(0.7, 1.3) * scale)
+            top, reach, thick = height - round(2.4 * scale), round(half * 1.6), max(2, round(0.3 * scale))
+            cv2.rectangle(picture, (middle - half, top), (middle + half, height), ink(rng.uniform(25, 150, 3)), -1)
+            cv2.rectangle(picture, (middle - half, top), (middle + half, height), (210, 210, 210), 2)
+            cv2.line(picture, (middle, top), (middle, height), (60, 60, 60), 1)
+            canopy = ink(rng.uniform(60, 220, 3))
+            cv2.rectangle(picture, (middle - reach, top - 2 * thick), (middle + reach, top - thick), canopy, -1)
         elif not blank[f, b]:
             mood, glass = today.random(), dark
             if mood < 0.10 + 0.14 * (season.sun_elevation_deg < 25):  # somebody has the light on
@@ -113,16 +119,6 @@ def _windows(
                 x = x0 + (x1 - x0) * pane // panes
                 cv2.line(picture, (x, y0), (x, y1), frame, 1)
             cv2.rectangle(picture, (x0 - 1, y1), (x1 + 1, y1 + max(1, round(0.1 * scale))), sill, -1)
-
-
-def _door(picture: Image, middle: int, rng: np.random.Generator, scale: float) -> None:
-    height, half = len(picture), round(rng.uniform(0.7, 1.3) * scale)
-    top, reach, thick = height - round(2.4 * scale), round(half * 1.6), max(2, round(0.3 * scale))
-    cv2.rectangle(picture, (middle - half, top), (middle + half, height), ink(rng.uniform(25, 150, 3)), -1)
-    cv2.rectangle(picture, (middle - half, top), (middle + half, height), (210, 210, 210), 2)
-    cv2.line(picture, (middle, top), (middle, height), (60, 60, 60), 1)
-    canopy = ink(rng.uniform(60, 220, 3))
-    cv2.rectangle(picture, (middle - reach, top - 2 * thick), (middle + reach, top - thick), canopy, -1)
 
 
 def _edges(picture: Image, is_wall: bool, snowy: bool, rng: np.random.Generator, scale: float) -> None:

@@ -14,6 +14,7 @@ from deepsimbad_campus.route import Drive, drive_length_m
 from deepsimbad_campus.season import PAPER_DATES, CampusError, drive_date
 from deepsimbad_campus.world import World
 
+TRUTH_FILE = "ground_truth/groundtruth_{}.csv"
 FORMAT = 1  # raised whenever the same seed would give other pictures
 JPEG_TIFF = (cv2.IMWRITE_TIFF_COMPRESSION, 7, cv2.IMWRITE_TIFF_ROWSPERSTRIP, 16)  # 7: JPEG; it needs rows by the eight
 
@@ -52,15 +53,11 @@ def write_campus(
     return [f"nclt:{root}/{date}" for date in dates]
 
 
-def _truth_file(root: Path, date: str) -> Path:
-    return root / "ground_truth" / f"groundtruth_{date}.csv"
-
-
 def _refuse_another(root: Path, date: str, order: dict[str, float]) -> None:
     """Never mix a drive with one made otherwise, or with a real recording."""
     folder, file = root / date, root / date / "campus.json"
     if not file.exists():
-        if (folder / "lb3").exists() or _truth_file(root, date).exists():
+        if (folder / "lb3").exists() or (root / TRUTH_FILE.format(date)).exists():
             raise CampusError(f"{root} holds {date}, but not as a rendered campus: choose another folder")
         return
     try:
@@ -74,7 +71,7 @@ def _refuse_another(root: Path, date: str, order: dict[str, float]) -> None:
 
 def _write_drive(root: Path, world: World, drive: Drive) -> Iterator[None]:
     """Write what is missing of a drive; yields once for every picture there is."""
-    truth, folder = _truth_file(root, f"{drive.date}"), root / f"{drive.date}" / "lb3" / "Cam5"
+    truth, folder = root / TRUTH_FILE.format(drive.date), root / f"{drive.date}" / "lb3" / "Cam5"
     truth.parent.mkdir(parents=True, exist_ok=True)
     folder.mkdir(parents=True, exist_ok=True)
     part = truth.with_name(f".{truth.name}.part")

@@ -104,10 +104,9 @@ def test_every_option_of_a_remap_and_a_session_can_be_given():
     assert members <= options
 
 
-@pytest.mark.parametrize(
-    ("blocking", "awaiting"), [(Client, AsyncClient), (Session, AsyncSession), (Admin, AsyncAdmin)]
-)
-def test_both_faces_show_signature_and_docstring(blocking, awaiting):
+@pytest.mark.parametrize("faces", [(Client, AsyncClient), (Session, AsyncSession), (Admin, AsyncAdmin)])
+def test_both_faces_show_signature_and_docstring(faces):
+    blocking, awaiting = faces
     calls = [name for name, _ in inspect.getmembers(blocking, inspect.isfunction) if name[0] != "_" and name != "close"]
     assert len(calls) > 6
     for name in calls:
