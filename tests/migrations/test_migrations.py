@@ -222,20 +222,3 @@ def test_todays_code_reads_past_files(
 ) -> None:
     restore(SCHEMAS / f"{dump}.sql", tmp_path / place)
     assert list(read(tmp_path)) == expected
-
-
-def test_a_failed_step_leaves_the_old_schema(kind: str, tmp_path: Path) -> None:
-    path = tmp_path / "a.sqlite"
-    broken = Migrations(SETS[kind].name)
-    broken._migrations = list(SETS[kind]._migrations)
-
-    @broken()
-    def m999_broken(db: Database) -> None:
-        db.execute("CREATE TABLE half_way (a)")
-        raise RuntimeError("power cut")
-
-    apply(path, SETS[kind])
-    before = schema_of(path)
-    with pytest.raises(RuntimeError):
-        apply(path, broken)
-    assert schema_of(path) == before

@@ -250,8 +250,8 @@ def test_what_is_no_backup_is_refused(tmp_path: Path) -> None:
         (["catalog.sqlite"], {"format": "other"}, "no backup of a data directory"),
         (["catalog.sqlite"], {"format_version": 2}, "newer release"),
     ]
-    for names, about, said in wrong:
-        with pytest.raises(InvalidArchiveError, match=said):
+    for names, about, message in wrong:
+        with pytest.raises(InvalidArchiveError, match=message):
             restore(forged(tmp_path, names, about), tmp_path / "there", silent)
     with pytest.raises(DamagedFileError, match=r"catalog\.sqlite"):
         restore(forged(tmp_path, ["catalog.sqlite"], {}), tmp_path / "there", silent)

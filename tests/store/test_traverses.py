@@ -1,6 +1,5 @@
 import subprocess
 import sys
-import threading
 import tracemalloc
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -16,7 +15,6 @@ from deepsimbad.errors import (
     InvalidEncodingError,
     InvalidInputError,
     InvalidRouteError,
-    UnavailableError,
     UnknownDomainError,
     UnknownTraverseError,
     WeightsDifferError,
@@ -101,15 +99,6 @@ def test_one_frame_is_new_once_and_then_replaced(summer: Traverse) -> None:
     assert np.isnan(frames.y_m[0])
 
 
-def test_batches_count_what_is_new(summer: Traverse, make_frames: MakeFrames) -> None:
-    assert summer.put_frames(make_frames(range(10))) == (10, 0)
-    assert summer.put_frames(make_frames(range(5, 20), seed=1)) == (10, 5)
-    assert summer.put_frames(make_frames([])) == (0, 0)
-    frames = summer.read()
-    assert np.array_equal(frames.encodings[:5], make_frames(range(10)).encodings[:5])
-    assert np.array_equal(frames.encodings[5:], make_frames(range(5, 20), seed=1).encodings)
-
-
 @pytest.mark.parametrize(
     ("change", "error"),
     [
@@ -140,34 +129,6 @@ def test_bad_frames_change_nothing(
     assert same(summer.read(), before)
 
 
-def test_the_first_bad_batch_does_not_fix_the_length(summer: Traverse, make_frames: MakeFrames) -> None:
-    with pytest.raises(InvalidRouteError):
-        summer.put_frames(replace(make_frames([0]), position_m=np.array([np.nan])))
-    assert summer.encoding_dim is None
-    assert summer.put_frame(0, np.ones(3, np.float32), 0.0)
-
-
-def test_many_threads_put_at_once(summer: Traverse, campus: Catalog, make_frames: MakeFrames) -> None:
-    failures: list[BaseException] = []
-
-    def put(start: int, traverse: Traverse) -> None:
-        try:
-            for index in range(start, start + 20):
-                traverse.put_frame(index, np.full(8, index, np.float32), float(index))
-        except BaseException as error:
-            failures.append(error)
-
-    with Traverse.open(campus.data_dir, "campus", "summer") as other:  # as a second process would
-        threads = [threading.Thread(target=put, args=[20 * i, (summer, other)[i % 2]]) for i in range(4)]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join()
-    assert failures == []
-    assert summer.read().encodings[:, 0].tolist() == list(range(80))
-    assert summer.missing == []
-
-
 def test_a_deleted_traverse_takes_no_more_frames(summer: Traverse, campus: Catalog, make_frames: MakeFrames) -> None:
     summer.put_frames(make_frames([0]))
     Traverse.delete(campus.data_dir, "campus", "summer")
@@ -192,17 +153,6 @@ def test_a_stale_log_is_not_replayed_into_a_new_traverse(campus: Catalog, make_f
     with Traverse.create(campus.data_dir, "campus", "summer") as new:
         assert new.n_frames == 0
         assert new.put_frames(make_frames(range(3))) == (3, 0)
-
-
-def test_a_full_disk_is_named_and_the_old_frames_stay(summer: Traverse, make_frames: MakeFrames) -> None:
-    summer.put_frames(make_frames(range(3)))
-    before = summer.read()
-    (n_pages,) = summer._db.conn.execute("PRAGMA page_count").fetchone()
-    summer._db.conn.execute(f"PRAGMA max_page_count = {n_pages}")
-    with pytest.raises(UnavailableError) as caught:
-        summer.put_frames(make_frames(range(1000), seed=1))
-    assert caught.value.hints["reason"] == "disk_full"
-    assert same(summer.read(), before)
 
 
 def test_a_truncated_or_foreign_file_is_named_and_can_be_deleted(campus: Catalog, make_frames: MakeFrames) -> None:
@@ -277,8 +227,8 @@ def test_the_weights_of_the_first_image_hold_for_all(summer: Traverse, make_fram
         summer.put_frames(replace(make_frames(range(4, 6)), weights_sha256="b" * 64))
     assert caught.value.hints == {"known_weights_sha256": "a" * 64, "given_weights_sha256": "b" * 64}
     summer.put_frames(make_frames(range(4, 5)))
-    kept = summer.read()
-    assert (kept.n_frames, kept.weights_sha256) == (5, "a" * 64)
+    frames = summer.read()
+    assert (frames.n_frames, frames.weights_sha256) == (5, "a" * 64)
 
 
 def test_encodings_take_half_the_bytes_where_nothing_is_lost(summer: Traverse, make_frames: MakeFrames) -> None:

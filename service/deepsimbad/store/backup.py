@@ -121,19 +121,8 @@ def back_up(data_dir: Path, file: Path, release: str, on_progress: Progress) -> 
 
     Whatever was acknowledged before it began is in it, and everything that its sessions and its catalog speak of:
     sessions are copied first, the catalog after them, maps and traverses last. Every SQLite file is copied as of one
-    moment; what is damaged is not copied, but named.
-
-    Args:
-        data_dir: The data directory.
-        file: The new file; it appears when it is whole.
-        release: Which release makes it.
-        on_progress: Told how far it is.
-
-    Raises:
-        ConflictError: There is a file of that name.
-        InvalidInputError: There is no folder for it.
-        DamagedFileError, DamagedMapError: What is damaged, by name.
-        UnavailableError: The disk is full, ...
+    moment; what is damaged is not copied, but named (DamagedFileError, DamagedMapError). The new file appears when it
+    is whole; it replaces none (ConflictError).
     """
     catalog = layout.catalog_path(data_dir)
     with storage_faults(file), written_aside(file, "a backup") as new:
@@ -220,12 +209,7 @@ def _add(tar: tarfile.TarFile, name: str, path: Path) -> dict[str, Any]:
 
 
 def restore(file: Path, data_dir: Path, on_progress: Progress) -> RestoreReport:
-    """Make a data directory of a backup; nothing takes its name before every digest was checked.
-
-    Args:
-        file: The backup.
-        data_dir: Where; absent or empty.
-        on_progress: Told how far it is.
+    """Make a data directory, absent or empty before, of a backup; nothing takes its name before all was checked.
 
     Raises:
         InvalidArchiveError: It is not a backup, was cut short or changed, or would write elsewhere.

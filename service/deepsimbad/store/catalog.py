@@ -2,7 +2,6 @@
 
 import fcntl
 import os
-import shutil
 from collections.abc import Callable, Sequence
 from enum import Enum
 from pathlib import Path
@@ -49,7 +48,6 @@ from deepsimbad.store.records import (
 )
 from deepsimbad_migrations.catalog.migrations import migrations
 
-_OF_OLDER_RELEASES = ("jobs", "owners")  # folders of what unfinished work needed then
 _SELECT_MAP = """
     SELECT version, state, created_at, sha256, file_bytes, config, metrics, activated_at, retired_at, removed_at
     FROM map
@@ -58,13 +56,12 @@ _MAX_INTEGER = 2**63 - 1
 
 
 class AnyVersion(Enum):
-    """The type of `ANY`."""
+    """To activate a map whatever is active now."""
 
     ANY = "any"
 
 
 ANY: Final = AnyVersion.ANY
-"""Activate whatever is active now."""
 
 
 class Catalog(JobCatalog, KeyCatalog):
@@ -115,17 +112,7 @@ class Catalog(JobCatalog, KeyCatalog):
         actions_m: Sequence[float],
         max_domains: int | None = None,
     ) -> tuple[DomainRecord, bool]:
-        """Make a domain; the same again changes nothing.
-
-        Args:
-            name: What to call it.
-            evaluator: Its evaluator's configuration.
-            closed: Whether the route is a loop.
-            actions_m: Moves in metres.
-            max_domains: How many there may be, this one included; None: any number.
-
-        Returns:
-            The domain, and whether it is new.
+        """Make a domain, of at most `max_domains`; the same again changes nothing. Returns it and whether it is new.
 
         Raises:
             InvalidInputError: The name cannot be a name, or a value has no JSON form.
@@ -139,11 +126,8 @@ class Catalog(JobCatalog, KeyCatalog):
         row = {"evaluator": to_json(evaluator), "closed": int(closed), "actions_m": to_json(moves_m)}
         with self._writing() as db:
             for record in read_domains(db, name):
-                present = {
-                    "evaluator": record.evaluator,
-                    "closed": record.closed,
-                    "actions_m": list(record.actions_m),
-                }
+                moves_m = list(record.actions_m)
+                present = {"evaluator": record.evaluator, "closed": record.closed, "actions_m": moves_m}
                 if to_json(present) != wanted:
                     raise DomainDiffersError(
                         f"domain {name} exists with another configuration: delete it first, or choose another name",
@@ -222,8 +206,6 @@ class Catalog(JobCatalog, KeyCatalog):
                 self._finish_deletion(db, name)
                 lines.append(f"removed the folder of the deleted domain {name}")
         empty_graves(layout.domains_folder(self.data_dir))
-        for folder in _OF_OLDER_RELEASES:
-            shutil.rmtree(self.data_dir / folder, ignore_errors=True)
         return lines
 
     # Map versions
@@ -351,11 +333,8 @@ class Catalog(JobCatalog, KeyCatalog):
     def remove_map(self, domain: str, version: int, is_pinned: Callable[[], bool]) -> None:
         """Remove the file of a version; its row stays, retired.
 
-        Args:
-            domain: Of the version.
-            version: Its number.
-            is_pinned: Asked while nothing changes in this catalog: who pins a version first, and then finds it here
-                without `removed_at`, keeps it. It must not wait for anyone who waits for the catalog.
+        `is_pinned` is asked while nothing changes in this catalog: who pins a version first, and then finds it here
+        without `removed_at`, keeps it. It must not wait for anyone who waits for the catalog.
 
         Raises:
             UnknownDomainError, UnknownMapVersionError: There is no such version.
@@ -414,8 +393,8 @@ class Catalog(JobCatalog, KeyCatalog):
 
     def map_of_job(self, domain: str, job_id: str) -> MapRecord | None:
         """The version that a job has sealed, whatever became of it since; raises UnknownDomainError."""
-        made = [record for record in self.maps(domain) if record.metrics.get("job_id") == job_id]
-        return made[-1] if made else None
+        records = [record for record in self.maps(domain) if record.metrics.get("job_id") == job_id]
+        return records[-1] if records else None
 
     def map_path(self, domain: str, version: int) -> Path:
         """Where the sealed file of a version lies, or will; raises InvalidInputError."""

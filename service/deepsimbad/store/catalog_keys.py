@@ -5,7 +5,7 @@ import json
 import re
 import secrets
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import timedelta
 from typing import Any, Self
 
@@ -24,15 +24,10 @@ _SELECT = "SELECT key_id, name, scope, secret_sha256, domains, created_at, expir
 
 @dataclass(frozen=True)
 class ApiKey:
-    """A key as its holder has it; `repr` does not show the secret.
-
-    Attributes:
-        key_id: Twelve hexadecimal digits; it may be shown and logged.
-        secret: 256 random bits in 43 letters.
-    """
+    """A key as its holder has it; its id, twelve hexadecimal digits, may be shown and logged, its secret not."""
 
     key_id: str
-    secret: str
+    secret: str = field(repr=False)  # 256 random bits in 43 letters
 
     @classmethod
     def new(cls) -> Self:
@@ -55,9 +50,6 @@ class ApiKey:
         """What is stored of the secret. It is random, so that a fast digest gives nothing away."""
         return hashlib.sha256(self.secret.encode()).hexdigest()
 
-    def __repr__(self) -> str:
-        return f"ApiKey({self.key_id})"
-
 
 class KeyCatalog(OpenFile):
     """The keys. Rows are never deleted: whether a key was ever created decides whether the service runs open."""
@@ -71,14 +63,8 @@ class KeyCatalog(OpenFile):
     ) -> tuple[KeyRecord, ApiKey]:
         """Make an API key; its secret is returned here and can never be had again.
 
-        Args:
-            scope: What it opens.
-            name: What to call it, at most 100 printable letters; may be empty.
-            lifetime: From now on, above 0; None: it does not expire.
-            domains: Those that it opens, of scope `localize` alone; they need not exist yet. None: all.
-
-        Raises:
-            InvalidInputError: The name, the lifetime or the domains cannot be kept.
+        Where `lifetime` is None it does not expire, where `domains` is None it opens all; they need not exist yet.
+        Raises InvalidInputError where the name, the lifetime or the domains cannot be kept.
         """
         if len(name) > _MAX_NAME or not name.isprintable():
             raise InvalidInputError(f"a key is named by at most {_MAX_NAME} printable letters")

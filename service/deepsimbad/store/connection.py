@@ -23,12 +23,8 @@ _STRANGE_SCHEMA = "SELECT 1 FROM sqlite_schema WHERE type NOT IN ('table', 'inde
 def open_database(path: Path, *, read_only: bool = False, create: bool = False, immutable: bool = False) -> Database:
     """Open a file with foreign keys on and a busy timeout, usable from any thread (its owner brings the lock).
 
-    Args:
-        path: The file.
-        read_only: Refuse every write.
-        create: Make the file where it is missing; else a missing file is an error.
-        immutable: Read a sealed file: no locks, no journal, no side files. Never for a file that may change: the newest
-            rows would silently be missing.
+    An `immutable` file is read without locks, journal or side files. Never for one that may change: the newest rows
+    would silently be missing.
     """
     mode = "ro&immutable=1" if immutable else "ro" if read_only else "rwc" if create else "rw"
     connection = sqlite3.connect(
@@ -101,9 +97,8 @@ def check_integrity(db: Database, path: Path) -> None:
 def pending_migrations(db: Database, migrations: Migrations, path: Path) -> bool:
     """Whether the file has an older schema than ours; an empty file has the oldest.
 
-    Raises:
-        DamagedFileError: The file is of another kind, a newer release wrote it, or it holds triggers, views or virtual
-            tables, which no release writes: using it would run what its maker wrote.
+    Raises DamagedFileError where it is of another kind, of a newer release, or holds triggers, views or virtual tables,
+    which no release writes: using it would run what its maker wrote.
     """
     if db.execute(_STRANGE_SCHEMA).fetchone() is not None:
         raise DamagedFileError(f"{path.name} is damaged: it holds what no release writes", file=path.name)
@@ -158,13 +153,7 @@ def open_working_file(path: Path, migrations: Migrations, *, create: bool = Fals
 
 
 class OpenFile:
-    """What every kind of working file has in common; usable from any thread.
-
-    Args:
-        path: The file, for messages.
-        db: The same, open.
-        reader: The same, open a second time, so that who reads never waits for who writes.
-    """
+    """A working file, usable from any thread; with a `reader`, open a second time, no reader waits for a writer."""
 
     def __init__(self, path: Path, db: Database, reader: Database | None = None) -> None:
         self._path = path
@@ -231,10 +220,7 @@ class GroupCommit:
     """One thread that commits what others hand in; a write counts when its future has a result, not earlier.
 
     Many writers, one disk: whatever waits while a transaction is being synced goes into the next one together.
-
-    Args:
-        transaction: Gives a write transaction.
-        on_commit: Called with the number of writes of every transaction.
+    `on_commit` is told the number of writes of every transaction.
     """
 
     def __init__(
@@ -251,11 +237,7 @@ class GroupCommit:
     def submit(self, run: Callable[[Database], T]) -> Future[T]:
         """Queue a write that is made inside a transaction, perhaps a second time in another one.
 
-        Returns:
-            Its result to come, once it is on the disk; or its error, and then nothing of it was kept.
-
-        Raises:
-            UnavailableError: The file has been closed.
+        Its future has a result once it is on the disk, or its error, and then nothing of it was kept.
         """
         done: Future[T] = Future()
         done.set_running_or_notify_cancel()  # whoever stops waiting does not undo it; before the thread can end it

@@ -66,10 +66,8 @@ _SENTENCES = {
 def storage_faults(path: Path, damaged: type[DamagedFileError | DamagedMapError] = DamagedFileError) -> Iterator[None]:
     """Turn what SQLite and the system raise inside the block into errors of the product that name the file.
 
-    Raises:
-        UnavailableError: The disk is full, read-only, busy, ...; `hints["reason"]` is the word.
-        DamagedFileError: (or `damaged`) The content is not that of such a file.
-        InvalidInputError: A value that the schema refuses.
+    UnavailableError where the disk is full, read-only, busy, ... (`hints["reason"]`), DamagedFileError (or `damaged`)
+    where the content is not that of such a file, InvalidInputError where the schema refuses a value.
     """
     try:
         yield
@@ -167,11 +165,7 @@ def empty_graves(parent: Path) -> None:
 def lock_folder(folder: Path, operation: int) -> int | None:
     """Open and lock a folder (`fcntl.flock`); the lock ends with the descriptor, or with the process in any way.
 
-    Returns:
-        The descriptor; None: LOCK_NB was asked for and another holds it.
-
-    Raises:
-        OSError: There is no such folder, or its file system locks nothing.
+    Returns None where LOCK_NB was asked for and another holds it. Raises OSError.
     """
     while True:
         descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
@@ -199,11 +193,7 @@ def service_lock(data_dir: Path, about: str) -> Iterator[None]:
     """Hold a data directory, made where it is missing, as its one service until the end of the block or process.
 
     Two services would each keep sessions in memory that the other does not know of; commands take no lock. The folder
-    itself is locked, which cannot be taken away while its files are in use; a file in it says whose it is.
-
-    Args:
-        data_dir: The folder.
-        about: Where the service listens, for the message that a second one gives.
+    itself is locked, which cannot be taken away while its files are in use; a file in it says where it listens.
 
     Raises:
         DataDirInUseError: Another service has it.

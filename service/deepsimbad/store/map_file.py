@@ -54,12 +54,7 @@ _TABLES = ("calibration", "landmark_statistics", "listed_dissimilarity", "map_im
 def write_map(path: Path, map_: Map, on_progress: Callable[[float], None] = lambda _: None) -> None:
     """Write a new, unsealed map file; one of the same name is replaced, and a failure leaves none.
 
-    It is not synced: only `seal` makes it durable.
-
-    Args:
-        path: Where; `Catalog.building_path`.
-        map_: All of it.
-        on_progress: Called with 0..1; what it raises (a cancel) ends the writing.
+    It is not synced: only `seal` makes it durable. `on_progress` is told 0..1; what it raises (a cancel) ends it.
 
     Raises:
         InvalidInputError: A Q-value is NaN or infinite.

@@ -116,11 +116,6 @@ class SessionStore(OpenFile):
 
     Writes are futures: done when they are on the disk, those of one moment in one transaction. Reads see what is
     done. Every method, and every future, raises UnavailableError or DamagedFileError where the file cannot be used.
-
-    Args:
-        path: The file.
-        db: The open file.
-        on_commit: Called with the number of writes of every transaction.
     """
 
     def __init__(self, path: Path, db: Database, on_commit: Callable[[int], None]) -> None:
@@ -129,7 +124,7 @@ class SessionStore(OpenFile):
 
     @classmethod
     def open(cls, data_dir: Path, on_commit: Callable[[int], None] = lambda _: None) -> Self:
-        """Open the sessions of a data directory; makes the file where it is missing."""
+        """Open the sessions of a data directory, or make them; `on_commit` is told the writes of every transaction."""
         path = layout.sessions_path(data_dir)
         make_data_dir(data_dir)
         with storage_faults(path):
