@@ -46,10 +46,10 @@ def server(tmp_path: Path) -> Iterator[LocalServer]:
 
 def until(look: Callable[[], Any]) -> Any:
     give_up = time.monotonic() + WITHIN_S
-    while not (result := look()):
+    while not (found := look()):
         assert time.monotonic() < give_up
         time.sleep(0.02)
-    return result
+    return found
 
 
 def log_of(server: LocalServer) -> list[dict[str, Any]]:
@@ -94,7 +94,7 @@ def test_the_next_service_begins_it_again_and_makes_one_map(server: LocalServer,
             client.admin.delete_traverse("campus", "drive")
         done, after = ended(client, job.job_id), ended(client, waits.job_id)
         assert (done.state, after.state) == ("succeeded", "succeeded"), (done, after)
-        assert [record.version for record in client.admin.maps("campus")] == [2, 1]
+        assert [each.version for each in client.admin.maps("campus")] == [2, 1]
         assert done.result is not None
         assert done.result["map_version"] == 1
 

@@ -155,8 +155,8 @@ class Robot:
                 if answer.status != 200:
                     self.refusals.append(answer.status)
                     return
-                state = json.loads(content)
-                self.n_told, self.belief = state["n_observations"], state["belief"]
+                told = json.loads(content)
+                self.n_told, self.belief = told["n_observations"], told["belief"]
         except (OSError, http.client.HTTPException):
             return
         finally:

@@ -105,7 +105,7 @@ class Service:
     def ask(self, method: str, path: str, **more: Any) -> httpx2.Response:
         return self._client.request(method, path, **more)
 
-    def answer(self, method: str, path: str, **more: Any) -> Any:
+    def told(self, method: str, path: str, **more: Any) -> Any:
         """The answer to a request that succeeds."""
         answer = self.ask(method, path, **more)
         assert answer.status_code < 300, answer.text
@@ -134,7 +134,7 @@ class Service:
         """A job, once it has ended."""
         give_up = time.monotonic() + READY_WITHIN_S
         while time.monotonic() < give_up:
-            job: dict[str, Any] = self.answer("GET", f"/v1/admin/jobs/{job_id}")
+            job: dict[str, Any] = self.told("GET", f"/v1/admin/jobs/{job_id}")
             if job["state"] in {"succeeded", "failed", "cancelled"}:
                 return job
             time.sleep(0.05)
@@ -195,12 +195,12 @@ def furnished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with Service(data_dir) as service:
         for domain, n_maps in (("loop", 2), ("yard", 1)):
             body = {"evaluator": {"kind": "feature_l2", "extractor": "none"}, "closed": domain == "loop"}
-            service.answer("PUT", f"/v1/admin/domains/{domain}", json=body)
-            service.answer("POST", f"/v1/admin/domains/{domain}/traverses", json={"name": "drive"})
+            service.told("PUT", f"/v1/admin/domains/{domain}", json=body)
+            service.told("POST", f"/v1/admin/domains/{domain}/traverses", json={"name": "drive"})
             path = f"/v1/admin/domains/{domain}/traverses/drive/frames"
-            service.answer("POST", path, content=batch(0), headers=NPZ)
+            service.told("POST", path, content=batch(0), headers=NPZ)
             for _ in range(n_maps):
-                job = service.answer("POST", f"/v1/admin/domains/{domain}/remaps", json=REMAP)
+                job = service.told("POST", f"/v1/admin/domains/{domain}/remaps", json=REMAP)
                 assert service.ended_job(job["job_id"])["state"] == "succeeded"
     return data_dir
 
@@ -213,9 +213,9 @@ def data_dir(furnished: Path, tmp_path: Path) -> Path:
 
 def begin(service: Service, n_views: int = 3) -> str:
     """A session with some views, each acknowledged."""
-    session_id: str = service.answer("POST", "/v1/domains/loop/sessions", json={"belief": "grid"})["session_id"]
+    session_id: str = service.told("POST", "/v1/domains/loop/sessions", json={"belief": "grid"})["session_id"]
     for view in range(n_views):
-        answer = service.answer("POST", **service.observe(session_id, view))
+        answer = service.told("POST", **service.observe(session_id, view))
         assert answer["n_observations"] == view + 1
     return session_id
 

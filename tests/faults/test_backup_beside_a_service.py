@@ -1,4 +1,4 @@
-"""A backup taken while robots observe, drives come in and maps are made and switched: all of before is in it."""
+"""A backup taken while robots observe, drives are uploaded and maps are made and switched: all told before is in it."""
 
 import shutil
 import threading
@@ -16,7 +16,7 @@ N_BACKUPS = 2
 
 
 @dataclass
-class Acknowledged:
+class Told:
     """What the service has acknowledged so far."""
 
     views: dict[str, int] = field(default_factory=dict)
@@ -24,37 +24,37 @@ class Acknowledged:
     version: int = 1
 
 
-def robot(service: Service, acknowledged: Acknowledged, ended: threading.Event) -> None:
+def robot(service: Service, told: Told, ended: threading.Event) -> None:
     session_id = begin(service, 1)
-    acknowledged.views[session_id] = 1
+    told.views[session_id] = 1
     while not ended.is_set():
-        view = acknowledged.views[session_id]
-        acknowledged.views[session_id] = service.answer("POST", **service.observe(session_id, view))["n_observations"]
+        view = told.views[session_id]
+        told.views[session_id] = service.told("POST", **service.observe(session_id, view))["n_observations"]
 
 
-def uploader(service: Service, acknowledged: Acknowledged, ended: threading.Event) -> None:
+def uploader(service: Service, told: Told, ended: threading.Event) -> None:
     while not ended.is_set():
-        acknowledged.n_frames = service.answer(
-            "POST", f"{DRIVE}/frames", content=batch(acknowledged.n_frames, 5), headers=NPZ
-        )["n_frames"]
+        told.n_frames = service.told("POST", f"{DRIVE}/frames", content=batch(told.n_frames, 5), headers=NPZ)[
+            "n_frames"
+        ]
         ended.wait(0.02)
 
 
-def mapper(service: Service, acknowledged: Acknowledged, ended: threading.Event) -> None:
+def mapper(service: Service, told: Told, ended: threading.Event) -> None:
     while not ended.is_set():
-        job = service.ended_job(service.answer("POST", "/v1/admin/domains/yard/remaps", json=REMAP)["job_id"])
+        job = service.ended_job(service.told("POST", "/v1/admin/domains/yard/remaps", json=REMAP)["job_id"])
         assert job["state"] == "succeeded", job
-        acknowledged.version = job["result"]["map_version"]
-        service.answer("PUT", "/v1/admin/domains/loop/active-map", json={"version": 1 + acknowledged.version % 2})
+        told.version = job["result"]["map_version"]
+        service.told("PUT", "/v1/admin/domains/loop/active-map", json={"version": 1 + told.version % 2})
 
 
 def test_everything_acknowledged_before_it_began_comes_back(data_dir: Path, tmp_path: Path) -> None:
-    acknowledged, ended = Acknowledged(), threading.Event()
+    told, ended = Told(), threading.Event()
     failed: list[BaseException] = []
 
-    def guarded(work: Callable[[Service, Acknowledged, threading.Event], None], service: Service) -> None:
+    def guarded(work: Callable[[Service, Told, threading.Event], None], service: Service) -> None:
         try:
-            work(service, acknowledged, ended)
+            work(service, told, ended)
         except BaseException as error:
             failed.append(error)
 
@@ -65,10 +65,10 @@ def test_everything_acknowledged_before_it_began_comes_back(data_dir: Path, tmp_
         try:
             backups = []
             for number in range(N_BACKUPS):
-                while acknowledged.version < 2 + number:
+                while told.version < 2 + number:
                     assert not failed, failed
                     ended.wait(0.05)
-                before = Acknowledged(dict(acknowledged.views), acknowledged.n_frames, acknowledged.version)
+                before = Told(dict(told.views), told.n_frames, told.version)
                 ran = command("backup", tmp_path / f"{number}.tar", "--data-dir", data_dir)
                 assert ran.code == 0, ran
                 backups.append(before)
@@ -84,9 +84,9 @@ def test_everything_acknowledged_before_it_began_comes_back(data_dir: Path, tmp_
         check_is_clean(there)  # the map that was being made
         with Service(there) as service:
             for session_id, n_views in before.views.items():
-                assert service.answer("GET", f"/v1/sessions/{session_id}")["n_observations"] >= n_views
-            assert service.answer("GET", DRIVE)["n_frames"] >= before.n_frames
-            assert service.answer("GET", "/v1/domains/yard")["map_version"] >= before.version
+                assert service.told("GET", f"/v1/sessions/{session_id}")["n_observations"] >= n_views
+            assert service.told("GET", DRIVE)["n_frames"] >= before.n_frames
+            assert service.told("GET", "/v1/domains/yard")["map_version"] >= before.version
         check_is_clean(there)
         shutil.rmtree(there)
 
@@ -102,4 +102,4 @@ def test_a_mounted_folder_is_restored_into(furnished: Path, tmp_path: Path) -> N
         check_is_clean(volume)
         assert "is not empty" in command("restore", tmp_path / "b.tar", "--data-dir", volume).line
         with Service(volume) as service:
-            assert service.answer("GET", "/v1/domains/loop")["map_version"] == 2
+            assert service.told("GET", "/v1/domains/loop")["map_version"] == 2

@@ -13,13 +13,26 @@ pytestmark = pytest.mark.slow
 VIEW = {"ranked_landmarks": [1, 2, 3]}
 
 
-def flip(path: Path, at: int) -> Callable[[], object]:
+def flip(path: Path, at: int) -> Callable[[], None]:
     """Flip a bit of a file; returns what flips it back."""
+    mode = path.stat().st_mode
     content = bytearray(path.read_bytes())
     content[at] ^= 4
     path.chmod(0o644)
     path.write_bytes(content)
-    return lambda: flip(path, at)
+    path.chmod(mode)
+
+    def undo() -> None:
+        flip(path, at)
+
+    return undo
+
+
+def place_of(path: Path, text: bytes) -> int:
+    """Where a file holds some bytes, for the first time."""
+    at = path.read_bytes().find(text)
+    assert at > 0, f"{text!r} is not in {path.name}"
+    return at
 
 
 def reported(data_dir: Path) -> set[str]:
@@ -53,17 +66,24 @@ def test_in_the_map_that_serves_another_version_helps_or_the_file_itself(data_di
     assert reported(data_dir) == {"domains/loop/maps/000002.sqlite"}
     for arguments in (("backup", tmp_path / "b.tar"), ("export", "loop", tmp_path / "m.map")):
         assert "map 2 of domain loop is damaged" in command(*arguments, "--data-dir", data_dir).line
-    with Service(data_dir, ready=False) as service:
+    ran = command("serve", "--data-dir", data_dir, "--port", 0, "--config", "/nowhere")
+    assert "there is no settings file" in ran.err.splitlines()[-1]
+    with damaged_service(data_dir) as service:
         problem = service.refused("POST", "/v1/domains/loop/localizations", json=VIEW)
         assert (problem["status"], problem["code"]) == (503, "damaged_map")
-        assert service.answer("POST", "/v1/domains/yard/localizations", json=VIEW)["map_version"] == 1
-        assert service.answer("PUT", "/v1/admin/domains/loop/active-map", json={"version": 1})["state"] == "active"
-        assert service.answer("POST", "/v1/domains/loop/localizations", json=VIEW)["map_version"] == 1
+        assert service.told("POST", "/v1/domains/yard/localizations", json=VIEW)["map_version"] == 1
+        assert service.told("PUT", "/v1/admin/domains/loop/active-map", json={"version": 1})["state"] == "active"
+        assert service.told("POST", "/v1/domains/loop/localizations", json=VIEW)["map_version"] == 1
         assert service.refused("PUT", "/v1/admin/domains/loop/active-map", json={"version": 2})["code"] == "damaged_map"
         undo()  # the operator puts a copy of the file in its place
-        assert service.answer("PUT", "/v1/admin/domains/loop/active-map", json={"version": 2})["state"] == "active"
-        assert service.answer("POST", "/v1/domains/loop/localizations", json=VIEW)["map_version"] == 2
+        assert service.told("PUT", "/v1/admin/domains/loop/active-map", json={"version": 2})["state"] == "active"
+        assert service.told("POST", "/v1/domains/loop/localizations", json=VIEW)["map_version"] == 2
     check_is_clean(data_dir)
+
+
+def damaged_service(data_dir: Path) -> Service:
+    """A service that is up though one of its maps is damaged."""
+    return Service(data_dir, ready=False)
 
 
 def test_in_a_backup_or_an_exported_map(data_dir: Path, tmp_path: Path) -> None:
@@ -74,7 +94,7 @@ def test_in_a_backup_or_an_exported_map(data_dir: Path, tmp_path: Path) -> None:
         undo = flip(backup, at)
         assert "cannot be restored" in command("restore", backup, "--data-dir", there).line
         undo()
-    undo = flip(exported, exported.read_bytes().index(np.arange(60.0).tobytes()) + 9)
+    undo = flip(exported, place_of(exported, np.arange(60.0).tobytes()) + 9)
     assert "no map that can serve here" in command("import", exported, "--data-dir", there).line
     undo()
     assert not list(there.glob("domains/*")) if there.exists() else True

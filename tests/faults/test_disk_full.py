@@ -69,8 +69,8 @@ def test_the_service_names_it_and_goes_on_when_there_is_room(disk: tuple[Path, F
     with Service(data_dir) as service:
         session_id = begin(service, 3)
         frames = "/v1/admin/domains/yard/traverses/drive/frames"
-        uploaded = service.answer("POST", frames, content=batch(60, 20), headers=NPZ)
-        assert uploaded["n_frames"] == 80
+        told = service.told("POST", frames, content=batch(60, 20), headers=NPZ)
+        assert told["n_frames"] == 80
         with full(data_dir.parent, service):
             problems = [
                 service.refused("POST", **service.observe(session_id, 3)),
@@ -86,25 +86,25 @@ def test_the_service_names_it_and_goes_on_when_there_is_room(disk: tuple[Path, F
                 assert (problem["status"], problem["code"]) == (503, "unavailable"), problem
                 assert problem["reason"] in FULL, problem
             # Whoever only asks is answered all the same.
-            assert service.answer("GET", f"/v1/sessions/{session_id}")["n_observations"] == 3
-            view = service.answer("POST", "/v1/domains/loop/localizations", json={"ranked_landmarks": [1, 2, 3]})
+            assert service.told("GET", f"/v1/sessions/{session_id}")["n_observations"] == 3
+            view = service.told("POST", "/v1/domains/loop/localizations", json={"ranked_landmarks": [1, 2, 3]})
             version = 2 if switched.status_code >= 400 else 1
             assert view["map_version"] == version
-            assert service.answer("GET", "/v1/admin/domains/yard/traverses/drive")["n_frames"] == 80
-        again = service.answer("POST", **service.observe(session_id, 3))
+            assert service.told("GET", "/v1/admin/domains/yard/traverses/drive")["n_frames"] == 80
+        again = service.told("POST", **service.observe(session_id, 3))
         assert again["n_observations"] == 4
-        assert service.answer("POST", frames, content=batch(80, 20), headers=NPZ)["n_frames"] == 100
-        job = service.answer("POST", "/v1/admin/domains/yard/remaps", json=REMAP)
+        assert service.told("POST", frames, content=batch(80, 20), headers=NPZ)["n_frames"] == 100
+        job = service.told("POST", "/v1/admin/domains/yard/remaps", json=REMAP)
         assert service.ended_job(job["job_id"])["state"] == "succeeded"
-        assert service.answer("GET", "/v1/domains/loop")["map_version"] == version
+        assert service.told("GET", "/v1/domains/loop")["map_version"] == version
         service.kill()
         check_is_clean(data_dir)
     with Service(data_dir) as service:
-        assert service.answer("GET", f"/v1/sessions/{session_id}")["n_observations"] == 4
+        assert service.told("GET", f"/v1/sessions/{session_id}")["n_observations"] == 4
         if begun.status_code < 400:
-            assert service.answer("GET", f"/v1/sessions/{begun.json()['session_id']}")["map_version"] == 2
-        assert service.answer("GET", "/v1/domains/loop")["map_version"] == version
-        assert service.answer("GET", "/v1/admin/domains/yard/traverses/drive")["n_frames"] == 100
+            assert service.told("GET", f"/v1/sessions/{begun.json()['session_id']}")["map_version"] == 2
+        assert service.told("GET", "/v1/domains/loop")["map_version"] == version
+        assert service.told("GET", "/v1/admin/domains/yard/traverses/drive")["n_frames"] == 100
     check_is_clean(data_dir)
 
 
@@ -115,15 +115,15 @@ def test_a_service_that_is_restarted_on_a_full_disk_answers_who_only_asks(furnis
             session_id = begin(service, 3)
         for is_killed in (False, True):
             with no_room_left(folder, service), Service(data_dir, ready=False) as service:
-                view = service.answer("POST", "/v1/domains/loop/localizations", json={"ranked_landmarks": [1, 2, 3]})
+                view = service.told("POST", "/v1/domains/loop/localizations", json={"ranked_landmarks": [1, 2, 3]})
                 assert view["map_version"] == 2
-                assert service.answer("GET", f"/v1/sessions/{session_id}")["n_observations"] == 3
+                assert service.told("GET", f"/v1/sessions/{session_id}")["n_observations"] == 3
                 assert service.ask("GET", "/readyz").status_code == 503
                 assert service.refused("POST", "/v1/domains/loop/sessions", json={})["status"] == 503
                 if is_killed:
                     service.kill()
         with Service(data_dir) as service:
-            assert service.answer("POST", **service.observe(session_id, 3))["n_observations"] == 4
+            assert service.told("POST", **service.observe(session_id, 3))["n_observations"] == 4
         check_is_clean(data_dir)
 
 
@@ -133,21 +133,19 @@ def test_a_job_that_finds_the_disk_full_says_so_and_leaves_nothing(furnished: Pa
         data_dir = Path(shutil.copytree(furnished, folder / "data"))
         before = sorted(path.name for path in (data_dir / "domains/yard/maps").iterdir())
         with Service(data_dir) as service:
-            service.answer(
-                "POST", "/v1/admin/domains/yard/traverses/drive/frames", content=batch(60, 2000), headers=NPZ
-            )
-            job_id = service.answer(
-                "POST", "/v1/admin/domains/yard/remaps", json=REMAP | {"training_episodes": 20_000}
-            )["job_id"]
+            service.told("POST", "/v1/admin/domains/yard/traverses/drive/frames", content=batch(60, 2000), headers=NPZ)
+            job_id = service.told("POST", "/v1/admin/domains/yard/remaps", json=REMAP | {"training_episodes": 20_000})[
+                "job_id"
+            ]
             with no_room_left(folder, service):
-                view = service.answer("POST", "/v1/domains/yard/localizations", json={"ranked_landmarks": [1, 2, 3]})
+                view = service.told("POST", "/v1/domains/yard/localizations", json={"ranked_landmarks": [1, 2, 3]})
                 assert view["map_version"] == 1
                 service.logged("a job failed")
             job = service.ended_job(job_id)
             assert (job["state"], job["error"]["code"]) == ("failed", "unavailable"), job
             assert "no space is left" in job["error"]["detail"]
             assert sorted(path.name for path in (data_dir / "domains/yard/maps").iterdir()) == before
-            job = service.answer("POST", "/v1/admin/domains/yard/remaps", json=REMAP)
+            job = service.told("POST", "/v1/admin/domains/yard/remaps", json=REMAP)
             assert service.ended_job(job["job_id"])["state"] == "succeeded"
         check_is_clean(data_dir)
 
@@ -190,9 +188,9 @@ def test_the_end_of_a_job_is_noted_once_there_is_room(tmp_path: Path) -> None:
             assert catalog.job(job.job_id).state is JobState.RUNNING
             catalog._db.execute("PRAGMA max_page_count = 1000000")
             give_up = time.monotonic() + 20
-            while (ended := catalog.job(job.job_id)).state is JobState.RUNNING:
+            while (found := catalog.job(job.job_id)).state is JobState.RUNNING:
                 assert time.monotonic() < give_up
                 time.sleep(0.05)
-            assert (ended.state, ended.error and ended.error["code"]) == (JobState.FAILED, "invalid_map_config")
+            assert (found.state, found.error and found.error["code"]) == (JobState.FAILED, "invalid_map_config")
         finally:
             runner.close()
