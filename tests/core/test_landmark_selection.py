@@ -1,10 +1,10 @@
-"""Landmark selection against the n x n matrix it avoids."""
+"""Landmark selection against the n x n matrix it avoids; what a landmark model's digest tells."""
 
 import numpy as np
 import pytest
 
 from deepsimbad.core import landmark_model
-from deepsimbad.core.landmark_model import select_landmarks
+from deepsimbad.core.landmark_model import landmark_model_digest, select_landmarks
 from deepsimbad.errors import CancelledError, InvalidEncodingError, InvalidMapConfigError, TooFewCandidatesError
 
 
@@ -54,3 +54,12 @@ def test_progress_reaches_one_and_can_cancel(monkeypatch):
 
     with pytest.raises(CancelledError):
         select_landmarks(candidates, 2, cancel)
+
+
+def test_a_digest_tells_names_types_shapes_and_numbers_and_not_how_they_lie_in_memory():
+    numbers = np.arange(6.0).reshape(2, 3)
+    others = (numbers.astype("f4"), numbers.reshape(3, 2), -numbers)
+    models = [{"a": numbers}, {"b": numbers}, *({"a": other} for other in others)]
+    assert len({landmark_model_digest(model) for model in models}) == len(models)
+    alike = [{"a": np.asfortranarray(numbers)}, {"a": numbers.astype(">f8")}]
+    assert {landmark_model_digest(model) for model in alike} == {landmark_model_digest(models[0])}

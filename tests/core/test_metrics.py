@@ -31,6 +31,13 @@ def test_scores_average_over_the_queries_that_have_a_truth():
     assert result.recall_at == {1: 50.0, 5: 100.0}
 
 
+def test_recall_counts_the_first_k_ranks_and_no_more():
+    scorer = RetrievalScorer()
+    for image in range(6):
+        scorer.add(np.array([6.0, 5, 4, 3, 2, 1]), np.array([image]))
+    assert scorer.result().recall_at == pytest.approx({1: 100 / 6, 5: 500 / 6})
+
+
 def test_nothing_scored_is_not_a_number_and_no_warning():
     assert np.isnan(RetrievalScorer().result().anr)
 

@@ -119,6 +119,14 @@ def test_rewards_and_neighbours_are_those_of_training_on_the_same_moves(world):
     assert 0 < np.count_nonzero(moves.reward) < len(moves.reward)
 
 
+def test_a_rank_counts_from_0_and_must_lie_below_the_share(world):
+    built, ranks = world
+    walk = walk_of(ranks, [4, 9, 10, 12, 17, 22, 27, 28, 33])
+    first_alone, nobody = (transitions_of(built, walk, NnqlConfig(top_share=share)).reward for share in (1 / N, 0.0))
+    assert first_alone.any()
+    assert not nobody.any()
+
+
 def test_moves_that_are_no_action_or_lead_nobody_knows_where_teach_nothing(world):
     built, ranks = world
     frames = [4, 9, 12, 13, 23, 24, 24, 25]  # 5, 3 (nearer to 2 than half a step: no), 1, 10, 1, 0, 1

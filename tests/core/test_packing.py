@@ -20,6 +20,11 @@ def test_far_runs_come_back(start, length):
     assert unpack_postings(pack_postings(ordered), 10_000_300).tolist() == ordered.tolist()
 
 
+def test_what_lies_side_by_side_is_written_as_runs_and_what_lies_apart_as_gaps():
+    assert len(pack_postings(np.arange(1000))) <= 4
+    assert len(pack_postings(np.arange(0, 4000, 4))) <= 1 + 1000 * 3 // 8
+
+
 def test_an_empty_list_is_an_empty_blob():
     assert pack_postings(np.array([], np.int64)) == b""
     assert unpack_postings(b"", 5).size == 0

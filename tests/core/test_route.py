@@ -44,6 +44,11 @@ def test_offsets_take_the_short_way_round():
     np.testing.assert_allclose(open_route.offset_m(np.array([9.0, 1.0]), 0.0), [9.0, 1.0])
 
 
+@pytest.mark.parametrize("closed", [False, True])
+def test_of_two_images_equally_near_the_one_before_counts(closed):
+    assert Route(np.arange(4.0), closed).nearest_image(np.array([0.5, 1.5, 2.75, 3.5])).tolist() == [0, 1, 3, 3]
+
+
 @pytest.mark.parametrize(
     ("positions", "says"),
     [

@@ -66,6 +66,7 @@ def test_a_domain_made_anew_under_an_old_name_gets_its_own_map(catalog: Catalog,
     clock.now += 2
     with pytest.raises(NoActiveMapError):
         maps.active("d")
+    assert maps.n_loaded == 0, "what cannot serve any more is not held"
     add_map(catalog)
     assert maps.active("d").snapshot is not before
 

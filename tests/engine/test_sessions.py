@@ -2,6 +2,7 @@
 
 import asyncio
 import threading
+from concurrent.futures import Future
 from dataclasses import replace
 from time import perf_counter
 from typing import Any
@@ -201,6 +202,37 @@ def test_what_cannot_be_written_leaves_the_session_as_it_was(mapped: Catalog) ->
         assert live.sessions.n_living == 2
 
     run(mapped, body)
+
+
+def test_a_write_that_failed_and_is_on_the_disk_all_the_same_counts(mapped: Catalog) -> None:
+    async def body(live: Live) -> None:
+        session_id = await live.begin()
+        append = live.store.append
+
+        def append_and_fail(*row: Any) -> Future[None]:
+            append(*row).result()
+            failed: Future[None] = Future()
+            failed.set_exception(UnavailableError("the disk failed"))
+            return failed
+
+        live.store.append = append_and_fail  # type: ignore[method-assign]
+        with pytest.raises(UnavailableError):
+            await live.sessions.observe(session_id, ranked(1))
+        live.store.append = append  # type: ignore[method-assign]
+        assert (await live.sessions.observe(session_id, ranked(2))).n_observations == 2
+
+    run(mapped, body)
+
+
+def test_a_restart_replays_the_last_row_and_no_more_than_lie_behind_a_snapshot(mapped: Catalog) -> None:
+    async def body(live: Live) -> list[int]:
+        session_id, n_rows = await live.begin(), []
+        for n_events in range(1, 10):
+            await live.sessions.observe(session_id, ranked(n_events, 0.5))
+            n_rows.append(len(live.store.history(live.store.find(session_id).number, n_events)[1]))
+        return n_rows
+
+    assert run(mapped, body, snapshot_every=4) == [1, 2, 3, 4, 1, 2, 3, 4, 1]
 
 
 def test_the_sessions_of_a_deleted_domain_end_though_robots_end_some_meanwhile(mapped: Catalog) -> None:

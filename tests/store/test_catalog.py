@@ -140,8 +140,8 @@ def test_activation_is_a_compare_and_swap(campus: Catalog) -> None:
     campus.activate("campus", second, first)
     assert campus.domain("campus").active_version == second
     assert [record.state for record in campus.maps("campus")][:2] == [MapState.RETIRED, MapState.ACTIVE]
-    campus.activate("campus", first, second)  # roll back
-    campus.activate("campus", first, first)  # the same again
+    rolled_back = campus.activate("campus", first, second)
+    assert campus.activate("campus", first, first) == rolled_back, "the same again changes nothing, its times neither"
     campus.activate("campus", second, ANY)
     assert campus.domain("campus").active_version == second
 

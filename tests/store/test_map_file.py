@@ -22,7 +22,7 @@ from deepsimbad.errors import (
 )
 from deepsimbad.store import arrays
 from deepsimbad.store.catalog import Catalog
-from deepsimbad.store.map_file import index_bytes, read_map, seal, table_bytes, verify, write_map
+from deepsimbad.store.map_file import adopt, index_bytes, read_map, seal, table_bytes, verify, write_map
 
 MakeMap = Callable[..., Map]
 
@@ -274,6 +274,9 @@ def test_a_changed_file_fails_its_digest(make_map: MakeMap, tmp_path: Path) -> N
         final.write_bytes(whole[:at] + bytes([whole[at] ^ 1]) + whole[at + 1 :])
         with pytest.raises(DamagedMapError):
             verify(final, digest)
+    with pytest.raises(DamagedMapError, match="SHA-256 differs"):
+        adopt(final, tmp_path / "b.sqlite", digest)
+    assert {path.name for path in tmp_path.iterdir()} == {"a.sqlite"}
     final.write_bytes(whole[:-1])
     with pytest.raises(DamagedMapError):
         verify(final, digest)

@@ -41,7 +41,9 @@ def observed(sequence: int, **changes: object) -> ObservedRow:
 def test_a_session_is_found_again_as_it_was(store: SessionStore, tmp_path: Path) -> None:
     session = store.create(RECORD).result()
     assert session == replace(RECORD, number=session.number)
-    assert store.create(replace(RECORD, domain="another")).result() == session, "an id is taken once"
+    assert store.create(replace(RECORD, domain="another", config={}, expires_at=9.0)).result() == session, (
+        "an id is taken once"
+    )
     assert store.find("s1") == session
     store.append(session.number, observed(1), 101.0).result()
     store.append(session.number, PriorRow(2, 333.0, 1.0, 2.0), 102.0).result()
