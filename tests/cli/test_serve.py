@@ -25,7 +25,7 @@ def wait_until_ready(port, running):
     while time.monotonic() < give_up:
         assert running.poll() is None, running.communicate()
         try:
-            with urllib.request.urlopen(f"http://127.0.0.1:{port}/readyz", timeout=5) as answer:
+            with urllib.request.urlopen(f"http://127.0.0.1:{port}/readyz", timeout=60) as answer:
                 return answer.status
         except urllib.error.URLError:
             time.sleep(0.05)

@@ -40,7 +40,7 @@ def serving(data_dir):
         if (services := getattr(app.state, "services", None)) is not None:
             services.stopping.set()
         server.should_exit = True
-        thread.join(20)
+        thread.join(60)
 
 
 @pytest.fixture(scope="session")

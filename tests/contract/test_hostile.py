@@ -52,7 +52,7 @@ def robot(served):
     before = served.mib()
     yield robot
     robot.stopped.set()
-    thread.join(30)
+    thread.join(60)
     assert robot.faults == []
     assert served.mib() - before < MOST_PEAK_MIB, "nothing is kept"
 

@@ -129,7 +129,7 @@ def test_two_at_once_are_answered_in_order_of_arrival_and_told_how_they_waited(m
 def hold_commits(live: Live) -> threading.Event:
     """Nothing reaches the disk until the event is set."""
     let_go = threading.Event()
-    live.store._commits.submit(lambda db: let_go.wait(10))
+    live.store._commits.submit(lambda db: let_go.wait(60))
     return let_go
 
 

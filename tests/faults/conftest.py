@@ -160,7 +160,7 @@ class Service:
 
     def _ended(self) -> None:
         try:
-            self._process.wait(20)
+            self._process.wait(60)
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()

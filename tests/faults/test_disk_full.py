@@ -183,11 +183,11 @@ def test_the_end_of_a_job_is_noted_once_there_is_room(tmp_path: Path) -> None:
         runner = JobRunner(catalog, fill_up, lambda domain: None)
         try:
             job = runner.submit("campus", RemapConfig(training_traverse="t"))
-            assert is_full.wait(10)
+            assert is_full.wait(60)
             time.sleep(0.5)
             assert catalog.job(job.job_id).state is JobState.RUNNING
             catalog._db.execute("PRAGMA max_page_count = 1000000")
-            give_up = time.monotonic() + 20
+            give_up = time.monotonic() + 60
             while (found := catalog.job(job.job_id)).state is JobState.RUNNING:
                 assert time.monotonic() < give_up
                 time.sleep(0.05)

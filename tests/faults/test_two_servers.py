@@ -43,7 +43,7 @@ def test_nothing_is_acknowledged_into_a_file_that_is_gone(data_dir: Path) -> Non
             problem = service.refused("POST", **request)
             assert (problem["status"], problem["code"]) == (503, "damaged_file")
             assert "sessions.sqlite was removed under the running service" in problem["detail"]
-        give_up = time.monotonic() + 30
+        give_up = time.monotonic() + 120
         while service.ask("GET", "/readyz").status_code != 503:  # it looks once a second
             assert time.monotonic() < give_up
             time.sleep(0.1)

@@ -31,7 +31,7 @@ from deepsimbad.store.durable import lock_folder
 from deepsimbad.store.map_file import read_map
 
 DOMAIN = "route"
-WITHIN_S = 30
+WITHIN_S = 120
 CONFIG = RemapConfig("drive", "other", n_landmarks=8, training_episodes=200)
 COMMAND = [sys.executable, "-P", "-m", "deepsimbad.jobs.child", "idle"]
 

@@ -18,7 +18,7 @@ from deepsimbad.store.records import JobState
 
 DOMAIN = "route"
 
-WITHIN_S = 20
+WITHIN_S = 120
 CONFIG = RemapConfig("drive", "other", n_landmarks=8)
 
 

@@ -263,7 +263,7 @@ def test_the_image_serves_and_holds_no_more_than_it_needs(image):
             assert client.get("/metrics").status_code == 200
     finally:
         serving.send_signal(signal.SIGTERM)
-        _, log = serving.communicate(timeout=30)
+        _, log = serving.communicate(timeout=120)
     assert serving.returncode == 0, log
     started = next(json.loads(line) for line in log.splitlines() if '"starting"' in line)
     assert started["data_dir"] == str((image.root / "var/lib/deepsimbad/data").resolve())

@@ -52,7 +52,7 @@ def port(tmp_path_factory):
             yield port
         finally:
             process.terminate()
-            process.wait(30)
+            process.wait(120)
 
 
 def received(port, *pieces):

@@ -44,7 +44,7 @@ def test_results_come_in_order_and_work_never_runs_far_ahead():
     def work(item):
         begun.append(item)
         if item == 0:
-            release.wait(10)
+            release.wait(60)
         return item * item
 
     results = in_order(work, range(100), 4)
