@@ -55,7 +55,7 @@ RUN /src/build/bin/python -m pip wheel --no-deps --no-build-isolation --wheel-di
 # takes its loops for the same kind of processor alone; on another kind it compiles anew, into the volume.
 RUN install -d -m 0700 /var/lib/deepsimbad/data /var/lib/deepsimbad/cache /var/lib/deepsimbad/weights \
     && NUMBA_CACHE_DIR=/var/lib/deepsimbad/cache DEEPSIMBAD_WEIGHTS_DIR=/var/lib/deepsimbad/weights \
-       /opt/deepsimbad/bin/python -c "from deepsimbad.engine.warm_up import warm_up; from deepsimbad.settings import Settings; from deepsimbad.engine.encoders import EvaluatorPool; warm_up(); EvaluatorPool(Settings().compute()).evaluator({'kind': 'feature_l2'}).load()"
+       /opt/deepsimbad/bin/python -c "from deepsimbad.engine.localizer import warm_up; from deepsimbad.engine.worker import EvaluatorPool; from deepsimbad.settings import Settings; warm_up(); EvaluatorPool(Settings().compute()).evaluator({'kind': 'feature_l2'}).load()"
 
 # hadolint ignore=DL3006
 FROM base-${VARIANT} AS service
