@@ -20,7 +20,7 @@ from deepsimbad.store.records import KeyScope
 from .conftest import N_SEEN, service
 from .served import Served
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
+pytestmark = pytest.mark.slow
 
 EXAMPLES = int(os.environ.get("SCHEMATHESIS_EXAMPLES", "8"))
 FEWEST_CASES = 1500

@@ -20,7 +20,7 @@ from deepsimbad_client.recordings.sources import open_source
 
 from .conftest import PROJECT, Page, Workplace
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
+pytestmark = pytest.mark.slow
 DRIVES = {"winter": "elsewhere", "spring": "summer", "summer": "winter"}
 
 

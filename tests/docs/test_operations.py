@@ -13,7 +13,7 @@ from deepsimbad_client import Client, errors
 
 from .conftest import PROJECT, Page, Workplace
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
+pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")

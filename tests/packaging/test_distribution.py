@@ -19,7 +19,7 @@ PACKAGES = {
 }
 HEAVY = ("numpy", "cv2", "torch", "numba", "fastapi", "uvicorn", "click", "matplotlib", "sqlite_utils")
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
+pytestmark = pytest.mark.slow
 
 
 def run(*command, **options):
