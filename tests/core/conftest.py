@@ -20,7 +20,7 @@ def a_drive(dissimilarities, encodings=None, position_m=None, **known):
     )
 
 
-def a_map(relevance, dissimilarities, list_length, second=None, closed=False, actions_m=(), **drive):
+def a_map(relevance, dissimilarities, list_length, closed=False, actions_m=(), **drive):
     """A map of such a drive."""
-    built = build_map(relevance, a_drive(dissimilarities, **drive), list_length, closed, second)
+    built = build_map(relevance, a_drive(dissimilarities, **drive), list_length, closed)
     return replace(built, actions_m=np.array(actions_m))

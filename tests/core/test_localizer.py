@@ -1,21 +1,23 @@
 """The algorithm on one page against straight-line code; restoring, priors, views that say nothing, the end."""
 
+import functools
 import itertools
 import math
-from statistics import NormalDist
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from deepsimbad.core.belief import FilterKind
+from deepsimbad.core.belief import FilterKind, GridFilter, ViewEvidence
+from deepsimbad.core.building import MapPlan, build, compose_map
 from deepsimbad.core.descriptor import rank_landmarks
 from deepsimbad.core.drive import Drive
 from deepsimbad.core.localizer import ActiveLocalizer, LocalizerConfig
-from deepsimbad.core.off_route import OffRouteModel
+from deepsimbad.core.planners import information_ahead
 from deepsimbad.core.relevance import Query, Relevance, UpdateRule
+from deepsimbad.core.retrieval import relevances
 from deepsimbad.errors import InvalidInputError, PastTheEndError
 from deepsimbad.evaluators.feature_l2 import FeatureL2
-from deepsimbad.jobs.build import build
 
 N_IMAGES, N_LANDMARKS, LIST_LENGTH, DIM = 150, 20, 4, 8
 EVALUATOR = FeatureL2("none")
@@ -34,24 +36,30 @@ def seasons():
     return [place + noise * rng.normal(size=place.shape) for noise in (0.3, 0.1, 0.3)]
 
 
+def measured(drive, model):
+    return replace(drive, dissimilarities=EVALUATOR.dissimilarities(drive.encodings, model))
+
+
 @pytest.fixture(scope="module")
 def snapshots(seasons):
     landmarks, training, _ = seasons
     model = EVALUATOR.fit_landmarks(landmarks[:N_LANDMARKS].astype(np.float32))
+    first, second = frames(training), frames(landmarks)
 
-    def make(relevance=Relevance.CALIBRATED, closed=False):
-        drives = (frames(training), frames(landmarks))
-        how = (model, relevance, LIST_LENGTH, ACTIONS_M, closed, lambda _: None)
-        return build(*drives, True, EVALUATOR, *how).map
+    def make(relevance=Relevance.COMPOSED, closed=False):
+        plan = MapPlan(relevance, LIST_LENGTH, ACTIONS_M, closed, same_route=True)
+        if relevance is Relevance.COMPOSED:
+            return compose_map(plan, first, second, second, N_LANDMARKS).map
+        return build(plan, first, second, model, measured).map
 
-    return make
+    return functools.cache(make)
 
 
 @pytest.fixture(scope="module")
 def queries(seasons, snapshots):
     encodings = seasons[2].astype(np.float32)
-    dissimilarities = EVALUATOR.dissimilarities(encodings, snapshots().landmark_model)
-    return [Query(*each) for each in zip(rank_landmarks(dissimilarities), dissimilarities, encodings, strict=True)]
+    dissimilarities = EVALUATOR.dissimilarities(encodings, snapshots(Relevance.RRF).landmark_model)
+    return [Query(*view) for view in zip(rank_landmarks(dissimilarities), dissimilarities, encodings, strict=True)]
 
 
 def walk(localizer, queries, frames, state=None):
@@ -71,92 +79,66 @@ def entropy(mass):
 # --- describe, retrieve, predict, update, plan ---------------------------------------------------------------------
 
 
-def slow_prediction(mass, action_m, std_m, closed):
-    """Images are one metre apart."""
-    n = len(mass)
-    moved = [0.0] * n
-    whole, part = int(action_m), action_m - int(action_m)
-    for image in range(n):
-        for step, share in ((whole, 1 - part), (whole + 1, part)):
-            if share and (closed or image + step < n):
-                moved[(image + step) % n] += mass[image] * share
-    total = sum(moved)
-    blurred = [0.0] * n
-    for image in range(n):
-        reach = range(-int(4 * std_m), int(4 * std_m) + 1)
-        weights = {d: math.exp(-0.5 * (d / std_m) ** 2) for d in reach if closed or 0 <= image + d < n}
-        for d, weight in weights.items():
-            blurred[(image + d) % n] += moved[image] / total * weight / sum(weights.values())
-    return blurred
-
-
-def slow_step(snapshot, mass, moments, query, action_m, closed):
-    """(mass, predicted, relevance); `moments` are (weight, mean, square), moved on in place."""
-    score = [NormalDist().inv_cdf((rank - 0.5) / N_LANDMARKS) for rank in query.ranks.tolist()]
-    n, mean, square = moments
-    mean = [(n * m + s) / (n + 1) for m, s in zip(mean, score, strict=True)]
-    square = [(n * q + s * s) / (n + 1) for q, s in zip(square, score, strict=True)]
-    moments[:] = n + 1, mean, square
-    z = [(s - m) / math.sqrt(q - m * m) for s, m, q in zip(score, mean, square, strict=True)]
-    assert snapshot.correlation is not None
-    assert snapshot.listed_score is not None
-    relevance = []
-    for image in range(N_IMAGES):
-        total = 0.0
-        for rank, landmark in enumerate(snapshot.lists[:, image].tolist()):
-            expected = snapshot.correlation[landmark] * snapshot.listed_score[rank, landmark]
-            total += expected * z[landmark] - expected**2 / 2
-        relevance.append(total)
-    predicted = mass
-    if action_m is not None:
-        predicted = slow_prediction(mass, action_m, math.sqrt(0.0025 + 0.01 * action_m), closed)
-    weighed = [m * math.exp(0.3 * r) for m, r in zip(predicted, relevance, strict=True)]
-    return [w / sum(weighed) for w in weighed], predicted, relevance
-
-
 @pytest.mark.parametrize("closed", [False, True])
-def test_a_step_is_describe_retrieve_predict_update_plan(snapshots, queries, closed):
-    snapshot = snapshots(closed=closed)
+@pytest.mark.parametrize("relevance", [Relevance.COMPOSED, Relevance.STANDARDISED, Relevance.RRF])
+def test_a_step_is_describe_retrieve_predict_update_plan(snapshots, queries, closed, relevance):
+    map_ = snapshots(relevance, closed=closed)
     ticks = itertools.count()
-    localizer = ActiveLocalizer(snapshot, LocalizerConfig(), lambda: float(next(ticks)))
-    state = localizer.start()
-    statistics = snapshot.landmark_statistics
-    assert statistics is not None
-    moments = [20.0, statistics.mean.tolist(), statistics.square.tolist()]
-    mass, off_route = (1 / N_IMAGES * np.ones(N_IMAGES)).tolist(), 0.02
+    localizer = ActiveLocalizer(map_, LocalizerConfig(price_bits_per_m=0.1), lambda: float(next(ticks)))
+    state, live, belief = localizer.start(), map_.live_statistics, GridFilter.uniform(map_.route, map_.update_rule)
     position_m = 120.0 if closed else 20.0
-    for action_m in (None, 5.0, 1.0, 2.0, 10.0, 0.0, 20.0):
-        position_m += action_m or 0.0
+    for number, action_m in enumerate((0.0, 5.0, 1.0, 2.0, 10.0, 0.0, 20.0)):
+        position_m += action_m
         query = queries[int(position_m) % N_IMAGES]
-        step = localizer.step(state, query, 77.0 if action_m is None else action_m)  # the first move is ignored
-        mass, predicted, relevance = slow_step(snapshot, mass, moments, query, action_m, closed)
-        assert step.state.relevance is not None
-        np.testing.assert_allclose(step.state.relevance, relevance, rtol=1e-4, atol=1e-4)
-        np.testing.assert_allclose(step.state.belief.mass, mass, rtol=1e-3, atol=1e-9)
-        if action_m is not None:
-            likelihood = np.exp(0.3 * np.array(relevance))
-            agreement = math.log(np.dot(predicted, likelihood) / likelihood.mean())
-            model = OffRouteModel.of(snapshot)
-            assert model is not None
-            log_odds = min(3, max(-3, model.intercept + model.slope * agreement))
-            moved = off_route * 0.95 + (1 - off_route) * 0.01
-            off_route = moved * math.exp(log_odds) / (moved * math.exp(log_odds) + 1 - moved)
-        assert step.state.off_route == pytest.approx(off_route, rel=1e-3)
-        assert snapshot.bits_ahead is not None
-        doubt = -math.log2(np.square(mass).sum()) / math.log2(len(mass))
-        mean_bits = [np.dot(mass, snapshot.bits_ahead[:, i]) for i in range(len(ACTIONS_M))]
-        values = [0.12 * a + math.sqrt(doubt) * bits for a, bits in zip(ACTIONS_M, mean_bits, strict=True)]
-        assert step.plan is not None
-        assert step.plan.values is not None
-        np.testing.assert_allclose(step.plan.values, values, rtol=1e-4)
-        assert step.plan.action_m == ACTIONS_M[int(np.argmax(values))]
-        again = localizer.plan(step.state)
-        assert again is not None
-        assert again.action_m == step.plan.action_m
+        step = localizer.step(state, query, action_m if number else 77.0)  # the first move is ignored
+        alike = map_.alike_after(action_m) if number else 0.0
+        live = live and live.observing(query, 1 - alike)
+        answered = relevances(map_, query, live)
+        shared = 0.0
+        if number:
+            belief = belief.predicted(action_m, math.sqrt(0.0025 + 0.01 * action_m), number)
+            shared = map_.shared_error_after(action_m)
+        belief = belief.updated(ViewEvidence.of(answered, map_.update_rule, map_.log_likelihood_scale, shared), number)
+        np.testing.assert_allclose(step.state.relevance, answered)
+        np.testing.assert_allclose(step.state.belief.mass, belief.mass)
+        assert step.state.belief.off_route == pytest.approx(belief.off_route)
+        ahead = information_ahead(map_, 0.1)
+        if ahead is None:
+            assert (step.plan.action_m, step.plan.values) == (5.0, None)
+        else:
+            np.testing.assert_allclose(step.plan.values, belief.mass @ ahead, rtol=1e-4)
+        assert localizer.plan(step.state).action_m == step.plan.action_m
         assert step.timings_ms == dict.fromkeys(("retrieve", "predict", "update", "plan"), 1000)
         state = step.state
-    assert int(state.belief.mass.argmax()) == int(position_m) % N_IMAGES
+    assert relevance is Relevance.RRF or int(state.belief.mass.argmax()) == int(position_m) % N_IMAGES
     assert state.n_observations == 7
+
+
+def test_views_of_one_place_share_their_errors_and_those_far_apart_do_not(snapshots):
+    map_ = snapshots()
+    assert map_.shared_error_after(0.0) == 1
+    assert 0 < map_.shared_error_after(5.0) < map_.shared_error_after(1.0) < 1
+    assert map_.shared_error_after(-2.0) == map_.shared_error_after(2.0)
+    assert map_.alike_after(0.0) == 1
+
+
+def test_while_it_stands_its_statistics_rest(snapshots, queries):
+    localizer = ActiveLocalizer(snapshots(), LocalizerConfig())
+    state = walk(localizer, queries, [10, 15])
+    stood = localizer.step(state, queries[15], 0.0).state
+    assert stood.live.encodings.weight == state.live.encodings.weight
+    moved = localizer.step(state, queries[20], 5.0).state
+    assert moved.live.encodings.weight > state.live.encodings.weight + 0.5
+
+
+@pytest.mark.parametrize("kind", list(FilterKind))
+def test_backward_within_its_error_is_no_move(snapshots, queries, kind):
+    localizer = ActiveLocalizer(snapshots(), LocalizerConfig(kind))
+    state = walk(localizer, queries, [10, 15, 20])
+    stood, jittered = (localizer.step(state, queries[20], action_m, 0.1).state for action_m in (0.0, -0.3))
+    np.testing.assert_array_equal(stood.belief.mass, jittered.belief.mass)
+    back = localizer.step(state, queries[15], -5.0).state
+    assert abs(int(back.belief.mass.argmax()) - 15) <= 1
 
 
 @pytest.mark.parametrize("relevance", list(Relevance))
@@ -189,19 +171,11 @@ def test_a_chosen_update_and_planner_are_used(snapshots, queries):
         ActiveLocalizer(snapshot, LocalizerConfig(planner="constant:3"))
 
 
-def test_a_map_of_one_season_knows_no_telling_places(snapshots, queries):
-    step = ActiveLocalizer(snapshots(Relevance.STANDARDISED), LocalizerConfig())
-    after = step.step(step.start(), queries[9])
-    assert after.state.off_route is None
-    assert after.plan is not None
-    assert (after.plan.action_m, after.plan.values) == (5.0, None)
-
-
 # --- nothing is lost -----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kind", list(FilterKind))
-@pytest.mark.parametrize("relevance", [Relevance.CALIBRATED, Relevance.SIMBAD])
+@pytest.mark.parametrize("relevance", [Relevance.COMPOSED, Relevance.STANDARDISED, Relevance.SIMBAD])
 def test_a_restored_state_goes_on_bit_for_bit(snapshots, queries, kind, relevance):
     localizer = ActiveLocalizer(snapshots(relevance), LocalizerConfig(kind, seed=5, n_particles=200))
     for visited in ([], [10], [10, 15, 17, 27]):
@@ -263,14 +237,6 @@ def test_a_view_that_shows_nothing_moves_no_belief(snapshots, queries, kind, rel
     moved = localizer.step(state, grey, 5.0)
     assert abs(int(moved.state.belief.mass.argmax()) - (int(state.belief.mass.argmax()) + 5)) <= 1
     assert stood.state.n_observations == 4
-
-
-def test_nothing_seen_says_nothing_of_the_route(snapshots, queries):
-    localizer = ActiveLocalizer(snapshots(), LocalizerConfig())
-    state = walk(localizer, queries, [10, 15, 20])
-    assert state.off_route is not None
-    grey = localizer.step(state, Query.uninformative(N_LANDMARKS), 5.0).state.off_route
-    assert grey == pytest.approx(state.off_route * 0.95 + (1 - state.off_route) * 0.01)
 
 
 @pytest.mark.parametrize("kind", list(FilterKind))

@@ -22,7 +22,7 @@ def whole(**changes):
     }
     arrays["lists"] = rng.integers(0, R, (H, N)).astype(np.uint16)
     arrays["position_m"] = np.arange(float(N))
-    config = {"relevance": "calibrated", "n_landmarks": R, "seed": 3}
+    config = {"relevance": "composed", "n_landmarks": R, "seed": 3}
     return Map(**{"config": config, "actions_m": (1.0, 2.5), "domain": "d", "version": 7, **arrays, **changes})
 
 
@@ -37,8 +37,8 @@ def whole(**changes):
         ({"lists": np.full((H, N), R, np.uint16)}, "not among the 5"),
         ({"values": np.zeros((H, N + 1), np.float32)}, "values is"),
         ({"q_values": np.zeros((N, 3), np.float32)}, "q_values is"),
-        ({"statistics": None}, "a map for calibrated needs statistics"),
-        ({"listed_score": None}, "needs listed_score"),
+        ({"statistics": None}, "a map for composed needs statistics"),
+        ({"usual_encoding": None}, "needs usual_encoding"),
         ({"actions_m": (1.0, "2")}, "no metres"),
     ],
 )
@@ -86,7 +86,7 @@ def test_it_comes_back_from_its_document_and_arrays():
     assert again.document() == map_.document()
     assert again.arrays().keys() == map_.arrays().keys() == ARRAYS.keys()
     assert all(np.array_equal(again.arrays()[name], array) for name, array in map_.arrays().items())
-    assert (again.index_bytes, again.index_bits_per_map_image, again.relevance) == (80, 80, Relevance.CALIBRATED)
+    assert (again.index_bytes, again.index_bits_per_map_image, again.relevance) == (80, 80, Relevance.COMPOSED)
 
 
 def test_a_part_of_its_images_and_those_put_together_again():
@@ -96,7 +96,7 @@ def test_a_part_of_its_images_and_those_put_together_again():
     assert part.position_m.tolist() == [0, 1, 4, 6]
     assert np.array_equal(part.lists, map_.lists[:, some])
     assert np.array_equal(part.q_values, map_.q_values[some])
-    assert part.correlation is map_.correlation
+    assert part.statistics is map_.statistics
     added = {name: array for name, array in map_.at(others).arrays().items() if "n" in ARRAYS[name].axes}
     for name, array in part.with_images(added).arrays().items():
         assert np.array_equal(array, map_.arrays()[name]), name

@@ -1,27 +1,19 @@
-"""Every planner on beliefs whose best move is plain; which places are telling, against the definition in loops."""
-
-import math
+"""Every planner on beliefs whose best move is plain; the value of moves against its definition in loops."""
 
 import numpy as np
 import pytest
 
-from deepsimbad.core.descriptor import rank_landmarks
-from deepsimbad.core.drive import SecondSeason
 from deepsimbad.core.map import Map
 from deepsimbad.core.planners import (
     PlanningView,
+    information_ahead,
     parse_planner,
     plan_at_random,
     plan_by_experience,
+    plan_by_information,
     plan_constantly,
-    plan_for_telling_places,
-    telling_bits,
 )
-from deepsimbad.core.relevance import Query, Relevance
-from deepsimbad.core.retrieval import relevances
 from deepsimbad.errors import InvalidInputError
-
-from .conftest import a_map
 
 ACTIONS_M = np.arange(1.0, 11.0)
 N_IMAGES = 200
@@ -40,14 +32,17 @@ def view_of(mass=None, bits=None, closed=False, **more):
         position_m=np.arange(float(N_IMAGES)),
         closed=closed,
         actions_m=actions_m,
-        telling_bits=None if bits is None else bits.copy(),
+        view_bits=None if bits is None else bits.copy(),
+        novelty=more.get("novelty", np.r_[1.0, np.zeros(10)]),
         q_values=more.get("q_values"),
     )
     mass = np.full(N_IMAGES, 1 / N_IMAGES) if mass is None else mass
-    return PlanningView(map_, mass, more.get("relevance"), more.get("seed", 0), more.get("step", 1))
+    return PlanningView(
+        map_, mass, more.get("relevance"), more.get("seed", 0), more.get("step", 1), more.get("price", 0.0)
+    )
 
 
-# --- telling -------------------------------------------------------------------------------------------------------
+# --- informed ------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -58,43 +53,61 @@ def bits():
     return bits
 
 
+def slow_values(bits, actions_m, news, price, closed):
+    """Discounted bits by value iteration, images a metre apart."""
+    n, best = len(bits), np.zeros(len(bits))
+    for _ in range(60):
+        values = np.empty((n, len(actions_m)))
+        for x in range(n):
+            for a, metres in enumerate(actions_m):
+                to = int(x + metres) % n if closed else int(x + metres)
+                inside = 0 <= to < n
+                there, then = (bits[to], best[to]) if inside else (bits.mean(), best.mean())
+                values[x, a] = news[a] * there - price * abs(metres) + 0.9 * then
+        best = values.max(axis=1)
+    return values
+
+
+@pytest.mark.parametrize("closed", [False, True])
+@pytest.mark.parametrize("actions_m", [(1.0, 4.0, 10.0), (-3.0, 0.0, 5.0)])
+def test_the_value_of_a_move_is_what_views_from_there_on_are_worth(closed, actions_m, bits):
+    novelty = np.r_[1.0, 0.6, 0.3, 0.2, 0.1, np.zeros(6)]
+    view = view_of(bits=bits, closed=closed, actions_m=np.array(actions_m), novelty=novelty)
+    news = [1 - novelty[int(abs(metres))] for metres in actions_m]
+    for price in (0.0, 0.2):
+        expected = slow_values(bits, actions_m, news, price, closed)
+        np.testing.assert_allclose(information_ahead(view.map, price), expected, rtol=1e-4)
+
+
 @pytest.mark.parametrize("away", [1, 4, 9])
 def test_a_robot_that_knows_its_place_goes_to_the_telling_one(bits, away):
-    plan = plan_for_telling_places(view_of(sharp(74 - away), bits))
+    plan = plan_by_information(view_of(sharp(74 - away), bits))
     assert plan.action_m == away
     assert plan.values.argmax() == away - 1
 
 
-def test_where_nobody_knows_what_is_telling_it_goes_far():
-    plan = plan_for_telling_places(view_of(sharp(3)))
+def test_where_nobody_knows_what_views_tell_it_goes_far():
+    plan = plan_by_information(view_of(sharp(3)))
     assert (plan.action_m, plan.values) == (10, None)
 
 
-def test_the_value_of_a_move_is_its_mean_bits_and_a_little_for_every_metre(bits):
+def test_moves_are_weighed_by_the_whole_belief_and_ties_go_far(bits):
     mass = np.random.default_rng(0).dirichlet(np.ones(N_IMAGES))
-    plan = plan_for_telling_places(view_of(mass, bits))
-    for action_m, value in zip(ACTIONS_M.astype(int).tolist(), plan.values.tolist(), strict=True):
-        ahead = [bits[m + action_m] if m + action_m < N_IMAGES else bits.mean() for m in range(N_IMAGES)]
-        doubt = -np.log2(sum(each**2 for each in mass)) / np.log2(N_IMAGES)
-        expected = doubt**0.5 * sum(mass[m] * ahead[m] for m in range(N_IMAGES)) + 0.12 * action_m
-        assert value == pytest.approx(expected, rel=1e-5)
+    view = view_of(mass, bits)
+    plan = plan_by_information(view)
+    np.testing.assert_allclose(plan.values, mass @ information_ahead(view.map, 0.0), rtol=1e-5)
+    assert plan_by_information(view_of(mass, np.ones(N_IMAGES, np.float32))).action_m == 10
 
 
-def test_two_places_in_mind_agree_on_what_suits_both(bits):
-    """One would rather go 4 m, the other 6 m, but 9 m tells something in either case."""
-    bits[:] = 1
-    bits[[54, 59]] = 4
-    bits[[156, 159]] = 4
-    assert plan_for_telling_places(view_of(sharp(50), bits)).action_m == 9
-    bits[[54, 156]] = 8
-    assert plan_for_telling_places(view_of(sharp(50), bits)).action_m == 4
-    assert plan_for_telling_places(view_of(0.5 * sharp(50) + 0.5 * sharp(150), bits)).action_m == 9
+def test_metres_have_a_price(bits):
+    flat = np.ones(N_IMAGES, np.float32)
+    assert plan_by_information(view_of(sharp(50), flat, price=0.3)).action_m == 1
+    assert plan_by_information(view_of(sharp(50), flat, novelty=np.linspace(1, 0, 11))).action_m == 10
 
 
 def test_a_closed_route_goes_on_behind_its_end(bits):
     at_end = sharp(N_IMAGES - 3)
-    assert plan_for_telling_places(view_of(at_end, bits, closed=True)).action_m == 3, "place 0 tells seven bits"
-    assert plan_for_telling_places(view_of(at_end, bits)).action_m == 10
+    assert plan_by_information(view_of(at_end, bits, closed=True)).action_m == 3, "place 0 tells seven bits"
 
 
 # --- the paper's ---------------------------------------------------------------------------------------------------
@@ -136,7 +149,7 @@ def test_random_moves_are_drawn_alike_from_the_seed_and_the_step():
 # --- by name -------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("text", ["telling", "nnql", "random", "constant:10", "constant:2.5"])
+@pytest.mark.parametrize("text", ["informed", "nnql", "random", "constant:10", "constant:2.5"])
 def test_planners_by_name(text):
     ones = np.ones((N_IMAGES, 10), np.float32)
     plan = parse_planner(text, (1.0, 2.5, 10.0))(view_of(q_values=ones, relevance=ones[:, 0]))
@@ -151,84 +164,11 @@ def test_no_such_planner_is_named_with_those_there_are(text):
     with pytest.raises(InvalidInputError) as caught:
         parse_planner(text, (1.0, 10.0))
     assert repr(text) in caught.value.message
-    assert caught.value.hints["allowed"] == ["telling", "nnql", "random", "constant:1", "constant:10"]
+    assert caught.value.hints["allowed"] == ["informed", "nnql", "random", "constant:1", "constant:10"]
 
 
-@pytest.mark.parametrize("text", ["telling", "nnql", "random", "constant:1"])
+@pytest.mark.parametrize("text", ["informed", "nnql", "random", "constant:1"])
 def test_a_domain_of_one_move_gets_that_move(text):
     ones = np.ones(N_IMAGES, np.float32)
     known = {"relevance": ones, "actions_m": ACTIONS_M[:1], "q_values": ones[:, np.newaxis]}
     assert parse_planner(text, (1.0,))(view_of(sharp(4), ones, **known)).action_m == 1
-
-
-# --- which places are telling ---------------------------------------------------------------------------------------
-
-N_PLACES, N_LANDMARKS = 60, 15
-
-
-@pytest.fixture
-def two_seasons():
-    """Dissimilarities [n, r] of a route in two seasons; its second half was hardly recognisable in the second."""
-    rng = np.random.default_rng(0)
-    place = rng.normal(size=(N_PLACES, N_LANDMARKS))
-    second = place + rng.normal(size=place.shape) * np.where(np.arange(N_PLACES) < 30, 0.2, 2.0)[:, np.newaxis]
-    return place.astype(np.float32), second.astype(np.float32)
-
-
-def slow_rank(values, truth):
-    """From 0: what is better, and half of what else is as good."""
-    better = sum(value > values[truth] for value in values)
-    tied = sum(value == values[truth] for value in values)
-    return better + 0.5 * (tied - 1)
-
-
-@pytest.mark.parametrize("closed", [False, True])
-def test_what_a_place_tells_equals_its_definition(two_seasons, closed):
-    first, second = two_seasons
-    position_m = np.cumsum(np.random.default_rng(1).uniform(0.2, 2.5, N_PLACES))
-    frames = np.random.default_rng(2).permutation(N_PLACES)[:45]
-    places = np.stack([np.sort(frames), np.sort(frames)], axis=1)
-    season = SecondSeason(second, places)
-    built = a_map(Relevance.CALIBRATED, first, 3, closed=closed, position_m=position_m)
-    found = telling_bits(built, season)
-
-    bits = {}
-    for image, frame in places.tolist():
-        relevance = relevances(built, Query(rank_landmarks(second[frame]))).tolist()
-        bits[image] = math.log2(N_PLACES / (1 + slow_rank(relevance, image)))
-    for image in range(N_PLACES):
-        weight = {
-            other: math.exp(-0.5 * (position_m[other] - position_m[image]) ** 2)
-            for other in bits
-            if abs(position_m[other] - position_m[image]) <= 3
-        }
-        expected = np.mean(list(bits.values()))
-        if weight:
-            expected = sum(weight[other] * bits[other] for other in weight) / sum(weight.values())
-        assert found[image] == pytest.approx(expected, rel=1e-5), image
-    assert found[:25].mean() > found[35:].mean() + 1, "the recognisable half is the telling one"
-
-
-def test_far_from_every_measurement_a_place_tells_the_mean(two_seasons):
-    first, second = two_seasons
-    built = a_map(Relevance.CALIBRATED, first, 3)
-    known = np.arange(35, 55)
-    places = np.stack([known, known], axis=1)
-    found = telling_bits(built, SecondSeason(second, places))
-    assert len(set(found[known].tolist())) > 15
-    assert len(set(found[:32].tolist())) == 1, "further than three metres"
-    measured = [
-        math.log2(N_PLACES / (1 + slow_rank(relevances(built, Query(rank_landmarks(second[i]))).tolist(), i)))
-        for i in known
-    ]
-    assert found[0] == pytest.approx(np.mean(measured))
-
-
-def test_long_traverses_are_sampled(two_seasons):
-    """More than 20,000 pairs are thinned evenly; what is left still covers the route."""
-    first, second = two_seasons
-    built = a_map(Relevance.CALIBRATED, first, 3)
-    once = np.stack([np.arange(N_PLACES), np.arange(N_PLACES)], axis=1)
-    found = telling_bits(built, SecondSeason(second, np.repeat(once, 20_000 // N_PLACES + 1, axis=0)))
-    expected = telling_bits(built, SecondSeason(second, once))
-    np.testing.assert_allclose(found, expected, rtol=1e-5)

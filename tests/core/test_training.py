@@ -6,13 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from deepsimbad.core.belief import GridFilter
 from deepsimbad.core.map import Map
 from deepsimbad.core.metrics import rank_of_truth
 from deepsimbad.core.nnql import NnqlConfig, initial_q_values
 from deepsimbad.core.relevance import Query, Relevance, UpdateRule
 from deepsimbad.core.retrieval import relevances, shortlist
-from deepsimbad.core.route import Route
 from deepsimbad.core.training import TrainingWorld, Walk, choose_actions, train, walk_greedily
 from deepsimbad.errors import CancelledError
 
@@ -31,20 +29,35 @@ def random_world(config: NnqlConfig, closed: bool = False, known: float = 1.0) -
     return TrainingWorld.on(map_, views, map_.route, true_image, config)
 
 
+def moved(mass: np.ndarray, metres: int, std_m: float, closed: bool) -> np.ndarray:
+    """A metre an image; what would be past the end of an open route is dropped."""
+    n, reach = len(mass), int(4 * std_m)
+    shifted = np.roll(mass, metres)
+    if not closed:
+        shifted[:metres] = 0
+    spread = np.zeros(n)
+    for image in range(n):
+        to = [d for d in range(-reach, reach + 1) if closed or 0 <= image + d < n]
+        weight = [np.exp(-0.5 * (d / std_m) ** 2) for d in to]
+        for d, w in zip(to, weight, strict=True):
+            spread[(image + d) % n] += shifted[image] * w / sum(weight)
+    return spread / spread.sum()
+
+
 def slow_training(world: TrainingWorld, config: NnqlConfig, closed: bool) -> np.ndarray:
     """One episode after the other in plain loops: the served filter, the served relevance. Batches of one."""
     n, n_actions = world.n_images, len(ACTIONS_M)
-    route = Route(np.arange(n, dtype=float), closed)
     q_values = np.full((n, n_actions), config.initial_q)
     for episode in range(config.n_episodes):
         rng = np.random.default_rng([config.seed, episode])
         frame = int(rng.choice(world.start_frames, 1)[0])
         epsilon = config.exploration_at(np.array([episode]))
-        belief = GridFilter.uniform(route)
+        belief = np.full(n, 1 / n)
 
         def look(belief, frame):
             relevance = relevances(world.map, world.views.at(frame))
-            return belief.updated(relevance, world.rule, 0), shortlist(relevance, config.n_neighbours)
+            seen = belief * n + np.maximum(relevance, 0)
+            return seen / seen.sum(), shortlist(relevance, config.n_neighbours)
 
         belief, near = look(belief, frame)
         for _ in range(config.n_actions_per_episode):
@@ -53,10 +66,10 @@ def slow_training(world: TrainingWorld, config: NnqlConfig, closed: bool) -> np.
             if action < 0:
                 break
             frame = int(frame + ACTIONS_M[action]) % n
-            belief = belief.predicted(ACTIONS_M[action], config.motion_std_m, 0)
+            belief = moved(belief, int(ACTIONS_M[action]), config.motion_std_m, closed)
             belief, then = look(belief, frame)
             if world.true_image[frame] >= 0:
-                rank = rank_of_truth(belief.mass, np.array([frame]))
+                rank = rank_of_truth(belief, np.array([frame]))
                 reward = config.reward if rank < config.top_share * n else 0.0
                 then_allowed = [a for a, m in enumerate(ACTIONS_M) if closed or frame + m <= n - 1]
                 best = max((q_values[then, a].mean() for a in then_allowed), default=0.0)

@@ -1,6 +1,5 @@
 """What a view that came as its nearest landmarks alone says of the others, against slow definitions."""
 
-import itertools
 import math
 from dataclasses import replace
 from statistics import NormalDist
@@ -9,14 +8,7 @@ import numpy as np
 import pytest
 
 from deepsimbad.core.descriptor import LandmarkStatistics, common_factors, rank_landmarks, ranks_from_ranked_landmarks
-from deepsimbad.core.drive import SecondSeason
-from deepsimbad.core.landmark_model import select_landmarks
-from deepsimbad.core.metrics import RetrievalScorer
-from deepsimbad.core.relevance import Query, Relevance
-from deepsimbad.core.retrieval import relevances
-from deepsimbad.evaluators.feature_l2 import FeatureL2
-
-from .conftest import a_map
+from deepsimbad.core.relevance import Query
 
 NORMAL = NormalDist()
 
@@ -158,27 +150,3 @@ def test_chance_makes_no_factors():
     scores = (scores - scores.mean(axis=0)) / scores.std(axis=0)
     loadings = common_factors(scores)
     assert np.abs((loadings @ loadings.T)[~np.eye(12, dtype=bool)]).max() < 0.2
-
-
-@pytest.mark.slow
-@pytest.mark.real_data
-def test_64_bytes_cost_less_than_a_tenth_of_the_anr(real_data):
-    n_landmarks, n_sent, evaluator = 300, 55, FeatureL2("none")
-    anr = {n_sent: [], n_landmarks: []}
-    for names in itertools.permutations(("nr", "nq", "nq2")):
-        drives = (np.load(real_data / "nordland_netvlad64" / f"{name}.npy").astype(np.float32) for name in names)
-        landmarks, training, test = drives
-        model = evaluator.fit_landmarks(landmarks[select_landmarks(landmarks, n_landmarks)])
-        own, other, live = (evaluator.dissimilarities(each, model) for each in (training, landmarks, test))
-        frames = np.arange(len(training))
-        second = SecondSeason(other, np.stack([frames, frames], axis=1))
-        built = a_map(Relevance.CALIBRATED, own, 4, second)
-        for m, found in anr.items():
-            statistics, scorer = built.landmark_statistics, RetrievalScorer()
-            for frame, ranks in enumerate(rank_landmarks(live)):
-                sent = ranks_from_ranked_landmarks(np.argsort(ranks)[:m].tolist(), n_landmarks)
-                statistics = statistics.observing(sent)
-                relevance = relevances(built, Query(sent), statistics)
-                scorer.add(relevance, np.flatnonzero(np.abs(frames - frame) <= 2))
-            found.append(scorer.result().anr)
-    assert np.mean(anr[n_sent]) < 1.1 * np.mean(anr[n_landmarks])

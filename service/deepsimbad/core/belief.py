@@ -1,26 +1,43 @@
-"""The belief over the route (II-C): predicted by moves, updated by views, on a grid or by particles; summarised."""
+"""The belief over the route (II-C): predicted by moves, updated by views, on a grid or by particles.
+
+The robot is somewhere on the route or lost: off it, or anywhere on it after having been carried. Being lost is entered
+at a small rate a metre and left to anywhere, and how well the believed places explain a view, against the map on the
+whole, decides between the two.
+
+Views err alike where they are near each other, so a view counts by what it says beyond the one before, carried along by
+the move; this is generalised least squares for errors that are autoregressive along the route. And how far this season
+can be trusted nobody knows before: the belief is a mixture of three, which trust a view half, once and twice as much as
+was learnt, weighed by how well each has predicted the views so far (`mixture`, ours). The paper's updates have one.
+"""
 
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from functools import cached_property
 from typing import Self, TypeAlias
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from deepsimbad.core.relevance import UpdateRule, evidence, weigh
-from deepsimbad.core.retrieval import shortlist
+from deepsimbad.core.relevance import UpdateRule, mean_ranks
 from deepsimbad.core.route import Route
 from deepsimbad.errors import PastTheEndError
 
+TRUSTS = (0.5, 1.0, 2.0)
+"""How much of the learnt log-likelihood each part of a mixture believes; each twice the one before."""
+
+LOST_AT_START = 0.02  # before anything was seen
+LOST_A_METRE = 0.0005
+FOUND_A_VIEW = 0.02  # of what is lost, spread over the route when the robot has moved
 LEAST_SURVIVING_SHARE = 1e-9  # of a belief before a move; with less it leads past the end wherever the robot may be
-_CREDIBLE_SHARE = 0.95
+_DOUBTING = 0.05  # a belief that takes the robot for lost by more refuses no move
 DEFAULT_N_PARTICLES = 1000
-_START, _MOVE, _RESAMPLE = range(3)  # what a draw is for; part of its seed
-_SIGMAS = 4.0  # a move's error is cut off here
+_START, _RETURN, _MOVE, _RESAMPLE = range(4)  # what a draw is for; part of its seed
+SIGMAS = 4.0  # a move's error is cut off here
+_SLIPS = 0.1  # how often odometry is wrong by more than it says
 _CELLS_A_SIGMA = 1024.0  # of the table that stands for the normal curve; exact to 1e-7
-_NORMAL = np.exp(-0.5 * np.square(np.arange(int(_SIGMAS * _CELLS_A_SIGMA) + 3) / _CELLS_A_SIGMA))
-_NEGLIGIBLE = 1e-12  # of the mean mass: a place with less is not spread any further
+_NORMAL = np.exp(-0.5 * np.square(np.arange(int(SIGMAS * _CELLS_A_SIGMA) + 3) / _CELLS_A_SIGMA))
+_NEGLIGIBLE = 1e-3  # of the mean mass: a place with less moves, but its error is not spread
 
 
 class FilterKind(StrEnum):
@@ -35,7 +52,88 @@ def motion_std_m(action_m: float) -> float:
 
     Independent errors add their variances: 0.1 m per square root of a metre, and 0.05 m for standing.
     """
-    return float(np.sqrt(0.05**2 + 0.01 * action_m))
+    return float(np.sqrt(0.05**2 + 0.01 * abs(action_m)))
+
+
+def _slipping_std_m(action_m: float, action_std_m: float) -> float:
+    """Standard deviation of a move whose odometry is wrong by a tenth, which it is now and then."""
+    return float(np.hypot(action_std_m, 0.1 * action_m))
+
+
+@dataclass(frozen=True)
+class ViewEvidence:
+    """What one view says of every map image."""
+
+    rule: UpdateRule
+    values: NDArray[np.float64]  # [n]; log-likelihoods but for a constant, mean 0, or what additive rules add
+    shared: float = 0.0  # c', how much of its error is that of the view before; of a first view nothing
+
+    @classmethod
+    def of(cls, relevance: NDArray[np.float32], rule: UpdateRule, scale: float, shared: float = 0.0) -> Self:
+        """Of a view's relevance [n], which counts `scale` times as a log-likelihood."""
+        if rule is UpdateRule.ADDITIVE_RELEVANCE:
+            return cls(rule, np.maximum(relevance, 0).astype(np.float64))
+        if rule is UpdateRule.ADDITIVE_RECIPROCAL_RANK:
+            return cls(rule, 1.0 / mean_ranks(relevance))
+        values = relevance.astype(np.float64)
+        return cls(rule, scale * (values - values.mean()), shared if rule is UpdateRule.MIXTURE else 0.0)
+
+    def news(self, last: NDArray[np.float64] | None) -> NDArray[np.float64]:
+        """[n] what it says beyond the last view's values, carried along; None: there was none."""
+        if last is None or self.shared == 0:
+            return self.values
+        return (self.values - self.shared * last) / (1 + self.shared)
+
+    @property
+    def is_added(self) -> bool:
+        """Whether it is added to weights, as in the paper, and does not multiply them."""
+        return self.rule in {UpdateRule.ADDITIVE_RELEVANCE, UpdateRule.ADDITIVE_RECIPROCAL_RANK}
+
+
+def _trusts(rule: UpdateRule) -> tuple[float, ...]:
+    return TRUSTS if rule is UpdateRule.MIXTURE else (1.0,)
+
+
+@dataclass(frozen=True)
+class _Doubt:
+    """What every filter knows besides places."""
+
+    lost: NDArray[np.float64]  # [t] by trust, of what that trust believes
+    log_trust: NDArray[np.float64]  # [t] how well each has predicted the views so far
+    last: NDArray[np.float64] | None = None  # [n] values of the last view, where the robot would have seen them
+
+    @classmethod
+    def at_start(cls, rule: UpdateRule) -> Self:
+        n = len(_trusts(rule))
+        return cls(np.full(n, LOST_AT_START), np.zeros(n))
+
+    @property
+    def trust(self) -> NDArray[np.float64]:
+        """[t] sums to 1."""
+        weight = np.exp(self.log_trust - self.log_trust.max())
+        return np.asarray(weight / weight.sum())
+
+    @property
+    def off_route(self) -> float:
+        """Probability of being lost."""
+        return float(self.trust @ self.lost)
+
+    def carried(self, route: Route, action_m: float) -> NDArray[np.float64] | None:
+        """The last view's values moved along with the robot; what lies before an open route says nothing."""
+        if self.last is None or action_m == 0:
+            return self.last
+        from_m = route.wrapped(route.position_m - action_m)
+        if route.closed:
+            return np.interp(from_m, route.position_m, self.last, period=route.length_m)
+        return np.interp(from_m, route.position_m, self.last, left=0.0, right=0.0)
+
+    def arrays(self) -> dict[str, NDArray[np.float64]]:
+        arrays = {"lost": self.lost, "log_trust": self.log_trust}
+        return arrays if self.last is None else {**arrays, "last": self.last}
+
+    @classmethod
+    def from_arrays(cls, arrays: dict[str, NDArray[np.float64]]) -> Self:
+        return cls(arrays["lost"], arrays["log_trust"], arrays.get("last"))
 
 
 @dataclass(frozen=True)
@@ -43,103 +141,199 @@ class GridFilter:
     """Masses of the map images."""
 
     route: Route
-    mass: NDArray[np.float64]  # [n] float64; sums to 1
+    masses: NDArray[np.float64]  # [t, n] by trust; with `doubt.lost` each row sums to 1
+    doubt: _Doubt
 
     @classmethod
-    def uniform(cls, route: Route) -> Self:
+    def uniform(cls, route: Route, rule: UpdateRule = UpdateRule.MIXTURE) -> Self:
         """No knowledge: every metre of the route alike, so images of one long stop share one place's mass."""
-        return cls(route, route.cell_m / route.cell_m.sum())
+        return cls._of(route, route.cell_m, rule)
 
     @classmethod
-    def around(cls, route: Route, position_m: float, std_m: float) -> Self:
+    def around(cls, route: Route, position_m: float, std_m: float, rule: UpdateRule = UpdateRule.MIXTURE) -> Self:
         """A normal belief around a position, cut off at the ends of an open route."""
         offset = route.offset_m(route.position_m, position_m)
         nearest = np.abs(offset).min()  # a prior narrower than the spacing still has its nearest image
         log_mass = -0.5 * (np.square(offset) - nearest**2) / max(std_m, 1e-3) ** 2
-        mass = route.cell_m * np.exp(log_mass)
-        return cls(route, mass / mass.sum())
+        return cls._of(route, route.cell_m * np.exp(log_mass), rule)
+
+    @classmethod
+    def _of(cls, route: Route, mass: NDArray[np.float64], rule: UpdateRule) -> Self:
+        doubt = _Doubt.at_start(rule)
+        return cls(route, np.outer(1 - doubt.lost, mass / mass.sum()), doubt)
 
     @classmethod
     def from_arrays(cls, route: Route, arrays: dict[str, NDArray[np.float64]]) -> Self:
         """Restore what `arrays` gave."""
-        return cls(route, arrays["mass"])
+        return cls(route, arrays["masses"], _Doubt.from_arrays(arrays))
 
     def arrays(self) -> dict[str, NDArray[np.float64]]:
         """All state."""
-        return {"mass": self.mass}
+        return {"masses": self.masses, **self.doubt.arrays()}
+
+    @cached_property
+    def mass(self) -> NDArray[np.float64]:
+        """[n] of the map images, if the robot is on the route; sums to 1."""
+        mass = self.doubt.trust @ self.masses
+        return np.asarray(mass / max(mass.sum(), 1e-300))
+
+    @property
+    def off_route(self) -> float:
+        """Probability that the robot is not where any of this could be right."""
+        return self.doubt.off_route
 
     def predicted(self, action_m: float, action_std_m: float, step: int) -> Self:  # noqa: ARG002 - nothing is random
-        """The belief after a move; what would be past the end of an open route is impossible and dropped.
+        """The belief after a move.
+
+        It ends where an open route ends, within its error; what certainly leads past the end is lost.
 
         Args:
-            action_m: Metres moved forward, at least 0.
+            action_m: Metres moved forward; backward where negative.
             action_std_m: Standard deviation of the move, at least 0.
             step: Number of this step in the session; seeds whatever is random in it.
 
         Raises:
             PastTheEndError: No place of the belief has that much open route before it.
         """
-        places = self.route.places
-        at_places = np.asarray(np.bincount(places.of_image, self.mass, places.position_m.size), np.float64)
-        length_m = self.route.length_m if self.route.closed else 0.0
-        moved = at_places
-        if action_m > 0:
-            moved = _shift(at_places, places.position_m, action_m, length_m)
-        total = moved.sum()
-        if total <= LEAST_SURVIVING_SHARE:
-            raise PastTheEndError(
-                f"no place of the belief has {action_m:g} m of route before it; the route ends at "
-                f"{self.route.position_m[-1]:g} m",
-                route_end_m=float(self.route.position_m[-1]),
-            )
-        spread = _spread(moved / total, places.position_m, action_std_m, length_m)
-        if action_m > 0:  # which of a stop's images comes next is open again
-            mass = spread[places.of_image] / places.n_images[places.of_image]
+        route, places = self.route, self.route.places
+        closed_m, reach_m = route.length_m if route.closed else 0.0, SIGMAS * action_std_m
+        shared = places.position_m.size < route.n_images  # some images show one place
+        moved = _summed(self.masses, places.of_image, places.position_m.size) if shared else self.masses
+        before = moved
+        if action_m != 0:
+            moved = _shift(moved, places.position_m, action_m, closed_m, reach_m)
+        on_route, surviving = before.sum(axis=1), moved.sum(axis=1)
+        _check_ahead(route, self.doubt, on_route, surviving, action_m)
+        spread = _spread(moved, places.position_m, action_std_m, _slipping_std_m(action_m, action_std_m), closed_m)
+        if not shared:
+            masses = spread
+        elif action_m != 0:  # which of a stop's images comes next is open again
+            masses = spread[:, places.of_image] / places.n_images[places.of_image]
         else:
-            stayed = np.where(at_places > 0, spread / np.where(at_places > 0, at_places, 1.0), 0.0)
-            fresh = np.where(at_places > 0, 0.0, spread / places.n_images)
-            mass = self.mass * stayed[places.of_image] + fresh[places.of_image]
-        return type(self)(self.route, mass / mass.sum())
+            stayed = np.where(before > 0, spread / np.where(before > 0, before, 1.0), 0.0)
+            fresh = np.where(before > 0, 0.0, spread / places.n_images)
+            masses = self.masses * stayed[:, places.of_image] + fresh[:, places.of_image]
+        lost, leaving, found = _leaving(self.doubt.lost + on_route - surviving, action_m)
+        masses = masses * (1 - leaving) + np.outer(found, route.cell_m / route.cell_m.sum())
+        lost = lost + leaving * surviving
+        total = masses.sum(axis=1) + lost
+        doubt = replace(self.doubt, lost=lost / total, last=self.doubt.carried(route, action_m))
+        return replace(self, masses=masses / total[:, np.newaxis], doubt=doubt)
 
-    def updated(self, relevance: NDArray[np.float32], rule: UpdateRule, step: int) -> Self:  # noqa: ARG002
-        """The belief after a view of relevance [n]."""
-        return type(self)(self.route, weigh(self.mass, evidence(relevance.astype(np.float64), rule), rule))
+    def updated(self, seen: ViewEvidence, step: int) -> Self:  # noqa: ARG002
+        """The belief after a view."""
+        if seen.is_added:
+            mass = _added(self.mass, seen.values)
+            return replace(self, masses=np.outer(1 - self.doubt.lost, mass))
+        likelihood = np.exp(_trusts(seen.rule)[0] * seen.news(self.doubt.last))
+        masses, lost, log_trust = _see(self.masses, self.doubt.lost, self.doubt.log_trust, likelihood)
+        return replace(self, masses=masses, doubt=_Doubt(lost, log_trust, seen.values))
+
+
+def _check_ahead(
+    route: Route, doubt: _Doubt, on_route: NDArray[np.float64], surviving: NDArray[np.float64], action_m: float
+) -> None:
+    """Raise PastTheEndError where a belief that does not take the robot for lost has nowhere to go."""
+    if (surviving > LEAST_SURVIVING_SHARE * on_route).any() or doubt.off_route > _DOUBTING:
+        return
+    end_m, side = (float(route.position_m[-1]), "ends") if action_m > 0 else (route.start_m, "begins")
+    raise PastTheEndError(
+        f"no place of the belief has {abs(action_m):g} m of route {'before' if action_m > 0 else 'behind'} it; "
+        f"the route {side} at {end_m:g} m",
+        route_end_m=end_m,
+    )
+
+
+def _leaving(lost: NDArray[np.float64], action_m: float) -> tuple[NDArray[np.float64], float, NDArray[np.float64]]:
+    """What stays lost [t], which share of the rest is lost by a move, and what is found anywhere [t]."""
+    found = FOUND_A_VIEW * lost if action_m != 0 else np.zeros_like(lost)
+    return lost - found, 1 - float(np.exp(-LOST_A_METRE * abs(action_m))), found
+
+
+def _added(mass: NDArray[np.float64], seen: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Masses [m], summing to 1, after evidence that is added, as the paper adds `v[u_k]` to its particles' weights.
+
+    Weights are taken with mean 1 for that, so that the belief that knows nothing gives every hypothesis weight 1,
+    however many there are.
+    """
+    weights = mass * mass.size + seen
+    return np.asarray(weights / weights.sum(), np.float64)
+
+
+@njit(cache=True, nogil=True)
+def _summed(masses: NDArray[np.float64], group: NDArray[np.intp], n_groups: int) -> NDArray[np.float64]:
+    sums = np.zeros((len(masses), n_groups))
+    for t in range(len(masses)):
+        for i in range(group.size):
+            sums[t, group[i]] += masses[t, i]
+    return sums
+
+
+@njit(cache=True, nogil=True)
+def _see(
+    masses: NDArray[np.float64],
+    lost: NDArray[np.float64],
+    log_trust: NDArray[np.float64],
+    likelihood: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Multiply by likelihoods, normalise, and weigh the trusts; `likelihood` [n], of the least trust, is used up."""
+    n_trusts, n = masses.shape
+    after = np.empty((n_trusts, n))
+    believed, average = np.zeros(n_trusts), np.zeros(n_trusts)
+    for t in range(n_trusts):  # the next trust is twice the one before
+        for i in range(n):
+            if t > 0:
+                likelihood[i] *= likelihood[i]
+            after[t, i] = masses[t, i] * likelihood[i]
+            believed[t] += after[t, i]
+            average[t] += likelihood[i]
+    average /= n
+    total = believed + lost * average
+    for t in range(n_trusts):
+        scale = 1 / total[t]
+        for i in range(n):
+            after[t, i] *= scale
+    return after, lost * average / total, log_trust + np.log(total / average)
 
 
 @njit(cache=True, nogil=True)
 def _shift(
-    mass: NDArray[np.float64], position_m: NDArray[np.float64], action_m: float, length_m: float
+    masses: NDArray[np.float64], position_m: NDArray[np.float64], action_m: float, length_m: float, reach_m: float
 ) -> NDArray[np.float64]:
-    """Move every place's mass forward; between two places it is shared by nearness. length_m > 0: a closed route."""
-    n = mass.size
-    moved = np.zeros(n)
+    """Move every place's masses; between two places they are shared by nearness. length_m > 0: a closed route.
+
+    What would be up to `reach_m` beyond an end of an open route stops there, and what would be farther is dropped.
+    """
+    n_trusts, n = masses.shape
+    moved = np.zeros((n_trusts, n))
     after = 0
-    start = position_m[0]
+    start, end = position_m[0], position_m[n - 1]
     last_target = -np.inf
     for i in range(n):
-        if mass[i] <= 0:
-            continue
         target = position_m[i] + action_m
         if length_m > 0:
             target = start + (target - start) % length_m
-        elif target > position_m[n - 1] + 1e-9:
+        elif target > end + reach_m + 1e-9 or target < start - reach_m - 1e-9:
             continue
+        else:
+            target = min(max(target, start), end)
         if target < last_target:  # wrapped round
             after = 0
         last_target = target
         while after < n and position_m[after] < target:
             after += 1
         if after == n:  # closed: between the last place and the first
-            gap = length_m - (position_m[n - 1] - start)
-            share = (target - position_m[n - 1]) / gap if gap > 0 and length_m > 0 else 0.0
-            moved[n - 1] += mass[i] * (1 - share)
-            moved[0] += mass[i] * share
+            gap = length_m - (end - start)
+            share = (target - end) / gap if gap > 0 and length_m > 0 else 0.0
+            one, other = n - 1, 0
         elif after == 0 or position_m[after] == target:
-            moved[after] += mass[i]
+            share, one, other = 1.0, after, after
         else:
             share = (target - position_m[after - 1]) / (position_m[after] - position_m[after - 1])
-            moved[after - 1] += mass[i] * (1 - share)
-            moved[after] += mass[i] * share
+            one, other = after - 1, after
+        for t in range(n_trusts):
+            moved[t, one] += masses[t, i] * (1 - share)
+            moved[t, other] += masses[t, i] * share
     return moved
 
 
@@ -153,21 +347,34 @@ def _normal(deviations: float) -> float:
     return weight
 
 
+@njit(cache=True, nogil=True, inline="always")
+def _error(off_m: float, std_m: float, slipping_m: float) -> float:
+    """Density of a move's error, but for a constant: mostly normal, now and then of a wheel that slips."""
+    density = _SLIPS * std_m / slipping_m * _normal(off_m / slipping_m)
+    if off_m < SIGMAS * std_m:
+        density += (1 - _SLIPS) * _normal(off_m / std_m)
+    return density
+
+
 @njit(cache=True, nogil=True)
 def _spread(  # noqa: PLR0912 - one pass over a band and its two wrapped ends
-    mass: NDArray[np.float64], position_m: NDArray[np.float64], std_m: float, length_m: float
+    masses: NDArray[np.float64], position_m: NDArray[np.float64], std_m: float, slipping_m: float, length_m: float
 ) -> NDArray[np.float64]:
     """Blur by a normal error; none is lost at the ends."""
-    n = mass.size
+    n_trusts, n = masses.shape
     if std_m <= 0 or n == 1:
-        return mass
-    reach = _SIGMAS * std_m
-    spread = np.zeros(n)
+        return masses
+    reach = SIGMAS * slipping_m
+    spread = np.zeros((n_trusts, n))
     least = _NEGLIGIBLE / n
     weights = np.empty(n)
     for i in range(n):
-        if mass[i] < least:
-            spread[i] += mass[i]
+        held = 0.0
+        for t in range(n_trusts):
+            held += masses[t, i]
+        if held < least:
+            for t in range(n_trusts):
+                spread[t, i] += masses[t, i]
             continue
         first = i
         while first > 0 and position_m[i] - position_m[first - 1] <= reach:
@@ -175,29 +382,28 @@ def _spread(  # noqa: PLR0912 - one pass over a band and its two wrapped ends
         stop = i + 1
         while stop < n and position_m[stop] - position_m[i] <= reach:
             stop += 1
-        total = 0.0
+        total: float = 0.0
         for j in range(first, stop):
-            weights[j] = _normal(abs(position_m[j] - position_m[i]) / std_m)
+            weights[j] = _error(abs(position_m[j] - position_m[i]), std_m, slipping_m)
             total += weights[j]
-        around_first, around_stop = 0, 0
+        around_first, around_stop = n, 0
         if length_m > 0:  # beyond a closed route's ends
             while around_stop < first and position_m[around_stop] + length_m - position_m[i] <= reach:
-                weights[around_stop] = _normal((position_m[around_stop] + length_m - position_m[i]) / std_m)
+                weights[around_stop] = _error(position_m[around_stop] + length_m - position_m[i], std_m, slipping_m)
                 total += weights[around_stop]
                 around_stop += 1
-            around_first = n
             while around_first > stop and position_m[i] + length_m - position_m[around_first - 1] <= reach:
                 around_first -= 1
-                weights[around_first] = _normal((position_m[i] + length_m - position_m[around_first]) / std_m)
+                weights[around_first] = _error(position_m[i] + length_m - position_m[around_first], std_m, slipping_m)
                 total += weights[around_first]
-        share = mass[i] / total
-        for j in range(first, stop):
-            spread[j] += share * weights[j]
-        if length_m > 0:
+        for t in range(n_trusts):
+            share: float = masses[t, i] / total
+            for j in range(first, stop):
+                spread[t, j] += share * weights[j]
             for j in range(around_stop):
-                spread[j] += share * weights[j]
+                spread[t, j] += share * weights[j]
             for j in range(around_first, n):
-                spread[j] += share * weights[j]
+                spread[t, j] += share * weights[j]
     return spread
 
 
@@ -206,79 +412,148 @@ class ParticleFilter:
     """Particles. Whatever is random is drawn from (seed, step), so that no generator's state need be kept."""
 
     route: Route
-    position_m: NDArray[np.float64]  # [m] float64, hypotheses of the route position
-    weight: NDArray[np.float64]  # [m] float64; sums to 1
+    position_m: NDArray[np.float64]  # [m] hypotheses of the route position
+    weights: NDArray[np.float64]  # [t, m] by trust; with `doubt.lost` and `found` each row sums to 1
+    found: NDArray[np.float64]  # [t] what may be anywhere again; the next view says where
+    doubt: _Doubt
     seed: int  # of all draws
 
     @classmethod
-    def uniform(cls, route: Route, n_particles: int = DEFAULT_N_PARTICLES, seed: int = 0) -> Self:
+    def uniform(
+        cls,
+        route: Route,
+        n_particles: int = DEFAULT_N_PARTICLES,
+        seed: int = 0,
+        rule: UpdateRule = UpdateRule.MIXTURE,
+    ) -> Self:
         """No knowledge: one particle in each of m equal stretches of the route."""
         rng = np.random.default_rng([seed, 0, _START])
         stretch = (np.arange(n_particles) + rng.random(n_particles)) / n_particles
-        return cls._equal(route, route.start_m + stretch * route.length_m, seed)
+        return cls._equal(route, route.start_m + stretch * route.length_m, seed, rule)
 
     @classmethod
     def around(
-        cls, route: Route, position_m: float, std_m: float, n_particles: int = DEFAULT_N_PARTICLES, seed: int = 0
+        cls,
+        route: Route,
+        position_m: float,
+        std_m: float,
+        n_particles: int = DEFAULT_N_PARTICLES,
+        seed: int = 0,
+        rule: UpdateRule = UpdateRule.MIXTURE,
     ) -> Self:
         """Particles drawn around a position; beyond the ends of an open route they stand at the end."""
         rng = np.random.default_rng([seed, 0, _START])
         drawn = position_m + std_m * rng.standard_normal(n_particles)
-        return cls._equal(route, _onto(route, drawn), seed)
+        return cls._equal(route, _onto(route, drawn), seed, rule)
+
+    @classmethod
+    def _equal(cls, route: Route, position_m: NDArray[np.float64], seed: int, rule: UpdateRule) -> Self:
+        doubt = _Doubt.at_start(rule)
+        weights = np.repeat((1 - doubt.lost)[:, np.newaxis] / position_m.size, position_m.size, axis=1)
+        return cls(route, position_m, weights, np.zeros_like(doubt.lost), doubt, seed)
 
     @classmethod
     def from_arrays(cls, route: Route, arrays: dict[str, NDArray[np.float64]], seed: int) -> Self:
         """Restore what `arrays` gave."""
-        return cls(route, arrays["position_m"], arrays["weight"], seed)
-
-    @classmethod
-    def _equal(cls, route: Route, position_m: NDArray[np.float64], seed: int) -> Self:
-        return cls(route, position_m, np.full(position_m.size, 1.0 / position_m.size), seed)
+        return cls(route, arrays["position_m"], arrays["weights"], arrays["found"], _Doubt.from_arrays(arrays), seed)
 
     def arrays(self) -> dict[str, NDArray[np.float64]]:
         """All state."""
-        return {"position_m": self.position_m, "weight": self.weight}
+        held = {"position_m": self.position_m, "weights": self.weights, "found": self.found}
+        return {**held, **self.doubt.arrays()}
 
-    @property
+    @cached_property
     def mass(self) -> NDArray[np.float64]:
         """[n] every particle counts for the map image nearest to it."""
         images = self.route.nearest_image(self.position_m)
-        return np.asarray(np.bincount(images, self.weight, self.route.n_images), np.float64)
+        mass = np.bincount(images, self.doubt.trust @ self.weights, self.route.n_images)
+        mass += (self.doubt.trust @ self.found) * self.route.cell_m / self.route.cell_m.sum()
+        return np.asarray(mass / max(mass.sum(), 1e-300), np.float64)
+
+    @property
+    def off_route(self) -> float:
+        """As `GridFilter.off_route`."""
+        return self.doubt.off_route
 
     def predicted(self, action_m: float, action_std_m: float, step: int) -> Self:
         """As `GridFilter.predicted`; a particle that would be past the end of an open route dies."""
+        route = self.route
         rng = np.random.default_rng([self.seed, step, _MOVE])
-        alive = self if self.route.closed or action_m == 0 else self._with_route_ahead(action_m, step)
-        moved = alive.position_m + action_m + action_std_m * rng.standard_normal(alive.position_m.size)
-        return replace(alive, position_m=_onto(self.route, moved))
+        target_m, weights = self.position_m + action_m, self.weights
+        if not route.closed and action_m != 0:
+            reach_m = SIGMAS * action_std_m + 1e-9
+            beyond = (target_m > route.position_m[-1] + reach_m) | (target_m < route.start_m - reach_m)
+            weights = np.where(beyond, 0.0, weights)
+        on_route, surviving = self.weights.sum(axis=1), weights.sum(axis=1)
+        _check_ahead(route, self.doubt, on_route, surviving, action_m)
+        lost, leaving, found = _leaving(self.doubt.lost + self.found + on_route - surviving, action_m)
+        slips = rng.random(target_m.size) < _SLIPS
+        std_m = np.where(slips, _slipping_std_m(action_m, action_std_m), action_std_m)
+        moved = _onto(route, target_m + std_m * rng.standard_normal(target_m.size))
+        doubt = replace(self.doubt, lost=lost + leaving * surviving, last=self.doubt.carried(route, action_m))
+        after = replace(self, position_m=moved, weights=weights * (1 - leaving), found=found, doubt=doubt)
+        return after._resampled(step) if (weights.sum(axis=0) == 0).any() and surviving.any() else after
 
-    def _with_route_ahead(self, action_m: float, step: int) -> Self:
-        """Particles that would be past the end die, and the living take their places."""
-        dead = self.position_m + action_m > self.route.position_m[-1] + 1e-9
-        if not dead.any():
-            return self
-        weight = np.where(dead, 0.0, self.weight)
-        if weight.sum() <= LEAST_SURVIVING_SHARE:
-            end_m = float(self.route.position_m[-1])
-            raise PastTheEndError(
-                f"no particle has {action_m:g} m of route before it; the route ends at {end_m:g} m", route_end_m=end_m
-            )
-        return replace(self, weight=weight / weight.sum())._resampled(step)
-
-    def updated(self, relevance: NDArray[np.float32], rule: UpdateRule, step: int) -> Self:
+    def updated(self, seen: ViewEvidence, step: int) -> Self:
         """As `GridFilter.updated`; resamples when the effective sample size falls below half the particles."""
-        seen = evidence(relevance.astype(np.float64), rule)[self.route.nearest_image(self.position_m)]
-        weighed = replace(self, weight=weigh(self.weight, seen, rule))
-        effective = 1.0 / np.square(weighed.weight).sum()
-        return weighed if effective >= weighed.weight.size / 2 else weighed._resampled(step)
+        images = self.route.nearest_image(self.position_m)
+        trust = self.doubt.trust
+        if seen.is_added:
+            on_route = 1 - self.doubt.lost
+            weights = np.outer(on_route, _added(trust @ self.weights / on_route.mean(), seen.values[images]))
+            weighed = replace(self, weights=weights, found=np.zeros_like(self.found))
+        else:
+            factors = np.exp(np.outer(_trusts(seen.rule), seen.news(self.doubt.last)))  # [t, n]
+            average = factors.mean(axis=1)
+            weights, found, lost = self.weights * factors[:, images], self.found * average, self.doubt.lost * average
+            total = weights.sum(axis=1) + found + lost
+            doubt = _Doubt(lost / total, self.doubt.log_trust + np.log(total / average), seen.values)
+            weighed = replace(self, weights=weights / total[:, np.newaxis], found=found / total, doubt=doubt)
+            weighed = weighed._placed(factors * self.route.cell_m, step)
+        together = weighed.doubt.trust @ weighed.weights
+        effective = np.square(together.sum()) / max(np.square(together).sum(), 1e-300)
+        return weighed if effective >= together.size / 2 else weighed._resampled(step)
 
-    def _resampled(self, step: int) -> Self:
+    def _placed(self, likelihood: NDArray[np.float64], step: int) -> Self:
+        """What was found gets particles where the view says it may be, in place of the lightest."""
+        trust, m = self.doubt.trust, self.position_m.size
+        n_placed = min(m // 2, round(float(trust @ self.found) * m))
+        if n_placed == 0:
+            return (
+                self
+                if not self.found.any()
+                else replace(
+                    self, doubt=replace(self.doubt, lost=self.doubt.lost + self.found), found=np.zeros_like(self.found)
+                )
+            )
+        rng = np.random.default_rng([self.seed, step, _RETURN])
+        density = (trust * self.found) @ (likelihood / likelihood.sum(axis=1, keepdims=True))
+        images = _comb(density, n_placed, rng.random())
+        kept = self._resampled(step, m - n_placed)
+        half_m = self.route.cell_m[images] * (rng.random(n_placed) - 0.5)
+        position_m = np.concatenate([kept.position_m, _onto(self.route, self.route.position_m[images] + half_m)])
+        placed = np.ascontiguousarray(likelihood[:, images]) / density[images]
+        placed *= (self.found / np.maximum(placed.sum(axis=1), 1e-300))[:, np.newaxis]
+        weights = np.concatenate([kept.weights, placed], axis=1)
+        return replace(self, position_m=position_m, weights=weights, found=np.zeros_like(self.found))
+
+    def _resampled(self, step: int, n_particles: int | None = None) -> Self:
         """Systematic resampling: one draw places an even comb over the cumulated weights."""
-        n = self.weight.size
-        offset = np.random.default_rng([self.seed, step, _RESAMPLE]).random()
-        cumulated = np.cumsum(self.weight)
-        chosen = np.searchsorted(cumulated / cumulated[-1], (np.arange(n) + offset) / n, side="right")
-        return self._equal(self.route, self.position_m[np.minimum(chosen, n - 1)], self.seed)
+        n = n_particles or self.position_m.size
+        together = self.doubt.trust @ self.weights
+        if together.sum() <= 0:
+            return self
+        chosen = _comb(together, n, np.random.default_rng([self.seed, step, _RESAMPLE]).random())
+        weights = np.ascontiguousarray(self.weights[:, chosen]) / together[chosen]
+        weights *= (self.weights.sum(axis=1) / np.maximum(weights.sum(axis=1), 1e-300))[:, np.newaxis]
+        return replace(self, position_m=self.position_m[chosen], weights=weights)
+
+
+def _comb(weight: NDArray[np.float64], count: int, offset: float) -> NDArray[np.intp]:
+    """[count] ids, each as often as its weight asks for."""
+    cumulated = np.cumsum(weight)
+    chosen = np.searchsorted(cumulated / cumulated[-1], (np.arange(count) + offset) / count, side="right")
+    return np.minimum(chosen, weight.size - 1)
 
 
 def _onto(route: Route, position_m: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -290,80 +565,3 @@ def _onto(route: Route, position_m: NDArray[np.float64]) -> NDArray[np.float64]:
 
 BeliefFilter: TypeAlias = GridFilter | ParticleFilter
 """A belief over the route. Immutable: every call returns a new one, so a failed step leaves nothing half done."""
-
-
-@dataclass(frozen=True)
-class BeliefSummary:
-    """A belief in a few numbers."""
-
-    # mean_m, std_m: Mean and standard deviation of the position; circular on a closed route
-    mean_m: float
-    mode_m: float  # position of the map image with the greatest mass
-    std_m: float
-    # The shortest stretch that holds 95 % of the mass; lo > hi crosses a closed route's start
-    credible_95_m: tuple[float, float]
-    entropy_bits: float  # entropy over map images
-    off_route: float | None  # probability that the robot is nowhere on the route; None where it is not calibrated
-    # histogram_edges_m, histogram_mass: Equal bins along the route, at most 200; [b + 1] and [b]
-    histogram_edges_m: NDArray[np.float64]
-    histogram_mass: NDArray[np.float64]
-    top: NDArray[np.int64]  # ids of the map images with the greatest mass, best first
-    top_mass: NDArray[np.float64]  # their masses
-
-
-def summarise(route: Route, mass: NDArray[np.float64], n_top: int, off_route: float | None = None) -> BeliefSummary:
-    """Summarise masses over map images, [n], which sum to 1; `n_top` of the likeliest are listed."""
-    top = shortlist(mass, n_top)
-    mean_m, std_m = _moments(route, mass)
-    edges_m, bins = route.histogram
-    held, position_m = mass[mass > 0], route.position_m
-    twice, unrolled_m = mass, position_m
-    if route.closed:
-        twice, unrolled_m = np.r_[mass, mass], np.r_[position_m, position_m + route.length_m]
-    first, last = _shortest_stretch(np.r_[0.0, np.cumsum(twice)], unrolled_m, mass.size)
-    return BeliefSummary(
-        mean_m=mean_m,
-        mode_m=float(position_m[top[0]]),
-        std_m=std_m,
-        credible_95_m=(float(position_m[first]), float(position_m[last % mass.size])),
-        entropy_bits=max(0.0, float(-(held * np.log2(held)).sum())),
-        off_route=off_route,
-        histogram_edges_m=edges_m,
-        histogram_mass=np.asarray(np.bincount(bins, mass, edges_m.size - 1), np.float64),
-        top=top,
-        top_mass=mass[top],
-    )
-
-
-def _moments(route: Route, mass: NDArray[np.float64]) -> tuple[float, float]:
-    # Sums, not dot products: BLAS would wake its threads for a vector this short.
-    position = route.position_m
-    if route.closed and route.length_m > 0:
-        turn = 2 * np.pi / route.length_m
-        resultant = (mass * np.exp(1j * turn * (position - route.start_m))).sum()
-        mean = route.start_m + (np.angle(resultant) / turn) % route.length_m
-        offset = route.offset_m(position, float(mean))
-    else:
-        mean = (mass * position).sum()
-        offset = position - mean
-    return float(mean), float(np.sqrt((mass * np.square(offset)).sum()))
-
-
-@njit(cache=True, nogil=True)
-def _shortest_stretch(before: NDArray[np.float64], position_m: NDArray[np.float64], n_starts: int) -> tuple[int, int]:
-    """First and last image of the shortest stretch of images whose masses reach 95 %, its end slid for every start.
-
-    `before` is the mass before every image, and after the last.
-    """
-    best_first, best_last, shortest_m = 0, position_m.size - 1, np.inf
-    last = 0
-    for first in range(n_starts):
-        wanted = before[first] + _CREDIBLE_SHARE * (1 - 1e-12)
-        while last < position_m.size and before[last + 1] < wanted:  # on to the image whose mass reaches the share
-            last += 1
-        if last == position_m.size:
-            break
-        length_m = position_m[last] - position_m[first]
-        if length_m < shortest_m:
-            best_first, best_last, shortest_m = first, last, length_m
-    return best_first, best_last

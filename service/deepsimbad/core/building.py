@@ -1,58 +1,257 @@
-"""Building a map from a drive's dissimilarities: what every image lists, and what the seasons of its route teach.
+"""Building a map from a drive: landmarks chosen, what every image lists, and what the seasons of its route teach.
 
-A map knows the route in two domains: the training traverse that becomes the map, and the landmark traverse. Where both
-saw the same place, their standardised scores of a landmark are a sample of what a view of a third season will score
-against the map. Their correlation `rho` says how much of a landmark's score belongs to the place. A map image lists
-the landmarks that were near in both seasons, and between its score z_m and the query's z_q, standard normal with
-correlation rho, the log-likelihood ratio of "seen from the place that lists it" against "seen from anywhere" is, for
-equal spread,
-
-    rho * z_m * z_q - (rho * z_m)^2 / 2.
-
-A landmark that was not sent, of which z_q is known but for a variance v, tells as much less: to second order in
-rho * z_m its ratio is rho * z_m * E[z_q] less (1 - v) of the square. The map stores no z_m; its mean over the images
-that list the landmark at that rank stands for it (`Map.listed_score`).
+A map knows the route in up to two seasons: the training traverse that becomes the map, and another drive of it, which
+is the landmark traverse where there is one. What both saw is fused, and shows how far views of a third season can be
+trusted: the second season is driven through a map whose lists do not know it, as no list knows the season to come.
 """
 
-from collections.abc import Sequence
-from dataclasses import replace
-from typing import Any
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from deepsimbad.core.descriptor import (
-    CALIBRATED_PRIOR_WEIGHT_FRAMES,
-    LandmarkStatistics,
-    common_factors,
-    nearest_landmarks,
-    rank_landmarks,
+from deepsimbad.core.composed import (
+    LEAST_SHARED_PLACES,
+    SECOND_SEASON_WEIGHT,
+    Moments,
+    compose,
+    described,
+    principal_directions,
+    unit,
+    within_place_whitening,
 )
-from deepsimbad.core.drive import UNKNOWN_TIMESTAMP, Drive, SecondSeason
+from deepsimbad.core.descriptor import LandmarkStatistics, common_factors, nearest_landmarks, rank_landmarks
+from deepsimbad.core.drive import UNKNOWN_TIMESTAMP, Drive, SameRoute, SecondSeason, second_season
+from deepsimbad.core.landmark_model import farthest_first
 from deepsimbad.core.map import Map
 from deepsimbad.core.nnql import NnqlConfig
+from deepsimbad.core.rehearsal import rehearsed
 from deepsimbad.core.relevance import Relevance
 from deepsimbad.errors import InvalidMapConfigError
 
-# Without two seasons of one place nothing can be learnt; this is what the development recordings show on average.
-DEFAULT_CORRELATION = 0.6
-SECOND_SEASON_WEIGHT = 0.6  # of its score against the map's own, in choosing what an image lists
-_BOUNDS = (0.05, 0.95)
-_PSEUDO_IMAGES = 3.0  # weight of the rank's mean in a landmark's mean score at that rank
+_OWN_PLACE_M = 2.0  # a landmark from no farther away is a place's own
+_SPREAD_OVER = 0.5  # of the route, at least, that places seen twice must cover before they tell of all of it
+Measure = Callable[[Drive, Mapping[str, NDArray[Any]]], Drive]
 
 
-def build_map(
-    relevance: Relevance,
-    drive: Drive,
-    list_length: int,
-    closed: bool = False,
-    second_season: SecondSeason | None = None,
-) -> Map:
-    """Describe every map image by the h landmarks its relevance keeps.
+@dataclass(frozen=True)
+class MapPlan:
+    """What a map is to be, and what it is made of."""
+
+    relevance: Relevance
+    list_length: int  # h
+    actions_m: tuple[float, ...]
+    closed: bool = False
+    same_route: bool | None = (
+        None  # whether the drives' positions are said to be comparable; None: where both know x, y
+    )
+
+
+@dataclass(frozen=True)
+class Built:
+    """A described traverse."""
+
+    map: Map  # as it will serve, but for its experience database
+    rehearsal: Map  # the map made without the second season's lists, for learning from that season as from one to come
+    own: Drive  # the training traverse, measured
+    second: Drive | None = None  # the second drive, measured, where it is of the same route
+    same_route: SameRoute | None = None  # whether it is, and why not; None where there is no second drive
+    places: NDArray[np.float32] | None = None  # [n, k] unit vectors that the lists stand for (`composed`)
+
+
+def build_from_dissimilarities(
+    plan: MapPlan,
+    training: Drive,
+    second: Drive | None,
+    model: Mapping[str, NDArray[Any]],
+    measure: Measure,
+    on_progress: Callable[[float], None] = lambda _: None,
+) -> Built:
+    """Describe every training frame by landmarks that are chosen, and learn from a second season where there is one.
 
     Args:
-        drive: The training traverse, its dissimilarities measured.
-        second_season: Read by `calibrated` alone.
+        second: Another drive, perhaps of the same route.
+        model: The evaluator's landmark model.
+        measure: Measures a drive's dissimilarities to a model's landmarks.
+
+    Raises:
+        InvalidMapConfigError: No image, or h not within 1..r.
+        InvalidRouteError: The positions go backwards or are NaN.
+    """
+    own = measure(training, model)
+    on_progress(0.4)
+    season = verdict = None
+    other: Drive | None = None
+    if second is not None:
+        season, other, verdict = second_season(
+            own, plan.closed, second, plan.same_route, lambda drive: measure(drive, model)
+        )
+    on_progress(0.7)
+    map_ = build_map(plan.relevance, own, plan.list_length, plan.closed)
+    map_ = replace(map_, landmark_model=model, actions_m=np.array(sorted(plan.actions_m)))
+    if plan.relevance is Relevance.STANDARDISED and own.dissimilarities is not None:
+        map_ = replace(map_, **rehearsed(map_, own.dissimilarities, season))
+    on_progress(1.0)
+    return Built(map_, map_, own, other, verdict)
+
+
+@dataclass(frozen=True)
+class _Space:
+    """Where unit encodings are compared, and the landmarks there."""
+
+    projection: NDArray[np.float32] | None  # [d, k]
+    prototypes: NDArray[np.float32]  # [r, k]
+    chosen: NDArray[np.int64] | None = None  # [r] which candidates they were; None: they stay those of another map
+
+    @classmethod
+    def among(cls, candidates: Drive, projection: NDArray[np.float32] | None, n_landmarks: int) -> Self:
+        """With landmarks chosen from a drive."""
+        u = _unit_vectors(candidates, projection)
+        chosen = farthest_first(u, n_landmarks)
+        return cls(projection, u[chosen], chosen)
+
+    def model(self, usual: Moments) -> dict[str, NDArray[Any]]:
+        """As a robot needs it: the landmarks, and what makes an encoding a unit vector."""
+        arrays: dict[str, NDArray[Any]] = {"prototypes": self.prototypes, "usual": usual.mean_std()}
+        return arrays if self.projection is None else {**arrays, "projection": self.projection}
+
+    def unit_vectors(self, drive: Drive) -> NDArray[np.float32]:
+        """[n, k] of a drive's frames, by its own statistics."""
+        return _unit_vectors(drive, self.projection)
+
+    def seen(self, drive: Drive) -> Drive:
+        """The drive with its dissimilarities: squared distances between unit vectors."""
+        products = self.unit_vectors(drive) @ self.prototypes.T
+        return replace(drive, dissimilarities=np.asarray(np.clip(2 - 2 * products, 0, 4), np.float32))
+
+    def whitened(self, first: Drive, second: Drive, places: NDArray[np.int64], candidates: Drive) -> Self:
+        """What a season changes counting less, landmarks chosen anew."""
+        images, frames = places.T
+        whitening = within_place_whitening(self.unit_vectors(second)[frames], self.unit_vectors(first)[images])
+        projection = whitening if self.projection is None else self.projection @ whitening
+        return self.among(candidates, projection, len(self.prototypes))
+
+
+def _unit_vectors(drive: Drive, projection: NDArray[np.float32] | None) -> NDArray[np.float32]:
+    return described(drive.encodings, Moments.of(drive.encodings), projection)
+
+
+def compose_map(
+    plan: MapPlan,
+    training: Drive,
+    second: Drive | None,
+    landmarks: Drive | Mapping[str, NDArray[Any]] | None,
+    n_landmarks: int,
+    on_progress: Callable[[float], None] = lambda _: None,
+) -> Built:
+    """The same for `composed`, which chooses its landmarks where it describes: among unit encodings.
+
+    Args:
+        second: Another drive, perhaps of the same route.
+        landmarks: The drive that they are chosen from, the model of which they stay, or None: the training drive.
+        n_landmarks: r.
+
+    Raises:
+        TooFewCandidatesError: That drive has fewer frames.
+    """
+    candidates = training if landmarks is None else landmarks
+    if isinstance(candidates, Drive):
+        drives = {id(drive): drive.encodings for drive in (training, candidates)}
+        space = _Space.among(candidates, principal_directions(*drives.values()), n_landmarks)
+    else:
+        space = _Space(candidates.get("projection"), np.asarray(candidates["prototypes"], np.float32))
+    check_list_length(plan.list_length, len(space.prototypes))
+    on_progress(0.3)
+    own, season, verdict = space.seen(training), None, None
+    other: Drive | None = None
+    if second is not None:
+        season, other, verdict = second_season(own, plan.closed, second, plan.same_route, space.seen)
+    on_progress(0.5)
+    if season is not None and other is not None and isinstance(candidates, Drive) and _covers(training, season.places):
+        space = space.whitened(training, other, season.places, candidates)
+        own, other = space.seen(training), space.seen(other)
+        season = SecondSeason(_measured(other), season.places)
+    on_progress(0.7)
+    usual, places = Moments.of(training.encodings), space.unit_vectors(training)
+    fused = places
+    if season is not None and other is not None:
+        usual, fused = Moments.of(training.encodings, other.encodings), places.copy()
+        images, frames = season.places.T
+        fused[images] = unit(places[images] + SECOND_SEASON_WEIGHT * space.unit_vectors(other)[frames])
+    model = space.model(usual) if isinstance(candidates, Drive) else candidates
+    map_ = _composed_map(plan, own, fused, usual, model)
+    rehearsal = map_
+    if season is not None:
+        barred = None if candidates is not second else _own_places(map_, season.places, space.chosen)
+        rehearsal = replace(map_, lists=compose(places, space.prototypes, plan.list_length, barred))
+    on_progress(0.8)
+    learnt = rehearsed(rehearsal, _measured(own), season)
+    on_progress(1.0)
+    return Built(replace(map_, **learnt), replace(rehearsal, **learnt), own, other, verdict, fused)
+
+
+def _composed_map(
+    plan: MapPlan, own: Drive, places: NDArray[np.float32], usual: Moments, model: Mapping[str, NDArray[Any]]
+) -> Map:
+    """The map of places [n, k] that were seen as `own`, but for what a rehearsal teaches."""
+    prototypes = np.asarray(model["prototypes"], np.float32)
+    dissimilarities, route = _measured(own), own.route(plan.closed)
+    ranks = rank_landmarks(dissimilarities)
+    statistics = LandmarkStatistics.of_map(ranks)
+    return Map(
+        config={"relevance": Relevance.COMPOSED.value, "n_landmarks": len(prototypes)},
+        closed=plan.closed,
+        actions_m=np.array(sorted(plan.actions_m)),
+        landmark_model=model,
+        position_m=route.position_m,
+        x_m=route.x_m,
+        y_m=route.y_m,
+        lists=compose(places, prototypes, plan.list_length),
+        statistics=np.stack([statistics.mean, statistics.std]),
+        loadings=common_factors(statistics.standardise(ranks)),
+        usual_encoding=usual.mean_std(),
+        usual_product=Moments.of((1 - dissimilarities / 2).astype(np.float32)).mean_std(),
+    )
+
+
+def _measured(drive: Drive) -> NDArray[np.float32]:
+    if drive.dissimilarities is None:
+        raise InvalidMapConfigError("the drive's dissimilarities are not measured")
+    return drive.dissimilarities
+
+
+def _covers(training: Drive, places: NDArray[np.int64]) -> bool:
+    """Whether places seen in two seasons are enough, and spread over the route."""
+    at_m = training.position_m[places[:, 0]]
+    spread = np.ptp(at_m) >= _SPREAD_OVER * np.ptp(training.position_m) if at_m.size else False
+    return bool(at_m.size >= LEAST_SHARED_PLACES and spread)
+
+
+def _own_places(map_: Map, places: NDArray[np.int64], chosen: NDArray[np.int64] | None) -> NDArray[np.bool_] | None:
+    """[n, r] which landmarks were seen from an image's own place; None where they were not chosen here."""
+    if chosen is None:
+        return None
+    image_of = np.full(max(int(places[:, 1].max()), int(chosen.max())) + 1, -1)
+    image_of[places[:, 1]] = places[:, 0]
+    image, route = image_of[chosen], map_.route
+    apart_m = np.abs(route.offset_m(route.position_m[:, np.newaxis], route.position_m[image]))
+    return np.asarray((apart_m <= _OWN_PLACE_M) & (image >= 0))
+
+
+def check_list_length(list_length: int, n_landmarks: int) -> None:
+    """Raise InvalidMapConfigError where h is not within 1..r."""
+    if not 1 <= list_length <= n_landmarks:
+        raise InvalidMapConfigError(
+            f"list_length {list_length} is not within 1 and the number of landmarks, {n_landmarks}",
+            list_length=list_length,
+            n_landmarks=n_landmarks,
+        )
+
+
+def build_map(relevance: Relevance, drive: Drive, list_length: int, closed: bool = False) -> Map:
+    """Describe every image of a measured drive by the h landmarks that any relevance but `composed` keeps.
 
     Returns:
         The map as far as dissimilarities tell; its landmark model, actions and names are the caller's to add.
@@ -61,17 +260,23 @@ def build_map(
         InvalidMapConfigError: No image, or h not within 1..r.
         InvalidRouteError: The positions go backwards or are NaN.
     """
-    dissimilarities = drive.dissimilarities
-    if dissimilarities is None or dissimilarities.ndim != 2 or len(dissimilarities) == 0:
+    dissimilarities = _measured(drive)
+    if dissimilarities.ndim != 2 or len(dissimilarities) == 0:
         raise InvalidMapConfigError("a map needs at least one image")
     n_landmarks = dissimilarities.shape[1]
-    if not 1 <= list_length <= n_landmarks:
-        raise InvalidMapConfigError(
-            f"list_length {list_length} is not within 1 and the number of landmarks, {n_landmarks}",
-            list_length=list_length,
-            n_landmarks=n_landmarks,
-        )
-    arrays = _described(relevance, dissimilarities, list_length, second_season)
+    check_list_length(list_length, n_landmarks)
+    ranks = rank_landmarks(dissimilarities)
+    arrays: dict[str, Any] = {}
+    if relevance is Relevance.STANDARDISED:
+        own = LandmarkStatistics.of_map(ranks)
+        scores = own.standardise(ranks)
+        arrays["statistics"] = np.stack([own.mean, own.std])
+        arrays["loadings"] = common_factors(scores)
+        lists = nearest_landmarks(scores, list_length)
+    else:
+        lists = nearest_landmarks(ranks, list_length)
+    if relevance is Relevance.SIMBAD:
+        arrays["values"] = _listed(dissimilarities, lists)
     route = drive.route(closed)
     return Map(
         config={"relevance": relevance.value, "n_landmarks": n_landmarks},
@@ -79,93 +284,15 @@ def build_map(
         position_m=route.position_m,
         x_m=route.x_m,
         y_m=route.y_m,
+        lists=lists,
         encodings=drive.encodings if relevance is Relevance.BRUTE_FORCE else None,
         **arrays,
     )
 
 
-def _described(
-    relevance: Relevance, dissimilarities: NDArray[np.float32], list_length: int, second: SecondSeason | None
-) -> dict[str, Any]:
-    """The named arrays that follow from dissimilarities."""
-    ranks = rank_landmarks(dissimilarities)
-    if relevance not in {Relevance.STANDARDISED, Relevance.CALIBRATED}:
-        lists = nearest_landmarks(ranks, list_length)
-        return {"lists": lists, "values": _listed(dissimilarities, lists) if relevance is Relevance.SIMBAD else None}
-    own = LandmarkStatistics.of_map(ranks)
-    scores = own.standardise(ranks)
-    own = replace(own, loadings=common_factors(scores))
-    if relevance is Relevance.STANDARDISED:
-        statistics = np.stack([own.mean, own.std])
-        return {"lists": nearest_landmarks(scores, list_length), "statistics": statistics, "loadings": own.loadings}
-    seasons, correlation = [own], np.full(len(own.mean), DEFAULT_CORRELATION)
-    if second is not None:
-        other_ranks = rank_landmarks(second.dissimilarities)
-        seasons.append(LandmarkStatistics.of_map(other_ranks))
-        scores, correlation = both_seasons(scores, seasons[1].standardise(other_ranks), second.places)
-    lists = nearest_landmarks(scores, list_length)
-    prior = live_prior(seasons)
-    return {
-        "lists": lists,
-        "statistics": np.stack([prior.mean, prior.std]),
-        "loadings": prior.loadings,
-        "correlation": correlation,
-        "listed_score": _listed_scores(scores, lists),
-    }
-
-
 def _listed(dissimilarities: NDArray[np.float32], lists: NDArray[np.uint16]) -> NDArray[np.float32]:
     """[h, n] the dissimilarities [n, r] of listed landmarks [h, n]."""
     return np.ascontiguousarray(np.take_along_axis(dissimilarities, lists.T.astype(np.intp), axis=1).T, np.float32)
-
-
-def both_seasons(
-    own: NDArray[np.float64], second: NDArray[np.float64], places: NDArray[np.int64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The standardised scores of the map images over two seasons, and how these go with a season not yet seen.
-
-    Args:
-        own: [n, r] scores of the map images by the map's own statistics.
-        second: [m, r] scores of the landmark traverse's frames by theirs.
-        places: [k, 2] (map image, frame) of the same place, k at least 1.
-
-    Returns:
-        Scores [n, r], about standard normal; correlations [r].
-    """
-    of_map, of_second = places.T
-    between = np.einsum("kr,kr->r", own[of_map], second[of_second]) / len(places)
-    between = np.clip(between, *_BOUNDS)
-    weight = SECOND_SEASON_WEIGHT
-    spread = np.sqrt(1 + weight**2 + 2 * weight * between)
-    scores = own.copy()
-    scores[of_map] = (own[of_map] + weight * second[of_second]) / spread
-    # Of a weighted mean of two equally related measurements with a third (Spearman and Brown).
-    return scores, np.clip(between * (1 + weight) / spread, *_BOUNDS)
-
-
-def _listed_scores(scores: NDArray[np.float64], lists: NDArray[np.uint16]) -> NDArray[np.float64]:
-    """[h, r] mean score [n, r] of a landmark where an image of these lists [h, n] has it at a rank."""
-    n_landmarks = scores.shape[1]
-    images = np.arange(lists.shape[1])
-    means = np.empty((len(lists), n_landmarks))
-    for rank, row in enumerate(lists):
-        listed = scores[images, row]
-        total = np.bincount(row, listed, n_landmarks) + _PSEUDO_IMAGES * listed.mean()
-        means[rank] = total / (np.bincount(row, minlength=n_landmarks) + _PSEUDO_IMAGES)
-    return means
-
-
-def live_prior(seasons: Sequence[LandmarkStatistics]) -> LandmarkStatistics:
-    """What is usual over all seasons that the map knows, taken alike: the best guess about another one.
-
-    How landmarks go together is a matter of places more than of seasons: it stays the first one's.
-    """
-    return LandmarkStatistics(
-        CALIBRATED_PRIOR_WEIGHT_FRAMES,
-        np.mean([season.mean for season in seasons], axis=0),
-        np.mean([season.square for season in seasons], axis=0),
-        seasons[0].loadings,
-    )
 
 
 def append_drive(map_: Map, drive: Drive) -> Map:
@@ -186,20 +313,26 @@ def append_drive(map_: Map, drive: Drive) -> Map:
     Raises:
         InvalidRouteError: The new frames go backwards.
     """
-    if drive.dissimilarities is None:
-        raise InvalidMapConfigError("the new frames' dissimilarities are not measured")
-    ranks, route = rank_landmarks(drive.dissimilarities), drive.route(map_.closed)
-    before = map_.landmark_statistics
-    scores: NDArray[np.floating] = ranks
-    statistics = map_.statistics
-    if before is not None:
-        own = LandmarkStatistics.of_map(ranks)
-        scores = before.pooled(before.weight, own, drive.n_frames).standardise(ranks)
-        pooled = before.pooled(map_.n_images, own, drive.n_frames)
-        statistics = np.stack([pooled.mean, pooled.std])
-    lists = nearest_landmarks(scores, map_.list_length)
+    route, usual = drive.route(map_.closed), map_.live_statistics
+    dissimilarities = _measured(drive)
+    ranks_of_frames = rank_landmarks(dissimilarities)
+    scores: NDArray[np.floating] = ranks_of_frames
+    pooled: dict[str, Any] = {}
+    if usual is not None:
+        own = LandmarkStatistics.of_map(ranks_of_frames)
+        scores = usual.ranks.pooled(usual.ranks.weight, own, drive.n_frames).standardise(ranks_of_frames)
+        ranks = usual.ranks.pooled(map_.n_images, own, drive.n_frames)
+        pooled["statistics"] = np.stack([ranks.mean, ranks.std])
+    if usual is not None and usual.encodings is not None:
+        own_encodings, model = Moments.of(drive.encodings), map_.landmark_model
+        soon_own = usual.encodings.pooled(usual.encodings.weight, own_encodings, drive.n_frames)
+        u = described(drive.encodings, soon_own, model.get("projection"))
+        lists = compose(u, model["prototypes"], map_.list_length)
+        pooled["usual_encoding"] = usual.encodings.pooled(map_.n_images, own_encodings, drive.n_frames).mean_std()
+    else:
+        lists = nearest_landmarks(scores, map_.list_length)
     nearest, is_near = nearest_known(map_, route.position_m)
-    q_values, bits = map_.q_values, map_.telling_bits
+    q_values, bits = map_.q_values, map_.view_bits
     if q_values is not None:
         q_values = np.where(is_near[:, np.newaxis], q_values[nearest], np.float32(NnqlConfig().initial_q))
     if bits is not None:
@@ -208,9 +341,9 @@ def append_drive(map_: Map, drive: Drive) -> Map:
         {
             "lists": lists,
             "position_m": _on_route(map_, route.position_m),
-            "values": None if map_.values is None else _listed(drive.dissimilarities, lists),
+            "values": None if map_.values is None else _listed(dissimilarities, lists),
             "encodings": None if map_.encodings is None else drive.encodings,
-            "telling_bits": bits,
+            "view_bits": bits,
             "timestamp_us": drive.timestamp_us if (drive.timestamp_us != UNKNOWN_TIMESTAMP).any() else None,
             "frame_digest": drive.digests(),
             "x_m": route.x_m,
@@ -218,7 +351,7 @@ def append_drive(map_: Map, drive: Drive) -> Map:
             "q_values": q_values,
         }
     )
-    return replace(longer, statistics=statistics)
+    return replace(longer, **pooled)
 
 
 def nearest_known(map_: Map, position_m: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:

@@ -25,8 +25,6 @@ from deepsimbad.errors import InvalidDissimilaritiesError, InvalidRankedLandmark
 
 MAX_LANDMARKS = 0xFFFF  # landmark ids are uint16 and the last value means "none"
 PRIOR_WEIGHT_FRAMES = 50.0  # how many live frames the map's statistics are worth at the start of a session
-# A live season differs from those that a calibrated map knows: its own views soon say more than their statistics do.
-CALIBRATED_PRIOR_WEIGHT_FRAMES = 20.0
 _LEAST_STD = 1e-6
 _ALL_KNOWN = np.ones(1)
 _MAX_FACTORS = 64
@@ -225,10 +223,10 @@ class LandmarkStatistics:
         std = np.sqrt(np.maximum(self.square - np.square(self.mean), 0.0))
         return np.where(std > _LEAST_STD, std, 1.0)
 
-    def observing(self, ranks: NDArray[np.float32]) -> Self:
+    def observing(self, ranks: NDArray[np.float32], worth: float = 1.0) -> Self:
         """The statistics after one more frame, [r] ranks, or one more of every drive, [e, r]; it counts in its own z.
 
-        Of landmarks that were not sent the expected moments count.
+        Of landmarks that were not sent the expected moments count; `worth` of a frame that saw little new is below 1.
         """
         scores = normal_scores(ranks, ranks.shape[-1])
         squares = np.square(scores)
@@ -236,9 +234,10 @@ class LandmarkStatistics:
             view = self.view(ranks)
             scores = self.mean + self.std * view.z
             squares = np.square(scores) + np.square(self.std) * (1.0 - view.certainty)
-        weight = self.weight + 1.0
-        mean = self.mean + (scores - self.mean) / weight
-        square = self.square + (squares - self.square) / weight
+        weight = self.weight + worth
+        share = worth / weight
+        mean = self.mean + (scores - self.mean) * share
+        square = self.square + (squares - self.square) * share
         return replace(self, weight=weight, mean=mean, square=square)
 
     def pooled(self, n_frames: float, other: "LandmarkStatistics", n_others: float) -> Self:

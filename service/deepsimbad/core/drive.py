@@ -26,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepsimbad.core.descriptor import LandmarkStatistics, normal_scores, rank_landmarks
+from deepsimbad.core.relevance import Query
 from deepsimbad.core.route import Route, same_places
 from deepsimbad.errors import InvalidEncodingError, InvalidInputError, InvalidMapConfigError, InvalidRouteError
 
@@ -191,6 +192,10 @@ class SecondSeason:
 
     dissimilarities: NDArray[np.float32]  # [m, r] of its frames to the landmarks
     places: NDArray[np.int64]  # [k, 2] int64, (map image, its frame) where both saw the same place; some
+
+    def views(self, frames: NDArray[np.int64]) -> Query:
+        """Some of its frames as live views, a batch."""
+        return Query(rank_landmarks(self.dissimilarities[frames]), self.dissimilarities[frames])
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,10 @@ from deepsimbad.core.localizer import ActiveLocalizer, LocalizerState, Step
 from deepsimbad.core.metrics import rank_of_truth
 from deepsimbad.core.relevance import Query
 from deepsimbad.core.route import Route
+from deepsimbad.core.summary import CONFIDENT_WITHIN_M, DEFAULT_CONFIDENCE, near_mode
+
+MOST_MOVES = 20
+PENALTY_VIEWS = 20
 
 
 @dataclass(frozen=True)
@@ -25,18 +29,21 @@ class TestDrive:
     route: Route  # their positions
     true_image: NDArray[np.int64]  # [m] int64, the map image nearest to every test frame
 
-    def starts(self, travel_m: float, count: int, seed: int) -> NDArray[np.int64]:
-        """Frames [count], uniform over those from which so many metres fit."""
+    def starts(self, travel_m: float, count: int | None, seed: int) -> NDArray[np.int64]:
+        """Frames from which so many metres fit: all of them, or some drawn."""
         fitting = np.flatnonzero(self.route.position_m + travel_m <= self.route.position_m[-1])
-        return np.random.default_rng(seed).choice(fitting, count) if fitting.size else fitting
+        return fitting if count is None or not fitting.size else np.random.default_rng(seed).choice(fitting, count)
 
 
 @dataclass(frozen=True)
 class Episode:
-    """One episode."""
+    """One episode: the truth's rank after each of some moves, and when the robot was sure of its place."""
 
     rank_share: NDArray[np.float64]  # [steps] share of map images placed before the truth after each move
     travelled_m: NDArray[np.float64]  # [steps] metres moved until then
+    views: float  # until it was sure; a sure mistake and never being sure count 20 more
+    metres: float  # moved by then
+    is_wrong: bool  # it was sure, and more than 5 m off
 
 
 Chooser: TypeAlias = Callable[[int, Step, float], float]
@@ -53,17 +60,37 @@ class EpisodeRunner:
     action_std_m: float | None = None  # how far the filter trusts a move; None: as usual
 
     def run(self, episode: int, start: int, choose: Chooser) -> Episode:
-        """One episode from a test frame."""
+        """One episode from a test frame; on to 20 moves, while the drive lasts, where it is not sure before."""
         shares, travelled = np.empty(self.n_steps), np.empty(self.n_steps)
-        position_m = float(self.drive.route.position_m[start])
+        route, position_m = self.drive.route, float(self.drive.route.position_m[start])
         step = self.localizer.step(self.localizer.start(), self.drive.views.at(start))
-        moved_m = 0.0
-        for number in range(self.n_steps):
+        moved_m, sure = 0.0, self._sure(step, position_m, 1, 0.0)
+        for number in range(max(self.n_steps, MOST_MOVES)):
+            if number >= self.n_steps and sure is not None:
+                break
             action_m = choose(episode, step, position_m)
-            moved_m, position_m = moved_m + action_m, position_m + action_m
-            step, shares[number] = self.observe(step.state, position_m, action_m)
-            travelled[number] = moved_m
-        return Episode(shares, travelled)
+            moved_m, position_m = moved_m + abs(action_m), position_m + action_m
+            if number >= self.n_steps and not route.start_m <= position_m <= route.position_m[-1]:
+                break
+            step, share = self.observe(step.state, position_m, action_m)
+            if number < self.n_steps:
+                shares[number], travelled[number] = share, moved_m
+            sure = sure or self._sure(step, position_m, number + 2, moved_m)
+        views, metres, is_wrong = sure or (MOST_MOVES + 1, moved_m, False)
+        late = PENALTY_VIEWS if is_wrong or sure is None else 0
+        return Episode(shares, travelled, float(views + late), metres, is_wrong)
+
+    def _sure(self, step: Step, position_m: float, views: int, metres: float) -> tuple[int, float, bool] | None:
+        """Views, metres, and whether it is mistaken, of a robot that is sure of its place; None where it is not."""
+        belief = step.state.belief
+        mass, route = belief.mass, belief.route
+        mode = int(mass.argmax())
+        if near_mode(route, mass, mode) * (1 - belief.off_route) < DEFAULT_CONFIDENCE:
+            return None
+        frame = int(self.drive.route.nearest_image(np.array([position_m]))[0])
+        truth_m = route.position_m[self.drive.true_image[frame]]
+        off_m = abs(float(route.offset_m(np.array([truth_m]), float(route.position_m[mode]))[0]))
+        return views, metres, off_m > CONFIDENT_WITHIN_M
 
     def observe(self, state: LocalizerState, position_m: float, action_m: float) -> tuple[Step, float]:
         """Look from the frame nearest to a position; returns the step and the truth's rank share."""

@@ -43,14 +43,7 @@ def select_landmarks(
         InvalidEncodingError: NaN or infinity among the candidates.
     """
     n_candidates = candidates.shape[0]
-    if n_landmarks < 1:
-        raise InvalidMapConfigError("n_landmarks must be at least 1", n_landmarks=n_landmarks)
-    if n_candidates < n_landmarks:
-        raise TooFewCandidatesError(
-            f"{n_candidates} candidates for {n_landmarks} landmarks; ask for fewer landmarks or drive further",
-            n_candidates=n_candidates,
-            n_landmarks=n_landmarks,
-        )
+    _check_number(n_candidates, n_landmarks)
     candidates = np.ascontiguousarray(candidates, np.float32)
     half_squares = 0.5 * np.einsum("nd,nd->n", candidates, candidates)
     if not np.isfinite(half_squares).all():
@@ -60,6 +53,35 @@ def select_landmarks(
     neighbours = _nearest_neighbours(candidates, half_squares, on_progress or (lambda _: None))
     scores = _squared_distances(candidates, neighbours)
     return np.argsort(-scores, kind="stable")[:n_landmarks].astype(np.int64)
+
+
+def farthest_first(u: NDArray[np.float32], n_landmarks: int) -> NDArray[np.int64]:
+    """[r] rows of unit vectors [n, k], each least like the nearest of those before it; the first least like the mean.
+
+    Raises:
+        TooFewCandidatesError: n < r.
+    """
+    _check_number(len(u), n_landmarks)
+    ids = np.empty(n_landmarks, np.int64)
+    ids[0] = np.argmin(u @ u.mean(axis=0))
+    nearest = u @ u[ids[0]]
+    nearest[ids[0]] = np.inf
+    for place in range(1, n_landmarks):
+        ids[place] = np.argmin(nearest)
+        np.maximum(nearest, u @ u[ids[place]], out=nearest)
+        nearest[ids[place]] = np.inf
+    return ids
+
+
+def _check_number(n_candidates: int, n_landmarks: int) -> None:
+    if n_landmarks < 1:
+        raise InvalidMapConfigError("n_landmarks must be at least 1", n_landmarks=n_landmarks)
+    if n_candidates < n_landmarks:
+        raise TooFewCandidatesError(
+            f"{n_candidates} candidates for {n_landmarks} landmarks; ask for fewer landmarks or drive further",
+            n_candidates=n_candidates,
+            n_landmarks=n_landmarks,
+        )
 
 
 def _nearest_neighbours(

@@ -12,15 +12,16 @@ from numpy.typing import NDArray
 
 from deepsimbad.core.belief import (
     DEFAULT_N_PARTICLES,
+    SIGMAS,
     BeliefFilter,
     FilterKind,
     GridFilter,
     ParticleFilter,
+    ViewEvidence,
     motion_std_m,
 )
-from deepsimbad.core.descriptor import LandmarkStatistics
+from deepsimbad.core.live_statistics import LiveStatistics
 from deepsimbad.core.map import Map
-from deepsimbad.core.off_route import OFF_ROUTE_AT_START, OffRouteModel, agreement_of
 from deepsimbad.core.planners import DEFAULT_PLANNER, Plan, PlanningView, parse_planner
 from deepsimbad.core.relevance import Query, UpdateRule
 from deepsimbad.core.retrieval import relevances
@@ -37,17 +38,16 @@ class LocalizerConfig:
     planner: str | None = None  # by name; None: the default
     seed: int = 0  # of whatever is random
     n_particles: int = DEFAULT_N_PARTICLES  # of the particle filter
+    price_bits_per_m: float = 0.0  # of moving, to the planner
 
 
 @dataclass(frozen=True)
 class LocalizerState:
     """All that is known of one robot. Immutable: a step makes a new one."""
 
-    belief: BeliefFilter  # where it is, if it is on the route
-    # What is usual for each landmark, from the map's statistics on; None where the relevance has none
-    live: LandmarkStatistics | None
+    belief: BeliefFilter  # where it is, and whether it is lost
+    live: LiveStatistics | None  # what is usual, from the map's statistics on; None where the relevance asks for none
     relevance: NDArray[np.float32] | None  # [n] of the last view; None before any
-    off_route: float | None  # probability that it is nowhere on the route; None where the map has not learnt to tell
     n_observations: int  # views so far
 
 
@@ -73,12 +73,10 @@ class ActiveLocalizer:
         self._clock = clock
         self._update = config.update or map_.update_rule
         self._planner = parse_planner(config.planner or DEFAULT_PLANNER, map_.actions_m.tolist())
-        self._off_route_model = OffRouteModel.of(map_)
 
     def start(self, position_m: float | None = None, std_m: float = 5.0) -> LocalizerState:
         """Before any view: around a position, or anywhere on the route."""
-        off_route = None if self._off_route_model is None else OFF_ROUTE_AT_START
-        return LocalizerState(self._prior(position_m, std_m), self._map.landmark_statistics, None, off_route, 0)
+        return LocalizerState(self._prior(position_m, std_m), self._map.live_statistics, None, 0)
 
     def step(
         self, state: LocalizerState, query: Query, action_m: float = 0.0, action_std_m: float | None = None
@@ -86,7 +84,7 @@ class ActiveLocalizer:
         """One observation.
 
         Args:
-            action_m: Metres moved since the last view; ignored for the first.
+            action_m: Metres moved since the last view; ignored for the first. Backward within its error is no move.
             action_std_m: How sure that is; None: as odometry usually is.
 
         Raises:
@@ -94,26 +92,27 @@ class ActiveLocalizer:
             InvalidInputError: The view lacks what the map's relevance compares.
         """
         laps = [self._clock()]
-        live, relevance, off_route = state.live, np.zeros(self._map.n_images, np.float32), state.off_route
+        map_, number = self._map, state.n_observations
+        std_m = motion_std_m(action_m) if action_std_m is None else action_std_m
+        moved_m = 0.0 if number == 0 or -SIGMAS * std_m <= action_m < 0 else action_m
+        alike = map_.alike_after(moved_m) if number > 0 else 0.0
+
+        live, relevance = state.live, np.zeros(map_.n_images, np.float32)
         if query.is_informative:
-            live = live.observing(query.ranks) if live else None
-            relevance = relevances(self._map, query, live)
+            live = live.observing(query, 1.0 - alike) if live else None
+            relevance = relevances(map_, query, live)
         laps.append(self._clock())
 
-        belief, number = state.belief, state.n_observations
-        if number > 0:
-            std_m = motion_std_m(action_m) if action_std_m is None else action_std_m
-            belief = belief.predicted(action_m, std_m, number)
-            if off_route is not None and self._off_route_model is not None:
-                agreement = agreement_of(belief.mass, relevance) if query.is_informative else None
-                off_route = self._off_route_model.after(off_route, agreement)
+        belief = state.belief.predicted(moved_m, std_m, number) if number > 0 else state.belief
         laps.append(self._clock())
 
         if query.is_informative:
-            belief = belief.updated(relevance, self._update, number)
+            shared = map_.shared_error_after(moved_m) if number > 0 else 0.0
+            seen = ViewEvidence.of(relevance, self._update, map_.log_likelihood_scale, shared)
+            belief = belief.updated(seen, number)
         laps.append(self._clock())
 
-        after = LocalizerState(belief, live, relevance, off_route, number + 1)
+        after = LocalizerState(belief, live, relevance, number + 1)
         plan = self.plan(after)
         laps.append(self._clock())
         return Step(after, plan, dict(zip(_STAGES, (1000 * np.diff(laps)).tolist(), strict=True)))
@@ -121,7 +120,14 @@ class ActiveLocalizer:
     def plan(self, state: LocalizerState) -> Plan | None:
         """The next best view from what is known now."""
         return self._planner(
-            PlanningView(self._map, state.belief.mass, state.relevance, self._config.seed, state.n_observations)
+            PlanningView(
+                self._map,
+                state.belief.mass,
+                state.relevance,
+                self._config.seed,
+                state.n_observations,
+                self._config.price_bits_per_m,
+            )
         )
 
     def with_prior(self, state: LocalizerState, position_m: float, std_m: float) -> LocalizerState:
@@ -133,39 +139,39 @@ class ActiveLocalizer:
         arrays: dict[str, NDArray[np.generic]] = {f"belief_{name}": a for name, a in state.belief.arrays().items()}
         arrays["n_observations"] = np.array([state.n_observations])
         if state.live is not None:
-            arrays["live"] = np.stack([state.live.mean, state.live.square])
-            arrays["live_weight"] = np.array([state.live.weight])
+            arrays |= {f"live_{name}": array for name, array in state.live.to_arrays().items()}
         if state.relevance is not None:
             arrays["relevance"] = state.relevance
-        if state.off_route is not None:
-            arrays["off_route"] = np.array([state.off_route])
         return arrays
 
     def from_arrays(self, arrays: dict[str, NDArray[np.generic]]) -> LocalizerState:
         """Restore what `to_arrays` gave; raises KeyError where an array is missing."""
-        prefix = "belief_"
-        held = {name.removeprefix(prefix): _floats(a) for name, a in arrays.items() if name.startswith(prefix)}
+        held = _of("belief_", arrays)
         belief: BeliefFilter
         if self._config.filter is FilterKind.GRID:
             belief = GridFilter.from_arrays(self._map.route, held)
         else:
             belief = ParticleFilter.from_arrays(self._map.route, held, self._config.seed)
-        live, of_map = None, self._map.landmark_statistics
-        if "live" in arrays and of_map is not None:
-            mean, square = _floats(arrays["live"])
-            live = replace(of_map, weight=_floats(arrays["live_weight"])[0].item(), mean=mean, square=square)
+        live = self._map.live_statistics
+        if live is not None:
+            live = live.from_arrays(_of("live_", arrays))
         relevance = np.asarray(arrays["relevance"], np.float32) if "relevance" in arrays else None
-        off_route = _floats(arrays["off_route"])[0].item() if "off_route" in arrays else None
-        return LocalizerState(belief, live, relevance, off_route, int(_floats(arrays["n_observations"])[0]))
+        return LocalizerState(belief, live, relevance, int(arrays["n_observations"][0]))
 
     def _prior(self, position_m: float | None, std_m: float) -> BeliefFilter:
-        route, config = self._map.route, self._config
+        route, config, rule = self._map.route, self._config, self._update
         if config.filter is FilterKind.GRID:
-            return GridFilter.uniform(route) if position_m is None else GridFilter.around(route, position_m, std_m)
+            if position_m is None:
+                return GridFilter.uniform(route, rule)
+            return GridFilter.around(route, position_m, std_m, rule)
         if position_m is None:
-            return ParticleFilter.uniform(route, config.n_particles, config.seed)
-        return ParticleFilter.around(route, position_m, std_m, config.n_particles, config.seed)
+            return ParticleFilter.uniform(route, config.n_particles, config.seed, rule)
+        return ParticleFilter.around(route, position_m, std_m, config.n_particles, config.seed, rule)
 
 
-def _floats(array: NDArray[np.generic]) -> NDArray[np.float64]:
-    return np.asarray(array, np.float64)
+def _of(prefix: str, arrays: dict[str, NDArray[np.generic]]) -> dict[str, NDArray[np.float64]]:
+    return {
+        name.removeprefix(prefix): np.asarray(array, np.float64)
+        for name, array in arrays.items()
+        if name.startswith(prefix)
+    }

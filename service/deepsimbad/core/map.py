@@ -12,23 +12,29 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from deepsimbad.core.descriptor import (
-    CALIBRATED_PRIOR_WEIGHT_FRAMES,
-    MAX_LANDMARKS,
-    PRIOR_WEIGHT_FRAMES,
-    LandmarkStatistics,
-)
+from deepsimbad.core.composed import Moments, lengths_of_sums
+from deepsimbad.core.descriptor import MAX_LANDMARKS, PRIOR_WEIGHT_FRAMES, LandmarkStatistics
 from deepsimbad.core.landmark_model import PortableLandmarks, landmark_model_digest, pack_landmarks
-from deepsimbad.core.relevance import DEFAULT_UPDATE, Relevance, UpdateRule
+from deepsimbad.core.live_statistics import LiveStatistics
+from deepsimbad.core.relevance import (
+    DEFAULT_LIKELIHOOD_SCALE,
+    DEFAULT_UPDATE,
+    OTHER_LIKELIHOOD_SCALE,
+    Relevance,
+    UpdateRule,
+)
 from deepsimbad.core.route import Route
 from deepsimbad.errors import InvalidMapConfigError, LandmarkModelDiffersError
 
 UNKNOWN_FRAME = 0  # no digest was kept of what an image was made of
+_USUAL_NOVELTY_M = 3.0  # over which views stop to err alike, where nobody measured it
+_SHARED_LEARNT, _SHARED_ELSE = 0.7, 0.5  # of the novelty curve, where two seasons taught it and where they did not
+_SAME_PLACE_M = 0.3
 
 # A relevance compares more than lists.
 _NEEDS: dict[str | None, tuple[str, ...]] = {
     Relevance.STANDARDISED: ("statistics",),
-    Relevance.CALIBRATED: ("statistics", "correlation", "listed_score"),
+    Relevance.COMPOSED: ("statistics", "usual_encoding", "usual_product"),
     Relevance.SIMBAD: ("values",),
     Relevance.BRUTE_FORCE: ("encodings",),
 }
@@ -62,13 +68,13 @@ class Map:
         position_m: Route position of every map image, not decreasing.
         values: The listed dissimilarities (`simbad` alone).
         encodings: Of every map image (`brute_force` alone).
-        statistics: Mean and std of every landmark's normal score (`standardised`: over the map's drive; `calibrated`:
-            over both seasons that the map knows). A live session starts from them.
+        statistics: Mean and std of every landmark's normal score over the map's drive. A live session starts from them.
         loadings: On common factors, how landmarks go together, where the drive tells.
-        correlation: How far each landmark can be trusted across seasons (`calibrated` alone).
-        listed_score: Mean score of a landmark where it is listed at a rank (`calibrated` alone).
-        telling_bits: By how many bits a view from a place narrows the map down, where a second season is known.
-        off_route_model: Slope and intercept of the log-odds of being off the route, likewise.
+        usual_encoding: Mean and std of every number of an encoding, over the seasons that the map knows (`composed`).
+        usual_product: Mean and std of every landmark's product with the drive's unit encodings (`composed`).
+        likelihood_scale: What a relevance counts as a log-likelihood, where two seasons taught it.
+        novelty: How much alike two views err that are 0, 1, 2.. m apart, 1 to 0.
+        view_bits: By how many bits a view from a place narrows the map down.
         timestamp_us: Microseconds since 1970, -1 where unknown.
         frame_digest: Which frame every image was made of (`Drive.digests`), 0 where nobody noted it.
         x_m, y_m: East and north, NaN where unknown.
@@ -92,10 +98,11 @@ class Map:
     encodings: NDArray[np.float32] | None = field(default=None, metadata=_row(np.float32, "n", "*"))
     statistics: NDArray[np.float64] | None = field(default=None, metadata=_row(np.float64, 2, "r"))
     loadings: NDArray[np.float32] | None = field(default=None, metadata=_row(np.float32, "r", "*"))
-    correlation: NDArray[np.float64] | None = field(default=None, metadata=_row(np.float64, "r"))
-    listed_score: NDArray[np.float64] | None = field(default=None, metadata=_row(np.float64, "h", "r"))
-    telling_bits: NDArray[np.float32] | None = field(default=None, metadata=_row(np.float32, "n"))
-    off_route_model: NDArray[np.float64] | None = field(default=None, metadata=_row(np.float64, 2))
+    usual_encoding: NDArray[np.float32] | None = field(default=None, metadata=_row(np.float32, 2, "*"))
+    usual_product: NDArray[np.float32] | None = field(default=None, metadata=_row(np.float32, 2, "r"))
+    likelihood_scale: NDArray[np.float64] | None = field(default=None, metadata=_row(np.float64, 1))
+    novelty: NDArray[np.float64] | None = field(default=None, metadata=_row(np.float64, "*"))
+    view_bits: NDArray[np.float32] | None = field(default=None, metadata=_row(np.float32, "n"))
     timestamp_us: NDArray[np.int64] | None = field(default=None, metadata=_row(np.int64, "n", unknown=-1))
     frame_digest: NDArray[np.uint64] | None = field(default=None, metadata=_row(np.uint64, "n", unknown=UNKNOWN_FRAME))
     x_m: NDArray[np.float64] | None = field(default=None, metadata=_row(np.float64, "n", unknown=np.nan))
@@ -261,19 +268,46 @@ class Map:
         return Route(self.position_m, self.closed, self.x_m, self.y_m)
 
     @cached_property
-    def landmark_statistics(self) -> LandmarkStatistics | None:
-        """What is usual for each landmark at the start of a session; None where the relevance asks for none."""
+    def live_statistics(self) -> LiveStatistics | None:
+        """What is usual at the start of a session; None where the relevance asks for none."""
         if self.statistics is None:
             return None
-        calibrated = self.relevance is Relevance.CALIBRATED
-        weight = CALIBRATED_PRIOR_WEIGHT_FRAMES if calibrated else PRIOR_WEIGHT_FRAMES
+        encoding, product = (
+            None if stored is None else Moments.from_mean_std(stored)
+            for stored in (self.usual_encoding, self.usual_product)
+        )
         mean, std = self.statistics
-        return LandmarkStatistics.from_mean_std(mean, std, weight, self.loadings)
+        ranks = LandmarkStatistics.from_mean_std(mean, std, PRIOR_WEIGHT_FRAMES, self.loadings)
+        return LiveStatistics(ranks, encoding, product)
 
     @cached_property
-    def bits_ahead(self) -> NDArray[np.float32] | None:
-        """[n, a] how telling the place is where every move leads; None where nobody knows."""
-        return None if self.telling_bits is None else self.route.ahead(self.telling_bits, self.actions_m)
+    def lengths(self) -> NDArray[np.float32]:
+        """[n] length of the weighted sum of every image's landmarks (`composed`)."""
+        return lengths_of_sums(self.lists, np.asarray(self.landmark_model["prototypes"], np.float32))
+
+    @cached_property
+    def information_tables(self) -> dict[float, NDArray[np.float32]]:
+        """What `planners.information_ahead` has worked out, by price."""
+        return {}
+
+    @property
+    def log_likelihood_scale(self) -> float:
+        """What a relevance, less its mean over the map, counts as a log-likelihood."""
+        if self.likelihood_scale is not None:
+            return float(self.likelihood_scale[0])
+        return DEFAULT_LIKELIHOOD_SCALE.get(self.relevance, OTHER_LIKELIHOOD_SCALE)
+
+    def alike_after(self, action_m: float) -> float:
+        """How much alike views err before and after a move, 1 to 0."""
+        if self.novelty is None:
+            return float(np.exp(-abs(action_m) / _USUAL_NOVELTY_M))
+        return float(np.interp(abs(action_m), np.arange(self.novelty.size), self.novelty))
+
+    def shared_error_after(self, action_m: float) -> float:
+        """How much of a view's error is that of the view before: of one from the same place nearly all of it."""
+        learnt = _SHARED_LEARNT if self.likelihood_scale is not None else _SHARED_ELSE
+        shared = learnt * self.alike_after(action_m)
+        return float(shared + (1 - shared) * np.exp(-abs(action_m) / _SAME_PLACE_M))
 
     @cached_property
     def landmark_model_digest(self) -> str:

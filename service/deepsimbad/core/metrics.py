@@ -62,9 +62,16 @@ class RetrievalScorer:
         )
 
 
-def mean_interval(values: NDArray[np.float64], seed: int) -> tuple[float, float]:
-    """95 % bootstrap interval of the mean of [n] values."""
+def mean_interval(
+    values: NDArray[np.float64], seed: int, block: NDArray[np.int64] | None = None
+) -> tuple[float, float]:
+    """95 % bootstrap interval of the mean of [n] values; of neighbours that are alike by their blocks [n]."""
     rng = np.random.default_rng([seed, values.size])
-    means = [values[rng.integers(0, values.size, values.size)].mean() for _ in range(_RESAMPLES)]
+    if block is None:
+        block = np.arange(values.size)
+    _, block = np.unique(block, return_inverse=True)
+    sums, counts = np.bincount(block, values), np.bincount(block)
+    drawn = rng.integers(0, sums.size, (_RESAMPLES, sums.size))
+    means = sums[drawn].sum(axis=1) / counts[drawn].sum(axis=1)
     low, high = np.percentile(means, _LEVELS)
     return float(low), float(high)

@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from deepsimbad.core.belief import GridFilter, motion_std_m
+from deepsimbad.core.belief import GridFilter, ViewEvidence, motion_std_m
 from deepsimbad.core.map import Map
 from deepsimbad.core.metrics import rank_of_truth
 from deepsimbad.core.relevance import Query, UpdateRule
@@ -153,7 +153,7 @@ def transitions_of(map_: Map, walk: KnownWalk, config: NnqlConfig) -> Transition
     moves, route = map_.actions_m, map_.route
     reach_m = np.diff(moves).min() / 2 if moves.size > 1 else moves[0] / 2
     rule = config.update or map_.update_rule
-    belief, live = GridFilter.uniform(route), map_.landmark_statistics
+    belief, live = GridFilter.uniform(route, rule), map_.live_statistics
     nearest: list[NDArray[np.int64]] = []
     rewarded: list[tuple[int, int, float]] = []  # view, action, reward
     for t, query in enumerate(walk.queries):
@@ -163,10 +163,11 @@ def transitions_of(map_: Map, walk: KnownWalk, config: NnqlConfig) -> Transition
             try:
                 belief = belief.predicted(action_m, std_m, t)
             except PastTheEndError:
-                belief = GridFilter.uniform(route)
-        live = None if live is None else live.observing(query.ranks)
+                belief = GridFilter.uniform(route, rule)
+        live = None if live is None else live.observing(query)
         relevance = relevances(map_, query, live)
-        belief = belief.updated(relevance, rule, t)
+        shared = map_.shared_error_after(float(walk.action_m[t])) if t > 0 else 0.0
+        belief = belief.updated(ViewEvidence.of(relevance, rule, map_.log_likelihood_scale, shared), t)
         nearest.append(shortlist(relevance, config.n_neighbours))
         if t == 0 or np.isnan(walk.true_position_m[t]):
             continue

@@ -1,4 +1,4 @@
-"""Which move would tell the robot most (II-D, and ours): what places are telling, and the planners."""
+"""Which move would tell the robot most (II-D, and ours)."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -9,21 +9,15 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from deepsimbad.core.descriptor import rank_landmarks
-from deepsimbad.core.drive import SecondSeason
 from deepsimbad.core.map import Map
-from deepsimbad.core.metrics import rank_of_truth
-from deepsimbad.core.relevance import Query
-from deepsimbad.core.retrieval import relevances, shortlist
+from deepsimbad.core.retrieval import shortlist
 from deepsimbad.core.route import Route
 from deepsimbad.errors import InvalidInputError
 
-NNQL, TELLING, RANDOM, CONSTANT = "nnql", "telling", "random", "constant"
-DEFAULT_PLANNER = TELLING
+NNQL, INFORMED, RANDOM, CONSTANT = "nnql", "informed", "random", "constant"
+DEFAULT_PLANNER = INFORMED
 NNQL_NEIGHBOURS = 4  # k of the paper
-_SMOOTHED_OVER_M = 1.0  # one view is a noisy measurement of its place; neighbours show much the same
-_MAX_VIEWS = 20_000  # more would only take longer
-_BITS_PER_METRE = 0.12  # what a longer move is worth for being less like the view before
+_DISCOUNT, _SWEEPS = 0.9, 60
 
 
 @dataclass(frozen=True)
@@ -35,6 +29,7 @@ class PlanningView:
     relevance: NDArray[np.float32] | None
     seed: int
     step: int
+    price_bits_per_m: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -69,25 +64,74 @@ def plan_by_experience(view: PlanningView) -> Plan | None:
     return Plan(NNQL, float(view.map.actions_m[np.argmax(values)]), values)
 
 
-def plan_for_telling_places(view: PlanningView) -> Plan:
-    """Ours: looks ahead over the map, under the whole belief; where nobody knows what is telling, the longest move.
+def plan_by_information(view: PlanningView) -> Plan:
+    """Ours: acts on bits that views ahead are worth, under the whole belief; ties go to the longer move.
 
-    The value of a move is the number of bits that views from where it leads are known to be worth, averaged over the
-    belief, less the less doubt there is left for them to remove, and a little for every metre. While the belief is
-    flat that average is much the same everywhere, so the robot moves on as far as it can; once it has a few places in
-    mind it seeks the telling ones before them; once it is sure it moves on, to views that are unlike the last.
+    Where nobody knows what views are worth it is the longest move.
     """
-    actions_m, bits_ahead = view.map.actions_m, view.map.bits_ahead
-    if bits_ahead is None:
-        return Plan(TELLING, float(actions_m[-1]))
-    doubt = 0.0  # what is left of the greatest there can be, 0..1: entropy (of order 2) over that of no knowledge
-    if view.mass.size > 1:
-        doubt = float(-np.log2(np.square(view.mass).sum()) / np.log2(view.mass.size))
-    values = _BITS_PER_METRE * actions_m + np.sqrt(doubt) * _averaged(view.mass, bits_ahead)
-    return Plan(TELLING, float(actions_m[np.argmax(values)]), values)
+    actions_m = view.map.actions_m
+    values = information_ahead(view.map, view.price_bits_per_m)
+    if values is None:
+        return Plan(INFORMED, float(actions_m[-1]))
+    averaged = _averaged(view.mass, values)
+    best = averaged.size - 1 - int(np.argmax(averaged[::-1]))
+    return Plan(INFORMED, float(actions_m[best]), averaged)
 
 
-_PLANNERS: dict[str, Planner] = {TELLING: plan_for_telling_places, NNQL: plan_by_experience, RANDOM: plan_at_random}
+def information_ahead(map_: Map, price_bits_per_m: float) -> NDArray[np.float32] | None:
+    """[n, a] discounted bits of a move from every image and the best moves after it; None where nobody knows.
+
+    A view is worth what its place is, but for what it shares with the view before: `(1 - c(a)) I(x + a)`, less the
+    price of the metres. Worked out once a price and map.
+    """
+    if map_.view_bits is None:
+        return None
+    tables = map_.information_tables
+    if price_bits_per_m not in tables:
+        actions_m = map_.actions_m
+        news = np.array([1.0 - map_.alike_after(action_m) for action_m in actions_m.tolist()])
+        tables[price_bits_per_m] = _swept(
+            _leads_to(map_.route, actions_m),
+            map_.view_bits.astype(np.float64),
+            news,
+            price_bits_per_m * np.abs(actions_m),
+        )
+    return tables[price_bits_per_m]
+
+
+def _leads_to(route: Route, actions_m: NDArray[np.float64]) -> NDArray[np.int64]:
+    """[n, a] the image where every move leads; -1 past an end of an open route."""
+    target_m = route.wrapped(route.position_m[:, np.newaxis] + actions_m)
+    image = route.nearest_image(target_m)
+    if route.closed:
+        return np.asarray(image, np.int64)
+    outside = (target_m > route.position_m[-1] + 1e-9) | (target_m < route.start_m - 1e-9)
+    return np.where(outside, -1, image)
+
+
+@njit(cache=True, nogil=True)
+def _swept(
+    leads_to: NDArray[np.int64], bits: NDArray[np.float64], news: NDArray[np.float64], price: NDArray[np.float64]
+) -> NDArray[np.float32]:
+    """Value iteration; past an end of the route everything is as on average."""
+    n, n_actions = leads_to.shape
+    values = np.zeros((n, n_actions), np.float32)
+    best = np.zeros(n)
+    usual_bits = bits.mean()
+    for _ in range(_SWEEPS):
+        usual = best.mean()
+        for i in range(n):
+            for a in range(n_actions):
+                image = leads_to[i, a]
+                there = usual_bits if image < 0 else bits[image]
+                then = usual if image < 0 else best[image]
+                values[i, a] = news[a] * there - price[a] + _DISCOUNT * then
+        for i in range(n):
+            best[i] = values[i].max()
+    return values
+
+
+_PLANNERS: dict[str, Planner] = {INFORMED: plan_by_information, NNQL: plan_by_experience, RANDOM: plan_at_random}
 
 
 @njit(cache=True, nogil=True)
@@ -110,7 +154,7 @@ def _mean_rows(table: NDArray[np.float32], rows: NDArray[np.int64]) -> NDArray[n
 
 
 def parse_planner(text: str, actions_m: Sequence[float]) -> Planner:
-    """A planner by name: `telling`, `nnql`, `random` or `constant:<m>`.
+    """A planner by name: `informed`, `nnql`, `random` or `constant:<m>`.
 
     Raises:
         InvalidInputError: No such planner, or a constant move the domain does not have.
@@ -119,37 +163,3 @@ def parse_planner(text: str, actions_m: Sequence[float]) -> Planner:
     if text not in planners:
         raise InvalidInputError(f"{text!r} is no planner of this domain", allowed=list(planners))
     return planners[text]
-
-
-def telling_bits(map_: Map, second: SecondSeason) -> NDArray[np.float32]:
-    """[n] by how many bits a view from every map image's place narrows the map down: how telling it is (ours).
-
-    The landmark traverse stands for a live drive of another season. Where it saw a place of the map, the rank of that
-    place in its retrieval says how telling the place is.
-
-    Args:
-        map_: Its lists must not know the second season.
-        second: Its `places` hold at least one pair.
-    """
-    step = -(-len(second.places) // _MAX_VIEWS)
-    places = second.places[::step]
-    bits = np.empty(len(places))
-    for row, (image, frame) in enumerate(places):
-        relevance = relevances(map_, Query(rank_landmarks(second.dissimilarities[frame])))
-        bits[row] = np.log2(relevance.size / (1 + rank_of_truth(relevance, np.array([image]))))
-    return _smooth(map_.route, map_.position_m[places[:, 0]], bits).astype(np.float32)
-
-
-def _smooth(route: Route, at_m: NDArray[np.float64], bits: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[n] local mean of measurements along the route; far from all of them their overall mean."""
-    order = np.argsort(at_m, kind="stable")
-    at_m, bits = at_m[order], bits[order]
-    reach = 3 * _SMOOTHED_OVER_M
-    first = np.searchsorted(at_m, route.position_m - reach)
-    stop = np.searchsorted(at_m, route.position_m + reach, side="right")
-    smoothed = np.full(route.n_images, bits.mean())
-    for image, (low, high) in enumerate(zip(first, stop, strict=True)):
-        if high > low:
-            near = np.exp(-0.5 * np.square((at_m[low:high] - route.position_m[image]) / _SMOOTHED_OVER_M))
-            smoothed[image] = (near * bits[low:high]).sum() / near.sum()
-    return smoothed

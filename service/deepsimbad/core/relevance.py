@@ -6,7 +6,6 @@ A relevance says how well a map image answers a view; larger is better. Four are
 
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,15 +14,16 @@ from numpy.typing import NDArray
 class Relevance(StrEnum):
     """The named relevances. A map is built for one of them."""
 
+    COMPOSED = "composed"
     STANDARDISED = "standardised"
-    CALIBRATED = "calibrated"
     RRF = "rrf"
     BAG_OF_LANDMARKS = "bag_of_landmarks"
     SIMBAD = "simbad"
     BRUTE_FORCE = "brute_force"
 
 
-DEFAULT_RELEVANCE = Relevance.CALIBRATED
+DEFAULT_RELEVANCE = Relevance.COMPOSED
+_FARTHEST = np.float32(4.001)  # squared distance of opposite unit vectors, and its rounding
 
 
 @dataclass(frozen=True)
@@ -39,6 +39,13 @@ class Query:
     def uninformative(cls, n_landmarks: int) -> "Query":
         """A view that shows nothing, a wall of grey: all landmarks share the mean rank."""
         return cls(np.full(n_landmarks, (n_landmarks + 1) / 2, np.float32))
+
+    @property
+    def products(self) -> NDArray[np.float32] | None:
+        """Products of unit vectors, from their squared distances; None where the dissimilarities are none such."""
+        if self.dissimilarities is None or self.dissimilarities.min() < 0 or self.dissimilarities.max() > _FARTHEST:
+            return None
+        return np.asarray(1 - self.dissimilarities / 2, np.float32)
 
     @property
     def is_informative(self) -> bool:
@@ -60,57 +67,22 @@ class UpdateRule(StrEnum):
     ADDITIVE_RELEVANCE = "additive_relevance"
     ADDITIVE_RECIPROCAL_RANK = "additive_reciprocal_rank"
     LOG_LIKELIHOOD = "log_likelihood"
+    MIXTURE = "mixture"
 
 
 DEFAULT_UPDATE = {
-    Relevance.STANDARDISED: UpdateRule.LOG_LIKELIHOOD,
-    Relevance.CALIBRATED: UpdateRule.LOG_LIKELIHOOD,
+    Relevance.COMPOSED: UpdateRule.MIXTURE,
+    Relevance.STANDARDISED: UpdateRule.MIXTURE,
     Relevance.RRF: UpdateRule.ADDITIVE_RELEVANCE,
     Relevance.BAG_OF_LANDMARKS: UpdateRule.ADDITIVE_RELEVANCE,
     Relevance.SIMBAD: UpdateRule.ADDITIVE_RECIPROCAL_RANK,
     Relevance.BRUTE_FORCE: UpdateRule.ADDITIVE_RECIPROCAL_RANK,
 }
 
-# The h landmarks of a list are not independent witnesses: their summed log-likelihoods count by this share. Chosen on
-# the development recordings; a belief that doubts too little keeps wrong modes.
-LOG_LIKELIHOOD_WEIGHT = 0.3
-
-_Float = TypeVar("_Float", np.float32, np.float64)
-
-
-def evidence(relevance: NDArray[_Float], rule: UpdateRule) -> NDArray[_Float]:
-    """What views of some relevance [..., n] add to weights, or multiply them by, [..., n], in the precision given.
-
-    Additive rules give what is added to weights whose mean is 1; `log_likelihood` gives factors, the greatest of which
-    is 1.
-    """
-    if rule is UpdateRule.LOG_LIKELIHOOD:
-        factors: NDArray[_Float] = relevance - relevance.max(axis=-1, keepdims=True)
-        factors *= relevance.dtype.type(LOG_LIKELIHOOD_WEIGHT)
-        np.exp(factors, out=factors)
-        return factors
-    if rule is UpdateRule.ADDITIVE_RELEVANCE:
-        return np.maximum(relevance, 0)
-    if relevance.ndim > 1:
-        return np.stack([evidence(row, rule) for row in relevance])
-    return (1.0 / mean_ranks(relevance)).astype(relevance.dtype)
-
-
-def weigh(weights: NDArray[np.float64], seen: NDArray[np.float64], rule: UpdateRule) -> NDArray[np.float64]:
-    """Weights after the evidence, summing to 1.
-
-    The paper adds `v[u_k]` to the weights of its particles (II-C). Weights are taken with mean 1 for that, so that
-    the belief that knows nothing gives every hypothesis weight 1, however many there are.
-
-    Args:
-        weights: [m], summing to 1.
-        seen: [m], the evidence there.
-    """
-    weighed = weights * seen if rule is UpdateRule.LOG_LIKELIHOOD else weights * weights.size + seen
-    total = weighed.sum()
-    if not np.isfinite(total) or total <= 0:  # every place this view allows was already excluded: keep what was known
-        return weights
-    return np.asarray(weighed / total, np.float64)
+# What a relevance counts as a log-likelihood, where nobody learnt it. The h landmarks of a list are not independent
+# witnesses, so summed scores count by less than 1.
+DEFAULT_LIKELIHOOD_SCALE = {Relevance.COMPOSED: 12.0}
+OTHER_LIKELIHOOD_SCALE = 0.3
 
 
 def mean_ranks(relevance: NDArray[np.floating]) -> NDArray[np.float64]:

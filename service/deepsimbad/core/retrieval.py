@@ -8,7 +8,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from deepsimbad.core.descriptor import LandmarkStatistics
+from deepsimbad.core.composed import list_weights, unit_encodings
+from deepsimbad.core.live_statistics import LiveStatistics
 from deepsimbad.core.map import Map
 from deepsimbad.core.relevance import Query, Relevance
 from deepsimbad.errors import InvalidInputError, InvalidMapConfigError
@@ -19,47 +20,76 @@ _SCAN_UP_TO = 64  # a longer shortlist is sorted whole
 _SCAN_BLOCK = 256  # values that are looked at in one vectorised sweep
 
 
-def relevances(map_: Map, query: Query, live: LandmarkStatistics | None = None) -> NDArray[np.float32]:
+def relevances(map_: Map, query: Query, live: LiveStatistics | None = None) -> NDArray[np.float32]:
     """[n] relevance of every map image, larger is better; of a batch of views [e, n].
 
     Args:
-        live: A session's own statistics, in place of the map's; of a batch [e, r].
+        live: A session's own statistics, in place of the map's; of a batch ranks alone, [e, r].
 
     Raises:
         InvalidInputError: The query lacks what the map's relevance compares.
     """
-    return _RULES[map_.relevance](map_, query, live or map_.landmark_statistics)
+    return _RULES[map_.relevance](map_, query, live)
 
 
-def _standardised(map_: Map, query: Query, live: LandmarkStatistics | None) -> NDArray[np.float32]:
+def _standardised(map_: Map, query: Query, live: LiveStatistics | None) -> NDArray[np.float32]:
     """Sum of -z over the list: a landmark counts by how unusually near it is."""
-    if live is None:
+    usual = live or map_.live_statistics
+    if usual is None:
         raise InvalidMapConfigError("the map has no landmark statistics")
-    return _sum_listed_alike(map_, -live.view(query.ranks).z)
+    return _sum_listed_alike(map_, -usual.ranks.view(query.ranks).z)
 
 
-def _calibrated(map_: Map, query: Query, live: LandmarkStatistics | None) -> NDArray[np.float32]:
-    """Sum over the list of log-likelihood ratios: seen from here, against seen from anywhere (`core.calibration`)."""
-    if live is None or map_.correlation is None or map_.listed_score is None:
-        raise InvalidMapConfigError("the map has no calibration")
-    # What a landmark that is listed at a rank will score in another season, rho * z_m, [h, r].
-    seen, expected = live.view(query.ranks), map_.correlation * map_.listed_score
-    certainty = seen.certainty[..., np.newaxis, :]
-    return sum_listed(map_, expected * seen.z[..., np.newaxis, :] - certainty * np.square(expected) / 2)
+def _composed(map_: Map, query: Query, live: LiveStatistics | None) -> NDArray[np.float32]:
+    """Cosine of a view with the weighted sum of every image's landmarks."""
+    products = products_with_landmarks(map_, query, live)
+    tables = list_weights(map_.list_length)[:, np.newaxis] * products[..., np.newaxis, :]
+    sums = sum_listed(map_, tables)
+    sums /= map_.lengths
+    return sums
 
 
-def _rrf(map_: Map, query: Query, _: LandmarkStatistics | None) -> NDArray[np.float32]:
+def products_with_landmarks(map_: Map, query: Query, live: LiveStatistics | None = None) -> NDArray[np.float32]:
+    """[..., r] products of a view's unit encoding with the landmarks: from its encoding, else as near as can be told.
+
+    What was measured on board was standardised by the map's statistics: a session moves and scales every landmark's
+    product by what is usual for it live. Of ranks alone the normal scores stand for products.
+
+    Args:
+        live: A session's own statistics; None: the map's.
+    """
+    of_map = map_.live_statistics
+    if of_map is None or of_map.encodings is None or of_map.products is None:
+        raise InvalidMapConfigError("the map does not know what is usual for encodings")
+    usual = live or of_map
+    if query.encoding is not None:
+        if query.encoding.shape[-1] != of_map.encodings.mean.size:
+            d = of_map.encodings.mean.size
+            raise InvalidInputError(f"an encoding of {query.encoding.shape[-1]} numbers; the map's have {d}")
+        model = map_.landmark_model
+        u = unit_encodings(query.encoding, usual.encodings or of_map.encodings, model.get("projection"))
+        return np.asarray(u @ model["prototypes"].T, np.float32)
+    products = query.products
+    if products is None:
+        return np.asarray(of_map.products.mean - of_map.products.std * usual.ranks.view(query.ranks).z, np.float32)
+    if live is None or live.products is None:
+        return products
+    z = (products - live.products.mean) / live.products.std
+    return np.asarray(of_map.products.mean + of_map.products.std * z, np.float32)
+
+
+def _rrf(map_: Map, query: Query, _: LiveStatistics | None) -> NDArray[np.float32]:
     """Inner product of reciprocal rank features; the query keeps all r ranks, the map image h."""
     reciprocal = 1.0 / np.arange(1, map_.list_length + 1)
     return sum_listed(map_, reciprocal[:, np.newaxis] * (1.0 / query.ranks.astype(np.float64))[..., np.newaxis, :])
 
 
-def _bag_of_landmarks(map_: Map, query: Query, _: LandmarkStatistics | None) -> NDArray[np.float32]:
+def _bag_of_landmarks(map_: Map, query: Query, _: LiveStatistics | None) -> NDArray[np.float32]:
     """How many landmarks the two lists of h share."""
     return _sum_listed_alike(map_, query.ranks <= map_.list_length)
 
 
-def _simbad(map_: Map, query: Query, _: LandmarkStatistics | None) -> NDArray[np.float32]:
+def _simbad(map_: Map, query: Query, _: LiveStatistics | None) -> NDArray[np.float32]:
     """-L2 between h-hot dissimilarity vectors, `|q - m|^2 = |q|^2 + sum over the list of (q_i - m_i)^2 - q_i^2`."""
     if query.dissimilarities is None or map_.values is None:
         raise InvalidInputError("a simbad map compares dissimilarities; ranks alone cannot answer it")
@@ -71,7 +101,7 @@ def _simbad(map_: Map, query: Query, _: LandmarkStatistics | None) -> NDArray[np
     return np.asarray(-np.sqrt(np.maximum(squared, 0.0)), np.float32)
 
 
-def _brute_force(map_: Map, query: Query, _: LandmarkStatistics | None) -> NDArray[np.float32]:
+def _brute_force(map_: Map, query: Query, _: LiveStatistics | None) -> NDArray[np.float32]:
     """-L2 between encodings, by one matrix product."""
     encodings = map_.encodings
     if query.encoding is None or encodings is None:
@@ -86,9 +116,9 @@ def _brute_force(map_: Map, query: Query, _: LandmarkStatistics | None) -> NDArr
     return np.asarray(distances if query.encoding.ndim > 1 else distances[0], np.float32)
 
 
-_RULES: dict[Relevance, Callable[[Map, Query, LandmarkStatistics | None], NDArray[np.float32]]] = {
+_RULES: dict[Relevance, Callable[[Map, Query, LiveStatistics | None], NDArray[np.float32]]] = {
     Relevance.STANDARDISED: _standardised,
-    Relevance.CALIBRATED: _calibrated,
+    Relevance.COMPOSED: _composed,
     Relevance.RRF: _rrf,
     Relevance.BAG_OF_LANDMARKS: _bag_of_landmarks,
     Relevance.SIMBAD: _simbad,

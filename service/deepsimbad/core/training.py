@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from deepsimbad.core.belief import motion_std_m
 from deepsimbad.core.belief_lattice import Lattice, Moves, moves_along, step_beliefs, uniform_beliefs
-from deepsimbad.core.descriptor import LandmarkStatistics
+from deepsimbad.core.live_statistics import LiveStatistics
 from deepsimbad.core.map import Map
 from deepsimbad.core.nnql import NnqlConfig, Transitions, initial_q_values, learn, q_of_nearest
-from deepsimbad.core.relevance import Query, UpdateRule, evidence
+from deepsimbad.core.relevance import Query, Relevance, UpdateRule, mean_ranks
 from deepsimbad.core.retrieval import relevances, shortlist
 from deepsimbad.core.route import Route
 
@@ -46,6 +46,8 @@ class TrainingWorld:
         actions_m = map_.actions_m
         lattice = Lattice.along(map_.route, float(actions_m.min()))
         stds_m = [motion_std_m(m) if config.motion_std_m is None else config.motion_std_m for m in actions_m.tolist()]
+        if map_.relevance is Relevance.COMPOSED:  # as compared with its own drive, measured once for all episodes
+            views = replace(views, encoding=None)
         return cls(
             map_,
             views,
@@ -68,17 +70,28 @@ class TrainingWorld:
         """a."""
         return int(self.next_frame.shape[1])
 
-    def observing(self, live: LandmarkStatistics | None, frames: NDArray[np.int64]) -> LandmarkStatistics | None:
-        """The episodes' own statistics after one more frame each, [e, r]; None where the relevance has none."""
-        start = live or self.map.landmark_statistics
-        return None if start is None else start.observing(self.views.ranks[frames])
+    def observing(self, live: LiveStatistics | None, frames: NDArray[np.int64]) -> LiveStatistics | None:
+        """The episodes' own statistics after one more frame each, [e, r]; None where a view is compared by itself."""
+        start = live or self.map.live_statistics
+        if start is None or start.encodings is not None:
+            return None
+        return replace(start, ranks=start.ranks.observing(self.views.ranks[frames]))
 
     def look(
-        self, frames: NDArray[np.int64], live: LandmarkStatistics | None
+        self, frames: NDArray[np.int64], live: LiveStatistics | None
     ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
         """Evidence [e, n] and the nearest map images [e, k], best first, of some frames [e] and statistics [e, r]."""
         relevance = relevances(self.map, self.views.at(frames), live)
-        return evidence(relevance, self.rule), shortlist(relevance, self.n_neighbours)
+        return _evidence(relevance, self.rule, self.map.log_likelihood_scale), shortlist(relevance, self.n_neighbours)
+
+
+def _evidence(relevance: NDArray[np.float32], rule: UpdateRule, scale: float) -> NDArray[np.float32]:
+    """What views of some relevance [e, n] add to weights of mean 1, or multiply them by."""
+    if rule is UpdateRule.ADDITIVE_RELEVANCE:
+        return np.maximum(relevance, 0)
+    if rule is UpdateRule.ADDITIVE_RECIPROCAL_RANK:
+        return np.stack([1.0 / mean_ranks(row) for row in relevance]).astype(np.float32)
+    return np.asarray(np.exp(np.float32(scale) * (relevance - relevance.max(axis=1, keepdims=True))), np.float32)
 
 
 def _next_frames(route: Route, actions_m: NDArray[np.float64]) -> NDArray[np.int64]:
@@ -139,7 +152,7 @@ class Walk:
         world, moved, frames = self.world, action[some], self.frames[some]
         live = self._live
         if live is not None:
-            live = replace(live, mean=live.mean[some], square=live.square[some])
+            live = replace(live, ranks=replace(live.ranks, mean=live.ranks.mean[some], square=live.ranks.square[some]))
         seen, self.nearest[some] = world.look(frames, live)
         moves = Moves(
             np.where(moved >= 0, world.moves.shift[moved], -1), world.moves.fraction[moved], world.moves.taps[moved]
@@ -150,7 +163,7 @@ class Walk:
             moves,
             seen,
             world.true_image[frames],
-            additive=world.rule is not UpdateRule.LOG_LIKELIHOOD,
+            additive=world.rule in {UpdateRule.ADDITIVE_RELEVANCE, UpdateRule.ADDITIVE_RECIPROCAL_RANK},
         )
 
 

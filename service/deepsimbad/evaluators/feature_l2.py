@@ -7,6 +7,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from deepsimbad.core.composed import Moments, described, is_composed
 from deepsimbad.errors import InvalidEncodingError, InvalidImageError, UnsupportedMediaTypeError
 from deepsimbad.evaluators.base import Image, LandmarkModel, named_lack_of_memory
 from deepsimbad.evaluators.compute import Compute
@@ -99,16 +100,25 @@ class FeatureL2:
         return {"prototypes": prototypes}
 
     def check_model(self, model: LandmarkModel, n_landmarks: int) -> None:
-        """See `Evaluator.check_model`."""
+        """See `Evaluator.check_model`; a composed model's prototypes are unit vectors, with what makes encodings such."""
         prototypes = model.get("prototypes")
         if prototypes is None or prototypes.ndim != 2 or len(prototypes) != n_landmarks:
             has = "none" if prototypes is None else list(prototypes.shape)
             raise InvalidEncodingError(f"{n_landmarks} landmarks have prototypes [{n_landmarks}, d], not {has}")
         self.fit_landmarks(np.asarray(prototypes, np.float32))
+        if is_composed(model):
+            usual, projection = model["usual"], model.get("projection")
+            (k,), d = prototypes.shape[1:], usual.shape[-1]
+            if usual.shape != (2, d) or (projection.shape if projection is not None else (k, k)) != (d, k):
+                raise InvalidEncodingError(f"landmarks [{n_landmarks}, {k}] with usual {usual.shape} fit no projection")
+            if not all(np.isfinite(array).all() for array in (usual, projection) if array is not None):
+                raise InvalidEncodingError("a landmark model holds NaN or infinity")
 
     def dissimilarities(self, encodings: NDArray[np.float32], model: LandmarkModel) -> NDArray[np.float32]:
-        """See `Evaluator.dissimilarities`: [n, r] squared L2."""
+        """See `Evaluator.dissimilarities`: [n, r] squared L2, of a composed model between unit vectors."""
         prototypes = np.ascontiguousarray(model["prototypes"], np.float32)
+        if is_composed(model):
+            return _between_units(encodings, model, prototypes)
         if encodings.ndim != 2 or encodings.shape[1] != prototypes.shape[1]:
             raise InvalidEncodingError(
                 f"an encoding of {encodings.shape[-1]} numbers cannot be compared with landmarks of "
@@ -119,6 +129,23 @@ class FeatureL2:
         if not np.isfinite(answer).all():
             raise InvalidEncodingError("an encoding holds NaN, infinity or numbers too large to compare")
         return answer
+
+
+def _between_units(
+    encodings: NDArray[np.float32], model: LandmarkModel, prototypes: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    usual = np.asarray(model["usual"], np.float32)
+    if encodings.ndim != 2 or encodings.shape[1] != usual.shape[1]:
+        raise InvalidEncodingError(
+            f"an encoding of {encodings.shape[-1]} numbers cannot be compared with landmarks of {usual.shape[1]}: they "
+            "come from another encoder",
+            encoding_dim=usual.shape[1],
+        )
+    if not np.isfinite(encodings).all():
+        raise InvalidEncodingError("an encoding holds NaN or infinity")
+    projection = np.asarray(model["projection"], np.float32) if "projection" in model else None
+    u = described(encodings, Moments.from_mean_std(usual), projection)
+    return np.asarray(np.clip(2 - 2 * (u @ prototypes.T), 0, 4), np.float32)
 
 
 @njit(cache=True, nogil=True)

@@ -5,20 +5,19 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from statistics import median
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from deepsimbad.core.building import build_map
+from deepsimbad.core.building import Built, MapPlan, build_from_dissimilarities, compose_map
 from deepsimbad.core.descriptor import rank_landmarks
-from deepsimbad.core.drive import UNKNOWN_TIMESTAMP, Drive, SameRoute, second_season
+from deepsimbad.core.drive import UNKNOWN_TIMESTAMP, Drive
 from deepsimbad.core.landmark_model import select_landmarks
 from deepsimbad.core.map import Map
 from deepsimbad.core.nnql import NnqlConfig, initial_q_values
-from deepsimbad.core.off_route import OffRouteModel
-from deepsimbad.core.planners import telling_bits
 from deepsimbad.core.relevance import Query, Relevance
 from deepsimbad.core.route import same_places
 from deepsimbad.core.training import LearningCurve, TrainingWorld, train
@@ -115,7 +114,7 @@ def choose_landmarks(
 
 
 def measured(
-    drive: Drive, evaluator: Evaluator, model: LandmarkModel, on_progress: Callable[[float], None] = lambda _: None
+    drive: Drive, model: LandmarkModel, evaluator: Evaluator, on_progress: Callable[[float], None] = lambda _: None
 ) -> Drive:
     """The drive with its frames' dissimilarities to the landmarks, measured block by block."""
     blocks = []
@@ -132,63 +131,40 @@ def views_of(drive: Drive) -> Query:
     return Query(rank_landmarks(drive.dissimilarities), drive.dissimilarities, drive.encodings)
 
 
-@dataclass(frozen=True)
-class Built:
-    """A described traverse."""
-
-    map: Map  # as it will serve, but for its experience database
-    rehearsal: Map  # the map made without the second season's lists, for learning from that season as from one to come
-    # The second drive, measured, where it is of the same route; None: nothing can be learnt from it
-    second: Drive | None = None
-    same_route: SameRoute | None = None  # whether it is, and why not; None where there is no second drive
-
-
 def build(
+    plan: MapPlan,
     training: Drive,
     second: Drive | None,
-    same_route: bool | None,
+    landmarks: Drive | LandmarkModel | None,
+    n_landmarks: int,
     evaluator: Evaluator,
-    model: LandmarkModel,
-    relevance: Relevance,
-    list_length: int,
-    actions_m: tuple[float, ...],
-    closed: bool,
-    on_progress: Callable[[float], None],
+    on_progress: Callable[[float], None] = lambda _: None,
 ) -> Built:
-    """Describe every training frame by its landmarks, and learn from a second season where there is one.
+    """Choose landmarks, describe every training frame by them, and learn from a second season where there is one.
 
     Args:
-        same_route: Whether its positions are said to be comparable; None: where both drives know x, y.
-        relevance: What the map is built for; only `calibrated` learns from a second season.
+        landmarks: The drive they are chosen from, the model that they stay in, or None: the training drive's own.
+        n_landmarks: r, where they are chosen.
     """
-    own = measured(training, evaluator, model, lambda share: on_progress(share if second is None else share / 2))
-    season = verdict = other = None
-    if second is not None:
-
-        def measure(drive: Drive) -> Drive:
-            return measured(drive, evaluator, model, lambda share: on_progress(0.5 + share / 4))
-
-        season, other, verdict = second_season(own, closed, second, same_route, measure)
-    parts: dict[str, Any] = {"landmark_model": model, "actions_m": np.array(sorted(actions_m))}
-    map_ = replace(build_map(relevance, own, list_length, closed, season), **parts)
-    if season is None or relevance is not Relevance.CALIBRATED:
-        on_progress(1.0)
-        return Built(map_, map_, other, verdict)
-    # Judged by lists that do not know the second season, as no list knows the season to come; with the trust in
-    # landmarks that two seasons taught.
-    unaware = replace(build_map(relevance, own, list_length, closed), **parts)
-    rehearsal = replace(unaware, correlation=map_.correlation)
-    bits = telling_bits(rehearsal, season)
-    on_progress(0.9)
-    off_route = OffRouteModel.learn(rehearsal, season)
-    on_progress(1.0)
-    model_array = None if off_route is None else np.array([off_route.slope, off_route.intercept])
-    return Built(replace(map_, telling_bits=bits, off_route_model=model_array), rehearsal, other, verdict)
+    if plan.relevance is Relevance.COMPOSED:
+        return compose_map(plan, training, second, landmarks, n_landmarks, on_progress)
+    candidates = training if landmarks is None else landmarks
+    model = candidates
+    if isinstance(candidates, Drive):
+        model = choose_landmarks(candidates.encodings, n_landmarks, evaluator, lambda share: on_progress(share / 2))
+    return build_from_dissimilarities(
+        plan,
+        training,
+        second,
+        model,
+        partial(measured, evaluator=evaluator),
+        lambda share: on_progress((1 + share) / 2),
+    )
 
 
 def train_nnql(
     map_: Map,
-    own: Callable[[], Drive],
+    own: Drive,
     second: Drive | None,
     config: NnqlConfig,
     on_progress: Callable[[float], None],
@@ -202,7 +178,7 @@ def train_nnql(
 
     Args:
         map_: The map; its lists must not have been made with knowledge of the second drive.
-        own: Gives the map's own traverse, measured; asked only where there is no second drive.
+        own: The map's own traverse, measured.
         second: Another drive of the same route, measured.
         config: The hyperparameters; small maps take fewer episodes than it says.
 
@@ -223,7 +199,7 @@ def train_nnql(
             curves.append(curve)
         elif n_episodes:
             used = replace(config, n_episodes=max(1, n_episodes // 2))
-            for fold, (images, half, live) in enumerate(_halves(map_, own())):
+            for fold, (images, half, live) in enumerate(_halves(map_, own)):
                 world = world_of(half, live, np.asarray(half.route.nearest_image(live.position_m), np.int64), used)
 
                 def report(share: float, fold: int = fold) -> None:

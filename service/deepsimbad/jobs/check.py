@@ -167,7 +167,7 @@ def _normalised_ranks(
     on_progress: Callable[[float], None],
 ) -> NDArray[np.float64]:
     """[q] share of the map's images, but those left out, before the true one, 0..1; NaN where there is no true one."""
-    views = views_of(measured(frames.drive.at(frames.asked), evaluator, map_.landmark_model))
+    views = views_of(measured(frames.drive.at(frames.asked), map_.landmark_model, evaluator))
     is_remaining = np.ones(map_.n_images, np.bool_)
     is_remaining[left_out] = False
     remaining = np.flatnonzero(is_remaining)

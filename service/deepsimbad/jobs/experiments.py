@@ -5,17 +5,17 @@ The first compares every relevance, the second every planner from the same start
 
 import pickle
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from deepsimbad.core.building import build_map
-from deepsimbad.core.drive import Drive, SameRoute, second_season
+from deepsimbad.core.building import Built, MapPlan
+from deepsimbad.core.composed import unit_encodings
+from deepsimbad.core.drive import Drive, SameRoute
 from deepsimbad.core.episodes import (
     Chooser,
     Episode,
@@ -25,6 +25,7 @@ from deepsimbad.core.episodes import (
     follow_plan,
     random_chooser,
 )
+from deepsimbad.core.live_statistics import LiveStatistics
 from deepsimbad.core.localizer import ActiveLocalizer, LocalizerConfig
 from deepsimbad.core.map import Map
 from deepsimbad.core.metrics import RetrievalScorer, RetrievalScores, mean_interval
@@ -34,15 +35,17 @@ from deepsimbad.core.relevance import DEFAULT_RELEVANCE, DEFAULT_UPDATE, Query, 
 from deepsimbad.core.retrieval import relevances
 from deepsimbad.core.route import same_places
 from deepsimbad.errors import InvalidMapConfigError, InvalidSourceError
-from deepsimbad.evaluators.base import Evaluator
+from deepsimbad.evaluators.base import Evaluator, LandmarkModel
 from deepsimbad.evaluators.compute import available_cores
-from deepsimbad.jobs.build import EncodedRecording, build, choose_landmarks, measured, train_nnql, views_of
+from deepsimbad.jobs.build import EncodedRecording, build, measured, train_nnql, views_of
 from deepsimbad.jobs.progress import Progress
 from deepsimbad.store.arrays import is_halvable
 from deepsimbad.store.map_file import index_bytes, seal, write_map
 
 _QUERIES_A_BLOCK = 64  # of brute force: large enough for a matrix product, small enough for memory
 CLAIRVOYANT = "clairvoyant"
+BRUTE_FORCE_U = "brute_force_u"  # all of the unit vectors that composed lists stand for: the most they could tell
+BLOCK_M = 20.0  # starts nearer together have much the same episode
 DISTANCES_M = (10.0, 20.0, 50.0)
 
 
@@ -55,6 +58,7 @@ class VprConfig:
     tolerance_m: float = 2.0  # how far from the query a map image may be and still be true
     relevances: tuple[Relevance, ...] = tuple(Relevance)  # which to compare, in the order of the report
     seed: int = 0  # kept with the result; nothing here is random
+    stateless: bool = False  # every view by itself, by the map's statistics, in place of one session in order
     # Whether positions of landmark and training traverse are comparable; None: where both know x, y
     same_route: bool | None = True
 
@@ -64,11 +68,11 @@ class VprReport:
     """Scores by relevance, and what they cost."""
 
     config: VprConfig
-    scores: dict[Relevance, RetrievalScores]
+    scores: dict[str, RetrievalScores]  # by relevance; and of what rivals it
     # Size on disk of the posting tables, of the map for the relevance that ships (or of the first asked for)
     index_bits_per_map_image: float
     seconds: dict[str, float]  # by stage
-    same_route: SameRoute  # whether the landmark traverse drove the mapped route
+    same_route: SameRoute | None  # whether the landmark traverse drove the mapped route; None: there is none
     encoding_dim: int  # d
     bytes_per_encoding: int  # of one frame in a traverse's file, places apart
     encode_ms: float | None  # median from reading an image to its encoding; None where encodings came ready
@@ -77,14 +81,14 @@ class VprReport:
         """The stable flat JSON document of design section 7."""
         first = next(iter(self.scores.values()))
         return {
-            "anr": {name.value: score.anr for name, score in self.scores.items()},
-            "recall_at_1": {name.value: score.recall_at[1] for name, score in self.scores.items()},
-            "recall_at_5": {name.value: score.recall_at[5] for name, score in self.scores.items()},
+            "anr": {name: score.anr for name, score in self.scores.items()},
+            "recall_at_1": {name: score.recall_at[1] for name, score in self.scores.items()},
+            "recall_at_5": {name: score.recall_at[5] for name, score in self.scores.items()},
             "default": DEFAULT_RELEVANCE.value,
             "n_queries": first.n_queries,
             "n_left_out": first.n_left_out,
             "index_bits_per_map_image": self.index_bits_per_map_image,
-            "second_season": self.same_route.as_dict(),
+            "second_season": None if self.same_route is None else self.same_route.as_dict(),
             "encoding_dim": self.encoding_dim,
             "bytes_per_encoding": self.bytes_per_encoding,
             "encode_ms": self.encode_ms,
@@ -95,7 +99,7 @@ class VprReport:
 
 def vpr_stages(config: VprConfig) -> dict[str, float]:
     """The stages `run_vpr` reports, with their weights."""
-    return {"select landmarks": 2.0, "describe": 1.0} | {
+    return {"describe": 3.0} | {
         f"query by {name.value}": 3.0 if name is Relevance.BRUTE_FORCE else 1.0 for name in config.relevances
     }
 
@@ -103,42 +107,45 @@ def vpr_stages(config: VprConfig) -> dict[str, float]:
 def run_vpr(
     config: VprConfig,
     evaluator: Evaluator,
-    landmarks: Drive,
+    landmarks: Drive | None,
     training: Drive,
     test: EncodedRecording,
     true_images: Sequence[NDArray[np.int64]],
     progress: Progress,
 ) -> VprReport:
-    """Select landmarks, map the training traverse, query every test frame in order as one passive session.
+    """Choose landmarks, map the training traverse, query every test frame in order as one passive session.
 
     Args:
-        landmarks: The landmark traverse; where it drove the mapped route, `calibrated` learns from it.
+        landmarks: The landmark traverse; where it drove the mapped route, maps learn from it. None: the training one.
         true_images: For every test frame the map images that count as true.
     """
-    progress.stage("select landmarks")
-    model = choose_landmarks(landmarks.encodings, config.n_landmarks, evaluator, progress.update)
     progress.stage("describe")
-    measure = partial(measured, evaluator=evaluator, model=model)
-    own = measure(training)
-    progress.update(0.3)
-    views = views_of(measure(test.drive))
-    progress.update(0.6)
-    season, _, verdict = second_season(own, False, landmarks, config.same_route, measure)
-    scores: dict[Relevance, RetrievalScores] = {}
-    maps: dict[Relevance, Map] = {}
+    scores: dict[str, RetrievalScores] = {}
+    built: dict[Relevance, Built] = {}
+    model: LandmarkModel | None = None
+    for number, name in enumerate(config.relevances):
+        plan = MapPlan(name, config.list_length, (1.0,), same_route=config.same_route)
+        chosen = landmarks if name is Relevance.COMPOSED or model is None else model
+        built[name] = build(plan, training, landmarks, chosen, config.n_landmarks, evaluator)
+        if name is not Relevance.COMPOSED:
+            model = built[name].map.landmark_model
+        progress.update((number + 1) / len(config.relevances))
     for name in config.relevances:
         progress.stage(f"query by {name.value}")
-        maps[name] = build_map(name, own, config.list_length, second_season=season)
-        scores[name] = _score(maps[name], views, true_images, progress.update)
+        views = views_of(measured(test.drive, built[name].map.landmark_model, evaluator))
+        live = None if config.stateless else built[name].map.live_statistics
+        scores[name.value] = _score(built[name].map, views, true_images, live, progress.update)
+        if name is Relevance.COMPOSED:
+            scores[BRUTE_FORCE_U] = _score_by_all(built[name], test.drive, true_images, config.stateless)
     stages = {stage.replace(" ", "_") for stage in vpr_stages(config)}
     seconds = {stage: took for stage, took in progress.seconds().items() if stage in stages}
-    sized = maps.get(DEFAULT_RELEVANCE, maps[config.relevances[0]])
+    sized = built.get(DEFAULT_RELEVANCE, built[config.relevances[0]])
     return VprReport(
         config,
         scores,
-        _bits_per_map_image(replace(sized, landmark_model=model)),
+        _bits_per_map_image(sized.map),
         seconds,
-        verdict,
+        sized.same_route,
         encoding_dim=test.drive.encoding_dim,
         bytes_per_encoding=test.drive.encoding_dim * (2 if is_halvable(test.drive.encodings) else 4),
         encode_ms=test.encode_ms,
@@ -155,18 +162,38 @@ def _bits_per_map_image(map_: Map) -> float:
 
 
 def _score(
-    map_: Map, views: Query, true_images: Sequence[NDArray[np.int64]], on_progress: Callable[[float], None]
+    map_: Map,
+    views: Query,
+    true_images: Sequence[NDArray[np.int64]],
+    live: LiveStatistics | None,
+    on_progress: Callable[[float], None],
 ) -> RetrievalScores:
     scorer = RetrievalScorer()
-    live = map_.landmark_statistics
     # Without a session's statistics every view is compared by itself; many at once are one matrix product.
     size = _QUERIES_A_BLOCK if map_.relevance is Relevance.BRUTE_FORCE else 1
     for first in range(0, len(true_images), size):
         asked = views.at(slice(first, first + size))
-        live = live.observing(asked.ranks[0]) if live else None
-        for row, truth in zip(relevances(map_, asked, live), true_images[first : first + size], strict=True):
+        if size == 1:
+            asked = views.at(first)
+        live = live.observing(asked) if live else None
+        rows = np.atleast_2d(relevances(map_, asked, live))
+        for row, truth in zip(rows, true_images[first : first + size], strict=True):
             scorer.add(row, truth)
         on_progress(min(1.0, (first + size) / len(true_images)))
+    return scorer.result()
+
+
+def _score_by_all(
+    built: Built, test: Drive, true_images: Sequence[NDArray[np.int64]], stateless: bool
+) -> RetrievalScores:
+    """What the lists stand for, compared whole: the same unit vectors, and nothing left out."""
+    scorer, usual = RetrievalScorer(), built.map.live_statistics
+    if built.places is None or usual is None or usual.encodings is None:
+        raise InvalidMapConfigError("only a composed map has unit vectors")
+    encodings, projection = usual.encodings, built.map.landmark_model.get("projection")
+    for encoding, truth in zip(test.encodings, true_images, strict=True):
+        encodings = encodings if stateless else encodings.observing(encoding)
+        scorer.add(built.places @ unit_encodings(encoding, encodings, projection), truth)
     return scorer.result()
 
 
@@ -181,7 +208,7 @@ class NbvConfig:
     actions_m: tuple[float, ...] = tuple(float(metres) for metres in range(1, 11))  # the moves
     n_steps: int = 10  # moves an episode
     training_episodes: int = 10_000  # of NNQL
-    episodes: int = 2000  # test episodes of every planner
+    episodes: int | None = None  # test episodes of every planner; None: one from every start
     seed: int = 0  # of starts, random moves and training
     # Whether positions of landmark and training traverse are comparable; None: where both know x, y
     same_route: bool | None = True
@@ -192,46 +219,69 @@ class NbvReport:
     """What every planner scored."""
 
     config: NbvConfig
-    ours: dict[str, NDArray[np.float64]]  # rank shares [episodes, steps] by planner, under our set-up
-    paper: dict[str, NDArray[np.float64]]  # and under the paper's
-    travelled_m: dict[str, NDArray[np.float64]]  # metres [episodes, steps] by planner, under our set-up
+    ours: dict[str, list[Episode]]  # by planner, under our set-up
+    paper: dict[str, list[Episode]]  # and under the paper's
+    block: NDArray[np.int64]  # [episodes] the stretch of 20 m that each began in
     same_route: SameRoute | None = None  # whether the landmark traverse drove the mapped route; None: nobody looked
 
     @property
     def best_constant(self) -> str:
-        """The constant move that did best, known only afterwards."""
-        return min((name for name in self.ours if name.startswith(CONSTANT)), key=lambda name: self.ours[name].mean())
+        """The constant move that took the fewest views, known only afterwards."""
+        constants = [name for name in self.ours if name.startswith(CONSTANT)]
+        return min(constants, key=lambda name: float(self._each(name, "views").mean()))
 
     def as_dict(self, sources: dict[str, Any]) -> dict[str, Any]:
         """The stable flat JSON document of design section 7; percent."""
-        by_episode = {name: shares.mean(axis=1) for name, shares in self.ours.items()}
-
-        def interval(shares: NDArray[np.float64]) -> list[float]:
-            return [100 * end for end in mean_interval(shares, self.config.seed)]
-
+        shares = {name: 100 * self._each(name, "rank_share") for name in self.ours}
+        by_episode = {name: rows.mean(axis=1) for name, rows in shares.items()}
+        views, metres = ({name: self._each(name, part) for name in self.ours} for part in ("views", "metres"))
+        wrong = {name: 100 * self._each(name, "is_wrong") for name in self.ours}
+        rivals = (RANDOM, self.best_constant)
         return {
-            "anr": {name: _percent(shares) for name, shares in self.ours.items()},
+            "anr": _means(by_episode),
             "default": DEFAULT_PLANNER,
-            "anr_paper": {name: _percent(shares) for name, shares in self.paper.items()},
-            "interval_95": {name: interval(shares) for name, shares in by_episode.items()},
-            "difference_95": {
-                f"{DEFAULT_PLANNER} - {rival}": interval(by_episode[DEFAULT_PLANNER] - by_episode[rival])
-                for rival in (RANDOM, self.best_constant)
+            "anr_paper": {
+                name: float(100 * _stack(episodes, "rank_share").mean()) for name, episodes in self.paper.items()
             },
+            "interval_95": self._intervals(by_episode),
+            "difference_95": self._differences(by_episode, rivals),
+            "views_to_confident": {**_means(views), "interval_95": self._intervals(views)},
+            "metres_to_confident": {**_means(metres), "interval_95": self._intervals(metres)},
+            "wrong_when_confident": {**_means(wrong), "interval_95": self._intervals(wrong)},
+            "views_difference_95": self._differences(views, rivals),
             "best_constant": self.best_constant,
-            "anr_by_step": {name: (100 * shares.mean(axis=0)).tolist() for name, shares in self.ours.items()},
+            "anr_by_step": {name: rows.mean(axis=0).tolist() for name, rows in shares.items()},
             "anr_at_distance_m": {
-                name: _at_distances(shares, self.travelled_m[name]) for name, shares in self.ours.items()
+                name: _at_distances(rows, self._each(name, "travelled_m")) for name, rows in shares.items()
             },
-            "n_episodes": self.config.episodes,
+            "n_episodes": len(self.block),
             "second_season": None if self.same_route is None else self.same_route.as_dict(),
             "config": {**asdict(self.config), **sources},
         }
 
+    def _each(self, planner: str, part: str) -> NDArray[np.float64]:
+        return _stack(self.ours[planner], part)
+
+    def _intervals(self, values: Mapping[str, NDArray[np.float64]]) -> dict[str, list[float]]:
+        return {name: list(mean_interval(rows, self.config.seed, self.block)) for name, rows in values.items()}
+
+    def _differences(self, values: Mapping[str, NDArray[np.float64]], rivals: Sequence[str]) -> dict[str, list[float]]:
+        """Of the default planner's values and its rivals', episode by episode."""
+        apart = {f"{DEFAULT_PLANNER} - {rival}": values[DEFAULT_PLANNER] - values[rival] for rival in rivals}
+        return self._intervals(apart)
+
+
+def _stack(episodes: Sequence[Episode], part: str) -> NDArray[np.float64]:
+    return np.array([getattr(episode, part) for episode in episodes], np.float64)
+
+
+def _means(values: Mapping[str, NDArray[np.float64]]) -> dict[str, float]:
+    return {name: float(rows.mean()) for name, rows in values.items()}
+
 
 def nbv_stages(config: NbvConfig) -> dict[str, float]:
     """The stages `run_nbv` reports, with their weights."""
-    stages = {"select landmarks": 2.0}
+    stages = {}
     for setup in ("ours", "paper"):
         stages |= {f"map ({setup})": 1.0, f"train ({setup})": 4.0}
         stages |= {f"{name} ({setup})": 4.0 if name in {RANDOM, CLAIRVOYANT} else 1.0 for name in _names(config)}
@@ -246,11 +296,9 @@ def run_nbv(
     Raises:
         InvalidMapConfigError: The test traverse is shorter than an episode.
     """
-    progress.stage("select landmarks")
-    model = choose_landmarks(landmarks.encodings, config.n_landmarks, evaluator, progress.update)
-    drive = TestDrive(views_of(measured(test, evaluator, model)), test.route(), _nearest_images(test, training))
+    route, true_image = test.route(), _nearest_images(test, training)
     travel_m = config.n_steps * max(config.actions_m)
-    starts = drive.starts(travel_m, config.episodes, config.seed)
+    starts = TestDrive(Query.uninformative(1), route, true_image).starts(travel_m, config.episodes, config.seed)
     if starts.size == 0:
         raise InvalidMapConfigError(f"the test traverse is shorter than an episode of {travel_m:g} m")
 
@@ -263,25 +311,15 @@ def run_nbv(
     same_route = None
     for setup, relevance, update, action_std_m in setups:
         progress.stage(f"map ({setup})")
-        built = build(
-            training,
-            landmarks,
-            config.same_route,
-            evaluator,
-            model,
-            relevance,
-            config.list_length,
-            config.actions_m,
-            False,
-            progress.update,
-        )
+        plan = MapPlan(relevance, config.list_length, config.actions_m, same_route=config.same_route)
+        built = build(plan, training, landmarks, landmarks, config.n_landmarks, evaluator, progress.update)
+        drive = TestDrive(views_of(measured(test, built.map.landmark_model, evaluator)), route, true_image)
         same_route = built.same_route
         progress.stage(f"train ({setup})")
         nnql = NnqlConfig(
             config.training_episodes, config.n_steps, update=update, motion_std_m=action_std_m, seed=config.seed
         )
-        own = partial(measured, training, evaluator, model)
-        q_values, _ = train_nnql(built.rehearsal, own, built.second, nnql, progress.update, available_cores())
+        q_values, _ = train_nnql(built.rehearsal, built.own, built.second, nnql, progress.update, available_cores())
         map_ = replace(built.map, q_values=q_values)
         results[setup] = {}
         for name in _names(config):
@@ -292,14 +330,8 @@ def run_nbv(
             runner = EpisodeRunner(localizer, drive, config.n_steps, action_std_m)
             chooser = _chooser(name, runner, config)
             results[setup][name] = _episodes(runner, starts, chooser, name == RANDOM, progress.update)
-    ours = results["ours"]
-    return NbvReport(
-        config,
-        {name: np.stack([episode.rank_share for episode in episodes]) for name, episodes in ours.items()},
-        {name: np.stack([episode.rank_share for episode in episodes]) for name, episodes in results["paper"].items()},
-        {name: np.stack([episode.travelled_m for episode in episodes]) for name, episodes in ours.items()},
-        same_route,
-    )
+    block = (route.position_m[starts] // BLOCK_M).astype(np.int64)
+    return NbvReport(config, results["ours"], results["paper"], block, same_route)
 
 
 def _names(config: NbvConfig) -> list[str]:
@@ -346,10 +378,6 @@ def _nearest_images(test: Drive, training: Drive) -> NDArray[np.int64]:
     return nearest
 
 
-def _percent(shares: NDArray[np.float64]) -> float:
-    return float(100 * shares.mean())
-
-
 def _at_distances(shares: NDArray[np.float64], travelled_m: NDArray[np.float64]) -> dict[str, float | None]:
     """ANR of the last view within each distance, over the episodes that went so far."""
     anr: dict[str, float | None] = {}
@@ -357,7 +385,7 @@ def _at_distances(shares: NDArray[np.float64], travelled_m: NDArray[np.float64])
         n_within = (travelled_m <= distance_m + 1e-9).sum(axis=1)
         reached = (travelled_m[:, -1] >= distance_m - 1e-9) & (n_within > 0)
         last = shares[np.arange(len(shares)), np.maximum(n_within - 1, 0)]
-        anr[f"{distance_m:g}"] = _percent(last[reached]) if reached.any() else None
+        anr[f"{distance_m:g}"] = float(last[reached].mean()) if reached.any() else None
     return anr
 
 

@@ -7,13 +7,14 @@ encoded or described again, and what two seasons taught stays.
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 from typing import Any, Self, TypeAlias
 
 import numpy as np
 
-from deepsimbad.core.building import append_drive
+from deepsimbad.core.building import MapPlan, append_drive
+from deepsimbad.core.composed import is_composed
 from deepsimbad.core.descriptor import MAX_LANDMARKS
 from deepsimbad.core.drive import UNKNOWN_TIMESTAMP, Drive
 from deepsimbad.core.map import Map
@@ -21,7 +22,7 @@ from deepsimbad.core.nnql import NnqlConfig
 from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Relevance
 from deepsimbad.errors import InvalidEncodingError, InvalidMapConfigError, LostActivationError, WeightsDifferError
 from deepsimbad.evaluators.base import Evaluator
-from deepsimbad.jobs.build import EPISODES_A_MAP_IMAGE, build, choose_landmarks, measured, train_nnql
+from deepsimbad.jobs.build import EPISODES_A_MAP_IMAGE, build, measured, train_nnql
 from deepsimbad.jobs.check import CheckFrames, check_map, traverses_in
 from deepsimbad.jobs.progress import Progress
 from deepsimbad.jobs.versions import activate_once, seal_version
@@ -33,6 +34,7 @@ from deepsimbad.store.traverses import Traverse
 DEFAULT_N_LANDMARKS = 500
 DEFAULT_LIST_LENGTH = 4
 DEFAULT_TRAINING_EPISODES = 10_000
+LANDMARK_TRAVERSE, ACTIVE_MAP, TRAINING = "landmark_traverse", "active_map", "training_traverse"
 
 
 @dataclass(frozen=True)
@@ -40,7 +42,8 @@ class RemapConfig:
     """Parameters of one remap, kept with the map."""
 
     training_traverse: str  # the traverse that becomes the map
-    # Where landmarks are selected; None keeps those of the active map (the paper's cheap retraining)
+    # Where landmarks are chosen; None keeps those of the active map (the paper's cheap retraining), and without one
+    # takes the training traverse's own
     landmark_traverse: str | None = None
     # r; None means 500 or, of a shorter landmark traverse, every frame; and as many as the active map has where its
     # landmarks stay
@@ -113,8 +116,7 @@ def remap_stages(config: RemapConfig, n_frames: int, n_candidates: int, encoding
         n_episodes = 0
     return {
         "read frames": 0.05 + 1e-8 * (n + m) * dim,
-        "select landmarks": 0.05 + m**2 * (5e-9 + 5e-12 * dim),
-        "describe": 0.1 + 1e-6 * n * n_landmarks,
+        "describe": 0.1 + (n + m) * (2e-8 * dim * 96 + 4e-7 * n_landmarks),
         "train": 0.01 + n_episodes * (4e-4 + 8e-8 * n),
         "check": 0.1 + 5e-6 * n,
         "seal": 0.3,
@@ -190,9 +192,9 @@ class _Inputs:
 
     domain: DomainRecord  # whose map it is
     training: Drive  # the traverse that becomes the map
-    candidates: Drive | None  # the traverse landmarks are selected from; None: those of `base` stay
-    base: Map | None  # the active map whose landmarks stay; None where they are selected
-    # The drive that a calibrated map learns from: the landmark traverse, else what the active map was made of; None
+    candidates: Drive | None  # the traverse landmarks are chosen from; None: those of `base` stay, or the training one
+    base: Map | None  # the active map whose landmarks stay; None where they are chosen
+    # The drive that the map learns from beside its own: the landmark traverse, else what the active map was made of; None
     # where there is none of the same encoder, or where frames are appended
     second: Drive | None
     check: Drive | None  # the drive that the new map is checked on; None: on frames of `training` that are held out
@@ -262,8 +264,9 @@ class _Remap:
         candidates = base = check = None
         if config.landmark_traverse is None:
             base = self._active_map(record)
-            joining = f"traverse {config.training_traverse}"
-            WeightsDifferError.check("the active map", base.weights_sha256, joining, training.weights_sha256)
+            if base is not None:
+                joining = f"traverse {config.training_traverse}"
+                WeightsDifferError.check("the active map", base.weights_sha256, joining, training.weights_sha256)
         else:
             candidates = read(config.landmark_traverse)
             self._check_encoder(config.landmark_traverse, candidates, training)
@@ -306,19 +309,20 @@ class _Remap:
                     return second  # else another encoder made it anew
         return None
 
-    def _active_map(self, record: DomainRecord) -> Map:
-        wanted = self.config.n_landmarks
+    def _active_map(self, record: DomainRecord) -> Map | None:
+        """The map whose landmarks stay; None: there is none, or its landmarks are of another kind than is asked for."""
+        config = self.config
         if record.active_version is None:
-            raise InvalidMapConfigError(
-                f"domain {record.name} has no active map that could be appended to"
-                if self.config.append
-                else f"domain {record.name} has no active map whose landmarks could stay; give a landmark_traverse"
-            )
+            if config.append:
+                raise InvalidMapConfigError(f"domain {record.name} has no active map that could be appended to")
+            return None
         base = read_map(self.catalog.map_path(record.name, record.active_version))
-        if wanted not in {None, base.n_landmarks}:
+        if not config.append and is_composed(base.landmark_model) != (config.relevance is Relevance.COMPOSED):
+            return None
+        if config.n_landmarks not in {None, base.n_landmarks}:
             raise InvalidMapConfigError(
-                f"the active map has {base.n_landmarks} landmarks, not {wanted}; give a landmark_traverse to select "
-                "anew",
+                f"the active map has {base.n_landmarks} landmarks, not {config.n_landmarks}; give a landmark_traverse "
+                "to choose anew",
                 n_landmarks=base.n_landmarks,
             )
         return base
@@ -326,24 +330,16 @@ class _Remap:
     def _mapped(self, inputs: _Inputs) -> _Draft:
         """The training traverse as a map of its own."""
         config, domain, training = self.config, inputs.domain, inputs.training
-        self.progress.stage("select landmarks")
-        if inputs.base is not None:
-            model = inputs.base.landmark_model
-        else:
-            candidates = (inputs.candidates or training).encodings
-            n_landmarks = config.n_landmarks or min(DEFAULT_N_LANDMARKS, len(candidates))
-            model = choose_landmarks(candidates, n_landmarks, self.evaluator, self.progress.update)
         self.progress.stage("describe")
+        landmarks = inputs.candidates if inputs.base is None else inputs.base.landmark_model
+        n_landmarks = config.n_landmarks or min(DEFAULT_N_LANDMARKS, (inputs.candidates or training).n_frames)
         built = build(
+            MapPlan(config.relevance, config.list_length, domain.actions_m, domain.closed, config.same_route),
             training,
             inputs.second,
-            config.same_route,
+            landmarks,
+            n_landmarks,
             self.evaluator,
-            model,
-            config.relevance,
-            config.list_length,
-            domain.actions_m,
-            domain.closed,
             self.progress.update,
         )
         q_values = learning = None
@@ -352,7 +348,7 @@ class _Remap:
             self.progress.stage("train")
             q_values, learning = train_nnql(
                 built.rehearsal,
-                partial(measured, training, self.evaluator, model),
+                built.own,
                 built.second,
                 NnqlConfig(n_episodes=config.training_episodes, seed=config.seed),
                 self.progress.update,
@@ -373,7 +369,8 @@ class _Remap:
             q_values=q_values,
         )
         second_season = None if built.same_route is None else built.same_route.as_dict()
-        return map_, asked, {"training": learning, "second_season": second_season}
+        source = TRAINING if landmarks is None else LANDMARK_TRAVERSE if inputs.base is None else ACTIVE_MAP
+        return map_, asked, {"landmarks": source, "training": learning, "second_season": second_season}
 
     def _appended(self, inputs: _Inputs, before: Map) -> _Draft:
         """A copy of the active map with the training traverse among its images."""
@@ -390,7 +387,7 @@ class _Remap:
                 map_version=record.version,
             )
         _check_alike(before, config)
-        map_ = append_drive(before, measured(drive, self.evaluator, before.landmark_model, self.progress.update))
+        map_ = append_drive(before, measured(drive, before.landmark_model, self.evaluator, self.progress.update))
         asked = config.as_dict()
         added = {"traverse": config.training_traverse, "n_frames": drive.n_frames, "to_version": record.version}
         # The catalog's configuration: the file of an imported map names traverses of another server.
@@ -403,7 +400,7 @@ class _Remap:
         weights_sha256 = drive.weights_sha256 or before.weights_sha256
         if weights_sha256 is not None:
             config_after["weights_sha256"] = weights_sha256
-        learnt = {name: record.metrics.get(name) for name in ("training", "second_season")}
+        learnt = {name: record.metrics.get(name) for name in ("landmarks", "training", "second_season")}
         return replace(map_, config=config_after), config_after, learnt
 
 

@@ -1,0 +1,271 @@
+"""`composed` against its definition in loops, and on real descriptors; what two seasons and one teach."""
+
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from deepsimbad.core import composed
+from deepsimbad.core.building import MapPlan, append_drive, compose_map
+from deepsimbad.core.composed import Moments, compose, lengths_of_sums, principal_directions, unit
+from deepsimbad.core.descriptor import rank_landmarks, ranks_from_ranked_landmarks
+from deepsimbad.core.drive import Drive
+from deepsimbad.core.landmark_model import farthest_first
+from deepsimbad.core.relevance import Query, Relevance
+from deepsimbad.core.retrieval import products_with_landmarks, relevances
+from deepsimbad.errors import InvalidInputError, InvalidMapConfigError, TooFewCandidatesError
+
+PLAN = MapPlan(Relevance.COMPOSED, 4, (1.0, 2.0, 5.0), same_route=True)
+WEIGHTS = (1.0, 0.8, 0.65, 0.5)
+
+
+def drive_of(encodings, position_m=None):
+    position_m = np.arange(float(len(encodings))) if position_m is None else position_m
+    return Drive(position_m=position_m, encodings=np.asarray(encodings, np.float32))
+
+
+@pytest.fixture(scope="module")
+def seasons():
+    """[n, d] encodings of one route in three seasons, each with its own shift and scale."""
+    rng = np.random.default_rng(0)
+    place = rng.normal(size=(160, 24))
+    return [
+        rng.normal(size=24) + rng.uniform(0.5, 2, 24) * (place + 0.4 * rng.normal(size=place.shape)) for _ in range(3)
+    ]
+
+
+# --- lists and relevance -------------------------------------------------------------------------------------------
+
+
+def slow_compose(place, landmarks, h, width):
+    """The best list of h that a beam of so many finds, by trying every next landmark."""
+    beam = [()]
+    for _ in range(h):
+        longer = {}
+        for ids in beam:
+            for k in range(len(landmarks)):
+                if k not in ids:
+                    total = sum(w * landmarks[i] for w, i in zip(WEIGHTS, (*ids, k), strict=False))
+                    longer[*ids, k] = float(place @ total / np.linalg.norm(total))
+        beam = sorted(longer, key=lambda ids: -longer[ids])[:width]
+    return beam[0]
+
+
+def test_lists_are_those_of_a_beam_search():
+    rng = np.random.default_rng(1)
+    places, landmarks = unit(rng.normal(size=(12, 6))), unit(rng.normal(size=(9, 6)))
+    lists = compose(places, landmarks, 4)
+    for image, place in enumerate(places):
+        assert tuple(lists[:, image].tolist()) == slow_compose(place.astype(float), landmarks.astype(float), 4, 8)
+
+
+def test_barred_landmarks_are_listed_last():
+    rng = np.random.default_rng(1)
+    places, landmarks = unit(rng.normal(size=(5, 6))), unit(rng.normal(size=(6, 6)))
+    barred = np.zeros((5, 6), bool)
+    barred[:, :2] = True
+    assert not (compose(places, landmarks, 4, barred) < 2).any()
+    assert (np.sort(compose(places, landmarks, 6, barred)[-2:], axis=0).T == [0, 1]).all()
+
+
+def test_relevance_is_the_cosine_with_the_sum_of_listed_landmarks(seasons):
+    map_ = compose_map(PLAN, drive_of(seasons[1]), None, None, 30).map
+    model, live = map_.landmark_model, map_.live_statistics
+    drive = seasons[1].astype(np.float32).astype(float)
+    mean, square, weight = drive.mean(axis=0), np.square(drive).mean(axis=0), 20.0
+    for row in seasons[2][:5].astype(np.float32):
+        weight, mean = weight + 1, mean + (row - mean) / (weight + 1)
+        square = square + (np.square(row.astype(float)) - square) / weight
+        u = (row - mean) / np.sqrt(square - mean**2)
+        u /= np.linalg.norm(u)
+        expected = []
+        for image in range(map_.n_images):
+            total = sum(w * model["prototypes"][i] for w, i in zip(WEIGHTS, map_.lists[:, image], strict=True))
+            expected.append(u @ total / np.linalg.norm(total))
+        query = Query(np.ones(30, np.float32), encoding=row)
+        live = live.observing(query)
+        np.testing.assert_allclose(relevances(map_, query, live), expected, atol=1e-4)
+
+
+def test_lengths_of_sums():
+    rng = np.random.default_rng(3)
+    landmarks, lists = unit(rng.normal(size=(9, 5))), np.array([[0, 3], [1, 4], [2, 5], [8, 0], [7, 1]], np.uint16)
+    weights = (*WEIGHTS, 0.5)
+    expected = [np.linalg.norm(sum(w * landmarks[i] for w, i in zip(weights, row, strict=True))) for row in lists.T]
+    np.testing.assert_allclose(lengths_of_sums(lists, landmarks), expected, rtol=1e-5)
+
+
+# --- every kind of view --------------------------------------------------------------------------------------------
+
+
+def views_of(map_, encoding):
+    """The same view as it may be sent."""
+    whole = Query(np.ones(map_.n_landmarks, np.float32), encoding=encoding)
+    apart = (2 - 2 * products_with_landmarks(map_, whole)).astype(np.float32)
+    ranks = rank_landmarks(apart)
+    nearest = ranks_from_ranked_landmarks(np.argsort(apart)[:15].tolist(), map_.n_landmarks)
+    return {"encoding": whole, "dissimilarities": Query(ranks, apart), "ranks": Query(ranks), "nearest": Query(nearest)}
+
+
+def test_every_kind_of_view_finds_its_place(seasons):
+    map_ = compose_map(PLAN, drive_of(seasons[1]), drive_of(seasons[0]), None, 100).map
+    hits = dict.fromkeys(("encoding", "dissimilarities", "ranks", "nearest"), 0)
+    live = dict.fromkeys(hits, map_.live_statistics)
+    for place, row in enumerate(seasons[2].astype(np.float32)):
+        for kind, query in views_of(map_, row).items():
+            live[kind] = live[kind].observing(query)
+            hits[kind] += int(relevances(map_, query, live[kind]).argmax()) == place
+    assert hits["encoding"] > 140
+    assert hits["dissimilarities"] > 110
+    assert hits["ranks"] > 100
+    assert hits["nearest"] > 80
+
+
+def test_without_a_session_dissimilarities_answer_as_their_encoding_does(seasons):
+    map_ = compose_map(PLAN, drive_of(seasons[1]), None, None, 50).map
+    views = views_of(map_, seasons[2][7].astype(np.float32))
+    np.testing.assert_allclose(
+        relevances(map_, views["dissimilarities"]), relevances(map_, views["encoding"]), atol=1e-5
+    )
+    foreign = Query(views["ranks"].ranks, 1000 * views["dissimilarities"].dissimilarities)
+    assert foreign.products is None, "no squared distances of unit vectors: their ranks count"
+    np.testing.assert_array_equal(relevances(map_, foreign), relevances(map_, views["ranks"]))
+
+
+def test_an_encoding_of_another_length_is_refused(seasons):
+    map_ = compose_map(PLAN, drive_of(seasons[1]), None, None, 50).map
+    with pytest.raises(InvalidInputError, match="7 numbers; the map's have 24"):
+        relevances(map_, Query(np.ones(50, np.float32), encoding=np.ones(7, np.float32)))
+
+
+# --- landmarks, projections, seasons -------------------------------------------------------------------------------
+
+
+def test_landmarks_are_farthest_first():
+    u = unit(np.random.default_rng(5).normal(size=(40, 4)))
+    chosen = [int(np.argmin(u @ u.mean(axis=0)))]
+    for _ in range(9):
+        chosen.append(min(set(range(40)) - set(chosen), key=lambda i: max(float(u[i] @ u[j]) for j in chosen)))
+    assert farthest_first(u, 10).tolist() == chosen
+    with pytest.raises(TooFewCandidatesError):
+        farthest_first(u, 41)
+
+
+def test_long_encodings_are_projected_and_keep_their_neighbours():
+    rng = np.random.default_rng(6)
+    place = rng.normal(size=(200, 20)) @ rng.normal(size=(20, 500))
+    one, other = (place + rng.normal(size=place.shape) for _ in range(2))
+    assert principal_directions(rng.normal(size=(50, 96)).astype(np.float32)) is None
+    map_ = compose_map(PLAN, drive_of(one), None, None, 100).map
+    assert map_.landmark_model["projection"].shape == (500, 96)
+    hits = [
+        int(relevances(map_, Query(np.ones(100, np.float32), encoding=row)).argmax()) == place
+        for place, row in enumerate(other.astype(np.float32))
+    ]
+    assert np.mean(hits) > 0.9
+    short = compose_map(PLAN, drive_of(one[:9]), None, None, 5).map
+    assert short.landmark_model["projection"].shape == (500, 8)
+
+
+def test_two_seasons_teach_and_one_does_not(seasons):
+    one = compose_map(PLAN, drive_of(seasons[1]), None, None, 60)
+    two = compose_map(PLAN, drive_of(seasons[1]), drive_of(seasons[0]), None, 60)
+    assert one.map.likelihood_scale is None
+    assert two.map.likelihood_scale[0] > 2
+    assert two.second is not None
+    assert not np.array_equal(two.map.lists, two.rehearsal.lists), "the rehearsal does not know the second season"
+    mean = np.mean([season.astype(np.float32).mean(axis=0) for season in seasons[:2]], axis=0)
+    np.testing.assert_allclose(two.map.usual_encoding[0], mean, atol=1e-4)
+    for built in (one, two):
+        assert built.map.novelty[0] == 1
+        assert (np.diff(built.map.novelty) <= 0).all()
+        assert np.isfinite(built.map.view_bits).all()
+        built.map.check()
+
+
+def test_a_reversed_or_foreign_drive_teaches_nothing(seasons):
+    for other in (seasons[0][::-1], np.random.default_rng(9).normal(size=(160, 24))):
+        built = compose_map(PLAN, drive_of(seasons[1]), drive_of(other), None, 60)
+        assert built.second is None
+        assert built.same_route is not None
+        assert not built.same_route.accepted
+
+
+def test_a_places_own_landmark_is_barred_from_the_rehearsal(seasons):
+    second = drive_of(seasons[0])
+    built = compose_map(PLAN, drive_of(seasons[1]), second, second, 160)
+    own = [(built.rehearsal.lists[:, image] == chosen).any() for chosen, image in enumerate(_frames_of(built, second))]
+    assert not any(own)
+    listed = [(built.map.lists[:, image] == chosen).any() for chosen, image in enumerate(_frames_of(built, second))]
+    assert np.mean(listed) > 0.5
+
+
+def _frames_of(built, second):
+    """Which frame each landmark was."""
+    model = built.map.landmark_model
+    u = unit(composed.described(second.encodings, Moments.of(second.encodings), None) @ model["projection"])
+    return (model["prototypes"] @ u.T).argmax(axis=1)
+
+
+def test_landmarks_that_stay_are_the_same_model(seasons):
+    before = compose_map(PLAN, drive_of(seasons[0]), None, None, 60).map
+    after = compose_map(PLAN, drive_of(seasons[1]), drive_of(seasons[0]), before.landmark_model, 60).map
+    assert after.landmark_model_digest == before.landmark_model_digest
+    assert not np.array_equal(after.usual_encoding, before.usual_encoding)
+
+
+@pytest.mark.parametrize("what", ["constant", "alike", "few"])
+def test_degenerate_drives(what, seasons):
+    encodings = seasons[1].copy()
+    if what == "constant":
+        encodings[:, 3] = 1.5
+    if what == "alike":
+        encodings[:] = encodings[0]
+    if what == "few":
+        with pytest.raises(TooFewCandidatesError):
+            compose_map(PLAN, drive_of(encodings[:9]), None, None, 10)
+        with pytest.raises(InvalidMapConfigError, match="list_length"):
+            compose_map(PLAN, drive_of(encodings[:9]), None, None, 3)
+        return
+    map_ = compose_map(PLAN, drive_of(encodings), drive_of(seasons[0]), None, 60).map
+    map_.check()
+    assert np.isfinite(relevances(map_, Query(np.ones(60, np.float32), encoding=map_.usual_encoding[0]))).all()
+
+
+def test_appended_frames_are_described_by_their_own_season(seasons):
+    before = compose_map(PLAN, drive_of(seasons[1][:100]), None, None, 60).map
+    model = before.landmark_model
+    added = drive_of(seasons[0][100:], np.arange(100.0, 160.0))
+    u = composed.described(added.encodings, before.live_statistics.encodings, model.get("projection"))
+    longer = append_drive(before, replace(added, dissimilarities=np.clip(2 - 2 * u @ model["prototypes"].T, 0, 4)))
+    assert np.array_equal(longer.lists[:, :100], before.lists)
+    hits, live = 0, longer.live_statistics
+    for place in range(100, 160):
+        query = Query(np.ones(60, np.float32), encoding=seasons[2][place].astype(np.float32))
+        live = live.observing(query)
+        hits += abs(int(relevances(longer, query, live).argmax()) - place) <= 1
+    assert hits > 40
+
+
+@pytest.mark.real_data
+@pytest.mark.parametrize(("n_landmarks", "anr", "recall", "worst"), [(300, 1.05, 46, 2.2), (512, 0.9, 54, 2.0)])
+def test_on_real_descriptors_two_seasons_make_the_difference(real_data, n_landmarks, anr, recall, worst):
+    """NetVLAD of a railway in three seasons, one session over the test drive (brute force: 3.64)."""
+    folder = real_data / "nordland_netvlad64"
+    drives = [drive_of(np.load(folder / f"{name}.npy")) for name in ("nr", "nq", "nq2")]
+    shares, firsts = [], []
+    for landmarks, training, test in itertools.permutations(drives):
+        map_ = compose_map(PLAN, training, landmarks, landmarks, n_landmarks).map
+        live, ranks = map_.live_statistics, []
+        for at, row in enumerate(test.encodings):
+            query = Query(np.ones(n_landmarks, np.float32), encoding=row)
+            live = live.observing(query)
+            relevance = relevances(map_, query, live)
+            best = relevance[max(0, at - 2) : at + 3].max()
+            ranks.append((relevance > best).sum())
+        shares.append(100 * np.mean(ranks) / 600)
+        firsts.append(100 * np.mean(np.array(ranks) == 0))
+    assert np.mean(shares) <= anr
+    assert np.mean(firsts) >= recall
+    assert max(shares) <= worst
