@@ -25,9 +25,9 @@ from deepsimbad.api.requests import (
     parse_json,
     read_bytes,
 )
-from deepsimbad.core.belief import BeliefSummary
 from deepsimbad.core.planners import Plan
 from deepsimbad.core.route import Route
+from deepsimbad.core.summary import DEFAULT_CONFIDENCE, BeliefSummary
 from deepsimbad.engine.localizer import (
     Dissimilarities,
     Localization,
@@ -45,6 +45,7 @@ from deepsimbad.engine.worker import EncodedImage, Priority, Stopwatch
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.image import MEDIA_TYPES
 
+PROBABLY = 0.5
 router = APIRouter(prefix="/v1/domains", tags=["localization"])
 
 RANKS = "application/vnd.deepsimbad.ranks"
@@ -119,10 +120,13 @@ class BeliefAnswer(TypedDict):
     mode_m: Annotated[float, Field(description="Position of the likeliest map image.")]
     std_m: float
     credible_95_m: Annotated[
-        tuple[float, float], Field(description="Shortest stretch with 95 % of the mass; lo > hi crosses the start.")
+        tuple[float, float],
+        Field(description="Hull of the smallest set that holds 95 % of the mass; lo > hi crosses the start."),
     ]
     entropy_bits: Annotated[float, Field(description="Over map images.", ge=0)]
-    off_route: Annotated[float | None, Field(description="Probability to be nowhere on the route; null: unknown.")]
+    credible_95_sets_m: Annotated[list[tuple[float, float]], Field(description="The pieces of that set.")]
+    off_route: Annotated[float, Field(description="Probability to be lost: off the route, or carried along it.")]
+    confident: Annotated[bool, Field(description="Whether enough mass is within 5 m of the mode.")]
     histogram: HistogramAnswer
     top: Annotated[list[PlaceAnswer], Field(description="Likeliest map images, best first.")]
 
@@ -140,6 +144,7 @@ class ActionAnswer(TypedDict):
 
     action_m: float
     q_value: float | None
+    expected_bits: Annotated[float | None, Field(description="That the view after it would tell; null: unknown.")]
 
 
 class NextBestViewAnswer(TypedDict):
@@ -147,6 +152,7 @@ class NextBestViewAnswer(TypedDict):
 
     planner: str
     action_m: float
+    stop: Annotated[bool, Field(description="Whether the robot is as sure of its place as it asked to be.")]
     actions: list[ActionAnswer]
 
 
@@ -165,6 +171,8 @@ class LocalizationAnswer(TypedDict):
     map_version: int
     timings_ms: Timings
     belief: BeliefAnswer
+    informative: Annotated[bool, Field(description="Whether the view told anything.")]
+    warnings: Annotated[list[str], Field(description="What a person should know, in sentences.")]
     retrieval: Annotated[list[RetrievedAnswer], Field(description="Most relevant map images, best first.")]
     next_best_view: Annotated[NextBestViewAnswer | None, Field(description="null until the map was trained for it.")]
 
@@ -174,7 +182,11 @@ def render_localization(localization: Localization, watch: Stopwatch) -> Localiz
     snapshot, relevance = localization.snapshot, localization.relevance
     return {
         "map_version": snapshot.version,
-        "belief": render_belief(snapshot.route, localization.belief),
+        "belief": render_belief(
+            snapshot.route, localization.belief, localization.belief.near_mode >= DEFAULT_CONFIDENCE
+        ),
+        "informative": localization.is_informative,
+        "warnings": warnings_of(localization.is_informative, localization.belief),
         "retrieval": render_shortlist(snapshot.route, localization.shortlist, relevance),
         "next_best_view": render_plan(localization.plan, snapshot.actions_m),
         "timings_ms": watch.timings_ms(),
@@ -193,14 +205,23 @@ def render_plan(plan: Plan | None, actions_m: NDArray[np.float64]) -> NextBestVi
     """A recommended move; None where there is none."""
     if plan is None:
         return None
-    values = [None] * actions_m.size if plan.values is None else plan.values.tolist()
+    unknown = [None] * actions_m.size
+    values, bits = (unknown if known is None else known.tolist() for known in (plan.values, plan.bits))
     actions: list[ActionAnswer] = []
-    for action_m, value in zip(actions_m.tolist(), values, strict=True):
-        actions.append({"action_m": action_m, "q_value": value})
-    return {"planner": plan.planner, "action_m": plan.action_m, "actions": actions}
+    for action_m, value, expected in zip(actions_m.tolist(), values, bits, strict=True):
+        actions.append({"action_m": action_m, "q_value": value, "expected_bits": expected})
+    return {"planner": plan.planner, "action_m": plan.action_m, "stop": plan.stop, "actions": actions}
 
 
-def render_belief(route: Route, belief: BeliefSummary) -> BeliefAnswer:
+def warnings_of(is_informative: bool, belief: BeliefSummary) -> list[str]:
+    """What a person should know of an answer."""
+    warnings = [] if is_informative else ["the view told nothing of the place"]
+    if belief.off_route > PROBABLY:
+        warnings.append(f"the robot is probably off the route, or was carried: off_route is {belief.off_route:.2f}")
+    return warnings
+
+
+def render_belief(route: Route, belief: BeliefSummary, is_confident: bool) -> BeliefAnswer:
     """A belief, with the coordinates of its likeliest places."""
     ids, top = belief.top, list[PlaceAnswer]()
     coordinates: list[list[float | None]] = []
@@ -217,6 +238,8 @@ def render_belief(route: Route, belief: BeliefSummary) -> BeliefAnswer:
         "mode_m": belief.mode_m,
         "std_m": belief.std_m,
         "credible_95_m": belief.credible_95_m,
+        "credible_95_sets_m": belief.credible_95_sets_m,
+        "confident": is_confident,
         "entropy_bits": belief.entropy_bits,
         "off_route": belief.off_route,
         "histogram": {"edges_m": belief.histogram_edges_m.tolist(), "mass": belief.histogram_mass.tolist()},

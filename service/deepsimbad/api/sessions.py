@@ -25,6 +25,7 @@ from deepsimbad.api.localizations import (
     render_plan,
     render_shortlist,
     view_in,
+    warnings_of,
 )
 from deepsimbad.api.problems import binary, declare_json, location, problems
 from deepsimbad.api.requests import (
@@ -55,6 +56,7 @@ from deepsimbad.api.requests import (
 )
 from deepsimbad.core.belief import FilterKind
 from deepsimbad.core.relevance import UpdateRule
+from deepsimbad.core.summary import DEFAULT_CONFIDENCE
 from deepsimbad.engine.session import DEFAULT_START_STD_M, Observation, SessionConfig, SessionView
 from deepsimbad.engine.worker import Stopwatch
 from deepsimbad.errors import DeepSimbadError
@@ -80,10 +82,18 @@ class SessionBody(JsonBody):
     ] = None
     planner: Annotated[
         Annotated[str, Field(min_length=1, max_length=64)] | None,
-        Field(description="`telling`, `nnql`, `random` or `constant:<m>`; null: the default."),
+        Field(description="`informed`, `nnql`, `random` or `constant:<m>`; null: the default."),
     ] = None
     belief: Annotated[FilterKind | None, Field(description="The filter; null: grid.")] = None
     update: Annotated[UpdateRule | None, Field(description="null: as the map's relevance wants.")] = None
+    confidence: Annotated[
+        Annotated[float, Field(strict=True, gt=0, lt=1)] | None,
+        Field(description=f"Mass within 5 m of the mode from which on it may stop; null: {DEFAULT_CONFIDENCE:g}."),
+    ] = None
+    price_bits_per_m: Annotated[
+        Annotated[float, Field(strict=True, ge=0, le=100)] | None,
+        Field(description="What a metre costs the planner `informed`, in bits; null: 0."),
+    ] = None
 
     def config(self) -> SessionConfig:
         """The engine's form."""
@@ -146,6 +156,8 @@ class ObservationAnswer(SessionAnswer):
     """A session after one more observation."""
 
     timings_ms: Timings
+    informative: Annotated[bool, Field(description="Whether the view changed the belief.")]
+    warnings: Annotated[list[str], Field(description="What a person should know, in sentences.")]
     retrieval: Annotated[list[RetrievedAnswer], Field(description="Map images most relevant to this view, best first.")]
 
 
@@ -193,7 +205,7 @@ def render_session(view: SessionView) -> SessionAnswer:
         "map_version": snapshot.version,
         "n_observations": view.n_observations,
         "expires_at": _iso(view.expires_at),
-        "belief": render_belief(snapshot.route, view.belief),
+        "belief": render_belief(snapshot.route, view.belief, view.is_confident),
         "next_best_view": render_plan(view.plan, snapshot.actions_m),
     }
 
@@ -201,7 +213,13 @@ def render_session(view: SessionView) -> SessionAnswer:
 def render_observation(view: SessionView, watch: Stopwatch) -> ObservationAnswer:
     """A session after an observation; the watch runs since the request arrived."""
     retrieval = [] if view.relevance is None else render_shortlist(view.snapshot.route, view.shortlist, view.relevance)
-    return {**render_session(view), "retrieval": retrieval, "timings_ms": watch.timings_ms()}
+    return {
+        **render_session(view),
+        "informative": view.is_informative,
+        "warnings": warnings_of(view.is_informative, view.belief),
+        "retrieval": retrieval,
+        "timings_ms": watch.timings_ms(),
+    }
 
 
 def render_listed(listed: ListedSession) -> ListedSessionAnswer:
@@ -254,7 +272,7 @@ async def post_observation(
     running: Running,
     action_m: Annotated[
         float,
-        Query(description="Metres moved since the last view, 0 to ten of the longest action; ignored for the first."),
+        Query(description="Metres moved since the last view, to ten of the longest action; ignored for the first."),
     ] = 0.0,
     action_std_m: Annotated[
         float | None, Query(description="How sure that is, a standard deviation; absent: usual odometry.")
@@ -316,7 +334,9 @@ async def get_belief(
     if prefers_binary(request):
         return npy_response(await running.sessions.mass(session_id, robot_of(request)))
     view = await running.sessions.view(session_id, shortlist, robot_of(request))
-    _, body = await running.written(view.belief.top.size, render_belief, view.snapshot.route, view.belief)
+    _, body = await running.written(
+        view.belief.top.size, render_belief, view.snapshot.route, view.belief, view.is_confident
+    )
     return Response(body, media_type=JSON)
 
 

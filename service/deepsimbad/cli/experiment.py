@@ -19,6 +19,7 @@ from deepsimbad.cli.terminal import (
     spacing_option,
     write_json,
 )
+from deepsimbad.core.drive import SameRoute
 from deepsimbad.core.metrics import RetrievalScores
 from deepsimbad.core.planners import DEFAULT_PLANNER
 from deepsimbad.core.relevance import DEFAULT_RELEVANCE, DEFAULT_UPDATE, Relevance, UpdateRule
@@ -97,6 +98,7 @@ def experiment() -> None:
     show_default=True,
     help="Metres within which a match is true.",
 )
+@click.option("--stateless", is_flag=True, help="Every view by itself, in place of one session over the test drive.")
 @click.option(
     "--ground-truth",
     type=click.Path(path_type=Path),
@@ -115,7 +117,14 @@ def vpr(
     same_route = asked["same_route"]
     if same_route is None and ground_truth is None:
         same_route = True  # test and training are scored by their positions: they count along one route
-    config = VprConfig(asked["n_landmarks"], asked["list_length"], tolerance, relevances, same_route=same_route)
+    config = VprConfig(
+        asked["n_landmarks"],
+        asked["list_length"],
+        tolerance,
+        relevances,
+        stateless=asked["stateless"],
+        same_route=same_route,
+    )
     documents: dict[str, Any] = {}
     reports: dict[str, VprReport] = {}
     for evaluator in evaluators:
@@ -146,7 +155,7 @@ def vpr(
 )
 @click.option("--training-episodes", type=click.IntRange(min=0), default=DEFAULT_TRAINING_EPISODES, show_default=True)
 @click.option(
-    "--episodes", type=click.IntRange(min=2), default=2000, show_default=True, help="Test episodes of every planner."
+    "--episodes", type=click.IntRange(min=2), help="Test episodes of every planner, drawn.  [default: from every start]"
 )
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
 def nbv(evaluator: EvaluatorConfig, relevance: str | None, update: str | None, **asked: Any) -> None:
@@ -198,7 +207,7 @@ def _tell(document: dict[str, Any], json_file: Path | None, print_for_people: Ca
 def _print_extractors(reports: dict[str, VprReport]) -> None:
     """One extractor a row."""
     scores = next(iter(reports.values())).scores
-    titles = (f"{relevance.value}: ANR / R@1 / R@5" for relevance in scores)
+    titles = (f"{relevance}: ANR / R@1 / R@5" for relevance in scores)
     table = Table("extractor", "numbers", "bytes", "ms an image", *titles)
     for extractor, report in reports.items():
         time_ms = "-" if report.encode_ms is None else f"{report.encode_ms:.1f}"
@@ -212,13 +221,13 @@ def _print_extractors(reports: dict[str, VprReport]) -> None:
 def _print_relevances(report: VprReport) -> None:
     table = Table("relevance", "ANR %", "R@1 %", "R@5 %")
     for name, score in report.scores.items():
-        shown = f"{name.value} (default)" if name is DEFAULT_RELEVANCE else name.value
+        shown = f"{name} (default)" if name == DEFAULT_RELEVANCE.value else name
         table.add_row(shown, f"{score.anr:.2f}", f"{score.recall_at[1]:.1f}", f"{score.recall_at[5]:.1f}")
     bits = f"index {report.index_bits_per_map_image:.1f} bits a map image"
-    print_table(table, f"{_queries(report.scores)}; {bits}", *_no_second_season(report.same_route.why), numbers=True)
+    print_table(table, f"{_queries(report.scores)}; {bits}", *_no_second_season(report.same_route), numbers=True)
 
 
-def _queries(scores: dict[Relevance, RetrievalScores]) -> str:
+def _queries(scores: dict[str, RetrievalScores]) -> str:
     first = next(iter(scores.values()))
     return f"{first.n_queries} queries scored, {first.n_left_out} left out (no true image)"
 
@@ -226,24 +235,30 @@ def _queries(scores: dict[Relevance, RetrievalScores]) -> str:
 def _print_planners(report: NbvReport, document: dict[str, Any]) -> None:
     at_distance = document["anr_at_distance_m"]
     distances_m = next(iter(at_distance.values()))
-    table = Table("planner", "ANR %", "95 %", "ANR % as in the paper", *(f"after {metres} m" for metres in distances_m))
-    for name, anr in sorted(document["anr"].items(), key=lambda item: float(item[1])):
-        low, high = document["interval_95"][name]
+    views, metres, wrong = (document[f"{what}_confident"] for what in ("views_to", "metres_to", "wrong_when"))
+    titles = ("planner", "views", "95 %", "metres", "wrong %", "ANR %", "ANR % as in the paper")
+    table = Table(*titles, *(f"after {metres} m" for metres in distances_m))
+    for name, anr in sorted(document["anr"].items(), key=lambda item: float(views[item[0]])):
+        low, high = views["interval_95"][name]
         table.add_row(
             f"{name} (default)" if name == DEFAULT_PLANNER else name,
+            f"{views[name]:.2f}",
+            f"{low:.2f} .. {high:.2f}",
+            f"{metres[name]:.0f}",
+            f"{wrong[name]:.1f}",
             f"{anr:.3f}",
-            f"{low:.3f} .. {high:.3f}",
             f"{document['anr_paper'][name]:.2f}",
             *("-" if value is None else f"{value:.2f}" for value in at_distance[name].values()),
         )
-    pairs = document["difference_95"].items()
+    pairs = document["views_difference_95"].items()
     print_table(
         table,
-        *(f"{pair}: {low:+.3f} .. {high:+.3f} % (paired, 95 %)" for pair, (low, high) in pairs),
-        *_no_second_season(None if report.same_route is None else report.same_route.why),
+        "views until the robot is 99 % sure of its place within 5 m; 20 more where it is mistaken or never sure",
+        *(f"{pair}: {low:+.2f} .. {high:+.2f} views (paired, 95 %)" for pair, (low, high) in pairs),
+        *_no_second_season(report.same_route),
         numbers=True,
     )
 
 
-def _no_second_season(why: str | None) -> tuple[str, ...]:
-    return () if why is None else (f"no second season was learnt from: {why}",)
+def _no_second_season(verdict: SameRoute | None) -> tuple[str, ...]:
+    return () if verdict is None or verdict.why is None else (f"no second season was learnt from: {verdict.why}",)

@@ -46,7 +46,7 @@ _ACTIONS_M = tuple(float(metres) for metres in range(1, 11))
 
 @click.command("map")
 @click.argument("domain")
-@click.option("--landmarks", required=True, help="SOURCE landmarks are selected from.")
+@click.option("--landmarks", help="SOURCE of another drive, to choose landmarks from and learn from.  [default: none]")
 @click.option("--training", required=True, help="SOURCE that becomes the map.")
 @evaluator_option
 @click.option(
@@ -70,7 +70,7 @@ _ACTIONS_M = tuple(float(metres) for metres in range(1, 11))
 @data_dir_option
 def map_(
     domain: str,
-    landmarks: str,
+    landmarks: str | None,
     training: str,
     evaluator: EvaluatorConfig,
     relevance: str,
@@ -79,21 +79,29 @@ def map_(
     as_json: bool,
     **options: Any,
 ) -> None:
-    """Map a route from two recordings: one gives the landmarks, the other becomes the map.
+    """Map a route from a recording, and learn from another drive of it where --landmarks gives one.
+
+    Landmarks are chosen from that drive, else from the recording itself.
 
     SOURCE is nclt:ROOT/DATE, a folder of images (with an optional positions.csv) or a .npy or .csv of ready
     encodings; each may end in #START:STOP[:STEP].
     """
     config = RemapConfig(
-        training_traverse="training", landmark_traverse="landmarks", relevance=Relevance(relevance), **options
+        training_traverse="training",
+        landmark_traverse=None if landmarks is None else "landmarks",
+        relevance=Relevance(relevance),
+        **options,
     )
     checked_name(domain, "domain")
     settings = given_settings()
     measure = make_evaluator(evaluator, settings.compute())
     # A mistake in what was typed should cost no minutes of encoding, and leave no domain behind.
-    sources = {"landmarks": landmarks, "training": training}
+    sources = {"training": training} if landmarks is None else {"landmarks": landmarks, "training": training}
     recordings = {role: open_source(source, spacing_m=spacing_m) for role, source in sources.items()}
-    n_candidates, n_landmarks = len(recordings["landmarks"].frames), config.n_landmarks
+    n_candidates, n_landmarks = (
+        len(recordings["training" if landmarks is None else "landmarks"].frames),
+        config.n_landmarks,
+    )
     if n_landmarks is not None and n_candidates < n_landmarks:
         raise TooFewCandidatesError(
             f"{n_candidates} candidates for {n_landmarks} landmarks; ask for fewer (--n-landmarks) or drive further"
@@ -114,7 +122,7 @@ def map_(
         return
     click.echo(f"map {result['map_version']} of {domain} is active: {result['metrics']['n_map_images']} images")
     season = result["metrics"]["second_season"]
-    if season["significance"] is not None and not season["accepted"]:
+    if season is not None and season["significance"] is not None and not season["accepted"]:
         click.echo(f"it learnt nothing of a second season: {season['why']}", err=True)
 
 

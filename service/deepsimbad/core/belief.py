@@ -371,7 +371,7 @@ def _spread(  # noqa: PLR0912 - one pass over a band and its two wrapped ends
     for i in range(n):
         held = 0.0
         for t in range(n_trusts):
-            held += masses[t, i]
+            held += float(masses[t, i])
         if held < least:
             for t in range(n_trusts):
                 spread[t, i] += masses[t, i]
@@ -385,19 +385,19 @@ def _spread(  # noqa: PLR0912 - one pass over a band and its two wrapped ends
         total: float = 0.0
         for j in range(first, stop):
             weights[j] = _error(abs(position_m[j] - position_m[i]), std_m, slipping_m)
-            total += weights[j]
+            total += float(weights[j])
         around_first, around_stop = n, 0
         if length_m > 0:  # beyond a closed route's ends
             while around_stop < first and position_m[around_stop] + length_m - position_m[i] <= reach:
                 weights[around_stop] = _error(position_m[around_stop] + length_m - position_m[i], std_m, slipping_m)
-                total += weights[around_stop]
+                total += float(weights[around_stop])
                 around_stop += 1
             while around_first > stop and position_m[i] + length_m - position_m[around_first - 1] <= reach:
                 around_first -= 1
                 weights[around_first] = _error(position_m[i] + length_m - position_m[around_first], std_m, slipping_m)
-                total += weights[around_first]
+                total += float(weights[around_first])
         for t in range(n_trusts):
-            share: float = masses[t, i] / total
+            share = masses[t, i] / total
             for j in range(first, stop):
                 spread[t, j] += share * weights[j]
             for j in range(around_stop):

@@ -25,7 +25,9 @@ from deepsimbad.core.map import Map
 from deepsimbad.core.planners import DEFAULT_PLANNER, Plan, PlanningView, parse_planner
 from deepsimbad.core.relevance import Query, UpdateRule
 from deepsimbad.core.retrieval import relevances
+from deepsimbad.core.summary import DEFAULT_CONFIDENCE, near_mode
 
+_LEAST_TOLD = 0.01  # of the mass that a view moved elsewhere; with less it told nothing
 _STAGES = ("retrieve", "predict", "update", "plan")
 
 
@@ -39,6 +41,7 @@ class LocalizerConfig:
     seed: int = 0  # of whatever is random
     n_particles: int = DEFAULT_N_PARTICLES  # of the particle filter
     price_bits_per_m: float = 0.0  # of moving, to the planner
+    confidence: float = DEFAULT_CONFIDENCE  # of the mass near the mode, from which on the robot may stop
 
 
 @dataclass(frozen=True)
@@ -57,6 +60,7 @@ class Step:
 
     state: LocalizerState  # the state after it
     plan: Plan | None  # the recommended next move; None where the planner has nothing to go by
+    is_informative: bool  # whether the view changed the belief
     timings_ms: dict[str, float]  # milliseconds by stage
 
 
@@ -106,20 +110,23 @@ class ActiveLocalizer:
         belief = state.belief.predicted(moved_m, std_m, number) if number > 0 else state.belief
         laps.append(self._clock())
 
+        told = 0.0
         if query.is_informative:
             shared = map_.shared_error_after(moved_m) if number > 0 else 0.0
             seen = ViewEvidence.of(relevance, self._update, map_.log_likelihood_scale, shared)
-            belief = belief.updated(seen, number)
+            before, belief = belief.mass, belief.updated(seen, number)
+            told = 0.5 * float(np.abs(belief.mass - before).sum())
         laps.append(self._clock())
 
         after = LocalizerState(belief, live, relevance, number + 1)
         plan = self.plan(after)
         laps.append(self._clock())
-        return Step(after, plan, dict(zip(_STAGES, (1000 * np.diff(laps)).tolist(), strict=True)))
+        return Step(after, plan, told > _LEAST_TOLD, dict(zip(_STAGES, (1000 * np.diff(laps)).tolist(), strict=True)))
 
     def plan(self, state: LocalizerState) -> Plan | None:
         """The next best view from what is known now."""
-        return self._planner(
+        belief = state.belief
+        plan = self._planner(
             PlanningView(
                 self._map,
                 state.belief.mass,
@@ -129,6 +136,10 @@ class ActiveLocalizer:
                 self._config.price_bits_per_m,
             )
         )
+        if plan is None:
+            return None
+        sure = near_mode(self._map.route, belief.mass, int(belief.mass.argmax())) * (1 - belief.off_route)
+        return replace(plan, stop=sure >= self._config.confidence)
 
     def with_prior(self, state: LocalizerState, position_m: float, std_m: float) -> LocalizerState:
         """The robot was carried, or got a fix: a new belief; what is usual for each landmark stays."""

@@ -40,6 +40,10 @@ class Plan:
     action_m: float  # the move
     # [a] what the planner thought of every move, larger is better; None where it did not compare
     values: NDArray[np.float64] | None = None
+    stop: bool = False  # whether the robot is as sure of its place as it asked to be
+    bits: NDArray[np.float64] | None = (
+        None  # [a] that the view after every move is expected to tell; None: nobody knows
+    )
 
 
 Planner: TypeAlias = Callable[[PlanningView], Plan | None]
@@ -70,19 +74,20 @@ def plan_by_information(view: PlanningView) -> Plan:
     Where nobody knows what views are worth it is the longest move.
     """
     actions_m = view.map.actions_m
-    values = information_ahead(view.map, view.price_bits_per_m)
-    if values is None:
+    table = information_ahead(view.map, view.price_bits_per_m)
+    if table is None:
         return Plan(INFORMED, float(actions_m[-1]))
-    averaged = _averaged(view.mass, values)
-    best = averaged.size - 1 - int(np.argmax(averaged[::-1]))
-    return Plan(INFORMED, float(actions_m[best]), averaged)
+    both = _averaged(view.mass, table)
+    values, bits = both[: actions_m.size], both[actions_m.size :]
+    best = values.size - 1 - int(np.argmax(values[::-1]))
+    return Plan(INFORMED, float(actions_m[best]), values, bits=bits)
 
 
 def information_ahead(map_: Map, price_bits_per_m: float) -> NDArray[np.float32] | None:
-    """[n, a] discounted bits of a move from every image and the best moves after it; None where nobody knows.
+    """[n, 2a] discounted bits of a move from every image and of the best after it, then bits of its first view alone.
 
     A view is worth what its place is, but for what it shares with the view before: `(1 - c(a)) I(x + a)`, less the
-    price of the metres. Worked out once a price and map.
+    price of the metres. Worked out once a price and map; None where nobody knows what views are worth.
     """
     if map_.view_bits is None:
         return None
@@ -90,12 +95,10 @@ def information_ahead(map_: Map, price_bits_per_m: float) -> NDArray[np.float32]
     if price_bits_per_m not in tables:
         actions_m = map_.actions_m
         news = np.array([1.0 - map_.alike_after(action_m) for action_m in actions_m.tolist()])
-        tables[price_bits_per_m] = _swept(
-            _leads_to(map_.route, actions_m),
-            map_.view_bits.astype(np.float64),
-            news,
-            price_bits_per_m * np.abs(actions_m),
-        )
+        leads_to, bits = _leads_to(map_.route, actions_m), map_.view_bits.astype(np.float64)
+        values = _swept(leads_to, bits, news, price_bits_per_m * np.abs(actions_m))
+        first = news * np.where(leads_to < 0, bits.mean(), bits[leads_to])
+        tables[price_bits_per_m] = np.hstack([values, first.astype(np.float32)])
     return tables[price_bits_per_m]
 
 

@@ -6,14 +6,16 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from deepsimbad.core.belief import BeliefSummary, GridFilter, summarise
+from deepsimbad.core.belief import GridFilter, ViewEvidence
+from deepsimbad.core.building import MapPlan, compose_map
 from deepsimbad.core.descriptor import rank_landmarks, ranks_from_ranked_landmarks, unpack_ranked_landmarks
+from deepsimbad.core.drive import Drive
 from deepsimbad.core.localizer import ActiveLocalizer, LocalizerConfig, LocalizerState
 from deepsimbad.core.map import Map
-from deepsimbad.core.off_route import OFF_ROUTE_AT_START
 from deepsimbad.core.planners import Plan
-from deepsimbad.core.relevance import Query
+from deepsimbad.core.relevance import Query, Relevance
 from deepsimbad.core.retrieval import relevances, shortlist
+from deepsimbad.core.summary import BeliefSummary, summarise
 from deepsimbad.engine.worker import EncodedImage, Stopwatch, encode_images
 from deepsimbad.errors import (
     InvalidDissimilaritiesError,
@@ -77,6 +79,7 @@ class Localization:
     shortlist: NDArray[np.int64]  # ids of the most relevant ones, best first
     belief: BeliefSummary  # after this one view, from a uniform prior
     plan: Plan | None  # the move that would tell most next; None where the map can name none
+    is_informative: bool  # whether the view shows anything
 
 
 def localize(
@@ -99,17 +102,16 @@ def localize(
     watch.lap("retrieve")
     best = shortlist(relevance, length)
     watch.lap("shortlist")
-    belief = GridFilter.uniform(snapshot.route).updated(relevance, snapshot.update_rule, step=0)
-    # One view from a belief that expects nothing says nothing about being off the route.
-    off_route = None if snapshot.off_route_model is None else OFF_ROUTE_AT_START
-    summary = summarise(snapshot.route, belief.mass, length, off_route)
+    rule = snapshot.update_rule
+    seen = ViewEvidence.of(relevance, rule, snapshot.log_likelihood_scale)
+    belief = GridFilter.uniform(snapshot.route, rule).updated(seen, step=0)
+    summary = summarise(snapshot.route, belief.mass, length, belief.off_route)
     watch.lap("belief")
     plan = None
-    if snapshot.bits_ahead is not None or snapshot.q_values is not None:
-        seen = LocalizerState(belief, None, relevance, off_route, 1)
-        plan = ActiveLocalizer(snapshot, LocalizerConfig()).plan(seen)
+    if snapshot.view_bits is not None or snapshot.q_values is not None:
+        plan = ActiveLocalizer(snapshot, LocalizerConfig()).plan(LocalizerState(belief, None, relevance, 1))
     watch.lap("plan")
-    return Localization(snapshot, relevance, best, summary, plan)
+    return Localization(snapshot, relevance, best, summary, plan, query.is_informative)
 
 
 def retrieve(snapshot: Map, query: Query) -> NDArray[np.float32]:
@@ -185,15 +187,11 @@ def shortlist_length(snapshot: Map, wanted: int | None) -> int:
 
 
 def warm_up() -> None:
-    """Answer one view on a map of two images and move on, which compiles the kernels: a matter of seconds, once."""
+    """Answer views on a small map of the default kind and move on, which compiles the kernels: seconds, once."""
     evaluator = FeatureL2("none")
-    map_ = Map(
-        config={"relevance": "rrf", "n_landmarks": 2},
-        lists=np.array([[0, 1]], np.uint16),
-        position_m=np.array([0.0, 1.0]),
-        actions_m=np.array([1.0]),
-        telling_bits=np.array([1, 2], np.float32),
-        landmark_model=evaluator.fit_landmarks(np.eye(2, dtype=np.float32)),
-    )
-    localize(map_, evaluator, ReadyEncoding(np.ones(2)))
-    GridFilter.uniform(map_.route).predicted(0.5, 0.1, step=1)
+    drive = Drive(position_m=np.arange(8.0), encodings=np.random.default_rng(0).normal(size=(8, 5)).astype(np.float32))
+    map_ = compose_map(MapPlan(Relevance.COMPOSED, 2, (1.0,)), drive, None, None, 4).map
+    localizer = ActiveLocalizer(map_, LocalizerConfig())
+    step = localizer.step(localizer.start(), Query(np.arange(1, 5, dtype=np.float32)))
+    localizer.step(step.state, describe(map_, evaluator, ReadyEncoding(np.ones(5))), 1.0)
+    localize(map_, evaluator, ReadyEncoding(np.ones(5)))

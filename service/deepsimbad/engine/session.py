@@ -15,13 +15,14 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from deepsimbad.core.belief import BeliefSummary, FilterKind, summarise
+from deepsimbad.core.belief import FilterKind
 from deepsimbad.core.localizer import ActiveLocalizer, LocalizerConfig, LocalizerState, Step
 from deepsimbad.core.map import Map
 from deepsimbad.core.planners import Plan
 from deepsimbad.core.relevance import Query, UpdateRule
 from deepsimbad.core.retrieval import shortlist
 from deepsimbad.core.route import Route
+from deepsimbad.core.summary import DEFAULT_CONFIDENCE, BeliefSummary, summarise
 from deepsimbad.engine.localizer import View, shortlist_length
 from deepsimbad.engine.worker import InferenceWorker, Priority
 from deepsimbad.errors import (
@@ -50,6 +51,8 @@ class SessionConfig:
     planner: str | None = None  # by name; None: the default
     belief: FilterKind = FilterKind.GRID
     update: UpdateRule | None = None  # how a view counts; None: as the map's relevance wants
+    confidence: float = DEFAULT_CONFIDENCE  # of the mass within 5 m of the mode, from which on it may stop
+    price_bits_per_m: float = 0.0  # of moving, to the planner
 
     def as_dict(self) -> dict[str, Any]:
         """JSON-ready."""
@@ -89,7 +92,12 @@ class SessionEngine:
         """The algorithm; raises InvalidInputError where the configuration cannot be."""
         config = self.config
         algorithm = LocalizerConfig(
-            filter=config.belief, update=config.update, planner=config.planner, seed=config.seed
+            filter=config.belief,
+            update=config.update,
+            planner=config.planner,
+            seed=config.seed,
+            price_bits_per_m=config.price_bits_per_m,
+            confidence=config.confidence,
         )
         return ActiveLocalizer(self.snapshot, algorithm, perf_counter)
 
@@ -127,7 +135,10 @@ class SessionState:
         with _journal_faults():
             if snapshot is None:
                 return cls.start(engine)
-            return cls(engine, snapshot.sequence, engine.localizer.from_arrays(snapshot.arrays))
+            try:
+                return cls(engine, snapshot.sequence, engine.localizer.from_arrays(snapshot.arrays))
+            except KeyError:  # written by an earlier release: the journal is followed from its beginning
+                return cls.start(engine)
 
     def followed(self, row: JournalRow) -> "SessionState":
         """The state after the journal's next row, the same bits as when it was written; raises DamagedFileError."""
@@ -213,6 +224,8 @@ class SessionView:
     plan: Plan | None  # the move to make next; None where the map can name none
     relevance: NDArray[np.float32] | None  # [n] of the last view; None before any
     shortlist: NDArray[np.int64]  # ids of the map images most relevant to the last view, best first
+    is_confident: bool = False  # whether it is as sure of its place as was asked
+    is_informative: bool = True  # whether the last view changed the belief
     is_repeated: bool = False  # whether the observation had been counted before
 
 
@@ -220,15 +233,18 @@ def view_of(live: LiveSession, expires_at: float, state: SessionState, n_shortli
     """Summarise a state, with lists of the usual length or another; milliseconds of work."""
     snapshot, belief, step = state.engine.snapshot, state.belief, state.step
     length = shortlist_length(snapshot, n_shortlist)
+    summary = summarise(snapshot.route, belief.belief.mass, length, belief.belief.off_route)
     return SessionView(
         session_id=live.record.session_id,
         expires_at=expires_at,
         snapshot=snapshot,
         n_observations=belief.n_observations,
-        belief=summarise(snapshot.route, belief.belief.mass, length, belief.off_route),
+        belief=summary,
         plan=state.engine.localizer.plan(belief) if step is None else step.plan,
         relevance=belief.relevance,
         shortlist=np.empty(0, np.int64) if belief.relevance is None else shortlist(belief.relevance, length),
+        is_confident=summary.near_mode >= state.engine.config.confidence,
+        is_informative=step is None or step.is_informative,
     )
 
 

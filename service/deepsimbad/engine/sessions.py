@@ -15,6 +15,8 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from deepsimbad.core.belief import SIGMAS, motion_std_m
+from deepsimbad.core.map import Map
 from deepsimbad.core.planners import Plan
 from deepsimbad.core.relevance import Relevance
 from deepsimbad.engine.localizer import View, describe, shortlist_length
@@ -45,6 +47,8 @@ from deepsimbad.store.sessions import JournalRow, ListedSession, ObservedRow, Pr
 T = TypeVar("T")
 
 DELETED, EXPIRED = "deleted", "expired"
+_ENCODED = {Relevance.COMPOSED, Relevance.BRUTE_FORCE}  # relevances that compare encodings
+_MEASURED = {Relevance.COMPOSED, Relevance.SIMBAD}  # and dissimilarities
 LONGEST_MOVE_ACTIONS = 10.0  # a robot may report a move of up to so many of the domain's longest action
 _LONGEST_RETRY_S = 60
 
@@ -323,14 +327,7 @@ class Sessions:
             state = live.state or await self._state(live)
             engine = state.engine
             shortlist_length(engine.snapshot, observation.n_shortlist)  # a bad one should not move the session
-            longest_m = LONGEST_MOVE_ACTIONS * float(engine.snapshot.actions_m.max())
-            for name, metres in (("action_m", observation.action_m), ("action_std_m", observation.action_std_m)):
-                if metres is not None and not (math.isfinite(metres) and 0 <= metres <= longest_m):
-                    raise InvalidMoveError(
-                        f"{name} is {metres}: give metres from 0 to {longest_m:g}, ten of the domain's longest action",
-                        minimum=0.0,
-                        maximum=longest_m,
-                    )
+            _check_move(engine.snapshot, observation.action_m, observation.action_std_m)
             watch.lap("wait")
             view = await observation.view(engine.evaluator)
             watch.lap("decode")
@@ -368,14 +365,15 @@ class Sessions:
         query = describe(snapshot, state.engine.evaluator, view)
         watch.lap("describe")
         relevance = snapshot.relevance
+        encoding = query.encoding if relevance in _ENCODED else None
         row = ObservedRow(  # what the map's relevance compares, and no more
             sequence=state.sequence + 1,
             expires_at=expires_at,
             action_m=observation.action_m,
             action_std_m=observation.action_std_m,
             ranks=query.ranks,
-            dissimilarities=query.dissimilarities if relevance is Relevance.SIMBAD else None,
-            encoding=query.encoding if relevance is Relevance.BRUTE_FORCE else None,
+            dissimilarities=None if encoding is not None else query.dissimilarities if relevance in _MEASURED else None,
+            encoding=encoding,
             idempotency=idempotency,
         )
         moved_on = state.after(row)
@@ -466,3 +464,20 @@ def check_owner(record: SessionRecord, key_id: str | None) -> None:
 
 def _ended(session_id: str, ending: str) -> EndedSessionError:
     return EndedSessionError(f"session {session_id} has ended ({ending}): begin a new one", ending=ending)
+
+
+def _check_move(snapshot: Map, action_m: float, action_std_m: float | None) -> None:
+    """Refuse a move that no robot of the domain makes: backward within its error is none."""
+    longest_m = LONGEST_MOVE_ACTIONS * float(np.abs(snapshot.actions_m).max())
+    if action_std_m is not None and not (math.isfinite(action_std_m) and 0 <= action_std_m <= longest_m):
+        raise InvalidMoveError(f"action_std_m is {action_std_m}: give metres from 0 to {longest_m:g}")
+    least_m = 0.0
+    if math.isfinite(action_m):
+        std_m = motion_std_m(action_m) if action_std_m is None else action_std_m
+        least_m = -longest_m if snapshot.actions_m.min() < 0 else -SIGMAS * std_m
+    if not (math.isfinite(action_m) and least_m <= action_m <= longest_m):
+        raise InvalidMoveError(
+            f"action_m is {action_m}: give metres from 0 to {longest_m:g}, ten of the domain's longest action",
+            minimum=0.0,
+            maximum=longest_m,
+        )

@@ -100,7 +100,7 @@ class FeatureL2:
         return {"prototypes": prototypes}
 
     def check_model(self, model: LandmarkModel, n_landmarks: int) -> None:
-        """See `Evaluator.check_model`; a composed model's prototypes are unit vectors, with what makes encodings such."""
+        """See `Evaluator.check_model`; a composed model's prototypes are unit vectors."""
         prototypes = model.get("prototypes")
         if prototypes is None or prototypes.ndim != 2 or len(prototypes) != n_landmarks:
             has = "none" if prototypes is None else list(prototypes.shape)

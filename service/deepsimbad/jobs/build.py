@@ -149,9 +149,9 @@ def build(
     if plan.relevance is Relevance.COMPOSED:
         return compose_map(plan, training, second, landmarks, n_landmarks, on_progress)
     candidates = training if landmarks is None else landmarks
-    model = candidates
     if isinstance(candidates, Drive):
-        model = choose_landmarks(candidates.encodings, n_landmarks, evaluator, lambda share: on_progress(share / 2))
+        chosen = choose_landmarks(candidates.encodings, n_landmarks, evaluator, lambda share: on_progress(share / 2))
+    model = chosen if isinstance(candidates, Drive) else candidates
     return build_from_dissimilarities(
         plan,
         training,

@@ -281,7 +281,7 @@ def _means(values: Mapping[str, NDArray[np.float64]]) -> dict[str, float]:
 
 def nbv_stages(config: NbvConfig) -> dict[str, float]:
     """The stages `run_nbv` reports, with their weights."""
-    stages = {}
+    stages: dict[str, float] = {}
     for setup in ("ours", "paper"):
         stages |= {f"map ({setup})": 1.0, f"train ({setup})": 4.0}
         stages |= {f"{name} ({setup})": 4.0 if name in {RANDOM, CLAIRVOYANT} else 1.0 for name in _names(config)}

@@ -194,8 +194,8 @@ class _Inputs:
     training: Drive  # the traverse that becomes the map
     candidates: Drive | None  # the traverse landmarks are chosen from; None: those of `base` stay, or the training one
     base: Map | None  # the active map whose landmarks stay; None where they are chosen
-    # The drive that the map learns from beside its own: the landmark traverse, else what the active map was made of; None
-    # where there is none of the same encoder, or where frames are appended
+    # The drive that the map learns from beside its own: the landmark traverse, else what the active map was made of;
+    # None where there is none of the same encoder, or where frames are appended
     second: Drive | None
     check: Drive | None  # the drive that the new map is checked on; None: on frames of `training` that are held out
 
