@@ -86,15 +86,15 @@ def plan_by_information(view: PlanningView) -> Plan:
 def information_ahead(map_: Map, price_bits_per_m: float) -> NDArray[np.float32] | None:
     """[n, 2a] discounted bits of a move from every image and of the best after it, then bits of its first view alone.
 
-    A view is worth what its place is, but for what it shares with the view before: `(1 - c(a)) I(x + a)`, less the
-    price of the metres. Worked out once a price and map; None where nobody knows what views are worth.
+    A view is worth what its place is, but for what the view before explains of its error: `(1 - c(a)^2) I(x + a)`,
+    less the price of the metres. Worked out once a price and map; None where nobody knows what views are worth.
     """
     if map_.view_bits is None:
         return None
     tables = map_.information_tables
     if price_bits_per_m not in tables:
         actions_m = map_.actions_m
-        news = np.array([1.0 - map_.alike_after(action_m) for action_m in actions_m.tolist()])
+        news = np.array([1.0 - map_.alike_after(action_m) ** 2 for action_m in actions_m.tolist()])
         leads_to, bits = _leads_to(map_.route, actions_m), map_.view_bits.astype(np.float64)
         values = _swept(leads_to, bits, news, price_bits_per_m * np.abs(actions_m))
         first = news * np.where(leads_to < 0, bits.mean(), bits[leads_to])
