@@ -11,8 +11,8 @@ KEYS = {
     *("anr", "recall_at_1", "recall_at_5", "default", "n_queries", "n_left_out", "index_bits_per_map_image", "seconds"),
     *("second_season", "config", "encoding_dim", "bytes_per_encoding", "encode_ms"),
 }
-SIX = {"calibrated", "standardised", "rrf", "bag_of_landmarks", "simbad", "brute_force"}
-PLANNERS = {"random", "clairvoyant", "nnql", "telling", *(f"constant_{action_m}" for action_m in range(1, 11))}
+SEVEN = {"composed", "brute_force_u", "standardised", "rrf", "bag_of_landmarks", "simbad", "brute_force"}
+PLANNERS = {"random", "clairvoyant", "nnql", "informed", *(f"constant_{action_m}" for action_m in range(1, 11))}
 
 
 def triplet_of(folder, test="winter"):
@@ -50,9 +50,9 @@ def measured(deepsimbad):
 def test_vpr_is_one_document_with_the_stable_keys(measured, triplet):
     document = measured("vpr", *triplet, *READY)
     assert set(document) == KEYS
-    assert set(document["anr"]) == set(document["recall_at_1"]) == set(document["recall_at_5"]) == SIX
+    assert set(document["anr"]) == set(document["recall_at_1"]) == set(document["recall_at_5"]) == SEVEN
     assert all(0 <= anr < 20 for anr in document["anr"].values()), document["anr"]
-    assert (document["default"], document["n_queries"], document["n_left_out"]) == ("calibrated", 80, 0)
+    assert (document["default"], document["n_queries"], document["n_left_out"]) == ("composed", 80, 0)
     config = document["config"]
     assert (config["n_landmarks"], config["list_length"], config["tolerance_m"], config["spacing_m"]) == (40, 4, 2, 1)
     assert config["training"].endswith("summer.npy")
@@ -63,12 +63,12 @@ def test_nbv_is_one_document_with_the_stable_keys(measured, route):
     document = measured("nbv", *route, *QUICK)
     assert set(document) >= {"anr", "default", "anr_paper", "interval_95", "config"}
     assert set(document["anr"]) == set(document["anr_paper"]) == set(document["interval_95"]) == PLANNERS
-    assert document["default"] == "telling"
+    assert document["default"] == "informed"
     assert all(0 <= anr < 60 for anr in (*document["anr"].values(), *document["anr_paper"].values()))
     for name, (low, high) in document["interval_95"].items():
         assert low <= document["anr"][name] <= high
     config = document["config"]
-    assert (config["relevance"], config["update"]) == ("calibrated", "log_likelihood")
+    assert (config["relevance"], config["update"]) == ("composed", "mixture")
     assert (config["n_landmarks"], config["list_length"], config["seed"]) == (40, 4, 0)
     assert (config["episodes"], config["training_episodes"], config["n_steps"]) == (6, 20, 10)
     assert (config["actions_m"], config["spacing_m"]) == (list(range(1, 11)), 1.0)
@@ -83,7 +83,7 @@ def test_json_into_a_file_leaves_the_table_to_people(deepsimbad, triplet, route,
     for name, anr in json.loads((tmp_path / "out.json").read_text())["anr"].items():
         (row,) = [line for line in ran.out.splitlines() if f" {name} " in line and "paired" not in line]
         assert f"{anr:.2f}" in row if kind == "vpr" else f"{anr:.3f}" in row
-    assert ("80 queries scored" if kind == "vpr" else "telling (default)") in ran.out
+    assert ("80 queries scored" if kind == "vpr" else "informed (default)") in ran.out
 
 
 def test_every_option_of_vpr_is_heeded(measured, triplet, drives):
@@ -131,7 +131,7 @@ def test_landmarks_of_another_season_are_told_from_those_of_elsewhere(measured, 
 
     def season(landmarks, *options):
         triplet = ("--landmarks", drives / f"{landmarks}.npy", *triplet_of(drives, "summer")[2:])
-        return measured("vpr", *triplet, *READY, "--relevance", "calibrated", *options)["second_season"]
+        return measured("vpr", *triplet, *READY, "--relevance", "composed", *options)["second_season"]
 
     assert season("winter")["accepted"]
     assert not season("landmarks")["accepted"]

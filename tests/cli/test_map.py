@@ -38,7 +38,7 @@ def test_a_map_is_made_and_described(deepsimbad, drives, tmp_path):
     assert (document["n_map_images"], document["n_landmarks"], document["list_length"]) == (80, 20, 4)
     assert document["route_length_m"] == 79.0
     assert document["actions_m"] == list(range(1, 11))
-    assert document["relevance"] == "calibrated"
+    assert document["relevance"] == "composed"
     table = deepsimbad("info", "route", "--data-dir", tmp_path / "here")
     assert table.code == 0
     assert "n_map_images" in table.out
@@ -109,7 +109,7 @@ def test_images_are_found_where_they_were_taken(deepsimbad, pictures, tmp_path):
         assert set(answer) >= {"image", "map_version", "timings_ms", "belief", "retrieval", "next_best_view"}
         assert answer["retrieval"][0]["map_image"] == place
         assert answer["belief"]["mode_m"] == 3.0 * place
-        assert answer["next_best_view"]["planner"] == "telling"
+        assert answer["next_best_view"]["planner"] == "informed"
         assert answer["next_best_view"]["action_m"] in range(1, 11)
     table = deepsimbad("localize", "route", *views)
     assert table.code == 0

@@ -64,7 +64,7 @@ def test_old_images_stay_and_appended_places_are_found(first, run, catalog, eval
     assert (np.diff(after.position_m) >= 0).all()
     assert np.array_equal(after.lists[:, is_old], before.lists)
     assert np.array_equal(after.landmark_model["prototypes"], before.landmark_model["prototypes"])
-    for name in ("correlation", "listed_score", "off_route_model"):
+    for name in ("likelihood_scale", "novelty"):
         assert np.array_equal(getattr(after, name), getattr(before, name))
     for name in ("values", "encodings"):
         kept, has = getattr(before, name), getattr(after, name)
@@ -120,7 +120,7 @@ def test_the_config_records_what_was_appended(first, run, catalog, drive):
     for config in (catalog.map(DOMAIN, 3).config, contents(catalog, 3).config):
         assert config["training_traverse"] == "drive"
         assert config["landmark_traverse"] == "landmarks"
-        assert (config["list_length"], config["n_landmarks"], config["relevance"]) == (3, 12, "calibrated")
+        assert (config["list_length"], config["n_landmarks"], config["relevance"]) == (3, 12, "composed")
         assert config["appended"] == [
             {"traverse": "more", "n_frames": 15, "to_version": 1},
             {"traverse": "third", "n_frames": 5, "to_version": 2},
@@ -138,7 +138,7 @@ def test_the_config_records_what_was_appended(first, run, catalog, drive):
     [
         ({"n_landmarks": 11}, "has 12 landmarks, not 11"),
         ({"list_length": 5}, "list_length 3, not 5"),
-        ({"relevance": Relevance.RRF}, "relevance calibrated, not rrf"),
+        ({"relevance": Relevance.RRF}, "relevance composed, not rrf"),
     ],
 )
 def test_what_is_appended_must_be_alike(first, run, catalog, wrong, match):

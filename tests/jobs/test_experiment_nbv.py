@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from deepsimbad.core.episodes import Episode
 from deepsimbad.errors import CancelledError, InvalidMapConfigError
 from deepsimbad.jobs.build import encode_recording
 from deepsimbad.jobs.experiments import NbvConfig, NbvReport, nbv_stages, run_nbv
@@ -12,7 +13,7 @@ from deepsimbad.jobs.progress import Progress
 from deepsimbad_client.recordings.sources import open_source
 
 QUICK = NbvConfig(n_landmarks=40, actions_m=(1.0, 2.0, 4.0), n_steps=4, training_episodes=60, episodes=60)
-PLANNERS = {"random", "constant_1", "constant_2", "constant_4", "clairvoyant", "nnql", "telling"}
+PLANNERS = {"random", "constant_1", "constant_2", "constant_4", "clairvoyant", "nnql", "informed"}
 
 
 @pytest.fixture(scope="session")
@@ -79,9 +80,14 @@ def slow_paper(rows, config, moves):
     return shares
 
 
+def shares_of(episodes):
+    """[episodes, steps] rank shares."""
+    return np.array([episode.rank_share for episode in episodes])
+
+
 def random_moves(report):
     """The moves that the random planner drew: they depend on the seed alone, not on what is believed."""
-    return np.diff(report.travelled_m["random"], axis=1, prepend=0)
+    return np.diff([episode.travelled_m for episode in report.paper["random"]], axis=1, prepend=0)
 
 
 def test_the_papers_set_up_agrees_with_the_slow_reference(drives, report):
@@ -90,11 +96,12 @@ def test_the_papers_set_up_agrees_with_the_slow_reference(drives, report):
         moves = np.full((QUICK.episodes, QUICK.n_steps), action_m)
         expected = slow_paper(rows, QUICK, moves)
         assert expected.mean() > 0.01, "all were found, so nothing was compared"
-        np.testing.assert_allclose(report.paper[f"constant_{action_m:g}"], expected, atol=1.01 / 110)
-        assert report.paper[f"constant_{action_m:g}"].mean() == pytest.approx(expected.mean(), abs=2e-4)
+        measured = shares_of(report.paper[f"constant_{action_m:g}"])
+        np.testing.assert_allclose(measured, expected, atol=1.01 / 110)
+        assert measured.mean() == pytest.approx(expected.mean(), abs=2e-4)
     moves = random_moves(report)
     assert set(np.unique(moves)) == set(QUICK.actions_m)
-    np.testing.assert_allclose(report.paper["random"], slow_paper(rows, QUICK, moves), atol=1.01 / 110)
+    np.testing.assert_allclose(shares_of(report.paper["random"]), slow_paper(rows, QUICK, moves), atol=1.01 / 110)
 
 
 @pytest.mark.slow
@@ -103,12 +110,14 @@ def test_real_netvlad_in_order_of_what_they_know(real_data, evaluator):
     folder, roles = real_data / "nordland_netvlad64", ("landmarks", "training", "test")
     sources = {role: str(folder / f"{name}.npy") for role, name in zip(roles, ("nr", "nq", "nq2"), strict=True)}
     report = experiment(sources, evaluator, NbvConfig(episodes=300, training_episodes=500))
-    mean = {name: shares.mean() for name, shares in report.ours.items()}
-    assert mean["clairvoyant"] < mean["telling"] < mean["random"]
-    assert all(report.ours[name].mean() < report.paper[name].mean() for name in report.ours)
+    mean, paper = (
+        {name: shares_of(episodes).mean() for name, episodes in setup.items()} for setup in (report.ours, report.paper)
+    )
+    assert mean["clairvoyant"] < mean["informed"] < mean["random"]
+    assert all(mean[name] < paper[name] for name in mean)
     rows = [np.load(path).astype(np.float64) for path in sources.values()]
     expected = slow_paper(rows, report.config, np.full((300, 10), 5.0))
-    assert 100 * report.paper["constant_5"].mean() == pytest.approx(100 * expected.mean(), abs=0.01)
+    assert 100 * paper["constant_5"] == pytest.approx(100 * expected.mean(), abs=0.01)
 
 
 # --- what is compared ----------------------------------------------------------------------------------------------
@@ -118,24 +127,24 @@ def test_every_planner_has_the_same_starts(drives, report, evaluator):
     """With one move to choose from, all planners are one."""
     config = replace(QUICK, actions_m=(2.0,), episodes=20)
     only = experiment(drives, evaluator, config)
-    for name, shares in only.ours.items():
-        np.testing.assert_array_equal(shares, only.ours["constant_2"], err_msg=name)
-        np.testing.assert_array_equal(only.paper[name], only.paper["constant_2"], err_msg=name)
+    for setup in (only.ours, only.paper):
+        for name, episodes in setup.items():
+            np.testing.assert_array_equal(shares_of(episodes), shares_of(setup["constant_2"]), err_msg=name)
     assert set(report.config.actions_m) == {1, 2, 4}, "the other tests are of several moves"
 
 
 def test_the_clairvoyant_is_no_worse_than_any_single_move(report):
-    first = report.ours["clairvoyant"][:, 0]
+    first = shares_of(report.ours["clairvoyant"])[:, 0]
     for action_m in QUICK.actions_m:
-        assert (first <= report.ours[f"constant_{action_m:g}"][:, 0]).all()
+        assert (first <= shares_of(report.ours[f"constant_{action_m:g}"])[:, 0]).all()
 
 
 def test_the_truth_is_the_map_image_nearest_in_metres(drives, evaluator):
     """Part of the mapped drive itself, driven again: frame i of the test is not map image i."""
     config = replace(QUICK, episodes=30, training_episodes=0)
     same = experiment({**drives, "test": drives["training"] + "#31:90:2"}, evaluator, config)
-    assert same.ours["constant_4"].mean() < 0.002
-    assert same.paper["constant_4"].mean() < 0.02
+    assert shares_of(same.ours["constant_4"]).mean() < 0.002
+    assert shares_of(same.paper["constant_4"]).mean() < 0.02
 
 
 def test_a_test_drive_too_short_is_named(drives, evaluator):
@@ -158,37 +167,70 @@ def test_stages_are_reported_and_the_whole_can_be_cancelled(drives, evaluator):
 
 def test_the_document_tells_what_was_measured(report):
     document = report.as_dict({"training": "here"})
-    for name, shares in report.ours.items():
+    for name, episodes in report.ours.items():
+        shares = shares_of(episodes)
         assert document["anr"][name] == pytest.approx(100 * shares.mean())
-        assert document["anr_paper"][name] == pytest.approx(100 * report.paper[name].mean())
+        assert document["anr_paper"][name] == pytest.approx(100 * shares_of(report.paper[name]).mean())
         low, high = document["interval_95"][name]
         assert low <= document["anr"][name] <= high
         assert document["anr_by_step"][name] == pytest.approx([100 * shares[:, step].mean() for step in range(4)])
-    assert document["default"] == "telling"
-    constants = {name: anr for name, anr in document["anr"].items() if name.startswith("constant")}
-    assert document["best_constant"] == min(constants, key=constants.get)
-    assert set(document["difference_95"]) == {"telling - random", f"telling - {document['best_constant']}"}
+        for figure, part in (("views_to_confident", "views"), ("metres_to_confident", "metres")):
+            assert document[figure][name] == pytest.approx(np.mean([getattr(each, part) for each in episodes]))
+            low, high = document[figure]["interval_95"][name]
+            assert low <= document[figure][name] <= high
+        assert document["wrong_when_confident"][name] == 100 * np.mean([episode.is_wrong for episode in episodes])
+    assert document["default"] == "informed"
+    views = document["views_to_confident"]
+    assert document["best_constant"] == min((name for name in views if name.startswith("constant")), key=views.get)
+    rivals = {"informed - random", f"informed - {document['best_constant']}"}
+    assert set(document["difference_95"]) == set(document["views_difference_95"]) == rivals
     assert document["n_episodes"] == 60
     assert document["config"]["training"] == "here"
     assert document["config"]["actions_m"] == (1.0, 2.0, 4.0)
 
 
+def episodes(shares, travelled_m=None, views=None):
+    """One an entry of [episodes, steps] rank shares."""
+    travelled_m = np.ones_like(shares) if travelled_m is None else travelled_m
+    views = np.ones(len(shares)) if views is None else views
+    return [Episode(*each, metres=0.0, is_wrong=False) for each in zip(shares, travelled_m, views, strict=True)]
+
+
 def test_differences_are_those_of_the_same_starts():
     """The default is better by one hundredth everywhere; how hard a start is does not blur that."""
     hard = np.random.default_rng(0).random((200, 3)) / 2
-    ours = {"telling": hard, "random": hard + 0.01, "constant_1": hard + 0.2, "constant_9": hard + 0.02}
-    report = NbvReport(QUICK, ours, ours, {name: np.ones((200, 3)) for name in ours})
-    difference = report.as_dict({})["difference_95"]
-    assert difference["telling - random"] == pytest.approx([-1, -1])
-    assert difference["telling - constant_9"] == pytest.approx([-2, -2])
-    assert report.best_constant == "constant_9"
+    views = 20 * hard[:, 0]
+    ours = {
+        "informed": episodes(hard, views=views),
+        "random": episodes(hard + 0.01, views=views + 3),
+        "constant_1": episodes(hard, views=views + 2),
+        "constant_9": episodes(hard + 0.02, views=views + 1),
+    }
+    report = NbvReport(QUICK, ours, ours, np.arange(200) // 20)
+    document = report.as_dict({})
+    assert document["difference_95"]["informed - random"] == pytest.approx([-1, -1])
+    assert document["difference_95"]["informed - constant_9"] == pytest.approx([-2, -2])
+    assert document["views_difference_95"]["informed - random"] == pytest.approx([-3, -3])
+    assert report.best_constant == "constant_9", "it takes the fewest views"
+
+
+def test_starts_of_one_stretch_count_as_one():
+    """Equal episodes of one stretch of 20 m do not make an interval narrower than stretches do."""
+    shares = np.repeat(np.random.default_rng(0).random((10, 3)), 20, axis=0)
+    ours = dict.fromkeys(("informed", "random", "constant_1"), episodes(shares))
+
+    def width(block):
+        low, high = NbvReport(QUICK, ours, ours, block).as_dict({})["interval_95"]["random"]
+        return high - low
+
+    assert width(np.arange(200) // 20) > 2 * width(np.arange(200))
 
 
 def test_at_a_distance_the_last_view_before_it_counts():
     shares = np.array([[0.5, 0.4, 0.3], [0.6, 0.2, 0.1], [0.9, 0.9, 0.9]])
     travelled = np.array([[4.0, 9.0, 12.0], [10.0, 20.0, 30.0], [1.0, 2.0, 3.0]])
-    ours = dict.fromkeys(("telling", "random", "constant_1"), shares)
-    document = NbvReport(QUICK, ours, ours, dict.fromkeys(ours, travelled)).as_dict({})
+    ours = dict.fromkeys(("informed", "random", "constant_1"), episodes(shares, travelled))
+    document = NbvReport(QUICK, ours, ours, np.arange(3)).as_dict({})
     at = document["anr_at_distance_m"]["random"]
     # 10 m: the second view of the first episode (9 m), the first of the second; the third never went so far
     assert at["10"] == pytest.approx(100 * (0.4 + 0.6) / 2)

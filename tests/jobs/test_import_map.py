@@ -32,8 +32,7 @@ from deepsimbad.store.traverses import Traverse
 
 EVALUATOR = {"kind": "feature_l2", "extractor": "none"}
 ACTIONS_M = (1.0, 2.0)
-CALIBRATED = {"relevance": "calibrated", "n_landmarks": 9}
-TRUST = {"correlation": np.full(9, 0.6), "listed_score": np.ones((3, 9))}
+STANDARDISED = {"relevance": "standardised", "n_landmarks": 9}
 
 
 def contents(domain, version, **changes):
@@ -235,9 +234,9 @@ import_map(catalog, Path(sys.argv[2]))
         {"actions_m": (-1.0, 2.0)},
         {"actions_m": (2.0, 1.0)},
         {"position_m": np.full(30, 5.0)},
-        {"config": CALIBRATED, "statistics": np.full((2, 9), np.nan), **TRUST},
-        {"config": CALIBRATED, "statistics": np.zeros((2, 9)), **TRUST},
-        {"telling_bits": np.full(30, np.inf, np.float32)},
+        {"config": STANDARDISED, "statistics": np.full((2, 9), np.nan)},
+        {"config": STANDARDISED, "statistics": np.zeros((2, 9))},
+        {"view_bits": np.full(30, np.inf, np.float32)},
     ],
 )
 def test_a_map_that_could_answer_nothing_is_refused(here, tmp_path, changes):

@@ -38,7 +38,7 @@ def a_map(relevance, own, actions_m=(1.0, 2.0, 5.0)):
 
 def trained(relevance=Relevance.RRF, second=None, own=None, config=None, on_progress=lambda _: None):
     own = own or drives()[0]
-    return train_nnql(a_map(relevance, own), lambda: own, second, config or NnqlConfig(n_episodes=200), on_progress)
+    return train_nnql(a_map(relevance, own), own, second, config or NnqlConfig(n_episodes=200), on_progress)
 
 
 @pytest.fixture

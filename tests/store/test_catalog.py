@@ -191,8 +191,8 @@ def test_of_many_swaps_at_once_one_wins(campus: Catalog) -> None:
 def test_the_life_of_a_job(campus: Catalog) -> None:
     job = campus.create_job("campus", "remap", {"seed": 3})
     assert (job.state, job.progress, job.stage, job.started_at) == (JobState.QUEUED, 0.0, None, None)
-    job = campus.update_job(job.job_id, state="running", stage="select landmarks", progress=0.25, eta_s=12.5)
-    assert (job.state, job.progress, job.stage, job.eta_s) == (JobState.RUNNING, 0.25, "select landmarks", 12.5)
+    job = campus.update_job(job.job_id, state="running", stage="describe", progress=0.25, eta_s=12.5)
+    assert (job.state, job.progress, job.stage, job.eta_s) == (JobState.RUNNING, 0.25, "describe", 12.5)
     assert job.started_at is not None
     assert job.finished_at is None
     assert campus.update_job(job.job_id, eta_s=float("inf")).eta_s is None
