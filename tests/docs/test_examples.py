@@ -77,7 +77,7 @@ def test_a_posted_image_is_answered_with_a_belief(workplace):
     answer = json.loads(workplace.answer_of("localizations?shortlist=3"))
     assert len(answer["retrieval"]) == len(answer["belief"]["top"]) == 3
     assert {"mean_m", "mode_m", "credible_95_m", "entropy_bits", "histogram"} <= set(answer["belief"])
-    assert answer["next_best_view"]["planner"] == "telling"
+    assert answer["next_best_view"]["planner"] == "informed"
     assert json.loads(workplace.answer_of("ranked_landmarks"))["map_version"] == 1
     domain = json.loads(workplace.answer_of("curl http://127.0.0.1:8000/v1/domains/nclt"))
     assert np.load(workplace.folder / "relevances.npy").shape == (domain["n_map_images"],)
@@ -92,7 +92,8 @@ def test_the_session_is_begun_moved_on_and_ended(workplace):
     second = json.loads(workplace.answer_of("observations?action_m=0"))
     assert (first["n_observations"], second["n_observations"]) == (1, 2)
     assert second["belief"]["entropy_bits"] <= first["belief"]["entropy_bits"]
-    assert second["belief"]["off_route"] is None, "36 frames are too short a route to learn from"
+    assert 0 < second["belief"]["off_route"] < 0.5
+    assert second["next_best_view"]["stop"] == second["belief"]["confident"]
     assert json.loads(workplace.answer_of("/next-best-view")) == second["next_best_view"]
     mass = np.load(workplace.folder / "belief.npy")
     assert mass.sum() == pytest.approx(1, abs=1e-3)
@@ -107,7 +108,7 @@ def test_replays_and_experiments_leave_their_files(workplace):
         assert left >= {"steps.jsonl", "summary.json"}
         assert any(name.endswith(".png") for name in left)
     assert json.loads((workplace.folder / "vpr.json").read_text())["n_queries"] == 50
-    assert "telling" in json.loads((workplace.folder / "nbv.json").read_text())["anr"]
+    assert "informed" in json.loads((workplace.folder / "nbv.json").read_text())["anr"]
     assert "standardised" in workplace.answer_of("experiment vpr --landmarks nclt:/data")
 
 
