@@ -39,7 +39,7 @@ def service(campus, tmp_path_factory):
         yield client, folder / "data"
 
 
-@pytest.mark.parametrize("relevance", ["calibrated", "standardised", "rrf"])
+@pytest.mark.parametrize("relevance", ["composed", "standardised", "rrf"])
 def test_a_replay_has_the_anr_of_the_experiment(service, tmp_path, relevance):
     """The same drive and map, once over HTTP and once offline: the same number."""
     client, _ = service
@@ -78,6 +78,8 @@ def test_a_map_made_here_equals_one_made_over_http(campus, service, tmp_path):
     assert np.array_equal(over_http.lists, here.lists)
     assert np.array_equal(over_http.landmark_model["prototypes"], here.landmark_model["prototypes"])
     assert np.array_equal(over_http.statistics, here.statistics)
+    assert np.array_equal(over_http.usual_encoding, here.usual_encoding)
+    assert np.array_equal(over_http.view_bits, here.view_bits)
     assert np.array_equal(over_http.position_m, here.position_m)
     assert np.array_equal(over_http.x_m, here.x_m)
     assert np.array_equal(over_http.timestamp_us, here.timestamp_us)

@@ -211,16 +211,16 @@ def _show_deleted(json_output: bool, **names: str | int) -> None:
 @click.option(
     *("--landmarks", "--landmark-traverse", "landmark_traverse"),
     metavar="TRAVERSE",
-    help="Where landmarks are chosen; absent: the active map's landmarks stay.",
+    help="Where landmarks are chosen; absent: the active map's landmarks stay, or, without one, those of the drive.",
 )
 @click.option("--n-landmarks", type=click.IntRange(min=1), help="r; absent: the service's default.")
 @click.option("--list-length", type=click.IntRange(min=1), help="h, landmarks a map image keeps.")
 @click.option(
     "--relevance",
     metavar="NAME",
-    help="calibrated, standardised, rrf, bag_of_landmarks, simbad or brute_force; absent: the service's default.",
+    help="composed, standardised, rrf, bag_of_landmarks, simbad or brute_force; absent: the service's default.",
 )
-@click.option("--training-episodes", type=click.IntRange(min=0), help="Length of the planner's training.")
+@click.option("--training-episodes", type=click.IntRange(min=0), help="Length of the training of the planner `nnql`.")
 @click.option("--seed", type=int)
 @click.option("--activate/--no-activate", default=True, show_default=True, help="Serve the new map at once.")
 @click.option(

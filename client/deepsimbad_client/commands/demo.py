@@ -1,8 +1,8 @@
 """`make demo`: a campus is rendered in three seasons, mapped, and driven again against a live service.
 
-The paper's triplet WI-SP-SU: landmarks from winter, the map from spring, the robot comes in summer. First the whole
-drive is one session, then an active robot chooses where to look next. Everything goes through the service's HTTP
-interface, as a robot's would.
+The paper's triplet WI-SP-SU: the map is of spring and knows winter too, the robot comes in summer, which nobody has
+seen. First the whole drive is one session, then an active robot chooses where to look next. Everything goes through
+the service's HTTP interface, as a robot's would.
 """
 
 import signal
@@ -35,7 +35,7 @@ DOMAIN = "campus"
 SEASONS = ("winter", "spring", "summer")
 LANDMARK_SEASON, MAP_SEASON, LIVE_SEASON = SEASONS
 # The one that ships comes last: it stays active.
-RELEVANCES = ("brute_force", "bag_of_landmarks", "simbad", "rrf", "standardised", "calibrated")
+RELEVANCES = ("brute_force", "bag_of_landmarks", "simbad", "rrf", "standardised", "composed")
 STEPS = 10
 EPISODES = 10
 PLANNERS = (DEFAULT_PLANNER, "random", "constant:10")
@@ -60,7 +60,10 @@ def demo(folder: Path, frames: int, seed: int) -> None:
     with LocalServer(folder / "data") as server, Client(server.url) as client:
         _say(f"2. The service runs at {server.url}; its log is {server.log_path}")
         _upload(client, drives)
-        _say(f"4. Map {MAP_SEASON}, drive {LIVE_SEASON}: every relevance by the live service")
+        _say(
+            f"4. {MAP_SEASON} becomes the map, {LANDMARK_SEASON} is known too, {LIVE_SEASON} is driven: "
+            "every relevance by the live service"
+        )
         n_landmarks = min(_N_LANDMARKS, len(drives[LANDMARK_SEASON].frames))
         table = Table("relevance", "ANR %", "R@1 %", "R@5 %", "median answer", caption="ANR: 0 is perfect, 50 chance")
         for column in table.columns[1:]:
@@ -103,7 +106,7 @@ def _drive(
 ) -> tuple[Replay, dict[str, Any]]:
     """Map for one relevance and replay the live drive against it; what that came to."""
     with JobBar(f"mapping for {relevance}") as bar:
-        remap(
+        job = remap(
             client,
             DOMAIN,
             MAP_SEASON,
@@ -113,6 +116,12 @@ def _drive(
             training_episodes=_TRAINING_EPISODES if relevance == RELEVANCES[-1] else 0,
             on_progress=bar,
         )
+    if relevance == RELEVANCES[-1]:
+        season = job.second_season
+        learnt = (
+            "it learnt from both" if season["accepted"] else f"{LANDMARK_SEASON} taught it nothing: {season['why']}"
+        )
+        _say(f"   the map for {relevance}: {learnt}")
     with ReplayBar(f"driving by {relevance}", len(live.frames)) as bar:
         driven = replay(client, live, DOMAIN, folder / "replays" / relevance, restart=True, on_progress=bar)
     summary = summarise(driven)

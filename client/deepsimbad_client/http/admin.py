@@ -49,7 +49,7 @@ _JOBS = "/v1/admin/jobs"
 class RemapOptions(TypedDict, total=False):
     """What a remap may be told; what is absent or None is left to the service's default."""
 
-    landmark_traverse: str | None  # where landmarks are chosen; absent: the active map's landmarks stay
+    landmark_traverse: str | None  # where landmarks are chosen; absent: the active map's, or the new map's own drive
     n_landmarks: int | None  # r
     list_length: int | None  # h, how many of them a map image keeps
     relevance: str | None  # how a map image is compared with a query

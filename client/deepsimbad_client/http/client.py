@@ -287,6 +287,8 @@ class ClientCalls(Face, Generic[AnySession]):
         planner: str | None = None,
         belief: str | None = None,
         update: str | None = None,
+        confidence: float | None = None,
+        price_bits_per_m: float | None = None,
         keep: bool = False,
         idempotency_key: str | None = None,
     ) -> AnySession:
@@ -296,11 +298,12 @@ class ClientCalls(Face, Generic[AnySession]):
         answer is asked for again and begins no second session.
 
         `start_position_m` is about where it starts along the route (absent: anywhere), `start_std_m` how well
-        that is known. The `planner` chooses the next view (`nnql`, `random`, `constant:3`, ...), `belief` is
-        `particle` or `grid`, `update` says how a view changes it, `seed` all that is drawn at random; what is
-        absent is the service's default. With `keep` it outlives its `with` block. The `idempotency_key` names
-        this beginning, so that it can be repeated after a `TransportError`. Raises UnknownDomainError,
-        NoActiveMapError, InvalidPriorError, TooManySessionsError.
+        that is known. The `planner` chooses the next view (`informed`, `nnql`, `random`, `constant:3`, ...), `belief`
+        is `particle` or `grid`, `update` says how a view changes it, `seed` all that is drawn at random. With mass of
+        `confidence` within 5 m of the likeliest place the robot may stop; `price_bits_per_m` is what a metre costs
+        `informed`. What is absent is the service's default. With `keep` it outlives its `with` block. The
+        `idempotency_key` names this beginning, so that it can be repeated after a `TransportError`. Raises
+        UnknownDomainError, NoActiveMapError, InvalidPriorError, TooManySessionsError.
         """
         document = {
             "start_position_m": start_position_m,
@@ -309,6 +312,8 @@ class ClientCalls(Face, Generic[AnySession]):
             "planner": planner,
             "belief": belief,
             "update": update,
+            "confidence": confidence,
+            "price_bits_per_m": price_bits_per_m,
         }
         call = Call.with_json("POST", f"{domain_path(domain)}/sessions", document, headers=once(idempotency_key))
         return self._session(self._wire, model_of(SessionState, await self._wire.send(call)), keep=keep)

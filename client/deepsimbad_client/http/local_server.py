@@ -14,7 +14,7 @@ import httpx2
 
 from deepsimbad_client.errors import DeepSimbadClientError
 
-_READY_WITHIN_S = 60.0
+_READY_WITHIN_S = 180.0  # the first start of an installation compiles the kernels
 _STOPPED_WITHIN_S = 15.0
 
 

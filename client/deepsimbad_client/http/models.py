@@ -83,9 +83,11 @@ class Belief(Answer):
     mean_m: float
     mode_m: float
     std_m: float
-    credible_95_m: tuple[float, float]  # (lo, hi); on a closed route lo > hi crosses the start
+    credible_95_m: tuple[float, float]  # (lo, hi), hull of the sets; on a closed route lo > hi crosses the start
+    credible_95_sets_m: tuple[tuple[float, float], ...] = ()  # pieces of the smallest set that holds 95 %
     entropy_bits: float
-    off_route: float | None = None
+    off_route: float | None = None  # probability to be lost: off the route, or carried along it
+    confident: bool = False  # whether enough of the mass is within 5 m of the mode
     histogram: Histogram
     top: tuple[Place, ...]
 
@@ -99,10 +101,11 @@ class Retrieved(Answer):
 
 
 class ActionValue(Answer):
-    """What the experience database expects of one move."""
+    """What is expected of one move."""
 
     action_m: float
     q_value: float | None = None
+    expected_bits: float | None = None  # that the view after it would tell
 
 
 class NextBestView(Answer):
@@ -110,6 +113,7 @@ class NextBestView(Answer):
 
     planner: str
     action_m: float
+    stop: bool = False  # the robot is as sure of its place as its session asked to be
     actions: tuple[ActionValue, ...] = ()
 
 
@@ -119,6 +123,8 @@ class Localization(Answer):
     map_version: int
     timings_ms: dict[str, float]
     belief: Belief
+    informative: bool = True  # whether the view told anything
+    warnings: tuple[str, ...] = ()  # what a person should know, in sentences
     retrieval: tuple[Retrieved, ...]
     next_best_view: NextBestView | None = None
 
@@ -142,6 +148,8 @@ class SessionAnswer(Answer):
     timings_ms: dict[str, float]
     n_observations: int | None = None
     belief: Belief
+    informative: bool = True  # whether the view told anything
+    warnings: tuple[str, ...] = ()  # what a person should know, in sentences
     retrieval: tuple[Retrieved, ...] = ()
     next_best_view: NextBestView | None = None
 

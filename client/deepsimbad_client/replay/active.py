@@ -46,9 +46,10 @@ class EpisodeStep:
     high_m: float  # to here
     error_m: float | None  # from the truth to the likeliest place
     entropy_bits: float  # how much is open
-    off_route: float | None  # probability that the robot is nowhere on the route
+    off_route: float | None  # probability that the robot is lost: off the route, or carried along it
     next_action_m: float | None  # the move asked for next
     latency_ms: float  # from posting the view to the answer
+    confident: bool = False  # whether enough of the belief is within 5 m of the likeliest place
     mass: tuple[float, ...] = ()  # the belief in equal stretches of the map's route; of the first few episodes alone
 
 
@@ -245,6 +246,7 @@ class Stage:
             error_m=None if true is None else float(scene.apart_m(row, np.array([mode]))[0]),
             entropy_bits=belief.entropy_bits,
             off_route=belief.off_route,
+            confident=belief.confident,
             next_action_m=None if plan is None else plan.action_m,
             latency_ms=seen.latency_ms,
             mass=tuple(round(share, MASS_DIGITS) for share in belief.histogram.mass),

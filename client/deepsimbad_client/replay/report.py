@@ -176,7 +176,9 @@ def active_tables(summary: dict[str, Any]) -> list[Table]:
         caption="ANR after each move: 0 is perfect, 50 is chance. 95 %: over resampled starts, the same for all.",
     )
     localized = _table(
-        f"after {config['steps']} moves", "planner", ["median error", "within 5 m", "within 10 m", "moved", "forgot"]
+        f"after {config['steps']} moves: how far from the truth",
+        "planner",
+        ["median", "within 5 m", "within 10 m", "moved", "forgot"],
     )
     for name in names:
         against = summary["against"].get(name, {"anr": None, "interval_95": None})

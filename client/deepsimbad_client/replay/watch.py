@@ -18,6 +18,7 @@ from deepsimbad_client.replay.active import EpisodeStep, Stage
 
 BLOCKS = " ▁▂▃▄▅▆▇█"
 _LEAST_SHOWN = 0.004  # A column with a smaller share of the fullest one stays empty
+_LEAST_LOST = 0.05
 
 
 def watch_episode(
@@ -98,7 +99,8 @@ def _show(state: SessionState, console: Console, live: Live | None) -> None:
     views = "1 view" if state.n_observations == 1 else f"{state.n_observations} views"
     console.print(
         f"{views}: likeliest at {belief.mode_m:.1f} m, 95 % within {low:.0f} .. {high:.0f} m, "
-        f"{belief.entropy_bits:.1f} bits of doubt{asked}",
+        f"{belief.entropy_bits:.1f} bits of doubt{_lost(belief.off_route)}"
+        f"{', confident' if belief.confident else ''}{asked}",
         soft_wrap=True,
     )
 
@@ -123,7 +125,7 @@ def in_words(step: EpisodeStep) -> str:
         seen += " Its belief had no room for that move, so it begins anew."
     believes = (
         f"It is likeliest at {step.mode_m:.1f} m, 95 % within {step.low_m:.0f} .. {step.high_m:.0f} m, "
-        f"{step.entropy_bits:.1f} bits of doubt."
+        f"{step.entropy_bits:.1f} bits of doubt{_lost(step.off_route)}{', confident' if step.confident else ''}."
     )
     if step.true_route_m is None or step.error_m is None:
         truth = "Truly it is where the map knows no place."
@@ -131,6 +133,15 @@ def in_words(step: EpisodeStep) -> str:
         truth = f"Truly it is by {step.true_route_m:.1f} m, on the ground {step.error_m:.1f} m from there."
     asks = "" if step.next_action_m is None else f" It asks to see what is {step.next_action_m:g} m ahead."
     return f"{seen} {believes} {truth}{asks}"
+
+
+def _may_stop(next_best_view: NextBestView | None) -> str:
+    return "-" if next_best_view is None else "yes" if next_best_view.stop else "no"
+
+
+def _lost(probability: float | None) -> str:
+    """How probable it is that the robot is off its route or was carried, where that is worth a word."""
+    return "" if probability is None or probability < _LEAST_LOST else f", lost with {100 * probability:.0f} %"
 
 
 def belief_blocks(mass: Sequence[float], width: int) -> str:
@@ -176,8 +187,9 @@ def pictured(
     low, high = belief.credible_95_m
     figures = Table.grid(padding=(0, 3))
     figures.add_row("likeliest", f"{belief.mode_m:.1f} m", "95 % within", f"{low:.0f} .. {high:.0f} m")
-    off_route = "-" if belief.off_route is None else f"{100 * belief.off_route:.0f} %"
-    figures.add_row("doubt", f"{belief.entropy_bits:.1f} bits", "off the route", off_route)
+    lost = "-" if belief.off_route is None else f"{100 * belief.off_route:.0f} %"
+    figures.add_row("doubt", f"{belief.entropy_bits:.1f} bits", "lost", lost)
+    figures.add_row("confident", "yes" if belief.confident else "no", "may stop", _may_stop(next_best_view))
     figures.add_row("views", str(n_observations), "last move", "-" if moved_m is None else f"{moved_m:.1f} m")
     asked = "-" if next_best_view is None else f"{next_best_view.action_m:g} m ({next_best_view.planner})"
     truth = "-" if true_route_m is None else f"{true_route_m:.1f} m"

@@ -37,7 +37,7 @@ def test_jobs_are_shown_with_what_they_do_and_the_time_left(shown):
     states: dict[str, dict[str, Any]] = {
         "waits": {"state": "queued"},
         "began": {"state": "running"},
-        "works": {"state": "running", "stage": "select landmarks", "progress": 0.25, "eta_s": 524.4},
+        "works": {"state": "running", "stage": "read_frames", "progress": 0.25, "eta_s": 524.4},
         "ended": {"state": "failed", "error": {"code": "damaged_file", "detail": "traverse drive: damaged"}},
     }
     lines = shown(job_table([Job(job_id=name, domain="d", **state) for name, state in states.items()]))
@@ -45,7 +45,7 @@ def test_jobs_are_shown_with_what_they_do_and_the_time_left(shown):
     assert "waiting for its turn" in rows["waits"]
     assert "beginning, 0 %" in rows["began"]
     assert "0:08:44" in rows["works"]
-    assert "select landmarks, 25 %" in rows["works"]
+    assert "read frames, 25 %" in rows["works"]
     assert "traverse drive: damaged" in rows["ended"]
 
 

@@ -26,7 +26,7 @@ def test_the_demonstration_on_a_tiny_campus(rendered, tmp_path, monkeypatch):
     shutil.copytree(rendered, tmp_path / "demo" / "campus", copy_function=os.link)
     ended = CliRunner().invoke(demonstration.demo, [str(tmp_path / "demo"), "--frames", "36"], catch_exceptions=False)
     assert ended.exit_code == 0
-    for words in ("calibrated (default)", "It looks and sees", "Move 1: it goes", "constant:10", "8. Pictures:"):
+    for words in ("composed (default)", "It looks and sees", "Move 1: it goes", "constant:10", "8. Pictures:"):
         assert words in ended.stdout
     assert (tmp_path / "demo" / "active" / "belief_by_step.png").exists()
 

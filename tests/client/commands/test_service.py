@@ -149,6 +149,21 @@ def test_the_command_line_end_to_end(service, encodings, tmp_path, capsys, monke
     assert capsys.readouterr().err.count("\n") == 1
 
 
+def test_a_drive_is_mapped_by_landmarks_of_its_own(service, encodings, capsys, monkeypatch):
+    monkeypatch.setenv("DEEPSIMBAD_URL", service)
+    assert run(["upload", str(encodings / "summer.npy"), "--domain", "own", "--traverse", "summer"]) == 0
+    capsys.readouterr()
+    command = ["remap", "--domain", "own", "--training", "summer", "--n-landmarks", "40", "--json"]
+    assert run(command) == 0
+    job = json.loads(capsys.readouterr().out)
+    assert job["result"]["metrics"]["landmarks"] == "training_traverse"
+    assert run(["localize", "--json", "--domain", "own", f"{encodings / 'winter.npy'}#30:31"]) == 0
+    (answer,) = json.loads(capsys.readouterr().out)
+    assert answer["belief"]["mode_m"] == 30
+    assert run(command) == 0
+    assert json.loads(capsys.readouterr().out)["result"]["metrics"]["landmarks"] == "active_map"
+
+
 def test_places_on_the_command_line(client, encodings, tmp_path, capsys):
     folder = tmp_path / "look [here]"
     folder.mkdir()

@@ -12,7 +12,7 @@ BELIEF = {
     "std_m": 0.5,
     "credible_95_m": [9.0, 1.0],
     "entropy_bits": 2.0,
-    "off_route": None,
+    "off_route": 0.0,
     "histogram": {"edges_m": [0.0, 1.0], "mass": [1.0]},
     "top": [{"map_image": 3, "route_position_m": 2.0, "x_m": None, "y_m": None, "mass": 0.5}],
 }

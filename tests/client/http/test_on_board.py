@@ -94,6 +94,32 @@ def test_ready_encodings_are_ranked_too(model):
         encoder.ranks(encoding=[1.0, 2.0])
 
 
+def test_landmarks_that_are_unit_vectors_are_ranked_by_what_is_usual_of_encodings():
+    rng = np.random.default_rng(1)
+    prototypes, usual, projection = rng.normal(size=(40, 3)), rng.random((2, 8)) + 1, rng.normal(size=(8, 3))
+    prototypes /= np.linalg.norm(prototypes, axis=1, keepdims=True)
+    model = {"prototypes": prototypes, "usual": usual, "projection": projection}
+    model = {name: array.astype(np.float32) for name, array in model.items()}
+    encoder = OnBoardEncoder(
+        pack_landmarks(PortableLandmarks(model, 40, 1, {"kind": "feature_l2", "extractor": "none"}))
+    )
+    encoding = rng.normal(size=8)
+    likeness = prototypes @ ((encoding - usual[0]) / usual[1] @ projection)
+    sent = unpack_ranked_landmarks(encoder.ranks(encoding=encoding, m=40).body, 40)
+    assert list(sent) == np.argsort(-likeness).tolist()
+    with pytest.raises(errors.InvalidArgumentError, match="another encoder"):
+        encoder.ranks(encoding=[1.0, 2.0, 3.0])
+    unfit = pack_landmarks(PortableLandmarks({**model, "usual": model["usual"][:, :5]}, 40, 1, {"kind": "feature_l2"}))
+    with pytest.raises(errors.InvalidLandmarkModelError):
+        OnBoardEncoder(unfit)
+
+
+def test_a_maps_own_landmarks_rank_a_view_as_the_service_does(route, views):
+    with Client(route) as client:
+        seen = client.on_board("route").ranks(encoding=views[33], m=50)
+        assert abs(client.localize("route", ranked=seen).belief.mode_m - 33) <= 2
+
+
 def test_arguments_that_cannot_be(content, tmp_path):
     encoder = OnBoardEncoder(content)
     for m in (0, -1, N_LANDMARKS + 1):

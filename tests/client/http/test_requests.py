@@ -187,7 +187,7 @@ def test_what_is_no_list_is_said(document):
 
 @pytest.mark.parametrize("is_named", [False, True])
 def test_every_answer_knows_its_request_which_the_caller_may_name(is_named):
-    plan, observed = {"planner": "telling", "action_m": 2.0}, {**LOCALIZATION, "n_observations": 1}
+    plan, observed = {"planner": "informed", "action_m": 2.0}, {**LOCALIZATION, "n_observations": 1}
     documents = [LOCALIZATION, STATE, observed, plan, JOB]
     names = (f"robot.{number}" for number in itertools.count())
     script = Script(*(answer(200, document, x_request_id=f"r{n}") for n, document in enumerate(documents)))

@@ -22,8 +22,18 @@ def test_a_session_from_start_to_end(client, views):
             observed = session.observe(encoding=views[at], action_m=np.float32(4))
         assert abs(observed.belief.mode_m - 68) <= 2
         assert observed.n_observations == 8
+        assert observed.belief.off_route < 0.05
         assert observed.next_best_view is not None
         assert observed.next_best_view.action_m == 4
+        assert observed.belief.confident
+        assert observed.next_best_view.stop
+        pieces = observed.belief.credible_95_sets_m
+        assert (pieces[0][0], pieces[-1][1]) == observed.belief.credible_95_m
+        assert (observed.informative, observed.warnings) == (True, ())
+        blank = session.observe(dissimilarities=[1] * 50)
+        assert not blank.informative
+        assert blank.warnings
+        observed = session.observe(encoding=views[68])
         masses = session.belief_masses()
         assert (masses.dtype, masses.shape) == (np.float32, (120,))
         assert masses.sum() == pytest.approx(1, abs=1e-5)
@@ -32,7 +42,7 @@ def test_a_session_from_start_to_end(client, views):
         carried = session.set_prior(20.0, 3.0)
         assert carried.belief.mode_m == 20
         with client.attach_session(session.session_id) as again:
-            assert (again.opened.belief, again.opened.n_observations) == (carried.belief, 8)
+            assert (again.opened.belief, again.opened.n_observations) == (carried.belief, 10)
         assert session.state().belief == carried.belief, "what was attached lives on"
         with client.attach_session(session.session_id, keep=False):
             pass
@@ -46,6 +56,7 @@ def test_a_session_from_start_to_end(client, views):
 
 def test_what_travels(client, link, views):
     wishes = {"planner": "nnql", "belief": "particle", "update": "log_likelihood"}
+    wishes |= {"confidence": 0.5, "price_bits_per_m": 0.25}
     client.session("route", keep=True)
     with client.session("route", 12.5, 3, seed=0, **wishes) as session:
         session.observe(encoding=views[12], action_m=1.5, action_std_m=0.25, shortlist=3, idempotency_key="mine")

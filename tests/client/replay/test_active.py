@@ -207,7 +207,7 @@ def test_the_commands_end_to_end(route, encodings, tmp_path, capsys, monkeypatch
     assert len((out / "steps.jsonl").read_text().splitlines()) == 6 * 6
     assert (out / "belief_by_step.png").read_bytes().startswith(b"\x89PNG")
     assert run([*command, "--episodes", "4", "--no-plots"]) == 0  # two more episodes
-    assert "telling (default)" in capsys.readouterr().out
+    assert "informed (default)" in capsys.readouterr().out
     assert len((out / "episodes.jsonl").read_text().splitlines()) == 8
     assert run([*command[:-1], "2"]) == 1
     assert "seed 1, now 2" in capsys.readouterr().err

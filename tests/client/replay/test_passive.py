@@ -48,7 +48,7 @@ def test_one_session_in_order_is_ranked_by_the_service(client, link, encodings, 
     driven = replay(client, recording, "route", tmp_path, tolerance_m=2)
     assert max(len(request.content) for request in link.requests) < 4_000
     assert [step.rank for step in driven.steps] == slow_ranks(client, recording, 2)
-    assert len({step.rank for step in driven.steps}) > 3, "else nothing is shown"
+    assert len({step.rank for step in driven.steps}) > 2, "else nothing is shown"
     with pytest.raises(errors.GoneError):
         client.attach_session(json.loads((tmp_path / "replay.json").read_text())["session_id"])
     for step in driven.steps:

@@ -38,7 +38,7 @@ def step(number, rank, action_m, travelled_m):
 
 def episode(planner, number, ranks, action_m):
     steps = tuple(step(at, rank, action_m if at else 0.0, at * action_m) for at, rank in enumerate(ranks))
-    return Episode(planner, "telling" if planner == "default" else planner, number, number, (0.0, 99.0), steps)
+    return Episode(planner, "informed" if planner == "default" else planner, number, number, (0.0, 99.0), steps)
 
 
 def replay_of(**ranks):
@@ -78,7 +78,7 @@ def test_figures_by_hand(two_planners):
     assert ours["within_5_m"] == [0.0, 50.0, 100.0]
     assert ours["within_10_m"] == [0.0, 100.0, 100.0]
     assert ours["travelled_m"] == [0.0, 2.0, 4.0]
-    assert summary["planner_named"] == {"default": "telling", "random": "random"}
+    assert summary["planner_named"] == {"default": "informed", "random": "random"}
     json.dumps(summary, allow_nan=False)
 
 
@@ -124,7 +124,7 @@ def test_tables_name_every_planner_and_every_picture_is_drawn(two_planners, tmp_
     for table in active_tables(summary):
         console.print(table)
     printed = capsys.readouterr().out
-    assert printed.count("telling (default)") == 2
+    assert printed.count("informed (default)") == 2
     assert printed.count("random") == 2
     assert "3.00" in printed  # how much better the first is
     assert "…" not in printed

@@ -39,13 +39,14 @@ def test_an_episode_off_a_terminal_is_a_line_for_each_view(stage):
 def test_an_episode_on_a_terminal_shows_belief_moves_and_truth(stage):
     shown, written = console(terminal=True)
     steps = watch_episode(stage, shown, planner="default", steps=2, seed=0, pause_s=0, sleep=lambda _: None)
-    for words in ("▲ likeliest", "● truth", "asks for", "m (telling)", "█", f"{steps[-1].true_route_m:.1f} m"):
+    figures = ("asks for", "m (informed)", "lost", "confident", "may stop", f"{steps[-1].true_route_m:.1f} m")
+    for words in ("▲ likeliest", "● truth", "█", *figures):
         assert words in written.getvalue()
 
 
 def test_another_robots_session_is_watched_until_it_ends_and_left_alone(client, views):
     shown, written = console(terminal=False)
-    robot = client.session("route", keep=True)
+    robot = client.session("route", confidence=0.5, keep=True)
     polls = iter(range(100))
 
     def meanwhile(seconds):
@@ -61,6 +62,8 @@ def test_another_robots_session_is_watched_until_it_ends_and_left_alone(client, 
     lines = written.getvalue().splitlines()
     assert [line.split()[0] for line in lines] == ["0", "1", "2"]
     assert "asks for" in lines[2]
+    assert [", confident" in line for line in lines] == [False, False, True]
+    assert not any(", lost with" in line for line in lines)
 
     def stop(seconds):
         raise KeyboardInterrupt
