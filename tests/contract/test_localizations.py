@@ -1,6 +1,8 @@
 """`POST /v1/domains/{domain}/localizations`: the answer's shape and truth."""
 
 import io
+import itertools
+import math
 
 import numpy as np
 import pytest
@@ -10,8 +12,8 @@ from .conftest import DIM, N_LANDMARKS, N_READY, N_SEEN, RANKS, TAKES_ENCODINGS,
 READY = "/v1/domains/ready/localizations"
 
 
-def localized(client, body=RANKS, shortlist=10):
-    answer = client.post(f"{READY}?shortlist={shortlist}", json=body)
+def localized(client, body=RANKS, shortlist=10, of="ready"):
+    answer = client.post(f"/v1/domains/{of}/localizations", params={"shortlist": shortlist}, json=body)
     assert answer.status_code == 200, answer.text
     assert answer.headers["content-type"] == "application/json"
     document = answer.json()
@@ -21,15 +23,30 @@ def localized(client, body=RANKS, shortlist=10):
 
 def test_the_answer_has_every_member_of_the_contract(client):
     answer = localized(client)
-    assert set(answer) == {"map_version", "timings_ms", "belief", "retrieval", "next_best_view"}
+    assert set(answer) == {
+        *("map_version", "timings_ms", "belief", "retrieval", "next_best_view", "informative", "warnings")
+    }
     assert answer["map_version"] == 1
-    assert set(answer["next_best_view"]) == {"planner", "action_m", "actions"}
-    assert [action["action_m"] for action in answer["next_best_view"]["actions"]] == list(range(1, 11))
+    assert (answer["informative"], answer["warnings"]) == (True, [])
+    plan = answer["next_best_view"]
+    assert set(plan) == {"planner", "action_m", "stop", "actions"}
+    assert (plan["planner"], plan["stop"]) == ("informed", answer["belief"]["confident"])
+    assert [action["action_m"] for action in plan["actions"]] == list(range(1, 11))
+    assert set(plan["actions"][0]) == {"action_m", "q_value", "expected_bits"}
+    assert all(0 < action["expected_bits"] < math.log2(N_READY) for action in plan["actions"])
+    best = max(plan["actions"], key=lambda action: (action["q_value"], action["action_m"]))
+    assert plan["action_m"] == best["action_m"]
     belief = answer["belief"]
     assert set(belief) == {
-        *("mean_m", "mode_m", "std_m", "credible_95_m", "entropy_bits", "off_route", "histogram", "top")
+        *("mean_m", "mode_m", "std_m", "credible_95_m", "credible_95_sets_m", "entropy_bits", "off_route"),
+        *("confident", "histogram", "top"),
     }
-    assert belief["off_route"] is None
+    assert 0 < belief["off_route"] < 0.1
+    pieces = belief["credible_95_sets_m"]
+    assert [pieces[0][0], pieces[-1][1]] == belief["credible_95_m"]
+    assert all(low <= high for low, high in pieces)
+    assert all(piece[1] < after[0] for piece, after in itertools.pairwise(pieces))
+    assert any(low <= belief["mode_m"] <= high for low, high in pieces)
     assert len(belief["histogram"]["edges_m"]) == len(belief["histogram"]["mass"]) + 1 <= 201
     assert sum(belief["histogram"]["mass"]) == pytest.approx(1)
     assert set(belief["top"][0]) == {"map_image", "route_position_m", "x_m", "y_m", "mass"}
@@ -58,8 +75,35 @@ def test_images_of_all_types_are_found_again(client, kind):
     assert answer.json()["retrieval"][0]["map_image"] == 7
 
 
-def test_encoding_dissimilarities_and_ranks_of_one_view_get_one_answer(client):
+def test_dissimilarities_by_the_served_landmark_model_are_answered_as_the_encoding_is(client):
+    """As a robot computes them: squared distances between unit vectors of what is standardised."""
+    model = np.load(io.BytesIO(client.get("/v1/domains/ready/landmark-model").content), allow_pickle=False)
+    mean, std = model["usual"].astype(np.float64)
+    for index in (3, 11, 29):
+        standardised = (ready_encodings()[index] - mean) / std
+        u = standardised / np.linalg.norm(standardised)
+        dissimilarities = np.square(u - model["prototypes"]).sum(axis=1)
+        by_encoding = localized(client, {"encoding": ready_encodings()[index].tolist()})
+        on_board = localized(client, {"dissimilarities": dissimilarities.tolist()})
+        assert by_encoding["retrieval"][0]["map_image"] == index
+        for one, other in zip(on_board["retrieval"], by_encoding["retrieval"], strict=True):
+            assert one == {**other, "relevance": pytest.approx(other["relevance"], abs=1e-5)}
+        assert on_board["belief"]["entropy_bits"] == pytest.approx(by_encoding["belief"]["entropy_bits"], abs=1e-4)
+        ranked = np.argsort(dissimilarities, kind="stable").tolist()
+        assert localized(client, {"ranked_landmarks": ranked})["retrieval"][0]["map_image"] == index
+
+
+def test_a_view_that_shows_nothing_is_said_so(client):
+    answer = localized(client, {"dissimilarities": [1.0] * N_LANDMARKS})
+    assert answer["informative"] is False
+    assert answer["warnings"] == ["the view told nothing of the place"]
+    assert answer["belief"]["entropy_bits"] == pytest.approx(math.log2(N_READY), abs=0.01)
+
+
+def test_encoding_dissimilarities_and_ranks_of_one_view_get_one_answer_where_ranks_are_compared(client, domain):
     """The landmarks by the paper's rule, slowly: the frames farthest from their nearest other."""
+    job = client.remap(domain, landmark_traverse="drive", n_landmarks=N_LANDMARKS, relevance="rrf")
+    assert job["state"] == "succeeded", job
     encodings = ready_encodings().astype(np.float64)
     apart = np.square(encodings[:, None] - encodings[None]).sum(axis=2)
     np.fill_diagonal(apart, np.inf)
@@ -67,7 +111,7 @@ def test_encoding_dissimilarities_and_ranks_of_one_view_get_one_answer(client):
     dissimilarities = np.square(landmarks - encodings[11]).sum(axis=1)
     ranked = np.argsort(dissimilarities, kind="stable")
     answers = [
-        localized(client, body)["retrieval"]
+        localized(client, body, of=domain)["retrieval"]
         for body in (
             {"encoding": encodings[11].tolist()},
             {"dissimilarities": dissimilarities.tolist()},
@@ -75,7 +119,7 @@ def test_encoding_dissimilarities_and_ranks_of_one_view_get_one_answer(client):
         )
     ]
     assert answers[0] == answers[1] == answers[2]
-    assert len(localized(client, {"ranked_landmarks": ranked[:1].tolist()})["retrieval"]) == 10
+    assert len(localized(client, {"ranked_landmarks": ranked[:1].tolist()}, of=domain)["retrieval"]) == 10
 
 
 def test_all_relevances_as_npy(client):

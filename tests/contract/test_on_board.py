@@ -12,7 +12,18 @@ from deepsimbad_client import Client, Observation
 from deepsimbad_client.errors import LandmarkModelDiffersError
 from deepsimbad_client.http.on_board import OnBoardEncoder
 
-from .conftest import N_LANDMARKS, N_READY, N_SEEN, TAKES_ENCODINGS, encoded, picture, problem, service
+from .conftest import (
+    DIM,
+    N_LANDMARKS,
+    N_READY,
+    N_SEEN,
+    TAKES_ENCODINGS,
+    encoded,
+    picture,
+    problem,
+    ready_encodings,
+    service,
+)
 
 PACKED = {"Content-Type": "application/vnd.deepsimbad.ranks"}
 READY = "/v1/domains/ready/localizations"
@@ -47,8 +58,11 @@ def test_the_landmark_model_is_an_npz_of_named_arrays(client):
     assert answer.status_code == 200, answer.text
     assert answer.headers["content-type"] == "application/octet-stream"
     arrays = np.load(io.BytesIO(answer.content), allow_pickle=False)
-    assert set(arrays.files) == {"prototypes", "map_version", "n_landmarks", "evaluator", "weights_sha256"}
-    assert (arrays["prototypes"].shape, arrays["prototypes"].dtype) == ((N_LANDMARKS, 8), np.float32)
+    assert set(arrays.files) == {"prototypes", "usual", "map_version", "n_landmarks", "evaluator", "weights_sha256"}
+    assert (arrays["prototypes"].shape, arrays["prototypes"].dtype) == ((N_LANDMARKS, DIM), np.float32)
+    assert np.linalg.norm(arrays["prototypes"], axis=1) == pytest.approx(np.ones(N_LANDMARKS))
+    usual = np.stack([ready_encodings().mean(axis=0), ready_encodings().std(axis=0)])
+    assert (arrays["usual"].dtype, arrays["usual"]) == (np.float32, pytest.approx(usual, abs=1e-6))
     assert arrays["map_version"].dtype == np.int64
     assert (int(arrays["map_version"]), int(arrays["n_landmarks"])) == (1, N_LANDMARKS)
     assert json.loads(str(arrays["evaluator"])) == TAKES_ENCODINGS["evaluator"]
@@ -136,23 +150,34 @@ def test_a_view_by_other_landmarks_moves_nothing_and_tells_no_relevances(client)
     assert client.get(path).json()["n_observations"] == 0
 
 
-def test_on_board_and_by_image_one_answer(client, tmp_path):
+def test_on_board_and_by_image_one_answer_where_ranks_are_compared(client, tmp_path):
     """The same picture: decoded, encoded and ranked here, and there."""
+    client.put("/v1/admin/domains/ranked", json={"evaluator": {"kind": "feature_l2"}})
+    client.upload_pictures("ranked", "drive")
+    client.remap("ranked", landmark_traverse="drive", n_landmarks=N_SEEN, list_length=3, relevance="standardised")
     robot = Client("http://testserver", transport=client._transport)
-    encoder = robot.on_board("seen")
+    encoder = robot.on_board("ranked")
     assert (encoder.map_version, encoder.n_landmarks) == (1, N_SEEN)
     path = tmp_path / "view.jpg"
-    with robot.session("seen") as here, robot.session("seen") as there:
+    with robot.session("ranked") as here, robot.session("ranked") as there:
         for number in (5, 3):
             path.write_bytes(encoded(picture(number)))
             ranked = encoder.ranks(path)
             assert len(ranked.body) <= 64
-            on_board, by_image = robot.localize("seen", ranked=ranked), robot.localize("seen", path)
+            on_board, by_image = robot.localize("ranked", ranked=ranked), robot.localize("ranked", path)
             assert (on_board.retrieval, on_board.belief) == (by_image.retrieval, by_image.belief)
             assert here.observe(ranked=ranked).belief == there.observe(path).belief
-        assert (robot.relevances("seen", ranked=ranked) == robot.relevances("seen", path)).all()
+        assert (robot.relevances("ranked", ranked=ranked) == robot.relevances("ranked", path)).all()
         dark = encoded(np.zeros((90, 120, 3), np.uint8))
         assert here.observe(ranked=encoder.ranks(dark)).belief == there.observe(dark).belief
+
+
+def test_ranks_find_the_place_on_a_map_that_compares_encodings(client):
+    robot = Client("http://testserver", transport=client._transport)
+    encoder = robot.on_board("seen")
+    for number in (5, 3):
+        ranked = encoder.ranks(encoded(picture(number)))
+        assert robot.localize("seen", ranked=ranked).retrieval[0].map_image == number
 
 
 def test_the_client_names_other_landmarks(client):

@@ -22,6 +22,7 @@ from .conftest import (
     path_of,
     picture,
     problem,
+    ready_encodings,
     service,
     small_settings,
     until,
@@ -73,12 +74,12 @@ def test_a_session_from_beginning_to_end(client):
     answer = client.post(f"{path}/observations", json=RANKS, params={"shortlist": 3})
     assert answer.status_code == 200, answer.text
     seen = answer.json()
-    assert set(seen) == STATE | {"timings_ms", "retrieval"}
+    assert set(seen) == STATE | {"timings_ms", "retrieval", "informative", "warnings"}
     assert seen["n_observations"] == 1
     assert len(seen["retrieval"]) == len(seen["belief"]["top"]) == 3
     relevance = [place["relevance"] for place in seen["retrieval"]]
     assert relevance == sorted(relevance, reverse=True)
-    assert set(seen["next_best_view"]) == {"planner", "action_m", "actions"}
+    assert set(seen["next_best_view"]) == {"planner", "action_m", "stop", "actions"}
 
     moved = client.post(f"{path}/observations", json=RANKS, params={"action_m": 4, "action_std_m": 0.5}).json()
     assert moved["n_observations"] == 2
@@ -130,16 +131,119 @@ def test_a_picture_of_nothing_says_nothing(client, belief):
         blank = encoded(np.full((120, 160, 3), shade, np.uint8))
         answer = client.post(f"{path}/observations", content=blank, headers=JPEG)
         assert answer.status_code == 200, answer.text
+        assert answer.json()["informative"] is False
+        assert answer.json()["warnings"][0] == "the view told nothing of the place"
         after = answer.json()["belief"]
         assert after["entropy_bits"] >= before["entropy_bits"] - 1e-9
         assert after["mode_m"] == before["mode_m"]
 
 
-def test_wholly_past_the_end(client):
-    path = client.session(start_position_m=78, start_std_m=0.5)
-    observe(client, path)
+def see(client, path, image, action_m=0.0, **query):
+    """An observation of what a map image shows, hardly changed."""
+    encoding = (ready_encodings()[image] + 0.1).tolist()
+    params = {"action_m": action_m, **query}
+    answer = client.post(f"{path}/observations", json={"encoding": encoding}, params=params)
+    assert answer.status_code == 200, answer.text
+    return answer.json()
+
+
+@pytest.mark.parametrize("belief", ["grid", "particle"])
+def test_a_move_wholly_past_the_end_is_refused_unless_the_robot_is_lost(client, belief):
+    path = client.session(start_position_m=78, start_std_m=0.5, belief=belief)
+    assert see(client, path, 39)["belief"]["off_route"] < 0.05
     assert problem(observe(client, path, 50), 422, "past_the_end")["route_end_m"] == 78
     assert client.get(path).json()["n_observations"] == 1
+    carried = client.session(start_position_m=78, start_std_m=0.5, belief=belief)
+    assert see(client, carried, 11)["belief"]["off_route"] > 0.05
+    assert observe(client, carried, 50).status_code == 200
+
+
+@pytest.mark.parametrize("belief", ["grid", "particle"])
+def test_a_route_ends_where_it_ends_within_the_error_of_a_move(client, belief):
+    path = client.session(start_position_m=76, start_std_m=0.5, belief=belief)
+    see(client, path, 38)
+    for action_m in (2.2, 0.4):
+        assert see(client, path, 39, action_m)["belief"]["mode_m"] == 78
+
+
+def test_a_move_backward_within_its_error_is_none(client):
+    beliefs = []
+    for action_m in (0, -0.39):
+        path = client.session(start_position_m=20, start_std_m=3)
+        see(client, path, 10)
+        beliefs.append(see(client, path, 11, action_m, action_std_m=0.1)["belief"])
+    assert beliefs[0] == beliefs[1]
+    problem(observe(client, path, "-0.41&action_std_m=0.1"), 422, "invalid_move")
+    assert client.get(path).json()["n_observations"] == 2
+
+
+# How sure, and what to do about it
+
+
+@pytest.mark.parametrize("belief", ["grid", "particle"])
+def test_a_robot_is_confident_when_it_knows_its_place_as_surely_as_it_asked_to(client, belief):
+    def answer(confidence):
+        path = client.session(belief=belief, confidence=confidence)
+        first = see(client, path, 11, shortlist=N_READY)
+        state = client.get(path).json()
+        assert state["belief"]["confident"] is first["belief"]["confident"] is first["next_best_view"]["stop"]
+        assert state["next_best_view"]["stop"] is first["next_best_view"]["stop"]
+        return first["belief"]
+
+    known = answer(None)
+    mass = sum(place["mass"] for place in known["top"] if abs(place["route_position_m"] - known["mode_m"]) <= 5)
+    sure = mass * (1 - known["off_route"])
+    assert 0.1 < sure < 0.9
+    assert not known["confident"]
+    assert [answer(sure + more)["confident"] for more in (-1e-6, 1e-6)] == [True, False]
+
+
+@pytest.mark.parametrize("belief", ["grid", "particle"])
+def test_a_robot_that_was_carried_is_lost_and_found(client, belief):
+    path = client.session(belief=belief)
+    on_route = [see(client, path, image, 4) for image in range(0, 24, 2)]
+    for image, answer in list(enumerate(on_route))[3:]:
+        assert (answer["belief"]["mode_m"], answer["belief"]["confident"]) == (4 * image, True)
+        assert (answer["belief"]["off_route"] < 0.01, answer["informative"], answer["warnings"]) == (True, True, [])
+    carried = [see(client, path, image, 2) for image in range(30, 40)]
+    lost = max(carried, key=lambda answer: answer["belief"]["off_route"])
+    assert lost["belief"]["off_route"] > 0.5
+    assert not lost["belief"]["confident"]
+    assert f"off_route is {lost['belief']['off_route']:.2f}" in " ".join(lost["warnings"])
+    assert carried[-1]["belief"]["mode_m"] == 78
+    assert carried[-1]["belief"]["off_route"] < 0.5
+
+
+def test_metres_may_be_given_a_price(client):
+    free, dear = (see(client, client.session(price_bits_per_m=price), 11)["next_best_view"] for price in (0, 100))
+    assert see(client, client.session(), 11)["next_best_view"] == free
+    assert (free["action_m"] > 5, dear["action_m"]) == (True, 1)
+    bits = [[action["expected_bits"] for action in plan["actions"]] for plan in (free, dear)]
+    assert bits[0] == bits[1]
+    values = [action["q_value"] for action in dear["actions"]]
+    assert values == sorted(values, reverse=True)
+    constant = client.begin(planner="constant:3", price_bits_per_m=1.5)["next_best_view"]
+    assert {(action["q_value"], action["expected_bits"]) for action in constant["actions"]} == {(None, None)}
+
+
+def test_the_credible_set_is_the_smallest_one(client):
+    belief = see(client, client.session(), 11, shortlist=N_READY)["belief"]
+    held = 0.0
+    members = []
+    for place in belief["top"]:
+        members.append(place["route_position_m"])
+        held += place["mass"]
+        if held >= 0.95:
+            break
+    pieces = []
+    for position_m in sorted(members):
+        if pieces and position_m - pieces[-1][1] <= 2:
+            pieces[-1][1] = position_m
+        else:
+            pieces.append([position_m, position_m])
+    assert len(pieces) > 1, "else nothing is shown"
+    assert belief["credible_95_sets_m"] == pieces
+    assert belief["credible_95_m"] == [min(members), max(members)]
 
 
 # Once under one key

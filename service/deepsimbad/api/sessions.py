@@ -156,7 +156,7 @@ class ObservationAnswer(SessionAnswer):
     """A session after one more observation."""
 
     timings_ms: Timings
-    informative: Annotated[bool, Field(description="Whether the view changed the belief.")]
+    informative: Annotated[bool, Field(description="Whether the view told anything of the place.")]
     warnings: Annotated[list[str], Field(description="What a person should know, in sentences.")]
     retrieval: Annotated[list[RetrievedAnswer], Field(description="Map images most relevant to this view, best first.")]
 

@@ -84,6 +84,10 @@ class ViewEvidence:
             return self.values
         return (self.values - self.shared * last) / (1 + self.shared)
 
+    def least_told(self, last: NDArray[np.float64] | None) -> float:
+        """The mass that its news would at least have moved elsewhere where nothing was known, when it is small."""
+        return 0.0 if self.is_added else 0.5 * _trusts(self.rule)[0] * float(np.abs(self.news(last)).mean())
+
     @property
     def is_added(self) -> bool:
         """Whether it is added to weights, as in the paper, and does not multiply them."""

@@ -27,7 +27,7 @@ from deepsimbad.core.relevance import Query, UpdateRule
 from deepsimbad.core.retrieval import relevances
 from deepsimbad.core.summary import DEFAULT_CONFIDENCE, near_mode
 
-_LEAST_TOLD = 0.01  # of the mass that a view moved elsewhere; with less it told nothing
+_LEAST_TOLD = 0.01  # of the mass that a view moves elsewhere; with less it told nothing
 _STAGES = ("retrieve", "predict", "update", "plan")
 
 
@@ -60,7 +60,7 @@ class Step:
 
     state: LocalizerState  # the state after it
     plan: Plan | None  # the recommended next move; None where the planner has nothing to go by
-    is_informative: bool  # whether the view changed the belief
+    is_informative: bool  # whether the view changed the belief, or would have changed one that was less sure
     timings_ms: dict[str, float]  # milliseconds by stage
 
 
@@ -114,8 +114,8 @@ class ActiveLocalizer:
         if query.is_informative:
             shared = map_.shared_error_after(moved_m) if number > 0 else 0.0
             seen = ViewEvidence.of(relevance, self._update, map_.log_likelihood_scale, shared)
-            before, belief = belief.mass, belief.updated(seen, number)
-            told = 0.5 * float(np.abs(belief.mass - before).sum())
+            before, belief = belief, belief.updated(seen, number)
+            told = max(0.5 * float(np.abs(belief.mass - before.mass).sum()), seen.least_told(before.doubt.last))
         laps.append(self._clock())
 
         after = LocalizerState(belief, live, relevance, number + 1)

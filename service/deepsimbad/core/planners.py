@@ -18,6 +18,7 @@ NNQL, INFORMED, RANDOM, CONSTANT = "nnql", "informed", "random", "constant"
 DEFAULT_PLANNER = INFORMED
 NNQL_NEIGHBOURS = 4  # k of the paper
 _DISCOUNT, _SWEEPS = 0.9, 60
+_MOST_PRICES = 8  # whose tables are kept: of 26,000 images each takes 2 MB
 
 
 @dataclass(frozen=True)
@@ -87,19 +88,23 @@ def information_ahead(map_: Map, price_bits_per_m: float) -> NDArray[np.float32]
     """[n, 2a] discounted bits of a move from every image and of the best after it, then bits of its first view alone.
 
     A view is worth what its place is, but for what the view before explains of its error: `(1 - c(a)^2) I(x + a)`,
-    less the price of the metres. Worked out once a price and map; None where nobody knows what views are worth.
+    less the price of the metres. Worked out once a price and map, for the last few prices; None where nobody knows what views are worth.
     """
     if map_.view_bits is None:
         return None
     tables = map_.information_tables
-    if price_bits_per_m not in tables:
+    table = tables.get(price_bits_per_m)
+    if table is None:
         actions_m = map_.actions_m
         news = np.array([1.0 - map_.alike_after(action_m) ** 2 for action_m in actions_m.tolist()])
         leads_to, bits = _leads_to(map_.route, actions_m), map_.view_bits.astype(np.float64)
         values = _swept(leads_to, bits, news, price_bits_per_m * np.abs(actions_m))
         first = news * np.where(leads_to < 0, bits.mean(), bits[leads_to])
-        tables[price_bits_per_m] = np.hstack([values, first.astype(np.float32)])
-    return tables[price_bits_per_m]
+        table = np.hstack([values, first.astype(np.float32)])
+        if len(tables) >= _MOST_PRICES:
+            tables.pop(next(iter(tables)), None)
+        tables[price_bits_per_m] = table
+    return table
 
 
 def _leads_to(route: Route, actions_m: NDArray[np.float64]) -> NDArray[np.int64]:

@@ -16,6 +16,7 @@ from deepsimbad.evaluators.registry import ExtractorName, make_extractor
 
 _SCENES_AT_ONCE = 16  # half a megabyte at d = 8,064, which stays in the cache
 _NUMBERS_A_SUM = 256
+_MOST_DEVIATIONS = 1e12  # from what is usual; the square of more has no place in float32
 
 
 class FeatureL2:
@@ -141,10 +142,12 @@ def _between_units(
             "come from another encoder",
             encoding_dim=usual.shape[1],
         )
-    if not np.isfinite(encodings).all():
-        raise InvalidEncodingError("an encoding holds NaN or infinity")
+    moments = Moments.from_mean_std(usual)
+    farthest = np.maximum(encodings.max(axis=0) - moments.mean, moments.mean - encodings.min(axis=0))
+    if not (farthest <= _MOST_DEVIATIONS * moments.std).all():
+        raise InvalidEncodingError("an encoding holds NaN, infinity or numbers too large to compare")
     projection = np.asarray(model["projection"], np.float32) if "projection" in model else None
-    u = described(encodings, Moments.from_mean_std(usual), projection)
+    u = described(encodings, moments, projection)
     return np.asarray(np.clip(2 - 2 * (u @ prototypes.T), 0, 4), np.float32)
 
 
