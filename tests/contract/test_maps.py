@@ -5,7 +5,7 @@ import hashlib
 
 import numpy as np
 
-from .conftest import DIM, N_READY, RANKS, problem, ready_encodings, service, until
+from .conftest import DIM, N_READY, RANKS, TAKES_ENCODINGS, problem, ready_encodings, service, until
 
 SAME = {"same_route": True}
 
@@ -123,6 +123,34 @@ def test_a_second_season_is_learnt_from_where_the_route_is_said_to_be_one(client
     assert (season["accepted"], job["config"]["same_route"]) == (False, True)
     assert "agree no better" in season["why"]
     assert versions(client, domain)[4]["metrics"]["second_season"] == season
+
+
+def test_landmarks_come_from_where_they_are_asked_for_or_known(client):
+    """The map's own drive on a new domain; the map that serves after that, as long as its landmarks are of a kind."""
+    assert client.put("/v1/admin/domains/fresh", json=TAKES_ENCODINGS).status_code == 201
+    client.upload("fresh", "drive", ready_encodings(), 2.0 * np.arange(N_READY))
+    client.upload("fresh", "again", ready_encodings() + 0.1 * noise(1), 2.0 * np.arange(N_READY))
+
+    def about(n_expected, **asked):
+        job = client.remap("fresh", list_length=3, **asked)
+        assert job["state"] == "succeeded", job
+        domain = client.get("/v1/domains/fresh").json()
+        assert domain["n_landmarks"] == n_expected
+        assert job["result"]["metrics"] == versions(client, "fresh")[domain["map_version"]]["metrics"]
+        return job["result"]["metrics"]["landmarks"], domain["landmark_model_digest"]
+
+    source, own = about(12, n_landmarks=12)
+    assert source == "training_traverse"
+    body = {"encoding": ready_encodings()[17].tolist()}
+    found = client.post("/v1/domains/fresh/localizations", json=body).json()
+    assert found["retrieval"][0]["map_image"] == 17
+    assert about(12, training_traverse="again") == ("active_map", own)
+    source, other = about(9, landmark_traverse="again", n_landmarks=9)
+    assert source == "landmark_traverse"
+    assert about(9) == ("active_map", other)
+    assert about(9, relevance="rrf", n_landmarks=9)[0] == "training_traverse"
+    assert about(9, relevance="standardised")[0] == "active_map"
+    assert about(N_READY, relevance="composed")[0] == "training_traverse"
 
 
 def test_a_closed_route_is_a_loop(client):

@@ -53,7 +53,8 @@ class RemapBody(JsonBody):
 
     training_traverse: Annotated[Name, Field(description="Its frames become the map images.")]
     landmark_traverse: Annotated[
-        Name | None, Field(description="Landmarks are selected among its frames; null keeps the active map's.")
+        Name | None,
+        Field(description="Where landmarks are chosen; null: the active map's, else the training traverse's."),
     ] = None
     n_landmarks: Annotated[
         Annotated[int, Field(strict=True, ge=1, le=MAX_LANDMARKS)] | None,
@@ -153,8 +154,9 @@ async def post_remap(
 ) -> JobAnswer:
     """Build the next map of a domain as a job; what serves stays until the new map is sealed.
 
-    Without `landmark_traverse` the active map's landmarks stay, which is the cheap way to retrain; with `append` its
-    images stay too, and the training traverse is added to them. The new map is compared with the active one
+    Without `landmark_traverse` the active map's landmarks stay, which is the cheap way to retrain, or where there are
+    none the training traverse's own are taken; with `append` the active map's images stay too, and the training
+    traverse is added to them. The new map is compared with the active one
     (`metrics.check` of the result), and with a `gate_margin` sealed but not activated where it is worse by more.
     """
     body = await read_json(request, RemapBody)
@@ -169,8 +171,8 @@ async def post_remap(
         for name in (config.training_traverse, config.landmark_traverse, config.check_traverse):
             if name is not None:
                 Traverse.open(running.settings.data_dir, domain, name).close()
-        if config.landmark_traverse is None and record.active_version is None:
-            what = "to take landmarks or images from: make one first, without append and with a landmark_traverse"
+        if config.append and record.active_version is None:
+            what = "to append to: make one first, without append"
             raise NoActiveMapError(f"domain {domain} has no active map {what}", domain=domain)
         if config.append and record.active_version is not None:
             active = running.catalog.map(domain, record.active_version)

@@ -88,7 +88,8 @@ def information_ahead(map_: Map, price_bits_per_m: float) -> NDArray[np.float32]
     """[n, 2a] discounted bits of a move from every image and of the best after it, then bits of its first view alone.
 
     A view is worth what its place is, but for what the view before explains of its error: `(1 - c(a)^2) I(x + a)`,
-    less the price of the metres. Worked out once a price and map, for the last few prices; None where nobody knows what views are worth.
+    less the price of the metres. Worked out once a map for each of the last few prices; None where nobody knows what
+    views are worth.
     """
     if map_.view_bits is None:
         return None
