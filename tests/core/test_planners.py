@@ -109,6 +109,15 @@ def test_metres_have_a_price(bits):
     assert plan_by_information(view_of(sharp(50), flat, novelty=np.linspace(1, 0, 11))).action_m == 10
 
 
+def test_tables_of_few_prices_are_kept(bits):
+    """Any robot may name its own price."""
+    map_ = view_of(bits=bits).map
+    tables = {price: information_ahead(map_, price) for price in np.linspace(0, 1, 50).tolist()}
+    assert len(map_.information_tables) <= 8
+    assert map_.information_tables[1.0] is tables[1.0]
+    assert (information_ahead(map_, 0.0) == tables[0.0]).all()
+
+
 def test_a_closed_route_goes_on_behind_its_end(bits):
     at_end = sharp(N_IMAGES - 3)
     assert plan_by_information(view_of(at_end, bits, closed=True)).action_m == 3, "place 0 tells seven bits"
