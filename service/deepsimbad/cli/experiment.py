@@ -19,6 +19,7 @@ from deepsimbad.cli.terminal import (
     spacing_option,
     write_json,
 )
+from deepsimbad.core.belief import FilterKind
 from deepsimbad.core.drive import SameRoute
 from deepsimbad.core.metrics import RetrievalScores
 from deepsimbad.core.planners import DEFAULT_PLANNER
@@ -27,6 +28,7 @@ from deepsimbad.core.route import true_images_of
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.registry import EvaluatorConfig, make_evaluator
 from deepsimbad.jobs.build import EncodedRecording, encode_recording
+from deepsimbad.jobs.calibration import VIEWS, CalibrationConfig, calibration_stages, run_calibration
 from deepsimbad.jobs.experiments import (
     NbvConfig,
     NbvReport,
@@ -177,6 +179,36 @@ def nbv(evaluator: EvaluatorConfig, relevance: str | None, update: str | None, *
     _tell(document, asked["json_file"], lambda: _print_planners(report, document))
 
 
+@experiment.command()
+@_triplet_options
+@evaluator_option
+@click.option("--relevance", type=RELEVANCES, default=DEFAULT_RELEVANCE.value, show_default=True)
+@click.option(
+    "--filter",
+    "filter_name",
+    type=click.Choice([kind.value for kind in FilterKind]),
+    default=FilterKind.GRID.value,
+    show_default=True,
+)
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
+def calibration(evaluator: EvaluatorConfig, relevance: str, filter_name: str, **asked: Any) -> None:
+    """How far a belief can be trusted: its 95 % sets and its sure answers against the truth.
+
+    Of robots that drive, stand still, are carried, leave the route, or misjudge their moves. Takes a test drive of 250 m.
+    """
+    config = CalibrationConfig(
+        relevance=Relevance(relevance),
+        filter=FilterKind(filter_name),
+        same_route=asked["same_route"] is not False,
+        **{name: asked[name] for name in ("n_landmarks", "list_length", "seed")},
+    )
+    with progress_bar(_READING_STAGES | calibration_stages(), "experiment") as progress:
+        measure, (landmarks, training, test), sources = _read_triplet(asked, evaluator, progress)
+        report = run_calibration(config, measure, landmarks.drive, training.drive, test.drive, progress)
+    document = report.as_dict(sources)
+    _tell(document, asked["json_file"], lambda: _print_calibration(document, report.same_route))
+
+
 def _read_triplet(
     asked: dict[str, Any], config: EvaluatorConfig, progress: Progress
 ) -> tuple[Evaluator, list[EncodedRecording], dict[str, Any]]:
@@ -258,6 +290,46 @@ def _print_planners(report: NbvReport, document: dict[str, Any]) -> None:
         *_no_second_season(report.same_route),
         numbers=True,
     )
+
+
+def _print_calibration(document: dict[str, Any], same_route: SameRoute | None) -> None:
+    """Moves a row; the rest in lines below."""
+    table = Table("moves, m", *(f"{views} views: % / m" for views in VIEWS), "wrong %")
+    for move, coverage in document["coverage_95"].items():
+        sizes_m = document["set_m"][move]
+        cells = (f"{coverage[views]:.1f} / {sizes_m[views]:.0f}" for views in coverage)
+        table.add_row(move, *cells, f"{document['wrong_when_confident'][move]:.1f}")
+    print_table(
+        table,
+        "% / m: how many 95 % sets hold the truth, and their size; wrong: 99 % sure of a place more than 5 m off",
+        *_other_robots(document),
+        *_no_second_season(same_route),
+        numbers=True,
+    )
+
+
+def _other_robots(document: dict[str, Any]) -> list[str]:
+    reliability, carried = document["reliability"], document["carried"]
+    bins = zip(reliability["near_mode"], reliability["within_5_m"], strict=True)
+    standing = {name: f"{share:.1f}" for name, share in document["standing_coverage_95"].items()}
+    off_route = (f"{share:.1f} {stage}" for stage, share in document["off_route"].items())
+    return [
+        "within 5 m of the mode, % believed: % true: "
+        + ", ".join(f"{held:.0f}: {true:.0f}" for held, true in bins if held is not None),
+        f"150 views standing still: {standing['unknown']} % covered from an unknown start, {standing['tracked']} % after "
+        f"50 m, where {_shown(document['lost_their_place'])} % lost their place",
+        f"carried 100 m or more: found after {carried['views_median']:.0f} views, 95 of 100 after {carried['views_95']:.0f}",
+        f"probability of being lost after ten views, %: {', '.join(off_route)}",
+        *(
+            f"odometry times {factor}: {coverage:.1f} % covered, {document['odometry_within_5_m'][factor]:.1f} % within 5 m"
+            for factor, coverage in document["odometry_coverage_95"].items()
+        ),
+        f"{sum(document['views_refused'].values())} views refused",
+    ]
+
+
+def _shown(share: float | None) -> str:
+    return "-" if share is None else f"{share:.1f}"
 
 
 def _no_second_season(verdict: SameRoute | None) -> tuple[str, ...]:

@@ -296,7 +296,7 @@ def run_nbv(
     Raises:
         InvalidMapConfigError: The test traverse is shorter than an episode.
     """
-    route, true_image = test.route(), _nearest_images(test, training)
+    route, true_image = test.route(), nearest_images(test, training)
     travel_m = config.n_steps * max(config.actions_m)
     starts = TestDrive(Query.uninformative(1), route, true_image).starts(travel_m, config.episodes, config.seed)
     if starts.size == 0:
@@ -369,7 +369,7 @@ def _episodes(
     return episodes
 
 
-def _nearest_images(test: Drive, training: Drive) -> NDArray[np.int64]:
+def nearest_images(test: Drive, training: Drive) -> NDArray[np.int64]:
     """[m] the map image nearest to every test frame: in the plane where both know it, else along the route."""
     route = training.route()
     nearest = route.nearest_image(test.position_m).astype(np.int64)
