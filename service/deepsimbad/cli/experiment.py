@@ -194,7 +194,7 @@ def nbv(evaluator: EvaluatorConfig, relevance: str | None, update: str | None, *
 def calibration(evaluator: EvaluatorConfig, relevance: str, filter_name: str, **asked: Any) -> None:
     """How far a belief can be trusted: its 95 % sets and its sure answers against the truth.
 
-    Of robots that drive, stand still, are carried, leave the route, or misjudge their moves. Takes a test drive of 250 m.
+    Of robots that drive, stand still, are carried, leave the route, or misjudge their moves; on 250 m at least.
     """
     config = CalibrationConfig(
         relevance=Relevance(relevance),
@@ -309,19 +309,20 @@ def _print_calibration(document: dict[str, Any], same_route: SameRoute | None) -
 
 
 def _other_robots(document: dict[str, Any]) -> list[str]:
-    reliability, carried = document["reliability"], document["carried"]
+    reliability, carried, near = (document[part] for part in ("reliability", "carried", "odometry_within_5_m"))
     bins = zip(reliability["near_mode"], reliability["within_5_m"], strict=True)
     standing = {name: f"{share:.1f}" for name, share in document["standing_coverage_95"].items()}
     off_route = (f"{share:.1f} {stage}" for stage, share in document["off_route"].items())
     return [
         "within 5 m of the mode, % believed: % true: "
         + ", ".join(f"{held:.0f}: {true:.0f}" for held, true in bins if held is not None),
-        f"150 views standing still: {standing['unknown']} % covered from an unknown start, {standing['tracked']} % after "
-        f"50 m, where {_shown(document['lost_their_place'])} % lost their place",
-        f"carried 100 m or more: found after {carried['views_median']:.0f} views, 95 of 100 after {carried['views_95']:.0f}",
+        f"150 views standing still: {standing['unknown']} % covered from an unknown start, {standing['tracked']} % "
+        f"after 50 m, where {_shown(document['lost_their_place'])} % lost their place",
+        f"carried 100 m or more: found after {carried['views_median']:.0f} views, "
+        f"95 of 100 after {carried['views_95']:.0f}",
         f"probability of being lost after ten views, %: {', '.join(off_route)}",
         *(
-            f"odometry times {factor}: {coverage:.1f} % covered, {document['odometry_within_5_m'][factor]:.1f} % within 5 m"
+            f"odometry times {factor}: {coverage:.1f} % covered, {near[factor]:.1f} % within 5 m"
             for factor, coverage in document["odometry_coverage_95"].items()
         ),
         f"{sum(document['views_refused'].values())} views refused",

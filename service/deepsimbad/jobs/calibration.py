@@ -68,7 +68,7 @@ class Sight(NamedTuple):
 
 @dataclass(frozen=True)
 class CalibrationReport:
-    """What every robot believed, and what that is worth."""
+    """What every robot believed."""
 
     config: CalibrationConfig
     sights: dict[str, Sight]  # by stage of `calibration_stages`
@@ -79,17 +79,15 @@ class CalibrationReport:
         moving = {f"{action_m:g}": self.sights[stage] for stage, action_m in _MOVING.items()}
         odometry = {f"{factor:g}": self.sights[stage] for stage, factor in _ODOMETRY.items()}
         standing, tracked = self.sights["standing"].is_covered, self.sights["tracked, then standing"]
+        held = tracked.is_covered[:, -_STANDING_VIEWS:]
         stayed = tracked.is_near[tracked.is_near[:, _TRACKED_MOVES] == 1, -1]
         found = views_until_found(self.sights["carried"].is_near[:, -_SEARCHING_VIEWS:])
         return {
-            "coverage_95": {move: _after(100 * sight.is_covered) for move, sight in moving.items()},
-            "set_m": {move: _after(sight.set_m) for move, sight in moving.items()},
+            "coverage_95": {a: {str(v): _percent(s.is_covered[:, v - 1]) for v in VIEWS} for a, s in moving.items()},
+            "set_m": {a: {str(v): float(s.set_m[:, v - 1].mean()) for v in VIEWS} for a, s in moving.items()},
             "reliability": reliability(list(moving.values())),
             "wrong_when_confident": {move: wrong_when_confident(sight) for move, sight in moving.items()},
-            "standing_coverage_95": {
-                "unknown": _percent(standing),
-                "tracked": _percent(tracked.is_covered[:, -_STANDING_VIEWS:]),
-            },
+            "standing_coverage_95": {"unknown": _percent(standing), "tracked": _percent(held)},
             "lost_their_place": _percent(1 - stayed),
             "carried": {"views_median": float(np.median(found)), "views_95": float(np.quantile(found, 0.95))},
             "off_route": {stage: _percent(self.sights[stage].off_route[:, -1]) for stage in _STRETCHES},
@@ -103,10 +101,6 @@ class CalibrationReport:
 
 def _percent(shares: NDArray[Any]) -> float | None:
     return float(100 * shares.mean()) if shares.size else None
-
-
-def _after(values: NDArray[np.float64]) -> dict[str, float]:
-    return {str(views): float(values[:, views - 1].mean()) for views in VIEWS}
 
 
 def reliability(sights: Sequence[Sight]) -> dict[str, list[Any]]:
@@ -132,7 +126,7 @@ def wrong_when_confident(sight: Sight) -> float:
 
 def views_until_found(is_near: NDArray[np.float64]) -> NDArray[np.int64]:
     """[robots] views until the mode is within 5 m of the truth; where it never is, one more than there are."""
-    return np.where(is_near.any(axis=1), is_near.argmax(axis=1) + 1, is_near.shape[1] + 1)
+    return np.asarray(np.where(is_near.any(axis=1), is_near.argmax(axis=1) + 1, is_near.shape[1] + 1), np.int64)
 
 
 def smallest_set(mass: NDArray[np.float64], share: float = 0.95) -> NDArray[np.bool_]:
@@ -156,8 +150,7 @@ def run_calibration(
     Raises:
         InvalidMapConfigError: The test traverse is too short.
     """
-    length_m = float(test.position_m[-1] - test.position_m[0])
-    if length_m < LEAST_M:
+    if (length_m := float(np.ptp(test.position_m))) < LEAST_M:
         raise InvalidMapConfigError(f"the test traverse is {length_m:g} m long; calibration takes {LEAST_M:g} m")
     progress.stage("map")
     plan = MapPlan(config.relevance, config.list_length, tuple(_MOVING.values()), same_route=config.same_route)
@@ -172,13 +165,13 @@ def run_calibration(
     mapped = training.at(np.flatnonzero(training.position_m <= middle_m))
     known = landmarks.at(np.flatnonzero((landmarks.position_m <= middle_m) | (config.same_route is False)))
     built_half = build(plan, mapped, known, known, min(config.n_landmarks, known.n_frames), evaluator)
-    at_m, path_m = training.position_m[true_image], _MOVE_M * np.arange(VIEWS[-1])
+    at_m, ahead_m = training.position_m[true_image], _MOVE_M * np.arange(VIEWS[-1])
     for stage, is_there in zip(_STRETCHES, (at_m > middle_m + _BESIDE_M, at_m <= middle_m), strict=True):
         progress.stage(stage)
         stretch = test.at(np.flatnonzero(is_there))
         course = _course(config, evaluator, built_half, stretch, nearest_images(stretch, mapped))
-        there_m = course.starts_m(path_m[-1], config.carried) + path_m
-        sights[stage] = course.driven(there_m, np.full(path_m.size, _MOVE_M), progress.update)
+        there_m = course.starts_m(ahead_m[-1], config.carried) + ahead_m
+        sights[stage] = course.driven(there_m, np.full(ahead_m.size, _MOVE_M), progress.update)
     return CalibrationReport(config, sights, built.same_route)
 
 
