@@ -28,6 +28,7 @@ GOLDEN = Path(__file__).parent
 COMMANDS = [
     *([], ["init"], ["serve"], ["keys"], ["keys", "create"], ["keys", "list"], ["keys", "revoke"], ["map"]),
     *(["localize"], ["info"], ["delete"], ["experiment"], ["experiment", "vpr"], ["experiment", "nbv"], ["settings"]),
+    ["experiment", "calibration"],
     *(["backup"], ["restore"], ["export"], ["import"], ["check"], ["weights"], ["weights", "list"]),
     *(["weights", "pull"], ["weights", "verify"]),
 ]
