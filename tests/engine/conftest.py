@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 import numpy as np
 import pytest
 
-from deepsimbad.core.building import build_map
+from deepsimbad.core.building import MapPlan, build_map, compose_map
 from deepsimbad.core.drive import Drive
 from deepsimbad.core.map import Map
 from deepsimbad.core.relevance import Relevance
@@ -53,14 +53,19 @@ def map_contents(
     model = evaluator.fit_landmarks(rng.normal(size=(N_LANDMARKS, DIM)).astype(np.float32))
     measured = evaluator.dissimilarities(encodings, model)
     drive = Drive(position_m=np.arange(N_IMAGES) * 1.5, encodings=encodings, dissimilarities=measured)
+    if relevance is Relevance.COMPOSED:
+        plan = MapPlan(relevance, LIST_LENGTH, (1.0, 2.0), closed)
+        map_ = compose_map(plan, drive, None, None, N_LANDMARKS).map
+    else:
+        map_ = replace(
+            build_map(relevance, drive, LIST_LENGTH, closed), actions_m=np.array([1.0, 2.0]), landmark_model=model
+        )
     return replace(
-        build_map(relevance, drive, LIST_LENGTH, closed),
+        map_,
         domain=domain,
         version=version,
         created_at="2026-01-01T00:00:00Z",
         evaluator=EVALUATOR,
-        actions_m=np.array([1.0, 2.0]),
-        landmark_model=model,
         index_bytes=1200,
     )
 

@@ -5,7 +5,8 @@ from statistics import NormalDist
 import numpy as np
 import pytest
 
-from deepsimbad.core.relevance import LOG_LIKELIHOOD_WEIGHT, Relevance
+from deepsimbad.core.belief import TRUSTS
+from deepsimbad.core.relevance import OTHER_LIKELIHOOD_SCALE, Relevance
 from deepsimbad.engine.localizer import Dissimilarities, RankedLandmarks, ReadyEncoding, View, describe, localize
 from deepsimbad.errors import (
     InvalidDissimilaritiesError,
@@ -38,8 +39,9 @@ def test_standardised_belief_is_the_normalised_exponential() -> None:
     z = [(NormalDist().inv_cdf((i + 0.5) / N_LANDMARKS) - mean[i]) / std[i] for i in range(N_LANDMARKS)]
     slow = np.array([-sum(z[snapshot.lists[j, m]] for j in range(LIST_LENGTH)) for m in range(N_IMAGES)])
     np.testing.assert_allclose(localization.relevance, slow, rtol=1e-5, atol=1e-6)
-    mass = np.exp(LOG_LIKELIHOOD_WEIGHT * (slow - slow.max()))
-    mass /= mass.sum()  # images are evenly spaced: a uniform prior weighs them alike
+    parts = np.array([np.exp(trust * OTHER_LIKELIHOOD_SCALE * (slow - slow.mean())) for trust in TRUSTS])
+    # Images are evenly spaced: a uniform prior weighs them alike, and the first view the three trusts.
+    mass = (parts / parts.sum(axis=1, keepdims=True)).mean(axis=0)
     np.testing.assert_allclose(localization.belief.top_mass, np.sort(mass)[::-1], rtol=1e-4)
     assert localization.belief.mean_m == pytest.approx(mass @ snapshot.position_m, rel=1e-4)
     assert localization.shortlist.tolist() == np.argsort(-localization.relevance, kind="stable").tolist()

@@ -109,7 +109,7 @@ def content(path):
         return held
 
 
-@pytest.mark.parametrize("relevance", ["calibrated", "standardised", "rrf", "simbad", "brute_force"])
+@pytest.mark.parametrize("relevance", ["composed", "standardised", "rrf", "simbad", "brute_force"])
 def test_map_file(drives, tmp_path, relevance):
     deepsimbad(
         *("map", "route", "--landmarks", drives / "autumn.npy", "--training", drives / "summer.npy", "--same-route"),

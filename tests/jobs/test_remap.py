@@ -206,11 +206,11 @@ def route(catalog):
         (True, {"landmark_traverse": "strange"}, False, "agree no better"),
     ],
 )
-@pytest.mark.parametrize("relevance", [Relevance.CALIBRATED, Relevance.RRF])
+@pytest.mark.parametrize("relevance", [Relevance.COMPOSED, Relevance.STANDARDISED, Relevance.RRF])
 def test_a_second_drive_is_learnt_from_only_on_the_same_route(
     catalog, route, evaluator, plane, asked, accepted, why, relevance
 ):
-    """One verdict holds for trust, for telling places and off the route, and for the live images of training."""
+    """One verdict holds for the likelihood, for whitening, and for the live images of training."""
     route(plane)
     asked = config(n_landmarks=60, training_episodes=20, relevance=relevance, **asked)
     metrics = remap(catalog, DOMAIN, asked, evaluator, Progress(REMAP_STAGES))["metrics"]
@@ -221,10 +221,10 @@ def test_a_second_drive_is_learnt_from_only_on_the_same_route(
     assert metrics["training"]["live_images"] == ("landmark_traverse" if accepted else "held_out_frames")
     assert catalog.map(DOMAIN, 1).metrics["second_season"] == season
     contents = read_map(catalog.map_path(DOMAIN, 1))
-    learnt = accepted and relevance is Relevance.CALIBRATED
-    assert (contents.telling_bits is not None) == (contents.off_route_model is not None) == learnt
-    if relevance is Relevance.CALIBRATED:
-        assert (set(contents.correlation.tolist()) != {0.6}) == accepted
+    learns = relevance is not Relevance.RRF
+    assert (contents.view_bits is not None) == (contents.novelty is not None) == learns
+    fused = accepted and relevance is Relevance.COMPOSED
+    assert (contents.likelihood_scale is not None) == ("projection" in contents.landmark_model) == fused
 
 
 def test_without_a_second_drive_there_is_no_verdict(catalog, drive, evaluator, quiet):
@@ -270,7 +270,7 @@ def test_stages_weigh_by_what_they_have_to_do():
     assert trained(10_000, append=True, landmark_traverse=None) < 0.1 < trained(10_000)
     assert trained(10_000, relevance=Relevance.BRUTE_FORCE) < 0.1
     kept = remap_stages(RemapConfig("drive"), 12_000, 0, 512)
-    assert kept["select landmarks"] < 0.1 < remap_stages(CONFIG, *SIZE)["select landmarks"]
+    assert 0.1 < kept["describe"] < 0.6 * remap_stages(CONFIG, *SIZE)["describe"]
 
 
 def test_the_size_is_that_of_the_traverses(catalog, drive):

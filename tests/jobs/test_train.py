@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from deepsimbad.core.building import build_map
+from deepsimbad.core.building import MapPlan, build_map, compose_map
 from deepsimbad.core.drive import Drive
 from deepsimbad.core.nnql import NnqlConfig
 from deepsimbad.core.relevance import Relevance
@@ -32,13 +32,13 @@ def drives(noise: float = 0.4, seed: int = 0) -> tuple[Drive, Drive]:
     return seen(), seen()
 
 
-def a_map(relevance, own, actions_m=(1.0, 2.0, 5.0)):
-    return replace(build_map(relevance, own, 4), actions_m=np.array(actions_m))
-
-
 def trained(relevance=Relevance.RRF, second=None, own=None, config=None, on_progress=lambda _: None):
-    own = own or drives()[0]
-    return train_nnql(a_map(relevance, own), own, second, config or NnqlConfig(n_episodes=200), on_progress)
+    own, actions_m, config = own or drives()[0], (1.0, 2.0, 5.0), config or NnqlConfig(n_episodes=200)
+    if relevance is Relevance.COMPOSED:
+        built = compose_map(MapPlan(relevance, 4, actions_m, same_route=True), own, second, second, R)
+        return train_nnql(built.rehearsal, built.own, built.second, config, on_progress)
+    map_ = replace(build_map(relevance, own, 4), actions_m=np.array(actions_m))
+    return train_nnql(map_, own, second, config, on_progress)
 
 
 @pytest.fixture

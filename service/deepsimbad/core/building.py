@@ -29,7 +29,7 @@ from deepsimbad.core.map import Map
 from deepsimbad.core.nnql import NnqlConfig
 from deepsimbad.core.rehearsal import rehearsed
 from deepsimbad.core.relevance import Relevance
-from deepsimbad.errors import InvalidMapConfigError
+from deepsimbad.errors import InvalidEncodingError, InvalidMapConfigError
 
 _OWN_PLACE_M = 2.0  # a landmark from no farther away is a place's own
 _SPREAD_OVER = 0.5  # of the route, at least, that places seen twice must cover before they tell of all of it
@@ -155,6 +155,7 @@ def compose_map(
 
     Raises:
         TooFewCandidatesError: That drive has fewer frames.
+        InvalidEncodingError: The model is of other encodings.
     """
     candidates = training if landmarks is None else landmarks
     if isinstance(candidates, Drive):
@@ -162,6 +163,10 @@ def compose_map(
         space = _Space.among(candidates, principal_directions(*drives.values()), n_landmarks)
     else:
         space = _Space(candidates.get("projection"), np.asarray(candidates["prototypes"], np.float32))
+        if (d := candidates["usual"].shape[1]) != training.encoding_dim:
+            raise InvalidEncodingError(
+                f"encodings of {training.encoding_dim} numbers cannot be compared with landmarks of {d}"
+            )
     check_list_length(plan.list_length, len(space.prototypes))
     on_progress(0.3)
     own, season, verdict = space.seen(training), None, None

@@ -193,7 +193,8 @@ class Map:
         """
         parts = {name: document[name] for name in document.keys() - {"n_map_images", "n_landmarks", "list_length"}}
         parts["closed"] = bool(parts["closed"])
-        return cls(**parts, landmark_model=landmark_model, index_bytes=index_bytes, **arrays)
+        known = {name: array for name, array in arrays.items() if name in ARRAYS}  # earlier releases had others
+        return cls(**parts, landmark_model=landmark_model, index_bytes=index_bytes, **known)
 
     def at(self, images: NDArray[np.integer[Any]]) -> Self:
         """The same map of some of its images alone, [m] in route order."""
