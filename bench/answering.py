@@ -22,7 +22,7 @@ from deepsimbad.core.belief import FilterKind
 from deepsimbad.core.descriptor import rank_landmarks
 from deepsimbad.core.localizer import ActiveLocalizer, LocalizerConfig
 from deepsimbad.core.map import Map
-from deepsimbad.core.planners import NNQL, TELLING
+from deepsimbad.core.planners import INFORMED, NNQL
 from deepsimbad.core.relevance import Query
 from deepsimbad.core.retrieval import relevances, shortlist
 
@@ -84,12 +84,12 @@ def _step_rows() -> Iterator[list[str]]:
     built = standardised_map(  # its lists drift; what it learnt is random
         dense_lists(NCLT_IMAGES),
         actions_m=np.array(ACTIONS_M),
-        telling_bits=rng.random(NCLT_IMAGES).astype(np.float32),
+        view_bits=rng.random(NCLT_IMAGES).astype(np.float32),
         q_values=rng.random((NCLT_IMAGES, len(ACTIONS_M))).astype(np.float32),
     )
     views = [Query(rng.permutation(N_LANDMARKS).astype(np.float32) + 1) for _ in range(32)]
     for kind in FilterKind:
-        for planner in (NNQL, TELLING):
+        for planner in (INFORMED, NNQL):
             localizer = ActiveLocalizer(built, LocalizerConfig(filter=kind, planner=planner), perf_counter)
             state = localizer.start()
             seconds, planning_ms = [], []

@@ -96,7 +96,7 @@ def documents(split: Split, work: Path) -> dict[str, Any]:
     """The result of every extractor."""
     into = work / "vpr.json"
     sources = ("--landmarks", split.landmarks, "--training", split.training, "--test", split.test)
-    relevances = ("--relevance", "calibrated", "--relevance", "rrf", "--relevance", "brute_force")
+    relevances = ("--relevance", "composed", "--relevance", "rrf", "--relevance", "brute_force")
     counted = ("--n-landmarks", str(split.n_landmarks), "--json", str(into))
     if code := run(["experiment", "vpr", *sources, *relevances, *counted, "--evaluator", "all", *split.more]):
         raise RuntimeError(f"the experiment on {split.group} ended with exit code {code}")
@@ -118,21 +118,21 @@ def report(splits: list[Split], work: Path) -> Iterator[str]:
         "",
         machine(),
         "",
-        "ANR in percent of `calibrated` / `rrf` / `brute_force`, and R@1 of `brute_force` in percent behind them. One "
+        "ANR in percent of `composed` / `rrf` / `brute_force`, and R@1 of `brute_force` in percent behind them. One "
         f"session over the test drive, h = 4, r = {N_LANDMARKS} or all candidates, tolerance two frames.",
         "",
     )
     rows, ratios = [], []
     for group, of_splits in grouped.items():
-        cells, best = [], _mean(of_splits, "gradient_grid", "anr", "calibrated")
+        cells, best = [], _mean(of_splits, "gradient_grid", "anr", "composed")
         for extractor in extractors:
-            anr = [_mean(of_splits, extractor, "anr", name) for name in ("calibrated", "rrf", "brute_force")]
+            anr = [_mean(of_splits, extractor, "anr", name) for name in ("composed", "rrf", "brute_force")]
             recall = _mean(of_splits, extractor, "recall_at_1", "brute_force")
             cells.append(" / ".join(f"{value:.2f}" for value in anr) + f" ({recall:.0f})")
         rows.append([group, *cells])
-        ratios.append([_mean(of_splits, extractor, "anr", "calibrated") / best for extractor in extractors])
+        ratios.append([_mean(of_splits, extractor, "anr", "composed") / best for extractor in extractors])
     means = [f"{mean:.2f}" for mean in np.exp(np.log(ratios).mean(axis=0))]
-    rows.append(["geometric mean of `calibrated` against the gradient grid", *means])
+    rows.append(["geometric mean of `composed` against the gradient grid", *means])
     yield from markdown(("split", *extractors), rows)
     yield ""
     costs = []

@@ -20,8 +20,9 @@ from numpy.typing import NDArray
 
 from bench.common import machine, markdown, real_recordings, write_page
 from bench.netvlad import DRIVES
-from deepsimbad.core.episodes import TestDrive
+from deepsimbad.core.episodes import Episode, TestDrive
 from deepsimbad.core.planners import CONSTANT, DEFAULT_PLANNER, RANDOM
+from deepsimbad.core.relevance import Query
 from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
 from deepsimbad.jobs.build import encode_recording
 from deepsimbad.jobs.experiments import CLAIRVOYANT, NbvConfig, NbvReport, nbv_stages, run_nbv
@@ -42,25 +43,30 @@ def measure(folder: Path, config: NbvConfig, names: tuple[str, ...]) -> Triplet:
     """Run one landmark-training-test triplet."""
     evaluator = make_evaluator(evaluator_config({"kind": "feature_l2", "extractor": "none"}))
     landmarks, training, test = (
-        encode_recording(open_source(str(folder / f"{name}.npy")), evaluator, 1, lambda _: None) for name in names
+        encode_recording(open_source(str(folder / f"{name}.npy")), evaluator, 1, lambda _: None).drive for name in names
     )
     report = run_nbv(config, evaluator, landmarks, training, test, Progress(nbv_stages(config)))
-    drive = TestDrive([], test.route, np.empty(0, np.int64))
+    drive = TestDrive(Query.uninformative(1), test.route(), np.empty(0, np.int64))
     starts = drive.starts(config.n_steps * max(config.actions_m), config.episodes, config.seed)
     return Triplet("-".join(names), report, starts)
 
 
+def shares(episodes: list[Episode]) -> NDArray[np.float64]:
+    """[episodes, steps] rank of the true image in percent."""
+    return 100 * np.array([episode.rank_share for episode in episodes])
+
+
 def mean_anr(triplets: list[Triplet], name: str) -> float:
     """ANR in percent, averaged over the triplets."""
-    return float(np.mean([100 * triplet.report.ours[name].mean() for triplet in triplets]))
+    return float(np.mean([shares(triplet.report.ours[name]).mean() for triplet in triplets]))
 
 
 def anr_table(triplets: list[Triplet], names: list[str]) -> Iterator[str]:
     """ANR by planner: of every triplet and on average, and on average in the paper's set-up."""
     rows = []
     for name in names:
-        ours = [f"{100 * triplet.report.ours[name].mean():.3f}" for triplet in triplets]
-        paper = np.mean([100 * triplet.report.paper[name].mean() for triplet in triplets])
+        ours = [f"{shares(triplet.report.ours[name]).mean():.3f}" for triplet in triplets]
+        paper = np.mean([shares(triplet.report.paper[name]).mean() for triplet in triplets])
         shown = f"**{name}** (default)" if name == DEFAULT_PLANNER else name
         rows.append([shown, f"**{mean_anr(triplets, name):.3f}**", *ours, f"{paper:.3f}"])
     return markdown(["planner", "mean", *(triplet.name for triplet in triplets), "mean, as in the paper"], rows)
@@ -71,8 +77,12 @@ def difference_table(triplets: list[Triplet], names: list[str]) -> Iterator[str]
     groups = np.concatenate([1_000_000 * place + triplet.starts for place, triplet in enumerate(triplets)])
     rows = []
     for rival in [name for name in names if name not in {DEFAULT_PLANNER, CLAIRVOYANT}]:
-        apart = [triplet.report.ours[DEFAULT_PLANNER] - triplet.report.ours[rival] for triplet in triplets]
-        difference = np.concatenate([100 * each.mean(axis=1) for each in apart])
+        difference = np.concatenate(
+            [
+                (shares(triplet.report.ours[DEFAULT_PLANNER]) - shares(triplet.report.ours[rival])).mean(axis=1)
+                for triplet in triplets
+            ]
+        )
         intervals = (interval(difference, np.arange(difference.size)), interval(difference, groups))
         rows.append([rival, f"{difference.mean():+.3f}", *(f"{low:+.3f} .. {high:+.3f}" for low, high in intervals)])
     return markdown(("default less", "difference", "95 %, episodes drawn", "95 %, starts drawn"), rows)
@@ -105,7 +115,7 @@ def step_table(triplets: list[Triplet], names: list[str]) -> Iterator[str]:
     """ANR after every move, averaged over the triplets."""
     rows = []
     for name in (DEFAULT_PLANNER, next(name for name in names if name.startswith(CONSTANT)), RANDOM, CLAIRVOYANT):
-        by_step = np.mean([100 * triplet.report.ours[name].mean(axis=0) for triplet in triplets], axis=0)
+        by_step = np.mean([shares(triplet.report.ours[name]).mean(axis=0) for triplet in triplets], axis=0)
         rows.append([name, *(f"{anr:.2f}" for anr in by_step)])
     return markdown(["planner", *map(str, range(1, triplets[0].report.config.n_steps + 1))], rows)
 
@@ -118,11 +128,11 @@ def page(triplets: list[Triplet], command: str, seconds: float) -> Iterator[str]
     yield from ("# Next-best-view planners on real NetVLAD encodings", "")
     yield (
         f"Three drives of the Nordland route, 600 places a metre apart, 64 numbers each; r = {config.n_landmarks}, "
-        f"h = {config.list_length}, {config.episodes} episodes of {config.n_steps} moves a planner and triplet, "
-        f"moves of {min(config.actions_m):g} to {max(config.actions_m):g} m, {config.training_episodes} training "
-        "episodes of NNQL at most. The robot moves exactly as far as it is told; the belief of the one map image "
-        "nearest to the truth is ranked after every move (ANR in percent: 0 is perfect, 50 chance; the first view does "
-        "not count)."
+        f"h = {config.list_length}, {config.episodes or distinct[-1]} episodes of {config.n_steps} moves a planner "
+        f"and triplet, moves of {min(config.actions_m):g} to {max(config.actions_m):g} m, {config.training_episodes} "
+        "training episodes of NNQL at most. The robot moves exactly as far as it is told; the belief of the one map "
+        "image nearest to the truth is ranked after every move (ANR in percent: 0 is perfect, 50 chance; the first view "
+        "does not count)."
     )
     yield ""
     yield f"Made by `{command}` in {seconds:.0f} s; `deepsimbad experiment nbv` gives each triplet alone."

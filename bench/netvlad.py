@@ -17,17 +17,17 @@ import numpy as np
 
 from bench.common import machine, markdown, real_recordings, write_page
 from deepsimbad.cli import run
-from deepsimbad.core.building import build_map
-from deepsimbad.core.descriptor import rank_landmarks
-from deepsimbad.core.drive import Drive, SecondSeason
-from deepsimbad.core.landmark_model import select_landmarks
+from deepsimbad.core.building import MapPlan
+from deepsimbad.core.drive import Drive
+from deepsimbad.core.map import Map
 from deepsimbad.core.metrics import RetrievalScorer
-from deepsimbad.core.relevance import Query, Relevance
+from deepsimbad.core.relevance import Relevance
 from deepsimbad.core.retrieval import relevances
 from deepsimbad.evaluators.feature_l2 import FeatureL2
+from deepsimbad.jobs.build import build, measured, views_of
 
 DRIVES = ("nr", "nq", "nq2")
-RELEVANCES = ("calibrated", "standardised", "rrf", "bag_of_landmarks", "simbad", "brute_force")
+RELEVANCES = ("composed", "brute_force_u", "standardised", "rrf", "bag_of_landmarks", "simbad", "brute_force")
 N_LANDMARKS, LIST_LENGTH, TOLERANCE = 300, 4, 2
 
 
@@ -46,23 +46,24 @@ def experiment(folder: Path, triplet: tuple[str, ...]) -> dict[str, Any]:
 
 def alone(folder: Path, triplet: tuple[str, ...]) -> Mapping[str, float]:
     """ANR in percent of every test frame localized on its own."""
-    landmarks, training, test = (np.load(folder / f"{name}.npy").astype(np.float32) for name in triplet)
-    evaluator = FeatureL2("none")
-    model = evaluator.fit_landmarks(landmarks[select_landmarks(landmarks, N_LANDMARKS)])
-    seen, other, live = (evaluator.dissimilarities(each, model) for each in (training, landmarks, test))
-    frames = np.arange(len(training))
-    second = SecondSeason(other, np.stack([frames, frames], axis=1))
-    drive = Drive(position_m=frames.astype(float), encodings=training, dissimilarities=seen)
+    encodings = (np.load(folder / f"{name}.npy").astype(np.float32) for name in triplet)
+    landmarks, training, test = (Drive(position_m=np.arange(float(len(rows))), encodings=rows) for rows in encodings)
+    evaluator, frames = FeatureL2("none"), np.arange(training.n_frames)
+
+    def mapped(relevance: Relevance, second: Drive | None) -> Map:
+        plan = MapPlan(relevance, LIST_LENGTH, (1.0,), same_route=True)
+        return build(plan, training, second, landmarks, N_LANDMARKS, evaluator).map
+
     maps = {
-        "calibrated": build_map(Relevance.CALIBRATED, drive, LIST_LENGTH, second_season=second),
-        "calibrated, one season": build_map(Relevance.CALIBRATED, drive, LIST_LENGTH),
-        "standardised": build_map(Relevance.STANDARDISED, drive, LIST_LENGTH),
+        "composed": mapped(Relevance.COMPOSED, landmarks),
+        "composed, one season": mapped(Relevance.COMPOSED, None),
+        "standardised": mapped(Relevance.STANDARDISED, None),
     }
     anr = {}
     for name, built in maps.items():
-        scorer = RetrievalScorer()
-        for frame, ranks in enumerate(rank_landmarks(live)):
-            scorer.add(relevances(built, Query(ranks)), np.flatnonzero(np.abs(frames - frame) <= TOLERANCE))
+        scorer, views = RetrievalScorer(), views_of(measured(test, built.landmark_model, evaluator))
+        for frame in frames:
+            scorer.add(relevances(built, views.at(int(frame))), np.flatnonzero(np.abs(frames - frame) <= TOLERANCE))
         anr[name] = scorer.result().anr
     return anr
 
@@ -92,8 +93,9 @@ def report(folder: Path) -> Iterator[str]:
     )
     yield ""
     yield (
-        "Made by `python -m bench.netvlad`, which runs `deepsimbad experiment vpr` six times. `calibrated` also learns "
-        "from the landmark traverse, here another season of the same route."
+        "Made by `python -m bench.netvlad`, which runs `deepsimbad experiment vpr` six times. `composed` also learns "
+        "from the landmark traverse, here another season of the same route; `brute_force_u` compares whole what its "
+        "lists stand for."
     )
     yield from ("", machine(), "", "ANR in percent:", "")
     yield from mean_table(RELEVANCES, {name: document["anr"] for name, document in documents.items()}, 2)

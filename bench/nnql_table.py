@@ -17,13 +17,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.common import ACTIONS_M, machine, markdown, real_recordings, write_page
+from deepsimbad.core.building import Built, MapPlan
 from deepsimbad.core.drive import Drive
 from deepsimbad.core.metrics import mean_interval
 from deepsimbad.core.nnql import NnqlConfig, initial_q_values
 from deepsimbad.core.relevance import Relevance, UpdateRule
 from deepsimbad.core.training import TrainingWorld, Walk, train, walk_greedily
 from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
-from deepsimbad.jobs.build import Built, build, choose_landmarks, measured, train_nnql, world_of
+from deepsimbad.jobs.build import build, measured, train_nnql, world_of
 
 DRIVES = ("nr", "nq", "nq2")
 TRIPLETS = tuple(itertools.permutations(DRIVES))
@@ -42,7 +43,7 @@ class Setup:
 
 
 PAPER = Setup("the paper's: rrf, additive relevance", Relevance.RRF, UpdateRule.ADDITIVE_RELEVANCE, 0.7)
-OURS = Setup("ours: calibrated, log-likelihood", Relevance.CALIBRATED, UpdateRule.LOG_LIKELIHOOD, None)
+OURS = Setup("ours: composed, log-likelihood", Relevance.COMPOSED, UpdateRule.LOG_LIKELIHOOD, None)
 
 
 @dataclass(frozen=True)
@@ -58,10 +59,9 @@ class Triplet:
         evaluator = make_evaluator(evaluator_config({"kind": "feature_l2", "extractor": "none"}))
         encodings = [np.load(self.folder / f"{name}.npy").astype(np.float32) for name in self.names]
         drives = [Drive(position_m=np.arange(float(len(rows))), encodings=rows) for rows in encodings]
-        model = choose_landmarks(drives[0].encodings, N_LANDMARKS, evaluator, lambda _: None)
-        how = (model, self.setup.relevance, LIST_LENGTH, ACTIONS_M, False, lambda _: None)
-        built = build(drives[1], drives[0], True, evaluator, *how)
-        return built, [measured(drive, evaluator, model) for drive in drives]
+        plan = MapPlan(self.setup.relevance, LIST_LENGTH, tuple(ACTIONS_M), same_route=True)
+        built = build(plan, drives[1], drives[0], drives[0], N_LANDMARKS, evaluator)
+        return built, [measured(drive, built.map.landmark_model, evaluator) for drive in drives]
 
     def learn(self, live: str, config: NnqlConfig, pool: Executor) -> NDArray[np.float32]:
         """Q-values learnt from some live images; `held-out frames` and `landmark traverse` as a remap does."""
@@ -69,7 +69,7 @@ class Triplet:
         config = replace(config, update=self.setup.update, motion_std_m=self.setup.motion_std_m)
         if live in {LANDMARK_DRIVE, HELD_OUT}:
             second = landmarks if live == LANDMARK_DRIVE else None
-            return train_nnql(built.rehearsal, lambda: own, second, config, lambda _: None, 2)[0]
+            return train_nnql(built.rehearsal, own, second, config, lambda _: None, 2)[0]
         drive, map_ = (test, built.map) if live == TEST_DRIVE else (own, built.rehearsal)
         return train(world_of(map_, drive, np.arange(drive.n_frames), config), config, lambda _: None, pool)[0]
 
@@ -276,7 +276,7 @@ CONCLUSIONS = (
     "26,208 images they reach an entry 1.5 times, and a value moves a tenth of its way at each: there NNQL with the "
     "paper's numbers has hardly begun to learn.",
     "",
-    "The planner that ships as default acts on the whole belief instead (`telling`).",
+    "The planner that ships as default acts on the whole belief instead (`informed`).",
 )
 
 

@@ -26,7 +26,7 @@ from deepsimbad_client.replay.passive import replay
 from deepsimbad_client.replay.report import summarise
 
 DOMAIN = "nordland"
-RELEVANCES = ("calibrated", "standardised", "rrf", "bag_of_landmarks", "simbad", "brute_force")
+RELEVANCES = ("composed", "standardised", "rrf", "bag_of_landmarks", "simbad", "brute_force")
 TOLERANCE_M = 2.0
 REMAP: dict[str, Any] = {"landmark_traverse": "landmarks", "n_landmarks": 300, "list_length": 4}
 MAP_FRAMES, LANDMARK_FRAMES = range(1000), range(1000, 2000)
@@ -114,7 +114,7 @@ def report(measured: Measured) -> Iterator[str]:
     yield ""
     yield (
         "Real images, posted one by one to a running service, each localized on its own (stateless: the map's "
-        "statistics alone). Landmarks come from another part of the route: `calibrated` has no second season to learn "
+        "statistics alone). Landmarks come from another part of the route: `composed` has no second season to learn "
         "from."
     )
     yield from ("", "Made by `python -m bench.nordland`.", "", machine(), "")

@@ -10,7 +10,7 @@ mean of the ranks left.
 import itertools
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -19,23 +19,20 @@ from numpy.typing import NDArray
 
 from bench.common import machine, markdown, real_recordings, write_page
 from bench.nordland import LANDMARK_FRAMES, MAP_FRAMES, kept_frames
-from deepsimbad.core.building import build_map
+from deepsimbad.core.building import MapPlan
 from deepsimbad.core.descriptor import (
-    LandmarkStatistics,
-    normal_scores,
     pack_ranked_landmarks,
-    rank_landmarks,
     ranks_from_ranked_landmarks,
 )
-from deepsimbad.core.drive import Drive, SecondSeason
-from deepsimbad.core.landmark_model import select_landmarks
+from deepsimbad.core.drive import Drive
 from deepsimbad.core.map import Map
 from deepsimbad.core.metrics import RetrievalScorer
 from deepsimbad.core.relevance import Query, Relevance
-from deepsimbad.core.retrieval import relevances, sum_listed
+from deepsimbad.core.retrieval import relevances
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.feature_l2 import FeatureL2
 from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
+from deepsimbad.jobs.build import build, measured, views_of
 
 N_LANDMARKS, N_SENT = (300, 500), (8, 16, 32, 48, 55, 64)
 LIST_LENGTH, TOLERANCE, BUDGET_BYTES = 4, 2, 64
@@ -62,14 +59,14 @@ class Drives:
     def views(self, relevance: Relevance, n_landmarks: int) -> tuple[Map, NDArray[np.float32]]:
         """The map, and the ranks of the test frames, [n, r]."""
         evaluator = FeatureL2("none")
-        model = evaluator.fit_landmarks(self.landmarks[select_landmarks(self.landmarks, n_landmarks)])
-        seen, other, live = (
-            evaluator.dissimilarities(each, model) for each in (self.training, self.landmarks, self.test)
+        landmarks, training, test = (
+            Drive(position_m=np.arange(float(len(rows))), encodings=rows)
+            for rows in (self.landmarks, self.training, self.test)
         )
-        rows = np.arange(len(self.training))
-        second = SecondSeason(other, np.stack([rows, rows], axis=1)) if self.is_of_two_seasons else None
-        drive = Drive(position_m=np.arange(float(len(rows))), encodings=self.training, dissimilarities=seen)
-        return build_map(relevance, drive, LIST_LENGTH, second_season=second), rank_landmarks(live)
+        second = landmarks if self.is_of_two_seasons else None
+        plan = MapPlan(relevance, LIST_LENGTH, (1.0,), same_route=True)
+        built = build(plan, training, second, landmarks, n_landmarks, evaluator).map
+        return built, views_of(measured(test, built.landmark_model, evaluator)).ranks
 
 
 def anr(drives: Drives, built: Map, ranks: NDArray[np.float32], m: int, how: str) -> tuple[float, float]:
@@ -80,35 +77,18 @@ def anr(drives: Drives, built: Map, ranks: NDArray[np.float32], m: int, how: str
         built: The map.
         ranks: [n, r] of the test frames.
         m: How many landmarks a view sends.
-        how: `session`: with the live statistics of a drive in order; `alone`: every view by the map's; `mean rank`: a
-            session in which landmarks that were not sent take the mean of the ranks left for what they are.
+        how: `session`: with the live statistics of a drive in order; `alone`: every view by the map's.
     """
     scorer, spent_s = RetrievalScorer(), 0.0
-    live = built.landmark_statistics
+    live = built.live_statistics
     for frame, all_ranks in enumerate(ranks):
         query = Query(ranks_from_ranked_landmarks(np.argsort(all_ranks)[:m].tolist(), ranks.shape[1]))
         began = time.perf_counter()
-        if live is not None and how == "mean rank":
-            live, relevance = _by_mean_rank(built, live, query.ranks)
-        else:
-            live = live.observing(query.ranks) if live is not None and how == "session" else live
-            relevance = relevances(built, query, live)
+        live = live.observing(query) if live is not None and how == "session" else live
+        relevance = relevances(built, query, live)
         spent_s += time.perf_counter() - began
         scorer.add(relevance, np.flatnonzero(np.abs(drives.position - drives.position[frame]) <= TOLERANCE))
     return scorer.result().anr, 1000 * spent_s / len(ranks)
-
-
-def _by_mean_rank(
-    built: Map, live: LandmarkStatistics, ranks: NDArray[np.float32]
-) -> tuple[LandmarkStatistics, NDArray[np.float32]]:
-    """The statistics after a view, and its relevances, with the shared mean rank read as if it had been measured."""
-    if built.correlation is None or built.listed_score is None:
-        raise ValueError("the map is not a calibrated one")
-    scores, weight = normal_scores(ranks, ranks.size), live.weight + 1
-    mean = live.mean + (scores - live.mean) / weight
-    live = replace(live, weight=weight, mean=mean, square=live.square + (np.square(scores) - live.square) / weight)
-    expected = built.correlation * built.listed_score
-    return live, sum_listed(built, expected * live.standardise(ranks) - np.square(expected) / 2)
 
 
 def netvlad(folder: Path) -> list[Drives]:
@@ -144,9 +124,8 @@ def table(triplets: Sequence[Drives]) -> Iterator[str]:
         "r",
         "m",
         "bytes",
-        "calibrated, by mean rank",
-        "**calibrated**",
-        "calibrated, views alone",
+        "**composed**",
+        "composed, views alone",
         "rrf",
         "ms a view",
     )
@@ -154,13 +133,13 @@ def table(triplets: Sequence[Drives]) -> Iterator[str]:
 
 
 def _rows(triplets: Sequence[Drives], n_landmarks: int) -> Iterator[list[str]]:
-    calibrated = [(drives, *drives.views(Relevance.CALIBRATED, n_landmarks)) for drives in triplets]
+    composed = [(drives, *drives.views(Relevance.COMPOSED, n_landmarks)) for drives in triplets]
     rrf = [(drives, *drives.views(Relevance.RRF, n_landmarks)) for drives in triplets]
-    columns = ((calibrated, "mean rank"), (calibrated, "session"), (calibrated, "alone"), (rrf, "session"))
+    columns = ((composed, "session"), (composed, "alone"), (rrf, "session"))
     whole: list[float] = []
     for m in (n_landmarks, *N_SENT):
-        measured = np.array([[anr(*each, m, how) for each in maps] for maps, how in columns])
-        means = measured[:, :, 0].mean(axis=1).tolist()
+        figures = np.array([[anr(*each, m, how) for each in maps] for maps, how in columns])
+        means = figures[:, :, 0].mean(axis=1).tolist()
         whole = whole or means
         n_bytes = len(pack_ranked_landmarks(range(m), n_landmarks))
         shown = f"{'all' if m == n_landmarks else m}{' **(64 bytes)**' if n_bytes == BUDGET_BYTES else ''}"
@@ -168,7 +147,7 @@ def _rows(triplets: Sequence[Drives], n_landmarks: int) -> Iterator[list[str]]:
             f"{value:.2f}" + ("" if m == n_landmarks else f" ({100 * (value / best - 1):+.0f} %)")
             for value, best in zip(means, whole, strict=True)
         ]
-        yield [str(n_landmarks), shown, str(n_bytes), *costs, f"{measured[1, :, 1].mean():.1f}"]
+        yield [str(n_landmarks), shown, str(n_bytes), *costs, f"{figures[0, :, 1].mean():.1f}"]
 
 
 def report(recordings: Path) -> Iterator[str]:
@@ -182,11 +161,11 @@ def report(recordings: Path) -> Iterator[str]:
     )
     yield ""
     yield (
-        "`calibrated` is the default: of a landmark that was not sent the score is the expected one, given the "
+        "`composed` is the default: of a landmark that was not sent the score is the expected one, given the "
         "landmarks that were, how landmarks went together over the map's drive, and that it is farther than the last "
-        "that was sent; its evidence counts by how much of it is known. `by mean rank` gives it the mean of the ranks "
-        "left instead, as if that had been measured. `rrf` has no statistics and takes that mean. Times are those of "
-        "`calibrated` in a session, statistics and relevance, on a machine shared with other work."
+        "that was sent; its evidence counts by how much of it is known. `rrf` has no statistics and takes "
+        "the mean of the ranks left. Times are those of `composed` in a session, statistics and relevance, on a "
+        "machine shared with other work."
     )
     yield from ("", "Made by `python -m bench.onboard`.", "", machine(), "", "## NetVLAD encodings of Nordland", "")
     yield "Mean over the six landmark-training-test permutations of three drives, 600 places, 64 numbers each."
