@@ -131,8 +131,8 @@ def page(triplets: list[Triplet], command: str, seconds: float) -> Iterator[str]
         f"h = {config.list_length}, {config.episodes or distinct[-1]} episodes of {config.n_steps} moves a planner "
         f"and triplet, moves of {min(config.actions_m):g} to {max(config.actions_m):g} m, {config.training_episodes} "
         "training episodes of NNQL at most. The robot moves exactly as far as it is told; the belief of the one map "
-        "image nearest to the truth is ranked after every move (ANR in percent: 0 is perfect, 50 chance; the first view "
-        "does not count)."
+        "image nearest to the truth is ranked after every move (ANR in percent: 0 is perfect, 50 chance; the first "
+        "view does not count)."
     )
     yield ""
     yield f"Made by `{command}` in {seconds:.0f} s; `deepsimbad experiment nbv` gives each triplet alone."

@@ -26,11 +26,11 @@ from deepsimbad.errors import PastTheEndError
 TRUSTS = (0.5, 1.0, 2.0)
 """How much of the learnt log-likelihood each part of a mixture believes; each twice the one before."""
 
-LOST_AT_START = 0.02  # before anything was seen
+LOST_AT_START, LOST_AT_FIX = 0.02, 0.005  # before anything was seen: anywhere, and where somebody said it is
 LOST_A_METRE = 0.0005
 FOUND_A_VIEW = 0.02  # of what is lost, spread over the route when the robot has moved
 LEAST_SURVIVING_SHARE = 1e-9  # of a belief before a move; with less it leads past the end wherever the robot may be
-_DOUBTING = 0.05  # a belief that takes the robot for lost by more refuses no move
+_DOUBTING = 0.01  # a belief that takes the robot for lost by more refuses no move
 DEFAULT_N_PARTICLES = 1000
 _START, _RETURN, _MOVE, _RESAMPLE = range(4)  # what a draw is for; part of its seed
 SIGMAS = 4.0  # a move's error is cut off here
@@ -107,9 +107,9 @@ class _Doubt:
     last: NDArray[np.float64] | None = None  # [n] values of the last view, where the robot would have seen them
 
     @classmethod
-    def at_start(cls, rule: UpdateRule) -> Self:
+    def at_start(cls, rule: UpdateRule, lost: float) -> Self:
         n = len(_trusts(rule))
-        return cls(np.full(n, LOST_AT_START), np.zeros(n))
+        return cls(np.full(n, lost), np.zeros(n))
 
     @property
     def trust(self) -> NDArray[np.float64]:
@@ -151,7 +151,7 @@ class GridFilter:
     @classmethod
     def uniform(cls, route: Route, rule: UpdateRule = UpdateRule.MIXTURE) -> Self:
         """No knowledge: every metre of the route alike, so images of one long stop share one place's mass."""
-        return cls._of(route, route.cell_m, rule)
+        return cls._of(route, route.cell_m, rule, LOST_AT_START)
 
     @classmethod
     def around(cls, route: Route, position_m: float, std_m: float, rule: UpdateRule = UpdateRule.MIXTURE) -> Self:
@@ -159,11 +159,11 @@ class GridFilter:
         offset = route.offset_m(route.position_m, position_m)
         nearest = np.abs(offset).min()  # a prior narrower than the spacing still has its nearest image
         log_mass = -0.5 * (np.square(offset) - nearest**2) / max(std_m, 1e-3) ** 2
-        return cls._of(route, route.cell_m * np.exp(log_mass), rule)
+        return cls._of(route, route.cell_m * np.exp(log_mass), rule, LOST_AT_FIX)
 
     @classmethod
-    def _of(cls, route: Route, mass: NDArray[np.float64], rule: UpdateRule) -> Self:
-        doubt = _Doubt.at_start(rule)
+    def _of(cls, route: Route, mass: NDArray[np.float64], rule: UpdateRule, lost: float) -> Self:
+        doubt = _Doubt.at_start(rule, lost)
         return cls(route, np.outer(1 - doubt.lost, mass / mass.sum()), doubt)
 
     @classmethod
@@ -433,7 +433,7 @@ class ParticleFilter:
         """No knowledge: one particle in each of m equal stretches of the route."""
         rng = np.random.default_rng([seed, 0, _START])
         stretch = (np.arange(n_particles) + rng.random(n_particles)) / n_particles
-        return cls._equal(route, route.start_m + stretch * route.length_m, seed, rule)
+        return cls._equal(route, route.start_m + stretch * route.length_m, seed, rule, LOST_AT_START)
 
     @classmethod
     def around(
@@ -448,11 +448,11 @@ class ParticleFilter:
         """Particles drawn around a position; beyond the ends of an open route they stand at the end."""
         rng = np.random.default_rng([seed, 0, _START])
         drawn = position_m + std_m * rng.standard_normal(n_particles)
-        return cls._equal(route, _onto(route, drawn), seed, rule)
+        return cls._equal(route, _onto(route, drawn), seed, rule, LOST_AT_FIX)
 
     @classmethod
-    def _equal(cls, route: Route, position_m: NDArray[np.float64], seed: int, rule: UpdateRule) -> Self:
-        doubt = _Doubt.at_start(rule)
+    def _equal(cls, route: Route, position_m: NDArray[np.float64], seed: int, rule: UpdateRule, lost: float) -> Self:
+        doubt = _Doubt.at_start(rule, lost)
         weights = np.repeat((1 - doubt.lost)[:, np.newaxis] / position_m.size, position_m.size, axis=1)
         return cls(route, position_m, weights, np.zeros_like(doubt.lost), doubt, seed)
 
