@@ -134,7 +134,8 @@ def run_vpr(
         progress.stage(f"query by {name.value}")
         views = views_of(measured(test.drive, built[name].map.landmark_model, evaluator))
         live = None if config.stateless else built[name].map.live_statistics
-        scores[name.value] = _score(built[name].map, views, true_images, live, progress.update)
+        worth = _worth_of_views(built[name].map, test.drive)
+        scores[name.value] = _score(built[name].map, views, true_images, live, worth, progress.update)
         if name is Relevance.COMPOSED:
             scores[BRUTE_FORCE_U] = _score_by_all(built[name], test.drive, true_images, config.stateless)
     stages = {stage.replace(" ", "_") for stage in vpr_stages(config)}
@@ -161,11 +162,17 @@ def _bits_per_map_image(map_: Map) -> float:
         return 8 * index_bytes(sealed) / map_.n_images
 
 
+def _worth_of_views(map_: Map, drive: Drive) -> list[float]:
+    """What each view of a drive counts for among what is usual: as much as a session's view after that move."""
+    return [1.0, *(1.0 - map_.alike_after(move_m) for move_m in np.diff(drive.position_m).tolist())]
+
+
 def _score(
     map_: Map,
     views: Query,
     true_images: Sequence[NDArray[np.int64]],
     live: LiveStatistics | None,
+    worth: Sequence[float],
     on_progress: Callable[[float], None],
 ) -> RetrievalScores:
     scorer = RetrievalScorer()
@@ -175,7 +182,7 @@ def _score(
         asked = views.at(slice(first, first + size))
         if size == 1:
             asked = views.at(first)
-        live = live.observing(asked) if live else None
+        live = live.observing(asked, worth[first]) if live else None
         rows = np.atleast_2d(relevances(map_, asked, live))
         for row, truth in zip(rows, true_images[first : first + size], strict=True):
             scorer.add(row, truth)
@@ -191,8 +198,8 @@ def _score_by_all(
     if built.places is None or usual is None or usual.encodings is None:
         raise InvalidMapConfigError("only a composed map has unit vectors")
     encodings, projection = usual.encodings, built.map.landmark_model.get("projection")
-    for encoding, truth in zip(test.encodings, true_images, strict=True):
-        encodings = encodings if stateless else encodings.observing(encoding)
+    for encoding, truth, worth in zip(test.encodings, true_images, _worth_of_views(built.map, test), strict=True):
+        encodings = encodings if stateless else encodings.observing(encoding, worth)
         scorer.add(built.places @ unit_encodings(encoding, encodings, projection), truth)
     return scorer.result()
 
