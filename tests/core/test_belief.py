@@ -245,7 +245,7 @@ def test_a_robot_off_the_route_is_called_lost_and_one_on_it_is_not(route):
         noise[0, 10 + 5 * step] += 4
         noise[1, rng.integers(100)] += 4  # what it sees there looks like anything
         on, off = on.updated(seen(noise[0]), step), off.updated(seen(noise[1]), step)
-    assert on.off_route < 0.02 < 0.1 < off.off_route
+    assert on.off_route < 0.01 < 10 * on.off_route < off.off_route
 
 
 # --- particles -----------------------------------------------------------------------------------------------------

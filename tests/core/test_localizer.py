@@ -91,8 +91,7 @@ def test_a_step_is_describe_retrieve_predict_update_plan(snapshots, queries, clo
         position_m += action_m
         query = queries[int(position_m) % N_IMAGES]
         step = localizer.step(state, query, action_m if number else 77.0)  # the first move is ignored
-        alike = map_.alike_after(action_m) if number else 0.0
-        live = live and live.observing(query, 1 - alike)
+        live = live and live.observing(query, min(1.0, action_m) if number else 1.0)
         answered = relevances(map_, query, live)
         shared = 0.0
         if number:

@@ -11,6 +11,11 @@ from deepsimbad.core.descriptor import LandmarkStatistics
 from deepsimbad.core.relevance import Query
 
 
+def worth_of_move(action_m: float) -> float:
+    """What a view counts for after a move: a robot that stands sees nothing new, one a metre on does."""
+    return min(1.0, abs(action_m))
+
+
 @dataclass(frozen=True)
 class LiveStatistics:
     """Of whatever a robot sends; each kind of view is compared with views of its own kind alone."""

@@ -20,7 +20,7 @@ from deepsimbad.core.belief import (
     ViewEvidence,
     motion_std_m,
 )
-from deepsimbad.core.live_statistics import LiveStatistics
+from deepsimbad.core.live_statistics import LiveStatistics, worth_of_move
 from deepsimbad.core.map import Map
 from deepsimbad.core.planners import DEFAULT_PLANNER, Plan, PlanningView, parse_planner
 from deepsimbad.core.relevance import Query, UpdateRule
@@ -99,11 +99,10 @@ class ActiveLocalizer:
         map_, number = self._map, state.n_observations
         std_m = motion_std_m(action_m) if action_std_m is None else action_std_m
         moved_m = 0.0 if number == 0 or -SIGMAS * std_m <= action_m < 0 else action_m
-        alike = map_.alike_after(moved_m) if number > 0 else 0.0
 
         live, relevance = state.live, np.zeros(map_.n_images, np.float32)
         if query.is_informative:
-            live = live.observing(query, 1.0 - alike) if live else None
+            live = live.observing(query, worth_of_move(moved_m) if number > 0 else 1.0) if live else None
             relevance = relevances(map_, query, live)
         laps.append(self._clock())
 

@@ -25,7 +25,7 @@ from deepsimbad.core.episodes import (
     follow_plan,
     random_chooser,
 )
-from deepsimbad.core.live_statistics import LiveStatistics
+from deepsimbad.core.live_statistics import LiveStatistics, worth_of_move
 from deepsimbad.core.localizer import ActiveLocalizer, LocalizerConfig
 from deepsimbad.core.map import Map
 from deepsimbad.core.metrics import RetrievalScorer, RetrievalScores, mean_interval
@@ -134,7 +134,7 @@ def run_vpr(
         progress.stage(f"query by {name.value}")
         views = views_of(measured(test.drive, built[name].map.landmark_model, evaluator))
         live = None if config.stateless else built[name].map.live_statistics
-        worth = _worth_of_views(built[name].map, test.drive)
+        worth = _worth_of_views(test.drive)
         scores[name.value] = _score(built[name].map, views, true_images, live, worth, progress.update)
         if name is Relevance.COMPOSED:
             scores[BRUTE_FORCE_U] = _score_by_all(built[name], test.drive, true_images, config.stateless)
@@ -162,9 +162,9 @@ def _bits_per_map_image(map_: Map) -> float:
         return 8 * index_bytes(sealed) / map_.n_images
 
 
-def _worth_of_views(map_: Map, drive: Drive) -> list[float]:
+def _worth_of_views(drive: Drive) -> list[float]:
     """What each view of a drive counts for among what is usual: as much as a session's view after that move."""
-    return [1.0, *(1.0 - map_.alike_after(move_m) for move_m in np.diff(drive.position_m).tolist())]
+    return [1.0, *(worth_of_move(move_m) for move_m in np.diff(drive.position_m).tolist())]
 
 
 def _score(
@@ -198,7 +198,7 @@ def _score_by_all(
     if built.places is None or usual is None or usual.encodings is None:
         raise InvalidMapConfigError("only a composed map has unit vectors")
     encodings, projection = usual.encodings, built.map.landmark_model.get("projection")
-    for encoding, truth, worth in zip(test.encodings, true_images, _worth_of_views(built.map, test), strict=True):
+    for encoding, truth, worth in zip(test.encodings, true_images, _worth_of_views(test), strict=True):
         encodings = encodings if stateless else encodings.observing(encoding, worth)
         scorer.add(built.places @ unit_encodings(encoding, encodings, projection), truth)
     return scorer.result()
