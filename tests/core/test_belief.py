@@ -21,7 +21,7 @@ def seen(relevance, rule=UpdateRule.MIXTURE, scale=1.0, shared=0.0):
     return ViewEvidence.of(np.asarray(relevance, np.float32), rule, scale, shared)
 
 
-def holding(route, mass, lost=0.0, rule=UpdateRule.LOG_LIKELIHOOD):
+def holding(route, mass, lost=0.0, rule=UpdateRule.MIXTURE):
     """A grid of such masses."""
     start = GridFilter.uniform(route, rule)
     arrays = start.arrays()
@@ -213,6 +213,17 @@ def test_a_prior_narrower_than_the_spacing_keeps_its_nearest_image(route):
     assert GridFilter.around(route, 40.4, 0.01).mass[40] == pytest.approx(1)
 
 
+@pytest.mark.parametrize("kind", list(FilterKind))
+@pytest.mark.parametrize("rule", sorted(set(UpdateRule) - {UpdateRule.MIXTURE}))
+def test_to_the_papers_updates_a_move_past_the_end_is_impossible_and_nobody_is_lost(kind, rule, route):
+    moved = FILTERS[kind].uniform(route, rule=rule).predicted(20.0, 1e-6, step=1)
+    assert moved.off_route == pytest.approx(0.02)
+    assert moved.mass[:20].sum() == pytest.approx(0, abs=1e-9)
+    assert moved.mass[20:].sum() == pytest.approx(1)
+    with pytest.raises(PastTheEndError):
+        moved.predicted(120.0, 0.3, step=2)
+
+
 # --- lost ----------------------------------------------------------------------------------------------------------
 
 
@@ -277,7 +288,7 @@ def test_particles_come_near_the_exact_filter_as_they_grow(rule, closed):
         apart.append(np.abs(exact.mass - sampled.mass).sum() / 2)
     assert apart[1] < 0.12
     assert apart[1] < apart[0] / 2
-    assert sampled.off_route == pytest.approx(exact.off_route, abs=0.01)
+    assert sampled.off_route == pytest.approx(exact.off_route, abs=0.03)
 
 
 def test_the_same_seed_and_steps_give_the_same_bits():

@@ -13,7 +13,7 @@ from deepsimbad.core.nnql import (
     learn,
     transitions_of,
 )
-from deepsimbad.core.relevance import Query, Relevance
+from deepsimbad.core.relevance import Query, Relevance, UpdateRule
 from deepsimbad.core.retrieval import relevances
 from deepsimbad.core.training import TrainingWorld, Walk
 from deepsimbad.errors import InvalidInputError, InvalidMapConfigError
@@ -152,18 +152,18 @@ def test_the_end_of_the_route(world):
 
 
 def test_a_belief_wholly_past_the_end_begins_anew(world):
+    """To the paper's updates, which know nobody who is lost."""
     built, ranks = world
-    frames = [10, 15, 20]
-    odd = walk_of(ranks, frames, action_m=np.array([0.0, 300.0, 5.0]))
-    moves = transitions_of(built, odd, NnqlConfig(top_share=0.05))
+    odd = walk_of(ranks, [10, 15, 20], action_m=np.array([0.0, 300.0, 5.0]))
+    config = NnqlConfig(top_share=0.05, update=UpdateRule.LOG_LIKELIHOOD)
+    moves = transitions_of(built, odd, config)
     assert moves.action.tolist() == [2]
-    live, belief = built.live_statistics.observing(Query(ranks[10])), GridFilter.uniform(built.route)
+    live, belief = built.live_statistics.observing(Query(ranks[10])), GridFilter.uniform(built.route, config.update)
     for t, frame in enumerate((15, 20)):
         live = live.observing(Query(ranks[frame]))
         belief = belief.predicted(5.0, np.sqrt(0.05**2 + 0.01 * 5), 0) if t else belief
-        shared = built.shared_error_after(5.0 if t else 300.0)
         relevance = relevances(built, Query(ranks[frame]), live)
-        belief = belief.updated(ViewEvidence.of(relevance, built.update_rule, 0.3, shared), 0)
+        belief = belief.updated(ViewEvidence.of(relevance, config.update, 0.3), 0)
     earned = rank_of_truth(belief.mass, np.array([20])) < 0.05 * N
     assert moves.reward.tolist() == [100.0 * earned]
 

@@ -55,9 +55,9 @@ def motion_std_m(action_m: float) -> float:
     return float(np.sqrt(0.05**2 + 0.01 * abs(action_m)))
 
 
-def _slipping_std_m(action_m: float, action_std_m: float) -> float:
+def _slipping_std_m(action_m: float, action_std_m: float, doubt: "_Doubt") -> float:
     """Standard deviation of a move whose odometry is wrong by a tenth, which it is now and then."""
-    return float(np.hypot(action_std_m, 0.1 * action_m))
+    return float(np.hypot(action_std_m, 0.1 * action_m)) if doubt.is_mixture else action_std_m
 
 
 @dataclass(frozen=True)
@@ -110,6 +110,11 @@ class _Doubt:
     def at_start(cls, rule: UpdateRule, lost: float) -> Self:
         n = len(_trusts(rule))
         return cls(np.full(n, lost), np.zeros(n))
+
+    @property
+    def is_mixture(self) -> bool:
+        """Whether being lost is entered and left; to the paper's updates it stays as likely as at the start."""
+        return self.lost.size > 1
 
     @property
     def trust(self) -> NDArray[np.float64]:
@@ -208,7 +213,8 @@ class GridFilter:
             moved = _shift(moved, places.position_m, action_m, closed_m, reach_m)
         on_route, surviving = before.sum(axis=1), moved.sum(axis=1)
         _check_ahead(route, self.doubt, on_route, surviving, action_m)
-        spread = _spread(moved, places.position_m, action_std_m, _slipping_std_m(action_m, action_std_m), closed_m)
+        slipping_m = _slipping_std_m(action_m, action_std_m, self.doubt)
+        spread = _spread(moved, places.position_m, action_std_m, slipping_m, closed_m)
         if not shared:
             masses = spread
         elif action_m != 0:  # which of a stop's images comes next is open again
@@ -217,9 +223,8 @@ class GridFilter:
             stayed = np.where(before > 0, spread / np.where(before > 0, before, 1.0), 0.0)
             fresh = np.where(before > 0, 0.0, spread / places.n_images)
             masses = self.masses * stayed[:, places.of_image] + fresh[:, places.of_image]
-        lost, leaving, found = _leaving(self.doubt.lost + on_route - surviving, action_m)
-        masses = masses * (1 - leaving) + np.outer(found, route.cell_m / route.cell_m.sum())
-        lost = lost + leaving * surviving
+        lost, staying, found = _leaving(self.doubt, self.doubt.lost, on_route, surviving, action_m)
+        masses = masses * staying[:, np.newaxis] + np.outer(found, route.cell_m / route.cell_m.sum())
         total = masses.sum(axis=1) + lost
         doubt = replace(self.doubt, lost=lost / total, last=self.doubt.carried(route, action_m))
         return replace(self, masses=masses / total[:, np.newaxis], doubt=doubt)
@@ -238,7 +243,7 @@ def _check_ahead(
     route: Route, doubt: _Doubt, on_route: NDArray[np.float64], surviving: NDArray[np.float64], action_m: float
 ) -> None:
     """Raise PastTheEndError where a belief that does not take the robot for lost has nowhere to go."""
-    if (surviving > LEAST_SURVIVING_SHARE * on_route).any() or doubt.off_route > _DOUBTING:
+    if (surviving > LEAST_SURVIVING_SHARE * on_route).any() or (doubt.is_mixture and doubt.off_route > _DOUBTING):
         return
     end_m, side = (float(route.position_m[-1]), "ends") if action_m > 0 else (route.start_m, "begins")
     raise PastTheEndError(
@@ -248,10 +253,23 @@ def _check_ahead(
     )
 
 
-def _leaving(lost: NDArray[np.float64], action_m: float) -> tuple[NDArray[np.float64], float, NDArray[np.float64]]:
-    """What stays lost [t], which share of the rest is lost by a move, and what is found anywhere [t]."""
+def _leaving(
+    doubt: _Doubt,
+    lost: NDArray[np.float64],
+    on_route: NDArray[np.float64],
+    surviving: NDArray[np.float64],
+    action_m: float,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """What is lost after a move, by what the masses that survived it are multiplied, and what is found anywhere; [t].
+
+    To the paper's updates a move past the end is impossible, and nobody is lost on the way.
+    """
+    if not doubt.is_mixture:
+        return lost, on_route / surviving, np.zeros_like(lost)
+    lost = lost + on_route - surviving
     found = FOUND_A_VIEW * lost if action_m != 0 else np.zeros_like(lost)
-    return lost - found, 1 - float(np.exp(-LOST_A_METRE * abs(action_m))), found
+    leaving = 1 - np.exp(-LOST_A_METRE * abs(action_m))
+    return lost - found + leaving * surviving, np.full(lost.size, 1 - leaving), found
 
 
 def _added(mass: NDArray[np.float64], seen: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -490,12 +508,12 @@ class ParticleFilter:
             weights = np.where(beyond, 0.0, weights)
         on_route, surviving = self.weights.sum(axis=1), weights.sum(axis=1)
         _check_ahead(route, self.doubt, on_route, surviving, action_m)
-        lost, leaving, found = _leaving(self.doubt.lost + self.found + on_route - surviving, action_m)
+        lost, staying, found = _leaving(self.doubt, self.doubt.lost + self.found, on_route, surviving, action_m)
         slips = rng.random(target_m.size) < _SLIPS
-        std_m = np.where(slips, _slipping_std_m(action_m, action_std_m), action_std_m)
+        std_m = np.where(slips, _slipping_std_m(action_m, action_std_m, self.doubt), action_std_m)
         moved = _onto(route, target_m + std_m * rng.standard_normal(target_m.size))
-        doubt = replace(self.doubt, lost=lost + leaving * surviving, last=self.doubt.carried(route, action_m))
-        after = replace(self, position_m=moved, weights=weights * (1 - leaving), found=found, doubt=doubt)
+        doubt = replace(self.doubt, lost=lost, last=self.doubt.carried(route, action_m))
+        after = replace(self, position_m=moved, weights=weights * staying[:, np.newaxis], found=found, doubt=doubt)
         return after._resampled(step) if (weights.sum(axis=0) == 0).any() and surviving.any() else after
 
     def updated(self, seen: ViewEvidence, step: int) -> Self:
