@@ -210,7 +210,10 @@ class GridFilter:
         moved = _summed(self.masses, places.of_image, places.position_m.size) if shared else self.masses
         before = moved
         if action_m != 0:
-            moved = _shift(moved, places.position_m, action_m, closed_m, reach_m)
+            within_m = reach_m if self.doubt.is_mixture else 0.0
+            moved = _shift(before, places.position_m, action_m, closed_m, within_m)
+            if not moved.any():  # it may still have stopped at the end
+                moved = _shift(before, places.position_m, action_m, closed_m, reach_m)
         on_route, surviving = before.sum(axis=1), moved.sum(axis=1)
         _check_ahead(route, self.doubt, on_route, surviving, action_m)
         slipping_m = _slipping_std_m(action_m, action_std_m, self.doubt)
@@ -504,8 +507,10 @@ class ParticleFilter:
         target_m, weights = self.position_m + action_m, self.weights
         if not route.closed and action_m != 0:
             reach_m = SIGMAS * action_std_m + 1e-9
-            beyond = (target_m > route.position_m[-1] + reach_m) | (target_m < route.start_m - reach_m)
-            weights = np.where(beyond, 0.0, weights)
+            past_m = np.maximum(target_m - route.position_m[-1], route.start_m - target_m)
+            weights = np.where(past_m > (reach_m if self.doubt.is_mixture else 1e-9), 0.0, weights)
+            if not weights.any():  # it may still have stopped at the end
+                weights = np.where(past_m > reach_m, 0.0, self.weights)
         on_route, surviving = self.weights.sum(axis=1), weights.sum(axis=1)
         _check_ahead(route, self.doubt, on_route, surviving, action_m)
         lost, staying, found = _leaving(self.doubt, self.doubt.lost + self.found, on_route, surviving, action_m)
