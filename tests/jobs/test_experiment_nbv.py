@@ -61,36 +61,23 @@ def slow_paper(rows, config, moves):
     n = len(mapped)
     last_start = len(live) - 1 - config.n_steps * int(max(config.actions_m))
     starts = np.random.default_rng(config.seed).choice(np.arange(last_start + 1), config.episodes)
+    off = np.subtract.outer(np.arange(n), np.arange(n))
+    blur = np.where(np.abs(off) <= 4 * 0.7, np.exp(-0.5 * (off / 0.7) ** 2), 0.0)
+    blur /= blur.sum(axis=1, keepdims=True)
     shares = np.empty((config.episodes, config.n_steps))
     for episode, start in enumerate(starts):
         frame = int(start)
         weights = np.full(n, 1.0) + relevance[frame]
-        belief, lost = weights / weights.sum(), 0.02
+        belief = weights / weights.sum()
         for step, action in enumerate(moves[episode]):
             frame += int(action)
-            belief, lost = slow_move(belief, lost, int(action))
-            weights = n * belief + relevance[frame]
+            moved = np.zeros(n)
+            moved[int(action) :] = belief[: n - int(action)]
+            weights = n * (moved / moved.sum()) @ blur + relevance[frame]
             belief = weights / weights.sum()
             tied = np.isclose(belief, belief[frame], rtol=1e-7, atol=0)
             shares[episode, step] = ((belief[~tied] > belief[frame]).sum() + 0.5 * (tied.sum() - 1)) / n
     return shares
-
-
-def slow_move(belief, lost, action):
-    """The belief on the route and the share lost, after a move of 0.7 m error that is a tenth wrong now and then."""
-    n = len(belief)
-    off, slipping = np.abs(np.subtract.outer(np.arange(n), np.arange(n))), np.hypot(0.7, 0.1 * action)
-    blur = 0.9 * np.where(off < 4 * 0.7, np.exp(-0.5 * (off / 0.7) ** 2), 0.0)
-    blur += 0.1 * 0.7 / slipping * np.where(off <= 4 * slipping, np.exp(-0.5 * (off / slipping) ** 2), 0.0)
-    blur /= blur.sum(axis=1, keepdims=True)
-    moved = np.zeros(n)
-    for image, mass in enumerate((1 - lost) * belief):
-        if image + action <= n - 1 + 4 * 0.7:
-            moved[min(image + action, n - 1)] += mass
-    lost = 1 - moved.sum()
-    leaving, found = 1 - np.exp(-0.0005 * action), 0.02 * lost
-    held = moved @ blur * (1 - leaving) + found / n
-    return held / held.sum(), 1 - held.sum()
 
 
 def shares_of(episodes):
