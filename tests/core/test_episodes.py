@@ -17,6 +17,7 @@ class Notebook:
     """In the localizer's place: writes down what it is told, and believes what `believe` says of a view."""
 
     believe: object = None
+    apart_m: float = 1.0  # its five map images: within 5 m of each other, so that it is sure from the first view on
     told: list = field(default_factory=list)
 
     def start(self):
@@ -26,7 +27,8 @@ class Notebook:
         self.told.append((state.n_observations, query, action_m, action_std_m))
         views = (*state.views, query)
         mass = np.ones(5) / 5 if self.believe is None else self.believe(views)
-        belief = SimpleNamespace(mass=mass)
+        route = Route(self.apart_m * np.arange(5))
+        belief = SimpleNamespace(mass=mass, route=route, off_route=0.0)
         after = SimpleNamespace(n_observations=state.n_observations + 1, views=views, belief=belief)
         return SimpleNamespace(state=after, plan=Plan("p", 1.0 + len(views)))
 
@@ -126,3 +128,25 @@ def test_of_equally_good_moves_the_clairvoyant_takes_the_shortest(drive):
     runner = EpisodeRunner(Notebook(), drive, 1)
     chooser = clairvoyant_chooser(runner, np.array([2.0, 3.0, 5.0]))
     assert runner.run(0, 0, chooser).travelled_m.tolist() == [2]
+
+
+# --- until it is sure ----------------------------------------------------------------------------------------------
+
+
+def sure_after(n_views, image):
+    """Believes in every image alike, and from some view on in one."""
+    return lambda views: np.eye(5)[image] if len(views) >= n_views else np.full(5, 0.2)
+
+
+@pytest.mark.parametrize(
+    ("n_views", "image", "views", "metres", "is_wrong"),
+    [(1, 0, 1, 0, False), (3, 1, 3, 2, False), (3, 4, 23, 2, True), (5, 1, 5, 4, False), (99, 0, 41, 10, False)],
+    ids=["at once", "in time", "mistaken", "after the moves that are ranked", "never"],
+)
+def test_views_and_metres_count_until_it_is_sure(n_views, image, views, metres, is_wrong):
+    """A metre a move, three of them ranked; where the drive ends before it is sure, it never was."""
+    drive = Drive(Frames(), Route(np.arange(11.0)), np.array([0, 0, 1, 1, 1, 1, 1, 1, 1, 1, 1]))
+    notebook = Notebook(sure_after(n_views, image), apart_m=100.0)
+    episode = EpisodeRunner(notebook, drive, 3).run(0, 0, lambda *_: 1.0)
+    assert (episode.views, episode.metres, episode.is_wrong) == (views, metres, is_wrong)
+    assert len(episode.rank_share) == 3

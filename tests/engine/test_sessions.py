@@ -114,8 +114,8 @@ def test_two_at_once_are_answered_in_order_of_arrival_and_told_how_they_waited(m
         held_ms = 1000 * (perf_counter() - began)
         gate.set()
         answers = await asyncio.gather(*posted)
-        assert watches[0].timings_ms()["decode"] >= held_ms - 0.001
-        assert watches[1].timings_ms()["wait"] >= held_ms - 0.001
+        assert watches[0].timings_ms()["decode"] >= held_ms - 5
+        assert watches[1].timings_ms()["wait"] >= held_ms - 5
         for seed in range(12):
             await live.sessions.observe(one_by_one, ranked(seed))
         numbers = [answer.n_observations for answer in answers]

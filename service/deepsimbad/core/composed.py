@@ -8,6 +8,7 @@ weighted by list position, comes nearest to it in direction; a view answers a pl
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any, Self
 
 import numpy as np
@@ -136,9 +137,12 @@ def within_place_whitening(first: NDArray[np.float32], second: NDArray[np.float3
     return np.asarray((vectors * scale) @ vectors.T, np.float32)
 
 
+@cache
 def list_weights(list_length: int) -> NDArray[np.float32]:
-    """[h] float32."""
-    return np.array([WEIGHTS[min(place, len(WEIGHTS) - 1)] for place in range(list_length)], np.float32)
+    """[h] float32, frozen."""
+    weights = np.array([WEIGHTS[min(place, len(WEIGHTS) - 1)] for place in range(list_length)], np.float32)
+    weights.setflags(write=False)
+    return weights
 
 
 def compose(

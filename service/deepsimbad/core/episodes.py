@@ -69,9 +69,9 @@ class EpisodeRunner:
             if number >= self.n_steps and sure is not None:
                 break
             action_m = choose(episode, step, position_m)
-            moved_m, position_m = moved_m + abs(action_m), position_m + action_m
-            if number >= self.n_steps and not route.start_m <= position_m <= route.position_m[-1]:
+            if number >= self.n_steps and not route.start_m <= position_m + action_m <= route.position_m[-1]:
                 break
+            moved_m, position_m = moved_m + abs(action_m), position_m + action_m
             step, share = self.observe(step.state, position_m, action_m)
             if number < self.n_steps:
                 shares[number], travelled[number] = share, moved_m
