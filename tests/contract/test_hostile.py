@@ -218,11 +218,12 @@ def test_unfinished_bodies_on_many_connections_take_nobodys_turn(served, robot):
 def test_with_more_connections_than_may_be_all_are_told_so(served, robot):
     """Plain words of the server: an operator's proxy keeps so many from coming."""
     asked = request("GET", "/healthz")
-    with robot.turn, contextlib.ExitStack() as stack:
-        for _ in range(MAX_CONNECTIONS):
-            stack.enter_context(served.connect())
-        until(lambda: statuses(served.tell(asked)) == [503])
-    until(lambda: statuses(served.tell(asked)) == [200])
+    with robot.turn:  # until the server has noticed that they are gone
+        with contextlib.ExitStack() as stack:
+            for _ in range(MAX_CONNECTIONS):
+                stack.enter_context(served.connect())
+            until(lambda: statuses(served.tell(asked)) == [503])
+        until(lambda: statuses(served.tell(asked)) == [200])
 
 
 # Heads
