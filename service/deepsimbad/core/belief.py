@@ -84,6 +84,11 @@ class ViewEvidence:
             return self.values
         return (self.values - self.shared * last) / (1 + self.shared)
 
+    def likelihood(self, last: NDArray[np.float64] | None) -> NDArray[np.float64]:
+        """[n] of the least trust, the greatest 1: whatever the relevances are, none overflows."""
+        news = self.news(last)
+        return np.asarray(np.exp(_trusts(self.rule)[0] * (news - news.max())))
+
     def least_told(self, last: NDArray[np.float64] | None) -> float:
         """The mass that its news would at least have moved elsewhere where nothing was known, when it is small."""
         return 0.0 if self.is_added else 0.5 * _trusts(self.rule)[0] * float(np.abs(self.news(last)).mean())
@@ -237,7 +242,7 @@ class GridFilter:
         if seen.is_added:
             mass = _added(self.mass, seen.values)
             return replace(self, masses=np.outer(1 - self.doubt.lost, mass))
-        likelihood = np.exp(_trusts(seen.rule)[0] * seen.news(self.doubt.last))
+        likelihood = seen.likelihood(self.doubt.last)
         masses, lost, log_trust = _see(self.masses, self.doubt.lost, self.doubt.log_trust, likelihood)
         return replace(self, masses=masses, doubt=_Doubt(lost, log_trust, seen.values))
 
@@ -301,7 +306,10 @@ def _see(
     log_trust: NDArray[np.float64],
     likelihood: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Multiply by likelihoods, normalise, and weigh the trusts; `likelihood` [n], of the least trust, is used up."""
+    """Multiply by likelihoods, normalise, and weigh the trusts; `likelihood` [n], of the least trust, is used up.
+
+    Where a view allows nothing that a trust still believes, that trust keeps what it knew.
+    """
     n_trusts, n = masses.shape
     after = np.empty((n_trusts, n))
     believed, average = np.zeros(n_trusts), np.zeros(n_trusts)
@@ -313,12 +321,17 @@ def _see(
             believed[t] += after[t, i]
             average[t] += likelihood[i]
     average /= n
-    total = believed + lost * average
+    lost_after, log_trust_after = lost.copy(), log_trust.copy()
     for t in range(n_trusts):
-        scale = 1 / total[t]
+        total = believed[t] + lost[t] * average[t]
+        if total <= 0:
+            after[t] = masses[t]
+            continue
         for i in range(n):
-            after[t, i] *= scale
-    return after, lost * average / total, log_trust + np.log(total / average)
+            after[t, i] /= total
+        lost_after[t] = lost[t] * average[t] / total
+        log_trust_after[t] += np.log(total / average[t])
+    return after, lost_after, log_trust_after
 
 
 @njit(cache=True, nogil=True)
@@ -530,10 +543,13 @@ class ParticleFilter:
             weights = np.outer(on_route, _added(trust @ self.weights / on_route.mean(), seen.values[images]))
             weighed = replace(self, weights=weights, found=np.zeros_like(self.found))
         else:
-            factors = np.exp(np.outer(_trusts(seen.rule), seen.news(self.doubt.last)))  # [t, n]
+            least = seen.likelihood(self.doubt.last)
+            factors = np.stack([least ** (2**t) for t in range(trust.size)])  # the next trust is twice the one before
             average = factors.mean(axis=1)
             weights, found, lost = self.weights * factors[:, images], self.found * average, self.doubt.lost * average
             total = weights.sum(axis=1) + found + lost
+            if (total <= 0).any():  # the view allows nothing that is still believed: what was known stays
+                return self
             doubt = _Doubt(lost / total, self.doubt.log_trust + np.log(total / average), seen.values)
             weighed = replace(self, weights=weights / total[:, np.newaxis], found=found / total, doubt=doubt)
             weighed = weighed._placed(factors * self.route.cell_m, step)

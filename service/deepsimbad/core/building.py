@@ -44,9 +44,8 @@ class MapPlan:
     list_length: int  # h
     actions_m: tuple[float, ...]
     closed: bool = False
-    same_route: bool | None = (
-        None  # whether the drives' positions are said to be comparable; None: where both know x, y
-    )
+    # Whether the drives' positions are said to be comparable; None: where both know x, y
+    same_route: bool | None = None
 
 
 @dataclass(frozen=True)
@@ -150,7 +149,8 @@ def compose_map(
 
     Args:
         second: Another drive, perhaps of the same route.
-        landmarks: The drive that they are chosen from, the model of which they stay, or None: the training drive.
+        landmarks: The drive that they are chosen from (the same object as `second` where it is that one: a rehearsal
+            then leaves a place's own landmark out), the model in which they stay, or None: the training drive.
         n_landmarks: r.
 
     Raises:
