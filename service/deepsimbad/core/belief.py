@@ -26,6 +26,8 @@ from deepsimbad.errors import PastTheEndError
 TRUSTS = (0.5, 1.0, 2.0)
 """How much of the learnt log-likelihood each part of a mixture believes; each twice the one before."""
 
+_TRUSTS_OF = {rule: TRUSTS if rule is UpdateRule.MIXTURE else (1.0,) for rule in UpdateRule}
+
 LOST_AT_START, LOST_AT_FIX = 0.02, 0.005  # before anything was seen: anywhere, and where somebody said it is
 LOST_A_METRE = 0.0005
 FOUND_A_VIEW = 0.02  # of what is lost, spread over the route when the robot has moved
@@ -87,20 +89,16 @@ class ViewEvidence:
     def likelihood(self, last: NDArray[np.float64] | None) -> NDArray[np.float64]:
         """[n] of the least trust, the greatest 1: whatever the relevances are, none overflows."""
         news = self.news(last)
-        return np.asarray(np.exp(_trusts(self.rule)[0] * (news - news.max())))
+        return np.asarray(np.exp(_TRUSTS_OF[self.rule][0] * (news - news.max())))
 
     def least_told(self, last: NDArray[np.float64] | None) -> float:
         """The mass that its news would at least have moved elsewhere where nothing was known, when it is small."""
-        return 0.0 if self.is_added else 0.5 * _trusts(self.rule)[0] * float(np.abs(self.news(last)).mean())
+        return 0.0 if self.is_added else 0.5 * _TRUSTS_OF[self.rule][0] * float(np.abs(self.news(last)).mean())
 
     @property
     def is_added(self) -> bool:
         """Whether it is added to weights, as in the paper, and does not multiply them."""
         return self.rule in {UpdateRule.ADDITIVE_RELEVANCE, UpdateRule.ADDITIVE_RECIPROCAL_RANK}
-
-
-def _trusts(rule: UpdateRule) -> tuple[float, ...]:
-    return TRUSTS if rule is UpdateRule.MIXTURE else (1.0,)
 
 
 @dataclass(frozen=True)
@@ -113,7 +111,7 @@ class _Doubt:
 
     @classmethod
     def at_start(cls, rule: UpdateRule, lost: float) -> Self:
-        n = len(_trusts(rule))
+        n = len(_TRUSTS_OF[rule])
         return cls(np.full(n, lost), np.zeros(n))
 
     @property
