@@ -20,11 +20,11 @@ from numpy.typing import NDArray
 
 from bench.common import machine, markdown, real_recordings, write_page
 from bench.netvlad import DRIVES
-from deepsimbad.core.episodes import Episode, TestDrive
 from deepsimbad.core.planners import CONSTANT, DEFAULT_PLANNER, RANDOM
 from deepsimbad.core.relevance import Query
 from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
 from deepsimbad.jobs.build import encode_recording
+from deepsimbad.jobs.episodes import Episode, TestDrive
 from deepsimbad.jobs.experiments import CLAIRVOYANT, NbvConfig, NbvReport, nbv_stages, run_nbv
 from deepsimbad.jobs.progress import Progress
 from deepsimbad_client.recordings.sources import open_source

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from deepsimbad.core.belief import FilterKind, GridFilter, ParticleFilter, ViewEvidence
+from deepsimbad.core.belief import FilterKind, GridFilter, ViewEvidence
+from deepsimbad.core.particles import ParticleFilter
 from deepsimbad.core.relevance import UpdateRule
 from deepsimbad.core.route import Route
 from deepsimbad.errors import PastTheEndError

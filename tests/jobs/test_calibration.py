@@ -9,11 +9,11 @@ import pytest
 from click.testing import CliRunner
 
 from deepsimbad.cli import deepsimbad as commands
-from deepsimbad.core.belief import FilterKind, GridFilter, ParticleFilter
+from deepsimbad.core.belief import FilterKind, GridFilter
 from deepsimbad.core.building import MapPlan
 from deepsimbad.core.drive import Drive
-from deepsimbad.core.episodes import TestDrive as DrivenByTest
 from deepsimbad.core.localizer import ActiveLocalizer, LocalizerConfig
+from deepsimbad.core.particles import ParticleFilter
 from deepsimbad.core.relevance import Relevance
 from deepsimbad.errors import InvalidMapConfigError
 from deepsimbad.jobs.build import build, measured, views_of
@@ -29,6 +29,7 @@ from deepsimbad.jobs.calibration import (
     views_until_found,
     wrong_when_confident,
 )
+from deepsimbad.jobs.episodes import TestDrive as DrivenByTest
 from deepsimbad.jobs.progress import Progress
 
 QUICK = CalibrationConfig(n_landmarks=60, standing=3, carried=12)

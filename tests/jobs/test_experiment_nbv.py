@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from deepsimbad.core.episodes import Episode
 from deepsimbad.errors import CancelledError, InvalidMapConfigError
 from deepsimbad.jobs.build import encode_recording
+from deepsimbad.jobs.episodes import Episode
 from deepsimbad.jobs.experiments import NbvConfig, NbvReport, nbv_stages, run_nbv
 from deepsimbad.jobs.progress import Progress
 from deepsimbad_client.recordings.sources import open_source

@@ -13,7 +13,7 @@ was learnt, weighed by how well each has predicted the views so far (`mixture`, 
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import cached_property
-from typing import Self, TypeAlias
+from typing import Self
 
 import numpy as np
 from numba import njit
@@ -26,17 +26,15 @@ from deepsimbad.errors import PastTheEndError
 TRUSTS = (0.5, 1.0, 2.0)
 """How much of the learnt log-likelihood each part of a mixture believes; each twice the one before."""
 
-_TRUSTS_OF = {rule: TRUSTS if rule is UpdateRule.MIXTURE else (1.0,) for rule in UpdateRule}
+TRUSTS_OF = {rule: TRUSTS if rule is UpdateRule.MIXTURE else (1.0,) for rule in UpdateRule}
 
 LOST_AT_START, LOST_AT_FIX = 0.02, 0.005  # before anything was seen: anywhere, and where somebody said it is
 LOST_A_METRE = 0.0005
 FOUND_A_VIEW = 0.02  # of what is lost, spread over the route when the robot has moved
 LEAST_SURVIVING_SHARE = 1e-9  # of a belief before a move; with less it leads past the end wherever the robot may be
 _DOUBTING = 0.01  # a belief that takes the robot for lost by more refuses no move
-DEFAULT_N_PARTICLES = 1000
-_START, _RETURN, _MOVE, _RESAMPLE = range(4)  # what a draw is for; part of its seed
 SIGMAS = 4.0  # a move's error is cut off here
-_SLIPS = 0.1  # how often odometry is wrong by more than it says
+SLIPS = 0.1  # how often odometry is wrong by more than it says
 _CELLS_A_SIGMA = 1024.0  # of the table that stands for the normal curve; exact to 1e-7
 _NORMAL = np.exp(-0.5 * np.square(np.arange(int(SIGMAS * _CELLS_A_SIGMA) + 3) / _CELLS_A_SIGMA))
 _NEGLIGIBLE = 1e-3  # of the mean mass: a place with less moves, but its error is not spread
@@ -57,7 +55,7 @@ def motion_std_m(action_m: float) -> float:
     return float(np.sqrt(0.05**2 + 0.01 * abs(action_m)))
 
 
-def _slipping_std_m(action_m: float, action_std_m: float, doubt: "_Doubt") -> float:
+def slipping_std_m(action_m: float, action_std_m: float, doubt: "Doubt") -> float:
     """Standard deviation of a move whose odometry is wrong by a tenth, which it is now and then."""
     return float(np.hypot(action_std_m, 0.1 * action_m)) if doubt.is_mixture else action_std_m
 
@@ -89,11 +87,11 @@ class ViewEvidence:
     def likelihood(self, last: NDArray[np.float64] | None) -> NDArray[np.float64]:
         """[n] of the least trust, the greatest 1: whatever the relevances are, none overflows."""
         news = self.news(last)
-        return np.asarray(np.exp(_TRUSTS_OF[self.rule][0] * (news - news.max())))
+        return np.asarray(np.exp(TRUSTS_OF[self.rule][0] * (news - news.max())))
 
     def least_told(self, last: NDArray[np.float64] | None) -> float:
         """The mass that its news would at least have moved elsewhere where nothing was known, when it is small."""
-        return 0.0 if self.is_added else 0.5 * _TRUSTS_OF[self.rule][0] * float(np.abs(self.news(last)).mean())
+        return 0.0 if self.is_added else 0.5 * TRUSTS_OF[self.rule][0] * float(np.abs(self.news(last)).mean())
 
     @property
     def is_added(self) -> bool:
@@ -102,7 +100,7 @@ class ViewEvidence:
 
 
 @dataclass(frozen=True)
-class _Doubt:
+class Doubt:
     """What every filter knows besides places."""
 
     lost: NDArray[np.float64]  # [t] by trust, of what that trust believes
@@ -111,7 +109,8 @@ class _Doubt:
 
     @classmethod
     def at_start(cls, rule: UpdateRule, lost: float) -> Self:
-        n = len(_TRUSTS_OF[rule])
+        """Before any view, lost with this probability."""
+        n = len(TRUSTS_OF[rule])
         return cls(np.full(n, lost), np.zeros(n))
 
     @property
@@ -140,11 +139,13 @@ class _Doubt:
         return np.interp(from_m, route.position_m, self.last, left=0.0, right=0.0)
 
     def arrays(self) -> dict[str, NDArray[np.float64]]:
+        """All state."""
         arrays = {"lost": self.lost, "log_trust": self.log_trust}
         return arrays if self.last is None else {**arrays, "last": self.last}
 
     @classmethod
     def from_arrays(cls, arrays: dict[str, NDArray[np.float64]]) -> Self:
+        """Restore what `arrays` gave."""
         return cls(arrays["lost"], arrays["log_trust"], arrays.get("last"))
 
 
@@ -154,7 +155,7 @@ class GridFilter:
 
     route: Route
     masses: NDArray[np.float64]  # [t, n] by trust; with `doubt.lost` each row sums to 1
-    doubt: _Doubt
+    doubt: Doubt
 
     @classmethod
     def uniform(cls, route: Route, rule: UpdateRule = UpdateRule.MIXTURE) -> Self:
@@ -171,13 +172,13 @@ class GridFilter:
 
     @classmethod
     def _of(cls, route: Route, mass: NDArray[np.float64], rule: UpdateRule, lost: float) -> Self:
-        doubt = _Doubt.at_start(rule, lost)
+        doubt = Doubt.at_start(rule, lost)
         return cls(route, np.outer(1 - doubt.lost, mass / mass.sum()), doubt)
 
     @classmethod
     def from_arrays(cls, route: Route, arrays: dict[str, NDArray[np.float64]]) -> Self:
         """Restore what `arrays` gave."""
-        return cls(route, arrays["masses"], _Doubt.from_arrays(arrays))
+        return cls(route, arrays["masses"], Doubt.from_arrays(arrays))
 
     def arrays(self) -> dict[str, NDArray[np.float64]]:
         """All state."""
@@ -218,8 +219,8 @@ class GridFilter:
             if not moved.any():  # it may still have stopped at the end
                 moved = _shift(before, places.position_m, action_m, closed_m, reach_m)
         on_route, surviving = before.sum(axis=1), moved.sum(axis=1)
-        _check_ahead(route, self.doubt, on_route, surviving, action_m)
-        slipping_m = _slipping_std_m(action_m, action_std_m, self.doubt)
+        check_ahead(route, self.doubt, on_route, surviving, action_m)
+        slipping_m = slipping_std_m(action_m, action_std_m, self.doubt)
         spread = _spread(moved, places.position_m, action_std_m, slipping_m, closed_m)
         if not shared:
             masses = spread
@@ -229,7 +230,7 @@ class GridFilter:
             stayed = np.where(before > 0, spread / np.where(before > 0, before, 1.0), 0.0)
             fresh = np.where(before > 0, 0.0, spread / places.n_images)
             masses = self.masses * stayed[:, places.of_image] + fresh[:, places.of_image]
-        lost, staying, found = _leaving(self.doubt, self.doubt.lost, on_route, surviving, action_m)
+        lost, staying, found = leaving_and_found(self.doubt, self.doubt.lost, on_route, surviving, action_m)
         masses = masses * staying[:, np.newaxis] + np.outer(found, route.cell_m / route.cell_m.sum())
         total = masses.sum(axis=1) + lost
         doubt = replace(self.doubt, lost=lost / total, last=self.doubt.carried(route, action_m))
@@ -238,15 +239,15 @@ class GridFilter:
     def updated(self, seen: ViewEvidence, step: int) -> Self:  # noqa: ARG002
         """The belief after a view."""
         if seen.is_added:
-            mass = _added(self.mass, seen.values)
+            mass = added(self.mass, seen.values)
             return replace(self, masses=np.outer(1 - self.doubt.lost, mass))
         likelihood = seen.likelihood(self.doubt.last)
         masses, lost, log_trust = _see(self.masses, self.doubt.lost, self.doubt.log_trust, likelihood)
-        return replace(self, masses=masses, doubt=_Doubt(lost, log_trust, seen.values))
+        return replace(self, masses=masses, doubt=Doubt(lost, log_trust, seen.values))
 
 
-def _check_ahead(
-    route: Route, doubt: _Doubt, on_route: NDArray[np.float64], surviving: NDArray[np.float64], action_m: float
+def check_ahead(
+    route: Route, doubt: Doubt, on_route: NDArray[np.float64], surviving: NDArray[np.float64], action_m: float
 ) -> None:
     """Raise PastTheEndError where a belief that does not take the robot for lost has nowhere to go."""
     if (surviving > LEAST_SURVIVING_SHARE * on_route).any() or (doubt.is_mixture and doubt.off_route > _DOUBTING):
@@ -259,8 +260,8 @@ def _check_ahead(
     )
 
 
-def _leaving(
-    doubt: _Doubt,
+def leaving_and_found(
+    doubt: Doubt,
     lost: NDArray[np.float64],
     on_route: NDArray[np.float64],
     surviving: NDArray[np.float64],
@@ -278,7 +279,7 @@ def _leaving(
     return lost - found + leaving * surviving, np.full(lost.size, 1 - leaving), found
 
 
-def _added(mass: NDArray[np.float64], seen: NDArray[np.float64]) -> NDArray[np.float64]:
+def added(mass: NDArray[np.float64], seen: NDArray[np.float64]) -> NDArray[np.float64]:
     """Masses [m], summing to 1, after evidence that is added, as the paper adds `v[u_k]` to its particles' weights.
 
     Weights are taken with mean 1 for that, so that the belief that knows nothing gives every hypothesis weight 1,
@@ -386,9 +387,9 @@ def _normal(deviations: float) -> float:
 @njit(cache=True, nogil=True, inline="always")
 def _error(off_m: float, std_m: float, slipping_m: float) -> float:
     """Density of a move's error, but for a constant: mostly normal, now and then of a wheel that slips."""
-    density = _SLIPS * std_m / slipping_m * _normal(off_m / slipping_m)
+    density = SLIPS * std_m / slipping_m * _normal(off_m / slipping_m)
     if off_m < SIGMAS * std_m:
-        density += (1 - _SLIPS) * _normal(off_m / std_m)
+        density += (1 - SLIPS) * _normal(off_m / std_m)
     return density
 
 
@@ -441,168 +442,3 @@ def _spread(  # noqa: PLR0912 - one pass over a band and its two wrapped ends
             for j in range(around_first, n):
                 spread[t, j] += share * weights[j]
     return spread
-
-
-@dataclass(frozen=True)
-class ParticleFilter:
-    """Particles. Whatever is random is drawn from (seed, step), so that no generator's state need be kept."""
-
-    route: Route
-    position_m: NDArray[np.float64]  # [m] hypotheses of the route position
-    weights: NDArray[np.float64]  # [t, m] by trust; with `doubt.lost` and `found` each row sums to 1
-    found: NDArray[np.float64]  # [t] what may be anywhere again; the next view says where
-    doubt: _Doubt
-    seed: int  # of all draws
-
-    @classmethod
-    def uniform(
-        cls,
-        route: Route,
-        n_particles: int = DEFAULT_N_PARTICLES,
-        seed: int = 0,
-        rule: UpdateRule = UpdateRule.MIXTURE,
-    ) -> Self:
-        """No knowledge: one particle in each of m equal stretches of the route."""
-        rng = np.random.default_rng([seed, 0, _START])
-        stretch = (np.arange(n_particles) + rng.random(n_particles)) / n_particles
-        return cls._equal(route, route.start_m + stretch * route.length_m, seed, rule, LOST_AT_START)
-
-    @classmethod
-    def around(
-        cls,
-        route: Route,
-        position_m: float,
-        std_m: float,
-        n_particles: int = DEFAULT_N_PARTICLES,
-        seed: int = 0,
-        rule: UpdateRule = UpdateRule.MIXTURE,
-    ) -> Self:
-        """Particles drawn around a position; beyond the ends of an open route they stand at the end."""
-        rng = np.random.default_rng([seed, 0, _START])
-        drawn = position_m + std_m * rng.standard_normal(n_particles)
-        return cls._equal(route, _onto(route, drawn), seed, rule, LOST_AT_FIX)
-
-    @classmethod
-    def _equal(cls, route: Route, position_m: NDArray[np.float64], seed: int, rule: UpdateRule, lost: float) -> Self:
-        doubt = _Doubt.at_start(rule, lost)
-        weights = np.repeat((1 - doubt.lost)[:, np.newaxis] / position_m.size, position_m.size, axis=1)
-        return cls(route, position_m, weights, np.zeros_like(doubt.lost), doubt, seed)
-
-    @classmethod
-    def from_arrays(cls, route: Route, arrays: dict[str, NDArray[np.float64]], seed: int) -> Self:
-        """Restore what `arrays` gave."""
-        return cls(route, arrays["position_m"], arrays["weights"], arrays["found"], _Doubt.from_arrays(arrays), seed)
-
-    def arrays(self) -> dict[str, NDArray[np.float64]]:
-        """All state."""
-        held = {"position_m": self.position_m, "weights": self.weights, "found": self.found}
-        return {**held, **self.doubt.arrays()}
-
-    @cached_property
-    def mass(self) -> NDArray[np.float64]:
-        """[n] every particle counts for the map image nearest to it."""
-        images = self.route.nearest_image(self.position_m)
-        mass = np.bincount(images, self.doubt.trust @ self.weights, self.route.n_images)
-        mass += (self.doubt.trust @ self.found) * self.route.cell_m / self.route.cell_m.sum()
-        return np.asarray(mass / max(mass.sum(), 1e-300), np.float64)
-
-    @property
-    def off_route(self) -> float:
-        """As `GridFilter.off_route`."""
-        return self.doubt.off_route
-
-    def predicted(self, action_m: float, action_std_m: float, step: int) -> Self:
-        """As `GridFilter.predicted`; a particle that would be past the end of an open route dies."""
-        route = self.route
-        rng = np.random.default_rng([self.seed, step, _MOVE])
-        target_m, weights = self.position_m + action_m, self.weights
-        if not route.closed and action_m != 0:
-            reach_m = SIGMAS * action_std_m + 1e-9
-            past_m = np.maximum(target_m - route.position_m[-1], route.start_m - target_m)
-            weights = np.where(past_m > (reach_m if self.doubt.is_mixture else 1e-9), 0.0, weights)
-            if not weights.any():  # it may still have stopped at the end
-                weights = np.where(past_m > reach_m, 0.0, self.weights)
-        on_route, surviving = self.weights.sum(axis=1), weights.sum(axis=1)
-        _check_ahead(route, self.doubt, on_route, surviving, action_m)
-        lost, staying, found = _leaving(self.doubt, self.doubt.lost + self.found, on_route, surviving, action_m)
-        slips = rng.random(target_m.size) < _SLIPS
-        std_m = np.where(slips, _slipping_std_m(action_m, action_std_m, self.doubt), action_std_m)
-        moved = _onto(route, target_m + std_m * rng.standard_normal(target_m.size))
-        doubt = replace(self.doubt, lost=lost, last=self.doubt.carried(route, action_m))
-        after = replace(self, position_m=moved, weights=weights * staying[:, np.newaxis], found=found, doubt=doubt)
-        return after._resampled(step) if (weights.sum(axis=0) == 0).any() and surviving.any() else after
-
-    def updated(self, seen: ViewEvidence, step: int) -> Self:
-        """As `GridFilter.updated`; resamples when the effective sample size falls below half the particles."""
-        images = self.route.nearest_image(self.position_m)
-        trust = self.doubt.trust
-        if seen.is_added:
-            on_route = 1 - self.doubt.lost
-            weights = np.outer(on_route, _added(trust @ self.weights / on_route.mean(), seen.values[images]))
-            weighed = replace(self, weights=weights, found=np.zeros_like(self.found))
-        else:
-            least = seen.likelihood(self.doubt.last)
-            factors = np.stack([least ** (2**t) for t in range(trust.size)])  # the next trust is twice the one before
-            average = factors.mean(axis=1)
-            weights, found, lost = self.weights * factors[:, images], self.found * average, self.doubt.lost * average
-            total = weights.sum(axis=1) + found + lost
-            if (total <= 0).any():  # the view allows nothing that is still believed: what was known stays
-                return self
-            doubt = _Doubt(lost / total, self.doubt.log_trust + np.log(total / average), seen.values)
-            weighed = replace(self, weights=weights / total[:, np.newaxis], found=found / total, doubt=doubt)
-            weighed = weighed._placed(factors * self.route.cell_m, step)
-        together = weighed.doubt.trust @ weighed.weights
-        effective = np.square(together.sum()) / max(np.square(together).sum(), 1e-300)
-        return weighed if effective >= together.size / 2 else weighed._resampled(step)
-
-    def _placed(self, likelihood: NDArray[np.float64], step: int) -> Self:
-        """What was found gets particles where the view says it may be, in place of the lightest."""
-        trust, m = self.doubt.trust, self.position_m.size
-        n_placed = min(m // 2, round(float(trust @ self.found) * m))
-        if n_placed == 0:
-            return (
-                self
-                if not self.found.any()
-                else replace(
-                    self, doubt=replace(self.doubt, lost=self.doubt.lost + self.found), found=np.zeros_like(self.found)
-                )
-            )
-        rng = np.random.default_rng([self.seed, step, _RETURN])
-        density = (trust * self.found) @ (likelihood / likelihood.sum(axis=1, keepdims=True))
-        images = _comb(density, n_placed, rng.random())
-        kept = self._resampled(step, m - n_placed)
-        half_m = self.route.cell_m[images] * (rng.random(n_placed) - 0.5)
-        position_m = np.concatenate([kept.position_m, _onto(self.route, self.route.position_m[images] + half_m)])
-        placed = np.ascontiguousarray(likelihood[:, images]) / density[images]
-        placed *= (self.found / np.maximum(placed.sum(axis=1), 1e-300))[:, np.newaxis]
-        weights = np.concatenate([kept.weights, placed], axis=1)
-        return replace(self, position_m=position_m, weights=weights, found=np.zeros_like(self.found))
-
-    def _resampled(self, step: int, n_particles: int | None = None) -> Self:
-        """Systematic resampling: one draw places an even comb over the cumulated weights."""
-        n = n_particles or self.position_m.size
-        together = self.doubt.trust @ self.weights
-        if together.sum() <= 0:
-            return self
-        chosen = _comb(together, n, np.random.default_rng([self.seed, step, _RESAMPLE]).random())
-        weights = np.ascontiguousarray(self.weights[:, chosen]) / together[chosen]
-        weights *= (self.weights.sum(axis=1) / np.maximum(weights.sum(axis=1), 1e-300))[:, np.newaxis]
-        return replace(self, position_m=self.position_m[chosen], weights=weights)
-
-
-def _comb(weight: NDArray[np.float64], count: int, offset: float) -> NDArray[np.intp]:
-    """[count] ids, each as often as its weight asks for."""
-    cumulated = np.cumsum(weight)
-    chosen = np.searchsorted(cumulated / cumulated[-1], (np.arange(count) + offset) / count, side="right")
-    return np.minimum(chosen, weight.size - 1)
-
-
-def _onto(route: Route, position_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Positions on the route: round a closed one, to the ends of an open one."""
-    if route.closed and route.length_m > 0:
-        return route.wrapped(position_m)
-    return np.clip(position_m, route.start_m, route.position_m[-1])
-
-
-BeliefFilter: TypeAlias = GridFilter | ParticleFilter
-"""A belief over the route. Immutable: every call returns a new one, so a failed step leaves nothing half done."""

@@ -11,19 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepsimbad.core.belief import (
-    DEFAULT_N_PARTICLES,
     SIGMAS,
-    BeliefFilter,
     FilterKind,
     GridFilter,
-    ParticleFilter,
     ViewEvidence,
     motion_std_m,
 )
-from deepsimbad.core.live_statistics import LiveStatistics, worth_of_move
 from deepsimbad.core.map import Map
+from deepsimbad.core.particles import DEFAULT_N_PARTICLES, BeliefFilter, ParticleFilter
 from deepsimbad.core.planners import DEFAULT_PLANNER, Plan, PlanningView, parse_planner
-from deepsimbad.core.relevance import Query, UpdateRule
+from deepsimbad.core.relevance import LiveStatistics, Query, UpdateRule, worth_of_move
 from deepsimbad.core.retrieval import relevances
 from deepsimbad.core.summary import DEFAULT_CONFIDENCE, near_mode
 

@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from deepsimbad.core.composed import Moments, lengths_of_sums
 from deepsimbad.core.descriptor import MAX_LANDMARKS, PRIOR_WEIGHT_FRAMES, LandmarkStatistics
 from deepsimbad.core.landmark_model import PortableLandmarks, landmark_model_digest, pack_landmarks
-from deepsimbad.core.live_statistics import LiveStatistics
 from deepsimbad.core.relevance import (
     DEFAULT_LIKELIHOOD_SCALE,
     DEFAULT_UPDATE,
     OTHER_LIKELIHOOD_SCALE,
+    LiveStatistics,
     Relevance,
     UpdateRule,
 )

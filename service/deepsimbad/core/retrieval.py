@@ -9,9 +9,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from deepsimbad.core.composed import list_weights, unit_encodings
-from deepsimbad.core.live_statistics import LiveStatistics
 from deepsimbad.core.map import Map
-from deepsimbad.core.relevance import Query, Relevance
+from deepsimbad.core.relevance import LiveStatistics, Query, Relevance
 from deepsimbad.errors import InvalidInputError, InvalidMapConfigError
 
 _BLOCK = 4096  # images whose sums stay in the first-level cache

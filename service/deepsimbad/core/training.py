@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 
 from deepsimbad.core.belief import motion_std_m
 from deepsimbad.core.belief_lattice import Lattice, Moves, moves_along, step_beliefs, uniform_beliefs
-from deepsimbad.core.live_statistics import LiveStatistics
 from deepsimbad.core.map import Map
 from deepsimbad.core.nnql import NnqlConfig, Transitions, initial_q_values, learn, q_of_nearest
-from deepsimbad.core.relevance import Query, Relevance, UpdateRule, mean_ranks
+from deepsimbad.core.relevance import LiveStatistics, Query, Relevance, UpdateRule, mean_ranks
 from deepsimbad.core.retrieval import relevances, shortlist
 from deepsimbad.core.route import Route
 

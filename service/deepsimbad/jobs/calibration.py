@@ -11,17 +11,18 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from deepsimbad.core.belief import BeliefFilter, FilterKind
+from deepsimbad.core.belief import FilterKind
 from deepsimbad.core.building import Built, MapPlan
 from deepsimbad.core.drive import Drive, SameRoute
-from deepsimbad.core.episodes import TestDrive
 from deepsimbad.core.localizer import ActiveLocalizer, LocalizerConfig
+from deepsimbad.core.particles import BeliefFilter
 from deepsimbad.core.planners import CONSTANT
 from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Relevance
 from deepsimbad.core.summary import CONFIDENT_WITHIN_M, DEFAULT_CONFIDENCE, near_mode
 from deepsimbad.errors import InvalidMapConfigError, PastTheEndError
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.jobs.build import build, measured, views_of
+from deepsimbad.jobs.episodes import TestDrive
 from deepsimbad.jobs.experiments import nearest_images
 from deepsimbad.jobs.progress import Progress
 

@@ -16,7 +16,27 @@ from numpy.typing import NDArray
 from deepsimbad.core.building import Built, MapPlan
 from deepsimbad.core.composed import unit_encodings
 from deepsimbad.core.drive import Drive, SameRoute
-from deepsimbad.core.episodes import (
+from deepsimbad.core.localizer import ActiveLocalizer, LocalizerConfig
+from deepsimbad.core.map import Map
+from deepsimbad.core.metrics import RetrievalScorer, RetrievalScores, mean_interval
+from deepsimbad.core.nnql import NnqlConfig
+from deepsimbad.core.planners import CONSTANT, DEFAULT_PLANNER, NNQL, RANDOM
+from deepsimbad.core.relevance import (
+    DEFAULT_RELEVANCE,
+    DEFAULT_UPDATE,
+    LiveStatistics,
+    Query,
+    Relevance,
+    UpdateRule,
+    worth_of_move,
+)
+from deepsimbad.core.retrieval import relevances
+from deepsimbad.core.route import same_places
+from deepsimbad.errors import InvalidMapConfigError, InvalidSourceError
+from deepsimbad.evaluators.base import Evaluator, LandmarkModel
+from deepsimbad.evaluators.compute import available_cores
+from deepsimbad.jobs.build import EncodedRecording, build, measured, train_nnql, views_of
+from deepsimbad.jobs.episodes import (
     Chooser,
     Episode,
     EpisodeRunner,
@@ -25,19 +45,6 @@ from deepsimbad.core.episodes import (
     follow_plan,
     random_chooser,
 )
-from deepsimbad.core.live_statistics import LiveStatistics, worth_of_move
-from deepsimbad.core.localizer import ActiveLocalizer, LocalizerConfig
-from deepsimbad.core.map import Map
-from deepsimbad.core.metrics import RetrievalScorer, RetrievalScores, mean_interval
-from deepsimbad.core.nnql import NnqlConfig
-from deepsimbad.core.planners import CONSTANT, DEFAULT_PLANNER, NNQL, RANDOM
-from deepsimbad.core.relevance import DEFAULT_RELEVANCE, DEFAULT_UPDATE, Query, Relevance, UpdateRule
-from deepsimbad.core.retrieval import relevances
-from deepsimbad.core.route import same_places
-from deepsimbad.errors import InvalidMapConfigError, InvalidSourceError
-from deepsimbad.evaluators.base import Evaluator, LandmarkModel
-from deepsimbad.evaluators.compute import available_cores
-from deepsimbad.jobs.build import EncodedRecording, build, measured, train_nnql, views_of
 from deepsimbad.jobs.progress import Progress
 from deepsimbad.store.arrays import is_halvable
 from deepsimbad.store.map_file import index_bytes, seal, write_map

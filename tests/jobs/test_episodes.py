@@ -6,10 +6,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from deepsimbad.core.episodes import EpisodeRunner, clairvoyant_chooser, follow_plan, random_chooser
-from deepsimbad.core.episodes import TestDrive as Drive
 from deepsimbad.core.planners import Plan
 from deepsimbad.core.route import Route
+from deepsimbad.jobs.episodes import EpisodeRunner, clairvoyant_chooser, follow_plan, random_chooser
+from deepsimbad.jobs.episodes import TestDrive as Drive
 
 
 @dataclass
