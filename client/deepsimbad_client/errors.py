@@ -46,6 +46,10 @@ class BrokenFrameError(SourceError, code="broken_frame"):
         self.reason = reason
 
 
+class TooManyLeftOutError(SourceError, code="frames_left_out"):
+    """More frames of a recording are left out than may be without the caller's word."""
+
+
 class ReplayError(DeepSimbadClientError, code="replay"):
     """A replay that cannot go on or be scored."""
 

@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 import signal
 import time
 
@@ -147,6 +148,24 @@ def test_named_errors_are_one_line_and_make_nothing(deepsimbad, drives, pictures
     named_error(deepsimbad("localize", "nowhere", pictures / "1.png"), "nowhere")
     named_error(deepsimbad("localize", "route", pictures / "1.png"), "route")  # it has no map
     named_error(deepsimbad("map", "route", *images, "--evaluator", "feature_l2"), "another configuration")
+
+
+def test_no_frame_is_left_out_of_a_map_without_a_word(deepsimbad, pictures, tmp_path):
+    drive = shutil.copytree(pictures, tmp_path / "drive")
+    (drive / "1.png").write_bytes(b"no image")
+    command = ("map", "route", "--training", drive, "--training-episodes", 0)
+    ran = deepsimbad(*command)
+    assert (ran.code, ran.err) == (0, "left out of training: 1 undecodable (1.png)\n")
+    shutil.rmtree(tmp_path / "deepsimbad-data")
+    positions = (drive / "positions.csv").read_text()
+    (drive / "positions.csv").write_text(positions.replace("0.png", "0.pgn"))  # 0, 10 and 20
+    lost = ("3 not in positions.csv (0.png, 10.png, 20.png)", "3 in positions.csv without an image (0.pgn, 10.pgn, 20.")
+    named_error(deepsimbad(*command), "frames_left_out", *lost, "--allow-missing")
+    assert not (tmp_path / "deepsimbad-data").exists()
+    ran = deepsimbad(*command, "--allow-missing", "--verbose")
+    assert ran.code == 0
+    assert len(ran.err.splitlines()) == 3
+    assert all(line in ran.err for line in lost)
 
 
 def test_a_view_that_cannot_be_used_is_named(deepsimbad, pictures, tmp_path):

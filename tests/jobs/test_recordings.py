@@ -2,7 +2,6 @@
 
 import os
 import pickle
-from typing import ClassVar
 
 import cv2
 import numpy as np
@@ -14,7 +13,7 @@ from deepsimbad.evaluators.image import decode_image
 from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
 from deepsimbad.jobs.build import encode_recording
 from deepsimbad.jobs.experiments import read_ground_truth
-from deepsimbad_client.recordings import Frame
+from deepsimbad_client.recordings import Frame, Recording
 from deepsimbad_client.recordings.sources import open_source
 
 MAX_PIXELS = 1_000_000
@@ -86,25 +85,17 @@ def test_ready_encodings_are_taken_as_they_are(tmp_path, judge):
     assert encoded.drive.route().x_m is None
 
 
-class Placed:
+def placed(*positions_m):
     """A recording that knows the ground coordinates of some frames."""
-
-    name = "placed"
-    left_out: ClassVar[dict[str, int]] = {}
-    encodings = np.eye(3, dtype=np.float32)
-
-    def __init__(self, *positions_m):
-        self.frames = tuple(
-            Frame(i, str(i), at, timestamp_us=i, x_m=None if i == 1 else 1.0 * i, y_m=2.0)
-            for i, at in enumerate(positions_m)
-        )
-
-    def image(self, frame, input_size):
-        raise AssertionError("ready encodings have no images")
+    frames = tuple(
+        Frame(i, str(i), at, timestamp_us=i, x_m=None if i == 1 else 1.0 * i, y_m=2.0)
+        for i, at in enumerate(positions_m)
+    )
+    return Recording("placed", frames, encodings=np.eye(3, dtype=np.float32))
 
 
 def test_ground_coordinates_and_times_are_kept(judge):
-    encoded = encode_recording(Placed(0, 1, 2), judge, MAX_PIXELS, lambda _: None)
+    encoded = encode_recording(placed(0, 1, 2), judge, MAX_PIXELS, lambda _: None)
     assert encoded.drive.timestamp_us.tolist() == [0, 1, 2]
     np.testing.assert_array_equal(encoded.drive.route().x_m, [0.0, np.nan, 2.0])
     np.testing.assert_array_equal(encoded.drive.route().y_m, [2.0, 2.0, 2.0])
@@ -112,7 +103,7 @@ def test_ground_coordinates_and_times_are_kept(judge):
 
 def test_positions_that_go_backwards_are_named(judge):
     with pytest.raises(InvalidRouteError, match="frame 2"):
-        encode_recording(Placed(0, 2, 1), judge, MAX_PIXELS, lambda _: None)
+        encode_recording(placed(0, 2, 1), judge, MAX_PIXELS, lambda _: None)
 
 
 # --- ground truth --------------------------------------------------------------------------------------------------

@@ -7,7 +7,6 @@ import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from datetime import timedelta
 from functools import wraps
-from pathlib import Path
 from typing import Any
 
 import click
@@ -57,23 +56,6 @@ def serving(command: Command) -> Command:
             command(client=client, **options)
 
     return connected
-
-
-def reading(command: Command) -> Command:
-    """Options of every command that reads a recording."""
-    spacing = click.option(
-        "--spacing-m",
-        type=float,
-        default=1.0,
-        show_default=True,
-        help="Metres between frames where the source does not say where they are.",
-    )
-    undistortion = click.option(
-        "--undistortion",
-        type=click.Path(exists=True, path_type=Path),
-        help="NCLT's undistortion maps (U2D_Cam*.txt or their folder); absent: images stay as they are.",
-    )
-    return spacing(undistortion(command))
 
 
 at_once = click.option(

@@ -18,7 +18,6 @@ from deepsimbad_client.commands.console import (
     domain_option,
     json_flag,
     place_table,
-    reading,
     serving,
     show,
 )
@@ -26,7 +25,8 @@ from deepsimbad_client.errors import UnknownDomainError
 from deepsimbad_client.http.client import Client
 from deepsimbad_client.http.upload import upload as upload_recording
 from deepsimbad_client.recordings import Frame, Recording
-from deepsimbad_client.recordings.sources import ENCODING_SUFFIXES, FolderRecording, open_source
+from deepsimbad_client.recordings.options import accounting, opened, reading, tell_left_out
+from deepsimbad_client.recordings.sources import ENCODING_SUFFIXES, FolderRecording
 from deepsimbad_client.replay import DEFAULT_PLANNER
 from deepsimbad_client.replay.active import EPISODES, STEPS, Stage, active_replay
 from deepsimbad_client.replay.passive import TOLERANCE_M
@@ -47,6 +47,7 @@ ENCODING_EVALUATOR = {"kind": "feature_l2", "extractor": "none"}
 @click.option("--resend", is_flag=True, help="Send also the frames that the service has already.")
 @at_once
 @reading
+@accounting
 @json_flag
 @serving
 def upload(
@@ -58,8 +59,9 @@ def upload(
     evaluator: str | None,
     resend: bool,
     concurrency: int,
-    spacing_m: float,
-    undistortion: Path | None,
+    reading: dict[str, Any],
+    allow_missing: bool,
+    verbose: bool,
     json_output: bool,
 ) -> None:
     """Send a recording to a traverse.
@@ -68,12 +70,17 @@ def upload(
 
     Interrupted, the same command goes on where it stopped.
     """
-    recording = open_source(source, spacing_m=spacing_m, undistortion=undistortion)
+    recording = opened(source, allow_missing, **reading)
     _make_domain_if_missing(client, domain, recording, closed, evaluator)
     with UploadBar(f"{recording.name} to {domain}/{traverse}", len(recording.frames)) as bar:
         report = upload_recording(
-            client, recording, domain, traverse, concurrency=concurrency, resend=resend, on_progress=bar
+            *(client, recording, domain, traverse),
+            concurrency=concurrency,
+            resend=resend,
+            allow_missing=allow_missing,
+            on_progress=bar,
         )
+    tell_left_out(report.left_out_names, recording.name, verbose=verbose)
     if json_output:
         click.echo(as_json(report.as_dict()))
         return
@@ -81,10 +88,6 @@ def upload(
         f"{report.n_sent} frames sent ({report.bytes_sent / 1e6:.1f} MB in {report.seconds:.1f} s), "
         f"{report.n_skipped} were there already"
     )
-    for reason, count in [*report.left_out.items(), *report.n_broken.items()]:
-        click.echo(f"left out: {count} {reason}")
-    if report.broken_names:
-        click.echo(f"broken: {', '.join(report.broken_names)}")
 
 
 @click.command()
@@ -120,7 +123,7 @@ def _views(images: Iterable[str], input_size: tuple[int, int] | None) -> Iterato
                 name=path.parent.name, frames=(Frame(0, path.name, 0.0),), folder=path.parent
             )
         else:
-            recording = open_source(name)
+            recording = opened(name)
         for row, frame in enumerate(recording.frames):
             yield name if is_image else frame.name, recording.view(row, input_size)
 
@@ -171,6 +174,7 @@ def _make_domain_if_missing(
 @click.option("--plots/--no-plots", default=True, show_default=True)
 @at_once
 @reading
+@accounting
 @json_flag
 @serving
 def replay(
@@ -186,8 +190,9 @@ def replay(
     restart: bool,
     plots: bool,
     concurrency: int,
-    spacing_m: float,
-    undistortion: Path | None,
+    reading: dict[str, Any],
+    allow_missing: bool,
+    verbose: bool,
     json_output: bool,
 ) -> None:
     """Localize every frame of a recording, score the answers; with --planner, drive along it as an active robot.
@@ -201,7 +206,7 @@ def replay(
         raise click.UsageError(f"{', '.join(active_only)} belong to an active replay: give --planner too")
     if planners and tolerance_m is not None:
         raise click.UsageError("--tolerance belongs to a passive replay: an active one ranks the nearest map image")
-    recording = open_source(source, spacing_m=spacing_m, undistortion=undistortion)
+    recording = opened(source, allow_missing, **reading)
     folder = out or Path("replays") / f"{domain}-{recording.name}{'-active' if planners else ''}"
     name = f"{recording.name} against {domain}"
     common: dict[str, Any] = {"concurrency": concurrency, "restart": restart}
@@ -224,6 +229,7 @@ def replay(
             replayed = passive_replay(
                 *(client, recording, domain, folder),
                 tolerance_m=TOLERANCE_M if tolerance_m is None else tolerance_m,
+                allow_missing=allow_missing,
                 on_progress=bar,
                 **common,
             )
@@ -242,6 +248,8 @@ def replay(
     else:
         for shown in tables:
             show(shown)
+    names = recording.left_out_names if planners else replayed.left_out_names
+    tell_left_out(names, recording.name, verbose=verbose)
     REMARKS.print(f"results in {folder}", soft_wrap=True)
 
 
@@ -271,8 +279,7 @@ def watch(
     steps: int,
     seed: int,
     pause_s: float,
-    spacing_m: float,
-    undistortion: Path | None,
+    reading: dict[str, Any],
 ) -> None:
     """Show one session live: what it believes along the route, its last move and the next.
 
@@ -286,6 +293,6 @@ def watch(
         return
     if source is None or domain is None:
         raise click.UsageError("give SOURCE and --domain, or --session")
-    recording = open_source(source, spacing_m=spacing_m, undistortion=undistortion)
+    recording = opened(source, **reading)
     stage = Stage(client, recording, domain)
     watch_episode(stage, console, planner=planner, steps=steps, seed=seed, pause_s=pause_s)

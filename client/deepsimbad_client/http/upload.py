@@ -19,10 +19,10 @@ from deepsimbad_client.errors import (
 from deepsimbad_client.http.client import Client
 from deepsimbad_client.http.models import Traverse
 from deepsimbad_client.recordings import Frame, Recording
+from deepsimbad_client.recordings.left_out import LeftOut
 
 BATCH_BYTES = 8 * 2**20  # Size of a batch of ready encodings: worth its round trip, and lost cheaply on a thin link
 CONCURRENCY = 4
-NAMED_BROKEN_FRAMES = 20
 UNUSABLE_IMAGE_CODES = frozenset({"undecodable_image", "truncated_image", "empty_body"})
 
 Item = TypeVar("Item")
@@ -37,8 +37,9 @@ class UploadReport:
     n_sent: int = 0  # by this run
     n_skipped: int = 0  # which the service had already
     n_broken: Counter[str] = field(default_factory=Counter)  # could not be sent, by reason; the others go on
-    broken_names: list[str] = field(default_factory=list)  # the first of them
+    broken_names: list[str] = field(default_factory=list)
     left_out: dict[str, int] = field(default_factory=dict)  # by the reader before, by reason
+    left_out_names: dict[str, list[str]] = field(default_factory=dict)  # both kinds, by reason
     bytes_sent: int = 0  # of images and encodings
     seconds: float = 0.0
 
@@ -60,6 +61,7 @@ def upload(
     *,
     concurrency: int = CONCURRENCY,
     resend: bool = False,
+    allow_missing: bool = True,
     on_progress: Callable[[UploadReport], None] | None = None,
 ) -> UploadReport:
     """Send the frames of a recording that the service does not have yet.
@@ -68,14 +70,16 @@ def upload(
     that cannot be read here, or decoded there, is counted and passed over.
 
     The domain must exist, the traverse is made. What is there already is sent again with `resend` alone.
-    `on_progress` is told how far it is after every frame or batch. Raises SourceError, ApiError, TransportError.
+    `on_progress` is told how far it is after every frame or batch. Raises SourceError (without `allow_missing` also as
+    soon as more than a twentieth of the recording is left out), ApiError, TransportError.
     """
     if not recording.frames:
         raise SourceError(f"{recording.name} has no frames to send")
+    left_out = LeftOut(recording, allow_missing=allow_missing)
     started = time.monotonic()
     input_size = client.domain(domain).input_size
     stored = _open_traverse(client, domain, traverse)
-    report = UploadReport(len(recording.frames), left_out=dict(recording.left_out))
+    report = UploadReport(len(recording.frames), left_out=recording.left_out, left_out_names=left_out.names)
     rows = [row for row, frame in enumerate(recording.frames) if resend or not stored.has(frame.index)]
     report.n_skipped = len(recording.frames) - len(rows)
 
@@ -102,8 +106,8 @@ def upload(
                 report.bytes_sent += outcome
             else:
                 report.n_broken[outcome] += 1
-                if len(report.broken_names) < NAMED_BROKEN_FRAMES:
-                    report.broken_names.append(frame.name)
+                report.broken_names.append(frame.name)
+                left_out.add(outcome, frame.name)
             tell()
     report.seconds = time.monotonic() - started
     if report.n_sent + report.n_skipped == 0:

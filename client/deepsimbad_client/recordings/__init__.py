@@ -32,7 +32,7 @@ class Frame:
     """One moment of a recording; None: not known."""
 
     index: int  # place in the whole recording, from 0; kept when the recording is sliced
-    name: str  # the file's name, or the row's for ready encodings
+    name: str  # path-like, as read: the file's name, or the row's for ready encodings
     position_m: float  # along the route
     timestamp_us: int | None = None  # Unix microseconds
     x_m: float | None = None  # first ground coordinate (NCLT: north)
@@ -54,8 +54,20 @@ class Recording:
 
     name: str  # a short one for people: the date, the folder or the file
     frames: Sequence[Frame]  # those that can be used
-    left_out: Mapping[str, int] = field(default_factory=dict)  # reason -> number of frames that are not in `frames`
+    left_out_names: Mapping[str, Sequence[str]] = field(default_factory=dict)  # reason -> frames not in `frames`
     encodings: NDArray[np.float32] | None = None  # [n, d], row i of frame i; None where the frames are images
+    remarks: Sequence[str] = ()  # what the reader took the recording for, where that is not plain
+    n_before_slice: int | None = None  # how many frames there were before a slice was taken; None: there was no slice
+
+    @property
+    def left_out(self) -> dict[str, int]:
+        """Reason -> how many frames are not in `frames`."""
+        return {reason: len(names) for reason, names in self.left_out_names.items()}
+
+    @property
+    def n_whole(self) -> int:
+        """Frames that could be used before any slice was taken."""
+        return len(self.frames) if self.n_before_slice is None else self.n_before_slice
 
     def image(self, frame: Frame, input_size: tuple[int, int] | None) -> EncodedImage:  # noqa: ARG002
         """Read one frame's image, ready to post; one larger than `input_size` (width, height) is resized to exactly it.
@@ -84,7 +96,7 @@ class Recording:
             text = "#" + ":".join("" if end is None else str(end) for end in ends)
             raise SourceError(f"the slice {text} leaves none of the {len(self.frames)} frames of {self.name}")
         encodings = None if self.encodings is None else self.encodings[part]
-        return dataclasses.replace(self, frames=frames, encodings=encodings)
+        return dataclasses.replace(self, frames=frames, encodings=encodings, n_before_slice=self.n_whole)
 
 
 def finite_number(text: str) -> float | None:

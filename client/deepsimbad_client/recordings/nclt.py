@@ -135,7 +135,7 @@ def read_nclt(root: Path, date: str, *, camera: int = FRONT_CAMERA, undistortion
         root / "ground_truth" / f"{date}.csv",
     ]
     truth = read_ground_truth(_first(f"ground truth of NCLT {date}", truths, Path.is_file))
-    names, n_not_times = _images_by_time(folder)
+    names, not_times = _images_by_time(folder)
     if not names:
         raise SourceError(f"{folder} holds no image named <utime>.tiff")
     time_us = np.array(sorted(names), dtype=np.int64)
@@ -147,10 +147,10 @@ def read_nclt(root: Path, date: str, *, camera: int = FRONT_CAMERA, undistortion
             f"{truth.time_us[0]} to {truth.time_us[-1]} microseconds: are they of one date?"
         )
     left_out = {
-        "before or after the ground truth": int((~poses.covered).sum()),
-        "gap in the ground truth": int(poses.in_gap.sum()),
-        f"missing in Cam{camera}": _n_missing(folder, names),
-        "file name is not a time": n_not_times,
+        "before or after the ground truth": [names[int(time)] for time in time_us[~poses.covered]],
+        "gap in the ground truth": [names[int(time)] for time in time_us[poses.in_gap]],
+        f"missing in Cam{camera}": _missing(folder, names),
+        "file name is not a time": not_times,
     }
     frames = tuple(
         Frame(
@@ -168,7 +168,7 @@ def read_nclt(root: Path, date: str, *, camera: int = FRONT_CAMERA, undistortion
     return NcltRecording(
         name=date,
         frames=frames,
-        left_out={reason: n for reason, n in left_out.items() if n},
+        left_out_names={reason: files for reason, files in left_out.items() if files},
         folder=folder,
         probes=[frames[place].name for place in probed],
         undistortion=None if undistortion is None else read_undistortion(undistortion, camera),
@@ -182,23 +182,23 @@ def _first(what: str, places: Sequence[Path], is_there: Callable[[Path], bool]) 
     raise SourceError(f"no {what}: looked for {', '.join(map(str, places))}")
 
 
-def _images_by_time(folder: Path) -> tuple[dict[int, str], int]:
-    """List a camera's folder: Unix microseconds -> file name, and how many TIFFs are not named by a time."""
+def _images_by_time(folder: Path) -> tuple[dict[int, str], list[str]]:
+    """List a camera's folder: Unix microseconds -> file name, and the TIFFs that are not named by a time."""
     try:
         paths = [path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and path.name[0] != "."]
     except OSError as error:
         raise SourceError(f"cannot read the folder {folder}: {error.strerror or error}") from error
     timed = [path for path in paths if path.stem.isascii() and path.stem.isdigit() and len(path.stem) <= 18]
-    return {int(path.stem): path.name for path in timed}, len(paths) - len(timed)
+    return {int(path.stem): path.name for path in timed}, sorted(path.name for path in set(paths) - set(timed))
 
 
-def _n_missing(folder: Path, names: Mapping[int, str]) -> int:
-    """How many times of exposure the other cameras on disk have and this one lacks."""
-    others: set[int] = set()
+def _missing(folder: Path, names: Mapping[int, str]) -> list[str]:
+    """Files of the other cameras on disk, of times of exposure that this one lacks."""
+    others: dict[int, str] = {}
     for other in folder.parent.glob("Cam[0-9]"):
         if other != folder and other.is_dir():
-            others.update(_images_by_time(other)[0])
-    return len(others - names.keys())
+            others |= _images_by_time(other)[0]
+    return [others[time] for time in sorted(others.keys() - names.keys())]
 
 
 def read_undistortion(path: Path, camera: int) -> UndistortionMap:

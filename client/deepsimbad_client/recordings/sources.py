@@ -224,19 +224,19 @@ def read_folder(folder: Path, spacing_m: float) -> FolderRecording:
     if not path.is_file():
         frames = tuple(Frame(i, file, i * spacing_m) for i, file in enumerate(names))
         return FolderRecording(name=name, folder=folder, frames=frames)
-    values, n_without_image = _values_by_name(path, names)
+    values, without_image = _values_by_name(path, names)
     listed = [file for file in names if file in values]
     if not listed:
         raise SourceError(f"{path} names none of the {len(names)} images beside it")
     left_out = {
-        "not in positions.csv": len(names) - len(listed),
-        "in positions.csv without an image": n_without_image,
+        "not in positions.csv": [file for file in names if file not in values],
+        "in positions.csv without an image": without_image,
     }
     return FolderRecording(
         name=name,
         folder=folder,
         frames=_placed_frames(listed, [values[file] for file in listed]),
-        left_out={reason: n for reason, n in left_out.items() if n},
+        left_out_names={reason: files for reason, files in left_out.items() if files},
     )
 
 
@@ -260,8 +260,8 @@ def _placed_frames(names: Sequence[str], lines: Sequence[Mapping[str, float]]) -
     )
 
 
-def _values_by_name(path: Path, names: Sequence[str]) -> tuple[dict[str, dict[str, float]], int]:
-    """Each line's numbers by the image's file name, and how many lines have no image."""
+def _values_by_name(path: Path, names: Sequence[str]) -> tuple[dict[str, dict[str, float]], list[str]]:
+    """Each line's numbers by the image's file name, and what lines call images that are not there."""
     columns, lines = _columns(path, _lines(path))
     if not {"name", "index"} & set(columns) and len(lines) != len(names):
         raise SourceError(f"{path} has {len(lines)} lines for {len(names)} images: add a column `name`")
@@ -270,7 +270,7 @@ def _values_by_name(path: Path, names: Sequence[str]) -> tuple[dict[str, dict[st
     by_index = dict(enumerate(names))
     values: dict[str, dict[str, float]] = {}
     line_of: dict[str, int] = {}
-    n_without_image = 0
+    without_image: list[str] = []
     for place, (number, line) in enumerate(lines):
         where = f"{path}, line {number}"
         if len(line) < len(columns):
@@ -285,12 +285,12 @@ def _values_by_name(path: Path, names: Sequence[str]) -> tuple[dict[str, dict[st
             raise SourceError(f"{where}: the index {index!r} is not a whole number from 0")
         name = by_index.get(int(index)) if spelling is None else by_spelling.get(Path(spelling).name)
         if name is None:
-            n_without_image += 1
+            without_image.append(index if spelling is None else spelling)
         elif name in values:
             raise SourceError(f"{where}: {name} stands in line {line_of[name]} already")
         else:
             values[name], line_of[name] = numbers, number
-    return values, n_without_image
+    return values, without_image
 
 
 def _lines(path: Path) -> list[_Line]:

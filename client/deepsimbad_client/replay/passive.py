@@ -14,6 +14,7 @@ from deepsimbad_client.errors import GoneError, ReplayError, UnknownSessionError
 from deepsimbad_client.http.client import Client, Session
 from deepsimbad_client.http.upload import CONCURRENCY, in_order
 from deepsimbad_client.recordings import Recording
+from deepsimbad_client.recordings.left_out import LeftOut
 from deepsimbad_client.replay import MASS_DIGITS, Journal, Scene, Seen, write_lines
 
 TOLERANCE_M = 2.0
@@ -58,6 +59,7 @@ class Replay:
     steps: list[Step]  # every frame, in order
     route: Route  # the map's images
     identity: dict[str, Any]  # what was replayed against what
+    left_out_names: dict[str, list[str]]  # reason -> frames that were not asked, those that the reader left out first
     seconds: float  # how long this run took
 
 
@@ -70,6 +72,7 @@ def replay(
     tolerance_m: float = TOLERANCE_M,
     concurrency: int = CONCURRENCY,
     restart: bool = False,
+    allow_missing: bool = True,
     on_progress: Callable[[Step, int], None] | None = None,
 ) -> Replay:
     """Ask the service for the place of every frame in order, in one session, and compare with the truth.
@@ -78,19 +81,26 @@ def replay(
     `folder` takes `replay.json`, `views.jsonl` (the journal) and `steps.jsonl` (all steps, at the end); interrupted at
     any moment, the same call goes on after the last answer written down, while the session lives; `restart` throws away
     what is there. `concurrency` images are made ready at once, and posted in order all the same. `on_progress` is told
-    of every step, those of an earlier run first, and how many there are. Raises ReplayError, ApiError, TransportError.
+    of every step, those of an earlier run first, and how many there are. Raises ReplayError, ApiError, TransportError,
+    TooManyLeftOutError (without `allow_missing`: more than a twentieth of the recording is left out).
     """
+    left_out = LeftOut(recording, allow_missing=allow_missing)
     started = time.perf_counter()
     scene = Scene.of(client, recording, domain, tolerance_m)
     identity = {"kind": "passive", **scene.identity, "tolerance_m": tolerance_m}
     with Journal(folder, "views.jsonl", identity, _record, "view", restart=restart) as journal:
         drive = _Drive(scene, journal, on_progress)
+        for step in drive.steps:
+            if step.broken is not None:
+                left_out.add(step.broken, step.name)
         for row, view in in_order(scene.view, range(len(drive.steps), len(recording.frames)), concurrency):
             drive.observe(row, view)
+            if (reason := drive.steps[-1].broken) is not None:
+                left_out.add(reason, recording.frames[row].name)
         drive.tell_truths()
         drive.end()
     write_lines(folder / "steps.jsonl", (asdict(step) for step in drive.steps))
-    return Replay(folder, drive.steps, scene.route, identity, time.perf_counter() - started)
+    return Replay(folder, drive.steps, scene.route, identity, left_out.names, time.perf_counter() - started)
 
 
 class _Drive:

@@ -48,6 +48,7 @@ def summarise(replay: Replay) -> dict[str, Any]:
         "n_queries": len(scored),
         "n_left_out": len(asked) - len(scored),
         "n_broken": dict(Counter(step.broken for step in replay.steps if step.broken is not None)),
+        "left_out": {reason: len(names) for reason, names in replay.left_out_names.items()},
         "n_map_images": replay.route.n_images,
         "error_m": {"median": quantile(errors, 0.5), "p90": quantile(errors, 0.9)},
         "within_5_m": share([error <= 5 for error in errors]),
@@ -88,7 +89,7 @@ def table(summary: dict[str, Any]) -> Table:
         rows.add_row(label, _shown(value, ".1f", f" {unit}"))
     rows.add_section()
     counts = {"queries scored": summary["n_queries"], "left out: no right answer in the map": summary["n_left_out"]}
-    counts |= {f"left out: {reason}": count for reason, count in summary["n_broken"].items()}
+    counts |= {f"left out: {reason}": count for reason, count in summary["left_out"].items()}
     for label, count in (counts | {"map images": summary["n_map_images"]}).items():
         rows.add_row(label, str(count))
     return rows

@@ -15,7 +15,6 @@ from deepsimbad.cli.terminal import (
     json_option,
     print_table,
     progress_bar,
-    spacing_option,
     write_json,
 )
 from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Relevance
@@ -38,7 +37,7 @@ from deepsimbad.jobs.remap import (
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.layout import checked_name
 from deepsimbad.store.traverses import Traverse
-from deepsimbad_client.recordings.sources import open_source
+from deepsimbad_client.recordings.options import accounting, opened, reading, tell_left_out
 
 _READING = {"read landmarks": 4.0, "read training": 4.0}
 _ACTIONS_M = tuple(float(metres) for metres in range(1, 11))
@@ -65,7 +64,8 @@ _ACTIONS_M = tuple(float(metres) for metres in range(1, 11))
     "it.  [default: where both know x, y]",
 )
 @click.option("--closed", is_flag=True, help="The end of the route joins its start.")
-@spacing_option
+@reading
+@accounting
 @json_option
 @data_dir_option
 def map_(
@@ -75,7 +75,9 @@ def map_(
     evaluator: EvaluatorConfig,
     relevance: str,
     closed: bool,
-    spacing_m: float,
+    reading: dict[str, Any],
+    allow_missing: bool,
+    verbose: bool,
     as_json: bool,
     **options: Any,
 ) -> None:
@@ -97,7 +99,8 @@ def map_(
     measure = make_evaluator(evaluator, settings.compute())
     # A mistake in what was typed should cost no minutes of encoding, and leave no domain behind.
     sources = {"training": training} if landmarks is None else {"landmarks": landmarks, "training": training}
-    recordings = {role: open_source(source, spacing_m=spacing_m) for role, source in sources.items()}
+    recordings = {role: opened(source, allow_missing, **reading) for role, source in sources.items()}
+    left_out = {}
     n_candidates, n_landmarks = (
         len(recordings["training" if landmarks is None else "landmarks"].frames),
         config.n_landmarks,
@@ -111,14 +114,19 @@ def map_(
         with progress_bar(_READING | REMAP_STAGES, f"map {domain}") as progress:
             for role, recording in recordings.items():
                 progress.stage(f"read {role}")
-                encoded = encode_recording(recording, measure, settings.max_pixels, progress.update)
+                encoded = encode_recording(
+                    recording, measure, settings.max_pixels, progress.update, allow_missing=allow_missing
+                )
+                left_out[role] = encoded.left_out_names
                 if role in Traverse.list(catalog.data_dir, domain):
                     Traverse.delete(catalog.data_dir, domain, role)
                 with Traverse.create(catalog.data_dir, domain, role) as traverse:
                     traverse.put_frames(encoded.drive)
             result = remap(catalog, domain, config, measure, progress, n_threads=available_cores())
+    for role, names in left_out.items():
+        tell_left_out(names, role, verbose=verbose)
     if as_json:
-        write_json({"domain": domain, **result})
+        write_json({"domain": domain, **result, "left_out": left_out})
         return
     click.echo(f"map {result['map_version']} of {domain} is active: {result['metrics']['n_map_images']} images")
     season = result["metrics"]["second_season"]

@@ -26,6 +26,7 @@ from deepsimbad.evaluators.base import Evaluator, Image, LandmarkModel
 from deepsimbad.evaluators.image import decode_image
 from deepsimbad_client.errors import BrokenFrameError
 from deepsimbad_client.recordings import Recording
+from deepsimbad_client.recordings.left_out import LeftOut
 
 _FRAMES_A_BLOCK = 1024
 EPISODES_A_MAP_IMAGE = 25  # more would visit every entry of a small map again and again
@@ -37,12 +38,22 @@ class EncodedRecording:
     """One recorded drive, encoded."""
 
     drive: Drive  # its frames, those that could be used
-    left_out: dict[str, int] = field(default_factory=dict)  # reason -> number of frames that could not
+    left_out_names: dict[str, list[str]] = field(default_factory=dict)  # reason -> frames that could not
     encode_ms: float | None = None  # median from reading an image to its encoding; None where encodings came ready
+
+    @property
+    def left_out(self) -> dict[str, int]:
+        """Reason -> how many frames could not be used."""
+        return {reason: len(names) for reason, names in self.left_out_names.items()}
 
 
 def encode_recording(
-    recording: Recording, evaluator: Evaluator, max_pixels: int, on_progress: Callable[[float], None]
+    recording: Recording,
+    evaluator: Evaluator,
+    max_pixels: int,
+    on_progress: Callable[[float], None],
+    *,
+    allow_missing: bool = True,
 ) -> EncodedRecording:
     """Encode a recording's images as the service would, or take its ready encodings.
 
@@ -50,15 +61,16 @@ def encode_recording(
 
     Raises:
         InvalidSourceError: No frame can be used.
+        TooManyLeftOutError: More than a twentieth of the frames are left out, without `allow_missing`.
         InvalidRouteError: The positions go backwards or are NaN.
     """
-    frames, left_out = list(recording.frames), dict(recording.left_out)
+    frames, left_out = list(recording.frames), LeftOut(recording, allow_missing=allow_missing)
     encodings, encode_ms, weights_sha256 = recording.encodings, None, None
     if encodings is None:
         places, encodings, encode_ms = _encode_images(recording, evaluator, max_pixels, left_out, on_progress)
         frames, weights_sha256 = [frames[place] for place in places], evaluator.weights_sha256
     if not frames:
-        raise InvalidSourceError(f"{recording.name} has no frame that can be used: {left_out}")
+        raise InvalidSourceError(f"{recording.name} has no frame that can be used: {left_out.counts}")
 
     times_us = [UNKNOWN_TIMESTAMP if frame.timestamp_us is None else frame.timestamp_us for frame in frames]
     drive = Drive(
@@ -71,14 +83,14 @@ def encode_recording(
         weights_sha256=weights_sha256,
     )
     drive.route()
-    return EncodedRecording(drive, left_out, encode_ms)
+    return EncodedRecording(drive, left_out.names, encode_ms)
 
 
 def _encode_images(
     recording: Recording,
     evaluator: Evaluator,
     max_pixels: int,
-    left_out: dict[str, int],
+    left_out: LeftOut,
     on_progress: Callable[[float], None],
 ) -> tuple[list[int], NDArray[np.float32], float | None]:
     """Places of the frames that could be read, their encodings, the median of milliseconds; broken ones are counted."""
@@ -93,7 +105,7 @@ def _encode_images(
         try:
             body = recording.image(frame, evaluator.input_size).body
         except BrokenFrameError as error:
-            left_out[error.reason] = left_out.get(error.reason, 0) + 1
+            left_out.add(error.reason, frame.name)
         else:
             began = began if waiting else time.perf_counter()
             waiting.append(evaluator.prepare(decode_image(body, max_pixels)))

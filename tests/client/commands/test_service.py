@@ -68,7 +68,7 @@ def test_a_failure_comes_in_its_turn_and_stops_the_rest():
     assert len(begun) < 20
 
 
-def test_images_with_a_broken_one_among_them(client, tmp_path):
+def test_images_with_a_broken_one_among_them(client, tmp_path, capsys):
     folder = tmp_path / "images"
     folder.mkdir()
     rng = np.random.default_rng(3)
@@ -82,7 +82,16 @@ def test_images_with_a_broken_one_among_them(client, tmp_path):
     remap(client, "pictures", "t", landmark_traverse="t", n_landmarks=5, list_length=2)
     driven = replay(client, open_source(str(folder)), "pictures", tmp_path / "out", tolerance_m=0, concurrency=2)
     summary = summarise(driven)
-    assert (summary["n_queries"], sum(summary["n_broken"].values())) == (7, 1)
+    assert (summary["n_queries"], summary["n_broken"], summary["left_out"]) == (7, *[dict(report.n_broken)] * 2)
+    too_many = "frames_left_out: 12% of the frames of images are left out: 1 undecodable (3.jpg); more than 5% need"
+    used = (["upload", "--traverse", "again"], ["replay", "--out", str(tmp_path / "again"), "--no-plots"])
+    for command in used:
+        command += ["--server", client.url, "--domain", "pictures", str(folder)]
+        capsys.readouterr()
+        assert run(command) == 1
+        assert too_many in capsys.readouterr().err
+        assert run([*command, "--allow-missing", "--verbose"]) == 0
+        assert "left out of images: 1 undecodable (3.jpg)" in capsys.readouterr().err
     answer = client.localize("pictures", folder / "5.jpg", shortlist=3)
     assert len(answer.retrieval) == 3
 

@@ -12,7 +12,7 @@ bounds = st.none() | st.integers(-30, 30)
 
 def recording_of(n):
     frames = tuple(Frame(index=i, name=str(i), position_m=i * 0.7) for i in range(n))
-    return Recording("r", frames, {"lost": 3}, np.arange(n * 2, dtype=np.float32).reshape(n, 2))
+    return Recording("r", frames, {"lost": list("abc")}, np.arange(n * 2, dtype=np.float32).reshape(n, 2))
 
 
 @given(st.integers(1, 20), bounds, bounds, bounds.filter(lambda step: step != 0))

@@ -169,11 +169,11 @@ def test_summary_counts_what_it_leaves_out():
         Step(3, 3, "d", 3.0, None, None, broken="undecodable"),
     ]
     route = Route(np.arange(10.0))
-    summary = summarise(Replay(Path(), steps, route, {"domain": "d"}, 1.0))
+    summary = summarise(Replay(Path(), steps, route, {"domain": "d"}, {"undecodable": ["3.png"]}, 1.0))
     assert (summary["anr"], summary["recall_at_1"], summary["recall_at_5"]) == (5.0, 50.0, 100.0)
     assert (summary["n_queries"], summary["n_left_out"], summary["n_broken"]) == (2, 1, {"undecodable": 1})
     assert (summary["within_5_m"], summary["within_10_m"]) == (50.0, 100.0)
-    empty = summarise(Replay(Path(), steps[3:], route, {}, 1.0))
+    empty = summarise(Replay(Path(), steps[3:], route, {}, {}, 1.0))
     assert empty["anr"] is None
     json.dumps(empty, allow_nan=False)
 

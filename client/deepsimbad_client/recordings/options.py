@@ -1,0 +1,66 @@
+"""What the commands of client and service ask about a recording, and how they open it."""
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import wraps
+from pathlib import Path
+from typing import Any
+
+import click
+
+from deepsimbad_client.recordings import Recording
+from deepsimbad_client.recordings.left_out import MOST_LEFT_OUT, LeftOut, shown
+from deepsimbad_client.recordings.sources import open_source
+
+Command = Callable[..., Any]
+
+_OPTIONS = (
+    click.option(
+        "--spacing-m",
+        type=float,
+        default=1.0,
+        show_default=True,
+        help="Metres between frames where the source does not say where they are.",
+    ),
+    click.option(
+        "--undistortion",
+        type=click.Path(exists=True, path_type=Path),
+        help="NCLT's undistortion maps (U2D_Cam*.txt or their folder); absent: images stay as they are.",
+    ),
+)
+
+
+def reading(command: Command) -> Command:
+    """Options of every command that reads a recording; given on as `reading`, arguments of `opened`."""
+
+    @wraps(command)
+    def with_reading(**options: Any) -> Any:
+        asked = {name: options.pop(name) for name in ("spacing_m", "undistortion")}
+        return command(reading=asked, **options)
+
+    for option in reversed(_OPTIONS):
+        with_reading = option(with_reading)
+    return with_reading
+
+
+def accounting(command: Command) -> Command:
+    """Options of every command that uses a whole recording: what becomes of frames that cannot be used."""
+    missing = click.option(
+        "--allow-missing", is_flag=True, help=f"Go on where more than {MOST_LEFT_OUT:.0%} of the frames are left out."
+    )
+    return missing(click.option("--verbose", is_flag=True, help="Name every frame that is left out.")(command))
+
+
+def opened(source: str, allow_missing: bool = True, **reading: Any) -> Recording:
+    """Open a SOURCE, telling on standard error what it was taken for. Raises SourceError, TooManyLeftOutError."""
+    recording = open_source(source, **reading)
+    for remark in recording.remarks:
+        click.echo(f"{recording.name}: {remark}", err=True)
+    LeftOut(recording, allow_missing=allow_missing)
+    return recording
+
+
+def tell_left_out(names: Mapping[str, Sequence[str]], recording: str, *, verbose: bool) -> None:
+    """Say on standard error what is left out of a recording, a line a reason, and of which frames."""
+    for reason, frames in names.items():
+        listed = shown(frames, len(frames) if verbose else 3)
+        click.echo(f"left out of {recording}: {len(frames)} {reason} ({listed})", err=True)
