@@ -25,7 +25,7 @@ from deepsimbad.core.relevance import Query
 from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
 from deepsimbad.jobs.build import encode_recording
 from deepsimbad.jobs.episodes import Episode, TestDrive
-from deepsimbad.jobs.experiments import CLAIRVOYANT, NbvConfig, NbvReport, nbv_stages, run_nbv
+from deepsimbad.jobs.nbv import CLAIRVOYANT, NbvConfig, NbvReport, nbv_stages, run_nbv
 from deepsimbad.jobs.progress import Progress
 from deepsimbad_client.recordings.sources import open_source
 

@@ -9,7 +9,7 @@ READY = ("--evaluator", "feature_l2:none", "--n-landmarks", 40)
 QUICK = (*READY, "--episodes", 6, "--training-episodes", 20)
 KEYS = {
     *("anr", "recall_at_1", "recall_at_5", "default", "n_queries", "n_left_out", "index_bits_per_map_image", "seconds"),
-    *("second_season", "config", "encoding_dim", "bytes_per_encoding", "encode_ms"),
+    *("passive", "second_season", "config", "encoding_dim", "bytes_per_encoding", "encode_ms"),
 }
 SEVEN = {"composed", "brute_force_u", "standardised", "rrf", "bag_of_landmarks", "simbad", "brute_force"}
 PLANNERS = {"random", "clairvoyant", "nnql", "informed", *(f"constant_{action_m}" for action_m in range(1, 11))}
@@ -57,6 +57,30 @@ def test_vpr_is_one_document_with_the_stable_keys(measured, triplet):
     assert (config["n_landmarks"], config["list_length"], config["tolerance_m"], config["spacing_m"]) == (40, 4, 2, 1)
     assert config["training"].endswith("summer.npy")
     assert all(seconds >= 0 for seconds in document["seconds"].values())
+
+
+def test_vpr_drives_in_order_unless_every_view_is_by_itself(measured, deepsimbad, triplet):
+    passive = measured("vpr", *triplet, *READY, "--relevance", "composed")["passive"]
+    sums = {"filter", "sum", "sum_any_speed", "sum_brute_force_u"}
+    for of in ("anr", "recall_at_1"):
+        assert set(passive[of]) == sums
+        assert all(set(each) == {"1", "2", "5", "10", "20"} for each in passive[of].values())
+    assert passive["n_queries"] == {"1": 80, "2": 79, "5": 76, "10": 71, "20": 61}
+    assert passive["whole_drive"]["recall_at_1"] > 95
+    shown = deepsimbad("experiment", "vpr", *triplet, *READY, "--relevance", "composed").out
+    (row,) = [line for line in shown.splitlines() if " sum_any_speed " in line]
+    assert f"{passive['anr']['sum_any_speed']['5']:.2f} / {passive['recall_at_1']['sum_any_speed']['5']:.1f}" in row
+    for more in (("--stateless", "--relevance", "composed"), ("--relevance", "rrf")):
+        assert measured("vpr", *triplet, *READY, *more)["passive"] is None
+
+
+def test_how_much_lists_owe_to_their_own_places_landmarks(measured, deepsimbad, route):
+    asked = (*route, *READY[:2], "--n-landmarks", 120, "--relevance", "composed")
+    usual, barred = measured("vpr", *asked), measured("vpr", *asked, "--bar-own-place")
+    assert set(barred["anr"]) == {"composed", "brute_force_u"}
+    assert barred["recall_at_1"]["composed"] < usual["recall_at_1"]["composed"]
+    assert barred["recall_at_1"]["brute_force_u"] == usual["recall_at_1"]["brute_force_u"]
+    assert deepsimbad("experiment", "vpr", *route, *READY, "--relevance", "rrf", "--bar-own-place").code == 2
 
 
 def test_nbv_is_one_document_with_the_stable_keys(measured, route):

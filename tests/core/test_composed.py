@@ -201,6 +201,19 @@ def test_a_places_own_landmark_is_barred_from_the_rehearsal(seasons):
     assert np.mean(listed) > 0.5
 
 
+@pytest.mark.parametrize("landmarks", ["of the second drive", "of its own"])
+def test_own_places_landmarks_can_be_barred_from_all_lists(seasons, landmarks):
+    second = drive_of(seasons[0])
+    chosen_from = second if landmarks == "of the second drive" else None
+    plan = replace(PLAN, bars_own_place=True)
+    built = compose_map(plan, own := drive_of(seasons[1]), second, chosen_from, 120)
+    frames = _frames_of(built, own if chosen_from is None else second)
+    for lists in (built.map.lists, built.rehearsal.lists):
+        assert (np.abs(frames[lists] - np.arange(160)) > 2).all()
+    usual = compose_map(PLAN, own, second, chosen_from, 120)
+    assert (np.abs(frames[usual.map.lists] - np.arange(160)) <= 2).any()
+
+
 def _frames_of(built, second):
     """Which frame each landmark was."""
     model = built.map.landmark_model

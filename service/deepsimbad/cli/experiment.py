@@ -29,19 +29,12 @@ from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.registry import EvaluatorConfig, make_evaluator
 from deepsimbad.jobs.build import EncodedRecording, encode_recording
 from deepsimbad.jobs.calibration import VIEWS, CalibrationConfig, calibration_stages, run_calibration
-from deepsimbad.jobs.experiments import (
-    NbvConfig,
-    NbvReport,
-    VprConfig,
-    VprReport,
-    nbv_stages,
-    read_ground_truth,
-    run_nbv,
-    run_vpr,
-    vpr_stages,
-)
+from deepsimbad.jobs.nbv import NbvConfig, NbvReport, nbv_stages, run_nbv
+from deepsimbad.jobs.passive import WINDOWS, PassiveScores
 from deepsimbad.jobs.progress import Progress
 from deepsimbad.jobs.remap import DEFAULT_TRAINING_EPISODES
+from deepsimbad.jobs.truth import read_ground_truth
+from deepsimbad.jobs.vpr import VprConfig, VprReport, run_vpr, vpr_stages
 from deepsimbad_client.recordings.sources import open_source
 
 _ROLES = ("landmarks", "training", "test")
@@ -102,6 +95,11 @@ def experiment() -> None:
 )
 @click.option("--stateless", is_flag=True, help="Every view by itself, in place of one session over the test drive.")
 @click.option(
+    "--bar-own-place",
+    is_flag=True,
+    help="No map image lists a landmark seen within 2 m of it: of composed alone, to tell how much lists owe to those.",
+)
+@click.option(
     "--ground-truth",
     type=click.Path(path_type=Path),
     help="FILE.npy of accepted training frames for every test frame, in place of --tolerance; positions then count as "
@@ -114,8 +112,15 @@ def vpr(
     ground_truth: Path | None,
     **asked: Any,
 ) -> None:
-    """Single-view place recognition (III, Fig. 6): ANR and recall of every relevance."""
+    """Single-view place recognition (III, Fig. 6): ANR and recall of every relevance.
+
+    Beside it the drive in order: what composed's belief makes of the last 1 to 20 views, and what sums make of them.
+    """
     relevances = tuple(Relevance(name) for name in names) or tuple(Relevance)
+    if asked["bar_own_place"]:
+        if set(names) - {Relevance.COMPOSED.value}:
+            raise click.UsageError("--bar-own-place is of composed alone")
+        relevances = (Relevance.COMPOSED,)
     same_route = asked["same_route"]
     if same_route is None and ground_truth is None:
         same_route = True  # test and training are scored by their positions: they count along one route
@@ -126,6 +131,7 @@ def vpr(
         relevances,
         stateless=asked["stateless"],
         same_route=same_route,
+        bar_own_place=asked["bar_own_place"],
     )
     documents: dict[str, Any] = {}
     reports: dict[str, VprReport] = {}
@@ -257,6 +263,23 @@ def _print_relevances(report: VprReport) -> None:
         table.add_row(shown, f"{score.anr:.2f}", f"{score.recall_at[1]:.1f}", f"{score.recall_at[5]:.1f}")
     bits = f"index {report.index_bits_per_map_image:.1f} bits a map image"
     print_table(table, f"{_queries(report.scores)}; {bits}", *_no_second_season(report.same_route), numbers=True)
+    if report.passive is not None:
+        _print_passive(report.passive)
+
+
+def _print_passive(passive: PassiveScores) -> None:
+    """The belief and its rivals a row."""
+    table = Table("in order", *(f"{views} views: ANR / R@1" for views in WINDOWS))
+    for name, scores in passive.by_window.items():
+        table.add_row(name, *(f"{score.anr:.2f} / {score.recall_at[1]:.1f}" for score in scores.values()))
+    whole = passive.whole
+    print_table(
+        table,
+        f"filter over the whole drive, after every view: ANR {whole.anr:.2f}, R@1 {whole.recall_at[1]:.1f}",
+        "sums: relevances of the last views, moved along by odometry, at one or the best of five speeds; "
+        "sum_brute_force_u: with nothing left out",
+        numbers=True,
+    )
 
 
 def _queries(scores: dict[str, RetrievalScores]) -> str:

@@ -131,12 +131,7 @@ class Doubt:
 
     def carried(self, route: Route, action_m: float) -> NDArray[np.float64] | None:
         """The last view's values moved along with the robot; what lies before an open route says nothing."""
-        if self.last is None or action_m == 0:
-            return self.last
-        from_m = route.wrapped(route.position_m - action_m)
-        if route.closed:
-            return np.interp(from_m, route.position_m, self.last, period=route.length_m)
-        return np.interp(from_m, route.position_m, self.last, left=0.0, right=0.0)
+        return self.last if self.last is None else moved_along(route, self.last, action_m)
 
     def arrays(self) -> dict[str, NDArray[np.float64]]:
         """All state."""
@@ -147,6 +142,16 @@ class Doubt:
     def from_arrays(cls, arrays: dict[str, NDArray[np.float64]]) -> Self:
         """Restore what `arrays` gave."""
         return cls(arrays["lost"], arrays["log_trust"], arrays.get("last"))
+
+
+def moved_along(route: Route, values: NDArray[np.float64], action_m: float) -> NDArray[np.float64]:
+    """[n] values of map images, where a robot that moves sees them next; what lies before an open route is 0."""
+    if action_m == 0:
+        return values
+    from_m = route.wrapped(route.position_m - action_m)
+    if route.closed:
+        return np.interp(from_m, route.position_m, values, period=route.length_m)
+    return np.interp(from_m, route.position_m, values, left=0.0, right=0.0)
 
 
 @dataclass(frozen=True)

@@ -29,6 +29,7 @@ from deepsimbad.core.map import Map
 from deepsimbad.core.nnql import NnqlConfig
 from deepsimbad.core.rehearsal import rehearsed
 from deepsimbad.core.relevance import Relevance
+from deepsimbad.core.route import Route
 from deepsimbad.errors import InvalidEncodingError, InvalidMapConfigError
 
 _OWN_PLACE_M = 2.0  # a landmark from no farther away is a place's own
@@ -46,6 +47,7 @@ class MapPlan:
     closed: bool = False
     # Whether the drives' positions are said to be comparable; None: where both know x, y
     same_route: bool | None = None
+    bars_own_place: bool = False  # no image lists a landmark that was seen from its own place (`composed`)
 
 
 @dataclass(frozen=True)
@@ -186,10 +188,14 @@ def compose_map(
         images, frames = season.places.T
         fused[images] = unit(places[images] + SECOND_SEASON_WEIGHT * space.unit_vectors(other)[frames])
     model = space.model(usual) if isinstance(candidates, Drive) else candidates
-    map_ = _composed_map(plan, own, fused, usual, model)
+    seen_from = space.chosen if candidates is training else None
+    if candidates is second and season is not None and space.chosen is not None:
+        seen_from = _images_of(season.places, space.chosen)
+    own_places = None if seen_from is None else _own_places(own.route(plan.closed), seen_from)
+    map_ = _composed_map(plan, own, fused, usual, model, own_places if plan.bars_own_place else None)
     rehearsal = map_
     if season is not None:
-        barred = None if candidates is not second else _own_places(map_, season.places, space.chosen)
+        barred = own_places if candidates is second or plan.bars_own_place else None
         rehearsal = replace(map_, lists=compose(places, space.prototypes, plan.list_length, barred))
     on_progress(0.8)
     learnt = rehearsed(rehearsal, _measured(own), season)
@@ -198,7 +204,12 @@ def compose_map(
 
 
 def _composed_map(
-    plan: MapPlan, own: Drive, places: NDArray[np.float32], usual: Moments, model: Mapping[str, NDArray[Any]]
+    plan: MapPlan,
+    own: Drive,
+    places: NDArray[np.float32],
+    usual: Moments,
+    model: Mapping[str, NDArray[Any]],
+    barred: NDArray[np.bool_] | None,
 ) -> Map:
     """The map of places [n, k] that were seen as `own`, but for what a rehearsal teaches."""
     prototypes = np.asarray(model["prototypes"], np.float32)
@@ -213,7 +224,7 @@ def _composed_map(
         position_m=route.position_m,
         x_m=route.x_m,
         y_m=route.y_m,
-        lists=compose(places, prototypes, plan.list_length),
+        lists=compose(places, prototypes, plan.list_length, barred),
         statistics=np.stack([statistics.mean, statistics.std]),
         loadings=common_factors(statistics.standardise(ranks)),
         usual_encoding=usual.mean_std(),
@@ -234,15 +245,17 @@ def _covers(training: Drive, places: NDArray[np.int64]) -> bool:
     return bool(at_m.size >= LEAST_SHARED_PLACES and spread)
 
 
-def _own_places(map_: Map, places: NDArray[np.int64], chosen: NDArray[np.int64] | None) -> NDArray[np.bool_] | None:
-    """[n, r] which landmarks were seen from an image's own place; None where they were not chosen here."""
-    if chosen is None:
-        return None
-    image_of = np.full(max(int(places[:, 1].max()), int(chosen.max())) + 1, -1)
+def _images_of(places: NDArray[np.int64], frames: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The map image at the place of each of another drive's frames, by pairs of (map image, frame); -1: none."""
+    image_of = np.full(max(int(places[:, 1].max()), int(frames.max())) + 1, -1)
     image_of[places[:, 1]] = places[:, 0]
-    image, route = image_of[chosen], map_.route
-    apart_m = np.abs(route.offset_m(route.position_m[:, np.newaxis], route.position_m[image]))
-    return np.asarray((apart_m <= _OWN_PLACE_M) & (image >= 0))
+    return image_of[frames]
+
+
+def _own_places(route: Route, seen_from: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """[n, r] which landmarks were seen from an image's own place, by the image at each one's place, -1: none."""
+    apart_m = np.abs(route.offset_m(route.position_m[:, np.newaxis], route.position_m[seen_from]))
+    return np.asarray((apart_m <= _OWN_PLACE_M) & (seen_from >= 0))
 
 
 def check_list_length(list_length: int, n_landmarks: int) -> None:

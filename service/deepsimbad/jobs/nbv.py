@@ -1,0 +1,221 @@
+"""The paper's active experiment on one landmark-training-test triplet (III, Fig. 7).
+
+Every planner from the same starts, under our set-up and under the paper's.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deepsimbad.core.building import MapPlan
+from deepsimbad.core.drive import Drive, SameRoute
+from deepsimbad.core.localizer import ActiveLocalizer, LocalizerConfig
+from deepsimbad.core.metrics import mean_interval
+from deepsimbad.core.nnql import NnqlConfig
+from deepsimbad.core.planners import CONSTANT, DEFAULT_PLANNER, NNQL, RANDOM
+from deepsimbad.core.relevance import DEFAULT_RELEVANCE, DEFAULT_UPDATE, Query, Relevance, UpdateRule
+from deepsimbad.errors import InvalidMapConfigError
+from deepsimbad.evaluators.base import Evaluator
+from deepsimbad.evaluators.compute import available_cores
+from deepsimbad.jobs.build import build, measured, train_nnql, views_of
+from deepsimbad.jobs.episodes import (
+    Chooser,
+    Episode,
+    EpisodeRunner,
+    TestDrive,
+    clairvoyant_chooser,
+    follow_plan,
+    random_chooser,
+)
+from deepsimbad.jobs.progress import Progress
+from deepsimbad.jobs.truth import nearest_images
+
+CLAIRVOYANT = "clairvoyant"
+BLOCK_M = 20.0  # starts nearer together have much the same episode
+DISTANCES_M = (10.0, 20.0, 50.0)
+
+
+@dataclass(frozen=True)
+class NbvConfig:
+    """What is compared."""
+
+    n_landmarks: int = 300  # r
+    list_length: int = 4  # h
+    relevance: Relevance = DEFAULT_RELEVANCE  # of our set-up, as update; the paper's is measured beside it
+    update: UpdateRule = DEFAULT_UPDATE[DEFAULT_RELEVANCE]
+    actions_m: tuple[float, ...] = tuple(float(metres) for metres in range(1, 11))  # the moves
+    n_steps: int = 10  # moves an episode
+    training_episodes: int = 10_000  # of NNQL
+    episodes: int | None = None  # test episodes of every planner; None: one from every start
+    seed: int = 0  # of starts, random moves and training
+    # Whether positions of landmark and training traverse are comparable; None: where both know x, y
+    same_route: bool | None = True
+
+
+@dataclass(frozen=True)
+class NbvReport:
+    """What every planner scored."""
+
+    config: NbvConfig
+    ours: dict[str, list[Episode]]  # by planner, under our set-up
+    paper: dict[str, list[Episode]]  # and under the paper's
+    block: NDArray[np.int64]  # [episodes] the stretch of 20 m that each began in
+    same_route: SameRoute | None = None  # whether the landmark traverse drove the mapped route; None: nobody looked
+
+    @property
+    def best_constant(self) -> str:
+        """The constant move that took the fewest views, known only afterwards."""
+        constants = [name for name in self.ours if name.startswith(CONSTANT)]
+        return min(constants, key=lambda name: float(self._each(name, "views").mean()))
+
+    def as_dict(self, sources: dict[str, Any]) -> dict[str, Any]:
+        """The stable flat JSON document of design section 7; percent."""
+        shares = {name: 100 * self._each(name, "rank_share") for name in self.ours}
+        by_episode = {name: rows.mean(axis=1) for name, rows in shares.items()}
+        views, metres = ({name: self._each(name, part) for name in self.ours} for part in ("views", "metres"))
+        wrong = {name: 100 * self._each(name, "is_wrong") for name in self.ours}
+        rivals = (RANDOM, self.best_constant)
+        return {
+            "anr": _means(by_episode),
+            "default": DEFAULT_PLANNER,
+            "anr_paper": {
+                name: float(100 * _stack(episodes, "rank_share").mean()) for name, episodes in self.paper.items()
+            },
+            "interval_95": self._intervals(by_episode),
+            "difference_95": self._differences(by_episode, rivals),
+            "views_to_confident": {**_means(views), "interval_95": self._intervals(views)},
+            "metres_to_confident": {**_means(metres), "interval_95": self._intervals(metres)},
+            "wrong_when_confident": {**_means(wrong), "interval_95": self._intervals(wrong)},
+            "views_difference_95": self._differences(views, rivals),
+            "best_constant": self.best_constant,
+            "anr_by_step": {name: rows.mean(axis=0).tolist() for name, rows in shares.items()},
+            "anr_at_distance_m": {
+                name: _at_distances(rows, self._each(name, "travelled_m")) for name, rows in shares.items()
+            },
+            "n_episodes": len(self.block),
+            "second_season": None if self.same_route is None else self.same_route.as_dict(),
+            "config": {**asdict(self.config), **sources},
+        }
+
+    def _each(self, planner: str, part: str) -> NDArray[np.float64]:
+        return _stack(self.ours[planner], part)
+
+    def _intervals(self, values: Mapping[str, NDArray[np.float64]]) -> dict[str, list[float]]:
+        return {name: list(mean_interval(rows, self.config.seed, self.block)) for name, rows in values.items()}
+
+    def _differences(self, values: Mapping[str, NDArray[np.float64]], rivals: Sequence[str]) -> dict[str, list[float]]:
+        """Of the default planner's values and its rivals', episode by episode."""
+        apart = {f"{DEFAULT_PLANNER} - {rival}": values[DEFAULT_PLANNER] - values[rival] for rival in rivals}
+        return self._intervals(apart)
+
+
+def _stack(episodes: Sequence[Episode], part: str) -> NDArray[np.float64]:
+    return np.array([getattr(episode, part) for episode in episodes], np.float64)
+
+
+def _means(values: Mapping[str, NDArray[np.float64]]) -> dict[str, float]:
+    return {name: float(rows.mean()) for name, rows in values.items()}
+
+
+def nbv_stages(config: NbvConfig) -> dict[str, float]:
+    """The stages `run_nbv` reports, with their weights."""
+    stages: dict[str, float] = {}
+    for setup in ("ours", "paper"):
+        stages |= {f"map ({setup})": 1.0, f"train ({setup})": 4.0}
+        stages |= {f"{name} ({setup})": 4.0 if name in {RANDOM, CLAIRVOYANT} else 1.0 for name in _names(config)}
+    return stages
+
+
+def run_nbv(
+    config: NbvConfig, evaluator: Evaluator, landmarks: Drive, training: Drive, test: Drive, progress: Progress
+) -> NbvReport:
+    """Map, train, and drive every planner's episodes.
+
+    Raises:
+        InvalidMapConfigError: The test traverse is shorter than an episode.
+    """
+    route, true_image = test.route(), nearest_images(test, training)
+    travel_m = config.n_steps * max(config.actions_m)
+    starts = TestDrive(Query.uninformative(1), route, true_image).starts(travel_m, config.episodes, config.seed)
+    if starts.size == 0:
+        raise InvalidMapConfigError(f"the test traverse is shorter than an episode of {travel_m:g} m")
+
+    setups = (
+        ("ours", config.relevance, config.update, None),
+        # With the blur that the reference figures of the paper's set-up have, metres.
+        ("paper", Relevance.RRF, UpdateRule.ADDITIVE_RELEVANCE, 0.7),
+    )
+    results: dict[str, dict[str, list[Episode]]] = {}
+    same_route = None
+    for setup, relevance, update, action_std_m in setups:
+        progress.stage(f"map ({setup})")
+        plan = MapPlan(relevance, config.list_length, config.actions_m, same_route=config.same_route)
+        built = build(plan, training, landmarks, landmarks, config.n_landmarks, evaluator, progress.update)
+        drive = TestDrive(views_of(measured(test, built.map.landmark_model, evaluator)), route, true_image)
+        same_route = built.same_route
+        progress.stage(f"train ({setup})")
+        nnql = NnqlConfig(
+            config.training_episodes, config.n_steps, update=update, motion_std_m=action_std_m, seed=config.seed
+        )
+        q_values, _ = train_nnql(built.rehearsal, built.own, built.second, nnql, progress.update, available_cores())
+        map_ = replace(built.map, q_values=q_values)
+        results[setup] = {}
+        for name in _names(config):
+            progress.stage(f"{name} ({setup})")
+            # The localizer plans by itself alone; what only an experiment has is a chooser, and planning costs nothing.
+            planner = name if name in {NNQL, DEFAULT_PLANNER} else f"{CONSTANT}:{config.actions_m[0]:g}"
+            localizer = ActiveLocalizer(map_, LocalizerConfig(update=update, planner=planner))
+            runner = EpisodeRunner(localizer, drive, config.n_steps, action_std_m)
+            chooser = _chooser(name, runner, config)
+            results[setup][name] = _episodes(runner, starts, chooser, name == RANDOM, progress.update)
+    block = (route.position_m[starts] // BLOCK_M).astype(np.int64)
+    return NbvReport(config, results["ours"], results["paper"], block, same_route)
+
+
+def _names(config: NbvConfig) -> list[str]:
+    constants = (f"{CONSTANT}_{action_m:g}" for action_m in config.actions_m)
+    return [RANDOM, *constants, CLAIRVOYANT, NNQL, DEFAULT_PLANNER]
+
+
+def _chooser(name: str, runner: EpisodeRunner, config: NbvConfig) -> Chooser:
+    actions_m = np.array(config.actions_m)
+    if name == RANDOM:
+        return random_chooser(actions_m, config.seed)
+    if name == CLAIRVOYANT:
+        return clairvoyant_chooser(runner, actions_m)
+    if name in {NNQL, DEFAULT_PLANNER}:
+        return follow_plan
+    action_m = float(name.removeprefix(f"{CONSTANT}_"))
+    return lambda *_: action_m
+
+
+def _episodes(
+    runner: EpisodeRunner,
+    starts: NDArray[np.int64],
+    choose: Chooser,
+    draws: bool,
+    on_progress: Callable[[float], None],
+) -> list[Episode]:
+    """Every start's episode; where nothing is drawn, equal starts have equal episodes and are run once."""
+    driven: dict[int, Episode] = {}
+    episodes = []
+    for number, start in enumerate(starts.tolist()):
+        if draws or start not in driven:
+            driven[start] = runner.run(number, start, choose)
+        episodes.append(driven[start])
+        on_progress((number + 1) / starts.size)
+    return episodes
+
+
+def _at_distances(shares: NDArray[np.float64], travelled_m: NDArray[np.float64]) -> dict[str, float | None]:
+    """ANR of the last view within each distance, over the episodes that went so far."""
+    anr: dict[str, float | None] = {}
+    for distance_m in DISTANCES_M:
+        n_within = (travelled_m <= distance_m + 1e-9).sum(axis=1)
+        reached = (travelled_m[:, -1] >= distance_m - 1e-9) & (n_within > 0)
+        last = shares[np.arange(len(shares)), np.maximum(n_within - 1, 0)]
+        anr[f"{distance_m:g}"] = float(last[reached].mean()) if reached.any() else None
+    return anr
