@@ -56,13 +56,13 @@ def test_a_map_is_made_and_described(deepsimbad, drives, tmp_path):
 
 def test_every_option_of_a_map_is_heeded(deepsimbad, drives, tmp_path):
     options = ("--n-landmarks", 12, "--list-length", 3, "--relevance", "rrf", "--training-episodes", 7, "--seed", 5)
-    given = (*options, "--spacing-m", 2.5, "--closed", "--data-dir", "here")
+    given = (*options, "--spacing-m", 2.5, "--closed", "--actions-m", "-2.5,0,5", "--data-dir", "here")
     ran = deepsimbad("map", "route", *sources(drives), *READY, *given)
     assert ran.code == 0, ran.err
     made = contents(tmp_path / "here")
     assert made.lists.shape == (3, 80)
     assert made.landmark_model["prototypes"].shape == (12, 16)
-    assert made.closed is True
+    assert (made.closed, made.actions_m.tolist()) == (True, [-2.5, 0, 5])
     assert made.position_m.tolist() == (2.5 * np.arange(80)).tolist()
     assert made.statistics is None
     expected = {"n_landmarks": 12, "list_length": 3, "relevance": "rrf", "training_episodes": 7, "seed": 5}
@@ -142,6 +142,7 @@ def test_named_errors_are_one_line_and_make_nothing(deepsimbad, drives, pictures
     named_error(deepsimbad("map", "route", "--landmarks", "nowhere", "--training", pictures, *READY), "nowhere")
     images = ("--landmarks", pictures, "--training", pictures, "--n-landmarks", 20)
     named_error(deepsimbad("map", "route", *images, *READY), "ready encodings")
+    named_error(deepsimbad(*route, "--actions-m", "5,-5"), "ascend")
     named_error(deepsimbad("map", "no/name", *sources(drives), *READY), "1 to 64 letters")
     named_error(deepsimbad("map", "route", *sources(drives), "--evaluator", "feature_l2:crystal_ball"), "extractor")
     named_error(deepsimbad("info", "nowhere"), "nowhere")
@@ -205,6 +206,7 @@ def test_a_damaged_map_is_named_in_one_line(deepsimbad, process, pictures, tmp_p
         ("map", "route", "--landmarks", "a", "--training", "b", "--n-landmarks", "0"),
         ("map", "route", "--landmarks", "a", "--training", "b", "--relevance", "magic"),
         ("map", "route", "--landmarks", "a", "--training", "b", "--spacing-m", "0"),
+        ("map", "route", "--training", "b", "--actions-m", "far"),
         ("localize", "route"),
         ("info",),
         ("info", "route", "--yaml"),

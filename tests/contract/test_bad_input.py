@@ -221,7 +221,12 @@ STRANGE = {"unknown": "1"}
         ("POST", f"{READY}/sessions", {}, {"price_bits_per_m": '-0.1 100.1 NaN 1e999 "1" true'}),
         ("POST", f"{READY}/sessions", {}, {"confidence": '0 1 -0.5 2 NaN "0.9" true'}),
         ("PUT", BAD, {"evaluator": KIND}, STRANGE | {"closed": '"perhaps"', "actions_m": "[] [2,1] [1,1]"}),
-        ("PUT", BAD, {"evaluator": KIND}, {"actions_m": '[0] [NaN] [1e999] [-1] [1e9] [null] [true] ["1"]'}),
+        (
+            "PUT",
+            BAD,
+            {"evaluator": KIND},
+            {"actions_m": '[0] [-0.0] [NaN] [1e999] [-1e4] [1e9] [null] [true] ["1"] [0,-5]'},
+        ),
         ("POST", f"{ADMIN}/traverses", {}, STRANGE | {"name": '"" "../x" 3 "a\\n"'}),
         ("POST", f"{ADMIN}/remaps", REMAP, STRANGE | {"list_length": "0", "n_landmarks": "0 65536", "seed": "-1 1.5"}),
         ("POST", f"{ADMIN}/remaps", REMAP, {"training_episodes": "-1", "activate": '"yes"', "relevance": '"magic"'}),

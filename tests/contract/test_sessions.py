@@ -361,3 +361,63 @@ def test_a_restart_and_a_retired_map(tmp_path):
         path = client.session()
         assert client.delete("/v1/admin/domains/ready").status_code == 204
         problem(client.get(path), 410, "ended_session")
+
+
+# Any action set
+
+
+BACK_AND_FORTH_M = [-6.0, 0.0, 2.0, 10.0]
+
+
+@pytest.fixture(scope="module", params=[False, True], ids=["open", "closed"])
+def back_and_forth(client, request):
+    """A domain whose robot may be told to go back or to stay, and whether its route is a loop."""
+    name = f"back-and-forth-{'closed' if request.param else 'open'}"
+    client.make_ready_domain(name, closed=request.param, actions_m=BACK_AND_FORTH_M)
+    assert client.get(f"/v1/domains/{name}").json()["actions_m"] == BACK_AND_FORTH_M
+    return name, request.param
+
+
+@pytest.mark.parametrize("belief", ["grid", "particle"])
+def test_a_robot_that_goes_backward_is_followed(client, back_and_forth, belief):
+    name, closed = back_and_forth
+    path = client.session(name, start_position_m=20, start_std_m=0.5, belief=belief)
+    image = 10
+    see(client, path, image)
+    for action_m in (10, -6, -6, 0, -0.4, -12, 2):
+        image = round(image + action_m / 2) % N_READY
+        known = see(client, path, image, action_m)["belief"]
+        assert (known["mode_m"], known["off_route"] < 0.1) == (2 * image, True), action_m
+    for action_m in ("-100.5", "100.5", "nan"):
+        refused = problem(observe(client, path, action_m), 422, "invalid_move")
+        assert (refused["minimum"], refused["maximum"]) == (-100, 100)
+    path = client.session(name, start_position_m=10, start_std_m=0.5, belief=belief)
+    see(client, path, 5)
+    beyond = observe(client, path, -50)
+    if closed:
+        assert beyond.status_code == 200, beyond.text
+    else:
+        refused = problem(beyond, 422, "past_the_end")
+        assert (refused["route_end_m"], "the route begins at 0 m" in refused["detail"]) == (0, True)
+
+
+@pytest.mark.parametrize("planner", ["informed", "nnql", "random", "constant:-6", "constant:0"])
+def test_every_planner_chooses_among_all_moves_and_staying_is_no_stop(client, back_and_forth, planner):
+    name, _ = back_and_forth
+    path = client.session(name, planner=planner, confidence=0.999999, start_position_m=40, start_std_m=20)
+    for image in (20, 17):
+        plan = see(client, path, image, -6)["next_best_view"]
+        assert (plan["planner"], plan["stop"]) == (planner, False)
+        assert [action["action_m"] for action in plan["actions"]] == BACK_AND_FORTH_M
+        assert plan["action_m"] in BACK_AND_FORTH_M
+    if planner.startswith("constant"):
+        assert plan["action_m"] == float(planner.partition(":")[2])
+    if planner == "informed":
+        tells = {action["action_m"]: action["expected_bits"] for action in plan["actions"]}
+        assert tells[0] == 0 < min(tells[-6], tells[2], tells[10])
+        dear = client.session(name, planner=planner, confidence=0.999999, price_bits_per_m=100)
+        stays = see(client, dear, 20)["next_best_view"]
+        assert (stays["action_m"], stays["stop"]) == (0, False), "moving is too dear, and the place is not known"
+    sure = client.session(name, planner=planner, confidence=0.5, start_position_m=40, start_std_m=0.1)
+    assert see(client, sure, 20)["next_best_view"]["stop"] is True, "whatever the next move would be"
+    problem(client.post(f"/v1/domains/{name}/sessions", json={"planner": "constant:-2"}), 422, "invalid_input")

@@ -3,11 +3,9 @@
 import numpy as np
 import pytest
 
-from deepsimbad.core.belief_lattice import Lattice, Moves, moves_along, step_beliefs, uniform_beliefs
+from deepsimbad.core.belief_lattice import NO_MOVE, Lattice, Moves, moves_along, step_beliefs, uniform_beliefs
 from deepsimbad.core.metrics import rank_of_truth
 from deepsimbad.core.route import Route
-
-STILL = -1
 
 
 def equal_route(n: int, spacing_m: float, closed: bool) -> Route:
@@ -15,7 +13,7 @@ def equal_route(n: int, spacing_m: float, closed: bool) -> Route:
 
 
 def at_first_view(moves: Moves, action: int, first: bool) -> Moves:
-    shift = np.array([STILL if first else moves.shift[action]])
+    shift = np.array([NO_MOVE if first else moves.shift[action]])
     return Moves(shift, moves.fraction[[action]], moves.taps[[action]])
 
 
@@ -25,7 +23,7 @@ def slow_move(mass: np.ndarray, cells: float, std_cells: float, closed: bool) ->
     part, moved, spread = cells - whole, np.zeros(n), np.zeros(n)
     for c in range(n):
         for to, share in ((c + whole, 1 - part), (c + whole + 1, part)):
-            if share > 1e-4 and (closed or c + whole + (part > 1e-4) < n):
+            if share > 1e-4 and (closed or (c + whole >= 0 and c + whole + (part > 1e-4) < n)):
                 moved[to % n] += mass[c] * share
     reach = int(4 * std_cells + 1e-9)
     for c in range(n):
@@ -37,10 +35,13 @@ def slow_move(mass: np.ndarray, cells: float, std_cells: float, closed: bool) ->
 
 @pytest.mark.parametrize("closed", [False, True])
 @pytest.mark.parametrize("additive", [False, True])
-@pytest.mark.parametrize(("spacing_m", "actions_m"), [(1.0, (1.0, 4.0)), (0.2, (1.0, 3.0)), (0.5, (1.3, 0.2))])
+@pytest.mark.parametrize(
+    ("spacing_m", "actions_m"),
+    [(1.0, (1.0, 4.0)), (0.2, (1.0, 3.0)), (0.5, (1.3, 0.2)), (1.0, (-3.0, 0.0)), (0.5, (-1.3, 2.0))],
+)
 def test_on_equal_steps_the_beliefs_are_those_of_plain_loops(closed, additive, spacing_m, actions_m):
     route = equal_route(120, spacing_m, closed)
-    lattice = Lattice.along(route, 0.0)  # not cut to the moves: the cells are the images
+    lattice = Lattice.along(route, np.zeros(1))  # not cut to the moves: the cells are the images
     assert lattice.n_cells == 120
     stds_m = [0.72, 0.33]  # cut off between two images, so that rounding decides nothing
     moves = moves_along(lattice, actions_m, stds_m)
@@ -71,7 +72,7 @@ def test_on_equal_steps_the_beliefs_are_those_of_plain_loops(closed, additive, s
 
 def test_beliefs_do_not_touch_each_other_and_ranks_count_images():
     route = equal_route(50, 1.0, closed=False)
-    lattice = Lattice.along(route, 1.0)
+    lattice = Lattice.along(route, np.array([1.0, 5.0]))
     moves = moves_along(lattice, (1.0, 5.0), (0.4, 0.9))
     rng = np.random.default_rng(0)
     seen = rng.random((3, 50), np.float32)
@@ -79,7 +80,7 @@ def test_beliefs_do_not_touch_each_other_and_ranks_count_images():
     each = [uniform_beliefs(lattice, 1) for _ in range(3)]
     for turn in range(4):
         action = rng.integers(0, 2, 3)
-        steps = Moves(moves.shift[action] if turn else np.full(3, STILL), moves.fraction[action], moves.taps[action])
+        steps = Moves(moves.shift[action] if turn else np.full(3, NO_MOVE), moves.fraction[action], moves.taps[action])
         ranks = step_beliefs(lattice, both, steps, seen, np.array([7, 40, -1]), additive=True)
         assert ranks[2] == -1
         for place, belief in enumerate(each):
@@ -91,19 +92,19 @@ def test_beliefs_do_not_touch_each_other_and_ranks_count_images():
 
 def test_uneven_images_take_the_cell_nearest_to_them():
     position_m = np.array([0.0, 0.0, 0.0, 1.1, 1.9, 3.0, 3.0, 6.0])
-    lattice = Lattice.along(Route(position_m), 1.0)
+    lattice = Lattice.along(Route(position_m), np.array([-2.0, 0.0, 1.0]))
     assert lattice.step_m == 1.0
     assert lattice.cell_of_image.tolist() == [0, 0, 0, 1, 2, 3, 3, 6]
     assert lattice.images_in_cell.tolist() == [3, 1, 1, 2, 0, 0, 1]
     assert [position_m[i] for i in lattice.image_of_cell] == [0.0, 1.1, 1.9, 3.0, 3.0, 6.0, 6.0]
     seen = np.array([[0, 0, 0, 1, 5, 2, 2, 0]], np.float32)
-    first = Moves(np.array([STILL]), np.zeros(1, np.float32), np.ones((1, 1), np.float32))
+    first = Moves(np.array([NO_MOVE]), np.zeros(1, np.float32), np.ones((1, 1), np.float32))
     rank = step_beliefs(lattice, uniform_beliefs(lattice, 1), first, seen, np.array([5]), additive=True)
     assert rank[0] == 1 + 0.5  # the image at 1.9 is better, the other at 3.0 is tied
 
 
 def test_a_belief_that_would_be_wholly_past_the_end_stays():
-    lattice = Lattice.along(equal_route(10, 1.0, closed=False), 1.0)
+    lattice = Lattice.along(equal_route(10, 1.0, closed=False), np.ones(1))
     beliefs = np.zeros((1, 10), np.float32)
     beliefs[0, 8] = 1
     moves = moves_along(lattice, (3.0,), (0.0,))
@@ -113,7 +114,7 @@ def test_a_belief_that_would_be_wholly_past_the_end_stays():
 
 
 def test_evidence_against_every_place_is_not_believed():
-    lattice = Lattice.along(equal_route(10, 1.0, closed=False), 1.0)
+    lattice = Lattice.along(equal_route(10, 1.0, closed=False), np.ones(1))
     beliefs = uniform_beliefs(lattice, 1)
     moves = moves_along(lattice, (1.0,), (0.0,))
     step_beliefs(lattice, beliefs, moves, np.zeros((1, 10), np.float32), np.array([8]), additive=False)
@@ -123,7 +124,7 @@ def test_evidence_against_every_place_is_not_believed():
 
 def test_one_place_and_one_image():
     for position_m in ([2.0], [2.0, 2.0, 2.0]):
-        lattice = Lattice.along(Route(np.array(position_m)), 1.0)
+        lattice = Lattice.along(Route(np.array(position_m)), np.ones(1))
         assert lattice.n_cells == len(position_m) or lattice.n_cells == 1
         beliefs = uniform_beliefs(lattice, 1)
         moves = moves_along(lattice, (1.0,), (0.5,))

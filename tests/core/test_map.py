@@ -63,12 +63,16 @@ def test_a_route_that_goes_backwards_and_an_unknown_relevance_are_refused():
         ({"position_m": np.full(N, 4.0)}, "at one position"),
         ({"actions_m": (2.0, 1.0)}, "no moves that ascend"),
         ({"actions_m": (), "q_values": None}, "no moves that ascend"),
-        ({"actions_m": (-1.0, 1.0)}, "no moves that ascend"),
+        ({"actions_m": (1.0, 1.0)}, "no moves that ascend"),
+        ({"actions_m": (1.0, np.nan)}, "no moves that ascend"),
+        ({"actions_m": (1.0, 1001.0)}, "at most 1000 m"),
+        ({"actions_m": (0.0,), "q_values": None}, "goes somewhere"),
     ],
 )
 def test_what_makes_no_sense_may_not_serve(changes, says):
     whole().check()
     whole(x_m=np.full(N, np.nan)).check()
+    whole(actions_m=(-1.0, 0.0)).check()
     with pytest.raises(InvalidMapConfigError, match=says):
         whole(**changes).check()
 

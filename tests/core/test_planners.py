@@ -90,6 +90,7 @@ def test_a_robot_that_knows_its_place_goes_to_the_telling_one(bits, away):
 def test_where_nobody_knows_what_views_tell_it_goes_far():
     plan = plan_by_information(view_of(sharp(3)))
     assert (plan.action_m, plan.values) == (10, None)
+    assert plan_by_information(view_of(sharp(3), actions_m=np.array([-4.0, 0.0, 1.0]))).action_m == -4
 
 
 def test_moves_are_weighed_by_the_whole_belief_and_ties_go_far(bits):
@@ -100,7 +101,10 @@ def test_moves_are_weighed_by_the_whole_belief_and_ties_go_far(bits):
     np.testing.assert_allclose(np.r_[plan.values, plan.bits], table, rtol=1e-5)
     ahead = [bits[m + 4] if m + 4 < N_IMAGES else bits.mean() for m in range(N_IMAGES)]
     assert plan.bits[3] == pytest.approx(mass @ ahead, rel=1e-5)
-    assert plan_by_information(view_of(mass, np.ones(N_IMAGES, np.float32))).action_m == 10
+    flat = np.ones(N_IMAGES, np.float32)
+    assert plan_by_information(view_of(mass, flat)).action_m == 10
+    for actions_m, longest_m in (((-10.0, 0.0, 10.0), 10), ((-10.0, 0.0, 9.0), -10)):
+        assert plan_by_information(view_of(mass, flat, actions_m=np.array(actions_m))).action_m == longest_m
 
 
 def test_metres_have_a_price(bits):

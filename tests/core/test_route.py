@@ -64,16 +64,10 @@ def test_bad_positions_are_named(positions, says):
         Route(np.array(positions, float))
 
 
-def test_ahead_is_what_lies_where_a_move_leads():
-    values, actions_m = np.arange(10, dtype=np.float32), np.array([1.0, 2.4, 8.0])
-    ahead = Route(np.arange(10.0)).ahead(values, actions_m)
-    mean = 4.5
-    assert ahead[0].tolist() == [1, 2, 8]
-    assert ahead[7].tolist() == [8, mean, mean], "7 + 2.4 is past the end, at 9"
-    assert ahead[9].tolist() == [mean, mean, mean]
-    around = Route(np.arange(10.0), closed=True).ahead(values, actions_m)
-    assert around[7].tolist() == [8, 9, 5]
-    assert around[9].tolist() == [0, 1, 7]
+def test_an_open_route_ends_and_a_closed_one_does_not():
+    at_m = np.array([4.9, 5.0, 9.0, 14.0, 14.1])
+    assert Route(np.arange(5.0, 15.0)).reaches(at_m).tolist() == [False, True, True, True, False]
+    assert Route(np.arange(5.0, 15.0), closed=True).reaches(at_m).all()
 
 
 # --- which images show the same place ------------------------------------------------------------------------------

@@ -17,24 +17,29 @@ from deepsimbad.errors import CancelledError
 from .conftest import a_map
 
 ACTIONS_M = (1.0, 2.0, 3.0)
+BACK_AND_FORTH_M = (-2.0, 0.0, 3.0)
 
 
-def random_world(config: NnqlConfig, closed: bool = False, known: float = 1.0) -> TrainingWorld:
+def random_world(
+    config: NnqlConfig, closed: bool = False, known: float = 1.0, actions_m: tuple[float, ...] = ACTIONS_M
+) -> TrainingWorld:
     rng = np.random.default_rng(5)
     n, r = 80, 15
     mapped, live = rng.normal(size=(2, n, r)).astype(np.float32)
-    map_ = a_map(Relevance.RRF, mapped, 4, closed=closed, actions_m=ACTIONS_M)
+    map_ = a_map(Relevance.RRF, mapped, 4, closed=closed, actions_m=actions_m)
     views = Query(live.argsort(axis=1).argsort(axis=1) + np.float32(1))
     true_image = np.where(rng.random(n) < known, np.arange(n), -1)
     return TrainingWorld.on(map_, views, map_.route, true_image, config)
 
 
 def moved(mass: np.ndarray, metres: int, std_m: float, closed: bool) -> np.ndarray:
-    """A metre an image; what would be past the end of an open route is dropped."""
+    """A metre an image; what would be past an end of an open route is dropped."""
     n, reach = len(mass), int(4 * std_m)
     shifted = np.roll(mass, metres)
-    if not closed:
+    if not closed and metres > 0:
         shifted[:metres] = 0
+    if not closed and metres < 0:
+        shifted[metres:] = 0
     spread = np.zeros(n)
     for image in range(n):
         to = [d for d in range(-reach, reach + 1) if closed or 0 <= image + d < n]
@@ -46,8 +51,8 @@ def moved(mass: np.ndarray, metres: int, std_m: float, closed: bool) -> np.ndarr
 
 def slow_training(world: TrainingWorld, config: NnqlConfig, closed: bool) -> np.ndarray:
     """One episode after the other in plain loops: the served filter, the served relevance. Batches of one."""
-    n, n_actions = world.n_images, len(ACTIONS_M)
-    q_values = np.full((n, n_actions), config.initial_q)
+    n, actions_m = world.n_images, world.map.actions_m
+    q_values = np.full((n, actions_m.size), config.initial_q)
     for episode in range(config.n_episodes):
         rng = np.random.default_rng([config.seed, episode])
         frame = int(rng.choice(world.start_frames, 1)[0])
@@ -61,17 +66,17 @@ def slow_training(world: TrainingWorld, config: NnqlConfig, closed: bool) -> np.
 
         belief, near = look(belief, frame)
         for _ in range(config.n_actions_per_episode):
-            allowed = np.array([closed or frame + m <= n - 1 for m in ACTIONS_M])
+            allowed = np.array([closed or 0 <= frame + m <= n - 1 for m in actions_m])
             action = int(choose_actions(q_values[near].mean(axis=0)[None], allowed[None], epsilon, rng)[0])
             if action < 0:
                 break
-            frame = int(frame + ACTIONS_M[action]) % n
-            belief = moved(belief, int(ACTIONS_M[action]), config.motion_std_m, closed)
+            frame = int(frame + actions_m[action]) % n
+            belief = moved(belief, int(actions_m[action]), config.motion_std_m, closed)
             belief, then = look(belief, frame)
             if world.true_image[frame] >= 0:
                 rank = rank_of_truth(belief, np.array([frame]))
                 reward = config.reward if rank < config.top_share * n else 0.0
-                then_allowed = [a for a, m in enumerate(ACTIONS_M) if closed or frame + m <= n - 1]
+                then_allowed = [a for a, m in enumerate(actions_m) if closed or 0 <= frame + m <= n - 1]
                 best = max((q_values[then, a].mean() for a in then_allowed), default=0.0)
                 target = reward + config.discount * best
                 for image in near:
@@ -80,10 +85,13 @@ def slow_training(world: TrainingWorld, config: NnqlConfig, closed: bool) -> np.
     return q_values
 
 
-@pytest.mark.parametrize(("closed", "known"), [(False, 1.0), (True, 0.6)])
-def test_the_same_values_as_plain_loops(closed, known):
+@pytest.mark.parametrize(
+    ("closed", "known", "actions_m"),
+    [(False, 1.0, ACTIONS_M), (True, 0.6, ACTIONS_M), (False, 1.0, BACK_AND_FORTH_M), (True, 1.0, BACK_AND_FORTH_M)],
+)
+def test_the_same_values_as_plain_loops(closed, known, actions_m):
     config = NnqlConfig(n_episodes=60, batch_episodes=1, motion_std_m=0.33, top_share=0.2, exploration=0.5, seed=3)
-    world = random_world(config, closed, known)
+    world = random_world(config, closed, known, actions_m)
     learnt, _ = train(world, config, lambda _: None)
     expected = slow_training(world, config, closed)
     assert (expected > 1).any()

@@ -231,7 +231,7 @@ import_map(catalog, Path(sys.argv[2]))
         {"landmark_model": {"prototypes": np.zeros((9, 0), np.float32)}},
         {"landmark_model": {"prototypes": np.full((9, 4), np.nan, np.float32)}},
         {"actions_m": ()},
-        {"actions_m": (-1.0, 2.0)},
+        {"actions_m": (0.0,)},
         {"actions_m": (2.0, 1.0)},
         {"position_m": np.full(30, 5.0)},
         {"config": STANDARDISED, "statistics": np.full((2, 9), np.nan)},

@@ -44,6 +44,11 @@ ENCODING_EVALUATOR = {"kind": "feature_l2", "extractor": "none"}
 @click.option("--traverse", required=True, metavar="NAME", help="Made when the domain does not have it.")
 @click.option("--closed", is_flag=True, help="The route ends where it starts (counts when the domain is made).")
 @click.option("--evaluator", metavar="JSON", help="Of a domain that is to be made.")
+@click.option(
+    "--actions-m",
+    metavar="METRES",
+    help="Moves of a domain that is to be made, ascending, with commas; negative: backward.  [default: 1,2 to 10]",
+)
 @click.option("--resend", is_flag=True, help="Send also the frames that the service has already.")
 @at_once
 @reading
@@ -57,6 +62,7 @@ def upload(
     traverse: str,
     closed: bool,
     evaluator: str | None,
+    actions_m: str | None,
     resend: bool,
     concurrency: int,
     reading: dict[str, Any],
@@ -71,7 +77,7 @@ def upload(
     Interrupted, the same command goes on where it stopped.
     """
     recording = opened(source, allow_missing, **reading)
-    _make_domain_if_missing(client, domain, recording, closed, evaluator)
+    _make_domain_if_missing(client, domain, recording, closed, evaluator, actions_m)
     with UploadBar(f"{recording.name} to {domain}/{traverse}", len(recording.frames)) as bar:
         report = upload_recording(
             *(client, recording, domain, traverse),
@@ -129,7 +135,7 @@ def _views(images: Iterable[str], input_size: tuple[int, int] | None) -> Iterato
 
 
 def _make_domain_if_missing(
-    client: Client, name: str, recording: Recording, closed: bool, evaluator: str | None
+    client: Client, name: str, recording: Recording, closed: bool, evaluator: str | None, actions_m: str | None
 ) -> None:
     try:
         client.domain(name)
@@ -141,7 +147,11 @@ def _make_domain_if_missing(
             except (TypeError, ValueError) as error:
                 example = 'give a JSON object such as {"kind": "feature_l2"}'
                 raise click.BadParameter(example, param_hint="--evaluator") from error
-        client.admin.put_domain(name, config, closed=closed)
+        try:
+            moves_m = None if actions_m is None else [float(metres) for metres in actions_m.split(",")]
+        except ValueError as error:
+            raise click.BadParameter("give metres as -5,0,1,10", param_hint="--actions-m") from error
+        client.admin.put_domain(name, config, closed=closed, actions_m=moves_m)
         REMARKS.print(f"made domain {name} ({json.dumps(config)})", soft_wrap=True)
 
 

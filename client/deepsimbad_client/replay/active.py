@@ -35,7 +35,7 @@ class EpisodeStep:
     y_m: float | None
     commanded_m: float | None  # the move asked for; None before the first
     action_m: float  # metres really moved
-    travelled_m: float  # since the episode's start
+    travelled_m: float  # since the episode's start, forward or backward
     forgot: bool  # the belief had no room left for the move and was set back to knowing nothing
     true_map_image: int | None  # the one nearest to the truth; None where the map does not hold the place
     true_route_m: float | None  # where that lies along the map's route
@@ -151,30 +151,31 @@ class Stage:
         The draw depends on `seed` and `episode` alone, so every planner starts from the same places. Raises ReplayError
         (the recording is too short).
         """
-        longest_m = max(self.scene.domain.actions_m, default=_LONGEST_ACTION_M)
-        room_m = float(self.position_m[-1]) - steps * longest_m
-        n_starts = int(np.searchsorted(self.position_m, room_m, side="right"))
-        if n_starts == 0:
+        actions_m = self.scene.domain.actions_m or (_LONGEST_ACTION_M,)
+        back_m, ahead_m = min(0.0, *actions_m), max(0.0, *actions_m)
+        first = int(np.searchsorted(self.position_m, self.position_m[0] - steps * back_m))
+        stop = int(np.searchsorted(self.position_m, self.position_m[-1] - steps * ahead_m, side="right"))
+        if stop <= first:
             length_m = float(self.position_m[-1] - self.position_m[0])
             raise ReplayError(
-                f"{steps} moves of up to {longest_m:g} m do not fit the {length_m:g} m of "
+                f"{steps} moves of up to {max(-back_m, ahead_m):g} m do not fit the {length_m:g} m of "
                 f"{self.scene.recording.name}: ask for fewer steps"
             )
         rng = np.random.default_rng([seed, episode])
-        return int(rng.integers(n_starts)), int(rng.integers(2**31))
+        return int(rng.integers(first, stop)), int(rng.integers(2**31))
 
-    def nearest(self, commanded_m: float, broken: frozenset[int], beyond_m: float = -np.inf) -> int:
-        """The row recorded nearest to a place, of those that are not broken; ReplayError where all are.
+    def nearest(self, here_m: float, commanded_m: float, broken: frozenset[int]) -> int:
+        """The row recorded nearest to where a move leads, of those that are not broken; ReplayError where all are.
 
-        Only frames farther along than `beyond_m`, where there are any: a robot told to move does move, though the next
-        frame may be farther than it was told, and does not look at the same picture twice.
+        Only frames farther that way, where there are any: a robot told to move does move, though the next frame may be
+        farther than it was told, and does not look at the same picture twice.
         """
         usable = np.delete(np.arange(len(self.position_m)), sorted(broken))
         if not usable.size:
             raise ReplayError(f"none of the frames of {self.scene.recording.name} can be used")
-        ahead = usable[self.position_m[usable] > beyond_m]
-        usable = ahead if ahead.size else usable
-        return int(usable[np.abs(self.position_m[usable] - commanded_m).argmin()])
+        that_way = usable[(self.position_m[usable] - here_m) * commanded_m > 0]
+        usable = that_way if that_way.size else usable
+        return int(usable[np.abs(self.position_m[usable] - here_m - commanded_m).argmin()])
 
     def play(self, session: Session, row: int, steps: int) -> Iterator[tuple[Seen, EpisodeStep]]:
         """Drive one episode: look, ask for the next-best view, move there, look again; judge every view.
@@ -192,9 +193,9 @@ class Stage:
                 if not isinstance(seen, str):
                     break
                 broken |= {row}
-                row = self.nearest(here_m + (commanded_m or 0.0), broken, here_m if commanded_m else -np.inf)
+                row = self.nearest(here_m, commanded_m or 0.0, broken)
             action_m = action_m if step else 0.0
-            travelled_m += action_m
+            travelled_m += abs(action_m)
             moves = {"step": step, "commanded_m": commanded_m, "action_m": action_m, "travelled_m": travelled_m}
             yield seen, self._judged(row, seen, session, moves)
             if step == steps:
@@ -206,7 +207,7 @@ class Stage:
                     "episodes"
                 )
             here_m, commanded_m = float(self.position_m[row]), plan.action_m
-            row = self.nearest(here_m + commanded_m, broken, here_m if commanded_m > 0 else -np.inf)
+            row = self.nearest(here_m, commanded_m, broken)
 
     def drive(self, planner: str, number: int, row: int, seed: int, steps: int) -> Episode:
         """One whole episode in a session of its own."""

@@ -169,7 +169,7 @@ def _strip(axes: Axes, episode: Episode) -> None:
     for step, middle in zip(episode.steps[:-1], middles, strict=False):
         if step.next_action_m is not None:
             at = (1.008, 1 - (middle + 0.5) / n_rows)
-            axes.annotate(f"+{step.next_action_m:g} m", at, xycoords="axes fraction", **style)
+            axes.annotate(f"{step.next_action_m:+g} m", at, xycoords="axes fraction", **style)
 
 
 def _compared(summary: Mapping[str, Any], title: str, path: Path) -> Path:

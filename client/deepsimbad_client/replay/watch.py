@@ -131,8 +131,15 @@ def in_words(step: EpisodeStep) -> str:
         truth = "Truly it is where the map knows no place."
     else:
         truth = f"Truly it is by {step.true_route_m:.1f} m, on the ground {step.error_m:.1f} m from there."
-    asks = "" if step.next_action_m is None else f" It asks to see what is {step.next_action_m:g} m ahead."
-    return f"{seen} {believes} {truth}{asks}"
+    return f"{seen} {believes} {truth}{_asks(step.next_action_m)}"
+
+
+def _asks(action_m: float | None) -> str:
+    if action_m is None:
+        return ""
+    if action_m == 0:
+        return " It asks to look again from where it is."
+    return f" It asks to see what is {abs(action_m):g} m {'ahead' if action_m > 0 else 'behind'}."
 
 
 def _may_stop(next_best_view: NextBestView | None) -> str:

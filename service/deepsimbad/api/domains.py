@@ -10,9 +10,10 @@ from pydantic import Field, model_validator
 
 from deepsimbad.api.problems import binary, declare_json, problems
 from deepsimbad.api.requests import BINARY, GREATEST_ID, KEPT, Answer, DomainName, JsonBody, Running, names, read_json
+from deepsimbad.core.map import DEFAULT_ACTIONS_M, MOST_ACTION_M, check_actions
 from deepsimbad.engine.maps import Maps
 from deepsimbad.engine.worker import EvaluatorPool, ready
-from deepsimbad.errors import NoActiveMapError, UnavailableError, UnknownDomainError
+from deepsimbad.errors import InvalidMapConfigError, NoActiveMapError, UnavailableError, UnknownDomainError
 from deepsimbad.evaluators.registry import EXTRACTOR_PATTERN, EvaluatorKind, evaluator_config
 from deepsimbad.store.records import DomainRecord
 
@@ -42,14 +43,16 @@ class DomainBody(JsonBody):
     ]
     closed: Annotated[bool, Field(strict=True, description="Whether the end of the route joins its start.")] = False
     actions_m: Annotated[
-        tuple[Annotated[float, Field(strict=True, gt=0, le=1000, allow_inf_nan=False)], ...],
-        Field(min_length=1, max_length=64, description="Moves in metres, ascending."),
-    ] = tuple(float(action) for action in range(1, 11))
+        tuple[Annotated[float, Field(strict=True, ge=-MOST_ACTION_M, le=MOST_ACTION_M, allow_inf_nan=False)], ...],
+        Field(min_length=1, max_length=64, description="Moves in metres, ascending; backward ones are negative."),
+    ] = DEFAULT_ACTIONS_M
 
     @model_validator(mode="after")
-    def _ascending(self) -> Self:
-        if any(longer <= shorter for shorter, longer in zip(self.actions_m, self.actions_m[1:], strict=False)):
-            raise ValueError("actions_m must ascend")
+    def _moves(self) -> Self:
+        try:
+            check_actions(self.actions_m)
+        except InvalidMapConfigError as error:
+            raise ValueError(error.message) from error
         return self
 
 

@@ -272,7 +272,10 @@ async def post_observation(
     running: Running,
     action_m: Annotated[
         float,
-        Query(description="Metres moved since the last view, to ten of the longest action; ignored for the first."),
+        Query(
+            description="Metres moved since the last view, to ten of the longest action, and backward where the "
+            "domain's actions are; ignored for the first."
+        ),
     ] = 0.0,
     action_std_m: Annotated[
         float | None, Query(description="How sure that is, a standard deviation; absent: usual odometry.")

@@ -17,6 +17,7 @@ from deepsimbad.cli.terminal import (
     progress_bar,
     write_json,
 )
+from deepsimbad.core.map import DEFAULT_ACTIONS_M, check_actions
 from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Relevance
 from deepsimbad.engine.localizer import localize as localize_view
 from deepsimbad.engine.maps import Maps
@@ -40,7 +41,15 @@ from deepsimbad.store.traverses import Traverse
 from deepsimbad_client.recordings.options import accounting, opened, reading, tell_left_out
 
 _READING = {"read landmarks": 4.0, "read training": 4.0}
-_ACTIONS_M = tuple(float(metres) for metres in range(1, 11))
+
+
+def _actions_m(_context: click.Context, _parameter: click.Parameter, value: str | None) -> tuple[float, ...]:
+    try:
+        actions_m = DEFAULT_ACTIONS_M if value is None else tuple(float(metres) for metres in value.split(","))
+    except ValueError as error:
+        raise click.BadParameter("give metres with commas between, as -5,0,1,10") from error
+    check_actions(actions_m)
+    return actions_m
 
 
 @click.command("map")
@@ -64,6 +73,12 @@ _ACTIONS_M = tuple(float(metres) for metres in range(1, 11))
     "it.  [default: where both know x, y]",
 )
 @click.option("--closed", is_flag=True, help="The end of the route joins its start.")
+@click.option(
+    "--actions-m",
+    metavar="METRES",
+    callback=_actions_m,
+    help="Moves that a robot may be told to make, ascending, with commas; negative: backward.  [default: 1,2 to 10]",
+)
 @reading
 @accounting
 @json_option
@@ -75,6 +90,7 @@ def map_(
     evaluator: EvaluatorConfig,
     relevance: str,
     closed: bool,
+    actions_m: tuple[float, ...],
     reading: dict[str, Any],
     allow_missing: bool,
     verbose: bool,
@@ -110,7 +126,7 @@ def map_(
             f"{n_candidates} candidates for {n_landmarks} landmarks; ask for fewer (--n-landmarks) or drive further"
         )
     with Catalog.open(settings.data_dir) as catalog:
-        catalog.create_domain(domain, evaluator.as_dict(), closed, _ACTIONS_M)
+        catalog.create_domain(domain, evaluator.as_dict(), closed, actions_m)
         with progress_bar(_READING | REMAP_STAGES, f"map {domain}") as progress:
             for role, recording in recordings.items():
                 progress.stage(f"read {role}")

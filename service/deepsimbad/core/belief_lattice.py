@@ -20,11 +20,15 @@ _WHOLE = 1e-4  # of a cell; a lesser part of one is a rounding of positions
 _BLOCK = 2048  # cells whose sums stay in the first-level cache
 
 
+NO_MOVE = np.iinfo(np.int64).min
+"""The shift of a first view."""
+
+
 @dataclass(frozen=True)
 class Moves:
     """One move of every belief, in cells."""
 
-    shift: NDArray[np.int64]  # [e] int64, whole cells; below 0: no move, this is a first view
+    shift: NDArray[np.int64]  # [e] int64, whole cells, backward ones negative; NO_MOVE: this is a first view
     fraction: NDArray[np.float32]  # [e] float32, the part of a cell moved besides, 0..1
     taps: NDArray[np.float32]  # [e, 2w + 1] float32, weights of the move's error
 
@@ -40,12 +44,13 @@ class Lattice:
     images_in_cell: NDArray[np.int32]  # [c] int32, how many map images have a cell as their nearest
 
     @classmethod
-    def along(cls, route: Route, shortest_action_m: float) -> "Lattice":
+    def along(cls, route: Route, actions_m: NDArray[np.float64]) -> "Lattice":
         """Cells as long as map images are apart on average, and a whole part of the shortest move if that is longer."""
+        shortest_action_m = float(np.abs(actions_m[actions_m != 0]).min(initial=np.inf))
         n = route.n_images
         n_steps = n if route.closed else n - 1
         step_m = route.length_m / n_steps if n_steps > 0 and route.length_m > 0 else 1.0
-        if shortest_action_m > step_m and not route.closed:
+        if np.isfinite(shortest_action_m) and shortest_action_m > step_m and not route.closed:
             step_m = shortest_action_m / round(shortest_action_m / step_m)
         n_cells = max(1, round(route.length_m / step_m) + (0 if route.closed else 1))
         cells_m = np.asarray(route.start_m + step_m * np.arange(n_cells), np.float64)
@@ -149,7 +154,7 @@ def _step(
     for e in range(n_beliefs):
         belief, at_cells = beliefs[e], moved[reach : reach + n_cells]
         total = np.float32(0.0)
-        if shift[e] >= 0:
+        if shift[e] != NO_MOVE:
             total = _shift(belief, shift[e], fraction[e], closed, at_cells)
         if total > 0:  # else a first view; or no place has that much route ahead, and the belief stays
             _pad(moved, reach, n_cells, taps[e], closed)
@@ -166,18 +171,22 @@ def _step(
 def _shift(
     belief: NDArray[np.float32], shift: int, fraction: np.float32, closed: bool, moved: NDArray[np.float32]
 ) -> np.float32:
-    """Shift forward; what would be past the end of an open route is dropped. Returns the total that is left."""
+    """Shift; what would be past an end of an open route is dropped. Returns the total that is left."""
     n = belief.size
     if closed:
         shift %= n
         moved[shift:] = belief[: n - shift]
         moved[:shift] = belief[n - shift :]
-    else:
+    elif shift >= 0:
         shift = min(shift, n)
         moved[:shift] = 0
         moved[shift:] = belief[: n - shift]
         if fraction > 0 and n > shift:  # the last cell's mass would be past the end
             moved[n - 1] = 0
+    else:
+        shift = max(shift, -n)
+        moved[: n + shift] = belief[-shift:]
+        moved[n + shift :] = 0
     if fraction > 0:
         last = moved[n - 1]
         for c in range(n - 1, 0, -1):

@@ -377,7 +377,7 @@ def nearest_known(map_: Map, position_m: NDArray[np.float64]) -> tuple[NDArray[n
     route, placed_m = map_.route, _on_route(map_, position_m)
     nearest = route.nearest_image(placed_m)
     apart_m = np.abs(route.offset_m(placed_m - route.position_m[nearest], 0.0))
-    return nearest, apart_m <= map_.actions_m.max(initial=0.0)
+    return nearest, apart_m <= map_.longest_action_m
 
 
 def _on_route(map_: Map, position_m: NDArray[np.float64]) -> NDArray[np.float64]:

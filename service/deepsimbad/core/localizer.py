@@ -85,7 +85,8 @@ class ActiveLocalizer:
         """One observation.
 
         Args:
-            action_m: Metres moved since the last view; ignored for the first. Backward within its error is no move.
+            action_m: Metres moved since the last view; ignored for the first. Backward within its error is no move
+                where the domain's actions go forward alone.
             action_std_m: How sure that is; None: as odometry usually is.
 
         Raises:
@@ -95,7 +96,8 @@ class ActiveLocalizer:
         laps = [self._clock()]
         map_, number = self._map, state.n_observations
         std_m = motion_std_m(action_m) if action_std_m is None else action_std_m
-        moved_m = 0.0 if number == 0 or -SIGMAS * std_m <= action_m < 0 else action_m
+        jitters = not map_.goes_backward and -SIGMAS * std_m <= action_m < 0
+        moved_m = 0.0 if number == 0 or jitters else action_m
 
         live, relevance = state.live, np.zeros(map_.n_images, np.float32)
         if query.is_informative:

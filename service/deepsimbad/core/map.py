@@ -4,7 +4,7 @@ Its arrays are named once, here, with their axes: what writes them, reads them, 
 know what they mean.
 """
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any, Self
@@ -27,6 +27,8 @@ from deepsimbad.core.route import Route
 from deepsimbad.errors import InvalidMapConfigError, LandmarkModelDiffersError
 
 UNKNOWN_FRAME = 0  # no digest was kept of what an image was made of
+DEFAULT_ACTIONS_M = tuple(float(metres) for metres in range(1, 11))
+MOST_ACTION_M = 1000.0
 _USUAL_NOVELTY_M = 3.0  # over which views stop to err alike, where nobody measured it
 _SHARED_LEARNT, _SHARED_ELSE = 0.7, 0.5  # of the novelty curve, where two seasons taught it and where they did not
 _SAME_PLACE_M = 0.3
@@ -156,9 +158,7 @@ class Map:
             raise InvalidMapConfigError("the statistics of a landmark have no spread")
         if self.n_images > 1 and self.route.length_m <= 0:
             raise InvalidMapConfigError("all map images are at one position")
-        moves_m = np.concatenate([[0.0], self.actions_m])
-        if not self.actions_m.size or not np.isfinite(moves_m).all() or not (np.diff(moves_m) > 0).all():
-            raise InvalidMapConfigError(f"its actions_m {self.actions_m.tolist()} are no moves that ascend")
+        check_actions(self.actions_m)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """The named arrays that it has."""
@@ -247,6 +247,16 @@ class Map:
     def relevance(self) -> Relevance:
         """What it was built for; raises KeyError or ValueError where its configuration names none that exists."""
         return Relevance(self.config["relevance"])
+
+    @cached_property
+    def goes_backward(self) -> bool:
+        """Whether a robot of the domain may be told to."""
+        return bool(self.actions_m.min(initial=0.0) < 0)
+
+    @cached_property
+    def longest_action_m(self) -> float:
+        """Either way."""
+        return float(np.abs(self.actions_m).max(initial=0.0))
 
     @property
     def update_rule(self) -> UpdateRule:
@@ -353,6 +363,19 @@ class NamedArray:
 
 ARRAYS = {row.name: NamedArray(**row.metadata) for row in fields(Map) if row.metadata}
 """All named arrays of a map."""
+
+
+def check_actions(actions_m: Sequence[float] | NDArray[np.float64]) -> None:
+    """Raise InvalidMapConfigError where no robot could move by them: metres, backward ones negative, ascending."""
+    moves_m = np.asarray(actions_m, np.float64)
+    if not moves_m.size or not (np.abs(moves_m) <= MOST_ACTION_M).all() or not (np.diff(moves_m) > 0).all():
+        raise InvalidMapConfigError(
+            f"actions_m {moves_m.tolist()} are no moves that ascend, each there once, of at most {MOST_ACTION_M:g} m"
+        )
+    if not moves_m.any():
+        raise InvalidMapConfigError(
+            "actions_m [0] leave a robot where it is: give at least one move that goes somewhere"
+        )
 
 
 def weights_of(config: Mapping[str, Any]) -> str | None:

@@ -151,7 +151,7 @@ def transitions_of(map_: Map, walk: KnownWalk, config: NnqlConfig) -> Transition
     one action alone, than half of it). Other moves, and those to an unknown place, teach nothing.
     """
     moves, route = map_.actions_m, map_.route
-    reach_m = np.diff(moves).min() / 2 if moves.size > 1 else moves[0] / 2
+    reach_m = np.diff(moves).min() / 2 if moves.size > 1 else abs(moves[0]) / 2
     rule = config.update or map_.update_rule
     belief, live = GridFilter.uniform(route, rule), map_.live_statistics
     nearest: list[NDArray[np.int64]] = []
@@ -185,5 +185,5 @@ def transitions_of(map_: Map, walk: KnownWalk, config: NnqlConfig) -> Transition
         action=np.array([action for _, action, _ in rewarded], np.int64),
         reward=np.array([reward for _, _, reward in rewarded], np.float64),
         next_nearest=rows[views],
-        next_allowed=route.closed | (ahead_m <= route.position_m[-1] + 1e-9),
+        next_allowed=route.reaches(ahead_m),
     )

@@ -70,17 +70,18 @@ def plan_by_experience(view: PlanningView) -> Plan | None:
 
 
 def plan_by_information(view: PlanningView) -> Plan:
-    """Ours: acts on bits that views ahead are worth, under the whole belief; ties go to the longer move.
+    """Ours: acts on bits that views ahead are worth, under the whole belief; ties go to the longer move, and forward.
 
     Where nobody knows what views are worth it is the longest move.
     """
     actions_m = view.map.actions_m
     table = information_ahead(view.map, view.price_bits_per_m)
+    longest_first = np.lexsort((-actions_m, -np.abs(actions_m)))
     if table is None:
-        return Plan(INFORMED, float(actions_m[-1]))
+        return Plan(INFORMED, float(actions_m[longest_first[0]]))
     both = _averaged(view.mass, table)
     values, bits = both[: actions_m.size], both[actions_m.size :]
-    best = values.size - 1 - int(np.argmax(values[::-1]))
+    best = longest_first[np.argmax(values[longest_first])]
     return Plan(INFORMED, float(actions_m[best]), values, bits=bits)
 
 
@@ -112,10 +113,7 @@ def _leads_to(route: Route, actions_m: NDArray[np.float64]) -> NDArray[np.int64]
     """[n, a] the image where every move leads; -1 past an end of an open route."""
     target_m = route.wrapped(route.position_m[:, np.newaxis] + actions_m)
     image = route.nearest_image(target_m)
-    if route.closed:
-        return np.asarray(image, np.int64)
-    outside = (target_m > route.position_m[-1] + 1e-9) | (target_m < route.start_m - 1e-9)
-    return np.where(outside, -1, image)
+    return np.where(route.reaches(target_m), image, -1)
 
 
 @njit(cache=True, nogil=True)

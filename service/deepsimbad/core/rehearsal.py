@@ -30,7 +30,7 @@ def rehearsed(map_: Map, own: NDArray[np.float32], season: SecondSeason | None) 
         own: [n, r] dissimilarities of the map images themselves.
         season: None: there is no other.
     """
-    longest_m = float(np.abs(map_.actions_m).max(initial=1.0))
+    longest_m = max(1.0, map_.longest_action_m)
     scores = _scores(map_, own)
     if season is None:
         curve = novelty_curve(map_.position_m, scores - scores.mean(axis=0), longest_m)

@@ -113,15 +113,10 @@ class Route:
             return position_m
         return np.asarray(self.start_m + (position_m - self.start_m) % self.length_m)
 
-    def ahead(self, values: NDArray[np.float32], actions_m: NDArray[np.float64]) -> NDArray[np.float32]:
-        """[n, a] an image's value [n] where every move [a] leads; past the end of an open route the mean of all."""
-        ahead = np.empty((self.n_images, actions_m.size), np.float32)
-        for place, action_m in enumerate(actions_m):
-            position_m = self.wrapped(self.position_m + action_m)
-            ahead[:, place] = values[self.nearest_image(position_m)]
-            if not self.closed:
-                ahead[position_m > self.position_m[-1], place] = values.mean()
-        return ahead
+    def reaches(self, position_m: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Whether positions are on the route: of an open one not past its ends, but for rounding."""
+        inside = (position_m >= self.start_m - 1e-9) & (position_m <= self.position_m[-1] + 1e-9)
+        return np.asarray(inside | self.closed)
 
     @cached_property
     def places(self) -> Places:

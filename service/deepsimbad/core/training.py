@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepsimbad.core.belief import motion_std_m
-from deepsimbad.core.belief_lattice import Lattice, Moves, moves_along, step_beliefs, uniform_beliefs
+from deepsimbad.core.belief_lattice import NO_MOVE, Lattice, Moves, moves_along, step_beliefs, uniform_beliefs
 from deepsimbad.core.map import Map
 from deepsimbad.core.nnql import NnqlConfig, Transitions, initial_q_values, learn, q_of_nearest
 from deepsimbad.core.relevance import LiveStatistics, Query, Relevance, UpdateRule, mean_ranks
@@ -43,7 +43,7 @@ class TrainingWorld:
     ) -> "TrainingWorld":
         """A world of one drive: its frames, and where they are along the drive itself."""
         actions_m = map_.actions_m
-        lattice = Lattice.along(map_.route, float(actions_m.min()))
+        lattice = Lattice.along(map_.route, actions_m)
         stds_m = [motion_std_m(m) if config.motion_std_m is None else config.motion_std_m for m in actions_m.tolist()]
         if map_.relevance is Relevance.COMPOSED:  # as compared with its own drive, measured once for all episodes
             views = replace(views, encoding=None)
@@ -55,7 +55,7 @@ class TrainingWorld:
             lattice,
             true_image,
             _next_frames(live_route, actions_m),
-            _start_frames(live_route, true_image, float(actions_m.max()) * config.n_actions_per_episode),
+            _start_frames(live_route, true_image, config.n_actions_per_episode * actions_m),
             moves_along(lattice, actions_m.tolist(), stds_m),
         )
 
@@ -95,15 +95,13 @@ def _evidence(relevance: NDArray[np.float32], rule: UpdateRule, scale: float) ->
 
 def _next_frames(route: Route, actions_m: NDArray[np.float64]) -> NDArray[np.int64]:
     target = route.position_m[:, np.newaxis] + actions_m
-    if route.closed and route.length_m > 0:
-        return np.asarray(route.nearest_image(route.wrapped(target)), np.int64)
-    return np.where(target <= route.position_m[-1] + 1e-9, route.nearest_image(target), -1)
+    return np.where(route.reaches(target), route.nearest_image(route.wrapped(target)), -1)
 
 
-def _start_frames(route: Route, true_image: NDArray[np.int64], episode_m: float) -> NDArray[np.int64]:
-    """Frames of known place from which a whole episode fits; where there is none, all of known place."""
+def _start_frames(route: Route, true_image: NDArray[np.int64], episodes_m: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Frames of known place from which whole episodes [a] of one move fit; where there is none, all of known place."""
     is_placed = true_image >= 0
-    fits = is_placed & (route.closed | (route.position_m + episode_m <= route.position_m[-1] + 1e-9))
+    fits = is_placed & route.reaches(route.position_m[:, np.newaxis] + episodes_m).all(axis=1)
     return np.flatnonzero(fits if fits.any() else is_placed)
 
 
@@ -154,7 +152,9 @@ class Walk:
             live = replace(live, ranks=replace(live.ranks, mean=live.ranks.mean[some], square=live.ranks.square[some]))
         seen, self.nearest[some] = world.look(frames, live)
         moves = Moves(
-            np.where(moved >= 0, world.moves.shift[moved], -1), world.moves.fraction[moved], world.moves.taps[moved]
+            np.where(moved >= 0, world.moves.shift[moved], NO_MOVE),
+            world.moves.fraction[moved],
+            world.moves.taps[moved],
         )
         self.ranks[some] = step_beliefs(
             world.lattice,

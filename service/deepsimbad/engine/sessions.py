@@ -468,16 +468,15 @@ def _ended(session_id: str, ending: str) -> EndedSessionError:
 
 def _check_move(snapshot: Map, action_m: float, action_std_m: float | None) -> None:
     """Refuse a move that no robot of the domain makes: backward within its error is none."""
-    longest_m = LONGEST_MOVE_ACTIONS * float(np.abs(snapshot.actions_m).max())
+    longest_m = LONGEST_MOVE_ACTIONS * snapshot.longest_action_m
     if action_std_m is not None and not (math.isfinite(action_std_m) and 0 <= action_std_m <= longest_m):
         raise InvalidMoveError(f"action_std_m is {action_std_m}: give metres from 0 to {longest_m:g}")
-    least_m = 0.0
-    if math.isfinite(action_m):
-        std_m = motion_std_m(action_m) if action_std_m is None else action_std_m
-        least_m = -longest_m if snapshot.actions_m.min() < 0 else -SIGMAS * std_m
-    if not (math.isfinite(action_m) and least_m <= action_m <= longest_m):
+    least_m = within_error_m = -longest_m if snapshot.goes_backward else 0.0
+    if math.isfinite(action_m) and not snapshot.goes_backward:
+        within_error_m = -SIGMAS * (motion_std_m(action_m) if action_std_m is None else action_std_m)
+    if not (math.isfinite(action_m) and within_error_m <= action_m <= longest_m):
         raise InvalidMoveError(
-            f"action_m is {action_m}: give metres from 0 to {longest_m:g}, ten of the domain's longest action",
-            minimum=0.0,
+            f"action_m is {action_m}: give metres from {least_m:g} to {longest_m:g}, ten of the longest action",
+            minimum=least_m,
             maximum=longest_m,
         )

@@ -121,7 +121,7 @@ class Catalog(JobCatalog, KeyCatalog):
             ConflictError: Files that no domain owns lie where its files would.
         """
         folder = layout.domain_folder(self.data_dir, name)
-        moves_m = [float(action) for action in actions_m]
+        moves_m = [float(action) + 0.0 for action in actions_m]  # a zero has no sign
         wanted = to_json({"evaluator": evaluator, "closed": closed, "actions_m": moves_m})
         row = {"evaluator": to_json(evaluator), "closed": int(closed), "actions_m": to_json(moves_m)}
         with self._writing() as db:

@@ -158,9 +158,15 @@ def test_the_command_line_end_to_end(service, encodings, tmp_path, capsys, monke
     assert capsys.readouterr().err.count("\n") == 1
 
 
-def test_a_drive_is_mapped_by_landmarks_of_its_own(service, encodings, capsys, monkeypatch):
+def test_a_robot_that_may_go_backward_drives_a_map_of_its_own_landmarks(
+    service, encodings, tmp_path, capsys, monkeypatch
+):
     monkeypatch.setenv("DEEPSIMBAD_URL", service)
-    assert run(["upload", str(encodings / "summer.npy"), "--domain", "own", "--traverse", "summer"]) == 0
+    sent = ["upload", str(encodings / "summer.npy"), "--domain", "own", "--traverse", "summer", "--actions-m"]
+    assert run([*sent, "1,x"]) == 2
+    assert run([*sent, "1,-5"]) == 1
+    assert "ascend" in capsys.readouterr().err
+    assert run([*sent, "-5,0,1,10"]) == 0
     capsys.readouterr()
     command = ["remap", "--domain", "own", "--training", "summer", "--n-landmarks", "40", "--json"]
     assert run(command) == 0
@@ -171,6 +177,15 @@ def test_a_drive_is_mapped_by_landmarks_of_its_own(service, encodings, capsys, m
     assert answer["belief"]["mode_m"] == 30
     assert run(command) == 0
     assert json.loads(capsys.readouterr().out)["result"]["metrics"]["landmarks"] == "active_map"
+    planners = ("constant:-5", "constant:0")
+    driven = ["replay", str(encodings / "winter.npy"), "--domain", "own", "--out", str(tmp_path), "--no-plots"]
+    asked = [word for planner in planners for word in ("--planner", planner)]
+    assert run([*driven, *asked, "--episodes", "2", "--steps", "2"]) == 0
+    steps = [json.loads(line) for line in (tmp_path / "steps.jsonl").read_text().splitlines()]
+    moved = {planner: [step["action_m"] for step in steps if step["planner"] == planner] for planner in planners}
+    assert moved == {"constant:-5": 2 * [0, -5, -5], "constant:0": 6 * [0]}
+    assert max(step["travelled_m"] for step in steps) == 10
+    assert all(step["error_m"] < 1 for step in steps if step["step"] == 2)
 
 
 def test_places_on_the_command_line(client, encodings, tmp_path, capsys):
