@@ -109,12 +109,13 @@ def test_images_are_found_where_they_were_taken(deepsimbad, pictures, tmp_path):
     for answer, place in zip(answers, (7, 21), strict=True):
         assert set(answer) >= {"image", "map_version", "timings_ms", "belief", "retrieval", "next_best_view"}
         assert answer["retrieval"][0]["map_image"] == place
+        assert answer["retrieval"][0]["frame"] == answer["belief"]["top"][0]["frame"] == f"{place}.png"
         assert answer["belief"]["mode_m"] == 3.0 * place
         assert answer["next_best_view"]["planner"] == "informed"
         assert answer["next_best_view"]["action_m"] in range(1, 11)
     table = deepsimbad("localize", "route", *views)
     assert table.code == 0
-    assert "21.0 m" in table.out
+    assert re.search(r"/7\.png +│ 7\.png +│ 21\.0 m", table.out), table.out
     assert "63.0 m" in table.out
 
 

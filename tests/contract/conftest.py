@@ -105,7 +105,7 @@ class Caller(httpx2.Client):
         assert answer.status_code == 202, answer.text
         return self.wait_for(answer.json()["job_id"])
 
-    def upload(self, domain, name, encodings, position_m, **more):
+    def upload(self, domain, name, encodings, position_m, /, **more):
         base = f"/v1/admin/domains/{domain}/traverses"
         assert self.post(base, json={"name": name}).status_code == 201
         batch = npz(encodings=encodings, index=np.arange(len(encodings)), position_m=position_m, **more)
@@ -117,7 +117,9 @@ class Caller(httpx2.Client):
         frames = f"/v1/admin/domains/{domain}/traverses/{name}/frames"
         self.post(f"/v1/admin/domains/{domain}/traverses", json={"name": name})
         return [
-            self.put(f"{frames}/{n}?position_m={n}", content=encoded(picture(n)), headers=JPEG).status_code
+            self.put(
+                f"{frames}/{n}?position_m={n}&name=Stra%C3%9Fe%20{n}.png", content=encoded(picture(n)), headers=JPEG
+            ).status_code
             for n in range(N_SEEN)
         ]
 
@@ -125,7 +127,8 @@ class Caller(httpx2.Client):
         assert self.put(f"/v1/admin/domains/{name}", json={**TAKES_ENCODINGS, **domain}).status_code == 201
         n = np.arange(N_READY)
         x_m = np.where(n == 3, np.nan, 2.0 * n)
-        self.upload(name, "drive", ready_encodings(), 2.0 * n, timestamp_us=n, x_m=x_m, y_m=-1.0 * n)
+        names = np.array(["" if image == 3 else f"{image}.png" for image in n])
+        self.upload(name, "drive", ready_encodings(), 2.0 * n, timestamp_us=n, x_m=x_m, y_m=-1.0 * n, name=names)
         job = self.remap(name, landmark_traverse="drive", n_landmarks=N_LANDMARKS, list_length=4)
         assert job["state"] == "succeeded", job
 

@@ -49,8 +49,8 @@ def test_the_answer_has_every_member_of_the_contract(client):
     assert any(low <= belief["mode_m"] <= high for low, high in pieces)
     assert len(belief["histogram"]["edges_m"]) == len(belief["histogram"]["mass"]) + 1 <= 201
     assert sum(belief["histogram"]["mass"]) == pytest.approx(1)
-    assert set(belief["top"][0]) == {"map_image", "route_position_m", "x_m", "y_m", "mass"}
-    assert set(answer["retrieval"][0]) == {"map_image", "route_position_m", "relevance"}
+    assert set(belief["top"][0]) == {"map_image", "frame", "route_position_m", "x_m", "y_m", "mass"}
+    assert set(answer["retrieval"][0]) == {"map_image", "frame", "route_position_m", "relevance"}
     relevance = [place["relevance"] for place in answer["retrieval"]]
     assert relevance == sorted(relevance, reverse=True)
 
@@ -65,6 +65,7 @@ def test_a_map_frames_own_encoding_is_found_again_and_unknown_coordinates_are_nu
     top = {place["map_image"]: place for place in localized(client, shortlist=N_READY)["belief"]["top"]}
     assert len(top) == N_READY
     assert (top[3]["x_m"], top[4]["x_m"], top[4]["y_m"]) == (None, 8.0, -4.0)
+    assert (top[3]["frame"], top[4]["frame"], best["frame"]) == (None, "4.png", f"{best['map_image']}.png")
 
 
 @pytest.mark.parametrize("kind", ["jpeg", "png", "tiff", "webp"])
@@ -73,6 +74,7 @@ def test_images_of_all_types_are_found_again(client, kind):
     answer = client.post("/v1/domains/seen/localizations", **sent)
     assert answer.status_code == 200, answer.text
     assert answer.json()["retrieval"][0]["map_image"] == 7
+    assert answer.json()["belief"]["top"][0]["frame"] == "Straße 7.png"
 
 
 def test_dissimilarities_by_the_served_landmark_model_are_answered_as_the_encoding_is(client):

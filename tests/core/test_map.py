@@ -19,7 +19,9 @@ def whole(**changes):
     arrays = {
         name: rng.random([lengths.get(axis, axis) for axis in row.axes]).astype(row.dtype)
         for name, row in ARRAYS.items()
+        if row.dtype.kind != "U"
     }
+    arrays |= {"frame_name": np.array([f"{i:0{i}}.png" for i in range(N)]), "frame_drive": np.array(["a", "bc"] * 4)}
     arrays["lists"] = rng.integers(0, R, (H, N)).astype(np.uint16)
     arrays["position_m"] = np.arange(float(N))
     config = {"relevance": "composed", "n_landmarks": R, "seed": 3}
@@ -107,12 +109,15 @@ def test_a_part_of_its_images_and_those_put_together_again():
 
 
 def test_of_added_images_what_only_the_others_know_is_unknown():
-    map_ = replace(whole(), x_m=None, y_m=None)
+    map_ = replace(whole(), x_m=None, y_m=None, frame_name=None, frame_drive=None)
+    names = np.array([f"{i}.png" for i in range(N)])
     required = {name: map_.arrays()[name] for name, row in ARRAYS.items() if "n" in row.axes and row.unknown is None}
-    longer = map_.with_images({**required, "x_m": np.arange(float(N))})
+    longer = map_.with_images({**required, "x_m": np.arange(float(N)), "frame_name": names})
     assert longer.n_images == 2 * N
     assert np.isnan(longer.x_m[::2]).all(), "at one position the old come first"
     assert longer.x_m[1::2].tolist() == list(range(N))
     assert (longer.timestamp_us[1::2] == -1).all()
     assert (longer.frame_digest[1::2] == 0).all()
     assert longer.y_m is None
+    assert longer.frames.tolist() == [name for i in range(N) for name in (None, f"{i}.png")]
+    assert longer.frame_drive is None

@@ -43,6 +43,7 @@ def drive(catalog: Catalog) -> Callable[..., np.ndarray]:
             timestamp_us=known.get("timestamp_us", np.full(n, UNKNOWN_TIMESTAMP)),
             x_m=known.get("x_m", np.full(n, np.nan)),
             y_m=known.get("y_m", np.full(n, np.nan)),
+            frame_name=np.array([f"{name}{i}.png" for i in range(n)], np.str_),
             encodings=encodings,
         )
         with Traverse.create(catalog.data_dir, DOMAIN, name) as traverse:

@@ -183,6 +183,9 @@ def test_a_map_knows_the_frames_it_is_made_of(first, run, catalog):
     is_old = np.isin(after.position_m, np.arange(40.0))
     assert after.frame_digest[is_old].tolist() == digests(old)
     assert after.frame_digest[~is_old].tolist() == digests(new)
+    assert after.frame_name[is_old].tolist() == [f"drive{i}.png" for i in range(40)]
+    assert after.frame_name[~is_old].tolist() == [f"more{i}.png" for i in range(15)]
+    assert (after.frame_drive == np.where(is_old, "drive", "more")).all()
 
 
 def test_digests_stay_as_they_are():

@@ -281,9 +281,9 @@ def place_table(answers: Sequence[tuple[str, Localization]]) -> Table:
     def row(name: str, answer: Localization) -> tuple[str, ...]:
         top, (low, high) = answer.belief.top[0], answer.belief.credible_95_m
         plane = (_shown(top.x_m, ".1f"), _shown(top.y_m, ".1f")) if knows_plane else ()
-        return name, f"{answer.belief.mode_m:.1f}", f"{low:.1f} .. {high:.1f}", *plane
+        return name, top.frame or "-", f"{answer.belief.mode_m:.1f}", f"{low:.1f} .. {high:.1f}", *plane
 
-    headings = "image*~, likeliest [m]>!, 95 % within [m]>!" + (", x [m]>!, y [m]>!" if knows_plane else "")
+    headings = "image*~, most like~, likeliest [m]>!, 95 % within [m]>!" + (", x [m]>!, y [m]>!" if knows_plane else "")
     return _table("places", headings, (row(*answer) for answer in answers))
 
 

@@ -36,6 +36,8 @@ Image = bytes | bytearray | memoryview | str | PathLike[str]  # an encoded image
 Numbers = Iterable[Any]  # any sequence of numbers, numpy arrays among them
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
+MAX_NAME_LENGTH = 255  # of a frame
+_NO_CHARACTER = re.compile(r"[\x00-\x1f\x7f-\x9f\ud800-\udfff]")
 REQUEST_ID = "X-Request-ID"
 BINARY = {"Accept": "application/octet-stream"}
 RETRIED_STATUSES = frozenset({408, 429, 502, 503, 504})
@@ -173,6 +175,11 @@ def image_bytes(image: Image) -> bytes:
         return Path(image).read_bytes()
     except OSError as error:
         raise BrokenFrameError(f"cannot read {image}: {error.strerror or error}") from error
+
+
+def text_of(name: str) -> str:
+    """A frame's name as the service takes it: what is no character, or controls a terminal, becomes U+FFFD."""
+    return _NO_CHARACTER.sub("\ufffd", name)[:MAX_NAME_LENGTH]
 
 
 def known_positions(true_positions_m: Numbers) -> list[float | None]:

@@ -30,6 +30,7 @@ from deepsimbad_client.http import (
     once,
     require_numpy,
     session_path,
+    text_of,
 )
 from deepsimbad_client.http.download import MapFile, OnBytes, download
 from deepsimbad_client.http.models import Domain, FramesStored, FrameStored, Job, ListedSession, MapVersion, Traverse
@@ -122,15 +123,18 @@ class AdminCalls(Face):
         timestamp_us: int | None = None,
         x_m: float | None = None,
         y_m: float | None = None,
+        name: str | None = None,
         content_type: str | None = None,
         encoding: Numbers | None = None,
     ) -> FrameStored:
         """Send one frame, an image as `Client.localize` takes it or a ready encoding; the same index again replaces it.
 
-        `index` is its place in the recording, from 0; `position_m` its distance along the route.
+        `index` is its place in the recording, from 0; `position_m` its distance along the route. Answers show
+        the `name`, as of its file.
         """
         view = observation(image, content_type=content_type, encoding=encoding)
-        place = {"position_m": position_m, "timestamp_us": timestamp_us, "x_m": x_m, "y_m": y_m}
+        place: dict[str, float | str | None] = {"position_m": position_m, "timestamp_us": timestamp_us}
+        place |= {"x_m": x_m, "y_m": y_m, "name": None if name is None else text_of(name)}
         call = Call("PUT", f"{_traverse(domain, traverse)}/frames/{int(index)}", place, view.headers, view.body)
         return model_of(FrameStored, await self._wire.send(call))
 
@@ -146,16 +150,20 @@ class AdminCalls(Face):
         timestamp_us: "ArrayLike | None" = None,
         x_m: "ArrayLike | None" = None,
         y_m: "ArrayLike | None" = None,
+        name: Sequence[str] | None = None,
     ) -> FramesStored:
         """Send a batch of frames whose encodings [n, d] are known (needs numpy); the same indices again replace them.
 
-        Everything else is [n]; unknown times are -1, unknown places NaN. `x_m` and `y_m` are sent together or not.
+        Everything else is [n]; unknown times are -1, unknown places NaN, unknown names "". `x_m` and `y_m` are sent
+        together or not.
         """
         np = require_numpy()
         columns: dict[str, tuple[Any, Any]] = {"encodings": (encodings, np.float32), "index": (index, np.int64)}
         columns |= {"position_m": (position_m, np.float64), "timestamp_us": (timestamp_us, np.int64)}
         if x_m is not None and y_m is not None:
             columns |= {"x_m": (x_m, np.float64), "y_m": (y_m, np.float64)}
+        if name is not None:
+            columns["name"] = ([text_of(text) for text in name], np.str_)
         packed = BytesIO()
         np.savez(packed, **{name: np.asarray(*column) for name, column in columns.items() if column[0] is not None})
         headers = {"Content-Type": "application/octet-stream"}

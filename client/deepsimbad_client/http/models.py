@@ -71,6 +71,7 @@ class Place(Answer):
     """A map image the belief favours."""
 
     map_image: int
+    frame: str | None = None  # what the map image is called in its recording
     route_position_m: float
     x_m: float | None = None
     y_m: float | None = None
@@ -96,6 +97,7 @@ class Retrieved(Answer):
     """A map image and how well it answers the query; larger is better."""
 
     map_image: int
+    frame: str | None = None  # as in `Place`
     route_position_m: float
     relevance: float
 

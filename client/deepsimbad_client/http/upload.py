@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import partial
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from deepsimbad_client.errors import (
     BrokenFrameError,
@@ -169,6 +169,7 @@ def _send_image(
             timestamp_us=frame.timestamp_us,
             x_m=frame.x_m,
             y_m=frame.y_m,
+            name=frame.name,
         )
     except BrokenFrameError as error:
         return error.reason
@@ -179,10 +180,11 @@ def _send_image(
     return len(image.body)
 
 
-def _columns(frames: Sequence[Frame]) -> dict[str, list[float]]:
+def _columns(frames: Sequence[Frame]) -> dict[str, Any]:
     """What is known of frames, as a batch tells it; one of which something is unknown has -1 or NaN for it."""
-    columns: dict[str, list[float]] = {
+    columns: dict[str, Any] = {
         "index": [frame.index for frame in frames],
+        "name": [frame.name for frame in frames],
         "position_m": [frame.position_m for frame in frames],
     }
     if any(frame.timestamp_us is not None for frame in frames):

@@ -45,3 +45,9 @@ def m002_weights(db: Database) -> None:
 def m003_without_checksums(db: Database) -> None:
     """SQLite is trusted with rows."""
     db.execute("ALTER TABLE encoding DROP COLUMN checksum")
+
+
+@migrations()
+def m004_frame_names(db: Database) -> None:
+    """What a frame is called in its recording."""
+    db.execute("ALTER TABLE frame ADD COLUMN name TEXT")

@@ -25,8 +25,8 @@ from deepsimbad.api.requests import (
     parse_json,
     read_bytes,
 )
+from deepsimbad.core.map import Map
 from deepsimbad.core.planners import Plan
-from deepsimbad.core.route import Route
 from deepsimbad.core.summary import DEFAULT_CONFIDENCE, BeliefSummary
 from deepsimbad.engine.localizer import (
     Dissimilarities,
@@ -96,6 +96,9 @@ Shortlist = Annotated[
 # Answers: plain dictionaries, because there are some forty in one of them, made for every view
 
 
+FrameName = Annotated[str | None, Field(description="What the map image is called in its recording.")]
+
+
 class HistogramAnswer(TypedDict):
     """The belief in equal bins along the whole route, at most 200 of them whatever the number of map images."""
 
@@ -107,6 +110,7 @@ class PlaceAnswer(TypedDict):
     """A map image that the belief favours."""
 
     map_image: int
+    frame: FrameName
     route_position_m: float
     x_m: float | None
     y_m: float | None
@@ -135,6 +139,7 @@ class RetrievedAnswer(TypedDict):
     """A map image and how well it answers the view."""
 
     map_image: int
+    frame: FrameName
     route_position_m: float
     relevance: Annotated[float, Field(description="Larger is better.")]
 
@@ -182,22 +187,21 @@ def render_localization(localization: Localization, watch: Stopwatch) -> Localiz
     snapshot, relevance = localization.snapshot, localization.relevance
     return {
         "map_version": snapshot.version,
-        "belief": render_belief(
-            snapshot.route, localization.belief, localization.belief.near_mode >= DEFAULT_CONFIDENCE
-        ),
+        "belief": render_belief(snapshot, localization.belief, localization.belief.near_mode >= DEFAULT_CONFIDENCE),
         "informative": localization.is_informative,
         "warnings": warnings_of(localization.is_informative, localization.belief),
-        "retrieval": render_shortlist(snapshot.route, localization.shortlist, relevance),
+        "retrieval": render_shortlist(snapshot, localization.shortlist, relevance),
         "next_best_view": render_plan(localization.plan, snapshot.actions_m),
         "timings_ms": watch.timings_ms(),
     }
 
 
-def render_shortlist(route: Route, ids: NDArray[np.int64], relevance: NDArray[np.float32]) -> list[RetrievedAnswer]:
-    """Map images with their places and relevances."""
+def render_shortlist(snapshot: Map, ids: NDArray[np.int64], relevance: NDArray[np.float32]) -> list[RetrievedAnswer]:
+    """Map images with their frames, places and relevances."""
     rows: list[RetrievedAnswer] = []
-    for image, at_m, worth in zip(ids.tolist(), route.position_m[ids].tolist(), relevance[ids].tolist(), strict=True):
-        rows.append({"map_image": image, "route_position_m": at_m, "relevance": worth})
+    columns = (ids, snapshot.frames[ids], snapshot.route.position_m[ids], relevance[ids])
+    for image, frame, at_m, worth in zip(*map(np.ndarray.tolist, columns), strict=True):
+        rows.append({"map_image": image, "frame": frame, "route_position_m": at_m, "relevance": worth})
     return rows
 
 
@@ -221,18 +225,18 @@ def warnings_of(is_informative: bool, belief: BeliefSummary) -> list[str]:
     return warnings
 
 
-def render_belief(route: Route, belief: BeliefSummary, is_confident: bool) -> BeliefAnswer:
+def render_belief(snapshot: Map, belief: BeliefSummary, is_confident: bool) -> BeliefAnswer:
     """A belief, with the coordinates of its likeliest places."""
-    ids, top = belief.top, list[PlaceAnswer]()
-    coordinates: list[list[float | None]] = []
+    route, ids, top = snapshot.route, belief.top, list[PlaceAnswer]()
+    coordinates = []
     for metres in (route.x_m, route.y_m):
         values = np.full(ids.size, np.nan) if metres is None else metres[ids]
         shown = values.astype(object)
         shown[~np.isfinite(values)] = None
-        coordinates.append(shown.tolist())
-    positions, masses = route.position_m[ids].tolist(), belief.top_mass.tolist()
-    for image, at_m, x, y, mass in zip(ids.tolist(), positions, *coordinates, masses, strict=True):
-        top.append({"map_image": image, "route_position_m": at_m, "x_m": x, "y_m": y, "mass": mass})
+        coordinates.append(shown)
+    columns = (ids, snapshot.frames[ids], route.position_m[ids], *coordinates, belief.top_mass)
+    for image, frame, at_m, x, y, mass in zip(*map(np.ndarray.tolist, columns), strict=True):
+        top.append({"map_image": image, "frame": frame, "route_position_m": at_m, "x_m": x, "y_m": y, "mass": mass})
     return {
         "mean_m": belief.mean_m,
         "mode_m": belief.mode_m,

@@ -205,14 +205,14 @@ def render_session(view: SessionView) -> SessionAnswer:
         "map_version": snapshot.version,
         "n_observations": view.n_observations,
         "expires_at": _iso(view.expires_at),
-        "belief": render_belief(snapshot.route, view.belief, view.is_confident),
+        "belief": render_belief(snapshot, view.belief, view.is_confident),
         "next_best_view": render_plan(view.plan, snapshot.actions_m),
     }
 
 
 def render_observation(view: SessionView, watch: Stopwatch) -> ObservationAnswer:
     """A session after an observation; the watch runs since the request arrived."""
-    retrieval = [] if view.relevance is None else render_shortlist(view.snapshot.route, view.shortlist, view.relevance)
+    retrieval = [] if view.relevance is None else render_shortlist(view.snapshot, view.shortlist, view.relevance)
     return {
         **render_session(view),
         "informative": view.is_informative,
@@ -337,9 +337,7 @@ async def get_belief(
     if prefers_binary(request):
         return npy_response(await running.sessions.mass(session_id, robot_of(request)))
     view = await running.sessions.view(session_id, shortlist, robot_of(request))
-    _, body = await running.written(
-        view.belief.top.size, render_belief, view.snapshot.route, view.belief, view.is_confident
-    )
+    _, body = await running.written(view.belief.top.size, render_belief, view.snapshot, view.belief, view.is_confident)
     return Response(body, media_type=JSON)
 
 

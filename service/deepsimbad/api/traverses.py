@@ -36,7 +36,7 @@ from deepsimbad.api.requests import (
     read_bytes,
     read_json,
 )
-from deepsimbad.core.drive import MAX_POSITION_M, UNKNOWN_TIMESTAMP, Drive
+from deepsimbad.core.drive import FRAME_NAME, MAX_NAME_LENGTH, MAX_POSITION_M, UNKNOWN_TIMESTAMP, Drive
 from deepsimbad.engine.localizer import ready_encodings
 from deepsimbad.engine.worker import EncodedImage, Priority
 from deepsimbad.errors import (
@@ -218,6 +218,10 @@ async def put_frame(
     ] = None,
     x_m: Annotated[float | None, _metres("East, in metres.")] = None,
     y_m: Annotated[float | None, _metres("North, in metres.")] = None,
+    frame_name: Annotated[
+        str | None,
+        Query(alias="name", pattern=f"^{FRAME_NAME}$", description="As answers show it; the file's, in a recording."),
+    ] = None,
 ) -> FrameAnswer:
     """Store one frame, in any order; the same index again replaces it.
 
@@ -240,7 +244,9 @@ async def put_frame(
 
     def store() -> tuple[bool, int]:
         with running.open_traverses.lend(domain, name) as traverse:
-            created = traverse.put_frame(index, encoding, position_m, timestamp_us, x_m, y_m, weights_sha256)
+            created = traverse.put_frame(
+                *(index, encoding, position_m, timestamp_us, x_m, y_m, weights_sha256, frame_name)
+            )
             return created, traverse.n_frames
 
     created, n_frames = await run_sync(store)
@@ -257,7 +263,8 @@ async def put_frame(
                 "type": "string",
                 "format": "binary",
                 "description": "npz (numpy.savez) of `encodings` [n, d] float, `index` [n] integer, `position_m` [n], "
-                "and where known `timestamp_us` [n] integer (-1: unknown), `x_m` and `y_m` [n] (NaN: unknown).",
+                "and where known `timestamp_us` [n] integer (-1: unknown), `x_m` and `y_m` [n] (NaN: unknown), "
+                "`name` [n] text (empty: unknown).",
             }
         }
     ),
@@ -298,10 +305,11 @@ def _check_traverse(running: Services, domain: str, name: str) -> None:
 
 # A batch is read with distrust: what it declares is judged before anything is unpacked.
 
-MEMBERS = {"encodings": 2, "index": 1, "position_m": 1, "timestamp_us": 1, "x_m": 1, "y_m": 1}
+MEMBERS = {"encodings": 2, "index": 1, "position_m": 1, "timestamp_us": 1, "x_m": 1, "y_m": 1, "name": 1}
 """Arrays that a batch may hold, and how many dimensions each has."""
 REQUIRED = ("encodings", "index", "position_m")
-_KINDS = {"encodings": "f", "position_m": "fiu", "x_m": "fiu", "y_m": "fiu"}  # numpy's letters; of the others "iu"
+_KINDS = {"encodings": "f", "position_m": "fiu", "x_m": "fiu", "y_m": "fiu", "name": "U"}  # numpy's; else "iu"
+_KIND_WORDS = {"f": "floats", "U": "texts"}
 _END_OF_DIRECTORY, _LARGE_DIRECTORY = b"PK\x05\x06", b"PK\x06\x07"
 _MAX_HEADER_BYTES = 4096
 
@@ -335,6 +343,7 @@ def read_batch(file: IO[bytes], max_bytes: int) -> Drive:
         timestamp_us=arrays.get("timestamp_us", np.full(n_frames, UNKNOWN_TIMESTAMP)),
         x_m=arrays.get("x_m", unknown),
         y_m=arrays.get("y_m", unknown),
+        frame_name=arrays.get("name", np.full(n_frames, "")),
         encodings=arrays["encodings"],
     )
 
@@ -383,8 +392,8 @@ def _check_header(name: str, stream: IO[bytes], n_bytes: int) -> None:
     read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     shape, _, dtype = read(stream, max_header_size=_MAX_HEADER_BYTES)
     kinds = _KINDS.get(name, "iu")
-    if dtype.kind not in kinds or dtype.itemsize > 8:
-        raise InvalidBatchError(f"{name} holds {dtype}; it must hold {'floats' if 'f' in kinds else 'integers'}")
+    if dtype.kind not in kinds or dtype.itemsize > (4 * MAX_NAME_LENGTH if dtype.kind == "U" else 8):
+        raise InvalidBatchError(f"{name} holds {dtype}; it must hold {_KIND_WORDS.get(kinds[0], 'integers')}")
     if len(shape) != MEMBERS[name]:
         raise InvalidBatchError(f"{name} has shape {list(shape)}; it must have {MEMBERS[name]} dimensions")
     if stream.tell() + math.prod(shape) * dtype.itemsize != n_bytes:

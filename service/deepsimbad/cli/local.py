@@ -180,12 +180,13 @@ def localize(domain: str, images: tuple[Path, ...], as_json: bool) -> None:
     if as_json:
         write_json([{"image": str(path), **answer} for path, answer in zip(images, answers, strict=True)])
         return
-    table = Table("image", "most likely at", "mean +- std", "95 % within", "entropy")
+    table = Table("image", "most like", "most likely at", "mean +- std", "95 % within", "entropy")
     for path, answer in zip(images, answers, strict=True):
         belief = answer["belief"]
         mean, (low, high) = f"{belief['mean_m']:.1f} +- {belief['std_m']:.1f} m", belief["credible_95_m"]
         within = f"{low:.1f} .. {high:.1f} m"
-        table.add_row(str(path), f"{belief['mode_m']:.1f} m", mean, within, f"{belief['entropy_bits']:.1f} bit")
+        frame = belief["top"][0]["frame"] or f"image {belief['top'][0]['map_image']}"
+        table.add_row(str(path), frame, f"{belief['mode_m']:.1f} m", mean, within, f"{belief['entropy_bits']:.1f} bit")
     print_table(table)
 
 

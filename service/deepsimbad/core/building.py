@@ -23,7 +23,7 @@ from deepsimbad.core.composed import (
     within_place_whitening,
 )
 from deepsimbad.core.descriptor import LandmarkStatistics, common_factors, nearest_landmarks, rank_landmarks
-from deepsimbad.core.drive import UNKNOWN_TIMESTAMP, Drive, SameRoute, SecondSeason, second_season
+from deepsimbad.core.drive import Drive, SameRoute, SecondSeason, second_season
 from deepsimbad.core.landmark_model import farthest_first
 from deepsimbad.core.map import Map
 from deepsimbad.core.nnql import NnqlConfig
@@ -362,8 +362,7 @@ def append_drive(map_: Map, drive: Drive) -> Map:
             "values": None if map_.values is None else _listed(dissimilarities, lists),
             "encodings": None if map_.encodings is None else drive.encodings,
             "view_bits": bits,
-            "timestamp_us": drive.timestamp_us if (drive.timestamp_us != UNKNOWN_TIMESTAMP).any() else None,
-            "frame_digest": drive.digests(),
+            **drive.origins(),
             "x_m": route.x_m,
             "y_m": route.y_m,
             "q_values": q_values,

@@ -17,6 +17,7 @@ than chance allows, a little. So agreement must also be worth learning from.
 """
 
 import hashlib
+import re
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from statistics import NormalDist
@@ -33,6 +34,8 @@ from deepsimbad.errors import InvalidEncodingError, InvalidInputError, InvalidMa
 UNKNOWN_TIMESTAMP = -1
 MAX_FRAME_INDEX = 2**53
 MAX_POSITION_M = 1e9  # either way; 25 times round the earth, and squares and spans are far from overflow
+MAX_NAME_LENGTH = 255  # characters; file systems allow no more
+FRAME_NAME = rf"[^\x00-\x1f\x7f-\x9f]{{1,{MAX_NAME_LENGTH}}}"
 _ROWS_AT_ONCE = 1024
 _DIGEST_BYTES = 8
 
@@ -54,6 +57,7 @@ _Unknown: Any = None  # filled in by __post_init__
 class Drive:
     """Frames of one traverse, in the order they were driven."""
 
+    name: str = ""  # of the traverse; "" of a recording that is none
     # Route position, [n] float64, at most MAX_POSITION_M either way; need not increase here
     position_m: NDArray[np.float64]
     encodings: NDArray[np.float32]  # [n, d] float32, finite
@@ -61,6 +65,7 @@ class Drive:
     timestamp_us: NDArray[np.int64] = _Unknown  # [n] int64, microseconds, -1 where unknown
     x_m: NDArray[np.float64] = _Unknown  # east, [n] float64, at most MAX_POSITION_M either way, NaN where unknown
     y_m: NDArray[np.float64] = _Unknown  # north, likewise
+    frame_name: NDArray[np.str_] = _Unknown  # in the recording, as of its file, [n] str, "" where unknown
     # Of the network that encoded images among them; None where none did, or nobody knows
     weights_sha256: str | None = None
     # [n, r] float32 to a map's landmarks, smaller is nearer; None before they are measured
@@ -73,6 +78,7 @@ class Drive:
             "timestamp_us": np.full(n, UNKNOWN_TIMESTAMP, np.int64),
             "x_m": np.full(n, np.nan),
             "y_m": np.full(n, np.nan),
+            "frame_name": np.full(n, "", np.str_),
         }
         for name, array in unknown.items():
             if getattr(self, name) is None:
@@ -112,6 +118,15 @@ class Drive:
         digests = b"".join(hashlib.blake2b(row, digest_size=_DIGEST_BYTES).digest() for row in rows)
         return np.frombuffer(digests, "<u8").astype(np.uint64)
 
+    def origins(self) -> dict[str, Any]:
+        """Where every frame came from, as the named arrays of a map that is made of them."""
+        return {
+            "timestamp_us": self.timestamp_us if (self.timestamp_us != UNKNOWN_TIMESTAMP).any() else None,
+            "frame_digest": self.digests(),
+            "frame_name": self.frame_name if (self.frame_name != "").any() else None,
+            "frame_drive": np.full(self.n_frames, self.name) if self.name else None,
+        }
+
     def checked(self) -> Self:
         """The same frames with exact dtypes, fit to be stored.
 
@@ -130,10 +145,11 @@ class Drive:
             timestamp_us=_integers(self.timestamp_us, "timestamp_us"),
             x_m=_reals(self.x_m, "x_m"),
             y_m=_reals(self.y_m, "y_m"),
+            frame_name=_texts(self.frame_name, "frame_name"),
             encodings=encodings,
         )
         n = encodings.shape[0]
-        for name in ("index", "position_m", "timestamp_us", "x_m", "y_m"):
+        for name in ("index", "position_m", "timestamp_us", "x_m", "y_m", "frame_name"):
             shape = getattr(frames, name).shape
             if shape != (n,):
                 raise InvalidInputError(f"{name} has shape {shape}; there are {n} encodings")
@@ -177,6 +193,17 @@ def _integers(values: NDArray[np.int64], name: str) -> NDArray[np.int64]:
     if array.dtype.kind not in "iu" and array.size:
         raise InvalidInputError(f"{name} holds {array.dtype}, not whole numbers")
     return array.astype(np.int64, copy=False)
+
+
+def _texts(values: NDArray[np.str_], name: str) -> NDArray[np.str_]:
+    array = np.ascontiguousarray(values)
+    if array.dtype.kind != "U":
+        raise InvalidInputError(f"{name} holds {array.dtype}, not texts")
+    codes = array.reshape(-1).view(np.uint32) if array.nbytes else np.empty(0, np.uint32)
+    is_text = not ((codes >= 0x110000) | ((codes >= 0xD800) & (codes < 0xE000))).any()
+    if not is_text or not all(text == "" or re.fullmatch(FRAME_NAME, text) for text in array.reshape(-1).tolist()):
+        raise InvalidInputError(f"a {name} is at most {MAX_NAME_LENGTH} characters, none of them a control character")
+    return array
 
 
 def _reals(values: NDArray[np.float64], name: str) -> NDArray[np.float64]:

@@ -42,7 +42,7 @@ _NEEDS: dict[str | None, tuple[str, ...]] = {
 }
 
 
-def _row(dtype: type[np.generic], *axes: str | int, unknown: float | None = None) -> dict[str, Any]:
+def _row(dtype: type[np.generic], *axes: str | int, unknown: float | str | None = None) -> dict[str, Any]:
     """One row of the table of named arrays.
 
     Args:
@@ -80,6 +80,8 @@ class Map:
         timestamp_us: Microseconds since 1970, -1 where unknown.
         frame_digest: Which frame every image was made of (`Drive.digests`), 0 where nobody noted it.
         x_m, y_m: East and north, NaN where unknown.
+        frame_name: What the frame of every image is called in its recording, "" where unknown.
+        frame_drive: And the drive that it is of.
         q_values: The experience database.
     """
 
@@ -109,6 +111,8 @@ class Map:
     frame_digest: NDArray[np.uint64] | None = field(default=None, metadata=_row(np.uint64, "n", unknown=UNKNOWN_FRAME))
     x_m: NDArray[np.float64] | None = field(default=None, metadata=_row(np.float64, "n", unknown=np.nan))
     y_m: NDArray[np.float64] | None = field(default=None, metadata=_row(np.float64, "n", unknown=np.nan))
+    frame_name: NDArray[np.str_] | None = field(default=None, metadata=_row(np.str_, "n", unknown=""))
+    frame_drive: NDArray[np.str_] | None = field(default=None, metadata=_row(np.str_, "n", unknown=""))
     q_values: NDArray[np.float32] | None = field(default=None, metadata=_row(np.float32, "n", "a"))
 
     def __post_init__(self) -> None:
@@ -138,7 +142,7 @@ class Map:
             fits = len(shape) == array.ndim and all(
                 want in {"*", length} for want, length in zip(shape, array.shape, strict=True)
             )
-            if array.dtype != row.dtype or not fits:
+            if not fits or (array.dtype != row.dtype and not array.dtype.kind == row.dtype.kind == "U"):
                 raise InvalidMapConfigError(f"{name} is {array.dtype} {array.shape}, not {row.dtype} {list(shape)}")
         if self.list_length > self.n_landmarks or self.lists.max() >= self.n_landmarks:  # scoring does not ask again
             raise InvalidMapConfigError(
@@ -279,6 +283,15 @@ class Map:
         return Route(self.position_m, self.closed, self.x_m, self.y_m)
 
     @cached_property
+    def frames(self) -> NDArray[np.object_]:
+        """[n] what the frame of every image is called, None where unknown."""
+        named = np.full(self.n_images, None, object)
+        if self.frame_name is not None:
+            named[self.frame_name != ""] = self.frame_name[self.frame_name != ""]
+        named.setflags(write=False)
+        return named
+
+    @cached_property
     def live_statistics(self) -> LiveStatistics | None:
         """What is usual at the start of a session; None where the relevance asks for none."""
         if self.statistics is None:
@@ -358,7 +371,7 @@ class NamedArray:
 
     dtype: np.dtype[Any]
     axes: tuple[str | int, ...]
-    unknown: float | None
+    unknown: float | str | None
 
 
 ARRAYS = {row.name: NamedArray(**row.metadata) for row in fields(Map) if row.metadata}

@@ -25,6 +25,7 @@ from deepsimbad.errors import InvalidSourceError
 from deepsimbad.evaluators.base import Evaluator, Image, LandmarkModel
 from deepsimbad.evaluators.image import decode_image
 from deepsimbad_client.errors import BrokenFrameError
+from deepsimbad_client.http import text_of
 from deepsimbad_client.recordings import Recording
 from deepsimbad_client.recordings.left_out import LeftOut
 
@@ -79,6 +80,7 @@ def encode_recording(
         timestamp_us=np.array(times_us, np.int64),
         x_m=np.array([np.nan if frame.x_m is None else frame.x_m for frame in frames], np.float64),
         y_m=np.array([np.nan if frame.y_m is None else frame.y_m for frame in frames], np.float64),
+        frame_name=np.array([text_of(frame.name) for frame in frames]),
         encodings=encodings,
         weights_sha256=weights_sha256,
     )

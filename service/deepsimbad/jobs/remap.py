@@ -16,7 +16,7 @@ import numpy as np
 from deepsimbad.core.building import MapPlan, append_drive
 from deepsimbad.core.composed import is_composed
 from deepsimbad.core.descriptor import MAX_LANDMARKS
-from deepsimbad.core.drive import UNKNOWN_TIMESTAMP, Drive
+from deepsimbad.core.drive import Drive
 from deepsimbad.core.map import Map
 from deepsimbad.core.nnql import NnqlConfig
 from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Relevance
@@ -364,8 +364,7 @@ class _Remap:
             domain=domain.name,
             evaluator=domain.evaluator,
             config={**asked, **built.map.config},
-            timestamp_us=training.timestamp_us if (training.timestamp_us != UNKNOWN_TIMESTAMP).any() else None,
-            frame_digest=training.digests(),
+            **training.origins(),
             q_values=q_values,
         )
         second_season = None if built.same_route is None else built.same_route.as_dict()

@@ -15,6 +15,7 @@ from deepsimbad.store.records import from_json, to_json
 
 PART_BYTES = 16 * 2**20  # far below SQLite's limit for a value, and all that is held beside the array itself
 _CODES = np.dtype("<u2")
+_TEXT_BYTES = 4 * 256  # most that one text takes
 
 
 class Checksum:
@@ -124,3 +125,24 @@ def load_packed(db: Database, table: str, checksum: Checksum) -> dict[str, NDArr
         raise ValueError(f"{table} holds what no release wrote")
     codes = np.frombuffer(planes, np.uint8).reshape(_CODES.itemsize, -1)[::-1].T.copy().view(_CODES).reshape(shape)
     return {row["name"]: (lowest + step * codes).astype(np.float32)}
+
+
+def pack_texts(texts: NDArray[np.str_]) -> NDArray[np.uint8]:
+    """Texts [n] without line breaks as bytes, which an older release keeps without understanding them."""
+    return np.frombuffer(zlib.compress("\n".join(texts.tolist()).encode(), 6), np.uint8).copy()
+
+
+def unpack_texts(packed: NDArray[np.uint8], n_texts: int) -> NDArray[np.str_]:
+    """Back from `pack_texts`.
+
+    Raises:
+        ValueError: They are not so many texts.
+    """
+    try:
+        body = zlib.decompressobj().decompress(packed.tobytes(), n_texts * _TEXT_BYTES)
+    except zlib.error as error:
+        raise ValueError(f"texts are damaged: {error}") from error
+    texts = body.decode().split("\n")
+    if len(texts) != n_texts:
+        raise ValueError(f"{len(texts)} texts of {n_texts}")
+    return np.array(texts)

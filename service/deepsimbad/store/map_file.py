@@ -23,7 +23,15 @@ from deepsimbad.errors import (
     NoActiveMapError,
     UnknownMapVersionError,
 )
-from deepsimbad.store.arrays import Checksum, load_arrays, load_packed, save_arrays, save_packed
+from deepsimbad.store.arrays import (
+    Checksum,
+    load_arrays,
+    load_packed,
+    pack_texts,
+    save_arrays,
+    save_packed,
+    unpack_texts,
+)
 from deepsimbad.store.catalog import Catalog, removed
 from deepsimbad.store.connection import check_integrity, in_todays_schema, open_database
 from deepsimbad.store.durable import remove_database, sha256_of, storage_faults, sync, written_aside
@@ -46,8 +54,9 @@ _TABLE_OF = {
     "values": "listed_dissimilarity",
     "encodings": "map_image_encoding",
     "q_values": _PACKED_TABLE,
-    **dict.fromkeys(("position_m", "timestamp_us", "x_m", "y_m", "frame_digest"), "route"),
+    **dict.fromkeys(("position_m", "timestamp_us", "x_m", "y_m", "frame_digest", "frame_name", "frame_drive"), "route"),
 }
+_TEXTS = frozenset({"frame_name", "frame_drive"})
 _TABLES = ("calibration", "landmark_statistics", "listed_dissimilarity", "map_image_encoding", _PACKED_TABLE, "route")
 
 
@@ -92,7 +101,9 @@ def _write(
     db.conn.executemany("INSERT INTO posting (landmark, rank, image_ids) VALUES (?, ?, ?)", postings)
     on_progress(0.5)
     save_arrays(db, _MODEL_TABLE, map_.landmark_model, checksum)
-    arrays = {name: array for name, array in map_.arrays().items() if name != "lists"}
+    arrays = {
+        name: pack_texts(array) if name in _TEXTS else array for name, array in map_.arrays().items() if name != "lists"
+    }
     for table in _TABLES:
         of_table = {name: array for name, array in arrays.items() if _TABLE_OF.get(name, "calibration") == table}
         (save_packed if table == _PACKED_TABLE else save_arrays)(db, table, of_table, checksum)
@@ -134,6 +145,7 @@ def _read(db: Database, path: Path) -> Map:
         arrays |= (load_packed if table == _PACKED_TABLE else load_arrays)(db, table, checksum)
     if checksum.value != stored["checksum"]:
         raise DamagedMapError(f"{path.name} is damaged: it does not match its checksum", file=path.name)
+    arrays |= {name: unpack_texts(arrays[name], stored["n_map_images"]) for name in _TEXTS & arrays.keys()}
     arrays["lists"] = unpack_index(postings, stored["list_length"], stored["n_map_images"])
     document = {name: from_json(stored[name]) if name in _AS_JSON else stored[name] for name in _DESCRIPTION}
     return Map.from_arrays(document, model, arrays, _bytes_by_table(db)["posting"])

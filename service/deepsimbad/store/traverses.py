@@ -115,6 +115,7 @@ class Traverse(OpenFile):
         x_m: float | None = None,
         y_m: float | None = None,
         weights_sha256: str | None = None,
+        name: str | None = None,
     ) -> bool:
         """As `put_frames` with one frame, of which None is unknown; answers whether it is new."""
         frames = Drive(
@@ -123,6 +124,7 @@ class Traverse(OpenFile):
             timestamp_us=np.array([UNKNOWN_TIMESTAMP if timestamp_us is None else timestamp_us]),
             x_m=np.array([np.nan if x_m is None else x_m], np.float64),
             y_m=np.array([np.nan if y_m is None else y_m], np.float64),
+            frame_name=np.array([name or ""]),
             encodings=np.asarray(encoding, np.float32)[np.newaxis],
             weights_sha256=weights_sha256,
         )
@@ -156,13 +158,14 @@ class Traverse(OpenFile):
                 "UPDATE traverse SET encoding_dim = ?, weights_sha256 = coalesce(?, weights_sha256)",
                 [dim, frames.weights_sha256],
             )
-            places = (frames.index, frames.position_m, frames.timestamp_us, frames.x_m, frames.y_m)
+            places = (frames.index, frames.position_m, frames.timestamp_us, frames.x_m, frames.y_m, frames.frame_name)
             db.conn.executemany(  # NaN becomes NULL
                 """
-                INSERT INTO frame (frame_index, position_m, timestamp_us, x_m, y_m)
-                VALUES (?, ?, nullif(?, -1), ?, ?)
+                INSERT INTO frame (frame_index, position_m, timestamp_us, x_m, y_m, name)
+                VALUES (?, ?, nullif(?, -1), ?, ?, nullif(?, ''))
                 ON CONFLICT (frame_index) DO UPDATE SET position_m = excluded.position_m,
-                    timestamp_us = excluded.timestamp_us, x_m = excluded.x_m, y_m = excluded.y_m
+                    timestamp_us = excluded.timestamp_us, x_m = excluded.x_m, y_m = excluded.y_m,
+                    name = excluded.name
                 """,
                 zip(*(numbers.tolist() for numbers in places), strict=True),
             )
@@ -211,27 +214,29 @@ class Traverse(OpenFile):
             places = np.empty((n, 3))
             index, timestamp_us = np.empty(n, np.int64), np.empty(n, np.int64)
             encodings = np.empty((n, dim or 0), np.float32)
+            names: list[str] = []  # the class has a `list` of its own
             rows = db.execute(
                 """
-                SELECT frame.frame_index, coalesce(timestamp_us, ?), position_m, x_m, y_m, body
+                SELECT frame.frame_index, coalesce(timestamp_us, ?), coalesce(name, ''), position_m, x_m, y_m, body
                 FROM frame LEFT JOIN encoding ON encoding.frame_index = frame.frame_index
                 ORDER BY frame.frame_index
                 """,
                 [UNKNOWN_TIMESTAMP],
             )
-            for row, (frame_index, moment_us, *place, body) in enumerate(rows):
+            for row, (frame_index, moment_us, name, *place, body) in enumerate(rows):
                 dtype = _DTYPE_OF_BYTES.get(len(body or b"") / (dim or 1))  # a single number would be broadcast
                 if dtype is None:
                     raise DamagedFileError(
                         f"traverse {self.name} is damaged: the encoding of frame {frame_index} has another length; "
                         "delete it and upload it again"
                     )
+                names.append(name)
                 index[row], timestamp_us[row], places[row] = frame_index, moment_us, place  # None becomes NaN
                 encodings[row] = np.frombuffer(body, dtype)
         position_m, x_m, y_m = places.T.copy()
         return Drive(
-            index=index, position_m=position_m, timestamp_us=timestamp_us, x_m=x_m, y_m=y_m, encodings=encodings,
-            weights_sha256=weights_sha256,
+            name=self.name, index=index, position_m=position_m, timestamp_us=timestamp_us, x_m=x_m, y_m=y_m,
+            frame_name=np.array(names, np.str_), encodings=encodings, weights_sha256=weights_sha256,
         )  # fmt: skip
 
     def _described(self, db: Database) -> tuple[int | None, str | None]:

@@ -1,6 +1,7 @@
 """The client against the real service: nothing between them is pretended."""
 
 import json
+import re
 import threading
 
 import cv2
@@ -201,9 +202,12 @@ def test_places_on_the_command_line(client, encodings, tmp_path, capsys):
     assert run([*command, "--json", "--domain", "places", str(folder / "4.png"), f"{folder}#1:3"]) == 0
     placed = json.loads(capsys.readouterr().out)
     assert [answer["retrieval"][0]["map_image"] for answer in placed] == [4, 1, 2]
+    assert [answer["belief"]["top"][0]["frame"] for answer in placed] == ["4.png", "1.png", "2.png"]
     assert run([*command, "--json", "--domain", "route", f"{encodings / 'summer.npy'}#7:8"]) == 0
     assert json.loads(capsys.readouterr().out)[0]["retrieval"][0]["map_image"] == 7
     assert run([*command, "--domain", "places", str(folder / "4.png")]) == 0
-    assert "likeliest [m]" in capsys.readouterr().out
+    shown = capsys.readouterr().out
+    assert "likeliest [m]" in shown
+    assert re.search(r"4\.png +│ 4\.png +│ +4\.0", shown), shown
     assert run([*command, "--domain", "places", str(folder / "9.png")]) == 1
     assert "no recording" in capsys.readouterr().err
