@@ -160,8 +160,11 @@ def test_no_frame_is_left_out_of_a_map_without_a_word(deepsimbad, pictures, tmp_
     assert (ran.code, ran.err) == (0, "left out of training: 1 undecodable (1.png)\n")
     shutil.rmtree(tmp_path / "deepsimbad-data")
     positions = (drive / "positions.csv").read_text()
-    (drive / "positions.csv").write_text(positions.replace("0.png", "0.pgn"))  # 0, 10 and 20
-    lost = ("3 not in positions.csv (0.png, 10.png, 20.png)", "3 in positions.csv without an image (0.pgn, 10.pgn, 20.")
+    (drive / "positions.csv").write_text(positions.replace("0.png", "x.png"))  # 0, 10 and 20
+    lost = (
+        "3 not in positions.csv (0.png, 10.png, 20.png)",
+        "3 in positions.csv without an image (x.png, 1x.png, 2x.png)",
+    )
     named_error(deepsimbad(*command), "frames_left_out", *lost, "--allow-missing")
     assert not (tmp_path / "deepsimbad-data").exists()
     ran = deepsimbad(*command, "--allow-missing", "--verbose")

@@ -25,8 +25,9 @@ from deepsimbad_client.errors import UnknownDomainError
 from deepsimbad_client.http.client import Client
 from deepsimbad_client.http.upload import upload as upload_recording
 from deepsimbad_client.recordings import Frame, Recording
+from deepsimbad_client.recordings.encodings import ENCODING_SUFFIXES
+from deepsimbad_client.recordings.folder import FolderRecording
 from deepsimbad_client.recordings.options import accounting, opened, reading, tell_left_out
-from deepsimbad_client.recordings.sources import ENCODING_SUFFIXES, FolderRecording
 from deepsimbad_client.replay import DEFAULT_PLANNER
 from deepsimbad_client.replay.active import EPISODES, STEPS, Stage, active_replay
 from deepsimbad_client.replay.passive import TOLERANCE_M

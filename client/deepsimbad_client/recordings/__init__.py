@@ -2,7 +2,6 @@
 
 import dataclasses
 import math
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from io import BytesIO
@@ -22,7 +21,6 @@ Image = NDArray[np.uint8]  # [height, width, 3] BGR
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", ".pgm", ".ppm"})
 JPEG_QUALITY = 92
 
-_DIGITS = re.compile(r"(\d+)")
 _STRIPS, _TILES = (273, 279), (324, 325)  # TIFF's tags of where each lies in the file, and how long it is
 _START_OF_SCAN, _END_OF_JPEG = b"\xff\xda", b"\xff\xd9"
 
@@ -83,6 +81,18 @@ class Recording:
         image = self.image(self.frames[row], input_size)
         return {"image": image.body, "content_type": image.content_type}
 
+    def reversed(self) -> Self:
+        """The frames in the other order: positions that fell rise now; those that rose count from the other end."""
+        first_m, last_m = self.frames[0].position_m, self.frames[-1].position_m
+        frames = tuple(
+            dataclasses.replace(
+                frame, index=index, position_m=last_m - frame.position_m if last_m >= first_m else frame.position_m
+            )
+            for index, frame in enumerate(self.frames[::-1])
+        )
+        encodings = None if self.encodings is None else np.ascontiguousarray(self.encodings[::-1])
+        return dataclasses.replace(self, frames=frames, encodings=encodings)
+
     def sliced(self, part: slice) -> Self:
         """Python's slice of the frames, which keep their indices and positions; what was left out stays counted.
 
@@ -106,12 +116,6 @@ def finite_number(text: str) -> float | None:
     except ValueError:
         return None
     return value if math.isfinite(value) else None
-
-
-def natural_order(name: str) -> tuple[list[tuple[int, str]], str]:
-    """Sort key for file names: digits count as numbers, so 2.png comes before 10.png; padded names sort as usual."""
-    parts = _DIGITS.split(name)
-    return [(int(part), "") if place % 2 else (-1, part) for place, part in enumerate(parts)], name
 
 
 def read_file(path: Path) -> bytes:

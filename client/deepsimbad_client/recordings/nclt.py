@@ -20,9 +20,8 @@ import logging
 import warnings
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
-from math import hypot
 from pathlib import Path
 
 import cv2
@@ -31,6 +30,8 @@ from numpy.typing import NDArray
 
 from deepsimbad_client.errors import BrokenFrameError, SourceError
 from deepsimbad_client.recordings import EncodedImage, Frame, Image, Recording, as_jpeg, decode, read_file
+from deepsimbad_client.recordings.placing import placed_on
+from deepsimbad_client.recordings.track import Reals, Track, track_of
 
 FRONT_CAMERA = 5
 N_CAMERAS = 6
@@ -39,13 +40,6 @@ STORED_SIZE = (1616, 1232)  # (width, height) of the dataset's own images as sto
 N_SIZE_PROBES = 9
 SUFFIXES = frozenset({".tiff", ".tif"})
 N_COLUMNS = 7
-MAX_GAP_S = 1.0  # Between ground-truth rows farther apart than this nothing is interpolated: the robot may have turned
-DEADBAND_M = 0.25
-SMOOTHING_HALF_WIDTH_US = 250_000
-
-Reals = NDArray[np.float64]
-Times = NDArray[np.int64]
-
 
 logger = logging.getLogger(__name__)
 
@@ -138,39 +132,19 @@ def read_nclt(root: Path, date: str, *, camera: int = FRONT_CAMERA, undistortion
     names, not_times = _images_by_time(folder)
     if not names:
         raise SourceError(f"{folder} holds no image named <utime>.tiff")
-    time_us = np.array(sorted(names), dtype=np.int64)
-    poses = truth.at(time_us)
-    usable = np.flatnonzero(poses.covered & ~poses.in_gap)
-    if not len(usable):
-        raise SourceError(
-            f"none of the {len(names)} images in {folder} has ground truth, which covers "
-            f"{truth.time_us[0]} to {truth.time_us[-1]} microseconds: are they of one date?"
-        )
+    result = placed_on(truth, [(name, time) for time, name in names.items()], str(folder), "the ground truth")
     left_out = {
-        "before or after the ground truth": [names[int(time)] for time in time_us[~poses.covered]],
-        "gap in the ground truth": [names[int(time)] for time in time_us[poses.in_gap]],
+        **result.left_out_names,
         f"missing in Cam{camera}": _missing(folder, names),
         "file name is not a time": not_times,
     }
-    frames = tuple(
-        Frame(
-            index,
-            names[int(time_us[at])],
-            float(poses.position_m[at]),
-            timestamp_us=int(time_us[at]),
-            x_m=float(poses.x_m[at]),
-            y_m=float(poses.y_m[at]),
-            heading_rad=float(poses.heading_rad[at]),
-        )
-        for index, at in enumerate(usable)
-    )
-    probed = np.unique(np.linspace(0, len(frames) - 1, N_SIZE_PROBES).round().astype(int))
+    probed = np.unique(np.linspace(0, len(result.frames) - 1, N_SIZE_PROBES).round().astype(int))
     return NcltRecording(
         name=date,
-        frames=frames,
+        frames=tuple(result.frames),
         left_out_names={reason: files for reason, files in left_out.items() if files},
         folder=folder,
-        probes=[frames[place].name for place in probed],
+        probes=[result.frames[place].name for place in probed],
         undistortion=None if undistortion is None else read_undistortion(undistortion, camera),
     )
 
@@ -231,60 +205,7 @@ def read_undistortion(path: Path, camera: int) -> UndistortionMap:
     return UndistortionMap(u=u, v=v)
 
 
-@dataclass(frozen=True, eq=False)
-class Poses:
-    """Poses at [n] asked times; where `covered` is False or `in_gap` True the values mean nothing."""
-
-    covered: NDArray[np.bool_]  # the time lies between the first and the last ground-truth row
-    in_gap: NDArray[np.bool_]  # covered, but between two rows too far apart to interpolate
-    x_m: Reals  # north
-    y_m: Reals  # east
-    heading_rad: Reals  # in (-pi, pi], from north towards east
-    position_m: Reals  # along the track
-
-
-@dataclass(frozen=True, eq=False)
-class GroundTruth:
-    """The track of one drive: as `Poses`, at [m] strictly increasing times."""
-
-    time_us: Times
-    x_m: Reals
-    y_m: Reals
-    heading_rad: Reals
-    position_m: Reals
-    n_skipped_rows: int = 0  # that held NaN, too few values or no numbers
-
-    def at(self, time_us: Times) -> Poses:
-        """Interpolate at [n] times, in any order: x, y and position linearly, heading the short way round."""
-        covered = (time_us >= self.time_us[0]) & (time_us <= self.time_us[-1])
-        last = len(self.time_us) - 1
-        before = np.clip(np.searchsorted(self.time_us, time_us, side="right") - 1, 0, last)
-        after = np.minimum(before + 1, last)
-        # Differences of int64 first: absolute microseconds and fractions of them do not fit one float.
-        step_us = self.time_us[after] - self.time_us[before]
-        since_us = np.clip(time_us - self.time_us[before], 0, step_us)
-        share = since_us / np.maximum(step_us, 1)
-
-        def between(values: Reals) -> Reals:
-            return np.asarray(values[before] + share * (values[after] - values[before]), dtype=np.float64)
-
-        turn = wrapped_rad(self.heading_rad[after] - self.heading_rad[before])
-        return Poses(
-            covered=covered,
-            in_gap=covered & (since_us > 0) & (step_us > MAX_GAP_S * 1e6),
-            x_m=between(self.x_m),
-            y_m=between(self.y_m),
-            heading_rad=wrapped_rad(self.heading_rad[before] + share * turn),
-            position_m=between(self.position_m),
-        )
-
-
-def wrapped_rad(angle_rad: Reals) -> Reals:
-    """Bring angles into (-pi, pi]."""
-    return np.asarray(np.pi - np.mod(np.pi - angle_rad, 2 * np.pi), dtype=np.float64)
-
-
-def read_ground_truth(path: Path) -> GroundTruth:
+def read_ground_truth(path: Path) -> Track:
     """Read a ground-truth file in whatever state it is: rows out of order are sorted, of one time the first stays.
 
     Raises SourceError (it cannot be read, or fewer than two usable rows are in it).
@@ -295,17 +216,16 @@ def read_ground_truth(path: Path) -> GroundTruth:
         raise SourceError(f"cannot read the ground truth {path}: {error.strerror or error}") from error
     # Unix microseconds have 16 digits: below 2^53 a float64 holds every one of them exactly.
     usable = rows[np.isfinite(rows).all(axis=1) & (np.abs(rows[:, 0]) < 2**53)]
-    time_us, first = np.unique(usable[:, 0].astype(np.int64), return_index=True)
-    if len(time_us) < 2:
+    track = track_of(*usable[:, [0, 1, 2, 6]].T)
+    if track is None:
         raise SourceError(
-            f"{path}: {len(time_us)} usable rows among {len(rows)}; ground truth needs at least two rows of "
+            f"{path}: fewer than 2 usable rows among {len(rows)}; ground truth needs at least two rows of "
             "utime,x,y,z,roll,pitch,yaw without NaN"
         )
-    x_m, y_m, heading_rad = (usable[first, column].copy() for column in (1, 2, 6))
-    n_skipped = len(rows) - len(usable)
+    n_skipped = track.n_skipped_rows + len(rows) - len(usable)
     if n_skipped:
-        logger.info("%s: %d of %d rows skipped (NaN or unreadable)", path, n_skipped, len(rows))
-    return GroundTruth(time_us, x_m, y_m, wrapped_rad(heading_rad), arc_length_m(x_m, y_m, time_us), n_skipped)
+        logger.info("%s: %d of %d rows skipped (NaN, unreadable or far off the track)", path, n_skipped, len(rows))
+    return replace(track, n_skipped_rows=n_skipped)
 
 
 def _rows(path: Path) -> Reals:
@@ -329,45 +249,3 @@ def _row(line: str) -> list[float]:
     except ValueError:
         return broken
     return values if len(values) == N_COLUMNS else broken
-
-
-def arc_length_m(x_m: Reals, y_m: Reals, time_us: Times | None = None) -> Reals:
-    """How far a track [n], in travel order, has gone at each of its poses: [n] metres, non-decreasing, 0 at the first.
-
-    A pose stream of 100-150 Hz trembles by centimetres, and summing its steps as they are turns a minute of standing
-    into a hundred metres of driving. So, where increasing times [n] are given, each pose is first averaged with those
-    within a quarter of a second; the track is then walked by anchors: the position is the distance summed up to the
-    last anchor plus the greatest distance from it reached so far, and a pose at least `DEADBAND_M` away becomes the
-    next anchor. A robot that moves straight on gets its distance exactly, at every pose and not only at anchors.
-    """
-    travelled = np.zeros(len(x_m), dtype=np.float64)
-    if len(x_m) == 0:
-        return travelled
-    if time_us is not None:
-        x_m, y_m = _smoothed(x_m, time_us), _smoothed(y_m, time_us)
-    xs, ys = x_m.tolist(), y_m.tolist()
-    anchor_x, anchor_y = xs[0], ys[0]
-    up_to_anchor = farthest = 0.0
-    for i, (x, y) in enumerate(zip(xs, ys, strict=True)):
-        away = hypot(x - anchor_x, y - anchor_y)
-        farthest = max(farthest, away)
-        travelled[i] = up_to_anchor + farthest
-        if away >= DEADBAND_M:
-            up_to_anchor += away
-            anchor_x, anchor_y, farthest = x, y, 0.0
-    return travelled
-
-
-def _smoothed(values: Reals, time_us: Times) -> Reals:
-    """Average each value with those near in time; one-sided windows would shift both ends of every drive and gap."""
-    breaks = np.flatnonzero(np.diff(time_us) > SMOOTHING_HALF_WIDTH_US) + 1
-    starts = np.concatenate(([0], breaks))
-    lengths = np.diff(np.concatenate((starts, [len(values)])))
-    first_us = np.repeat(time_us[starts], lengths)
-    last_us = np.repeat(time_us[starts + lengths - 1], lengths)
-    half_us = np.minimum(SMOOTHING_HALF_WIDTH_US, np.minimum(time_us - first_us, last_us - time_us))
-    low = np.searchsorted(time_us, time_us - half_us, side="left")
-    high = np.searchsorted(time_us, time_us + half_us, side="right")
-    centre = values.mean()  # keeps the running sum small, hence exact
-    running = np.concatenate(([0.0], np.cumsum(values - centre)))
-    return np.asarray(centre + (running[high] - running[low]) / (high - low), dtype=np.float64)

@@ -16,7 +16,7 @@ Command = Callable[..., Any]
 _OPTIONS = (
     click.option(
         "--spacing-m",
-        type=float,
+        type=click.FloatRange(min=0, min_open=True),
         default=1.0,
         show_default=True,
         help="Metres between frames where the source does not say where they are.",
@@ -26,6 +26,9 @@ _OPTIONS = (
         type=click.Path(exists=True, path_type=Path),
         help="NCLT's undistortion maps (U2D_Cam*.txt or their folder); absent: images stay as they are.",
     ),
+    click.option(
+        "--reverse", is_flag=True, help="Take the frames in the other order: where positions fall along the drive."
+    ),
 )
 
 
@@ -34,7 +37,7 @@ def reading(command: Command) -> Command:
 
     @wraps(command)
     def with_reading(**options: Any) -> Any:
-        asked = {name: options.pop(name) for name in ("spacing_m", "undistortion")}
+        asked = {name: options.pop(name) for name in ("spacing_m", "undistortion", "reverse")}
         return command(reading=asked, **options)
 
     for option in reversed(_OPTIONS):

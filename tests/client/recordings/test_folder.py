@@ -83,7 +83,6 @@ def test_unlisted_images_and_lines_without_an_image_are_counted(folder):
     ("lines", "message"),
     [
         (["position_m", "0", "1", "two", "3"], r"positions\.csv, line 4: position_m is 'two'"),
-        (["position_m", "0", "nan", "2", "3"], r"line 3: position_m is 'nan', not a finite number"),
         (["position_m", "0", "1", "2"], r"3 lines for 4 images: add a column `name`"),
         (["name,position_m", "8.png,0", "9.png,1", "8.png,2"], r"line 4: 8\.png stands in line 2 already"),
         (["name,position_m", "8.png,0", "9.png"], r"line 3: 1 values where 2 are needed"),
@@ -93,7 +92,18 @@ def test_unlisted_images_and_lines_without_an_image_are_counted(folder):
         (["position,position_m", "0,0"], r"two columns mean the same"),
         (["name,position_m", "a.png,0"], r"names none of the 4 images"),
         ([""], r"is empty"),
-        (["x_m,y_m", "0,0", "0,inf", "0,0", "0,0"], r"line 3: y_m is 'inf'"),
+        (["position_m", "nan", "-", "NA", "null"], r"none of 4 frames has a position"),
+        (["position_m", "3", "2", "1", "0"], r"positions fall along the drive, from 3 m \(8\.png\) to 0 m.*--reverse"),
+        (["position_m", "0", "5", "2", "6"], r"to and fro, for example from 0\.00 m \(8\.png\) to 5\.00 m \(9\.png\)"),
+        (
+            ["name,position_m,timestamp", "8.png,0,0.1", "9.png,1,0.2"],
+            r"line 2: nobody can tell the unit of the time 0\.1",
+        ),
+        (
+            ["name,position_m,time", "8.png,0,1305031103", "9.png,1,1305031103000"],
+            r"several units: .*line 2 is in s; .*ms",
+        ),
+        (["name,position_m,time", "8.png,0,noon"], r"line 2: 'noon' is not a time"),
         (["position_m,x_m,y_m", "0,0,0", "1,one,0", "2,0,0", "3,0,0"], r"line 3: x_m is 'one'"),
     ],
 )
@@ -101,6 +111,87 @@ def test_positions_that_make_no_sense_are_refused_with_their_line(folder, lines,
     positions(folder, *lines)
     with pytest.raises(SourceError, match=message):
         open_source(str(folder))
+
+
+def test_a_frame_without_a_place_is_left_out_by_name(folder):
+    positions(folder, "name,position_m", "8.png,0", "9.png,", "10.png,nan", "11.png,4")
+    recording = open_source(str(folder))
+    assert [(frame.index, frame.name, frame.position_m) for frame in recording.frames] == [
+        (0, "8.png", 0.0),
+        (1, "11.png", 4.0),
+    ]
+    assert recording.left_out_names == {"without a position": ["9.png", "10.png"]}
+
+
+def test_a_path_written_on_windows_finds_its_file(folder):
+    positions(folder, "name,position_m", *(f"Images\\{n}.PNG,{n}" for n in (8, 9, 10, 11)))
+    assert placed(folder) == [("8.png", 8), ("9.png", 9), ("10.png", 10), ("11.png", 11)]
+
+
+def test_falling_positions_are_reversed_when_asked_for(folder):
+    positions(folder, "position_m", "3.5", "2", "2.01", "0")
+    recording = open_source(str(folder), reverse=True)
+    assert [(frame.index, frame.name, frame.position_m) for frame in recording.frames] == [
+        (0, "11.png", 0.0),
+        (1, "10.png", 2.0),
+        (2, "9.png", 2.0),
+        (3, "8.png", 3.5),
+    ]
+    (folder / "positions.csv").unlink()
+    assert [frame.position_m for frame in open_source(str(folder), reverse=True, spacing_m=2).frames] == [0, 2, 4, 6]
+
+
+@pytest.mark.parametrize(
+    ("column", "unit_us"),
+    [("timestamp", 1), ("timestamp", 1000), ("time", 1_000_000), ("timestamp_us", 0.001), ("timestamp_us", 1000)],
+)
+def test_units_of_times_are_told_by_their_magnitude(folder, column, unit_us):
+    at_us = [1_400_000_000_000_000 + 100_000 * place for place in range(4)]
+    times = [f"{at // unit_us if unit_us >= 1 else at * 1000:.0f}" for at in at_us]
+    positions(
+        folder,
+        f"name,position_m,{column}",
+        *(f"{n}.png,{n},{time}" for n, time in zip(range(8, 12), times, strict=True)),
+    )
+    if unit_us == 1_000_000:
+        at_us = [at_us[0]] * 4
+    recording = open_source(str(folder))
+    assert [frame.timestamp_us for frame in recording.frames] == at_us
+    assert len(recording.remarks) == 1
+
+
+def test_times_say_how_far_and_in_which_order(folder):
+    header = "name,x_m,y_m,timestamp_s"
+    positions(folder, header, "8.png,30,0,3", "9.png,0,0,0", "10.png,10,0,1", "11.png,20,0,2")
+    assert placed(folder) == [("9.png", 0), ("10.png", 10), ("11.png", 20), ("8.png", 30)]
+    assert "order of their times" in open_source(str(folder)).remarks[0]
+    positions(folder, header, "8.png,0,0,0", "9.png,10,0,1", "10.png,5735000,619000,2", "11.png,20,0,3")
+    recording = open_source(str(folder))
+    assert [frame.position_m for frame in recording.frames] == [0, 10, 20]
+    assert recording.left_out_names == {"where no robot can have been": ["10.png"]}
+    assert recording.remarks == ["10.png would be 5768299 m from 9.png"]
+
+
+def test_lines_at_a_rate_of_their_own_are_interpolated_at_the_times_that_names_tell(tmp_path):
+    for at in ("1305031103.05", "1305031103.5", "1305031109.9"):
+        cv2.imwrite(str(tmp_path / f"{at}.png"), np.zeros((4, 4), np.uint8))
+    rows = (f"{1_305_031_103_000 + 100 * k},{k},7" for k in range(11))
+    positions(tmp_path, "timestamp,x_m,y_m", *rows)
+    recording = open_source(str(tmp_path))
+    (first, second) = recording.frames
+    assert (first.name, first.x_m, first.position_m, second.position_m) == ("1305031103.05.png", 0.5, 0.5, 5.0)
+    assert recording.left_out_names == {"before or after the positions": ["1305031109.9.png"]}
+
+
+def test_clocks_that_differ_are_told(tmp_path):
+    times = range(1_305_031_103, 1_305_031_106)
+    for at in times:
+        cv2.imwrite(str(tmp_path / f"{at}.png"), np.zeros((4, 4), np.uint8))
+    positions(
+        tmp_path, "name,position_m,time", *(f"{1_305_031_103 + at},{at},{1_305_034_703 + 1.5 * at}" for at in range(3))
+    )
+    (_, remark) = open_source(str(tmp_path)).remarks
+    assert "by +3600.000 s at the first frame and +3601.000 s at the last" in remark
 
 
 def test_a_small_image_goes_as_it_is_and_a_larger_one_resized_as_jpeg(folder):

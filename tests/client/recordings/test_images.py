@@ -9,7 +9,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from deepsimbad_client.errors import BrokenFrameError
-from deepsimbad_client.recordings import decode, natural_order
+from deepsimbad_client.recordings import decode
 
 NOISE = np.random.default_rng(0).integers(0, 255, (40, 60, 3), np.uint8)
 HERE = Path("frame")
@@ -72,17 +72,3 @@ def test_grey_16_bit_and_alpha_become_8_bit_bgr():
     np.testing.assert_array_equal(decode(encoded(".png", deep), HERE), NOISE)
     with_alpha = np.dstack((NOISE, np.zeros((40, 60), np.uint8)))
     np.testing.assert_array_equal(decode(encoded(".png", with_alpha), HERE), NOISE)
-
-
-def test_names_count_digits_as_numbers():
-    names = ["10.png", "2.png", "a10b2.png", "a10b1.png", "a9.png", "1.png", "02.png"]
-    ordered = ["1.png", "02.png", "2.png", "10.png", "a9.png", "a10b1.png", "a10b2.png"]
-    assert sorted(names, key=natural_order) == ordered
-
-
-@given(st.lists(st.integers(0, 99_999), unique=True, min_size=1))
-def test_padded_names_sort_as_usual_and_bare_ones_by_number(numbers):
-    padded = [f"frame{number:05d}.png" for number in numbers]
-    assert sorted(padded, key=natural_order) == sorted(padded)
-    bare = [f"{number}.png" for number in numbers]
-    assert sorted(bare, key=natural_order) == [f"{number}.png" for number in sorted(numbers)]

@@ -119,7 +119,7 @@ def test_errors_say_what_is_missing(nclt_tree):
     with pytest.raises(SourceError, match=r"no ground truth .*groundtruth_2012-01-22\.csv.*groundtruth\.csv"):
         open_source(nclt_tree.source)
     nclt_tree.truth(nclt_tree.walk_north(1))
-    with pytest.raises(SourceError, match=r"none of the 1 images .* are they of one date"):
+    with pytest.raises(SourceError, match=r"none of 1 images has a position: .* the ground truth of 2012-01-08T13:56"):
         open_source(nclt_tree.source)
     (nclt_tree.root / "2012-01-22/lb3/Cam5/5.tiff").unlink()
     with pytest.raises(SourceError, match=r"no image named <utime>\.tiff"):

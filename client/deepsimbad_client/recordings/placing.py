@@ -1,0 +1,148 @@
+"""Frames as a source tells of them become frames along a route: in order, without spikes, measured, the rest named."""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+
+import numpy as np
+
+from deepsimbad_client.errors import SourceError
+from deepsimbad_client.recordings import Frame
+from deepsimbad_client.recordings.left_out import MOST_LEFT_OUT
+from deepsimbad_client.recordings.track import Reals, Times, Track, arc_length_m, on_track, rising_m
+
+UNPLACED = math.nan  # position_m of a frame of which the source says none
+STATED_SPEEDS = 100.0  # A stated position may jump by so many usual steps: somebody may have meant it
+
+
+@dataclass
+class Placed:
+    """Frames along the route, and what became of the others."""
+
+    frames: Sequence[Frame]
+    left_out_names: dict[str, list[str]] = field(default_factory=dict)
+    remarks: list[str] = field(default_factory=list)
+
+    def leave_out(self, usable: Sequence[bool], reason: str) -> None:
+        """Keep the usable ones of the frames."""
+        lost = [frame.name for frame, good in zip(self.frames, usable, strict=True) if not good]
+        if lost:
+            self.left_out_names[reason] = lost
+        self.frames = [frame for frame, good in zip(self.frames, usable, strict=True) if good]
+
+    def number(self) -> None:
+        """Count the frames' indices from 0."""
+        self.frames = [dataclasses.replace(frame, index=index) for index, frame in enumerate(self.frames)]
+
+
+def placed(frames: Sequence[Frame], where: str) -> Placed:
+    """Put frames on the route, by their stated `position_m` where any has one, else by the distance along x_m, y_m.
+
+    Frames whose times are all known come in the order of their times. Indices count anew from 0. Stated positions that
+    fall along the drive stay falling. Raises SourceError (no frame has a position, or positions go to and fro).
+    """
+    result = Placed(frames)
+    stated = any(math.isfinite(frame.position_m) for frame in frames)
+    result.leave_out([_has_place(frame, stated) for frame in frames], "without a position")
+    if not result.frames:
+        raise SourceError(f"{where}: none of {len(frames)} frames has a position")
+    time_us = _in_time_order(result)
+    if stated:
+        _use_stated(result, time_us, where)
+    else:
+        _measure(result, time_us)
+    result.frames = [dataclasses.replace(frame, index=index) for index, frame in enumerate(result.frames)]
+    return result
+
+
+def placed_on(track: Track, images: Sequence[tuple[str, int]], where: str, what: str = "the positions") -> Placed:
+    """Put images, names and Unix microseconds, where a track was at their times. Raises SourceError (none is on it)."""
+    images = sorted(images, key=lambda image: image[1])
+    time_us = np.array([time for _, time in images], dtype=np.int64)
+    poses = track.at(time_us)
+    if not (poses.covered & ~poses.in_gap).any():
+        raise SourceError(
+            f"{where}: none of {len(images)} images has a position: they are of {_span(time_us)}, {what} of "
+            f"{_span(track.time_us)}. Are they of one drive? --time-offset-s corrects the images' clock"
+        )
+    columns = (values.tolist() for values in (poses.position_m, poses.x_m, poses.y_m, poses.heading_rad))
+    result = Placed(
+        [
+            Frame(0, name, position_m, time, x_m, y_m, None if math.isnan(heading_rad) else heading_rad)
+            for (name, time), position_m, x_m, y_m, heading_rad in zip(images, *columns, strict=True)
+        ]
+    )
+    result.leave_out(poses.covered.tolist(), f"before or after {what}")
+    result.leave_out((~poses.in_gap[poses.covered]).tolist(), f"gap in {what}")
+    result.number()
+    return result
+
+
+def _span(time_us: Times) -> str:
+    ends = (datetime.fromtimestamp(int(time) / 1e6, UTC) for time in (time_us.min(), time_us.max()))
+    return " to ".join(end.isoformat(timespec="milliseconds") for end in ends)
+
+
+def _has_place(frame: Frame, stated: bool) -> bool:
+    return math.isfinite(frame.position_m) if stated else frame.x_m is not None and frame.y_m is not None
+
+
+def _in_time_order(result: Placed) -> Times | None:
+    """Sort the frames by time where every one has one and they differ; these times."""
+    times = [frame.timestamp_us for frame in result.frames if frame.timestamp_us is not None]
+    if len(times) < len(result.frames) or len(set(times)) < 2:
+        return None
+    time_us = np.array(times, dtype=np.int64)
+    order = np.argsort(time_us, kind="stable")
+    if (np.diff(time_us) < 0).any():
+        result.frames = [result.frames[place] for place in order]
+        result.remarks.append("frames are taken in the order of their times, which is not that of their names")
+    return np.asarray(time_us[order])
+
+
+def _measure(result: Placed, time_us: Times | None) -> None:
+    x_m, y_m = (np.array([getattr(frame, axis) for frame in result.frames], np.float64) for axis in ("x_m", "y_m"))
+    usable = on_track(x_m, y_m, time_us)
+    _without_spikes(result, usable, x_m, y_m)
+    along_m = arc_length_m(x_m[usable], y_m[usable], None if time_us is None else time_us[usable])
+    result.frames = [
+        dataclasses.replace(frame, position_m=position_m)
+        for frame, position_m in zip(result.frames, along_m.tolist(), strict=True)
+    ]
+
+
+def _use_stated(result: Placed, time_us: Times | None, where: str) -> None:
+    position_m = np.array([frame.position_m for frame in result.frames], np.float64)
+    usable = on_track(position_m, np.zeros_like(position_m), time_us, STATED_SPEEDS)
+    _without_spikes(result, usable, position_m, np.zeros_like(position_m))
+    position_m = position_m[usable]
+    risen, rises = rising_m(position_m)
+    fallen, falls = rising_m(-position_m)
+    turned_m, usable = (-fallen, falls) if falls.sum() > rises.sum() else (risen, rises)
+    n_back = int((~usable).sum())
+    if n_back > MOST_LEFT_OUT * len(usable):
+        at = int(np.flatnonzero(~usable)[0])
+        before, names = max(at - 1, 0), [frame.name for frame in result.frames]
+        raise SourceError(
+            f"{where}: positions go to and fro, for example from {position_m[before]:.2f} m ({names[before]}) to "
+            f"{position_m[at]:.2f} m ({names[at]}), {n_back} of {len(names)} frames against the others: a route goes "
+            "one way. Give x_m, y_m in place of position_m, or cut the recording there (#START:STOP)"
+        )
+    result.leave_out(usable.tolist(), "where the position goes back")
+    result.frames = [
+        dataclasses.replace(frame, position_m=at)
+        for frame, at in zip(result.frames, turned_m[usable].tolist(), strict=True)
+    ]
+
+
+def _without_spikes(result: Placed, usable: np.ndarray, x_m: Reals, y_m: Reals) -> None:
+    """Leave out what no robot can have reached, saying how far off the first of it is."""
+    if usable.all():
+        return
+    at = int(np.flatnonzero(~usable)[0])
+    nearest = int(np.flatnonzero(usable)[np.abs(np.flatnonzero(usable) - at).argmin()])
+    off_m = math.hypot(x_m[at] - x_m[nearest], y_m[at] - y_m[nearest])
+    result.remarks.append(f"{result.frames[at].name} would be {off_m:.0f} m from {result.frames[nearest].name}")
+    result.leave_out(usable.tolist(), "where no robot can have been")

@@ -1,0 +1,217 @@
+"""`positions.csv`: where the images beside it were taken.
+
+A header and one line for each image. Columns, in any order, others are ignored:
+
+    name          the image's file name: folders before it, letter case and its ending do not matter; without this
+                  column (and without `index`) the lines go with the images in name order and there must be as many
+    index         instead of a name: the image's place in name order, from 0
+    position_m    metres along the route; without it the distance along x_m, y_m is taken
+    x_m, y_m      ground coordinates in metres
+    timestamp_us  Unix microseconds; seconds, milli- and nanoseconds are told by their magnitude, or by the column's
+                  name (timestamp_s, timestamp_ms, timestamp_ns); dates such as 2012-01-22T08:30:00Z do as well
+    heading_rad   turning from x towards y
+
+Without a header it may hold just positions, one number a line, or `name,position_m`, or `name,x_m,y_m`. Images that
+are not listed, lines whose image does not exist, and images whose place is empty or NaN are left out and counted.
+"""
+
+import csv
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from deepsimbad_client.errors import SourceError
+from deepsimbad_client.recordings import Frame, finite_number
+from deepsimbad_client.recordings.clock import UNITS, UNKNOWN, times_us
+from deepsimbad_client.recordings.names import Finder
+from deepsimbad_client.recordings.placing import UNPLACED, Placed, placed_on
+from deepsimbad_client.recordings.track import track_of
+
+CLOCKS_APART_S = 0.5
+
+POSITIONS_FILE = "positions.csv"
+
+_SPELLINGS = {
+    "name": ("name", "file", "filename", "file_name", "image"),
+    "index": ("index", "frame"),
+    "position_m": ("position_m", "route_position_m", "position"),
+    "x_m": ("x_m", "x"),
+    "y_m": ("y_m", "y"),
+    "heading_rad": ("heading_rad", "yaw"),
+    "timestamp": (
+        "timestamp",
+        "time",
+        "stamp",
+        "utime",
+        *(f"{what}_{unit}" for what in ("timestamp", "time") for unit in UNITS),
+    ),
+}
+_COLUMN_OF = {spelling: column for column, spellings in _SPELLINGS.items() for spelling in spellings}
+_WITHOUT_HEADER = {
+    (1, False): ["position_m"],
+    (2, True): ["name", "position_m"],
+    (3, True): ["name", "x_m", "y_m"],
+}  # by how many cells a line has, and whether the first is a word
+
+
+@dataclass(frozen=True)
+class _Table:
+    """What the file says, a line a row."""
+
+    path: Path
+    columns: Sequence[str | None]  # what each is; None: ignored
+    time_unit: str | None  # as the column of times is named
+    lines: Sequence[tuple[int, list[str]]]  # its number in the file, its cells
+
+    def where(self, row: int) -> str:
+        """A row's place, for errors."""
+        return f"{self.path}, line {self.lines[row][0]}"
+
+    def cells(self, column: str) -> list[str] | None:
+        """A column; None: there is no such one."""
+        if column not in self.columns:
+            return None
+        at = self.columns.index(column)
+        return [line[at] for _, line in self.lines]
+
+    def numbers(self, column: str) -> list[float | None]:
+        """A column of numbers, None where nothing is known. Raises SourceError (something else stands there)."""
+        values: list[float | None] = []
+        for row, cell in enumerate(self.cells(column) or [""] * len(self.lines)):
+            values.append(finite_number(cell))
+            if values[-1] is None and cell.lower() not in UNKNOWN:
+                raise SourceError(f"{self.where(row)}: {column} is {cell!r}, not a number")
+        return values
+
+    def times_us(self) -> tuple[list[int | None], list[str]]:
+        """The times, and what is to be said of them. Raises SourceError."""
+        cells = self.cells("timestamp")
+        if cells is None:
+            return [None] * len(self.lines), []
+        times, unit = times_us(cells, self.time_unit, [self.where(row) for row in range(len(self.lines))])
+        differs = unit is not None and unit != self.time_unit
+        return times, [f"times in {self.path.name} are taken for {unit}"] if differs else []
+
+
+def read_positions(path: Path, names: Sequence[str], name_times_us: Sequence[int | None]) -> Placed:
+    """What `positions.csv` says of images, given in their order, with the times that their names tell.
+
+    The frames are still to be placed. Lines without names, of another number than the images, are interpolated at the
+    times of the images. Raises SourceError.
+    """
+    table = _read(path)
+    times, remarks = table.times_us()
+    places = zip(*(table.numbers(column) for column in ("position_m", "x_m", "y_m", "heading_rad")), times, strict=True)
+    rows = [
+        Frame(row, "", UNPLACED if position_m is None else position_m, time_us, x_m, y_m, heading_rad)
+        for row, (position_m, x_m, y_m, heading_rad, time_us) in enumerate(places)
+    ]
+    if not {"name", "index"} & set(table.columns) and len(rows) != len(names):
+        if "timestamp" in table.columns and {"x_m", "y_m"} <= set(table.columns) and None not in name_times_us:
+            return _interpolated(rows, names, name_times_us, path)
+        raise SourceError(f"{path} has {len(rows)} lines for {len(names)} images: add a column `name`")
+    row_of, without_image = _rows_by_name(table, names)
+    if not row_of:
+        raise SourceError(f"{path} names none of the {len(names)} images beside it")
+    listed = [(name, time_us) for name, time_us in zip(names, name_times_us, strict=True) if name in row_of]
+    frames = [
+        dataclasses.replace(
+            rows[row_of[name]], name=name, timestamp_us=time_us if times[row_of[name]] is None else times[row_of[name]]
+        )
+        for name, time_us in listed
+    ]
+    lost = {
+        f"not in {path.name}": [name for name in names if name not in row_of],
+        f"in {path.name} without an image": without_image,
+    }
+    return Placed(frames, {reason: some for reason, some in lost.items() if some}, remarks + _apart(listed, frames))
+
+
+def _apart(listed: Sequence[tuple[str, int | None]], frames: Sequence[Frame]) -> list[str]:
+    """Remarks on clocks: the times that the names tell differ from those in the table."""
+    apart_s = [
+        (frame.timestamp_us - time_us) / 1e6
+        for (_, time_us), frame in zip(listed, frames, strict=True)
+        if time_us is not None and frame.timestamp_us is not None
+    ]
+    if not apart_s or max(map(abs, apart_s)) < CLOCKS_APART_S:
+        return []
+    return [
+        f"the table's times differ from those of the names by {apart_s[0]:+.3f} s at the first frame and "
+        f"{apart_s[-1]:+.3f} s at the last: the table's are taken"
+    ]
+
+
+def _interpolated(rows: Sequence[Frame], names: Sequence[str], times_us: Sequence[int | None], path: Path) -> Placed:
+    columns = np.array([[row.timestamp_us, row.x_m, row.y_m] for row in rows], np.float64).T  # None becomes NaN
+    track = track_of(*columns)
+    if track is None:
+        raise SourceError(f"{path}: fewer than two lines hold a time and a place")
+    images = [(name, time_us) for name, time_us in zip(names, times_us, strict=True) if time_us is not None]
+    return placed_on(track, images, str(path))
+
+
+def _rows_by_name(table: _Table, names: Sequence[str]) -> tuple[dict[str, int], list[str]]:
+    """Each image's row, and what rows call images that are not there."""
+    spellings, indices = table.cells("name"), table.cells("index")
+    finder, row_of = Finder(names), dict[str, int]()
+    without_image: list[str] = []
+    for row in range(len(table.lines)):
+        if spellings is not None:
+            called, name = spellings[row], finder.find(spellings[row])
+        else:
+            called = str(row) if indices is None else indices[row]
+            if not (called.isascii() and called.isdigit()):
+                raise SourceError(f"{table.where(row)}: the index {called!r} is not a whole number from 0")
+            name = names[int(called)] if int(called) < len(names) else None
+        if name is None:
+            without_image.append(called)
+        elif name in row_of:
+            raise SourceError(f"{table.where(row)}: {name} stands in line {table.lines[row_of[name]][0]} already")
+        else:
+            row_of[name] = row
+    return row_of, without_image
+
+
+def _read(path: Path) -> _Table:
+    """Read the file. Raises SourceError."""
+    lines = _lines(path)
+    first = lines[0][1]
+    columns = [_COLUMN_OF.get(cell.lower()) for cell in first]
+    unit = None
+    if any(columns):
+        lines = lines[1:]
+        if "timestamp" in columns:
+            called = first[columns.index("timestamp")].lower()
+            unit = "us" if called == "utime" else next((unit for unit in UNITS if called.endswith(f"_{unit}")), None)
+    else:
+        columns = list(_WITHOUT_HEADER.get((len(first), finite_number(first[0]) is None), []))
+    wanted = [column for column in columns if column is not None]
+    if len(set(wanted)) != len(wanted):
+        raise SourceError(f"{path}: two columns mean the same: {', '.join(first)}")
+    if "position_m" not in wanted and not {"x_m", "y_m"} <= set(wanted):
+        raise SourceError(
+            f"{path}: the first line must name the columns, among them position_m, or x_m and y_m "
+            f"(and, to name the images, name); it is: {','.join(first)}"
+        )
+    for number, cells in lines:
+        if len(cells) < len(columns):
+            raise SourceError(f"{path}, line {number}: {len(cells)} values where {len(columns)} are needed")
+    return _Table(path, columns, unit, lines)
+
+
+def _lines(path: Path) -> list[tuple[int, list[str]]]:
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as text:
+            reader = csv.reader(text)
+            lines = [(reader.line_num, [cell.strip() for cell in cells]) for cells in reader if any(cells)]
+    except OSError as error:
+        raise SourceError(f"cannot read {path}: {error.strerror or error}") from error
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise SourceError(f"{path} is not a csv text: {error}") from error
+    if not lines:
+        raise SourceError(f"{path} is empty: remove it, or give a position for each image")
+    return lines
