@@ -73,6 +73,7 @@ TAKEN = {"allowed": [*IMAGES, "application/json", "application/vnd.deepsimbad.ra
     [
         ("seen", b"hello, robot", "image/jpeg", 422, "undecodable_image", {}),
         ("seen", encoded(picture(1))[:-200], "image/jpeg", 422, "truncated_image", {}),
+        ("seen", encoded(picture(1))[:-200] + b"\xff\xd9", "image/jpeg", 422, "truncated_image", {}),
         ("seen", claimed_png(60_000, 60_000), "image/png", 413, "image_too_large", {"max_pixels": 300_000}),
         ("seen", b"", "image/jpeg", 422, "empty_body", {}),
         ("seen", b"", "application/json", 422, "empty_body", {}),

@@ -20,7 +20,8 @@ from deepsimbad.errors import (
     TruncatedImageError,
 )
 from deepsimbad.evaluators.feature_l2 import FeatureL2
-from deepsimbad.evaluators.image import KEPT_PIXELS, MEDIA_TYPES, decode_image, is_blank
+from deepsimbad.evaluators.image import KEPT_PIXELS, decode_image, is_blank
+from deepsimbad.evaluators.image_files import MEDIA_TYPES
 
 LIMIT = 1_000_000
 

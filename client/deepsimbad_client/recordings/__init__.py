@@ -4,15 +4,15 @@ import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from io import BytesIO
 from pathlib import Path
 from typing import Any, Self
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from PIL.TiffImagePlugin import TiffImageFile
 
+from deepsimbad.errors import DeepSimbadError
+from deepsimbad.evaluators.image import decode_image
 from deepsimbad_client.errors import BrokenFrameError, SourceError
 from deepsimbad_client.http import media_type_of
 
@@ -21,8 +21,7 @@ Image = NDArray[np.uint8]  # [height, width, 3] BGR
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", ".pgm", ".ppm"})
 JPEG_QUALITY = 92
 
-_STRIPS, _TILES = (273, 279), (324, 325)  # TIFF's tags of where each lies in the file, and how long it is
-_START_OF_SCAN, _END_OF_JPEG = b"\xff\xda", b"\xff\xd9"
+_MAX_PIXELS = 1 << 30  # the picture is the caller's own
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,18 +129,17 @@ def read_file(path: Path) -> bytes:
 
 
 def decode(body: bytes, path: Path, *, as_stored: bool = False) -> Image:
-    """Decode an image to 8-bit BGR; grey becomes grey BGR, 16 bits become 8, alpha is dropped.
+    """Decode an image to 8-bit BGR as the service does (`deepsimbad.evaluators.image`).
 
-    `as_stored` leaves the pixels as they lie in the file; else its own orientation tag is obeyed. Raises
-    BrokenFrameError (not an image, damaged, or its end is missing).
+    What the service does not take (BMP, PGM, PPM) is decoded too. `as_stored` leaves pixels as they lie in the file.
+    Raises BrokenFrameError (not an image, damaged, or its end is missing).
     """
-    if _ends_early(body):
-        raise BrokenFrameError(f"{path} is truncated: its end is missing", "undecodable")
-    flags = cv2.IMREAD_COLOR | (cv2.IMREAD_IGNORE_ORIENTATION if as_stored else 0)
     try:
-        image = cv2.imdecode(np.frombuffer(body, dtype=np.uint8), flags)
-    except cv2.error as error:
-        raise BrokenFrameError(f"{path} cannot be decoded: {error.err or error}", "undecodable") from error
+        if media_type_of(body) is not None:
+            return decode_image(body, _MAX_PIXELS, as_stored=as_stored)
+        image = cv2.imdecode(np.frombuffer(body, dtype=np.uint8), cv2.IMREAD_COLOR_BGR)
+    except (DeepSimbadError, cv2.error) as error:
+        raise BrokenFrameError(f"{path} cannot be read: {error}", "undecodable") from error
     if image is None:
         raise BrokenFrameError(f"{path} is not an image that can be decoded", "undecodable")
     return np.asarray(image, dtype=np.uint8)
@@ -158,29 +156,3 @@ def as_jpeg(image: Image, input_size: tuple[int, int] | None) -> EncodedImage:
         image = np.asarray(cv2.resize(image, input_size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
     _, body = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
     return EncodedImage(body.tobytes(), "image/jpeg")
-
-
-def _ends_early(body: bytes) -> bool:
-    """Whether the end of an image is missing: decoders fill the rest with grey or black and say nothing."""
-    match media_type_of(body):
-        case "image/jpeg":
-            # A preview inside the header has an end of its own; the one that counts follows the last scan.
-            return body.rfind(_END_OF_JPEG) < body.rfind(_START_OF_SCAN) or _END_OF_JPEG not in body
-        case "image/png":
-            return b"IEND" not in body
-        case "image/webp":
-            return len(body) < 8 + int.from_bytes(body[4:8], "little")
-        case "image/tiff":
-            return _tiff_ends_early(body)
-        case _:
-            return False
-
-
-def _tiff_ends_early(body: bytes) -> bool:
-    """Whether the first picture of a TIFF points past the end of the file; what cannot be told the decoder will say."""
-    try:
-        tags = TiffImageFile(BytesIO(body)).tag_v2
-        pieces = [zip(tags[at], tags[length], strict=False) for at, length in (_STRIPS, _TILES) if at in tags]
-    except Exception:  # Pillow raises a dozen kinds
-        return False
-    return any(at + length > len(body) for piece in pieces for at, length in piece)

@@ -43,7 +43,7 @@ from deepsimbad.engine.localizer import (
 )
 from deepsimbad.engine.worker import EncodedImage, Priority, Stopwatch
 from deepsimbad.evaluators.base import Evaluator
-from deepsimbad.evaluators.image import MEDIA_TYPES
+from deepsimbad.evaluators.image_files import MEDIA_TYPES
 
 PROBABLY = 0.5
 router = APIRouter(prefix="/v1/domains", tags=["localization"])

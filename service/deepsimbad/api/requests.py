@@ -30,7 +30,8 @@ from deepsimbad.engine.truths import Truths
 from deepsimbad.engine.worker import EvaluatorPool, InferenceWorker, Priority, ready
 from deepsimbad.errors import EmptyBodyError, OverloadedError, UnsupportedMediaTypeError
 from deepsimbad.evaluators.base import Evaluator, Image
-from deepsimbad.evaluators.image import KEPT_PIXELS, ImageFile, is_blank
+from deepsimbad.evaluators.image import KEPT_PIXELS, decode_file, is_blank
+from deepsimbad.evaluators.image_files import ImageFile
 from deepsimbad.jobs.runner import JobRunner
 from deepsimbad.settings import Settings
 from deepsimbad.store.catalog import Catalog
@@ -135,7 +136,7 @@ class Decoders:
 
 def _decode(file: ImageFile, evaluator: Evaluator) -> tuple[Image, bool]:
     ready(evaluator)  # where it is not, decoding is in vain
-    image = file.decode()
+    image = decode_file(file)
     return evaluator.prepare(image), is_blank(image)
 
 

@@ -48,7 +48,7 @@ from deepsimbad.errors import (
     TraverseInUseError,
     UnknownTraverseError,
 )
-from deepsimbad.evaluators.image import MEDIA_TYPES
+from deepsimbad.evaluators.image_files import MEDIA_TYPES
 from deepsimbad.store.durable import storage_faults
 from deepsimbad.store.records import ListPage
 from deepsimbad.store.traverses import Traverse
