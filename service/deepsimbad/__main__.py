@@ -8,6 +8,7 @@ NEEDED = (
     "cv2",
     "fastapi",
     "fastapi_offline",
+    "jinja2",
     "numba",
     "numpy",
     "prometheus_client",

@@ -73,6 +73,10 @@ class Recording:
         """
         raise SourceError(f"{self.name} holds ready encodings, not images")
 
+    def stamp(self, frame: Frame) -> str:
+        """What changes when a frame's image does: its name, and of a file its size and time."""
+        return frame.name
+
     def view(self, row: int, input_size: tuple[int, int] | None) -> dict[str, Any]:
         """What is seen from `frames[row]`, as arguments of a client's calls; raises as `image` does."""
         if self.encodings is not None:
@@ -115,6 +119,15 @@ def finite_number(text: str) -> float | None:
     except ValueError:
         return None
     return value if math.isfinite(value) else None
+
+
+def stamp_of(path: Path) -> str:
+    """Name, size and time of a file; of one that is not there its name."""
+    try:
+        there = path.stat()
+    except OSError:
+        return path.name
+    return f"{path.name} {there.st_size} {there.st_mtime_ns}"
 
 
 def read_file(path: Path) -> bytes:

@@ -17,6 +17,7 @@ from deepsimbad_client.recordings import (
     decode,
     is_larger,
     read_file,
+    stamp_of,
 )
 from deepsimbad_client.recordings.names import in_order, times_of
 from deepsimbad_client.recordings.placing import placed
@@ -28,6 +29,10 @@ class FolderRecording(Recording):
     """The images of a folder in name order."""
 
     folder: Path
+
+    def stamp(self, frame: Frame) -> str:
+        """Of its file; see `Recording.stamp`."""
+        return stamp_of(self.folder / frame.name)
 
     def image(self, frame: Frame, input_size: tuple[int, int] | None) -> EncodedImage:
         """Read a frame: a file no larger than asked goes as it is, a larger one as JPEG.

@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepsimbad_client.errors import BrokenFrameError, SourceError
-from deepsimbad_client.recordings import EncodedImage, Frame, Image, Recording, as_jpeg, decode, read_file
+from deepsimbad_client.recordings import EncodedImage, Frame, Image, Recording, as_jpeg, decode, read_file, stamp_of
 from deepsimbad_client.recordings.placing import placed_on
 from deepsimbad_client.recordings.track import Reals, Track, track_of
 
@@ -72,6 +72,10 @@ class NcltRecording(Recording):
     folder: Path  # the camera's
     probes: Sequence[str]  # file names of a few frames spread over the drive
     undistortion: UndistortionMap | None = None  # applied before an image is turned upright
+
+    def stamp(self, frame: Frame) -> str:
+        """Of its file; see `Recording.stamp`."""
+        return stamp_of(self.folder / frame.name)
 
     def image(self, frame: Frame, input_size: tuple[int, int] | None) -> EncodedImage:
         """Read a frame upright, no larger than asked, as JPEG; see `Recording.image`."""

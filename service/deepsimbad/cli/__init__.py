@@ -12,6 +12,7 @@ from deepsimbad.cli.experiment import experiment
 from deepsimbad.cli.local import delete, info, localize, map_
 from deepsimbad.cli.serve import init, keys, serve, settings
 from deepsimbad.cli.storage import backup, check, export, import_, restore
+from deepsimbad.cli.trial import try_
 from deepsimbad.cli.weights import weights
 from deepsimbad.errors import CancelledError, DeepSimbadError, UnavailableError
 from deepsimbad_client.errors import DeepSimbadClientError
@@ -26,7 +27,7 @@ def deepsimbad() -> None:
 
 
 for command in (
-    *(init, serve, map_, localize, info, delete, experiment, keys, settings),
+    *(init, serve, map_, localize, try_, info, delete, experiment, keys, settings),
     *(backup, restore, export, import_, check, weights),
 ):
     deepsimbad.add_command(command)
@@ -38,7 +39,10 @@ def run(arguments: Sequence[str] | None = None) -> int:
     logging.getLogger("deepsimbad").addHandler(logging.NullHandler())
     try:
         code = deepsimbad.main(args=None if arguments is None else list(arguments), standalone_mode=False)
-    except (click.exceptions.Abort, KeyboardInterrupt, CancelledError):
+    except CancelledError as error:
+        click.echo(error.message, err=True)
+        return _CANCELLED
+    except (click.exceptions.Abort, KeyboardInterrupt):
         click.echo("cancelled", err=True)
         return _CANCELLED
     except click.ClickException as error:

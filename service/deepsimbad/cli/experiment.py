@@ -6,6 +6,8 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import click
+import numpy as np
+from numpy.typing import NDArray
 from rich.table import Table
 
 from deepsimbad.cli.terminal import (
@@ -20,7 +22,7 @@ from deepsimbad.cli.terminal import (
     write_json,
 )
 from deepsimbad.core.belief import FilterKind
-from deepsimbad.core.drive import SameRoute
+from deepsimbad.core.drive import Drive, SameRoute
 from deepsimbad.core.metrics import RetrievalScores
 from deepsimbad.core.planners import DEFAULT_PLANNER
 from deepsimbad.core.relevance import DEFAULT_RELEVANCE, DEFAULT_UPDATE, Relevance, UpdateRule
@@ -39,8 +41,23 @@ from deepsimbad_client.recordings.sources import open_source
 
 _ROLES = ("landmarks", "training", "test")
 _READING_STAGES = {f"read {role}": 2.0 for role in _ROLES}
-_STANDARD_OUTPUT = Path("-")
+STANDARD_OUTPUT = Path("-")
 _Command = TypeVar("_Command", bound=Callable[..., Any])
+json_file_option = click.option(
+    "--json",
+    "json_file",
+    type=click.Path(dir_okay=False, path_type=Path),
+    is_flag=False,
+    flag_value=STANDARD_OUTPUT,
+    help="Write the result as JSON to FILE; without FILE to standard output.",
+)
+tolerance_option = click.option(
+    "--tolerance",
+    type=click.FloatRange(min=0),
+    default=2.0,
+    show_default=True,
+    help="Metres within which a match is true.",
+)
 
 
 def _triplet_options(command: _Command) -> _Command:
@@ -58,14 +75,7 @@ def _triplet_options(command: _Command) -> _Command:
             help="Whether landmarks and training count their positions along one route, as test and training do.  "
             "[default: they do]",
         ),
-        click.option(
-            "--json",
-            "json_file",
-            type=click.Path(dir_okay=False, path_type=Path),
-            is_flag=False,
-            flag_value=_STANDARD_OUTPUT,
-            help="Write the result as JSON to FILE; without FILE to standard output.",
-        ),
+        json_file_option,
         config_option,
         click.option(  # as every command does, so that a script may give it to all of them
             "--data-dir",
@@ -86,13 +96,7 @@ def experiment() -> None:
 @_triplet_options
 @evaluators_option
 @click.option("--relevance", "names", type=RELEVANCES, multiple=True, help="Only this one; may be repeated.")
-@click.option(
-    "--tolerance",
-    type=click.FloatRange(min=0),
-    default=2.0,
-    show_default=True,
-    help="Metres within which a match is true.",
-)
+@tolerance_option
 @click.option("--stateless", is_flag=True, help="Every view by itself, in place of one session over the test drive.")
 @click.option(
     "--bar-own-place",
@@ -139,17 +143,14 @@ def vpr(
         extractor = evaluator.extractor
         with progress_bar(_READING_STAGES | vpr_stages(config), extractor) as progress:
             measure, (landmarks, training, test), sources = _read_triplet(asked, evaluator, progress)
-            if ground_truth is None:
-                truth = true_images_of(test.drive.route(), training.drive.route(), tolerance)
-            else:
-                truth = read_ground_truth(ground_truth, test.drive.index, training.drive.index)
+            truth = true_images(test.drive, training.drive, tolerance, ground_truth)
             report = run_vpr(config, measure, landmarks.drive, training.drive, test, truth, progress)
         sources["ground_truth"] = None if ground_truth is None else str(ground_truth)
         documents[extractor], reports[extractor] = report.as_dict(sources), report
     if len(reports) > 1:
-        _tell({"extractors": documents}, asked["json_file"], lambda: _print_extractors(reports))
+        tell({"extractors": documents}, asked["json_file"], lambda: _print_extractors(reports))
     else:
-        _tell(documents[extractor], asked["json_file"], lambda: _print_relevances(report))
+        tell(documents[extractor], asked["json_file"], lambda: _print_relevances(report))
 
 
 @experiment.command()
@@ -182,7 +183,7 @@ def nbv(evaluator: EvaluatorConfig, relevance: str | None, update: str | None, *
         measure, (landmarks, training, test), sources = _read_triplet(asked, evaluator, progress)
         report = run_nbv(config, measure, landmarks.drive, training.drive, test.drive, progress)
     document = report.as_dict(sources)
-    _tell(document, asked["json_file"], lambda: _print_planners(report, document))
+    tell(document, asked["json_file"], lambda: _print_planners(report, document))
 
 
 @experiment.command()
@@ -212,7 +213,7 @@ def calibration(evaluator: EvaluatorConfig, relevance: str, filter_name: str, **
         measure, (landmarks, training, test), sources = _read_triplet(asked, evaluator, progress)
         report = run_calibration(config, measure, landmarks.drive, training.drive, test.drive, progress)
     document = report.as_dict(sources)
-    _tell(document, asked["json_file"], lambda: _print_calibration(document, report.same_route))
+    tell(document, asked["json_file"], lambda: _print_calibration(document, report.same_route))
 
 
 def _read_triplet(
@@ -234,11 +235,18 @@ def _read_triplet(
     return evaluator, recordings, sources
 
 
-def _tell(document: dict[str, Any], json_file: Path | None, print_for_people: Callable[[], None]) -> None:
+def true_images(test: Drive, training: Drive, tolerance_m: float, file: Path | None) -> list[NDArray[np.int64]]:
+    """For every test frame the map images that are true: by a file of ground truth, else by positions."""
+    if file is not None:
+        return read_ground_truth(file, test.index, training.index)
+    return true_images_of(test.route(), training.route(), tolerance_m)
+
+
+def tell(document: dict[str, Any], json_file: Path | None, print_for_people: Callable[[], None]) -> None:
     """Where `--json` is standard output, that holds nothing else."""
     if json_file is not None:
-        write_json(document, None if json_file == _STANDARD_OUTPUT else json_file)
-    if json_file != _STANDARD_OUTPUT:
+        write_json(document, None if json_file == STANDARD_OUTPUT else json_file)
+    if json_file != STANDARD_OUTPUT:
         print_for_people()
 
 

@@ -1,7 +1,7 @@
 """From recordings to a map: encoded, landmarks chosen, every frame described, experience learnt (II-B to II-D)."""
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, MutableMapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field, replace
@@ -55,10 +55,14 @@ def encode_recording(
     on_progress: Callable[[float], None],
     *,
     allow_missing: bool = True,
+    kept: MutableMapping[str, NDArray[np.float32]] | None = None,
 ) -> EncodedRecording:
     """Encode a recording's images as the service would, or take its ready encodings.
 
     The client's own readers prepare the images (decision 0003), so one that is uploaded has the same numbers.
+
+    Args:
+        kept: Encodings by `Recording.stamp` of earlier calls, which are not made again; takes those that are.
 
     Raises:
         InvalidSourceError: No frame can be used.
@@ -68,7 +72,7 @@ def encode_recording(
     frames, left_out = list(recording.frames), LeftOut(recording, allow_missing=allow_missing)
     encodings, encode_ms, weights_sha256 = recording.encodings, None, None
     if encodings is None:
-        places, encodings, encode_ms = _encode_images(recording, evaluator, max_pixels, left_out, on_progress)
+        places, encodings, encode_ms = _encode_images(recording, evaluator, max_pixels, left_out, on_progress, kept)
         frames, weights_sha256 = [frames[place] for place in places], evaluator.weights_sha256
     if not frames:
         raise InvalidSourceError(f"{recording.name} has no frame that can be used: {left_out.counts}")
@@ -94,28 +98,41 @@ def _encode_images(
     max_pixels: int,
     left_out: LeftOut,
     on_progress: Callable[[float], None],
+    kept: MutableMapping[str, NDArray[np.float32]] | None,
 ) -> tuple[list[int], NDArray[np.float32], float | None]:
     """Places of the frames that could be read, their encodings, the median of milliseconds; broken ones are counted."""
     if not evaluator.takes_images or evaluator.encoding_dim is None:
         raise InvalidSourceError("this evaluator takes ready encodings alone; give a .npy or .csv file")
     encodings = np.empty((len(recording.frames), evaluator.encoding_dim), np.float32)
     places: list[int] = []
+    kept = {} if kept is None else kept
     waiting: list[Image] = []  # as many as are best encoded at once
+    rows: list[int] = []  # where their encodings belong
+    stamps: list[str] = []  # and what they are kept by
     took_ms: list[float] = []
     began = time.perf_counter()
     for place, frame in enumerate(recording.frames):
-        try:
-            body = recording.image(frame, evaluator.input_size).body
-        except BrokenFrameError as error:
-            left_out.add(error.reason, frame.name)
-        else:
-            began = began if waiting else time.perf_counter()
-            waiting.append(evaluator.prepare(decode_image(body, max_pixels)))
+        stamp = recording.stamp(frame)
+        if (encoding := kept.get(stamp)) is not None:
+            encodings[len(places)] = encoding
             places.append(place)
+        else:
+            try:
+                body = recording.image(frame, evaluator.input_size).body
+            except BrokenFrameError as error:
+                left_out.add(error.reason, frame.name)
+            else:
+                began = began if waiting else time.perf_counter()
+                waiting.append(evaluator.prepare(decode_image(body, max_pixels)))
+                rows.append(len(places))
+                stamps.append(stamp)
+                places.append(place)
         if waiting and (len(waiting) >= evaluator.largest_batch or place == len(recording.frames) - 1):
-            encodings[len(places) - len(waiting) : len(places)] = evaluator.encode(waiting)
+            encodings[rows] = evaluator.encode(waiting)
+            kept.update(zip(stamps, encodings[rows], strict=True))
             took_ms += [1000 * (time.perf_counter() - began) / len(waiting)] * len(waiting)
-            waiting.clear()
+            for pile in (waiting, rows, stamps):
+                pile.clear()
         on_progress((place + 1) / len(recording.frames))
     return places, encodings[: len(places)], median(took_ms) if took_ms else None
 

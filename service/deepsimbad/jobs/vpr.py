@@ -142,7 +142,7 @@ def run_vpr(
         progress.stage("drive")
         map_ = built[Relevance.COMPOSED].map
         views = views_of(measured(test.drive, map_.landmark_model, evaluator))
-        by_all = _relevances_by_all(built[Relevance.COMPOSED], test.drive, stateless=False)
+        by_all = relevances_by_all(built[Relevance.COMPOSED], test.drive, stateless=False)
         passive = drive_in_order(map_, views, test.drive.position_m, by_all, true_images, progress.update)
     stages = {stage.replace(" ", "_") for stage in vpr_stages(config)}
     seconds = {stage: took for stage, took in progress.seconds().items() if stage in stages}
@@ -150,7 +150,7 @@ def run_vpr(
     return VprReport(
         config,
         scores,
-        _bits_per_map_image(sized.map),
+        bits_per_map_image(sized.map),
         seconds,
         sized.same_route,
         encoding_dim=test.drive.encoding_dim,
@@ -160,7 +160,7 @@ def run_vpr(
     )
 
 
-def _bits_per_map_image(map_: Map) -> float:
+def bits_per_map_image(map_: Map) -> float:
     """Write the map to a file, as a remap would, and count the pages of its posting tables."""
     with tempfile.TemporaryDirectory() as folder:
         building, sealed = Path(folder) / "1.building", Path(folder) / "1.sqlite"
@@ -201,12 +201,12 @@ def _score_by_all(
     built: Built, test: Drive, true_images: Sequence[NDArray[np.int64]], stateless: bool
 ) -> RetrievalScores:
     scorer = RetrievalScorer()
-    for relevance, truth in zip(_relevances_by_all(built, test, stateless), true_images, strict=True):
+    for relevance, truth in zip(relevances_by_all(built, test, stateless), true_images, strict=True):
         scorer.add(relevance, truth)
     return scorer.result()
 
 
-def _relevances_by_all(built: Built, test: Drive, stateless: bool) -> Iterator[NDArray[np.float32]]:
+def relevances_by_all(built: Built, test: Drive, stateless: bool) -> Iterator[NDArray[np.float32]]:
     """[n] of every frame by what the lists stand for: the same unit vectors, and nothing left out."""
     usual = built.map.live_statistics
     if built.places is None or usual is None or usual.encodings is None:

@@ -1,0 +1,229 @@
+"""Two drives tried out: one is mapped, the other localized on it in order as one session, and held to the truth."""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deepsimbad.core.building import MapPlan
+from deepsimbad.core.drive import Drive
+from deepsimbad.core.localizer import ActiveLocalizer, LocalizerConfig, LocalizerState
+from deepsimbad.core.map import Map
+from deepsimbad.core.metrics import RetrievalScorer, RetrievalScores
+from deepsimbad.core.planners import CONSTANT
+from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Query
+from deepsimbad.core.summary import CONFIDENT_WITHIN_M
+from deepsimbad.errors import PastTheEndError
+from deepsimbad.evaluators.base import Evaluator
+from deepsimbad.jobs.build import build, measured, views_of
+from deepsimbad.jobs.progress import Progress
+from deepsimbad.jobs.remap import DEFAULT_LIST_LENGTH, DEFAULT_N_LANDMARKS
+from deepsimbad.jobs.truth import nearest_images
+from deepsimbad.jobs.vpr import BRUTE_FORCE_U, bits_per_map_image, relevances_by_all
+
+RECALL_RANKS = tuple(range(1, 26))  # N of the curve of recall@N
+TRIAL_STAGES = {"map": 3.0, "localize": 3.0}
+_N_STRETCHES = 20  # that a drive is cut into, to say where it fails
+
+
+@dataclass(frozen=True)
+class TrialConfig:
+    """What a trial is of, beside the two drives; the rest is as a remap has it by default."""
+
+    tolerance_m: float = 2.0  # how far from the query a map image may be and still be true
+    # Whether positions of the landmark drive and the database are comparable; None: where both know x, y
+    same_route: bool | None = True
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One query, and what came back."""
+
+    best_image: int  # the map image that this view alone places first
+    true_image: int | None  # the nearest of those that are true; None: the map does not hold the place
+    rank: float | None  # of the best-placed true image, from 0; None where there is none
+    error_m: float | None  # from the best image to the true one
+    belief_error_m: float | None  # the same from the place that the session holds likeliest by then
+
+    @property
+    def is_wrong(self) -> bool:
+        """It has a true image, and another came first."""
+        return self.rank is not None and self.rank >= 1
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """A part of the query drive, and how its queries fared."""
+
+    from_m: float
+    to_m: float
+    n_queries: int
+    n_wrong: int
+    median_error_m: float  # of the wrong ones
+
+
+@dataclass(frozen=True)
+class TrialReport:
+    """What a trial came to."""
+
+    config: TrialConfig
+    map: Map
+    queries: Drive
+    outcomes: list[Outcome]  # in the order of the queries
+    belief: NDArray[np.float32]  # [m, b] after each query, by equal parts of the map's route
+    scores: dict[str, RetrievalScores]  # of the map's lists; and of the whole vectors that they stand for
+    seconds: dict[str, float]  # by stage
+    n_forgot: int = 0  # moves that the belief had no room for, after which the session began anew
+    stretches: list[Stretch] = field(init=False)  # those where some query fails, worst first
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "stretches", _stretches(self.queries, self.outcomes))
+
+    def share_within(self, metres: float) -> float:
+        """Percent of scored queries after which the session's likeliest place was no farther off; NaN without any."""
+        errors = [outcome.belief_error_m for outcome in self.outcomes if outcome.belief_error_m is not None]
+        return 100 * float(np.mean([error <= metres for error in errors])) if errors else float("nan")
+
+    def as_dict(self, sources: dict[str, Any]) -> dict[str, Any]:
+        """The stable flat JSON document, as `experiment vpr` has it."""
+        score = self.scores[DEFAULT_RELEVANCE.value]
+        errors = [outcome.error_m for outcome in self.outcomes if outcome.error_m is not None]
+        return {
+            "anr": {name: each.anr for name, each in self.scores.items()},
+            "recall_at_1": {name: each.recall_at[1] for name, each in self.scores.items()},
+            "recall_at_5": {name: each.recall_at[5] for name, each in self.scores.items()},
+            "recall_at": {name: {str(n): r for n, r in each.recall_at.items()} for name, each in self.scores.items()},
+            "default": DEFAULT_RELEVANCE.value,
+            "n_queries": score.n_queries,
+            "n_left_out": score.n_left_out,
+            "n_map_images": self.map.n_images,
+            "n_landmarks": self.map.n_landmarks,
+            "error_m": {"median": _quantile(errors, 0.5), "p90": _quantile(errors, 0.9)},
+            "belief_within_5_m": self.share_within(CONFIDENT_WITHIN_M),
+            "n_forgot": self.n_forgot,
+            "fails": [asdict(stretch) for stretch in self.stretches],
+            "index_bits_per_map_image": bits_per_map_image(self.map),
+            "config": {**asdict(self.config), **sources},
+            "seconds": self.seconds,
+        }
+
+
+def run_trial(
+    config: TrialConfig,
+    evaluator: Evaluator,
+    landmarks: Drive | None,
+    database: Drive,
+    queries: Drive,
+    true_images: Sequence[NDArray[np.int64]],
+    progress: Progress,
+) -> TrialReport:
+    """Map the database as a remap does by default, and localize every query in order, as one session.
+
+    Args:
+        landmarks: Another drive to choose landmarks from and learn from; None: the database's own frames.
+        true_images: For every query the map images that count as true.
+    """
+    progress.stage("map")
+    plan = MapPlan(DEFAULT_RELEVANCE, DEFAULT_LIST_LENGTH, (CONFIDENT_WITHIN_M,), same_route=config.same_route)
+    n_landmarks = min(DEFAULT_N_LANDMARKS, (landmarks or database).n_frames)
+    built = build(plan, database, landmarks, landmarks, n_landmarks, evaluator, progress.update)
+    progress.stage("localize")
+    views = views_of(measured(queries, built.map.landmark_model, evaluator))
+    session = _Session(built.map, views, queries)
+    scorer, by_all, outcomes = RetrievalScorer(RECALL_RANKS), RetrievalScorer(RECALL_RANKS), []
+    nearest = nearest_images(queries, database)
+    whole = relevances_by_all(built, queries, stateless=False)
+    for row, (truth, of_all) in enumerate(zip(true_images, whole, strict=True)):
+        relevance, mass = session.look(row)
+        by_all.add(of_all, truth)
+        rank = scorer.add(relevance, truth)
+        outcomes.append(_outcome(built.map, relevance, mass, truth, rank, int(nearest[row])))
+        progress.update((row + 1) / len(true_images))
+    scores = {DEFAULT_RELEVANCE.value: scorer.result(), BRUTE_FORCE_U: by_all.result()}
+    return TrialReport(
+        *(config, built.map, queries, outcomes, np.array(session.belief, np.float32), scores),
+        {stage: seconds for stage, seconds in progress.seconds().items() if stage in TRIAL_STAGES},
+        session.n_forgot,
+    )
+
+
+class _Session:
+    """One robot on the query drive, which knows how far it moves.
+
+    Attributes:
+        belief: After each view, by equal parts of the route.
+        n_forgot: How often it began anew.
+    """
+
+    def __init__(self, map_: Map, views: Query, queries: Drive) -> None:
+        # Nobody follows its plans, and a constant planner's cost nothing.
+        self._localizer = ActiveLocalizer(map_, LocalizerConfig(planner=f"{CONSTANT}:{CONFIDENT_WITHIN_M:g}"))
+        self._state: LocalizerState = self._localizer.start()
+        self._views, self._moves_m = views, np.diff(queries.position_m, prepend=queries.position_m[0])
+        self._edges_m, self._bins = map_.route.histogram
+        self.belief: list[NDArray[np.float64]] = []
+        self.n_forgot = 0
+
+    def look(self, row: int) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+        """The relevance of every map image to one view, [n], and their masses after it, [n]."""
+        view, move_m = self._views.at(row), float(self._moves_m[row])
+        try:
+            state = self._localizer.step(self._state, view, move_m).state
+        except PastTheEndError:  # it was taken for elsewhere: from knowing nothing, but what is usual, on
+            anew = self._localizer.with_prior(self._state, *_anywhere(self._state))
+            state, self.n_forgot = self._localizer.step(anew, view).state, self.n_forgot + 1
+        self._state, mass = state, state.belief.mass
+        self.belief.append(np.asarray(np.bincount(self._bins, mass, self._edges_m.size - 1), np.float64))
+        if state.relevance is None:
+            raise ValueError("a step leaves the view's relevance")
+        return state.relevance, mass
+
+
+def _anywhere(state: LocalizerState) -> tuple[float, float]:
+    route = state.belief.route
+    return route.start_m + route.length_m / 2, 100 * max(route.length_m, 1.0)
+
+
+def _outcome(
+    map_: Map,
+    relevance: NDArray[np.float32],
+    mass: NDArray[np.float64],
+    truth: NDArray[np.int64],
+    rank: float | None,
+    nearest: int,
+) -> Outcome:
+    best = int(relevance.argmax())
+    if rank is None:
+        return Outcome(best, None, None, None, None)
+    true = nearest if nearest in truth else int(truth[truth.size // 2])  # a file of ground truth may know it better
+    return Outcome(best, true, rank, _apart_m(map_, best, true), _apart_m(map_, int(mass.argmax()), true))
+
+
+def _apart_m(map_: Map, image: int, other: int) -> float:
+    """Metres between map images: in the plane where both are known, else along the route."""
+    route = map_.route
+    if route.x_m is not None and route.y_m is not None:
+        plane_m = float(np.hypot(route.x_m[other] - route.x_m[image], route.y_m[other] - route.y_m[image]))
+        if np.isfinite(plane_m):
+            return plane_m
+    return abs(float(route.offset_m(route.position_m[[other]], float(route.position_m[image]))[0]))
+
+
+def _stretches(queries: Drive, outcomes: Sequence[Outcome]) -> list[Stretch]:
+    edges_m = np.linspace(queries.position_m[0], queries.position_m[-1], min(_N_STRETCHES, len(outcomes)) + 1)
+    part = np.clip(np.searchsorted(edges_m, queries.position_m, side="right") - 1, 0, max(edges_m.size - 2, 0))
+    stretches = []
+    for number in range(edges_m.size - 1):
+        there = [outcome for outcome, at in zip(outcomes, part, strict=True) if at == number]
+        scored = [outcome for outcome in there if outcome.rank is not None]
+        errors = [outcome.error_m for outcome in scored if outcome.is_wrong and outcome.error_m is not None]
+        if errors:
+            ends_m = float(edges_m[number]), float(edges_m[number + 1])
+            stretches.append(Stretch(*ends_m, len(scored), len(errors), float(np.median(errors))))
+    return sorted(stretches, key=lambda stretch: (-stretch.n_wrong / stretch.n_queries, -stretch.median_error_m))
+
+
+def _quantile(values: Sequence[float], q: float) -> float:
+    return float(np.quantile(values, q)) if values else float("nan")
