@@ -4,6 +4,7 @@ import json
 import struct
 import zlib
 
+import numpy as np
 import pytest
 
 from deepsimbad.store.catalog import ANY, Catalog
@@ -396,3 +397,108 @@ def test_our_own_fault_tells_nothing_but_its_id(client, monkeypatch):
     assert problem(answer, 500, "internal_error")["request_id"] == "mine-1"
     assert "secret" not in answer.text
     assert answer.headers["x-content-type-options"] == "nosniff"
+
+
+# Drives that teach nothing, and seasons that are not what they were taken for
+
+PLACES = 120
+AT_M = np.arange(float(PLACES))
+
+
+def season(seed, n_frames=PLACES):
+    """Encodings of one route, a metre apart."""
+    place = np.random.default_rng(0).normal(size=(n_frames, DIM))
+    return (place + 0.2 * np.random.default_rng(seed).normal(size=place.shape)).astype(np.float32)
+
+
+@pytest.fixture
+def mapped(client, request):
+    """The job that maps drives, and a function that tells where a view is placed."""
+    name = f"drives-{zlib.crc32(request.node.name.encode())}"
+    assert client.put(f"/v1/admin/domains/{name}", json={"evaluator": {**KIND, "extractor": "none"}}).is_success
+
+    def mapped(summer, winter=None, plane=(None, None), **remap):
+        for traverse, encodings, at_m in (("summer", summer, plane[0]), ("winter", winter, plane[1])):
+            if encodings is not None:
+                x_m = {} if at_m is None else {"x_m": at_m, "y_m": np.zeros(len(at_m))}
+                client.upload(name, traverse, encodings, np.arange(float(len(encodings))), **x_m)
+        options = {"training_episodes": 0, **({} if winter is None else {"landmark_traverse": "winter"}), **remap}
+        job = client.remap(name, training_traverse="summer", **options)
+        return job, lambda view: client.post(
+            f"/v1/domains/{name}/localizations", json={"encoding": view.astype(float).tolist()}
+        ).json()
+
+    yield mapped
+    assert client.delete(f"/v1/admin/domains/{name}").status_code == 204
+
+
+@pytest.mark.parametrize("still", ["summer", "winter", "both"])
+def test_a_number_that_stands_still_in_a_season_says_nothing(mapped, still):
+    summer, winter, live = season(1), season(2), season(3)
+    for drive, names in ((summer, ("summer", "both")), (winter, ("winter", "both"))):
+        if still in names:
+            drive[:, 3] = 700 if drive is winter else -3
+    job, place = mapped(summer, winter, same_route=True)
+    assert job["state"] == "succeeded", job["error"]
+    assert job["result"]["metrics"]["second_season"]["accepted"] is True
+    for value in (-3, 0, 700):
+        live[:, 3] = value
+        assert [place(live[frame])["belief"]["mode_m"] for frame in (30, 80)] == [30, 80]
+
+
+@pytest.mark.parametrize(
+    ("n_frames", "options", "code", "says"),
+    [
+        (PLACES, {"n_landmarks": PLACES + 1}, "too_few_candidates", "ask for fewer landmarks or drive further"),
+        (3, {}, "invalid_map_config", "list_length 4"),
+        (1, {}, "invalid_map_config", "list_length 4"),
+    ],
+)
+def test_fewer_frames_than_landmarks_are_named(mapped, n_frames, options, code, says):
+    job, _ = mapped(season(1, n_frames), **options)
+    assert (job["state"], job["error"]["code"]) == ("failed", code)
+    assert says in job["error"]["detail"]
+
+
+def test_a_short_drive_is_mapped_by_landmarks_of_a_longer_one(mapped):
+    job, place = mapped(season(1)[:3], season(2), n_landmarks=100)
+    assert job["state"] == "succeeded", job["error"]
+    assert place(season(3)[1])["belief"]["mode_m"] == 1
+
+
+@pytest.mark.parametrize("plane", [False, True])
+def test_a_drive_the_other_way_teaches_no_second_season(mapped, plane):
+    planes = (AT_M, AT_M[::-1].copy()) if plane else (None, None)
+    job, place = mapped(season(1), season(2)[::-1], planes, same_route=None if plane else True)
+    verdict = job["result"]["metrics"]["second_season"]
+    says = "share 0 places" if plane else "agree no better than where one is shifted"
+    assert (verdict["accepted"], says in verdict["why"]) == (False, True)
+    assert place(season(3)[30])["belief"]["mode_m"] == 30
+
+
+def test_a_drive_of_another_extractor_is_named_or_teaches_nothing(mapped, client):
+    other = np.random.default_rng(9).normal(size=(PLACES, DIM)).astype(np.float32)
+    job, _ = mapped(season(1), other, same_route=True)
+    verdict = job["result"]["metrics"]["second_season"]
+    assert (verdict["accepted"], "agree no better" in verdict["why"]) == (False, True)
+    client.upload(job["domain"], "short", other[:, :5], AT_M)
+    job = client.remap(job["domain"], training_traverse="summer", landmark_traverse="short")
+    assert (job["state"], job["error"]["code"]) == ("failed", "invalid_encoding")
+    assert "encodings of 5 numbers" in job["error"]["detail"]
+
+
+@pytest.mark.parametrize("covered", ["summer", "winter"])
+@pytest.mark.parametrize("relevance", ["composed", "rrf"])
+def test_a_drive_that_shows_one_picture_alone_is_named(mapped, covered, relevance):
+    drives = {"summer": season(1), "winter": season(2)}
+    drives[covered][:] = drives[covered][0]
+    job, _ = mapped(**drives, relevance=relevance)
+    assert (job["state"], job["error"]["code"]) == ("failed", "invalid_encoding")
+    assert f"all {PLACES} frames of traverse {covered} have one and the same encoding" in job["error"]["detail"]
+
+
+@pytest.mark.parametrize("scale", [1e-30, 1e30])
+def test_encodings_of_any_size_are_compared(mapped, scale):
+    job, place = mapped(season(1) * np.float32(scale))
+    assert job["state"] == "succeeded", job["error"]
+    assert place(season(3)[30] * np.float32(scale))["belief"]["mode_m"] == 30

@@ -262,7 +262,8 @@ def check_list_length(list_length: int, n_landmarks: int) -> None:
     """Raise InvalidMapConfigError where h is not within 1..r."""
     if not 1 <= list_length <= n_landmarks:
         raise InvalidMapConfigError(
-            f"list_length {list_length} is not within 1 and the number of landmarks, {n_landmarks}",
+            f"list_length {list_length} is not within 1 and the number of landmarks, {n_landmarks}: ask for "
+            "shorter lists, or landmarks from a longer drive",
             list_length=list_length,
             n_landmarks=n_landmarks,
         )

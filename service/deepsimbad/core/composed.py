@@ -24,7 +24,7 @@ SECOND_SEASON_WEIGHT = 0.8  # of the landmark drive's view of a place beside the
 LEAST_SHARED_PLACES = 100  # that within-place scatter is learnt from
 _EVENING_OUT = 5.0  # of the mean variance: how far a projection's strong dimensions are held back
 _BEAM = 8  # partial lists that are followed at once
-_LEAST_STD = 1e-6
+_STILL, _MUTE = 1e-6, 1e6  # of the greatest deviation: what moves less tells nothing, and is divided by so much
 _BARRED = np.float32(-1e9)
 _ROWS_AT_ONCE = 1024
 _MOST_FRAMES = 2048  # that principal directions are found from
@@ -40,10 +40,18 @@ class Moments:
 
     @classmethod
     def of(cls, *drives: NDArray[np.float32]) -> Self:
-        """Mean of the drives' means, mean of their variances: what is usual for a view of an unknown season."""
-        mean = np.mean([drive.mean(axis=0, dtype=np.float64) for drive in drives], axis=0)
-        variance = np.mean([drive.var(axis=0, dtype=np.float64) for drive in drives], axis=0)
-        return cls(PRIOR_WEIGHT_FRAMES, mean, variance + np.square(mean))
+        """Mean of the drives' means, mean of their variances: what is usual for a view of an unknown season.
+
+        A number that stood still in one of the drives has so great a deviation that it says nothing.
+        """
+        means, variances = [], []
+        for drive in drives:
+            means.append(drive.mean(axis=0, dtype=np.float64))
+            variance = drive.var(axis=0, dtype=np.float64)
+            greatest = variance.max() or 1.0
+            variances.append(np.where(variance <= _STILL**2 * greatest, _MUTE**2 * greatest, variance))
+        mean = np.mean(means, axis=0)
+        return cls(PRIOR_WEIGHT_FRAMES, mean, np.mean(variances, axis=0) + np.square(mean))
 
     @classmethod
     def from_mean_std(cls, statistics: NDArray[np.floating]) -> Self:
@@ -53,9 +61,8 @@ class Moments:
 
     @property
     def std(self) -> NDArray[np.float64]:
-        """[d]; of a number that never moved 1, so that it says nothing."""
-        std = np.sqrt(np.maximum(self.square - np.square(self.mean), 0.0))
-        return np.where(std > _LEAST_STD, std, 1.0)
+        """[d] float64."""
+        return np.sqrt(np.maximum(self.square - np.square(self.mean), 1e-300))
 
     def mean_std(self) -> NDArray[np.float32]:
         """[2, d], as a map stores it."""

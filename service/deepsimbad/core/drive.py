@@ -99,6 +99,15 @@ class Drive:
         arrays = {name: array[frames] for name, array in vars(self).items() if isinstance(array, np.ndarray)}
         return replace(self, **arrays)
 
+    def check_differs(self, name: str) -> None:
+        """Raise InvalidEncodingError where no frame can be told from another."""
+        first, *others = self.encodings
+        if others and all(np.array_equal(first, row) for row in others):
+            raise InvalidEncodingError(
+                f"all {self.n_frames} frames of {name} have one and the same encoding, which tells no place from "
+                "another: is the lens covered, or the extractor broken? Record another drive"
+            )
+
     def route(self, closed: bool = False) -> Route:
         """The frames' positions as a route; x, y only where some frame knows them.
 

@@ -68,6 +68,7 @@ def encode_recording(
         InvalidSourceError: No frame can be used.
         TooManyLeftOutError: More than a twentieth of the frames are left out, without `allow_missing`.
         InvalidRouteError: The positions go backwards or are NaN.
+        InvalidEncodingError: All frames have one encoding.
     """
     frames, left_out = list(recording.frames), LeftOut(recording, allow_missing=allow_missing)
     encodings, encode_ms, weights_sha256 = recording.encodings, None, None
@@ -89,6 +90,7 @@ def encode_recording(
         weights_sha256=weights_sha256,
     )
     drive.route()
+    drive.check_differs(recording.name)
     return EncodedRecording(drive, left_out.names, encode_ms)
 
 

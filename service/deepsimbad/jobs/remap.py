@@ -282,6 +282,7 @@ class _Remap:
             drive = traverse.read()
         if drive.n_frames == 0:
             raise InvalidMapConfigError(f"traverse {name} has no frames yet; upload some first", traverse=name)
+        drive.check_differs(f"traverse {name}")
         return drive
 
     def _check_encoder(self, name: str, drive: Drive, training: Drive) -> None:
