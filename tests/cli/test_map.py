@@ -6,6 +6,7 @@ import shutil
 import signal
 import time
 
+import cv2
 import numpy as np
 import pytest
 
@@ -171,6 +172,22 @@ def test_no_frame_is_left_out_of_a_map_without_a_word(deepsimbad, pictures, tmp_
     assert ran.code == 0
     assert len(ran.err.splitlines()) == 3
     assert all(line in ran.err for line in lost)
+
+
+def test_a_raw_image_of_nclt_is_turned_upright_in_map_and_localize(deepsimbad, pictures, tmp_path):
+    camera = tmp_path / "lb3" / "Cam5"
+    camera.mkdir(parents=True)
+    for place in range(8):
+        lying = cv2.rotate(
+            cv2.imread(str(pictures / f"{place}.png")).transpose(1, 0, 2), cv2.ROTATE_90_COUNTERCLOCKWISE
+        )
+        cv2.imwrite(str(camera / f"{1_326_030_975_000_000 + place}.tiff"), lying)
+    ran = deepsimbad("map", "route", "--training", camera, "--training-episodes", 0)
+    assert (ran.code, ran.err.count("turned upright")) == (0, 1)
+    ran = deepsimbad("localize", "route", camera / "1326030975000005.tiff", "--json")
+    assert "turned upright" in ran.err
+    (answer,) = json.loads(ran.out)
+    assert answer["belief"]["mode_m"] == 5
 
 
 def test_a_view_that_cannot_be_used_is_named(deepsimbad, pictures, tmp_path):

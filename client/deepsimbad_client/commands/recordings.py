@@ -24,10 +24,10 @@ from deepsimbad_client.commands.console import (
 from deepsimbad_client.errors import UnknownDomainError
 from deepsimbad_client.http.client import Client
 from deepsimbad_client.http.upload import upload as upload_recording
-from deepsimbad_client.recordings import Frame, Recording
+from deepsimbad_client.recordings import Recording
 from deepsimbad_client.recordings.encodings import ENCODING_SUFFIXES
-from deepsimbad_client.recordings.folder import FolderRecording
-from deepsimbad_client.recordings.options import accounting, opened, reading, tell_left_out
+from deepsimbad_client.recordings.folder import single
+from deepsimbad_client.recordings.options import accounting, opened, reading, tell_left_out, tell_remarks
 from deepsimbad_client.replay import DEFAULT_PLANNER
 from deepsimbad_client.replay.active import EPISODES, STEPS, Stage, active_replay
 from deepsimbad_client.replay.passive import TOLERANCE_M
@@ -126,9 +126,8 @@ def _views(images: Iterable[str], input_size: tuple[int, int] | None) -> Iterato
         path = Path(name)
         is_image = path.is_file() and path.suffix.lower() not in ENCODING_SUFFIXES
         if is_image:
-            recording: Recording = FolderRecording(
-                name=path.parent.name, frames=(Frame(0, path.name, 0.0),), folder=path.parent
-            )
+            recording: Recording = single(path)
+            tell_remarks(recording)
         else:
             recording = opened(name)
         for row, frame in enumerate(recording.frames):

@@ -20,6 +20,7 @@ Image = NDArray[np.uint8]  # [height, width, 3] BGR
 
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", ".pgm", ".ppm"})
 JPEG_QUALITY = 92
+TURNS = {0: None, 90: cv2.ROTATE_90_CLOCKWISE, 180: cv2.ROTATE_180, 270: cv2.ROTATE_90_COUNTERCLOCKWISE}
 
 _MAX_PIXELS = 1 << 30  # the picture is the caller's own
 
@@ -156,6 +157,12 @@ def decode(body: bytes, path: Path, *, as_stored: bool = False) -> Image:
     if image is None:
         raise BrokenFrameError(f"{path} is not an image that can be decoded", "undecodable")
     return np.asarray(image, dtype=np.uint8)
+
+
+def turned(image: Image, degrees: int) -> Image:
+    """Turn an image clockwise by a multiple of 90 degrees."""
+    turn = TURNS[degrees]
+    return image if turn is None else np.asarray(cv2.rotate(image, turn), dtype=np.uint8)
 
 
 def is_larger(image: Image, input_size: tuple[int, int] | None) -> bool:

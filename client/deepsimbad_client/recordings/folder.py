@@ -1,5 +1,6 @@
 """Folders of images in the order of their names, placed by a `positions.csv` beside them."""
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,8 +19,10 @@ from deepsimbad_client.recordings import (
     is_larger,
     read_file,
     stamp_of,
+    turned,
 )
 from deepsimbad_client.recordings.names import in_order, times_of
+from deepsimbad_client.recordings.nclt import TURNED_UPRIGHT, UPRIGHT_TURN, lies_on_its_side
 from deepsimbad_client.recordings.placing import placed
 from deepsimbad_client.recordings.positions import POSITIONS_FILE, read_positions
 
@@ -29,6 +32,7 @@ class FolderRecording(Recording):
     """The images of a folder in name order."""
 
     folder: Path
+    rotate: int = 0  # degrees clockwise by which images are turned
 
     def stamp(self, frame: Frame) -> str:
         """Of its file; see `Recording.stamp`."""
@@ -42,17 +46,34 @@ class FolderRecording(Recording):
         path = self.folder / frame.name
         body = read_file(path)
         image = decode(body, path)
-        if is_larger(image, input_size):
-            return as_jpeg(image, input_size)
+        if self.rotate or is_larger(image, input_size):
+            return as_jpeg(turned(image, self.rotate), input_size)
         media_type = media_type_of(body)
         if media_type is None:
             return EncodedImage(cv2.imencode(".png", image)[1].tobytes(), "image/png")
         return EncodedImage(body, media_type)
 
 
-def read_folder(folder: Path, spacing_m: float) -> FolderRecording:
+def single(path: Path, rotate: int | None = None) -> FolderRecording:
+    """One image file as a recording, turned as `read_folder` would turn it."""
+    return _upright(FolderRecording(path.parent.name, (Frame(0, path.name, 0.0),), folder=path.parent), rotate)
+
+
+def _upright(recording: FolderRecording, rotate: int | None) -> FolderRecording:
+    """The recording turned as asked; where nothing is asked, NCLT's images upright, which is said."""
+    if rotate is not None:
+        return dataclasses.replace(recording, rotate=rotate)
+    frames = recording.frames
+    probes = {frames[place].name for place in (0, len(frames) // 2, len(frames) - 1)}
+    if 2 * sum(lies_on_its_side(recording.folder / name) for name in probes) <= len(probes):
+        return recording
+    return dataclasses.replace(recording, rotate=UPRIGHT_TURN, remarks=[*recording.remarks, TURNED_UPRIGHT])
+
+
+def read_folder(folder: Path, spacing_m: float, rotate: int | None = None) -> FolderRecording:
     """Open a folder of images; without a positions.csv frame i is `i * spacing_m` metres along the route.
 
+    `rotate` turns the images clockwise by so many degrees; None: NCLT's images upright, others not at all.
     Raises SourceError: no images, or a positions.csv that cannot be understood; the message names the line.
     """
     try:
@@ -70,13 +91,14 @@ def read_folder(folder: Path, spacing_m: float) -> FolderRecording:
             Frame(i, file, i * spacing_m, timestamp_us=time_us)
             for i, (file, time_us) in enumerate(zip(names, times_us, strict=True))
         )
-        return FolderRecording(name=name, folder=folder, frames=frames)
+        return _upright(FolderRecording(name=name, folder=folder, frames=frames), rotate)
     table = read_positions(path, names, times_us)
     result = placed(table.frames, str(path))
-    return FolderRecording(
+    recording = FolderRecording(
         name=name,
         folder=folder,
         frames=tuple(result.frames),
         left_out_names=table.left_out_names | result.left_out_names,
         remarks=[*table.remarks, *result.remarks],
     )
+    return _upright(recording, rotate)

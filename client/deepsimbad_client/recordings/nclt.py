@@ -17,6 +17,7 @@ the track, unmoved by a robot that stands still: see `arc_length_m`.
 """
 
 import logging
+import re
 import warnings
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -29,7 +30,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepsimbad_client.errors import BrokenFrameError, SourceError
-from deepsimbad_client.recordings import EncodedImage, Frame, Image, Recording, as_jpeg, decode, read_file, stamp_of
+from deepsimbad_client.recordings import (
+    IMAGE_SUFFIXES,
+    EncodedImage,
+    Frame,
+    Image,
+    Recording,
+    as_jpeg,
+    decode,
+    read_file,
+    stamp_of,
+    turned,
+)
 from deepsimbad_client.recordings.placing import placed_on
 from deepsimbad_client.recordings.track import Reals, Track, track_of
 
@@ -38,8 +50,14 @@ N_CAMERAS = 6
 STORED_SIZE = (1616, 1232)  # (width, height) of the dataset's own images as stored; smaller copies are read too
 
 N_SIZE_PROBES = 9
-SUFFIXES = frozenset({".tiff", ".tif"})
+UPRIGHT_TURN = 90  # degrees clockwise, of images as stored
+TURNED_UPRIGHT = f"NCLT's images, which lie on their side as stored, are turned upright ({UPRIGHT_TURN} degrees)"
 N_COLUMNS = 7
+SHAPE_TOLERANCE = 0.01  # of width / height, by which a copy is told from other cameras' 4:3
+
+TIFF_SUFFIXES = frozenset({".tiff", ".tif"})
+_CAMERA = re.compile(r"Cam[0-5].*")
+_UTIME = re.compile(r"[0-9]{16}")
 
 logger = logging.getLogger(__name__)
 
@@ -72,6 +90,7 @@ class NcltRecording(Recording):
     folder: Path  # the camera's
     probes: Sequence[str]  # file names of a few frames spread over the drive
     undistortion: UndistortionMap | None = None  # applied before an image is turned upright
+    rotate: int | None = None  # degrees clockwise; None: upright, which copies that are higher than wide are already
 
     def stamp(self, frame: Frame) -> str:
         """Of its file; see `Recording.stamp`."""
@@ -93,7 +112,8 @@ class NcltRecording(Recording):
             )
         if self.undistortion is not None:
             stored = self.undistortion.apply(stored)
-        return np.asarray(cv2.rotate(stored, cv2.ROTATE_90_CLOCKWISE), dtype=np.uint8)
+        turn = (UPRIGHT_TURN if expected[0] > expected[1] else 0) if self.rotate is None else self.rotate
+        return turned(stored, turn)
 
     @cached_property
     def stored_size(self) -> tuple[int, int]:
@@ -116,16 +136,43 @@ class NcltRecording(Recording):
         return decode(read_file(path), path, as_stored=True)
 
 
-def read_nclt(root: Path, date: str, *, camera: int = FRONT_CAMERA, undistortion: Path | None = None) -> NcltRecording:
+def lies_on_its_side(path: Path) -> bool:
+    """Whether an image is one of NCLT's, by its folder (lb3/Cam5) or its name (Unix microseconds), lying as stored.
+
+    A file that cannot be read is none.
+    """
+    in_layout = bool(_CAMERA.fullmatch(path.parent.name)) and path.parent.parent.name.startswith("lb3")
+    if not in_layout and not _UTIME.fullmatch(path.stem):
+        return False
+    try:
+        height, width = decode(read_file(path), path, as_stored=True).shape[:2]
+    except BrokenFrameError:
+        return False
+    return width > height and (in_layout or abs(width / height - STORED_SIZE[0] / STORED_SIZE[1]) < SHAPE_TOLERANCE)
+
+
+def read_nclt(
+    root: Path,
+    date: str,
+    *,
+    camera: int = FRONT_CAMERA,
+    undistortion: Path | None = None,
+    rotate: int | None = None,
+    folder: Path | None = None,
+) -> NcltRecording:
     """Open one date (2012-01-22) of NCLT, whose folders are below `root`; camera 5 looks forward, 0 up.
 
+    Frames may be copies in another format, smaller, undistorted or turned upright; `folder` names theirs.
     `undistortion` is a `U2D_Cam<k>_*.txt` or the folder of them; None: images stay as the lens made them. Raises
     SourceError (no images, no ground truth, or no image that has ground truth).
     """
     if not 0 <= camera < N_CAMERAS:
         raise SourceError(f"camera {camera}: NCLT has cameras 0 to {N_CAMERAS - 1}; 5 looks forward")
-    places = [above / date / "lb3" / f"Cam{camera}" for above in (root, root / "images")]
-    folder = _first(f"images of NCLT {date}", places, Path.is_dir)
+    if folder is None:
+        places = [above / date / "lb3" / f"Cam{camera}" for above in (root, root / "images")]
+        for above in (root, root / "images"):
+            places += sorted((above / date).glob(f"lb3*/Cam{camera}*"))
+        folder = _first(f"images of NCLT {date}", places, Path.is_dir)
     truths = [
         root / "ground_truth" / f"groundtruth_{date}.csv",
         root / date / f"groundtruth_{date}.csv",
@@ -135,7 +182,7 @@ def read_nclt(root: Path, date: str, *, camera: int = FRONT_CAMERA, undistortion
     truth = read_ground_truth(_first(f"ground truth of NCLT {date}", truths, Path.is_file))
     names, not_times = _images_by_time(folder)
     if not names:
-        raise SourceError(f"{folder} holds no image named <utime>.tiff")
+        raise SourceError(f"{folder} holds no image named <utime>.tiff (nor .jpg, .png or another format)")
     result = placed_on(truth, [(name, time) for time, name in names.items()], str(folder), "the ground truth")
     left_out = {
         **result.left_out_names,
@@ -150,6 +197,7 @@ def read_nclt(root: Path, date: str, *, camera: int = FRONT_CAMERA, undistortion
         folder=folder,
         probes=[result.frames[place].name for place in probed],
         undistortion=None if undistortion is None else read_undistortion(undistortion, camera),
+        rotate=rotate,
     )
 
 
@@ -161,12 +209,13 @@ def _first(what: str, places: Sequence[Path], is_there: Callable[[Path], bool]) 
 
 
 def _images_by_time(folder: Path) -> tuple[dict[int, str], list[str]]:
-    """List a camera's folder: Unix microseconds -> file name, and the TIFFs that are not named by a time."""
+    """List a camera's folder: Unix microseconds -> file name, a TIFF's before a copy's; the images not named so."""
     try:
-        paths = [path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and path.name[0] != "."]
+        paths = [path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES and path.name[0] != "."]
     except OSError as error:
         raise SourceError(f"cannot read the folder {folder}: {error.strerror or error}") from error
     timed = [path for path in paths if path.stem.isascii() and path.stem.isdigit() and len(path.stem) <= 18]
+    timed.sort(key=lambda path: path.suffix.lower() in TIFF_SUFFIXES)
     return {int(path.stem): path.name for path in timed}, sorted(path.name for path in set(paths) - set(timed))
 
 

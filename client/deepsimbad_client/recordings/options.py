@@ -27,6 +27,12 @@ _OPTIONS = (
         help="NCLT's undistortion maps (U2D_Cam*.txt or their folder); absent: images stay as they are.",
     ),
     click.option(
+        "--rotate",
+        type=click.Choice(["0", "90", "180", "270"]),
+        callback=lambda _context, _parameter, value: None if value is None else int(value),
+        help="Degrees clockwise by which every image is turned.  [default: NCLT's upright, others not at all]",
+    ),
+    click.option(
         "--reverse", is_flag=True, help="Take the frames in the other order: where positions fall along the drive."
     ),
 )
@@ -37,7 +43,7 @@ def reading(command: Command) -> Command:
 
     @wraps(command)
     def with_reading(**options: Any) -> Any:
-        asked = {name: options.pop(name) for name in ("spacing_m", "undistortion", "reverse")}
+        asked = {name: options.pop(name) for name in ("spacing_m", "undistortion", "rotate", "reverse")}
         return command(reading=asked, **options)
 
     for option in reversed(_OPTIONS):
@@ -56,10 +62,15 @@ def accounting(command: Command) -> Command:
 def opened(source: str, allow_missing: bool = True, **reading: Any) -> Recording:
     """Open a SOURCE, telling on standard error what it was taken for. Raises SourceError, TooManyLeftOutError."""
     recording = open_source(source, **reading)
-    for remark in recording.remarks:
-        click.echo(f"{recording.name}: {remark}", err=True)
+    tell_remarks(recording)
     LeftOut(recording, allow_missing=allow_missing)
     return recording
+
+
+def tell_remarks(recording: Recording) -> None:
+    """Say on standard error what a recording was taken for."""
+    for remark in recording.remarks:
+        click.echo(f"{recording.name}: {remark}", err=True)
 
 
 def tell_left_out(names: Mapping[str, Sequence[str]], recording: str, *, verbose: bool) -> None:

@@ -10,6 +10,7 @@ In a folder, name order counts digits as numbers (2.png before 10.png); names pa
 usual. Folders inside and files whose name starts with a dot are not looked at.
 """
 
+import dataclasses
 import math
 import re
 from pathlib import Path
@@ -19,6 +20,7 @@ from deepsimbad_client.recordings import Recording
 from deepsimbad_client.recordings.encodings import ENCODING_SUFFIXES, read_encodings
 from deepsimbad_client.recordings.folder import read_folder
 from deepsimbad_client.recordings.nclt import FRONT_CAMERA, read_nclt
+from deepsimbad_client.recordings.positions import POSITIONS_FILE
 
 NCLT_PREFIX = "nclt:"
 
@@ -31,17 +33,19 @@ def open_source(
     spacing_m: float = 1.0,
     camera: int = FRONT_CAMERA,
     undistortion: Path | None = None,
+    rotate: int | None = None,
     reverse: bool = False,
 ) -> Recording:
     """Open a recording, see the top of this module; `spacing_m` stands between frames of unsaid places.
 
-    `camera` is NCLT's, 0..5, and `undistortion` its table or the folder of them. `reverse` takes the frames in the
-    other order. Raises SourceError, also where positions fall along the drive.
+    `camera` is NCLT's, 0..5, and `undistortion` its table or the folder of them. `rotate` turns images clockwise by
+    90, 180 or 270 degrees; None: NCLT's upright, others not. `reverse` takes the frames in the other order. Raises
+    SourceError, also where positions fall along the drive.
     """
     if not (math.isfinite(spacing_m) and spacing_m > 0):
         raise SourceError(f"a spacing of {spacing_m} m: frames must be more than 0 m apart")
     place, part = split_slice(source)
-    recording = _open_whole(place, spacing_m, camera, undistortion)
+    recording = _open_whole(place, spacing_m, camera, undistortion, rotate)
     first, last = recording.frames[0], recording.frames[-1]
     if reverse:
         recording = recording.reversed()
@@ -69,19 +73,36 @@ def split_slice(source: str) -> tuple[str, slice | None]:
     raise SourceError(f"{source}: a slice is #START:STOP or #START:STOP:STEP in whole frames, not #{ending}")
 
 
-def _open_whole(place: str, spacing_m: float, camera: int, undistortion: Path | None) -> Recording:
+def _open_whole(place: str, spacing_m: float, camera: int, undistortion: Path | None, rotate: int | None) -> Recording:
     if place.startswith(NCLT_PREFIX):
         drive = Path(place.removeprefix(NCLT_PREFIX)).expanduser()
         if not drive.name or drive.name == "..":
             raise SourceError(f"{place}: expected nclt:ROOT/DATE, for example nclt:/data/nclt/2012-01-22")
-        return read_nclt(drive.parent, drive.name, camera=camera, undistortion=undistortion)
+        return read_nclt(drive.parent, drive.name, camera=camera, undistortion=undistortion, rotate=rotate)
     path = Path(place).expanduser()
     if not place or not path.exists():
         raise SourceError(
             f"no recording at {place!r}: expected nclt:ROOT/DATE, a folder of images, or encodings in a .npy or .csv"
         )
     if path.is_dir():
-        return read_folder(path, spacing_m)
+        return _nclt_camera(path, undistortion, rotate) or read_folder(path, spacing_m, rotate)
     if path.suffix.lower() in ENCODING_SUFFIXES:
         return read_encodings(path, spacing_m)
     raise SourceError(f"{path}: a file of ready encodings is a .npy or a .csv [n, d]; images are named by their folder")
+
+
+def _nclt_camera(folder: Path, undistortion: Path | None, rotate: int | None) -> Recording | None:
+    """The recording of a camera's folder in NCLT's layout (ROOT/DATE/lb3/Cam5); None: it is none, or has no poses."""
+    drive = folder.resolve().parent.parent
+    camera = re.fullmatch(r"Cam([0-5]).*", folder.resolve().name)
+    if camera is None or not folder.resolve().parent.name.startswith("lb3") or (folder / POSITIONS_FILE).exists():
+        return None
+    root = drive.parent.parent if drive.parent.name == "images" else drive.parent
+    try:
+        recording = read_nclt(
+            *(root, drive.name), camera=int(camera[1]), undistortion=undistortion, rotate=rotate, folder=folder
+        )
+    except SourceError:
+        return None
+    said = f"NCLT's layout: read as {NCLT_PREFIX}{root / drive.name}, camera {camera[1]}, upright"
+    return dataclasses.replace(recording, remarks=[said])

@@ -38,6 +38,8 @@ from deepsimbad.jobs.remap import (
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.layout import checked_name
 from deepsimbad.store.traverses import Traverse
+from deepsimbad_client.recordings import turned
+from deepsimbad_client.recordings.nclt import TURNED_UPRIGHT, UPRIGHT_TURN, lies_on_its_side
 from deepsimbad_client.recordings.options import accounting, opened, reading, tell_left_out
 
 _READING = {"read landmarks": 4.0, "read training": 4.0}
@@ -174,6 +176,9 @@ def localize(domain: str, images: tuple[Path, ...], as_json: bool) -> None:
                 view = decode_image(body, settings.max_pixels)
             except (InvalidImageError, ImageTooLargeError) as error:
                 raise type(error)(f"{path}: {error.message}", **error.hints) from error
+            if lies_on_its_side(path):
+                click.echo(f"{path}: {TURNED_UPRIGHT}", err=True)
+                view = turned(view, UPRIGHT_TURN)
             watch.lap("decode")
             localization = localize_view(active.snapshot, evaluator, view, watch=watch)
             answers.append(render_localization(localization, watch))

@@ -1,4 +1,5 @@
 import gzip
+import shutil
 
 import cv2
 import numpy as np
@@ -219,3 +220,76 @@ def test_a_real_drive(real_data, nclt_tree):
     course = np.arctan2(np.gradient(frame_y), np.gradient(frame_x))
     heading = np.array([frame.heading_rad for frame in recording.frames])
     assert np.mean(np.cos(heading - course)[moving] > 0) > 0.97
+
+
+@pytest.mark.parametrize("ending", ["jpg", "PNG", "tiff"])
+def test_copies_in_another_format_are_read_like_copies_of_another_size(nclt_tree, ending):
+    for utime in fill(nclt_tree, seconds=1):
+        tiff = nclt_tree.root / f"2012-01-22/lb3/Cam5/{utime}.tiff"
+        cv2.imwrite(str(tiff.with_suffix(f".{ending}")), cv2.imread(str(tiff)))
+        if ending != "tiff":
+            tiff.unlink()
+    recording = open_source(nclt_tree.source)
+    assert {frame.name.partition(".")[2] for frame in recording.frames} == {ending}
+    assert recording.upright(recording.frames[0]).shape == (64, 48, 3)
+
+
+def test_of_a_tiff_and_its_copy_the_tiff_is_read(nclt_tree):
+    (utime, *_) = fill(nclt_tree, seconds=1)
+    cv2.imwrite(str(nclt_tree.root / f"2012-01-22/lb3/Cam5/{utime}.jpg"), np.zeros((4, 6), np.uint8))
+    assert open_source(nclt_tree.source).frames[0].name == f"{utime}.tiff"
+
+
+def test_undistorted_copies_that_stand_upright_already_are_not_turned(nclt_tree):
+    folder = nclt_tree.root / "2012-01-22" / "lb3_undistorted" / "Cam5"
+    folder.mkdir(parents=True)
+    nclt_tree.truth(nclt_tree.walk_north(1))
+    upright = cv2.rotate(nclt_tree.picture(), cv2.ROTATE_90_CLOCKWISE)
+    cv2.imwrite(str(folder / f"{nclt_tree.start_us}.png"), upright)
+    recording = open_source(nclt_tree.source)
+    np.testing.assert_array_equal(recording.upright(recording.frames[0]), upright)
+
+
+def seen(recording):
+    return [recording.image(frame, None).body for frame in recording.frames]
+
+
+def test_a_cameras_folder_is_recognised_with_its_poses_and_without(nclt_tree):
+    fill(nclt_tree, seconds=1)
+    camera = nclt_tree.root / nclt_tree.date / "lb3" / "Cam5"
+    whole, found = open_source(nclt_tree.source), open_source(str(camera))
+    assert found.frames == whole.frames
+    assert found.remarks == [f"NCLT's layout: read as {nclt_tree.source}, camera 5, upright"]
+    shutil.rmtree(nclt_tree.root / "ground_truth")
+    found = open_source(f"{camera}#:")
+    assert "turned upright" in found.remarks[0]
+    assert seen(found) == seen(whole)
+    assert found.frames[1].timestamp_us == whole.frames[1].timestamp_us
+
+
+def test_nclts_images_anywhere_are_turned_upright_by_name_and_shape(nclt_tree, tmp_path):
+    stored = cv2.resize(nclt_tree.picture(), (202, 154))
+    upright = cv2.rotate(stored, cv2.ROTATE_90_CLOCKWISE)
+    folder = tmp_path / "some"
+    folder.mkdir()
+    for place in range(3):
+        cv2.imwrite(str(folder / f"{nclt_tree.start_us + 200_000 * place}.png"), stored)
+    recording = open_source(str(folder))
+    assert recording.remarks
+    sent = cv2.imdecode(np.frombuffer(seen(recording)[1], np.uint8), cv2.IMREAD_COLOR)
+    assert sent.shape == upright.shape
+    assert np.abs(sent.astype(int) - upright).mean() < 3
+    assert open_source(str(folder), rotate=0).rotate == 0
+    for place in range(3):
+        (folder / f"{nclt_tree.start_us + 200_000 * place}.png").rename(folder / f"{place}.png")
+    assert open_source(str(folder)).rotate == 0
+
+
+@pytest.mark.parametrize("degrees", [90, 180, 270])
+def test_a_camera_that_hangs_otherwise_is_turned_as_asked(tmp_path, nclt_tree, degrees):
+    image = nclt_tree.picture()
+    cv2.imwrite(str(tmp_path / "a.png"), np.rot90(image, degrees // 90))
+    recording = open_source(str(tmp_path), rotate=degrees)
+    sent = cv2.imdecode(np.frombuffer(seen(recording)[0], np.uint8), cv2.IMREAD_COLOR)
+    assert sent.shape == image.shape
+    assert np.abs(sent.astype(int) - image).mean() < 3
