@@ -14,7 +14,7 @@ from deepsimbad.core.descriptor import rank_landmarks
 from deepsimbad.core.drive import Drive
 from deepsimbad.core.localizer import ActiveLocalizer, LocalizerConfig
 from deepsimbad.core.planners import information_ahead
-from deepsimbad.core.relevance import Query, Relevance, UpdateRule
+from deepsimbad.core.relevance import Query, Relevance, UpdateRule, shows_nothing
 from deepsimbad.core.retrieval import relevances
 from deepsimbad.errors import InvalidInputError, PastTheEndError
 from deepsimbad.evaluators.feature_l2 import FeatureL2
@@ -236,6 +236,45 @@ def test_a_view_that_shows_nothing_moves_no_belief(snapshots, queries, kind, rel
     moved = localizer.step(state, grey, 5.0)
     assert abs(int(moved.state.belief.mass.argmax()) - (int(state.belief.mass.argmax()) + 5)) <= 1
     assert stood.state.n_observations == 4
+
+
+def test_noise_tells_nothing_of_a_route_and_an_odd_season_does():
+    """A route of 400 numbers that few causes vary; noise shows what no place does, the same wherever the robot is."""
+    rng = np.random.default_rng(6)
+    causes = rng.normal(size=(20, 400))
+    place = np.maximum(rng.normal(size=(N_IMAGES, 20)) @ causes, 0)  # as of a network: many numbers are 0
+    map_ = compose_map(MapPlan(Relevance.COMPOSED, LIST_LENGTH, ACTIONS_M), frames(place), None, None, N_LANDMARKS).map
+    localizer = ActiveLocalizer(map_, LocalizerConfig())
+    noise = np.abs(rng.normal(0, 4 * place.std(), 400))
+    seen = np.where(rng.random(400) < 0.1, rng.normal(0, 3, 400), 0) * place.std(axis=0)  # of a season
+    both = np.concatenate([np.tile(noise, (60, 1)) + rng.normal(0, 0.3, (60, 400)), place[:60] + seen])
+    views = [Query(np.arange(1.0, N_LANDMARKS + 1, dtype=np.float32), None, view) for view in both.astype(np.float32)]
+    state = localizer.start()
+    for number, view in enumerate(views):
+        step = localizer.step(state, view, 1.0)
+        assert step.is_informative == (number >= 60)
+        state = step.state
+        if number < 60:
+            assert entropy(state.belief.mass) > math.log2(N_IMAGES) - 1
+    assert abs(int(state.belief.mass.argmax()) - 59) <= 1
+    whole = np.concatenate([place, both[:3]]).astype(np.float32)
+    assert np.flatnonzero(shows_nothing(whole)).tolist() == [150, 151, 152]
+
+
+def test_a_season_that_is_stranger_than_any_known_is_soon_believed():
+    rng = np.random.default_rng(7)
+    place = rng.normal(size=(N_IMAGES, 400))
+    map_ = compose_map(MapPlan(Relevance.COMPOSED, LIST_LENGTH, ACTIONS_M), frames(place), None, None, 60).map
+    localizer = ActiveLocalizer(map_, LocalizerConfig())
+    shift = np.where(np.arange(400) < 120, 3.0, 0.0)
+    told, state = [], localizer.start()
+    for view in (place + shift + rng.normal(0, 0.2, place.shape)).astype(np.float32)[:80]:
+        step = localizer.step(state, Query(np.arange(1.0, 61, dtype=np.float32), None, view), 1.0)
+        told.append(step.is_informative)
+        state = step.state
+    assert not any(told[:15])
+    assert all(told[30:])
+    assert abs(int(state.belief.mass.argmax()) - 79) <= 1
 
 
 @pytest.mark.parametrize("kind", list(FilterKind))

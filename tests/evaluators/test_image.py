@@ -273,14 +273,21 @@ def test_the_thinnest_image_keeps_a_row():
     assert decode_image(body, 50_000_000).shape == (10, 500_000, 3)
 
 
-def test_blank_is_what_the_deviation_of_all_grey_levels_says():
+def _grained(random, grain, level=128, spread=50, size=(120, 160)):
+    noise = cv2.GaussianBlur(random.normal(0, 1, size), (0, 0), grain) if grain else random.normal(0, 1, size)
+    grey = np.clip(level + spread * noise / noise.std(), 0, 255).astype(np.uint8)
+    return np.repeat(grey[..., np.newaxis], 3, axis=2)
+
+
+@pytest.mark.parametrize("scale", [1.0, 4.0])
+def test_one_grey_is_blank_and_so_is_noise_of_small_grain_but_not_a_faint_scene(scale):
     random = np.random.default_rng(4)
-    decided = []
-    for sigma in np.linspace(0.2, 2.5, 60):
-        noisy = np.clip(random.normal(100, sigma, (37, 53, 3)).round(), 0, 255).astype(np.uint8)
-        decided.append(is_blank(noisy))
-        assert decided[-1] == (cv2.cvtColor(noisy, cv2.COLOR_BGR2GRAY).std() < 1.0)
-    assert 10 < sum(decided) < 50
+    size = (int(120 * scale), int(160 * scale))
+    for nothing in (_grained(random, 0, 250, 2, size), _grained(random, 0, 8, 3, size), _grained(random, 1, size=size)):
+        assert is_blank(nothing)
+    assert is_blank(np.full((*size, 3), 90, np.uint8))
+    faint = _grained(random, 25 * scale, 20, 2, size)  # blots as large as houses, hardly lit
+    assert not is_blank(np.clip(faint + random.normal(0, 1, faint.shape), 0, 255).astype(np.uint8))
 
 
 # Any bytes give an image or a named error, never a crash

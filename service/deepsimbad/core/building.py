@@ -28,7 +28,7 @@ from deepsimbad.core.landmark_model import farthest_first
 from deepsimbad.core.map import Map
 from deepsimbad.core.nnql import NnqlConfig
 from deepsimbad.core.rehearsal import rehearsed
-from deepsimbad.core.relevance import Relevance
+from deepsimbad.core.relevance import Relevance, most_strange
 from deepsimbad.core.route import Route
 from deepsimbad.errors import InvalidEncodingError, InvalidMapConfigError
 
@@ -199,6 +199,8 @@ def compose_map(
         rehearsal = replace(map_, lists=compose(places, space.prototypes, plan.list_length, barred))
     on_progress(0.8)
     learnt = rehearsed(rehearsal, _measured(own), season)
+    strangest = most_strange(training.encodings, None if other is None else other.encodings)
+    learnt["most_strange"] = np.array([strangest])
     on_progress(1.0)
     return Built(replace(map_, **learnt), replace(rehearsal, **learnt), own, other, verdict, fused)
 

@@ -100,8 +100,9 @@ class ActiveLocalizer:
         moved_m = 0.0 if number == 0 or jitters else action_m
 
         live, relevance = state.live, np.zeros(map_.n_images, np.float32)
+        is_strange = query.encoding is not None and map_.is_strange(query.encoding, live)
         if query.is_informative:
-            live = live.observing(query, worth_of_move(moved_m) if number > 0 else 1.0) if live else None
+            live = live.observing(query, worth_of_move(moved_m if number > 0 else 1.0, is_strange)) if live else None
             relevance = relevances(map_, query, live)
         laps.append(self._clock())
 
@@ -109,7 +110,7 @@ class ActiveLocalizer:
         laps.append(self._clock())
 
         told = 0.0
-        if query.is_informative:
+        if query.is_informative and not is_strange:
             shared = map_.shared_error_after(moved_m) if number > 0 else 0.0
             seen = ViewEvidence.of(relevance, self._update, map_.log_likelihood_scale, shared)
             before, belief = belief, belief.updated(seen, number)

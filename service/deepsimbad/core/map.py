@@ -22,6 +22,7 @@ from deepsimbad.core.relevance import (
     LiveStatistics,
     Relevance,
     UpdateRule,
+    is_strange,
 )
 from deepsimbad.core.route import Route
 from deepsimbad.errors import InvalidMapConfigError, LandmarkModelDiffersError
@@ -75,6 +76,7 @@ class Map:
         usual_encoding: Mean and std of every number of an encoding, over the seasons that the map knows (`composed`).
         usual_product: Mean and std of every landmark's product with the drive's unit encodings (`composed`).
         likelihood_scale: What a relevance counts as a log-likelihood, where two seasons taught it.
+        most_strange: How strange a view of a place may be (`relevance.strangeness`), where encodings are compared.
         novelty: How much alike two views err that are 0, 1, 2.. m apart, 1 to 0.
         view_bits: By how many bits a view from a place narrows the map down.
         timestamp_us: Microseconds since 1970, -1 where unknown.
@@ -105,6 +107,7 @@ class Map:
     usual_encoding: NDArray[np.float32] | None = field(default=None, metadata=_row(np.float32, 2, "*"))
     usual_product: NDArray[np.float32] | None = field(default=None, metadata=_row(np.float32, 2, "r"))
     likelihood_scale: NDArray[np.float64] | None = field(default=None, metadata=_row(np.float64, 1))
+    most_strange: NDArray[np.float64] | None = field(default=None, metadata=_row(np.float64, 1))
     novelty: NDArray[np.float64] | None = field(default=None, metadata=_row(np.float64, "*"))
     view_bits: NDArray[np.float32] | None = field(default=None, metadata=_row(np.float32, "n"))
     timestamp_us: NDArray[np.int64] | None = field(default=None, metadata=_row(np.int64, "n", unknown=-1))
@@ -303,6 +306,17 @@ class Map:
         mean, std = self.statistics
         ranks = LandmarkStatistics.from_mean_std(mean, std, PRIOR_WEIGHT_FRAMES, self.loadings)
         return LiveStatistics(ranks, encoding, product)
+
+    def is_strange(self, encoding: NDArray[np.float32], live: LiveStatistics | None = None) -> bool:
+        """Whether a view shows nothing of the route, by what is usual for encodings [d] there or in the session.
+
+        Maps that were built before this was learnt take all views for views of places.
+        """
+        usual = self.live_statistics
+        if self.most_strange is None or usual is None or usual.encodings is None:
+            return False
+        live_encodings = None if live is None else live.encodings
+        return is_strange(encoding, usual.encodings, live_encodings, float(self.most_strange[0]))
 
     @cached_property
     def lengths(self) -> NDArray[np.float32]:

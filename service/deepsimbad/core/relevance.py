@@ -27,6 +27,11 @@ class Relevance(StrEnum):
 
 
 DEFAULT_RELEVANCE = Relevance.COMPOSED
+_FAR_STD = 2.0  # deviations from what is usual
+_MOST_FAR = 3 / 16  # of a view's numbers; where places are seen, in whatever season, fewer are so far off
+_WORTH_STRANGE = 0.5  # what a view that shows nothing of the route counts for among what is usual
+_SEASON_VIEWS, _SEASON_VARIETY = 10.0, 0.65  # from which on a session's views may be of a season that is odd
+_ODDEST_SEASON = 1.5  # times as strange as a view may be
 _FARTHEST = np.float32(4.001)  # squared distance of opposite unit vectors, and its rounding
 
 
@@ -96,9 +101,69 @@ def mean_ranks(relevance: NDArray[np.floating]) -> NDArray[np.float64]:
     return np.asarray(mean_rank[place], np.float64)
 
 
-def worth_of_move(action_m: float) -> float:
+def worth_of_move(action_m: float, is_strange: bool = False) -> float:
     """What a view counts for after a move: a robot that stands sees nothing new, one a metre on does."""
-    return min(1.0, abs(action_m))
+    return min(1.0, abs(action_m)) * (_WORTH_STRANGE if is_strange else 1.0)
+
+
+def strangeness(encodings: NDArray[np.floating], usual: Moments) -> NDArray[np.float64]:
+    """[...] which share of the numbers of encodings [..., d] is farther than two deviations from what is usual."""
+    far = np.abs(encodings - usual.mean) > _FAR_STD * usual.std
+    return np.asarray(far.mean(axis=-1))
+
+
+def most_strange(first: NDArray[np.float32], second: NDArray[np.float32] | None = None) -> float:
+    """The strangeness from which on a view shows nothing of a route.
+
+    Noise, glare and the dark leave what an extractor shows of places, whichever season it is: 3 in 16 numbers far off,
+    and three deviations of what that share is by chance. Where a second season was stranger to the first, that counts.
+
+    Args:
+        first: [n, d] encodings of the route.
+        second: [m, d] of another season; None: there is none.
+    """
+    by_default = _MOST_FAR + 3 * float(np.sqrt(_MOST_FAR * (1 - _MOST_FAR) / first.shape[1]))
+    if second is None:
+        return by_default
+    return max(by_default, float(np.quantile(strangeness(second, Moments.of(first)), 0.99)))
+
+
+def is_strange(encoding: NDArray[np.float32], usual: Moments, live: Moments | None, most: float) -> bool:
+    """Whether a view shows nothing of a route.
+
+    A season may be stranger than `most`. Its views differ among themselves as the route's do, and noise hardly does:
+    where a session's did, they are judged by their own mean.
+
+    Args:
+        encoding: [d].
+        usual: On the map.
+        live: The same with a session's views, which began as that.
+    """
+    seen = strangeness(encoding, usual)
+    if seen <= most or live is None or seen > _ODDEST_SEASON * most:
+        return bool(seen > most)
+    season = _season(usual, live)
+    return season is None or bool(strangeness(encoding, season) > most)
+
+
+def _season(usual: Moments, live: Moments) -> Moments | None:
+    """What is usual for a session's own views, with the route's deviations; None where they are few or all alike."""
+    weight = live.weight - usual.weight
+    if weight < _SEASON_VIEWS:
+        return None
+    mean, square = (
+        (after * live.weight - before * usual.weight) / weight
+        for after, before in ((live.mean, usual.mean), (live.square, usual.square))
+    )
+    variety = np.minimum((square - np.square(mean)) / np.square(usual.std), 2.0).mean()
+    if variety < _SEASON_VARIETY:
+        return None
+    return replace(usual, mean=mean, square=np.square(mean) + np.square(usual.std))
+
+
+def shows_nothing(drive: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """[n] which frames of a drive, [n, d] encodings, show nothing of its route: noise, glare, the dark."""
+    return np.asarray(strangeness(drive, Moments.of(drive)) > most_strange(drive))
 
 
 @dataclass(frozen=True)

@@ -104,14 +104,16 @@ def localize(
     watch.lap("shortlist")
     rule = snapshot.update_rule
     seen = ViewEvidence.of(relevance, rule, snapshot.log_likelihood_scale)
-    belief = GridFilter.uniform(snapshot.route, rule).updated(seen, step=0)
+    belief = GridFilter.uniform(snapshot.route, rule)
+    is_informative = query.is_informative and (query.encoding is None or not snapshot.is_strange(query.encoding))
+    belief = belief.updated(seen, step=0) if is_informative else belief
     summary = summarise(snapshot.route, belief.mass, length, belief.off_route)
     watch.lap("belief")
     plan = None
     if snapshot.view_bits is not None or snapshot.q_values is not None:
         plan = ActiveLocalizer(snapshot, LocalizerConfig()).plan(LocalizerState(belief, None, relevance, 1))
     watch.lap("plan")
-    return Localization(snapshot, relevance, best, summary, plan, query.is_informative)
+    return Localization(snapshot, relevance, best, summary, plan, is_informative)
 
 
 def retrieve(snapshot: Map, query: Query) -> NDArray[np.float32]:
