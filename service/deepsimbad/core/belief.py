@@ -129,10 +129,6 @@ class Doubt:
         """Probability of being lost."""
         return float(self.trust @ self.lost)
 
-    def carried(self, route: Route, action_m: float) -> NDArray[np.float64] | None:
-        """The last view's values moved along with the robot; what lies before an open route says nothing."""
-        return self.last if self.last is None else moved_along(route, self.last, action_m)
-
     def arrays(self) -> dict[str, NDArray[np.float64]]:
         """All state."""
         arrays = {"lost": self.lost, "log_trust": self.log_trust}
@@ -238,7 +234,9 @@ class GridFilter:
         lost, staying, found = leaving_and_found(self.doubt, self.doubt.lost, on_route, surviving, action_m)
         masses = masses * staying[:, np.newaxis] + np.outer(found, route.cell_m / route.cell_m.sum())
         total = masses.sum(axis=1) + lost
-        doubt = replace(self.doubt, lost=lost / total, last=self.doubt.carried(route, action_m))
+        last = self.doubt.last
+        last = last if last is None else moved_along(route, last, action_m)
+        doubt = replace(self.doubt, lost=lost / total, last=last)
         return replace(self, masses=masses / total[:, np.newaxis], doubt=doubt)
 
     def updated(self, seen: ViewEvidence, step: int) -> Self:  # noqa: ARG002

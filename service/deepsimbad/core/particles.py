@@ -18,6 +18,7 @@ from deepsimbad.core.belief import (
     added,
     check_ahead,
     leaving_and_found,
+    moved_along,
     slipping_std_m,
 )
 from deepsimbad.core.relevance import UpdateRule
@@ -114,7 +115,9 @@ class ParticleFilter:
         slips = rng.random(target_m.size) < SLIPS
         std_m = np.where(slips, slipping_std_m(action_m, action_std_m, self.doubt), action_std_m)
         moved = _onto(route, target_m + std_m * rng.standard_normal(target_m.size))
-        doubt = replace(self.doubt, lost=lost, last=self.doubt.carried(route, action_m))
+        last = self.doubt.last
+        last = last if last is None else moved_along(route, last, action_m)
+        doubt = replace(self.doubt, lost=lost, last=last)
         after = replace(self, position_m=moved, weights=weights * staying[:, np.newaxis], found=found, doubt=doubt)
         return after._resampled(step) if (weights.sum(axis=0) == 0).any() and surviving.any() else after
 
