@@ -5,12 +5,14 @@ from collections.abc import Iterator
 from bench.answering import retrieval_table, step_table
 from bench.building import landmark_table, map_file_table, nnql_table
 from bench.common import machine, write_page
+from bench.index_size import index_table
 from bench.remap import remap_table
 from bench.serving import http_table, restart_table, session_table
 
 TABLES = (
     retrieval_table,
     landmark_table,
+    index_table,
     map_file_table,
     nnql_table,
     step_table,

@@ -1,76 +1,116 @@
-"""Posting lists survive packing, and damage is noticed."""
+"""The lists of a map survive packing, in few bits, and damage is noticed."""
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deepsimbad.core.packing import pack_index, pack_postings, unpack_index, unpack_postings
+from deepsimbad.core import packing
+from deepsimbad.core.packing import pack_lists, unpack_lists
+from deepsimbad.core.postings import unpack_postings
+
+RNG = np.random.default_rng(0)
+PROTOTYPES = RNG.normal(size=(60, 16)).astype(np.float32)
 
 
-@given(st.sets(st.integers(0, 3000), min_size=1))
-def test_any_posting_list_comes_back(image_ids):
-    ordered = np.array(sorted(image_ids))
-    assert unpack_postings(pack_postings(ordered), 3001).tolist() == ordered.tolist()
-
-
-@given(st.integers(1, 10_000_000), st.integers(0, 200))
-def test_far_runs_come_back(start, length):
-    ordered = np.arange(start, start + length + 1)
-    assert unpack_postings(pack_postings(ordered), 10_000_300).tolist() == ordered.tolist()
-
-
-def test_what_lies_side_by_side_is_written_as_runs_and_what_lies_apart_as_gaps():
-    assert len(pack_postings(np.arange(1000))) <= 4
-    assert len(pack_postings(np.arange(0, 4000, 4))) <= 1 + 1000 * 3 // 8
-
-
-def test_an_empty_list_is_an_empty_blob():
-    assert pack_postings(np.array([], np.int64)) == b""
-    assert unpack_postings(b"", 5).size == 0
-
-
-@pytest.mark.parametrize("image_ids", [[3, 3], [4, 2], [-1, 2]])
-def test_ids_that_do_not_increase_are_refused(image_ids):
-    with pytest.raises(ValueError, match="increase"):
-        pack_postings(np.array(image_ids))
-
-
-def _lists(rng, n_images, n_landmarks, list_length):
-    shuffled = rng.random((n_images, n_landmarks)).argsort(axis=1)[:, :list_length]
+def scattered(n_images, n_landmarks, list_length):
+    shuffled = RNG.random((n_images, n_landmarks)).argsort(axis=1)[:, :list_length]
     return np.ascontiguousarray(shuffled.T, np.uint16)
 
 
-@pytest.mark.parametrize(("n_images", "n_landmarks", "list_length"), [(1, 1, 1), (7, 5, 5), (400, 60, 4)])
-def test_an_index_comes_back(n_images, n_landmarks, list_length):
-    lists = _lists(np.random.default_rng(0), n_images, n_landmarks, list_length)
-    postings = list(pack_index(lists, n_landmarks))
-    assert [key[:2] for key in postings] == sorted(key[:2] for key in postings)
-    assert all(blob for _, _, blob in postings)
-    np.testing.assert_array_equal(unpack_index(postings, list_length, n_images), lists)
+def nearest(n_images):
+    """The four landmarks most like a view that wanders."""
+    views = np.zeros((n_images + 1, 16))
+    for image in range(n_images):
+        views[image + 1] = 0.9 * views[image] + RNG.normal(size=16)
+    return np.ascontiguousarray((-views[1:] @ PROTOTYPES.T).argsort(axis=1)[:, :4].T, np.uint16)
 
 
-def test_random_lists_stay_below_the_papers_size():
-    lists = _lists(np.random.default_rng(1), 26_208, 500, 4)
-    payload_bits = sum(8 * len(blob) for _, _, blob in pack_index(lists, 500))
-    assert payload_bits / 26_208 < 44  # the paper spends 15h = 60
+def n_bits(lists, n_landmarks, prototypes):
+    return 8 * sum(map(len, pack_lists(lists, n_landmarks, prototypes))) / lists.shape[1]
 
 
-def test_damage_is_noticed():
-    lists = _lists(np.random.default_rng(3), 50, 8, 2)
-    postings = list(pack_index(lists, 8))
+def comes_back(lists, n_landmarks, prototypes=None):
+    blocks = pack_lists(lists, n_landmarks, prototypes)
+    np.testing.assert_array_equal(unpack_lists(blocks, *lists.shape, n_landmarks, prototypes), lists)
+    return blocks
+
+
+@pytest.mark.parametrize(
+    ("n_images", "n_landmarks", "list_length"), [(1, 1, 1), (7, 5, 5), (400, 60, 4), (40, 9000, 6)]
+)
+def test_lists_come_back(n_images, n_landmarks, list_length):
+    lists = scattered(n_images, n_landmarks, list_length)
+    comes_back(lists, n_landmarks)
+    comes_back(lists, n_landmarks, RNG.normal(size=(n_landmarks, 3)))
+
+
+@given(st.lists(st.lists(st.integers(0, 5), min_size=3, max_size=3), min_size=1, max_size=50), st.booleans())
+def test_any_lists_come_back_with_landmarks_twice_and_standing_robots(rows, are_alike):
+    """Also by prototypes that tell nothing: all alike, infinite, or not a number."""
+    prototypes = np.ones((6, 2)) if are_alike else np.array([[0.0, np.nan], *[[np.inf, 1.0]] * 5])
+    comes_back(np.ascontiguousarray(np.array(rows, np.uint16).T), 6, prototypes)
+
+
+def test_lists_without_any_order_take_little_more_than_their_landmarks_numbers():
+    lists = scattered(20_000, 500, 4)
+    assert n_bits(lists, 500, None) < 4 * np.log2(500) + 0.6
+
+
+def test_what_neighbours_share_and_what_is_alike_costs_less():
+    lists = nearest(2000)
+    assert n_bits(lists, 60, PROTOTYPES) < n_bits(lists, 60, None) - 0.7 < 4 * np.log2(60) - 8
+    assert n_bits(np.repeat(lists[:, :5], 400, axis=1), 60, PROTOTYPES) < 0.5  # a robot that stands
+
+
+def test_appending_changes_no_block_but_the_last(monkeypatch):
+    monkeypatch.setattr(packing, "BLOCK", 100)
+    lists = nearest(450)
+    whole, part = comes_back(lists, 60, PROTOTYPES), comes_back(lists[:, :330], 60, PROTOTYPES)
+    assert (len(whole), len(part)) == (5, 4)
+    assert whole[:3] == part[:3]
+    assert whole[3] != part[3]
+
+
+def test_blocks_that_are_not_of_such_lists_are_refused():
+    blocks = pack_lists(nearest(300), 60, PROTOTYPES)
+    for some in ([], [b""], [blocks[0][:-3]], [blocks[0] + b"\0"], [*blocks, blocks[0]]):
+        with pytest.raises(ValueError, match="block"):
+            unpack_lists(some, 4, 300, 60, PROTOTYPES)
+    for list_length, n_images in ((0, 300), (61, 300), (4, 0), (4, 10**9)):
+        with pytest.raises(ValueError, match="blocks are not those"):
+            unpack_lists(blocks, list_length, n_images, 60, PROTOTYPES)
+
+
+@given(st.binary(max_size=80), st.integers(1, 200))
+def test_arbitrary_bytes_never_crash(block, n_images):
+    try:
+        lists = unpack_lists([block], 4, n_images, 60, PROTOTYPES)
+    except ValueError:
+        return
+    assert lists.max() < 60
+
+
+# Posting lists, which earlier releases wrote: the first as runs, the others as gaps.
+POSTED = np.array([[0, 0, 0, 0, 1, 2, 1, 3, 0, 0, 0, 0], [1, 2, 3, 1, 0, 3, 2, 0, 1, 1, 1, 1]])
+POSTINGS = [
+    *((0, 1, b"@\xb1`"), (0, 2, b"\x01$"), (1, 1, b"\x01,"), (1, 2, b"\x00\x90\xf0")),
+    *((2, 1, b"\x010"), (2, 2, b"\x01\xc8"), (3, 1, b"\x02p"), (3, 2, b"\x00$")),
+]
+
+
+def test_posting_lists_of_earlier_releases_come_back():
+    lists = unpack_postings(POSTINGS, 2, 12)
+    np.testing.assert_array_equal(lists, POSTED)
     with pytest.raises(ValueError, match="fill"):
-        unpack_index(postings[:-1], 2, 50)
+        unpack_postings(POSTINGS[:-1], 2, 12)
     with pytest.raises(ValueError, match="damaged"):
-        unpack_index([*postings, postings[0]], 2, 50)
+        unpack_postings([*POSTINGS, POSTINGS[0]], 2, 12)
     with pytest.raises(ValueError, match="out of range"):
-        unpack_index([(0, 3, postings[0][2])], 2, 50)
+        unpack_postings([(0, 3, POSTINGS[0][2])], 2, 12)
 
 
 @given(st.binary(min_size=1, max_size=40))
-def test_arbitrary_bytes_never_crash(blob):
-    try:
-        image_ids = unpack_postings(blob, 300)
-    except ValueError:
-        return
-    assert ((image_ids >= 0) & (image_ids < 300)).all()
+def test_arbitrary_postings_never_crash(blob):
+    with pytest.raises(ValueError, match=r"fill|damaged"):
+        unpack_postings([(0, 1, blob), (0, 1, blob)], 1, 300)

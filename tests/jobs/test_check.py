@@ -293,7 +293,7 @@ def test_a_damaged_active_map_does_not_keep_its_remedy_away(remapped, seasons, c
     ("module", "name", "error", "reason"),
     [
         (maps_module, "verify", OSError(errno.EIO, "Input/output error"), "io_error"),
-        (map_file, "unpack_index", MemoryError(), "out_of_memory"),
+        (map_file, "unpack_lists", MemoryError(), "out_of_memory"),
     ],
 )
 def test_no_gate_opens_because_a_sound_map_could_not_be_read(

@@ -105,3 +105,25 @@ def m003_calibration(db: Database) -> None:
         )
         """
     )
+
+
+@migrations()
+def m004_coded_lists(db: Database) -> None:
+    """The index as blocks of coded lists, in route order: rows without landmark and rank.
+
+    Posting lists of before stay as they are. With `part` as the key a block fills whole pages.
+    """
+    db.executescript(
+        """
+        CREATE TABLE posting_coded (
+            part INTEGER PRIMARY KEY,
+            landmark INTEGER,
+            rank INTEGER,
+            body BLOB NOT NULL
+        );
+        INSERT INTO posting_coded (landmark, rank, body)
+            SELECT landmark, rank, image_ids FROM posting ORDER BY landmark, rank;
+        DROP TABLE posting;
+        ALTER TABLE posting_coded RENAME TO posting;
+        """
+    )

@@ -1,206 +1,309 @@
-"""The durable form of the inverted index: posting lists packed below the byte (II-C, "15h bits per map image").
+"""The durable form of the inverted index: the map images' lists in route order, coded without loss.
 
-A posting list is the increasing ids of the map images that hold one landmark at one rank. It is written either as
-gaps or, where neighbouring map images share the landmark, as runs (gap, length); whichever is shorter. All numbers
-are Rice codes: the quotient in unary (zeros, then a one), then the low bits. The zeros that pad the last byte can
-never end a quotient, so a list needs no stored length.
+Neighbours see the same landmarks, and a list holds landmarks that are alike. So each place of a list says which place
+of the list before it repeats, by how often such places have done so, or names another landmark: the likelier, the more
+it is like those of the list before and those already in its own (the landmark model, which lies in the same file, tells
+how alike two are), and if it was listed a moment ago. An arithmetic coder turns these likelihoods into bits.
 
-Blob: one header byte, then the bit stream, most significant bit first. The header's low five bits are the Rice
-parameter of the gaps; its high three bits are 0 for plain gaps, else 1 + the Rice parameter of the run lengths.
+Every block of 8,192 images is a stream of its own, and what was learnt goes on from block to block: appending images
+changes none but the last. All arithmetic is of integers, or rounded as IEEE 754 says, so every machine reads the same.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-_MAX_GAP_PARAMETER = 31
-_MAX_RUN_PARAMETER = 6
+from deepsimbad.core.composed import list_weights
+
+BLOCK = 8192  # images
+
+# The coder works on an interval of `_STATE_BITS`; likelihoods are whole numbers that sum up to less than 2^28.
+_STATE_BITS, _TOTAL_BITS = 34, 28
+_LOW, _HIGH, _VALUE, _PENDING, _AT = range(5)  # of the coder's state
+
+# What was learnt: how often a place of a list repeats place k of the one before, or (k = h) none, by what the place
+# before it did, and whatever that did. Halved at so many, so that it follows the route.
+_MOST_AFTER, _MOST_EVER = 1 << 10, 1 << 13
+_PRIOR = 5  # both of what is counted at the beginning, and of what the second counts beside the first
+
+# How much likeness counts, by place of the list, in 1/1024 of 1/16 bit: to the list before, to its own list so far.
+_TO_BEFORE, _TO_OWN = np.array([55, 32, 26, 16]), np.array([0, 110, 45, 32])
+_RECENT, _RECENT_PARTS = 32, 16  # listed within so many images, so many 1/16 bits likelier
+_MOST_ALIKE = 4096  # landmarks; of more no table of likeness is made
+_DIMENSIONS = 256  # of a prototype, spread evenly, that are compared
+_PARTS = 16  # of a bit
+_POWERS = np.array(  # 2^(15 + i/16), rounded
+    [32768, 34219, 35734, 37316, 38968, 40693, 42495, 44376, 46341, 48393, 50535, 52773, 55109, 57549, 60097, 62757]
+)
+
+
+def pack_lists(lists: NDArray[np.uint16], n_landmarks: int, prototypes: NDArray[Any] | None) -> list[bytes]:
+    """The blocks of landmark lists, [h, n].
+
+    Args:
+        lists: Landmarks below `n_landmarks`.
+        n_landmarks: r.
+        prototypes: [r, ...] of the landmark model; None: it has none.
+    """
+    model = _Model(len(lists), n_landmarks, prototypes)
+    return [model.write(lists[:, at : at + BLOCK].copy()) for at in range(0, lists.shape[1], BLOCK)]
+
+
+def unpack_lists(
+    blocks: Sequence[bytes], list_length: int, n_images: int, n_landmarks: int, prototypes: NDArray[Any] | None
+) -> NDArray[np.uint16]:
+    """Back from `pack_lists`.
+
+    Raises:
+        ValueError: The blocks are not those of so many lists and of these landmarks.
+    """
+    if not 1 <= list_length <= n_landmarks or n_images < 1 or len(blocks) != -(-n_images // BLOCK):
+        raise ValueError(f"{len(blocks)} blocks are not those of {n_images} lists of {list_length} landmarks")
+    model = _Model(list_length, n_landmarks, prototypes)
+    sizes = (min(BLOCK, n_images - at) for at in range(0, n_images, BLOCK))
+    return np.concatenate([model.read(*each) for each in zip(blocks, sizes, strict=True)], axis=1)
+
+
+class _Model:
+    """What makes a landmark likely at a place of a list, as far as the images before have taught it."""
+
+    def __init__(self, list_length: int, n_landmarks: int, prototypes: NDArray[Any] | None) -> None:
+        h = list_length
+        places = np.minimum(np.arange(h), len(_TO_OWN) - 1)
+        shares = np.stack([np.rint(10 * list_weights(h)), _TO_BEFORE[places], _TO_OWN[places]])
+        self._likeness = _likeness(n_landmarks, prototypes), shares.astype(np.int32)
+        after, ever = np.zeros((h, h + 1, h + 1), np.int64), np.full((h, h + 1), _PRIOR, np.int64)
+        seen = np.full(n_landmarks, -_RECENT - 1, np.int64)  # the last image that listed a landmark
+        before = np.full(h + 1, -1, np.int64)  # the list before, and which of its places the next one's first repeated
+        self._learnt = after, ever, seen, before
+        self._n_images = 0
+
+    def write(self, lists: NDArray[np.uint16]) -> bytes:
+        """The block of the next lists, [h, b]."""
+        stream = np.zeros(8 * lists.size + 8, np.uint8)
+        return stream[: self._coded(lists, stream, False)].tobytes()
+
+    def read(self, block: bytes, n_images: int) -> NDArray[np.uint16]:
+        """The next lists from their block; raises ValueError where they take another number of bytes."""
+        lists = np.zeros((self._learnt[0].shape[0], n_images), np.uint16)
+        if self._coded(lists, np.frombuffer(block, np.uint8).copy(), True) != len(block):
+            raise ValueError("a block of the index is damaged")
+        return lists
+
+    def _coded(self, lists: NDArray[np.uint16], stream: NDArray[np.uint8], is_read: bool) -> int:
+        n_bytes = _code(lists, stream, is_read, self._n_images, *self._likeness, *self._learnt)
+        self._n_images += lists.shape[1]
+        return int(n_bytes)
+
+
+def _likeness(n_landmarks: int, prototypes: NDArray[Any] | None) -> NDArray[np.int8]:
+    """[r, r] cosines of the landmarks' prototypes, less their mean, in 1/127; [0, 0] where they are not to be had.
+
+    Products of whole numbers this small are exact in float64, in whatever order they are summed.
+    """
+    if prototypes is None or prototypes.shape[:1] != (n_landmarks,) or not prototypes.size or n_landmarks > _MOST_ALIKE:
+        return np.zeros((0, 0), np.int8)
+    rows = prototypes.reshape(n_landmarks, -1)
+    rows = np.nan_to_num(rows[:, :: -(-rows.shape[1] // _DIMENSIONS)].astype(np.float64))
+    greatest = np.abs(rows).max(axis=1, keepdims=True)
+    whole = np.rint(rows * (1023 / np.where(greatest > 0, greatest, 1.0)))
+    whole -= np.rint(whole.sum(axis=0) / n_landmarks)
+    products = whole @ whole.T
+    lengths = np.sqrt(np.maximum(np.diag(products), 1.0))
+    return np.rint(127 * (products / lengths / lengths[:, np.newaxis])).astype(np.int8)
 
 
 @njit(cache=True, nogil=True)
-def _best_parameter(numbers: NDArray[np.int64], limit: int) -> tuple[int, int]:
-    """The Rice parameter in 0..limit that writes the numbers in the fewest bits, and those bits."""
-    best, best_bits = 0, 1 << 62
-    for parameter in range(limit + 1):
-        bits = numbers.size * (parameter + 1)
-        for place in range(numbers.size):
-            bits += int(numbers[place]) >> parameter
-        if bits < best_bits:
-            best, best_bits = parameter, bits
-    return best, best_bits
+def _code(
+    lists: NDArray[np.uint16],
+    stream: NDArray[np.uint8],
+    is_read: bool,
+    first: int,
+    alike: NDArray[np.int8],
+    shares: NDArray[np.int32],
+    after: NDArray[np.int64],
+    ever: NDArray[np.int64],
+    seen: NDArray[np.int64],
+    before: NDArray[np.int64],
+) -> int:
+    """Write lists from image `first` on into the zeroed stream, or read them; returns the bytes it takes.
+
+    More than the stream has: it is not one of such lists.
+    """
+    (h, n), r = lists.shape, seen.size
+    powers, coder = _powers(r), _coder(stream, is_read)
+    toward, own, likely = np.zeros(r, np.int32), np.zeros(r, np.int32), np.zeros(r, np.int32)
+    choice = np.zeros(h + 1, np.int32)
+    for image in range(first, first + n):
+        if coder[_AT] > 8 * stream.size + _STATE_BITS:
+            return stream.size + 1
+        row = lists[:, image - first]
+        earlier = before[:h] if before[0] >= 0 else before[:0]
+        _sum_alike(toward, alike, earlier, shares[0])
+        came = int(before[h])
+        before[h] = h
+        for j in range(h):
+            place = h
+            if earlier.size:
+                _weigh_places(choice, row[:j], earlier, after[j, came], ever[j], r)
+                place = _symbol(choice, _place_of(row[j], earlier), coder, stream, is_read)
+                _count(after[j, came], place, _MOST_AFTER)
+                _count(ever[j], place, _MOST_EVER)
+                came = place
+                if j == 0:
+                    before[h] = place
+            if place < h:
+                row[j] = earlier[place]
+            else:
+                _sum_alike(own, alike, row[:j], shares[0])
+                _weigh_others(likely, shares[1, j] * toward + shares[2, j] * own, seen, image - _RECENT, powers)
+                likely[row[:j]] = 1  # twice in a list, which hardly anybody makes
+                likely[earlier] = 0
+                row[j] = _symbol(likely, int(row[j]), coder, stream, is_read)
+        before[:h] = row
+        seen[row] = image
+    if is_read:
+        return int(coder[_AT] - _STATE_BITS + 2 + 7) // 8
+    coder[_PENDING] += 1
+    _write_bit(coder, stream, int(coder[_LOW] >= 1 << (_STATE_BITS - 2)))
+    return int(coder[_AT] + 7) // 8
 
 
 @njit(cache=True, nogil=True)
-def _write_rice(stream: NDArray[np.uint8], at: int, number: int, parameter: int) -> int:
-    """Write one number into the zeroed stream from bit `at`; returns the next free bit."""
-    at += number >> parameter
-    stream[at >> 3] |= np.uint8(0x80 >> (at & 7))
-    at += 1
-    for shift in range(parameter - 1, -1, -1):
-        if (number >> shift) & 1:
-            stream[at >> 3] |= np.uint8(0x80 >> (at & 7))
-        at += 1
-    return at
+def _powers(n_landmarks: int) -> NDArray[np.int32]:
+    """2^(i/16) as whole numbers, up to what so many landmarks may each have."""
+    n_bits = _TOTAL_BITS - 1
+    while n_landmarks << n_bits >= 1 << _TOTAL_BITS:
+        n_bits -= 1
+    powers = np.empty(_PARTS * n_bits + 1, np.int32)
+    for part in range(powers.size):
+        powers[part] = (_POWERS[part % _PARTS] << (part // _PARTS)) >> 15
+    return powers
 
 
 @njit(cache=True, nogil=True)
-def _read_rice(stream: NDArray[np.uint8], at: int, parameter: int) -> tuple[int, int]:
-    """Read one number from bit `at`; returns it and the next bit, or -1 where the stream holds no more."""
-    n_bits = stream.size * 8
-    number = 0
-    while at < n_bits and not (stream[at >> 3] >> (7 - (at & 7))) & 1:
-        number += 1
-        at += 1
-    at += 1
-    if at + parameter > n_bits:
-        return -1, n_bits
-    for _ in range(parameter):
-        number = (number << 1) | ((stream[at >> 3] >> (7 - (at & 7))) & 1)
-        at += 1
-    return number, at
+def _place_of(landmark: int, earlier: NDArray[np.int64]) -> int:
+    """The first place of a list that holds a landmark; its length where none does."""
+    for place in range(earlier.size):
+        if earlier[place] == landmark:
+            return place
+    return int(earlier.size)
 
 
 @njit(cache=True, nogil=True)
-def _runs(image_ids: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Split increasing ids into runs: gaps before each (the least possible counts as 0), and lengths less 1."""
-    gaps = np.empty(image_ids.size, np.int64)
-    lengths = np.empty(image_ids.size, np.int64)
-    n_runs = 0
-    previous = np.int64(-2)
-    for image in image_ids:
-        if image == previous + 1:
-            lengths[n_runs - 1] += 1
-        else:
-            gaps[n_runs] = image - previous - 2
-            lengths[n_runs] = 0
-            n_runs += 1
-        previous = image
-    return gaps[:n_runs], lengths[:n_runs]
+def _sum_alike(sums: NDArray[np.int32], alike: NDArray[np.int8], landmarks: Any, weights: NDArray[np.int32]) -> None:
+    """How much every landmark is like the weighted sum of some."""
+    sums[:] = 0
+    for place in range(landmarks.size if alike.size else 0):
+        weight, of_landmark = weights[place], alike[landmarks[place]]
+        for other in range(sums.size):
+            sums[other] += weight * np.int32(of_landmark[other])
 
 
 @njit(cache=True, nogil=True)
-def _pack(image_ids: NDArray[np.int64]) -> NDArray[np.uint8]:
-    plain = np.empty_like(image_ids)
-    previous = np.int64(-1)
-    for place, image in enumerate(image_ids):
-        plain[place] = image - previous - 1
-        previous = image
-    parameter, bits = _best_parameter(plain, _MAX_GAP_PARAMETER)
-    run_gaps, run_lengths = _runs(image_ids)
-    gap_parameter, gap_bits = _best_parameter(run_gaps, _MAX_GAP_PARAMETER)
-    run_parameter, run_bits = _best_parameter(run_lengths, _MAX_RUN_PARAMETER)
+def _weigh_others(likely: Any, worth: Any, seen: Any, recent: int, powers: Any) -> None:
+    """How likely each landmark is by what it is worth, the likeliest as much as may be."""
+    for other in range(likely.size):
+        likely[other] = (worth[other] >> 10) + (_RECENT_PARTS if seen[other] >= recent else 0)
+    least = likely.max() - powers.size + 1
+    for other in range(likely.size):
+        likely[other] = powers[max(0, likely[other] - least)]
 
-    as_runs = gap_bits + run_bits < bits
-    if as_runs:
-        bits = gap_bits + run_bits
-    blob = np.zeros(1 + (bits + 7) // 8, np.uint8)
-    stream = blob[1:]
-    at = 0
-    if as_runs:
-        blob[0] = np.uint8(gap_parameter | (run_parameter + 1) << 5)
-        for place in range(run_gaps.size):
-            at = _write_rice(stream, at, int(run_gaps[place]), gap_parameter)
-            at = _write_rice(stream, at, int(run_lengths[place]), run_parameter)
+
+@njit(cache=True, nogil=True)
+def _weigh_places(choice: Any, row: Any, earlier: Any, after: Any, ever: Any, n_landmarks: int) -> None:
+    """How likely the next landmark of a list is at each place of the list before, or (the last) at none."""
+    n_distinct, n_ever = 0, ever.sum()
+    for place in range(choice.size):
+        choice[place] = after[place] * n_ever + _PRIOR * ever[place]
+    for place in range(earlier.size):
+        if _place_of(earlier[place], earlier) < place:
+            choice[place] = 0
+            continue
+        n_distinct += 1
+        for listed in row:
+            if listed == earlier[place]:
+                choice[place] = 1
+    if n_distinct == n_landmarks:
+        choice[-1] = 0
+
+
+@njit(cache=True, nogil=True)
+def _count(counts: NDArray[np.int64], place: int, most: int) -> None:
+    """Count one more; all are halved, and what was counted stays above 0, where there are too many."""
+    counts[place] += 1
+    if counts.sum() >= most:
+        for k in range(counts.size):
+            counts[k] = (counts[k] + 1) >> 1
+
+
+@njit(cache=True, nogil=True)
+def _symbol(
+    shares: NDArray[np.int32], symbol: int, coder: NDArray[np.int64], stream: NDArray[np.uint8], is_read: bool
+) -> int:
+    """Write a symbol, one of those whose likelihoods have these shares, or read one; returns it."""
+    total, low = shares.sum(), coder[_LOW]
+    span = coder[_HIGH] - low + 1
+    below = np.int64(0)
+    if is_read:
+        aim = ((coder[_VALUE] - low + 1) * total - 1) // span
+        symbol = 0
+        while below + shares[symbol] <= aim:
+            below += shares[symbol]
+            symbol += 1
     else:
-        blob[0] = np.uint8(parameter)
-        for place in range(plain.size):
-            at = _write_rice(stream, at, int(plain[place]), parameter)
-    return blob
+        below = shares[:symbol].sum()
+    coder[_HIGH] = low + span * (below + shares[symbol]) // total - 1
+    coder[_LOW] = low + span * below // total
+    half = np.int64(1) << (_STATE_BITS - 1)
+    quarter = half >> 1
+    while True:
+        if coder[_HIGH] < half:
+            taken = np.int64(0)
+        elif coder[_LOW] >= half:
+            taken = half
+        elif coder[_LOW] >= quarter and coder[_HIGH] < half + quarter:
+            taken = quarter
+        else:
+            return symbol
+        for bound in (_LOW, _HIGH, _VALUE):
+            coder[bound] = (coder[bound] - taken) << 1
+        coder[_HIGH] |= 1
+        if is_read:
+            coder[_VALUE] |= _next_bit(coder, stream)
+        elif taken == quarter:
+            coder[_PENDING] += 1
+        else:
+            _write_bit(coder, stream, int(taken > 0))
 
 
 @njit(cache=True, nogil=True)
-def _place(blob: NDArray[np.uint8], column: NDArray[np.uint16], landmark: int, empty: int) -> int:
-    """Write the landmark at every image of the blob; returns how many, or -1 - image at a bad one."""
-    parameter = int(blob[0]) & 31
-    run_parameter = (int(blob[0]) >> 5) - 1
-    stream = blob[1:]
-    at, image, n_placed = 0, -1, 0
-    if run_parameter >= 0:
-        image = -2
-    while True:
-        gap, at = _read_rice(stream, at, parameter)
-        if gap < 0:
-            return n_placed
-        length = 0
-        if run_parameter >= 0:
-            length, at = _read_rice(stream, at, run_parameter)
-            if length < 0:
-                return -1 - column.size
-            image += 1
-        for _ in range(length + 1):
-            image += 1 + gap
-            gap = 0
-            if image >= column.size or column[image] != empty:
-                return -1 - image
-            column[image] = landmark
-            n_placed += 1
+def _coder(stream: NDArray[np.uint8], is_read: bool) -> NDArray[np.int64]:
+    """The state at the beginning of a stream."""
+    coder = np.zeros(5, np.int64)
+    coder[_HIGH] = (1 << _STATE_BITS) - 1
+    for _ in range(_STATE_BITS if is_read else 0):
+        coder[_VALUE] = coder[_VALUE] << 1 | _next_bit(coder, stream)
+    return coder
 
 
-_EMPTY = np.uint16(0xFFFF)  # no landmark: ids stay below it (see Map)
+@njit(cache=True, nogil=True)
+def _next_bit(coder: NDArray[np.int64], stream: NDArray[np.uint8]) -> int:
+    """The next bit of the stream; behind its end 0."""
+    at = coder[_AT]
+    coder[_AT] += 1
+    return (stream[at >> 3] >> (7 - (at & 7))) & 1 if at >> 3 < stream.size else 0
 
 
-def pack_postings(image_ids: NDArray[np.int64]) -> bytes:
-    """Pack one posting list, [m] image ids; the blob of an empty one is empty.
-
-    Raises:
-        ValueError: The ids do not increase strictly from 0.
-    """
-    image_ids = np.ascontiguousarray(image_ids, np.int64)
-    if image_ids.size == 0:
-        return b""
-    if image_ids[0] < 0 or (np.diff(image_ids) <= 0).any():
-        raise ValueError("image ids of a posting list must increase strictly from 0")
-    return _pack(image_ids).tobytes()
-
-
-def unpack_postings(blob: bytes, n_images: int) -> NDArray[np.int64]:
-    """Unpack one posting list of a map with `n_images` images into its increasing ids.
-
-    Raises:
-        ValueError: The blob names an image the map does not have.
-    """
-    column = np.full(n_images, _EMPTY)
-    _place_blob(blob, column, 0)
-    return np.flatnonzero(column == 0)
-
-
-def pack_index(lists: NDArray[np.uint16], n_landmarks: int) -> Iterator[tuple[int, int, bytes]]:
-    """(landmark from 0, rank from 1, blob) of every posting list of landmark lists [h, n], in order; empty ones not."""
-    grouped = []
-    for row in lists:
-        order = np.argsort(row, kind="stable")
-        starts = np.searchsorted(row[order], np.arange(n_landmarks + 1))
-        grouped.append((order.astype(np.int64), starts))
-    for landmark in range(n_landmarks):
-        for rank, (order, starts) in enumerate(grouped, start=1):
-            image_ids = order[starts[landmark] : starts[landmark + 1]]
-            if image_ids.size:
-                yield landmark, rank, pack_postings(image_ids)
-
-
-def unpack_index(postings: Iterable[tuple[int, int, bytes]], list_length: int, n_images: int) -> NDArray[np.uint16]:
-    """Rebuild the landmark lists, [h, n] uint16, from the posting lists.
-
-    Raises:
-        ValueError: A map image is listed twice at a rank, missing from one, or out of range.
-    """
-    lists = np.full((list_length, n_images), _EMPTY)
-    n_placed = 0
-    for landmark, rank, blob in postings:
-        if not 1 <= rank <= list_length or not 0 <= landmark < _EMPTY:
-            raise ValueError(f"posting of landmark {landmark} at rank {rank} is out of range")
-        n_placed += _place_blob(blob, lists[rank - 1], landmark)
-    if n_placed != lists.size:
-        raise ValueError(f"the postings fill {n_placed} of {lists.size} places of the map images' lists")
-    return lists
-
-
-def _place_blob(blob: bytes, column: NDArray[np.uint16], landmark: int) -> int:
-    if not blob:
-        return 0
-    n_placed = int(_place(np.frombuffer(blob, np.uint8), column, landmark, int(_EMPTY)))
-    if n_placed < 0:
-        raise ValueError(f"a posting of landmark {landmark} is damaged at image {-1 - n_placed}")
-    return n_placed
+@njit(cache=True, nogil=True)
+def _write_bit(coder: NDArray[np.int64], stream: NDArray[np.uint8], bit: int) -> None:
+    """Write a bit, and the opposite of it as often as was put off."""
+    for put_off in range(coder[_PENDING] + 1):
+        at = coder[_AT]
+        if bit != (put_off > 0):
+            stream[at >> 3] |= np.uint8(0x80 >> (at & 7))
+        coder[_AT] += 1
+    coder[_PENDING] = 0

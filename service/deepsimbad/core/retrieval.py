@@ -135,8 +135,8 @@ def _sum_listed_alike(map_: Map, worth: NDArray[np.generic]) -> NDArray[np.float
 def sum_listed(map_: Map, tables: NDArray[np.number]) -> NDArray[np.float32]:
     """Sum over every map image's list what a view gives each landmark at each rank.
 
-    The durable form of the lists is posting lists by (landmark, rank) (`core.packing`). Since a view keeps all r ranks,
-    every posting takes part in every query, so memory holds the same postings sorted by map image.
+    The paper's inverted index walks the posting lists of a view's landmarks. Since a view keeps all r ranks, every
+    posting takes part in every query, so memory holds the same postings sorted by map image.
 
     Args:
         tables: [h, r], what landmark i is worth at rank j + 1; of a batch of views [e, h, r], which gives [e, n].

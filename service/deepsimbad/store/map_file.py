@@ -1,4 +1,4 @@
-"""One map version as a self-contained file: its description, posting lists, and named arrays; sealing and export.
+"""One map version as a self-contained file: its description, index, and named arrays; sealing and export.
 
 What the arrays mean is not known here: `core.map` names them, a table holds each.
 """
@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from sqlite_utils import Database
 
 from deepsimbad.core.map import Map
-from deepsimbad.core.packing import pack_index, unpack_index
+from deepsimbad.core.packing import pack_lists, unpack_lists
+from deepsimbad.core.postings import unpack_postings
 from deepsimbad.errors import (
     ConflictError,
     DamagedFileError,
@@ -44,8 +45,9 @@ _DESCRIPTION = (  # the columns of `map` in the order of the checksum
     *("n_map_images", "n_landmarks", "list_length"),
 )
 _WAL_HEADER = bytes([2, 2])  # read and write version at offset 18 of a file that may have a write-ahead log
-_PAGE_SIZES = (4096, 8192, 16384, 32768, 65536)
-_ROW_OVERHEAD = 12  # cell pointer, cell and record headers, landmark and rank of one posting row
+_PAGE_SIZES = (65536, 32768, 16384, 8192, 4096, 2048, 1024, 512)
+_ROW_OVERHEAD = 12  # cell pointer, cell and record headers, the number of a block
+_WORTH_SMALLER_PAGES = 1.01  # of the index's bytes: with small pages all else takes more of them
 
 _MODEL_TABLE, _PACKED_TABLE = "landmark_model", "q_value"
 # In which table of the frozen schema an array lies, all of one layout; what is not named here, what seasons teach.
@@ -69,36 +71,33 @@ def write_map(path: Path, map_: Map, on_progress: Callable[[float], None] = lamb
         InvalidInputError: A Q-value is NaN or infinite.
         UnavailableError: The disk is full, read-only, ...
     """
-    postings = list(pack_index(map_.lists, map_.n_landmarks))
+    blocks = pack_lists(map_.lists, map_.n_landmarks, map_.landmark_model.get("prototypes"))
     on_progress(0.3)
     with storage_faults(path, DamagedMapError):
         remove_database(path)
         try:
             with open_database(path, create=True) as db:
-                db.execute(f"PRAGMA page_size = {_fitting_page_size([len(blob) for _, _, blob in postings])}")
+                db.execute(f"PRAGMA page_size = {_fitting_page_size([len(block) for block in blocks])}")
                 db.execute("PRAGMA journal_mode = MEMORY")  # a crash leaves a file that is discarded anyway
                 db.execute("PRAGMA synchronous = OFF")
                 migrations.apply(db)
                 with db.atomic():
-                    _write(db, map_, postings, on_progress)
+                    _write(db, map_, blocks, on_progress)
         except BaseException:
             remove_database(path)
             raise
     on_progress(1.0)
 
 
-def _write(
-    db: Database, map_: Map, postings: list[tuple[int, int, bytes]], on_progress: Callable[[float], None]
-) -> None:
+def _write(db: Database, map_: Map, blocks: list[bytes], on_progress: Callable[[float], None]) -> None:
     checksum = Checksum()
     description = {
         column: to_json(value) if column in _AS_JSON else int(value) if isinstance(value, bool) else value
         for column, value in map_.document().items()
     }
     checksum.add(*(description[column] for column in _DESCRIPTION))
-    for posting in postings:
-        checksum.add(*posting)
-    db.conn.executemany("INSERT INTO posting (landmark, rank, image_ids) VALUES (?, ?, ?)", postings)
+    checksum.add(*blocks)
+    db.conn.executemany("INSERT INTO posting (body) VALUES (?)", [(block,) for block in blocks])
     on_progress(0.5)
     save_arrays(db, _MODEL_TABLE, map_.landmark_model, checksum)
     arrays = {
@@ -136,7 +135,11 @@ def _read(db: Database, path: Path) -> Map:
     stored = rows[0]
     checksum = Checksum()
     checksum.add(*(stored[column] for column in _DESCRIPTION))
-    postings = db.execute("SELECT landmark, rank, image_ids FROM posting ORDER BY landmark, rank").fetchall()
+    blocks = [body for (body,) in db.execute("SELECT body FROM posting WHERE landmark IS NULL ORDER BY part")]
+    checksum.add(*blocks)
+    postings = db.execute(  # of an earlier release
+        "SELECT landmark, rank, body FROM posting WHERE landmark IS NOT NULL ORDER BY landmark, rank"
+    ).fetchall()
     for posting in postings:
         checksum.add(*posting)
     model = load_arrays(db, _MODEL_TABLE, checksum)
@@ -146,7 +149,11 @@ def _read(db: Database, path: Path) -> Map:
     if checksum.value != stored["checksum"]:
         raise DamagedMapError(f"{path.name} is damaged: it does not match its checksum", file=path.name)
     arrays |= {name: unpack_texts(arrays[name], stored["n_map_images"]) for name in _TEXTS & arrays.keys()}
-    arrays["lists"] = unpack_index(postings, stored["list_length"], stored["n_map_images"])
+    shape = stored["list_length"], stored["n_map_images"]
+    if postings:
+        arrays["lists"] = unpack_postings(postings, *shape)
+    else:
+        arrays["lists"] = unpack_lists(blocks, *shape, stored["n_landmarks"], model.get("prototypes"))
     document = {name: from_json(stored[name]) if name in _AS_JSON else stored[name] for name in _DESCRIPTION}
     return Map.from_arrays(document, model, arrays, _bytes_by_table(db)["posting"])
 
@@ -191,27 +198,29 @@ def _opened(path: Path) -> Iterator[Database]:
         raise DamagedMapError(error.message, **error.hints) from error
 
 
-def _fitting_page_size(blob_lengths: Sequence[int]) -> int:
-    """The page size that stores posting lists of these lengths in the fewest bytes.
+def _fitting_page_size(block_lengths: Sequence[int]) -> int:
+    """The largest page size that stores blocks of these lengths in nearly the fewest bytes.
 
-    A row of more than about a quarter page spills into pages of its own, the last of which stays part empty; on large
-    maps that would double the index.
+    Pages are counted whole, and the last of a block's stays part empty: of a small map's index that is a good part.
     """
 
     def cost(page_size: int) -> int:
-        local = spilled = 0
-        for length in blob_lengths:
-            n_local, n_pages = _spill(length + _ROW_OVERHEAD, page_size)
-            local += n_local
-            spilled += n_pages * page_size
-        return spilled + -(-local // (page_size - 12)) * page_size
+        n_pages, room = 1, page_size - 8
+        for length in block_lengths:
+            local, n_spilled = _spill(length + _ROW_OVERHEAD, page_size)
+            n_pages += n_spilled
+            if local > room:
+                n_pages, room = n_pages + 1, page_size - 8
+            room -= local
+        return n_pages * page_size
 
-    return min(_PAGE_SIZES, key=cost)
+    least = min(map(cost, _PAGE_SIZES))
+    return next(size for size in _PAGE_SIZES if cost(size) <= _WORTH_SMALLER_PAGES * least)
 
 
 def _spill(payload: int, page_size: int) -> tuple[int, int]:
-    """The bytes of an index leaf's payload that stay in its page, and its overflow pages (SQLite file format, 1.6)."""
-    most, least = ((page_size - 12) * share // 255 - 23 for share in (64, 32))
+    """The bytes of a row that stay in its page, and its overflow pages (SQLite file format, 1.6)."""
+    most, least = page_size - 35, (page_size - 12) * 32 // 255 - 23
     if payload <= most:
         return payload, 0
     local = least + (payload - least) % (page_size - 4)
