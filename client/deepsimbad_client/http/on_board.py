@@ -144,10 +144,9 @@ class OnBoardEncoder:
         evaluator = self._loaded
         if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] != 3 or pixels.size == 0:
             raise InvalidArgumentError(f"{what} is {list(pixels.shape)} {pixels.dtype}, not [height, width, 3] uint8")
-        if is_blank(pixels):
-            return None
         with _named_errors("the image cannot be encoded"):
-            return self._compared(evaluator.encode([pixels]))
+            pixels = evaluator.prepare(pixels)
+            return None if is_blank(pixels) else self._compared(evaluator.encode([pixels]))
 
     def _of_encoding(self, encoding: Numbers | None) -> NDArray[np.float32]:
         try:

@@ -12,14 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepsimbad.errors import DeepSimbadError
-from deepsimbad.evaluators.image import decode_image
+from deepsimbad.evaluators.image import decode_image, resized
 from deepsimbad_client.errors import BrokenFrameError, SourceError
 from deepsimbad_client.http import media_type_of
 
 Image = NDArray[np.uint8]  # [height, width, 3] BGR
 
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", ".pgm", ".ppm"})
-JPEG_QUALITY = 92
 TURNS = {0: None, 90: cv2.ROTATE_90_CLOCKWISE, 180: cv2.ROTATE_180, 270: cv2.ROTATE_90_COUNTERCLOCKWISE}
 
 _MAX_PIXELS = 1 << 30  # the picture is the caller's own
@@ -68,7 +67,9 @@ class Recording:
         return len(self.frames) if self.n_before_slice is None else self.n_before_slice
 
     def image(self, frame: Frame, input_size: tuple[int, int] | None) -> EncodedImage:  # noqa: ARG002
-        """Read one frame's image, ready to post; one larger than `input_size` (width, height) is resized to exactly it.
+        """Read one frame's image, ready to post; one larger than `input_size` (width, height) may be resized to it.
+
+        Whichever is sent, the service encodes the same pixels.
 
         Raises BrokenFrameError (this file cannot be used; the others can), SourceError (there are no images at all).
         """
@@ -170,9 +171,11 @@ def is_larger(image: Image, input_size: tuple[int, int] | None) -> bool:
     return input_size is not None and (image.shape[1] > input_size[0] or image.shape[0] > input_size[1])
 
 
-def as_jpeg(image: Image, input_size: tuple[int, int] | None) -> EncodedImage:
-    """Make an image ready to post: resized to exactly `input_size` where it is larger, as JPEG of quality 92."""
+def as_png(image: Image, input_size: tuple[int, int] | None) -> EncodedImage:
+    """Make an image ready to post without loss: the service sees what it would make of the whole picture itself.
+
+    One that is larger is brought to exactly `input_size` by the rule that the service's evaluators resize by.
+    """
     if input_size is not None and is_larger(image, input_size):
-        image = np.asarray(cv2.resize(image, input_size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
-    _, body = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-    return EncodedImage(body.tobytes(), "image/jpeg")
+        image = resized(image, input_size)
+    return EncodedImage(cv2.imencode(".png", image)[1].tobytes(), "image/png")

@@ -5,8 +5,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
-
 from deepsimbad_client.errors import SourceError
 from deepsimbad_client.http import media_type_of
 from deepsimbad_client.recordings import (
@@ -14,7 +12,7 @@ from deepsimbad_client.recordings import (
     EncodedImage,
     Frame,
     Recording,
-    as_jpeg,
+    as_png,
     decode,
     is_larger,
     read_file,
@@ -39,19 +37,22 @@ class FolderRecording(Recording):
         return stamp_of(self.folder / frame.name)
 
     def image(self, frame: Frame, input_size: tuple[int, int] | None) -> EncodedImage:
-        """Read a frame: a file no larger than asked goes as it is, a larger one as JPEG.
+        """Read a frame: the file itself, or the image at the size asked for where that is larger and takes fewer bytes.
 
         A format that cannot be posted (BMP, PGM, PPM) goes as PNG.
         """
         path = self.folder / frame.name
         body = read_file(path)
         image = decode(body, path)
-        if self.rotate or is_larger(image, input_size):
-            return as_jpeg(turned(image, self.rotate), input_size)
         media_type = media_type_of(body)
-        if media_type is None:
-            return EncodedImage(cv2.imencode(".png", image)[1].tobytes(), "image/png")
-        return EncodedImage(body, media_type)
+        if media_type is None or self.rotate:
+            return as_png(turned(image, self.rotate), input_size)
+        whole = EncodedImage(body, media_type)
+        return min(as_png(image, input_size), whole, key=_n_bytes) if is_larger(image, input_size) else whole
+
+
+def _n_bytes(image: EncodedImage) -> int:
+    return len(image.body)
 
 
 def single(path: Path, rotate: int | None = None) -> FolderRecording:

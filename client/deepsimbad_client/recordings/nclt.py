@@ -36,7 +36,7 @@ from deepsimbad_client.recordings import (
     Frame,
     Image,
     Recording,
-    as_jpeg,
+    as_png,
     decode,
     read_file,
     stamp_of,
@@ -97,8 +97,8 @@ class NcltRecording(Recording):
         return stamp_of(self.folder / frame.name)
 
     def image(self, frame: Frame, input_size: tuple[int, int] | None) -> EncodedImage:
-        """Read a frame upright, no larger than asked, as JPEG; see `Recording.image`."""
-        return as_jpeg(self.upright(frame), input_size)
+        """Read a frame upright, no larger than asked, as PNG; see `Recording.image`."""
+        return as_png(self.upright(frame), input_size)
 
     def upright(self, frame: Frame) -> Image:
         """Read a frame, undistorted where asked, turned upright; raises BrokenFrameError."""

@@ -136,8 +136,8 @@ class Decoders:
 
 def _decode(file: ImageFile, evaluator: Evaluator) -> tuple[Image, bool]:
     ready(evaluator)  # where it is not, decoding is in vain
-    image = decode_file(file)
-    return evaluator.prepare(image), is_blank(image)
+    image = evaluator.prepare(decode_file(file))
+    return image, is_blank(image)  # as it is encoded: so it is the same for a view that was sent smaller
 
 
 @dataclass(frozen=True)

@@ -144,6 +144,7 @@ def describe(snapshot: Map, evaluator: Evaluator, view: View) -> Query:
         within = np.clip(view.values, -_LARGEST_DISSIMILARITY, _LARGEST_DISSIMILARITY).astype(np.float32)
         return Query(rank_landmarks(view.values), within)
     if isinstance(view, np.ndarray):
+        view = evaluator.prepare(view)
         view = NothingSeen() if is_blank(view) else encode_images(evaluator, [view])[0]
     if isinstance(view, NothingSeen):
         return Query.uninformative(n_landmarks)

@@ -67,6 +67,18 @@ def decode_file(file: ImageFile, *, as_stored: bool = False) -> Image:
     raise InvalidImageError("the image cannot be decoded")
 
 
+def resized(image: Image, size: tuple[int, int]) -> Image:
+    """An image at (width, height): averaged where it shrinks, interpolated linearly where it grows; aspect not kept.
+
+    Clients resize by this rule too, so that a view encodes to the same numbers wherever it was made small.
+    """
+    height, width = image.shape[:2]
+    if (width, height) == size:
+        return image
+    shrinks = width >= size[0] and height >= size[1]
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR), np.uint8)
+
+
 def is_blank(image: Image) -> bool:
     """Whether an image shows nothing: it is of one grey but for noise, be that a sensor's in the dark or all there is.
 

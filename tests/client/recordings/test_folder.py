@@ -194,15 +194,16 @@ def test_clocks_that_differ_are_told(tmp_path):
     assert "by +3600.000 s at the first frame and +3601.000 s at the last" in remark
 
 
-def test_a_small_image_goes_as_it_is_and_a_larger_one_resized_as_jpeg(folder):
+def test_a_small_image_goes_as_it_is_and_a_larger_one_resized_where_that_is_shorter(folder):
+    cv2.imwrite(str(folder / "8.png"), np.random.default_rng(0).integers(0, 16, (12, 16, 3), np.uint8))
     recording = open_source(str(folder))
     frame = recording.frames[0]
-    for input_size in (None, (16, 12), (100, 100)):
+    for input_size in (None, (16, 12), (100, 100), (15, 100)):
         sent = recording.image(frame, input_size)
         assert (sent.body, sent.content_type) == ((folder / "8.png").read_bytes(), "image/png")
-    for input_size in ((15, 100), (100, 11), (4, 4)):
+    for input_size in ((9, 12), (12, 9), (4, 4)):
         sent = recording.image(frame, input_size)
-        assert sent.content_type == "image/jpeg"
+        assert sent.content_type == "image/png"
         image = cv2.imdecode(np.frombuffer(sent.body, np.uint8), cv2.IMREAD_COLOR)
         assert (image.shape[1], image.shape[0]) == input_size
         assert abs(float(image.mean()) - 8) < 2

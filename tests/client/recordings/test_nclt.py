@@ -11,7 +11,7 @@ from deepsimbad_client.recordings.sources import open_source
 
 
 def decoded(encoded):
-    assert encoded.content_type == "image/jpeg"
+    assert encoded.content_type == "image/png"
     return cv2.imdecode(np.frombuffer(encoded.body, np.uint8), cv2.IMREAD_COLOR)
 
 
@@ -53,7 +53,7 @@ def test_frames_lie_where_the_ground_truth_was_when_they_were_taken(nclt_tree):
         assert (frame.y_m, frame.heading_rad) == pytest.approx((3.0, 0.0), abs=1e-9)
 
 
-def test_frames_are_upright_resized_and_jpeg(nclt_tree):
+def test_frames_are_upright_and_resized_without_loss(nclt_tree):
     fill(nclt_tree, seconds=1)
     recording = open_source(nclt_tree.source)
     for input_size, shape in ((None, (64, 48)), ((48, 64), (64, 48)), ((200, 200), (64, 48)), ((20, 20), (20, 20))):

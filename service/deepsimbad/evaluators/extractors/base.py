@@ -4,11 +4,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from deepsimbad.evaluators.base import Image
+from deepsimbad.evaluators.image import resized
 from deepsimbad.evaluators.runtimes import Run
 
 
@@ -93,15 +93,3 @@ class NetworkExtractor:
         least = max(self.side_multiple, self.shortest_side)
         wide, high = (max(least, round(side * shrink)) for side in (width, height))
         return resized(image, (wide - wide % self.side_multiple, high - high % self.side_multiple))
-
-
-def resized(image: Image, size: tuple[int, int]) -> Image:
-    """An image at (width, height): averaged where it shrinks, interpolated linearly where it grows; aspect not kept.
-
-    Clients resize by the same rule, so that a view encodes to the same numbers wherever it was made small.
-    """
-    height, width = image.shape[:2]
-    if (width, height) == size:
-        return image
-    shrinks = width >= size[0] and height >= size[1]
-    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR), np.uint8)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from deepsimbad.evaluators.base import Image
 from deepsimbad.evaluators.compute import Compute
+from deepsimbad.evaluators.image import resized
 
 _SIDE = 128  # pixels
 _POOL = 4  # pixels averaged before blurring: nothing finer survives the blur anyway
@@ -43,10 +44,7 @@ class GradientGrid:
 
     def prepare(self, image: Image) -> Image:
         """See `Extractor`; colours go, of which it sees nothing."""
-        grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
-        if grey.shape != (_SIDE, _SIDE):
-            shrinks = grey.shape[0] >= _SIDE and grey.shape[1] >= _SIDE
-            grey = cv2.resize(grey, self.input_size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
+        grey = cv2.cvtColor(resized(image, self.input_size), cv2.COLOR_BGR2GRAY)
         return np.asarray(cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR), np.uint8)
 
     def encode(self, images: Sequence[Image]) -> NDArray[np.float32]:
