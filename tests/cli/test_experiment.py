@@ -177,6 +177,12 @@ def test_frames_left_out_are_told(measured, pictures, tmp_path):
     assert (document["n_queries"], document["n_left_out"]) == (29, 1)
 
 
+def test_as_many_landmarks_are_taken_as_fit_and_the_number_is_told(deepsimbad, measured, triplet):
+    by_itself = ("--evaluator", "feature_l2:none", "--relevance", "rrf")
+    assert measured("vpr", *triplet, *by_itself)["config"]["n_landmarks"] == 60, "every frame of the landmark drive"
+    assert "60 landmarks" in deepsimbad("experiment", "vpr", *triplet, *by_itself).out
+
+
 def test_named_errors(deepsimbad, triplet, route, tmp_path):
     short = [*route[:-1], f"{route[-1]}#:90"]
     for kind, sources, more in (

@@ -31,7 +31,7 @@ def contents(data_dir, version=1, domain="route"):
 
 def test_a_map_is_made_and_described(deepsimbad, drives, tmp_path):
     ran = deepsimbad("map", "route", *sources(drives), *READY, "--n-landmarks", 20, "--data-dir", tmp_path / "here")
-    assert (ran.code, ran.out, ran.err) == (0, "map 1 of route is active: 80 images\n", "")
+    assert (ran.code, ran.out, ran.err) == (0, "map 1 of route is active: 80 images, 20 landmarks\n", "")
     ran = deepsimbad("info", "route", "--json", "--data-dir", tmp_path / "here")
     document = json.loads(ran.out)
     assert (ran.code, ran.err) == (0, "")
@@ -133,7 +133,7 @@ def test_named_errors_are_one_line_and_make_nothing(deepsimbad, drives, pictures
     route = ("map", "route", *sources(drives), *READY)
     for command in (("info", "route"), ("localize", "route", "view.png")):
         named_error(deepsimbad(*command), "no domains in deepsimbad-data", "--data-dir")
-    named_error(deepsimbad(*route, "--n-landmarks", 61), "60 candidates for 61 landmarks", "--n-landmarks")
+    named_error(deepsimbad(*route, "--n-landmarks", 61), "60 candidates for 61 landmarks", "60 is the most that fit")
     with monkeypatch.context() as patched:
         patched.setenv("DEEPSIMBAD_MAX_PIXELS", "many")
         named_error(deepsimbad(*route), "max_pixels")

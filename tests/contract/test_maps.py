@@ -46,6 +46,22 @@ def test_the_history_tells_what_a_map_was_built_with_when_and_how_good_it_is(cli
     assert history[1]["retired_at"] is not None
 
 
+def test_more_landmarks_than_frames_are_refused_at_once_and_none_asked_for_are_as_many_as_fit(client):
+    remaps = "/v1/admin/domains/fitting/remaps"
+    assert client.put("/v1/admin/domains/fitting", json=TAKES_ENCODINGS).status_code == 201
+    client.upload("fitting", "drive", ready_encodings(), np.arange(N_READY))
+    client.upload("fitting", "short", noise(3, 12), np.arange(12))
+    more = {"training_traverse": "drive", "n_landmarks": N_READY + 1}
+    refused = problem(client.post(remaps, json=more), 422, "too_few_candidates")
+    assert f"{N_READY} is the most that fit" in refused["detail"]
+    assert refused["n_candidates"] == N_READY
+    more = {"training_traverse": "drive", "landmark_traverse": "short", "n_landmarks": 13}
+    assert problem(client.post(remaps, json=more), 422, "too_few_candidates")["n_candidates"] == 12
+    assert client.get("/v1/admin/jobs", params={"domain": "fitting"}).json()["jobs"] == []
+    made = client.wait_for(client.post(remaps, json={"training_traverse": "drive"}).json()["job_id"])
+    assert made["result"]["metrics"]["n_landmarks"] == N_READY
+
+
 def test_versions_are_switched_and_rolled_back(client, domain):
     active = f"/v1/admin/domains/{domain}/active-map"
     job = client.remap(domain, relevance="rrf", activate=False)

@@ -1,7 +1,7 @@
 """Every command, curl example and Python example of README and the pages beside it is run against a live service.
 
 README's are run as printed, one after the other in a folder that holds a person's own images; only the server's address
-is another. In the pages the folder of NCLT is a rendered campus in its layout, and fewer landmarks are asked for.
+is another. In the pages the folder of NCLT is a rendered campus in its layout.
 """
 
 import hashlib
@@ -54,8 +54,7 @@ def first_hour(readme, nclt, tmp_path_factory):
 @pytest.fixture(scope="module")
 def workplace(nclt, tmp_path_factory):
     """The pages behind it."""
-    words = {"/data/nclt": nclt, "--n-landmarks 500": "--n-landmarks 20", "--n-landmarks 300": "--n-landmarks 10"}
-    place = Workplace(furnished(tmp_path_factory.mktemp("workplace"), nclt), **words)
+    place = Workplace(furnished(tmp_path_factory.mktemp("workplace"), nclt), **{"/data/nclt": nclt})
     with ExitStack() as stack:
         place.serve("data", stack)
         for name in ("recordings", "methods", "http"):

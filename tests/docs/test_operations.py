@@ -31,7 +31,7 @@ def workplace(nclt, tmp_path_factory):
         for season in ("winter", "spring"):  # what an operator has when the page begins
             drive = f"nclt:/data/nclt/{PAPER_DATES[season]}"
             place.run(f"deepsimbad-client upload {drive} --domain campus --traverse {season}")
-        place.run("deepsimbad-client remap --domain campus --landmarks winter --training spring --n-landmarks 20")
+        place.run("deepsimbad-client remap --domain campus --landmarks winter --training spring")
         place.follow(Page(PROJECT / "docs" / "operations.md"), stack)
         assert len(place.output) > 15
         yield place

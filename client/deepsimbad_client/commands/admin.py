@@ -213,7 +213,11 @@ def _show_deleted(json_output: bool, **names: str | int) -> None:
     metavar="TRAVERSE",
     help="Where landmarks are chosen; absent: the active map's landmarks stay, or, without one, those of the drive.",
 )
-@click.option("--n-landmarks", type=click.IntRange(min=1), help="r; absent: the service's default.")
+@click.option(
+    "--n-landmarks",
+    type=click.IntRange(min=1),
+    help="How many landmarks; absent: 500, or every frame of a shorter drive.",
+)
 @click.option("--list-length", type=click.IntRange(min=1), help="h, landmarks a map image keeps.")
 @click.option(
     "--relevance",
@@ -321,6 +325,9 @@ def _show_job(job: Job, json_output: bool) -> None:
     version = result.get("map_version")
     if version is None:
         return
+    metrics = result.get("metrics") or {}
+    if metrics.get("n_landmarks") is not None:
+        REMARKS.print(f"map {version}: {metrics['n_map_images']} images, {metrics['n_landmarks']} landmarks")
     why = gate_verdict(job.check)
     if not result.get("active", True):
         click.echo(f"map {version} was sealed but not activated{f': {why}' if why else ''}")

@@ -31,9 +31,16 @@ from deepsimbad.api.requests import (
     read_json,
 )
 from deepsimbad.api.sessions import TruePositions
+from deepsimbad.core.landmark_model import fitting_number
 from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Relevance
 from deepsimbad.errors import DeepSimbadError, NoActiveMapError, UnknownJobError
-from deepsimbad.jobs.remap import DEFAULT_LIST_LENGTH, DEFAULT_TRAINING_EPISODES, RemapConfig, refuse_known_traverse
+from deepsimbad.jobs.remap import (
+    DEFAULT_LIST_LENGTH,
+    DEFAULT_N_LANDMARKS,
+    DEFAULT_TRAINING_EPISODES,
+    RemapConfig,
+    refuse_known_traverse,
+)
 from deepsimbad.jobs.runner import REMAP
 from deepsimbad.jobs.versions import EXPERIENCE, ExperienceConfig, keep_true_positions
 from deepsimbad.store.records import JobRecord
@@ -168,9 +175,14 @@ async def post_remap(
         if before is not None:
             return JobAnswer.model_validate(before)
         record = running.catalog.domain(domain)
+        n_frames: dict[str | None, int] = {}
         for name in (config.training_traverse, config.landmark_traverse, config.check_traverse):
             if name is not None:
-                Traverse.open(running.settings.data_dir, domain, name).close()
+                with Traverse.open(running.settings.data_dir, domain, name) as traverse:
+                    n_frames[name] = traverse.n_frames
+        if config.landmark_traverse is not None or record.active_version is None:
+            candidates = config.landmark_traverse or config.training_traverse
+            fitting_number(config.n_landmarks, n_frames[candidates], DEFAULT_N_LANDMARKS)
         if config.append and record.active_version is None:
             what = "to append to: make one first, without append"
             raise NoActiveMapError(f"domain {domain} has no active map {what}", domain=domain)

@@ -1,6 +1,7 @@
 """`deepsimbad experiment`: the paper's experiments on a landmark-training-test triplet of recordings."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import reduce
 from pathlib import Path
 from typing import Any, TypeVar
@@ -23,6 +24,7 @@ from deepsimbad.cli.terminal import (
 )
 from deepsimbad.core.belief import FilterKind
 from deepsimbad.core.drive import Drive, SameRoute
+from deepsimbad.core.landmark_model import fitting_number
 from deepsimbad.core.metrics import RetrievalScores
 from deepsimbad.core.planners import DEFAULT_PLANNER
 from deepsimbad.core.relevance import DEFAULT_RELEVANCE, DEFAULT_UPDATE, Relevance, UpdateRule
@@ -39,6 +41,7 @@ from deepsimbad.jobs.truth import read_ground_truth
 from deepsimbad.jobs.vpr import VprConfig, VprReport, run_vpr, vpr_stages
 from deepsimbad_client.recordings.sources import open_source
 
+_N_LANDMARKS = 300
 _ROLES = ("landmarks", "training", "test")
 _READING_STAGES = {f"read {role}": 2.0 for role in _ROLES}
 STANDARD_OUTPUT = Path("-")
@@ -67,7 +70,11 @@ def _triplet_options(command: _Command) -> _Command:
         click.option("--training", required=True, help="SOURCE that becomes the map."),
         click.option("--test", required=True, help="SOURCE of the live views, in the order they were driven."),
         spacing_option,
-        click.option("--n-landmarks", type=click.IntRange(min=1), default=300, show_default=True),
+        click.option(
+            "--n-landmarks",
+            type=click.IntRange(min=1),
+            help=f"How many landmarks.  [default: {_N_LANDMARKS}, or every frame of a shorter recording]",
+        ),
         click.option("--list-length", type=click.IntRange(min=1), default=4, show_default=True),
         click.option(
             "--same-route/--no-same-route",
@@ -129,10 +136,9 @@ def vpr(
     if same_route is None and ground_truth is None:
         same_route = True  # test and training are scored by their positions: they count along one route
     config = VprConfig(
-        asked["n_landmarks"],
-        asked["list_length"],
-        tolerance,
-        relevances,
+        list_length=asked["list_length"],
+        tolerance_m=tolerance,
+        relevances=relevances,
         stateless=asked["stateless"],
         same_route=same_route,
         bar_own_place=asked["bar_own_place"],
@@ -142,7 +148,8 @@ def vpr(
     for evaluator in evaluators:
         extractor = evaluator.extractor
         with progress_bar(_READING_STAGES | vpr_stages(config), extractor) as progress:
-            measure, (landmarks, training, test), sources = _read_triplet(asked, evaluator, progress)
+            measure, (landmarks, training, test), sources, n_landmarks = _read_triplet(asked, evaluator, progress)
+            config = replace(config, n_landmarks=n_landmarks)
             truth = true_images(test.drive, training.drive, tolerance, ground_truth)
             report = run_vpr(config, measure, landmarks.drive, training.drive, test, truth, progress)
         sources["ground_truth"] = None if ground_truth is None else str(ground_truth)
@@ -177,10 +184,11 @@ def nbv(evaluator: EvaluatorConfig, relevance: str | None, update: str | None, *
         relevance=chosen,
         update=UpdateRule(update) if update else DEFAULT_UPDATE[chosen],
         same_route=asked["same_route"] is not False,
-        **{name: asked[name] for name in ("n_landmarks", "list_length", "training_episodes", "episodes", "seed")},
+        **{name: asked[name] for name in ("list_length", "training_episodes", "episodes", "seed")},
     )
     with progress_bar(_READING_STAGES | nbv_stages(config), "experiment") as progress:
-        measure, (landmarks, training, test), sources = _read_triplet(asked, evaluator, progress)
+        measure, (landmarks, training, test), sources, n_landmarks = _read_triplet(asked, evaluator, progress)
+        config = replace(config, n_landmarks=n_landmarks)
         report = run_nbv(config, measure, landmarks.drive, training.drive, test.drive, progress)
     document = report.as_dict(sources)
     tell(document, asked["json_file"], lambda: _print_planners(report, document))
@@ -207,10 +215,11 @@ def calibration(evaluator: EvaluatorConfig, relevance: str, filter_name: str, **
         relevance=Relevance(relevance),
         filter=FilterKind(filter_name),
         same_route=asked["same_route"] is not False,
-        **{name: asked[name] for name in ("n_landmarks", "list_length", "seed")},
+        **{name: asked[name] for name in ("list_length", "seed")},
     )
     with progress_bar(_READING_STAGES | calibration_stages(), "experiment") as progress:
-        measure, (landmarks, training, test), sources = _read_triplet(asked, evaluator, progress)
+        measure, (landmarks, training, test), sources, n_landmarks = _read_triplet(asked, evaluator, progress)
+        config = replace(config, n_landmarks=n_landmarks)
         report = run_calibration(config, measure, landmarks.drive, training.drive, test.drive, progress)
     document = report.as_dict(sources)
     tell(document, asked["json_file"], lambda: _print_calibration(document, report.same_route))
@@ -218,13 +227,15 @@ def calibration(evaluator: EvaluatorConfig, relevance: str, filter_name: str, **
 
 def _read_triplet(
     asked: dict[str, Any], config: EvaluatorConfig, progress: Progress
-) -> tuple[Evaluator, list[EncodedRecording], dict[str, Any]]:
-    """What measures, the three recordings, and what was read, for the result's `config`."""
+) -> tuple[Evaluator, list[EncodedRecording], dict[str, Any], int]:
+    """What measures, the three recordings, what was read, for the result's `config`, and how many landmarks fit."""
     settings = given_settings()
-    evaluator, recordings = make_evaluator(config, settings.compute()), []
-    for stage, role in zip(_READING_STAGES, _ROLES, strict=True):
+    evaluator = make_evaluator(config, settings.compute())
+    opened = [open_source(asked[role], spacing_m=asked["spacing_m"]) for role in _ROLES]
+    fitting_number(asked["n_landmarks"], len(opened[0].frames), _N_LANDMARKS)  # before minutes of encoding
+    recordings = []
+    for stage, recording in zip(_READING_STAGES, opened, strict=True):
         progress.stage(stage)
-        recording = open_source(asked[role], spacing_m=asked["spacing_m"])
         recordings.append(encode_recording(recording, evaluator, settings.max_pixels, progress.update))
     sources = {
         **{role: asked[role] for role in _ROLES},
@@ -232,7 +243,8 @@ def _read_triplet(
         "spacing_m": asked["spacing_m"],
         "left_out": {role: recording.left_out for role, recording in zip(_ROLES, recordings, strict=True)},
     }
-    return evaluator, recordings, sources
+    n_landmarks = fitting_number(asked["n_landmarks"], recordings[0].drive.n_frames, _N_LANDMARKS)
+    return evaluator, recordings, sources, n_landmarks
 
 
 def true_images(test: Drive, training: Drive, tolerance_m: float, file: Path | None) -> list[NDArray[np.int64]]:
@@ -269,7 +281,7 @@ def _print_relevances(report: VprReport) -> None:
     for name, score in report.scores.items():
         shown = f"{name} (default)" if name == DEFAULT_RELEVANCE.value else name
         table.add_row(shown, f"{score.anr:.2f}", f"{score.recall_at[1]:.1f}", f"{score.recall_at[5]:.1f}")
-    bits = f"index {report.index_bits_per_map_image:.1f} bits a map image"
+    bits = f"{report.config.n_landmarks} landmarks; index {report.index_bits_per_map_image:.1f} bits a map image"
     print_table(table, f"{_queries(report.scores)}; {bits}", *_no_second_season(report.same_route), numbers=True)
     if report.passive is not None:
         _print_passive(report.passive)

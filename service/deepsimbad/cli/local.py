@@ -17,12 +17,13 @@ from deepsimbad.cli.terminal import (
     progress_bar,
     write_json,
 )
+from deepsimbad.core.landmark_model import fitting_number
 from deepsimbad.core.map import DEFAULT_ACTIONS_M, check_actions
 from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Relevance
 from deepsimbad.engine.localizer import localize as localize_view
 from deepsimbad.engine.maps import Maps
 from deepsimbad.engine.worker import EvaluatorPool, Stopwatch
-from deepsimbad.errors import ImageTooLargeError, InvalidImageError, InvalidSourceError, TooFewCandidatesError
+from deepsimbad.errors import ImageTooLargeError, InvalidImageError, InvalidSourceError
 from deepsimbad.evaluators.compute import available_cores
 from deepsimbad.evaluators.image import decode_image
 from deepsimbad.evaluators.registry import EvaluatorConfig, make_evaluator
@@ -119,14 +120,7 @@ def map_(
     sources = {"training": training} if landmarks is None else {"landmarks": landmarks, "training": training}
     recordings = {role: opened(source, allow_missing, **reading) for role, source in sources.items()}
     left_out = {}
-    n_candidates, n_landmarks = (
-        len(recordings["training" if landmarks is None else "landmarks"].frames),
-        config.n_landmarks,
-    )
-    if n_landmarks is not None and n_candidates < n_landmarks:
-        raise TooFewCandidatesError(
-            f"{n_candidates} candidates for {n_landmarks} landmarks; ask for fewer (--n-landmarks) or drive further"
-        )
+    fitting_number(config.n_landmarks, len(recordings[next(iter(sources))].frames), DEFAULT_N_LANDMARKS)
     with Catalog.open(settings.data_dir) as catalog:
         catalog.create_domain(domain, evaluator.as_dict(), closed, actions_m)
         with progress_bar(_READING | REMAP_STAGES, f"map {domain}") as progress:
@@ -146,8 +140,10 @@ def map_(
     if as_json:
         write_json({"domain": domain, **result, "left_out": left_out})
         return
-    click.echo(f"map {result['map_version']} of {domain} is active: {result['metrics']['n_map_images']} images")
-    season = result["metrics"]["second_season"]
+    metrics = result["metrics"]
+    size = f"{metrics['n_map_images']} images, {metrics['n_landmarks']} landmarks"
+    click.echo(f"map {result['map_version']} of {domain} is active: {size}")
+    season = metrics["second_season"]
     if season is not None and season["significance"] is not None and not season["accepted"]:
         click.echo(f"it learnt nothing of a second season: {season['why']}", err=True)
 

@@ -73,12 +73,25 @@ def farthest_first(u: NDArray[np.float32], n_landmarks: int) -> NDArray[np.int64
     return ids
 
 
+def fitting_number(asked: int | None, n_candidates: int, usual: int) -> int:
+    """r: what is asked for, else what is usual or, of fewer candidates, all of them.
+
+    Raises:
+        TooFewCandidatesError: More are asked for than there are candidates.
+    """
+    if asked is None:
+        return min(usual, n_candidates)
+    _check_number(n_candidates, asked)
+    return asked
+
+
 def _check_number(n_candidates: int, n_landmarks: int) -> None:
     if n_landmarks < 1:
         raise InvalidMapConfigError("n_landmarks must be at least 1", n_landmarks=n_landmarks)
     if n_candidates < n_landmarks:
         raise TooFewCandidatesError(
-            f"{n_candidates} candidates for {n_landmarks} landmarks; ask for fewer landmarks or drive further",
+            f"{n_candidates} candidates for {n_landmarks} landmarks: {n_candidates} is the most that fit; ask for no "
+            "more, or leave the number out, and as many are taken as fit",
             n_candidates=n_candidates,
             n_landmarks=n_landmarks,
         )

@@ -17,6 +17,7 @@ from deepsimbad.core.building import MapPlan, append_drive
 from deepsimbad.core.composed import is_composed
 from deepsimbad.core.descriptor import MAX_LANDMARKS
 from deepsimbad.core.drive import Drive
+from deepsimbad.core.landmark_model import fitting_number
 from deepsimbad.core.map import Map
 from deepsimbad.core.nnql import NnqlConfig
 from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Relevance
@@ -243,7 +244,13 @@ class _Remap:
             progress.update,
         )
         seconds = {name: took for name, took in progress.seconds().items() if name.replace("_", " ") in REMAP_STAGES}
-        metrics = {"n_map_images": map_.n_images, "seconds": seconds, **learnt, "check": check}
+        metrics = {
+            "n_map_images": map_.n_images,
+            "n_landmarks": map_.n_landmarks,
+            "seconds": seconds,
+            **learnt,
+            "check": check,
+        }
         progress.stage("seal")
         return seal_version(self.catalog, self.domain, map_, record_config, metrics, progress.update, job_id)
 
@@ -333,7 +340,12 @@ class _Remap:
         config, domain, training = self.config, inputs.domain, inputs.training
         self.progress.stage("describe")
         landmarks = inputs.candidates if inputs.base is None else inputs.base.landmark_model
-        n_landmarks = config.n_landmarks or min(DEFAULT_N_LANDMARKS, (inputs.candidates or training).n_frames)
+        n_candidates = (inputs.candidates or training).n_frames
+        n_landmarks = (
+            fitting_number(config.n_landmarks, n_candidates, DEFAULT_N_LANDMARKS)
+            if inputs.base is None
+            else inputs.base.n_landmarks
+        )
         built = build(
             MapPlan(config.relevance, config.list_length, domain.actions_m, domain.closed, config.same_route),
             training,

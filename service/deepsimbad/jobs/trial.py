@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from deepsimbad.core.building import MapPlan
 from deepsimbad.core.drive import Drive
+from deepsimbad.core.landmark_model import fitting_number
 from deepsimbad.core.localizer import ActiveLocalizer, LocalizerConfig, LocalizerState
 from deepsimbad.core.map import Map
 from deepsimbad.core.metrics import RetrievalScorer, RetrievalScores
@@ -127,7 +128,7 @@ def run_trial(
     """
     progress.stage("map")
     plan = MapPlan(DEFAULT_RELEVANCE, DEFAULT_LIST_LENGTH, (CONFIDENT_WITHIN_M,), same_route=config.same_route)
-    n_landmarks = min(DEFAULT_N_LANDMARKS, (landmarks or database).n_frames)
+    n_landmarks = fitting_number(None, (landmarks or database).n_frames, DEFAULT_N_LANDMARKS)
     built = build(plan, database, landmarks, landmarks, n_landmarks, evaluator, progress.update)
     progress.stage("localize")
     views = views_of(measured(queries, built.map.landmark_model, evaluator))
