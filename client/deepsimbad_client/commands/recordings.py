@@ -25,9 +25,9 @@ from deepsimbad_client.errors import UnknownDomainError
 from deepsimbad_client.http.client import Client
 from deepsimbad_client.http.upload import upload as upload_recording
 from deepsimbad_client.recordings import Recording
-from deepsimbad_client.recordings.encodings import ENCODING_SUFFIXES
 from deepsimbad_client.recordings.folder import single
 from deepsimbad_client.recordings.options import accounting, opened, reading, tell_left_out, tell_remarks
+from deepsimbad_client.recordings.sources import RECORDING_SUFFIXES
 from deepsimbad_client.replay import DEFAULT_PLANNER
 from deepsimbad_client.replay.active import EPISODES, STEPS, Stage, active_replay
 from deepsimbad_client.replay.passive import TOLERANCE_M
@@ -124,7 +124,7 @@ def _views(images: Iterable[str], input_size: tuple[int, int] | None) -> Iterato
     """Every view with its name, made ready as an upload would make it, so that it is encoded like a map's own."""
     for name in images:
         path = Path(name)
-        is_image = path.is_file() and path.suffix.lower() not in ENCODING_SUFFIXES
+        is_image = path.is_file() and path.suffix.lower() not in RECORDING_SUFFIXES
         if is_image:
             recording: Recording = single(path)
             tell_remarks(recording)

@@ -7,12 +7,12 @@ from decimal import Decimal, InvalidOperation
 from deepsimbad_client.errors import SourceError
 
 UNITS = {"s": Decimal(10**6), "ms": Decimal(1000), "us": Decimal(1), "ns": Decimal("0.001")}  # in microseconds
-_FIRST_US, _LAST_US = Decimal(631_152_000 * 10**6), Decimal(4_102_444_800 * 10**6)  # 1990 to 2100: no two units overlap
+FIRST_US, LAST_US = 631_152_000 * 10**6, 4_102_444_800 * 10**6  # 1990 to 2100: no two units overlap
 
 
 def unit_of(time: Decimal) -> str | None:
     """The unit in which a number is a time since 1970 between 1990 and 2100; None: in none."""
-    return next((unit for unit, in_us in UNITS.items() if _FIRST_US <= time * in_us < _LAST_US), None)
+    return next((unit for unit, in_us in UNITS.items() if FIRST_US <= time * in_us < LAST_US), None)
 
 
 def times_us(cells: Sequence[str], unit: str | None, where: Sequence[str]) -> tuple[list[int | None], str | None]:

@@ -71,10 +71,11 @@ def _upright(recording: FolderRecording, rotate: int | None) -> FolderRecording:
     return dataclasses.replace(recording, rotate=UPRIGHT_TURN, remarks=[*recording.remarks, TURNED_UPRIGHT])
 
 
-def read_folder(folder: Path, spacing_m: float, rotate: int | None = None) -> FolderRecording:
+def read_folder(folder: Path, spacing_m: float, rotate: int | None = None, time_offset_us: int = 0) -> FolderRecording:
     """Open a folder of images; without a positions.csv frame i is `i * spacing_m` metres along the route.
 
     `rotate` turns the images clockwise by so many degrees; None: NCLT's images upright, others not at all.
+    `time_offset_us` is added to the times that names tell.
     Raises SourceError: no images, or a positions.csv that cannot be understood; the message names the line.
     """
     try:
@@ -86,7 +87,8 @@ def read_folder(folder: Path, spacing_m: float, rotate: int | None = None) -> Fo
         hint = f"; for NCLT write nclt:{folder}" if (folder / "lb3").is_dir() else ""
         raise SourceError(f"{folder} holds no images ({', '.join(sorted(IMAGE_SUFFIXES))}){hint}")
     name, path = folder.resolve().name, folder / POSITIONS_FILE
-    times_us: Sequence[int | None] = times_of(names) or [None] * len(names)
+    told_us: Sequence[int | None] = times_of(names) or [None] * len(names)
+    times_us = [None if time is None else time + time_offset_us for time in told_us]
     if not path.is_file():
         frames = tuple(
             Frame(i, file, i * spacing_m, timestamp_us=time_us)

@@ -80,5 +80,5 @@ _KEYS: tuple[Callable[[str], Hashable], ...] = (
 def _unambiguous(names: Sequence[str], key: Callable[[str], Hashable]) -> dict[Hashable, str]:
     files: dict[Hashable, list[str]] = {}
     for name in names:
-        files.setdefault(key(name), []).append(name)
+        files.setdefault(key(PureWindowsPath(name).name), []).append(name)
     return {text: same[0] for text, same in files.items() if len(same) == 1 and text is not None}

@@ -13,10 +13,11 @@ from deepsimbad_client.recordings.sources import open_source
 
 Command = Callable[..., Any]
 
+_ABOVE_0 = click.FloatRange(min=0, min_open=True)
 _OPTIONS = (
     click.option(
         "--spacing-m",
-        type=click.FloatRange(min=0, min_open=True),
+        type=_ABOVE_0,
         default=1.0,
         show_default=True,
         help="Metres between frames where the source does not say where they are.",
@@ -33,9 +34,19 @@ _OPTIONS = (
         help="Degrees clockwise by which every image is turned.  [default: NCLT's upright, others not at all]",
     ),
     click.option(
+        "--time-offset-s",
+        type=float,
+        default=0.0,
+        show_default=True,
+        help="Seconds by which the images' clock is behind that of the track beside them.",
+    ),
+    click.option("--every-s", type=_ABOVE_0, help="Take one frame every so many seconds.  [default: all]"),
+    click.option("--every-m", type=_ABOVE_0, help="Take one frame every so many metres.  [default: all]"),
+    click.option(
         "--reverse", is_flag=True, help="Take the frames in the other order: where positions fall along the drive."
     ),
 )
+_NAMES = ("spacing_m", "undistortion", "rotate", "time_offset_s", "every_s", "every_m", "reverse")
 
 
 def reading(command: Command) -> Command:
@@ -43,7 +54,7 @@ def reading(command: Command) -> Command:
 
     @wraps(command)
     def with_reading(**options: Any) -> Any:
-        asked = {name: options.pop(name) for name in ("spacing_m", "undistortion", "rotate", "reverse")}
+        asked = {name: options.pop(name) for name in _NAMES}
         return command(reading=asked, **options)
 
     for option in reversed(_OPTIONS):

@@ -10,6 +10,7 @@ import numpy as np
 
 from deepsimbad_client.errors import SourceError
 from deepsimbad_client.recordings import Frame
+from deepsimbad_client.recordings.clock import FIRST_US
 from deepsimbad_client.recordings.left_out import MOST_LEFT_OUT
 from deepsimbad_client.recordings.track import Reals, Times, Track, arc_length_m, on_track, rising_m
 
@@ -57,9 +58,22 @@ def placed(frames: Sequence[Frame], where: str) -> Placed:
     return result
 
 
-def placed_on(track: Track, images: Sequence[tuple[str, int]], where: str, what: str = "the positions") -> Placed:
-    """Put images, names and Unix microseconds, where a track was at their times. Raises SourceError (none is on it)."""
-    images = sorted(images, key=lambda image: image[1])
+def placed_on(
+    track: Track,
+    images: Sequence[tuple[str, int]],
+    where: str,
+    what: str = "the positions",
+    *,
+    together: bool = False,
+) -> Placed:
+    """Put images, names and microseconds, where a track was at their times. Raises SourceError (none is on it).
+
+    With `together`, images whose times do not count from 1970, as the track's do, begin with the track.
+    """
+    images, remarks = sorted(images, key=lambda image: image[1]), []
+    if together and images[-1][1] < FIRST_US <= track.time_us[0]:
+        images = [(name, time + int(track.time_us[0])) for name, time in images]
+        remarks.append(f"{what} say the time, the images do not: they are taken to begin together")
     time_us = np.array([time for _, time in images], dtype=np.int64)
     poses = track.at(time_us)
     if not (poses.covered & ~poses.in_gap).any():
@@ -72,7 +86,8 @@ def placed_on(track: Track, images: Sequence[tuple[str, int]], where: str, what:
         [
             Frame(0, name, position_m, time, x_m, y_m, None if math.isnan(heading_rad) else heading_rad)
             for (name, time), position_m, x_m, y_m, heading_rad in zip(images, *columns, strict=True)
-        ]
+        ],
+        remarks=remarks,
     )
     result.leave_out(poses.covered.tolist(), f"before or after {what}")
     result.leave_out((~poses.in_gap[poses.covered]).tolist(), f"gap in {what}")

@@ -151,7 +151,7 @@ def _interpolated(rows: Sequence[Frame], names: Sequence[str], times_us: Sequenc
     if track is None:
         raise SourceError(f"{path}: fewer than two lines hold a time and a place")
     images = [(name, time_us) for name, time_us in zip(names, times_us, strict=True) if time_us is not None]
-    return placed_on(track, images, str(path))
+    return placed_on(track, images, str(path), together=True)
 
 
 def _rows_by_name(table: _Table, names: Sequence[str]) -> tuple[dict[str, int], list[str]]:

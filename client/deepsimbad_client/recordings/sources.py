@@ -2,6 +2,7 @@
 
     nclt:ROOT/DATE        one date of the NCLT dataset (`nclt`)
     FOLDER                images in name order, with an optional positions.csv
+    FILE.mp4 and others   a video (`video`)
     FILE.npy, FILE.csv    ready encodings [n, d], one row for each frame, in travel order
 
 Each may end in #START:STOP or #START:STOP:STEP, Python's slice of its frames, which keep their places and positions.
@@ -13,16 +14,21 @@ usual. Folders inside and files whose name starts with a dot are not looked at.
 import dataclasses
 import math
 import re
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from deepsimbad_client.errors import SourceError
-from deepsimbad_client.recordings import Recording
+from deepsimbad_client.recordings import TURNS, Recording
 from deepsimbad_client.recordings.encodings import ENCODING_SUFFIXES, read_encodings
 from deepsimbad_client.recordings.folder import read_folder
 from deepsimbad_client.recordings.nclt import FRONT_CAMERA, read_nclt
 from deepsimbad_client.recordings.positions import POSITIONS_FILE
+from deepsimbad_client.recordings.video import VIDEO_SUFFIXES, read_video
 
 NCLT_PREFIX = "nclt:"
+RECORDING_SUFFIXES = ENCODING_SUFFIXES | VIDEO_SUFFIXES
+"""Of files that hold many frames."""
 
 _SLICE = re.compile(r"\s*([+-]?\d+)?\s*:\s*([+-]?\d+)?\s*(?::\s*([+-]?\d+)?\s*)?")
 
@@ -34,18 +40,34 @@ def open_source(
     camera: int = FRONT_CAMERA,
     undistortion: Path | None = None,
     rotate: int | None = None,
+    time_offset_s: float = 0.0,
+    every_s: float | None = None,
+    every_m: float | None = None,
     reverse: bool = False,
 ) -> Recording:
-    """Open a recording, see the top of this module; `spacing_m` stands between frames of unsaid places.
+    """Open a recording, see the top of this module.
 
-    `camera` is NCLT's, 0..5, and `undistortion` its table or the folder of them. `rotate` turns images clockwise by
-    90, 180 or 270 degrees; None: NCLT's upright, others not. `reverse` takes the frames in the other order. Raises
-    SourceError, also where positions fall along the drive.
+    Args:
+        source: SOURCE.
+        spacing_m: Between frames of unsaid places.
+        camera: NCLT's, 0..5.
+        undistortion: NCLT's table, or the folder of them.
+        rotate: Degrees clockwise, 0, 90, 180 or 270, by which images are turned; None: NCLT's upright, others not.
+        time_offset_s: Added to the images' times before a track is asked where they were taken.
+        every_s: Take one frame every so many seconds.
+        every_m: Take one frame every so many metres.
+        reverse: Take the frames in the other order.
+
+    Raises:
+        SourceError: There is no such recording, it makes no sense, or positions fall along the drive.
     """
     if not (math.isfinite(spacing_m) and spacing_m > 0):
         raise SourceError(f"a spacing of {spacing_m} m: frames must be more than 0 m apart")
+    if rotate is not None and rotate not in TURNS:
+        raise SourceError(f"images cannot be turned by {rotate} degrees: give 0, 90, 180 or 270")
     place, part = split_slice(source)
-    recording = _open_whole(place, spacing_m, camera, undistortion, rotate)
+    how = _How(spacing_m, camera, undistortion, rotate, round(time_offset_s * 1e6))
+    recording = _open_whole(place, how)
     first, last = recording.frames[0], recording.frames[-1]
     if reverse:
         recording = recording.reversed()
@@ -54,7 +76,19 @@ def open_source(
             f"{place}: positions fall along the drive, from {first.position_m:g} m ({first.name}) to "
             f"{last.position_m:g} m ({last.name}), and a route's rise: --reverse takes the frames in the other order"
         )
+    recording = recording.thinned(every_s, every_m)
     return recording if part is None else recording.sliced(part)
+
+
+@dataclass(frozen=True)
+class _How:
+    """As `open_source` was asked."""
+
+    spacing_m: float
+    camera: int
+    undistortion: Path | None
+    rotate: int | None
+    time_offset_us: int
 
 
 def split_slice(source: str) -> tuple[str, slice | None]:
@@ -73,35 +107,40 @@ def split_slice(source: str) -> tuple[str, slice | None]:
     raise SourceError(f"{source}: a slice is #START:STOP or #START:STOP:STEP in whole frames, not #{ending}")
 
 
-def _open_whole(place: str, spacing_m: float, camera: int, undistortion: Path | None, rotate: int | None) -> Recording:
+def _open_whole(place: str, how: _How) -> Recording:
     if place.startswith(NCLT_PREFIX):
         drive = Path(place.removeprefix(NCLT_PREFIX)).expanduser()
         if not drive.name or drive.name == "..":
             raise SourceError(f"{place}: expected nclt:ROOT/DATE, for example nclt:/data/nclt/2012-01-22")
-        return read_nclt(drive.parent, drive.name, camera=camera, undistortion=undistortion, rotate=rotate)
+        return read_nclt(drive.parent, drive.name, camera=how.camera, undistortion=how.undistortion, rotate=how.rotate)
     path = Path(place).expanduser()
     if not place or not path.exists():
         raise SourceError(
-            f"no recording at {place!r}: expected nclt:ROOT/DATE, a folder of images, or encodings in a .npy or .csv"
+            f"no recording at {place!r}: expected nclt:ROOT/DATE, a folder of images, a video, or encodings in a .npy "
+            "or .csv"
         )
     if path.is_dir():
-        return _nclt_camera(path, undistortion, rotate) or read_folder(path, spacing_m, rotate)
+        return _nclt_camera(path, how) or read_folder(path, how.spacing_m, how.rotate, how.time_offset_us)
+    if path.suffix.lower() in VIDEO_SUFFIXES:
+        return read_video(path, how.spacing_m, how.rotate or 0, how.time_offset_us)
     if path.suffix.lower() in ENCODING_SUFFIXES:
-        return read_encodings(path, spacing_m)
-    raise SourceError(f"{path}: a file of ready encodings is a .npy or a .csv [n, d]; images are named by their folder")
+        return read_encodings(path, how.spacing_m)
+    raise SourceError(
+        f"{path}: expected a video ({', '.join(sorted(VIDEO_SUFFIXES))}) or ready encodings [n, d] in a .npy or .csv; "
+        "images are named by their folder"
+    )
 
 
-def _nclt_camera(folder: Path, undistortion: Path | None, rotate: int | None) -> Recording | None:
+def _nclt_camera(folder: Path, how: _How) -> Recording | None:
     """The recording of a camera's folder in NCLT's layout (ROOT/DATE/lb3/Cam5); None: it is none, or has no poses."""
     drive = folder.resolve().parent.parent
     camera = re.fullmatch(r"Cam([0-5]).*", folder.resolve().name)
     if camera is None or not folder.resolve().parent.name.startswith("lb3") or (folder / POSITIONS_FILE).exists():
         return None
     root = drive.parent.parent if drive.parent.name == "images" else drive.parent
+    options: dict[str, Any] = {"undistortion": how.undistortion, "rotate": how.rotate, "folder": folder}
     try:
-        recording = read_nclt(
-            *(root, drive.name), camera=int(camera[1]), undistortion=undistortion, rotate=rotate, folder=folder
-        )
+        recording = read_nclt(root, drive.name, camera=int(camera[1]), **options)
     except SourceError:
         return None
     said = f"NCLT's layout: read as {NCLT_PREFIX}{root / drive.name}, camera {camera[1]}, upright"

@@ -53,7 +53,7 @@ def test_sources_end_to_end_with_a_slice(tmp_path):
         ("/no/such/place", "no recording at '/no/such/place'"),
         ("e.npy#::0", "step 0"),
         ("e.npy#3:3", "#3:3 leaves none of the 3 frames"),
-        ("e.txt", r"a \.npy or a \.csv"),
+        ("e.txt", r"a \.npy or \.csv"),
     ],
 )
 def test_bad_sources_say_what_to_write(tmp_path, monkeypatch, source, message):

@@ -1,0 +1,117 @@
+"""Video files: frames by number, a second by the frame rate apart, placed by a table or a track beside them.
+
+`drive.mp4` takes its positions from `drive.csv` (the columns of `positions.csv`: a line a frame, an `index`, or times
+with x_m, y_m, which begin with the video where they count from 1970); without one frames are evenly spaced.
+"""
+
+import threading
+from collections import OrderedDict
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from deepsimbad_client.errors import BrokenFrameError, SourceError
+from deepsimbad_client.recordings import EncodedImage, Frame, Image, Recording, as_png, stamp_of, turned
+from deepsimbad_client.recordings.placing import Placed, placed
+from deepsimbad_client.recordings.positions import read_positions
+
+VIDEO_SUFFIXES = frozenset({".mp4", ".avi", ".mov", ".mkv", ".m4v", ".webm", ".mpg", ".mpeg", ".ts", ".wmv"})
+MOST_HZ, USUAL_HZ = 1000.0, 30.0  # a rate beyond the one says nothing; the other stands for it
+N_KEPT = 32  # decoded frames, for several threads ask for neighbours in any order
+
+
+class _Decoder:
+    """Decodes frames by number: forwards fast, backwards from the beginning, which alone is exact in every format."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._turn = threading.Lock()
+        self._capture: cv2.VideoCapture | None = None
+        self._next = 0
+        self._kept: OrderedDict[int, Image] = OrderedDict()
+
+    def frame(self, number: int, wanted: frozenset[int]) -> Image:
+        """One frame; those of `wanted` that are passed on the way are kept. Raises BrokenFrameError."""
+        with self._turn:
+            if number not in self._kept:
+                self._read_to(number, wanted)
+            if number not in self._kept:
+                raise BrokenFrameError(f"{self._path} has no frame {number} that can be decoded", "undecodable")
+            return self._kept[number]
+
+    def _read_to(self, number: int, wanted: frozenset[int]) -> None:
+        if self._capture is None or number < self._next:
+            self._capture, self._next = cv2.VideoCapture(str(self._path)), 0
+        while self._next <= number and self._capture.grab():
+            if self._next in wanted:
+                decoded, image = self._capture.retrieve()
+                if decoded:
+                    self._kept[self._next] = np.asarray(image, dtype=np.uint8)
+            self._next += 1
+        while len(self._kept) > N_KEPT:
+            self._kept.popitem(last=False)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class VideoRecording(Recording):
+    """Frames of a video."""
+
+    path: Path
+    rotate: int = 0  # degrees clockwise by which images are turned
+    decoder: _Decoder = field(repr=False)
+
+    def stamp(self, frame: Frame) -> str:
+        """Of its file and number; see `Recording.stamp`."""
+        return f"{stamp_of(self.path)} {frame.name}"
+
+    def image(self, frame: Frame, input_size: tuple[int, int] | None) -> EncodedImage:
+        """Decode a frame, as PNG; see `Recording.image`."""
+        return as_png(turned(self.decoder.frame(_number(frame), self._wanted), self.rotate), input_size)
+
+    @cached_property
+    def _wanted(self) -> frozenset[int]:
+        return frozenset(map(_number, self.frames))
+
+
+def _number(frame: Frame) -> int:
+    return int(frame.name.rpartition("/")[2])
+
+
+def read_video(path: Path, spacing_m: float, rotate: int = 0, time_offset_us: int = 0) -> VideoRecording:
+    """Open a video; raises SourceError (it cannot be decoded, or what lies beside it does not place its frames)."""
+    capture = cv2.VideoCapture(str(path))
+    n_frames, rate_hz = int(capture.get(cv2.CAP_PROP_FRAME_COUNT)), capture.get(cv2.CAP_PROP_FPS)
+    if not capture.grab() or n_frames < 1:
+        raise SourceError(f"{path} is no video that OpenCV can decode: convert it, for example to H.264 in an .mp4")
+    capture.release()
+    names = [f"{path.name}/{number:06d}" for number in range(n_frames)]
+    rate_hz = rate_hz if 0 < rate_hz < MOST_HZ else USUAL_HZ
+    times_us = [round(number * 1e6 / rate_hz) + time_offset_us for number in range(n_frames)]
+    table = path.with_suffix(".csv")
+    if table.is_file():
+        told = read_positions(table, names, times_us)
+        result = placed(told.frames, str(table))
+        result = Placed(result.frames, told.left_out_names | result.left_out_names, [*told.remarks, *result.remarks])
+    else:
+        result = Placed(
+            [
+                Frame(number, name, number * spacing_m, time_us)
+                for number, (name, time_us) in enumerate(zip(names, times_us, strict=True))
+            ]
+        )
+        result.remarks.append(
+            f"{n_frames} frames, {rate_hz:g} a second, are taken {spacing_m:g} m apart: --every-s takes fewer, "
+            f"{table.name} beside the video says where they are"
+        )
+    return VideoRecording(
+        path.stem,
+        tuple(result.frames),
+        result.left_out_names,
+        remarks=result.remarks,
+        path=path,
+        rotate=rotate,
+        decoder=_Decoder(path),
+    )

@@ -1,0 +1,81 @@
+import cv2
+import numpy as np
+import pytest
+
+from deepsimbad_client.errors import BrokenFrameError, SourceError
+from deepsimbad_client.http.upload import in_order
+from deepsimbad_client.recordings.sources import open_source
+
+
+@pytest.fixture
+def video(tmp_path):
+    """Thirty frames, ten a second; the grey of each is five times its number."""
+    path = tmp_path / "drive.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10, (64, 48))
+    for number in range(30):
+        writer.write(np.full((48, 64, 3), 5 * number, np.uint8))
+    writer.release()
+    return path
+
+
+def grey(recording, frame):
+    image = recording.image(frame, None)
+    return float(cv2.imdecode(np.frombuffer(image.body, np.uint8), cv2.IMREAD_COLOR).mean())
+
+
+def test_a_video_is_its_frames_in_any_order_asked_for(video):
+    recording = open_source(f"{video}#3:30:4", spacing_m=2)
+    assert [(frame.name, frame.position_m, frame.timestamp_us) for frame in recording.frames[:2]] == [
+        ("drive.avi/000003", 6, 300_000),
+        ("drive.avi/000007", 14, 700_000),
+    ]
+    for frame in [*recording.frames[::-1], *recording.frames]:
+        assert grey(recording, frame) == pytest.approx(5 * int(frame.name[-2:]), abs=2)
+    seen = dict(in_order(lambda frame: grey(recording, frame), recording.frames, 4))
+    assert [round(shade / 20 - 0.75) for shade in seen.values()] == list(range(7))
+
+
+def test_frames_are_taken_by_time_or_by_distance(video):
+    recording = open_source(f"{video}#1:", every_s=0.5)
+    assert [(frame.index, frame.name[-2:]) for frame in recording.frames] == [(k, f"{5 * k:02}") for k in range(1, 6)]
+    video.with_suffix(".csv").write_text("time_s,x_m,y_m\n0,0,0\n1,0,5\n1.5,0,5\n2.5,0,15\n3,0,20\n")
+    recording = open_source(str(video), every_m=5)
+    assert [(frame.name[-2:], round(frame.position_m, 1)) for frame in recording.frames] == [
+        ("00", 0),
+        ("10", 5),
+        ("20", 10),
+        ("25", 15),
+    ]
+    at_us = 1_400_000_000_000_000
+    video.with_suffix(".csv").write_text(
+        f"time,x_m,y_m\n{at_us},0,0\n{at_us + 1_000_000},0,5\n{at_us + 2_900_000},0,9\n"
+    )
+    recording = open_source(str(video), time_offset_s=0.5)
+    assert [round(recording.frames[at].position_m, 1) for at in (0, 5)] == [2.5, 5]
+    assert recording.left_out_names["before or after the positions"] == [f"drive.avi/0000{at}" for at in range(25, 30)]
+    assert "begin together" in recording.remarks[0]
+    with pytest.raises(SourceError, match="--every-s"):
+        open_source(str(video), every_m=5, every_s=1)
+
+
+def test_lines_for_every_frame_place_them(video):
+    video.with_suffix(".csv").write_text("position_m\n" + "".join(f"{at / 2}\n" for at in range(30)))
+    assert open_source(str(video)).frames[-1].position_m == 14.5
+
+
+def test_a_camera_that_hangs_upside_down_is_turned(video):
+    recording = open_source(str(video), rotate=90)
+    body = recording.image(recording.frames[0], None).body
+    assert cv2.imdecode(np.frombuffer(body, np.uint8), cv2.IMREAD_COLOR).shape == (64, 48, 3)
+
+
+def test_a_video_cut_short_has_broken_frames_and_none_at_all_is_named(video, capfd):
+    whole = video.read_bytes()
+    video.write_bytes(whole[: len(whole) // 2])
+    recording = open_source(str(video))
+    with pytest.raises(BrokenFrameError, match="no frame 29"):
+        recording.image(recording.frames[29], None)
+    video.write_bytes(b"no video")
+    with pytest.raises(SourceError, match=r"drive\.avi is no video"):
+        open_source(str(video))
+    capfd.readouterr()  # FFmpeg's own words
