@@ -1,6 +1,7 @@
 """`deepsimbad experiment vpr` and `nbv`: their tables, their JSON, their options."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ READY = ("--evaluator", "feature_l2:none", "--n-landmarks", 40)
 QUICK = (*READY, "--episodes", 6, "--training-episodes", 20)
 KEYS = {
     *("anr", "recall_at_1", "recall_at_5", "default", "n_queries", "n_left_out", "index_bits_per_map_image", "seconds"),
-    *("passive", "second_season", "config", "encoding_dim", "bytes_per_encoding", "encode_ms"),
+    *("passive", "second_season", "config", "warnings", "encoding_dim", "bytes_per_encoding", "encode_ms"),
 }
 SEVEN = {"composed", "brute_force_u", "standardised", "rrf", "bag_of_landmarks", "simbad", "brute_force"}
 PLANNERS = {"random", "clairvoyant", "nnql", "informed", *(f"constant_{action_m}" for action_m in range(1, 11))}
@@ -41,8 +42,10 @@ def measured(deepsimbad):
 
     def run(*arguments):
         ran = deepsimbad("experiment", *arguments, "--json")
-        assert (ran.code, ran.err) == (0, "")
-        return json.loads(ran.out, parse_constant=lambda constant: pytest.fail(f"{constant} is no JSON"))
+        document = json.loads(ran.out, parse_constant=lambda constant: pytest.fail(f"{constant} is no JSON"))
+        told = "".join(f"warning: {warning}\n" for warning in document["warnings"])
+        assert (ran.code, ran.err) == (0, told)
+        return document
 
     return run
 
@@ -181,6 +184,22 @@ def test_as_many_landmarks_are_taken_as_fit_and_the_number_is_told(deepsimbad, m
     by_itself = ("--evaluator", "feature_l2:none", "--relevance", "rrf")
     assert measured("vpr", *triplet, *by_itself)["config"]["n_landmarks"] == 60, "every frame of the landmark drive"
     assert "60 landmarks" in deepsimbad("experiment", "vpr", *triplet, *by_itself).out
+
+
+def test_a_test_drive_that_was_learnt_from_is_warned_of_whatever_it_is_called(measured, drives, tmp_path):
+    np.save(tmp_path / "copy.npy", np.load(drives / "winter.npy"))
+
+    def ran(landmarks, training):
+        sources = ("--landmarks", landmarks, "--training", training, "--test", drives / "winter.npy")
+        document = measured("vpr", *sources, *READY, "--relevance", "composed")
+        return [re.findall(r"^test_drive_known: .* the (\w+) drive", each) for each in document["warnings"]], document
+
+    assert ran(drives / "landmarks.npy", drives / "summer.npy")[0] == []
+    assert ran("copy.npy", drives / "summer.npy")[0] == [["landmarks"]]
+    assert ran(drives / "landmarks.npy", "copy.npy")[0] == [["training"]]
+    warned, document = ran(drives / "winter.npy", "copy.npy")
+    assert warned == [["landmarks"], ["training"]]
+    assert document["second_season"] is None, "one drive under two names is one season"
 
 
 def test_named_errors(deepsimbad, triplet, route, tmp_path):

@@ -136,6 +136,14 @@ def test_ready_encodings_have_figures_and_a_page_without_pictures(deepsimbad, dr
     assert (none["n_queries"], none["anr"]["composed"]) == (0, None)
 
 
+def test_queries_that_the_map_was_made_of_are_warned_of_in_the_page_too(deepsimbad, drives, tmp_path):
+    ran = deepsimbad("try", drives / "summer.npy", drives / "summer.npy", "--evaluator", "feature_l2:none", "--json")
+    document = json.loads(ran.out)
+    assert ran.err.startswith("warning: test_drive_known: ")
+    assert "in the database drive too" in document["warnings"][0]
+    assert "test_drive_known" in (tmp_path / document["page"]).read_text()
+
+
 def test_landmarks_of_another_drive_are_taken_where_they_are_given(deepsimbad, drives):
     sources = (drives / "summer.npy", drives / "winter.npy", "--landmarks", drives / "landmarks.npy")
     document = json.loads(deepsimbad("try", *sources, "--evaluator", "feature_l2:none", "--json").out)

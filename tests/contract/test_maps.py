@@ -37,7 +37,7 @@ def test_the_history_tells_what_a_map_was_built_with_when_and_how_good_it_is(cli
     check = client.remap(domain, training_traverse="dense", relevance="rrf")["result"]["metrics"]["check"]
     assert set(check) == {
         *("frames", "traverse", "n_queries", "n_left_out", "tolerance_m", "anr", "anr_active"),
-        *("active_version", "gate_margin", "passed", "why"),
+        *("active_version", "gate_margin", "passed", "why", "warnings"),
     }
     assert (check["n_queries"], check["tolerance_m"], check["active_version"]) == (4, 2, 1)
     assert None not in {check["anr"], check["anr_active"]}

@@ -87,6 +87,7 @@ def test_the_first_map_has_nothing_to_be_compared_with(seasons, remapped):
         "gate_margin": 0.0,
         "passed": True,
         "why": "no map serves yet that the new one could be compared with",
+        "warnings": [],
     }
 
 
@@ -247,6 +248,16 @@ def test_a_check_on_the_drive_that_the_active_map_is_made_of_says_so(remapped, s
     assert "check on another drive" in check["why"]
 
 
+def test_a_check_on_the_drive_that_gave_a_map_its_landmarks_is_a_warning_by_name(remapped, seasons):
+    def warned(**config):
+        return remapped(training_traverse="good", **config)["metrics"]["check"]["warnings"]
+
+    assert warned() == warned(check_traverse="day") == []
+    (of_active,) = warned(check_traverse="landmarks", landmark_traverse=None)
+    assert of_active.startswith("check_drive_known: map 2, which serves took its landmarks from traverse landmarks")
+    assert len(warned(check_traverse="landmarks")) == 1, "the map before kept its landmarks, and chose none"
+
+
 def test_a_map_without_any_place_of_the_check_traverse_loses_its_gate(store, remapped, seasons, catalog):
     remapped(training_traverse="good")
     store("elsewhere", season(0.2, 5), 1000.0 + np.arange(PLACES))
@@ -332,7 +343,7 @@ def test_a_long_drive_is_checked_on_a_thousand_frames_at_most(store, remapped):
 def test_an_unknown_or_unsuitable_check_traverse_is_named_before_anything_is_built(store, remapped, seasons, catalog):
     with pytest.raises(UnknownTraverseError, match="nowhere"):
         remapped(training_traverse="good", check_traverse="nowhere")
-    store("short", np.ones((5, DIM - 1)))
+    store("short", np.eye(5, DIM - 1))
     with pytest.raises(InvalidEncodingError, match="short holds encodings of 7"):
         remapped(training_traverse="good", check_traverse="short")
     store("backwards", season(0.2, 5), np.arange(PLACES)[::-1])

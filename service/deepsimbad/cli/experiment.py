@@ -1,10 +1,10 @@
 """`deepsimbad experiment`: the paper's experiments on a landmark-training-test triplet of recordings."""
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import reduce
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Self, TypeVar
 
 import click
 import numpy as np
@@ -37,7 +37,7 @@ from deepsimbad.jobs.nbv import NbvConfig, NbvReport, nbv_stages, run_nbv
 from deepsimbad.jobs.passive import WINDOWS, PassiveScores
 from deepsimbad.jobs.progress import Progress
 from deepsimbad.jobs.remap import DEFAULT_TRAINING_EPISODES
-from deepsimbad.jobs.truth import read_ground_truth
+from deepsimbad.jobs.truth import known_drives, read_ground_truth
 from deepsimbad.jobs.vpr import VprConfig, VprReport, run_vpr, vpr_stages
 from deepsimbad_client.recordings.sources import open_source
 
@@ -148,14 +148,17 @@ def vpr(
     for evaluator in evaluators:
         extractor = evaluator.extractor
         with progress_bar(_READING_STAGES | vpr_stages(config), extractor) as progress:
-            measure, (landmarks, training, test), sources, n_landmarks = _read_triplet(asked, evaluator, progress)
-            config = replace(config, n_landmarks=n_landmarks)
-            truth = true_images(test.drive, training.drive, tolerance, ground_truth)
-            report = run_vpr(config, measure, landmarks.drive, training.drive, test, truth, progress)
-        sources["ground_truth"] = None if ground_truth is None else str(ground_truth)
-        documents[extractor], reports[extractor] = report.as_dict(sources), report
+            read = _Triplet.read(asked, evaluator, progress)
+            config = replace(config, n_landmarks=read.n_landmarks)
+            landmarks, training, test = read.drives
+            truth = true_images(test, training, tolerance, ground_truth)
+            report = run_vpr(config, read.evaluator, landmarks, training, read.test, truth, progress)
+        sources = {**read.sources, "ground_truth": None if ground_truth is None else str(ground_truth)}
+        documents[extractor] = {**report.as_dict(sources), "warnings": read.warnings}
+        reports[extractor] = report
     if len(reports) > 1:
-        tell({"extractors": documents}, asked["json_file"], lambda: _print_extractors(reports))
+        whole = {"extractors": documents, "warnings": read.warnings}
+        tell(whole, asked["json_file"], lambda: _print_extractors(reports))
     else:
         tell(documents[extractor], asked["json_file"], lambda: _print_relevances(report))
 
@@ -187,10 +190,10 @@ def nbv(evaluator: EvaluatorConfig, relevance: str | None, update: str | None, *
         **{name: asked[name] for name in ("list_length", "training_episodes", "episodes", "seed")},
     )
     with progress_bar(_READING_STAGES | nbv_stages(config), "experiment") as progress:
-        measure, (landmarks, training, test), sources, n_landmarks = _read_triplet(asked, evaluator, progress)
-        config = replace(config, n_landmarks=n_landmarks)
-        report = run_nbv(config, measure, landmarks.drive, training.drive, test.drive, progress)
-    document = report.as_dict(sources)
+        read = _Triplet.read(asked, evaluator, progress)
+        config = replace(config, n_landmarks=read.n_landmarks)
+        report = run_nbv(config, read.evaluator, *read.drives, progress)
+    document = {**report.as_dict(read.sources), "warnings": read.warnings}
     tell(document, asked["json_file"], lambda: _print_planners(report, document))
 
 
@@ -218,33 +221,51 @@ def calibration(evaluator: EvaluatorConfig, relevance: str, filter_name: str, **
         **{name: asked[name] for name in ("list_length", "seed")},
     )
     with progress_bar(_READING_STAGES | calibration_stages(), "experiment") as progress:
-        measure, (landmarks, training, test), sources, n_landmarks = _read_triplet(asked, evaluator, progress)
-        config = replace(config, n_landmarks=n_landmarks)
-        report = run_calibration(config, measure, landmarks.drive, training.drive, test.drive, progress)
-    document = report.as_dict(sources)
+        read = _Triplet.read(asked, evaluator, progress)
+        config = replace(config, n_landmarks=read.n_landmarks)
+        report = run_calibration(config, read.evaluator, *read.drives, progress)
+    document = {**report.as_dict(read.sources), "warnings": read.warnings}
     tell(document, asked["json_file"], lambda: _print_calibration(document, report.same_route))
 
 
-def _read_triplet(
-    asked: dict[str, Any], config: EvaluatorConfig, progress: Progress
-) -> tuple[Evaluator, list[EncodedRecording], dict[str, Any], int]:
-    """What measures, the three recordings, what was read, for the result's `config`, and how many landmarks fit."""
-    settings = given_settings()
-    evaluator = make_evaluator(config, settings.compute())
-    opened = [open_source(asked[role], spacing_m=asked["spacing_m"]) for role in _ROLES]
-    fitting_number(asked["n_landmarks"], len(opened[0].frames), _N_LANDMARKS)  # before minutes of encoding
-    recordings = []
-    for stage, recording in zip(_READING_STAGES, opened, strict=True):
-        progress.stage(stage)
-        recordings.append(encode_recording(recording, evaluator, settings.max_pixels, progress.update))
-    sources = {
-        **{role: asked[role] for role in _ROLES},
-        "evaluator": config.as_dict(),
-        "spacing_m": asked["spacing_m"],
-        "left_out": {role: recording.left_out for role, recording in zip(_ROLES, recordings, strict=True)},
-    }
-    n_landmarks = fitting_number(asked["n_landmarks"], recordings[0].drive.n_frames, _N_LANDMARKS)
-    return evaluator, recordings, sources, n_landmarks
+@dataclass(frozen=True)
+class _Triplet:
+    """Three recordings, read."""
+
+    evaluator: Evaluator
+    landmarks: EncodedRecording
+    training: EncodedRecording
+    test: EncodedRecording
+    n_landmarks: int  # as many as are asked for, or fit
+    sources: dict[str, Any]  # what was read, for the result's `config`
+    warnings: list[str]
+
+    @classmethod
+    def read(cls, asked: dict[str, Any], config: EvaluatorConfig, progress: Progress) -> Self:
+        """Open all, then encode: a mistake in what was typed should cost no minutes."""
+        settings = given_settings()
+        evaluator = make_evaluator(config, settings.compute())
+        opened = [open_source(asked[role], spacing_m=asked["spacing_m"]) for role in _ROLES]
+        fitting_number(asked["n_landmarks"], len(opened[0].frames), _N_LANDMARKS)
+        recordings = []
+        for stage, recording in zip(_READING_STAGES, opened, strict=True):
+            progress.stage(stage)
+            recordings.append(encode_recording(recording, evaluator, settings.max_pixels, progress.update))
+        landmarks, training, test = recordings
+        sources = {
+            **{role: asked[role] for role in _ROLES},
+            "evaluator": config.as_dict(),
+            "spacing_m": asked["spacing_m"],
+            "left_out": {role: recording.left_out for role, recording in zip(_ROLES, recordings, strict=True)},
+        }
+        n_landmarks = fitting_number(asked["n_landmarks"], landmarks.drive.n_frames, _N_LANDMARKS)
+        warnings = known_drives(test.drive, landmarks=landmarks.drive, training=training.drive)
+        return cls(evaluator, landmarks, training, test, n_landmarks, sources, warnings)
+
+    @property
+    def drives(self) -> tuple[Drive, Drive, Drive]:
+        """Landmarks, training, test."""
+        return self.landmarks.drive, self.training.drive, self.test.drive
 
 
 def true_images(test: Drive, training: Drive, tolerance_m: float, file: Path | None) -> list[NDArray[np.int64]]:
@@ -255,7 +276,9 @@ def true_images(test: Drive, training: Drive, tolerance_m: float, file: Path | N
 
 
 def tell(document: dict[str, Any], json_file: Path | None, print_for_people: Callable[[], None]) -> None:
-    """Where `--json` is standard output, that holds nothing else."""
+    """Where `--json` is standard output, that holds nothing else; warnings go to standard error."""
+    for warning in document.get("warnings", ()):
+        click.echo(f"warning: {warning}", err=True)
     if json_file is not None:
         write_json(document, None if json_file == STANDARD_OUTPUT else json_file)
     if json_file != STANDARD_OUTPUT:

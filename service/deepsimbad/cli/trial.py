@@ -22,6 +22,7 @@ from deepsimbad.evaluators.registry import EvaluatorConfig, make_evaluator
 from deepsimbad.jobs.build import EncodedRecording, encode_recording
 from deepsimbad.jobs.kept_encodings import kept_encodings
 from deepsimbad.jobs.trial import TRIAL_STAGES, TrialConfig, TrialReport, run_trial
+from deepsimbad.jobs.truth import known_drives
 from deepsimbad.jobs.vpr import BRUTE_FORCE_U
 from deepsimbad_client.recordings.options import accounting, opened, reading, tell_left_out
 
@@ -101,6 +102,8 @@ def try_(
                     "left_out": {role: each.left_out for role, each in encoded.items()},
                 }
             )
+            others = {role: drive for role, drive in drives.items() if role != "queries"}
+            document["warnings"] = known_drives(drives["queries"], **others)
             progress.stage("pictures")
             places, views = (
                 Album(recordings[role], drives[role], settings.max_pixels) for role in ("database", "queries")

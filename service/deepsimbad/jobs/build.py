@@ -179,6 +179,8 @@ def build(
         landmarks: The drive they are chosen from, the model that they stay in, or None: the training drive's own.
         n_landmarks: r, where they are chosen.
     """
+    if second is not None and np.array_equal(second.encodings, training.encodings):
+        second = None  # one drive under two names is one season
     if plan.relevance is Relevance.COMPOSED:
         return compose_map(plan, training, second, landmarks, n_landmarks, on_progress)
     candidates = training if landmarks is None else landmarks

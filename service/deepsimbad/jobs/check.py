@@ -77,17 +77,18 @@ def check_map(
     catalog: Catalog,
     domain: str,
     new: Map,
-    traverses: Collection[str],
+    config: Mapping[str, Any],
     frames: CheckFrames,
     gate_margin: float | None,
     evaluator: Evaluator,
     on_progress: Callable[[float], None],
 ) -> dict[str, Any]:
-    """Score a new map, made of some traverses, and the active one beside it; answers `metrics["check"]`, JSON-ready.
+    """Score a new map, made as `config` says, and the active one beside it; answers `metrics["check"]`, JSON-ready.
 
     A gate is lost where the new ANR is more than `gate_margin` percentage points above the active one, and where the
     two cannot be compared on these frames though a sound map serves: who asks for a gate wants no map to take over
     unseen. Where no map serves, or a damaged one, there is nothing to lose and the gate passes. `why` says which.
+    `warnings` names a map that took its landmarks from the check's own drive.
 
     Raises:
         UnavailableError: The active map may be whole, but could not be read.
@@ -96,13 +97,15 @@ def check_map(
     its_name = f"map {serving}, which serves,"
     active = theirs = withheld = None
     why = "no map serves yet that the new one could be compared with" if serving is None else None
-    own = frames.images_in(new, traverses)
+    configs = {"the new map": config}
+    own = frames.images_in(new, traverses_in(config))
     ranks = _normalised_ranks(new, frames, own, evaluator, lambda share: on_progress(share / 2))
     if serving is not None:
         try:
             active = load_snapshot(catalog, domain, serving)
             WeightsDifferError.check("a map", active.weights_sha256, "a frame", frames.drive.weights_sha256)
-            withheld = frames.images_in(active, traverses_in(catalog.map(domain, serving).config))
+            configs[its_name.removesuffix(",")] = its_config = catalog.map(domain, serving).config
+            withheld = frames.images_in(active, traverses_in(its_config))
             theirs = _normalised_ranks(active, frames, withheld, evaluator, lambda share: on_progress(0.5 + share / 2))
         except (DamagedMapError, RetiredMapError):
             why = f"{its_name} is damaged and cannot be compared"
@@ -150,6 +153,12 @@ def check_map(
         "gate_margin": gate_margin,
         "passed": passed,
         "why": why,
+        "warnings": [
+            f"check_drive_known: {whose} took its landmarks from traverse {frames.source}, and learnt from it, so that "
+            "its figure flatters: check on a drive of another day, which no map was made of"
+            for whose, made_of in configs.items()
+            if not frames.is_held_out and made_of.get("landmark_traverse") == frames.source
+        ],
     }
 
 

@@ -237,7 +237,7 @@ class _Remap:
             self.catalog,
             self.domain,
             map_,
-            traverses_in(record_config),
+            record_config,
             frames,
             config.gate_margin,
             self.evaluator,

@@ -11,6 +11,8 @@ from deepsimbad.core.drive import Drive
 from deepsimbad.core.route import same_places
 from deepsimbad.errors import InvalidSourceError
 
+_MOSTLY = 0.5  # of a drive's frames
+
 
 def nearest_images(test: Drive, training: Drive) -> NDArray[np.int64]:
     """[m] the map image nearest to every test frame: in the plane where both know it, else along the route."""
@@ -19,6 +21,17 @@ def nearest_images(test: Drive, training: Drive) -> NDArray[np.int64]:
     pairs = same_places(test.route(), route, tolerance_m=np.inf)
     nearest[pairs[:, 1]] = pairs[:, 0]
     return nearest
+
+
+def known_drives(test: Drive, **others: Drive | None) -> list[str]:
+    """A warning for every other drive that the test drive's frames are of, whatever it is called."""
+    digests = test.digests()
+    return [
+        f"test_drive_known: most frames of the test drive are in the {role} drive too, so that the figures flatter: "
+        "what was learnt from is no test; give a drive of another day"
+        for role, other in others.items()
+        if other is not None and np.isin(digests, other.digests()).mean() > _MOSTLY
+    ]
 
 
 class _ArraysOnly(pickle.Unpickler):
