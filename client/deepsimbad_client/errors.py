@@ -1,6 +1,6 @@
 """Every error the client raises, in one tree: of recordings, of the network, of the service's answers."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 
@@ -48,6 +48,14 @@ class BrokenFrameError(SourceError, code="broken_frame"):
 
 class TooManyLeftOutError(SourceError, code="frames_left_out"):
     """More frames of a recording are left out than may be without the caller's word."""
+
+
+class OtherFramesError(SourceError, code="other_frames"):
+    """A recording whose frames are others than those that its traverse holds; `names` are of the first that differ."""
+
+    def __init__(self, message: str, names: Sequence[str]) -> None:
+        super().__init__(message)
+        self.names = tuple(names)
 
 
 class ReplayError(DeepSimbadClientError, code="replay"):
@@ -190,6 +198,10 @@ class LandmarkModelDiffersError(
     advice="`client.on_board(domain, map_version={map_version})` fetches it",
 ):
     """The view was ranked by another landmark model than the answering map's: fetch the `map_version` of `problem`."""
+
+
+class FramesDifferError(ConflictError, code="frames_differ"):
+    """Frames that may replace none differ from those of their indices that are there."""
 
 
 class TraverseInUseError(ConflictError, code="traverse_in_use"):

@@ -194,6 +194,10 @@ class LandmarkModelDiffersError(ConflictError, code="landmark_model_differs"):
     """A view ranked by another landmark model than that of the map that should answer."""
 
 
+class FramesDifferError(ConflictError, code="frames_differ"):
+    """Frames of other content, place or time than those of the same indices that are there already."""
+
+
 class TraverseInUseError(ConflictError, code="traverse_in_use"):
     """A running job still reads the traverse or domain."""
 

@@ -1,8 +1,10 @@
 """The admin calls that make and fill a domain, and the jobs they begin: each once, only so many, told to the end."""
 
 import errno
+import hashlib
 import json
 import threading
+from io import BytesIO
 
 import numpy as np
 import pytest
@@ -80,7 +82,8 @@ def shelf(client, request):
     base = f"/v1/admin/domains/{request.node.name.replace('_', '-')[:60]}"
     client.put(base, json=TAKES_ENCODINGS)
     made = client.post(f"{base}/traverses", json={"name": "t"})
-    assert (made.status_code, made.json()) == (201, {"name": "t", "n_frames": 0, "missing": []})
+    unknown = dict.fromkeys(("length_m", "span_us", "digest"))
+    assert (made.status_code, made.json()) == (201, {**unknown, "name": "t", "n_frames": 0, "missing": []})
     return f"{base}/traverses"
 
 
@@ -107,10 +110,54 @@ def test_frames_twice_and_out_of_order(client, shelf):
         answer = client.put(f"{shelf}/t/frames/{index}", params=where, json={"encoding": [float(index)] * DIM})
         answers.append((answer.status_code, answer.json()["index"], answer.json()["n_frames"]))
     assert answers == [(201, 5, 1), (201, 0, 2), (201, 2, 3), (200, 5, 3)]
-    assert client.get(f"{shelf}/t").json() == {"name": "t", "n_frames": 3, "missing": [[1, 1], [3, 4]]}
+    described = client.get(f"{shelf}/t").json()
+    assert len(described.pop("digest")) == 64
+    assert described == {
+        "name": "t",
+        "n_frames": 3,
+        "missing": [[1, 1], [3, 4]],
+        "length_m": 5.0,
+        "span_us": [0, 5],
+    }
     batch = npz(encodings=np.ones((3, DIM)), index=np.array([4, 2, 3]), position_m=np.array([4, 2, 3]))
     answer = client.post(f"{shelf}/t/frames", content=batch, headers=NPZ)
     assert (answer.status_code, answer.json()) == (200, {"n_new": 2, "n_replaced": 1, "n_frames": 5})
+
+
+def test_what_is_there_stays_where_nothing_may_be_replaced(client, shelf):
+    there = {"encodings": np.eye(DIM)[:3], "index": np.arange(3), "position_m": np.arange(3.0)}
+    frames = f"{shelf}/t/frames"
+    assert client.post(f"{frames}?replace=false", content=npz(**there), headers=NPZ).json()["n_new"] == 3
+    before = client.get(f"{shelf}/t").json()
+
+    again = client.post(f"{frames}?replace=false", content=npz(**there), headers=NPZ)
+    assert again.json() == {"n_new": 0, "n_replaced": 0, "n_frames": 3}
+    encoding = {"encoding": np.eye(DIM)[1].tolist()}
+    assert client.put(f"{frames}/1?position_m=1&replace=false", json=encoding).status_code == 200
+    for changed, indices, what in (
+        ({"position_m": np.array([0.0, 5, 6])}, [1, 2], "position"),
+        ({"x_m": np.array([np.nan, 1, np.nan])}, [1], "x"),
+        ({"timestamp_us": np.array([-1, -1, 7])}, [2], "time"),
+        ({"encodings": np.eye(DIM)[[3, 1, 2]]}, [0], "content"),
+    ):
+        batch = npz(**{**there, "index": np.arange(3), **changed})
+        refused = problem(client.post(f"{frames}?replace=false", content=batch, headers=NPZ), 409, "frames_differ")
+        assert (refused["indices"], refused["n_differing"]) == (indices, len(indices))
+        assert f"differ in {what}," in refused["detail"]
+    refused = client.put(f"{frames}/1?position_m=4&replace=false", json=encoding)
+    assert problem(refused, 409, "frames_differ")["indices"] == [1]
+    assert client.get(f"{shelf}/t").json() == before
+    with np.load(BytesIO(client.get(frames).content)) as known:
+        assert {name: known[name].tolist() for name in ("index", "position_m", "timestamp_us")} == {
+            "index": [0, 1, 2],
+            "position_m": [0, 1, 2],
+            "timestamp_us": [-1] * 3,
+        }
+        assert np.isnan([known["x_m"], known["y_m"]]).all()
+        assert known["content_digest"].tolist() == [
+            int.from_bytes(hashlib.blake2b(row.astype("<f4").tobytes(), digest_size=8).digest(), "little")
+            for row in np.eye(DIM)[:3]
+        ]
 
 
 @pytest.mark.parametrize("dim", [64, 4096])

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from deepsimbad.core.drive import UNKNOWN_TIMESTAMP, Drive
+from deepsimbad.core.drive import Drive
+from deepsimbad.core.frames import UNKNOWN_TIMESTAMP
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
 from deepsimbad.jobs.progress import Progress

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from deepsimbad.core.drive import UNKNOWN_TIMESTAMP
+from deepsimbad.core.frames import UNKNOWN_TIMESTAMP
 from deepsimbad.errors import ImageTooLargeError, InvalidRouteError, InvalidSourceError
 from deepsimbad.evaluators.image import decode_image
 from deepsimbad.evaluators.registry import evaluator_config, make_evaluator

@@ -50,7 +50,9 @@ ENCODING_EVALUATOR = {"kind": "feature_l2", "extractor": "none"}
     metavar="METRES",
     help="Moves of a domain that is to be made, ascending, with commas; negative: backward.  [default: 1,2 to 10]",
 )
-@click.option("--resend", is_flag=True, help="Send also the frames that the service has already.")
+@click.option(
+    "--replace", is_flag=True, help="Put frames in the place of those there that differ; else they are refused."
+)
 @at_once
 @reading
 @accounting
@@ -64,7 +66,7 @@ def upload(
     closed: bool,
     evaluator: str | None,
     actions_m: str | None,
-    resend: bool,
+    replace: bool,
     concurrency: int,
     reading: dict[str, Any],
     allow_missing: bool,
@@ -83,7 +85,7 @@ def upload(
         report = upload_recording(
             *(client, recording, domain, traverse),
             concurrency=concurrency,
-            resend=resend,
+            replace=replace,
             allow_missing=allow_missing,
             on_progress=bar,
         )

@@ -263,14 +263,24 @@ def page_of(kind: type[Model], key: str, response: httpx2.Response) -> tuple[tup
 
 def float_array(response: httpx2.Response) -> "NDArray[np.float32]":
     """The [n] float32 of an npy body; raises MissingExtraError, UnexpectedAnswerError."""
-    try:
-        values = require_numpy().load(BytesIO(response.content), allow_pickle=False)
-    except (ValueError, EOFError, OSError) as error:
-        raise _unexpected(response, error) from error
+    values = _loaded(response)
     if values.ndim != 1:
         raise _unexpected(response, ValueError(f"an array of shape {values.shape}"))
     floats: NDArray[np.float32] = values.astype("<f4", copy=False)
     return floats
+
+
+def named_arrays(response: httpx2.Response) -> "dict[str, NDArray[Any]]":
+    """The arrays of an npz body; raises MissingExtraError, UnexpectedAnswerError."""
+    with _loaded(response) as arrays:
+        return dict(arrays)
+
+
+def _loaded(response: httpx2.Response) -> Any:
+    try:
+        return require_numpy().load(BytesIO(response.content), allow_pickle=False)
+    except (ValueError, EOFError, OSError) as error:
+        raise _unexpected(response, error) from error
 
 
 def require_numpy() -> Any:

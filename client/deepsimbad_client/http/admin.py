@@ -18,6 +18,7 @@ from deepsimbad_client.errors import (
     TransportError,
 )
 from deepsimbad_client.http import (
+    BINARY,
     RETRIED_STATUSES,
     Call,
     Image,
@@ -26,6 +27,7 @@ from deepsimbad_client.http import (
     in_path,
     known_positions,
     model_of,
+    named_arrays,
     observation,
     once,
     require_numpy,
@@ -37,7 +39,7 @@ from deepsimbad_client.http.models import Domain, FramesStored, FrameStored, Job
 from deepsimbad_client.http.wire import Awaiting, Blocking, Face, shared, shared_stream
 
 if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
+    from numpy.typing import ArrayLike, NDArray
 
     from deepsimbad_client.http.client import Client
 
@@ -124,17 +126,19 @@ class AdminCalls(Face):
         x_m: float | None = None,
         y_m: float | None = None,
         name: str | None = None,
+        replace: bool = True,
         content_type: str | None = None,
         encoding: Numbers | None = None,
     ) -> FrameStored:
         """Send one frame, an image as `Client.localize` takes it or a ready encoding; the same index again replaces it.
 
         `index` is its place in the recording, from 0; `position_m` its distance along the route. Answers show
-        the `name`, as of its file.
+        the `name`, as of its file. Without `replace` an equal frame stays, and another one raises FramesDifferError.
         """
         view = observation(image, content_type=content_type, encoding=encoding)
         place: dict[str, float | str | None] = {"position_m": position_m, "timestamp_us": timestamp_us}
         place |= {"x_m": x_m, "y_m": y_m, "name": None if name is None else text_of(name)}
+        place |= _keeping(replace)
         call = Call("PUT", f"{_traverse(domain, traverse)}/frames/{int(index)}", place, view.headers, view.body)
         return model_of(FrameStored, await self._wire.send(call))
 
@@ -151,11 +155,12 @@ class AdminCalls(Face):
         x_m: "ArrayLike | None" = None,
         y_m: "ArrayLike | None" = None,
         name: Sequence[str] | None = None,
+        replace: bool = True,
     ) -> FramesStored:
         """Send a batch of frames whose encodings [n, d] are known (needs numpy); the same indices again replace them.
 
         Everything else is [n]; unknown times are -1, unknown places NaN, unknown names "". `x_m` and `y_m` are sent
-        together or not.
+        together or not. `replace` is that of `put_frame`.
         """
         np = require_numpy()
         columns: dict[str, tuple[Any, Any]] = {"encodings": (encodings, np.float32), "index": (index, np.int64)}
@@ -167,8 +172,14 @@ class AdminCalls(Face):
         packed = BytesIO()
         np.savez(packed, **{name: np.asarray(*column) for name, column in columns.items() if column[0] is not None})
         headers = {"Content-Type": "application/octet-stream"}
-        call = Call("POST", f"{_traverse(domain, traverse)}/frames", headers=headers, body=packed.getvalue())
+        call = Call("POST", f"{_traverse(domain, traverse)}/frames", _keeping(replace), headers, packed.getvalue())
         return model_of(FramesStored, await self._wire.send(call))
+
+    @shared
+    async def frames(self, domain: str, traverse: str) -> "dict[str, NDArray[Any]]":
+        """What is there, without encodings: `index`, and the arrays [n] that `deepsimbad.core.frames` names."""
+        call = Call("GET", f"{_traverse(domain, traverse)}/frames", headers=BINARY)
+        return named_arrays(await self._wire.send(call))
 
     @shared
     async def remap(
@@ -318,6 +329,10 @@ def _domain(name: str) -> str:
 
 def _traverse(domain: str, name: str) -> str:
     return f"{_domain(domain)}/traverses/{in_path('traverse', name)}"
+
+
+def _keeping(replace: bool) -> dict[str, str]:
+    return {} if replace else {"replace": "false"}
 
 
 def _job(job_id: str) -> str:

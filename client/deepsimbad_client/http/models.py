@@ -187,13 +187,9 @@ class Traverse(Answer):
     n_frames: int = 0
     missing: tuple[tuple[int, int], ...] = ()
     """(first, last) ranges of indices that have not arrived, below the greatest that has."""
-
-    def has(self, index: int) -> bool:
-        """Whether the frame of this index has arrived."""
-        n_missing = sum(last - first + 1 for first, last in self.missing)
-        return 0 <= index < self.n_frames + n_missing and not any(
-            first <= index <= last for first, last in self.missing
-        )
+    length_m: float | None = None  # from the least position to the greatest
+    span_us: tuple[int, int] | None = None  # first and last known time of a frame
+    digest: str | None = None  # SHA-256 over indices, contents, places and times; one drive, one digest
 
 
 class FrameStored(Answer):

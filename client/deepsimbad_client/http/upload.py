@@ -3,27 +3,26 @@
 import math
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, TypeVar
 
-from deepsimbad_client.errors import (
-    BrokenFrameError,
-    ConflictError,
-    InvalidInputError,
-    SourceError,
-    UnknownTraverseError,
-)
+import numpy as np
+from numpy.typing import NDArray
+
+from deepsimbad.core.frames import IDENTITY, UNKNOWN_CONTENT, UNKNOWN_TIMESTAMP, content_digest, differences
+from deepsimbad_client.errors import BrokenFrameError, InvalidInputError, OtherFramesError, SourceError
 from deepsimbad_client.http.client import Client
-from deepsimbad_client.http.models import Traverse
 from deepsimbad_client.recordings import Frame, Recording
-from deepsimbad_client.recordings.left_out import LeftOut
+from deepsimbad_client.recordings.left_out import LeftOut, shown
 
 BATCH_BYTES = 8 * 2**20  # Size of a batch of ready encodings: worth its round trip, and lost cheaply on a thin link
 CONCURRENCY = 4
 UNUSABLE_IMAGE_CODES = frozenset({"undecodable_image", "truncated_image", "empty_body"})
+
+_UNKNOWN = {"timestamp_us": UNKNOWN_TIMESTAMP, "content_digest": UNKNOWN_CONTENT}
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -35,7 +34,7 @@ class UploadReport:
 
     n_frames: int  # that could be sent
     n_sent: int = 0  # by this run
-    n_skipped: int = 0  # which the service had already
+    n_skipped: int = 0  # which the service had already, equal
     n_broken: Counter[str] = field(default_factory=Counter)  # could not be sent, by reason; the others go on
     broken_names: list[str] = field(default_factory=list)
     left_out: dict[str, int] = field(default_factory=dict)  # by the reader before, by reason
@@ -60,7 +59,7 @@ def upload(
     traverse: str,
     *,
     concurrency: int = CONCURRENCY,
-    resend: bool = False,
+    replace: bool = False,
     allow_missing: bool = True,
     on_progress: Callable[[UploadReport], None] | None = None,
 ) -> UploadReport:
@@ -69,7 +68,8 @@ def upload(
     Images go one by one, a few at once, resized to what the domain asks for; ready encodings go in batches. A frame
     that cannot be read here, or decoded there, is counted and passed over.
 
-    The domain must exist, the traverse is made. What is there already is sent again with `resend` alone.
+    The domain must exist, the traverse is made. Frames that are there already are compared by place, time and content:
+    equal ones are passed over; others raise OtherFramesError before anything is sent, or are replaced with `replace`.
     `on_progress` is told how far it is after every frame or batch. Raises SourceError (without `allow_missing` also as
     soon as more than a twentieth of the recording is left out), ApiError, TransportError.
     """
@@ -78,28 +78,34 @@ def upload(
     left_out = LeftOut(recording, allow_missing=allow_missing)
     started = time.monotonic()
     input_size = client.domain(domain).input_size
-    stored = _open_traverse(client, domain, traverse)
+    client.admin.create_traverse(domain, traverse)
     report = UploadReport(len(recording.frames), left_out=recording.left_out, left_out_names=left_out.names)
-    rows = [row for row, frame in enumerate(recording.frames) if resend or not stored.has(frame.index)]
-    report.n_skipped = len(recording.frames) - len(rows)
 
     def tell() -> None:
         if on_progress is not None:
             on_progress(report)
 
     tell()
+    there = Comparison(recording, client.admin.frames(domain, traverse))
+    for _ in there.reading(input_size, concurrency):
+        report.n_skipped += 1
+        tell()
+    others = there.others(f"{domain}/{traverse}", replace=replace)
+    equal = set(there.rows) - others
+    rows = [row for row in range(len(recording.frames)) if row not in equal]
+    report.n_skipped = len(equal)
     if recording.encodings is not None:
         batch_size = max(1, BATCH_BYTES // max(1, 4 * recording.encodings.shape[1]))
         for start in range(0, len(rows), batch_size):
             batch = rows[start : start + batch_size]
             values = recording.encodings[batch]
             columns = _columns([recording.frames[row] for row in batch])
-            client.admin.put_frames(domain, traverse, encodings=values, **columns)
+            client.admin.put_frames(domain, traverse, encodings=values, replace=replace, **columns)
             report.n_sent += len(batch)
             report.bytes_sent += values.nbytes
             tell()
     else:
-        send = partial(_send_image, client, recording, domain, traverse, input_size)
+        send = partial(_send_image, client, recording, domain, traverse, input_size, replace)
         for frame, outcome in in_order(send, [recording.frames[row] for row in rows], concurrency):
             if isinstance(outcome, int):
                 report.n_sent += 1
@@ -114,6 +120,64 @@ def upload(
         reasons = ", ".join(f"{count} {reason}" for reason, count in report.n_broken.items())
         raise SourceError(f"none of the {report.n_frames} frames of {recording.name} could be sent: {reasons}")
     return report
+
+
+class Comparison:
+    """A recording beside the frames that its traverse holds, known as `Admin.frames` tells."""
+
+    def __init__(self, recording: Recording, known: Mapping[str, NDArray[Any]]) -> None:
+        row_of = {index: row for row, index in enumerate(known["index"].tolist())}
+        self.rows = [row for row, frame in enumerate(recording.frames) if frame.index in row_of]  # those it holds
+        self._n_beside = len(row_of) - len(self.rows)
+        self._recording = recording
+        frames = [recording.frames[row] for row in self.rows]
+        at = [row_of[frame.index] for frame in frames]
+        self._stored = {name: known[name][at] for name in IDENTITY}
+        own = {name: [_UNKNOWN.get(name, math.nan)] * len(frames) for name in IDENTITY} | _columns(frames)
+        self._own = {name: np.array(own[name], self._stored[name].dtype) for name in IDENTITY}
+
+    def reading(self, input_size: tuple[int, int] | None, concurrency: int) -> Iterator[int]:
+        """Take the digest of every frame whose stored one is known, and tell its row; a broken one stays unknown."""
+
+        def digest(place: int) -> int:
+            row = self.rows[place]
+            if self._stored["content_digest"][place] == UNKNOWN_CONTENT:
+                return UNKNOWN_CONTENT
+            if self._recording.encodings is not None:
+                return content_digest(np.asarray(self._recording.encodings[row], "<f4").tobytes())
+            try:
+                return content_digest(self._recording.image(self._recording.frames[row], input_size).body)
+            except BrokenFrameError:
+                return UNKNOWN_CONTENT
+
+        for place, found in in_order(digest, range(len(self.rows)), concurrency):
+            self._own["content_digest"][place] = found
+            yield self.rows[place]
+
+    def others(self, traverse: str, *, replace: bool) -> set[int]:
+        """Rows of the frames that differ from those there; raises OtherFramesError where these may not be replaced.
+
+        Nor may they where the traverse holds frames that the recording lacks: it would be made of two.
+        """
+        differ = differences(self._own, self._stored)
+        if not differ:
+            return set()
+        rows = [self.rows[place] for place in np.flatnonzero(np.any(list(differ.values()), axis=0))]
+        names = [self._recording.frames[row].name for row in rows]
+        if replace and not self._n_beside:
+            return set(rows)
+        domain, _, name = traverse.partition("/")
+        raise OtherFramesError(
+            f"traverse {traverse} holds other frames than {self._recording.name}: {len(rows)} of the {len(self.rows)} "
+            f"that both have differ in {', '.join(differ)} ({shown(names)}), and nothing was sent: "
+            + (
+                f"{self._n_beside} frames there are not of this recording, so delete it first (`deepsimbad-client "
+                f"delete-traverse {domain} {name}`) or choose another --traverse"
+                if replace
+                else "--replace puts these in their place, or choose another --traverse"
+            ),
+            names,
+        )
 
 
 def in_order(
@@ -140,23 +204,13 @@ def in_order(
         executor.shutdown(wait=True, cancel_futures=True)
 
 
-def _open_traverse(client: Client, domain: str, name: str) -> Traverse:
-    try:
-        return client.admin.traverse(domain, name)
-    except UnknownTraverseError:
-        pass
-    try:
-        return client.admin.create_traverse(domain, name)
-    except ConflictError:  # another uploader, or a repetition of our own request, was quicker
-        return client.admin.traverse(domain, name)
-
-
 def _send_image(
     client: Client,
     recording: Recording,
     domain: str,
     traverse: str,
     input_size: tuple[int, int] | None,
+    replace: bool,
     frame: Frame,
 ) -> int | str:
     """Send one frame; returns its bytes, or the reason why it is broken."""
@@ -170,6 +224,7 @@ def _send_image(
             x_m=frame.x_m,
             y_m=frame.y_m,
             name=frame.name,
+            replace=replace,
         )
     except BrokenFrameError as error:
         return error.reason

@@ -51,3 +51,9 @@ def m003_without_checksums(db: Database) -> None:
 def m004_frame_names(db: Database) -> None:
     """What a frame is called in its recording."""
     db.execute("ALTER TABLE frame ADD COLUMN name TEXT")
+
+
+@migrations()
+def m005_content_digests(db: Database) -> None:
+    """What a frame was made of, to tell it from another one: eight bytes of a digest, as a signed integer."""
+    db.execute("ALTER TABLE frame ADD COLUMN content_digest INTEGER")

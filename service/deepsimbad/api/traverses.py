@@ -1,12 +1,13 @@
 """Traverses of a domain, and their frames: one by one, or many whose encodings are known."""
 
+import dataclasses
 import logging
 import math
 import struct
 import tempfile
 import zipfile
 from contextlib import suppress
-from dataclasses import replace
+from io import BytesIO
 from typing import IO, Annotated, Any, cast
 
 import numpy as np
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 from pydantic import FailFast, Field, StrictFloat
 
 from deepsimbad.api.localizations import IMAGE_SCHEMA, only
-from deepsimbad.api.problems import declare, declare_json, problems
+from deepsimbad.api.problems import binary, declare, declare_json, problems
 from deepsimbad.api.requests import (
     BINARY,
     GREATEST_EXACT_INTEGER,
@@ -36,7 +37,8 @@ from deepsimbad.api.requests import (
     read_bytes,
     read_json,
 )
-from deepsimbad.core.drive import FRAME_NAME, MAX_NAME_LENGTH, MAX_POSITION_M, UNKNOWN_TIMESTAMP, Drive
+from deepsimbad.core.drive import FRAME_NAME, MAX_NAME_LENGTH, MAX_POSITION_M, Drive
+from deepsimbad.core.frames import UNKNOWN_CONTENT, UNKNOWN_TIMESTAMP, content_digest
 from deepsimbad.engine.localizer import ready_encodings
 from deepsimbad.engine.worker import EncodedImage, Priority
 from deepsimbad.errors import (
@@ -85,6 +87,12 @@ class TraverseAnswer(Answer):
     name: str
     n_frames: int
     missing: Annotated[list[IndexRange], Field(description="Gaps below the greatest index that has arrived.")]
+    length_m: Annotated[float | None, Field(description="From the least position to the greatest.")]
+    span_us: Annotated[tuple[int, int] | None, Field(description="First and last known time of a frame.")]
+    digest: Annotated[
+        str | None,
+        Field(description="SHA-256 over indices, contents, places and times: one drive, one digest; null: unknown."),
+    ]
 
 
 class TraverseList(Answer):
@@ -191,6 +199,11 @@ async def delete_traverse(domain: DomainName, name: TraverseName, running: Runni
 
 # Handlers of frames
 
+Replace = Annotated[
+    bool,
+    Query(description="false: a frame that is there already and differs is a 409 `frames_differ`, an equal one stays."),
+]
+
 
 def _metres(description: str) -> Any:
     return Query(ge=-MAX_POSITION_M, le=MAX_POSITION_M, allow_inf_nan=False, description=description)
@@ -201,7 +214,7 @@ def _metres(description: str) -> Any:
     status_code=201,
     responses={
         200: {"model": FrameAnswer, "description": "It replaced the frame of that index"},
-        **problems(404, 413, 415, 422),
+        **problems(404, 409, 413, 415, 422),
     },
     openapi_extra=declare({**dict.fromkeys(MEDIA_TYPES, IMAGE_SCHEMA), JSON: _ENCODING_SCHEMA}),
 )
@@ -222,6 +235,7 @@ async def put_frame(
         str | None,
         Query(alias="name", pattern=f"^{FRAME_NAME}$", description="As answers show it; the file's, in a recording."),
     ] = None,
+    replace: Replace = True,
 ) -> FrameAnswer:
     """Store one frame, in any order; the same index again replaces it.
 
@@ -233,19 +247,19 @@ async def put_frame(
     media_type = media_type_of(request, FRAME_TYPES)
     body = await read_bytes(request)
     evaluator = running.evaluators.evaluator(evaluator_config)
-    weights_sha256 = None
+    weights_sha256, digest = None, UNKNOWN_CONTENT
     if media_type == JSON:
         values = np.array((await parse_json(body, EncodingBody, running)).encoding, np.float64)
         encoding = (await run_sync(ready_encodings, values[np.newaxis]))[0]
     else:
         image, _ = await running.decoders.decoded(body, evaluator, Priority.BATCH)
         encoded = cast("EncodedImage", await running.look(evaluator, image, lambda view: view, Priority.BATCH))
-        encoding, weights_sha256 = encoded.values, encoded.weights_sha256
+        encoding, weights_sha256, digest = encoded.values, encoded.weights_sha256, content_digest(body)
 
     def store() -> tuple[bool, int]:
         with running.open_traverses.lend(domain, name) as traverse:
             created = traverse.put_frame(
-                *(index, encoding, position_m, timestamp_us, x_m, y_m, weights_sha256, frame_name)
+                *(index, encoding, position_m, timestamp_us, x_m, y_m, weights_sha256, frame_name, digest, replace)
             )
             return created, traverse.n_frames
 
@@ -254,9 +268,36 @@ async def put_frame(
     return FrameAnswer(index=index, n_frames=n_frames)
 
 
+@router.get(
+    "/{name}/frames",
+    response_class=Response,
+    responses={
+        200: {
+            "content": binary(
+                "npz, in index order, of `index` [n], `position_m`, `timestamp_us` (-1: unknown), `x_m` and `y_m` "
+                "(NaN: unknown), and `content_digest`: blake2b of eight bytes, as uint64, of the posted picture, or of "
+                "the encoding as float32; 0: unknown"
+            )
+        },
+        **problems(404, 422),
+    },
+)
+async def get_frames(domain: DomainName, name: TraverseName, running: Running) -> Response:
+    """What is there: the places, times and digests of all frames, by which a drive is compared before it is sent."""
+    await run_sync(running.catalog.domain, domain)
+
+    def packed() -> bytes:
+        with running.open_traverses.lend(domain, name) as traverse:
+            content = BytesIO()
+            np.savez(content, **traverse.known())  # type: ignore[arg-type]
+            return content.getvalue()
+
+    return Response(await run_sync(packed, limiter=running.batches), media_type=BINARY)
+
+
 @router.post(
     "/{name}/frames",
-    responses=problems(404, 413, 415, 422),
+    responses=problems(404, 409, 413, 415, 422),
     openapi_extra=declare(
         {
             BINARY: {
@@ -269,7 +310,9 @@ async def put_frame(
         }
     ),
 )
-async def post_frames(domain: DomainName, name: TraverseName, request: Request, running: Running) -> BatchAnswer:
+async def post_frames(
+    domain: DomainName, name: TraverseName, request: Request, running: Running, replace: Replace = True
+) -> BatchAnswer:
     """Store a batch of frames whose encodings are known, all or none; the same indices again replace them."""
     await run_sync(running.catalog.domain, domain)
     await run_sync(_check_traverse, running, domain, name)
@@ -280,7 +323,7 @@ async def post_frames(domain: DomainName, name: TraverseName, request: Request, 
         frames = read_batch(spool, max_bytes)
         encodings = ready_encodings(frames.encodings)
         with running.open_traverses.lend(domain, name) as traverse:
-            n_new, n_replaced = traverse.put_frames(replace(frames, encodings=encodings))
+            n_new, n_replaced = traverse.put_frames(dataclasses.replace(frames, encodings=encodings), replace)
             return BatchAnswer(n_new=n_new, n_replaced=n_replaced, n_frames=traverse.n_frames)
 
     data_dir = running.settings.data_dir  # the system's folder for such files is often memory

@@ -16,7 +16,6 @@ The theory takes a route for a stationary process. Real scenery repeats: of two 
 than chance allows, a little. So agreement must also be worth learning from.
 """
 
-import hashlib
 import re
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
@@ -27,17 +26,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepsimbad.core.descriptor import LandmarkStatistics, normal_scores, rank_landmarks
+from deepsimbad.core.frames import UNKNOWN_CONTENT, UNKNOWN_TIMESTAMP, content_digest
 from deepsimbad.core.relevance import Query
 from deepsimbad.core.route import Route, same_places
 from deepsimbad.errors import InvalidEncodingError, InvalidInputError, InvalidMapConfigError, InvalidRouteError
 
-UNKNOWN_TIMESTAMP = -1
 MAX_FRAME_INDEX = 2**53
 MAX_POSITION_M = 1e9  # either way; 25 times round the earth, and squares and spans are far from overflow
 MAX_NAME_LENGTH = 255  # characters; file systems allow no more
 FRAME_NAME = rf"[^\x00-\x1f\x7f-\x9f]{{1,{MAX_NAME_LENGTH}}}"
 _ROWS_AT_ONCE = 1024
-_DIGEST_BYTES = 8
 
 SIGNIFICANCE = 0.002  # of the agreement at shift 0, up to which it counts as more than chance
 LEAST_CORRELATION = (
@@ -66,6 +64,7 @@ class Drive:
     x_m: NDArray[np.float64] = _Unknown  # east, [n] float64, at most MAX_POSITION_M either way, NaN where unknown
     y_m: NDArray[np.float64] = _Unknown  # north, likewise
     frame_name: NDArray[np.str_] = _Unknown  # in the recording, as of its file, [n] str, "" where unknown
+    content_digest: NDArray[np.uint64] = _Unknown  # of what was posted, [n] uint64, 0: its encoding, or unknown
     # Of the network that encoded images among them; None where none did, or nobody knows
     weights_sha256: str | None = None
     # [n, r] float32 to a map's landmarks, smaller is nearer; None before they are measured
@@ -79,6 +78,7 @@ class Drive:
             "x_m": np.full(n, np.nan),
             "y_m": np.full(n, np.nan),
             "frame_name": np.full(n, "", np.str_),
+            "content_digest": np.full(n, UNKNOWN_CONTENT, np.uint64),
         }
         for name, array in unknown.items():
             if getattr(self, name) is None:
@@ -124,8 +124,7 @@ class Drive:
         is found out, and so is one that was deleted since, or that came with a map of another server.
         """
         rows = np.ascontiguousarray(self.encodings, "<f4")
-        digests = b"".join(hashlib.blake2b(row, digest_size=_DIGEST_BYTES).digest() for row in rows)
-        return np.frombuffer(digests, "<u8").astype(np.uint64)
+        return np.fromiter((content_digest(row.tobytes()) for row in rows), np.uint64, len(rows))
 
     def origins(self) -> dict[str, Any]:
         """Where every frame came from, as the named arrays of a map that is made of them."""

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from deepsimbad.core.building import Built, MapPlan, build_from_dissimilarities, compose_map
 from deepsimbad.core.descriptor import rank_landmarks
-from deepsimbad.core.drive import UNKNOWN_TIMESTAMP, Drive
+from deepsimbad.core.drive import Drive
+from deepsimbad.core.frames import UNKNOWN_TIMESTAMP
 from deepsimbad.core.landmark_model import select_landmarks
 from deepsimbad.core.map import Map
 from deepsimbad.core.nnql import NnqlConfig, initial_q_values

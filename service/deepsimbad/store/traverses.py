@@ -1,20 +1,24 @@
 """One recorded drive on the disk: its frames' encodings and places, not its images."""
 
+import dataclasses
 import fcntl
+import hashlib
 import os
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from sqlite_utils import Database
 
-from deepsimbad.core.drive import UNKNOWN_TIMESTAMP, Drive
+from deepsimbad.core.drive import Drive
+from deepsimbad.core.frames import IDENTITY, UNKNOWN_CONTENT, UNKNOWN_TIMESTAMP, differences
 from deepsimbad.errors import (
     ConflictError,
     DamagedFileError,
+    FramesDifferError,
     InvalidEncodingError,
     UnknownDomainError,
     UnknownTraverseError,
@@ -24,9 +28,10 @@ from deepsimbad.store import layout
 from deepsimbad.store.arrays import is_halvable
 from deepsimbad.store.connection import OpenFile, open_database, open_working_file, write_transaction
 from deepsimbad.store.durable import lock_folder, remove_database, storage_faults, sync
-from deepsimbad.store.records import now
+from deepsimbad.store.records import now, to_json
 from deepsimbad_migrations.traverse.migrations import migrations
 
+_NAMED_INDICES = 100  # most that an error names
 IndexRanges = list[tuple[int, int]]  # the class has a `list` of its own
 _DTYPE_OF_BYTES = {2.0: "<f2", 4.0: "<f4"}  # by the bytes of one number
 
@@ -116,6 +121,8 @@ class Traverse(OpenFile):
         y_m: float | None = None,
         weights_sha256: str | None = None,
         name: str | None = None,
+        content_digest: int = UNKNOWN_CONTENT,
+        replace: bool = True,
     ) -> bool:
         """As `put_frames` with one frame, of which None is unknown; answers whether it is new."""
         frames = Drive(
@@ -125,13 +132,17 @@ class Traverse(OpenFile):
             x_m=np.array([np.nan if x_m is None else x_m], np.float64),
             y_m=np.array([np.nan if y_m is None else y_m], np.float64),
             frame_name=np.array([name or ""]),
+            content_digest=np.array([content_digest], np.uint64),
             encodings=np.asarray(encoding, np.float32)[np.newaxis],
             weights_sha256=weights_sha256,
         )
-        return self.put_frames(frames)[0] == 1
+        return self.put_frames(frames, replace)[0] == 1
 
-    def put_frames(self, frames: Drive) -> tuple[int, int]:
-        """Store a batch in one transaction, replacing frames of the same index; never holds a second copy of it.
+    def put_frames(self, frames: Drive, replace: bool = True) -> tuple[int, int]:
+        """Store a batch in one transaction; never holds a second copy of it.
+
+        Args:
+            replace: Whether they take the place of those of the same index; else equal ones are passed over.
 
         Returns:
             (n_new, n_replaced).
@@ -141,12 +152,17 @@ class Traverse(OpenFile):
             InvalidRouteError: A position is NaN or infinite.
             InvalidEncodingError: An encoding is not finite, or of another length than those of the traverse.
             WeightsDifferError: The traverse holds frames that other weights encoded.
+            FramesDifferError: None may be replaced, and some would be.
             UnknownTraverseError: The traverse was deleted meanwhile.
         """
         frames = frames.checked()
+        content = np.where(frames.content_digest == UNKNOWN_CONTENT, frames.digests(), frames.content_digest)
+        frames = dataclasses.replace(frames, content_digest=content)
         if frames.n_frames == 0:
             return 0, 0
         with self._writing() as db:
+            if not replace:
+                frames = frames.at(np.flatnonzero(~np.isin(frames.index, self._equal(db, frames))))
             n_before, dim = _count(db), frames.encodings.shape[1]
             present_dim, weights_sha256 = self._described(db)
             if present_dim not in {None, dim}:
@@ -158,16 +174,19 @@ class Traverse(OpenFile):
                 "UPDATE traverse SET encoding_dim = ?, weights_sha256 = coalesce(?, weights_sha256)",
                 [dim, frames.weights_sha256],
             )
-            places = (frames.index, frames.position_m, frames.timestamp_us, frames.x_m, frames.y_m, frames.frame_name)
+            content = frames.content_digest.view(np.int64)  # SQLite's integers have a sign
+            places = (frames.index, frames.position_m, frames.timestamp_us, frames.x_m, frames.y_m)
             db.conn.executemany(  # NaN becomes NULL
                 """
-                INSERT INTO frame (frame_index, position_m, timestamp_us, x_m, y_m, name)
-                VALUES (?, ?, nullif(?, -1), ?, ?, nullif(?, ''))
+                INSERT INTO frame (frame_index, position_m, timestamp_us, x_m, y_m, name, content_digest)
+                VALUES (?, ?, nullif(?, -1), ?, ?, nullif(?, ''), ?)
                 ON CONFLICT (frame_index) DO UPDATE SET position_m = excluded.position_m,
                     timestamp_us = excluded.timestamp_us, x_m = excluded.x_m, y_m = excluded.y_m,
-                    name = excluded.name
+                    name = excluded.name, content_digest = excluded.content_digest
                 """,
-                zip(*(numbers.tolist() for numbers in places), strict=True),
+                zip(
+                    *(values.tolist() for values in places), map(str, frames.frame_name), map(int, content), strict=True
+                ),
             )
             db.conn.executemany(
                 """
@@ -182,6 +201,27 @@ class Traverse(OpenFile):
             n_new = _count(db) - n_before
         return n_new, frames.n_frames - n_new
 
+    def _equal(self, db: Database, frames: Drive) -> NDArray[np.int64]:
+        """The indices of those frames that are there already; raises FramesDifferError where one is another."""
+        stored = _known(db, frames.index)
+        there, at, _ = np.intersect1d(frames.index, stored["index"], return_indices=True)
+        differ = differences({name: getattr(frames, name)[at] for name in IDENTITY}, stored)
+        if differ:
+            indices = there[np.any(list(differ.values()), axis=0)].tolist()
+            raise FramesDifferError(
+                f"{len(indices)} frames of traverse {self.name} are there already and differ in "
+                f"{', '.join(differ)}, the first of index {indices[0]}: nothing was stored. Have them "
+                "replaced, or choose another traverse",
+                n_differing=len(indices),
+                indices=indices[:_NAMED_INDICES],
+            )
+        return there
+
+    def known(self) -> dict[str, NDArray[Any]]:
+        """`index` and the arrays of `core.frames.IDENTITY` of all frames, in index order; reads no encodings."""
+        with self._reading() as db:
+            return _known(db)
+
     @property
     def n_frames(self) -> int:
         """How many frames there are; reads no encodings."""
@@ -193,6 +233,31 @@ class Traverse(OpenFile):
         """The length of the encodings; None before the first frame."""
         with self._reading() as db:
             return self._described(db)[0]
+
+    @property
+    def length_m(self) -> float | None:
+        """From the least position to the greatest; None before the first frame."""
+        with self._reading() as db:
+            (length_m,) = db.execute("SELECT max(position_m) - min(position_m) FROM frame").fetchone()
+            return None if length_m is None else float(length_m)
+
+    @property
+    def span_us(self) -> tuple[int, int] | None:
+        """The first and the last known time of a frame; None where none is known."""
+        with self._reading() as db:
+            first, last = db.execute("SELECT min(timestamp_us), max(timestamp_us) FROM frame").fetchone()
+            return None if first is None else (first, last)
+
+    @property
+    def digest(self) -> str | None:
+        """SHA-256 in hex of all that its frames are known by; None where there are none, or a content is unknown."""
+        known = self.known()
+        if not known["index"].size or (known["content_digest"] == UNKNOWN_CONTENT).any():
+            return None
+        digest = hashlib.sha256()
+        for array in known.values():
+            digest.update(array.astype(array.dtype.newbyteorder("<")).tobytes())
+        return digest.hexdigest()
 
     @property
     def missing(self) -> IndexRanges:
@@ -247,6 +312,27 @@ class Traverse(OpenFile):
         if row is None:
             raise DamagedFileError(f"traverse {self.name} is damaged: it does not describe itself; upload it again")
         return row
+
+
+def _known(db: Database, among: NDArray[np.int64] | None = None) -> dict[str, NDArray[Any]]:
+    """As `Traverse.known`, of the frames of some indices alone or of all."""
+    chosen = "" if among is None else "WHERE frame_index IN (SELECT value FROM json_each(?))"
+    rows = db.execute(
+        f"""
+        SELECT frame_index, position_m, coalesce(timestamp_us, -1), x_m, y_m, coalesce(content_digest, 0)
+        FROM frame {chosen} ORDER BY frame_index
+        """,  # noqa: S608 - of our own words
+        [] if among is None else [to_json(among.tolist())],
+    ).fetchall()
+    index, position_m, timestamp_us, x_m, y_m, content = zip(*rows, strict=True) if rows else [()] * 6
+    return {
+        "index": np.array(index, np.int64),
+        "position_m": np.array(position_m, np.float64),
+        "timestamp_us": np.array(timestamp_us, np.int64),
+        "x_m": np.array(x_m, np.float64),  # None becomes NaN
+        "y_m": np.array(y_m, np.float64),
+        "content_digest": np.array(content, np.int64).view(np.uint64),
+    }
 
 
 def _count(db: Database) -> int:

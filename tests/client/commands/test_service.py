@@ -34,8 +34,55 @@ def test_an_upload_goes_on_where_it_stopped(client, encodings, monkeypatch):
     assert (report.n_skipped, report.n_sent) == (20, 100)
     there = client.admin.traverse("again", "t")
     assert (there.n_frames, there.missing) == (120, ())
-    resent = upload(client, open_source(str(encodings / "summer.npy")), "again", "t", resend=True)
-    assert (resent.n_skipped, resent.n_sent) == (0, 120)
+    again = upload(client, open_source(str(encodings / "summer.npy")), "again", "t")
+    assert (again.n_skipped, again.n_sent) == (120, 0)
+    with pytest.raises(errors.OtherFramesError, match="again/t holds other frames than winter: 120 of the 120 that"):
+        upload(client, open_source(str(encodings / "winter.npy")), "again", "t")
+    with pytest.raises(errors.OtherFramesError, match="90 frames there are not of this recording, so delete it"):
+        upload(client, open_source(f"{encodings / 'winter.npy'}#:30"), "again", "t", replace=True)
+    assert client.admin.traverse("again", "t") == there
+
+
+def test_another_drive_or_corrected_positions_never_pass_for_what_is_there(client, tmp_path, capsys):
+    def drive(name, seed, n, metres, first_us=1_700_000_000_000_000):
+        folder = tmp_path / name
+        folder.mkdir(exist_ok=True)
+        rng = np.random.default_rng(seed)
+        for number in range(n):
+            cv2.imwrite(str(folder / f"{number}.png"), cv2.resize(rng.integers(0, 255, (4, 6, 3), np.uint8), (96, 64)))
+        lines = [f"{number}.png,{metres * number},{first_us + 200_000 * number}" for number in range(n)]
+        (folder / "positions.csv").write_text("\n".join(["name,position_m,timestamp_us", *lines]))
+        return ["upload", str(folder), "--server", client.url, "--domain", "identity", "--traverse", "drive"]
+
+    def ran(command):
+        code, (out, err) = run(command), capsys.readouterr()
+        return code, out, err
+
+    client.admin.put_domain("identity", {"kind": "feature_l2", "extractor": "gradient_grid"})
+    summer = drive("summer", 1, 6, 1)
+    assert ran(summer)[0] == 0
+    first = client.admin.traverse("identity", "drive")
+    assert (first.n_frames, first.length_m, first.span_us) == (6, 5.0, (1_700_000_000_000_000, 1_700_000_001_000_000))
+    code, out, _ = ran(summer)
+    assert (code, "0 frames sent" in out, "6 were there already" in out) == (0, True, True)
+    for changed, differ in (
+        (("summer", 1, 6, 7), "5 of the 6 that both have differ in position (1.png, 2.png, 3.png, ...)"),
+        (("summer", 1, 6, 1, 1_600_000_000_000_000), "6 of the 6 that both have differ in time"),
+        (("winter", 2, 8, 1), "6 of the 6 that both have differ in content"),
+    ):
+        code, out, err = ran(drive(*changed))
+        assert (code, out) == (1, "")
+        assert differ in err
+        assert "--replace" in err
+        assert client.admin.traverse("identity", "drive") == first
+    code, out, _ = ran([*drive("summer", 1, 6, 7), "--replace"])
+    assert (code, "5 frames sent" in out, "1 were there already" in out) == (0, True, True)
+    moved = client.admin.traverse("identity", "drive")
+    assert (moved.n_frames, moved.length_m) == (6, 35.0)
+    assert ran([*drive("summer", 1, 6, 1), "--replace"])[0] == 0
+    assert client.admin.traverse("identity", "drive").digest == first.digest != moved.digest
+    assert ran([*drive("winter", 2, 8, 1), "--replace"])[0] == 0
+    assert client.admin.traverse("identity", "drive").n_frames == 8
 
 
 def test_results_come_in_order_and_work_never_runs_far_ahead():

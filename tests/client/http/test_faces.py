@@ -61,6 +61,7 @@ ASKED: dict[str, Ask] = {
     "DELETE /v1/admin/domains/{domain}/maps/{version}": lambda c, s, f: c.admin.delete_map("d", 2),
     "GET /v1/admin/domains/{domain}/maps/{version}/file": lambda c, s, f: c.admin.download_map("d", 2, f),
     "PUT /v1/admin/domains/{domain}/active-map": lambda c, s, f: c.admin.activate("d", 2),
+    "GET /v1/admin/domains/{domain}/traverses/{name}/frames": lambda c, s, f: c.admin.frames("d", "t"),
     "GET /v1/admin/sessions": lambda c, s, f: c.admin.sessions(),
     "GET /v1/admin/jobs": lambda c, s, f: c.admin.jobs(),
     "GET /v1/admin/jobs/{job_id}": lambda c, s, f: c.admin.job("j"),

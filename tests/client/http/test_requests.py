@@ -16,7 +16,7 @@ from deepsimbad import errors as service_errors
 from deepsimbad_client import Client, errors
 from deepsimbad_client.errors import BY_CODE, BY_STATUS, InvalidArgumentError
 from deepsimbad_client.http import RETRIED_STATUSES, media_type_of, observation
-from deepsimbad_client.http.models import Job, Localization, Traverse
+from deepsimbad_client.http.models import Job, Localization
 
 from .scripted import JOB, LOCALIZATION, STATE, Script, answer
 
@@ -145,13 +145,6 @@ def test_an_unheard_code_falls_back_on_the_status(status):
     assert type(raised.value) is BY_STATUS[status]
     assert (raised.value.code, raised.value.status, raised.value.request_id) == ("of_the_future", status, "abc")
     assert "abc" in str(raised.value)
-
-
-@pytest.mark.parametrize("index", range(-1, 12))
-def test_what_a_traverse_has(index):
-    present = {0, 1, 4, 5, 8}
-    traverse = Traverse(name="t", n_frames=len(present), missing=((2, 3), (6, 7)))
-    assert traverse.has(index) == (index in present)
 
 
 def shelf(request):
