@@ -184,6 +184,14 @@ def test_two_seasons_teach_and_one_does_not(seasons):
         built.map.check()
 
 
+def test_places_that_look_alike_tell_less(seasons):
+    """A stretch that comes again stands out less than one that does not, by two seasons and by one."""
+    twice = [np.concatenate([season[:40], season[:120]]) for season in seasons[:2]]
+    for second in (None, drive_of(twice[0])):
+        bits = compose_map(PLAN, drive_of(twice[1]), second, None, 60).map.view_bits
+        assert bits[80:].mean() > bits[:80].mean() + 0.3
+
+
 def test_a_reversed_or_foreign_drive_teaches_nothing(seasons):
     for other in (seasons[0][::-1], np.random.default_rng(9).normal(size=(160, 24))):
         built = compose_map(PLAN, drive_of(seasons[1]), drive_of(other), None, 60)

@@ -27,7 +27,7 @@ from deepsimbad.core.drive import Drive, SameRoute, SecondSeason, second_season
 from deepsimbad.core.landmark_model import farthest_first
 from deepsimbad.core.map import Map
 from deepsimbad.core.nnql import NnqlConfig
-from deepsimbad.core.rehearsal import rehearsed
+from deepsimbad.core.rehearsal import rehearsed, view_bits
 from deepsimbad.core.relevance import Relevance, most_strange
 from deepsimbad.core.route import Route
 from deepsimbad.errors import InvalidEncodingError, InvalidMapConfigError
@@ -94,6 +94,7 @@ def build_from_dissimilarities(
     map_ = replace(map_, landmark_model=model, actions_m=np.array(sorted(plan.actions_m)))
     if plan.relevance is Relevance.STANDARDISED and own.dissimilarities is not None:
         map_ = replace(map_, **rehearsed(map_, own.dissimilarities, season))
+        map_ = replace(map_, view_bits=view_bits(map_, own.dissimilarities, map_, season))
     on_progress(1.0)
     return Built(map_, map_, own, other, verdict)
 
@@ -124,8 +125,11 @@ class _Space:
 
     def seen(self, drive: Drive) -> Drive:
         """The drive with its dissimilarities: squared distances between unit vectors."""
-        products = self.unit_vectors(drive) @ self.prototypes.T
-        return replace(drive, dissimilarities=np.asarray(np.clip(2 - 2 * products, 0, 4), np.float32))
+        return replace(drive, dissimilarities=self.dissimilarities(self.unit_vectors(drive)))
+
+    def dissimilarities(self, u: NDArray[np.float32]) -> NDArray[np.float32]:
+        """[n, r] squared distances of unit vectors to the landmarks."""
+        return np.asarray(np.clip(2 - 2 * (u @ self.prototypes.T), 0, 4), np.float32)
 
     def whitened(self, first: Drive, second: Drive, places: NDArray[np.int64], candidates: Drive) -> Self:
         """What a season changes counting less, landmarks chosen anew."""
@@ -199,8 +203,12 @@ def compose_map(
         rehearsal = replace(map_, lists=compose(places, space.prototypes, plan.list_length, barred))
     on_progress(0.8)
     learnt = rehearsed(rehearsal, _measured(own), season)
+    map_, rehearsal = replace(map_, **learnt), replace(rehearsal, **learnt)
     strangest = most_strange(training.encodings, None if other is None else other.encodings)
-    learnt["most_strange"] = np.array([strangest])
+    learnt = {
+        "view_bits": view_bits(map_, space.dissimilarities(fused), rehearsal, season),
+        "most_strange": np.array([strangest]),
+    }
     on_progress(1.0)
     return Built(replace(map_, **learnt), replace(rehearsal, **learnt), own, other, verdict, fused)
 

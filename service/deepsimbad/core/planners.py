@@ -88,7 +88,7 @@ def plan_by_information(view: PlanningView) -> Plan:
 def information_ahead(map_: Map, price_bits_per_m: float) -> NDArray[np.float32] | None:
     """[n, 2a] discounted bits of a move from every image and of the best after it, then bits of its first view alone.
 
-    A view is worth what its place is, but for what the view before explains of its error: `(1 - c(a)^2) I(x + a)`,
+    A view is worth what its place is, but for what the view before explains of its error: `(1 - c(a)) I(x + a)`,
     less the price of the metres. Worked out once a map for each of the last few prices; None where nobody knows what
     views are worth.
     """
@@ -98,7 +98,7 @@ def information_ahead(map_: Map, price_bits_per_m: float) -> NDArray[np.float32]
     table = tables.get(price_bits_per_m)
     if table is None:
         actions_m = map_.actions_m
-        news = np.array([1.0 - map_.alike_after(action_m) ** 2 for action_m in actions_m.tolist()])
+        news = np.array([1.0 - map_.alike_after(action_m) for action_m in actions_m.tolist()])
         leads_to, bits = _leads_to(map_.route, actions_m), map_.view_bits.astype(np.float64)
         values = _swept(leads_to, bits, news, price_bits_per_m * np.abs(actions_m))
         first = news * np.where(leads_to < 0, bits.mean(), bits[leads_to])

@@ -8,62 +8,75 @@ from numpy.typing import NDArray
 from deepsimbad.core.descriptor import normal_scores, rank_landmarks
 from deepsimbad.core.drive import SecondSeason
 from deepsimbad.core.map import Map
-from deepsimbad.core.metrics import rank_of_truth
-from deepsimbad.core.relevance import Query, Relevance
+from deepsimbad.core.relevance import Relevance
 from deepsimbad.core.retrieval import relevances
 
-DEFAULT_CORRELATION = 0.6  # between seasons, of a landmark's scores: what development recordings show on average
+SEASONS_ALIKE = 0.6  # correlation of a landmark's scores in two seasons: what development recordings show on average
 _SMOOTHED_OVER_M = 1.0  # one view is a noisy measurement of its place; neighbours show much the same
 _MAX_VIEWS = 20_000  # more would only take longer
 _LIKELIHOOD_VIEWS = 400
 _NEAR_M = 2.0  # views of places no farther apart are of one place
 _LEAST_SCALE, _MOST_SCALE = 2.0, 60.0
-_GUESSED_PLACES, _GUESSES = 1000, 8
-_SEED = 0x51BAD
+_DISTINCT_PLACES = 5000
 
 
 def rehearsed(map_: Map, own: NDArray[np.float32], season: SecondSeason | None) -> dict[str, Any]:
-    """The named arrays that say what views are worth: `likelihood_scale`, `novelty` and `view_bits`.
+    """The named arrays that say how views err: `novelty`, and `likelihood_scale` where a season teaches it.
 
     Args:
         map_: Its lists must not know the second season, as no list knows the season to come.
         own: [n, r] dissimilarities of the map images themselves.
         season: None: there is no other.
     """
-    longest_m = max(1.0, map_.longest_action_m)
+    longest_m = float(np.abs(map_.actions_m).max(initial=1.0))
     scores = _scores(map_, own)
     if season is None:
-        curve = novelty_curve(map_.position_m, scores - scores.mean(axis=0), longest_m)
-        return {"novelty": curve, "view_bits": _guessed_bits(map_, own, DEFAULT_CORRELATION).astype(np.float32)}
+        return {"novelty": novelty_curve(map_.position_m, scores - scores.mean(axis=0), longest_m)}
     images, frames = season.places.T
-    other = _scores(map_, season.dissimilarities[frames])
-    correlation = float(np.mean(_standardised(scores)[images] * _standardised(other)))
-    difference = other - scores[images]
-    curve = novelty_curve(map_.position_m[images], difference - difference.mean(axis=0), longest_m)
-    guessed = _guessed_bits(map_, own, float(np.clip(correlation, 0.05, 0.95)))
-    seen = _seen_bits(map_, season)
-    both = _standardised(_standardised(seen) + 0.3 * _standardised(guessed))
-    arrays: dict[str, Any] = {"novelty": curve, "view_bits": (seen.mean() + seen.std() * both).astype(np.float32)}
+    difference = _scores(map_, season.dissimilarities[frames]) - scores[images]
+    arrays: dict[str, Any] = {
+        "novelty": novelty_curve(map_.position_m[images], difference - difference.mean(axis=0), longest_m)
+    }
     if map_.relevance is Relevance.COMPOSED:
         arrays["likelihood_scale"] = np.array([likelihood_scale(map_, season)])
     return arrays
+
+
+def view_bits(
+    map_: Map, places: NDArray[np.float32], rehearsal: Map, season: SecondSeason | None
+) -> NDArray[np.float32]:
+    """[n] bits that a view is expected to tell of its place, smoothed along the route.
+
+    What the second season's views told, and how distinct the place is in the map alone, weigh alike.
+
+    Args:
+        map_: As it will serve, but for these bits.
+        places: [n, r] dissimilarities of what its lists stand for.
+        rehearsal: The map whose lists do not know the second season.
+        season: None: there is no other.
+    """
+    distinct = _distinct_bits(map_, places)
+    if season is None:
+        return distinct.astype(np.float32)
+    seen = _seen_bits(rehearsal, season)
+    both = _standardised(_standardised(seen) + _standardised(distinct))
+    return np.asarray(seen.mean() + seen.std() * both, np.float32)
 
 
 def likelihood_scale(map_: Map, season: SecondSeason) -> float:
     """The scale at which relevances make the season's true places likeliest, by the softmax over the map's images."""
     places = season.places[:: -(-len(season.places) // _LIKELIHOOD_VIEWS)]
     relevance = relevances(map_, season.views(places[:, 1])).astype(np.float64)
-    route = map_.route
-    near = np.abs(route.offset_m(route.position_m, route.position_m[places[:, :1]])) <= _NEAR_M
 
-    def log_likelihood(scale: float) -> float:
-        likelihood = np.exp(scale * (relevance - relevance.max(axis=1, keepdims=True)))
-        return float(np.log((likelihood * near).sum(axis=1) / likelihood.sum(axis=1) + 1e-300).mean())
+    def bits(scale: float) -> float:
+        return float(
+            np.mean([_bits(map_, scale * row, image) for row, image in zip(relevance, places[:, 0], strict=True)])
+        )
 
     low, high = np.log(_LEAST_SCALE), np.log(_MOST_SCALE)
     for _ in range(12):  # golden section
         a, b = high - 0.618 * (high - low), low + 0.618 * (high - low)
-        low, high = (low, b) if log_likelihood(np.exp(a)) > log_likelihood(np.exp(b)) else (a, high)
+        low, high = (low, b) if bits(np.exp(a)) > bits(np.exp(b)) else (a, high)
     return float(np.exp((low + high) / 2))
 
 
@@ -117,32 +130,26 @@ def _standardised(values: NDArray[np.floating]) -> NDArray[np.float64]:
 
 
 def _seen_bits(map_: Map, season: SecondSeason) -> NDArray[np.float64]:
-    """[n] bits by which the second season's views narrowed the map down, smoothed along the route."""
+    """[n] bits that the second season's views told of their places, smoothed along the route."""
     places = season.places[:: -(-len(season.places) // _MAX_VIEWS)]
     places = places[np.argsort(map_.position_m[places[:, 0]], kind="stable")]
-    bits = np.array([_bits(map_, season.views(np.array([frame])), image) for image, frame in places])
-    return _smooth_to(map_.position_m, map_.position_m[places[:, 0]], bits)
+    scale = map_.log_likelihood_scale
+    bits = [_bits(map_, scale * relevances(map_, season.views(frame)), image) for image, frame in places]
+    return _smooth_to(map_.position_m, map_.position_m[places[:, 0]], np.array(bits))
 
 
-def _guessed_bits(map_: Map, own: NDArray[np.float32], correlation: float) -> NDArray[np.float64]:
-    """[n] the same of views that are like a place as far as seasons are alike, and for the rest like any other."""
-    n = map_.n_images
-    images = np.linspace(0, n - 1, min(n, _GUESSED_PLACES)).astype(np.int64)
-    rng = np.random.default_rng(_SEED)
-    bits = np.zeros(images.size)
-    composed = map_.relevance is Relevance.COMPOSED
-    scores = _scores(map_, own)
-    for row, image in enumerate(images):
-        for other in rng.integers(0, n, _GUESSES):
-            mixed = correlation * scores[image] + np.sqrt(1 - correlation**2) * scores[other]
-            if composed:  # 2 - 2 p, mixed in p
-                mixed += 2 * (1 - correlation - np.sqrt(1 - correlation**2))
-                mixed = np.clip(mixed, 0, 4)
-            mixed = mixed.astype(np.float32)
-            bits[row] += _bits(map_, Query(rank_landmarks(mixed), mixed), image) / _GUESSES
-    return _smooth_to(map_.position_m, map_.position_m[images], bits)
+def _distinct_bits(map_: Map, places: NDArray[np.float32]) -> NDArray[np.float64]:
+    """[n] the same of views that are like the places themselves, whose relevances count as far as seasons are alike."""
+    images = np.linspace(0, map_.n_images - 1, min(map_.n_images, _DISTINCT_PLACES)).astype(np.int64)
+    scale = SEASONS_ALIKE * map_.log_likelihood_scale
+    views = SecondSeason(places, np.stack([images, images], axis=1))
+    bits = [_bits(map_, scale * relevances(map_, views.views(image)), image) for image in images]
+    return _smooth_to(map_.position_m, map_.position_m, np.interp(np.arange(map_.n_images), images, bits))
 
 
-def _bits(map_: Map, view: Query, image: int) -> float:
-    relevance = relevances(map_, view).reshape(-1)
-    return float(np.log2(relevance.size / (1 + rank_of_truth(relevance, np.array([image])))))
+def _bits(map_: Map, log_likelihood: NDArray[np.floating], image: int) -> float:
+    """By how many bits a view makes the surroundings of its place likelier than the map on the whole."""
+    likelihood = np.exp(log_likelihood - log_likelihood.max())
+    route = map_.route
+    near = np.abs(route.offset_m(route.position_m, float(route.position_m[image]))) <= _NEAR_M
+    return float(np.log2(likelihood[near].mean() / likelihood.mean() + 1e-300))
