@@ -186,6 +186,20 @@ def turned(image: Image, degrees: int) -> Image:
     return image if turn is None else np.asarray(cv2.rotate(image, turn), dtype=np.uint8)
 
 
+def ready(body: bytes, path: Path, input_size: tuple[int, int] | None, rotate: int) -> EncodedImage:
+    """An image file's body made ready to post: as it is, or the image at the size asked for where that is smaller.
+
+    One that is to be turned, or of a format that cannot be posted, goes as PNG. Raises BrokenFrameError.
+    """
+    image, media_type = decode(body, path), media_type_of(body)
+    if media_type is None or rotate:
+        return as_png(turned(image, rotate), input_size)
+    whole = EncodedImage(body, media_type)
+    if not is_larger(image, input_size):
+        return whole
+    return min(as_png(image, input_size), whole, key=lambda encoded: len(encoded.body))
+
+
 def is_larger(image: Image, input_size: tuple[int, int] | None) -> bool:
     """Whether an image is wider or higher than (width, height)."""
     return input_size is not None and (image.shape[1] > input_size[0] or image.shape[0] > input_size[1])

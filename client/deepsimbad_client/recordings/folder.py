@@ -6,18 +6,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from deepsimbad_client.errors import SourceError
-from deepsimbad_client.http import media_type_of
 from deepsimbad_client.recordings import (
     IMAGE_SUFFIXES,
     EncodedImage,
     Frame,
     Recording,
-    as_png,
-    decode,
-    is_larger,
     read_file,
+    ready,
     stamp_of,
-    turned,
 )
 from deepsimbad_client.recordings.names import in_order, times_of
 from deepsimbad_client.recordings.nclt import TURNED_UPRIGHT, UPRIGHT_TURN, lies_on_its_side
@@ -37,22 +33,9 @@ class FolderRecording(Recording):
         return stamp_of(self.folder / frame.name)
 
     def image(self, frame: Frame, input_size: tuple[int, int] | None) -> EncodedImage:
-        """Read a frame: the file itself, or the image at the size asked for where that is larger and takes fewer bytes.
-
-        A format that cannot be posted (BMP, PGM, PPM) goes as PNG.
-        """
+        """Read a frame; see `Recording.image`."""
         path = self.folder / frame.name
-        body = read_file(path)
-        image = decode(body, path)
-        media_type = media_type_of(body)
-        if media_type is None or self.rotate:
-            return as_png(turned(image, self.rotate), input_size)
-        whole = EncodedImage(body, media_type)
-        return min(as_png(image, input_size), whole, key=_n_bytes) if is_larger(image, input_size) else whole
-
-
-def _n_bytes(image: EncodedImage) -> int:
-    return len(image.body)
+        return ready(read_file(path), path, input_size, self.rotate)
 
 
 def single(path: Path, rotate: int | None = None) -> FolderRecording:

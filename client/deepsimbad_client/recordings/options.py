@@ -6,6 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import click
+from rich.console import Console
+from rich.progress import Progress
 
 from deepsimbad_client.recordings import Recording
 from deepsimbad_client.recordings.left_out import MOST_LEFT_OUT, LeftOut, shown
@@ -72,7 +74,10 @@ def accounting(command: Command) -> Command:
 
 def opened(source: str, allow_missing: bool = True, **reading: Any) -> Recording:
     """Open a SOURCE, telling on standard error what it was taken for. Raises SourceError, TooManyLeftOutError."""
-    recording = open_source(source, **reading)
+    console = Console(stderr=True)
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as bars:
+        task = bars.add_task(f"open {source}", total=1.0)
+        recording = open_source(source, on_progress=lambda share: bars.update(task, completed=share), **reading)
     tell_remarks(recording)
     LeftOut(recording, allow_missing=allow_missing)
     return recording

@@ -33,6 +33,10 @@ class Placed:
             self.left_out_names[reason] = lost
         self.frames = [frame for frame, good in zip(self.frames, usable, strict=True) if good]
 
+    def without_plane(self) -> None:
+        """Forget x, y and heading, where they are of this drive's own beginning and no other's."""
+        self.frames = [dataclasses.replace(frame, x_m=None, y_m=None, heading_rad=None) for frame in self.frames]
+
     def number(self) -> None:
         """Count the frames' indices from 0."""
         self.frames = [dataclasses.replace(frame, index=index) for index, frame in enumerate(self.frames)]

@@ -2,6 +2,7 @@
 
     nclt:ROOT/DATE        one date of the NCLT dataset (`nclt`)
     FOLDER                images in name order, with an optional positions.csv
+    rosbag:FILE[#topic]   a ROS bag; an MCAP file needs no prefix (`bag`)
     FILE.mp4 and others   a video (`video`)
     FILE.npy, FILE.csv    ready encodings [n, d], one row for each frame, in travel order
 
@@ -14,12 +15,14 @@ usual. Folders inside and files whose name starts with a dot are not looked at.
 import dataclasses
 import math
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from deepsimbad_client.errors import SourceError
 from deepsimbad_client.recordings import TURNS, Recording
+from deepsimbad_client.recordings.bag import BAG_PREFIX, BAG_SUFFIXES, METADATA, read_bag
 from deepsimbad_client.recordings.encodings import ENCODING_SUFFIXES, read_encodings
 from deepsimbad_client.recordings.folder import read_folder
 from deepsimbad_client.recordings.nclt import FRONT_CAMERA, read_nclt
@@ -27,7 +30,7 @@ from deepsimbad_client.recordings.positions import POSITIONS_FILE
 from deepsimbad_client.recordings.video import VIDEO_SUFFIXES, read_video
 
 NCLT_PREFIX = "nclt:"
-RECORDING_SUFFIXES = ENCODING_SUFFIXES | VIDEO_SUFFIXES
+RECORDING_SUFFIXES = ENCODING_SUFFIXES | VIDEO_SUFFIXES | BAG_SUFFIXES
 """Of files that hold many frames."""
 
 _SLICE = re.compile(r"\s*([+-]?\d+)?\s*:\s*([+-]?\d+)?\s*(?::\s*([+-]?\d+)?\s*)?")
@@ -44,6 +47,7 @@ def open_source(
     every_s: float | None = None,
     every_m: float | None = None,
     reverse: bool = False,
+    on_progress: Callable[[float], None] = lambda _: None,
 ) -> Recording:
     """Open a recording, see the top of this module.
 
@@ -57,6 +61,7 @@ def open_source(
         every_s: Take one frame every so many seconds.
         every_m: Take one frame every so many metres.
         reverse: Take the frames in the other order.
+        on_progress: Told the share that is read, where opening takes long.
 
     Raises:
         SourceError: There is no such recording, it makes no sense, or positions fall along the drive.
@@ -66,7 +71,7 @@ def open_source(
     if rotate is not None and rotate not in TURNS:
         raise SourceError(f"images cannot be turned by {rotate} degrees: give 0, 90, 180 or 270")
     place, part = split_slice(source)
-    how = _How(spacing_m, camera, undistortion, rotate, round(time_offset_s * 1e6))
+    how = _How(spacing_m, camera, undistortion, rotate, round(time_offset_s * 1e6), on_progress)
     recording = _open_whole(place, how)
     first, last = recording.frames[0], recording.frames[-1]
     if reverse:
@@ -89,6 +94,7 @@ class _How:
     undistortion: Path | None
     rotate: int | None
     time_offset_us: int
+    on_progress: Callable[[float], None]
 
 
 def split_slice(source: str) -> tuple[str, slice | None]:
@@ -100,6 +106,8 @@ def split_slice(source: str) -> tuple[str, slice | None]:
     if not mark:
         return source, None
     match = _SLICE.fullmatch(ending)
+    if not match and _is_bag(source.partition("#")[0]):
+        return source, None
     if match:
         return place, slice(*(None if number is None else int(number) for number in match.groups()))
     if Path(source.removeprefix(NCLT_PREFIX)).expanduser().exists():
@@ -113,11 +121,17 @@ def _open_whole(place: str, how: _How) -> Recording:
         if not drive.name or drive.name == "..":
             raise SourceError(f"{place}: expected nclt:ROOT/DATE, for example nclt:/data/nclt/2012-01-22")
         return read_nclt(drive.parent, drive.name, camera=how.camera, undistortion=how.undistortion, rotate=how.rotate)
+    bag, _, topics = place.partition("#")
+    if _is_bag(bag):
+        bag_path = Path(bag.removeprefix(BAG_PREFIX)).expanduser()
+        if not bag_path.exists():
+            raise SourceError(f"no bag at {bag_path}")
+        return read_bag(bag_path, topics, how.spacing_m, how.rotate or 0, how.time_offset_us, how.on_progress)
     path = Path(place).expanduser()
     if not place or not path.exists():
         raise SourceError(
-            f"no recording at {place!r}: expected nclt:ROOT/DATE, a folder of images, a video, or encodings in a .npy "
-            "or .csv"
+            f"no recording at {place!r}: expected nclt:ROOT/DATE, a folder of images, rosbag:FILE, a video, or "
+            "encodings in a .npy or .csv"
         )
     if path.is_dir():
         return _nclt_camera(path, how) or read_folder(path, how.spacing_m, how.rotate, how.time_offset_us)
@@ -129,6 +143,11 @@ def _open_whole(place: str, how: _How) -> Recording:
         f"{path}: expected a video ({', '.join(sorted(VIDEO_SUFFIXES))}) or ready encodings [n, d] in a .npy or .csv; "
         "images are named by their folder"
     )
+
+
+def _is_bag(place: str) -> bool:
+    path = Path(place)
+    return place.startswith(BAG_PREFIX) or path.suffix.lower() in BAG_SUFFIXES or (path / METADATA).is_file()
 
 
 def _nclt_camera(folder: Path, how: _How) -> Recording | None:

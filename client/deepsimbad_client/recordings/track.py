@@ -75,7 +75,9 @@ class Track:
         )
 
 
-def track_of(time_us: Times, x_m: Reals, y_m: Reals, heading_rad: Reals | None = None) -> Track | None:
+def track_of(
+    time_us: Times, x_m: Reals, y_m: Reals, heading_rad: Reals | None = None, deadband_m: float = DEADBAND_M
+) -> Track | None:
     """The track that rows [k] tell, in whatever state they are; None: fewer than two can be used.
 
     Rows out of order are sorted, of one time the first stays, those with NaN and spikes are not used.
@@ -93,7 +95,7 @@ def track_of(time_us: Times, x_m: Reals, y_m: Reals, heading_rad: Reals | None =
         return None
     x_m, y_m = x_m[rows], y_m[rows]
     return Track(
-        *(times, x_m, y_m, wrapped_rad(heading_rad[rows]), arc_length_m(x_m, y_m, times)),
+        *(times, x_m, y_m, wrapped_rad(heading_rad[rows]), arc_length_m(x_m, y_m, times, deadband_m)),
         n_skipped_rows=int((~usable).sum() + (~rows_on_track).sum()),
         max_gap_s=max(MAX_GAP_S, 5e-6 * float(np.median(np.diff(times)))),
     )
@@ -150,13 +152,13 @@ def on_track(x_m: Reals, y_m: Reals, time_us: Times | None, speeds: float = SPIK
     return ok
 
 
-def arc_length_m(x_m: Reals, y_m: Reals, time_us: Times | None = None) -> Reals:
+def arc_length_m(x_m: Reals, y_m: Reals, time_us: Times | None = None, deadband_m: float = DEADBAND_M) -> Reals:
     """How far a track [n], in travel order, has gone at each of its poses: [n] metres, non-decreasing, 0 at the first.
 
     A pose stream of 100-150 Hz trembles by centimetres, GPS by decimetres, and summing its steps as they are turns
     a minute of standing into a hundred metres of driving. So, where non-decreasing times [n] are given, each pose is
     first averaged with those within a quarter of a second; the track is then walked by anchors (`walked_m`), at least
-    `DEADBAND_M` and six times the noise that is left apart. A robot that moves straight on gets its distance exactly,
+    `deadband_m` and six times the noise that is left apart. A robot that moves straight on gets its distance exactly,
     at every pose and not only at anchors.
     """
     if len(x_m) == 0:
@@ -166,7 +168,7 @@ def arc_length_m(x_m: Reals, y_m: Reals, time_us: Times | None = None) -> Reals:
         n_averaged = _window(time_us)
         x_m, y_m = _averaged(x_m, *n_averaged), _averaged(y_m, *n_averaged)
         noise /= float(np.sqrt(np.median(n_averaged[1] - n_averaged[0])))
-    return walked_m(x_m, y_m, max(DEADBAND_M, DEADBAND_NOISES * noise))
+    return walked_m(x_m, y_m, max(deadband_m, DEADBAND_NOISES * noise))
 
 
 def walked_m(x_m: Reals, y_m: Reals, deadband_m: float) -> Reals:

@@ -1,0 +1,267 @@
+"""ROS bags and MCAP files: images of one topic, placed by poses, fixes or odometry of another (library `rosbags`).
+
+    rosbag:FILE.bag, rosbag:FOLDER, FILE.mcap, FILE.db3     and behind each #IMAGE_TOPIC or #IMAGE_TOPIC,POSITION_TOPIC
+
+Images are `sensor_msgs/Image` or `CompressedImage`. Positions are the first there is of `geometry_msgs/PoseStamped` and
+`PoseWithCovarianceStamped`, `sensor_msgs/NavSatFix`, and `nav_msgs/Odometry`, whose x, y begin anew with every drive
+and are not kept. Times are those of the headers, or of the recording where headers have none.
+"""
+
+import math
+import threading
+import weakref
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+
+from deepsimbad_client.errors import BrokenFrameError, MissingExtraError, SourceError
+from deepsimbad_client.recordings import EncodedImage, Frame, Image, Recording, as_png, decode, ready, stamp_of, turned
+from deepsimbad_client.recordings.placing import Placed, placed_on
+from deepsimbad_client.recordings.plane import GPS_DEADBAND_M, utm
+from deepsimbad_client.recordings.track import DEADBAND_M, Track, track_of
+
+if TYPE_CHECKING:
+    from rosbags.highlevel import AnyReader
+
+BAG_PREFIX = "rosbag:"
+BAG_SUFFIXES = frozenset({".bag", ".mcap", ".db3"})
+METADATA = "metadata.yaml"  # in the folder that is a ROS 2 bag
+
+_IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+_POSES = ("geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped")
+_FIX, _ODOMETRY = "sensor_msgs/msg/NavSatFix", "nav_msgs/msg/Odometry"
+_POSITIONS = (*_POSES, _FIX, _ODOMETRY)  # by which drives can be compared best first
+_LAYOUTS: dict[str, tuple[type, int, int | None]] = {  # sample type, channels, how to BGR
+    "mono8": (np.uint8, 1, None),
+    "8UC1": (np.uint8, 1, None),
+    "bgr8": (np.uint8, 3, None),
+    "8UC3": (np.uint8, 3, None),
+    "rgb8": (np.uint8, 3, cv2.COLOR_RGB2BGR),
+    "bgra8": (np.uint8, 4, cv2.COLOR_BGRA2BGR),
+    "rgba8": (np.uint8, 4, cv2.COLOR_RGBA2BGR),
+    "mono16": (np.uint16, 1, None),
+    "16UC1": (np.uint16, 1, None),
+    "bayer_rggb8": (np.uint8, 1, cv2.COLOR_BayerRGGB2BGR),
+    "bayer_bggr8": (np.uint8, 1, cv2.COLOR_BayerBGGR2BGR),
+    "bayer_gbrg8": (np.uint8, 1, cv2.COLOR_BayerGBRG2BGR),
+    "bayer_grbg8": (np.uint8, 1, cv2.COLOR_BayerGRBG2BGR),
+    "yuv422": (np.uint8, 2, cv2.COLOR_YUV2BGR_UYVY),
+    "uyvy": (np.uint8, 2, cv2.COLOR_YUV2BGR_UYVY),
+    "yuv422_yuy2": (np.uint8, 2, cv2.COLOR_YUV2BGR_YUY2),
+    "yuyv": (np.uint8, 2, cv2.COLOR_YUV2BGR_YUY2),
+}
+
+_Rows = list[tuple[int, float, float, float]]  # microseconds, two coordinates, heading
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class BagRecording(Recording):
+    """Images of one topic."""
+
+    path: Path
+    topic: str
+    received_ns: Mapping[str, int]  # by frame name: when the recorder wrote it down, by which it is read again
+    rotate: int = 0  # degrees clockwise by which images are turned
+    turn: threading.Lock = field(default_factory=threading.Lock, repr=False)  # the reader serves one thread
+
+    def stamp(self, frame: Frame) -> str:
+        """Of its file and time; see `Recording.stamp`."""
+        return f"{stamp_of(self.path)} {frame.name}"
+
+    def image(self, frame: Frame, input_size: tuple[int, int] | None) -> EncodedImage:
+        """Read a frame: a compressed one as it is, a raw one as PNG; see `Recording.image`."""
+        at = self.received_ns[frame.name]
+        with self.turn:
+            of_topic = [connection for connection in self._reader.connections if connection.topic == self.topic]
+            for connection, _, raw in self._reader.messages(of_topic, start=at, stop=at + 1):
+                message: Any = _message(self._reader, raw, connection.msgtype, frame.name)
+                break
+            else:
+                raise BrokenFrameError(f"{frame.name} is not in {self.path} any more", "unreadable file")
+        if connection.msgtype == _IMAGES[1]:
+            return ready(bytes(message.data), Path(frame.name), input_size, self.rotate)
+        return as_png(turned(_pixels(message, frame.name), self.rotate), input_size)
+
+    @cached_property
+    def _reader(self) -> "AnyReader":
+        """Opened when the first image is asked for, closed with the recording."""
+        reader = _opened(self.path)
+        reader.open()
+        weakref.finalize(self, reader.close)
+        return reader
+
+
+def read_bag(
+    path: Path,
+    topics: str,
+    spacing_m: float,
+    rotate: int = 0,
+    time_offset_us: int = 0,
+    on_progress: Callable[[float], None] = lambda _: None,
+) -> BagRecording:
+    """Open a bag; `topics` is IMAGE, or IMAGE,POSITION, or "": what there is.
+
+    All messages of both topics are gone through once, for the times in their headers. Raises SourceError (the library
+    cannot read it, or which topic is meant cannot be told), MissingExtraError.
+    """
+    image_topic, _, position_topic = topics.partition(",")
+    remarks: list[str] = []
+    with _opened(path) as reader:
+        types = {connection.topic: connection.msgtype for connection in reader.connections if connection.msgcount}
+        image_topic = _chosen(image_topic, [name for name, kind in types.items() if kind in _IMAGES], "images", path)
+        placing = sorted((name for name in types if types[name] in _POSITIONS), key=lambda name: _rank(types[name]))
+        if position_topic or placing:
+            position_topic = _chosen(position_topic, placing, "positions", path, take_first=True)
+            others = f" (there are {', '.join(placing)})" if len(placing) > 1 else ""
+            remarks.append(f"images of {image_topic}, positions of {position_topic}{others}")
+        else:
+            remarks.append(f"images of {image_topic}, {spacing_m:g} m apart: there are no poses, fixes or odometry")
+        received_ns: dict[str, int] = {}
+        images: list[tuple[str, int]] = []
+        rows: _Rows = []
+        unreadable: list[str] = []
+        span = max(1, reader.end_time - reader.start_time)
+        for topic, kind, received, raw in _messages(reader, {image_topic, position_topic}):
+            on_progress((received - reader.start_time) / span)
+            name = f"{path.name}{topic}/{received}"
+            try:
+                message: Any = _message(reader, raw, kind, name)
+            except BrokenFrameError:
+                if topic == image_topic:
+                    unreadable.append(name)
+                continue
+            header = message.header.stamp
+            stamped_us = (header.sec * 10**9 + header.nanosec) // 1000
+            time_us = stamped_us or received // 1000
+            if topic == position_topic:
+                rows.append((time_us, *_place(message, kind)))
+            elif name in received_ns:
+                unreadable.append(name)
+            else:
+                received_ns[name] = received
+                images.append((name, time_us + time_offset_us))
+    if not images:
+        raise SourceError(f"{path}: {image_topic} holds no image that can be read")
+    images.sort(key=lambda image: image[1])
+    if position_topic:
+        result = _placed(images, rows, types[position_topic], f"{path}, {position_topic}")
+    else:
+        result = Placed([Frame(i, name, i * spacing_m, time_us) for i, (name, time_us) in enumerate(images)])
+    if unreadable:
+        result.left_out_names["unreadable message"] = unreadable
+    return BagRecording(
+        path.stem,
+        tuple(result.frames),
+        result.left_out_names,
+        remarks=[*remarks, *result.remarks],
+        path=path,
+        topic=image_topic,
+        received_ns=received_ns,
+        rotate=rotate,
+    )
+
+
+def _opened(path: Path) -> "AnyReader":
+    """A reader to be entered. Raises MissingExtraError, SourceError."""
+    try:
+        from rosbags.highlevel import AnyReader, AnyReaderError  # noqa: PLC0415 - an extra
+        from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415
+    except ImportError as error:
+        raise MissingExtraError("bags and MCAP files need rosbags: pip install 'deep-simbad[rosbag]'") from error
+
+    class Reader(AnyReader):  # whose faults are named as ours
+        def open(self) -> None:
+            try:
+                super().open()
+            except (AnyReaderError, OSError, ValueError, KeyError) as error:
+                raise SourceError(f"{path} cannot be read: {error}") from error
+
+    try:
+        return Reader([path], default_typestore=get_typestore(Stores.LATEST))
+    except (AnyReaderError, OSError) as error:
+        raise SourceError(f"{path} cannot be read as a bag: {error}") from error
+
+
+def _messages(reader: "AnyReader", topics: set[str]) -> Iterator[tuple[str, str, int, bytes]]:
+    connections = [connection for connection in reader.connections if connection.topic in topics]
+    for connection, received, raw in reader.messages(connections):
+        yield connection.topic, connection.msgtype, received, raw
+
+
+def _message(reader: "AnyReader", raw: bytes, kind: str, name: str) -> object:
+    try:
+        return reader.deserialize(raw, kind)
+    except Exception as error:  # rosbags lets struct's, numpy's and its own through
+        raise BrokenFrameError(f"{name} cannot be read: {error}", "undecodable") from error
+
+
+def _chosen(asked: str, there: list[str], what: str, path: Path, *, take_first: bool = False) -> str:
+    if asked in there:
+        return asked
+    if not asked and there and (take_first or len(there) == 1):
+        return there[0]
+    if not there:
+        raise SourceError(f"{path} holds no {what}: none of its topics has a type that is read")
+    trouble = f"no {what} in {asked}" if asked else f"{what} in several topics"
+    raise SourceError(f"{path}: {trouble}: name one of {', '.join(sorted(there))} as {BAG_PREFIX}{path}#TOPIC")
+
+
+def _rank(kind: str) -> int:
+    return _POSITIONS.index(kind)
+
+
+def _place(message: Any, kind: str) -> tuple[float, float, float]:
+    """Two coordinates, of a fix in degrees, and the heading; NaN: not known."""
+    if kind == _FIX:
+        fixed = message.status.status >= 0
+        return (message.latitude if fixed else math.nan, message.longitude if fixed else math.nan, math.nan)
+    pose = message.pose if kind == _POSES[0] else message.pose.pose
+    q = pose.orientation
+    heading = math.atan2(2 * (q.w * q.z + q.x * q.y), 1 - 2 * (q.y**2 + q.z**2))
+    return pose.position.x, pose.position.y, heading
+
+
+def _track(rows: _Rows, kind: str) -> Track | None:
+    columns = np.array(rows, np.float64).reshape(-1, 4)
+    time_us = np.array([row[0] for row in rows], np.int64)
+    x_m, y_m, heading_rad = columns[:, 1], columns[:, 2], columns[:, 3]
+    if kind == _FIX:
+        return track_of(time_us, *utm(x_m, y_m), deadband_m=GPS_DEADBAND_M)
+    return track_of(time_us, x_m, y_m, heading_rad, deadband_m=DEADBAND_M)
+
+
+def _placed(images: list[tuple[str, int]], rows: _Rows, kind: str, where: str) -> Placed:
+    track = _track(rows, kind)
+    if track is None:
+        raise SourceError(f"{where}: fewer than two positions can be used")
+    result = placed_on(track, images, where)
+    if kind == _ODOMETRY:
+        result.without_plane()
+    return result
+
+
+def _pixels(message: Any, name: str) -> Image:
+    """A raw image as 8-bit BGR."""
+    layout = _LAYOUTS.get(message.encoding)
+    if layout is None:
+        raise BrokenFrameError(f"{name}: nobody reads the encoding {message.encoding!r}", "unknown encoding")
+    sample, channels, to_bgr = layout
+    dtype = np.dtype(sample).newbyteorder(">" if message.is_bigendian else "<")
+    try:
+        lines = np.frombuffer(bytes(message.data), np.uint8).reshape(message.height, message.step)
+        width = message.width * channels * dtype.itemsize
+        pixels = np.ascontiguousarray(lines[:, :width]).view(dtype).reshape(message.height, message.width, channels)
+    except ValueError as error:
+        raise BrokenFrameError(f"{name}: {error}", "undecodable") from error
+    pixels = pixels.astype(sample)
+    if sample is np.uint16:
+        body = cv2.imencode(".png", pixels)[1].tobytes()  # what 16 bits are as 8 is one rule, that of files
+        return decode(body, Path(name))
+    if to_bgr is None:
+        to_bgr = cv2.COLOR_GRAY2BGR if channels == 1 else None
+    return np.asarray(pixels if to_bgr is None else cv2.cvtColor(pixels, to_bgr), dtype=np.uint8)

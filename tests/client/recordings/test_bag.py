@@ -1,0 +1,207 @@
+import math
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as Writer2
+from rosbags.typesys import Stores, get_typestore
+
+from deepsimbad_client.errors import BrokenFrameError, MissingExtraError, SourceError
+from deepsimbad_client.recordings.sources import open_source
+
+START_NS = 1_400_000_000_000_000_000
+TYPES = get_typestore(Stores.ROS2_HUMBLE)
+PICTURE = np.random.default_rng(0).integers(0, 255, (12, 16, 3), np.uint8)
+
+
+class Bag:
+    """Writes messages of a drive of 1 m/s: images five a second, positions twenty a second."""
+
+    def __init__(self, path, kind):
+        self.path, self.ros1 = path, kind == "bag"
+        self.types = get_typestore(Stores.ROS1_NOETIC) if self.ros1 else TYPES
+        storage = StoragePlugin.MCAP if kind == "mcap" else StoragePlugin.SQLITE3
+        self.writer = Writer1(path) if self.ros1 else Writer2(path, version=9, storage_plugin=storage)
+        self.topics = {}
+
+    def type(self, name):
+        return self.types.types[name]
+
+    def header(self, ns):
+        stamp = self.type("builtin_interfaces/msg/Time")(sec=ns // 10**9, nanosec=ns % 10**9)
+        seq = {"seq": 0} if self.ros1 else {}
+        return self.type("std_msgs/msg/Header")(stamp=stamp, frame_id="map", **seq)
+
+    def write(self, topic, name, at_ns, late_ns=2_000_000, **fields):
+        if topic not in self.topics:
+            self.topics[topic] = self.writer.add_connection(topic, name, typestore=self.types)
+        message = self.type(name)(header=self.header(at_ns), **fields)
+        encode = self.types.serialize_ros1 if self.ros1 else self.types.serialize_cdr
+        self.writer.write(self.topics[topic], START_NS + at_ns % START_NS + late_ns, encode(message, name))
+
+    def image(self, at_ns, topic="/front", pixels=PICTURE, encoding="bgr8"):
+        data = np.frombuffer(pixels.tobytes(), np.uint8)
+        size = {"height": pixels.shape[0], "width": pixels.shape[1], "step": len(data) // pixels.shape[0]}
+        self.write(topic, "sensor_msgs/msg/Image", at_ns, encoding=encoding, is_bigendian=0, data=data, **size)
+
+    def compressed(self, at_ns, body, topic="/front/compressed"):
+        data = np.frombuffer(body, np.uint8)
+        self.write(topic, "sensor_msgs/msg/CompressedImage", at_ns, format="jpeg", data=data)
+
+    def pose(self, x, y, yaw):
+        turn = self.type("geometry_msgs/msg/Quaternion")(x=0.0, y=0.0, z=math.sin(yaw / 2), w=math.cos(yaw / 2))
+        return self.type("geometry_msgs/msg/Pose")(
+            position=self.type("geometry_msgs/msg/Point")(x=x, y=y, z=0.0), orientation=turn
+        )
+
+    def poses(self, topic="/pose", seconds=4, name="geometry_msgs/msg/PoseStamped"):
+        for k in range(20 * seconds + 1):
+            pose = self.pose(k / 20, 7.0, 0.5)
+            if name == "nav_msgs/msg/Odometry":
+                zero = self.type("geometry_msgs/msg/Vector3")(x=0.0, y=0.0, z=0.0)
+                twist = self.type("geometry_msgs/msg/Twist")(linear=zero, angular=zero)
+                fields = {
+                    "child_frame_id": "base",
+                    "pose": self.type("geometry_msgs/msg/PoseWithCovariance")(pose=pose, covariance=np.zeros(36)),
+                    "twist": self.type("geometry_msgs/msg/TwistWithCovariance")(twist=twist, covariance=np.zeros(36)),
+                }
+            else:
+                fields = {"pose": pose}
+            self.write(topic, name, START_NS + 50_000_000 * k, **fields)
+
+    def fixes(self, topic="/fix", seconds=4):
+        """North from Greenwich, without a fix in the first half second and with one of 0, 0."""
+        for k in range(20 * seconds + 1):
+            at = 51.5 + k / 20 / 111_250, 0.0 if k < 10 else 0.5
+            latitude, longitude = (0.0, 0.0) if k == 40 else at
+            status = self.type("sensor_msgs/msg/NavSatStatus")(status=-1 if k < 10 else 0, service=1)
+            place = {"latitude": latitude, "longitude": longitude, "altitude": 0.0}
+            place |= {"position_covariance": np.zeros(9), "position_covariance_type": 0}
+            self.write(topic, "sensor_msgs/msg/NavSatFix", START_NS + 50_000_000 * k, status=status, **place)
+
+
+@pytest.fixture
+def bag(tmp_path):
+    """A function that writes a bag of a kind (bag, folder, mcap) with what is told, and gives its SOURCE."""
+
+    def written(kind, *parts):
+        path = tmp_path / ("drive.bag" if kind == "bag" else kind)
+        made = Bag(path, kind)
+        made.writer.open()
+        for part in parts:
+            part(made)
+        made.writer.close()
+        if kind == "mcap":
+            (inner,) = path.glob("*.mcap")
+            shutil.move(inner, tmp_path / "drive.mcap")
+            return str(tmp_path / "drive.mcap")
+        return f"rosbag:{path}"
+
+    return written
+
+
+def images(made):
+    for k in range(20):
+        made.image(START_NS + 200_000_000 * k)
+
+
+def odometry(made):
+    made.poses("/odom", name="nav_msgs/msg/Odometry")
+
+
+def sent(recording, row=0):
+    encoded = recording.image(recording.frames[row], None)
+    return cv2.imdecode(np.frombuffer(encoded.body, np.uint8), cv2.IMREAD_COLOR)
+
+
+@pytest.mark.parametrize("kind", ["bag", "folder", "mcap"])
+def test_images_are_placed_by_poses_at_the_times_in_their_headers(bag, kind):
+    source = bag(kind, images, Bag.poses)
+    recording = open_source(f"{source}#5:15:2")
+    assert [round(frame.position_m, 6) for frame in recording.frames] == [1, 1.4, 1.8, 2.2, 2.6]
+    first = recording.frames[0]
+    assert (first.index, first.timestamp_us) == (5, START_NS // 1000 + 1_000_000)
+    assert (first.x_m, first.y_m, first.heading_rad) == pytest.approx((1, 7, 0.5))
+    assert first.name.endswith(f"/front/{START_NS + 1_002_000_000}")
+    for row in (3, 0, 4):
+        np.testing.assert_array_equal(sent(recording, row), PICTURE)
+    assert open_source(f"{source}#/front,/pose#:3").frames[2].position_m == pytest.approx(0.4)
+
+
+def test_fixes_are_metres_of_one_plane_and_those_without_a_fix_are_not_used(bag):
+    recording = open_source(bag("mcap", images, Bag.fixes))
+    assert recording.left_out == {"before or after the positions": 3}
+    ahead = [frame.position_m for frame in recording.frames]
+    assert ahead[-1] - ahead[0] == pytest.approx(3.2, abs=0.05)
+    assert recording.frames[0].x_m == pytest.approx(5_709_000, abs=20_000), "north of the equator in UTM"
+
+
+def test_odometry_measures_but_gives_no_plane_that_another_drive_shares(bag):
+    recording = open_source(bag("folder", images, odometry))
+    assert recording.frames[-1].position_m == pytest.approx(3.8)
+    assert recording.frames[-1].x_m is None
+    recording = open_source(bag("bag", images, Bag.fixes, odometry))
+    assert "positions of /fix (there are /fix, /odom)" in recording.remarks[0]
+
+
+def test_without_positions_images_are_evenly_spaced(bag):
+    recording = open_source(bag("mcap", images), spacing_m=0.5, every_s=0.4)
+    assert [frame.position_m for frame in recording.frames] == [float(k) for k in range(10)]
+
+
+def test_one_of_several_topics_is_named(bag):
+    source = bag("folder", images, lambda made: made.image(START_NS, "/rear"), Bag.poses)
+    with pytest.raises(SourceError, match=r"images in several topics: name one of /front, /rear as rosbag:"):
+        open_source(source)
+    assert len(open_source(f"{source}#/front").frames) == 20
+    with pytest.raises(SourceError, match="no images in /side"):
+        open_source(f"{source}#/side")
+    with pytest.raises(SourceError, match="holds no images"):
+        open_source(bag("bag", Bag.poses))
+
+
+@pytest.mark.parametrize(
+    ("encoding", "pixels", "seen"),
+    [
+        ("rgb8", PICTURE[:, :, ::-1], PICTURE),
+        ("bgra8", np.dstack((PICTURE, PICTURE[:, :, 0])), PICTURE),
+        ("mono8", PICTURE[:, :, 0], PICTURE[:, :, [0, 0, 0]]),
+        ("mono16", PICTURE[:, :, 0].astype(np.uint16) * 257, PICTURE[:, :, [0, 0, 0]]),
+        ("bayer_rggb8", np.full((12, 16), 90, np.uint8), np.full((12, 16, 3), 90, np.uint8)),
+    ],
+)
+def test_raw_images_of_every_layout_become_bgr(bag, encoding, pixels, seen):
+    recording = open_source(bag("mcap", lambda made: made.image(START_NS, pixels=pixels, encoding=encoding)))
+    np.testing.assert_allclose(sent(recording).astype(int), seen, atol=1)
+
+
+def test_a_compressed_image_goes_as_it_is_and_a_broken_one_is_named(bag):
+    body = cv2.imencode(".jpg", PICTURE)[1].tobytes()
+
+    def both(made):
+        made.compressed(START_NS, body)
+        made.compressed(START_NS + 1_000, body[:-40])
+        made.image(START_NS, "/raw", encoding="depth")
+
+    source = bag("folder", both)
+    recording = open_source(f"{source}#/front/compressed")
+    assert recording.image(recording.frames[0], None).body == body
+    with pytest.raises(BrokenFrameError):
+        recording.image(recording.frames[1], None)
+    recording = open_source(f"{source}#/raw", rotate=90)
+    with pytest.raises(BrokenFrameError, match="encoding 'depth'"):
+        recording.image(recording.frames[0], None)
+
+
+def test_what_is_no_bag_is_named(tmp_path, monkeypatch):
+    (tmp_path / "a.mcap").write_bytes(b"no bag")
+    with pytest.raises(SourceError, match=r"a\.mcap cannot be read"):
+        open_source(str(tmp_path / "a.mcap"))
+    with pytest.raises(SourceError, match="no bag at"):
+        open_source(f"rosbag:{tmp_path}/none.bag")
+    monkeypatch.setitem(__import__("sys").modules, "rosbags.highlevel", None)
+    with pytest.raises(MissingExtraError, match=r"deep-simbad\[rosbag\]"):
+        open_source(str(tmp_path / "a.mcap"))
