@@ -15,10 +15,11 @@ from deepsimbad.errors import DeepSimbadError
 from deepsimbad.evaluators.image import decode_image, resized
 from deepsimbad_client.errors import BrokenFrameError, SourceError
 from deepsimbad_client.http import media_type_of
+from deepsimbad_client.recordings.heic import HEIC_SUFFIXES, decode_heic
 
 Image = NDArray[np.uint8]  # [height, width, 3] BGR
 
-IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", ".pgm", ".ppm"})
+IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", ".pgm", ".ppm"}) | HEIC_SUFFIXES
 TURNS = {0: None, 90: cv2.ROTATE_90_CLOCKWISE, 180: cv2.ROTATE_180, 270: cv2.ROTATE_90_COUNTERCLOCKWISE}
 
 _EARLY_SHARE = 0.02  # of a step, by which a frame may come before it is due
@@ -172,8 +173,10 @@ def decode(body: bytes, path: Path, *, as_stored: bool = False) -> Image:
     try:
         if media_type_of(body) is not None:
             return decode_image(body, _MAX_PIXELS, as_stored=as_stored)
+        if path.suffix.lower() in HEIC_SUFFIXES:
+            return decode_heic(body)
         image = cv2.imdecode(np.frombuffer(body, dtype=np.uint8), cv2.IMREAD_COLOR_BGR)
-    except (DeepSimbadError, cv2.error) as error:
+    except (DeepSimbadError, cv2.error, OSError, ValueError) as error:
         raise BrokenFrameError(f"{path} cannot be read: {error}", "undecodable") from error
     if image is None:
         raise BrokenFrameError(f"{path} is not an image that can be decoded", "undecodable")

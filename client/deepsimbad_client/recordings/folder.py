@@ -1,9 +1,12 @@
-"""Folders of images in the order of their names, placed by a `positions.csv` beside them."""
+"""Folders of images in the order of their names, placed by a `positions.csv`, a track, or EXIF."""
 
 import dataclasses
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+
+import numpy as np
 
 from deepsimbad_client.errors import SourceError
 from deepsimbad_client.recordings import (
@@ -15,9 +18,12 @@ from deepsimbad_client.recordings import (
     ready,
     stamp_of,
 )
+from deepsimbad_client.recordings.gps import TRACK_SUFFIXES, read_exif, read_track
+from deepsimbad_client.recordings.heic import HEIC_SUFFIXES, require_heic
 from deepsimbad_client.recordings.names import in_order, times_of
 from deepsimbad_client.recordings.nclt import TURNED_UPRIGHT, UPRIGHT_TURN, lies_on_its_side
-from deepsimbad_client.recordings.placing import placed
+from deepsimbad_client.recordings.placing import UNPLACED, Placed, placed, placed_on
+from deepsimbad_client.recordings.plane import GPS_DEADBAND_M, utm
 from deepsimbad_client.recordings.positions import POSITIONS_FILE, read_positions
 
 
@@ -54,37 +60,88 @@ def _upright(recording: FolderRecording, rotate: int | None) -> FolderRecording:
     return dataclasses.replace(recording, rotate=UPRIGHT_TURN, remarks=[*recording.remarks, TURNED_UPRIGHT])
 
 
-def read_folder(folder: Path, spacing_m: float, rotate: int | None = None, time_offset_us: int = 0) -> FolderRecording:
-    """Open a folder of images; without a positions.csv frame i is `i * spacing_m` metres along the route.
+def read_folder(
+    folder: Path,
+    spacing_m: float,
+    rotate: int | None = None,
+    time_offset_us: int = 0,
+    on_progress: Callable[[float], None] = lambda _: None,
+) -> FolderRecording:
+    """Open a folder of images, placed by a positions.csv in it, else a GPX or NMEA file, else their own EXIF.
 
-    `rotate` turns the images clockwise by so many degrees; None: NCLT's images upright, others not at all.
-    `time_offset_us` is added to the times that names tell.
-    Raises SourceError: no images, or a positions.csv that cannot be understood; the message names the line.
+    Without any of these frame i is `i * spacing_m` metres along the route. `rotate` turns the images clockwise by so
+    many degrees; None: NCLT's images upright, others not at all. `time_offset_us` is added to the times that names or
+    EXIF tell. Raises SourceError: no images, or positions that cannot be understood; the message names the line.
     """
     try:
         paths = [path for path in folder.iterdir() if path.name[0] != "." and not path.is_dir()]
-        names = in_order([path.name for path in paths if path.suffix.lower() in IMAGE_SUFFIXES])
     except OSError as error:
         raise SourceError(f"cannot read the folder {folder}: {error.strerror or error}") from error
+    names = in_order([path.name for path in paths if path.suffix.lower() in IMAGE_SUFFIXES])
     if not names:
         hint = f"; for NCLT write nclt:{folder}" if (folder / "lb3").is_dir() else ""
         raise SourceError(f"{folder} holds no images ({', '.join(sorted(IMAGE_SUFFIXES))}){hint}")
-    name, path = folder.resolve().name, folder / POSITIONS_FILE
+    if any(Path(name).suffix.lower() in HEIC_SUFFIXES for name in names):
+        require_heic()
     told_us: Sequence[int | None] = times_of(names) or [None] * len(names)
     times_us = [None if time is None else time + time_offset_us for time in told_us]
-    if not path.is_file():
-        frames = tuple(
-            Frame(i, file, i * spacing_m, timestamp_us=time_us)
-            for i, (file, time_us) in enumerate(zip(names, times_us, strict=True))
-        )
-        return _upright(FolderRecording(name=name, folder=folder, frames=frames), rotate)
-    table = read_positions(path, names, times_us)
-    result = placed(table.frames, str(path))
+    tracks = sorted(path for path in paths if path.suffix.lower() in TRACK_SUFFIXES)
+    table = folder / POSITIONS_FILE
+    if table.is_file():
+        result = read_positions(table, names, times_us)
+        result.follow(placed(result.frames, str(table), result.deadband_m))
+    elif tracks:
+        result = _on_track(tracks, names, times_us, folder, time_offset_us)
+    elif any(math.isfinite(read_exif(folder / names[at]).latitude) for at in (0, len(names) // 2, -1)):
+        result = _by_exif(names, times_us, folder, time_offset_us, on_progress)
+    else:
+        frames = zip(names, times_us, strict=True)
+        result = Placed([Frame(i, name, i * spacing_m, timestamp_us=time) for i, (name, time) in enumerate(frames)])
     recording = FolderRecording(
-        name=name,
-        folder=folder,
-        frames=tuple(result.frames),
-        left_out_names=table.left_out_names | result.left_out_names,
-        remarks=[*table.remarks, *result.remarks],
+        folder.resolve().name, tuple(result.frames), result.left_out_names, remarks=result.remarks, folder=folder
     )
     return _upright(recording, rotate)
+
+
+def _on_track(
+    tracks: Sequence[Path], names: Sequence[str], times_us: Sequence[int | None], folder: Path, time_offset_us: int
+) -> Placed:
+    if len(tracks) > 1:
+        raise SourceError(f"{folder} holds several tracks ({', '.join(path.name for path in tracks)}): leave one")
+    remarks = [f"placed by {tracks[0].name}"]
+    if None in times_us:
+        taken = [read_exif(folder / name) for name in names]
+        times_us = [None if one.time_us is None else one.time_us + time_offset_us for one in taken]
+        if not all(one.in_zone for one in taken if one.time_us is not None):
+            remarks.append("EXIF says times without a zone, read as UTC: --time-offset-s corrects them")
+    images = [(name, time) for name, time in zip(names, times_us, strict=True) if time is not None]
+    if not images:
+        raise SourceError(f"{folder}: no image tells its time, by name or EXIF, so {tracks[0].name} cannot place it")
+    result = placed_on(read_track(tracks[0]), images, str(tracks[0]), "the track")
+    without = [name for name, time in zip(names, times_us, strict=True) if time is None]
+    if without:
+        result.left_out_names["without a time"] = without
+    result.remarks = remarks + result.remarks
+    return result
+
+
+def _by_exif(
+    names: Sequence[str],
+    times_us: Sequence[int | None],
+    folder: Path,
+    time_offset_us: int,
+    on_progress: Callable[[float], None],
+) -> Placed:
+    taken = []
+    for at, name in enumerate(names):
+        taken.append(read_exif(folder / name))
+        on_progress((at + 1) / len(names))
+    x_m, y_m = utm(*np.array([(one.latitude, one.longitude) for one in taken], np.float64).T)
+    frames = []
+    for name, one, told_us, x, y in zip(names, taken, times_us, x_m.tolist(), y_m.tolist(), strict=True):
+        exif_us = None if one.time_us is None else one.time_us + time_offset_us
+        place = (None, None) if math.isnan(x) else (x, y)
+        frames.append(Frame(0, name, UNPLACED, exif_us if told_us is None else told_us, *place))
+    result = placed(frames, str(folder), GPS_DEADBAND_M)
+    result.remarks.insert(0, "placed by the EXIF of the images")
+    return result

@@ -12,7 +12,7 @@ from deepsimbad_client.errors import SourceError
 from deepsimbad_client.recordings import Frame
 from deepsimbad_client.recordings.clock import FIRST_US
 from deepsimbad_client.recordings.left_out import MOST_LEFT_OUT
-from deepsimbad_client.recordings.track import Reals, Times, Track, arc_length_m, on_track, rising_m
+from deepsimbad_client.recordings.track import DEADBAND_M, Reals, Times, Track, arc_length_m, on_track, rising_m
 
 UNPLACED = math.nan  # position_m of a frame of which the source says none
 STATED_SPEEDS = 100.0  # A stated position may jump by so many usual steps: somebody may have meant it
@@ -25,6 +25,7 @@ class Placed:
     frames: Sequence[Frame]
     left_out_names: dict[str, list[str]] = field(default_factory=dict)
     remarks: list[str] = field(default_factory=list)
+    deadband_m: float = DEADBAND_M  # of the positions: within it nobody has moved
 
     def leave_out(self, usable: Sequence[bool], reason: str) -> None:
         """Keep the usable ones of the frames."""
@@ -32,6 +33,12 @@ class Placed:
         if lost:
             self.left_out_names[reason] = lost
         self.frames = [frame for frame, good in zip(self.frames, usable, strict=True) if good]
+
+    def follow(self, later: "Placed") -> None:
+        """Take over the frames of a later step, with what it left out and said."""
+        self.frames = later.frames
+        self.left_out_names |= later.left_out_names
+        self.remarks += later.remarks
 
     def without_plane(self) -> None:
         """Forget x, y and heading, where they are of this drive's own beginning and no other's."""
@@ -42,13 +49,13 @@ class Placed:
         self.frames = [dataclasses.replace(frame, index=index) for index, frame in enumerate(self.frames)]
 
 
-def placed(frames: Sequence[Frame], where: str) -> Placed:
+def placed(frames: Sequence[Frame], where: str, deadband_m: float = DEADBAND_M) -> Placed:
     """Put frames on the route, by their stated `position_m` where any has one, else by the distance along x_m, y_m.
 
     Frames whose times are all known come in the order of their times. Indices count anew from 0. Stated positions that
     fall along the drive stay falling. Raises SourceError (no frame has a position, or positions go to and fro).
     """
-    result = Placed(frames)
+    result = Placed(frames, deadband_m=deadband_m)
     stated = any(math.isfinite(frame.position_m) for frame in frames)
     result.leave_out([_has_place(frame, stated) for frame in frames], "without a position")
     if not result.frames:
@@ -125,7 +132,7 @@ def _measure(result: Placed, time_us: Times | None) -> None:
     x_m, y_m = (np.array([getattr(frame, axis) for frame in result.frames], np.float64) for axis in ("x_m", "y_m"))
     usable = on_track(x_m, y_m, time_us)
     _without_spikes(result, usable, x_m, y_m)
-    along_m = arc_length_m(x_m[usable], y_m[usable], None if time_us is None else time_us[usable])
+    along_m = arc_length_m(x_m[usable], y_m[usable], None if time_us is None else time_us[usable], result.deadband_m)
     result.frames = [
         dataclasses.replace(frame, position_m=position_m)
         for frame, position_m in zip(result.frames, along_m.tolist(), strict=True)

@@ -6,7 +6,7 @@ A header and one line for each image. Columns, in any order, others are ignored:
                   column (and without `index`) the lines go with the images in name order and there must be as many
     index         instead of a name: the image's place in name order, from 0
     position_m    metres along the route; without it the distance along x_m, y_m is taken
-    x_m, y_m      ground coordinates in metres
+    x_m, y_m      ground coordinates in metres; or latitude, longitude in degrees (lat, lon), which become UTM
     timestamp_us  Unix microseconds; seconds, milli- and nanoseconds are told by their magnitude, or by the column's
                   name (timestamp_s, timestamp_ms, timestamp_ns); dates such as 2012-01-22T08:30:00Z do as well
     heading_rad   turning from x towards y
@@ -17,6 +17,7 @@ are not listed, lines whose image does not exist, and images whose place is empt
 
 import csv
 import dataclasses
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,7 +29,8 @@ from deepsimbad_client.recordings import Frame, finite_number
 from deepsimbad_client.recordings.clock import UNITS, UNKNOWN, times_us
 from deepsimbad_client.recordings.names import Finder
 from deepsimbad_client.recordings.placing import UNPLACED, Placed, placed_on
-from deepsimbad_client.recordings.track import track_of
+from deepsimbad_client.recordings.plane import GPS_DEADBAND_M, utm
+from deepsimbad_client.recordings.track import DEADBAND_M, track_of
 
 CLOCKS_APART_S = 0.5
 
@@ -40,6 +42,8 @@ _SPELLINGS = {
     "position_m": ("position_m", "route_position_m", "position"),
     "x_m": ("x_m", "x"),
     "y_m": ("y_m", "y"),
+    "latitude": ("latitude", "lat"),
+    "longitude": ("longitude", "lon", "lng"),
     "heading_rad": ("heading_rad", "yaw"),
     "timestamp": (
         "timestamp",
@@ -50,6 +54,7 @@ _SPELLINGS = {
     ),
 }
 _COLUMN_OF = {spelling: column for column, spellings in _SPELLINGS.items() for spelling in spellings}
+_PLANES = ({"x_m", "y_m"}, {"latitude", "longitude"})
 _WITHOUT_HEADER = {
     (1, False): ["position_m"],
     (2, True): ["name", "position_m"],
@@ -104,14 +109,20 @@ def read_positions(path: Path, names: Sequence[str], name_times_us: Sequence[int
     """
     table = _read(path)
     times, remarks = table.times_us()
-    places = zip(*(table.numbers(column) for column in ("position_m", "x_m", "y_m", "heading_rad")), times, strict=True)
+    plane = [table.numbers(column) for column in ("x_m", "y_m")]
+    deadband_m = DEADBAND_M
+    if "latitude" in table.columns and "x_m" not in table.columns:
+        degrees = [np.array(table.numbers(column), np.float64) for column in ("latitude", "longitude")]  # None: NaN
+        plane = [[None if math.isnan(metres) else metres for metres in axis.tolist()] for axis in utm(*degrees)]
+        deadband_m = GPS_DEADBAND_M
+    places = zip(table.numbers("position_m"), *plane, table.numbers("heading_rad"), times, strict=True)
     rows = [
         Frame(row, "", UNPLACED if position_m is None else position_m, time_us, x_m, y_m, heading_rad)
         for row, (position_m, x_m, y_m, heading_rad, time_us) in enumerate(places)
     ]
     if not {"name", "index"} & set(table.columns) and len(rows) != len(names):
-        if "timestamp" in table.columns and {"x_m", "y_m"} <= set(table.columns) and None not in name_times_us:
-            return _interpolated(rows, names, name_times_us, path)
+        if "timestamp" in table.columns and "position_m" not in table.columns and None not in name_times_us:
+            return _interpolated(rows, names, name_times_us, path, deadband_m)
         raise SourceError(f"{path} has {len(rows)} lines for {len(names)} images: add a column `name`")
     row_of, without_image = _rows_by_name(table, names)
     if not row_of:
@@ -127,7 +138,9 @@ def read_positions(path: Path, names: Sequence[str], name_times_us: Sequence[int
         f"not in {path.name}": [name for name in names if name not in row_of],
         f"in {path.name} without an image": without_image,
     }
-    return Placed(frames, {reason: some for reason, some in lost.items() if some}, remarks + _apart(listed, frames))
+    return Placed(
+        frames, {reason: some for reason, some in lost.items() if some}, remarks + _apart(listed, frames), deadband_m
+    )
 
 
 def _apart(listed: Sequence[tuple[str, int | None]], frames: Sequence[Frame]) -> list[str]:
@@ -145,9 +158,12 @@ def _apart(listed: Sequence[tuple[str, int | None]], frames: Sequence[Frame]) ->
     ]
 
 
-def _interpolated(rows: Sequence[Frame], names: Sequence[str], times_us: Sequence[int | None], path: Path) -> Placed:
+def _interpolated(
+    rows: Sequence[Frame], names: Sequence[str], times_us: Sequence[int | None], path: Path, deadband_m: float
+) -> Placed:
     columns = np.array([[row.timestamp_us, row.x_m, row.y_m] for row in rows], np.float64).T  # None becomes NaN
-    track = track_of(*columns)
+    time_us, x_m, y_m = columns
+    track = track_of(time_us, x_m, y_m, deadband_m=deadband_m)
     if track is None:
         raise SourceError(f"{path}: fewer than two lines hold a time and a place")
     images = [(name, time_us) for name, time_us in zip(names, times_us, strict=True) if time_us is not None]
@@ -189,13 +205,15 @@ def _read(path: Path) -> _Table:
             unit = "us" if called == "utime" else next((unit for unit in UNITS if called.endswith(f"_{unit}")), None)
     else:
         columns = list(_WITHOUT_HEADER.get((len(first), finite_number(first[0]) is None), []))
+    if {"name", "index"} & set(columns):
+        lines = [line for line in lines if any(line[1])]
     wanted = [column for column in columns if column is not None]
     if len(set(wanted)) != len(wanted):
         raise SourceError(f"{path}: two columns mean the same: {', '.join(first)}")
-    if "position_m" not in wanted and not {"x_m", "y_m"} <= set(wanted):
+    if "position_m" not in wanted and not any(plane <= set(wanted) for plane in _PLANES):
         raise SourceError(
-            f"{path}: the first line must name the columns, among them position_m, or x_m and y_m "
-            f"(and, to name the images, name); it is: {','.join(first)}"
+            f"{path}: the first line must name the columns, among them position_m, or x_m and y_m, or latitude "
+            f"and longitude (and, to name the images, name); it is: {','.join(first)}"
         )
     for number, cells in lines:
         if len(cells) < len(columns):
@@ -207,7 +225,9 @@ def _lines(path: Path) -> list[tuple[int, list[str]]]:
     try:
         with path.open(encoding="utf-8-sig", newline="") as text:
             reader = csv.reader(text)
-            lines = [(reader.line_num, [cell.strip() for cell in cells]) for cells in reader if any(cells)]
+            lines = [(reader.line_num, [cell.strip() for cell in cells]) for cells in reader if cells]
+            while lines and not any(lines[-1][1]):
+                lines.pop()
     except OSError as error:
         raise SourceError(f"cannot read {path}: {error.strerror or error}") from error
     except (UnicodeDecodeError, csv.Error) as error:

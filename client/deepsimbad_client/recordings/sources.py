@@ -134,7 +134,9 @@ def _open_whole(place: str, how: _How) -> Recording:
             "encodings in a .npy or .csv"
         )
     if path.is_dir():
-        return _nclt_camera(path, how) or read_folder(path, how.spacing_m, how.rotate, how.time_offset_us)
+        return _nclt_camera(path, how) or read_folder(
+            path, how.spacing_m, how.rotate, how.time_offset_us, how.on_progress
+        )
     if path.suffix.lower() in VIDEO_SUFFIXES:
         return read_video(path, how.spacing_m, how.rotate or 0, how.time_offset_us)
     if path.suffix.lower() in ENCODING_SUFFIXES:

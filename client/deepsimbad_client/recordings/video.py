@@ -1,7 +1,8 @@
 """Video files: frames by number, a second by the frame rate apart, placed by a table or a track beside them.
 
 `drive.mp4` takes its positions from `drive.csv` (the columns of `positions.csv`: a line a frame, an `index`, or times
-with x_m, y_m, which begin with the video where they count from 1970); without one frames are evenly spaced.
+with x_m, y_m, which begin with the video where they count from 1970), from `drive.gpx` or `drive.nmea`; without one
+frames are evenly spaced.
 """
 
 import threading
@@ -15,7 +16,8 @@ import numpy as np
 
 from deepsimbad_client.errors import BrokenFrameError, SourceError
 from deepsimbad_client.recordings import EncodedImage, Frame, Image, Recording, as_png, stamp_of, turned
-from deepsimbad_client.recordings.placing import Placed, placed
+from deepsimbad_client.recordings.gps import TRACK_SUFFIXES, read_track
+from deepsimbad_client.recordings.placing import Placed, placed, placed_on
 from deepsimbad_client.recordings.positions import read_positions
 
 VIDEO_SUFFIXES = frozenset({".mp4", ".avi", ".mov", ".mkv", ".m4v", ".webm", ".mpg", ".mpeg", ".ts", ".wmv"})
@@ -91,10 +93,13 @@ def read_video(path: Path, spacing_m: float, rotate: int = 0, time_offset_us: in
     rate_hz = rate_hz if 0 < rate_hz < MOST_HZ else USUAL_HZ
     times_us = [round(number * 1e6 / rate_hz) + time_offset_us for number in range(n_frames)]
     table = path.with_suffix(".csv")
+    track = next((there for suffix in TRACK_SUFFIXES if (there := path.with_suffix(suffix)).is_file()), None)
     if table.is_file():
-        told = read_positions(table, names, times_us)
-        result = placed(told.frames, str(table))
-        result = Placed(result.frames, told.left_out_names | result.left_out_names, [*told.remarks, *result.remarks])
+        result = read_positions(table, names, times_us)
+        result.follow(placed(result.frames, str(table), result.deadband_m))
+    elif track is not None:
+        images = list(zip(names, times_us, strict=True))
+        result = placed_on(read_track(track), images, str(track), "the track", together=True)
     else:
         result = Placed(
             [
@@ -104,7 +109,8 @@ def read_video(path: Path, spacing_m: float, rotate: int = 0, time_offset_us: in
         )
         result.remarks.append(
             f"{n_frames} frames, {rate_hz:g} a second, are taken {spacing_m:g} m apart: --every-s takes fewer, "
-            f"{table.name} beside the video says where they are"
+            f"{table.name} (or .gpx, .nmea) beside the video says where "
+            "they are"
         )
     return VideoRecording(
         path.stem,

@@ -228,7 +228,7 @@ def test_a_broken_image_is_named_when_it_is_read(folder):
 
 
 def test_a_folder_without_images_says_what_it_looked_for(tmp_path):
-    with pytest.raises(SourceError, match=r"holds no images \(\.bmp, \.jpeg"):
+    with pytest.raises(SourceError, match=r"holds no images \(\.bmp, \.heic"):
         open_source(str(tmp_path))
     (tmp_path / "lb3").mkdir()
     with pytest.raises(SourceError, match=f"for NCLT write nclt:{tmp_path}"):

@@ -1,0 +1,122 @@
+"""Where a receiver was: GPX and NMEA files as tracks, and what EXIF says of an image's place and time."""
+
+import math
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from functools import reduce
+from operator import xor
+from pathlib import Path
+from typing import Any
+from xml.etree.ElementTree import ParseError, iterparse
+
+import numpy as np
+from PIL import Image as Pictures
+from PIL import UnidentifiedImageError
+
+from deepsimbad_client.errors import SourceError
+from deepsimbad_client.recordings.plane import GPS_DEADBAND_M, utm
+from deepsimbad_client.recordings.track import Track, track_of
+
+TRACK_SUFFIXES = (".gpx", ".nmea")
+_GPS, _EXIF = 0x8825, 0x8769  # EXIF's folders, and tags in them
+_LATITUDE, _LONGITUDE, _GPS_TIME, _GPS_DATE = (1, 2), (3, 4), 7, 29
+_TAKEN, _SUBSECOND, _ZONE = 36867, 37521, 36881
+
+_Fix = tuple[int, float, float]  # microseconds, degrees north, degrees east
+
+
+def read_track(path: Path) -> Track:
+    """Read a GPX or NMEA file; raises SourceError (it is none, or fewer than two of its fixes can be used)."""
+    try:
+        fixes = list(_gpx(path) if path.suffix.lower() == ".gpx" else _nmea(path))
+    except (OSError, ParseError, ValueError) as error:
+        raise SourceError(f"{path} cannot be read as a track: {error}") from error
+    time_us = np.array([fix[0] for fix in fixes], np.int64)
+    degrees = np.array([fix[1:] for fix in fixes], np.float64).reshape(-1, 2)
+    track = track_of(time_us, *utm(degrees[:, 0], degrees[:, 1]), deadband_m=GPS_DEADBAND_M)
+    if track is None:
+        raise SourceError(f"{path}: fewer than two of its {len(fixes)} fixes with a time can be used")
+    return track
+
+
+def _gpx(path: Path) -> Iterator[_Fix]:
+    """Track points that have a time, of every version's namespace."""
+    with path.open("rb") as file:
+        for _, point in iterparse(file):  # noqa: S314 - expat itself stops entities that grow
+            if point.tag.rpartition("}")[2] == "trkpt":
+                times = [part.text for part in point if part.tag.rpartition("}")[2] == "time"]
+                if times and times[0]:
+                    yield _microseconds(datetime.fromisoformat(times[0].strip())), *_degrees_of(point)
+                point.clear()
+
+
+def _degrees_of(point: Any) -> tuple[float, float]:
+    return float(point.get("lat", "nan")), float(point.get("lon", "nan"))
+
+
+def _nmea(path: Path) -> Iterator[_Fix]:
+    """Recommended minimum sentences (RMC), which alone say the date; those without a fix or damaged are passed over."""
+    for line in path.read_text(encoding="ascii", errors="replace").splitlines():
+        sentence, _, checksum = line.strip().lstrip("$").partition("*")
+        cells = sentence.split(",")
+        if not cells[0].endswith("RMC") or len(cells) < 10 or cells[2] != "A":
+            continue
+        with suppress(ValueError):
+            if checksum and int(checksum[:2], 16) != reduce(xor, sentence.encode(), 0):
+                continue
+            time = datetime.strptime(f"{cells[9]} {cells[1][:6]}", "%d%m%y %H%M%S").replace(tzinfo=UTC)
+            since = timedelta(seconds=float(f"0{cells[1][6:]}"))
+            yield _microseconds(time + since), _angle(*cells[3:5]), _angle(*cells[5:7])
+
+
+def _angle(text: str, side: str) -> float:
+    """Degrees of DDDMM.MMMM and N, S, E or W."""
+    whole, minutes = divmod(float(text), 100)
+    return (whole + minutes / 60) * (-1 if side in "SW" else 1)
+
+
+def _microseconds(time: datetime) -> int:
+    time = time if time.tzinfo else time.replace(tzinfo=UTC)
+    return (time - datetime(1970, 1, 1, tzinfo=UTC)) // timedelta(microseconds=1)
+
+
+@dataclass(frozen=True)
+class Taken:
+    """What EXIF says; NaN, None: nothing."""
+
+    latitude: float = math.nan
+    longitude: float = math.nan
+    time_us: int | None = None
+    in_zone: bool = False  # the time says its zone, or is the receiver's; else it is read as UTC
+
+
+def read_exif(path: Path) -> Taken:
+    """Where and when an image was taken."""
+    try:
+        with Pictures.open(path) as picture:
+            exif = picture.getexif()
+            gps, details = exif.get_ifd(_GPS), exif.get_ifd(_EXIF)
+    except (OSError, UnidentifiedImageError, ValueError, SyntaxError, Pictures.DecompressionBombError):
+        return Taken()
+    latitude, longitude = _exif_degrees(gps, *_LATITUDE), _exif_degrees(gps, *_LONGITUDE)
+    with suppress(KeyError, ValueError, TypeError, ZeroDivisionError):
+        hours, minutes, seconds = (float(part) for part in gps[_GPS_TIME])
+        day = datetime.strptime(gps[_GPS_DATE], "%Y:%m:%d").replace(tzinfo=UTC)
+        since = timedelta(hours=hours, minutes=minutes, seconds=seconds)
+        return Taken(latitude, longitude, _microseconds(day + since), in_zone=True)
+    with suppress(KeyError, ValueError, TypeError):
+        taken = datetime.strptime(details[_TAKEN], "%Y:%m:%d %H:%M:%S")
+        zone = str(details.get(_ZONE, ""))
+        subsecond = float(f"0.{str(details.get(_SUBSECOND, 0)).strip()}")
+        time = datetime.fromisoformat(f"{taken.isoformat()}{zone}") + timedelta(seconds=subsecond)
+        return Taken(latitude, longitude, _microseconds(time), in_zone=bool(zone))
+    return Taken(latitude, longitude)
+
+
+def _exif_degrees(gps: dict[int, Any], side: int, angle: int) -> float:
+    with suppress(KeyError, ValueError, TypeError, ZeroDivisionError):
+        degrees, minutes, seconds = (float(part) for part in gps[angle])
+        return (degrees + minutes / 60 + seconds / 3600) * (-1 if str(gps[side]) in {"S", "W"} else 1)
+    return math.nan

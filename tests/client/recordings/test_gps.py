@@ -1,0 +1,162 @@
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from deepsimbad_client.errors import MissingExtraError, SourceError
+from deepsimbad_client.recordings.plane import utm
+from deepsimbad_client.recordings.sources import open_source
+
+START = 1_305_031_103  # 2011-05-10T12:38:23Z
+DEGREE_M = 111_320  # of latitude, roughly; of longitude at the equator
+
+
+def test_degrees_become_utm_metres_and_the_unknown_stays_unknown():
+    north, east = utm(np.array([43.642567, 0.0, np.nan, 91.0]), np.array([-79.387139, 0.0, 1.0, 1.0]))
+    assert (north[0], east[0]) == pytest.approx((4_833_438.6, 630_084.3), abs=0.1)
+    assert np.isnan(north[1:]).all()
+    north, east = utm(np.array([-33.9]), np.array([151.2]))
+    assert north[0] == pytest.approx(-3_752_900, abs=1_500), "south of the equator"
+
+
+def pictures(folder, names, **exif_of):
+    folder.mkdir(exist_ok=True)
+    for place, name in enumerate(names):
+        exif = Image.Exif()
+        for tag, value in exif_of.get("base", lambda _: {})(place).items():
+            exif.get_ifd(0x8769)[tag] = value
+        for tag, value in exif_of.get("gps", lambda _: {})(place).items():
+            exif.get_ifd(0x8825)[tag] = value
+        Image.fromarray(np.full((12, 16, 3), 10 * place % 250, np.uint8)).save(folder / name, exif=exif)
+    return str(folder)
+
+
+def gpx(path, n=60):
+    """A fix a second, 2 m to the north each; the twentieth is nowhere."""
+    points = "".join(
+        f'<trkpt lat="{0 if k == 20 else 51 + 2 * k / 111_270}" lon="{0 if k == 20 else 9}">'
+        f"<ele>3</ele><time>2011-05-10T12:{38 + (23 + k) // 60}:{(23 + k) % 60:02}Z</time></trkpt>"
+        for k in range(n)
+    )
+    path.write_text(f'<gpx xmlns="http://www.topografix.com/GPX/1/1"><trk><trkseg>{points}</trkseg></trk></gpx>')
+
+
+def test_images_with_times_for_names_are_placed_by_the_gpx_beside_them(tmp_path):
+    source = pictures(tmp_path / "drive", [f"{START + 2 * k}.5.png" for k in range(-1, 31)])
+    gpx(tmp_path / "drive" / "a.gpx")
+    recording = open_source(source)
+    assert recording.left_out == {"before or after the track": 2}
+    ahead = np.diff([frame.position_m for frame in recording.frames])
+    np.testing.assert_allclose(ahead, 4, atol=0.02)
+    assert recording.frames[0].x_m == pytest.approx(5_650_300, abs=600)
+    assert open_source(source, time_offset_s=10).frames[0].position_m == pytest.approx(17, abs=0.1)
+    gpx(tmp_path / "drive" / "b.gpx")
+    with pytest.raises(SourceError, match=r"several tracks \(a\.gpx, b\.gpx\)"):
+        open_source(source)
+
+
+def test_exif_tells_the_time_where_names_do_not(tmp_path):
+    def taken(place):
+        return {36867: f"2011:05:10 14:38:{25 + place}", 36881: "+02:00", 37521: "5"} if place else {}
+
+    source = pictures(tmp_path / "drive", [f"{k}.jpg" for k in range(5)], base=taken)
+    gpx(tmp_path / "drive" / "track.gpx")
+    recording = open_source(source)
+    assert recording.left_out_names == {"without a time": ["0.jpg"]}
+    assert recording.frames[0].position_m == pytest.approx(7, abs=0.05)
+    source = pictures(tmp_path / "local", ["a.jpg"], base=lambda _: {36867: "2011:05:10 14:38:30"})
+    gpx(tmp_path / "local" / "track.gpx")
+    with pytest.raises(SourceError, match=r"they are of 2011-05-10T14:38.*--time-offset-s"):
+        open_source(source)
+    recording = open_source(source, time_offset_s=-7200)
+    assert recording.frames[0].position_m == pytest.approx(14, abs=0.1)
+    assert "without a zone" in recording.remarks[1]
+    gpx(tmp_path / "track.gpx")
+    source = pictures(tmp_path, ["a.png"])
+    with pytest.raises(SourceError, match="no image tells its time"):
+        open_source(source)
+
+
+def nmea(seconds, latitude, valid="A"):
+    minutes = 60 * (latitude % 1)
+    body = (
+        f"GPRMC,{12 * 10000 + 3800 + seconds:06}.00,{valid},{int(latitude)}{minutes:09.6f},N,00900.000,E,1,0,100511,,"
+    )
+    checksum = 0
+    for byte in body.encode():
+        checksum ^= byte
+    return f"${body}*{checksum:02X}"
+
+
+def test_nmea_is_read_without_what_is_damaged_or_has_no_fix(tmp_path):
+    source = pictures(tmp_path / "drive", [f"{START + k}.png" for k in range(5)])
+    lines = [nmea(23 + k, 51 + k / 111_270, "V" if k == 2 else "A") for k in range(30)]
+    lines[3] = lines[3].replace("51", "57", 1)  # its checksum no longer fits
+    (tmp_path / "drive" / "log.nmea").write_text("\r\n".join(["$GPGSV,1", *lines, "$GPRM"]))
+    assert [frame.position_m for frame in open_source(source).frames] == pytest.approx([0, 1, 2, 3, 4], abs=0.02)
+    (tmp_path / "drive" / "log.nmea").write_text("nothing")
+    with pytest.raises(SourceError, match="fewer than two of its 0 fixes"):
+        open_source(source)
+
+
+def degrees(angle):
+    return (int(angle), int(angle % 1 * 60), angle * 60 % 1 * 60)
+
+
+def test_exif_places_the_images_that_have_it(tmp_path):
+    def gps(place):
+        if place == 20:
+            return {}
+        along = 51 + (9 if place == 10 else 2 * place / 111_270)  # the tenth is a spike
+        return {1: "N", 2: degrees(along), 3: "W", 4: degrees(9), 29: "2011:05:10", 7: (12, 38, place)}
+
+    recording = open_source(pictures(tmp_path / "drive", [f"{k}.jpg" for k in range(30)], gps=gps))
+    assert recording.left_out_names == {
+        "without a position": ["20.jpg"],
+        "where no robot can have been": ["10.jpg"],
+    }
+    assert recording.frames[-1].position_m == pytest.approx(58, abs=0.1)
+    assert recording.frames[-1].timestamp_us == (1_305_031_080 + 29) * 1_000_000
+
+
+def test_latitude_and_longitude_stand_in_a_table_too(tmp_path):
+    source = pictures(tmp_path / "drive", ["0.png", "1.png", "2.png"])
+    (tmp_path / "drive" / "positions.csv").write_text(f"lat,lon\n51,9\n,\n{51 + 50 / 111_270},9\n")
+    recording = open_source(source)
+    assert recording.left_out == {"without a position": 1}
+    assert recording.frames[1].position_m == pytest.approx(50, abs=0.1)
+
+
+def test_a_receiver_that_wanders_while_it_stands_goes_nowhere(tmp_path):
+    rng = np.random.default_rng(0)
+    wander = np.cumsum(rng.normal(0, 0.05, 600))  # correlated, as a receiver's is: no white noise to tell it by
+    wander -= np.linspace(wander[0], wander[-1], 600)
+    along = np.concatenate((np.arange(100.0), 100 + wander, np.arange(100.0, 200)))
+    lines = "".join(f"{51 + metres / 111_270},9,{START + k}\n" for k, metres in enumerate(along))
+    source = pictures(tmp_path / "drive", [f"{START + k}.png" for k in range(0, 800, 20)])
+    (tmp_path / "drive" / "positions.csv").write_text(f"lat,lon,time\n{lines}")
+    assert open_source(source).frames[-1].position_m == pytest.approx(180, abs=8)
+
+
+def test_a_video_begins_with_the_track_beside_it(tmp_path):
+    writer = cv2.VideoWriter(str(tmp_path / "drive.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 10, (64, 48))
+    for number in range(30):
+        writer.write(np.full((48, 64, 3), number, np.uint8))
+    writer.release()
+    gpx(tmp_path / "drive.gpx")
+    assert open_source(str(tmp_path / "drive.avi")).frames[-1].position_m == pytest.approx(5.8, abs=0.05)
+
+
+def test_heic_is_read_or_its_library_is_named(tmp_path, monkeypatch):
+    pillow_heif = pytest.importorskip("pillow_heif")
+    pillow_heif.register_heif_opener()
+    picture = cv2.resize(np.random.default_rng(0).integers(0, 255, (4, 6, 3), np.uint8), (96, 64))
+    Image.fromarray(picture).save(tmp_path / "a.HEIC", format="HEIF", quality=95)
+    recording = open_source(str(tmp_path))
+    sent = recording.image(recording.frames[0], None)
+    assert sent.content_type == "image/png"
+    seen = cv2.imdecode(np.frombuffer(sent.body, np.uint8), cv2.IMREAD_COLOR_RGB)
+    assert np.abs(seen.astype(int) - picture).mean() < 8
+    monkeypatch.setitem(__import__("sys").modules, "pillow_heif", None)
+    with pytest.raises(MissingExtraError, match=r"deep-simbad\[heic\]"):
+        open_source(str(tmp_path))
