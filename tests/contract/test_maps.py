@@ -2,6 +2,7 @@
 
 import base64
 import hashlib
+import io
 
 import numpy as np
 
@@ -153,17 +154,23 @@ def test_landmarks_come_from_where_they_are_asked_for_or_known(client):
         domain = client.get("/v1/domains/fresh").json()
         assert domain["n_landmarks"] == n_expected
         assert job["result"]["metrics"] == versions(client, "fresh")[domain["map_version"]]["metrics"]
-        return job["result"]["metrics"]["landmarks"], domain["landmark_model_digest"]
+        model = client.get("/v1/domains/fresh/landmark-model")
+        assert model.headers["etag"] == f'"{domain["landmark_model_digest"]}"'
+        arrays = np.load(io.BytesIO(model.content))
+        usual = arrays["usual"].tolist() if "usual" in arrays else None
+        return job["result"]["metrics"]["landmarks"], arrays["prototypes"].tolist(), usual
 
-    source, own = about(12, n_landmarks=12)
+    source, own, usual = about(12, n_landmarks=12)
     assert source == "training_traverse"
     body = {"encoding": ready_encodings()[17].tolist()}
     found = client.post("/v1/domains/fresh/localizations", json=body).json()
     assert found["retrieval"][0]["map_image"] == 17
-    assert about(12, training_traverse="again") == ("active_map", own)
-    source, other = about(9, landmark_traverse="again", n_landmarks=9)
+    again = about(12, training_traverse="again")
+    assert again[:2] == ("active_map", own)
+    assert again[2] != usual, "what is usual for robots that encode on board is of the drive that is mapped"
+    source, *other = about(9, landmark_traverse="again", n_landmarks=9)
     assert source == "landmark_traverse"
-    assert about(9) == ("active_map", other)
+    assert about(9) == ("active_map", *other)
     assert about(9, relevance="rrf", n_landmarks=9)[0] == "training_traverse"
     assert about(9, relevance="standardised")[0] == "active_map"
     assert about(N_READY, relevance="composed")[0] == "training_traverse"

@@ -12,6 +12,7 @@ from deepsimbad.core.relevance import Query, Relevance
 from deepsimbad.core.retrieval import relevances
 from deepsimbad.engine.maps import load_snapshot
 from deepsimbad.errors import InvalidMapConfigError
+from deepsimbad.jobs.append import KnownDrives, fuse
 from deepsimbad.jobs.progress import Progress
 from deepsimbad.jobs.remap import REMAP_STAGES, RemapConfig, remap
 from deepsimbad.jobs.versions import import_map
@@ -64,6 +65,12 @@ def test_old_images_stay_and_appended_places_are_found(first, run, catalog, eval
     assert (np.diff(after.position_m) >= 0).all()
     assert np.array_equal(after.lists[:, is_old], before.lists)
     assert np.array_equal(after.landmark_model["prototypes"], before.landmark_model["prototypes"])
+    if relevance is Relevance.COMPOSED:
+        assert np.array_equal(after.landmark_model["usual"], after.usual_encoding)
+        both = np.concatenate([old, new]).astype(np.float64)
+        assert after.usual_encoding == pytest.approx(np.stack([both.mean(axis=0), both.std(axis=0)]), rel=1e-4)
+        assert not np.array_equal(after.usual_product, before.usual_product)
+        assert "drive are not stored here" in result["metrics"]["fused"]["why"]
     for name in ("likelihood_scale", "novelty"):
         assert np.array_equal(getattr(after, name), getattr(before, name))
     for name in ("values", "encodings"):
@@ -122,8 +129,8 @@ def test_the_config_records_what_was_appended(first, run, catalog, drive):
         assert config["landmark_traverse"] == "landmarks"
         assert (config["list_length"], config["n_landmarks"], config["relevance"]) == (3, 12, "composed")
         assert config["appended"] == [
-            {"traverse": "more", "n_frames": 15, "to_version": 1},
-            {"traverse": "third", "n_frames": 5, "to_version": 2},
+            {"traverse": "more", "n_frames": 15, "to_version": 1, "fused": False},
+            {"traverse": "third", "n_frames": 5, "to_version": 2, "fused": False},
         ]
         assert (config["append"], config["check_traverse"], config["gate_margin"]) == (True, "more", 100.0)
     assert catalog.map(DOMAIN, 3).metrics["training"] == catalog.map(DOMAIN, 1).metrics["training"]
@@ -210,7 +217,7 @@ def test_an_imported_map_is_appended_to_under_the_names_of_here(first, run, cata
     assert run("more", append=True)["map_version"] == 4
     for config in (catalog.map(DOMAIN, 4).config, contents(catalog, 4).config):
         assert (config["training_traverse"], config["imported"]["version"]) == (None, 2)
-        assert config["appended"] == [{"traverse": "more", "n_frames": 15, "to_version": 3}]
+        assert config["appended"] == [{"traverse": "more", "n_frames": 15, "to_version": 3, "fused": False}]
 
 
 def test_there_must_be_a_map_to_append_to(drive, run):
@@ -234,3 +241,119 @@ def test_a_loop_takes_the_frames_of_any_turn(catalog, evaluator, drive):
     assert after.position_m.max() == 39.5
     snapshot = load_snapshot(catalog, DOMAIN, 2)
     assert snapshot.route.length_m == pytest.approx(40.0, abs=0.51)
+
+
+# --- the same route again ------------------------------------------------------------------------------------------
+
+PLACES = 160
+
+
+@pytest.fixture(params=[16, 130], ids=["whole", "projected"])
+def season(catalog, request):
+    """Stores a drive of one route in a season of its own, some places of it; returns its encodings."""
+    d = request.param
+    place = np.random.default_rng(0).normal(size=(PLACES + 20, d))
+
+    def store(name, seed, at=range(PLACES), weight=1.2):
+        rng = np.random.default_rng(seed)
+        seen = place[at] + weight * rng.normal(size=(len(at), d)) * (np.arange(d) % 4 == 0)  # a season changes these
+        encodings = (rng.normal(size=d) + rng.uniform(0.5, 2, d) * (seen + 0.2 * rng.normal(size=seen.shape))).astype(
+            np.float32
+        )
+        with Traverse.create(catalog.data_dir, DOMAIN, name) as traverse:
+            traverse.put_frames(Drive(position_m=np.array(at, float), encodings=encodings))
+        return encodings
+
+    return store
+
+
+def stored(catalog, name):
+    with Traverse.open(catalog.data_dir, DOMAIN, name) as traverse:
+        return traverse.read()
+
+
+def hits(map_, encodings):
+    """How many views of a season are placed within a metre, each taken by itself."""
+    relevance = relevances(
+        map_, Query(np.ones((len(encodings), map_.n_landmarks), np.float32), encoding=encodings), map_.live_statistics
+    )
+    return np.sum(np.abs(map_.position_m[relevance.argmax(axis=1)] - np.arange(len(encodings))) <= 1)
+
+
+def test_places_seen_again_become_the_mean_of_their_seasons(season, run, catalog):
+    """At the same bits, and as well as if all seasons had been known from the start."""
+    season("summer", 1)
+    season("winter", 2, range(PLACES + 20))
+    season("spring", 3)
+    live = season("live", 4)
+    run("summer", n_landmarks=60, training_episodes=50)
+    second = run("winter", append=True)["metrics"]
+    assert (second["n_map_images"], second["fused"]["accepted"], second["fused"]["n_new_images"]) == (
+        PLACES + 18,  # the last two of the map are within 2 m of the first two that it lacks
+        True,
+        18,
+    )
+    third = run("spring", append=True)["metrics"]
+    assert (third["n_map_images"], third["fused"]["accepted"], third["fused"]["n_new_images"]) == (PLACES + 18, True, 0)
+    one, two, three = (contents(catalog, version) for version in (1, 2, 3))
+    assert three.list_length == one.list_length
+    assert np.array_equal(three.frame_digest[:PLACES], one.frame_digest), "images stay"
+    assert three.q_values.shape == (PLACES + 18, 2)
+    assert three.landmark_model["prototypes"].shape == one.landmark_model["prototypes"].shape
+    moved = np.einsum("rk,rk->r", three.landmark_model["prototypes"], two.landmark_model["prototypes"])
+    assert moved.min() > 0.5, "landmarks are the same frames, in a space where seasons count less"
+    assert np.array_equal(three.landmark_model["usual"], three.usual_encoding)
+    run("summer", landmark_traverse="winter", n_landmarks=60, training_episodes=0, same_route=True)
+    found = [hits(map_, live) for map_ in (one, two, three, contents(catalog, 4))]
+    assert found[0] + 10 < found[1] < found[2]
+    assert found[1] > found[3] - 10
+
+
+def test_a_drive_is_fused_only_where_its_views_agree(season, run, catalog):
+    season("summer", 1)
+    season("later", 2)
+    other = np.random.default_rng(9).permutation(PLACES)
+    season("elsewhere", 3, other)
+    run("summer", n_landmarks=60, training_episodes=0)
+    encodings = stored(catalog, "elsewhere").encodings
+    with Traverse.create(catalog.data_dir, DOMAIN, "shuffled") as traverse:
+        traverse.put_frames(Drive(position_m=np.arange(PLACES) + 0.25, encodings=encodings))
+    added = run("shuffled", append=True)["metrics"]
+    assert (added["fused"]["accepted"], added["n_map_images"]) == (False, 2 * PLACES)
+    assert "agree no better" in added["fused"]["why"]
+    again = run("later", append=True)["metrics"]
+    assert (again["fused"]["accepted"], again["n_map_images"]) == (True, 2 * PLACES), "with the images that agree"
+    catalog.activate(DOMAIN, 1, 3)
+    said = run("later", append=True, same_route=False)["metrics"]["fused"]
+    assert (said["accepted"], "said not to share" in said["why"]) == (False, True)
+
+
+def test_a_fused_frame_does_not_find_itself_when_the_map_is_checked(season, run, catalog):
+    season("summer", 1)
+    season("winter", 2)
+    season("spring", 3)
+    run("summer", n_landmarks=60, training_episodes=0)
+    held_out = run("winter", append=True)["metrics"]["check"]
+    assert (held_out["n_queries"], held_out["anr"] < held_out["anr_active"]) == (PLACES // 10, True)
+    before, after = contents(catalog, 1), contents(catalog, 2)
+    summer, winter = (stored(catalog, name) for name in ("summer", "winter"))
+    fused, _ = fuse(before, KnownDrives.of(before, [(summer, True)], summer), winter, None)
+    assert np.array_equal(fused.map.lists, after.lists)
+    is_asked = np.arange(PLACES) % 10 == 0
+    same = (fused.without(np.flatnonzero(is_asked)).lists == after.lists).all(axis=0)
+    assert (same[~is_asked].all(), same[is_asked].all()) == (True, False)
+    of_itself = run("spring", append=True, check_traverse="winter")["metrics"]["check"]
+    assert (of_itself["anr"], "made of the frames of traverse winter itself" in of_itself["why"]) == (None, True)
+
+
+def test_what_was_deleted_or_changed_cannot_be_fused(season, run, catalog):
+    season("summer", 1)
+    season("winter", 2)
+    run("summer", n_landmarks=60, training_episodes=0)
+    Traverse.delete(catalog.data_dir, DOMAIN, "summer")
+    season("summer", 7)
+    added = run("winter", append=True)["metrics"]
+    assert (added["n_map_images"], added["fused"]["why"]) == (
+        2 * PLACES,
+        "the drives that the map is made of hold other frames by now",
+    )

@@ -180,7 +180,12 @@ def compose_map(
     if second is not None:
         season, other, verdict = second_season(own, plan.closed, second, plan.same_route, space.seen)
     on_progress(0.5)
-    if season is not None and other is not None and isinstance(candidates, Drive) and _covers(training, season.places):
+    if (
+        season is not None
+        and other is not None
+        and isinstance(candidates, Drive)
+        and covers(training.position_m, season.places[:, 0])
+    ):
         space = space.whitened(training, other, season.places, candidates)
         own, other = space.seen(training), space.seen(other)
         season = SecondSeason(_measured(other), season.places)
@@ -191,12 +196,13 @@ def compose_map(
         usual, fused = Moments.of(training.encodings, other.encodings), places.copy()
         images, frames = season.places.T
         fused[images] = unit(places[images] + SECOND_SEASON_WEIGHT * space.unit_vectors(other)[frames])
-    model = space.model(usual) if isinstance(candidates, Drive) else candidates
+    # Landmarks may stay; what is usual is of this map, for robots that encode on board as here
+    model = space.model(usual) if isinstance(candidates, Drive) else {**candidates, "usual": usual.mean_std()}
     seen_from = space.chosen if candidates is training else None
     if candidates is second and season is not None and space.chosen is not None:
         seen_from = _images_of(season.places, space.chosen)
     own_places = None if seen_from is None else _own_places(own.route(plan.closed), seen_from)
-    map_ = _composed_map(plan, own, fused, usual, model, own_places if plan.bars_own_place else None)
+    map_ = composed_map(plan, own, fused, usual, model, own_places if plan.bars_own_place else None)
     rehearsal = map_
     if season is not None:
         barred = own_places if candidates is second or plan.bars_own_place else None
@@ -213,13 +219,13 @@ def compose_map(
     return Built(replace(map_, **learnt), replace(rehearsal, **learnt), own, other, verdict, fused)
 
 
-def _composed_map(
+def composed_map(
     plan: MapPlan,
     own: Drive,
     places: NDArray[np.float32],
     usual: Moments,
     model: Mapping[str, NDArray[Any]],
-    barred: NDArray[np.bool_] | None,
+    barred: NDArray[np.bool_] | None = None,
 ) -> Map:
     """The map of places [n, k] that were seen as `own`, but for what a rehearsal teaches."""
     prototypes = np.asarray(model["prototypes"], np.float32)
@@ -248,10 +254,10 @@ def _measured(drive: Drive) -> NDArray[np.float32]:
     return drive.dissimilarities
 
 
-def _covers(training: Drive, places: NDArray[np.int64]) -> bool:
-    """Whether places seen in two seasons are enough, and spread over the route."""
-    at_m = training.position_m[places[:, 0]]
-    spread = np.ptp(at_m) >= _SPREAD_OVER * np.ptp(training.position_m) if at_m.size else False
+def covers(position_m: NDArray[np.float64], images: NDArray[np.int64]) -> bool:
+    """Whether images that were seen in two seasons are enough, and spread over the route at `position_m`."""
+    at_m = position_m[images]
+    spread = np.ptp(at_m) >= _SPREAD_OVER * np.ptp(position_m) if at_m.size else False
     return bool(at_m.size >= LEAST_SHARED_PLACES and spread)
 
 
@@ -330,7 +336,7 @@ def append_drive(map_: Map, drive: Drive) -> Map:
     The new frames' lists come from their own drive's statistics, as those of any map do. A short drive says little of
     what is usual for a landmark (one frame: nothing), so its statistics begin as the map's, weighted as for a live
     session, and soon are its own. The map's statistics become those of all its images; what only two seasons of one
-    place can teach stays. A new image knows of its place what the nearest old one does.
+    place can teach stays.
 
     Args:
         drive: The new frames, their dissimilarities to its landmarks measured; along the same route, on a closed one
@@ -342,9 +348,7 @@ def append_drive(map_: Map, drive: Drive) -> Map:
     Raises:
         InvalidRouteError: The new frames go backwards.
     """
-    route, usual = drive.route(map_.closed), map_.live_statistics
-    dissimilarities = _measured(drive)
-    ranks_of_frames = rank_landmarks(dissimilarities)
+    usual, ranks_of_frames = map_.live_statistics, rank_landmarks(_measured(drive))
     scores: NDArray[np.floating] = ranks_of_frames
     pooled: dict[str, Any] = {}
     if usual is not None:
@@ -353,24 +357,34 @@ def append_drive(map_: Map, drive: Drive) -> Map:
         ranks = usual.ranks.pooled(map_.n_images, own, drive.n_frames)
         pooled["statistics"] = np.stack([ranks.mean, ranks.std])
     if usual is not None and usual.encodings is not None:
-        own_encodings, model = Moments.of(drive.encodings), map_.landmark_model
+        own_encodings, model = Moments.counted(drive.encodings), map_.landmark_model
         soon_own = usual.encodings.pooled(usual.encodings.weight, own_encodings, drive.n_frames)
         u = described(drive.encodings, soon_own, model.get("projection"))
         lists = compose(u, model["prototypes"], map_.list_length)
-        pooled["usual_encoding"] = usual.encodings.pooled(map_.n_images, own_encodings, drive.n_frames).mean_std()
+        of_all = usual.encodings.pooled(map_.n_images, own_encodings, drive.n_frames).mean_std()
+        pooled |= {"usual_encoding": of_all, "landmark_model": {**model, "usual": of_all}}
+        if usual.products is not None:
+            own_products = Moments.counted(u @ np.asarray(model["prototypes"], np.float32).T)
+            pooled["usual_product"] = usual.products.pooled(map_.n_images, own_products, drive.n_frames).mean_std()
     else:
         lists = nearest_landmarks(scores, map_.list_length)
+    return replace(with_frames(map_, drive, lists), **pooled)
+
+
+def with_frames(map_: Map, drive: Drive, lists: NDArray[np.uint16]) -> Map:
+    """With frames of known lists [h, m] among the images; each knows of its place what the nearest old one does."""
+    route = drive.route(map_.closed)
     nearest, is_near = nearest_known(map_, route.position_m)
     q_values, bits = map_.q_values, map_.view_bits
     if q_values is not None:
         q_values = np.where(is_near[:, np.newaxis], q_values[nearest], np.float32(NnqlConfig().initial_q))
     if bits is not None:
         bits = np.where(is_near, bits[nearest], bits.mean(dtype=np.float32))
-    longer = map_.with_images(
+    return map_.with_images(
         {
             "lists": lists,
             "position_m": _on_route(map_, route.position_m),
-            "values": None if map_.values is None else _listed(dissimilarities, lists),
+            "values": None if map_.values is None else _listed(_measured(drive), lists),
             "encodings": None if map_.encodings is None else drive.encodings,
             "view_bits": bits,
             **drive.origins(),
@@ -379,7 +393,6 @@ def append_drive(map_: Map, drive: Drive) -> Map:
             "q_values": q_values,
         }
     )
-    return replace(longer, **pooled)
 
 
 def nearest_known(map_: Map, position_m: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:

@@ -54,6 +54,12 @@ class Moments:
         return cls(PRIOR_WEIGHT_FRAMES, mean, np.mean(variances, axis=0) + np.square(mean))
 
     @classmethod
+    def counted(cls, frames: NDArray[np.float32]) -> Self:
+        """As they are, to be pooled: what stood still in a few frames may move in others."""
+        mean = frames.mean(axis=0, dtype=np.float64)
+        return cls(PRIOR_WEIGHT_FRAMES, mean, frames.var(axis=0, dtype=np.float64) + np.square(mean))
+
+    @classmethod
     def from_mean_std(cls, statistics: NDArray[np.floating]) -> Self:
         """From a map's stored mean and standard deviation, [2, d]."""
         mean, std = statistics.astype(np.float64)

@@ -11,7 +11,7 @@ landmarks and statistics know these frames. So a map that fails is broken, and o
 better on a day to come only a drive of another day can tell.
 """
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -22,7 +22,7 @@ from deepsimbad.core.drive import Drive
 from deepsimbad.core.map import UNKNOWN_FRAME, Map
 from deepsimbad.core.metrics import rank_of_truth
 from deepsimbad.core.retrieval import relevances
-from deepsimbad.core.route import Route, true_images_of
+from deepsimbad.core.route import Route, same_places, true_images_of
 from deepsimbad.engine.maps import load_snapshot
 from deepsimbad.errors import DamagedMapError, InvalidEncodingError, RetiredMapError, WeightsDifferError
 from deepsimbad.evaluators.base import Evaluator
@@ -61,13 +61,15 @@ class CheckFrames:
             withheld = np.arange(drive.n_frames)
         return cls(source, held_out, drive, drive.route(closed), asked, withheld)
 
-    def images_in(self, map_: Map, traverses: Collection[str]) -> NDArray[np.int64]:
-        """The images that a map, made of some traverses, has of the withheld frames."""
+    def images_in(self, map_: Map, config: Mapping[str, Any]) -> NDArray[np.int64]:
+        """The images that a map has of the withheld frames, by its configuration in the catalog."""
         digests = map_.frame_digest
         if digests is None:
             digests = np.full(map_.n_images, UNKNOWN_FRAME, np.uint64)
         is_withheld = np.isin(digests, self.drive.at(self.withheld).digests())
-        if self.source in traverses:
+        if not self.is_held_out and self.source in _fused_in(config):
+            is_withheld[same_places(self.route, map_.route, TOLERANCE_M)[:, 0]] = True
+        if self.source in traverses_in(config):
             at_their_places = np.isin(map_.position_m, self.drive.position_m[self.withheld])
             is_withheld |= (digests == UNKNOWN_FRAME) & at_their_places
         return np.flatnonzero(is_withheld)
@@ -98,14 +100,14 @@ def check_map(
     active = theirs = withheld = None
     why = "no map serves yet that the new one could be compared with" if serving is None else None
     configs = {"the new map": config}
-    own = frames.images_in(new, traverses_in(config))
+    own = frames.images_in(new, config)
     ranks = _normalised_ranks(new, frames, own, evaluator, lambda share: on_progress(share / 2))
     if serving is not None:
         try:
             active = load_snapshot(catalog, domain, serving)
             WeightsDifferError.check("a map", active.weights_sha256, "a frame", frames.drive.weights_sha256)
             configs[its_name.removesuffix(",")] = its_config = catalog.map(domain, serving).config
-            withheld = frames.images_in(active, traverses_in(its_config))
+            withheld = frames.images_in(active, its_config)
             theirs = _normalised_ranks(active, frames, withheld, evaluator, lambda share: on_progress(0.5 + share / 2))
         except (DamagedMapError, RetiredMapError):
             why = f"{its_name} is damaged and cannot be compared"
@@ -160,6 +162,11 @@ def check_map(
             if not frames.is_held_out and made_of.get("landmark_traverse") == frames.source
         ],
     }
+
+
+def _fused_in(config: Mapping[str, Any]) -> set[str]:
+    """The names of the traverses that were fused into a map's images."""
+    return {added["traverse"] for added in config.get("appended", ()) if added.get("fused")}
 
 
 def traverses_in(config: Mapping[str, Any]) -> set[str]:

@@ -23,6 +23,7 @@ from deepsimbad.core.nnql import NnqlConfig
 from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Relevance
 from deepsimbad.errors import InvalidEncodingError, InvalidMapConfigError, LostActivationError, WeightsDifferError
 from deepsimbad.evaluators.base import Evaluator
+from deepsimbad.jobs.append import KnownDrives, fuse
 from deepsimbad.jobs.build import EPISODES_A_MAP_IMAGE, build, measured, train_nnql
 from deepsimbad.jobs.check import CheckFrames, check_map, traverses_in
 from deepsimbad.jobs.progress import Progress
@@ -198,12 +199,14 @@ class _Inputs:
     # The drive that the map learns from beside its own: the landmark traverse, else what the active map was made of;
     # None where there is none of the same encoder, or where frames are appended
     second: Drive | None
+    known: KnownDrives | str | None  # what `base` is made of, or why nothing can be fused; None: nothing is appended
     check: Drive | None  # the drive that the new map is checked on; None: on frames of `training` that are held out
 
 
-# A map that is not yet sealed, its version unknown; its configuration as the catalog keeps it; and of its metrics
-# `training`, how its experience was learnt, and `second_season`, whether it learnt from one, both None where it did not
-_Draft: TypeAlias = tuple[Map, dict[str, Any], dict[str, Any]]
+# A map that is not yet sealed, its version unknown; the map to check in its place, which does not know frames that are
+# held out; its configuration as the catalog keeps it; and of its metrics `training`, how its experience was learnt,
+# `second_season`, whether it learnt from one, both None where it did not, and `fused`, what became of a drive appended
+_Draft: TypeAlias = tuple[Map, Map, dict[str, Any], dict[str, Any]]
 
 
 @dataclass(frozen=True)
@@ -222,21 +225,21 @@ class _Remap:
         config, progress = self.config, self.progress
         progress.stage("read frames")
         inputs = self._read()
-        if inputs.base is not None and config.append:
-            map_, record_config, learnt = self._appended(inputs, inputs.base)
-        else:
-            map_, record_config, learnt = self._mapped(inputs)
-        progress.stage("check")
         frames = CheckFrames.of(
             config.check_traverse or config.training_traverse,
             inputs.check or inputs.training,
             inputs.domain.closed,
             held_out=inputs.check is None,
         )
+        if inputs.base is not None and config.append:
+            map_, checked, record_config, learnt = self._appended(inputs, inputs.base, frames)
+        else:
+            map_, checked, record_config, learnt = self._mapped(inputs)
+        progress.stage("check")
         check = check_map(
             self.catalog,
             self.domain,
-            map_,
+            checked,
             record_config,
             frames,
             config.gate_margin,
@@ -282,7 +285,33 @@ class _Remap:
             self._check_encoder(config.check_traverse, check, training)
             check.route(record.closed)
         second = None if config.append else self._second_season(record, training, read)
-        return _Inputs(record, training, candidates, base, second, check)
+        known = self._known_drives(record, base, training, read) if config.append and base is not None else None
+        return _Inputs(record, training, candidates, base, second, known, check)
+
+    def _known_drives(
+        self, record: DomainRecord, base: Map, training: Drive, read: Callable[[str], Drive]
+    ) -> KnownDrives | str:
+        """What the active map is made of, as far as it is still here; else in a sentence why nothing can be fused."""
+        active = self.catalog.map(record.name, record.active_version or 0)
+        config, metrics = active.config, active.metrics
+        if base.relevance is not Relevance.COMPOSED:
+            return f"places are fused in maps for composed alone, and this one is for {base.relevance}"
+        first, landmarks = config["training_traverse"], config["landmark_traverse"]
+        names = {first: True}
+        if (metrics.get("second_season") or {}).get("accepted"):
+            names[landmarks] = True
+        names |= {added["traverse"]: added.get("fused", False) for added in config.get("appended", ())}
+        stored = Traverse.list(self.catalog.data_dir, record.name)
+        if gone := [name for name in names if name not in stored]:
+            return f"of the drives that the map is made of {gone[0] or 'those of another server'} are not stored here"
+        drives = [(read(name), agrees) for name, agrees in names.items()]
+        if any(drive.encoding_dim != training.encoding_dim for drive, _ in drives):
+            return "the drives that the map is made of come from another encoder by now"
+        candidates = drives[0][0] if metrics.get("landmarks") == TRAINING else None
+        if metrics.get("landmarks") == LANDMARK_TRAVERSE and landmarks in stored:
+            candidates = read(landmarks)
+        known = KnownDrives.of(base, drives, candidates)
+        return known or "the drives that the map is made of hold other frames by now"
 
     def _drive(self, name: str) -> Drive:
         with Traverse.open(self.catalog.data_dir, self.domain, name) as traverse:
@@ -382,10 +411,10 @@ class _Remap:
         )
         second_season = None if built.same_route is None else built.same_route.as_dict()
         source = TRAINING if landmarks is None else LANDMARK_TRAVERSE if inputs.base is None else ACTIVE_MAP
-        return map_, asked, {"landmarks": source, "training": learning, "second_season": second_season}
+        return map_, map_, asked, {"landmarks": source, "training": learning, "second_season": second_season}
 
-    def _appended(self, inputs: _Inputs, before: Map) -> _Draft:
-        """A copy of the active map with the training traverse among its images."""
+    def _appended(self, inputs: _Inputs, before: Map, frames: CheckFrames) -> _Draft:
+        """A copy of the active map with the training traverse fused into its images, or among them."""
         config, drive = self.config, inputs.training
         record = self.catalog.map(self.domain, inputs.domain.active_version or 0)
         self.progress.stage("describe")
@@ -399,9 +428,17 @@ class _Remap:
                 map_version=record.version,
             )
         _check_alike(before, config)
-        map_ = append_drive(before, measured(drive, before.landmark_model, self.evaluator, self.progress.update))
+        fused, verdict = None, {"accepted": False, "why": inputs.known}
+        if isinstance(inputs.known, KnownDrives):
+            fused, judged = fuse(before, inputs.known, drive, config.same_route)
+            verdict = judged.as_dict()
+        if fused is None:
+            map_ = append_drive(before, measured(drive, before.landmark_model, self.evaluator, self.progress.update))
+        else:
+            map_ = fused.map
         asked = config.as_dict()
         added = {"traverse": config.training_traverse, "n_frames": drive.n_frames, "to_version": record.version}
+        added["fused"] = fused is not None
         # The catalog's configuration: the file of an imported map names traverses of another server.
         config_after = {
             **record.config,
@@ -413,7 +450,9 @@ class _Remap:
         if weights_sha256 is not None:
             config_after["weights_sha256"] = weights_sha256
         learnt = {name: record.metrics.get(name) for name in ("landmarks", "training", "second_season")}
-        return replace(map_, config=config_after), config_after, learnt
+        learnt["fused"] = {**verdict, "n_new_images": map_.n_images - before.n_images}
+        checked = fused.without(frames.withheld) if fused is not None and frames.is_held_out else map_
+        return replace(map_, config=config_after), checked, config_after, learnt
 
 
 def refuse_known_traverse(config: Mapping[str, Any], version: int, name: str) -> None:

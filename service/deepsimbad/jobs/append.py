@@ -1,0 +1,184 @@
+"""A drive appended to a `composed` map of its route: places seen again become the mean of their seasons.
+
+The map is made anew at the same bits from the drives that it is made of, which must still be stored: its images and the
+candidates that are its landmarks stay, what a season changes is learnt from all of them, and so are the lists. What
+the map lacks becomes images of its own.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deepsimbad.core.building import MapPlan, composed_map, covers, with_frames
+from deepsimbad.core.composed import (
+    SECOND_SEASON_WEIGHT,
+    Moments,
+    compose,
+    described,
+    principal_directions,
+    unit,
+    within_place_whitening,
+)
+from deepsimbad.core.drive import Drive, SameRoute, SecondSeason, second_season
+from deepsimbad.core.map import Map
+from deepsimbad.core.rehearsal import rehearsed
+from deepsimbad.core.relevance import Relevance, most_strange
+from deepsimbad.core.route import same_places
+
+
+@dataclass(frozen=True)
+class KnownDrives:
+    """The drives that a map is made of."""
+
+    seasons: tuple[Drive, ...]  # whose frames are images, or fused into them; the first is the training traverse
+    agree: NDArray[np.bool_]  # which of them see the same at one place as the first
+    source: NDArray[np.int64]  # [n, 2] of every image, which of them and which frame of it
+    candidates: Drive | None  # that landmarks were chosen from; None: unknown
+
+    @classmethod
+    def of(cls, map_: Map, seasons: Sequence[tuple[Drive, bool]], candidates: Drive | None) -> Self | None:
+        """By the digests of the frames; None where some image's frame is in none of them."""
+        if map_.frame_digest is None:
+            return None
+        places = {
+            digest: (number, frame)
+            for number, (drive, _) in enumerate(seasons)
+            for frame, digest in enumerate(drive.digests().tolist())
+        }
+        source = [places.get(digest, (-1, -1)) for digest in map_.frame_digest.tolist()]
+        found = np.array(source, np.int64).reshape(-1, 2)
+        drives, agree = zip(*seasons, strict=True)
+        return None if (found < 0).any() else cls(drives, np.array(agree), found, candidates)
+
+    def fusable(self, places: NDArray[np.int64], number: int | None = None) -> NDArray[np.int64]:
+        """Those pairs (map image, frame) whose image is not of the same season, `number`, and agrees with it."""
+        season = self.source[places[:, 0], 0]
+        is_fusable = self.agree[season] & (number is None or self.agree[number]) & (season != number)
+        return np.asarray(places[is_fusable], np.int64)
+
+    def basis(self, map_: Map) -> tuple[NDArray[np.float32] | None, NDArray[np.float64] | None]:
+        """What encodings were projected by before a season's changes counted less, and by what they count less.
+
+        Returns:
+            [d, k], None where d = k; and P [k, k], None where the two cannot be told apart any more.
+        """
+        whole = map_.landmark_model.get("projection")
+        drives = {id(drive): drive.encodings for drive in (self.seasons[0], self.candidates) if drive is not None}
+        directions = principal_directions(*drives.values())
+        if directions is None or whole is None:
+            k = self.seasons[0].encoding_dim
+            return None, np.eye(k) if whole is None else np.asarray(whole, np.float64)
+        whitening = np.linalg.lstsq(directions.astype(np.float64), np.asarray(whole, np.float64), rcond=None)[0]
+        is_whole = np.allclose(directions @ whitening, whole, atol=1e-3 * float(np.abs(whole).max()))
+        return (directions, whitening) if is_whole else (whole, None)
+
+
+@dataclass(frozen=True)
+class Fused:
+    """A map with one drive more, and what it is checked by."""
+
+    map: Map
+    base: Map  # before new images
+    drive: Drive
+    new: NDArray[np.int64]  # frames that became images
+    new_lists: NDArray[np.uint16]
+    before: NDArray[np.float32]  # [n, k] sums over the earlier seasons
+    u: NDArray[np.float32]  # [m, k] of the drive
+    pairs: NDArray[np.int64]  # [p, 2] (map image, frame)
+
+    def without(self, withheld: NDArray[np.int64]) -> Map:
+        """The same map, had the drive's withheld frames not been fused."""
+        others = self.pairs[~np.isin(self.pairs[:, 1], withheld)]
+        lists = _lists(self.base, unit(self.before + _season(self.u, others, self.base.n_images)))
+        return _with_new(replace(self.base, lists=lists), self.drive, self.new, self.new_lists)
+
+
+def fuse(map_: Map, known: KnownDrives, drive: Drive, same_route: bool | None) -> tuple[Fused | None, SameRoute]:
+    """The map with a drive fused into it, None where that is not of the same route; and the verdict.
+
+    Args:
+        map_: A `composed` map.
+        same_route: False: it is said not to be; else its positions count along the map's route, and views decide.
+    """
+    basis, whitening = known.basis(map_)
+    seasons = (*known.seasons, drive)
+    rows = [described(season.encodings, Moments.of(season.encodings), basis) for season in seasons]
+    own_rows = np.stack([rows[season][frame] for season, frame in known.source.tolist()])
+    prototypes = np.asarray(map_.landmark_model["prototypes"], np.float32)
+    unknown = np.full(map_.n_images, np.nan)
+    own = Drive(
+        position_m=map_.position_m,
+        x_m=unknown if map_.x_m is None else map_.x_m,
+        y_m=unknown if map_.y_m is None else map_.y_m,
+        encodings=own_rows,
+        dissimilarities=_dissimilarities(own_rows, whitening, prototypes),
+    )
+    seen_now = replace(drive, dissimilarities=_dissimilarities(rows[-1], whitening, prototypes))
+    is_same = same_route is not False
+    season, _, verdict = second_season(own, map_.closed, drive, is_same, lambda _: seen_now)
+    if season is None:
+        return None, verdict
+
+    pairs = [
+        known.fusable(same_places(earlier.route(), map_.route), number) for number, earlier in enumerate(known.seasons)
+    ]
+    pairs.append(known.fusable(season.places))
+    plan = MapPlan(Relevance.COMPOSED, map_.list_length, tuple(map_.actions_m.tolist()), map_.closed, is_same)
+    if whitening is not None and covers(map_.position_m, np.concatenate(pairs)[:, 0]):
+        seen_rows = np.concatenate([row[places[:, 1]] for row, places in zip(rows, pairs, strict=True)])
+        learnt = within_place_whitening(seen_rows, own_rows[np.concatenate(pairs)[:, 0]])
+        prototypes = unit(prototypes @ np.linalg.solve(whitening, learnt.astype(np.float64)))
+        whitening = learnt.astype(np.float64)
+        projection: NDArray[np.float32] | None = np.asarray(learnt if basis is None else basis @ learnt, np.float32)
+    else:
+        projection = map_.landmark_model.get("projection")
+
+    u = [_units(row, whitening) for row in rows]
+    before = _units(own_rows, whitening)
+    for units, shared in zip(u[:-1], pairs[:-1], strict=True):
+        before = before + _season(units, shared, map_.n_images)
+    places = unit(before + _season(u[-1], pairs[-1], map_.n_images))
+    usual = Moments.of(*(other.encodings for other in seasons))
+    model = {**map_.landmark_model, "prototypes": prototypes, "usual": usual.mean_std()}
+    model |= {} if projection is None else {"projection": projection}
+    own_dissimilarities = _dissimilarities(own_rows, whitening, prototypes)
+    own = replace(own, dissimilarities=own_dissimilarities)
+    made = composed_map(plan, own, places, usual, model)
+    rehearsal = replace(made, lists=_lists(made, unit(before)))
+    season = SecondSeason(_dissimilarities(rows[-1], whitening, prototypes), pairs[-1])
+    arrays = {**made.arrays(), **rehearsed(rehearsal, own_dissimilarities, season)}
+    strangest = max(most_strange(seasons[0].encodings, other.encodings) for other in seasons[1:])
+    arrays["most_strange"] = np.array([strangest])
+    base = replace(map_, landmark_model=model, **arrays)
+    new = np.setdiff1d(np.arange(drive.n_frames), pairs[-1][:, 1])
+    new_lists = compose(u[-1][new], prototypes, map_.list_length)
+    longer = _with_new(base, drive, new, new_lists)
+    return Fused(longer, base, drive, new, new_lists, before, u[-1], pairs[-1]), verdict
+
+
+def _units(rows: NDArray[np.float32], whitening: NDArray[np.float64] | None) -> NDArray[np.float32]:
+    return rows if whitening is None else unit(rows @ whitening.astype(np.float32))
+
+
+def _dissimilarities(
+    rows: NDArray[np.float32], whitening: NDArray[np.float64] | None, prototypes: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    return np.asarray(np.clip(2 - 2 * _units(rows, whitening) @ prototypes.T, 0, 4), np.float32)
+
+
+def _season(u: NDArray[np.float32], places: NDArray[np.int64], n_images: int) -> NDArray[np.float32]:
+    """[n, k] what a season adds to every place: the direction of its frames there, weighted."""
+    seen = np.zeros((n_images, u.shape[1]), np.float32)
+    np.add.at(seen, places[:, 0], u[places[:, 1]])
+    return np.asarray(SECOND_SEASON_WEIGHT * unit(seen), np.float32)
+
+
+def _lists(map_: Map, places: NDArray[np.float32]) -> NDArray[np.uint16]:
+    return compose(places, np.asarray(map_.landmark_model["prototypes"], np.float32), map_.list_length)
+
+
+def _with_new(map_: Map, drive: Drive, new: NDArray[np.int64], lists: NDArray[np.uint16]) -> Map:
+    return with_frames(map_, drive.at(new), lists) if new.size else map_
