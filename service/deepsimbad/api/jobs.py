@@ -86,7 +86,11 @@ class RemapBody(JsonBody):
     ] = None
     append: Annotated[
         bool,
-        Field(strict=True, description="Add the traverse to a copy of the active map; landmark_traverse must be null."),
+        Field(
+            strict=True,
+            description="Add the traverse to a copy of the active map, whose places it saw again become the mean of their "
+            "seasons (composed; metrics.fused tells); landmark_traverse must be null.",
+        ),
     ] = False
     same_route: Annotated[
         Annotated[bool, Field(strict=True)] | None,
