@@ -88,8 +88,8 @@ class RemapBody(JsonBody):
         bool,
         Field(
             strict=True,
-            description="Add the traverse to a copy of the active map, whose places it saw again become the mean of their "
-            "seasons (composed; metrics.fused tells); landmark_traverse must be null.",
+            description="Add the traverse to a copy of the active map: of composed, places seen again become the mean "
+            "of their seasons (metrics.fused tells); landmark_traverse must be null.",
         ),
     ] = False
     same_route: Annotated[

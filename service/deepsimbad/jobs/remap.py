@@ -1,7 +1,7 @@
 """Remapping a domain: from stored traverses to a sealed, active map version (design section 5).
 
-A remap makes a map of its own, or appends a drive to a copy of the active one (`jobs.append`): no image is encoded again,
-and where nothing is fused none is described again, and what two seasons taught stays.
+A remap makes a map of its own, or appends a drive to a copy of the active one (`jobs.append`): no image is encoded
+again, and where nothing is fused none is described again, and what two seasons taught stays.
 """
 
 import math
@@ -63,8 +63,8 @@ class RemapConfig:
     # By how many percentage points of ANR the new map may be worse than the active one and still take over; None:
     # whatever it is
     gate_margin: float | None = None
-    # Fuse the training traverse into a copy of the active map, whose images, landmarks and experience stay, or add it to
-    # them; n_landmarks, list_length and relevance are the active map's
+    # Fuse the training traverse into a copy of the active map, whose images, landmarks and experience stay, or add it
+    # to them; n_landmarks, list_length and relevance are the active map's
     append: bool = False
     # Whether positions of the training traverse and of the second drive (the landmark traverse, else what the active
     # map was made of) are comparable; None: only where both know x, y
