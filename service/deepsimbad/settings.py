@@ -53,6 +53,8 @@ class Settings(BaseSettings):
     """Address to listen on."""
     port: Annotated[int, Field(ge=0, le=65535)] = 8000
     """Port to listen on; 0 takes a free one."""
+    root_path: Annotated[str, Field(pattern=r"^(/[A-Za-z0-9._~-]+)*$")] = ""
+    """Path below which a proxy shows the service, as `/simbad`: `Location` and `/docs` heed it."""
     allow_open: bool = False
     """Serve without keys on an address other machines can reach. Off: refuse to start."""
     require_keys: bool = False

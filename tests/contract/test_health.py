@@ -16,11 +16,50 @@ def test_health_readiness_and_documents(client):
     assert client.get("/healthz").json() == {"status": "alive"}
     assert client.get("/readyz").json() == {"status": "ready", "damaged_maps": []}
     assert client.get("/openapi.json").json()["openapi"].startswith("3.1")
-    for path in ("/healthz", "/readyz"):  # as load balancers ask
-        answer = client.head(path)
-        assert (answer.status_code, answer.headers["content-type"]) == (200, "application/json"), path
-    answer = client.head("/v1/domains")
-    assert (answer.status_code, answer.headers["allow"]) == (405, "GET")
+
+
+def test_head_is_answered_as_get_is_without_a_body(client):
+    job = client.services.catalog.create_job("ready", "remap", {"training_traverse": "drive"})  # one that waits
+    for path in (
+        *(
+            "/healthz",
+            "/readyz",
+            "/metrics",
+            "/docs",
+            "/openapi.json",
+            "/v1/domains",
+            "/v1/domains/ready",
+            "/v1/domains/x",
+        ),
+        *("/v1/admin/domains/ready/maps/1/file", "/v1/domains/ready/landmark-model", "/nowhere"),
+        "/v1/admin/domains/ready/traverses/drive/frames",
+    ):
+        head, got = client.head(path), client.get(path)
+        assert (head.status_code, head.content) == (got.status_code, b""), path
+        for name in ("content-type", "etag", "accept-ranges"):
+            assert head.headers.get(name) == got.headers.get(name), path
+    events = client.head(f"/v1/admin/jobs/{job.job_id}/events")
+    assert (events.status_code, events.headers["content-type"]) == (200, "text/event-stream; charset=utf-8")
+    assert client.head("/v1/domains/ready/localizations").status_code == 405
+    assert client.services.event_streams.n_taken == 0
+    assert client.delete(f"/v1/admin/jobs/{job.job_id}").status_code == 204
+
+
+def test_a_service_is_shown_below_a_path(tmp_path):
+    with service(tmp_path, root_path="/robots/simbad") as client:
+        client.make_ready_domain("below")
+        assert client.get("/openapi.json").json()["servers"] == [{"url": "/robots/simbad"}]
+        for given_on in ("", "/robots/simbad"):  # by proxies that take it away, and those that do not
+            assert client.get(f"{given_on}/v1/domains/below").status_code == 200
+            begun = client.post(f"{given_on}/v1/domains/below/sessions", json={})
+            assert begun.headers["location"] == f"/robots/simbad/v1/sessions/{begun.json()['session_id']}"
+            assert client.get(begun.headers["location"]).status_code == 200
+        job = client.post("/v1/admin/domains/below/remaps", json={"training_traverse": "drive"})
+        assert job.headers["location"] == f"/robots/simbad/v1/admin/jobs/{job.json()['job_id']}"
+        assert client.get("/robots/simbadly/v1/domains").status_code == 404
+        client.services.keys.by_id["k"] = None  # one was made: who has none is let nowhere
+        for path in ("/v1/domains", "/v1/admin/jobs"):
+            problem(client.get(f"/robots/simbad{path}"), 401, "unauthorized")
 
 
 def test_what_was_acknowledged_is_there_after_a_restart(tmp_path):

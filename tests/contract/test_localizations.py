@@ -68,6 +68,22 @@ def test_a_map_frames_own_encoding_is_found_again_and_unknown_coordinates_are_nu
     assert (top[3]["frame"], top[4]["frame"], best["frame"]) == (None, "4.png", f"{best['map_image']}.png")
 
 
+@pytest.mark.parametrize("kind", ["jpg", "pjpeg", "tif", "x-png", "X-TIFF"])
+def test_types_that_are_spelt_otherwise_are_taken_and_the_bytes_say_what_it_is(client, kind):
+    sent = {"content": encoded(picture(7)), "headers": {"Content-Type": f"image/{kind}"}}
+    answer = client.post("/v1/domains/seen/localizations", **sent)
+    assert answer.json()["retrieval"][0]["map_image"] == 7
+
+
+def test_a_byte_order_mark_before_json_is_passed_over(client):
+    path, body = "/v1/domains/ready/localizations", b'{"ranked_landmarks": [7, 3, 1]}'
+    plain, marked = (
+        client.post(path, content=mark + body, headers={"Content-Type": "application/json"}).json()
+        for mark in (b"", b"\xef\xbb\xbf")
+    )
+    assert marked["belief"] == plain["belief"]
+
+
 @pytest.mark.parametrize("kind", ["jpeg", "png", "tiff", "webp"])
 def test_images_of_all_types_are_found_again(client, kind):
     sent = {"content": encoded(picture(7), f".{kind}"), "headers": {"Content-Type": f"image/{kind}"}}

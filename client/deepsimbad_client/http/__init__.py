@@ -11,7 +11,7 @@ from enum import Enum
 from io import BytesIO
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypedDict, TypeVar, Unpack
+from typing import IO, TYPE_CHECKING, Any, Protocol, TypedDict, TypeVar, Unpack
 from urllib.parse import quote
 from uuid import uuid4
 
@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 Model = TypeVar("Model", bound=Answer)
-Image = bytes | bytearray | memoryview | str | PathLike[str]  # an encoded image, or the path of one
 Numbers = Iterable[Any]  # any sequence of numbers, numpy arrays among them
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
@@ -49,6 +48,19 @@ _SIGNATURES = {
     "image/tiff": rb"II[*+]\x00|MM\x00[*+]",
     "image/webp": rb"(?s:RIFF....WEBP)",
 }
+
+
+class Pixels(Protocol):
+    """An array of [height, width, 3] BGR or [height, width] grey, uint8."""
+
+    @property
+    def dtype(self) -> Any: ...  # noqa: D102
+    @property
+    def shape(self) -> tuple[int, ...]: ...  # noqa: D102
+
+
+Image = bytes | bytearray | memoryview | str | PathLike[str] | IO[bytes] | Pixels
+"""An encoded image, the path or the open file of one, or its pixels."""
 
 
 class Repeat(Enum):
@@ -154,7 +166,7 @@ def observation(image: Image | None = None, **view: Unpack[ViewForm]) -> Observa
         body = image_bytes(image)
         media_type = content_type or media_type_of(body)
         if media_type is None:
-            what = "the file" if isinstance(image, str | PathLike) else "the bytes"
+            what = "the file" if isinstance(image, str | PathLike) or hasattr(image, "read") else "the bytes"
             raise InvalidArgumentError(f"{what} given as image is not a JPEG, PNG, TIFF or WebP")
         return Observation(body, media_type)
     ((name, form),) = forms.items()
@@ -168,13 +180,31 @@ def observation(image: Image | None = None, **view: Unpack[ViewForm]) -> Observa
 
 
 def image_bytes(image: Image) -> bytes:
-    """The bytes of an encoded image, or of the file at a path; raises BrokenFrameError."""
-    if not isinstance(image, str | PathLike):
-        return bytes(image)
+    """An encoded image's bytes, a file's, or pixels as PNG; raises InvalidArgumentError, BrokenFrameError."""
+    content: Any = image
     try:
-        return Path(image).read_bytes()
+        if isinstance(image, str | PathLike):
+            content = Path(image).read_bytes()
+        elif hasattr(image, "read"):
+            content = image.read()
     except OSError as error:
-        raise BrokenFrameError(f"cannot read {image}: {error.strerror or error}") from error
+        raise BrokenFrameError(f"cannot read {image!s}: {error.strerror or error}") from error
+    if isinstance(content, bytes | bytearray | memoryview):
+        return bytes(content)
+    if not hasattr(content, "dtype"):
+        what = f"image is {type(image).__name__}" + (" that reads text" if isinstance(content, str) else "")
+        raise InvalidArgumentError(
+            f"{what}: give encoded bytes, a path, a file opened as binary, or an array of pixels"
+        )
+    has_pixels = content.ndim in {2, 3} and content.shape[2:] in {(), (3,)} and content.size
+    if not has_pixels or str(content.dtype) != "uint8":
+        shown = f"{list(content.shape)} {content.dtype}"
+        raise InvalidArgumentError(f"image is {shown}: pixels are [height, width, 3] BGR or [height, width], uint8")
+    try:
+        import cv2  # noqa: PLC0415 - the client alone must work without it
+    except ImportError as error:
+        raise MissingExtraError("pixels need OpenCV: pip install 'deep-simbad[replay]'") from error
+    return bytes(cv2.imencode(".png", content)[1].tobytes())
 
 
 def text_of(name: str) -> str:

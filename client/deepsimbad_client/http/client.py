@@ -254,7 +254,8 @@ class ClientCalls(Face, Generic[AnySession]):
     ) -> Localization:
         """Where one view probably is; give exactly one form of it.
 
-        `image` is an encoded one (JPEG, PNG, TIFF, WebP) or its path, sent as it is; the other forms are those of
+        `image` is an encoded one (JPEG, PNG, TIFF, WebP), its path or open file, sent as it is, or an array of pixels,
+        [height, width, 3] BGR or [height, width] grey, sent as PNG; the other forms are those of
         `ViewForm`. `shortlist` is the length of `retrieval` and `belief.top`. Raises UnknownDomainError,
         NoActiveMapError, LandmarkModelDiffersError (`ranked` was made with other landmarks than the map's),
         InvalidInputError.

@@ -14,8 +14,10 @@ from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Callable, 
 from contextlib import aclosing, asynccontextmanager, closing
 from dataclasses import dataclass
 from functools import wraps
+from ipaddress import ip_address
 from types import TracebackType
 from typing import Any, Concatenate, Generic, ParamSpec, Self, TypeVar, overload
+from urllib.request import getproxies, proxy_bypass
 
 import httpx2
 
@@ -68,7 +70,26 @@ def speaking_to(url: str | None, api_key: str | None, timeout: httpx2.Timeout) -
         if not (key.isascii() and key.isprintable()):
             raise InvalidArgumentError("the API key holds characters that no header can carry")
         headers["Authorization"] = f"Bearer {key}"
-    return {"base_url": url, "headers": headers, "timeout": timeout, "limits": _CONNECTIONS}
+    settings = {"base_url": url, "headers": headers, "timeout": timeout, "limits": _CONNECTIONS}
+    # A proxy of the environment does not lead to this machine.
+    return settings | ({"mounts": {f"all://{parsed.netloc.decode()}": None}} if _is_loopback(parsed.host) else {})
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return host == "localhost" or ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def _by_proxy(url: str) -> str:
+    """Words for the proxy of the environment that requests go through; "" where there is none."""
+    parsed = httpx2.URL(url)
+    if _is_loopback(parsed.host) or proxy_bypass(parsed.host):
+        return ""
+    proxies = getproxies()
+    proxy = proxies.get(parsed.scheme) or proxies.get("all")
+    return f" by the proxy {httpx2.URL(proxy).copy_with(userinfo=b'')} of the environment" if proxy else ""
 
 
 @dataclass(frozen=True)
@@ -215,7 +236,7 @@ class Wire:
 
     def attempts(self, call: Call) -> Attempts:
         """The tries of a call, none of them made yet."""
-        return Attempts(self._retry, call.repeat, f"{call} at {self.url}", self._jitter)
+        return Attempts(self._retry, call.repeat, f"{call} at {self.url}{_by_proxy(self.url)}", self._jitter)
 
     def request(self, call: Call) -> httpx2.Request:
         """A call as an HTTP request; raises InvalidArgumentError (the caller's id cannot name it)."""

@@ -101,7 +101,7 @@ def create_app(settings: Settings, run_job: RunJob | None = None) -> FastAPI:
     for part in _ROUTERS:
         app.include_router(part)
     install_problem_handlers(app, [route for part in _ROUTERS for route in part.routes if isinstance(route, Route)])
-    install_openapi(app)
+    install_openapi(app, settings.root_path)
     app.add_middleware(Door, settings=settings, keys=keys, metrics=metrics)
     return app
 
@@ -282,14 +282,12 @@ def _disk_faults(data_dir: Path) -> list[str]:
     return faults
 
 
-@router.head("/healthz", include_in_schema=False)
 @router.get("/healthz", responses=problems())
 async def healthz() -> Health:
     """The process lives; a supervisor restarts it where this stays unanswered."""
     return Health(status="alive")
 
 
-@router.head("/readyz", include_in_schema=False)
 @router.get("/readyz", responses=problems())
 async def readyz(running: Running) -> Readiness:
     """What serves is there: threads that work, a catalog and sessions that can be read and written, room on the disk.

@@ -12,6 +12,7 @@ from contextlib import ExitStack
 from functools import lru_cache
 from urllib.parse import urlsplit
 
+from anyio import CancelScope
 from starlette.middleware.cors import CORSMiddleware
 from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -99,6 +100,9 @@ class Door:
         if scope["type"] != "http":
             await self._routes(scope, receive, send)
             return
+        root = self.settings.root_path
+        if root and scope["path"].startswith(f"{root}/"):  # a proxy may give it on or take it away
+            scope["path"] = scope["path"].removeprefix(root)
         request = scope["door"] = _Request(self, scope, receive, send)
         self.metrics.request_began()
         try:
@@ -122,7 +126,22 @@ class Door:
         except DeepSimbadError as error:
             await error_response(scope, error)(scope, receive, send)
         else:
-            await self._routes(scope, receive, send)
+            await (self._head if scope["method"] == "HEAD" else self._routes)(scope, receive, send)
+
+    async def _head(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """What GET would answer, without its body: of a stream nothing is begun."""
+        with CancelScope() as until_begun:
+
+            async def begin(message: Message) -> None:
+                await send(message)
+                await send({"type": "http.response.body"})
+                until_begun.cancel()
+
+            scope["method"] = "GET"
+            try:
+                await self._routes(scope, receive, begin)
+            finally:
+                scope["method"] = "HEAD"
 
 
 class _Request:
@@ -227,7 +246,10 @@ class _Request:
         if message["type"] == "http.response.start":
             self._turn.close()
             self.status = message["status"]
-            message["headers"] = list({**self._own_headers, **dict(message.get("headers", ()))}.items())
+            headers = {**self._own_headers, **dict(message.get("headers", ()))}
+            if headers.get(b"location", b"").startswith(b"/"):
+                headers[b"location"] = self._door.settings.root_path.encode() + headers[b"location"]
+            message["headers"] = list(headers.items())
         await self._send(message)
 
     def end(self) -> None:

@@ -313,13 +313,17 @@ def declare(content: dict[str, Any]) -> dict[str, Any]:
     return {"requestBody": {"required": True, "content": described}}
 
 
-def install_openapi(app: FastAPI) -> None:
+def install_openapi(app: FastAPI, root_path: str) -> None:
     """Complete the document of `app` with the models that routes only refer to, and with what comes before routes."""
 
     def document() -> dict[str, Any]:
         if app.openapi_schema is None:
             app.openapi_schema = get_openapi(
-                title=app.title, version=app.version, description=app.description, routes=app.routes
+                title=app.title,
+                version=app.version,
+                description=app.description,
+                routes=app.routes,
+                servers=[{"url": root_path}] if root_path else None,
             )
             _complete(app.openapi_schema)
         return app.openapi_schema

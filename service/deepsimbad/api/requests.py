@@ -42,6 +42,13 @@ T = TypeVar("T")
 
 JSON = "application/json"
 BINARY = "application/octet-stream"
+# As programs spell types that have another name; what an image is its first bytes say anyway.
+_SPELT_OTHERWISE = {
+    **dict.fromkeys(("image/jpg", "image/pjpeg", "image/x-jpeg"), "image/jpeg"),
+    **dict.fromkeys(("image/tif", "image/x-tif", "image/x-tiff"), "image/tiff"),
+    "image/x-png": "image/png",
+}
+_BYTE_ORDER_MARK = b"\xef\xbb\xbf"  # some editors and PowerShell begin UTF-8 with it
 NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$"
 GREATEST_EXACT_INTEGER = 2**53 - 1
 GREATEST_ID = 2**31 - 1
@@ -332,6 +339,7 @@ def media_type_of(request: Request, allowed: tuple[str, ...]) -> str:
     """The body's media type, without parameters; raises UnsupportedMediaTypeError for none, or one not allowed."""
     header = request.headers.get("content-type")
     media_type = (header or "").partition(";")[0].strip().lower()
+    media_type = _SPELT_OTHERWISE.get(media_type, media_type)
     if media_type not in allowed:
         what = f"Content-Type {media_type[:100]!r} is not taken" if header else "the request has no Content-Type"
         raise UnsupportedMediaTypeError(f"{what}; send one of {', '.join(allowed)}", allowed=list(allowed))
@@ -368,7 +376,7 @@ def _parsed(body: bytes, kind: type[Body]) -> Body:
     if body.count(b",") >= MAX_NUMBERS:
         raise invalid_body(f"more than {MAX_NUMBERS} numbers", "too_many_numbers")
     try:
-        return kind.model_validate_json(body)
+        return kind.model_validate_json(body.removeprefix(_BYTE_ORDER_MARK))
     except ValidationError as error:
         findings = error.errors(include_url=False, include_context=False, include_input=False)
         raise invalid_request(findings, "body") from error

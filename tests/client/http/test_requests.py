@@ -5,15 +5,16 @@ import itertools
 import json
 import subprocess
 import sys
-from io import BytesIO
+from io import BytesIO, StringIO
 
+import cv2
 import httpx2
 import numpy as np
 import pydantic
 import pytest
 
 from deepsimbad import errors as service_errors
-from deepsimbad_client import Client, errors
+from deepsimbad_client import Client, RetryPolicy, errors
 from deepsimbad_client.errors import BY_CODE, BY_STATUS, InvalidArgumentError
 from deepsimbad_client.http import RETRIED_STATUSES, media_type_of, observation
 from deepsimbad_client.http.models import Job, Localization
@@ -60,6 +61,54 @@ def test_what_can_never_be_sent_is_refused_here(tmp_path):
             observation(**form)
     with pytest.raises(errors.BrokenFrameError, match=r"no\.jpg"):
         observation(tmp_path / "no.jpg")
+    wrong = {
+        "int": 3,
+        "reads text": StringIO("a"),
+        r"2, 2, 4": np.zeros((2, 2, 4), np.uint8),
+        "float64": np.zeros((2, 2)),
+    }
+    for says, image in wrong.items():
+        with pytest.raises(InvalidArgumentError, match=says):
+            observation(image)
+
+
+def test_an_image_may_be_bytes_a_path_an_open_file_or_pixels(tmp_path):
+    pixels = np.random.default_rng(0).integers(0, 255, (6, 8, 3), np.uint8)
+    body = cv2.imencode(".png", pixels)[1].tobytes()
+    path = tmp_path / "view.png"
+    path.write_bytes(body)
+    with path.open("rb") as file:
+        given = [
+            body,
+            bytearray(body),
+            memoryview(body),
+            path,
+            str(path),
+            BytesIO(body),
+            file,
+            pixels,
+            pixels[..., ::1],
+        ]
+        views = [observation(image) for image in given]
+    assert {(view.body, view.headers["Content-Type"]) for view in views} == {(body, "image/png")}
+    grey = observation(pixels[..., 0])
+    assert np.array_equal(cv2.imdecode(np.frombuffer(grey.body, np.uint8), cv2.IMREAD_UNCHANGED), pixels[..., 0])
+
+
+def test_a_proxy_is_not_asked_for_this_machine_and_named_for_others(monkeypatch):
+    monkeypatch.setenv("HTTP_PROXY", "http://user:geheim@127.0.0.1:9")
+    monkeypatch.setenv("http_proxy", "http://user:geheim@127.0.0.1:9")
+    monkeypatch.delenv("NO_PROXY", raising=False)
+    monkeypatch.delenv("no_proxy", raising=False)
+    for url, is_proxied in (
+        ("http://127.0.0.1:1", False),
+        ("http://localhost:1", False),
+        ("http://robots.invalid", True),
+    ):
+        with Client(url, retry=RetryPolicy(attempts=1)) as client, pytest.raises(errors.TransportError) as raised:
+            client.domains()
+        assert ("by the proxy http://127.0.0.1:9 of the environment" in str(raised.value)) == is_proxied
+        assert "geheim" not in str(raised.value)
 
 
 def test_media_type_of():
