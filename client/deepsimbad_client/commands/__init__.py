@@ -44,8 +44,8 @@ class LazyGroup(click.Group):
 def cli() -> None:
     """Send recordings to a Deep SIMBAD service, map them, and see how well it localizes.
 
-    SOURCE is nclt:ROOT/DATE, a folder of images in name order (with an optional positions.csv), or a .npy or .csv of
-    ready encodings; it may end in #START:STOP[:STEP], Python's slice of its frames.
+    SOURCE is nclt:ROOT/DATE, a folder of images in name order (with an optional positions.csv), rosbag:FILE[#topic], a
+    video, or a .npy or .csv of ready encodings; it may end in #START:STOP[:STEP], Python's slice of its frames.
     """
 
 

@@ -79,7 +79,7 @@ def upload(
 
     Interrupted, the same command goes on where it stopped.
     """
-    recording = opened(source, allow_missing, **reading)
+    recording = opened(source, allow_missing, closed=closed, **reading)
     _make_domain_if_missing(client, domain, recording, closed, evaluator, actions_m)
     with UploadBar(f"{recording.name} to {domain}/{traverse}", len(recording.frames)) as bar:
         report = upload_recording(

@@ -22,7 +22,6 @@ Image = NDArray[np.uint8]  # [height, width, 3] BGR
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", ".pgm", ".ppm"}) | HEIC_SUFFIXES
 TURNS = {0: None, 90: cv2.ROTATE_90_CLOCKWISE, 180: cv2.ROTATE_180, 270: cv2.ROTATE_90_COUNTERCLOCKWISE}
 
-_EARLY_SHARE = 0.02  # of a step, by which a frame may come before it is due
 _MAX_PIXELS = 1 << 30  # the picture is the caller's own
 
 
@@ -87,37 +86,6 @@ class Recording:
             return {"encoding": self.encodings[row]}
         image = self.image(self.frames[row], input_size)
         return {"image": image.body, "content_type": image.content_type}
-
-    def thinned(self, every_s: float | None, every_m: float | None) -> Self:
-        """The first frame of every so many seconds or metres, counted anew; with neither all of them.
-
-        Raises SourceError (both are given, one is not above 0, or the frames have no times).
-        """
-        every = every_s if every_m is None else every_m
-        if every is None:
-            return self
-        if (every_s is not None and every_m is not None) or not (math.isfinite(every) and every > 0):
-            raise SourceError("frames are taken every so many seconds (--every-s) or metres (--every-m), above 0")
-        at = [frame.position_m if every_m else (frame.timestamp_us or 0) / 1e6 for frame in self.frames]
-        if every_s is not None and any(frame.timestamp_us is None for frame in self.frames):
-            raise SourceError(f"{self.name} does not say when its frames were taken: --every-m goes by their positions")
-        steps = np.floor((np.array(at) - at[0]) / every + _EARLY_SHARE)  # a clock that trembles skips no frame
-        rows = np.flatnonzero(np.diff(steps, prepend=np.nan) != 0)
-        frames = tuple(dataclasses.replace(self.frames[row], index=index) for index, row in enumerate(rows.tolist()))
-        encodings = None if self.encodings is None else self.encodings[rows]
-        return dataclasses.replace(self, frames=frames, encodings=encodings)
-
-    def reversed(self) -> Self:
-        """The frames in the other order: positions that fell rise now; those that rose count from the other end."""
-        first_m, last_m = self.frames[0].position_m, self.frames[-1].position_m
-        frames = tuple(
-            dataclasses.replace(
-                frame, index=index, position_m=last_m - frame.position_m if last_m >= first_m else frame.position_m
-            )
-            for index, frame in enumerate(self.frames[::-1])
-        )
-        encodings = None if self.encodings is None else np.ascontiguousarray(self.encodings[::-1])
-        return dataclasses.replace(self, frames=frames, encodings=encodings)
 
     def sliced(self, part: slice) -> Self:
         """Python's slice of the frames, which keep their indices and positions; what was left out stays counted.

@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from deepsimbad_client.recordings import Recording
+from deepsimbad_client.recordings.cuts import one_turn
 from deepsimbad_client.recordings.left_out import MOST_LEFT_OUT, LeftOut, shown
 from deepsimbad_client.recordings.sources import open_source
 
@@ -72,12 +73,16 @@ def accounting(command: Command) -> Command:
     return missing(click.option("--verbose", is_flag=True, help="Name every frame that is left out.")(command))
 
 
-def opened(source: str, allow_missing: bool = True, **reading: Any) -> Recording:
-    """Open a SOURCE, telling on standard error what it was taken for. Raises SourceError, TooManyLeftOutError."""
+def opened(source: str, allow_missing: bool = True, *, closed: bool = False, **reading: Any) -> Recording:
+    """Open a SOURCE, one turn of a closed route, telling on standard error what it was taken for.
+
+    Raises SourceError, TooManyLeftOutError.
+    """
     console = Console(stderr=True)
     with Progress(console=console, transient=True, disable=not console.is_terminal) as bars:
         task = bars.add_task(f"open {source}", total=1.0)
         recording = open_source(source, on_progress=lambda share: bars.update(task, completed=share), **reading)
+    recording = one_turn(recording) if closed else recording
     tell_remarks(recording)
     LeftOut(recording, allow_missing=allow_missing)
     return recording

@@ -23,6 +23,7 @@ from typing import Any
 from deepsimbad_client.errors import SourceError
 from deepsimbad_client.recordings import TURNS, Recording
 from deepsimbad_client.recordings.bag import BAG_PREFIX, BAG_SUFFIXES, METADATA, read_bag
+from deepsimbad_client.recordings.cuts import check_one_drive, thinned, turned_back
 from deepsimbad_client.recordings.encodings import ENCODING_SUFFIXES, read_encodings
 from deepsimbad_client.recordings.folder import read_folder
 from deepsimbad_client.recordings.nclt import FRONT_CAMERA, read_nclt
@@ -75,14 +76,16 @@ def open_source(
     recording = _open_whole(place, how)
     first, last = recording.frames[0], recording.frames[-1]
     if reverse:
-        recording = recording.reversed()
+        recording = turned_back(recording)
     elif last.position_m < first.position_m:
         raise SourceError(
             f"{place}: positions fall along the drive, from {first.position_m:g} m ({first.name}) to "
             f"{last.position_m:g} m ({last.name}), and a route's rise: --reverse takes the frames in the other order"
         )
-    recording = recording.thinned(every_s, every_m)
-    return recording if part is None else recording.sliced(part)
+    recording = thinned(recording, every_s, every_m)
+    recording = recording if part is None else recording.sliced(part)
+    check_one_drive(recording)
+    return recording
 
 
 @dataclass(frozen=True)

@@ -104,8 +104,8 @@ def map_(
 
     Landmarks are chosen from that drive, else from the recording itself.
 
-    SOURCE is nclt:ROOT/DATE, a folder of images (with an optional positions.csv) or a .npy or .csv of ready
-    encodings; each may end in #START:STOP[:STEP].
+    SOURCE is nclt:ROOT/DATE, a folder of images (with an optional positions.csv), rosbag:FILE[#topic], a video, or a
+    .npy or .csv of ready encodings; each may end in #START:STOP[:STEP].
     """
     config = RemapConfig(
         training_traverse="training",
@@ -118,7 +118,7 @@ def map_(
     measure = make_evaluator(evaluator, settings.compute())
     # A mistake in what was typed should cost no minutes of encoding, and leave no domain behind.
     sources = {"training": training} if landmarks is None else {"landmarks": landmarks, "training": training}
-    recordings = {role: opened(source, allow_missing, **reading) for role, source in sources.items()}
+    recordings = {role: opened(source, allow_missing, closed=closed, **reading) for role, source in sources.items()}
     left_out = {}
     fitting_number(config.n_landmarks, len(recordings[next(iter(sources))].frames), DEFAULT_N_LANDMARKS)
     with Catalog.open(settings.data_dir) as catalog:

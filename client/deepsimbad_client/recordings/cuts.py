@@ -1,0 +1,98 @@
+"""Which frames of a recording are taken, and in which order: every few, from the other end, one turn, one drive."""
+
+import dataclasses
+import math
+
+import numpy as np
+
+from deepsimbad_client.errors import SourceError
+from deepsimbad_client.recordings import Recording
+
+EARLY_SHARE = 0.02  # of a step, by which a frame may come before it is due
+FEWEST_OF_A_TURN, NEAR_START_M = 10, 1.0
+LONGEST_PAUSE_S, SAME_PLACE_M = 3600.0, 10.0  # of one drive, unless the robot goes on where it stood
+
+
+def thinned(recording: Recording, every_s: float | None, every_m: float | None) -> Recording:
+    """The first frame of every so many seconds or metres, counted anew; with neither all of them.
+
+    Raises SourceError (both are given, one is not above 0, or the frames have no times).
+    """
+    every = every_s if every_m is None else every_m
+    if every is None:
+        return recording
+    if (every_s is not None and every_m is not None) or not (math.isfinite(every) and every > 0):
+        raise SourceError("frames are taken every so many seconds (--every-s) or metres (--every-m), above 0")
+    at = [frame.position_m if every_m else (frame.timestamp_us or 0) / 1e6 for frame in recording.frames]
+    if every_s is not None and any(frame.timestamp_us is None for frame in recording.frames):
+        raise SourceError(
+            f"{recording.name} does not say when its frames were taken: --every-m goes by their positions"
+        )
+    steps = np.floor((np.array(at) - at[0]) / every + EARLY_SHARE)  # a clock that trembles skips no frame
+    rows = np.flatnonzero(np.diff(steps, prepend=np.nan) != 0)
+    frames = tuple(dataclasses.replace(recording.frames[row], index=index) for index, row in enumerate(rows.tolist()))
+    encodings = None if recording.encodings is None else recording.encodings[rows]
+    return dataclasses.replace(recording, frames=frames, encodings=encodings)
+
+
+def one_turn(recording: Recording) -> Recording:
+    """Of a drive along a closed route: without what comes after it reached its start again.
+
+    Told by x, y: near the first frame within two usual steps, in its direction. What is not known stays.
+    """
+    places = [(frame.x_m, frame.y_m) for frame in recording.frames if frame.x_m is not None and frame.y_m is not None]
+    if len(places) < max(len(recording.frames), FEWEST_OF_A_TURN):
+        return recording
+    x_m, y_m = np.array(places, np.float64).T
+    steps = np.hypot(np.diff(x_m), np.diff(y_m))
+    near_m = max(NEAR_START_M, 2 * float(np.median(steps[steps > 0]))) if (steps > 0).any() else NEAR_START_M
+    away_m = np.hypot(x_m - x_m[0], y_m - y_m[0])
+    left = int(np.argmax(away_m > 3 * near_m))
+    ahead_x, ahead_y = x_m[left] - x_m[0], y_m[left] - y_m[0]
+    onwards = np.gradient(x_m) * ahead_x + np.gradient(y_m) * ahead_y >= 0
+    back = np.flatnonzero((np.arange(len(x_m)) > left) & (away_m <= near_m) & onwards)
+    if not left or not len(back):
+        return recording
+    visit = back[: int(np.argmax(np.diff(back, append=len(x_m) + 2) > 1)) + 1]
+    end = int(visit[np.argmin(away_m[visit])]) + 1
+    if end == len(recording.frames):
+        return recording
+    said = (
+        f"the start is reached again at {recording.frames[end - 1].name}: {len(recording.frames) - end} frames of a "
+        "second turn are not used"
+    )
+    return dataclasses.replace(recording.sliced(slice(0, end)), remarks=[*recording.remarks, said])
+
+
+def turned_back(recording: Recording) -> Recording:
+    """The frames in the other order: positions that fell rise now; those that rose count from the other end."""
+    first_m, last_m = recording.frames[0].position_m, recording.frames[-1].position_m
+    frames = tuple(
+        dataclasses.replace(
+            frame, index=index, position_m=last_m - frame.position_m if last_m >= first_m else frame.position_m
+        )
+        for index, frame in enumerate(recording.frames[::-1])
+    )
+    encodings = None if recording.encodings is None else np.ascontiguousarray(recording.encodings[::-1])
+    return dataclasses.replace(recording, frames=frames, encodings=encodings)
+
+
+def check_one_drive(recording: Recording) -> None:
+    """Refuse what was recorded in several goes, elsewhere each: the way between was not recorded, nor is its length."""
+    frames = recording.frames
+    times = [frame.timestamp_us for frame in frames if frame.timestamp_us is not None]
+    if len(times) < len(frames) or len(times) < 3:
+        return
+    pauses_s = np.abs(np.diff(np.array(times, np.int64))) / 1e6
+    longest = int(np.argmax(pauses_s))
+    if pauses_s[longest] < max(LONGEST_PAUSE_S, 100 * float(np.median(pauses_s))):
+        return
+    before, after = frames[longest : longest + 2]
+    if None not in (before.x_m, before.y_m, after.x_m, after.y_m):
+        apart_m = math.dist((before.x_m or 0, before.y_m or 0), (after.x_m or 0, after.y_m or 0))
+        if apart_m <= SAME_PLACE_M:
+            return
+    raise SourceError(
+        f"{recording.name}: between {before.name} and {after.name} pass {pauses_s[longest] / 3600:.1f} hours: these "
+        f"are several drives. Name one of them by a slice (#:{longest + 1} or #{longest + 1}:), or move them apart"
+    )

@@ -1,0 +1,58 @@
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from deepsimbad_client.errors import SourceError
+from deepsimbad_client.recordings import Frame, Recording
+from deepsimbad_client.recordings.cuts import check_one_drive, one_turn
+
+
+def loop(n, noise_m=0.0):
+    """A circle of 100 m, a frame a metre."""
+    radius = 100 / (2 * math.pi)
+    noise = np.random.default_rng(0).normal(0, noise_m, (n, 2))
+    return Recording(
+        "loop",
+        tuple(
+            Frame(k, str(k), float(k), k, radius * math.cos(k / radius) + dx, radius * math.sin(k / radius) + dy)
+            for k, (dx, dy) in enumerate(noise)
+        ),
+    )
+
+
+@pytest.mark.parametrize(("n", "kept"), [(95, 95), (101, 101), (125, 101), (330, 101)])
+def test_a_closed_route_is_driven_once(n, kept):
+    once = one_turn(loop(n))
+    assert len(once.frames) == kept
+    assert bool(once.remarks) == (kept < n)
+    assert abs(len(one_turn(loop(n, noise_m=0.2)).frames) - kept) <= 2
+    assert once.left_out == {}
+    assert once.n_whole == n
+
+
+def test_a_way_back_through_the_start_is_no_turn():
+    there = [Frame(k, str(k), float(k), None, float(x), 0.0) for k, x in enumerate([*range(40), *range(40, -40, -1)])]
+    assert len(one_turn(Recording("r", there)).frames) == 120
+    unknown = [dataclasses.replace(frame, x_m=None) for frame in loop(130).frames]
+    assert len(one_turn(Recording("r", unknown)).frames) == 130
+
+
+def paused(hours, apart_m):
+    pause_us = int(hours * 3600e6)
+    return Recording(
+        "r",
+        [
+            Frame(k, f"{k}.png", float(k), 200_000 * k + pause_us * (k >= 40), k + apart_m * (k >= 40), 0.0)
+            for k in range(60)
+        ],
+    )
+
+
+def test_several_drives_in_one_recording_are_refused_and_a_rest_is_not():
+    with pytest.raises(SourceError, match=r"between 39\.png and 40\.png pass 24\.0 hours.*#:40 or #40:"):
+        check_one_drive(paused(24, 300))
+    for hours, apart_m in ((0.5, 300), (24, 3)):
+        check_one_drive(paused(hours, apart_m))
+    check_one_drive(paused(24, 300).sliced(slice(40, None)))
