@@ -136,7 +136,7 @@ def run_vpr(
         worth = _worth_of_views(test.drive)
         scores[name.value] = _score(built[name].map, views, true_images, live, worth, progress.update)
         if name is Relevance.COMPOSED:
-            scores[BRUTE_FORCE_U] = _score_by_all(built[name], test.drive, true_images, config.stateless)
+            scores[BRUTE_FORCE_U] = score_by_all(built[name], test.drive, true_images, config.stateless)
     passive: PassiveScores | None = None
     if _is_driven(config):
         progress.stage("drive")
@@ -197,9 +197,10 @@ def _score(
     return scorer.result()
 
 
-def _score_by_all(
+def score_by_all(
     built: Built, test: Drive, true_images: Sequence[NDArray[np.int64]], stateless: bool
 ) -> RetrievalScores:
+    """What unit vectors of places, `built.places`, score: those that lists stand for, or what else restores them."""
     scorer = RetrievalScorer()
     for relevance, truth in zip(relevances_by_all(built, test, stateless), true_images, strict=True):
         scorer.add(relevance, truth)

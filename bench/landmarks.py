@@ -1,0 +1,245 @@
+"""How many landmarks, chosen how: accuracy over r, time over length of route; and what else was tried for lists.
+
+    python -m bench.landmarks
+
+What is tried is chosen by the rehearsal alone, in which the landmark drive is driven through lists of the training
+drive without a place's own landmark; the test drive is then judged once.
+"""
+
+import itertools
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from unittest.mock import patch
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.common import duration, machine, markdown, real_recordings, timed, write_page
+from bench.netvlad import LIST_LENGTH
+from bench.quantised import composed_places, k_means, netvlad_drives, row_of, scored
+from deepsimbad.core import composed
+from deepsimbad.core.building import Built, MapPlan, compose_map
+from deepsimbad.core.composed import Moments, compose, described, unit
+from deepsimbad.core.drive import Drive
+from deepsimbad.core.landmark_model import farthest_first, select_landmarks
+from deepsimbad.core.metrics import RetrievalScorer, RetrievalScores
+from deepsimbad.core.relevance import Relevance
+from deepsimbad.core.route import true_images_of
+from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
+from deepsimbad.jobs.build import encode_recording
+from deepsimbad_client.recordings.sources import open_source
+
+_MAX_PIXELS = 10_000_000
+_NUMBERS = (37, 75, 150, 300)  # r: a sixteenth of the NetVLAD places, an eighth, a quarter, a half
+_LENGTHS = (1_000, 5_000, 26_208)  # map images
+_N_LANDMARKS = 500
+Rule = Callable[[NDArray[np.float32], int], NDArray[np.int64]]
+Lists = Callable[[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_] | None], NDArray[np.uint16]]
+
+
+def medoids(u: NDArray[np.float32], n_landmarks: int) -> NDArray[np.int64]:
+    """[r] the rows nearest to the centres of k-means of unit vectors, none twice."""
+    centres, taken = unit(k_means(u, n_landmarks)), np.zeros(len(u), bool)
+    chosen = []
+    for products in centres @ u.T:
+        products[taken] = -2.0
+        chosen.append(int(products.argmax()))
+        taken[chosen[-1]] = True
+    return np.array(chosen, np.int64)
+
+
+RULES: dict[str, Rule] = {
+    "farthest first (default)": farthest_first,
+    "medoids of k-means": medoids,
+    "the paper's (II-B)": select_landmarks,
+}
+
+
+@dataclass(frozen=True)
+class Case:
+    """A map to make and a drive to judge it by."""
+
+    training: Drive
+    test: Drive
+    second: Drive | None = None  # of the same route, and the landmark drive; None: the training drive gives them
+
+    def built(self, r: int) -> Built:
+        """By the default."""
+        plan = MapPlan(Relevance.COMPOSED, LIST_LENGTH, (1.0,), same_route=self.second is not None)
+        return compose_map(plan, self.training, self.second, self.second, r)
+
+    def landmarks(self, built: Built, rule: Rule, r: int) -> NDArray[np.float32]:
+        """[r, k] chosen by a rule, where the map is described."""
+        candidates = self.second or self.training
+        projection = built.map.landmark_model.get("projection")
+        u = described(candidates.encodings, Moments.of(candidates.encodings), projection)
+        return u[rule(u, r)]
+
+
+def cases() -> dict[str, list[Case]]:
+    """By name: real recordings, and how they are used."""
+    drives = netvlad_drives()
+    folder, evaluator = real_recordings(), make_evaluator(evaluator_config({"kind": "feature_l2"}))
+
+    def encoded(source: str) -> Drive:
+        return encode_recording(open_source(str(folder / source)), evaluator, _MAX_PIXELS, lambda _: None).drive
+
+    query, reference = encoded("corridor/query"), encoded("corridor/ref")
+    summer, winter = encoded("nordland/summer#0:600"), encoded("nordland/winter#0:600")
+    return {
+        "NetVLAD, two seasons": [Case(m, t, second) for second, m, t in itertools.permutations(drives.values())],
+        "NetVLAD, one season": [Case(m, t) for m, t in itertools.permutations(drives.values(), 2)],
+        "Nordland images, one season": [Case(summer, winter), Case(winter, summer)],
+        "corridor, one season": [Case(reference, query), Case(query, reference)],
+    }
+
+
+def accuracy(named: dict[str, list[Case]]) -> Iterator[str]:
+    """ANR and R@1 by set, rule and r; r is cut to the number of frames."""
+    rows = []
+    for name, of in named.items():
+        scores: dict[str, list[list[RetrievalScores]]] = {rule: [] for rule in RULES}
+        for r in _NUMBERS:
+            for per_rule in scores.values():
+                per_rule.append([])
+            for case in of:
+                n_landmarks = min(r, case.training.n_frames)
+                built = case.built(n_landmarks)
+                for rule, choose in RULES.items():
+                    landmarks = case.landmarks(built, choose, n_landmarks)
+                    restored = composed_places(compose(built.places, landmarks, LIST_LENGTH), landmarks)
+                    scores[rule][-1].append(scored(built, restored, case.test))
+        for rule, by_r in scores.items():
+            cells = (row_of(each) for each in by_r)
+            rows.append([name, rule, *(f"{anr} / {recall}" for anr, recall, _ in cells)])
+    return markdown(("set", "landmarks by", *(f"r = {r}" for r in _NUMBERS)), rows)
+
+
+def times() -> Iterator[str]:
+    """Seconds to choose 500 landmarks and to compose all lists, on made-up drives in which neighbours are alike."""
+    rows = []
+    for n in _LENGTHS:
+        steps = np.random.default_rng(0).normal(size=(n, composed.MOST_DIMENSIONS)).astype(np.float32)
+        u = unit(steps + np.roll(steps, 1, axis=0) + np.roll(steps, 2, axis=0))
+        chosen = [timed(lambda rule=rule, u=u: rule(u, _N_LANDMARKS), 1, 0) for rule in RULES.values()]
+        landmarks = u[farthest_first(u, _N_LANDMARKS)]
+        composing = timed(lambda u=u, landmarks=landmarks: compose(u, landmarks, LIST_LENGTH), 1, 0)
+        rows.append([f"{n:,}", *(duration(each.median_s) for each in (*chosen, composing))])
+    return markdown(("map images", *RULES, "all lists"), rows)
+
+
+def by_beam(
+    places: NDArray[np.float32], landmarks: NDArray[np.float32], barred: NDArray[np.bool_] | None
+) -> NDArray[np.uint16]:
+    """[h, n] as they ship."""
+    return compose(places, landmarks, LIST_LENGTH, barred)
+
+
+def greedy(
+    places: NDArray[np.float32], landmarks: NDArray[np.float32], barred: NDArray[np.bool_] | None
+) -> NDArray[np.uint16]:
+    """[h, n] the landmark that brings the sum nearest, one after the other: a beam of one."""
+    products, gram, rows = places @ landmarks.T, landmarks @ landmarks.T, np.arange(len(places))
+    excluded = np.zeros(products.shape, bool) if barred is None else barred.copy()
+    along, squares, cross, lists = np.zeros(len(places)), np.zeros(len(places)), np.zeros(products.shape), []
+    for weight in composed.list_weights(LIST_LENGTH):
+        cosine = (along[:, np.newaxis] + weight * products) / np.sqrt(
+            np.maximum(squares[:, np.newaxis] + weight * (2 * cross + weight), 1e-9)
+        )
+        cosine[excluded] = -np.inf
+        lists.append(ids := cosine.argmax(axis=1))
+        along += weight * products[rows, ids]
+        squares += weight * (2 * cross[rows, ids] + weight)
+        cross += weight * gram[ids]
+        excluded[rows, ids] = True
+    return np.array(lists, np.uint16)
+
+
+def smoothed(
+    places: NDArray[np.float32], landmarks: NDArray[np.float32], barred: NDArray[np.bool_] | None
+) -> NDArray[np.uint16]:
+    """[h, n] of places that are the mean of themselves and, at a quarter, their neighbours along the route."""
+    beside = np.concatenate([places[:1], places, places[-1:]])
+    return by_beam(unit(places + 0.25 * (beside[:-2] + beside[2:])), landmarks, barred)
+
+
+WEIGHTS = [tuple(share**place for place in range(LIST_LENGTH)) for share in (0.5, 0.6, 0.7, 0.8, 0.9, 1.0)]
+
+
+def tried(of: Sequence[Case], r: int) -> Iterator[str]:
+    """Other ways to make lists, by rehearsal and on the test drives."""
+    ways: dict[str, tuple[tuple[float, ...], Lists]] = {
+        "beam of 8 (default)": (composed.WEIGHTS, by_beam),
+        "greedy, beam of 1": (composed.WEIGHTS, greedy),
+        "smoothed along the route": (composed.WEIGHTS, smoothed),
+        **{f"weights {', '.join(f'{weight:.2f}' for weight in weights)}": (weights, by_beam) for weights in WEIGHTS},
+    }
+    rehearsals: dict[str, list[RetrievalScores]] = {name: [] for name in ways}
+    tests: dict[str, list[RetrievalScores]] = {name: [] for name in ways}
+    for case in of:
+        built = case.built(r)
+        landmarks = case.landmarks(built, farthest_first, r)
+        for name, (weights, lists) in ways.items():
+            frozen = np.array(weights, np.float32)
+            with patch.object(composed, "list_weights", lambda _, frozen=frozen: frozen):
+                rehearsals[name].append(rehearsed(case, built, landmarks, frozen, lists))
+                restored = weighted(lists(built.places, landmarks, None), landmarks, frozen)
+            tests[name].append(scored(built, restored, case.test))
+    rows = [[name, *row_of(rehearsals[name]), *row_of(tests[name])] for name in ways]
+    titles = (f"{where}: {what}" for where in ("rehearsal", "test") for what in ("ANR %", "R@1 %", "worst"))
+    return markdown(("lists by", *titles), rows)
+
+
+def weighted(
+    lists: NDArray[np.uint16], landmarks: NDArray[np.float32], weights: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """[n, k] directions of the sums of lists with these weights."""
+    return unit(np.einsum("h,hnk->nk", weights, landmarks[lists]))
+
+
+def rehearsed(
+    case: Case, built: Built, landmarks: NDArray[np.float32], weights: NDArray[np.float32], lists: Lists
+) -> RetrievalScores:
+    """The landmark drive against lists of the training drive alone, its own places' landmarks barred."""
+    projection = built.map.landmark_model.get("projection")
+    views, own = (
+        described(each.encodings, Moments.of(each.encodings), projection) for each in (case.second, case.training)
+    )
+    from_m = case.second.position_m[(landmarks @ views.T).argmax(axis=1)]
+    barred = np.abs(case.training.position_m[:, np.newaxis] - from_m) <= 2.0
+    restored, scorer = weighted(lists(own, landmarks, barred), landmarks, weights), RetrievalScorer()
+    for view, truth in zip(views, true_images_of(case.second.route(), case.training.route(), 2.0), strict=True):
+        scorer.add(restored @ view, truth)
+    return scorer.result()
+
+
+def report() -> Iterator[str]:
+    """The lines of the page."""
+    named = cases()
+    yield "# Landmarks: how many, chosen how"
+    yield ""
+    yield (
+        "h = 4, one session over the test drive, tolerance 2 m, every order of the drives. Images (the corridor, and "
+        "600 places of Nordland) are encoded by the default extractor. One season: landmarks from the map's own drive."
+    )
+    yield from ("", "Made by `python -m bench.landmarks`.", "", machine())
+    yield from ("", "## Accuracy", "", "ANR / R@1, percent.", "")
+    yield from accuracy(named)
+    yield from ("", f"## Time to choose {_N_LANDMARKS}, made-up encodings of {composed.MOST_DIMENSIONS} numbers", "")
+    yield from times()
+    yield from ("", "## What was tried for lists", "")
+    yield (
+        "NetVLAD, two seasons, r = 300. Rehearsal: the landmark drive against lists of the training drive alone, by "
+        "which a way may be chosen; test: what it comes to, looked at once."
+    )
+    yield ""
+    yield from tried(named["NetVLAD, two seasons"], 300)
+
+
+def main() -> None:
+    """Measure, print, write `docs/results/landmarks.md`."""
+    write_page("landmarks.md", report())
+
+
+if __name__ == "__main__":
+    main()
