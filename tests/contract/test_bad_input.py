@@ -349,11 +349,12 @@ def test_remaps_that_fail_leave_the_map_that_serves(client):
         ({"training_traverse": "backwards"}, "invalid_route"),
         ({"training_traverse": "empty"}, None),
         ({"training_traverse": "drive", "list_length": N_LANDMARKS + 1}, "invalid_map_config"),
-        ({**REMAP, "landmark_traverse": "drive", "n_landmarks": N_READY + 1}, "too_few_candidates"),
     ):
         job = client.remap("ready", **config)
         assert job["state"] == "failed"
         assert code is None or job["error"]["code"] == code
+    too_many = {**REMAP, "landmark_traverse": "drive", "n_landmarks": N_READY + 1}
+    assert problem(client.post(f"{ADMIN}/remaps", json=too_many), 422, "too_few_candidates")["n_candidates"] == N_READY
     assert client.get(READY).json()["map_version"] == 1
     client.post("/v1/admin/domains/unmapped/traverses", json={"name": "drive"})
     appended = client.post("/v1/admin/domains/unmapped/remaps", json={**REMAP, "append": True})
@@ -449,12 +450,11 @@ def test_a_number_that_stands_still_in_a_season_says_nothing(mapped, still):
 @pytest.mark.parametrize(
     ("n_frames", "options", "code", "says"),
     [
-        (PLACES, {"n_landmarks": PLACES + 1}, "too_few_candidates", "ask for fewer landmarks or drive further"),
         (3, {}, "invalid_map_config", "list_length 4"),
         (1, {}, "invalid_map_config", "list_length 4"),
     ],
 )
-def test_fewer_frames_than_landmarks_are_named(mapped, n_frames, options, code, says):
+def test_fewer_frames_than_a_list_takes_are_named(mapped, n_frames, options, code, says):
     job, _ = mapped(season(1, n_frames), **options)
     assert (job["state"], job["error"]["code"]) == ("failed", code)
     assert says in job["error"]["detail"]

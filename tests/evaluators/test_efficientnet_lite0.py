@@ -116,7 +116,7 @@ def test_a_batch_changes_nothing_that_counts():
     one = make_extractor("efficientnet_lite0", Compute(runtime=Runtime.TORCH, largest_batch=1)).encode(images)
     many = make_extractor("efficientnet_lite0", Compute(runtime=Runtime.TORCH, largest_batch=4)).encode(images)
     assert np.abs(one - many).max() < 1e-3
-    assert (np.einsum("nd,nd->n", one, many) > 1 - 1e-6).all()
+    assert (np.einsum("nd,nd->n", one, many) > 1 - 1e-4).all(), "as near as halved precision allows"
 
 
 def test_cuda_that_is_not_there_is_said(monkeypatch):

@@ -20,7 +20,7 @@ def driven(evaluator):
     place = rng.normal(size=(N, 12))
     seen = np.repeat(np.arange(0, N, 3), 2)  # every third place and the middle of the next two
     mixed = np.where(np.arange(seen.size)[:, np.newaxis] % 2, (place[seen + 1] + place[seen + 2]) / 2, place[seen])
-    test = drive_of(mixed + 1.5 * rng.normal(size=mixed.shape), 1.5)
+    test = drive_of(mixed + rng.normal(size=mixed.shape), 1.5)
     map_ = compose_map(MapPlan(Relevance.COMPOSED, 4, (1.0, 2.0)), drive_of(place, 1.0), None, None, 40).map
     views = views_of(measured(test, map_.landmark_model, evaluator))
     truth = [np.flatnonzero(np.abs(map_.position_m - at_m) <= 1.0) for at_m in test.position_m]
@@ -80,7 +80,7 @@ def test_a_belief_of_one_view_ranks_as_its_relevance_does_and_more_views_help(dr
     of_filter, of_sum = scores.by_window[passive.FILTER], scores.by_window[passive.SUM]
     assert of_filter[1].normalised_ranks.tolist() == of_sum[1].normalised_ranks.tolist()
     assert of_filter[10].anr < 0.5 * of_filter[1].anr
-    assert scores.whole.anr < of_filter[5].anr
+    assert scores.whole.anr < 0.5 * of_filter[1].anr
     assert scores.whole.n_queries == of_filter[1].n_queries
     assert shares[-1] == 1.0
 

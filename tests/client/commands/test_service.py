@@ -158,7 +158,7 @@ def test_errors_arrive_with_their_names(client, encodings):
     with pytest.raises(errors.UnknownJobError):
         client.admin.job("none")
     upload(client, open_source(str(encodings / "summer.npy")), "empty", "summer")
-    with pytest.raises(errors.JobFailedError, match="landmarks"):
+    with pytest.raises(errors.InvalidInputError, match="120 is the most that fit"):
         remap(client, "empty", "summer", landmark_traverse="summer", n_landmarks=500)
     client.admin.delete_traverse("empty", "summer")
     client.admin.delete_domain("empty")
