@@ -19,6 +19,7 @@ MAX_HEADING_RAD = np.deg2rad(62)  # away from the general direction, so that the
 BLOCK = 100  # frames drawn from one block of randomness; a longer drive begins like a shorter one
 INTERVAL_US, TRUTH_STEP_US = 700_000, 10_000
 START_M, WIDEST_M = 2.0, 1.2
+LEAST_UNCOVERED = 100  # pictures of a drive of which some have no ground truth: more than a twentieth would be refused
 UNCOVERED_FIRST, UNCOVERED_LAST = 2.4, 1.4  # intervals between pictures without ground truth at both ends
 NAN_SHARE, NAN_FIRST = 0.004, 3
 
@@ -142,10 +143,11 @@ class Drive:
         """[m, 7] utime (us), x (north), y (east), z (down) in metres, roll, pitch, yaw in radians, a block at a time.
 
         As NCLT publishes them, at about 100 Hz, with the quirks a reader must survive: the first and last few pictures
-        lie outside of the time covered (unless the drive is too short for that), and some rows hold NaN.
+        lie outside of the time covered (of a drive of fewer than 100, hardly any), and some rows hold NaN.
         """
-        cut = INTERVAL_US if len(self.utime) >= 8 else 0
-        first, last = int(self.utime[0] + cut * UNCOVERED_FIRST), int(self.utime[-1] - cut * UNCOVERED_LAST)
+        is_long = len(self.utime) >= LEAST_UNCOVERED
+        cut_first, cut_last = (UNCOVERED_FIRST, UNCOVERED_LAST) if is_long else (0.0, -1.0)
+        first, last = int(self.utime[0] + INTERVAL_US * cut_first), int(self.utime[-1] - INTERVAL_US * cut_last)
         for block, start in enumerate(range(first, max(last, first + 1), BLOCK * INTERVAL_US)):
             rng = stream(self.seed, f"ground truth {self.date}", block)
             clock = np.arange(start, min(start + BLOCK * INTERVAL_US, last + 1), TRUTH_STEP_US)
