@@ -5,6 +5,8 @@
 ...     print(client.localize("campus", "view.jpg").belief.mode_m)
 """
 
+from importlib.metadata import version
+
 from deepsimbad_client.errors import ApiError, DeepSimbadClientError
 from deepsimbad_client.http import Observation
 from deepsimbad_client.http.client import AsyncClient, AsyncSession, Client, Session
@@ -22,6 +24,8 @@ from deepsimbad_client.http.models import (
     TruthScore,
 )
 from deepsimbad_client.http.wire import RetryPolicy
+
+__version__ = version("deep-simbad")
 
 __all__ = [
     "ApiError",

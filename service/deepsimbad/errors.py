@@ -5,6 +5,8 @@ values, the missing name). The API translates the branches to HTTP statuses in o
 the command line to exit code 1 and one line on standard error.
 """
 
+from collections.abc import Iterable
+from difflib import get_close_matches
 from typing import Any, ClassVar
 
 
@@ -25,6 +27,19 @@ class DeepSimbadError(Exception):
         super().__init__(message)
         self.message = message
         self.hints = hints
+
+
+_MOST_NAMED, _LONGEST_WORD = 20, 100
+
+
+def nearest_of(word: str, names: Iterable[str]) -> str:
+    """What to say behind an unknown word: the nearest that there is, and all, as far as anybody would read."""
+    known = list(names)
+    if not known:
+        return ": there is none yet"
+    near = get_close_matches(word.lower(), known, 1, 0.5) if len(word) <= _LONGEST_WORD else []
+    listed = ", ".join(known[:_MOST_NAMED]) + (", ..." if len(known) > _MOST_NAMED else "")
+    return f": did you mean {near[0]}? There is {listed}" if near else f": there is {listed}"
 
 
 class InvalidInputError(DeepSimbadError, code="invalid_input"):

@@ -3,6 +3,7 @@
 import json
 import logging
 import os
+import re
 import socket
 import ssl
 import subprocess
@@ -12,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from deepsimbad.api.server import JsonFormatter, configure_logging, serve
+from deepsimbad.api.server import JsonFormatter, PlainFormatter, configure_logging, serve
 from deepsimbad.errors import SettingsError, UnavailableError
 from deepsimbad.settings import Settings
 
@@ -118,6 +119,18 @@ def test_a_line_holds_message_extras_and_exception():
     assert "\n" not in line
     assert line.isascii()
     assert "ValueError" in json.loads(line)["exception"]
+
+
+def test_on_a_terminal_lines_are_for_people(monkeypatch, capsys):
+    record = logging.makeLogRecord({"levelno": logging.INFO, "levelname": "INFO", "msg": "ready", "url": "http://a:1"})
+    assert re.fullmatch(r"\d\d:\d\d:\d\d  ready  url=http://a:1", PlainFormatter().format(record))
+    record.levelno, record.levelname = logging.WARNING, "WARNING"
+    assert "  WARNING: ready  url=" in PlainFormatter().format(record)
+    for is_terminal, form in ((True, PlainFormatter), (False, JsonFormatter)):
+        monkeypatch.setattr(sys.stderr, "isatty", lambda is_terminal=is_terminal: is_terminal)
+        configure_logging("INFO")
+        (handler,) = logging.getLogger().handlers[-1:]
+        assert isinstance(handler.formatter, form)
 
 
 def test_configuring_keeps_uvicorns_access_lines_out():

@@ -276,7 +276,7 @@ def test_ctrl_c_cancels_a_map_and_leaves_no_half_of_one(process, tmp_path):
 def test_a_domain_is_deleted_when_that_is_confirmed(deepsimbad, drives, tmp_path):
     here = ("--data-dir", tmp_path / "here")
     deepsimbad("map", "route", *sources(drives), *READY, "--n-landmarks", 20, *here)
-    ran = deepsimbad("delete", "route", "--yes", *here)
+    ran = deepsimbad("delete-domain", "route", "--yes", *here)
     assert (ran.code, ran.out) == (0, "domain route is deleted\n")
     assert deepsimbad("info", "route", *here).code == 1
-    assert deepsimbad("delete", "route", "--yes", *here).code == 1
+    assert deepsimbad("delete-domain", "route", "--yes", *here).code == 1

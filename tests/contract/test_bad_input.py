@@ -342,6 +342,22 @@ def test_names_that_are_none(client, name):
 # What only a job finds out
 
 
+def test_an_unknown_word_is_answered_with_the_nearest_and_with_what_there_is(client):
+    def detail(answer, status, code):
+        return problem(answer, status, code)["detail"]
+
+    there = detail(client.get("/v1/domains/raedy"), 404, "unknown_domain")
+    assert "did you mean ready? There is " in there
+    assert "did you mean drive?" in detail(client.get(f"{ADMIN}/traverses/drvie"), 404, "unknown_traverse")
+    sessions = f"{READY}/sessions"
+    assert "did you mean informed?" in detail(client.post(sessions, json={"planner": "infromed"}), 422, "invalid_input")
+    for body, nearest in (({"planer": "nnql"}, "planner"), ({"update": "mixtrue"}, "mixture")):
+        assert f"did you mean {nearest}? There is " in detail(client.post(sessions, json=body), 422, "invalid_request")
+    kinds = {"evaluator": {"kind": "featurel2"}}
+    made = client.put("/v1/admin/domains/mistyped", json=kinds)
+    assert "did you mean feature_l2?" in detail(made, 422, "invalid_input")
+
+
 def test_remaps_that_fail_leave_the_map_that_serves(client):
     client.upload("ready", "backwards", ready_encodings()[:2], [5.0, 4.0])
     client.post(f"{ADMIN}/traverses", json={"name": "empty"})

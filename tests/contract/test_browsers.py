@@ -42,6 +42,14 @@ def test_every_answer_carries_them_once(client, method, path, status, monkeypatc
         assert answer.headers.get_list(name) == [value], name
 
 
+def test_the_root_says_where_to_go(client):
+    told = client.get("/").json()
+    assert client.get(f"/{told['documentation']}").status_code == client.get(f"/{told['domains']}").status_code == 200
+    page = client.get("/", headers={"Accept": "text/html,*/*;q=0.8"})
+    assert page.headers["content-type"].startswith("text/html")
+    assert set(re.findall(r'href="([^"]+)"', page.text)) == set(told.values()) - {told["name"], told["version"]}
+
+
 def test_the_page_of_the_documentation_loads_nothing_from_elsewhere(client):
     page = client.get("/docs")
     assert page.headers["content-type"].startswith("text/html")

@@ -14,7 +14,7 @@ from deepsimbad.store.records import KeyScope
 
 from .conftest import RANKS, path_of, problem, service, until
 
-WITHOUT_KEY = {"/healthz", "/readyz", "/metrics", "/docs", "/docs/start.js", "/docs/{asset}", "/openapi.json"}
+WITHOUT_KEY = {"/", "/healthz", "/readyz", "/metrics", "/docs", "/docs/start.js", "/docs/{asset}", "/openapi.json"}
 
 
 class Keyed:

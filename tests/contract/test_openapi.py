@@ -1,12 +1,17 @@
 """Laws of the OpenAPI document; tests/golden pins its text."""
 
 import json
+import os
 import re
+from pathlib import Path
 
 import pytest
 
+from deepsimbad.api import problems
 from deepsimbad.api.localizations import ObservationBody
 from deepsimbad.api.problems import BODY_EXAMPLES, ENCODED_ON_BOARD, _declared_bodies
+
+from .conftest import ready_encodings
 
 PROBLEM = {"application/problem+json": {"schema": {"$ref": "#/components/schemas/Problem"}}}
 NAME = "^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$"
@@ -79,3 +84,48 @@ def test_schemas_are_there_for_every_reader(document):
     assert len(answers) > 10
     for name, schema in answers.items():
         assert set(schema["required"]) == set(schema["properties"]), name
+
+
+def test_every_summary_is_a_sentence(operations):
+    summaries = [operation["summary"] for operation in operations.values()]
+    assert all(re.fullmatch(r"[A-Z][^.]* [^.]*\.", summary) for summary in summaries), summaries
+
+
+def test_examples_are_real_answers(client, domain, document):
+    """GOLDEN_UPDATE=1 writes them anew."""
+    place, view = f"/v1/domains/{domain}", {"encoding": ready_encodings()[6].tolist()}
+    job = client.remap(domain, landmark_traverse="drive", training_episodes=20)
+    session = client.post(f"{place}/sessions", json={}).json()
+    observations = f"/v1/sessions/{session['session_id']}/observations?shortlist=3"
+    client.post(observations, json=view)
+    answers = {
+        "DomainAnswer": client.get(place).json(),
+        "JobAnswer": job,
+        "LocalizationAnswer": client.post(f"{place}/localizations?shortlist=3", json=view).json(),
+        "ObservationAnswer": client.post(f"{observations}&action_m=2", json=view).json(),
+        "SessionAnswer": session,
+        "TraverseAnswer": client.get(f"/v1/admin/domains/{domain}/traverses/drive").json(),
+    }
+    if os.environ.get("GOLDEN_UPDATE"):
+        text = json.dumps(shortened(answers), indent=None, sort_keys=True).replace('}, "', '},\n"')
+        Path(problems.__file__).with_name("examples.json").write_text(text + "\n")
+    for name, answer in answers.items():
+        (example,) = document["components"]["schemas"][name]["examples"]
+        assert members(example) == members(answer), name
+
+
+def shortened(value):
+    if isinstance(value, dict):
+        return {name: shortened(member) for name, member in value.items()}
+    if isinstance(value, list):
+        return [shortened(member) for member in value]
+    return float(f"{value:.4g}") if isinstance(value, float) else value
+
+
+def members(value, place=""):
+    """Every place where a member of an object stands."""
+    if isinstance(value, list):
+        return set().union(*(members(member, f"{place}[]") for member in value))
+    if not isinstance(value, dict):
+        return set()
+    return {f"{place}.{name}" for name in value}.union(*(members(value[name], f"{place}.{name}") for name in value))

@@ -62,7 +62,7 @@ def test_a_data_directory_that_cannot_be_made_is_named(read_only: Path) -> None:
 @pytest.mark.parametrize(
     "arguments",
     [
-        ("delete", "loop", "--yes"),
+        ("delete-domain", "loop", "--yes"),
         ("keys", "create", "--scope", "admin"),
     ],
 )

@@ -27,7 +27,16 @@ from deepsimbad_client.commands import cli
 GOLDEN = Path(__file__).parent
 COMMANDS = [
     *([], ["init"], ["serve"], ["keys"], ["keys", "create"], ["keys", "list"], ["keys", "revoke"], ["map"]),
-    *(["localize"], ["info"], ["delete"], ["experiment"], ["experiment", "vpr"], ["experiment", "nbv"], ["settings"]),
+    *(
+        ["localize"],
+        ["try"],
+        ["info"],
+        ["delete-domain"],
+        ["experiment"],
+        ["experiment", "vpr"],
+        ["experiment", "nbv"],
+        ["settings"],
+    ),
     ["experiment", "calibration"],
     *(["backup"], ["restore"], ["export"], ["import"], ["check"], ["weights"], ["weights", "list"]),
     *(["weights", "pull"], ["weights", "verify"]),

@@ -16,6 +16,8 @@ from deepsimbad_client.commands.console import show_waits
 from deepsimbad_client.errors import DeepSimbadClientError
 
 DONE, FAILED, CANCELLED = 0, 1, 130
+RESUMABLE = {"upload", "replay", "download", "campus"}
+GOES_ON = "; the same command goes on where it stopped"
 ELSEWHERE = {"campus": "deepsimbad_campus.__main__:campus_command"}
 """Commands that are imported when they are asked for."""
 
@@ -58,6 +60,12 @@ for command in COMMANDS:
     cli.add_command(command)
 
 
+def resumes(arguments: Sequence[str] | None) -> bool:
+    """Whether the command that was given goes on where it stopped."""
+    given = sys.argv[1:] if arguments is None else arguments
+    return bool(given) and given[0] in RESUMABLE
+
+
 def run(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns its exit code."""
     show_waits()
@@ -73,7 +81,7 @@ def run(arguments: Sequence[str] | None = None) -> int:
         error.show()
         return error.exit_code
     except (click.Abort, KeyboardInterrupt):
-        sys.stderr.write("deepsimbad-client: cancelled\n")
+        sys.stderr.write(f"deepsimbad-client: cancelled{GOES_ON if resumes(arguments) else ''}\n")
         return CANCELLED
     except BrokenPipeError:  # whoever read our output has read enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

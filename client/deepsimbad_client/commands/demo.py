@@ -28,7 +28,7 @@ from deepsimbad_client.replay import DEFAULT_PLANNER
 from deepsimbad_client.replay.active import Stage, active_replay
 from deepsimbad_client.replay.passive import Replay, replay
 from deepsimbad_client.replay.plots import draw_active, draw_passive
-from deepsimbad_client.replay.report import active_tables, summarise, summarise_active, write_summary
+from deepsimbad_client.replay.report import active_tables, shown_name, summarise, summarise_active, write_summary
 from deepsimbad_client.replay.watch import in_words
 
 DOMAIN = "campus"
@@ -157,7 +157,23 @@ def _drive_actively(client: Client, live: Recording, folder: Path) -> list[Path]
     write_summary(summary, folder)
     for table in active_tables(summary)[:2]:
         _say(table)
+    _say(f"   {_verdict(summary)}")
     return draw_active(driven, summary, folder)
+
+
+def _verdict(summary: dict[str, Any]) -> str:
+    """Which planner did best, the default or another, and what so few episodes can tell."""
+    anr = {name: value for name, value in summary["anr"].items() if value is not None}
+    if not anr:
+        return "No episode could be scored."
+    ours, best = PLANNERS[0], min(anr, key=lambda name: anr[name])
+    intervals = {name: against["interval_95"] for name, against in summary["against"].items()}
+    clear = [name for name, ends in intervals.items() if ends is not None and not ends[0] <= 0 <= ends[1]]
+    told = f"Lowest ANR: {shown_name(best, summary['planner_named'][best])}, {anr[best]:.2f} %."
+    if best == ours:
+        return f"{told} By these {EPISODES} starts that is more than chance over {', '.join(clear) or 'none'}."
+    sure = "and that is more than chance" if best in clear else f"which {EPISODES} starts cannot tell from chance"
+    return f"{told} The default did not win here, {sure}."
 
 
 def _show_one(client: Client, live: Recording) -> None:

@@ -15,11 +15,11 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from anyio.to_thread import run_sync
-from fastapi import APIRouter, FastAPI, Response
+from fastapi import APIRouter, FastAPI, Request, Response
 from fastapi import Path as PathParameter
 from prometheus_client.exposition import CONTENT_TYPE_LATEST
 from pydantic import Field
-from starlette.responses import FileResponse, PlainTextResponse
+from starlette.responses import FileResponse, JSONResponse, PlainTextResponse
 from starlette.routing import Route
 
 from deepsimbad.api import domains, jobs, localizations, maps, sessions, traverses
@@ -337,6 +337,24 @@ _POLICY = (
     "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
 _KEPT = {"Cache-Control": "public, max-age=3600"}
+
+
+_LINKS = {"documentation": "docs", "openapi": "openapi.json", "domains": "v1/domains", "ready": "readyz"}
+_ROOT = (
+    '<!DOCTYPE html><html lang="en"><meta charset="utf-8"><meta name="color-scheme" content="light dark">'
+    "<title>Deep SIMBAD</title><h1>Deep SIMBAD</h1><ul>"
+    + "".join(f'<li><a href="{path}">{name}</a></li>' for name, path in _LINKS.items())
+    + "</ul></html>"
+)
+
+
+@router.head("/", include_in_schema=False)
+@router.get("/", include_in_schema=False)
+async def root(request: Request) -> Response:
+    """Where to go from here, for a browser as a page."""
+    if "text/html" in request.headers.get("accept", ""):
+        return Response(_ROOT, media_type="text/html")
+    return JSONResponse({"name": "Deep SIMBAD", "version": release(), **_LINKS})
 
 
 @router.get("/docs", include_in_schema=False)

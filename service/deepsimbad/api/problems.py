@@ -10,6 +10,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from http import HTTPStatus
+from importlib import resources
 from typing import Annotated, Any
 
 from fastapi import FastAPI, Request
@@ -355,6 +356,8 @@ def _complete(document: dict[str, Any]) -> None:
         for method, operation in by_method.items()
     }
     for name, operation in operations.items():
+        if told := operation.get("description"):  # in place of a function's name: the first sentence, or clause
+            operation["summary"] = re.split(r"[.;:](?:\s|$)", " ".join(told.split()), maxsplit=1)[0] + "."
         needed = needed_scope(name.partition(" ")[2])
         if needed is not None:
             operation["security"] = [{scheme: [needed.value]} for scheme in _SECURITY_SCHEMES]
@@ -362,7 +365,8 @@ def _complete(document: dict[str, Any]) -> None:
                 operation["responses"].setdefault(str(refusal), _problem(refusal))
         operation["responses"] = dict(sorted(operation["responses"].items()))
     _link(operations)
-    for name, example in BODY_EXAMPLES.items():
+    answers = json.loads(resources.files("deepsimbad.api").joinpath("examples.json").read_text(encoding="utf-8"))
+    for name, example in {**BODY_EXAMPLES, **answers}.items():
         schemas[name]["examples"] = [example]
     for operation in operations.values():
         for parameter in operation.get("parameters", ()):

@@ -17,7 +17,7 @@ from anyio import CapacityLimiter
 from anyio.to_thread import run_sync
 from fastapi import Depends, Header, Path, Query, Request
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
-from pydantic_core import to_json
+from pydantic_core import ErrorDetails, to_json
 
 from deepsimbad.api.keys import KeyRing
 from deepsimbad.api.metrics import Metrics
@@ -28,7 +28,7 @@ from deepsimbad.engine.sessions import Sessions
 from deepsimbad.engine.traverses import OpenTraverses
 from deepsimbad.engine.truths import Truths
 from deepsimbad.engine.worker import EvaluatorPool, InferenceWorker, Priority, ready
-from deepsimbad.errors import EmptyBodyError, OverloadedError, UnsupportedMediaTypeError
+from deepsimbad.errors import EmptyBodyError, OverloadedError, UnsupportedMediaTypeError, nearest_of
 from deepsimbad.evaluators.base import Evaluator, Image
 from deepsimbad.evaluators.image import KEPT_PIXELS, decode_file, is_blank
 from deepsimbad.evaluators.image_files import ImageFile
@@ -335,6 +335,16 @@ class Answer(BaseModel):
 Body = TypeVar("Body", bound=JsonBody)
 
 
+def _with_nearest(finding: ErrorDetails, kind: type[Body]) -> ErrorDetails:
+    """What pydantic found, with the nearest spelling of an unknown member of a body, or of a choice."""
+    if finding["type"] == "extra_forbidden" and len(finding["loc"]) == 1:
+        return {**finding, "msg": f"there is no such member{nearest_of(str(finding['loc'][0]), kind.model_fields)}"}
+    choices = re.findall(r"'([^']*)'", str(finding.get("ctx", {}).get("expected", "")))
+    if choices and isinstance(finding["input"], str):
+        return {**finding, "msg": f"it is none of these{nearest_of(finding['input'], choices)}"}
+    return finding
+
+
 def media_type_of(request: Request, allowed: tuple[str, ...]) -> str:
     """The body's media type, without parameters; raises UnsupportedMediaTypeError for none, or one not allowed."""
     header = request.headers.get("content-type")
@@ -378,7 +388,8 @@ def _parsed(body: bytes, kind: type[Body]) -> Body:
     try:
         return kind.model_validate_json(body.removeprefix(_BYTE_ORDER_MARK))
     except ValidationError as error:
-        findings = error.errors(include_url=False, include_context=False, include_input=False)
-        raise invalid_request(findings, "body") from error
+        raise invalid_request(
+            [_with_nearest(each, kind) for each in error.errors(include_url=False)], "body"
+        ) from error
     except (RecursionError, OverflowError, ValueError) as error:
         raise InvalidRequestError("body: not JSON that can be read") from error

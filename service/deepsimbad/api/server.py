@@ -1,4 +1,4 @@
-"""Serving the application with uvicorn, and its log: lines a machine can read, one JSON object each."""
+"""Serving the application with uvicorn, and its log: one JSON object a line, or plain lines for a person."""
 
 import json
 import logging
@@ -47,13 +47,30 @@ class JsonFormatter(logging.Formatter):
         return _ENCODER.encode(line)
 
 
+class PlainFormatter(logging.Formatter):
+    """One line a record for a person at a terminal: time, level where it is no news, message, what was given beside."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Render a record."""
+        extra = islice(record.__dict__.items(), _N_STANDARD, None)
+        told = [f"{name}={value}" for name, value in extra if name not in _STANDARD and value not in (None, {}, [])]
+        level = "" if record.levelno <= logging.INFO else f"{record.levelname}: "
+        at = time.strftime("%H:%M:%S", time.localtime(record.created))
+        line = "  ".join([f"{at}  {level}{record.getMessage()}", *told])
+        return f"{line}\n{self.formatException(record.exc_info)}" if record.exc_info else line
+
+
 @lru_cache(maxsize=2)
 def _second(since_1970: int) -> str:
     return time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime(since_1970))
 
 
 def configure_logging(level: str) -> None:
-    """Send everything at `level` and above to standard error as JSON lines; uvicorn's own lines too."""
+    """Send everything at `level` and above to standard error, uvicorn's own lines too.
+
+    As JSON lines; where that is a terminal, as a person reads them.
+    """
+    form = PlainFormatter if sys.stderr.isatty() else JsonFormatter
     # No line of ours tells these, and every record would look them up.
     logging.logThreads = logging.logProcesses = logging.logMultiprocessing = False
     if sys.version_info >= (3, 12):
@@ -62,8 +79,8 @@ def configure_logging(level: str) -> None:
         {
             "version": 1,
             "disable_existing_loggers": False,
-            "formatters": {"json": {"()": JsonFormatter}},
-            "handlers": {"stderr": {"class": "logging.StreamHandler", "formatter": "json"}},
+            "formatters": {"lines": {"()": form}},
+            "handlers": {"stderr": {"class": "logging.StreamHandler", "formatter": "lines"}},
             "root": {"level": "WARNING", "handlers": ["stderr"]},
             "loggers": {
                 "deepsimbad": {"level": level},
@@ -99,7 +116,11 @@ class _Server(uvicorn.Server):
         """Open the application and listen, and say so when both are done."""
         await super().startup(sockets)
         addresses = [listening.getsockname()[:2] for server in self.servers for listening in server.sockets]
-        log.info("ready", extra={"addresses": [f"{host}:{port}" for host, port in addresses]})
+        host, port = addresses[0]
+        reached = "localhost" if host in {"0.0.0.0", "::"} else f"[{host}]" if ":" in host else host  # noqa: S104
+        url = f"{'https' if self.config.is_ssl else 'http'}://{reached}:{port}"
+        told = {"addresses": [f"{host}:{port}" for host, port in addresses], "url": url, "docs": f"{url}/docs"}
+        log.info("ready", extra=told)
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         """End connections and requests, then the application: also where nobody waits, its files are closed."""

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import click
 
 from deepsimbad.cli.experiment import experiment
-from deepsimbad.cli.local import delete, info, localize, map_
+from deepsimbad.cli.local import delete_domain, info, localize, map_
 from deepsimbad.cli.serve import init, keys, serve, settings
 from deepsimbad.cli.storage import backup, check, export, import_, restore
 from deepsimbad.cli.trial import try_
@@ -21,13 +21,13 @@ _FAILED, _CANCELLED = 1, 130
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
-@click.version_option(package_name="deep-simbad")
+@click.version_option(package_name="deep-simbad", message="%(version)s")
 def deepsimbad() -> None:
     """Where on a known route a robot is, and which move would tell it most next."""
 
 
 for command in (
-    *(init, serve, map_, localize, try_, info, delete, experiment, keys, settings),
+    *(init, serve, map_, localize, try_, info, delete_domain, experiment, keys, settings),
     *(backup, restore, export, import_, check, weights),
 ):
     deepsimbad.add_command(command)

@@ -191,11 +191,11 @@ def localize(domain: str, images: tuple[Path, ...], as_json: bool) -> None:
     print_table(table)
 
 
-@click.command()
+@click.command("delete-domain")
 @click.argument("domain")
 @click.confirmation_option("--yes", prompt="Delete the domain with its recordings and maps?")
 @data_dir_option
-def delete(domain: str) -> None:
+def delete_domain(domain: str) -> None:
     """Delete a domain with everything it holds."""
     with Catalog.open(existing_data_dir()) as catalog:
         catalog.delete_domain(domain)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from deepsimbad.core.map import Map
 from deepsimbad.core.retrieval import shortlist
 from deepsimbad.core.route import Route
-from deepsimbad.errors import InvalidInputError
+from deepsimbad.errors import InvalidInputError, nearest_of
 
 NNQL, INFORMED, RANDOM, CONSTANT = "nnql", "informed", "random", "constant"
 DEFAULT_PLANNER = INFORMED
@@ -168,5 +168,7 @@ def parse_planner(text: str, actions_m: Sequence[float]) -> Planner:
     """
     planners = _PLANNERS | {f"{CONSTANT}:{action_m:g}": partial(plan_constantly, action_m) for action_m in actions_m}
     if text not in planners:
-        raise InvalidInputError(f"{text!r} is no planner of this domain", allowed=list(planners))
+        raise InvalidInputError(
+            f"{text!r} is no planner of this domain{nearest_of(text, planners)}", allowed=list(planners)
+        )
     return planners[text]

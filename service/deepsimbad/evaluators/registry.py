@@ -9,7 +9,7 @@ from importlib import import_module
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, cast
 
-from deepsimbad.errors import InvalidInputError, InvalidWeightsError, MissingPackageError
+from deepsimbad.errors import InvalidInputError, InvalidWeightsError, MissingPackageError, nearest_of
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.compute import Compute
 from deepsimbad.evaluators.runtimes import INSTALL_TORCH, has_torch
@@ -89,15 +89,23 @@ def evaluator_config(raw: Mapping[str, Any]) -> EvaluatorConfig:
     """
     kinds = [kind.value for kind in EvaluatorKind]
     if raw.get("kind") not in kinds:
-        raise InvalidInputError(f"the evaluator's kind must be one of {', '.join(kinds)}", field="kind", allowed=kinds)
+        raise InvalidInputError(
+            f"{raw.get('kind')!a} is no kind of evaluator{nearest_of(str(raw.get('kind')), kinds)}",
+            field="kind",
+            allowed=kinds,
+        )
     kind, allowed = EvaluatorKind(raw["kind"]), ["kind", "extractor"]
     unknown = sorted(str(key) for key in raw if key not in allowed)
     if unknown:  # a typing mistake is never silent
-        raise InvalidInputError(f"{kind.value} has no option {', '.join(unknown)}", unknown=unknown, allowed=allowed)
+        raise InvalidInputError(
+            f"{kind.value} has no option {', '.join(unknown)}{nearest_of(unknown[0], allowed)}",
+            unknown=unknown,
+            allowed=allowed,
+        )
     extractor = raw.get("extractor", default_extractor().value)
     if not isinstance(extractor, str) or re.fullmatch(EXTRACTOR_PATTERN, extractor) is None:
         raise InvalidInputError(
-            f"{kind.value}'s extractor must be one of {', '.join(EXTRACTOR_FORMS)}",
+            f"{extractor!a} is no extractor of {kind.value}{nearest_of(str(extractor), EXTRACTOR_FORMS)}",
             field="extractor",
             allowed=list(EXTRACTOR_FORMS),
         )

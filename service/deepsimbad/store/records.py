@@ -12,7 +12,7 @@ from typing import Any, Generic, TypeVar
 
 from sqlite_utils import Database
 
-from deepsimbad.errors import InvalidInputError, UnknownDomainError
+from deepsimbad.errors import InvalidInputError, UnknownDomainError, nearest_of
 from deepsimbad.store.layout import is_name
 
 Record = TypeVar("Record")
@@ -89,7 +89,7 @@ def get_domain(db: Database, name: str) -> DomainRecord:
     for record in read_domains(db, name):
         return record
     present = [row[0] for row in db.execute("SELECT name FROM domain ORDER BY name LIMIT 20")]
-    raise UnknownDomainError(f"there is no domain {name!a}", known=present)
+    raise UnknownDomainError(f"there is no domain {name!a}{nearest_of(name, present)}", known=present)
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,7 @@ from deepsimbad.errors import (
     UnknownDomainError,
     UnknownTraverseError,
     WeightsDifferError,
+    nearest_of,
 )
 from deepsimbad.store import layout
 from deepsimbad.store.arrays import is_halvable
@@ -76,7 +77,7 @@ class Traverse(OpenFile):
         """Open a traverse; raises UnknownTraverseError."""
         path = layout.traverse_path(data_dir, domain, name)
         if not path.is_file():
-            raise UnknownTraverseError(f"domain {domain} has no traverse {name}", known=cls.list(data_dir, domain)[:20])
+            raise _unknown(data_dir, domain, name)
         with storage_faults(path):
             return cls(name, path, open_working_file(path, migrations, is_checked=False))
 
@@ -88,7 +89,7 @@ class Traverse(OpenFile):
             if path.parent.is_dir():
                 until_gone.enter_context(_locked_folder(path.parent, domain))
             if not path.is_file():
-                raise UnknownTraverseError(f"domain {domain} has no traverse {name}")
+                raise _unknown(data_dir, domain, name)
             try:
                 db = until_gone.enter_context(open_database(path))
                 until_gone.enter_context(write_transaction(db))
@@ -352,3 +353,8 @@ def _locked_folder(folder: Path, domain: str) -> Iterator[None]:
         yield
     finally:
         os.close(descriptor)
+
+
+def _unknown(data_dir: Path, domain: str, name: str) -> UnknownTraverseError:
+    known = Traverse.list(data_dir, domain)
+    return UnknownTraverseError(f"domain {domain} has no traverse {name}{nearest_of(name, known)}", known=known[:20])
