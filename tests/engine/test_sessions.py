@@ -32,7 +32,7 @@ from deepsimbad.store.catalog import Catalog
 from .conftest import KEEP_ENDED_S, TTL_S, Clock, Live, add_domain, add_map, encoded, map_contents, ranked, run
 
 Masses = NDArray[np.float64]
-STAGES = ["wait", "decode", "describe", "retrieve", "predict", "update", "plan", "commit", "summarise", "total"]
+STAGES = ["wait", "decode", "describe", "retrieve", "predict", "update", "plan", "summarise", "commit", "total"]
 
 
 def test_a_session_is_the_localizer_step_by_step(mapped: Catalog) -> None:

@@ -210,7 +210,8 @@ def render_plan(plan: Plan | None, actions_m: NDArray[np.float64]) -> NextBestVi
     if plan is None:
         return None
     unknown = [None] * actions_m.size
-    values, bits = (unknown if known is None else known.tolist() for known in (plan.values, plan.bits))
+    values = unknown if plan.values is None else plan.values.tolist()
+    bits = unknown if plan.bits is None else plan.bits.tolist()
     actions: list[ActionAnswer] = []
     for action_m, value, expected in zip(actions_m.tolist(), values, bits, strict=True):
         actions.append({"action_m": action_m, "q_value": value, "expected_bits": expected})

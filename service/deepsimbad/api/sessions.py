@@ -4,7 +4,7 @@ import hashlib
 import math
 from datetime import UTC, datetime
 from functools import partial
-from typing import Annotated
+from typing import Annotated, cast
 
 from anyio.to_thread import run_sync
 from fastapi import APIRouter, Query, Request, Response
@@ -269,7 +269,6 @@ async def post_session(
 async def post_observation(
     session_id: SessionId,
     request: Request,
-    running: Running,
     action_m: Annotated[
         float,
         Query(
@@ -291,7 +290,7 @@ async def post_observation(
     When this has answered, the observation survives whatever happens to the service. Two at once are both answered, in
     order of arrival. The body is what `localizations` takes.
     """
-    watch = Stopwatch()
+    watch, running = Stopwatch(), cast("Services", request.app.state.services)
     try:
         media_type = media_type_of(request, OBSERVATION_TYPES)
         body = await read_bytes(request)

@@ -6,9 +6,9 @@ import secrets
 import time
 from collections import Counter
 from collections.abc import Callable, Coroutine
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, TypeVar
 
@@ -35,6 +35,7 @@ from deepsimbad.engine.session import (
 from deepsimbad.engine.worker import EncodedImage, EvaluatorPool, InferenceWorker, Stopwatch
 from deepsimbad.errors import (
     DamagedFileError,
+    DeepSimbadError,
     EndedSessionError,
     IdempotencyKeyReusedError,
     InvalidMoveError,
@@ -332,13 +333,12 @@ class Sessions:
             view = await observation.view(engine.evaluator)
             watch.lap("decode")
             step = partial(self._step, live, state, observation, self._clock() + self._ttl_s, watch)
-            stepped = await asyncio.wrap_future(self._worker.look(engine.evaluator, view, step))
-            if isinstance(stepped, int):
-                answer = await self._repeated(live, state, stepped, observation.n_shortlist)
-            else:
-                answer = await self._commit(live, state, *stepped, observation.n_shortlist, watch)
-            watch.lap("summarise")  # of a new one what it took beyond the disk
-            return answer
+            try:
+                return await self._published(live, self._worker.look(engine.evaluator, view, step), watch)
+            except _CountedBefore as before:
+                answer = await self._repeated(live, state, before.sequence, observation.n_shortlist)
+                watch.lap("summarise")
+                return answer
 
     def _step(
         self,
@@ -348,8 +348,8 @@ class Sessions:
         expires_at: float,
         watch: Stopwatch,
         view: View,
-    ) -> tuple[ObservedRow, SessionState] | int:
-        """On the worker: the next row and what it leads to; or the row's number, if it was counted before."""
+    ) -> "_Move":
+        """On the worker: move on by the next row; raises _CountedBefore."""
         watch.lap("wait", {"encode": view.encode_ms} if isinstance(view, EncodedImage) else None)
         idempotency, snapshot = observation.idempotency, state.engine.snapshot
         if idempotency is not None:
@@ -359,7 +359,7 @@ class Sessions:
                     "this idempotency key came before with another observation: choose a new one"
                 )
             if earlier is not None:
-                return earlier[0]
+                raise _CountedBefore(earlier[0])
         if observation.landmark_models is not None:
             snapshot.check_landmark_model(observation.landmark_models)
         query = describe(snapshot, state.engine.evaluator, view)
@@ -376,10 +376,37 @@ class Sessions:
             encoding=encoding,
             idempotency=idempotency,
         )
-        moved_on = state.after(row)
-        if moved_on.step is not None:
-            watch.lap("plan", moved_on.step.timings_ms)
-        return row, moved_on
+        return self._move_on(live, state, row, observation.n_shortlist, watch)
+
+    def _move_on(
+        self, live: LiveSession, before: SessionState, row: JournalRow, n_shortlist: int | None, watch: Stopwatch
+    ) -> "_Move":
+        """On the worker: the state after a row, which is on its way to the disk while the answer is summed up."""
+        after = before.after(row)
+        if after.step is not None:
+            watch.lap("plan", after.step.timings_ms)
+        snapshot = None
+        if before.sequence > 0 and before.sequence % self._snapshot_every == 0:
+            # Of the state before the row, so that a restart replays at least the last row and has its whole step.
+            snapshot = before.snapshot()
+        written = self._store.append(live.record.number, row, self._clock(), snapshot)
+        answer = view_of(live, row.expires_at, after, n_shortlist)
+        watch.lap("summarise")
+        return _Move(after, answer, written)
+
+    async def _published(self, live: LiveSession, moving: "Future[_Move]", watch: Stopwatch) -> SessionView:
+        """The answer after a move, once it is on the disk and the session has moved."""
+        try:
+            move = await asyncio.wrap_future(moving)
+            await asyncio.wrap_future(move.written)
+        except BaseException as error:
+            was_refused = isinstance(error, DeepSimbadError | _CountedBefore) and moving.exception() is error
+            if not was_refused:
+                live.state = None  # what the file holds is the truth: it is read again at the next touch
+            raise
+        live.expires_at, live.state = move.answer.expires_at, move.after
+        watch.lap("commit")
+        return move.answer
 
     async def _repeated(
         self, live: LiveSession, state: SessionState, sequence: int, n_shortlist: int | None
@@ -404,32 +431,9 @@ class Sessions:
             state = live.state or await self._state(live)
             check_prior(state.engine.snapshot.route, position_m, std_m)
             row = PriorRow(state.sequence + 1, self._clock() + self._ttl_s, position_m, std_m)
-            moved_on = await asyncio.wrap_future(self._worker.submit(lambda: state.after(row)))
-            return await self._commit(live, state, row, moved_on, None, Stopwatch())
-
-    async def _commit(
-        self,
-        live: LiveSession,
-        before: SessionState,
-        row: JournalRow,
-        after: SessionState,
-        n_shortlist: int | None,
-        watch: Stopwatch,
-    ) -> SessionView:
-        """Write a row, then publish what it leads to; the disk and the summary take their time together."""
-        answer = asyncio.wrap_future(self._summaries.submit(view_of, live, row.expires_at, after, n_shortlist))
-        snapshot = None
-        if before.sequence > 0 and before.sequence % self._snapshot_every == 0:
-            # Of the state before the row, so that a restart replays at least the last row and has its whole step.
-            snapshot = before.snapshot()
-        try:
-            await asyncio.wrap_future(self._store.append(live.record.number, row, self._clock(), snapshot))
-        except BaseException:
-            live.state = None  # what the file holds is the truth: it is read again at the next touch
-            raise
-        live.expires_at, live.state = row.expires_at, after
-        watch.lap("commit")
-        return await answer
+            watch = Stopwatch()
+            moving = self._worker.submit(lambda: self._move_on(live, state, row, None, watch))
+            return await self._published(live, moving, watch)
 
     # Ending
 
@@ -454,6 +458,23 @@ class Sessions:
         self._under_way.add(task)
         task.add_done_callback(self._under_way.discard)
         return await asyncio.shield(task)
+
+
+class _CountedBefore(Exception):  # noqa: N818 - nobody's error
+    """An observation came again; `sequence` is the number of its row."""
+
+    def __init__(self, sequence: int) -> None:
+        super().__init__()
+        self.sequence = sequence
+
+
+@dataclass(frozen=True)
+class _Move:
+    """A session moved on, but for the disk."""
+
+    after: SessionState
+    answer: SessionView
+    written: Future[None]  # done when it is on the disk
 
 
 def check_owner(record: SessionRecord, key_id: str | None) -> None:
