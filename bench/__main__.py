@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 
 from bench.answering import retrieval_table, step_table
-from bench.building import landmark_table, map_file_table, nnql_table
+from bench.building import composed_table, landmark_table, map_file_table, nnql_table
 from bench.common import machine, write_page
 from bench.index_size import index_table
 from bench.remap import remap_table
@@ -14,6 +14,7 @@ TABLES = (
     landmark_table,
     index_table,
     map_file_table,
+    composed_table,
     nnql_table,
     step_table,
     http_table,

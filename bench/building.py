@@ -26,13 +26,20 @@ from bench.worlds import (
     scattered_lists,
     standardised_map,
 )
+from deepsimbad.core.building import MapPlan
+from deepsimbad.core.composed import MOST_DIMENSIONS, compose, unit
+from deepsimbad.core.drive import Drive
 from deepsimbad.core.landmark_model import select_landmarks
 from deepsimbad.core.map import Map
 from deepsimbad.core.nnql import NnqlConfig
-from deepsimbad.core.planners import PlanningView, plan_by_experience
+from deepsimbad.core.planners import PlanningView, information_ahead, plan_by_experience
 from deepsimbad.core.relevance import DEFAULT_UPDATE, Query, Relevance
 from deepsimbad.core.training import TrainingWorld, train
+from deepsimbad.evaluators.feature_l2 import FeatureL2
+from deepsimbad.jobs.build import build, measured, views_of
 from deepsimbad.store.map_file import index_bytes, read_map, seal, table_bytes, write_map
+
+_DIM = 64  # of encodings whose number is all that counts
 
 
 def landmark_table() -> Iterator[str]:
@@ -94,6 +101,20 @@ def _with_model(built: Map) -> Map:
     return replace(built, evaluator=evaluator, actions_m=actions_m, landmark_model={"prototypes": prototypes})
 
 
+def composed_table() -> Iterator[str]:
+    """Markdown lines."""
+    yield f"## Lists and the planner's table: {NCLT_IMAGES:,} map images, r = {N_LANDMARKS}, h = 4"
+    yield ""
+    rng = np.random.default_rng(0)
+    places, landmarks = (unit(rng.normal(size=(count, MOST_DIMENSIONS))) for count in (NCLT_IMAGES, N_LANDMARKS))
+    listing = timed(lambda: compose(places, landmarks, 4), repeats=3, warm_up=1)
+    view_bits = rng.random(NCLT_IMAGES).astype(np.float32)
+    built = rrf_map(dense_lists(NCLT_IMAGES), actions_m=np.array(ACTIONS_M), view_bits=view_bits)
+    prices = iter(np.arange(1, 100) / 1000)  # a price that was asked before is kept
+    planning = timed(lambda: information_ahead(built, float(next(prices))), repeats=9)
+    yield f"Lists of `composed`: {listing}. The table of `informed`, once a map and price: {planning}."
+
+
 def nnql_table() -> Iterator[str]:
     """Markdown lines."""
     yield f"## NNQL: {NCLT_IMAGES:,} map images {SPACING_M:g} m apart, 10 actions, r = {N_LANDMARKS}, h = 4"
@@ -102,7 +123,7 @@ def nnql_table() -> Iterator[str]:
     yield ""
     head = ("relevance, update", "time", "processor time", "peak memory of the whole process")
     rows = []
-    for relevance in (Relevance.RRF, Relevance.STANDARDISED):
+    for relevance in (Relevance.RRF, Relevance.STANDARDISED, Relevance.COMPOSED):
         spent = _in_own_process(relevance.value)
         times = (f"{spent['seconds']:.1f} s", f"{spent['processor_seconds']:.1f} s", f"{spent['peak_mb']:.0f} MB")
         rows.append((f"{relevance.value}, {DEFAULT_UPDATE[relevance].value}", *times))
@@ -141,20 +162,38 @@ def _selection() -> dict[str, float]:
 
 
 def _training(relevance: Relevance) -> dict[str, float]:
-    """On a live drive whose landmark order resembles the lists of the places it passes."""
-    config, lists = NnqlConfig(), dense_lists(NCLT_IMAGES)
-    level = np.random.default_rng(0).random((NCLT_IMAGES, N_LANDMARKS), np.float32)
-    level[np.arange(NCLT_IMAGES), lists] *= 0.2
-    ranks = np.empty_like(level)
-    np.put_along_axis(ranks, level.argsort(axis=1), np.arange(1, N_LANDMARKS + 1, dtype=np.float32)[np.newaxis], axis=1)
-    make = rrf_map if relevance is Relevance.RRF else standardised_map
-    built = make(lists, actions_m=np.array(ACTIONS_M))
-    world = TrainingWorld.on(built, Query(ranks), built.route, np.arange(NCLT_IMAGES), config)
+    """On a live drive that resembles the places it passes."""
+    config = NnqlConfig()
+    built, views = _composed() if relevance is Relevance.COMPOSED else _listed(relevance)
+    world = TrainingWorld.on(built, views, built.route, np.arange(NCLT_IMAGES), config)
     with ThreadPoolExecutor(2) as pool:
         train(world, replace(config, n_episodes=100), lambda _: None, pool)  # compiles
         began, began_processor = perf_counter(), process_time()
         train(world, config, lambda _: None, pool)
         return {"seconds": perf_counter() - began, "processor_seconds": process_time() - began_processor}
+
+
+def _listed(relevance: Relevance) -> tuple[Map, Query]:
+    lists = dense_lists(NCLT_IMAGES)
+    level = np.random.default_rng(0).random((NCLT_IMAGES, N_LANDMARKS), np.float32)
+    level[np.arange(NCLT_IMAGES), lists] *= 0.2
+    ranks = np.empty_like(level)
+    np.put_along_axis(ranks, level.argsort(axis=1), np.arange(1, N_LANDMARKS + 1, dtype=np.float32)[np.newaxis], axis=1)
+    make = rrf_map if relevance is Relevance.RRF else standardised_map
+    return make(lists, actions_m=np.array(ACTIONS_M)), Query(ranks)
+
+
+def _composed() -> tuple[Map, Query]:
+    """Of a drive with itself for landmarks, and another that passes the same places."""
+    rng, evaluator = np.random.default_rng(0), FeatureL2("none")
+    places = np.cumsum(rng.normal(size=(NCLT_IMAGES, _DIM)), axis=0)
+    places /= np.linalg.norm(places, axis=1, keepdims=True)
+    seasons = (places + 0.5 / np.sqrt(_DIM) * rng.normal(size=places.shape) for _ in range(2))
+    own, other = (
+        Drive(position_m=np.arange(NCLT_IMAGES) * SPACING_M, encodings=season.astype(np.float32)) for season in seasons
+    )
+    built = build(MapPlan(Relevance.COMPOSED, 4, ACTIONS_M), own, None, own, N_LANDMARKS, evaluator).map
+    return built, views_of(measured(other, built.landmark_model, evaluator))
 
 
 if __name__ == "__main__":

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from deepsimbad.core.composed import unit
 from deepsimbad.core.descriptor import LandmarkStatistics, rank_landmarks
 from deepsimbad.core.drive import Drive
 from deepsimbad.core.map import Map
@@ -51,6 +52,22 @@ def standardised_map(lists: NDArray[np.uint16], **more: Any) -> Map:
         lists=lists,
         position_m=np.arange(lists.shape[1]) * SPACING_M,
         statistics=np.stack([statistics.mean, statistics.std]),
+        **more,
+    )
+
+
+def composed_map(lists: NDArray[np.uint16], **more: Any) -> Map:
+    """A map of these lists for the default relevance; its landmarks are drawn at random."""
+    rng = np.random.default_rng(0)
+    usual = {name: np.stack([np.zeros(n), np.ones(n)]) for name, n in (("encoding", 96), ("product", N_LANDMARKS))}
+    return Map(
+        config={"relevance": Relevance.COMPOSED.value, "n_landmarks": N_LANDMARKS},
+        lists=lists,
+        position_m=np.arange(lists.shape[1]) * SPACING_M,
+        statistics=np.stack([np.zeros(N_LANDMARKS), np.ones(N_LANDMARKS)]),
+        usual_encoding=usual["encoding"].astype(np.float32),
+        usual_product=usual["product"].astype(np.float32),
+        landmark_model={"prototypes": unit(rng.normal(size=(N_LANDMARKS, 96)))},
         **more,
     )
 
