@@ -12,7 +12,17 @@ from deepsimbad_client.errors import SourceError
 from deepsimbad_client.recordings import Frame
 from deepsimbad_client.recordings.clock import FIRST_US
 from deepsimbad_client.recordings.left_out import MOST_LEFT_OUT
-from deepsimbad_client.recordings.track import DEADBAND_M, Reals, Times, Track, arc_length_m, on_track, rising_m
+from deepsimbad_client.recordings.track import (
+    DEADBAND_M,
+    Reals,
+    Times,
+    Track,
+    arc_length_m,
+    back_tolerance_m,
+    longest_rising,
+    on_track,
+    rising_m,
+)
 
 UNPLACED = math.nan  # position_m of a frame of which the source says none
 STATED_SPEEDS = 100.0  # A stated position may jump by so many usual steps: somebody may have meant it
@@ -121,6 +131,10 @@ def _in_time_order(result: Placed) -> Times | None:
     if len(times) < len(result.frames) or len(set(times)) < 2:
         return None
     time_us = np.array(times, dtype=np.int64)
+    fits = np.isin(np.arange(len(times)), longest_rising(times))
+    if 0 < (~fits).sum() <= MOST_LEFT_OUT * len(times):  # a few wrong times, not wrong names
+        result.leave_out(fits.tolist(), "whose time goes back")
+        time_us = time_us[fits]
     order = np.argsort(time_us, kind="stable")
     if (np.diff(time_us) < 0).any():
         result.frames = [result.frames[place] for place in order]
@@ -149,12 +163,18 @@ def _use_stated(result: Placed, time_us: Times | None, where: str) -> None:
     turned_m, usable = (-fallen, falls) if falls.sum() > rises.sum() else (risen, rises)
     n_back = int((~usable).sum())
     if n_back > MOST_LEFT_OUT * len(usable):
-        at = int(np.flatnonzero(~usable)[0])
-        before, names = max(at - 1, 0), [frame.name for frame in result.frames]
+        names, upwards = (
+            [frame.name for frame in result.frames],
+            -position_m if falls.sum() > rises.sum() else position_m,
+        )
+        farthest = np.maximum.accumulate(upwards)
+        at = int(np.argmax(upwards < farthest - back_tolerance_m(position_m)))
+        before = int(np.argmax(upwards[:at]))
         raise SourceError(
-            f"{where}: positions go to and fro, for example from {position_m[before]:.2f} m ({names[before]}) to "
-            f"{position_m[at]:.2f} m ({names[at]}), {n_back} of {len(names)} frames against the others: a route goes "
-            "one way. Give x_m, y_m in place of position_m, or cut the recording there (#START:STOP)"
+            f"{where}: positions go to and fro: {names[at]} is at {position_m[at]:.2f} m after "
+            f"{position_m[before]:.2f} m ({names[before]}), and {n_back} of {len(names)} frames go against the rest; a "
+            "route goes one way. Give x_m, y_m in place of position_m, or cut the recording there into folders of its "
+            "parts"
         )
     result.leave_out(usable.tolist(), "where the position goes back")
     result.frames = [

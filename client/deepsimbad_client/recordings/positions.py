@@ -1,6 +1,7 @@
 """`positions.csv`: where the images beside it were taken.
 
-A header and one line for each image. Columns, in any order, others are ignored:
+A header and one line for each image, cells between commas, semicolons or tabs. Columns, in any order,
+others are ignored:
 
     name          the image's file name: folders before it, letter case and its ending do not matter; without this
                   column (and without `index`) the lines go with the images in name order and there must be as many
@@ -224,7 +225,9 @@ def _read(path: Path) -> _Table:
 def _lines(path: Path) -> list[tuple[int, list[str]]]:
     try:
         with path.open(encoding="utf-8-sig", newline="") as text:
-            reader = csv.reader(text)
+            first = text.readline()
+            text.seek(0)
+            reader = csv.reader(text, delimiter=max(",;\t", key=first.count))
             lines = [(reader.line_num, [cell.strip() for cell in cells]) for cells in reader if cells]
             while lines and not any(lines[-1][1]):
                 lines.pop()

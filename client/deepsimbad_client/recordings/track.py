@@ -5,6 +5,7 @@ recording's own speed. Noise is told by third differences, which neither driving
 """
 
 from bisect import bisect_right
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import hypot
 
@@ -16,6 +17,7 @@ DEADBAND_NOISES = 6.0
 SMOOTHING_HALF_WIDTH_US = 250_000
 MAX_GAP_S = 1.0  # Between rows of a track farther apart than this nothing is interpolated: the robot may have turned
 FEWEST_FOR_NOISE = 16  # positions of which noise can be told
+MOST_NOISE_M = 10.0  # What leaps farther, as frames of two drives by turns, is none
 SPIKE_M, SPIKE_NOISES, SPIKE_SPEEDS = 0.5, 8.0, 5.0
 SLOWEST_LIMIT_M_S, FASTEST_M_S = (
     5.0,
@@ -111,7 +113,8 @@ def noise_m(*axes: Reals) -> float:
     if len(axes[0]) < FEWEST_FOR_NOISE:
         return 0.0
     differences = np.abs(np.concatenate([np.diff(axis, 3) for axis in axes]))
-    return float(np.median(differences) / 0.6745 / np.sqrt(20))  # of a normal: median / sigma; 1 + 9 + 9 + 1
+    noise = float(np.median(differences) / 0.6745 / np.sqrt(20))  # of a normal: median / sigma; 1 + 9 + 9 + 1
+    return min(noise, MOST_NOISE_M)
 
 
 def on_track(x_m: Reals, y_m: Reals, time_us: Times | None, speeds: float = SPIKE_SPEEDS) -> NDArray[np.bool_]:
@@ -191,14 +194,19 @@ def walked_m(x_m: Reals, y_m: Reals, deadband_m: float) -> Reals:
     return travelled
 
 
+def back_tolerance_m(position_m: Reals) -> float:
+    """How far stated positions may step back while the robot stands."""
+    return max(DEADBAND_M, DEADBAND_NOISES * noise_m(position_m))
+
+
 def rising_m(position_m: Reals) -> tuple[Reals, NDArray[np.bool_]]:
     """Stated positions [n] without steps back within their noise: those, and which can be used.
 
     The longest sequence that does not fall is kept as it is; what lies beside it by no more than `DEADBAND_M` or six
     times the noise is taken as standing; the rest goes back, and the robot may have too.
     """
-    tolerance = max(DEADBAND_M, DEADBAND_NOISES * noise_m(position_m))
-    chosen = _longest_rising(position_m.tolist())
+    tolerance = back_tolerance_m(position_m)
+    chosen = longest_rising(position_m.tolist())
     place = np.arange(len(position_m))
     before = position_m[chosen][np.maximum(np.searchsorted(chosen, place, side="right") - 1, 0)]
     after = position_m[chosen][np.minimum(np.searchsorted(chosen, place), len(chosen) - 1)]
@@ -208,7 +216,7 @@ def rising_m(position_m: Reals) -> tuple[Reals, NDArray[np.bool_]]:
     return risen, usable
 
 
-def _longest_rising(values: list[float]) -> NDArray[np.intp]:
+def longest_rising(values: Sequence[float]) -> NDArray[np.intp]:
     """Places of the longest subsequence that does not fall."""
     tails: list[float] = []
     tail_places: list[int] = []

@@ -45,6 +45,7 @@ def test_images_come_in_name_order_evenly_spaced(folder):
         ["8.png,0", "9.png,1.5", "10.png,4", "11.png,9"],
         ["Index, Position_M ,weather", "0,0,rain", "1,1.5,", "3,9,sun", "2,4,x"],
         ["image,route_position_m", "summer/8.png,0", "summer/9.png,1.5", "summer/10.png,4", "summer/11.png,9"],
+        ["name;position_m", "8.png;0", "9.png;1.5", "10.png;4", "11.png;9"],
         ["\ufeffposition_m", "", "0", "1.5", "", "4", "9"],
     ],
 )
@@ -94,7 +95,7 @@ def test_unlisted_images_and_lines_without_an_image_are_counted(folder):
         ([""], r"is empty"),
         (["position_m", "nan", "-", "NA", "null"], r"none of 4 frames has a position"),
         (["position_m", "3", "2", "1", "0"], r"positions fall along the drive, from 3 m \(8\.png\) to 0 m.*--reverse"),
-        (["position_m", "0", "5", "2", "6"], r"to and fro, for example from 0\.00 m \(8\.png\) to 5\.00 m \(9\.png\)"),
+        (["position_m", "0", "5", "2", "6"], r"to and fro: 10\.png is at 2\.00 m after 5\.00 m \(9\.png\)"),
         (
             ["name,position_m,timestamp", "8.png,0,0.1", "9.png,1,0.2"],
             r"line 2: nobody can tell the unit of the time 0\.1",
@@ -170,6 +171,15 @@ def test_times_say_how_far_and_in_which_order(folder):
     assert [frame.position_m for frame in recording.frames] == [0, 10, 20]
     assert recording.left_out_names == {"where no robot can have been": ["10.png"]}
     assert recording.remarks == ["10.png would be 5768299 m from 9.png"]
+
+
+def test_one_wrong_time_among_many_is_left_out_by_name(tmp_path):
+    for at in range(40):
+        cv2.imwrite(str(tmp_path / f"{at}.png"), np.zeros((4, 4), np.uint8))
+    positions(tmp_path, "x_m,y_m,time_s", *(f"{at},0,{at + 1000 * (at == 20)}" for at in range(40)))
+    recording = open_source(str(tmp_path))
+    assert recording.left_out_names == {"whose time goes back": ["20.png"]}
+    assert recording.frames[-1].position_m == 39
 
 
 def test_lines_at_a_rate_of_their_own_are_interpolated_at_the_times_that_names_tell(tmp_path):

@@ -109,6 +109,12 @@ def test_spikes_alone_are_off_the_track(hz, spikes):
         assert np.flatnonzero(~on_track(x, y, time_us)).tolist() == list(places)
 
 
+def test_two_drives_by_turns_are_one_and_spikes():
+    along = np.arange(200.0)
+    by_turns = np.where(np.arange(200) % 2, along + 800, along)
+    assert on_track(by_turns, 0 * along, None).sum() == 100
+
+
 def test_honest_tracks_have_no_spikes():
     rng = np.random.default_rng(0)
     fast = np.cumsum(np.concatenate((np.full(300, 0.1), np.full(300, 3.0), np.zeros(50))))  # crawls, then 30 m/s, stops
