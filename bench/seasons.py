@@ -1,0 +1,98 @@
+"""What further seasons of a route are worth to one map: appended one by one, against all known from the start.
+
+    python -m bench.seasons SOURCE SOURCE SOURCE [SOURCE...]
+
+SOURCEs are drives of one route in as many seasons; every order of them is measured, the last one driven in one session.
+"""
+
+import itertools
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from bench.common import ACTIONS_M, machine, markdown
+from deepsimbad.core.building import MapPlan, compose_map
+from deepsimbad.core.drive import Drive
+from deepsimbad.core.map import Map
+from deepsimbad.core.metrics import RetrievalScorer, RetrievalScores
+from deepsimbad.core.relevance import Query, Relevance
+from deepsimbad.core.retrieval import relevances
+from deepsimbad.core.route import true_images_of
+from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
+from deepsimbad.jobs.append import KnownDrives, fuse
+from deepsimbad.jobs.build import encode_recording
+from deepsimbad_client.recordings.sources import open_source
+
+PLAN = MapPlan(Relevance.COMPOSED, 4, ACTIONS_M, same_route=True)
+MOST_LANDMARKS = 300
+MAX_PIXELS = 50_000_000
+TOLERANCE_M = 2.0
+KINDS = ("one season", "one, and one appended", "two from the start", "one, and two appended")
+
+
+def lines(sources: Sequence[str]) -> Iterator[str]:
+    """The table."""
+    yield from (machine(), "", f"`python -m bench.seasons {' '.join(sources)}`", "")
+    scores: dict[str, list[tuple[RetrievalScores, RetrievalScores]]] = {kind: [] for kind in KINDS}
+    for training, *others in itertools.permutations(encoded(sources)):
+        *seasons, test = others
+        for kind, map_ in maps(training, seasons):
+            scores[kind].append((driven(map_, test, stateless=False), driven(map_, test, stateless=True)))
+    yield from markdown(
+        ("map of", "orders", "one session: ANR / R@1 / worst ANR", "every view on its own"),
+        ((kind, len(rows), *map(figures, zip(*rows, strict=True))) for kind, rows in scores.items() if rows),
+    )
+
+
+def encoded(sources: Sequence[str]) -> list[Drive]:
+    """Every drive; images by the default extractor."""
+    drives = []
+    for source in sources:
+        recording = open_source(source)
+        config = {"kind": "feature_l2", **({} if recording.encodings is None else {"extractor": "none"})}
+        evaluator = make_evaluator(evaluator_config(config))
+        drives.append(encode_recording(recording, evaluator, MAX_PIXELS, lambda _: None).drive)
+    return drives
+
+
+def maps(training: Drive, seasons: Sequence[Drive]) -> Iterator[tuple[str, Map]]:
+    """Maps of one drive that know more and more of the seasons."""
+    n_landmarks = min(MOST_LANDMARKS, training.n_frames)
+    map_ = compose_map(PLAN, training, None, None, n_landmarks).map
+    map_ = replace(map_, frame_digest=training.digests())
+    yield KINDS[0], map_
+    drives = [(training, True)]
+    for kind, season in zip((KINDS[1], KINDS[3]), seasons, strict=False):
+        known = KnownDrives.of(map_, drives, training)
+        fused = None if known is None else fuse(map_, known, season, same_route=True)[0]
+        if fused is None:
+            raise SystemExit("these are no drives of one route")
+        map_ = fused.map
+        drives.append((season, True))
+        yield kind, map_
+    if seasons:
+        yield KINDS[2], compose_map(PLAN, training, seasons[0], seasons[0], n_landmarks).map
+
+
+def driven(map_: Map, test: Drive, *, stateless: bool) -> RetrievalScores:
+    """One session over the drive, or every view by itself."""
+    scorer, live = RetrievalScorer(), map_.live_statistics
+    truths = true_images_of(test.route(), map_.route, TOLERANCE_M)
+    for encoding, truth in zip(test.encodings, truths, strict=True):
+        view = Query(np.ones(map_.n_landmarks, np.float32), encoding=encoding)
+        live = live if stateless or live is None else live.observing(view)
+        scorer.add(relevances(map_, view, live), truth)
+    return scorer.result()
+
+
+def figures(scores: Sequence[RetrievalScores]) -> str:
+    """Means, and the worst ANR, in percent."""
+    anr = [score.anr for score in scores]
+    return f"{np.mean(anr):.2f} / {np.mean([score.recall_at[1] for score in scores]):.1f} / {max(anr):.2f}"
+
+
+if __name__ == "__main__":
+    for line in lines(sys.argv[1:]):
+        print(line, flush=True)
