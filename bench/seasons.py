@@ -1,8 +1,10 @@
 """What further seasons of a route are worth to one map: appended one by one, against all known from the start.
 
     python -m bench.seasons SOURCE SOURCE SOURCE [SOURCE...]
+    python -m bench.seasons --camera FIRST SECOND SOURCE SOURCE [SOURCE...]
 
 SOURCEs are drives of one route in as many seasons; every order of them is measured, the last one driven in one session.
+With --camera maps of one season learn what a season changes from FIRST and SECOND, two drives of another route.
 """
 
 import itertools
@@ -13,13 +15,13 @@ from dataclasses import replace
 import numpy as np
 
 from bench.common import ACTIONS_M, machine, markdown
-from deepsimbad.core.building import MapPlan, compose_map
+from deepsimbad.core.building import MapPlan, SeenTwice, compose_map
 from deepsimbad.core.drive import Drive
 from deepsimbad.core.map import Map
 from deepsimbad.core.metrics import RetrievalScorer, RetrievalScores
 from deepsimbad.core.relevance import Query, Relevance
 from deepsimbad.core.retrieval import relevances
-from deepsimbad.core.route import true_images_of
+from deepsimbad.core.route import same_places, true_images_of
 from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
 from deepsimbad.jobs.append import KnownDrives, fuse
 from deepsimbad.jobs.build import encode_recording
@@ -29,21 +31,39 @@ PLAN = MapPlan(Relevance.COMPOSED, 4, ACTIONS_M, same_route=True)
 MOST_LANDMARKS = 300
 MAX_PIXELS = 50_000_000
 TOLERANCE_M = 2.0
-KINDS = ("one season", "one, and one appended", "two from the start", "one, and two appended")
+KINDS = ("one season", "one, and one appended", "two from the start", "one, and two appended", "one, and the camera's")
 
 
 def lines(sources: Sequence[str]) -> Iterator[str]:
     """The table."""
     yield from (machine(), "", f"`python -m bench.seasons {' '.join(sources)}`", "")
     scores: dict[str, list[tuple[RetrievalScores, RetrievalScores]]] = {kind: [] for kind in KINDS}
-    for training, *others in itertools.permutations(encoded(sources)):
-        *seasons, test = others
-        for kind, map_ in maps(training, seasons):
+    for test, compared in worlds(sources):
+        for kind, map_ in compared:
             scores[kind].append((driven(map_, test, stateless=False), driven(map_, test, stateless=True)))
     yield from markdown(
         ("map of", "orders", "one session: ANR / R@1 / worst ANR", "every view on its own"),
         ((kind, len(rows), *map(figures, zip(*rows, strict=True))) for kind, rows in scores.items() if rows),
     )
+
+
+def worlds(sources: Sequence[str]) -> Iterator[tuple[Drive, Iterator[tuple[str, Map]]]]:
+    """Every test drive, and the maps that it is driven on."""
+    if sources[0] != "--camera":
+        for training, *seasons, test in itertools.permutations(encoded(sources)):
+            yield test, maps(training, seasons)
+        return
+    first, second, *drives = encoded(sources[1:])
+    camera = (SeenTwice(first, second, same_places(second.route(), first.route())),)
+    for training, test in itertools.permutations(drives, 2):
+        yield test, by_camera(training, camera)
+
+
+def by_camera(training: Drive, camera: Sequence[SeenTwice]) -> Iterator[tuple[str, Map]]:
+    """Maps of one drive without and with what its camera's seasons taught elsewhere."""
+    n_landmarks = min(MOST_LANDMARKS, training.n_frames)
+    yield KINDS[0], compose_map(PLAN, training, None, None, n_landmarks).map
+    yield KINDS[4], compose_map(PLAN, training, None, None, n_landmarks, camera=camera).map
 
 
 def encoded(sources: Sequence[str]) -> list[Drive]:

@@ -145,6 +145,7 @@ def test_named_errors_are_one_line_and_make_nothing(deepsimbad, drives, pictures
     images = ("--landmarks", pictures, "--training", pictures, "--n-landmarks", 20)
     named_error(deepsimbad("map", "route", *images, *READY), "ready encodings")
     named_error(deepsimbad(*route, "--actions-m", "5,-5"), "ascend")
+    named_error(deepsimbad(*route, "--n-landmarks", 20, "--camera-of", "yard"), "yard")
     named_error(deepsimbad("map", "no/name", *sources(drives), *READY), "1 to 64 letters")
     named_error(deepsimbad("map", "route", *sources(drives), "--evaluator", "feature_l2:crystal_ball"), "extractor")
     named_error(deepsimbad("info", "nowhere"), "nowhere")

@@ -5,6 +5,7 @@ import hashlib
 import io
 
 import numpy as np
+import pytest
 
 from .conftest import DIM, N_READY, RANKS, TAKES_ENCODINGS, problem, ready_encodings, service, until
 
@@ -327,3 +328,79 @@ def test_versions_beyond_those_kept_lose_their_files(tmp_path):
         until(lambda: files() == [3, 4])
         assert versions(client, "route")[2]["removed_at"] == removed_at
         assert len(versions(client, "route")) == 4
+
+
+# What a camera's seasons teach
+
+
+D_SEEN = 16
+
+
+def route_seen(route, drive):
+    """A drive of a route in a season of its own; a season changes every fourth number of a place."""
+    place = np.random.default_rng(route).normal(size=(140, D_SEEN))
+    rng = np.random.default_rng(100 * route + drive)
+    changed = 4 * rng.normal(size=place.shape) * (np.arange(D_SEEN) % 4 == 0)
+    return (rng.normal(size=D_SEEN) + place + changed + 0.2 * rng.normal(size=place.shape)).astype(np.float32)
+
+
+@pytest.fixture
+def yard(client):
+    """The domain `yard`, mapped from two seasons, and `lane`, of which one drive is there."""
+    for name in ("yard", "lane"):
+        assert client.put(f"/v1/admin/domains/{name}", json=TAKES_ENCODINGS).status_code == 201
+        for drive, traverse in enumerate(("drive", "winter") if name == "yard" else ("drive",)):
+            client.upload(name, traverse, route_seen(5 if name == "lane" else 4, drive), np.arange(140.0))
+    about = {"training_episodes": 0, "n_landmarks": 60}
+    job = client.remap("yard", landmark_traverse="winter", same_route=True, **about)
+    assert job["result"]["metrics"]["second_season"]["accepted"] is True
+    assert job["result"]["metrics"]["camera_of"] is None
+    yield about
+    for name in ("yard", "lane"):
+        assert client.delete(f"/v1/admin/domains/{name}").status_code == 204
+
+
+def test_what_a_cameras_seasons_teach_serves_its_other_routes(client, yard):
+    def found(**asked):
+        job = client.remap("lane", **yard, **asked)
+        assert job["state"] == "succeeded", job["error"]
+        hits = 0
+        for frame, encoding in enumerate(route_seen(5, 7).astype(float).tolist()):
+            answer = client.post("/v1/domains/lane/localizations", json={"encoding": encoding}).json()
+            hits += answer["retrieval"][0]["map_image"] == frame
+        return hits, job["result"]["metrics"]["camera_of"]
+
+    alone, by_camera = found(), found(camera_of="yard")
+    assert (alone[1], by_camera[1]) == (None, "yard")
+    assert by_camera[0] > alone[0] + 10
+    client.upload("lane", "winter", route_seen(5, 1), np.arange(140.0))
+    seen_twice = found(camera_of="yard", landmark_traverse="winter", same_route=True)
+    assert seen_twice[1] is None, "what this route itself taught counts"
+
+
+def test_a_camera_that_cannot_serve_is_named(client, yard):
+    def why(domain="lane", **asked):
+        job = client.remap(domain, **yard, **asked)
+        assert job["state"] == "failed", job
+        return job["error"]["code"], job["error"]["detail"]
+
+    body = {"training_traverse": "drive"}
+    path = "/v1/admin/domains/lane/remaps"
+    problem(client.post(path, json={**body, "camera_of": "nowhere"}), 404, "unknown_domain")
+    for more in ({"relevance": "rrf"}, {"append": True}):
+        problem(client.post(path, json={**body, "camera_of": "yard", **more}), 422, "invalid_map_config")
+    assert why(camera_of="lane") == (
+        "invalid_map_config",
+        "camera_of names domain lane itself: name one of another route",
+    )
+    assert "another evaluator" in why(camera_of="seen")[1]
+    assert why("yard", camera_of="lane")[0] == "no_active_map"
+    assert client.remap("lane", **yard)["state"] == "succeeded"
+    assert "knows no second season" in why("yard", camera_of="lane")[1]
+    assert client.put("/v1/admin/domains/short", json=TAKES_ENCODINGS).status_code == 201
+    client.upload("short", "drive", route_seen(5, 0)[:, :9], np.arange(140.0))
+    code, says = why("short", camera_of="yard")
+    assert (code, "encodings of 16 numbers, not of 9" in says) == ("invalid_encoding", True)
+    assert client.delete("/v1/admin/domains/short").status_code == 204
+    assert client.delete("/v1/admin/domains/yard/traverses/winter").status_code == 204
+    assert "made of traverse winter, which is gone" in why(camera_of="yard")[1]

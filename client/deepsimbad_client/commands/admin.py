@@ -249,6 +249,12 @@ def _show_deleted(json_output: bool, **names: str | int) -> None:
     help="Whether both drives count their positions along one route, so that the map may learn from two seasons of it; "
     "absent: only where both know x, y.",
 )
+@click.option(
+    "--camera-of",
+    metavar="DOMAIN",
+    help="Another domain of the same camera, mapped from two seasons of its route: where this route was seen in one, "
+    "what a season changes is learnt there.",
+)
 @click.option("--wait/--no-wait", default=True, show_default=True, help="Follow the job to its end.")
 @json_flag
 @serving

@@ -62,6 +62,7 @@ class RemapOptions(TypedDict, total=False):
     check_traverse: str | None  # the drive that the new map and the active one are compared on
     gate_margin: float | None  # percentage points of ANR by which the new map may be worse and still be activated
     append: bool | None  # whether the traverse is added to a copy of the active map
+    camera_of: str | None  # another domain of the camera, that what a season changes is learnt from
     same_route: bool | None  # whether both drives count their positions along one route; absent: where both know x, y
 
 

@@ -100,6 +100,14 @@ class RemapBody(JsonBody):
         ),
     ] = None
 
+    camera_of: Annotated[
+        Name | None,
+        Field(
+            description="Another domain of the same camera, whose active map knows two seasons of its route: where "
+            "this route was seen in one, what a season changes is learnt there (composed; metrics.camera_of says so)."
+        ),
+    ] = None
+
     def config(self) -> RemapConfig:
         """The job's form; raises InvalidMapConfigError."""
         return RemapConfig(**{name: getattr(self, name) for name in type(self).model_fields})
@@ -179,6 +187,8 @@ async def post_remap(
         if before is not None:
             return JobAnswer.model_validate(before)
         record = running.catalog.domain(domain)
+        if config.camera_of is not None:
+            running.catalog.domain(config.camera_of)
         n_frames: dict[str | None, int] = {}
         for name in (config.training_traverse, config.landmark_traverse, config.check_traverse):
             if name is not None:

@@ -75,6 +75,12 @@ def _actions_m(_context: click.Context, _parameter: click.Parameter, value: str 
     help="Whether both recordings count their positions along one route, so that the map may learn from two seasons of "
     "it.  [default: where both know x, y]",
 )
+@click.option(
+    "--camera-of",
+    metavar="DOMAIN",
+    help="Another domain of the same camera, mapped from two seasons of its route: where this route was seen in one, "
+    "what a season changes is learnt there.",
+)
 @click.option("--closed", is_flag=True, help="The end of the route joins its start.")
 @click.option(
     "--actions-m",

@@ -5,7 +5,7 @@ is the landmark traverse where there is one. What both saw is fused, and shows h
 trusted: the second season is driven through a map whose lists do not know it, as no list knows the season to come.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Self
 
@@ -60,6 +60,7 @@ class Built:
     second: Drive | None = None  # the second drive, measured, where it is of the same route
     same_route: SameRoute | None = None  # whether it is, and why not; None where there is no second drive
     places: NDArray[np.float32] | None = None  # [n, k] unit vectors that the lists stand for (`composed`)
+    by_camera: bool = False  # whether what a season changes was learnt on another route
 
 
 def build_from_dissimilarities(
@@ -100,6 +101,15 @@ def build_from_dissimilarities(
 
 
 @dataclass(frozen=True)
+class SeenTwice:
+    """Places of one route that a camera saw in two seasons."""
+
+    first: Drive
+    second: Drive
+    places: NDArray[np.int64]  # [k, 2] frames of the first and the second
+
+
+@dataclass(frozen=True)
 class _Space:
     """Where unit encodings are compared, and the landmarks there."""
 
@@ -131,10 +141,11 @@ class _Space:
         """[n, r] squared distances of unit vectors to the landmarks."""
         return np.asarray(np.clip(2 - 2 * (u @ self.prototypes.T), 0, 4), np.float32)
 
-    def whitened(self, first: Drive, second: Drive, places: NDArray[np.int64], candidates: Drive) -> Self:
+    def whitened(self, seasons: Sequence["SeenTwice"], candidates: Drive) -> Self:
         """What a season changes counting less, landmarks chosen anew."""
-        images, frames = places.T
-        whitening = within_place_whitening(self.unit_vectors(second)[frames], self.unit_vectors(first)[images])
+        firsts = [self.unit_vectors(seen.first)[seen.places[:, 0]] for seen in seasons]
+        seconds = [self.unit_vectors(seen.second)[seen.places[:, 1]] for seen in seasons]
+        whitening = within_place_whitening(np.concatenate(seconds), np.concatenate(firsts))
         projection = whitening if self.projection is None else self.projection @ whitening
         return self.among(candidates, projection, len(self.prototypes))
 
@@ -150,6 +161,7 @@ def compose_map(
     landmarks: Drive | Mapping[str, NDArray[Any]] | None,
     n_landmarks: int,
     on_progress: Callable[[float], None] = lambda _: None,
+    camera: Sequence[SeenTwice] = (),
 ) -> Built:
     """The same for `composed`, which chooses its landmarks where it describes: among unit encodings.
 
@@ -158,6 +170,8 @@ def compose_map(
         landmarks: The drive that they are chosen from (the same object as `second` where it is that one: a rehearsal
             then leaves a place's own landmark out), the model in which they stay, or None: the training drive.
         n_landmarks: r.
+        camera: What it saw twice on other routes: what a season changes is learnt from that where this route was
+            not seen twice, and landmarks are chosen here.
 
     Raises:
         TooFewCandidatesError: That drive has fewer frames.
@@ -180,15 +194,15 @@ def compose_map(
     if second is not None:
         season, other, verdict = second_season(own, plan.closed, second, plan.same_route, space.seen)
     on_progress(0.5)
-    if (
-        season is not None
-        and other is not None
-        and isinstance(candidates, Drive)
-        and covers(training.position_m, season.places[:, 0])
-    ):
-        space = space.whitened(training, other, season.places, candidates)
-        own, other = space.seen(training), space.seen(other)
-        season = SecondSeason(_measured(other), season.places)
+    seen_twice, by_camera = camera, bool(camera)
+    if season is not None and other is not None and covers(training.position_m, season.places[:, 0]):
+        seen_twice, by_camera = (SeenTwice(training, other, season.places),), False
+    if seen_twice and isinstance(candidates, Drive):
+        space = space.whitened(seen_twice, candidates)
+        own = space.seen(training)
+        if season is not None and other is not None:
+            other = space.seen(other)
+            season = SecondSeason(_measured(other), season.places)
     on_progress(0.7)
     usual, places = Moments.of(training.encodings), space.unit_vectors(training)
     fused = places
@@ -208,15 +222,32 @@ def compose_map(
         barred = own_places if candidates is second or plan.bars_own_place else None
         rehearsal = replace(map_, lists=compose(places, space.prototypes, plan.list_length, barred))
     on_progress(0.8)
-    learnt = rehearsed(rehearsal, _measured(own), season)
-    map_, rehearsal = replace(map_, **learnt), replace(rehearsal, **learnt)
-    strangest = most_strange(training.encodings, None if other is None else other.encodings)
-    learnt = {
-        "view_bits": view_bits(map_, space.dissimilarities(fused), rehearsal, season),
-        "most_strange": np.array([strangest]),
-    }
+    known = (training,) if other is None else (training, other)
+    map_, rehearsal = taught(map_, rehearsal, _measured(own), space.dissimilarities(fused), season, known)
     on_progress(1.0)
-    return Built(replace(map_, **learnt), replace(rehearsal, **learnt), own, other, verdict, fused)
+    return Built(map_, rehearsal, own, other, verdict, fused, by_camera)
+
+
+def taught(
+    map_: Map,
+    rehearsal: Map,
+    own: NDArray[np.float32],
+    places: NDArray[np.float32],
+    season: SecondSeason | None,
+    drives: Sequence[Drive],
+) -> tuple[Map, Map]:
+    """A `composed` map and its rehearsal with what a further season, or the map itself, tells of views to come.
+
+    Args:
+        own, places: [n, r] dissimilarities of the map images, and of what the lists stand for.
+        drives: Every season of the route.
+    """
+    learnt = rehearsed(rehearsal, own, season)
+    map_, rehearsal = replace(map_, **learnt), replace(rehearsal, **learnt)
+    first, *others = (drive.encodings for drive in drives)
+    strangest = max([most_strange(first), *(most_strange(first, other) for other in others)])
+    learnt = {"view_bits": view_bits(map_, places, rehearsal, season), "most_strange": np.array([strangest])}
+    return replace(map_, **learnt), replace(rehearsal, **learnt)
 
 
 def composed_map(

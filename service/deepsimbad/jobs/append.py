@@ -5,14 +5,14 @@ candidates that are its landmarks stay, what a season changes is learnt from all
 the map lacks becomes images of its own.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from deepsimbad.core.building import MapPlan, composed_map, covers, with_frames
+from deepsimbad.core.building import MapPlan, composed_map, covers, taught, with_frames
 from deepsimbad.core.composed import (
     SECOND_SEASON_WEIGHT,
     Moments,
@@ -24,9 +24,20 @@ from deepsimbad.core.composed import (
 )
 from deepsimbad.core.drive import Drive, SameRoute, SecondSeason, second_season
 from deepsimbad.core.map import Map
-from deepsimbad.core.rehearsal import rehearsed
-from deepsimbad.core.relevance import Relevance, most_strange
+from deepsimbad.core.relevance import Relevance
 from deepsimbad.core.route import same_places
+
+
+def seasons_in(config: Mapping[str, Any], metrics: Mapping[str, Any]) -> dict[str | None, bool]:
+    """The traverses that a map is made of, by its configuration and metrics in the catalog; None: of another server.
+
+    The first is the training traverse; whether each sees the same at one place as that one.
+    """
+    names = {config["training_traverse"]: True}
+    second = metrics.get("second_season") or {}
+    if second.get("accepted"):
+        names[second.get("traverse", config["landmark_traverse"])] = True
+    return names | {added["traverse"]: added.get("fused", False) for added in config.get("appended", ())}
 
 
 @dataclass(frozen=True)
@@ -149,9 +160,9 @@ def fuse(map_: Map, known: KnownDrives, drive: Drive, same_route: bool | None) -
     made = composed_map(plan, own, places, usual, model)
     rehearsal = replace(made, lists=_lists(made, unit(before)))
     season = SecondSeason(_dissimilarities(rows[-1], whitening, prototypes), pairs[-1])
-    arrays = {**made.arrays(), **rehearsed(rehearsal, own_dissimilarities, season)}
-    strangest = max(most_strange(seasons[0].encodings, other.encodings) for other in seasons[1:])
-    arrays["most_strange"] = np.array([strangest])
+    stands_for = _dissimilarities(places, None, prototypes)
+    made, _ = taught(made, rehearsal, own_dissimilarities, stands_for, season, seasons)
+    arrays: dict[str, Any] = dict(made.arrays())
     base = replace(map_, landmark_model=model, **arrays)
     new = np.setdiff1d(np.arange(drive.n_frames), pairs[-1][:, 1])
     new_lists = compose(u[-1][new], prototypes, map_.list_length)

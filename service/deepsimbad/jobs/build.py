@@ -1,7 +1,7 @@
 """From recordings to a map: encoded, landmarks chosen, every frame described, experience learnt (II-B to II-D)."""
 
 import time
-from collections.abc import Callable, Iterator, MutableMapping
+from collections.abc import Callable, Iterator, MutableMapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field, replace
@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from deepsimbad.core.building import Built, MapPlan, build_from_dissimilarities, compose_map
+from deepsimbad.core.building import Built, MapPlan, SeenTwice, build_from_dissimilarities, compose_map
 from deepsimbad.core.descriptor import rank_landmarks
 from deepsimbad.core.drive import Drive
 from deepsimbad.core.frames import UNKNOWN_TIMESTAMP
@@ -173,17 +173,19 @@ def build(
     n_landmarks: int,
     evaluator: Evaluator,
     on_progress: Callable[[float], None] = lambda _: None,
+    camera: Sequence[SeenTwice] = (),
 ) -> Built:
     """Choose landmarks, describe every training frame by them, and learn from a second season where there is one.
 
     Args:
         landmarks: The drive they are chosen from, the model that they stay in, or None: the training drive's own.
         n_landmarks: r, where they are chosen.
+        camera: What it saw twice on other routes (`composed`).
     """
     if second is not None and np.array_equal(second.encodings, training.encodings):
         second = None  # one drive under two names is one season
     if plan.relevance is Relevance.COMPOSED:
-        return compose_map(plan, training, second, landmarks, n_landmarks, on_progress)
+        return compose_map(plan, training, second, landmarks, n_landmarks, on_progress, camera)
     candidates = training if landmarks is None else landmarks
     if isinstance(candidates, Drive):
         chosen = choose_landmarks(candidates.encodings, n_landmarks, evaluator, lambda share: on_progress(share / 2))

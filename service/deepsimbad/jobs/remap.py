@@ -13,7 +13,7 @@ from typing import Any, Self, TypeAlias
 
 import numpy as np
 
-from deepsimbad.core.building import MapPlan, append_drive
+from deepsimbad.core.building import MapPlan, SeenTwice, append_drive
 from deepsimbad.core.composed import is_composed
 from deepsimbad.core.descriptor import MAX_LANDMARKS
 from deepsimbad.core.drive import Drive
@@ -23,8 +23,9 @@ from deepsimbad.core.nnql import NnqlConfig
 from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Relevance
 from deepsimbad.errors import InvalidEncodingError, InvalidMapConfigError, LostActivationError, WeightsDifferError
 from deepsimbad.evaluators.base import Evaluator
-from deepsimbad.jobs.append import KnownDrives, fuse
+from deepsimbad.jobs.append import KnownDrives, fuse, seasons_in
 from deepsimbad.jobs.build import EPISODES_A_MAP_IMAGE, build, measured, train_nnql
+from deepsimbad.jobs.camera import seen_twice
 from deepsimbad.jobs.check import CheckFrames, check_map, traverses_in
 from deepsimbad.jobs.progress import Progress
 from deepsimbad.jobs.versions import activate_once, seal_version
@@ -69,6 +70,9 @@ class RemapConfig:
     # Whether positions of the training traverse and of the second drive (the landmark traverse, else what the active
     # map was made of) are comparable; None: only where both know x, y
     same_route: bool | None = None
+    # Another domain, whose active map knows several seasons of its route by the same camera: what a season changes is
+    # learnt there where this route was seen in one; landmarks are chosen anew. None: nowhere else
+    camera_of: str | None = None
 
     def __post_init__(self) -> None:
         n_landmarks = self.n_landmarks
@@ -88,6 +92,8 @@ class RemapConfig:
             raise InvalidMapConfigError(
                 "a map finds the frames it was made of at once: give another check_traverse, or none to hold frames out"
             )
+        if self.camera_of is not None and (self.append or self.relevance is not Relevance.COMPOSED):
+            raise InvalidMapConfigError("camera_of is for maps that are made anew, for the relevance composed")
         if self.append and self.landmark_traverse is not None:
             raise InvalidMapConfigError(
                 "what is appended is described by the active map's landmarks: landmark_traverse must be null"
@@ -199,6 +205,7 @@ class _Inputs:
     # The drive that the map learns from beside its own: the landmark traverse, else what the active map was made of;
     # None where there is none of the same encoder, or where frames are appended
     second: Drive | None
+    camera: tuple[SeenTwice, ...]  # what the camera saw twice on another route
     known: KnownDrives | str | None  # what `base` is made of, or why nothing can be fused; None: nothing is appended
     check: Drive | None  # the drive that the new map is checked on; None: on frames of `training` that are held out
 
@@ -272,8 +279,11 @@ class _Remap:
         training = read(config.training_traverse)
         training.route(record.closed)  # what is wrong with it is said now, not after the map is built
         candidates = base = check = None
+        camera: tuple[SeenTwice, ...] = ()
+        if config.camera_of is not None:
+            camera = seen_twice(self.catalog, config.camera_of, record, training)
         if config.landmark_traverse is None:
-            base = self._active_map(record)
+            base = None if camera else self._active_map(record)
             if base is not None:
                 joining = f"traverse {config.training_traverse}"
                 WeightsDifferError.check("the active map", base.weights_sha256, joining, training.weights_sha256)
@@ -286,7 +296,7 @@ class _Remap:
             check.route(record.closed)
         second = None if config.append else self._second_season(record, training, read)
         known = self._known_drives(record, base, training, read) if config.append and base is not None else None
-        return _Inputs(record, training, candidates, base, second, known, check)
+        return _Inputs(record, training, candidates, base, second, camera, known, check)
 
     def _known_drives(
         self, record: DomainRecord, base: Map, training: Drive, read: Callable[[str], Drive]
@@ -296,15 +306,11 @@ class _Remap:
         config, metrics = active.config, active.metrics
         if base.relevance is not Relevance.COMPOSED:
             return f"places are fused in maps for composed alone, and this one is for {base.relevance}"
-        first, landmarks = config["training_traverse"], config["landmark_traverse"]
-        names = {first: True}
-        if (metrics.get("second_season") or {}).get("accepted"):
-            names[landmarks] = True
-        names |= {added["traverse"]: added.get("fused", False) for added in config.get("appended", ())}
+        names, landmarks = seasons_in(config, metrics), config["landmark_traverse"]
         stored = Traverse.list(self.catalog.data_dir, record.name)
         if gone := [name for name in names if name not in stored]:
             return f"of the drives that the map is made of {gone[0] or 'those of another server'} are not stored here"
-        drives = [(read(name), agrees) for name, agrees in names.items()]
+        drives = [(read(name), agrees) for name, agrees in names.items() if name is not None]
         if any(drive.encoding_dim != training.encoding_dim for drive, _ in drives):
             return "the drives that the map is made of come from another encoder by now"
         candidates = drives[0][0] if metrics.get("landmarks") == TRAINING else None
@@ -383,6 +389,7 @@ class _Remap:
             n_landmarks,
             self.evaluator,
             self.progress.update,
+            inputs.camera,
         )
         q_values = learning = None
         # The baseline that compares whole encodings would need hours for it, and serves no robot.
@@ -409,9 +416,13 @@ class _Remap:
             **training.origins(),
             q_values=q_values,
         )
-        second_season = None if built.same_route is None else built.same_route.as_dict()
+        second_season = None
+        if built.same_route is not None and inputs.second is not None:
+            second_season = {**built.same_route.as_dict(), "traverse": inputs.second.name}
         source = TRAINING if landmarks is None else LANDMARK_TRAVERSE if inputs.base is None else ACTIVE_MAP
-        return map_, map_, asked, {"landmarks": source, "training": learning, "second_season": second_season}
+        learnt = {"landmarks": source, "training": learning, "second_season": second_season}
+        learnt["camera_of"] = config.camera_of if built.by_camera else None
+        return map_, map_, asked, learnt
 
     def _appended(self, inputs: _Inputs, before: Map, frames: CheckFrames) -> _Draft:
         """A copy of the active map with the training traverse fused into its images, or among them."""
@@ -449,7 +460,7 @@ class _Remap:
         weights_sha256 = drive.weights_sha256 or before.weights_sha256
         if weights_sha256 is not None:
             config_after["weights_sha256"] = weights_sha256
-        learnt = {name: record.metrics.get(name) for name in ("landmarks", "training", "second_season")}
+        learnt = {name: record.metrics.get(name) for name in ("landmarks", "training", "second_season", "camera_of")}
         learnt["fused"] = {**verdict, "n_new_images": map_.n_images - before.n_images}
         checked = fused.without(frames.withheld) if fused is not None and frames.is_held_out else map_
         return replace(map_, config=config_after), checked, config_after, learnt
