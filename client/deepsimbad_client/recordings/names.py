@@ -43,13 +43,12 @@ def _number(name: str) -> Decimal | None:
 
 
 def times_of(names: Sequence[str]) -> list[int] | None:
-    """Unix microseconds, where all names are times since 1970 of one unit (s, ms, us or ns); else None."""
-    numbers = [_number(name) for name in names]
-    units = {None if number is None else unit_of(number) for number in numbers}
-    unit = units.pop()
-    if units or unit is None:
-        return None
-    return [round(number * UNITS[unit]) for number in numbers if number is not None]
+    """Unix microseconds, where all names end in a time since 1970 of one unit (s, ms, us or ns); else None."""
+    tokens = [_DECIMALS.split(stem(name))[1::2] for name in names]
+    numbers = [Decimal(parts[-1]) for parts in tokens if parts]
+    units = {unit_of(number) for number in numbers}
+    unit = units.pop() if len(units) == 1 and len(numbers) == len(names) else None
+    return None if unit is None else [round(number * UNITS[unit]) for number in numbers]
 
 
 class Finder:

@@ -36,7 +36,7 @@ def test_times_as_scripts_write_them_are_in_the_order_of_time(times):
 
 def test_names_that_are_times_tell_them():
     in_us = 1_305_031_103_250_000
-    for name in ("1305031103.25.png", "1305031103250.jpg", "1305031103250000.tiff", "1305031103250000000"):
+    for name in ("1305031103.25.png", "1305031103250.jpg", "left_1305031103250000.tiff", "f7-1305031103250000000"):
         assert times_of([name]) == [in_us]
     for names in (["7.png"], ["1305031103.25.png", "1305031103250.png"], ["1305031103.png", "cover.png"]):
         assert times_of(names) is None
