@@ -82,8 +82,9 @@ def shelf(client, request):
     base = f"/v1/admin/domains/{request.node.name.replace('_', '-')[:60]}"
     client.put(base, json=TAKES_ENCODINGS)
     made = client.post(f"{base}/traverses", json={"name": "t"})
-    unknown = dict.fromkeys(("length_m", "span_us", "digest"))
-    assert (made.status_code, made.json()) == (201, {**unknown, "name": "t", "n_frames": 0, "missing": []})
+    empty = dict.fromkeys(("length_m", "span_us", "digest", "grey_levels"))
+    empty |= {"name": "t", "n_frames": 0, "missing": [], "n_uninformative": 0}
+    assert (made.status_code, made.json()) == (201, empty)
     return f"{base}/traverses"
 
 
@@ -118,6 +119,8 @@ def test_frames_twice_and_out_of_order(client, shelf):
         "missing": [[1, 1], [3, 4]],
         "length_m": 5.0,
         "span_us": [0, 5],
+        "n_uninformative": 0,
+        "grey_levels": None,
     }
     batch = npz(encodings=np.ones((3, DIM)), index=np.array([4, 2, 3]), position_m=np.array([4, 2, 3]))
     answer = client.post(f"{shelf}/t/frames", content=batch, headers=NPZ)

@@ -136,8 +136,8 @@ def run(
         return asyncio.run(body(live))
 
 
-def viewed(view: View) -> Callable[[Evaluator], Awaitable[View]]:
-    async def give(_evaluator: Evaluator) -> View:
+def viewed(view: View) -> Callable[[Evaluator, Map], Awaitable[View]]:
+    async def give(_evaluator: Evaluator, _map: Map) -> View:
         return view
 
     return give

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from deepsimbad.core.belief import FilterKind
 from deepsimbad.core.localizer import ActiveLocalizer, LocalizerConfig
+from deepsimbad.core.map import Map
 from deepsimbad.core.relevance import Relevance
 from deepsimbad.engine.localizer import View, describe
 from deepsimbad.engine.worker import Stopwatch
@@ -45,7 +46,7 @@ def test_a_session_is_the_localizer_step_by_step(mapped: Catalog) -> None:
             observation = ranked(seed)
             view = await live.sessions.observe(session_id, observation)
             evaluator = FeatureL2("none")
-            query = describe(snapshot, evaluator, await observation.view(evaluator))
+            query = describe(snapshot, evaluator, await observation.view(evaluator, snapshot))
             state = localizer.step(state, query, observation.action_m).state
             np.testing.assert_array_equal(await live.sessions.mass(session_id), state.belief.mass)
             assert view.n_observations == seed + 1
@@ -98,9 +99,9 @@ def test_two_at_once_are_answered_in_order_of_arrival_and_told_how_they_waited(m
         gate = asyncio.Event()
         slow = ranked(0)
 
-        async def late(evaluator: Evaluator) -> View:
+        async def late(evaluator: Evaluator, map_: Map) -> View:
             await gate.wait()  # its image takes long to decode; it arrived first all the same
-            return await slow.view(evaluator)
+            return await slow.view(evaluator, map_)
 
         watches = [Stopwatch() for _ in range(12)]
         posted = [asyncio.create_task(live.sessions.observe(at_once, replace(slow, view=late), watches[0]))]

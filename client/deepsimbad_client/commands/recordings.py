@@ -23,6 +23,7 @@ from deepsimbad_client.commands.console import (
 )
 from deepsimbad_client.errors import UnknownDomainError
 from deepsimbad_client.http.client import Client
+from deepsimbad_client.http.models import Domain
 from deepsimbad_client.http.upload import upload as upload_recording
 from deepsimbad_client.recordings import Recording
 from deepsimbad_client.recordings.folder import single
@@ -112,17 +113,14 @@ def localize(client: Client, images: tuple[str, ...], domain: str, shortlist: in
     """
     described = client.domain(domain)
     shortlist = min(shortlist, described.n_map_images or shortlist)
-    answers = [
-        (name, client.localize(domain, shortlist=shortlist, **view))
-        for name, view in _views(images, described.input_size)
-    ]
+    answers = [(name, client.localize(domain, shortlist=shortlist, **view)) for name, view in _views(images, described)]
     if json_output:
         click.echo(as_json([{"image": name, **answer.model_dump(mode="json")} for name, answer in answers]))
     else:
         show(place_table(answers))
 
 
-def _views(images: Iterable[str], input_size: tuple[int, int] | None) -> Iterator[tuple[str, dict[str, Any]]]:
+def _views(images: Iterable[str], domain: Domain) -> Iterator[tuple[str, dict[str, Any]]]:
     """Every view with its name, made ready as an upload would make it, so that it is encoded like a map's own."""
     for name in images:
         path = Path(name)
@@ -132,8 +130,9 @@ def _views(images: Iterable[str], input_size: tuple[int, int] | None) -> Iterato
             tell_remarks(recording)
         else:
             recording = opened(name)
+        recording = recording.shown_by(domain.grey_levels)
         for row, frame in enumerate(recording.frames):
-            yield name if is_image else frame.name, recording.view(row, input_size)
+            yield name if is_image else frame.name, recording.view(row, domain.input_size)
 
 
 def _make_domain_if_missing(

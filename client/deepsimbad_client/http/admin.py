@@ -93,10 +93,14 @@ class AdminCalls(Face):
         await self._wire.send(Call.delete(_domain(name)))
 
     @shared
-    async def create_traverse(self, domain: str, name: str) -> Traverse:
-        """Make an empty traverse; one of that name that is there stays as it is."""
+    async def create_traverse(self, domain: str, name: str, *, grey_levels: tuple[int, int] | None = None) -> Traverse:
+        """Make an empty traverse; one of that name that is there stays as it is.
+
+        `grey_levels` are what is shown black and what white of pictures of more than 8 bits; absent: by the first one.
+        A traverse that has some keeps them.
+        """
         in_path("traverse", name)
-        call = Call.with_json("POST", f"{_domain(domain)}/traverses", {"name": name})
+        call = Call.with_json("POST", f"{_domain(domain)}/traverses", {"name": name, "grey_levels": grey_levels})
         return model_of(Traverse, await self._wire.send(call))
 
     @shared

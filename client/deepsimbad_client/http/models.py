@@ -51,6 +51,8 @@ class Domain(Answer):
     evaluator: str | dict[str, Any] | None = None
     input_size: tuple[int, int] | None = None
     """(width, height) an image is best resized to before it is sent; None: as it is, or no images at all."""
+    grey_levels: tuple[int, int] | None = None
+    """What is shown black and white of views of more than 8 bits, as of the map's pictures; None: those had 8."""
     encoding_dim: int | None = None
     """Length of an image's encoding; None: no images are taken. Ready ones may have any one length."""
     relevance: str | None = None
@@ -190,6 +192,9 @@ class Traverse(Answer):
     length_m: float | None = None  # from the least position to the greatest
     span_us: tuple[int, int] | None = None  # first and last known time of a frame
     digest: str | None = None  # SHA-256 over indices, contents, places and times; one drive, one digest
+    n_uninformative: int = 0  # frames whose pictures show nothing
+    grey_levels: tuple[int, int] | None = None
+    """What is shown black and white of pictures of more than 8 bits; None: none came."""
 
 
 class FrameStored(Answer):

@@ -34,6 +34,7 @@ try:
     from deepsimbad.errors import DeepSimbadError, InvalidImageError, InvalidInputError, MissingPackageError
     from deepsimbad.evaluators.base import Evaluator
     from deepsimbad.evaluators.compute import Compute
+    from deepsimbad.evaluators.grey_levels import levels_in
     from deepsimbad.evaluators.image import decode_image, is_blank
     from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
 except ImportError as missing:
@@ -138,7 +139,8 @@ class OnBoardEncoder:
         else:
             what = str(image) if isinstance(image, str | PathLike) else "the bytes given as image"
             try:
-                pixels = decode_image(image_bytes(image), _MAX_PIXELS)
+                levels = levels_in(self.landmarks.model)
+                pixels = decode_image(image_bytes(image), _MAX_PIXELS, levels=levels)
             except DeepSimbadError as error:
                 raise BrokenFrameError(f"{what}: {error.message}") from error
         evaluator = self._loaded

@@ -78,7 +78,8 @@ def upload(
     left_out = LeftOut(recording, allow_missing=allow_missing)
     started = time.monotonic()
     input_size = client.domain(domain).input_size
-    client.admin.create_traverse(domain, traverse)
+    stored = client.admin.create_traverse(domain, traverse, grey_levels=recording.grey_levels)
+    recording = recording.shown_by(stored.grey_levels)
     report = UploadReport(len(recording.frames), left_out=recording.left_out, left_out_names=left_out.names)
 
     def tell() -> None:

@@ -12,7 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepsimbad.errors import DeepSimbadError
-from deepsimbad.evaluators.image import decode_image, resized
+from deepsimbad.evaluators.grey_levels import GreyLevels, measured, shown
+from deepsimbad.evaluators.image import decode_deep, resized
+from deepsimbad.evaluators.image_files import ImageFile
 from deepsimbad_client.errors import BrokenFrameError, SourceError
 from deepsimbad_client.http import media_type_of
 from deepsimbad_client.recordings.heic import HEIC_SUFFIXES, decode_heic
@@ -22,6 +24,7 @@ Image = NDArray[np.uint8]  # [height, width, 3] BGR
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", ".pgm", ".ppm"}) | HEIC_SUFFIXES
 TURNS = {0: None, 90: cv2.ROTATE_90_CLOCKWISE, 180: cv2.ROTATE_180, 270: cv2.ROTATE_90_COUNTERCLOCKWISE}
 
+_N_LEVEL_PROBES, _N_SURE = 16, 3  # images that tell the grey levels; so many of 8 bits, and the others are too
 _MAX_PIXELS = 1 << 30  # the picture is the caller's own
 
 
@@ -55,6 +58,7 @@ class Recording:
     left_out_names: Mapping[str, Sequence[str]] = field(default_factory=dict)  # reason -> frames not in `frames`
     encodings: NDArray[np.float32] | None = None  # [n, d], row i of frame i; None where the frames are images
     remarks: Sequence[str] = ()  # what the reader took the recording for, where that is not plain
+    grey_levels: GreyLevels | None = None  # by which images of more than 8 bits are shown; None: by each one's own
     n_before_slice: int | None = None  # how many frames there were before a slice was taken; None: there was no slice
 
     @property
@@ -75,6 +79,10 @@ class Recording:
         Raises BrokenFrameError (this file cannot be used; the others can), SourceError (there are no images at all).
         """
         raise SourceError(f"{self.name} holds ready encodings, not images")
+
+    def shown_by(self, levels: GreyLevels | None) -> Self:
+        """The recording shown by the grey levels of the traverse or the map that it goes to; None: by its own."""
+        return self if levels is None else dataclasses.replace(self, grey_levels=levels)
 
     def stamp(self, frame: Frame) -> str:
         """What changes when a frame's image does: its name, and of a file its size and time."""
@@ -132,23 +140,44 @@ def read_file(path: Path) -> bytes:
     return body
 
 
-def decode(body: bytes, path: Path, *, as_stored: bool = False) -> Image:
+def decode(body: bytes, path: Path, *, as_stored: bool = False, levels: GreyLevels | None = None) -> Image:
     """Decode an image to 8-bit BGR as the service does (`deepsimbad.evaluators.image`).
 
-    What the service does not take (BMP, PGM, PPM) is decoded too. `as_stored` leaves pixels as they lie in the file.
-    Raises BrokenFrameError (not an image, damaged, or its end is missing).
+    What the service does not take (BMP, PGM, PPM) is decoded too. `as_stored` leaves pixels as they lie in the file,
+    `levels` show more than 8 bits. Raises BrokenFrameError (not an image, damaged, or its end is missing).
     """
+    pixels = _decode_deep(body, path, as_stored)
+    return pixels if pixels.dtype == np.uint8 else shown(pixels, levels or measured([pixels]))
+
+
+def _decode_deep(body: bytes, path: Path, as_stored: bool) -> NDArray[Any]:
+    """As `decode`, of 9 to 16 bits all, as uint16."""
     try:
         if media_type_of(body) is not None:
-            return decode_image(body, _MAX_PIXELS, as_stored=as_stored)
+            return decode_deep(ImageFile.read(body, _MAX_PIXELS), as_stored=as_stored)
         if path.suffix.lower() in HEIC_SUFFIXES:
             return decode_heic(body)
-        image = cv2.imdecode(np.frombuffer(body, dtype=np.uint8), cv2.IMREAD_COLOR_BGR)
+        image = cv2.imdecode(np.frombuffer(body, np.uint8), cv2.IMREAD_COLOR_BGR | cv2.IMREAD_ANYDEPTH)
     except (DeepSimbadError, cv2.error, OSError, ValueError) as error:
         raise BrokenFrameError(f"{path} cannot be read: {error}", "undecodable") from error
-    if image is None:
+    if image is None or image.dtype not in {np.dtype(np.uint8), np.dtype(np.uint16)}:
         raise BrokenFrameError(f"{path} is not an image that can be decoded", "undecodable")
-    return np.asarray(image, dtype=np.uint8)
+    return np.asarray(image)
+
+
+def levels_over(paths: Sequence[Path]) -> GreyLevels | None:
+    """Grey levels that suit a recording's images, measured on a few spread over it; None: they have 8 bits."""
+    at = np.unique(np.linspace(0, len(paths) - 1, _N_LEVEL_PROBES).round().astype(int))
+    pictures: list[NDArray[np.uint16]] = []
+    for number, place in enumerate(at.tolist()):
+        if number == _N_SURE and not pictures:
+            return None
+        try:
+            picture = _decode_deep(read_file(paths[place]), paths[place], as_stored=True)
+        except BrokenFrameError:
+            continue
+        pictures += [picture] if picture.dtype == np.uint16 else []
+    return measured(pictures) if pictures else None
 
 
 def turned(image: Image, degrees: int) -> Image:
@@ -157,13 +186,16 @@ def turned(image: Image, degrees: int) -> Image:
     return image if turn is None else np.asarray(cv2.rotate(image, turn), dtype=np.uint8)
 
 
-def ready(body: bytes, path: Path, input_size: tuple[int, int] | None, rotate: int) -> EncodedImage:
+def ready(
+    body: bytes, path: Path, input_size: tuple[int, int] | None, rotate: int, levels: GreyLevels | None = None
+) -> EncodedImage:
     """An image file's body made ready to post: as it is, or the image at the size asked for where that is smaller.
 
-    One that is to be turned, or of a format that cannot be posted, goes as PNG. Raises BrokenFrameError.
+    One that is to be turned or shown by levels, or of a format that cannot be posted, goes as PNG. Raises
+    BrokenFrameError.
     """
-    image, media_type = decode(body, path), media_type_of(body)
-    if media_type is None or rotate:
+    image, media_type = decode(body, path, levels=levels), media_type_of(body)
+    if media_type is None or rotate or levels is not None:
         return as_png(turned(image, rotate), input_size)
     whole = EncodedImage(body, media_type)
     if not is_larger(image, input_size):

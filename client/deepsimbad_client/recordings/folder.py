@@ -14,6 +14,7 @@ from deepsimbad_client.recordings import (
     EncodedImage,
     Frame,
     Recording,
+    levels_over,
     read_file,
     ready,
     stamp_of,
@@ -41,7 +42,7 @@ class FolderRecording(Recording):
     def image(self, frame: Frame, input_size: tuple[int, int] | None) -> EncodedImage:
         """Read a frame; see `Recording.image`."""
         path = self.folder / frame.name
-        return ready(read_file(path), path, input_size, self.rotate)
+        return ready(read_file(path), path, input_size, self.rotate, self.grey_levels)
 
 
 def single(path: Path, rotate: int | None = None) -> FolderRecording:
@@ -100,6 +101,15 @@ def read_folder(
     recording = FolderRecording(
         folder.resolve().name, tuple(result.frames), result.left_out_names, remarks=result.remarks, folder=folder
     )
+    return _prepared(recording, rotate)
+
+
+def _prepared(recording: FolderRecording, rotate: int | None) -> FolderRecording:
+    """The recording turned as asked, and shown by the grey levels of its images, which is said."""
+    levels = levels_over([recording.folder / frame.name for frame in recording.frames])
+    if levels is not None:
+        remark = f"images of more than 8 bits are shown as 8: {levels[0]} is black, {levels[1]} white"
+        recording = dataclasses.replace(recording, grey_levels=levels, remarks=[*recording.remarks, remark])
     return _upright(recording, rotate)
 
 

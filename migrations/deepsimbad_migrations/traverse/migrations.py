@@ -57,3 +57,11 @@ def m004_frame_names(db: Database) -> None:
 def m005_content_digests(db: Database) -> None:
     """What a frame was made of, to tell it from another one: eight bytes of a digest, as a signed integer."""
     db.execute("ALTER TABLE frame ADD COLUMN content_digest INTEGER")
+
+
+@migrations()
+def m006_pictures(db: Database) -> None:
+    """By which grey levels pictures of more than 8 bits are shown, and which frames show nothing (NULL: not known)."""
+    db.execute("ALTER TABLE traverse ADD COLUMN black INTEGER")
+    db.execute("ALTER TABLE traverse ADD COLUMN white INTEGER")
+    db.execute("ALTER TABLE frame ADD COLUMN shows_nothing INTEGER")

@@ -14,6 +14,7 @@ from deepsimbad.core.map import DEFAULT_ACTIONS_M, MOST_ACTION_M, check_actions
 from deepsimbad.engine.maps import Maps
 from deepsimbad.engine.worker import EvaluatorPool, ready
 from deepsimbad.errors import InvalidMapConfigError, NoActiveMapError, UnavailableError, UnknownDomainError
+from deepsimbad.evaluators.grey_levels import GreyLevels, levels_in
 from deepsimbad.evaluators.registry import EXTRACTOR_PATTERN, EvaluatorKind, evaluator_config
 from deepsimbad.store.records import DomainRecord
 
@@ -79,6 +80,13 @@ class DomainAnswer(Answer):
     list_length: int | None
     index_bits_per_map_image: float | None
     landmark_model_digest: Annotated[str | None, Field(description="SHA-256 of what `landmark-model` answers.")]
+    grey_levels: Annotated[
+        GreyLevels | None,
+        Field(
+            description="What is shown black and white of views of more than 8 bits, as of the map's own pictures; "
+            "null: those had 8."
+        ),
+    ]
 
 
 class DomainList(Answer):
@@ -123,6 +131,7 @@ def describe_domain(record: DomainRecord, evaluators: EvaluatorPool, maps: Maps)
         list_length=snapshot and snapshot.list_length,
         index_bits_per_map_image=snapshot and snapshot.index_bits_per_map_image,
         landmark_model_digest=snapshot and snapshot.landmark_model_digest,
+        grey_levels=snapshot and levels_in(snapshot.landmark_model),
     )
 
 

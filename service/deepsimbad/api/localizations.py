@@ -1,5 +1,6 @@
 """Where a single view places the robot, from a uniform prior; and what every answer to a view is made of."""
 
+from collections.abc import Sequence
 from io import BytesIO
 from typing import Annotated, Any
 
@@ -43,6 +44,7 @@ from deepsimbad.engine.localizer import (
 )
 from deepsimbad.engine.worker import EncodedImage, Priority, Stopwatch
 from deepsimbad.evaluators.base import Evaluator
+from deepsimbad.evaluators.grey_levels import levels_in
 from deepsimbad.evaluators.image_files import MEDIA_TYPES
 
 PROBABLY = 0.5
@@ -182,14 +184,16 @@ class LocalizationAnswer(TypedDict):
     next_best_view: Annotated[NextBestViewAnswer | None, Field(description="null until the map was trained for it.")]
 
 
-def render_localization(localization: Localization, watch: Stopwatch) -> LocalizationAnswer:
-    """The answer to one view; the watch runs since the request arrived."""
+def render_localization(
+    localization: Localization, watch: Stopwatch, remarks: Sequence[str] = ()
+) -> LocalizationAnswer:
+    """The answer to one view, with remarks on its picture; the watch runs since the request arrived."""
     snapshot, relevance = localization.snapshot, localization.relevance
     return {
         "map_version": snapshot.version,
         "belief": render_belief(snapshot, localization.belief, localization.belief.near_mode >= DEFAULT_CONFIDENCE),
         "informative": localization.is_informative,
-        "warnings": warnings_of(localization.is_informative, localization.belief),
+        "warnings": [*remarks, *warnings_of(localization.is_informative, localization.belief)],
         "retrieval": render_shortlist(snapshot, localization.shortlist, relevance),
         "next_best_view": render_plan(localization.plan, snapshot.actions_m),
         "timings_ms": watch.timings_ms(),
@@ -284,7 +288,8 @@ async def post_localization(
     body = await read_bytes(request)
     watch.lap("receive")
     evaluator = running.evaluators.evaluator(active.record.evaluator)
-    view = await view_in(body, running, media_type, evaluator)
+    remarks: list[str] = []
+    view = await view_in(body, running, media_type, remarks, evaluator, snapshot)
     if prefers_binary(request):
 
         def compare(view: View) -> NDArray[np.float32]:
@@ -300,13 +305,20 @@ async def post_localization(
         return localize(snapshot, evaluator, view, shortlist, watch)
 
     localization = await running.look(evaluator, view, look)
-    answer, body = await running.written(localization.belief.top.size, render_localization, localization, watch)
+    answer, body = await running.written(
+        localization.belief.top.size, render_localization, localization, watch, remarks
+    )
     running.metrics.localized(domain, answer["timings_ms"], answer["belief"]["entropy_bits"])
     return Response(body, media_type=JSON)
 
 
-async def view_in(body: bytes, running: Services, media_type: str, evaluator: Evaluator) -> View:
-    """The observation in a body that has been read; an image at its evaluator's size."""
+async def view_in(
+    body: bytes, running: Services, media_type: str, remarks: list[str], evaluator: Evaluator, snapshot: Map
+) -> View:
+    """The observation in a body that has been read; an image at its evaluator's size, shown by its map's grey levels.
+
+    What a person should know of a picture is added to the remarks.
+    """
     if media_type == JSON:
         observation = await parse_json(body, ObservationBody, running)
         if len(observation.model_fields_set) != 1:
@@ -318,8 +330,10 @@ async def view_in(body: bytes, running: Services, media_type: str, evaluator: Ev
         return ReadyEncoding(np.array(observation.encoding, np.float64))
     if media_type == RANKS:
         return PackedRanks(body)
-    image, is_blank = await running.decoders.decoded(body, evaluator, Priority.LIVE)
-    return NothingSeen() if is_blank else image
+    levels = levels_in(snapshot.landmark_model)
+    decoded = await running.decoders.decoded(body, evaluator, Priority.LIVE, levels)
+    remarks += decoded.remarks
+    return NothingSeen() if decoded.is_blank else decoded.image
 
 
 def prefers_binary(request: Request) -> bool:

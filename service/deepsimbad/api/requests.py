@@ -11,8 +11,9 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Annotated, Any, NamedTuple, TypeVar, cast
+from typing import Annotated, Any, NamedTuple, Self, TypeVar, cast
 
+import numpy as np
 from anyio import CapacityLimiter
 from anyio.to_thread import run_sync
 from fastapi import Depends, Header, Path, Query, Request
@@ -30,7 +31,8 @@ from deepsimbad.engine.truths import Truths
 from deepsimbad.engine.worker import EvaluatorPool, InferenceWorker, Priority, ready
 from deepsimbad.errors import EmptyBodyError, OverloadedError, UnsupportedMediaTypeError, nearest_of
 from deepsimbad.evaluators.base import Evaluator, Image
-from deepsimbad.evaluators.image import KEPT_PIXELS, decode_file, is_blank
+from deepsimbad.evaluators.grey_levels import FEW_GREYS, GreyLevels, holds_few_greys, measured, shown
+from deepsimbad.evaluators.image import KEPT_PIXELS, decode_deep, is_blank
 from deepsimbad.evaluators.image_files import ImageFile
 from deepsimbad.jobs.runner import JobRunner
 from deepsimbad.settings import Settings
@@ -113,8 +115,10 @@ class Decoders:
         self._threads = {Priority.LIVE: CapacityLimiter(4), Priority.BATCH: CapacityLimiter(2)}
         self._large = CapacityLimiter(1)
 
-    async def decoded(self, body: bytes, evaluator: Evaluator, priority: Priority) -> tuple[Image, bool]:
-        """The image in a body, [height, width, 3] uint8 BGR at its evaluator's size, and whether it shows nothing.
+    async def decoded(
+        self, body: bytes, evaluator: Evaluator, priority: Priority, levels: GreyLevels | None
+    ) -> "Decoded":
+        """The image in a body at its evaluator's size; `levels` as `decode_file` takes them.
 
         Raises:
             InvalidImageError, ImageTooLargeError, EmptyBodyError, OutOfMemoryError: As `ImageFile`.
@@ -122,7 +126,7 @@ class Decoders:
             OverloadedError: The image is large, and as many large ones wait as may.
         """
         threads = self._threads[priority]
-        image = await run_sync(self._read, body, evaluator, limiter=threads)
+        image = await run_sync(self._read, body, evaluator, levels, limiter=threads)
         if not isinstance(image, ImageFile):
             return image
         if self._large.statistics().tasks_waiting >= self.LARGE_WAITING:
@@ -133,18 +137,32 @@ class Decoders:
                 most_pixels_at_once=KEPT_PIXELS,
             )
         async with self._large:
-            return await run_sync(_decode, image, evaluator, limiter=threads)
+            return await run_sync(Decoded.of, image, evaluator, levels, limiter=threads)
 
-    def _read(self, body: bytes, evaluator: Evaluator) -> tuple[Image, bool] | ImageFile:
+    def _read(self, body: bytes, evaluator: Evaluator, levels: GreyLevels | None) -> "Decoded | ImageFile":
         """The file where its image is large, else what it decodes to."""
         file = ImageFile.read(body, self._max_pixels)
-        return file if file.n_pixels > KEPT_PIXELS else _decode(file, evaluator)
+        return file if file.n_pixels > KEPT_PIXELS else Decoded.of(file, evaluator, levels)
 
 
-def _decode(file: ImageFile, evaluator: Evaluator) -> tuple[Image, bool]:
-    ready(evaluator)  # where it is not, decoding is in vain
-    image = evaluator.prepare(decode_file(file))
-    return image, is_blank(image)  # as it is encoded: so it is the same for a view that was sent smaller
+class Decoded(NamedTuple):
+    """An image, and what is seen of it."""
+
+    image: Image  # [height, width, 3] uint8 BGR at its evaluator's size
+    is_blank: bool  # whether it shows nothing, as it is encoded: so it is the same for a view that was sent smaller
+    levels: GreyLevels | None  # by which it is shown; None: it had 8 bits
+    remarks: list[str]  # what a person should know of it
+
+    @classmethod
+    def of(cls, file: ImageFile, evaluator: Evaluator, levels: GreyLevels | None) -> Self:
+        """Decode a file; takes milliseconds."""
+        ready(evaluator)  # where it is not, decoding is in vain
+        pixels = decode_deep(file)
+        is_deep = pixels.dtype != np.uint8
+        levels = (levels or measured([pixels])) if is_deep else None
+        image = evaluator.prepare(pixels if levels is None else shown(pixels, levels))
+        shows_nothing = is_blank(image)
+        return cls(image, shows_nothing, levels, [FEW_GREYS] if not shows_nothing and holds_few_greys(image) else [])
 
 
 @dataclass(frozen=True)

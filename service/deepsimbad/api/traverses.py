@@ -14,7 +14,7 @@ import numpy as np
 from anyio.to_thread import run_sync
 from fastapi import APIRouter, Path, Query, Request, Response
 from numpy.typing import NDArray
-from pydantic import FailFast, Field, StrictFloat
+from pydantic import FailFast, Field, StrictFloat, field_validator
 
 from deepsimbad.api.localizations import IMAGE_SCHEMA, only
 from deepsimbad.api.problems import binary, declare, declare_json, problems
@@ -50,6 +50,7 @@ from deepsimbad.errors import (
     TraverseInUseError,
     UnknownTraverseError,
 )
+from deepsimbad.evaluators.grey_levels import DEEPEST, GreyLevels
 from deepsimbad.evaluators.image_files import MEDIA_TYPES
 from deepsimbad.store.durable import storage_faults
 from deepsimbad.store.records import ListPage
@@ -69,6 +70,20 @@ class TraverseBody(JsonBody):
     """A traverse to be made."""
 
     name: Name
+    grey_levels: Annotated[
+        GreyLevels | None,
+        Field(
+            description="What is shown black and what white of pictures of more than 8 bits, 0 <= black < white <= "
+            "65535; null: by the first one that shows anything."
+        ),
+    ] = None
+
+    @field_validator("grey_levels")
+    @classmethod
+    def _ascend(cls, levels: GreyLevels | None) -> GreyLevels | None:
+        if levels is not None and not 0 <= levels[0] < levels[1] <= DEEPEST:
+            raise ValueError(f"grey levels are black and white, 0 <= black < white <= {DEEPEST}")
+        return levels
 
 
 class EncodingBody(JsonBody):
@@ -92,6 +107,11 @@ class TraverseAnswer(Answer):
     digest: Annotated[
         str | None,
         Field(description="SHA-256 over indices, contents, places and times: one drive, one digest; null: unknown."),
+    ]
+    n_uninformative: Annotated[int, Field(description="Frames whose pictures show nothing: one grey, noise, the dark.")]
+    grey_levels: Annotated[
+        GreyLevels | None,
+        Field(description="By which pictures of more than 8 bits are shown as 8, black and white; null: none came."),
     ]
 
 
@@ -127,18 +147,20 @@ class BatchAnswer(Answer):
     openapi_extra=declare_json(TraverseBody),
 )
 async def post_traverse(domain: DomainName, request: Request, response: Response, running: Running) -> TraverseAnswer:
-    """Make an empty traverse; one of that name that is there stays as it is."""
+    """Make an empty traverse; one of that name that is there stays as it is, but for grey levels it did not know."""
     body = await read_json(request, TraverseBody)
     data_dir = running.settings.data_dir
 
     def make() -> tuple[TraverseAnswer, bool]:
         running.catalog.domain(domain)
         try:
-            with Traverse.create(data_dir, domain, body.name) as traverse:
-                return TraverseAnswer.model_validate(traverse), True
+            traverse, created = Traverse.create(data_dir, domain, body.name), True
         except ConflictError:
-            with Traverse.open(data_dir, domain, body.name) as traverse:
-                return TraverseAnswer.model_validate(traverse), False
+            traverse, created = Traverse.open(data_dir, domain, body.name), False
+        with traverse:
+            if body.grey_levels is not None:
+                traverse.keep_levels(body.grey_levels)
+            return TraverseAnswer.model_validate(traverse), created
 
     answer, created = await run_sync(make)
     response.status_code = 201 if created else 200
@@ -243,23 +265,29 @@ async def put_frame(
     that go backwards are accepted here and refused by the remap.
     """
     evaluator_config = (await run_sync(running.catalog.domain, domain)).evaluator
-    await run_sync(_check_traverse, running, domain, name)
+    levels = await run_sync(_levels_of, running, domain, name)  # an unknown traverse should not cost an upload
     media_type = media_type_of(request, FRAME_TYPES)
     body = await read_bytes(request)
     evaluator = running.evaluators.evaluator(evaluator_config)
-    weights_sha256, digest = None, UNKNOWN_CONTENT
+    weights_sha256, digest, shows_nothing = None, UNKNOWN_CONTENT, False
     if media_type == JSON:
         values = np.array((await parse_json(body, EncodingBody, running)).encoding, np.float64)
         encoding = (await run_sync(ready_encodings, values[np.newaxis]))[0]
     else:
-        image, _ = await running.decoders.decoded(body, evaluator, Priority.BATCH)
-        encoded = cast("EncodedImage", await running.look(evaluator, image, lambda view: view, Priority.BATCH))
+        seen = await running.decoders.decoded(body, evaluator, Priority.BATCH, levels)
+        shows_nothing = seen.is_blank
+        if levels is None and seen.levels is not None and not shows_nothing:
+            levels = await run_sync(_keep_levels, running, domain, name, seen.levels)
+            if levels != seen.levels:  # another frame was quicker
+                seen = await running.decoders.decoded(body, evaluator, Priority.BATCH, levels)
+        encoded = cast("EncodedImage", await running.look(evaluator, seen.image, lambda view: view, Priority.BATCH))
         encoding, weights_sha256, digest = encoded.values, encoded.weights_sha256, content_digest(body)
 
     def store() -> tuple[bool, int]:
         with running.open_traverses.lend(domain, name) as traverse:
             created = traverse.put_frame(
-                *(index, encoding, position_m, timestamp_us, x_m, y_m, weights_sha256, frame_name, digest, replace)
+                *(index, encoding, position_m, timestamp_us, x_m, y_m, weights_sha256, frame_name, digest, replace),
+                shows_nothing=shows_nothing,
             )
             return created, traverse.n_frames
 
@@ -315,7 +343,7 @@ async def post_frames(
 ) -> BatchAnswer:
     """Store a batch of frames whose encodings are known, all or none; the same indices again replace them."""
     await run_sync(running.catalog.domain, domain)
-    await run_sync(_check_traverse, running, domain, name)
+    await run_sync(_levels_of, running, domain, name)  # as above
     media_type_of(request, (BINARY,))
     max_bytes = running.settings.max_batch_bytes
 
@@ -340,10 +368,14 @@ async def post_frames(
         return await run_sync(store, spool, limiter=running.batches)
 
 
-def _check_traverse(running: Services, domain: str, name: str) -> None:
-    """An unknown traverse should not cost an upload."""
-    with running.open_traverses.lend(domain, name):
-        pass
+def _levels_of(running: Services, domain: str, name: str) -> GreyLevels | None:
+    with running.open_traverses.lend(domain, name) as traverse:
+        return traverse.grey_levels
+
+
+def _keep_levels(running: Services, domain: str, name: str, levels: GreyLevels) -> GreyLevels:
+    with running.open_traverses.lend(domain, name) as traverse:
+        return traverse.keep_levels(levels)
 
 
 # A batch is read with distrust: what it declares is judged before anything is unpacked.

@@ -25,6 +25,7 @@ from deepsimbad.engine.maps import Maps
 from deepsimbad.engine.worker import EvaluatorPool, Stopwatch
 from deepsimbad.errors import ImageTooLargeError, InvalidImageError, InvalidSourceError
 from deepsimbad.evaluators.compute import available_cores
+from deepsimbad.evaluators.grey_levels import levels_in
 from deepsimbad.evaluators.image import decode_image
 from deepsimbad.evaluators.registry import EvaluatorConfig, make_evaluator
 from deepsimbad.jobs.build import encode_recording
@@ -167,7 +168,7 @@ def localize(domain: str, images: tuple[Path, ...], as_json: bool) -> None:
     with Catalog.open(existing_data_dir()) as catalog:
         active = Maps(catalog).active(domain)
         evaluator = EvaluatorPool(settings.compute()).evaluator(active.record.evaluator)
-        answers = []
+        answers, levels = [], levels_in(active.snapshot.landmark_model)
         for path in images:
             watch = Stopwatch()
             try:
@@ -175,7 +176,7 @@ def localize(domain: str, images: tuple[Path, ...], as_json: bool) -> None:
             except OSError as error:
                 raise InvalidSourceError(f"cannot read {path}: {error.strerror or error}") from error
             try:
-                view = decode_image(body, settings.max_pixels)
+                view = decode_image(body, settings.max_pixels, levels=levels)
             except (InvalidImageError, ImageTooLargeError) as error:
                 raise type(error)(f"{path}: {error.message}", **error.hints) from error
             if lies_on_its_side(path):

@@ -67,6 +67,9 @@ class Drive:
     content_digest: NDArray[np.uint64] = _Unknown  # of what was posted, [n] uint64, 0: its encoding, or unknown
     # Of the network that encoded images among them; None where none did, or nobody knows
     weights_sha256: str | None = None
+    # What is shown black and white of pictures of more than 8 bits; None: there were none
+    grey_levels: tuple[int, int] | None = None
+    shows_nothing: NDArray[np.bool_] = _Unknown  # [n] whether the picture of a frame does; False where nobody looked
     # [n, r] float32 to a map's landmarks, smaller is nearer; None before they are measured
     dissimilarities: NDArray[np.float32] | None = None
 
@@ -79,6 +82,7 @@ class Drive:
             "y_m": np.full(n, np.nan),
             "frame_name": np.full(n, "", np.str_),
             "content_digest": np.full(n, UNKNOWN_CONTENT, np.uint64),
+            "shows_nothing": np.zeros(n, np.bool_),
         }
         for name, array in unknown.items():
             if getattr(self, name) is None:

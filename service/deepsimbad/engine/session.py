@@ -70,8 +70,9 @@ class SessionConfig:
 class Observation:
     """A move and the view after it, as a robot reports them."""
 
-    # Gives the view, at the size of the evaluator it is given. Called in the session's turn: order is that of arrival
-    view: Callable[[Evaluator], Awaitable[View]]
+    # Gives the view as the evaluator and the map it is given want it. Called in the session's turn: order is that of
+    # arrival
+    view: Callable[[Evaluator, Map], Awaitable[View]]
     action_m: float = 0.0  # metres moved since the last view; ignored for the first one
     action_std_m: float | None = None  # None: as usual
     n_shortlist: int | None = None  # length of the answer's lists; None: the usual one

@@ -330,7 +330,7 @@ class Sessions:
             shortlist_length(engine.snapshot, observation.n_shortlist)  # a bad one should not move the session
             _check_move(engine.snapshot, observation.action_m, observation.action_std_m)
             watch.lap("wait")
-            view = await observation.view(engine.evaluator)
+            view = await observation.view(engine.evaluator, engine.snapshot)
             watch.lap("decode")
             step = partial(self._step, live, state, observation, self._clock() + self._ttl_s, watch)
             try:

@@ -1,20 +1,24 @@
 """The one place where images are decoded: JPEG, PNG, TIFF and WebP bytes -> upright 8-bit BGR.
 
-EXIF (and TIFF) orientation is applied; grey becomes three equal channels; of 16 bits a channel the upper 8 are
-kept; alpha is dropped (PNG and WebP give their colours as stored, TIFF's come composited on black); of several
-pages or animation frames the first is taken and no other decoded. An image of more than `KEPT_PIXELS` is reduced by a
-whole factor, whoever decodes it: no extractor needs so many, and looking at them would keep live views waiting.
+EXIF (and TIFF) orientation is applied; grey becomes three equal channels; of 16 bits a channel 8 are shown, by the
+grey levels of a recording (`evaluators.grey_levels`); alpha is dropped (PNG and WebP give their colours as stored,
+TIFF's come composited on black); of several pages or animation frames the first is taken and no other decoded. An image
+of more than `KEPT_PIXELS` is reduced by a whole factor, whoever decodes it: no extractor needs so many, and looking at
+them would keep live views waiting.
 """
 
 import math
 from collections.abc import Callable, Mapping
+from typing import Any
 
 import cv2
 import numpy as np
 import simplejpeg
+from numpy.typing import NDArray
 
 from deepsimbad.errors import InvalidImageError
 from deepsimbad.evaluators.base import Image, named_lack_of_memory
+from deepsimbad.evaluators.grey_levels import GreyLevels, measured, shown
 from deepsimbad.evaluators.image_files import JPEG, ImageFile, truncated
 
 KEPT_PIXELS = 3840 * 2160
@@ -25,7 +29,8 @@ cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
 _BLANK_BELOW_STD = 1.0  # grey levels of 256
 _FIELDS, _BLANK_BELOW_SHARE = 8, 0.25  # a side; of all variation, how much is left between the means of fields
 _DECODER_BYTES = 9  # a pixel: the picture, and the coefficients of a progressive JPEG
-_UPRIGHT: Mapping[int, Callable[[Image], cv2.typing.MatLike]] = {  # by Exif's orientation
+_DTYPES = (np.uint8, np.uint16)
+_UPRIGHT: Mapping[int, Callable[[cv2.typing.MatLike], cv2.typing.MatLike]] = {  # by Exif's orientation
     2: lambda image: cv2.flip(image, 1),
     3: lambda image: cv2.rotate(image, cv2.ROTATE_180),
     4: lambda image: cv2.flip(image, 0),
@@ -36,31 +41,42 @@ _UPRIGHT: Mapping[int, Callable[[Image], cv2.typing.MatLike]] = {  # by Exif's o
 }
 
 
-def decode_image(body: bytes, max_pixels: int, *, as_stored: bool = False) -> Image:
+def decode_image(body: bytes, max_pixels: int, *, as_stored: bool = False, levels: GreyLevels | None = None) -> Image:
     """Read and decode one image; see `ImageFile.read` and `decode_file`."""
-    return decode_file(ImageFile.read(body, max_pixels), as_stored=as_stored)
+    return decode_file(ImageFile.read(body, max_pixels), as_stored=as_stored, levels=levels)
 
 
-def decode_file(file: ImageFile, *, as_stored: bool = False) -> Image:
+def decode_file(file: ImageFile, *, as_stored: bool = False, levels: GreyLevels | None = None) -> Image:
     """[height, width, 3] uint8 BGR; height x width is at most `KEPT_PIXELS`.
 
-    `as_stored` leaves the pixels as they lie in the file, whatever it says of its orientation.
+    Args:
+        as_stored: The pixels as they lie in the file, whatever it says of its orientation.
+        levels: By which more than 8 bits are shown; None: by those that suit the picture itself.
 
     Raises:
         InvalidImageError: It is damaged; TruncatedImageError where a part of its picture is missing.
         OutOfMemoryError: There is too little memory for it.
     """
+    pixels = decode_deep(file, as_stored=as_stored)
+    if pixels.dtype == np.uint8:
+        return np.asarray(pixels, np.uint8)
+    return shown(pixels, levels or measured([pixels]))
+
+
+def decode_deep(file: ImageFile, *, as_stored: bool = False) -> NDArray[Any]:
+    """As `decode_file`, but of 9 to 16 bits a channel all, as uint16."""
     try:
         with named_lack_of_memory("decode"):
             if file.media_type == JPEG:
                 image: cv2.typing.MatLike | None = _of_jpeg(file.picture)
             else:
                 flags = cv2.IMREAD_COLOR_BGR | (cv2.IMREAD_IGNORE_ORIENTATION if as_stored else 0)
+                flags |= cv2.IMREAD_ANYDEPTH if 8 < file.bits <= 16 else 0
                 image = cv2.imdecode(np.frombuffer(file.picture, np.uint8), flags)
-            if image is not None and image.dtype == np.uint8 and image.size and image.shape[2:] == (3,):
+            if image is not None and image.dtype in _DTYPES and image.size and image.shape[2:] == (3,):
                 if not as_stored and file.orientation in _UPRIGHT:
-                    image = _UPRIGHT[file.orientation](np.asarray(image, np.uint8))
-                return _reduced(np.ascontiguousarray(image, np.uint8))
+                    image = _UPRIGHT[file.orientation](image)
+                return _reduced(np.ascontiguousarray(image))
             np.empty(_DECODER_BYTES * file.n_pixels, np.uint8)  # codecs say of too little memory what of damage
     except cv2.error as error:
         raise InvalidImageError("the image cannot be decoded") from error
@@ -109,11 +125,11 @@ def _without_filling(picture: bytes) -> bytes:
     return scan + (b"\0" if scan.endswith(b"\xff") else b"") + end
 
 
-def _reduced(image: Image) -> Image:
+def _reduced(image: NDArray[Any]) -> NDArray[Any]:
     """Means of squares, of the least whole side that leaves no more than may be kept; usual images as they are."""
     height, width = image.shape[:2]
     side = math.ceil(math.sqrt(height * width / KEPT_PIXELS))
     if side == 1:
         return image
     size = (max(1, width // side), max(1, height // side))
-    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))

@@ -41,8 +41,8 @@ _TIFF_FORMATS = {
 }  # the integer types: BYTE, SHORT, LONG, IFD, 8 bytes
 _TIFF_SIZES = (256, 257, 322, 323, 277)  # width and height, those of tiles, samples of a pixel
 _TIFF_PARTS = ((273, 279), (324, 325))  # offsets and byte counts of strips, of tiles
-_TIFF_ORIENTATION = 274
-_TIFF_TAGS = {*_TIFF_SIZES, *_TIFF_PARTS[0], *_TIFF_PARTS[1], _TIFF_ORIENTATION}
+_TIFF_BITS, _TIFF_ORIENTATION = 258, 274
+_TIFF_TAGS = {*_TIFF_SIZES, *_TIFF_PARTS[0], *_TIFF_PARTS[1], _TIFF_BITS, _TIFF_ORIENTATION}
 _TIFF_MAX_SAMPLES = 5  # CMYK and alpha
 
 
@@ -54,6 +54,7 @@ class ImageFile:
     picture: bytes  # the file, without what a decoder need not see
     n_pixels: int  # of the largest surface that its header makes a decoder allocate
     orientation: int = 1  # as a JPEG's Exif gives it; what else a file says of it its decoder obeys
+    bits: int = 8  # a channel
 
     @classmethod
     def read(cls, body: bytes, max_pixels: int) -> "ImageFile":
@@ -177,7 +178,7 @@ def _exif_orientation(exif: bytes) -> int:
     return orientation if orientation in range(1, 9) else 1
 
 
-def _png(body: bytes, max_pixels: int) -> tuple[bytes, int]:
+def _png(body: bytes, max_pixels: int) -> tuple[bytes, int, int, int]:
     """Signature, then chunks of (length, name, content, checksum); IHDR first, IEND last.
 
     Texts, colour profiles and further frames are left away: the decoder would unpack them, and complain of damaged ones
@@ -206,7 +207,7 @@ def _png(body: bytes, max_pixels: int) -> tuple[bytes, int]:
         _damaged(f"it has more than {_MAX_PARTS} parts")
     # Twice, for interlacing adds a little.
     _check_unpacks(packed, 2 * height * (1 + width * bits * _PNG_CHANNELS.get(colour, 4) // 8) + (1 << 16))
-    return b"".join(picture), n_pixels
+    return b"".join(picture), n_pixels, 1, bits
 
 
 def _check_unpacks(packed: list[memoryview], most: int) -> None:
@@ -226,7 +227,7 @@ def _check_unpacks(packed: list[memoryview], most: int) -> None:
         raise InvalidImageError("the image file is damaged: its picture cannot be unpacked") from error
 
 
-def _tiff(body: bytes, max_pixels: int) -> tuple[bytes, int]:
+def _tiff(body: bytes, max_pixels: int) -> tuple[bytes, int, int, int]:
     fields = _tiff_fields(body)
     width, height, tile_width, tile_height, samples = (max(fields.get(tag, ()), default=0) for tag in _TIFF_SIZES)
     if samples > _TIFF_MAX_SAMPLES:
@@ -240,7 +241,7 @@ def _tiff(body: bytes, max_pixels: int) -> tuple[bytes, int]:
         _damaged("it has no picture")
     if max(ends) > len(body):
         truncated()
-    return body, n_pixels
+    return body, n_pixels, 1, max(fields.get(_TIFF_BITS, ()), default=1)
 
 
 def _tiff_fields(body: bytes) -> dict[int, tuple[int, ...]]:

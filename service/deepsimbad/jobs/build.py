@@ -24,7 +24,7 @@ from deepsimbad.core.route import same_places
 from deepsimbad.core.training import LearningCurve, TrainingWorld, train
 from deepsimbad.errors import InvalidSourceError
 from deepsimbad.evaluators.base import Evaluator, Image, LandmarkModel
-from deepsimbad.evaluators.image import decode_image
+from deepsimbad.evaluators.image import decode_image, is_blank
 from deepsimbad_client.errors import BrokenFrameError
 from deepsimbad_client.http import text_of
 from deepsimbad_client.recordings import Recording
@@ -73,8 +73,11 @@ def encode_recording(
     """
     frames, left_out = list(recording.frames), LeftOut(recording, allow_missing=allow_missing)
     encodings, encode_ms, weights_sha256 = recording.encodings, None, None
+    shows_nothing = np.zeros(len(frames), np.bool_)
     if encodings is None:
-        places, encodings, encode_ms = _encode_images(recording, evaluator, max_pixels, left_out, on_progress, kept)
+        places, encodings, shows_nothing, encode_ms = _encode_images(
+            recording, evaluator, max_pixels, left_out, on_progress, kept
+        )
         frames, weights_sha256 = [frames[place] for place in places], evaluator.weights_sha256
     if not frames:
         raise InvalidSourceError(f"{recording.name} has no frame that can be used: {left_out.counts}")
@@ -89,6 +92,8 @@ def encode_recording(
         frame_name=np.array([text_of(frame.name) for frame in frames]),
         encodings=encodings,
         weights_sha256=weights_sha256,
+        grey_levels=recording.grey_levels,
+        shows_nothing=shows_nothing,
     )
     drive.route()
     drive.check_differs(recording.name)
@@ -102,11 +107,15 @@ def _encode_images(
     left_out: LeftOut,
     on_progress: Callable[[float], None],
     kept: MutableMapping[str, NDArray[np.float32]] | None,
-) -> tuple[list[int], NDArray[np.float32], float | None]:
-    """Places of the frames that could be read, their encodings, the median of milliseconds; broken ones are counted."""
+) -> tuple[list[int], NDArray[np.float32], NDArray[np.bool_], float | None]:
+    """Places of the frames that could be read, their encodings, which show nothing, the median of milliseconds.
+
+    Broken ones are counted.
+    """
     if not evaluator.takes_images or evaluator.encoding_dim is None:
         raise InvalidSourceError("this evaluator takes ready encodings alone; give a .npy or .csv file")
     encodings = np.empty((len(recording.frames), evaluator.encoding_dim), np.float32)
+    shows_nothing = np.zeros(len(recording.frames), np.bool_)
     places: list[int] = []
     kept = {} if kept is None else kept
     waiting: list[Image] = []  # as many as are best encoded at once
@@ -127,6 +136,7 @@ def _encode_images(
             else:
                 began = began if waiting else time.perf_counter()
                 waiting.append(evaluator.prepare(decode_image(body, max_pixels)))
+                shows_nothing[len(places)] = is_blank(waiting[-1])
                 rows.append(len(places))
                 stamps.append(stamp)
                 places.append(place)
@@ -137,7 +147,8 @@ def _encode_images(
             for pile in (waiting, rows, stamps):
                 pile.clear()
         on_progress((place + 1) / len(recording.frames))
-    return places, encodings[: len(places)], median(took_ms) if took_ms else None
+    n_read, encode_ms = len(places), median(took_ms) if took_ms else None
+    return places, encodings[:n_read], shows_nothing[:n_read], encode_ms
 
 
 def choose_landmarks(

@@ -23,6 +23,7 @@ from deepsimbad.core.nnql import NnqlConfig
 from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Relevance
 from deepsimbad.errors import InvalidEncodingError, InvalidMapConfigError, LostActivationError, WeightsDifferError
 from deepsimbad.evaluators.base import Evaluator
+from deepsimbad.evaluators.grey_levels import with_levels
 from deepsimbad.jobs.append import KnownDrives, fuse, seasons_in
 from deepsimbad.jobs.build import EPISODES_A_MAP_IMAGE, build, measured, train_nnql
 from deepsimbad.jobs.camera import seen_twice
@@ -256,6 +257,7 @@ class _Remap:
         seconds = {name: took for name, took in progress.seconds().items() if name.replace("_", " ") in REMAP_STAGES}
         metrics = {
             "n_map_images": map_.n_images,
+            "n_uninformative": int(inputs.training.shows_nothing.sum()),
             "n_landmarks": map_.n_landmarks,
             "seconds": seconds,
             **learnt,
@@ -413,6 +415,7 @@ class _Remap:
             domain=domain.name,
             evaluator=domain.evaluator,
             config={**asked, **built.map.config},
+            landmark_model=with_levels(built.map.landmark_model, training.grey_levels),
             **training.origins(),
             q_values=q_values,
         )

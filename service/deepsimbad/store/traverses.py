@@ -124,6 +124,7 @@ class Traverse(OpenFile):
         name: str | None = None,
         content_digest: int = UNKNOWN_CONTENT,
         replace: bool = True,
+        shows_nothing: bool = False,
     ) -> bool:
         """As `put_frames` with one frame, of which None is unknown; answers whether it is new."""
         frames = Drive(
@@ -136,6 +137,7 @@ class Traverse(OpenFile):
             content_digest=np.array([content_digest], np.uint64),
             encodings=np.asarray(encoding, np.float32)[np.newaxis],
             weights_sha256=weights_sha256,
+            shows_nothing=np.array([shows_nothing]),
         )
         return self.put_frames(frames, replace)[0] == 1
 
@@ -199,6 +201,11 @@ class Traverse(OpenFile):
                     for index, encoding in zip(frames.index.tolist(), frames.encodings, strict=True)
                 ),
             )
+            db.conn.executemany(
+                "UPDATE frame SET shows_nothing = ? WHERE frame_index = ?",
+                zip(frames.shows_nothing.astype(int).tolist(), frames.index.tolist(), strict=True),
+            )
+            _keep_levels(db, frames.grey_levels)
             n_new = _count(db) - n_before
         return n_new, frames.n_frames - n_new
 
@@ -273,10 +280,29 @@ class Traverse(OpenFile):
             )
             return [(first, last) for first, last in rows]
 
+    @property
+    def n_uninformative(self) -> int:
+        """How many frames are pictures that show nothing."""
+        with self._reading() as db:
+            return len(_blanks(db))
+
+    @property
+    def grey_levels(self) -> tuple[int, int] | None:
+        """What is shown black and white of pictures of more than 8 bits; None where nobody said yet."""
+        with self._reading() as db:
+            return _levels(db)
+
+    def keep_levels(self, levels: tuple[int, int]) -> tuple[int, int]:
+        """Keep grey levels for all pictures to come, unless there are some; answers those that count."""
+        with self._writing() as db:
+            _keep_levels(db, levels)
+            return _levels(db) or levels
+
     def read(self) -> Drive:
         """All frames in index order; one array of encodings, no copy beside it."""
         with self._reading() as db:
             n, (dim, weights_sha256) = _count(db), self._described(db)
+            levels, blanks = _levels(db), _blanks(db)
             places = np.empty((n, 3))
             index, timestamp_us = np.empty(n, np.int64), np.empty(n, np.int64)
             encodings = np.empty((n, dim or 0), np.float32)
@@ -303,6 +329,7 @@ class Traverse(OpenFile):
         return Drive(
             name=self.name, index=index, position_m=position_m, timestamp_us=timestamp_us, x_m=x_m, y_m=y_m,
             frame_name=np.array(names, np.str_), encodings=encodings, weights_sha256=weights_sha256,
+            grey_levels=levels, shows_nothing=np.isin(index, blanks),
         )  # fmt: skip
 
     def _described(self, db: Database) -> tuple[int | None, str | None]:
@@ -334,6 +361,20 @@ def _known(db: Database, among: NDArray[np.int64] | None = None) -> dict[str, ND
         "y_m": np.array(y_m, np.float64),
         "content_digest": np.array(content, np.int64).view(np.uint64),
     }
+
+
+def _levels(db: Database) -> tuple[int, int] | None:
+    row: tuple[int, int] | None = db.execute("SELECT black, white FROM traverse WHERE black IS NOT NULL").fetchone()
+    return row
+
+
+def _keep_levels(db: Database, levels: tuple[int, int] | None) -> None:
+    if levels is not None:
+        db.execute("UPDATE traverse SET black = ?, white = ? WHERE black IS NULL", list(levels))
+
+
+def _blanks(db: Database) -> list[int]:
+    return [index for (index,) in db.execute("SELECT frame_index FROM frame WHERE shows_nothing")]
 
 
 def _count(db: Database) -> int:

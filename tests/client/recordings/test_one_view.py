@@ -11,9 +11,11 @@ from PIL import Image as Pillow
 
 from deepsimbad.cli import run as run_service
 from deepsimbad.evaluators.feature_l2 import FeatureL2
+from deepsimbad.evaluators.grey_levels import measured
 from deepsimbad.evaluators.image import decode_image, is_blank, resized
 from deepsimbad_client import Client
 from deepsimbad_client.commands import run
+from deepsimbad_client.errors import InvalidInputError
 from deepsimbad_client.http.admin import remap
 from deepsimbad_client.http.upload import upload
 from deepsimbad_client.recordings.sources import open_source
@@ -110,3 +112,56 @@ def test_a_view_has_one_answer_by_every_route(tmp_path, capsys):
             for part in ("belief", "retrieval", "informative"):
                 assert other[number][part] == expected[part]
         assert by_ranks[number].retrieval[0].map_image == expected["retrieval"][0]["map_image"]
+
+
+def deep(seed):
+    """Of a camera of 12 bits on a pedestal, in 16."""
+    return (2000 + 2 * scene(seed)[..., 1].astype(np.uint16)).astype(np.uint16)
+
+
+def test_views_of_more_than_eight_bits_are_shown_as_their_map_was(tmp_path, capsys):
+    drive, look, data_dir = tmp_path / "drive", tmp_path / "look.png", str(tmp_path / "data")
+    drive.mkdir()
+    for place in range(12):
+        cv2.imwrite(str(drive / f"{place:02}.png"), deep(100 + place))
+    cv2.imwrite(str(drive / "12.png"), np.full((240, 320), 2300, np.uint16))  # the lens was covered
+    sunny = deep(105)
+    sunny[:12, :60] = 4000  # which would change the levels of the picture alone
+    cv2.imwrite(str(look), sunny)
+    levels = open_source(str(drive)).grey_levels
+    image, header = look.read_bytes(), {"Content-Type": "image/png"}
+    with serving(tmp_path / "data") as url, Client(url) as client:
+        client.admin.put_domain("yard", EVALUATOR)
+        upload(client, open_source(str(drive)), "yard", "t")
+        stored = client.admin.traverse("yard", "t")
+        assert (stored.grey_levels, stored.n_uninformative) == (levels, 1)
+        assert upload(client, open_source(f"{drive}#3:6"), "yard", "t").n_skipped == 3
+        job = remap(client, "yard", "t", n_landmarks=8, list_length=4)
+        assert job.result["metrics"]["n_uninformative"] == 1
+        assert client.domain("yard").grey_levels == levels
+        by_curl = httpx2.post(f"{url}/v1/domains/yard/localizations", content=image, headers=header).json()
+        on_board = client.on_board("yard")
+        assert on_board.ranks(look, m=8) == on_board.ranks(decode_image(image, LIMIT, levels=levels), m=8)
+        with client.session("yard") as session:
+            in_session = session.observe(image=image)
+            flat = session.observe(image=cv2.imencode(".png", scene(105) >> 5)[1].tobytes())
+        capsys.readouterr()
+        assert run(["localize", str(look), "--domain", "yard", "--server", url, "--json"]) == 0
+        (by_command,) = json.loads(capsys.readouterr().out)
+        frame = f"{url}/v1/admin/domains/yard/traverses/raw/frames"
+        client.admin.create_traverse("yard", "raw")
+        for place, name in enumerate(("12.png", "00.png", "01.png")):
+            body = (drive / name).read_bytes()
+            httpx2.put(f"{frame}/{place}?position_m={place}", content=body, headers=header).raise_for_status()
+        raw = client.admin.traverse("yard", "raw")
+        assert raw.n_uninformative == 1
+        assert raw.grey_levels == measured([cv2.imread(str(drive / "00.png"), cv2.IMREAD_UNCHANGED)])
+        with pytest.raises(InvalidInputError, match="black and white"):
+            client.admin.create_traverse("yard", "odd", grey_levels=(9, 9))
+    assert run_service(["localize", "yard", str(look), "--data-dir", data_dir, "--json"]) == 0
+    (here,) = json.loads(capsys.readouterr().out)
+    assert by_curl["belief"]["mode_m"] == 5
+    for other in (by_command, here):
+        assert (other["belief"], other["retrieval"]) == (by_curl["belief"], by_curl["retrieval"])
+    assert any("8 grey levels of 256" in warning for warning in flat.warnings)
+    assert not any("grey levels" in warning for warning in [*in_session.warnings, *by_curl["warnings"]])
