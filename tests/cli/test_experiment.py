@@ -177,6 +177,7 @@ def test_frames_left_out_are_told(measured, pictures, tmp_path):
     left_out = document["config"]["left_out"]
     assert left_out["landmarks"] == left_out["test"] == {}
     assert list(left_out["training"].values()) == [1]
+    assert "training: left out: 1 undecodable (4.png)" in document["warnings"]
     assert (document["n_queries"], document["n_left_out"]) == (29, 1)
 
 

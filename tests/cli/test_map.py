@@ -159,7 +159,7 @@ def test_no_frame_is_left_out_of_a_map_without_a_word(deepsimbad, pictures, tmp_
     (drive / "1.png").write_bytes(b"no image")
     command = ("map", "route", "--training", drive, "--training-episodes", 0)
     ran = deepsimbad(*command)
-    assert (ran.code, ran.err) == (0, "left out of training: 1 undecodable (1.png)\n")
+    assert (ran.code, ran.err) == (0, "training: left out: 1 undecodable (1.png)\n")
     shutil.rmtree(tmp_path / "deepsimbad-data")
     positions = (drive / "positions.csv").read_text()
     (drive / "positions.csv").write_text(positions.replace("0.png", "x.png"))  # 0, 10 and 20

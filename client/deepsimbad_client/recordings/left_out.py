@@ -1,6 +1,6 @@
 """Frames of a recording that are not used: by reason, by name, and how many may be."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from deepsimbad_client.errors import TooManyLeftOutError
 from deepsimbad_client.recordings import Recording
@@ -38,6 +38,14 @@ class LeftOut:
             f"{self._share:.0%} of the frames of {self._recording.name} are left out: {reasons}; more than "
             f"{MOST_LEFT_OUT:.0%} need --allow-missing"
         )
+
+
+def left_out_lines(names: Mapping[str, Sequence[str]], *, verbose: bool) -> list[str]:
+    """What is left out of a recording, reason -> names: a line a reason, with every name or the first of them."""
+    return [
+        f"left out: {len(frames)} {reason} ({shown(frames, len(frames) if verbose else 3)})"
+        for reason, frames in names.items()
+    ]
 
 
 def shown(names: Sequence[str], n_shown: int = 3) -> str:

@@ -11,7 +11,7 @@ from rich.progress import Progress
 
 from deepsimbad_client.recordings import Recording
 from deepsimbad_client.recordings.cuts import one_turn
-from deepsimbad_client.recordings.left_out import MOST_LEFT_OUT, LeftOut, shown
+from deepsimbad_client.recordings.left_out import MOST_LEFT_OUT, LeftOut, left_out_lines
 from deepsimbad_client.recordings.sources import open_source
 
 Command = Callable[..., Any]
@@ -95,7 +95,6 @@ def tell_remarks(recording: Recording) -> None:
 
 
 def tell_left_out(names: Mapping[str, Sequence[str]], recording: str, *, verbose: bool) -> None:
-    """Say on standard error what is left out of a recording, a line a reason, and of which frames."""
-    for reason, frames in names.items():
-        listed = shown(frames, len(frames) if verbose else 3)
-        click.echo(f"left out of {recording}: {len(frames)} {reason} ({listed})", err=True)
+    """Say on standard error what is left out of a recording."""
+    for line in left_out_lines(names, verbose=verbose):
+        click.echo(f"{recording}: {line}", err=True)

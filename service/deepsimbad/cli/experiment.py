@@ -39,6 +39,7 @@ from deepsimbad.jobs.progress import Progress
 from deepsimbad.jobs.remap import DEFAULT_TRAINING_EPISODES
 from deepsimbad.jobs.truth import known_drives, read_ground_truth
 from deepsimbad.jobs.vpr import VprConfig, VprReport, run_vpr, vpr_stages
+from deepsimbad_client.recordings.left_out import left_out_lines
 from deepsimbad_client.recordings.sources import open_source
 
 _N_LANDMARKS = 300
@@ -260,6 +261,9 @@ class _Triplet:
         }
         n_landmarks = fitting_number(asked["n_landmarks"], landmarks.drive.n_frames, _N_LANDMARKS)
         warnings = known_drives(test.drive, landmarks=landmarks.drive, training=training.drive)
+        for role, recording, encoded in zip(_ROLES, opened, recordings, strict=True):
+            warnings += [f"{role}: {remark}" for remark in recording.remarks]
+            warnings += [f"{role}: {line}" for line in left_out_lines(encoded.left_out_names, verbose=False)]
         return cls(evaluator, landmarks, training, test, n_landmarks, sources, warnings)
 
     @property

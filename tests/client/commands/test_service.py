@@ -139,7 +139,7 @@ def test_images_with_a_broken_one_among_them(client, tmp_path, capsys):
         assert run(command) == 1
         assert too_many in capsys.readouterr().err
         assert run([*command, "--allow-missing", "--verbose"]) == 0
-        assert "left out of images: 1 undecodable (3.jpg)" in capsys.readouterr().err
+        assert "images: left out: 1 undecodable (3.jpg)" in capsys.readouterr().err
     answer = client.localize("pictures", folder / "5.jpg", shortlist=3)
     assert len(answer.retrieval) == 3
 
