@@ -270,6 +270,14 @@ def test_appended_frames_are_described_by_their_own_season(seasons):
     assert hits > 40
 
 
+def test_a_few_appended_frames_that_are_alike_mute_nothing(seasons):
+    before = compose_map(PLAN, drive_of(seasons[1]), None, None, 60).map
+    u = composed.described(drive_of(seasons[1][:1]).encodings, before.live_statistics.encodings, None)
+    added = drive_of(seasons[1][:1], np.array([7.5]))
+    after = append_drive(before, replace(added, dissimilarities=np.clip(2 - 2 * u @ u.T, 0, 4).repeat(60, axis=1)))
+    assert after.usual_encoding == pytest.approx(before.usual_encoding, abs=0.05)
+
+
 @pytest.mark.real_data
 @pytest.mark.parametrize(("n_landmarks", "anr", "recall", "worst"), [(300, 1.05, 46, 2.2), (512, 0.9, 54, 2.0)])
 def test_on_real_descriptors_two_seasons_make_the_difference(real_data, n_landmarks, anr, recall, worst):

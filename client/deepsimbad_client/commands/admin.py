@@ -342,6 +342,9 @@ def _show_job(job: Job, json_output: bool) -> None:
         click.echo(f"to serve it all the same: deepsimbad-client activate {job.domain} {version}")
     elif why:
         click.echo(f"map {version}: {why}")
+    if fused := metrics.get("fused"):
+        told = "fused into the places seen again" if fused.get("accepted") else f"not fused: {fused.get('why')}"
+        REMARKS.print(f"map {version}: the drive is {told}; {fused.get('n_new_images')} new images", soft_wrap=True)
     season = job.second_season
     if season.get("significance") is not None and not season.get("accepted"):  # compared, and found to differ
         REMARKS.print(f"map {version} learnt nothing of a second season: {season.get('why')}", soft_wrap=True)

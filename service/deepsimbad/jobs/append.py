@@ -137,6 +137,10 @@ def fuse(map_: Map, known: KnownDrives, drive: Drive, same_route: bool | None) -
         known.fusable(same_places(earlier.route(), map_.route), number) for number, earlier in enumerate(known.seasons)
     ]
     pairs.append(known.fusable(season.places))
+    if not pairs[-1].size:
+        return None, replace(
+            verdict, accepted=False, why="all that it saw again are images of drives that agree with none"
+        )
     plan = MapPlan(Relevance.COMPOSED, map_.list_length, tuple(map_.actions_m.tolist()), map_.closed, is_same)
     if whitening is not None and covers(map_.position_m, np.concatenate(pairs)[:, 0]):
         seen_rows = np.concatenate([row[places[:, 1]] for row, places in zip(rows, pairs, strict=True)])

@@ -202,6 +202,8 @@ def test_the_command_line_end_to_end(service, encodings, tmp_path, capsys, monke
     assert "cli" in capsys.readouterr().out
     assert run(["jobs"]) == 0
     assert "succeeded" in capsys.readouterr().out
+    assert run(["remap", "--domain", "cli", "--training", "landmarks", "--append", "--no-same-route"]) == 0
+    assert "the drive is not fused: the two drives are said not to share" in capsys.readouterr().err
     assert run(["remap", "--domain", "cli", "--training", "summer", "--camera-of", "nowhere"]) == 1
     assert "nowhere" in capsys.readouterr().err
     assert run(["remap", "--domain", "cli", "--training", "nothing"]) == 1
