@@ -49,8 +49,8 @@ log = logging.getLogger(__name__)
 LEAST_FREE_BYTES = 16 * MEBIBYTE  # with less, the next map or the write-ahead log may not fit
 TRUSTED_S = 1.0  # anybody may ask whether it is ready, and every look writes to the disk
 _WRITE_TIMEOUT_S = 2.0
-_ROUTERS = (
-    *(router, domains.router, localizations.router, sessions.router, domains.admin),
+_ROUTERS = (  # routes are tried in this order: those that robots ask come first
+    *(sessions.router, localizations.router, router, domains.router, domains.admin),
     *(traverses.router, jobs.making, jobs.router, maps.router, sessions.listing),
 )
 _DESCRIPTION = (
