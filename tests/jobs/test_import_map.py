@@ -182,7 +182,7 @@ def test_a_map_of_an_evaluator_that_is_not_here_is_refused(there, here, tmp_path
     there.create_domain("new", {"kind": "telepathy"}, False, ACTIONS_M)
     add(there, "new", evaluator={"kind": "telepathy"})
     export_map(there, "new", None, tmp_path / "new.map")
-    with pytest.raises(InvalidArchiveError, match="the evaluator's kind must be one of"):
+    with pytest.raises(InvalidArchiveError, match="no kind of evaluator"):
         import_map(here, tmp_path / "new.map")
     export_map(there, "campus", None, tmp_path / "campus.map")
     with pytest.raises(InvalidInputError, match="a domain is named by"):
