@@ -189,6 +189,10 @@ def test_a_raw_image_of_nclt_is_turned_upright_in_map_and_localize(deepsimbad, p
     assert "turned upright" in ran.err
     (answer,) = json.loads(ran.out)
     assert answer["belief"]["mode_m"] == 5
+    upright = cv2.rotate(cv2.imread(str(camera / "1326030975000005.tiff")), cv2.ROTATE_90_CLOCKWISE)
+    cv2.imwrite(str(tmp_path / "upside_down.png"), cv2.rotate(upright, cv2.ROTATE_180))
+    ran = deepsimbad("localize", "route", tmp_path / "upside_down.png", "--rotate", 180, "--json")
+    assert json.loads(ran.out)[0]["belief"] == answer["belief"]
 
 
 def test_a_view_that_cannot_be_used_is_named(deepsimbad, pictures, tmp_path):

@@ -27,7 +27,7 @@ from deepsimbad_client.http.models import Domain
 from deepsimbad_client.http.upload import upload as upload_recording
 from deepsimbad_client.recordings import Recording
 from deepsimbad_client.recordings.folder import single
-from deepsimbad_client.recordings.options import accounting, opened, reading, tell_left_out, tell_remarks
+from deepsimbad_client.recordings.options import accounting, opened, reading, rotate_option, tell_left_out, tell_remarks
 from deepsimbad_client.recordings.sources import RECORDING_SUFFIXES
 from deepsimbad_client.replay import DEFAULT_PLANNER
 from deepsimbad_client.replay.active import EPISODES, STEPS, Stage, active_replay
@@ -104,32 +104,36 @@ def upload(
 @click.argument("images", nargs=-1, required=True, metavar="IMAGE...")
 @domain_option
 @click.option("--shortlist", type=click.IntRange(min=1), default=10, show_default=True)
+@rotate_option
 @json_flag
 @serving
-def localize(client: Client, images: tuple[str, ...], domain: str, shortlist: int, json_output: bool) -> None:
+def localize(
+    client: Client, images: tuple[str, ...], domain: str, shortlist: int, rotate: int | None, json_output: bool
+) -> None:
     """Say where images were probably taken.
 
     IMAGE is a file, or a SOURCE such as nclt:ROOT/DATE#40:41 or a folder; each image is placed on its own.
     """
     described = client.domain(domain)
     shortlist = min(shortlist, described.n_map_images or shortlist)
-    answers = [(name, client.localize(domain, shortlist=shortlist, **view)) for name, view in _views(images, described)]
+    views = _views(images, described, rotate)
+    answers = [(name, client.localize(domain, shortlist=shortlist, **view)) for name, view in views]
     if json_output:
         click.echo(as_json([{"image": name, **answer.model_dump(mode="json")} for name, answer in answers]))
     else:
         show(place_table(answers))
 
 
-def _views(images: Iterable[str], domain: Domain) -> Iterator[tuple[str, dict[str, Any]]]:
+def _views(images: Iterable[str], domain: Domain, rotate: int | None) -> Iterator[tuple[str, dict[str, Any]]]:
     """Every view with its name, made ready as an upload would make it, so that it is encoded like a map's own."""
     for name in images:
         path = Path(name)
         is_image = path.is_file() and path.suffix.lower() not in RECORDING_SUFFIXES
         if is_image:
-            recording: Recording = single(path)
+            recording: Recording = single(path, rotate)
             tell_remarks(recording)
         else:
-            recording = opened(name)
+            recording = opened(name, rotate=rotate)
         recording = recording.shown_by(domain.grey_levels)
         for row, frame in enumerate(recording.frames):
             yield name if is_image else frame.name, recording.view(row, domain.input_size)

@@ -2,10 +2,10 @@
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
 import cv2
 import numpy as np
@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from deepsimbad.errors import DeepSimbadError
 from deepsimbad.evaluators.grey_levels import GreyLevels, measured, shown
-from deepsimbad.evaluators.image import decode_deep, resized
+from deepsimbad.evaluators.image import decode_deep as decode_file
+from deepsimbad.evaluators.image import resized
 from deepsimbad.evaluators.image_files import ImageFile
 from deepsimbad_client.errors import BrokenFrameError, SourceError
 from deepsimbad_client.http import media_type_of
@@ -111,6 +112,9 @@ class Recording:
         return dataclasses.replace(self, frames=frames, encodings=encodings, n_before_slice=self.n_whole)
 
 
+AnyRecording = TypeVar("AnyRecording", bound=Recording)
+
+
 def finite_number(text: str) -> float | None:
     """The number that a cell of a table holds; None: no finite one."""
     try:
@@ -146,15 +150,15 @@ def decode(body: bytes, path: Path, *, as_stored: bool = False, levels: GreyLeve
     What the service does not take (BMP, PGM, PPM) is decoded too. `as_stored` leaves pixels as they lie in the file,
     `levels` show more than 8 bits. Raises BrokenFrameError (not an image, damaged, or its end is missing).
     """
-    pixels = _decode_deep(body, path, as_stored)
+    pixels = decode_deep(body, path, as_stored=as_stored)
     return pixels if pixels.dtype == np.uint8 else shown(pixels, levels or measured([pixels]))
 
 
-def _decode_deep(body: bytes, path: Path, as_stored: bool) -> NDArray[Any]:
+def decode_deep(body: bytes, path: Path, *, as_stored: bool = True) -> NDArray[Any]:
     """As `decode`, of 9 to 16 bits all, as uint16."""
     try:
         if media_type_of(body) is not None:
-            return decode_deep(ImageFile.read(body, _MAX_PIXELS), as_stored=as_stored)
+            return decode_file(ImageFile.read(body, _MAX_PIXELS), as_stored=as_stored)
         if path.suffix.lower() in HEIC_SUFFIXES:
             return decode_heic(body)
         image = cv2.imdecode(np.frombuffer(body, np.uint8), cv2.IMREAD_COLOR_BGR | cv2.IMREAD_ANYDEPTH)
@@ -165,19 +169,26 @@ def _decode_deep(body: bytes, path: Path, as_stored: bool) -> NDArray[Any]:
     return np.asarray(image)
 
 
-def levels_over(paths: Sequence[Path]) -> GreyLevels | None:
-    """Grey levels that suit a recording's images, measured on a few spread over it; None: they have 8 bits."""
-    at = np.unique(np.linspace(0, len(paths) - 1, _N_LEVEL_PROBES).round().astype(int))
+def with_grey_levels(recording: AnyRecording, image: Callable[[int], NDArray[Any]]) -> AnyRecording:
+    """The recording, shown by the grey levels that suit its images, where these have more than 8 bits; which is said.
+
+    They are measured on a few spread over it; `image` gives one by its place, as `decode_deep` does.
+    """
+    at = np.unique(np.linspace(0, len(recording.frames) - 1, _N_LEVEL_PROBES).round().astype(int))
     pictures: list[NDArray[np.uint16]] = []
     for number, place in enumerate(at.tolist()):
         if number == _N_SURE and not pictures:
-            return None
+            return recording
         try:
-            picture = _decode_deep(read_file(paths[place]), paths[place], as_stored=True)
+            picture = image(place)
         except BrokenFrameError:
             continue
         pictures += [picture] if picture.dtype == np.uint16 else []
-    return measured(pictures) if pictures else None
+    if not pictures:
+        return recording
+    levels = measured(pictures)
+    remark = f"images of more than 8 bits are shown as 8: {levels[0]} is black, {levels[1]} white"
+    return dataclasses.replace(recording, grey_levels=levels, remarks=[*recording.remarks, remark])
 
 
 def turned(image: Image, degrees: int) -> Image:

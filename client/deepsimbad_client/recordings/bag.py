@@ -18,9 +18,21 @@ from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
+from deepsimbad.evaluators.grey_levels import measured, shown
 from deepsimbad_client.errors import BrokenFrameError, MissingExtraError, SourceError
-from deepsimbad_client.recordings import EncodedImage, Frame, Image, Recording, as_png, decode, ready, stamp_of, turned
+from deepsimbad_client.recordings import (
+    EncodedImage,
+    Frame,
+    Recording,
+    as_png,
+    decode_deep,
+    ready,
+    stamp_of,
+    turned,
+    with_grey_levels,
+)
 from deepsimbad_client.recordings.placing import Placed, placed_on
 from deepsimbad_client.recordings.plane import GPS_DEADBAND_M, utm
 from deepsimbad_client.recordings.track import DEADBAND_M, Track, track_of
@@ -32,7 +44,8 @@ BAG_PREFIX = "rosbag:"
 BAG_SUFFIXES = frozenset({".bag", ".mcap", ".db3"})
 METADATA = "metadata.yaml"  # in the folder that is a ROS 2 bag
 
-_IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+_COMPRESSED = "sensor_msgs/msg/CompressedImage"
+_IMAGES = ("sensor_msgs/msg/Image", _COMPRESSED)
 _POSES = ("geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped")
 _FIX, _ODOMETRY = "sensor_msgs/msg/NavSatFix", "nav_msgs/msg/Odometry"
 _POSITIONS = (*_POSES, _FIX, _ODOMETRY)  # by which drives can be compared best first
@@ -75,17 +88,27 @@ class BagRecording(Recording):
 
     def image(self, frame: Frame, input_size: tuple[int, int] | None) -> EncodedImage:
         """Read a frame: a compressed one as it is, a raw one as PNG; see `Recording.image`."""
+        kind, message = self._read(frame)
+        if kind == _COMPRESSED:
+            return ready(bytes(message.data), Path(frame.name), input_size, self.rotate, self.grey_levels)
+        pixels = _pixels(message, frame.name)
+        image = pixels if pixels.dtype == np.uint8 else shown(pixels, self.grey_levels or measured([pixels]))
+        return as_png(turned(image, self.rotate), input_size)
+
+    def deep(self, row: int) -> NDArray[Any]:
+        """A frame's pixels, of 9 to 16 bits all."""
+        kind, message = self._read(self.frames[row])
+        name = self.frames[row].name
+        return decode_deep(bytes(message.data), Path(name)) if kind == _COMPRESSED else _pixels(message, name)
+
+    def _read(self, frame: Frame) -> tuple[str, Any]:
+        """A frame's message and its type. Raises BrokenFrameError."""
         at = self.received_ns[frame.name]
         with self.turn:
             of_topic = [connection for connection in self._reader.connections if connection.topic == self.topic]
             for connection, _, raw in self._reader.messages(of_topic, start=at, stop=at + 1):
-                message: Any = _message(self._reader, raw, connection.msgtype, frame.name)
-                break
-            else:
-                raise BrokenFrameError(f"{frame.name} is not in {self.path} any more", "unreadable file")
-        if connection.msgtype == _IMAGES[1]:
-            return ready(bytes(message.data), Path(frame.name), input_size, self.rotate)
-        return as_png(turned(_pixels(message, frame.name), self.rotate), input_size)
+                return connection.msgtype, _message(self._reader, raw, connection.msgtype, frame.name)
+        raise BrokenFrameError(f"{frame.name} is not in {self.path} any more", "unreadable file")
 
     @cached_property
     def _reader(self) -> "AnyReader":
@@ -154,7 +177,7 @@ def read_bag(
         result = Placed([Frame(i, name, i * spacing_m, time_us) for i, (name, time_us) in enumerate(images)])
     if unreadable:
         result.left_out_names["unreadable message"] = unreadable
-    return BagRecording(
+    recording = BagRecording(
         path.stem,
         tuple(result.frames),
         result.left_out_names,
@@ -164,6 +187,7 @@ def read_bag(
         received_ns=received_ns,
         rotate=rotate,
     )
+    return with_grey_levels(recording, recording.deep)
 
 
 def _opened(path: Path) -> "AnyReader":
@@ -245,8 +269,8 @@ def _placed(images: list[tuple[str, int]], rows: _Rows, kind: str, where: str) -
     return result
 
 
-def _pixels(message: Any, name: str) -> Image:
-    """A raw image as 8-bit BGR."""
+def _pixels(message: Any, name: str) -> NDArray[Any]:
+    """A raw image as BGR, of its own depth: uint8 or uint16."""
     layout = _LAYOUTS.get(message.encoding)
     if layout is None:
         raise BrokenFrameError(f"{name}: nobody reads the encoding {message.encoding!r}", "unknown encoding")
@@ -259,9 +283,6 @@ def _pixels(message: Any, name: str) -> Image:
     except ValueError as error:
         raise BrokenFrameError(f"{name}: {error}", "undecodable") from error
     pixels = pixels.astype(sample)
-    if sample is np.uint16:
-        body = cv2.imencode(".png", pixels)[1].tobytes()  # what 16 bits are as 8 is one rule, that of files
-        return decode(body, Path(name))
     if to_bgr is None:
         to_bgr = cv2.COLOR_GRAY2BGR if channels == 1 else None
-    return np.asarray(pixels if to_bgr is None else cv2.cvtColor(pixels, to_bgr), dtype=np.uint8)
+    return pixels if to_bgr is None else np.asarray(cv2.cvtColor(pixels, to_bgr))

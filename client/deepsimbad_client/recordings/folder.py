@@ -14,10 +14,11 @@ from deepsimbad_client.recordings import (
     EncodedImage,
     Frame,
     Recording,
-    levels_over,
+    decode_deep,
     read_file,
     ready,
     stamp_of,
+    with_grey_levels,
 )
 from deepsimbad_client.recordings.gps import TRACK_SUFFIXES, read_exif, read_track
 from deepsimbad_client.recordings.heic import HEIC_SUFFIXES, require_heic
@@ -106,10 +107,8 @@ def read_folder(
 
 def _prepared(recording: FolderRecording, rotate: int | None) -> FolderRecording:
     """The recording turned as asked, and shown by the grey levels of its images, which is said."""
-    levels = levels_over([recording.folder / frame.name for frame in recording.frames])
-    if levels is not None:
-        remark = f"images of more than 8 bits are shown as 8: {levels[0]} is black, {levels[1]} white"
-        recording = dataclasses.replace(recording, grey_levels=levels, remarks=[*recording.remarks, remark])
+    paths = [recording.folder / frame.name for frame in recording.frames]
+    recording = with_grey_levels(recording, lambda at: decode_deep(read_file(paths[at]), paths[at]))
     return _upright(recording, rotate)
 
 

@@ -17,6 +17,12 @@ from deepsimbad_client.recordings.sources import open_source
 Command = Callable[..., Any]
 
 _ABOVE_0 = click.FloatRange(min=0, min_open=True)
+rotate_option = click.option(
+    "--rotate",
+    type=click.Choice(["0", "90", "180", "270"]),
+    callback=lambda _context, _parameter, value: None if value is None else int(value),
+    help="Degrees clockwise by which every image is turned.  [default: NCLT's upright, others not at all]",
+)
 _OPTIONS = (
     click.option(
         "--spacing-m",
@@ -30,12 +36,7 @@ _OPTIONS = (
         type=click.Path(exists=True, path_type=Path),
         help="NCLT's undistortion maps (U2D_Cam*.txt or their folder); absent: images stay as they are.",
     ),
-    click.option(
-        "--rotate",
-        type=click.Choice(["0", "90", "180", "270"]),
-        callback=lambda _context, _parameter, value: None if value is None else int(value),
-        help="Degrees clockwise by which every image is turned.  [default: NCLT's upright, others not at all]",
-    ),
+    rotate_option,
     click.option(
         "--time-offset-s",
         type=float,

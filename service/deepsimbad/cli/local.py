@@ -42,7 +42,7 @@ from deepsimbad.store.layout import checked_name
 from deepsimbad.store.traverses import Traverse
 from deepsimbad_client.recordings import turned
 from deepsimbad_client.recordings.nclt import TURNED_UPRIGHT, UPRIGHT_TURN, lies_on_its_side
-from deepsimbad_client.recordings.options import accounting, opened, reading, tell_left_out
+from deepsimbad_client.recordings.options import accounting, opened, reading, rotate_option, tell_left_out
 
 _READING = {"read landmarks": 4.0, "read training": 4.0}
 
@@ -158,9 +158,10 @@ def map_(
 @click.command()
 @click.argument("domain")
 @click.argument("images", nargs=-1, required=True, type=click.Path(path_type=Path))
+@rotate_option
 @click.option("--json", "as_json", is_flag=True, help="Print the full answers as one JSON list.")
 @data_dir_option
-def localize(domain: str, images: tuple[Path, ...], as_json: bool) -> None:
+def localize(domain: str, images: tuple[Path, ...], rotate: int | None, as_json: bool) -> None:
     """Say where on the route each image was probably taken."""
     from deepsimbad.api.localizations import render_localization  # noqa: PLC0415 - as below
 
@@ -179,7 +180,9 @@ def localize(domain: str, images: tuple[Path, ...], as_json: bool) -> None:
                 view = decode_image(body, settings.max_pixels, levels=levels)
             except (InvalidImageError, ImageTooLargeError) as error:
                 raise type(error)(f"{path}: {error.message}", **error.hints) from error
-            if lies_on_its_side(path):
+            if rotate is not None:
+                view = turned(view, rotate)
+            elif lies_on_its_side(path):
                 click.echo(f"{path}: {TURNED_UPRIGHT}", err=True)
                 view = turned(view, UPRIGHT_TURN)
             watch.lap("decode")

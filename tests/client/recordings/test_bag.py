@@ -178,6 +178,18 @@ def test_raw_images_of_every_layout_become_bgr(bag, encoding, pixels, seen):
     np.testing.assert_allclose(sent(recording).astype(int), seen, atol=1)
 
 
+def test_a_camera_of_twelve_bits_is_shown_by_the_levels_of_its_recording(bag):
+    def dim_and_bright(made):
+        for k, most in enumerate((1000, 4000)):
+            grey = np.linspace(0, most, 12 * 16).reshape(12, 16).astype(np.uint16)
+            made.image(START_NS + 10**9 * k, pixels=grey, encoding="mono16")
+
+    recording = open_source(bag("mcap", dim_and_bright))
+    assert recording.grey_levels == (0, 4095)
+    assert [int(sent(recording, row).max()) for row in (0, 1)] == [62, 250]
+    assert int(sent(recording.shown_by((0, 1023)), 0).max()) == 250
+
+
 def test_a_compressed_image_goes_as_it_is_and_a_broken_one_is_named(bag):
     body = cv2.imencode(".jpg", PICTURE)[1].tobytes()
 
