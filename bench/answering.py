@@ -4,7 +4,6 @@ from collections.abc import Iterator
 from statistics import median
 from time import perf_counter
 
-import faiss
 import numpy as np
 
 from bench.common import ACTIONS_M, Timing, duration, interleaved, markdown
@@ -45,6 +44,8 @@ def retrieval_table() -> Iterator[str]:
 
 
 def _retrieval_rows() -> Iterator[list[str]]:
+    import faiss  # noqa: PLC0415 - the other tables go without
+
     rng = np.random.default_rng(1)
     dissimilarities = rng.random(N_LANDMARKS, dtype=np.float32)
     for n_images in SIZES:

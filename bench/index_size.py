@@ -1,4 +1,4 @@
-"""What the index takes, beside models of the same lists and xz; also by itself: python -m bench.index_size."""
+"""What the index takes, beside models of the same lists and xz."""
 
 import itertools
 import lzma
@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from bench.common import ACTIONS_M, Limit, limit_table, machine, markdown, real_recordings
+from bench.common import ACTIONS_M, Limit, limit_table, markdown, real_recordings
 from bench.worlds import N_LANDMARKS, NCLT_IMAGES, dense_lists, rrf_map, scattered_lists
 from deepsimbad.core.building import MapPlan
 from deepsimbad.core.drive import Drive
@@ -162,8 +162,3 @@ def _by_list(lists: NDArray[np.int64], n_landmarks: int) -> float:
         for j in range(h):
             listed[lists[j, m]] += 1
     return bits
-
-
-if __name__ == "__main__":
-    for line in (machine(), "", *index_table()):
-        print(line)
