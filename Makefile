@@ -20,7 +20,7 @@ install: .venv/.installed ## .venv with the service, the client and the tools fr
 .venv/.installed: pyproject.toml constraints.txt
 	@test -n "$(PYTHON)" || { echo "No Python 3.11 or newer with venv found; install one, or name it: make PYTHON=/path/to/python $(MAKECMDGOALS)" >&2; exit 1; }
 	$(PYTHON) -m venv --clear .venv
-	@echo "Installing into .venv: about 0.6 GB to download and 1.8 GB on the disk with PyTorch's CPU build, 4 and 8 GB with CUDA's," >&2
+	@echo "Installing the service, the client, PyTorch and the tools of constraints.txt into .venv: about 0.6 GB to download and 1.8 GB on the disk with PyTorch's CPU build, 4 and 8 GB with CUDA's," >&2
 	@echo "which is what pip takes on Linux unless told: make $(or $(MAKECMDGOALS),install) TORCH_INDEX=https://download.pytorch.org/whl/cpu" >&2
 	$(PIP_INSTALL) --editable '.[dev]'
 	@touch $@

@@ -271,6 +271,7 @@ def test_ctrl_c_cancels_a_map_and_leaves_no_half_of_one(process, tmp_path):
     assert running.returncode == 130, err
     assert out == ""
     assert err.startswith("cancelled while it was at: ")
+    assert "no map was made, and the same command begins again" in err
     maps = stored.parent.parent / "maps"
     assert not maps.exists() or not list(maps.iterdir())
     with Catalog.open(tmp_path / "here") as catalog:

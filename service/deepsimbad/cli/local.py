@@ -1,5 +1,7 @@
 """`deepsimbad map`, `localize` and `info`: the same data directory as the server's, without a server."""
 
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +25,8 @@ from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Relevance
 from deepsimbad.engine.localizer import localize as localize_view
 from deepsimbad.engine.maps import Maps
 from deepsimbad.engine.worker import EvaluatorPool, Stopwatch
-from deepsimbad.errors import ImageTooLargeError, InvalidImageError, InvalidSourceError
+from deepsimbad.errors import CancelledError, ImageTooLargeError, InvalidImageError, InvalidSourceError
+from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.compute import available_cores
 from deepsimbad.evaluators.grey_levels import levels_in
 from deepsimbad.evaluators.image import decode_image
@@ -33,18 +36,18 @@ from deepsimbad.jobs.remap import (
     DEFAULT_LIST_LENGTH,
     DEFAULT_N_LANDMARKS,
     DEFAULT_TRAINING_EPISODES,
-    REMAP_STAGES,
     RemapConfig,
     remap,
+    remap_stages,
 )
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.layout import checked_name
 from deepsimbad.store.traverses import Traverse
-from deepsimbad_client.recordings import turned
+from deepsimbad_client.recordings import Recording, turned
 from deepsimbad_client.recordings.nclt import TURNED_UPRIGHT, UPRIGHT_TURN, lies_on_its_side
 from deepsimbad_client.recordings.options import accounting, opened, reading, rotate_option, tell_left_out
 
-_READING = {"read landmarks": 4.0, "read training": 4.0}
+_FRAMES_A_SECOND = 150.0  # that are encoded, against which the stages of a remap are weighed
 
 
 def _actions_m(_context: click.Context, _parameter: click.Parameter, value: str | None) -> tuple[float, ...]:
@@ -130,7 +133,7 @@ def map_(
     fitting_number(config.n_landmarks, len(recordings[next(iter(sources))].frames), DEFAULT_N_LANDMARKS)
     with Catalog.open(settings.data_dir) as catalog:
         catalog.create_domain(domain, evaluator.as_dict(), closed, actions_m)
-        with progress_bar(_READING | REMAP_STAGES, f"map {domain}") as progress:
+        with _nothing_kept(), progress_bar(_stages(config, recordings, measure), f"map {domain}") as progress:
             for role, recording in recordings.items():
                 progress.stage(f"read {role}")
                 encoded = encode_recording(
@@ -153,6 +156,24 @@ def map_(
     season = metrics["second_season"]
     if season is not None and season["significance"] is not None and not season["accepted"]:
         click.echo(f"it learnt nothing of a second season: {season['why']}", err=True)
+
+
+def _stages(config: RemapConfig, recordings: Mapping[str, Recording], measure: Evaluator) -> dict[str, float]:
+    """What is to be done, with about the seconds it takes."""
+    n_frames = {role: len(recording.frames) for role, recording in recordings.items()}
+    ready = recordings["training"].encodings
+    dim = (measure.encoding_dim or 0) if ready is None else ready.shape[1]
+    reading = {f"read {role}": n / _FRAMES_A_SECOND for role, n in n_frames.items()}
+    return reading | remap_stages(config, n_frames["training"], n_frames.get("landmarks", 0), dim)
+
+
+@contextmanager
+def _nothing_kept() -> Iterator[None]:
+    """Say what a Ctrl-C leaves."""
+    try:
+        yield
+    except CancelledError as error:
+        raise CancelledError(f"{error}; no map was made, and the same command begins again") from error
 
 
 @click.command()

@@ -180,7 +180,9 @@ def compose_map(
     candidates = training if landmarks is None else landmarks
     if isinstance(candidates, Drive):
         drives = {id(drive): drive.encodings for drive in (training, candidates)}
-        space = _Space.among(candidates, principal_directions(*drives.values()), n_landmarks)
+        directions = principal_directions(*drives.values(), on_progress=lambda share: on_progress(0.6 * share))
+        on_progress(0.6)
+        space = _Space.among(candidates, directions, n_landmarks)
     else:
         space = _Space(candidates.get("projection"), np.asarray(candidates["prototypes"], np.float32))
         if (d := candidates["usual"].shape[1]) != training.encoding_dim:
@@ -188,12 +190,12 @@ def compose_map(
                 f"encodings of {training.encoding_dim} numbers cannot be compared with landmarks of {d}"
             )
     check_list_length(plan.list_length, len(space.prototypes))
-    on_progress(0.3)
+    on_progress(0.7)
     own, season, verdict = space.seen(training), None, None
     other: Drive | None = None
     if second is not None:
         season, other, verdict = second_season(own, plan.closed, second, plan.same_route, space.seen)
-    on_progress(0.5)
+    on_progress(0.75)
     seen_twice, by_camera = camera, bool(camera)
     if season is not None and other is not None and covers(training.position_m, season.places[:, 0]):
         seen_twice, by_camera = (SeenTwice(training, other, season.places),), False
@@ -203,7 +205,7 @@ def compose_map(
         if season is not None and other is not None:
             other = space.seen(other)
             season = SecondSeason(_measured(other), season.places)
-    on_progress(0.7)
+    on_progress(0.85)
     usual, places = Moments.of(training.encodings), space.unit_vectors(training)
     fused = places
     if season is not None and other is not None:
@@ -221,7 +223,7 @@ def compose_map(
     if season is not None:
         barred = own_places if candidates is second or plan.bars_own_place else None
         rehearsal = replace(map_, lists=compose(places, space.prototypes, plan.list_length, barred))
-    on_progress(0.8)
+    on_progress(0.92)
     known = (training,) if other is None else (training, other)
     map_, rehearsal = taught(map_, rehearsal, _measured(own), space.dissimilarities(fused), season, known)
     on_progress(1.0)

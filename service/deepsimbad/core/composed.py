@@ -6,7 +6,7 @@ of both, and what a season changes counts less (within-place whitening). The h l
 weighted by list position, comes nearest to it in direction; a view answers a place by its cosine with that sum.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any, Self
@@ -112,7 +112,9 @@ def described(
     return np.concatenate([unit_encodings(encodings[at : at + _ROWS_AT_ONCE], usual, projection) for at in blocks])
 
 
-def principal_directions(*drives: NDArray[np.float32]) -> NDArray[np.float32] | None:
+def principal_directions(
+    *drives: NDArray[np.float32], on_progress: Callable[[float], None] = lambda _: None
+) -> NDArray[np.float32] | None:
     """[d, k] the directions in which standardised frames differ most, the strongest held back a little.
 
     k is 96 or the number of frames less 1, whichever is less. By the matrix of products between frames, at most 2,048
@@ -131,8 +133,12 @@ def principal_directions(*drives: NDArray[np.float32]) -> NDArray[np.float32] | 
     frames = np.concatenate(
         [unit_encodings(rows, Moments.of(drive), None) for rows, drive in zip(some, drives, strict=True)]
     )
+    on_progress(0.4)
     k = max(1, min(MOST_DIMENSIONS, len(frames) - 1))
-    variance, vectors = np.linalg.eigh((frames @ frames.T).astype(np.float64) / len(frames))
+    products = (frames @ frames.T).astype(np.float64) / len(frames)
+    on_progress(0.5)
+    variance, vectors = np.linalg.eigh(products)
+    on_progress(0.8)
     variance, vectors = np.maximum(variance[-k:], 1e-12), vectors[:, -k:]
     scale = 1 / np.sqrt(variance * len(frames) * (variance + _EVENING_OUT * variance.mean()))
     return np.asarray(frames.T.astype(np.float64) @ (vectors * scale), np.float32)
