@@ -174,7 +174,8 @@ def with_grey_levels(recording: AnyRecording, image: Callable[[int], NDArray[Any
 
     They are measured on a few spread over it; `image` gives one by its place, as `decode_deep` does.
     """
-    at = np.unique(np.linspace(0, len(recording.frames) - 1, _N_LEVEL_PROBES).round().astype(int))
+    n = len(recording.frames)
+    at = np.unique(np.linspace(0, max(0, n - 1), min(n, _N_LEVEL_PROBES)).round().astype(int))
     pictures: list[NDArray[np.uint16]] = []
     for number, place in enumerate(at.tolist()):
         if number == _N_SURE and not pictures:

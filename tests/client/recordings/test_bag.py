@@ -170,6 +170,7 @@ def test_one_of_several_topics_is_named(bag):
         ("bgra8", np.dstack((PICTURE, PICTURE[:, :, 0])), PICTURE),
         ("mono8", PICTURE[:, :, 0], PICTURE[:, :, [0, 0, 0]]),
         ("mono16", PICTURE[:, :, 0].astype(np.uint16) * 257, PICTURE[:, :, [0, 0, 0]]),
+        ("16UC1", PICTURE[:, :, 0].astype(np.uint16) * 16, PICTURE[:, :, [0, 0, 0]]),
         ("bayer_rggb8", np.full((12, 16), 90, np.uint8), np.full((12, 16, 3), 90, np.uint8)),
     ],
 )
