@@ -114,6 +114,11 @@ def test_images_are_found_where_they_were_taken(deepsimbad, pictures, tmp_path):
         assert answer["belief"]["mode_m"] == 3.0 * place
         assert answer["next_best_view"]["planner"] == "informed"
         assert answer["next_best_view"]["action_m"] in range(1, 11)
+        assert answer["warnings"] == []
+    lying = tmp_path / "lying.png"
+    cv2.imwrite(str(lying), cv2.rotate(cv2.imread(str(views[0])), cv2.ROTATE_90_CLOCKWISE))
+    (answer,) = json.loads(deepsimbad("localize", "route", lying, "--json").out)
+    assert any("they lie on their side" in warning for warning in answer["warnings"])
     table = deepsimbad("localize", "route", *views)
     assert table.code == 0
     assert re.search(r"/7\.png +│ 7\.png +│ 21\.0 m", table.out), table.out

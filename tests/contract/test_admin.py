@@ -6,6 +6,7 @@ import json
 import threading
 from io import BytesIO
 
+import cv2
 import numpy as np
 import pytest
 
@@ -83,7 +84,7 @@ def shelf(client, request):
     client.put(base, json=TAKES_ENCODINGS)
     made = client.post(f"{base}/traverses", json={"name": "t"})
     empty = dict.fromkeys(("length_m", "span_us", "digest", "grey_levels"))
-    empty |= {"name": "t", "n_frames": 0, "missing": [], "n_uninformative": 0}
+    empty |= {"name": "t", "n_frames": 0, "missing": [], "n_uninformative": 0, "cameras": [], "warnings": []}
     assert (made.status_code, made.json()) == (201, empty)
     return f"{base}/traverses"
 
@@ -121,6 +122,8 @@ def test_frames_twice_and_out_of_order(client, shelf):
         "span_us": [0, 5],
         "n_uninformative": 0,
         "grey_levels": None,
+        "cameras": [],
+        "warnings": [],
     }
     batch = npz(encodings=np.ones((3, DIM)), index=np.array([4, 2, 3]), position_m=np.array([4, 2, 3]))
     answer = client.post(f"{shelf}/t/frames", content=batch, headers=NPZ)
@@ -188,6 +191,44 @@ def test_an_image_and_its_encoding_are_the_same_frame(client):
     assert client.put(frame, content=encoded(picture(3)), headers=headers).status_code == 200
     dim = client.get("/v1/domains/seen").json()["encoding_dim"]
     assert client.put(frame, json={"encoding": [0.5]}).json()["encoding_dim"] == dim
+
+
+def test_drives_of_two_cameras_are_told_from_upload_to_remap(client):
+    base = "/v1/admin/domains/cameras"
+    client.put(base, json={"evaluator": {"kind": "feature_l2", "extractor": "gradient_grid"}})
+    for name, turn in (("upright", None), ("lying", cv2.ROTATE_90_CLOCKWISE)):
+        client.post(f"{base}/traverses", json={"name": name})
+        for n in range(8):
+            view = encoded(picture(n) if turn is None else cv2.rotate(picture(n), turn))
+            path = f"{base}/traverses/{name}/frames/{n}?position_m={n}&x_m={n}&y_m=0&camera=Cam5"
+            assert client.put(path, content=view, headers=JPEG).status_code == 201
+    upright, lying = (client.get(f"{base}/traverses/{name}").json() for name in ("upright", "lying"))
+    assert upright["cameras"] == [
+        {"name": "Cam5", "width": 160, "height": 120, "aspect_ratio": 4 / 3, "orientation": "landscape"}
+    ]
+    assert (lying["cameras"][0]["width"], lying["cameras"][0]["orientation"]) == (120, "portrait")
+    (warning,) = lying["warnings"]
+    assert warning.startswith("its pictures are not like those of traverse upright: they lie on their side")
+    client.put(f"{base}/traverses/upright/frames/8?position_m=8", content=view, headers=JPEG)
+    listed = client.get(f"{base}/traverses").json()["traverses"]
+    (mixed,) = (traverse["warnings"] for traverse in listed if traverse["name"] == "upright")
+    assert len(mixed) == 1
+    assert mixed[0].startswith(
+        "some of its pictures are not like the others: they lie on their side: they are 120 x 160"
+    )
+    alone = client.remap("cameras", training_traverse="upright", n_landmarks=8)
+    assert alone["result"]["metrics"]["warnings"] == []
+    both = client.remap("cameras", training_traverse="upright", landmark_traverse="lying", n_landmarks=8)
+    (warning,) = both["result"]["metrics"]["warnings"]
+    assert warning.startswith(
+        "the pictures of traverse lying are not like those of traverse upright: they lie on their"
+    )
+    added = client.remap("cameras", training_traverse="lying", append=True, n_landmarks=8)
+    (warning,) = added["result"]["metrics"]["warnings"]
+    assert warning.startswith("the pictures of traverse lying are not like those of the active map: they lie on their")
+    view = {"content": encoded(cv2.rotate(picture(1), cv2.ROTATE_90_CLOCKWISE)), "headers": JPEG}
+    said = client.post("/v1/domains/cameras/localizations", **view).json()["warnings"]
+    assert not any("pixels" in warning for warning in said), "such pictures are in the map by now"
 
 
 # Jobs

@@ -4,10 +4,22 @@ import io
 import itertools
 import math
 
+import cv2
 import numpy as np
 import pytest
 
-from .conftest import DIM, N_LANDMARKS, N_READY, N_SEEN, RANKS, TAKES_ENCODINGS, encoded, picture, ready_encodings
+from .conftest import (
+    DIM,
+    N_LANDMARKS,
+    N_READY,
+    N_SEEN,
+    RANKS,
+    TAKES_ENCODINGS,
+    encoded,
+    path_of,
+    picture,
+    ready_encodings,
+)
 
 READY = "/v1/domains/ready/localizations"
 
@@ -66,6 +78,25 @@ def test_a_map_frames_own_encoding_is_found_again_and_unknown_coordinates_are_nu
     assert len(top) == N_READY
     assert (top[3]["x_m"], top[4]["x_m"], top[4]["y_m"]) == (None, 8.0, -4.0)
     assert (top[3]["frame"], top[4]["frame"], best["frame"]) == (None, "4.png", f"{best['map_image']}.png")
+
+
+@pytest.mark.parametrize(
+    ("turn", "size", "says"),
+    [
+        (cv2.ROTATE_90_CLOCKWISE, (120, 160), "they lie on their side: they are 120 x 160, the map's 160 x 120"),
+        (None, (240, 120), "they are of another shape"),
+        (None, (240, 180), None),
+    ],
+)
+def test_a_picture_that_lies_on_its_side_or_is_of_another_shape_is_answered_with_a_warning(client, turn, size, says):
+    view = picture(7) if turn is None else cv2.rotate(picture(7), turn)
+    sent = {"content": encoded(cv2.resize(view, size), ".tiff"), "headers": {"Content-Type": "image/tiff"}}
+    session = client.begin("seen")
+    answers = [client.post("/v1/domains/seen/localizations", **sent).json()]
+    sent["headers"]["Idempotency-Key"] = "once"
+    answers += [client.post(f"{path_of(session)}/observations", **sent).json() for _ in range(2)]
+    for answer in answers:
+        assert [says in warning for warning in answer["warnings"] if "pixels" in warning] == [True] * (says is not None)
 
 
 @pytest.mark.parametrize("kind", ["jpg", "pjpeg", "tif", "x-png", "X-TIFF"])

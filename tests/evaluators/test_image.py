@@ -20,7 +20,7 @@ from deepsimbad.errors import (
     TruncatedImageError,
 )
 from deepsimbad.evaluators.feature_l2 import FeatureL2
-from deepsimbad.evaluators.image import KEPT_PIXELS, decode_image, is_blank
+from deepsimbad.evaluators.image import KEPT_PIXELS, decode_image, is_blank, picture_size
 from deepsimbad.evaluators.image_files import MEDIA_TYPES
 
 LIMIT = 1_000_000
@@ -340,3 +340,21 @@ def test_damaged_headers_at_length(files, data):
     for place in data.draw(st.lists(st.integers(0, near - 1), min_size=1, max_size=10)):
         body[place] = data.draw(st.sampled_from((0, 1, 0x7F, 0x80, 0xFF)) | st.integers(0, 255))
     image_or_named_error(bytes(body))
+
+
+@pytest.mark.parametrize("form", ["JPEG", "TIFF", "PNG", "WEBP"])
+@pytest.mark.parametrize("orientation", [1, 3, 6, 8])
+def test_a_picture_is_as_large_as_it_is_decoded(form, orientation):
+    saved, exif = io.BytesIO(), Pillow.Exif()
+    exif[274] = orientation
+    Pillow.fromarray(np.zeros((40, 60, 3), np.uint8)).save(saved, form, exif=exif)
+    height, width = decode_image(saved.getvalue(), 10_000).shape[:2]
+    assert picture_size(saved.getvalue()) == (width, height)
+    assert picture_size(saved.getvalue()[:20]) is None
+
+
+def test_pixels_that_are_not_square_are_heeded():
+    saved = io.BytesIO()
+    Pillow.fromarray(np.zeros((40, 60, 3), np.uint8)).save(saved, "JPEG")
+    anamorphic = saved.getvalue().replace(b"JFIF\0\1\1\0\0\1\0\1", b"JFIF\0\1\1\0\0\2\0\1")
+    assert (picture_size(saved.getvalue()), picture_size(anamorphic)) == ((60, 40), (30, 40))

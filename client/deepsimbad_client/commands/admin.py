@@ -334,7 +334,7 @@ def _show_job(job: Job, json_output: bool) -> None:
     metrics = result.get("metrics") or {}
     if metrics.get("n_landmarks") is not None:
         REMARKS.print(f"map {version}: {metrics['n_map_images']} images, {metrics['n_landmarks']} landmarks")
-    for warning in job.check.get("warnings", ()):
+    for warning in job.warnings:
         REMARKS.print(f"warning: {warning}", soft_wrap=True)
     why = gate_verdict(job.check)
     if not result.get("active", True):

@@ -98,6 +98,8 @@ def upload(
         f"{report.n_sent} frames sent ({report.bytes_sent / 1e6:.1f} MB in {report.seconds:.1f} s), "
         f"{report.n_skipped} were there already"
     )
+    for warning in report.warnings:
+        REMARKS.print(f"warning: {warning}", soft_wrap=True)
 
 
 @click.command()

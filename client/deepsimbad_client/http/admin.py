@@ -131,6 +131,7 @@ class AdminCalls(Face):
         x_m: float | None = None,
         y_m: float | None = None,
         name: str | None = None,
+        camera: str | None = None,
         replace: bool = True,
         content_type: str | None = None,
         encoding: Numbers | None = None,
@@ -138,12 +139,13 @@ class AdminCalls(Face):
         """Send one frame, an image as `Client.localize` takes it or a ready encoding; the same index again replaces it.
 
         `index` is its place in the recording, from 0; `position_m` its distance along the route. Answers show
-        the `name`, as of its file. Without `replace` an equal frame stays, and another one raises FramesDifferError.
+        the `name`, as of its file; `camera` names what took it. Without `replace` an equal frame stays, and another one
+        raises FramesDifferError.
         """
         view = observation(image, content_type=content_type, encoding=encoding)
         place: dict[str, float | str | None] = {"position_m": position_m, "timestamp_us": timestamp_us}
         place |= {"x_m": x_m, "y_m": y_m, "name": None if name is None else text_of(name)}
-        place |= _keeping(replace)
+        place |= {"camera": None if camera is None else text_of(camera), **_keeping(replace)}
         call = Call("PUT", f"{_traverse(domain, traverse)}/frames/{int(index)}", place, view.headers, view.body)
         return model_of(FrameStored, await self._wire.send(call))
 

@@ -191,6 +191,8 @@ class Traverse(Answer):
     """(first, last) ranges of indices that have not arrived, below the greatest that has."""
     length_m: float | None = None  # from the least position to the greatest
     span_us: tuple[int, int] | None = None  # first and last known time of a frame
+    cameras: tuple[dict[str, Any], ...] = ()  # name, width, height, aspect_ratio, orientation; that of most first
+    warnings: tuple[str, ...] = ()  # what a person should know of its pictures, in sentences
     digest: str | None = None  # SHA-256 over indices, contents, places and times; one drive, one digest
     n_uninformative: int = 0  # frames whose pictures show nothing
     grey_levels: tuple[int, int] | None = None
@@ -240,6 +242,11 @@ class Job(Answer):
     def check(self) -> dict[str, Any]:
         """How its map compares with the one active before; empty where that was not looked at."""
         return _within(self.result, "metrics", "check")
+
+    @property
+    def warnings(self) -> list[str]:
+        """What a person should know of its drives, in sentences."""
+        return [*_within(self.result, "metrics").get("warnings", ()), *self.check.get("warnings", ())]
 
     @property
     def second_season(self) -> dict[str, Any]:

@@ -40,6 +40,7 @@ class UploadReport:
     left_out: dict[str, int] = field(default_factory=dict)  # by the reader before, by reason
     left_out_names: dict[str, list[str]] = field(default_factory=dict)  # both kinds, by reason
     bytes_sent: int = 0  # of images and encodings
+    warnings: tuple[str, ...] = ()  # of the service, about the pictures that are there
     seconds: float = 0.0
 
     @property
@@ -116,6 +117,7 @@ def upload(
                 report.broken_names.append(frame.name)
                 left_out.add(outcome, frame.name)
             tell()
+    report.warnings = client.admin.traverse(domain, traverse).warnings
     report.seconds = time.monotonic() - started
     if report.n_sent + report.n_skipped == 0:
         reasons = ", ".join(f"{count} {reason}" for reason, count in report.n_broken.items())
@@ -225,6 +227,7 @@ def _send_image(
             x_m=frame.x_m,
             y_m=frame.y_m,
             name=frame.name,
+            camera=recording.camera,
             replace=replace,
         )
     except BrokenFrameError as error:

@@ -2,8 +2,11 @@
 
 import dataclasses
 import math
+import struct
+import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from fractions import Fraction
 from pathlib import Path
 from typing import Any, Self, TypeVar
 
@@ -61,6 +64,7 @@ class Recording:
     remarks: Sequence[str] = ()  # what the reader took the recording for, where that is not plain
     grey_levels: GreyLevels | None = None  # by which images of more than 8 bits are shown; None: by each one's own
     n_before_slice: int | None = None  # how many frames there were before a slice was taken; None: there was no slice
+    camera: str | None = None  # what took the images, by its name
 
     @property
     def left_out(self) -> dict[str, int]:
@@ -225,6 +229,16 @@ def as_png(image: Image, input_size: tuple[int, int] | None) -> EncodedImage:
 
     One that is larger is brought to exactly `input_size` by the rule that the service's evaluators resize by.
     """
+    height, width = image.shape[:2]
     if input_size is not None and is_larger(image, input_size):
         image = resized(image, input_size)
-    return EncodedImage(cv2.imencode(".png", image)[1].tobytes(), "image/png")
+    body = cv2.imencode(".png", image)[1].tobytes()
+    return EncodedImage(body if image.shape[:2] == (height, width) else _shown_as(width, height, body), "image/png")
+
+
+def _shown_as(width: int, height: int, png: bytes) -> bytes:
+    """A PNG that says by the shape of its pixels which picture it is a copy of (its chunk pHYs, of no unit)."""
+    own_width, own_height = struct.unpack_from(">II", png, 16)
+    shape = Fraction(own_width * height, own_height * width)
+    chunk = b"pHYs" + struct.pack(">IIB", shape.numerator, shape.denominator, 0)
+    return png[:33] + struct.pack(">I", 9) + chunk + struct.pack(">I", zlib.crc32(chunk)) + png[33:]

@@ -198,6 +198,7 @@ def read_nclt(
         probes=[result.frames[place].name for place in probed],
         undistortion=None if undistortion is None else read_undistortion(undistortion, camera),
         rotate=rotate,
+        camera=f"Cam{camera}",
     )
 
 

@@ -65,3 +65,11 @@ def m006_pictures(db: Database) -> None:
     db.execute("ALTER TABLE traverse ADD COLUMN black INTEGER")
     db.execute("ALTER TABLE traverse ADD COLUMN white INTEGER")
     db.execute("ALTER TABLE frame ADD COLUMN shows_nothing INTEGER")
+
+
+@migrations()
+def m007_cameras(db: Database) -> None:
+    """Which camera took a frame's picture, and how large it is shown, upright."""
+    db.execute("ALTER TABLE frame ADD COLUMN camera TEXT")
+    db.execute("ALTER TABLE frame ADD COLUMN image_width INTEGER")
+    db.execute("ALTER TABLE frame ADD COLUMN image_height INTEGER")

@@ -26,6 +26,7 @@ from deepsimbad.api.requests import (
     parse_json,
     read_bytes,
 )
+from deepsimbad.core.camera import Camera
 from deepsimbad.core.map import Map
 from deepsimbad.core.planners import Plan
 from deepsimbad.core.summary import DEFAULT_CONFIDENCE, BeliefSummary
@@ -45,6 +46,7 @@ from deepsimbad.engine.localizer import (
 from deepsimbad.engine.worker import EncodedImage, Priority, Stopwatch
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.grey_levels import levels_in
+from deepsimbad.evaluators.image import picture_size
 from deepsimbad.evaluators.image_files import MEDIA_TYPES
 
 PROBABLY = 0.5
@@ -184,6 +186,14 @@ class LocalizationAnswer(TypedDict):
     next_best_view: Annotated[NextBestViewAnswer | None, Field(description="null until the map was trained for it.")]
 
 
+def remarks_on_shape(snapshot: Map, body: bytes) -> list[str]:
+    """What a person should know of a view's picture beside the map's."""
+    if not snapshot.cameras or (size := picture_size(body)) is None:
+        return []
+    why = Camera(*size).unlike(snapshot.cameras, "the map's")
+    return [] if why is None else [f"the view's pixels are not like the map's: {why}"]
+
+
 def render_localization(
     localization: Localization, watch: Stopwatch, remarks: Sequence[str] = ()
 ) -> LocalizationAnswer:
@@ -305,6 +315,8 @@ async def post_localization(
         return localize(snapshot, evaluator, view, shortlist, watch)
 
     localization = await running.look(evaluator, view, look)
+    if media_type in MEDIA_TYPES:
+        remarks += remarks_on_shape(snapshot, body)
     answer, body = await running.written(
         localization.belief.top.size, render_localization, localization, watch, remarks
     )

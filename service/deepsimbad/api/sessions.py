@@ -22,6 +22,7 @@ from deepsimbad.api.localizations import (
     Timings,
     npy_response,
     prefers_binary,
+    remarks_on_shape,
     render_belief,
     render_plan,
     render_shortlist,
@@ -61,6 +62,7 @@ from deepsimbad.core.summary import DEFAULT_CONFIDENCE
 from deepsimbad.engine.session import DEFAULT_START_STD_M, Observation, SessionConfig, SessionView
 from deepsimbad.engine.worker import Stopwatch
 from deepsimbad.errors import DeepSimbadError
+from deepsimbad.evaluators.image_files import MEDIA_TYPES
 from deepsimbad.store.sessions import IdempotencyKey, ListedSession
 
 router = APIRouter(prefix="/v1", tags=["sessions"])
@@ -308,6 +310,8 @@ async def post_observation(
     except DeepSimbadError as error:
         running.metrics.observed(error.code)
         raise
+    if media_type in MEDIA_TYPES:
+        remarks += remarks_on_shape(view.snapshot, body)
     answer, body = await running.written(view.belief.top.size, render_observation, view, watch, remarks)
     domain = request.scope["state"]["domain"] = answer["domain"]
     outcome = "repeated" if view.is_repeated else "accepted"

@@ -8,7 +8,7 @@ import tempfile
 import zipfile
 from contextlib import suppress
 from io import BytesIO
-from typing import IO, Annotated, Any, cast
+from typing import IO, Annotated, Any, Literal, cast
 
 import numpy as np
 from anyio.to_thread import run_sync
@@ -37,6 +37,7 @@ from deepsimbad.api.requests import (
     read_bytes,
     read_json,
 )
+from deepsimbad.core.camera import Camera
 from deepsimbad.core.drive import FRAME_NAME, MAX_NAME_LENGTH, MAX_POSITION_M, Drive
 from deepsimbad.core.frames import UNKNOWN_CONTENT, UNKNOWN_TIMESTAMP, content_digest
 from deepsimbad.engine.localizer import ready_encodings
@@ -51,6 +52,7 @@ from deepsimbad.errors import (
     UnknownTraverseError,
 )
 from deepsimbad.evaluators.grey_levels import DEEPEST, GreyLevels
+from deepsimbad.evaluators.image import picture_size
 from deepsimbad.evaluators.image_files import MEDIA_TYPES
 from deepsimbad.store.durable import storage_faults
 from deepsimbad.store.records import ListPage
@@ -96,6 +98,16 @@ _ENCODING_SCHEMA = only("encoding", {"type": "number"}, "A ready encoding, as lo
 IndexRange = Annotated[tuple[int, int], Field(description="First and last index of a gap, both inside it.")]
 
 
+class CameraAnswer(Answer):
+    """What took a drive's pictures."""
+
+    name: Annotated[str | None, Field(description="As frames gave it.")]
+    width: Annotated[int, Field(description="Of a picture as it is shown, upright, in pixels.")]
+    height: int
+    aspect_ratio: Annotated[float, Field(description="Width by height.")]
+    orientation: Literal["landscape", "portrait", "square"]
+
+
 class TraverseAnswer(Answer):
     """A recorded drive and what of it has arrived."""
 
@@ -112,6 +124,11 @@ class TraverseAnswer(Answer):
     grey_levels: Annotated[
         GreyLevels | None,
         Field(description="By which pictures of more than 8 bits are shown as 8, black and white; null: none came."),
+    ]
+    cameras: Annotated[list[CameraAnswer], Field(description="Which took its pictures, that of most first.")]
+    warnings: Annotated[
+        tuple[str, ...],
+        Field(description="What a person should know of its pictures; beside other drives' where one is asked for."),
     ]
 
 
@@ -195,8 +212,18 @@ async def get_traverse(domain: DomainName, name: TraverseName, running: Running)
 
     def described() -> TraverseAnswer:
         running.catalog.domain(domain)
-        with Traverse.open(running.settings.data_dir, domain, name) as traverse:
-            return TraverseAnswer.model_validate(traverse)
+        data_dir = running.settings.data_dir
+        with Traverse.open(data_dir, domain, name) as traverse:
+            answer, cameras = TraverseAnswer.model_validate(traverse), traverse.cameras
+        warnings = [*answer.warnings]
+        for other in Traverse.list(data_dir, domain) if cameras else ():
+            if other == name:
+                continue
+            with suppress(UnknownTraverseError), Traverse.open(data_dir, domain, other) as traverse:
+                whose = f"those of traverse {other}"
+                if (why := cameras[0].unlike(traverse.cameras[:1], whose)) is not None:
+                    warnings.append(f"its pictures are not like {whose}: {why}")
+        return answer.model_copy(update={"warnings": tuple(warnings)})
 
     return await run_sync(described)
 
@@ -257,6 +284,9 @@ async def put_frame(
         str | None,
         Query(alias="name", pattern=f"^{FRAME_NAME}$", description="As answers show it; the file's, in a recording."),
     ] = None,
+    camera: Annotated[
+        str | None, Query(pattern=f"^{FRAME_NAME}$", description="What took the picture, as `Cam5`.")
+    ] = None,
     replace: Replace = True,
 ) -> FrameAnswer:
     """Store one frame, in any order; the same index again replaces it.
@@ -269,7 +299,7 @@ async def put_frame(
     media_type = media_type_of(request, FRAME_TYPES)
     body = await read_bytes(request)
     evaluator = running.evaluators.evaluator(evaluator_config)
-    weights_sha256, digest, shows_nothing = None, UNKNOWN_CONTENT, False
+    weights_sha256, digest, shows_nothing, taken_by = None, UNKNOWN_CONTENT, False, None
     if media_type == JSON:
         values = np.array((await parse_json(body, EncodingBody, running)).encoding, np.float64)
         encoding = (await run_sync(ready_encodings, values[np.newaxis]))[0]
@@ -282,12 +312,15 @@ async def put_frame(
                 seen = await running.decoders.decoded(body, evaluator, Priority.BATCH, levels)
         encoded = cast("EncodedImage", await running.look(evaluator, seen.image, lambda view: view, Priority.BATCH))
         encoding, weights_sha256, digest = encoded.values, encoded.weights_sha256, content_digest(body)
+        size = picture_size(body)
+        taken_by = None if size is None else Camera(*size, camera)
 
     def store() -> tuple[bool, int]:
         with running.open_traverses.lend(domain, name) as traverse:
             created = traverse.put_frame(
                 *(index, encoding, position_m, timestamp_us, x_m, y_m, weights_sha256, frame_name, digest, replace),
                 shows_nothing=shows_nothing,
+                camera=taken_by,
             )
             return created, traverse.n_frames
 

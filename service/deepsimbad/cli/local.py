@@ -184,7 +184,7 @@ def _nothing_kept() -> Iterator[None]:
 @data_dir_option
 def localize(domain: str, images: tuple[Path, ...], rotate: int | None, as_json: bool) -> None:
     """Say where on the route each image was probably taken."""
-    from deepsimbad.api.localizations import render_localization  # noqa: PLC0415 - as below
+    from deepsimbad.api.localizations import remarks_on_shape, render_localization  # noqa: PLC0415 - as below
 
     settings = given_settings()
     with Catalog.open(existing_data_dir()) as catalog:
@@ -201,14 +201,16 @@ def localize(domain: str, images: tuple[Path, ...], rotate: int | None, as_json:
                 view = decode_image(body, settings.max_pixels, levels=levels)
             except (InvalidImageError, ImageTooLargeError) as error:
                 raise type(error)(f"{path}: {error.message}", **error.hints) from error
+            remarks = [] if rotate else remarks_on_shape(active.snapshot, body)
             if rotate is not None:
                 view = turned(view, rotate)
             elif lies_on_its_side(path):
+                remarks = []
                 click.echo(f"{path}: {TURNED_UPRIGHT}", err=True)
                 view = turned(view, UPRIGHT_TURN)
             watch.lap("decode")
             localization = localize_view(active.snapshot, evaluator, view, watch=watch)
-            answers.append(render_localization(localization, watch))
+            answers.append(render_localization(localization, watch, remarks))
     if as_json:
         write_json([{"image": str(path), **answer} for path, answer in zip(images, answers, strict=True)])
         return

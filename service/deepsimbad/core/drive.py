@@ -25,6 +25,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from deepsimbad.core.camera import Camera
 from deepsimbad.core.descriptor import LandmarkStatistics, normal_scores, rank_landmarks
 from deepsimbad.core.frames import UNKNOWN_CONTENT, UNKNOWN_TIMESTAMP, content_digest
 from deepsimbad.core.relevance import Query
@@ -56,6 +57,7 @@ class Drive:
     """Frames of one traverse, in the order they were driven."""
 
     name: str = ""  # of the traverse; "" of a recording that is none
+    camera: Camera | None = None  # of most of its pictures; None where there are none, or nobody knows
     # Route position, [n] float64, at most MAX_POSITION_M either way; need not increase here
     position_m: NDArray[np.float64]
     encodings: NDArray[np.float32]  # [n, d] float32, finite

@@ -12,6 +12,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from deepsimbad.core.camera import Camera
 from deepsimbad.core.composed import Moments, lengths_of_sums
 from deepsimbad.core.descriptor import MAX_LANDMARKS, PRIOR_WEIGHT_FRAMES, LandmarkStatistics
 from deepsimbad.core.landmark_model import PortableLandmarks, landmark_model_digest, pack_landmarks
@@ -284,6 +285,11 @@ class Map:
     def route(self) -> Route:
         """Where the map images are."""
         return Route(self.position_m, self.closed, self.x_m, self.y_m)
+
+    @cached_property
+    def cameras(self) -> tuple[Camera, ...]:
+        """Of the drives that it is made of, as far as they are known."""
+        return tuple(Camera.from_dict(camera) for camera in self.config.get("cameras", ()))
 
     @cached_property
     def frames(self) -> NDArray[np.object_]:

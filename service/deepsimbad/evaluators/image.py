@@ -9,10 +9,12 @@ them would keep live views waiting.
 
 import math
 from collections.abc import Callable, Mapping
+from io import BytesIO
 from typing import Any
 
 import cv2
 import numpy as np
+import PIL.Image
 import simplejpeg
 from numpy.typing import NDArray
 
@@ -39,6 +41,7 @@ _UPRIGHT: Mapping[int, Callable[[cv2.typing.MatLike], cv2.typing.MatLike]] = {  
     7: lambda image: cv2.rotate(cv2.transpose(image), cv2.ROTATE_180),
     8: lambda image: cv2.rotate(image, cv2.ROTATE_90_COUNTERCLOCKWISE),
 }
+_EXIF_ORIENTATION, _LYING = 274, frozenset({5, 6, 7, 8})
 
 
 def decode_image(body: bytes, max_pixels: int, *, as_stored: bool = False, levels: GreyLevels | None = None) -> Image:
@@ -81,6 +84,27 @@ def decode_deep(file: ImageFile, *, as_stored: bool = False) -> NDArray[Any]:
     except cv2.error as error:
         raise InvalidImageError("the image cannot be decoded") from error
     raise InvalidImageError("the image cannot be decoded")
+
+
+def picture_size(body: bytes) -> tuple[int, int] | None:
+    """(width, height) of a whole picture as it is shown: upright, its pixels square; None where nobody can tell.
+
+    A picture that was brought to another shape says so by the shape of its pixels, as clients' do (`as_png`).
+    """
+    try:
+        with PIL.Image.open(BytesIO(body)) as opened:
+            width, height = opened.size
+            # Of a TIFF the size is upright already, and of a PNG without it every pixel would be read first.
+            has_exif = opened.format != "TIFF" and (opened.format != "PNG" or "exif" in opened.info)
+            is_lying = has_exif and opened.getexif().get(_EXIF_ORIENTATION) in _LYING
+            across, along = opened.info.get("aspect") or (1, 1)  # pixels of one length either way, as PNG has it
+            if opened.info.get("jfif_unit") == 0:
+                across, along = opened.info["jfif_density"]
+    except Exception:  # Pillow raises a dozen kinds
+        return None
+    if across > 0 and along > 0 and across != along:
+        width = max(1, round(width * along / across))
+    return (height, width) if is_lying else (width, height)
 
 
 def resized(image: Image, size: tuple[int, int]) -> Image:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepsimbad.core.building import Built, MapPlan, SeenTwice, build_from_dissimilarities, compose_map
+from deepsimbad.core.camera import Camera
 from deepsimbad.core.descriptor import rank_landmarks
 from deepsimbad.core.drive import Drive
 from deepsimbad.core.frames import UNKNOWN_TIMESTAMP
@@ -24,10 +25,10 @@ from deepsimbad.core.route import same_places
 from deepsimbad.core.training import LearningCurve, TrainingWorld, train
 from deepsimbad.errors import InvalidSourceError
 from deepsimbad.evaluators.base import Evaluator, Image, LandmarkModel
-from deepsimbad.evaluators.image import decode_image, is_blank
+from deepsimbad.evaluators.image import decode_image, is_blank, picture_size
 from deepsimbad_client.errors import BrokenFrameError
 from deepsimbad_client.http import text_of
-from deepsimbad_client.recordings import Recording
+from deepsimbad_client.recordings import Frame, Recording
 from deepsimbad_client.recordings.left_out import LeftOut
 
 _FRAMES_A_BLOCK = 1024
@@ -94,10 +95,16 @@ def encode_recording(
         weights_sha256=weights_sha256,
         grey_levels=recording.grey_levels,
         shows_nothing=shows_nothing,
+        camera=None if recording.encodings is not None else _taken_by(recording, frames[0], evaluator),
     )
     drive.route()
     drive.check_differs(recording.name)
     return EncodedRecording(drive, left_out.names, encode_ms)
+
+
+def _taken_by(recording: Recording, frame: Frame, evaluator: Evaluator) -> Camera | None:
+    size = picture_size(recording.image(frame, evaluator.input_size).body)
+    return None if size is None else Camera(*size, recording.camera)
 
 
 def _encode_images(

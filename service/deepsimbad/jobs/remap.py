@@ -14,6 +14,7 @@ from typing import Any, Self, TypeAlias
 import numpy as np
 
 from deepsimbad.core.building import MapPlan, SeenTwice, append_drive
+from deepsimbad.core.camera import Camera
 from deepsimbad.core.composed import is_composed
 from deepsimbad.core.descriptor import MAX_LANDMARKS
 from deepsimbad.core.drive import Drive
@@ -262,9 +263,25 @@ class _Remap:
             "seconds": seconds,
             **learnt,
             "check": check,
+            "warnings": self._warnings(inputs),
         }
         progress.stage("seal")
         return seal_version(self.catalog, self.domain, map_, record_config, metrics, progress.update, job_id)
+
+    def _warnings(self, inputs: _Inputs) -> list[str]:
+        """What a person should know of the drives, in sentences: pictures of two shapes or cameras are not alike."""
+        own, theirs = inputs.training.camera, f"those of traverse {self.config.training_traverse}"
+        pairs: list[tuple[Drive | None, tuple[Camera | None, ...], str]]
+        pairs = [(drive, (own,), theirs) for drive in (inputs.candidates, inputs.second, inputs.check)]
+        if inputs.base is not None:
+            pairs.append((inputs.training, inputs.base.cameras, "those of the active map"))
+        warnings: dict[str, None] = {}  # in order, each once
+        for drive, cameras, whose in pairs:
+            if drive is not None and drive.camera is not None:
+                why = drive.camera.unlike(filter(None, cameras), whose)
+                if why is not None:
+                    warnings[f"the pictures of traverse {drive.name} are not like {whose}: {why}"] = None
+        return list(warnings)
 
     def _read(self) -> _Inputs:
         """Read what is needed, every traverse once.
@@ -410,6 +427,8 @@ class _Remap:
         weights_sha256 = training.weights_sha256 or (landmarks_from and landmarks_from.weights_sha256)
         if weights_sha256 is not None:
             asked["weights_sha256"] = weights_sha256
+        if training.camera is not None:
+            asked["cameras"] = [training.camera.as_dict()]
         map_ = replace(
             built.map,
             domain=domain.name,
@@ -463,6 +482,8 @@ class _Remap:
         weights_sha256 = drive.weights_sha256 or before.weights_sha256
         if weights_sha256 is not None:
             config_after["weights_sha256"] = weights_sha256
+        if drive.camera is not None and drive.camera not in before.cameras:
+            config_after["cameras"] = [camera.as_dict() for camera in (*before.cameras, drive.camera)]
         learnt = {name: record.metrics.get(name) for name in ("landmarks", "training", "second_season", "camera_of")}
         learnt["fused"] = {**verdict, "n_new_images": map_.n_images - before.n_images}
         checked = fused.without(frames.withheld) if fused is not None and frames.is_held_out else map_

@@ -6,6 +6,7 @@ import hashlib
 import os
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from itertools import repeat
 from pathlib import Path
 from typing import Any, Self
 
@@ -13,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sqlite_utils import Database
 
+from deepsimbad.core.camera import Camera
 from deepsimbad.core.drive import Drive
 from deepsimbad.core.frames import IDENTITY, UNKNOWN_CONTENT, UNKNOWN_TIMESTAMP, differences
 from deepsimbad.errors import (
@@ -125,6 +127,7 @@ class Traverse(OpenFile):
         content_digest: int = UNKNOWN_CONTENT,
         replace: bool = True,
         shows_nothing: bool = False,
+        camera: Camera | None = None,
     ) -> bool:
         """As `put_frames` with one frame, of which None is unknown; answers whether it is new."""
         frames = Drive(
@@ -135,6 +138,7 @@ class Traverse(OpenFile):
             y_m=np.array([np.nan if y_m is None else y_m], np.float64),
             frame_name=np.array([name or ""]),
             content_digest=np.array([content_digest], np.uint64),
+            camera=camera,
             encodings=np.asarray(encoding, np.float32)[np.newaxis],
             weights_sha256=weights_sha256,
             shows_nothing=np.array([shows_nothing]),
@@ -179,16 +183,23 @@ class Traverse(OpenFile):
             )
             content = frames.content_digest.view(np.int64)  # SQLite's integers have a sign
             places = (frames.index, frames.position_m, frames.timestamp_us, frames.x_m, frames.y_m)
+            camera = frames.camera
+            taken_by = (None,) * 3 if camera is None else (camera.name, camera.width, camera.height)
             db.conn.executemany(  # NaN becomes NULL
                 """
-                INSERT INTO frame (frame_index, position_m, timestamp_us, x_m, y_m, name, content_digest)
-                VALUES (?, ?, nullif(?, -1), ?, ?, nullif(?, ''), ?)
+                INSERT INTO frame (frame_index, position_m, timestamp_us, x_m, y_m, name, content_digest, camera,
+                    image_width, image_height)
+                VALUES (?, ?, nullif(?, -1), ?, ?, nullif(?, ''), ?, ?, ?, ?)
                 ON CONFLICT (frame_index) DO UPDATE SET position_m = excluded.position_m,
                     timestamp_us = excluded.timestamp_us, x_m = excluded.x_m, y_m = excluded.y_m,
-                    name = excluded.name, content_digest = excluded.content_digest
+                    name = excluded.name, content_digest = excluded.content_digest,
+                    camera = excluded.camera, image_width = excluded.image_width, image_height = excluded.image_height
                 """,
                 zip(
-                    *(values.tolist() for values in places), map(str, frames.frame_name), map(int, content), strict=True
+                    *(values.tolist() for values in places),
+                    *(map(str, frames.frame_name), map(int, content)),
+                    *(repeat(value, frames.n_frames) for value in taken_by),
+                    strict=True,
                 ),
             )
             db.conn.executemany(
@@ -241,6 +252,19 @@ class Traverse(OpenFile):
         """The length of the encodings; None before the first frame."""
         with self._reading() as db:
             return self._described(db)[0]
+
+    @property
+    def cameras(self) -> tuple[Camera, ...]:
+        """Those that took its pictures, the one of most first."""
+        with self._reading() as db:
+            return _cameras(db)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What a person should know of its pictures, in sentences."""
+        cameras = self.cameras
+        unlike = (camera.unlike(cameras[:1], "most") for camera in cameras[1:])
+        return tuple(f"some of its pictures are not like the others: {why}" for why in unlike if why is not None)[:1]
 
     @property
     def length_m(self) -> float | None:
@@ -301,7 +325,7 @@ class Traverse(OpenFile):
     def read(self) -> Drive:
         """All frames in index order; one array of encodings, no copy beside it."""
         with self._reading() as db:
-            n, (dim, weights_sha256) = _count(db), self._described(db)
+            n, (dim, weights_sha256), cameras = _count(db), self._described(db), _cameras(db)
             levels, blanks = _levels(db), _blanks(db)
             places = np.empty((n, 3))
             index, timestamp_us = np.empty(n, np.int64), np.empty(n, np.int64)
@@ -327,9 +351,9 @@ class Traverse(OpenFile):
                 encodings[row] = np.frombuffer(body, dtype)
         position_m, x_m, y_m = places.T.copy()
         return Drive(
-            name=self.name, index=index, position_m=position_m, timestamp_us=timestamp_us, x_m=x_m, y_m=y_m,
-            frame_name=np.array(names, np.str_), encodings=encodings, weights_sha256=weights_sha256,
-            grey_levels=levels, shows_nothing=np.isin(index, blanks),
+            name=self.name, camera=next(iter(cameras), None), index=index, position_m=position_m,
+            timestamp_us=timestamp_us, x_m=x_m, y_m=y_m, frame_name=np.array(names, np.str_), encodings=encodings,
+            weights_sha256=weights_sha256, grey_levels=levels, shows_nothing=np.isin(index, blanks),
         )  # fmt: skip
 
     def _described(self, db: Database) -> tuple[int | None, str | None]:
@@ -375,6 +399,16 @@ def _keep_levels(db: Database, levels: tuple[int, int] | None) -> None:
 
 def _blanks(db: Database) -> list[int]:
     return [index for (index,) in db.execute("SELECT frame_index FROM frame WHERE shows_nothing")]
+
+
+def _cameras(db: Database) -> tuple[Camera, ...]:
+    rows = db.execute(
+        """
+        SELECT image_width, image_height, camera FROM frame WHERE image_width IS NOT NULL
+        GROUP BY 1, 2, 3 ORDER BY count(*) DESC, min(frame_index)
+        """
+    )
+    return tuple(Camera(*row) for row in rows)
 
 
 def _count(db: Database) -> int:

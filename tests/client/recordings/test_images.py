@@ -8,8 +8,9 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from deepsimbad.evaluators.image import picture_size
 from deepsimbad_client.errors import BrokenFrameError
-from deepsimbad_client.recordings import decode
+from deepsimbad_client.recordings import as_png, decode
 
 NOISE = np.random.default_rng(0).integers(0, 255, (40, 60, 3), np.uint8)
 HERE = Path("frame")
@@ -72,3 +73,10 @@ def test_grey_16_bit_and_alpha_become_8_bit_bgr():
     np.testing.assert_array_equal(decode(encoded(".png", deep), HERE), NOISE)
     with_alpha = np.dstack((NOISE, np.zeros((40, 60), np.uint8)))
     np.testing.assert_array_equal(decode(encoded(".png", with_alpha), HERE), NOISE)
+
+
+@pytest.mark.parametrize(("size", "shown"), [((60, 40), (60, 40)), ((24, 24), (36, 24)), ((30, 40), (60, 40))])
+def test_a_copy_says_which_shape_its_picture_has(size, shown):
+    copy = as_png(NOISE, size).body
+    assert decode(copy, HERE).shape == (size[1], size[0], 3)
+    assert picture_size(copy) == shown

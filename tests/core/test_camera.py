@@ -1,0 +1,32 @@
+import pytest
+
+from deepsimbad.core.camera import Camera
+
+NCLT = Camera(1232, 1616, "Cam5")
+
+
+@pytest.mark.parametrize(
+    ("camera", "others", "says"),
+    [
+        (Camera(616, 808), [NCLT], None),
+        (Camera(616, 800), [NCLT], None),
+        (Camera(616, 808, "Cam5"), [NCLT], None),
+        (Camera(1616, 1232), [], None),
+        (Camera(1616, 1232), [NCLT, Camera(4, 3)], None),
+        (Camera(1232, 1616, "Cam1"), [Camera(1232, 1616)], None),
+        (Camera(1232, 1616, "Cam1"), [NCLT], "they are of camera Cam1, the map's of Cam5"),
+        (Camera(1616, 1232), [NCLT], "they lie on their side: they are 1616 x 1232, the map's 1232 x 1616; turn them"),
+        (Camera(1920, 1080), [NCLT], "they are of another shape, and so perhaps of another camera: 1920 x 1080, the"),
+        (Camera(100, 100), [Camera(4, 3)], "another shape"),
+    ],
+)
+def test_pictures_that_are_compared_badly_are_told(camera: Camera, others: list[Camera], says: str | None) -> None:
+    why = camera.unlike(others, "the map's")
+    assert (why is None) == (says is None)
+    assert says is None or says in str(why)
+
+
+def test_shape_and_document() -> None:
+    assert [Camera(*size).orientation for size in ((4, 3), (3, 4), (5, 5))] == ["landscape", "portrait", "square"]
+    assert Camera.from_dict(NCLT.as_dict()) == NCLT
+    assert Camera(4, 2).aspect_ratio == 2
