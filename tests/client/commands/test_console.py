@@ -7,7 +7,9 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from deepsimbad_client.commands import console
+import deepsimbad_client
+from deepsimbad.cli import run as service_run
+from deepsimbad_client.commands import cli, console, run
 from deepsimbad_client.commands.console import JobBar, domain_table, job_table, show, show_waits
 from deepsimbad_client.http.models import Domain, Job
 
@@ -118,3 +120,19 @@ def test_a_map_is_shown_with_both_figures_where_it_was_compared(shown, check, wo
     line = " ".join(" ".join(shown(job_table([job]))).replace("│", " ").split())
     assert (words or "map 7") in line
     assert words is not None or "ANR" not in line
+
+
+def test_both_commands_and_the_package_tell_one_version(capsys):
+    assert service_run(["--version"]) == run(["--version"]) == 0
+    assert capsys.readouterr().out.split() == [deepsimbad_client.__version__] * 2
+
+
+@pytest.mark.parametrize(("command", "goes_on"), [("upload", True), ("domains", False)])
+def test_a_ctrl_c_says_whether_the_same_command_goes_on(monkeypatch, capsys, command, goes_on):
+    def interrupted(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli, "main", interrupted)
+    assert run([command]) == 130
+    told = "; the same command goes on where it stopped" if goes_on else ""
+    assert capsys.readouterr().err == f"deepsimbad-client: cancelled{told}\n"
