@@ -34,12 +34,12 @@ from deepsimbad.api.sessions import TruePositions
 from deepsimbad.core.landmark_model import fitting_number
 from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Relevance
 from deepsimbad.errors import DeepSimbadError, NoActiveMapError, UnknownJobError
+from deepsimbad.jobs.append import refuse_known_traverse
 from deepsimbad.jobs.remap import (
     DEFAULT_LIST_LENGTH,
     DEFAULT_N_LANDMARKS,
     DEFAULT_TRAINING_EPISODES,
     RemapConfig,
-    refuse_known_traverse,
 )
 from deepsimbad.jobs.runner import REMAP
 from deepsimbad.jobs.versions import EXPERIENCE, ExperienceConfig, keep_true_positions

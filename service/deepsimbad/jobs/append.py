@@ -5,7 +5,7 @@ candidates that are its landmarks stay, what a season changes is learnt from all
 the map lacks becomes images of its own.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Self
 
@@ -26,6 +26,29 @@ from deepsimbad.core.drive import Drive, SameRoute, SecondSeason, second_season
 from deepsimbad.core.map import Map
 from deepsimbad.core.relevance import Relevance
 from deepsimbad.core.route import same_places
+from deepsimbad.errors import InvalidMapConfigError
+from deepsimbad.jobs.check import traverses_in
+from deepsimbad.store.catalog import Catalog
+from deepsimbad.store.records import DomainRecord
+from deepsimbad.store.traverses import Traverse
+
+LANDMARK_TRAVERSE, ACTIVE_MAP, TRAINING = "landmark_traverse", "active_map", "training_traverse"
+"""Where a map's landmarks come from, as its `metrics.landmarks` says."""
+
+
+def refuse_known_traverse(config: Mapping[str, Any], version: int, name: str) -> None:
+    """Refuse to append a traverse that a map holds by name, though it may hold other frames by now.
+
+    Raises:
+        InvalidMapConfigError: The map is made of a traverse of that name.
+    """
+    if name in traverses_in(config):
+        raise InvalidMapConfigError(
+            f"map {version}, which serves, holds traverse {name} already: nothing is appended twice. Append another "
+            "drive (a new one needs a name of its own), or activate a map without this one first",
+            traverse=name,
+            map_version=version,
+        )
 
 
 def seasons_in(config: Mapping[str, Any], metrics: Mapping[str, Any]) -> dict[str | None, bool]:
@@ -85,6 +108,31 @@ class KnownDrives:
         whitening = np.linalg.lstsq(directions.astype(np.float64), np.asarray(whole, np.float64), rcond=None)[0]
         is_whole = np.allclose(directions @ whitening, whole, atol=1e-3 * float(np.abs(whole).max()))
         return (directions, whitening) if is_whole else (whole, None)
+
+
+def known_drives(
+    catalog: Catalog, domain: DomainRecord, map_: Map, drive: Drive, read: Callable[[str], Drive]
+) -> KnownDrives | str:
+    """What a domain's active map is made of, as far as it is still stored; else in a sentence why nothing can be fused.
+
+    Args:
+        drive: The one that is to be fused.
+        read: Reads a traverse of the domain.
+    """
+    active = catalog.map(domain.name, domain.active_version or 0)
+    if map_.relevance is not Relevance.COMPOSED:
+        return f"places are fused in maps for composed alone, and this one is for {map_.relevance}"
+    names, landmarks = seasons_in(active.config, active.metrics), active.config["landmark_traverse"]
+    stored = Traverse.list(catalog.data_dir, domain.name)
+    if gone := [name for name in names if name not in stored]:
+        return f"of the drives that the map is made of {gone[0] or 'those of another server'} are not stored here"
+    drives = [(read(name), agrees) for name, agrees in names.items() if name is not None]
+    if any(known.encoding_dim != drive.encoding_dim for known, _ in drives):
+        return "the drives that the map is made of come from another encoder by now"
+    candidates = drives[0][0] if active.metrics.get("landmarks") == TRAINING else None
+    if active.metrics.get("landmarks") == LANDMARK_TRAVERSE and landmarks in stored:
+        candidates = read(landmarks)
+    return KnownDrives.of(map_, drives, candidates) or "the drives that the map is made of hold other frames by now"
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ again, and where nothing is fused none is described again, and what two seasons 
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -25,10 +25,18 @@ from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Relevance
 from deepsimbad.errors import InvalidEncodingError, InvalidMapConfigError, LostActivationError, WeightsDifferError
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.grey_levels import with_levels
-from deepsimbad.jobs.append import KnownDrives, fuse, seasons_in
+from deepsimbad.jobs.append import (
+    ACTIVE_MAP,
+    LANDMARK_TRAVERSE,
+    TRAINING,
+    KnownDrives,
+    fuse,
+    known_drives,
+    refuse_known_traverse,
+)
 from deepsimbad.jobs.build import EPISODES_A_MAP_IMAGE, build, measured, train_nnql
 from deepsimbad.jobs.camera import seen_twice
-from deepsimbad.jobs.check import CheckFrames, check_map, traverses_in
+from deepsimbad.jobs.check import CheckFrames, check_map
 from deepsimbad.jobs.progress import Progress
 from deepsimbad.jobs.versions import activate_once, seal_version
 from deepsimbad.store.catalog import ANY, Catalog
@@ -39,7 +47,6 @@ from deepsimbad.store.traverses import Traverse
 DEFAULT_N_LANDMARKS = 500
 DEFAULT_LIST_LENGTH = 4
 DEFAULT_TRAINING_EPISODES = 10_000
-LANDMARK_TRAVERSE, ACTIVE_MAP, TRAINING = "landmark_traverse", "active_map", "training_traverse"
 
 
 @dataclass(frozen=True)
@@ -314,29 +321,8 @@ class _Remap:
             self._check_encoder(config.check_traverse, check, training)
             check.route(record.closed)
         second = None if config.append else self._second_season(record, training, read)
-        known = self._known_drives(record, base, training, read) if config.append and base is not None else None
+        known = known_drives(self.catalog, record, base, training, read) if config.append and base is not None else None
         return _Inputs(record, training, candidates, base, second, camera, known, check)
-
-    def _known_drives(
-        self, record: DomainRecord, base: Map, training: Drive, read: Callable[[str], Drive]
-    ) -> KnownDrives | str:
-        """What the active map is made of, as far as it is still here; else in a sentence why nothing can be fused."""
-        active = self.catalog.map(record.name, record.active_version or 0)
-        config, metrics = active.config, active.metrics
-        if base.relevance is not Relevance.COMPOSED:
-            return f"places are fused in maps for composed alone, and this one is for {base.relevance}"
-        names, landmarks = seasons_in(config, metrics), config["landmark_traverse"]
-        stored = Traverse.list(self.catalog.data_dir, record.name)
-        if gone := [name for name in names if name not in stored]:
-            return f"of the drives that the map is made of {gone[0] or 'those of another server'} are not stored here"
-        drives = [(read(name), agrees) for name, agrees in names.items() if name is not None]
-        if any(drive.encoding_dim != training.encoding_dim for drive, _ in drives):
-            return "the drives that the map is made of come from another encoder by now"
-        candidates = drives[0][0] if metrics.get("landmarks") == TRAINING else None
-        if metrics.get("landmarks") == LANDMARK_TRAVERSE and landmarks in stored:
-            candidates = read(landmarks)
-        known = KnownDrives.of(base, drives, candidates)
-        return known or "the drives that the map is made of hold other frames by now"
 
     def _drive(self, name: str) -> Drive:
         with Traverse.open(self.catalog.data_dir, self.domain, name) as traverse:
@@ -488,21 +474,6 @@ class _Remap:
         learnt["fused"] = {**verdict, "n_new_images": map_.n_images - before.n_images}
         checked = fused.without(frames.withheld) if fused is not None and frames.is_held_out else map_
         return replace(map_, config=config_after), checked, config_after, learnt
-
-
-def refuse_known_traverse(config: Mapping[str, Any], version: int, name: str) -> None:
-    """Refuse to append a traverse that a map holds by name, though it may hold other frames by now.
-
-    Raises:
-        InvalidMapConfigError: The map is made of a traverse of that name.
-    """
-    if name in traverses_in(config):
-        raise InvalidMapConfigError(
-            f"map {version}, which serves, holds traverse {name} already: nothing is appended twice. Append another "
-            "drive (a new one needs a name of its own), or activate a map without this one first",
-            traverse=name,
-            map_version=version,
-        )
 
 
 def _check_alike(before: Map, config: RemapConfig) -> None:
