@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from deepsimbad.core import composed
-from deepsimbad.core.building import MapPlan, append_drive, compose_map
+from deepsimbad.core.building import MapPlan, compose_map
 from deepsimbad.core.composed import Moments, compose, lengths_of_sums, principal_directions, unit
 from deepsimbad.core.descriptor import rank_landmarks, ranks_from_ranked_landmarks
 from deepsimbad.core.drive import Drive
@@ -15,6 +15,7 @@ from deepsimbad.core.landmark_model import farthest_first
 from deepsimbad.core.relevance import Query, Relevance
 from deepsimbad.core.retrieval import products_with_landmarks, relevances
 from deepsimbad.errors import InvalidInputError, InvalidMapConfigError, TooFewCandidatesError
+from deepsimbad.jobs.append import append_drive
 
 PLAN = MapPlan(Relevance.COMPOSED, 4, (1.0, 2.0, 5.0), same_route=True)
 WEIGHTS = (1.0, 0.8, 0.65, 0.5)

@@ -26,7 +26,6 @@ from deepsimbad.core.descriptor import LandmarkStatistics, common_factors, neare
 from deepsimbad.core.drive import Drive, SameRoute, SecondSeason, second_season
 from deepsimbad.core.landmark_model import farthest_first
 from deepsimbad.core.map import Map
-from deepsimbad.core.nnql import NnqlConfig
 from deepsimbad.core.rehearsal import rehearsed, view_bits
 from deepsimbad.core.relevance import Relevance, most_strange
 from deepsimbad.core.route import Route
@@ -204,7 +203,7 @@ def compose_map(
         own = space.seen(training)
         if season is not None and other is not None:
             other = space.seen(other)
-            season = SecondSeason(_measured(other), season.places)
+            season = SecondSeason(measured_dissimilarities(other), season.places)
     on_progress(0.85)
     usual, places = Moments.of(training.encodings), space.unit_vectors(training)
     fused = places
@@ -225,7 +224,9 @@ def compose_map(
         rehearsal = replace(map_, lists=compose(places, space.prototypes, plan.list_length, barred))
     on_progress(0.92)
     known = (training,) if other is None else (training, other)
-    map_, rehearsal = taught(map_, rehearsal, _measured(own), space.dissimilarities(fused), season, known)
+    map_, rehearsal = taught(
+        map_, rehearsal, measured_dissimilarities(own), space.dissimilarities(fused), season, known
+    )
     on_progress(1.0)
     return Built(map_, rehearsal, own, other, verdict, fused, by_camera)
 
@@ -262,7 +263,7 @@ def composed_map(
 ) -> Map:
     """The map of places [n, k] that were seen as `own`, but for what a rehearsal teaches."""
     prototypes = np.asarray(model["prototypes"], np.float32)
-    dissimilarities, route = _measured(own), own.route(plan.closed)
+    dissimilarities, route = measured_dissimilarities(own), own.route(plan.closed)
     ranks = rank_landmarks(dissimilarities)
     statistics = LandmarkStatistics.of_map(ranks)
     return Map(
@@ -281,7 +282,8 @@ def composed_map(
     )
 
 
-def _measured(drive: Drive) -> NDArray[np.float32]:
+def measured_dissimilarities(drive: Drive) -> NDArray[np.float32]:
+    """[n, r] of a drive; raises InvalidMapConfigError where they are not measured."""
     if drive.dissimilarities is None:
         raise InvalidMapConfigError("the drive's dissimilarities are not measured")
     return drive.dissimilarities
@@ -328,7 +330,7 @@ def build_map(relevance: Relevance, drive: Drive, list_length: int, closed: bool
         InvalidMapConfigError: No image, or h not within 1..r.
         InvalidRouteError: The positions go backwards or are NaN.
     """
-    dissimilarities = _measured(drive)
+    dissimilarities = measured_dissimilarities(drive)
     if dissimilarities.ndim != 2 or len(dissimilarities) == 0:
         raise InvalidMapConfigError("a map needs at least one image")
     n_landmarks = dissimilarities.shape[1]
@@ -344,7 +346,7 @@ def build_map(relevance: Relevance, drive: Drive, list_length: int, closed: bool
     else:
         lists = nearest_landmarks(ranks, list_length)
     if relevance is Relevance.SIMBAD:
-        arrays["values"] = _listed(dissimilarities, lists)
+        arrays["values"] = listed(dissimilarities, lists)
     route = drive.route(closed)
     return Map(
         config={"relevance": relevance.value, "n_landmarks": n_landmarks},
@@ -358,87 +360,6 @@ def build_map(relevance: Relevance, drive: Drive, list_length: int, closed: bool
     )
 
 
-def _listed(dissimilarities: NDArray[np.float32], lists: NDArray[np.uint16]) -> NDArray[np.float32]:
+def listed(dissimilarities: NDArray[np.float32], lists: NDArray[np.uint16]) -> NDArray[np.float32]:
     """[h, n] the dissimilarities [n, r] of listed landmarks [h, n]."""
     return np.ascontiguousarray(np.take_along_axis(dissimilarities, lists.T.astype(np.intp), axis=1).T, np.float32)
-
-
-def append_drive(map_: Map, drive: Drive) -> Map:
-    """Describe new frames by a map's landmarks and merge them into it by route position.
-
-    The new frames' lists come from their own drive's statistics, as those of any map do. A short drive says little of
-    what is usual for a landmark (one frame: nothing), so its statistics begin as the map's, weighted as for a live
-    session, and soon are its own. The map's statistics become those of all its images; what only two seasons of one
-    place can teach stays.
-
-    Args:
-        drive: The new frames, their dissimilarities to its landmarks measured; along the same route, on a closed one
-            any turn of it.
-
-    Returns:
-        The longer map; of images at one position the old come first.
-
-    Raises:
-        InvalidRouteError: The new frames go backwards.
-    """
-    usual, ranks_of_frames = map_.live_statistics, rank_landmarks(_measured(drive))
-    scores: NDArray[np.floating] = ranks_of_frames
-    pooled: dict[str, Any] = {}
-    if usual is not None:
-        own = LandmarkStatistics.of_map(ranks_of_frames)
-        scores = usual.ranks.pooled(usual.ranks.weight, own, drive.n_frames).standardise(ranks_of_frames)
-        ranks = usual.ranks.pooled(map_.n_images, own, drive.n_frames)
-        pooled["statistics"] = np.stack([ranks.mean, ranks.std])
-    if usual is not None and usual.encodings is not None:
-        own_encodings, model = Moments.counted(drive.encodings), map_.landmark_model
-        soon_own = usual.encodings.pooled(usual.encodings.weight, own_encodings, drive.n_frames)
-        u = described(drive.encodings, soon_own, model.get("projection"))
-        lists = compose(u, model["prototypes"], map_.list_length)
-        of_all = usual.encodings.pooled(map_.n_images, own_encodings, drive.n_frames).mean_std()
-        pooled |= {"usual_encoding": of_all, "landmark_model": {**model, "usual": of_all}}
-        if usual.products is not None:
-            own_products = Moments.counted(u @ np.asarray(model["prototypes"], np.float32).T)
-            pooled["usual_product"] = usual.products.pooled(map_.n_images, own_products, drive.n_frames).mean_std()
-    else:
-        lists = nearest_landmarks(scores, map_.list_length)
-    return replace(with_frames(map_, drive, lists), **pooled)
-
-
-def with_frames(map_: Map, drive: Drive, lists: NDArray[np.uint16]) -> Map:
-    """With frames of known lists [h, m] among the images; each knows of its place what the nearest old one does."""
-    route = drive.route(map_.closed)
-    nearest, is_near = nearest_known(map_, route.position_m)
-    q_values, bits = map_.q_values, map_.view_bits
-    if q_values is not None:
-        q_values = np.where(is_near[:, np.newaxis], q_values[nearest], np.float32(NnqlConfig().initial_q))
-    if bits is not None:
-        bits = np.where(is_near, bits[nearest], bits.mean(dtype=np.float32))
-    return map_.with_images(
-        {
-            "lists": lists,
-            "position_m": _on_route(map_, route.position_m),
-            "values": None if map_.values is None else _listed(_measured(drive), lists),
-            "encodings": None if map_.encodings is None else drive.encodings,
-            "view_bits": bits,
-            **drive.origins(),
-            "x_m": route.x_m,
-            "y_m": route.y_m,
-            "q_values": q_values,
-        }
-    )
-
-
-def nearest_known(map_: Map, position_m: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-    """The map image nearest to each position [m], and whether it is within the longest move."""
-    route, placed_m = map_.route, _on_route(map_, position_m)
-    nearest = route.nearest_image(placed_m)
-    apart_m = np.abs(route.offset_m(placed_m - route.position_m[nearest], 0.0))
-    return nearest, apart_m <= map_.longest_action_m
-
-
-def _on_route(map_: Map, position_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Positions as the route counts them; only what lies outside a closed one's first turn is turned."""
-    route = map_.route
-    ahead_m = position_m - route.start_m
-    inside = (ahead_m >= 0) & (ahead_m < route.length_m)
-    return np.where(inside, position_m, route.wrapped(position_m))

@@ -1,8 +1,8 @@
-"""A drive appended to a `composed` map of its route: places seen again become the mean of their seasons.
+"""A drive appended to a map of its route: its frames become images, or places seen again the mean of their seasons.
 
-The map is made anew at the same bits from the drives that it is made of, which must still be stored: its images and the
-candidates that are its landmarks stay, what a season changes is learnt from all of them, and so are the lists. What
-the map lacks becomes images of its own.
+Seasons are fused in `composed` maps, made anew at the same bits from the drives that they are made of, which must still
+be stored: images and the candidates that are landmarks stay, what a season changes is learnt from all seasons, and so
+are the lists. What the map lacks becomes images of its own.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -12,7 +12,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from deepsimbad.core.building import MapPlan, composed_map, covers, taught, with_frames
+from deepsimbad.core.building import MapPlan, composed_map, covers, listed, measured_dissimilarities, taught
 from deepsimbad.core.composed import (
     SECOND_SEASON_WEIGHT,
     Moments,
@@ -22,8 +22,10 @@ from deepsimbad.core.composed import (
     unit,
     within_place_whitening,
 )
+from deepsimbad.core.descriptor import LandmarkStatistics, nearest_landmarks, rank_landmarks
 from deepsimbad.core.drive import Drive, SameRoute, SecondSeason, second_season
 from deepsimbad.core.map import Map
+from deepsimbad.core.nnql import NnqlConfig
 from deepsimbad.core.relevance import Relevance
 from deepsimbad.core.route import same_places
 from deepsimbad.errors import InvalidMapConfigError
@@ -245,3 +247,84 @@ def _lists(map_: Map, places: NDArray[np.float32]) -> NDArray[np.uint16]:
 
 def _with_new(map_: Map, drive: Drive, new: NDArray[np.int64], lists: NDArray[np.uint16]) -> Map:
     return with_frames(map_, drive.at(new), lists) if new.size else map_
+
+
+def append_drive(map_: Map, drive: Drive) -> Map:
+    """Describe new frames by a map's landmarks and merge them into it by route position.
+
+    The new frames' lists come from their own drive's statistics, as those of any map do. A short drive says little of
+    what is usual for a landmark (one frame: nothing), so its statistics begin as the map's, weighted as for a live
+    session, and soon are its own. The map's statistics become those of all its images; what only two seasons of one
+    place can teach stays.
+
+    Args:
+        drive: The new frames, their dissimilarities to its landmarks measured; along the same route, on a closed one
+            any turn of it.
+
+    Returns:
+        The longer map; of images at one position the old come first.
+
+    Raises:
+        InvalidRouteError: The new frames go backwards.
+    """
+    usual, ranks_of_frames = map_.live_statistics, rank_landmarks(measured_dissimilarities(drive))
+    scores: NDArray[np.floating] = ranks_of_frames
+    pooled: dict[str, Any] = {}
+    if usual is not None:
+        own = LandmarkStatistics.of_map(ranks_of_frames)
+        scores = usual.ranks.pooled(usual.ranks.weight, own, drive.n_frames).standardise(ranks_of_frames)
+        ranks = usual.ranks.pooled(map_.n_images, own, drive.n_frames)
+        pooled["statistics"] = np.stack([ranks.mean, ranks.std])
+    if usual is not None and usual.encodings is not None:
+        own_encodings, model = Moments.counted(drive.encodings), map_.landmark_model
+        soon_own = usual.encodings.pooled(usual.encodings.weight, own_encodings, drive.n_frames)
+        u = described(drive.encodings, soon_own, model.get("projection"))
+        lists = compose(u, model["prototypes"], map_.list_length)
+        of_all = usual.encodings.pooled(map_.n_images, own_encodings, drive.n_frames).mean_std()
+        pooled |= {"usual_encoding": of_all, "landmark_model": {**model, "usual": of_all}}
+        if usual.products is not None:
+            own_products = Moments.counted(u @ np.asarray(model["prototypes"], np.float32).T)
+            pooled["usual_product"] = usual.products.pooled(map_.n_images, own_products, drive.n_frames).mean_std()
+    else:
+        lists = nearest_landmarks(scores, map_.list_length)
+    return replace(with_frames(map_, drive, lists), **pooled)
+
+
+def with_frames(map_: Map, drive: Drive, lists: NDArray[np.uint16]) -> Map:
+    """With frames of known lists [h, m] among the images; each knows of its place what the nearest old one does."""
+    route = drive.route(map_.closed)
+    nearest, is_near = nearest_known(map_, route.position_m)
+    q_values, bits = map_.q_values, map_.view_bits
+    if q_values is not None:
+        q_values = np.where(is_near[:, np.newaxis], q_values[nearest], np.float32(NnqlConfig().initial_q))
+    if bits is not None:
+        bits = np.where(is_near, bits[nearest], bits.mean(dtype=np.float32))
+    return map_.with_images(
+        {
+            "lists": lists,
+            "position_m": _on_route(map_, route.position_m),
+            "values": None if map_.values is None else listed(measured_dissimilarities(drive), lists),
+            "encodings": None if map_.encodings is None else drive.encodings,
+            "view_bits": bits,
+            **drive.origins(),
+            "x_m": route.x_m,
+            "y_m": route.y_m,
+            "q_values": q_values,
+        }
+    )
+
+
+def nearest_known(map_: Map, position_m: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+    """The map image nearest to each position [m], and whether it is within the longest move."""
+    route, placed_m = map_.route, _on_route(map_, position_m)
+    nearest = route.nearest_image(placed_m)
+    apart_m = np.abs(route.offset_m(placed_m - route.position_m[nearest], 0.0))
+    return nearest, apart_m <= map_.longest_action_m
+
+
+def _on_route(map_: Map, position_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Positions as the route counts them; only what lies outside a closed one's first turn is turned."""
+    route = map_.route
+    ahead_m = position_m - route.start_m
+    inside = (ahead_m >= 0) & (ahead_m < route.length_m)
+    return np.where(inside, position_m, route.wrapped(position_m))

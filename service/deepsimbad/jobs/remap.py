@@ -13,7 +13,7 @@ from typing import Any, Self, TypeAlias
 
 import numpy as np
 
-from deepsimbad.core.building import MapPlan, SeenTwice, append_drive
+from deepsimbad.core.building import MapPlan, SeenTwice
 from deepsimbad.core.camera import Camera
 from deepsimbad.core.composed import is_composed
 from deepsimbad.core.descriptor import MAX_LANDMARKS
@@ -30,6 +30,7 @@ from deepsimbad.jobs.append import (
     LANDMARK_TRAVERSE,
     TRAINING,
     KnownDrives,
+    append_drive,
     fuse,
     known_drives,
     refuse_known_traverse,

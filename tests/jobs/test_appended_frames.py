@@ -7,14 +7,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deepsimbad.core.building import MapPlan, append_drive, compose_map, nearest_known
+from deepsimbad.core.building import MapPlan, compose_map
 from deepsimbad.core.descriptor import LandmarkStatistics, nearest_landmarks, normal_scores, rank_landmarks
 from deepsimbad.core.drive import Drive
 from deepsimbad.core.map import UNKNOWN_FRAME
 from deepsimbad.core.relevance import Query, Relevance
 from deepsimbad.core.retrieval import relevances
+from deepsimbad.jobs.append import append_drive, nearest_known
 
-from .conftest import a_drive, a_map
+from ..core.conftest import a_drive, a_map
 
 BUILT_FROM_DISSIMILARITIES = sorted(set(Relevance) - {Relevance.COMPOSED})
 
