@@ -279,6 +279,18 @@ def test_a_few_appended_frames_that_are_alike_mute_nothing(seasons):
     assert after.usual_encoding == pytest.approx(before.usual_encoding, abs=0.05)
 
 
+def test_progress_is_told_in_small_steps_while_the_directions_are_found():
+    """They take most of the time of a map of long encodings."""
+    encodings = np.random.default_rng(0).normal(size=(120, 200)).astype(np.float32)
+    shares = [0.0]
+    compose_map(PLAN, drive_of(encodings), None, None, 20, shares.append)
+    steps = np.diff(shares)
+    assert (steps >= 0).all()
+    assert steps.max() < 0.3
+    assert shares[-1] == 1
+    assert len(shares) > 8
+
+
 @pytest.mark.real_data
 @pytest.mark.parametrize(("n_landmarks", "anr", "recall", "worst"), [(300, 1.05, 46, 2.2), (512, 0.9, 54, 2.0)])
 def test_on_real_descriptors_two_seasons_make_the_difference(real_data, n_landmarks, anr, recall, worst):

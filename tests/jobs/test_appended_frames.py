@@ -7,9 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deepsimbad.core.building import MapPlan, compose_map
 from deepsimbad.core.descriptor import LandmarkStatistics, nearest_landmarks, normal_scores, rank_landmarks
-from deepsimbad.core.drive import Drive
 from deepsimbad.core.map import UNKNOWN_FRAME
 from deepsimbad.core.relevance import Query, Relevance
 from deepsimbad.core.retrieval import relevances
@@ -146,15 +144,3 @@ def test_a_new_image_knows_of_its_place_what_the_nearest_old_one_does():
     assert made.timestamp_us.tolist() == [-1, -1, -1, -1, 5, -1, -1, -1, -1, -1, 6]
     assert made.x_m[4] == 1.0
     assert np.isnan(np.delete(made.x_m, 4)).all()
-
-
-def test_progress_is_told_in_small_steps_while_the_directions_are_found():
-    """They take most of the time of a map of long encodings."""
-    encodings = np.random.default_rng(0).normal(size=(120, 200)).astype(np.float32)
-    drive, shares = Drive(position_m=np.arange(120.0), encodings=encodings), [0.0]
-    compose_map(MapPlan(Relevance.COMPOSED, 4, (1.0,)), drive, None, None, 20, shares.append)
-    steps = np.diff(shares)
-    assert (steps >= 0).all()
-    assert steps.max() < 0.3
-    assert shares[-1] == 1
-    assert len(shares) > 8
