@@ -63,8 +63,8 @@ def slow():
 
 
 async def shape_of(decoders, body, eyes=EYES, priority=Priority.LIVE):
-    image, _ = await decoders.decoded(body, eyes, priority)
-    return image.shape
+    decoded = await decoders.decoded(body, eyes, priority, None)
+    return decoded.image.shape
 
 
 async def test_few_images_are_held_at_full_size_and_live_views_have_places_of_their_own(slow):
@@ -96,10 +96,13 @@ async def test_a_refused_image_takes_no_place_and_what_shows_nothing_is_known_as
     decoders = Decoders(64)
     for _ in range(8):
         with pytest.raises(ImageTooLargeError):
-            await decoders.decoded(LARGE, EYES, Priority.LIVE)
+            await decoders.decoded(LARGE, EYES, Priority.LIVE, None)
         with pytest.raises(UnsupportedMediaTypeError):
-            await decoders.decoded(USUAL, FeatureL2("none"), Priority.LIVE)
-    assert [(await decoders.decoded(body, EYES, Priority.LIVE))[1] for body in (BLANK, USUAL)] == [True, False]
+            await decoders.decoded(USUAL, FeatureL2("none"), Priority.LIVE, None)
+    assert [(await decoders.decoded(body, EYES, Priority.LIVE, None)).is_blank for body in (BLANK, USUAL)] == [
+        True,
+        False,
+    ]
 
 
 # Long bodies and answers
