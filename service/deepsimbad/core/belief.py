@@ -26,6 +26,9 @@ from deepsimbad.errors import PastTheEndError
 TRUSTS = (0.5, 1.0, 2.0)
 """How much of the learnt log-likelihood each part of a mixture believes; each twice the one before."""
 
+PRIOR_TRUST = (0.2, 0.4, 0.4)
+"""How probable each is before anything was seen: few seasons are as bad as the least trust takes them for."""
+
 TRUSTS_OF = {rule: TRUSTS if rule is UpdateRule.MIXTURE else (1.0,) for rule in UpdateRule}
 
 LOST_AT_START, LOST_AT_FIX = 0.02, 0.005  # before anything was seen: anywhere, and where somebody said it is
@@ -34,7 +37,7 @@ FOUND_A_VIEW = 0.02  # of what is lost, spread over the route when the robot has
 LEAST_SURVIVING_SHARE = 1e-9  # of a belief before a move; with less it leads past the end wherever the robot may be
 _DOUBTING = 0.01  # a belief that takes the robot for lost by more refuses no move
 SIGMAS = 4.0  # a move's error is cut off here
-SLIPS = 0.1  # how often odometry is wrong by more than it says
+SLIPS = 0.3  # how often odometry is wrong by more than it says
 _CELLS_A_SIGMA = 1024.0  # of the table that stands for the normal curve; exact to 1e-7
 _NORMAL = np.exp(-0.5 * np.square(np.arange(int(SIGMAS * _CELLS_A_SIGMA) + 3) / _CELLS_A_SIGMA))
 _NEGLIGIBLE = 1e-3  # of the mean mass: a place with less moves, but its error is not spread
@@ -111,7 +114,7 @@ class Doubt:
     def at_start(cls, rule: UpdateRule, lost: float) -> Self:
         """Before any view, lost with this probability."""
         n = len(TRUSTS_OF[rule])
-        return cls(np.full(n, lost), np.zeros(n))
+        return cls(np.full(n, lost), np.log(PRIOR_TRUST) if n > 1 else np.zeros(n))
 
     @property
     def is_mixture(self) -> bool:

@@ -32,7 +32,7 @@ UNKNOWN_FRAME = 0  # no digest was kept of what an image was made of
 DEFAULT_ACTIONS_M = tuple(float(metres) for metres in range(1, 11))
 MOST_ACTION_M = 1000.0
 _USUAL_NOVELTY_M = 3.0  # over which views stop to err alike, where nobody measured it
-_SHARED_LEARNT, _SHARED_ELSE = 0.7, 0.5  # of the novelty curve, where two seasons taught it and where they did not
+_SHARED = 0.5  # of the novelty curve
 _SAME_PLACE_M = 0.3
 
 # A relevance compares more than lists.
@@ -349,8 +349,7 @@ class Map:
 
     def shared_error_after(self, action_m: float) -> float:
         """How much of a view's error is that of the view before: of one from the same place nearly all of it."""
-        learnt = _SHARED_LEARNT if self.likelihood_scale is not None else _SHARED_ELSE
-        shared = learnt * self.alike_after(action_m)
+        shared = _SHARED * self.alike_after(action_m)
         return float(shared + (1 - shared) * np.exp(-abs(action_m) / _SAME_PLACE_M))
 
     @cached_property

@@ -11,7 +11,6 @@ from deepsimbad.core.belief import (
     LOST_AT_FIX,
     LOST_AT_START,
     SIGMAS,
-    SLIPS,
     Doubt,
     GridFilter,
     ViewEvidence,
@@ -25,6 +24,8 @@ from deepsimbad.core.relevance import UpdateRule
 from deepsimbad.core.route import Route
 
 DEFAULT_N_PARTICLES = 1000
+_LEAST_PLACED = 4  # particles where a robot that was lost may be
+_NEGLIGIBLE = 1e-3  # of the belief; particles that hold no more are given up without drawing all anew
 _START, _RETURN, _MOVE, _RESAMPLE = range(4)  # what a draw is for; part of its seed
 
 
@@ -85,10 +86,14 @@ class ParticleFilter:
 
     @cached_property
     def mass(self) -> NDArray[np.float64]:
-        """[n] every particle counts for the map image nearest to it."""
-        images = self.route.nearest_image(self.position_m)
-        mass = np.bincount(images, self.doubt.trust @ self.weights, self.route.n_images)
-        mass += (self.doubt.trust @ self.found) * self.route.cell_m / self.route.cell_m.sum()
+        """[n] every particle counts for the stretch of route that it stands for; images of one place share its mass."""
+        route, trust = self.route, self.doubt.trust
+        together, order = trust @ self.weights, np.argsort(self.position_m, kind="stable")
+        if self.doubt.is_mixture:
+            mass = _on_images(route, *_stretches(route, self.position_m[order]), together[order])
+        else:  # the paper's count for the image nearest to them
+            mass = np.bincount(route.nearest_image(self.position_m), together, route.n_images).astype(np.float64)
+        mass = mass + (trust @ self.found) * route.cell_m / route.cell_m.sum()
         return np.asarray(mass / max(mass.sum(), 1e-300), np.float64)
 
     @property
@@ -108,12 +113,13 @@ class ParticleFilter:
             if not weights.any():  # it may still have stopped at the end
                 weights = np.where(past_m > reach_m, 0.0, self.weights)
         on_route, surviving = self.weights.sum(axis=1), weights.sum(axis=1)
-        check_ahead(route, self.doubt, on_route, surviving, action_m)
+        if step == 1 or not self.doubt.is_mixture:  # later it may have been carried, if no particle is where that is
+            check_ahead(route, self.doubt, on_route, surviving, action_m)
         lost, staying, found = leaving_and_found(
             self.doubt, self.doubt.lost + self.found, on_route, surviving, action_m
         )
-        slips = rng.random(target_m.size) < SLIPS
-        std_m = np.where(slips, slipping_std_m(action_m, action_std_m, self.doubt), action_std_m)
+        # The grid's moves are blurred by its spacing, these are not: every one may be wrong by a tenth.
+        std_m = slipping_std_m(action_m, action_std_m, self.doubt)
         moved = _onto(route, target_m + std_m * rng.standard_normal(target_m.size))
         last = self.doubt.last
         last = last if last is None else moved_along(route, last, action_m)
@@ -145,21 +151,22 @@ class ParticleFilter:
         return weighed if effective >= together.size / 2 else weighed._resampled(step)
 
     def _placed(self, likelihood: NDArray[np.float64], step: int) -> Self:
-        """What was found gets particles where the view says it may be, in place of the lightest."""
+        """What was found gets particles where the view says it may be, a few at least, in place of the lightest."""
         trust, m = self.doubt.trust, self.position_m.size
-        n_placed = min(m // 2, round(float(trust @ self.found) * m))
+        if not self.found.any():
+            return self
+        n_placed = int(np.clip(round(float(trust @ self.found) * m), min(_LEAST_PLACED, m // 2), m // 2))
         if n_placed == 0:
-            return (
-                self
-                if not self.found.any()
-                else replace(
-                    self, doubt=replace(self.doubt, lost=self.doubt.lost + self.found), found=np.zeros_like(self.found)
-                )
-            )
+            return replace(self, doubt=replace(self.doubt, lost=self.doubt.lost + self.found), found=0 * self.found)
         rng = np.random.default_rng([self.seed, step, _RETURN])
         density = (trust * self.found) @ (likelihood / likelihood.sum(axis=1, keepdims=True))
         images = _comb(density, n_placed, rng.random())
-        kept = self._resampled(step, m - n_placed)
+        together = trust @ self.weights
+        heaviest = np.argsort(together, kind="stable")[n_placed:]
+        if together[heaviest].sum() >= (1 - _NEGLIGIBLE) * together.sum():
+            kept = self._of(self.position_m[heaviest], self.weights[:, heaviest])
+        else:
+            kept = self._resampled(step, m - n_placed)
         half_m = self.route.cell_m[images] * (rng.random(n_placed) - 0.5)
         position_m = np.concatenate([kept.position_m, _onto(self.route, self.route.position_m[images] + half_m)])
         placed = np.ascontiguousarray(likelihood[:, images]) / density[images]
@@ -168,15 +175,30 @@ class ParticleFilter:
         return replace(self, position_m=position_m, weights=weights, found=np.zeros_like(self.found))
 
     def _resampled(self, step: int, n_particles: int | None = None) -> Self:
-        """Systematic resampling: one draw places an even comb over the cumulated weights."""
+        """Systematic resampling: one draw places an even comb over the cumulated weights.
+
+        All but the paper's are drawn anew from the stretches that they stand for, so that none is there twice.
+        """
         n = n_particles or self.position_m.size
         together = self.doubt.trust @ self.weights
         if together.sum() <= 0:
             return self
-        chosen = _comb(together, n, np.random.default_rng([self.seed, step, _RESAMPLE]).random())
-        weights = np.ascontiguousarray(self.weights[:, chosen]) / together[chosen]
-        weights *= (self.weights.sum(axis=1) / np.maximum(weights.sum(axis=1), 1e-300))[:, np.newaxis]
-        return replace(self, position_m=self.position_m[chosen], weights=weights)
+        rng = np.random.default_rng([self.seed, step, _RESAMPLE])
+        if self.doubt.is_mixture:
+            order = np.argsort(self.position_m, kind="stable")
+            chosen = _comb(together[order], n, rng.random())
+            low_m, high_m = _stretches(self.route, self.position_m[order])
+            position_m = low_m[chosen] + rng.random(n) * (high_m - low_m)[chosen]
+            chosen = order[chosen]
+        else:
+            chosen = _comb(together, n, rng.random())
+            position_m = self.position_m[chosen]
+        return self._of(position_m, np.ascontiguousarray(self.weights[:, chosen]) / together[chosen])
+
+    def _of(self, position_m: NDArray[np.float64], weights: NDArray[np.float64]) -> Self:
+        """Other particles, with as much of every trust's belief on the route as these have."""
+        total = np.maximum(weights.sum(axis=1), 1e-300)
+        return replace(self, position_m=position_m, weights=weights * (self.weights.sum(axis=1) / total)[:, np.newaxis])
 
 
 def _comb(weight: NDArray[np.float64], count: int, offset: float) -> NDArray[np.intp]:
@@ -184,6 +206,36 @@ def _comb(weight: NDArray[np.float64], count: int, offset: float) -> NDArray[np.
     cumulated = np.cumsum(weight)
     chosen = np.searchsorted(cumulated / cumulated[-1], (np.arange(count) + offset) / count, side="right")
     return np.minimum(chosen, weight.size - 1)
+
+
+def _stretches(route: Route, position_m: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """[m], [m] where the stretches begin and end that particles stand for, at ascending positions.
+
+    They go half the way to the next particles, no farther than a particle of a belief that knows nothing.
+    """
+    reach_m = max(route.length_m / position_m.size, float(np.median(route.cell_m))) / 2
+    half_m = np.minimum(np.diff(position_m) / 2, reach_m)
+    low_m, high_m = position_m - np.r_[reach_m, half_m], position_m + np.r_[half_m, reach_m]
+    end_m = route.start_m + route.length_m
+    return np.clip(low_m, route.start_m, end_m), np.clip(high_m, route.start_m, end_m)
+
+
+def _on_images(
+    route: Route, low_m: NDArray[np.float64], high_m: NDArray[np.float64], weight: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """[n] of weights [m] that lie evenly on stretches that do not overlap, in order."""
+    places = route.places
+    middle_m = (places.position_m[1:] + places.position_m[:-1]) / 2
+    last_m = route.start_m + route.length_m
+    if route.closed:  # behind the last image the first may be nearer
+        middle_m = np.r_[middle_m, (places.position_m[-1] + last_m) / 2]
+    bounds_m, cumulated = np.stack([low_m, high_m], 1).ravel(), np.cumsum(weight)
+    share = np.interp(middle_m, bounds_m, np.stack([cumulated - weight, cumulated], 1).ravel())
+    share = np.r_[0.0, share, cumulated[-1]]
+    mass = np.diff(share)
+    if route.closed:
+        mass = np.r_[mass[0] + mass[-1], mass[1:-1]]
+    return np.asarray(mass[places.of_image] / places.n_images[places.of_image])
 
 
 def _onto(route: Route, position_m: NDArray[np.float64]) -> NDArray[np.float64]:
