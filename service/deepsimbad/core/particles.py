@@ -102,17 +102,20 @@ class ParticleFilter:
         return self.doubt.off_route
 
     def predicted(self, action_m: float, action_std_m: float, step: int) -> Self:
-        """As `GridFilter.predicted`; a particle that would be past the end of an open route dies."""
-        route = self.route
+        """As `GridFilter.predicted`; a particle that would be past the end of an open route dies.
+
+        Particles are drawn anew now rather than after the last view, of which their weights told more.
+        """
+        route, before = self.route, self._evened_out(step) if self.doubt.is_mixture else self
         rng = np.random.default_rng([self.seed, step, _MOVE])
-        target_m, weights = self.position_m + action_m, self.weights
+        target_m, weights = before.position_m + action_m, before.weights
         if not route.closed and action_m != 0:
             reach_m = SIGMAS * action_std_m + 1e-9
             past_m = np.maximum(target_m - route.position_m[-1], route.start_m - target_m)
             weights = np.where(past_m > (reach_m if self.doubt.is_mixture else 1e-9), 0.0, weights)
             if not weights.any():  # it may still have stopped at the end
-                weights = np.where(past_m > reach_m, 0.0, self.weights)
-        on_route, surviving = self.weights.sum(axis=1), weights.sum(axis=1)
+                weights = np.where(past_m > reach_m, 0.0, before.weights)
+        on_route, surviving = before.weights.sum(axis=1), weights.sum(axis=1)
         if step == 1 or not self.doubt.is_mixture:  # later it may have been carried, if no particle is where that is
             check_ahead(route, self.doubt, on_route, surviving, action_m)
         lost, staying, found = leaving_and_found(
@@ -128,7 +131,7 @@ class ParticleFilter:
         return after._resampled(step) if (weights.sum(axis=0) == 0).any() and surviving.any() else after
 
     def updated(self, seen: ViewEvidence, step: int) -> Self:
-        """As `GridFilter.updated`; resamples when the effective sample size falls below half the particles."""
+        """As `GridFilter.updated`; the paper's particles are drawn anew at once where their weights ask for it."""
         images = self.route.nearest_image(self.position_m)
         trust = self.doubt.trust
         if seen.is_added:
@@ -146,9 +149,13 @@ class ParticleFilter:
             doubt = Doubt(lost / total, self.doubt.log_trust + np.log(total / average), seen.values)
             weighed = replace(self, weights=weights / total[:, np.newaxis], found=found / total, doubt=doubt)
             weighed = weighed._placed(factors * self.route.cell_m, step)
-        together = weighed.doubt.trust @ weighed.weights
+        return weighed if self.doubt.is_mixture else weighed._evened_out(step)
+
+    def _evened_out(self, step: int) -> Self:
+        """Resampled where the effective sample size has fallen below half the particles."""
+        together = self.doubt.trust @ self.weights
         effective = np.square(together.sum()) / max(np.square(together).sum(), 1e-300)
-        return weighed if effective >= together.size / 2 else weighed._resampled(step)
+        return self if effective >= together.size / 2 else self._resampled(step)
 
     def _placed(self, likelihood: NDArray[np.float64], step: int) -> Self:
         """What was found gets particles where the view says it may be, a few at least, in place of the lightest."""
