@@ -40,7 +40,7 @@ def test_standardised_belief_is_the_normalised_exponential() -> None:
     slow = np.array([-sum(z[snapshot.lists[j, m]] for j in range(LIST_LENGTH)) for m in range(N_IMAGES)])
     np.testing.assert_allclose(localization.relevance, slow, rtol=1e-5, atol=1e-6)
     parts = np.array([np.exp(trust * OTHER_LIKELIHOOD_SCALE * (slow - slow.mean())) for trust in TRUSTS])
-    # Images are evenly spaced: a uniform prior weighs them alike, and a first view leaves the three trusts as they were.
+    # Images are evenly spaced: a uniform prior weighs them alike, and a first view leaves trusts as they were.
     mass = np.array([0.2, 0.4, 0.4]) @ (parts / parts.sum(axis=1, keepdims=True))
     np.testing.assert_allclose(localization.belief.top_mass, np.sort(mass)[::-1], rtol=1e-4)
     assert localization.belief.mean_m == pytest.approx(mass @ snapshot.position_m, rel=1e-4)
