@@ -169,6 +169,18 @@ def test_long_encodings_are_projected_and_keep_their_neighbours():
     assert short.landmark_model["projection"].shape == (500, 8)
 
 
+def test_numbers_that_hardly_differ_count_little():
+    """Where they counted as much as those that show places, their noise would drown them."""
+    rng = np.random.default_rng(3)
+    places = rng.normal(size=(120, 24))
+    one, two = (np.hstack([places, 0.1 * rng.normal(size=(120, 1500))]).astype(np.float32) for _ in range(2))
+    projection = principal_directions(one)
+    u, v = (composed.described(drive, Moments.of(drive), projection) for drive in (one, two))
+    assert np.mean((u @ v.T).argmax(axis=0) == np.arange(120)) > 0.95
+    flat = [unit((drive - drive.mean(axis=0)) / drive.std(axis=0)) for drive in (one, two)]
+    assert np.mean((flat[0] @ flat[1].T).argmax(axis=0) == np.arange(120)) < 0.5
+
+
 def test_two_seasons_teach_and_one_does_not(seasons):
     one = compose_map(PLAN, drive_of(seasons[1]), None, None, 60)
     two = compose_map(PLAN, drive_of(seasons[1]), drive_of(seasons[0]), None, 60)

@@ -115,10 +115,11 @@ def described(
 def principal_directions(
     *drives: NDArray[np.float32], on_progress: Callable[[float], None] = lambda _: None
 ) -> NDArray[np.float32] | None:
-    """[d, k] the directions in which standardised frames differ most, the strongest held back a little.
+    """[d, k] the directions in which frames differ most, the strongest held back a little.
 
-    k is 96 or the number of frames less 1, whichever is less. By the matrix of products between frames, at most 2,048
-    of them, so that no d x d matrix need exist.
+    Numbers are standardised, and then weighed by how much they differ along the drives: of thousands many hardly do,
+    and their noise would count as much as what shows places. k is 96 or the number of frames less 1, whichever is
+    less. By the matrix of products between frames, at most 2,048 of them, so that no d x d matrix need exist.
 
     Args:
         drives: [n, d] encodings of each.
@@ -130,8 +131,10 @@ def principal_directions(
         return None
     most = _MOST_FRAMES // len(drives)
     some = [drive[np.linspace(0, len(drive) - 1, min(len(drive), most)).astype(np.intp)] for drive in drives]
+    spread = np.mean([rows.std(axis=0, dtype=np.float64) for rows in some], axis=0)
+    weight = (spread / max(spread.mean(), 1e-300)).astype(np.float32)
     frames = np.concatenate(
-        [unit_encodings(rows, Moments.of(drive), None) for rows, drive in zip(some, drives, strict=True)]
+        [unit(unit_encodings(rows, Moments.of(drive), None) * weight) for rows, drive in zip(some, drives, strict=True)]
     )
     on_progress(0.4)
     k = max(1, min(MOST_DIMENSIONS, len(frames) - 1))
@@ -141,7 +144,7 @@ def principal_directions(
     on_progress(0.8)
     variance, vectors = np.maximum(variance[-k:], 1e-12), vectors[:, -k:]
     scale = 1 / np.sqrt(variance * len(frames) * (variance + _EVENING_OUT * variance.mean()))
-    return np.asarray(frames.T.astype(np.float64) @ (vectors * scale), np.float32)
+    return np.asarray(weight[:, np.newaxis] * (frames.T.astype(np.float64) @ (vectors * scale)), np.float32)
 
 
 def within_place_whitening(first: NDArray[np.float32], second: NDArray[np.float32]) -> NDArray[np.float32]:
