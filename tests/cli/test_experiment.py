@@ -235,7 +235,8 @@ def test_the_corridor_by_its_own_ground_truth_as_a_process(process, real_data):
         *("--ground-truth", corridor / "ground_truth_new.npy", "--json"),
     )
     out, err = running.communicate(timeout=250)
-    assert (running.returncode, err) == (0, "")
+    assert running.returncode == 0, err
+    assert err.startswith("warning: test_drive_known: most frames of the test drive are in the landmarks drive too")
     document = json.loads(out)
     assert set(document) == KEYS
     assert (document["n_queries"], document["n_left_out"]) == (111, 0)
