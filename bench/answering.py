@@ -20,11 +20,11 @@ from bench.worlds import (
 )
 from deepsimbad.core.belief import FilterKind
 from deepsimbad.core.descriptor import rank_landmarks
+from deepsimbad.core.index.retrieval import relevances, shortlist
 from deepsimbad.core.localizer import ActiveLocalizer, LocalizerConfig
 from deepsimbad.core.map import Map
 from deepsimbad.core.planners import INFORMED, NNQL
 from deepsimbad.core.relevance import Query
-from deepsimbad.core.retrieval import relevances, shortlist
 
 SIZES = (NCLT_IMAGES, 1_000_000, 10_000_000)
 N_STEPS = 300

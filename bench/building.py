@@ -29,12 +29,12 @@ from bench.worlds import (
 from deepsimbad.core.building import MapPlan
 from deepsimbad.core.composed import MOST_DIMENSIONS, compose, unit
 from deepsimbad.core.drive import Drive
+from deepsimbad.core.experience.nnql import NnqlConfig
+from deepsimbad.core.experience.training import TrainingWorld, train
 from deepsimbad.core.landmark_model import select_landmarks
 from deepsimbad.core.map import Map
-from deepsimbad.core.nnql import NnqlConfig
 from deepsimbad.core.planners import PlanningView, information_ahead, plan_by_experience
 from deepsimbad.core.relevance import DEFAULT_UPDATE, Query, Relevance
-from deepsimbad.core.training import TrainingWorld, train
 from deepsimbad.evaluators.feature_l2 import FeatureL2
 from deepsimbad.jobs.build import build, measured, views_of
 from deepsimbad.store.map_file import index_bytes, read_map, seal, table_bytes, write_map

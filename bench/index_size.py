@@ -15,8 +15,8 @@ from bench.common import ACTIONS_M, Limit, limit_table, markdown, real_recording
 from bench.worlds import N_LANDMARKS, NCLT_IMAGES, dense_lists, rrf_map, scattered_lists
 from deepsimbad.core.building import MapPlan
 from deepsimbad.core.drive import Drive
+from deepsimbad.core.index.packing import pack_lists, unpack_lists
 from deepsimbad.core.map import Map
-from deepsimbad.core.packing import pack_lists, unpack_lists
 from deepsimbad.core.relevance import Relevance
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.compute import Compute

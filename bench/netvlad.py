@@ -19,10 +19,10 @@ from bench.common import machine, markdown, real_recordings, write_page
 from deepsimbad.cli import run
 from deepsimbad.core.building import MapPlan
 from deepsimbad.core.drive import Drive
+from deepsimbad.core.index.retrieval import relevances
 from deepsimbad.core.map import Map
 from deepsimbad.core.metrics import RetrievalScorer
 from deepsimbad.core.relevance import Relevance
-from deepsimbad.core.retrieval import relevances
 from deepsimbad.evaluators.feature_l2 import FeatureL2
 from deepsimbad.jobs.build import build, measured, views_of
 

@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 from bench.common import ACTIONS_M, machine, markdown, real_recordings, write_page
 from deepsimbad.core.building import Built, MapPlan
 from deepsimbad.core.drive import Drive
+from deepsimbad.core.experience.nnql import NnqlConfig, initial_q_values
+from deepsimbad.core.experience.training import TrainingWorld, Walk, train, walk_greedily
 from deepsimbad.core.metrics import mean_interval
-from deepsimbad.core.nnql import NnqlConfig, initial_q_values
 from deepsimbad.core.relevance import Relevance, UpdateRule
-from deepsimbad.core.training import TrainingWorld, Walk, train, walk_greedily
 from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
 from deepsimbad.jobs.build import build, measured, train_nnql, world_of
 

@@ -25,10 +25,10 @@ from deepsimbad.core.descriptor import (
     ranks_from_ranked_landmarks,
 )
 from deepsimbad.core.drive import Drive
+from deepsimbad.core.index.retrieval import relevances
 from deepsimbad.core.map import Map
 from deepsimbad.core.metrics import RetrievalScorer
 from deepsimbad.core.relevance import Query, Relevance
-from deepsimbad.core.retrieval import relevances
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.feature_l2 import FeatureL2
 from deepsimbad.evaluators.registry import evaluator_config, make_evaluator

@@ -17,10 +17,10 @@ import numpy as np
 from bench.common import ACTIONS_M, machine, markdown
 from deepsimbad.core.building import MapPlan, SeenTwice, compose_map
 from deepsimbad.core.drive import Drive
+from deepsimbad.core.index.retrieval import relevances
 from deepsimbad.core.map import Map
 from deepsimbad.core.metrics import RetrievalScorer, RetrievalScores
 from deepsimbad.core.relevance import Query, Relevance
-from deepsimbad.core.retrieval import relevances
 from deepsimbad.core.route import same_places, true_images_of
 from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
 from deepsimbad.jobs.append import KnownDrives, fuse

@@ -11,9 +11,9 @@ from deepsimbad.core.building import MapPlan, compose_map
 from deepsimbad.core.composed import Moments, compose, lengths_of_sums, principal_directions, unit
 from deepsimbad.core.descriptor import rank_landmarks, ranks_from_ranked_landmarks
 from deepsimbad.core.drive import Drive
+from deepsimbad.core.index.retrieval import products_with_landmarks, relevances
 from deepsimbad.core.landmark_model import farthest_first
 from deepsimbad.core.relevance import Query, Relevance
-from deepsimbad.core.retrieval import products_with_landmarks, relevances
 from deepsimbad.errors import InvalidInputError, InvalidMapConfigError, TooFewCandidatesError
 from deepsimbad.jobs.append import append_drive
 

@@ -12,10 +12,10 @@ from deepsimbad.core.belief import FilterKind, GridFilter, ViewEvidence
 from deepsimbad.core.building import MapPlan, build_from_dissimilarities, compose_map
 from deepsimbad.core.descriptor import rank_landmarks
 from deepsimbad.core.drive import Drive
+from deepsimbad.core.index.retrieval import relevances
 from deepsimbad.core.localizer import ActiveLocalizer, LocalizerConfig
 from deepsimbad.core.planners import information_ahead
 from deepsimbad.core.relevance import Query, Relevance, UpdateRule, shows_nothing
-from deepsimbad.core.retrieval import relevances
 from deepsimbad.errors import InvalidInputError, PastTheEndError
 from deepsimbad.evaluators.feature_l2 import FeatureL2
 

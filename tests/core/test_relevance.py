@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from deepsimbad.core.descriptor import PRIOR_WEIGHT_FRAMES, LandmarkStatistics, rank_landmarks
+from deepsimbad.core.index.retrieval import relevances, shortlist, sum_listed
 from deepsimbad.core.map import Map
 from deepsimbad.core.relevance import Query, Relevance
-from deepsimbad.core.retrieval import relevances, shortlist, sum_listed
 from deepsimbad.errors import InvalidInputError, InvalidMapConfigError
 
 from .conftest import a_map

@@ -7,9 +7,9 @@ import pytest
 
 from deepsimbad.core.descriptor import rank_landmarks
 from deepsimbad.core.drive import Drive
-from deepsimbad.core.nnql import NnqlConfig
+from deepsimbad.core.experience.nnql import NnqlConfig
+from deepsimbad.core.index.retrieval import relevances
 from deepsimbad.core.relevance import Query, Relevance
-from deepsimbad.core.retrieval import relevances
 from deepsimbad.engine.maps import load_snapshot
 from deepsimbad.errors import InvalidMapConfigError
 from deepsimbad.jobs.append import KnownDrives, fuse

@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from deepsimbad.core.descriptor import LandmarkStatistics, nearest_landmarks, normal_scores, rank_landmarks
+from deepsimbad.core.index.retrieval import relevances
 from deepsimbad.core.map import UNKNOWN_FRAME
 from deepsimbad.core.relevance import Query, Relevance
-from deepsimbad.core.retrieval import relevances
 from deepsimbad.jobs.append import append_drive, nearest_known
 
 from ..core.conftest import a_drive, a_map

@@ -7,9 +7,9 @@ import pytest
 
 from deepsimbad.core.descriptor import rank_landmarks
 from deepsimbad.core.drive import Drive
+from deepsimbad.core.index.retrieval import relevances
 from deepsimbad.core.metrics import rank_of_truth
 from deepsimbad.core.relevance import Query, Relevance
-from deepsimbad.core.retrieval import relevances
 from deepsimbad.engine import maps as maps_module
 from deepsimbad.engine.maps import load_snapshot
 from deepsimbad.errors import (

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from deepsimbad.core.descriptor import rank_landmarks
-from deepsimbad.core.nnql import KnownWalk
+from deepsimbad.core.experience.nnql import KnownWalk
 from deepsimbad.core.relevance import Query
 from deepsimbad.errors import CancelledError
 from deepsimbad.jobs.progress import Progress

@@ -5,8 +5,8 @@ import pytest
 
 from deepsimbad.core.building import MapPlan, compose_map
 from deepsimbad.core.drive import Drive
+from deepsimbad.core.index.retrieval import relevances
 from deepsimbad.core.relevance import Relevance
-from deepsimbad.core.retrieval import relevances
 from deepsimbad.jobs import passive
 from deepsimbad.jobs.build import measured, views_of
 

@@ -7,9 +7,9 @@ import pytest
 
 from deepsimbad.core.building import MapPlan, build_map, compose_map
 from deepsimbad.core.drive import Drive
-from deepsimbad.core.nnql import NnqlConfig
+from deepsimbad.core.experience.nnql import NnqlConfig
+from deepsimbad.core.experience.training import TrainingWorld
 from deepsimbad.core.relevance import Relevance
-from deepsimbad.core.training import TrainingWorld
 from deepsimbad.errors import CancelledError
 from deepsimbad.jobs.build import HELD_OUT, SECOND_DRIVE, train_nnql
 from deepsimbad.jobs.progress import Progress

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from deepsimbad.core.index.packing import pack_lists
 from deepsimbad.core.map import Map
-from deepsimbad.core.packing import pack_lists
 from deepsimbad.errors import (
     CancelledError,
     ConflictError,

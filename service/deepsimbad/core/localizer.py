@@ -17,11 +17,11 @@ from deepsimbad.core.belief import (
     ViewEvidence,
     motion_std_m,
 )
+from deepsimbad.core.index.retrieval import relevances
 from deepsimbad.core.map import Map
 from deepsimbad.core.particles import DEFAULT_N_PARTICLES, BeliefFilter, ParticleFilter
 from deepsimbad.core.planners import DEFAULT_PLANNER, Plan, PlanningView, parse_planner
 from deepsimbad.core.relevance import LiveStatistics, Query, UpdateRule, worth_of_move
-from deepsimbad.core.retrieval import relevances
 from deepsimbad.core.summary import DEFAULT_CONFIDENCE, near_mode
 
 _LEAST_TOLD = 0.01  # of the mass that a view moves elsewhere; with less it told nothing

@@ -9,8 +9,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from deepsimbad.core.index.retrieval import shortlist
 from deepsimbad.core.map import Map
-from deepsimbad.core.retrieval import shortlist
 from deepsimbad.core.route import Route
 from deepsimbad.errors import InvalidInputError, nearest_of
 

@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 
 from deepsimbad.core.descriptor import normal_scores, rank_landmarks
 from deepsimbad.core.drive import SecondSeason
+from deepsimbad.core.index.retrieval import relevances
 from deepsimbad.core.map import Map
 from deepsimbad.core.relevance import Relevance
-from deepsimbad.core.retrieval import relevances
 
 SEASONS_ALIKE = 0.6  # correlation of a landmark's scores in two seasons: what development recordings show on average
 _SMOOTHED_OVER_M = 1.0  # one view is a noisy measurement of its place; neighbours show much the same

@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from deepsimbad.core.retrieval import shortlist
+from deepsimbad.core.index.retrieval import shortlist
 from deepsimbad.core.route import Route
 
 CONFIDENT_WITHIN_M = 5.0  # of the mode, to either side

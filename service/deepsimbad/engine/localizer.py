@@ -10,11 +10,11 @@ from deepsimbad.core.belief import GridFilter, ViewEvidence
 from deepsimbad.core.building import MapPlan, compose_map
 from deepsimbad.core.descriptor import rank_landmarks, ranks_from_ranked_landmarks, unpack_ranked_landmarks
 from deepsimbad.core.drive import Drive
+from deepsimbad.core.index.retrieval import relevances, shortlist
 from deepsimbad.core.localizer import ActiveLocalizer, LocalizerConfig, LocalizerState
 from deepsimbad.core.map import Map
 from deepsimbad.core.planners import Plan
 from deepsimbad.core.relevance import Query, Relevance
-from deepsimbad.core.retrieval import relevances, shortlist
 from deepsimbad.core.summary import BeliefSummary, summarise
 from deepsimbad.engine.worker import EncodedImage, Stopwatch, encode_images
 from deepsimbad.errors import (

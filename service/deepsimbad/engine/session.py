@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepsimbad.core.belief import FilterKind
+from deepsimbad.core.index.retrieval import shortlist
 from deepsimbad.core.localizer import ActiveLocalizer, LocalizerConfig, LocalizerState, Step
 from deepsimbad.core.map import Map
 from deepsimbad.core.planners import Plan
 from deepsimbad.core.relevance import Query, UpdateRule
-from deepsimbad.core.retrieval import shortlist
 from deepsimbad.core.route import Route
 from deepsimbad.core.summary import DEFAULT_CONFIDENCE, BeliefSummary, summarise
 from deepsimbad.engine.localizer import View, shortlist_length

@@ -24,8 +24,8 @@ from deepsimbad.core.composed import (
 )
 from deepsimbad.core.descriptor import LandmarkStatistics, nearest_landmarks, rank_landmarks
 from deepsimbad.core.drive import Drive, SameRoute, SecondSeason, second_season
+from deepsimbad.core.experience.nnql import NnqlConfig
 from deepsimbad.core.map import Map
-from deepsimbad.core.nnql import NnqlConfig
 from deepsimbad.core.relevance import Relevance
 from deepsimbad.core.route import same_places
 from deepsimbad.errors import InvalidMapConfigError

@@ -16,13 +16,13 @@ from deepsimbad.core.building import Built, MapPlan, SeenTwice, build_from_dissi
 from deepsimbad.core.camera import Camera
 from deepsimbad.core.descriptor import rank_landmarks
 from deepsimbad.core.drive import Drive
+from deepsimbad.core.experience.nnql import NnqlConfig, initial_q_values
+from deepsimbad.core.experience.training import LearningCurve, TrainingWorld, train
 from deepsimbad.core.frames import UNKNOWN_TIMESTAMP
 from deepsimbad.core.landmark_model import select_landmarks
 from deepsimbad.core.map import Map
-from deepsimbad.core.nnql import NnqlConfig, initial_q_values
 from deepsimbad.core.relevance import Query, Relevance
 from deepsimbad.core.route import same_places
-from deepsimbad.core.training import LearningCurve, TrainingWorld, train
 from deepsimbad.errors import InvalidSourceError
 from deepsimbad.evaluators.base import Evaluator, Image, LandmarkModel
 from deepsimbad.evaluators.image import decode_image, is_blank, picture_size

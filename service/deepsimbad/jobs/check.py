@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepsimbad.core.drive import Drive
+from deepsimbad.core.index.retrieval import relevances
 from deepsimbad.core.map import UNKNOWN_FRAME, Map
 from deepsimbad.core.metrics import rank_of_truth
-from deepsimbad.core.retrieval import relevances
 from deepsimbad.core.route import Route, same_places, true_images_of
 from deepsimbad.engine.maps import load_snapshot
 from deepsimbad.errors import DamagedMapError, InvalidEncodingError, RetiredMapError, WeightsDifferError

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from deepsimbad.core.building import MapPlan
 from deepsimbad.core.drive import Drive, SameRoute
+from deepsimbad.core.experience.nnql import NnqlConfig
 from deepsimbad.core.localizer import ActiveLocalizer, LocalizerConfig
 from deepsimbad.core.metrics import mean_interval
-from deepsimbad.core.nnql import NnqlConfig
 from deepsimbad.core.planners import CONSTANT, DEFAULT_PLANNER, NNQL, RANDOM
 from deepsimbad.core.relevance import DEFAULT_RELEVANCE, DEFAULT_UPDATE, Query, Relevance, UpdateRule
 from deepsimbad.errors import InvalidMapConfigError

@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepsimbad.core.belief import moved_along
+from deepsimbad.core.index.retrieval import relevances
 from deepsimbad.core.localizer import ActiveLocalizer, LocalizerConfig, LocalizerState
 from deepsimbad.core.map import Map
 from deepsimbad.core.metrics import RetrievalScorer, RetrievalScores
 from deepsimbad.core.planners import CONSTANT
 from deepsimbad.core.relevance import Query, worth_of_move
-from deepsimbad.core.retrieval import relevances
 from deepsimbad.errors import PastTheEndError
 
 WINDOWS = (1, 2, 5, 10, 20)  # views

@@ -18,9 +18,9 @@ from deepsimbad.core.camera import Camera
 from deepsimbad.core.composed import is_composed
 from deepsimbad.core.descriptor import MAX_LANDMARKS
 from deepsimbad.core.drive import Drive
+from deepsimbad.core.experience.nnql import NnqlConfig
 from deepsimbad.core.landmark_model import fitting_number
 from deepsimbad.core.map import Map
-from deepsimbad.core.nnql import NnqlConfig
 from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Relevance
 from deepsimbad.errors import InvalidEncodingError, InvalidMapConfigError, LostActivationError, WeightsDifferError
 from deepsimbad.evaluators.base import Evaluator

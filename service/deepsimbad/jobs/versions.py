@@ -12,8 +12,8 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from deepsimbad.core.experience.nnql import KnownWalk, NnqlConfig, initial_q_values, learn, transitions_of
 from deepsimbad.core.map import Map
-from deepsimbad.core.nnql import KnownWalk, NnqlConfig, initial_q_values, learn, transitions_of
 from deepsimbad.core.relevance import Query
 from deepsimbad.engine.maps import retired, unreadable
 from deepsimbad.engine.truths import checked_truths

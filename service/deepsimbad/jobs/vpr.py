@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from deepsimbad.core.building import Built, MapPlan
 from deepsimbad.core.composed import unit_encodings
 from deepsimbad.core.drive import Drive, SameRoute
+from deepsimbad.core.index.retrieval import relevances
 from deepsimbad.core.map import Map
 from deepsimbad.core.metrics import RetrievalScorer, RetrievalScores
 from deepsimbad.core.relevance import DEFAULT_RELEVANCE, LiveStatistics, Query, Relevance, worth_of_move
-from deepsimbad.core.retrieval import relevances
 from deepsimbad.errors import InvalidMapConfigError
 from deepsimbad.evaluators.base import Evaluator, LandmarkModel
 from deepsimbad.jobs.build import EncodedRecording, build, measured, views_of

@@ -13,10 +13,10 @@ from numba import njit
 from numpy.typing import NDArray
 
 from deepsimbad.core.belief import GridFilter, ViewEvidence, motion_std_m
+from deepsimbad.core.index.retrieval import relevances, shortlist
 from deepsimbad.core.map import Map
 from deepsimbad.core.metrics import rank_of_truth
 from deepsimbad.core.relevance import Query, UpdateRule
-from deepsimbad.core.retrieval import relevances, shortlist
 from deepsimbad.errors import InvalidInputError, InvalidMapConfigError, PastTheEndError
 
 

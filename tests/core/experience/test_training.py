@@ -6,15 +6,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from deepsimbad.core.experience.nnql import NnqlConfig, initial_q_values
+from deepsimbad.core.experience.training import TrainingWorld, Walk, choose_actions, train, walk_greedily
+from deepsimbad.core.index.retrieval import relevances, shortlist
 from deepsimbad.core.map import Map
 from deepsimbad.core.metrics import rank_of_truth
-from deepsimbad.core.nnql import NnqlConfig, initial_q_values
 from deepsimbad.core.relevance import Query, Relevance, UpdateRule
-from deepsimbad.core.retrieval import relevances, shortlist
-from deepsimbad.core.training import TrainingWorld, Walk, choose_actions, train, walk_greedily
 from deepsimbad.errors import CancelledError
-
-from .conftest import a_map
+from tests.core.conftest import a_map
 
 ACTIONS_M = (1.0, 2.0, 3.0)
 BACK_AND_FORTH_M = (-2.0, 0.0, 3.0)

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from deepsimbad.core.belief import GridFilter, ViewEvidence
-from deepsimbad.core.metrics import rank_of_truth
-from deepsimbad.core.nnql import (
+from deepsimbad.core.experience.nnql import (
     KnownWalk,
     NnqlConfig,
     Transitions,
@@ -13,12 +12,12 @@ from deepsimbad.core.nnql import (
     learn,
     transitions_of,
 )
+from deepsimbad.core.experience.training import TrainingWorld, Walk
+from deepsimbad.core.index.retrieval import relevances
+from deepsimbad.core.metrics import rank_of_truth
 from deepsimbad.core.relevance import Query, Relevance, UpdateRule
-from deepsimbad.core.retrieval import relevances
-from deepsimbad.core.training import TrainingWorld, Walk
 from deepsimbad.errors import InvalidInputError, InvalidMapConfigError
-
-from .conftest import a_map
+from tests.core.conftest import a_map
 
 
 def some_moves(rng, n, a, k, t):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from deepsimbad.core.belief_lattice import NO_MOVE, Lattice, Moves, moves_along, step_beliefs, uniform_beliefs
+from deepsimbad.core.experience.lattice import NO_MOVE, Lattice, Moves, moves_along, step_beliefs, uniform_beliefs
 from deepsimbad.core.metrics import rank_of_truth
 from deepsimbad.core.route import Route
 

@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepsimbad.core.belief import motion_std_m
-from deepsimbad.core.belief_lattice import NO_MOVE, Lattice, Moves, moves_along, step_beliefs, uniform_beliefs
+from deepsimbad.core.experience.lattice import NO_MOVE, Lattice, Moves, moves_along, step_beliefs, uniform_beliefs
+from deepsimbad.core.experience.nnql import NnqlConfig, Transitions, initial_q_values, learn, q_of_nearest
+from deepsimbad.core.index.retrieval import relevances, shortlist
 from deepsimbad.core.map import Map
-from deepsimbad.core.nnql import NnqlConfig, Transitions, initial_q_values, learn, q_of_nearest
 from deepsimbad.core.relevance import LiveStatistics, Query, Relevance, UpdateRule, mean_ranks
-from deepsimbad.core.retrieval import relevances, shortlist
 from deepsimbad.core.route import Route
 
 EPISODES_A_POINT = 100  # of the learning curve
