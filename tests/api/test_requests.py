@@ -10,9 +10,9 @@ import pytest
 from anyio import CapacityLimiter
 
 from deepsimbad.api import requests
+from deepsimbad.api.frames import EncodingBody
 from deepsimbad.api.problems import InvalidRequestError
 from deepsimbad.api.requests import MAX_NUMBERS, Decoders, parse_json
-from deepsimbad.api.traverses import EncodingBody
 from deepsimbad.engine.worker import Priority
 from deepsimbad.errors import ImageTooLargeError, OverloadedError, UnsupportedMediaTypeError
 from deepsimbad.evaluators.feature_l2 import FeatureL2

@@ -6,7 +6,7 @@ import zipfile
 import numpy as np
 import pytest
 
-from deepsimbad.api.traverses import InvalidBatchError, read_batch
+from deepsimbad.api.frames import InvalidBatchError, read_batch
 from deepsimbad.errors import TooLargeError
 
 from .conftest import DIM, JSON, NPZ, npz, problem

@@ -22,7 +22,7 @@ from pydantic import Field
 from starlette.responses import FileResponse, JSONResponse, PlainTextResponse
 from starlette.routing import Route
 
-from deepsimbad.api import domains, jobs, localizations, maps, sessions, traverses
+from deepsimbad.api import domains, frames, jobs, localizations, maps, sessions, traverses
 from deepsimbad.api.door import STOPPING, Door
 from deepsimbad.api.keys import KeyRing
 from deepsimbad.api.metrics import Metrics, StateCollector
@@ -51,7 +51,7 @@ TRUSTED_S = 1.0  # anybody may ask whether it is ready, and every look writes to
 _WRITE_TIMEOUT_S = 2.0
 _ROUTERS = (  # routes are tried in this order: those that robots ask come first
     *(sessions.router, localizations.router, router, domains.router, domains.admin),
-    *(traverses.router, jobs.making, jobs.router, maps.router, sessions.listing),
+    *(traverses.router, frames.router, jobs.making, jobs.router, maps.router, sessions.listing),
 )
 _DESCRIPTION = (
     "Where on a prelearned route a robot is, from what it sees; every error is an RFC 9457 problem document. "
