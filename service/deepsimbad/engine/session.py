@@ -15,7 +15,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from deepsimbad.core.belief import FilterKind
+from deepsimbad.core.belief import SIGMAS, FilterKind, motion_std_m
 from deepsimbad.core.index.retrieval import shortlist
 from deepsimbad.core.localizer import ActiveLocalizer, LocalizerConfig, LocalizerState, Step
 from deepsimbad.core.map import Map
@@ -28,13 +28,22 @@ from deepsimbad.engine.worker import InferenceWorker, Priority
 from deepsimbad.errors import (
     DamagedFileError,
     DeepSimbadError,
+    InvalidMoveError,
     InvalidPriorError,
     UnknownSessionError,
 )
 from deepsimbad.evaluators.base import Evaluator
-from deepsimbad.store.sessions import IdempotencyKey, JournalRow, PriorRow, SessionRecord, SessionStore, StateSnapshot
+from deepsimbad.store.sessions import (
+    IdempotencyKey,
+    JournalRow,
+    PriorRow,
+    SessionRecord,
+    SessionStore,
+    StateSnapshot,
+)
 
 DEFAULT_START_STD_M = 5.0
+_LONGEST_MOVE_ACTIONS = 10.0  # a robot may report a move of up to so many of the domain's longest action
 _SLACK_STDS = 3.0  # a prior may lie beyond the route by so many of its deviations
 _LARGEST_STD_M = 1e6
 _ROWS_AT_ONCE = 64  # of a journal in memory: 130 kB with 500 landmarks
@@ -78,6 +87,26 @@ class Observation:
     n_shortlist: int | None = None  # length of the answer's lists; None: the usual one
     idempotency: IdempotencyKey | None = None  # how a repetition is known; None: it is not
     landmark_models: frozenset[str] | None = None  # digests, by one of which the view was ranked; None: nobody said
+
+    def check(self, snapshot: Map) -> None:
+        """Refuse a shortlist, or a move that no robot of the domain makes: backward within its error is none.
+
+        Raises:
+            InvalidInputError, InvalidMoveError: Not one of this map.
+        """
+        shortlist_length(snapshot, self.n_shortlist)
+        action_m, std_m, longest_m = self.action_m, self.action_std_m, _LONGEST_MOVE_ACTIONS * snapshot.longest_action_m
+        if std_m is not None and not (math.isfinite(std_m) and 0 <= std_m <= longest_m):
+            raise InvalidMoveError(f"action_std_m is {std_m}: give metres from 0 to {longest_m:g}")
+        least_m = within_error_m = -longest_m if snapshot.goes_backward else 0.0
+        if math.isfinite(action_m) and not snapshot.goes_backward:
+            within_error_m = -SIGMAS * (motion_std_m(action_m) if std_m is None else std_m)
+        if not (math.isfinite(action_m) and within_error_m <= action_m <= longest_m):
+            raise InvalidMoveError(
+                f"action_m is {action_m}: give metres from {least_m:g} to {longest_m:g}, ten of the longest action",
+                minimum=least_m,
+                maximum=longest_m,
+            )
 
 
 @dataclass(frozen=True)

@@ -15,11 +15,9 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from deepsimbad.core.belief import SIGMAS, motion_std_m
-from deepsimbad.core.map import Map
 from deepsimbad.core.planners import Plan
 from deepsimbad.core.relevance import Relevance
-from deepsimbad.engine.localizer import View, describe, shortlist_length
+from deepsimbad.engine.localizer import View, describe
 from deepsimbad.engine.maps import MappedDomain, Maps
 from deepsimbad.engine.session import (
     LiveSession,
@@ -38,7 +36,6 @@ from deepsimbad.errors import (
     DeepSimbadError,
     EndedSessionError,
     IdempotencyKeyReusedError,
-    InvalidMoveError,
     TooManySessionsError,
     UnknownSessionError,
 )
@@ -50,7 +47,6 @@ T = TypeVar("T")
 DELETED, EXPIRED = "deleted", "expired"
 _ENCODED = {Relevance.COMPOSED, Relevance.BRUTE_FORCE}  # relevances that compare encodings
 _MEASURED = {Relevance.COMPOSED, Relevance.SIMBAD}  # and dissimilarities
-LONGEST_MOVE_ACTIONS = 10.0  # a robot may report a move of up to so many of the domain's longest action
 _LONGEST_RETRY_S = 60
 
 
@@ -327,8 +323,7 @@ class Sessions:
         async with live.lock:
             state = live.state or await self._state(live)
             engine = state.engine
-            shortlist_length(engine.snapshot, observation.n_shortlist)  # a bad one should not move the session
-            _check_move(engine.snapshot, observation.action_m, observation.action_std_m)
+            observation.check(engine.snapshot)  # a bad one should not move the session
             watch.lap("wait")
             view = await observation.view(engine.evaluator, engine.snapshot)
             watch.lap("decode")
@@ -372,9 +367,9 @@ class Sessions:
             action_m=observation.action_m,
             action_std_m=observation.action_std_m,
             ranks=query.ranks,
-            dissimilarities=None if encoding is not None else query.dissimilarities if relevance in _MEASURED else None,
+            dissimilarities=query.dissimilarities if relevance in _MEASURED and encoding is None else None,
             encoding=encoding,
-            idempotency=idempotency,
+            idempotency=observation.idempotency,
         )
         return self._move_on(live, state, row, observation.n_shortlist, watch)
 
@@ -485,19 +480,3 @@ def check_owner(record: SessionRecord, key_id: str | None) -> None:
 
 def _ended(session_id: str, ending: str) -> EndedSessionError:
     return EndedSessionError(f"session {session_id} has ended ({ending}): begin a new one", ending=ending)
-
-
-def _check_move(snapshot: Map, action_m: float, action_std_m: float | None) -> None:
-    """Refuse a move that no robot of the domain makes: backward within its error is none."""
-    longest_m = LONGEST_MOVE_ACTIONS * snapshot.longest_action_m
-    if action_std_m is not None and not (math.isfinite(action_std_m) and 0 <= action_std_m <= longest_m):
-        raise InvalidMoveError(f"action_std_m is {action_std_m}: give metres from 0 to {longest_m:g}")
-    least_m = within_error_m = -longest_m if snapshot.goes_backward else 0.0
-    if math.isfinite(action_m) and not snapshot.goes_backward:
-        within_error_m = -SIGMAS * (motion_std_m(action_m) if action_std_m is None else action_std_m)
-    if not (math.isfinite(action_m) and within_error_m <= action_m <= longest_m):
-        raise InvalidMoveError(
-            f"action_m is {action_m}: give metres from {least_m:g} to {longest_m:g}, ten of the longest action",
-            minimum=least_m,
-            maximum=longest_m,
-        )
