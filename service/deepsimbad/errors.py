@@ -118,6 +118,10 @@ class SettingsError(InvalidInputError, code="invalid_settings"):
     """A setting that cannot be used."""
 
 
+class InvalidBatchError(InvalidInputError, code="invalid_batch"):
+    """A batch of frames that is not an npz file of the arrays asked for."""
+
+
 class InvalidArchiveError(InvalidInputError, code="invalid_archive"):
     """A backup or exported map that is not one, is incomplete or fails its digest."""
 
@@ -211,6 +215,10 @@ class LandmarkModelDiffersError(ConflictError, code="landmark_model_differs"):
 
 class FramesDifferError(ConflictError, code="frames_differ"):
     """Frames of other content, place or time than those of the same indices that are there already."""
+
+
+class GreyLevelsDifferError(ConflictError, code="grey_levels_differ"):
+    """Pictures shown by other grey levels than those of the traverse they should join."""
 
 
 class TraverseInUseError(ConflictError, code="traverse_in_use"):

@@ -207,6 +207,10 @@ def test_drives_of_two_cameras_are_told_from_upload_to_remap(client):
         {"name": "Cam5", "width": 160, "height": 120, "aspect_ratio": 4 / 3, "orientation": "landscape"}
     ]
     assert (lying["cameras"][0]["width"], lying["cameras"][0]["orientation"]) == (120, "portrait")
+    encoding = {"encoding": [0.5] * client.get("/v1/domains/cameras").json()["encoding_dim"]}
+    problem(
+        client.put(f"{base}/traverses/upright/frames/9?position_m=9&camera=Cam5", json=encoding), 422, "invalid_input"
+    )
     (warning,) = lying["warnings"]
     assert warning.startswith("its pictures are not like those of traverse upright: they lie on their side")
     client.put(f"{base}/traverses/upright/frames/8?position_m=8", content=view, headers=JPEG)
@@ -218,6 +222,11 @@ def test_drives_of_two_cameras_are_told_from_upload_to_remap(client):
     )
     alone = client.remap("cameras", training_traverse="upright", n_landmarks=8)
     assert alone["result"]["metrics"]["warnings"] == []
+    lies = {"content": encoded(cv2.rotate(picture(1), cv2.ROTATE_90_CLOCKWISE)), "headers": JPEG}
+    observations = f"/v1/sessions/{client.begin('cameras')['session_id']}/observations"
+    for path in ("/v1/domains/cameras/localizations", observations):
+        (warning,) = client.post(path, **lies).json()["warnings"]
+        assert warning.startswith("the view's pixels are not like the map's: they lie on their side")
     both = client.remap("cameras", training_traverse="upright", landmark_traverse="lying", n_landmarks=8)
     (warning,) = both["result"]["metrics"]["warnings"]
     assert warning.startswith(
@@ -226,8 +235,7 @@ def test_drives_of_two_cameras_are_told_from_upload_to_remap(client):
     added = client.remap("cameras", training_traverse="lying", append=True, n_landmarks=8)
     (warning,) = added["result"]["metrics"]["warnings"]
     assert warning.startswith("the pictures of traverse lying are not like those of the active map: they lie on their")
-    view = {"content": encoded(cv2.rotate(picture(1), cv2.ROTATE_90_CLOCKWISE)), "headers": JPEG}
-    said = client.post("/v1/domains/cameras/localizations", **view).json()["warnings"]
+    said = client.post("/v1/domains/cameras/localizations", **lies).json()["warnings"]
     assert not any("pixels" in warning for warning in said), "such pictures are in the map by now"
 
 

@@ -6,8 +6,8 @@ import zipfile
 import numpy as np
 import pytest
 
-from deepsimbad.api.frames import InvalidBatchError, read_batch
-from deepsimbad.errors import TooLargeError
+from deepsimbad.api.batches import read_batch
+from deepsimbad.errors import InvalidBatchError, TooLargeError
 
 from .conftest import DIM, JSON, NPZ, npz, problem
 

@@ -47,6 +47,16 @@ def test_a_small_unread_body_leaves_the_connection_open(server):
     connection.close()
 
 
+def test_a_head_is_answered_and_leaves_no_error_in_the_log(server):
+    connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=60)
+    for path in ("/v1/domains", "/", "/docs/start.js", "/v1/admin/domains/d/traverses/t/frames", "/readyz"):
+        connection.request("HEAD", path)
+        answer = connection.getresponse()
+        assert (answer.status, answer.read()) == (200, b"")
+    connection.close()
+    assert '"ERROR"' not in server.log.read_text()
+
+
 def test_a_sender_who_leaves_early_is_no_fault_of_ours_and_it_ends_well_when_asked(server):
     with server.connect() as connection:
         connection.sendall(HEAD + b"X-Request-ID: left\r\nContent-Length: 1000\r\n\r\nabc")

@@ -1,7 +1,7 @@
 """A catalog, maps made without a job, and a service over them that can be restarted."""
 
 import asyncio
-from collections.abc import Awaitable, Callable, Coroutine, Iterator
+from collections.abc import Awaitable, Callable, Coroutine, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -136,9 +136,9 @@ def run(
         return asyncio.run(body(live))
 
 
-def viewed(view: View) -> Callable[[Evaluator, Map], Awaitable[View]]:
-    async def give(_evaluator: Evaluator, _map: Map) -> View:
-        return view
+def viewed(view: View) -> Callable[[Evaluator, Map], Awaitable[tuple[View, Sequence[str]]]]:
+    async def give(_evaluator: Evaluator, _map: Map) -> tuple[View, Sequence[str]]:
+        return view, ()
 
     return give
 

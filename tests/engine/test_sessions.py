@@ -2,6 +2,7 @@
 
 import asyncio
 import threading
+from collections.abc import Sequence
 from concurrent.futures import Future
 from dataclasses import replace
 from time import perf_counter
@@ -20,6 +21,7 @@ from deepsimbad.engine.worker import Stopwatch
 from deepsimbad.errors import (
     EndedSessionError,
     IdempotencyKeyReusedError,
+    InvalidInputError,
     InvalidPriorError,
     RetiredMapError,
     TooManySessionsError,
@@ -46,7 +48,7 @@ def test_a_session_is_the_localizer_step_by_step(mapped: Catalog) -> None:
             observation = ranked(seed)
             view = await live.sessions.observe(session_id, observation)
             evaluator = FeatureL2("none")
-            query = describe(snapshot, evaluator, await observation.view(evaluator, snapshot))
+            query = describe(snapshot, evaluator, (await observation.view(evaluator, snapshot))[0])
             state = localizer.step(state, query, observation.action_m).state
             np.testing.assert_array_equal(await live.sessions.mass(session_id), state.belief.mass)
             assert view.n_observations == seed + 1
@@ -99,7 +101,7 @@ def test_two_at_once_are_answered_in_order_of_arrival_and_told_how_they_waited(m
         gate = asyncio.Event()
         slow = ranked(0)
 
-        async def late(evaluator: Evaluator, map_: Map) -> View:
+        async def late(evaluator: Evaluator, map_: Map) -> tuple[View, Sequence[str]]:
             await gate.wait()  # its image takes long to decode; it arrived first all the same
             return await slow.view(evaluator, map_)
 
@@ -220,6 +222,30 @@ def test_a_write_that_failed_and_is_on_the_disk_all_the_same_counts(mapped: Cata
         with pytest.raises(UnavailableError):
             await live.sessions.observe(session_id, ranked(1))
         live.store.append = append  # type: ignore[method-assign]
+        assert (await live.sessions.observe(session_id, ranked(2))).n_observations == 2
+
+    run(mapped, body)
+
+
+def test_an_observation_whose_answer_fails_counts_and_leaves_the_session_sound(
+    mapped: Catalog, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def body(live: Live) -> None:
+        session_id = await live.begin()
+
+        def fail(*_: object) -> None:
+            raise InvalidInputError("nobody asked for that")
+
+        may_write = threading.Event()
+        live.store._commits.submit(lambda _: may_write.wait())
+        with monkeypatch.context() as patched:
+            patched.setattr("deepsimbad.engine.sessions.view_of", fail)
+            failing = asyncio.create_task(live.sessions.observe(session_id, ranked(1)))
+            await asyncio.sleep(0.05)
+            assert not failing.done(), "its row is not on the disk"
+            may_write.set()
+            with pytest.raises(RuntimeError, match="summed up"):
+                await failing
         assert (await live.sessions.observe(session_id, ranked(2))).n_observations == 2
 
     run(mapped, body)

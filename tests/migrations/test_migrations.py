@@ -150,7 +150,7 @@ def the_traverse(data_dir: Path) -> Iterator[object]:
     with Traverse.open(data_dir, "campus", "summer") as traverse:
         frames = traverse.read()
         yield frames.encodings.tolist()
-        yield (traverse.missing, frames.timestamp_us.tolist())
+        yield (traverse.summary().missing, frames.timestamp_us.tolist())
 
 
 def the_map(data_dir: Path) -> Iterator[object]:

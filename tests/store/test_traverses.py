@@ -7,11 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from deepsimbad.core.camera import Camera
 from deepsimbad.core.drive import MAX_POSITION_M, Drive
 from deepsimbad.errors import (
     ConflictError,
     DamagedFileError,
     DeepSimbadError,
+    GreyLevelsDifferError,
     InvalidEncodingError,
     InvalidInputError,
     InvalidRouteError,
@@ -69,7 +71,7 @@ def test_a_traverse_is_made_listed_opened_and_deleted(campus: Catalog) -> None:
 def test_frames_come_back_exactly_and_in_index_order(
     summer: Traverse, campus: Catalog, make_frames: MakeFrames
 ) -> None:
-    assert (summer.n_frames, summer.encoding_dim, summer.missing) == (0, None, [])
+    assert (summer.n_frames, summer.encoding_dim, summer.summary().missing) == (0, None, [])
     assert summer.read().encodings.shape == (0, 0)
     frames = make_frames([7, 2, 5, 0])
     frames = replace(
@@ -84,7 +86,7 @@ def test_frames_come_back_exactly_and_in_index_order(
     expected = Drive(**{name: array[order] for name, array in arrays_of(frames).items()})
     assert same(summer.read(), expected)
     assert (summer.n_frames, summer.encoding_dim) == (4, 8)
-    assert summer.missing == [(1, 1), (3, 4), (6, 6)]
+    assert summer.summary().missing == [(1, 1), (3, 4), (6, 6)]
     summer.close()
     with Traverse.open(campus.data_dir, "campus", "summer") as again:
         assert same(again.read(), expected)
@@ -213,7 +215,7 @@ def test_an_acknowledged_frame_survives_kill_9(summer: Traverse, campus: Catalog
 def test_uploading_and_reading_hold_little_beside_the_one_array(summer: Traverse, make_frames: MakeFrames) -> None:
     frames = make_frames(range(16_384), dim=256)
     tracemalloc.start()
-    summer.put_frames(frames)
+    summer.put_frames(frames, replace=False)
     _, put_peak = tracemalloc.get_traced_memory()
     tracemalloc.reset_peak()
     before, _ = tracemalloc.get_traced_memory()
@@ -224,6 +226,36 @@ def test_uploading_and_reading_hold_little_beside_the_one_array(summer: Traverse
     assert put_peak < 0.25 * n_bytes
     assert n_bytes < read_peak - before < 1.25 * n_bytes
     assert np.array_equal(back.encodings, frames.encodings)
+
+
+def test_what_frames_show_is_stored_with_them_and_levels_with_the_frame_that_gave_them(
+    summer: Traverse, make_frames: MakeFrames
+) -> None:
+    frames = replace(make_frames(range(3)), shows_nothing=np.array([False, True, True]))
+    summer.put_frames(frames)
+    assert summer.summary().n_uninformative == 2
+    assert summer.read().shows_nothing.tolist() == [False, True, True]
+    summer.put_frames(make_frames([1]))  # replaced by one that does show something
+    with pytest.raises(InvalidEncodingError):
+        summer.put_frames(replace(make_frames([5], dim=3), grey_levels=(0, 1023)))
+    assert (summer.summary().n_uninformative, summer.grey_levels) == (1, None)
+    summer.put_frames(replace(make_frames([5]), grey_levels=(0, 4095)))
+    with pytest.raises(GreyLevelsDifferError):
+        summer.put_frames(replace(make_frames([6]), grey_levels=(0, 1023)))
+    assert (summer.n_frames, summer.grey_levels) == (4, (0, 4095))
+
+
+def test_the_camera_of_an_unchanged_traverse_is_read_once(campus: Catalog, monkeypatch: pytest.MonkeyPatch) -> None:
+    where = (campus.data_dir, "campus", "summer")
+    with Traverse.create(*where) as summer:
+        assert Traverse.main_camera(*where) is None
+        summer.put_frame(0, np.ones(4, np.float32), 0.0, camera=Camera(40, 30))
+        assert Traverse.main_camera(*where) == Camera(40, 30)
+    assert Traverse.main_camera(*where) == Camera(40, 30)  # the file was closed meanwhile
+    monkeypatch.setattr(Traverse, "open", None)
+    assert Traverse.main_camera(*where) == Camera(40, 30)
+    with pytest.raises(UnknownTraverseError):
+        Traverse.main_camera(campus.data_dir, "campus", "winter")
 
 
 def test_the_weights_of_the_first_image_hold_for_all(summer: Traverse, make_frames: MakeFrames) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepsimbad.errors import DeepSimbadError
-from deepsimbad.evaluators.grey_levels import GreyLevels, measured, shown
+from deepsimbad.evaluators.grey_levels import GreyLevels, in_eight_bits, measured
 from deepsimbad.evaluators.image import decode_deep as decode_file
 from deepsimbad.evaluators.image import resized
 from deepsimbad.evaluators.image_files import ImageFile
@@ -154,8 +154,7 @@ def decode(body: bytes, path: Path, *, as_stored: bool = False, levels: GreyLeve
     What the service does not take (BMP, PGM, PPM) is decoded too. `as_stored` leaves pixels as they lie in the file,
     `levels` show more than 8 bits. Raises BrokenFrameError (not an image, damaged, or its end is missing).
     """
-    pixels = decode_deep(body, path, as_stored=as_stored)
-    return pixels if pixels.dtype == np.uint8 else shown(pixels, levels or measured([pixels]))
+    return in_eight_bits(decode_deep(body, path, as_stored=as_stored), levels)[0]
 
 
 def decode_deep(body: bytes, path: Path, *, as_stored: bool = True) -> NDArray[Any]:

@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from deepsimbad.evaluators.grey_levels import measured, shown
+from deepsimbad.evaluators.grey_levels import in_eight_bits
 from deepsimbad_client.errors import BrokenFrameError, MissingExtraError, SourceError
 from deepsimbad_client.recordings import (
     EncodedImage,
@@ -91,8 +91,7 @@ class BagRecording(Recording):
         kind, message = self._read(frame)
         if kind == _COMPRESSED:
             return ready(bytes(message.data), Path(frame.name), input_size, self.rotate, self.grey_levels)
-        pixels = _pixels(message, frame.name)
-        image = pixels if pixels.dtype == np.uint8 else shown(pixels, self.grey_levels or measured([pixels]))
+        image, _ = in_eight_bits(_pixels(message, frame.name), self.grey_levels)
         return as_png(turned(image, self.rotate), input_size)
 
     def deep(self, row: int) -> NDArray[Any]:

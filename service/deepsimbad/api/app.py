@@ -27,7 +27,8 @@ from deepsimbad.api.door import STOPPING, Door
 from deepsimbad.api.keys import KeyRing
 from deepsimbad.api.metrics import Metrics, StateCollector
 from deepsimbad.api.problems import install_openapi, install_problem_handlers, problems
-from deepsimbad.api.requests import Answer, Decoders, Running, Services, Slots
+from deepsimbad.api.requests import Answer, Running, Services, Slots
+from deepsimbad.engine.decoders import Decoders
 from deepsimbad.engine.localizer import warm_up
 from deepsimbad.engine.maps import Maps, Retention
 from deepsimbad.engine.sessions import Sessions
@@ -348,7 +349,6 @@ _ROOT = (
 )
 
 
-@router.head("/", include_in_schema=False)
 @router.get("/", include_in_schema=False)
 async def root(request: Request) -> Response:
     """Where to go from here, for a browser as a page."""

@@ -133,6 +133,8 @@ class Door:
         with CancelScope() as until_begun:
 
             async def begin(message: Message) -> None:
+                if until_begun.cancel_called:  # heard only where the route waits for something
+                    return
                 await send(message)
                 await send({"type": "http.response.body"})
                 until_begun.cancel()

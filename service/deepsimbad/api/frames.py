@@ -1,10 +1,7 @@
 """Frames of a traverse: one by one, or many whose encodings are known."""
 
 import dataclasses
-import math
-import struct
 import tempfile
-import zipfile
 from io import BytesIO
 from typing import IO, Annotated, Any, cast
 
@@ -14,6 +11,7 @@ from fastapi import APIRouter, Path, Query, Request, Response
 from numpy.typing import NDArray
 from pydantic import FailFast, Field, StrictFloat
 
+from deepsimbad.api.batches import read_batch
 from deepsimbad.api.localizations import IMAGE_SCHEMA, only
 from deepsimbad.api.problems import binary, declare, problems
 from deepsimbad.api.requests import (
@@ -31,13 +29,13 @@ from deepsimbad.api.requests import (
 )
 from deepsimbad.api.traverses import TraverseName
 from deepsimbad.core.camera import Camera
-from deepsimbad.core.drive import FRAME_NAME, MAX_NAME_LENGTH, MAX_POSITION_M, Drive
-from deepsimbad.core.frames import UNKNOWN_CONTENT, UNKNOWN_TIMESTAMP, content_digest
+from deepsimbad.core.drive import FRAME_NAME, MAX_POSITION_M
+from deepsimbad.core.frames import content_digest
+from deepsimbad.engine.decoders import Decoded
 from deepsimbad.engine.localizer import ready_encodings
 from deepsimbad.engine.worker import EncodedImage, Priority
-from deepsimbad.errors import DeepSimbadError, EmptyBodyError, InvalidInputError, TooLargeError
+from deepsimbad.errors import EmptyBodyError, GreyLevelsDifferError, InvalidInputError
 from deepsimbad.evaluators.grey_levels import GreyLevels
-from deepsimbad.evaluators.image import picture_size
 from deepsimbad.evaluators.image_files import MEDIA_TYPES
 from deepsimbad.store.durable import storage_faults
 
@@ -121,37 +119,42 @@ async def put_frame(
     The body is the image, or its encoding where that is known. An image is encoded at once and not kept. Positions
     that go backwards are accepted here and refused by the remap.
     """
-    evaluator_config = (await run_sync(running.catalog.domain, domain)).evaluator
+    evaluator = running.evaluators.evaluator((await run_sync(running.catalog.domain, domain)).evaluator)
     levels = await run_sync(_levels_of, running, domain, name)  # an unknown traverse should not cost an upload
     media_type = media_type_of(request, FRAME_TYPES)
+    if media_type == JSON and camera is not None:
+        raise InvalidInputError("camera is what took a picture, and the body is an encoding: leave it out")
     body = await read_bytes(request)
-    evaluator = running.evaluators.evaluator(evaluator_config)
-    weights_sha256, digest, shows_nothing, taken_by = None, UNKNOWN_CONTENT, False, None
-    if media_type == JSON:
-        values = np.array((await parse_json(body, EncodingBody, running)).encoding, np.float64)
-        encoding = (await run_sync(ready_encodings, values[np.newaxis]))[0]
-    else:
-        seen = await running.decoders.decoded(body, evaluator, Priority.BATCH, levels)
-        shows_nothing = seen.is_blank
-        if levels is None and seen.levels is not None and not shows_nothing:
-            levels = await run_sync(_keep_levels, running, domain, name, seen.levels)
-            if levels != seen.levels:  # another frame was quicker
-                seen = await running.decoders.decoded(body, evaluator, Priority.BATCH, levels)
-        encoded = cast("EncodedImage", await running.look(evaluator, seen.image, lambda view: view, Priority.BATCH))
-        encoding, weights_sha256, digest = encoded.values, encoded.weights_sha256, content_digest(body)
-        size = picture_size(body)
-        taken_by = None if size is None else Camera(*size, camera)
+    place = (position_m, timestamp_us, x_m, y_m)
 
-    def store() -> tuple[bool, int]:
+    def store(encoding: NDArray[np.float32], **more: Any) -> tuple[bool, int]:
         with running.open_traverses.lend(domain, name) as traverse:
-            created = traverse.put_frame(
-                *(index, encoding, position_m, timestamp_us, x_m, y_m, weights_sha256, frame_name, digest, replace),
-                shows_nothing=shows_nothing,
-                camera=taken_by,
-            )
+            created = traverse.put_frame(index, encoding, *place, name=frame_name, replace=replace, **more)
             return created, traverse.n_frames
 
-    created, n_frames = await run_sync(store)
+    def store_picture(encoded: EncodedImage, seen: Decoded) -> tuple[bool, int]:
+        return store(
+            encoded.values,
+            weights_sha256=encoded.weights_sha256,
+            content_digest=content_digest(body),
+            shows_nothing=seen.is_blank,
+            camera=None if seen.size is None else Camera(*seen.size, camera),
+            grey_levels=None if seen.is_blank else seen.levels,
+        )
+
+    async def stored(levels: GreyLevels | None) -> tuple[bool, int]:
+        seen = await running.decoders.decoded(body, evaluator, Priority.BATCH, levels)
+        encoded = cast("EncodedImage", await running.look(evaluator, seen.image, lambda view: view, Priority.BATCH))
+        return await run_sync(store_picture, encoded, seen)
+
+    if media_type == JSON:
+        values = np.array((await parse_json(body, EncodingBody, running)).encoding, np.float64)
+        created, n_frames = await run_sync(lambda: store(ready_encodings(values[np.newaxis])[0]))
+    else:
+        try:
+            created, n_frames = await stored(levels)
+        except GreyLevelsDifferError:  # another frame came meanwhile, and its levels stay
+            created, n_frames = await stored(await run_sync(_levels_of, running, domain, name))
     response.status_code = 201 if created else 200
     return FrameAnswer(index=index, n_frames=n_frames)
 
@@ -220,9 +223,9 @@ async def post_frames(
         async for piece in request.stream():
             chunk += piece
             if len(chunk) >= _SPOOL_CHUNK_BYTES:
-                await run_sync(spool.write, bytes(chunk))
+                await run_sync(spool.write, chunk)
                 chunk.clear()
-        await run_sync(spool.write, bytes(chunk))
+        await run_sync(spool.write, chunk)
         if spool.tell() == 0:
             raise EmptyBodyError("the body is empty: send an npz file (numpy.savez)")
         return await run_sync(store, spool, limiter=running.batches)
@@ -231,105 +234,3 @@ async def post_frames(
 def _levels_of(running: Services, domain: str, name: str) -> GreyLevels | None:
     with running.open_traverses.lend(domain, name) as traverse:
         return traverse.grey_levels
-
-
-def _keep_levels(running: Services, domain: str, name: str, levels: GreyLevels) -> GreyLevels:
-    with running.open_traverses.lend(domain, name) as traverse:
-        return traverse.keep_levels(levels)
-
-
-# A batch is read with distrust: what it declares is judged before anything is unpacked.
-
-MEMBERS = {"encodings": 2, "index": 1, "position_m": 1, "timestamp_us": 1, "x_m": 1, "y_m": 1, "name": 1}
-"""Arrays that a batch may hold, and how many dimensions each has."""
-REQUIRED = ("encodings", "index", "position_m")
-_KINDS = {"encodings": "f", "position_m": "fiu", "x_m": "fiu", "y_m": "fiu", "name": "U"}  # numpy's; else "iu"
-_KIND_WORDS = {"f": "floats", "U": "texts"}
-_END_OF_DIRECTORY, _LARGE_DIRECTORY = b"PK\x05\x06", b"PK\x06\x07"
-_MAX_HEADER_BYTES = 4096
-
-
-class InvalidBatchError(InvalidInputError, code="invalid_batch"):
-    """A batch of frames that is not an npz file of the arrays asked for."""
-
-    code = "invalid_batch"
-
-
-def read_batch(file: IO[bytes], max_bytes: int) -> Drive:
-    """Read the arrays of an npz file, whose values are not yet judged; `encodings` may still be of another float type.
-
-    Raises:
-        InvalidBatchError: Not such a file; pickled objects are never read.
-        TooLargeError: The arrays are larger than `max_bytes`, unpacked.
-    """
-    try:
-        _check_directory(file)
-        with zipfile.ZipFile(file) as archive:
-            arrays = _arrays(archive, max_bytes)
-    except DeepSimbadError:
-        raise
-    except Exception as error:  # zipfile and numpy raise some ten kinds over a file that was meddled with
-        raise InvalidBatchError("the batch is not a whole npz file as numpy.savez writes it") from error
-    n_frames = len(arrays["encodings"])
-    unknown = np.full(n_frames, np.nan)
-    return Drive(
-        index=arrays["index"],
-        position_m=arrays["position_m"],
-        timestamp_us=arrays.get("timestamp_us", np.full(n_frames, UNKNOWN_TIMESTAMP)),
-        x_m=arrays.get("x_m", unknown),
-        y_m=arrays.get("y_m", unknown),
-        frame_name=arrays.get("name", np.full(n_frames, "")),
-        encodings=arrays["encodings"],
-    )
-
-
-def _check_directory(file: IO[bytes]) -> None:
-    """Refuse a table of contents that could be long: zipfile would read all of it into memory."""
-    size = file.seek(0, 2)
-    file.seek(max(0, size - (1 << 16) - 22))
-    tail = file.read()
-    end = tail.rfind(_END_OF_DIRECTORY)
-    if end < 0 or len(tail) - end < 22:
-        raise InvalidBatchError("the batch is not a whole npz file (numpy.savez)")
-    n_members, directory_bytes = struct.unpack_from("<HL", tail, end + 10)
-    is_large = tail[max(0, end - 20) : end].startswith(_LARGE_DIRECTORY)
-    if n_members > len(MEMBERS) or directory_bytes > 1 << 14 or is_large:
-        raise InvalidBatchError(f"the batch holds more than the arrays {', '.join(MEMBERS)}", allowed=list(MEMBERS))
-
-
-def _arrays(archive: zipfile.ZipFile, max_bytes: int) -> dict[str, NDArray[Any]]:
-    members = {member.filename.removesuffix(".npy"): member for member in archive.infolist()}
-    if not set(members) <= set(MEMBERS) or len(members) != len(archive.infolist()):
-        what = f"the batch holds arrays that are not known or stand twice; known are {', '.join(MEMBERS)}"
-        raise InvalidBatchError(what, allowed=list(MEMBERS))
-    if missing := [name for name in REQUIRED if name not in members]:
-        raise InvalidBatchError(f"the batch lacks {', '.join(missing)}", missing=missing)
-    n_bytes = sum(member.file_size for member in members.values())
-    if n_bytes > max_bytes:
-        what = f"the batch unpacks to {n_bytes} bytes; at most {max_bytes} are taken, send fewer frames at once"
-        raise TooLargeError(what, max_bytes=max_bytes)
-    arrays = {}
-    for name, member in members.items():
-        with archive.open(member) as stream:
-            _check_header(name, stream, member.file_size)
-        with archive.open(member) as stream:  # from its beginning; a piece at a time, into the array's own memory
-            arrays[name] = np.lib.format.read_array(stream, allow_pickle=False, max_header_size=_MAX_HEADER_BYTES)
-            if stream.read(1):  # reading to the end is also what checks the member's checksum
-                raise InvalidBatchError(f"{name} is longer than its header says")
-    return arrays
-
-
-def _check_header(name: str, stream: IO[bytes], n_bytes: int) -> None:
-    """Refuse a shape or type that is not the array's own, before room is made for its numbers."""
-    version = np.lib.format.read_magic(stream)
-    if version not in {(1, 0), (2, 0)}:
-        raise InvalidBatchError(f"{name} has npy version {version}; 1.0 and 2.0 are read")
-    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    shape, _, dtype = read(stream, max_header_size=_MAX_HEADER_BYTES)
-    kinds = _KINDS.get(name, "iu")
-    if dtype.kind not in kinds or dtype.itemsize > (4 * MAX_NAME_LENGTH if dtype.kind == "U" else 8):
-        raise InvalidBatchError(f"{name} holds {dtype}; it must hold {_KIND_WORDS.get(kinds[0], 'integers')}")
-    if len(shape) != MEMBERS[name]:
-        raise InvalidBatchError(f"{name} has shape {list(shape)}; it must have {MEMBERS[name]} dimensions")
-    if stream.tell() + math.prod(shape) * dtype.itemsize != n_bytes:
-        raise InvalidBatchError(f"{name} does not hold the {math.prod(shape)} numbers its header says")

@@ -42,7 +42,7 @@ from deepsimbad.jobs.remap import (
     RemapConfig,
 )
 from deepsimbad.jobs.runner import REMAP
-from deepsimbad.jobs.versions import EXPERIENCE, ExperienceConfig, keep_true_positions
+from deepsimbad.jobs.versions import EXPERIENCE, TRAVERSE_ROLES, ExperienceConfig, keep_true_positions
 from deepsimbad.store.records import JobRecord
 from deepsimbad.store.traverses import Traverse
 
@@ -190,7 +190,7 @@ async def post_remap(
         if config.camera_of is not None:
             running.catalog.domain(config.camera_of)
         n_frames: dict[str | None, int] = {}
-        for name in (config.training_traverse, config.landmark_traverse, config.check_traverse):
+        for name in (getattr(config, role) for role in TRAVERSE_ROLES):
             if name is not None:
                 with Traverse.open(running.settings.data_dir, domain, name) as traverse:
                     n_frames[name] = traverse.n_frames

@@ -26,10 +26,10 @@ from deepsimbad.api.requests import (
     parse_json,
     read_bytes,
 )
-from deepsimbad.core.camera import Camera
 from deepsimbad.core.map import Map
 from deepsimbad.core.planners import Plan
 from deepsimbad.core.summary import DEFAULT_CONFIDENCE, BeliefSummary
+from deepsimbad.engine.decoders import remarks_on_shape
 from deepsimbad.engine.localizer import (
     Dissimilarities,
     Localization,
@@ -46,7 +46,6 @@ from deepsimbad.engine.localizer import (
 from deepsimbad.engine.worker import EncodedImage, Priority, Stopwatch
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.grey_levels import levels_in
-from deepsimbad.evaluators.image import picture_size
 from deepsimbad.evaluators.image_files import MEDIA_TYPES
 
 PROBABLY = 0.5
@@ -186,14 +185,6 @@ class LocalizationAnswer(TypedDict):
     next_best_view: Annotated[NextBestViewAnswer | None, Field(description="null until the map was trained for it.")]
 
 
-def remarks_on_shape(snapshot: Map, body: bytes) -> list[str]:
-    """What a person should know of a view's picture beside the map's."""
-    if not snapshot.cameras or (size := picture_size(body)) is None:
-        return []
-    why = Camera(*size).unlike(snapshot.cameras, "the map's")
-    return [] if why is None else [f"the view's pixels are not like the map's: {why}"]
-
-
 def render_localization(
     localization: Localization, watch: Stopwatch, remarks: Sequence[str] = ()
 ) -> LocalizationAnswer:
@@ -298,8 +289,7 @@ async def post_localization(
     body = await read_bytes(request)
     watch.lap("receive")
     evaluator = running.evaluators.evaluator(active.record.evaluator)
-    remarks: list[str] = []
-    view = await view_in(body, running, media_type, remarks, evaluator, snapshot)
+    view, remarks = await view_in(body, running, media_type, evaluator, snapshot)
     if prefers_binary(request):
 
         def compare(view: View) -> NDArray[np.float32]:
@@ -315,8 +305,6 @@ async def post_localization(
         return localize(snapshot, evaluator, view, shortlist, watch)
 
     localization = await running.look(evaluator, view, look)
-    if media_type in MEDIA_TYPES:
-        remarks += remarks_on_shape(snapshot, body)
     answer, body = await running.written(
         localization.belief.top.size, render_localization, localization, watch, remarks
     )
@@ -325,27 +313,27 @@ async def post_localization(
 
 
 async def view_in(
-    body: bytes, running: Services, media_type: str, remarks: list[str], evaluator: Evaluator, snapshot: Map
-) -> View:
-    """The observation in a body that has been read; an image at its evaluator's size, shown by its map's grey levels.
+    body: bytes, running: Services, media_type: str, evaluator: Evaluator, snapshot: Map
+) -> tuple[View, list[str]]:
+    """The observation in a body that has been read, and what a person should know of its picture.
 
-    What a person should know of a picture is added to the remarks.
+    An image comes at its evaluator's size, shown by its map's grey levels.
     """
     if media_type == JSON:
         observation = await parse_json(body, ObservationBody, running)
         if len(observation.model_fields_set) != 1:
             raise invalid_body("give exactly one of ranked_landmarks, dissimilarities, encoding")
         if "ranked_landmarks" in observation.model_fields_set:
-            return RankedLandmarks(observation.ranked_landmarks)
+            return RankedLandmarks(observation.ranked_landmarks), []
         if "dissimilarities" in observation.model_fields_set:
-            return Dissimilarities(np.array(observation.dissimilarities, np.float64))
-        return ReadyEncoding(np.array(observation.encoding, np.float64))
+            return Dissimilarities(np.array(observation.dissimilarities, np.float64)), []
+        return ReadyEncoding(np.array(observation.encoding, np.float64)), []
     if media_type == RANKS:
-        return PackedRanks(body)
+        return PackedRanks(body), []
     levels = levels_in(snapshot.landmark_model)
     decoded = await running.decoders.decoded(body, evaluator, Priority.LIVE, levels)
-    remarks += decoded.remarks
-    return NothingSeen() if decoded.is_blank else decoded.image
+    remarks = [*decoded.remarks, *remarks_on_shape(snapshot, decoded.size)]
+    return NothingSeen() if decoded.is_blank else decoded.image, remarks
 
 
 def prefers_binary(request: Request) -> bool:

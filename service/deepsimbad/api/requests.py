@@ -11,9 +11,8 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Annotated, Any, NamedTuple, Self, TypeVar, cast
+from typing import Annotated, Any, NamedTuple, TypeVar, cast
 
-import numpy as np
 from anyio import CapacityLimiter
 from anyio.to_thread import run_sync
 from fastapi import Depends, Header, Path, Query, Request
@@ -23,17 +22,15 @@ from pydantic_core import ErrorDetails, to_json
 from deepsimbad.api.keys import KeyRing
 from deepsimbad.api.metrics import Metrics
 from deepsimbad.api.problems import InvalidRequestError, invalid_body, invalid_request
+from deepsimbad.engine.decoders import Decoders
 from deepsimbad.engine.localizer import View
 from deepsimbad.engine.maps import MappedDomain, Maps, Retention
 from deepsimbad.engine.sessions import Sessions
 from deepsimbad.engine.traverses import OpenTraverses
 from deepsimbad.engine.truths import Truths
-from deepsimbad.engine.worker import EvaluatorPool, InferenceWorker, Priority, ready
+from deepsimbad.engine.worker import EvaluatorPool, InferenceWorker, Priority
 from deepsimbad.errors import EmptyBodyError, OverloadedError, UnsupportedMediaTypeError, nearest_of
-from deepsimbad.evaluators.base import Evaluator, Image
-from deepsimbad.evaluators.grey_levels import FEW_GREYS, GreyLevels, holds_few_greys, measured, shown
-from deepsimbad.evaluators.image import KEPT_PIXELS, decode_deep, is_blank
-from deepsimbad.evaluators.image_files import ImageFile
+from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.jobs.runner import JobRunner
 from deepsimbad.settings import Settings
 from deepsimbad.store.catalog import Catalog
@@ -98,71 +95,6 @@ class Slots:
             yield
         finally:
             self.give_back()
-
-
-class Decoders:
-    """Decodes images in few threads and brings them to their evaluator's size there, so that little of each is held.
-
-    An image of more than `KEPT_PIXELS` takes most of a second and memory for all its pixels until it is reduced. So
-    there is one of those at a time, and usual images never wait for one; where eight wait, more are refused.
-    """
-
-    LARGE_WAITING = 8
-
-    def __init__(self, max_pixels: int) -> None:
-        self._max_pixels = max_pixels
-        # Live views have threads of their own: frames of a traverse must not keep them waiting.
-        self._threads = {Priority.LIVE: CapacityLimiter(4), Priority.BATCH: CapacityLimiter(2)}
-        self._large = CapacityLimiter(1)
-
-    async def decoded(
-        self, body: bytes, evaluator: Evaluator, priority: Priority, levels: GreyLevels | None
-    ) -> "Decoded":
-        """The image in a body at its evaluator's size; `levels` as `decode_file` takes them.
-
-        Raises:
-            InvalidImageError, ImageTooLargeError, EmptyBodyError, OutOfMemoryError: As `ImageFile`.
-            UnsupportedMediaTypeError, EvaluatorUnavailableError: The evaluator takes no images, or cannot be loaded.
-            OverloadedError: The image is large, and as many large ones wait as may.
-        """
-        threads = self._threads[priority]
-        image = await run_sync(self._read, body, evaluator, levels, limiter=threads)
-        if not isinstance(image, ImageFile):
-            return image
-        if self._large.statistics().tasks_waiting >= self.LARGE_WAITING:
-            raise OverloadedError(
-                f"images of more than {KEPT_PIXELS} pixels are looked at one by one, and {self.LARGE_WAITING} wait: "
-                "send smaller ones, or try again in a moment",
-                retry_after_s=1,
-                most_pixels_at_once=KEPT_PIXELS,
-            )
-        async with self._large:
-            return await run_sync(Decoded.of, image, evaluator, levels, limiter=threads)
-
-    def _read(self, body: bytes, evaluator: Evaluator, levels: GreyLevels | None) -> "Decoded | ImageFile":
-        """The file where its image is large, else what it decodes to."""
-        file = ImageFile.read(body, self._max_pixels)
-        return file if file.n_pixels > KEPT_PIXELS else Decoded.of(file, evaluator, levels)
-
-
-class Decoded(NamedTuple):
-    """An image, and what is seen of it."""
-
-    image: Image  # [height, width, 3] uint8 BGR at its evaluator's size
-    is_blank: bool  # whether it shows nothing, as it is encoded: so it is the same for a view that was sent smaller
-    levels: GreyLevels | None  # by which it is shown; None: it had 8 bits
-    remarks: list[str]  # what a person should know of it
-
-    @classmethod
-    def of(cls, file: ImageFile, evaluator: Evaluator, levels: GreyLevels | None) -> Self:
-        """Decode a file; takes milliseconds."""
-        ready(evaluator)  # where it is not, decoding is in vain
-        pixels = decode_deep(file)
-        is_deep = pixels.dtype != np.uint8
-        levels = (levels or measured([pixels])) if is_deep else None
-        image = evaluator.prepare(pixels if levels is None else shown(pixels, levels))
-        shows_nothing = is_blank(image)
-        return cls(image, shows_nothing, levels, [FEW_GREYS] if not shows_nothing and holds_few_greys(image) else [])
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,6 @@
 
 import hashlib
 import math
-from collections.abc import Sequence
 from datetime import UTC, datetime
 from functools import partial
 from typing import Annotated, cast
@@ -22,7 +21,6 @@ from deepsimbad.api.localizations import (
     Timings,
     npy_response,
     prefers_binary,
-    remarks_on_shape,
     render_belief,
     render_plan,
     render_shortlist,
@@ -62,7 +60,6 @@ from deepsimbad.core.summary import DEFAULT_CONFIDENCE
 from deepsimbad.engine.session import DEFAULT_START_STD_M, Observation, SessionConfig, SessionView
 from deepsimbad.engine.worker import Stopwatch
 from deepsimbad.errors import DeepSimbadError
-from deepsimbad.evaluators.image_files import MEDIA_TYPES
 from deepsimbad.store.sessions import IdempotencyKey, ListedSession
 
 router = APIRouter(prefix="/v1", tags=["sessions"])
@@ -213,13 +210,13 @@ def render_session(view: SessionView) -> SessionAnswer:
     }
 
 
-def render_observation(view: SessionView, watch: Stopwatch, remarks: Sequence[str] = ()) -> ObservationAnswer:
-    """A session after an observation, with remarks on its picture; the watch runs since the request arrived."""
+def render_observation(view: SessionView, watch: Stopwatch) -> ObservationAnswer:
+    """A session after an observation; the watch runs since the request arrived."""
     retrieval = [] if view.relevance is None else render_shortlist(view.snapshot, view.shortlist, view.relevance)
     return {
         **render_session(view),
         "informative": view.is_informative,
-        "warnings": [*remarks, *warnings_of(view.is_informative, view.belief)],
+        "warnings": [*view.remarks, *warnings_of(view.is_informative, view.belief)],
         "retrieval": retrieval,
         "timings_ms": watch.timings_ms(),
     }
@@ -302,17 +299,14 @@ async def post_observation(
         if idempotency_key is not None:
             query = f"{media_type}\n{action_m!r}\n{action_std_m!r}\n".encode()
             named = IdempotencyKey(idempotency_key, hashlib.sha256(query + body).digest())
-        remarks: list[str] = []
-        decode = partial(view_in, body, running, media_type, remarks)
+        decode = partial(view_in, body, running, media_type)
         models = None if if_match is None else insisted_on(if_match)
         observation = Observation(decode, action_m, action_std_m, shortlist, named, models)
         view = await running.sessions.observe(session_id, observation, watch, robot_of(request))
     except DeepSimbadError as error:
         running.metrics.observed(error.code)
         raise
-    if media_type in MEDIA_TYPES:
-        remarks += remarks_on_shape(view.snapshot, body)
-    answer, body = await running.written(view.belief.top.size, render_observation, view, watch, remarks)
+    answer, body = await running.written(view.belief.top.size, render_observation, view, watch)
     domain = request.scope["state"]["domain"] = answer["domain"]
     outcome = "repeated" if view.is_repeated else "accepted"
     running.metrics.localized(domain, answer["timings_ms"], answer["belief"]["entropy_bits"], outcome)

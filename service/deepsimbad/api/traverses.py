@@ -2,6 +2,7 @@
 
 import logging
 from contextlib import suppress
+from dataclasses import replace
 from typing import Annotated, Literal
 
 from anyio.to_thread import run_sync
@@ -27,6 +28,7 @@ from deepsimbad.errors import (
     UnknownTraverseError,
 )
 from deepsimbad.evaluators.grey_levels import DEEPEST, GreyLevels
+from deepsimbad.jobs.versions import TRAVERSE_ROLES
 from deepsimbad.store.records import ListPage
 from deepsimbad.store.traverses import Traverse
 
@@ -125,7 +127,7 @@ async def post_traverse(domain: DomainName, request: Request, response: Response
         with traverse:
             if body.grey_levels is not None:
                 traverse.keep_levels(body.grey_levels)
-            return TraverseAnswer.model_validate(traverse), created
+            return TraverseAnswer.model_validate(traverse.summary()), created
 
     answer, created = await run_sync(make)
     response.status_code = 201 if created else 200
@@ -148,7 +150,7 @@ async def list_traverses(
         answers = []
         for name in listed.records:  # a file each, so that those of other pages stay closed
             with suppress(UnknownTraverseError), Traverse.open(data_dir, domain, name) as traverse:
-                answers.append(TraverseAnswer.model_validate(traverse))
+                answers.append(TraverseAnswer.model_validate(traverse.summary()))
         return TraverseList(traverses=answers, next=page.next(listed.last_key))
 
     return await run_sync(described)
@@ -162,16 +164,16 @@ async def get_traverse(domain: DomainName, name: TraverseName, running: Running)
         running.catalog.domain(domain)
         data_dir = running.settings.data_dir
         with Traverse.open(data_dir, domain, name) as traverse:
-            answer, cameras = TraverseAnswer.model_validate(traverse), traverse.cameras
-        warnings = [*answer.warnings]
-        for other in Traverse.list(data_dir, domain) if cameras else ():
-            if other == name:
-                continue
-            with suppress(UnknownTraverseError), Traverse.open(data_dir, domain, other) as traverse:
-                whose = f"those of traverse {other}"
-                if (why := cameras[0].unlike(traverse.cameras[:1], whose)) is not None:
-                    warnings.append(f"its pictures are not like {whose}: {why}")
-        return answer.model_copy(update={"warnings": tuple(warnings)})
+            summary = traverse.summary()
+        warnings = [*summary.warnings]
+        for other in Traverse.list(data_dir, domain) if summary.cameras else ():
+            camera = None
+            with suppress(UnknownTraverseError):
+                camera = None if other == name else Traverse.main_camera(data_dir, domain, other)
+            whose = f"those of traverse {other}"
+            if camera is not None and (why := summary.cameras[0].unlike([camera], whose)) is not None:
+                warnings.append(f"its pictures are not like {whose}: {why}")
+        return TraverseAnswer.model_validate(replace(summary, warnings=tuple(warnings)))
 
     return await run_sync(described)
 
@@ -182,7 +184,7 @@ async def delete_traverse(domain: DomainName, name: TraverseName, running: Runni
 
     def delete() -> None:
         for job in running.catalog.jobs(domain):
-            needed = {job.config.get(role) for role in ("training_traverse", "landmark_traverse", "check_traverse")}
+            needed = {job.config.get(role) for role in TRAVERSE_ROLES}
             if name in needed and not job.state.is_final:
                 raise TraverseInUseError(
                     f"job {job.job_id} needs traverse {name}: cancel it or wait for its end", job_id=job.job_id

@@ -22,6 +22,7 @@ from deepsimbad.cli.terminal import (
 from deepsimbad.core.landmark_model import fitting_number
 from deepsimbad.core.map import DEFAULT_ACTIONS_M, check_actions
 from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Relevance
+from deepsimbad.engine.decoders import remarks_on_shape
 from deepsimbad.engine.localizer import localize as localize_view
 from deepsimbad.engine.maps import Maps
 from deepsimbad.engine.worker import EvaluatorPool, Stopwatch
@@ -29,7 +30,7 @@ from deepsimbad.errors import CancelledError, ImageTooLargeError, InvalidImageEr
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.compute import available_cores
 from deepsimbad.evaluators.grey_levels import levels_in
-from deepsimbad.evaluators.image import decode_image
+from deepsimbad.evaluators.image import decode_image, picture_size
 from deepsimbad.evaluators.registry import EvaluatorConfig, make_evaluator
 from deepsimbad.jobs.build import encode_recording
 from deepsimbad.jobs.remap import (
@@ -184,7 +185,7 @@ def _nothing_kept() -> Iterator[None]:
 @data_dir_option
 def localize(domain: str, images: tuple[Path, ...], rotate: int | None, as_json: bool) -> None:
     """Say where on the route each image was probably taken."""
-    from deepsimbad.api.localizations import remarks_on_shape, render_localization  # noqa: PLC0415 - as below
+    from deepsimbad.api.localizations import render_localization  # noqa: PLC0415 - as below
 
     settings = given_settings()
     with Catalog.open(existing_data_dir()) as catalog:
@@ -201,7 +202,7 @@ def localize(domain: str, images: tuple[Path, ...], rotate: int | None, as_json:
                 view = decode_image(body, settings.max_pixels, levels=levels)
             except (InvalidImageError, ImageTooLargeError) as error:
                 raise type(error)(f"{path}: {error.message}", **error.hints) from error
-            remarks = [] if rotate else remarks_on_shape(active.snapshot, body)
+            remarks = [] if rotate else remarks_on_shape(active.snapshot, picture_size(body))
             if rotate is not None:
                 view = turned(view, rotate)
             elif lies_on_its_side(path):

@@ -5,7 +5,7 @@ Live and after a restart it is moved on by the same function, so a journal leads
 
 import asyncio
 import math
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Awaitable, Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from functools import cached_property, partial
@@ -79,9 +79,9 @@ class SessionConfig:
 class Observation:
     """A move and the view after it, as a robot reports them."""
 
-    # Gives the view as the evaluator and the map it is given want it. Called in the session's turn: order is that of
-    # arrival
-    view: Callable[[Evaluator, Map], Awaitable[View]]
+    # Gives the view as the evaluator and the map it is given want it, and what a person should know of it. Called in
+    # the session's turn: order is that of arrival
+    view: Callable[[Evaluator, Map], Awaitable[tuple[View, Sequence[str]]]]
     action_m: float = 0.0  # metres moved since the last view; ignored for the first one
     action_std_m: float | None = None  # None: as usual
     n_shortlist: int | None = None  # length of the answer's lists; None: the usual one
@@ -257,6 +257,7 @@ class SessionView:
     is_confident: bool = False  # whether it is as sure of its place as was asked
     is_informative: bool = True  # whether the last view changed the belief
     is_repeated: bool = False  # whether the observation had been counted before
+    remarks: Sequence[str] = ()  # what a person should know of the view
 
 
 def view_of(live: LiveSession, expires_at: float, state: SessionState, n_shortlist: int | None = None) -> SessionView:

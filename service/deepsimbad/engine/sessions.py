@@ -6,7 +6,7 @@ import secrets
 import time
 from collections import Counter
 from collections.abc import Callable, Coroutine
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -325,15 +325,15 @@ class Sessions:
             engine = state.engine
             observation.check(engine.snapshot)  # a bad one should not move the session
             watch.lap("wait")
-            view = await observation.view(engine.evaluator, engine.snapshot)
+            view, remarks = await observation.view(engine.evaluator, engine.snapshot)
             watch.lap("decode")
             step = partial(self._step, live, state, observation, self._clock() + self._ttl_s, watch)
             try:
-                return await self._published(live, self._worker.look(engine.evaluator, view, step), watch)
+                answer = await self._published(live, self._worker.look(engine.evaluator, view, step), watch)
             except _CountedBefore as before:
                 answer = await self._repeated(live, state, before.sequence, observation.n_shortlist)
                 watch.lap("summarise")
-                return answer
+            return replace(answer, remarks=remarks) if remarks else answer
 
     def _step(
         self,
@@ -385,7 +385,11 @@ class Sessions:
             # Of the state before the row, so that a restart replays at least the last row and has its whole step.
             snapshot = before.snapshot()
         written = self._store.append(live.record.number, row, self._clock(), snapshot)
-        answer = view_of(live, row.expires_at, after, n_shortlist)
+        try:
+            answer = view_of(live, row.expires_at, after, n_shortlist)
+        except Exception as error:  # the row counts all the same, and is on the disk before the session is read again
+            wait([written])
+            raise RuntimeError("a session that moved cannot be summed up") from error
         watch.lap("summarise")
         return _Move(after, answer, written)
 

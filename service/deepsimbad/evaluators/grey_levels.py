@@ -6,7 +6,7 @@ views are shown by the same: docs/decisions/0025-grey-levels.md.
 """
 
 from collections.abc import Iterable
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,6 +53,14 @@ def shown(picture: NDArray[np.uint16], levels: GreyLevels) -> Image:
     black, white = levels
     table = np.clip((np.arange(DEEPEST + 1) - black) * 256 // (white + 1 - black), 0, 255).astype(np.uint8)
     return np.asarray(table[picture], np.uint8)
+
+
+def in_eight_bits(picture: NDArray[Any], levels: GreyLevels | None) -> tuple[Image, GreyLevels | None]:
+    """A picture of 8 bits as it is; one of more as 8, and by which levels: the given ones, else what suits it."""
+    if picture.dtype == np.uint8:
+        return picture, None
+    levels = levels or measured([picture])
+    return shown(picture, levels), levels
 
 
 def levels_in(model: LandmarkModel) -> GreyLevels | None:

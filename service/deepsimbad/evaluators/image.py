@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from deepsimbad.errors import InvalidImageError
 from deepsimbad.evaluators.base import Image, named_lack_of_memory
-from deepsimbad.evaluators.grey_levels import GreyLevels, measured, shown
+from deepsimbad.evaluators.grey_levels import GreyLevels, in_eight_bits
 from deepsimbad.evaluators.image_files import JPEG, ImageFile, truncated
 
 KEPT_PIXELS = 3840 * 2160
@@ -60,10 +60,7 @@ def decode_file(file: ImageFile, *, as_stored: bool = False, levels: GreyLevels 
         InvalidImageError: It is damaged; TruncatedImageError where a part of its picture is missing.
         OutOfMemoryError: There is too little memory for it.
     """
-    pixels = decode_deep(file, as_stored=as_stored)
-    if pixels.dtype == np.uint8:
-        return np.asarray(pixels, np.uint8)
-    return shown(pixels, levels or measured([pixels]))
+    return in_eight_bits(decode_deep(file, as_stored=as_stored), levels)[0]
 
 
 def decode_deep(file: ImageFile, *, as_stored: bool = False) -> NDArray[Any]:

@@ -38,8 +38,8 @@ from deepsimbad.store.sessions import ObservedRow, SessionRecord, SessionStore
 
 EXPERIENCE = "experience"  # the kind of job
 LEARN_STAGES = {"read map": 1.0, "learn": 2.0, "seal": 1.0, "activate": 0.1}
-# Traverses of the server where a map was made: one of the same name here would be another drive.
-_NAMES_THERE = ("training_traverse", "landmark_traverse", "check_traverse")
+TRAVERSE_ROLES = ("training_traverse", "landmark_traverse", "check_traverse")
+"""In a remap's configuration, whose names are those of one server: elsewhere they would be other drives."""
 
 
 def seal_version(
@@ -274,7 +274,7 @@ def import_map(
     digest, map_ = _read(file, sha256)
     measured = {"n_map_images": map_.n_images, "index_bits_per_map_image": map_.index_bits_per_map_image}
     config = {name: value for name, value in map_.config.items() if name != "appended"}
-    config |= dict.fromkeys(_NAMES_THERE)
+    config |= dict.fromkeys(TRAVERSE_ROLES)
     config["imported"] = {"domain": map_.domain, "version": map_.version, "sha256": digest}
     name = map_.domain if domain is None else domain
     _, is_new = catalog.create_domain(name, dict(map_.evaluator), map_.closed, map_.actions_m.tolist())

@@ -7,7 +7,7 @@ from concurrent.futures import Future
 from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 from queue import SimpleQueue
-from typing import Any, Self, TypeVar
+from typing import Any, Self, TypeAlias, TypeVar
 
 from sqlite_utils import Database, Migrations
 
@@ -15,6 +15,7 @@ from deepsimbad.errors import DamagedFileError, DeepSimbadError, UnavailableErro
 from deepsimbad.store.durable import storage_faults
 
 T = TypeVar("T")
+FileState: TypeAlias = tuple[int, ...]
 
 MAX_BATCH = 256  # writes in one transaction
 _STRANGE_SCHEMA = "SELECT 1 FROM sqlite_schema WHERE type NOT IN ('table', 'index') OR rootpage = 0 LIMIT 1"
@@ -50,22 +51,22 @@ def look_at(path: Path, ask: Callable[[Database], T]) -> T:
     A file whose log is empty is read as one that does not change, which works on a read-only disk too, and is read
     again where it has changed meanwhile.
     """
-    before = _state(path)
+    before = file_state(path)
     if before[-1] == 0:
         try:
             with open_database(path, immutable=True) as db:
                 answer = ask(db)
         except BaseException:
-            if _state(path) == before:
+            if file_state(path) == before:
                 raise
         else:
-            if _state(path) == before:
+            if file_state(path) == before:
                 return answer
     with open_database(path, read_only=True) as db:
         return ask(db)
 
 
-def _state(path: Path) -> tuple[int, ...]:
+def file_state(path: Path) -> FileState:
     """What changes with every write: the file's inode, size and time, and the size of its log."""
     file, log = path.stat(), path.with_name(f"{path.name}-wal")
     return file.st_ino, file.st_size, file.st_mtime_ns, log.stat().st_size if log.exists() else 0

@@ -6,6 +6,8 @@ import hashlib
 import os
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from functools import lru_cache
 from itertools import repeat
 from pathlib import Path
 from typing import Any, Self
@@ -21,6 +23,7 @@ from deepsimbad.errors import (
     ConflictError,
     DamagedFileError,
     FramesDifferError,
+    GreyLevelsDifferError,
     InvalidEncodingError,
     UnknownDomainError,
     UnknownTraverseError,
@@ -29,14 +32,36 @@ from deepsimbad.errors import (
 )
 from deepsimbad.store import layout
 from deepsimbad.store.arrays import is_halvable
-from deepsimbad.store.connection import OpenFile, open_database, open_working_file, write_transaction
+from deepsimbad.store.connection import (
+    FileState,
+    OpenFile,
+    file_state,
+    open_database,
+    open_working_file,
+    write_transaction,
+)
 from deepsimbad.store.durable import lock_folder, remove_database, storage_faults, sync
 from deepsimbad.store.records import now, to_json
 from deepsimbad_migrations.traverse.migrations import migrations
 
 _NAMED_INDICES = 100  # most that an error names
-IndexRanges = list[tuple[int, int]]  # the class has a `list` of its own
 _DTYPE_OF_BYTES = {2.0: "<f2", 4.0: "<f4"}  # by the bytes of one number
+
+
+@dataclass(frozen=True)
+class TraverseSummary:
+    """A traverse and what of it has arrived."""
+
+    name: str
+    n_frames: int
+    missing: list[tuple[int, int]]  # ranges [first, last] of indices below the greatest that have no frame
+    length_m: float | None  # from the least position to the greatest; None before the first frame
+    span_us: tuple[int, int] | None  # the first and the last known time of a frame
+    digest: str | None  # SHA-256 in hex of all that its frames are known by; None: none are there, or one is unknown
+    n_uninformative: int  # frames whose pictures show nothing
+    grey_levels: tuple[int, int] | None  # what is shown black and white of more than 8 bits; None: nobody said yet
+    cameras: tuple[Camera, ...]  # which took its pictures, the one of most first
+    warnings: tuple[str, ...]  # what a person should know of its pictures, in sentences
 
 
 class Traverse(OpenFile):
@@ -111,6 +136,15 @@ class Traverse(OpenFile):
                 return []
             return sorted(path.stem for path in folder.iterdir() if path.suffix == ".sqlite")
 
+    @classmethod
+    def main_camera(cls, data_dir: Path, domain: str, name: str) -> Camera | None:
+        """Which camera took most of its pictures; raises UnknownTraverseError. An unchanged file is opened once."""
+        path = layout.traverse_path(data_dir, domain, name)
+        with storage_faults(path):
+            if not path.is_file():
+                raise _unknown(data_dir, domain, name)
+            return _main_camera(data_dir, domain, name, file_state(path))
+
     def _gone(self) -> UnknownTraverseError:
         return UnknownTraverseError(f"traverse {self.name} was deleted")
 
@@ -128,6 +162,7 @@ class Traverse(OpenFile):
         replace: bool = True,
         shows_nothing: bool = False,
         camera: Camera | None = None,
+        grey_levels: tuple[int, int] | None = None,
     ) -> bool:
         """As `put_frames` with one frame, of which None is unknown; answers whether it is new."""
         frames = Drive(
@@ -141,6 +176,7 @@ class Traverse(OpenFile):
             camera=camera,
             encodings=np.asarray(encoding, np.float32)[np.newaxis],
             weights_sha256=weights_sha256,
+            grey_levels=grey_levels,
             shows_nothing=np.array([shows_nothing]),
         )
         return self.put_frames(frames, replace)[0] == 1
@@ -159,6 +195,7 @@ class Traverse(OpenFile):
             InvalidRouteError: A position is NaN or infinite.
             InvalidEncodingError: An encoding is not finite, or of another length than those of the traverse.
             WeightsDifferError: The traverse holds frames that other weights encoded.
+            GreyLevelsDifferError: The traverse's pictures are shown by other grey levels.
             FramesDifferError: None may be replaced, and some would be.
             UnknownTraverseError: The traverse was deleted meanwhile.
         """
@@ -168,8 +205,9 @@ class Traverse(OpenFile):
         if frames.n_frames == 0:
             return 0, 0
         with self._writing() as db:
+            rows = np.arange(frames.n_frames)  # that are written
             if not replace:
-                frames = frames.at(np.flatnonzero(~np.isin(frames.index, self._equal(db, frames))))
+                rows = rows[~np.isin(frames.index, self._equal(db, frames))]
             n_before, dim = _count(db), frames.encodings.shape[1]
             present_dim, weights_sha256 = self._described(db)
             if present_dim not in {None, dim}:
@@ -181,24 +219,34 @@ class Traverse(OpenFile):
                 "UPDATE traverse SET encoding_dim = ?, weights_sha256 = coalesce(?, weights_sha256)",
                 [dim, frames.weights_sha256],
             )
-            content = frames.content_digest.view(np.int64)  # SQLite's integers have a sign
-            places = (frames.index, frames.position_m, frames.timestamp_us, frames.x_m, frames.y_m)
+            if frames.grey_levels is not None:
+                _keep_levels(db, frames.grey_levels)
+                if (kept := _levels(db)) != frames.grey_levels:
+                    raise GreyLevelsDifferError(
+                        f"pictures of this traverse are shown by the grey levels {kept}, these by {frames.grey_levels}",
+                        grey_levels=kept,
+                    )
+            columns = (
+                *(frames.index, frames.position_m, frames.timestamp_us, frames.x_m, frames.y_m, frames.frame_name),
+                frames.content_digest.view(np.int64),  # SQLite's integers have a sign
+                frames.shows_nothing.astype(np.int64),
+            )
             camera = frames.camera
             taken_by = (None,) * 3 if camera is None else (camera.name, camera.width, camera.height)
             db.conn.executemany(  # NaN becomes NULL
                 """
-                INSERT INTO frame (frame_index, position_m, timestamp_us, x_m, y_m, name, content_digest, camera,
-                    image_width, image_height)
-                VALUES (?, ?, nullif(?, -1), ?, ?, nullif(?, ''), ?, ?, ?, ?)
+                INSERT INTO frame (frame_index, position_m, timestamp_us, x_m, y_m, name, content_digest, shows_nothing,
+                    camera, image_width, image_height)
+                VALUES (?, ?, nullif(?, -1), ?, ?, nullif(?, ''), ?, ?, ?, ?, ?)
                 ON CONFLICT (frame_index) DO UPDATE SET position_m = excluded.position_m,
                     timestamp_us = excluded.timestamp_us, x_m = excluded.x_m, y_m = excluded.y_m,
                     name = excluded.name, content_digest = excluded.content_digest,
-                    camera = excluded.camera, image_width = excluded.image_width, image_height = excluded.image_height
+                    shows_nothing = excluded.shows_nothing, camera = excluded.camera,
+                    image_width = excluded.image_width, image_height = excluded.image_height
                 """,
                 zip(
-                    *(values.tolist() for values in places),
-                    *(map(str, frames.frame_name), map(int, content)),
-                    *(repeat(value, frames.n_frames) for value in taken_by),
+                    *(map(values.item, rows) for values in columns),
+                    *(repeat(value, rows.size) for value in taken_by),
                     strict=True,
                 ),
             )
@@ -207,18 +255,10 @@ class Traverse(OpenFile):
                 INSERT INTO encoding (frame_index, body) VALUES (?, ?)
                 ON CONFLICT (frame_index) DO UPDATE SET body = excluded.body
                 """,
-                (
-                    (index, encoding.astype("<f2" if is_halvable(encoding) else "<f4").tobytes())
-                    for index, encoding in zip(frames.index.tolist(), frames.encodings, strict=True)
-                ),
+                ((int(frames.index[row]), _packed(frames.encodings[row])) for row in rows),
             )
-            db.conn.executemany(
-                "UPDATE frame SET shows_nothing = ? WHERE frame_index = ?",
-                zip(frames.shows_nothing.astype(int).tolist(), frames.index.tolist(), strict=True),
-            )
-            _keep_levels(db, frames.grey_levels)
             n_new = _count(db) - n_before
-        return n_new, frames.n_frames - n_new
+        return n_new, rows.size - n_new
 
     def _equal(self, db: Database, frames: Drive) -> NDArray[np.int64]:
         """The indices of those frames that are there already; raises FramesDifferError where one is another."""
@@ -253,62 +293,38 @@ class Traverse(OpenFile):
         with self._reading() as db:
             return self._described(db)[0]
 
-    @property
-    def cameras(self) -> tuple[Camera, ...]:
-        """Those that took its pictures, the one of most first."""
+    def summary(self) -> "TraverseSummary":
+        """What has arrived, of one moment; reads no encodings."""
         with self._reading() as db:
-            return _cameras(db)
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """What a person should know of its pictures, in sentences."""
-        cameras = self.cameras
-        unlike = (camera.unlike(cameras[:1], "most") for camera in cameras[1:])
-        return tuple(f"some of its pictures are not like the others: {why}" for why in unlike if why is not None)[:1]
-
-    @property
-    def length_m(self) -> float | None:
-        """From the least position to the greatest; None before the first frame."""
-        with self._reading() as db:
-            (length_m,) = db.execute("SELECT max(position_m) - min(position_m) FROM frame").fetchone()
-            return None if length_m is None else float(length_m)
-
-    @property
-    def span_us(self) -> tuple[int, int] | None:
-        """The first and the last known time of a frame; None where none is known."""
-        with self._reading() as db:
-            first, last = db.execute("SELECT min(timestamp_us), max(timestamp_us) FROM frame").fetchone()
-            return None if first is None else (first, last)
-
-    @property
-    def digest(self) -> str | None:
-        """SHA-256 in hex of all that its frames are known by; None where there are none, or a content is unknown."""
-        known = self.known()
-        if not known["index"].size or (known["content_digest"] == UNKNOWN_CONTENT).any():
-            return None
-        digest = hashlib.sha256()
-        for array in known.values():
-            digest.update(array.astype(array.dtype.newbyteorder("<")).tobytes())
-        return digest.hexdigest()
-
-    @property
-    def missing(self) -> IndexRanges:
-        """The ranges [first, last] of indices below the greatest that have no frame."""
-        with self._reading() as db:
-            rows = db.execute(
+            n_frames, n_uninformative, length_m, *span_us = db.execute(
+                """
+                SELECT count(*), count(nullif(shows_nothing, 0)), max(position_m) - min(position_m),
+                    min(timestamp_us), max(timestamp_us)
+                FROM frame
+                """
+            ).fetchone()
+            missing = db.execute(
                 """
                 SELECT previous + 1, frame_index - 1 FROM (
                     SELECT lag(frame_index, 1, -1) OVER (ORDER BY frame_index) AS previous, frame_index FROM frame
                 ) WHERE frame_index > previous + 1 ORDER BY frame_index
                 """
+            ).fetchall()
+            cameras = _cameras(db)
+            unlike = (camera.unlike(cameras[:1], "most") for camera in cameras[1:])
+            whys = [f"some of its pictures are not like the others: {why}" for why in unlike if why is not None]
+            return TraverseSummary(
+                name=self.name,
+                n_frames=n_frames,
+                missing=missing,
+                length_m=length_m,
+                span_us=None if span_us[0] is None else (span_us[0], span_us[1]),
+                digest=_digest(_known(db)),
+                n_uninformative=n_uninformative,
+                grey_levels=_levels(db),
+                cameras=cameras,
+                warnings=tuple(whys[:1]),
             )
-            return [(first, last) for first, last in rows]
-
-    @property
-    def n_uninformative(self) -> int:
-        """How many frames are pictures that show nothing."""
-        with self._reading() as db:
-            return len(_blanks(db))
 
     @property
     def grey_levels(self) -> tuple[int, int] | None:
@@ -326,20 +342,20 @@ class Traverse(OpenFile):
         """All frames in index order; one array of encodings, no copy beside it."""
         with self._reading() as db:
             n, (dim, weights_sha256), cameras = _count(db), self._described(db), _cameras(db)
-            levels, blanks = _levels(db), _blanks(db)
-            places = np.empty((n, 3))
-            index, timestamp_us = np.empty(n, np.int64), np.empty(n, np.int64)
+            levels, places = _levels(db), np.empty((n, 3))
+            index, timestamp_us, blank = np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n, np.bool_)
             encodings = np.empty((n, dim or 0), np.float32)
             names: list[str] = []  # the class has a `list` of its own
             rows = db.execute(
                 """
-                SELECT frame.frame_index, coalesce(timestamp_us, ?), coalesce(name, ''), position_m, x_m, y_m, body
+                SELECT frame.frame_index, coalesce(timestamp_us, ?), coalesce(name, ''),
+                    coalesce(shows_nothing, 0), position_m, x_m, y_m, body
                 FROM frame LEFT JOIN encoding ON encoding.frame_index = frame.frame_index
                 ORDER BY frame.frame_index
                 """,
                 [UNKNOWN_TIMESTAMP],
             )
-            for row, (frame_index, moment_us, name, *place, body) in enumerate(rows):
+            for row, (frame_index, moment_us, name, shows_nothing, *place, body) in enumerate(rows):
                 dtype = _DTYPE_OF_BYTES.get(len(body or b"") / (dim or 1))  # a single number would be broadcast
                 if dtype is None:
                     raise DamagedFileError(
@@ -348,12 +364,13 @@ class Traverse(OpenFile):
                     )
                 names.append(name)
                 index[row], timestamp_us[row], places[row] = frame_index, moment_us, place  # None becomes NaN
+                blank[row] = shows_nothing
                 encodings[row] = np.frombuffer(body, dtype)
         position_m, x_m, y_m = places.T.copy()
         return Drive(
             name=self.name, camera=next(iter(cameras), None), index=index, position_m=position_m,
             timestamp_us=timestamp_us, x_m=x_m, y_m=y_m, frame_name=np.array(names, np.str_), encodings=encodings,
-            weights_sha256=weights_sha256, grey_levels=levels, shows_nothing=np.isin(index, blanks),
+            weights_sha256=weights_sha256, grey_levels=levels, shows_nothing=blank,
         )  # fmt: skip
 
     def _described(self, db: Database) -> tuple[int | None, str | None]:
@@ -397,8 +414,19 @@ def _keep_levels(db: Database, levels: tuple[int, int] | None) -> None:
         db.execute("UPDATE traverse SET black = ?, white = ? WHERE black IS NULL", list(levels))
 
 
-def _blanks(db: Database) -> list[int]:
-    return [index for (index,) in db.execute("SELECT frame_index FROM frame WHERE shows_nothing")]
+def _digest(known: dict[str, NDArray[Any]]) -> str | None:
+    if not known["index"].size or (known["content_digest"] == UNKNOWN_CONTENT).any():
+        return None
+    digest = hashlib.sha256()
+    for array in known.values():
+        digest.update(array.astype(array.dtype.newbyteorder("<")).tobytes())
+    return digest.hexdigest()
+
+
+@lru_cache(maxsize=4096)
+def _main_camera(data_dir: Path, domain: str, name: str, _: FileState) -> Camera | None:
+    with Traverse.open(data_dir, domain, name) as traverse:
+        return next(iter(traverse.summary().cameras), None)
 
 
 def _cameras(db: Database) -> tuple[Camera, ...]:
@@ -409,6 +437,10 @@ def _cameras(db: Database) -> tuple[Camera, ...]:
         """
     )
     return tuple(Camera(*row) for row in rows)
+
+
+def _packed(encoding: NDArray[np.float32]) -> bytes:
+    return encoding.astype("<f2" if is_halvable(encoding) else "<f4").tobytes()
 
 
 def _count(db: Database) -> int:

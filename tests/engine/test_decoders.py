@@ -1,0 +1,105 @@
+"""Images decoded beside the event loop: how many at once, and who waits for whom."""
+
+import asyncio
+import threading
+
+import cv2
+import numpy as np
+import pytest
+
+from deepsimbad.engine.decoders import Decoders
+from deepsimbad.engine.worker import Priority
+from deepsimbad.errors import ImageTooLargeError, OverloadedError, UnsupportedMediaTypeError
+from deepsimbad.evaluators.feature_l2 import FeatureL2
+from deepsimbad.evaluators.image import KEPT_PIXELS
+
+USUAL = cv2.imencode(".png", np.arange(192, dtype=np.uint8).reshape(8, 8, 3))[1].tobytes()
+BLANK = cv2.imencode(".png", np.full((8, 8, 3), 90, np.uint8))[1].tobytes()
+LARGE = cv2.imencode(".png", np.full((2161, 3840, 3), 90, np.uint8))[1].tobytes()
+EYES = FeatureL2("gradient_grid")
+pytestmark = pytest.mark.anyio
+
+
+@pytest.fixture
+def anyio_backend():
+    return "asyncio"
+
+
+async def until(met):
+    for _ in range(6000):
+        if met():
+            return
+        await asyncio.sleep(0.01)
+    raise AssertionError("it did not come about")
+
+
+class Slow:
+    """An evaluator that holds every image, in its decoder's thread, until it is let go."""
+
+    def __init__(self):
+        self.held = []
+        self.most = 0
+        self.go = threading.Event()
+        self._lock = threading.Lock()
+
+    def load(self):
+        pass
+
+    def prepare(self, image):
+        with self._lock:
+            self.held.append(image.shape)
+            self.most = max(self.most, len(self.held))
+        self.go.wait()
+        with self._lock:
+            self.held.remove(image.shape)
+        return image
+
+
+@pytest.fixture
+def slow():
+    slow = Slow()
+    yield slow
+    slow.go.set()
+
+
+async def shape_of(decoders, body, eyes=EYES, priority=Priority.LIVE):
+    decoded = await decoders.decoded(body, eyes, priority, None)
+    return decoded.image.shape
+
+
+async def test_few_images_are_held_at_full_size_and_live_views_have_places_of_their_own(slow):
+    decoders = Decoders(2 * KEPT_PIXELS)
+    batch = [asyncio.create_task(shape_of(decoders, USUAL, slow, Priority.BATCH)) for _ in range(6)]
+    await until(lambda: len(slow.held) == 2)
+    assert await shape_of(decoders, USUAL) == (128, 128, 3)
+    assert len(slow.held) == 2
+    slow.go.set()
+    assert await asyncio.gather(*batch) == [(8, 8, 3)] * 6
+    assert slow.most == 2
+
+
+async def test_large_images_wait_for_each_other_and_usual_ones_for_none_of_them(slow):
+    decoders = Decoders(2 * KEPT_PIXELS)
+    n_taken = 1 + Decoders.LARGE_WAITING  # one has its turn
+    large = [asyncio.create_task(shape_of(decoders, LARGE, slow)) for _ in range(n_taken + 3)]
+    await until(lambda: sum(task.done() for task in large) == 3)
+    assert await shape_of(decoders, USUAL) == (128, 128, 3)
+    await until(lambda: slow.held == [(1080, 1920, 3)])
+    slow.go.set()
+    answers = await asyncio.gather(*large, return_exceptions=True)
+    assert [answer.hints["retry_after_s"] for answer in answers if isinstance(answer, OverloadedError)] == [1] * 3
+    assert answers.count((1080, 1920, 3)) == n_taken
+    assert slow.most == 1
+
+
+async def test_a_refused_image_takes_no_place_and_what_shows_nothing_is_known_as_it_was_sent():
+    decoders = Decoders(64)
+    for _ in range(8):
+        with pytest.raises(ImageTooLargeError):
+            await decoders.decoded(LARGE, EYES, Priority.LIVE, None)
+        with pytest.raises(UnsupportedMediaTypeError):
+            await decoders.decoded(USUAL, FeatureL2("none"), Priority.LIVE, None)
+    assert [(await decoders.decoded(body, EYES, Priority.LIVE, None)).is_blank for body in (BLANK, USUAL)] == [
+        True,
+        False,
+    ]
