@@ -98,6 +98,10 @@ class TooFewCandidatesError(InvalidMapConfigError, code="too_few_candidates"):
     """Fewer landmark candidates than landmarks asked for."""
 
 
+class TooFewToFitError(InvalidMapConfigError, code="too_few_to_fit"):
+    """Fewer landmarks or frames than an evaluator can be fitted to."""
+
+
 class InvalidSourceError(InvalidInputError, code="invalid_source"):
     """A recording that cannot be read."""
 
@@ -207,6 +211,10 @@ class WeightsDifferError(ConflictError, code="weights_differ"):
                 known_weights_sha256=known,
                 given_weights_sha256=given,
             )
+
+
+class SpoolFullError(ConflictError, code="spool_full"):
+    """Images that wait to be fitted take all the room that they may."""
 
 
 class LandmarkModelDiffersError(ConflictError, code="landmark_model_differs"):

@@ -5,10 +5,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from deepsimbad.errors import InvalidEncodingError, InvalidImageError, UnsupportedMediaTypeError
+from deepsimbad.core.composed import Moments, is_composed, unit_encodings
+from deepsimbad.errors import (
+    CancelledError,
+    InvalidEncodingError,
+    InvalidImageError,
+    TooFewToFitError,
+    UnsupportedMediaTypeError,
+)
+from deepsimbad.evaluators.base import Fitting, Lesson
 from deepsimbad.evaluators.compute import Compute, Runtime
 from deepsimbad.evaluators.feature_l2 import FeatureL2
-from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
+from deepsimbad.evaluators.registry import EvaluatorKind, evaluator_config, make_evaluator
+from deepsimbad.evaluators.space import seen
 
 from .references import random_network, random_squeezenet, write_caffe, write_matlab
 from .test_onnx_file import model
@@ -16,6 +25,8 @@ from .test_onnx_file import model
 EXTRACTORS = (
     *("efficientnet_lite0", "gradient_grid", "squeezenet:small.npz", "netvlad:small.mat", "onnx:small.onnx", "none"),
 )
+KINDS = [("feature_l2", extractor) for extractor in EXTRACTORS]
+KINDS += [(kind.value, name) for kind in EvaluatorKind if kind != "feature_l2" for name in ("gradient_grid", "none")]
 
 
 @pytest.fixture(scope="module")
@@ -28,11 +39,15 @@ def small_weights(tmp_path_factory):
     return folder
 
 
-@pytest.fixture(params=EXTRACTORS, scope="module")
+@pytest.fixture(params=KINDS, ids=":".join, scope="module")
 def evaluator(request, small_weights):
     """One a module: loading a network takes longer than all the laws."""
-    compute = Compute(Runtime.TORCH, weights_dir=small_weights)
-    return make_evaluator(evaluator_config({"kind": "feature_l2", "extractor": request.param}), compute)
+    compute, (kind, extractor) = Compute(Runtime.TORCH, weights_dir=small_weights), request.param
+    return make_evaluator(evaluator_config({"kind": kind, "extractor": extractor}), compute)
+
+
+def _fitted(evaluator, landmarks):
+    return evaluator.fit(Lesson.of_landmarks(landmarks)).model
 
 
 def _images(n, seed=0):
@@ -87,34 +102,39 @@ def test_what_is_no_image_is_refused(evaluator, wrong):
 
 
 def test_dissimilarities_against_every_landmark(evaluator):
-    landmarks, scenes = _encodings(evaluator, 9, 1), _encodings(evaluator, 5, 2)
-    model = evaluator.fit_landmarks(landmarks)
+    landmarks, scenes = _encodings(evaluator, 12, 1), _encodings(evaluator, 5, 2)
+    model = _fitted(evaluator, landmarks)
+    evaluator.check_model(model, 12)
     answer = evaluator.dissimilarities(scenes, model)
-    assert answer.shape == (5, 9)
+    assert answer.shape == (5, 12)
+    assert np.isfinite(answer).all()
     assert answer.dtype == np.float32
     assert (answer >= 0).all()
     assert all(isinstance(name, str) and isinstance(array, np.ndarray) for name, array in model.items())
 
 
 def test_a_landmark_is_nearest_to_itself(evaluator):
-    landmarks = _encodings(evaluator, 9, 1)
-    answer = evaluator.dissimilarities(landmarks, evaluator.fit_landmarks(landmarks))
-    np.testing.assert_array_equal(answer.argmin(axis=1), np.arange(9))
-    assert np.diag(answer).max() < 1e-9
+    landmarks = _encodings(evaluator, 9 if evaluator.is_squared_l2 else 12, 1)
+    answer = evaluator.dissimilarities(landmarks, _fitted(evaluator, landmarks))
+    if evaluator.is_squared_l2:
+        np.testing.assert_array_equal(answer.argmin(axis=1), np.arange(9))
+        assert np.diag(answer).max() < 1e-9
+    else:  # what is fitted takes neighbouring frames for one place, which random ones are not
+        assert (np.diag(answer) < np.median(answer, axis=1)).all()
 
 
 def test_a_scene_is_compared_the_same_alone_and_in_company(evaluator):
-    model = evaluator.fit_landmarks(_encodings(evaluator, 20, 1))
+    model = _fitted(evaluator, _encodings(evaluator, 20, 1))
     scenes = _encodings(evaluator, 2100, 2) if not evaluator.takes_images else _encodings(evaluator, 20, 2)
     together = evaluator.dissimilarities(scenes, model)
     for k in range(0, len(scenes), 7):
         alone = evaluator.dissimilarities(scenes[k : k + 1], model)[0]
-        np.testing.assert_allclose(alone, together[k], rtol=2e-7)
+        np.testing.assert_allclose(alone, together[k], rtol=2e-7 if evaluator.is_squared_l2 else 2e-3, atol=1e-6)
 
 
 def test_the_model_survives_a_copy_of_its_arrays_and_of_the_encodings(evaluator):
-    landmarks, scenes = _encodings(evaluator, 6, 1), _encodings(evaluator, 4, 2)
-    model = evaluator.fit_landmarks(landmarks)
+    landmarks, scenes = _encodings(evaluator, 12, 1), _encodings(evaluator, 4, 2)
+    model = _fitted(evaluator, landmarks)
     before = evaluator.dissimilarities(scenes, model)
     landmarks[:] = 0  # the caller's array is the caller's
     copied = {name: array.copy() for name, array in model.items()}
@@ -122,8 +142,8 @@ def test_the_model_survives_a_copy_of_its_arrays_and_of_the_encodings(evaluator)
 
 
 def test_bad_encodings_are_refused(evaluator):
-    landmarks = _encodings(evaluator, 4, 1)
-    model = evaluator.fit_landmarks(landmarks)
+    landmarks = _encodings(evaluator, 12, 1)
+    model = _fitted(evaluator, landmarks)
     short, holed, huge = landmarks[:, :-1], landmarks.copy(), np.full_like(landmarks, 3e38)
     holed[2, 1] = np.nan
     for bad in (short, holed, huge, landmarks[0]):
@@ -131,7 +151,98 @@ def test_bad_encodings_are_refused(evaluator):
             evaluator.dissimilarities(bad, model)
     for bad in (holed, landmarks[:0], landmarks[0]):
         with pytest.raises(InvalidEncodingError):
-            evaluator.fit_landmarks(bad)
+            _fitted(evaluator, bad)
+
+
+def test_a_composed_model_compares_unit_vectors_of_what_stands_for_encodings(evaluator):
+    landmarks, scenes = _encodings(evaluator, 12, 1), _encodings(evaluator, 5, 2)
+    model = dict(_fitted(evaluator, landmarks))
+    assert seen(evaluator, scenes, model)[1] is scenes, "a map that composes nothing compares encodings as they are"
+    stands_for = evaluator.compared(scenes, model)
+    if evaluator.is_squared_l2:
+        assert stands_for is scenes
+    else:
+        np.testing.assert_array_equal(stands_for, evaluator.dissimilarities(scenes, model))
+    usual = Moments.of(evaluator.compared(landmarks, model))
+    units = unit_encodings(evaluator.compared(landmarks, model), usual, None)
+    model |= {"usual": usual.mean_std(), "prototypes": units}
+    assert is_composed(model)
+    evaluator.check_model(model, 12)
+    expected = np.square(unit_encodings(stands_for, usual, None)[:, np.newaxis] - units).sum(axis=2)
+    np.testing.assert_allclose(evaluator.dissimilarities(scenes, model), expected, atol=1e-4)
+    for answer in seen(evaluator, scenes, model):
+        assert answer.shape[0] == 5
+    with pytest.raises(InvalidEncodingError):
+        evaluator.check_model({**model, "prototypes": units[:-1]}, 12)
+
+
+def test_a_model_of_another_kind_or_number_is_refused_by_name(evaluator):
+    landmarks = _encodings(evaluator, 12, 1)
+    with pytest.raises(InvalidEncodingError):
+        evaluator.check_model(_fitted(evaluator, landmarks), 11)
+    with pytest.raises(InvalidEncodingError):
+        evaluator.check_model({"others": landmarks}, 12)
+
+
+def _route(n=60, d=24, seed=0):
+    """A drive, another season of it, and views of it: places drift along the route, seasons add noise and a shift."""
+    rng = np.random.default_rng(seed)
+    places = rng.normal(size=(n, d))
+    season = places + 0.5 * rng.normal(size=(n, d)) + rng.normal(size=d)
+    views = places[:, np.newaxis] + 0.4 * rng.normal(size=(n, 4, d))
+    return (array.astype(np.float32) for array in (places, season, views))
+
+
+@pytest.mark.parametrize("kind", [kind for kind in EvaluatorKind if kind != "feature_l2"])
+def test_what_is_fitted_learns_from_a_second_season_and_is_the_same_again(kind):
+    evaluator = make_evaluator(evaluator_config({"kind": kind.value, "extractor": "none"}))
+    assert evaluator.fitting is not Fitting.NOTHING
+    places, season, views = _route()
+    landmarks, pairs = np.arange(0, 60, 2), np.column_stack([np.arange(60)] * 2)
+    lesson = Lesson(places, landmarks, np.arange(60.0), season, pairs, views[landmarks], seed=3)
+    fitted, again = evaluator.fit(lesson), evaluator.fit(lesson)
+    for name, array in fitted.model.items():
+        np.testing.assert_array_equal(array, again.model[name])
+    scored = fitted.metrics["held_out"][kind.value]
+    assert scored["anr"] < 10, "of a place that it did not see, seen in another season"
+    assert scored["n_queries"] > 0
+    assert fitted.metrics["n_dissimilarities"] > 1000
+    nearest = evaluator.dissimilarities(season[landmarks], fitted.model).argmin(axis=1)
+    assert (nearest == np.arange(30)).mean() > 0.9
+    other = make_evaluator(evaluator_config({"kind": "feature_l2", "extractor": "none"}))
+    with pytest.raises(InvalidEncodingError):
+        other.check_model(fitted.model, 30)
+
+
+@pytest.mark.parametrize("kind", [EvaluatorKind.SIAMESE, EvaluatorKind.AUTOENCODER])
+def test_training_is_cancelled_between_batches_and_asks_for_frames_enough(kind):
+    evaluator = make_evaluator(evaluator_config({"kind": kind.value, "extractor": "none"}))
+    places, *_ = _route()
+    shares = []
+
+    def cancel(share):
+        shares.append(share)
+        if share > 0.3:
+            raise CancelledError("cancelled")
+
+    with pytest.raises(CancelledError):
+        evaluator.fit(Lesson(places, np.arange(60), on_progress=cancel))
+    assert len(shares) > 5
+    assert shares == sorted(shares)
+    with pytest.raises(TooFewToFitError, match="feature_l2"):
+        evaluator.fit(Lesson.of_landmarks(places[:9]))
+
+
+def test_a_fitted_model_that_is_no_better_than_plain_l2_says_so():
+    evaluator = make_evaluator(evaluator_config({"kind": "siamese", "extractor": "none"}))
+    noise = np.random.default_rng(0).normal(size=(2, 60, 24)).astype(np.float32)
+    pairs = np.column_stack([np.arange(60)] * 2)
+    fitted = evaluator.fit(Lesson(noise[0], np.arange(60), None, noise[1], pairs, seed=1))
+    scores = fitted.metrics["held_out"]
+    assert bool(fitted.warnings) == (scores["siamese"]["anr"] >= scores["l2"]["anr"])
+    same = np.repeat(np.eye(24, dtype=np.float32), 3, axis=0)  # nothing to win: plain L2 is perfect
+    warnings = evaluator.fit(Lesson(same, np.arange(72), None, same, np.column_stack([np.arange(72)] * 2))).warnings
+    assert [warning.partition(":")[0] for warning in warnings] == ["siamese_no_better"]
 
 
 @settings(max_examples=40, deadline=None)

@@ -33,6 +33,7 @@ from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.registry import EvaluatorConfig, make_evaluator
 from deepsimbad.jobs.build import EncodedRecording, encode_recording
 from deepsimbad.jobs.calibration import VIEWS, CalibrationConfig, calibration_stages, run_calibration
+from deepsimbad.jobs.fitting import Pictures, RecordingPictures
 from deepsimbad.jobs.nbv import NbvConfig, NbvReport, nbv_stages, run_nbv
 from deepsimbad.jobs.passive import WINDOWS, PassiveScores
 from deepsimbad.jobs.progress import Progress
@@ -153,9 +154,9 @@ def vpr(
             config = replace(config, n_landmarks=read.n_landmarks)
             landmarks, training, test = read.drives
             truth = true_images(test, training, tolerance, ground_truth)
-            report = run_vpr(config, read.evaluator, landmarks, training, read.test, truth, progress)
+            report = run_vpr(*(config, read.evaluator, landmarks, training, read.test, truth, progress), read.pictures)
         sources = {**read.sources, "ground_truth": None if ground_truth is None else str(ground_truth)}
-        documents[extractor] = {**report.as_dict(sources), "warnings": read.warnings}
+        documents[extractor] = {**report.as_dict(sources), "warnings": [*read.warnings, *report.warnings]}
         reports[extractor] = report
     if len(reports) > 1:
         whole = {"extractors": documents, "warnings": read.warnings}
@@ -193,7 +194,7 @@ def nbv(evaluator: EvaluatorConfig, relevance: str | None, update: str | None, *
     with progress_bar(_READING_STAGES | nbv_stages(config), "experiment") as progress:
         read = _Triplet.read(asked, evaluator, progress)
         config = replace(config, n_landmarks=read.n_landmarks)
-        report = run_nbv(config, read.evaluator, *read.drives, progress)
+        report = run_nbv(config, read.evaluator, *read.drives, progress, read.pictures)
     document = {**report.as_dict(read.sources), "warnings": read.warnings}
     tell(document, asked["json_file"], lambda: _print_planners(report, document))
 
@@ -224,7 +225,7 @@ def calibration(evaluator: EvaluatorConfig, relevance: str, filter_name: str, **
     with progress_bar(_READING_STAGES | calibration_stages(), "experiment") as progress:
         read = _Triplet.read(asked, evaluator, progress)
         config = replace(config, n_landmarks=read.n_landmarks)
-        report = run_calibration(config, read.evaluator, *read.drives, progress)
+        report = run_calibration(config, read.evaluator, *read.drives, progress, read.pictures)
     document = {**report.as_dict(read.sources), "warnings": read.warnings}
     tell(document, asked["json_file"], lambda: _print_calibration(document, report.same_route))
 
@@ -240,6 +241,7 @@ class _Triplet:
     n_landmarks: int  # as many as are asked for, or fit
     sources: dict[str, Any]  # what was read, for the result's `config`
     warnings: list[str]
+    pictures: Pictures  # of the landmark recording
 
     @classmethod
     def read(cls, asked: dict[str, Any], config: EvaluatorConfig, progress: Progress) -> Self:
@@ -264,7 +266,8 @@ class _Triplet:
         for role, recording, encoded in zip(_ROLES, opened, recordings, strict=True):
             warnings += [f"{role}: {remark}" for remark in recording.remarks]
             warnings += [f"{role}: {line}" for line in left_out_lines(encoded.left_out_names, verbose=False)]
-        return cls(evaluator, landmarks, training, test, n_landmarks, sources, warnings)
+        pictures = RecordingPictures(opened[0], settings.max_pixels)
+        return cls(evaluator, landmarks, training, test, n_landmarks, sources, warnings, pictures)
 
     @property
     def drives(self) -> tuple[Drive, Drive, Drive]:

@@ -20,6 +20,7 @@ from deepsimbad.core.relevance import DEFAULT_RELEVANCE
 from deepsimbad.errors import CancelledError
 from deepsimbad.evaluators.registry import EvaluatorConfig, make_evaluator
 from deepsimbad.jobs.build import EncodedRecording, encode_recording
+from deepsimbad.jobs.fitting import RecordingPictures
 from deepsimbad.jobs.kept_encodings import kept_encodings
 from deepsimbad.jobs.trial import TRIAL_STAGES, TrialConfig, TrialReport, run_trial
 from deepsimbad.jobs.truth import known_drives
@@ -91,7 +92,8 @@ def try_(
             truth = true_images(drives["queries"], drives["database"], tolerance, ground_truth)
             config = TrialConfig(tolerance, same_route=True if ground_truth is None else None)
             ordered = (drives.get("landmarks"), drives["database"], drives["queries"])
-            report = run_trial(config, measure, *ordered, truth, progress)
+            pictures = RecordingPictures(recordings["landmarks" if landmarks else "database"], settings.max_pixels)
+            report = run_trial(config, measure, *ordered, truth, progress, pictures)
             document = report.as_dict(
                 {
                     **sources,
@@ -103,7 +105,7 @@ def try_(
                 }
             )
             others = {role: drive for role, drive in drives.items() if role != "queries"}
-            document["warnings"] = known_drives(drives["queries"], **others)
+            document["warnings"] = [*known_drives(drives["queries"], **others), *report.warnings]
             progress.stage("pictures")
             places, views = (
                 Album(recordings[role], drives[role], settings.max_pixels) for role in ("database", "queries")

@@ -60,6 +60,8 @@ class Built:
     same_route: SameRoute | None = None  # whether it is, and why not; None where there is no second drive
     places: NDArray[np.float32] | None = None  # [n, k] unit vectors that the lists stand for (`composed`)
     by_camera: bool = False  # whether what a season changes was learnt on another route
+    fitting: Mapping[str, Any] | None = None  # how the evaluator was fitted, JSON-ready; None: it was not, here
+    warnings: tuple[str, ...] = ()  # of fitting
 
 
 def build_from_dissimilarities(

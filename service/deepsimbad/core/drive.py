@@ -74,6 +74,8 @@ class Drive:
     shows_nothing: NDArray[np.bool_] = _Unknown  # [n] whether the picture of a frame does; False where nobody looked
     # [n, r] float32 to a map's landmarks, smaller is nearer; None before they are measured
     dissimilarities: NDArray[np.float32] | None = None
+    # [n] `digests` of encodings that something else stands for by now, see `standing_for`; None: of those there are
+    first_digests: NDArray[np.uint64] | None = None
 
     def __post_init__(self) -> None:
         n = len(self.encodings)
@@ -105,6 +107,10 @@ class Drive:
         arrays = {name: array[frames] for name, array in vars(self).items() if isinstance(array, np.ndarray)}
         return replace(self, **arrays)
 
+    def standing_for(self, vectors: NDArray[np.float32]) -> Self:
+        """With vectors [n, k] in place of encodings, where a map compares those; frames are known as before."""
+        return replace(self, encodings=vectors, first_digests=self.digests())
+
     def check_differs(self, name: str) -> None:
         """Raise InvalidEncodingError where no frame can be told from another."""
         first, *others = self.encodings
@@ -129,6 +135,8 @@ class Drive:
         A frame is known by its encoding, whatever traverse it is in: a drive that was uploaded again under another name
         is found out, and so is one that was deleted since, or that came with a map of another server.
         """
+        if self.first_digests is not None:
+            return self.first_digests
         rows = np.ascontiguousarray(self.encodings, "<f4")
         return np.fromiter((content_digest(row.tobytes()) for row in rows), np.uint64, len(rows))
 

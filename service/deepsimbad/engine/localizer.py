@@ -26,6 +26,7 @@ from deepsimbad.errors import (
 from deepsimbad.evaluators.base import Evaluator, Image
 from deepsimbad.evaluators.feature_l2 import FeatureL2
 from deepsimbad.evaluators.image import is_blank
+from deepsimbad.evaluators.space import seen
 
 DEFAULT_SHORTLIST = 10
 _LARGEST_DISSIMILARITY = 1e15
@@ -153,8 +154,8 @@ def describe(snapshot: Map, evaluator: Evaluator, view: View) -> Query:
         encoding = view.values
     else:
         encoding = ready_encodings(view.values[np.newaxis])[0]
-    dissimilarities = evaluator.dissimilarities(encoding[None, :], snapshot.landmark_model)[0]
-    return Query(rank_landmarks(dissimilarities), dissimilarities, encoding)
+    dissimilarities, compared = seen(evaluator, encoding[None, :], snapshot.landmark_model)
+    return Query(rank_landmarks(dissimilarities[0]), dissimilarities[0], compared[0])
 
 
 def ready_encodings(values: NDArray[Any]) -> NDArray[np.float32]:

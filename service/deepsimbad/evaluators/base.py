@@ -2,11 +2,24 @@
 
 The paper asks of an evaluator one thing only: a dissimilarity between a scene and a landmark. We split it in two steps,
 `encode` and `dissimilarities`, so that each image is encoded once however often the landmarks change.
+
+**Fitted evaluators.** `fit` makes the landmark model, named arrays that a map keeps and a robot gets, of a `Lesson`:
+the landmarks and all that is known around them. What it learnt from is said by `fitting`; where that is images, those
+of a traverse wait in its spool until a remap is made of it (`jobs.fitting`), and `Lesson.views` holds encodings of
+augmented views of every landmark. Without them (the spool is gone, encodings came ready) it fits on encodings alone.
+
+**composed** compares unit vectors. Where the dissimilarity is squared L2 (`is_squared_l2`) they are made of encodings;
+where it is any other, a scene's *dissimilarities to all fitted landmarks* take the encoding's place, as II-A has it:
+D(x, R) is a vector space, each landmark a dimension. `compared` gives the one or the other. All else, standardising by
+season, places as sums, lists, live statistics, is the same for all evaluators (docs/decisions/0029-own-space.md).
+`evaluators.space.OwnDissimilarities` does this for an evaluator that says its `own_dissimilarities`.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Protocol, TypeAlias
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +31,43 @@ Image: TypeAlias = NDArray[np.uint8]
 
 LandmarkModel: TypeAlias = Mapping[str, NDArray[np.generic]]
 """All an evaluator must remember of the landmarks, as named arrays the store saves without understanding."""
+
+
+class Fitting(StrEnum):
+    """What an evaluator learns from."""
+
+    NOTHING = "nothing"  # the landmarks' encodings are its model
+    ENCODINGS = "encodings"  # of the drives that are known
+    IMAGES = "images"  # the same, and augmented views of the landmarks: images wait in a spool
+
+
+@dataclass(frozen=True)
+class Lesson:
+    """What an evaluator is fitted to."""
+
+    encodings: NDArray[np.float32]  # [m, d] of the drive that landmarks were chosen from, in its order
+    landmarks: NDArray[np.int64]  # [r] which of its frames they are, in landmark order
+    position_m: NDArray[np.float64] | None = None  # [m] along its route; None: a metre a frame
+    other: NDArray[np.float32] | None = None  # [n, d] of another drive of the same route; None: none is known
+    # [k, 2] (frame, the other drive's frame) that saw one place; empty where there is no other
+    places: NDArray[np.int64] = field(default_factory=lambda: np.empty((0, 2), np.int64))
+    views: NDArray[np.float32] | None = None  # [r, a, d] of augmented views of every landmark; None: no images
+    seed: int = 0  # of everything random
+    on_progress: Callable[[float], None] = lambda _: None  # takes the share done, 0..1; may raise CancelledError
+
+    @classmethod
+    def of_landmarks(cls, encodings: NDArray[np.float32]) -> "Lesson":
+        """Of landmarks [r, d] about which nothing else is known."""
+        return cls(encodings, np.arange(len(encodings)))
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """What fitting came to."""
+
+    model: LandmarkModel
+    metrics: Mapping[str, Any] = field(default_factory=dict)  # JSON-ready, for `metrics.fitting` of the map
+    warnings: tuple[str, ...] = ()  # sentences that begin with a stable name and a colon, for `metrics.warnings`
 
 
 class Evaluator(Protocol):
@@ -57,21 +107,39 @@ class Evaluator(Protocol):
     def encode(self, images: Sequence[Image]) -> NDArray[np.float32]:
         """Encode n images to [n, d] float32, finite: no answer depends on its neighbours, beyond rounding."""
 
-    def fit_landmarks(self, encodings: NDArray[np.float32]) -> LandmarkModel:
-        """Turn the selected landmarks, [r, d] float32 in landmark order, into the model that `dissimilarities` takes.
+    @property
+    def fitting(self) -> Fitting:
+        """What `fit` learns from."""
+
+    @property
+    def is_squared_l2(self) -> bool:
+        """Whether dissimilarities are squared L2 between encodings, which `composed` then compares."""
+
+    def fit(self, lesson: Lesson) -> Fitted:
+        """Make the model that `dissimilarities` takes.
 
         Raises:
-            InvalidEncodingError: Not [r >= 1, d], or NaN or infinity in it.
+            InvalidEncodingError: Encodings are not [m >= 1, d], or hold NaN or infinity.
+            TooFewToFitError: There is too little to learn from.
+            MissingPackageError: A package that training needs is not installed.
+            CancelledError: As `on_progress` says.
         """
 
     def check_model(self, model: LandmarkModel, n_landmarks: int) -> None:
-        """Raise InvalidEncodingError where a model, of whatever origin, is not what `fit_landmarks` gives of r."""
+        """Raise InvalidEncodingError where a model, of whatever origin, is not what `fit` gives of r landmarks."""
 
     def dissimilarities(self, encodings: NDArray[np.float32], model: LandmarkModel) -> NDArray[np.float32]:
         """Compare scenes, [n, d] float32, with landmarks: [n, r] float32, at least 0, finite, smaller is nearer.
 
         Raises:
             InvalidEncodingError: Wrong length, NaN or infinity, or so large that the dissimilarity overflows.
+        """
+
+    def compared(self, encodings: NDArray[np.float32], model: LandmarkModel) -> NDArray[np.float32]:
+        """What `composed` makes unit vectors of: encodings [n, d] as they are, or own dissimilarities [n, r].
+
+        Raises:
+            InvalidEncodingError: As `dissimilarities`.
         """
 
 

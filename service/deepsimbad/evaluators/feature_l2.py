@@ -7,16 +7,16 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from deepsimbad.core.composed import Moments, described, is_composed
+from deepsimbad.core.composed import is_composed
 from deepsimbad.errors import InvalidEncodingError, InvalidImageError, UnsupportedMediaTypeError
-from deepsimbad.evaluators.base import Image, LandmarkModel, named_lack_of_memory
+from deepsimbad.evaluators.base import Fitted, Fitting, Image, LandmarkModel, Lesson, named_lack_of_memory
 from deepsimbad.evaluators.compute import Compute
 from deepsimbad.evaluators.extractors.base import Extractor
 from deepsimbad.evaluators.registry import ExtractorName, make_extractor
+from deepsimbad.evaluators.space import between_units, check_units
 
 _SCENES_AT_ONCE = 16  # half a megabyte at d = 8,064, which stays in the cache
 _NUMBERS_A_SUM = 256
-_MOST_DEVIATIONS = 1e12  # from what is usual; the square of more has no place in float32
 
 
 class FeatureL2:
@@ -26,6 +26,9 @@ class FeatureL2:
         extractor: What makes encodings of images, by its name in a configuration; `none`: ready encodings alone.
         compute: How a network is computed; None: by the defaults.
     """
+
+    fitting = Fitting.NOTHING
+    is_squared_l2 = True
 
     def __init__(self, extractor: str, compute: Compute | None = None) -> None:
         self._name, self._compute = extractor, compute or Compute()
@@ -90,13 +93,13 @@ class FeatureL2:
             if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 or image.size == 0:
                 raise InvalidImageError(f"an image is [height, width, 3] uint8, not {list(image.shape)} {image.dtype}")
 
+    def fit(self, lesson: Lesson) -> Fitted:
+        """See `Evaluator.fit`."""
+        return Fitted(self.fit_landmarks(checked_encodings(lesson.encodings)[lesson.landmarks]))
+
     def fit_landmarks(self, encodings: NDArray[np.float32]) -> LandmarkModel:
-        """See `Evaluator.fit_landmarks`: the landmarks' encodings are the model."""
-        prototypes = np.array(encodings, np.float32, order="C")
-        if prototypes.ndim != 2 or prototypes.size == 0:
-            raise InvalidEncodingError(f"landmark encodings are [r, d], not {list(prototypes.shape)}")
-        if not np.isfinite(prototypes).all():
-            raise InvalidEncodingError("a landmark's encoding holds NaN or infinity")
+        """The landmarks' encodings [r, d] are the model; raises InvalidEncodingError."""
+        prototypes = np.array(checked_encodings(encodings), np.float32, order="C")
         prototypes.setflags(write=False)
         return {"prototypes": prototypes}
 
@@ -108,18 +111,13 @@ class FeatureL2:
             raise InvalidEncodingError(f"{n_landmarks} landmarks have prototypes [{n_landmarks}, d], not {has}")
         self.fit_landmarks(np.asarray(prototypes, np.float32))
         if is_composed(model):
-            usual, projection = model["usual"], model.get("projection")
-            (k,), d = prototypes.shape[1:], usual.shape[-1]
-            if usual.shape != (2, d) or (projection.shape if projection is not None else (k, k)) != (d, k):
-                raise InvalidEncodingError(f"landmarks [{n_landmarks}, {k}] with usual {usual.shape} fit no projection")
-            if not all(np.isfinite(array).all() for array in (usual, projection) if array is not None):
-                raise InvalidEncodingError("a landmark model holds NaN or infinity")
+            check_units(model, n_landmarks)
 
     def dissimilarities(self, encodings: NDArray[np.float32], model: LandmarkModel) -> NDArray[np.float32]:
         """See `Evaluator.dissimilarities`: [n, r] squared L2, of a composed model between unit vectors."""
         prototypes = np.ascontiguousarray(model["prototypes"], np.float32)
         if is_composed(model):
-            return _between_units(encodings, model, prototypes)
+            return between_units(encodings, model)
         if encodings.ndim != 2 or encodings.shape[1] != prototypes.shape[1]:
             raise InvalidEncodingError(
                 f"an encoding of {encodings.shape[-1]} numbers cannot be compared with landmarks of "
@@ -131,24 +129,18 @@ class FeatureL2:
             raise InvalidEncodingError("an encoding holds NaN, infinity or numbers too large to compare")
         return answer
 
+    def compared(self, encodings: NDArray[np.float32], model: LandmarkModel) -> NDArray[np.float32]:  # noqa: ARG002
+        """See `Evaluator.compared`."""
+        return encodings
 
-def _between_units(
-    encodings: NDArray[np.float32], model: LandmarkModel, prototypes: NDArray[np.float32]
-) -> NDArray[np.float32]:
-    usual = np.asarray(model["usual"], np.float32)
-    if encodings.ndim != 2 or encodings.shape[1] != usual.shape[1]:
-        raise InvalidEncodingError(
-            f"an encoding of {encodings.shape[-1]} numbers cannot be compared with landmarks of {usual.shape[1]}: they "
-            "come from another encoder",
-            encoding_dim=usual.shape[1],
-        )
-    moments = Moments.from_mean_std(usual)
-    farthest = np.maximum(encodings.max(axis=0) - moments.mean, moments.mean - encodings.min(axis=0))
-    if not (farthest <= _MOST_DEVIATIONS * moments.std).all():
-        raise InvalidEncodingError("an encoding holds NaN, infinity or numbers too large to compare")
-    projection = np.asarray(model["projection"], np.float32) if "projection" in model else None
-    u = described(encodings, moments, projection)
-    return np.asarray(np.clip(2 - 2 * (u @ prototypes.T), 0, 4), np.float32)
+
+def checked_encodings(encodings: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Encodings of landmarks [r >= 1, d], finite; raises InvalidEncodingError."""
+    if encodings.ndim != 2 or encodings.size == 0:
+        raise InvalidEncodingError(f"landmark encodings are [r, d], not {list(encodings.shape)}")
+    if not np.isfinite(encodings).all():
+        raise InvalidEncodingError("a landmark's encoding holds NaN or infinity")
+    return encodings
 
 
 @njit(cache=True, nogil=True)

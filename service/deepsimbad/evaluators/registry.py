@@ -22,10 +22,19 @@ class EvaluatorKind(StrEnum):
     """The evaluators that are built."""
 
     FEATURE_L2 = "feature_l2"
+    SIAMESE = "siamese"
+    AUTOENCODER = "autoencoder"
+
+
+_MAKERS: Mapping[EvaluatorKind, str] = {  # module:class, of an extractor's name and `Compute`
+    EvaluatorKind.FEATURE_L2: "feature_l2:FeatureL2",
+    EvaluatorKind.SIAMESE: "siamese:Siamese",
+    EvaluatorKind.AUTOENCODER: "autoencoder:Autoencoder",
+}
 
 
 class ExtractorName(StrEnum):
-    """The extractors `feature_l2` can use; `none` takes ready encodings alone."""
+    """The extractors that evaluators of images can use; `none` takes ready encodings alone."""
 
     EFFICIENTNET_LITE0 = "efficientnet_lite0"
     GRADIENT_GRID = "gradient_grid"
@@ -114,9 +123,8 @@ def evaluator_config(raw: Mapping[str, Any]) -> EvaluatorConfig:
 
 def make_evaluator(config: EvaluatorConfig, compute: Compute | None = None) -> Evaluator:
     """Build the evaluator a configuration names; its extractor is loaded at first need, or by `Evaluator.load`."""
-    from deepsimbad.evaluators.feature_l2 import FeatureL2  # numba and cv2, for those who measure alone
-
-    return FeatureL2(config.extractor, compute)
+    module, _, name = _MAKERS[config.kind].partition(":")  # imported late: numba and cv2, for those who measure alone
+    return cast("Evaluator", getattr(import_module(f"deepsimbad.evaluators.{module}"), name)(config.extractor, compute))
 
 
 def make_extractor(text: str, compute: Compute) -> "Extractor":

@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator, MutableMapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field, replace
-from functools import partial
+from functools import cache, partial
 from statistics import median
 from typing import Any
 
@@ -14,18 +14,20 @@ from numpy.typing import NDArray
 
 from deepsimbad.core.building import Built, MapPlan, SeenTwice, build_from_dissimilarities, compose_map
 from deepsimbad.core.camera import Camera
+from deepsimbad.core.composed import is_composed
 from deepsimbad.core.descriptor import rank_landmarks
 from deepsimbad.core.drive import Drive
 from deepsimbad.core.experience.nnql import NnqlConfig, initial_q_values
 from deepsimbad.core.experience.training import LearningCurve, TrainingWorld, train
 from deepsimbad.core.frames import UNKNOWN_TIMESTAMP
-from deepsimbad.core.landmark_model import select_landmarks
 from deepsimbad.core.map import Map
 from deepsimbad.core.relevance import Query, Relevance
 from deepsimbad.core.route import same_places
 from deepsimbad.errors import InvalidSourceError
 from deepsimbad.evaluators.base import Evaluator, Image, LandmarkModel
 from deepsimbad.evaluators.image import decode_image, is_blank, picture_size
+from deepsimbad.evaluators.space import seen
+from deepsimbad.jobs.fitting import Fitter
 from deepsimbad_client.errors import BrokenFrameError
 from deepsimbad_client.http import text_of
 from deepsimbad_client.recordings import Frame, Recording
@@ -158,22 +160,25 @@ def _encode_images(
     return places, encodings[:n_read], shows_nothing[:n_read], encode_ms
 
 
-def choose_landmarks(
-    candidates: NDArray[np.float32], n_landmarks: int, evaluator: Evaluator, on_progress: Callable[[float], None]
-) -> LandmarkModel:
-    """Select r of the landmark traverse's encodings [m, d], and fit the evaluator's model to them."""
-    return evaluator.fit_landmarks(candidates[select_landmarks(candidates, n_landmarks, on_progress)])
-
-
 def measured(
     drive: Drive, model: LandmarkModel, evaluator: Evaluator, on_progress: Callable[[float], None] = lambda _: None
 ) -> Drive:
-    """The drive with its frames' dissimilarities to the landmarks, measured block by block."""
-    blocks = []
+    """The drive with its frames' dissimilarities to the landmarks, measured block by block.
+
+    Where the map compares something else than encodings, that stands for them.
+    """
+    blocks, vectors = [], []
     for start in range(0, drive.n_frames, _FRAMES_A_BLOCK):
-        blocks.append(evaluator.dissimilarities(drive.encodings[start : start + _FRAMES_A_BLOCK], model))
+        encodings = drive.encodings[start : start + _FRAMES_A_BLOCK]
+        dissimilarities, compared = seen(evaluator, encodings, model)
+        blocks.append(dissimilarities)
+        vectors.append(compared)
         on_progress(min(1.0, (start + _FRAMES_A_BLOCK) / drive.n_frames))
-    return replace(drive, dissimilarities=np.concatenate(blocks) if blocks else np.empty((0, 0), np.float32))
+    if not blocks:
+        return replace(drive, dissimilarities=np.empty((0, 0), np.float32))
+    if is_composed(model) and not evaluator.is_squared_l2:
+        drive = drive.standing_for(np.concatenate(vectors))
+    return replace(drive, dissimilarities=np.concatenate(blocks))
 
 
 def views_of(drive: Drive) -> Query:
@@ -192,6 +197,7 @@ def build(
     evaluator: Evaluator,
     on_progress: Callable[[float], None] = lambda _: None,
     camera: Sequence[SeenTwice] = (),
+    fitter: Fitter | None = None,
 ) -> Built:
     """Choose landmarks, describe every training frame by them, and learn from a second season where there is one.
 
@@ -199,23 +205,76 @@ def build(
         landmarks: The drive they are chosen from, the model that they stay in, or None: the training drive's own.
         n_landmarks: r, where they are chosen.
         camera: What it saw twice on other routes (`composed`).
+        fitter: Fits the evaluator, where landmarks are chosen; None: one without images.
     """
     if second is not None and np.array_equal(second.encodings, training.encodings):
         second = None  # one drive under two names is one season
-    if plan.relevance is Relevance.COMPOSED:
+    if plan.relevance is Relevance.COMPOSED and evaluator.is_squared_l2:
         return compose_map(plan, training, second, landmarks, n_landmarks, on_progress, camera)
-    candidates = training if landmarks is None else landmarks
-    if isinstance(candidates, Drive):
-        chosen = choose_landmarks(candidates.encodings, n_landmarks, evaluator, lambda share: on_progress(share / 2))
-    model = chosen if isinstance(candidates, Drive) else candidates
-    return build_from_dissimilarities(
+    candidates, fitted = training if landmarks is None else landmarks, None
+    if not isinstance(candidates, Drive):
+        model: LandmarkModel = candidates
+    else:
+        other = second if candidates is training else training
+        fitter = fitter or Fitter(evaluator)
+        fitted = fitter.fit(plan, candidates, n_landmarks, other, lambda share: on_progress(share / 2))
+        model = fitted.model
+
+    def further(share: float) -> None:
+        on_progress((1 + share) / 2)
+
+    if plan.relevance is Relevance.COMPOSED:
+        built = _composed_in_space(plan, training, second, landmarks, model, n_landmarks, evaluator, further, camera)
+    else:
+        built = build_from_dissimilarities(
+            plan, training, second, model, partial(measured, evaluator=evaluator), further
+        )
+    return built if fitted is None else replace(built, fitting=fitted.metrics or None, warnings=fitted.warnings)
+
+
+def _composed_in_space(
+    plan: MapPlan,
+    training: Drive,
+    second: Drive | None,
+    landmarks: Drive | LandmarkModel | None,
+    model: LandmarkModel,
+    n_landmarks: int,
+    evaluator: Evaluator,
+    on_progress: Callable[[float], None],
+    camera: Sequence[SeenTwice],
+) -> Built:
+    """`compose_map` where dissimilarities to all fitted landmarks stand for encodings (II-A, decision 0029)."""
+
+    @cache
+    def by_id(drive_id: int) -> Drive:  # two names of one drive stay one
+        return compared(drives[drive_id], model, evaluator)
+
+    def in_space(drive: Drive) -> Drive:
+        drives[id(drive)] = drive
+        return by_id(id(drive))
+
+    drives: dict[int, Drive] = {}
+    built = compose_map(
         plan,
-        training,
-        second,
-        model,
-        partial(measured, evaluator=evaluator),
-        lambda share: on_progress((1 + share) / 2),
+        in_space(training),
+        None if second is None else in_space(second),
+        in_space(landmarks) if isinstance(landmarks, Drive) else landmarks,
+        n_landmarks,
+        on_progress,
+        [replace(twice, first=in_space(twice.first), second=in_space(twice.second)) for twice in camera],
     )
+    whole = {**model, **built.map.landmark_model}
+    of_map, of_rehearsal = (replace(map_, landmark_model=whole) for map_ in (built.map, built.rehearsal))
+    return replace(built, map=of_map, rehearsal=of_rehearsal)
+
+
+def compared(drive: Drive, model: LandmarkModel, evaluator: Evaluator) -> Drive:
+    """The drive with what a composed map compares in place of its encodings."""
+    if evaluator.is_squared_l2:
+        return drive
+    starts = range(0, drive.n_frames, _FRAMES_A_BLOCK)
+    blocks = [evaluator.compared(drive.encodings[start : start + _FRAMES_A_BLOCK], model) for start in starts]
+    return drive.standing_for(np.concatenate(blocks))
 
 
 def train_nnql(

@@ -23,6 +23,7 @@ from deepsimbad.errors import InvalidMapConfigError, PastTheEndError
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.jobs.build import build, measured, views_of
 from deepsimbad.jobs.episodes import TestDrive
+from deepsimbad.jobs.fitting import Fitter, Pictures
 from deepsimbad.jobs.progress import Progress
 from deepsimbad.jobs.truth import nearest_images
 
@@ -144,18 +145,28 @@ def calibration_stages() -> dict[str, float]:
 
 
 def run_calibration(
-    config: CalibrationConfig, evaluator: Evaluator, landmarks: Drive, training: Drive, test: Drive, progress: Progress
+    config: CalibrationConfig,
+    evaluator: Evaluator,
+    landmarks: Drive,
+    training: Drive,
+    test: Drive,
+    progress: Progress,
+    pictures: Pictures | None = None,
 ) -> CalibrationReport:
     """Map the training traverse, and drive robots along the test traverse.
+
+    Args:
+        pictures: Of the landmark traverse, for evaluators that are fitted to images.
 
     Raises:
         InvalidMapConfigError: The test traverse is too short.
     """
     if (length_m := float(np.ptp(test.position_m))) < LEAST_M:
         raise InvalidMapConfigError(f"the test traverse is {length_m:g} m long; calibration takes {LEAST_M:g} m")
+    fitter = Fitter(evaluator, pictures, config.seed)
     progress.stage("map")
     plan = MapPlan(config.relevance, config.list_length, tuple(_MOVING.values()), same_route=config.same_route)
-    built = build(plan, training, landmarks, landmarks, config.n_landmarks, evaluator, progress.update)
+    built = build(plan, training, landmarks, landmarks, config.n_landmarks, evaluator, progress.update, fitter=fitter)
     true_image = nearest_images(test, training)
     course, sights = _course(config, evaluator, built, test, true_image), {}
     for stage, (path_m, moved_m) in _paths(course).items():
@@ -165,7 +176,7 @@ def run_calibration(
     middle_m = float(training.position_m[0] + training.position_m[-1]) / 2
     mapped = training.at(np.flatnonzero(training.position_m <= middle_m))
     known = landmarks.at(np.flatnonzero((landmarks.position_m <= middle_m) | (config.same_route is False)))
-    built_half = build(plan, mapped, known, known, min(config.n_landmarks, known.n_frames), evaluator)
+    built_half = build(plan, mapped, known, known, min(config.n_landmarks, known.n_frames), evaluator, fitter=fitter)
     at_m, ahead_m = training.position_m[true_image], _MOVE_M * np.arange(VIEWS[-1])
     for stage, is_there in zip(_STRETCHES, (at_m > middle_m + _BESIDE_M, at_m <= middle_m), strict=True):
         progress.stage(stage)

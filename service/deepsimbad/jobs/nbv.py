@@ -30,6 +30,7 @@ from deepsimbad.jobs.episodes import (
     follow_plan,
     random_chooser,
 )
+from deepsimbad.jobs.fitting import Fitter, Pictures
 from deepsimbad.jobs.progress import Progress
 from deepsimbad.jobs.truth import nearest_images
 
@@ -130,9 +131,18 @@ def nbv_stages(config: NbvConfig) -> dict[str, float]:
 
 
 def run_nbv(
-    config: NbvConfig, evaluator: Evaluator, landmarks: Drive, training: Drive, test: Drive, progress: Progress
+    config: NbvConfig,
+    evaluator: Evaluator,
+    landmarks: Drive,
+    training: Drive,
+    test: Drive,
+    progress: Progress,
+    pictures: Pictures | None = None,
 ) -> NbvReport:
     """Map, train, and drive every planner's episodes.
+
+    Args:
+        pictures: Of the landmark traverse, for evaluators that are fitted to images.
 
     Raises:
         InvalidMapConfigError: The test traverse is shorter than an episode.
@@ -143,6 +153,7 @@ def run_nbv(
     if starts.size == 0:
         raise InvalidMapConfigError(f"the test traverse is shorter than an episode of {travel_m:g} m")
 
+    fitter = Fitter(evaluator, pictures, config.seed)
     setups = (
         ("ours", config.relevance, config.update, None),
         # With the blur that the reference figures of the paper's set-up have, metres.
@@ -153,7 +164,9 @@ def run_nbv(
     for setup, relevance, update, action_std_m in setups:
         progress.stage(f"map ({setup})")
         plan = MapPlan(relevance, config.list_length, config.actions_m, same_route=config.same_route)
-        built = build(plan, training, landmarks, landmarks, config.n_landmarks, evaluator, progress.update)
+        built = build(
+            plan, training, landmarks, landmarks, config.n_landmarks, evaluator, progress.update, fitter=fitter
+        )
         drive = TestDrive(views_of(measured(test, built.map.landmark_model, evaluator)), route, true_image)
         same_route = built.same_route
         progress.stage(f"train ({setup})")

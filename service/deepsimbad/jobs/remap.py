@@ -35,9 +35,10 @@ from deepsimbad.jobs.append import (
     known_drives,
     refuse_known_traverse,
 )
-from deepsimbad.jobs.build import EPISODES_A_MAP_IMAGE, build, measured, train_nnql
+from deepsimbad.jobs.build import EPISODES_A_MAP_IMAGE, build, compared, measured, train_nnql
 from deepsimbad.jobs.camera import seen_twice
 from deepsimbad.jobs.check import CheckFrames, check_map
+from deepsimbad.jobs.fitting import Fitter
 from deepsimbad.jobs.progress import Progress
 from deepsimbad.jobs.versions import activate_once, seal_version
 from deepsimbad.store.catalog import ANY, Catalog
@@ -271,7 +272,7 @@ class _Remap:
             "seconds": seconds,
             **learnt,
             "check": check,
-            "warnings": self._warnings(inputs),
+            "warnings": [*learnt.get("warnings", ()), *self._warnings(inputs)],
         }
         progress.stage("seal")
         return seal_version(self.catalog, self.domain, map_, record_config, metrics, progress.update, job_id)
@@ -396,6 +397,7 @@ class _Remap:
             self.evaluator,
             self.progress.update,
             inputs.camera,
+            Fitter(self.evaluator, seed=config.seed),
         )
         q_values = learning = None
         # The baseline that compares whole encodings would need hours for it, and serves no robot.
@@ -429,8 +431,10 @@ class _Remap:
         if built.same_route is not None and inputs.second is not None:
             second_season = {**built.same_route.as_dict(), "traverse": inputs.second.name}
         source = TRAINING if landmarks is None else LANDMARK_TRAVERSE if inputs.base is None else ACTIVE_MAP
-        learnt = {"landmarks": source, "training": learning, "second_season": second_season}
+        learnt: dict[str, Any] = {"landmarks": source, "training": learning, "second_season": second_season}
         learnt["camera_of"] = config.camera_of if built.by_camera else None
+        if built.fitting is not None:
+            learnt |= {"fitting": dict(built.fitting), "warnings": list(built.warnings)}
         return map_, map_, asked, learnt
 
     def _appended(self, inputs: _Inputs, before: Map, frames: CheckFrames) -> _Draft:
@@ -450,7 +454,8 @@ class _Remap:
         _check_alike(before, config)
         fused, verdict = None, {"accepted": False, "why": inputs.known}
         if isinstance(inputs.known, KnownDrives):
-            fused, judged = fuse(before, inputs.known, drive, config.same_route)
+            known, joining = self._in_space(before, inputs.known, drive)
+            fused, judged = fuse(before, known, joining, config.same_route)
             verdict = judged.as_dict()
         if fused is None:
             map_ = append_drive(before, measured(drive, before.landmark_model, self.evaluator, self.progress.update))
@@ -475,6 +480,14 @@ class _Remap:
         learnt["fused"] = {**verdict, "n_new_images": map_.n_images - before.n_images}
         checked = fused.without(frames.withheld) if fused is not None and frames.is_held_out else map_
         return replace(map_, config=config_after), checked, config_after, learnt
+
+    def _in_space(self, before: Map, known: KnownDrives, drive: Drive) -> tuple[KnownDrives, Drive]:
+        """What a map is made of and what joins it, with what the map compares in place of encodings."""
+        of_id = {id(each): each for each in (*known.seasons, drive, known.candidates) if each is not None}
+        there = {key: compared(each, before.landmark_model, self.evaluator) for key, each in of_id.items()}
+        candidates = None if known.candidates is None else there[id(known.candidates)]
+        seasons = tuple(there[id(season)] for season in known.seasons)
+        return replace(known, seasons=seasons, candidates=candidates), there[id(drive)]
 
 
 def _check_alike(before: Map, config: RemapConfig) -> None:

@@ -19,6 +19,7 @@ from deepsimbad.core.summary import CONFIDENT_WITHIN_M
 from deepsimbad.errors import PastTheEndError
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.jobs.build import build, measured, views_of
+from deepsimbad.jobs.fitting import Fitter, Pictures
 from deepsimbad.jobs.progress import Progress
 from deepsimbad.jobs.remap import DEFAULT_LIST_LENGTH, DEFAULT_N_LANDMARKS
 from deepsimbad.jobs.truth import nearest_images
@@ -77,6 +78,7 @@ class TrialReport:
     scores: dict[str, RetrievalScores]  # of the map's lists; and of the whole vectors that they stand for
     seconds: dict[str, float]  # by stage
     n_forgot: int = 0  # moves that the belief had no room for, after which the session began anew
+    warnings: tuple[str, ...] = ()  # of fitting the evaluator
     stretches: list[Stretch] = field(init=False)  # those where some query fails, worst first
 
     def __post_init__(self) -> None:
@@ -119,23 +121,26 @@ def run_trial(
     queries: Drive,
     true_images: Sequence[NDArray[np.int64]],
     progress: Progress,
+    pictures: Pictures | None = None,
 ) -> TrialReport:
     """Map the database as a remap does by default, and localize every query in order, as one session.
 
     Args:
         landmarks: Another drive to choose landmarks from and learn from; None: the database's own frames.
         true_images: For every query the map images that count as true.
+        pictures: Of the drive that landmarks are chosen from, for evaluators that are fitted to images.
     """
     progress.stage("map")
     plan = MapPlan(DEFAULT_RELEVANCE, DEFAULT_LIST_LENGTH, (CONFIDENT_WITHIN_M,), same_route=config.same_route)
     n_landmarks = fitting_number(None, (landmarks or database).n_frames, DEFAULT_N_LANDMARKS)
-    built = build(plan, database, landmarks, landmarks, n_landmarks, evaluator, progress.update)
+    fitter = Fitter(evaluator, pictures)
+    built = build(plan, database, landmarks, landmarks, n_landmarks, evaluator, progress.update, fitter=fitter)
     progress.stage("localize")
-    views = views_of(measured(queries, built.map.landmark_model, evaluator))
-    session = _Session(built.map, views, queries)
+    seen = measured(queries, built.map.landmark_model, evaluator)
+    session = _Session(built.map, views_of(seen), queries)
     scorer, by_all, outcomes = RetrievalScorer(RECALL_RANKS), RetrievalScorer(RECALL_RANKS), []
     nearest = nearest_images(queries, database)
-    whole = relevances_by_all(built, queries, stateless=False)
+    whole = relevances_by_all(built, seen, stateless=False)
     for row, (truth, of_all) in enumerate(zip(true_images, whole, strict=True)):
         relevance, mass = session.look(row)
         by_all.add(of_all, truth)
@@ -147,6 +152,7 @@ def run_trial(
         *(config, built.map, queries, outcomes, np.array(session.belief, np.float32), scores),
         {stage: seconds for stage, seconds in progress.seconds().items() if stage in TRIAL_STAGES},
         session.n_forgot,
+        built.warnings,
     )
 
 

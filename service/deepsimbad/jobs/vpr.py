@@ -4,7 +4,7 @@ One session over the test drive in order; and what the belief makes of it, besid
 """
 
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,7 @@ from deepsimbad.core.relevance import DEFAULT_RELEVANCE, LiveStatistics, Query, 
 from deepsimbad.errors import InvalidMapConfigError
 from deepsimbad.evaluators.base import Evaluator, LandmarkModel
 from deepsimbad.jobs.build import EncodedRecording, build, measured, views_of
+from deepsimbad.jobs.fitting import Fitter, Pictures
 from deepsimbad.jobs.passive import PassiveScores, drive_in_order
 from deepsimbad.jobs.progress import Progress
 from deepsimbad.store.arrays import is_halvable
@@ -40,7 +41,7 @@ class VprConfig:
     list_length: int = 4
     tolerance_m: float = 2.0  # how far from the query a map image may be and still be true
     relevances: tuple[Relevance, ...] = tuple(Relevance)  # which to compare, in the order of the report
-    seed: int = 0  # kept with the result; nothing here is random
+    seed: int = 0  # of fitting an evaluator; kept with the result
     stateless: bool = False  # every view by itself, by the map's statistics, in place of one session in order
     # Whether positions of landmark and training traverse are comparable; None: where both know x, y
     same_route: bool | None = True
@@ -60,6 +61,8 @@ class VprReport:
     encoding_dim: int  # d
     bytes_per_encoding: int  # of one frame in a traverse's file, places apart
     encode_ms: float | None  # median from reading an image to its encoding; None where encodings came ready
+    fitting: Mapping[str, Any] | None = None  # how the evaluator was fitted; None: it was not
+    warnings: tuple[str, ...] = ()  # of fitting
     passive: PassiveScores | None = None  # the drive in order; None where `composed` is not asked for, or no session
 
     def as_dict(self, sources: dict[str, Any]) -> dict[str, Any]:
@@ -80,6 +83,7 @@ class VprReport:
             "encode_ms": self.encode_ms,
             "config": {**asdict(self.config), **sources},
             "seconds": self.seconds,
+            **({} if self.fitting is None else {"fitting": dict(self.fitting)}),
         }
 
 
@@ -105,14 +109,17 @@ def run_vpr(
     test: EncodedRecording,
     true_images: Sequence[NDArray[np.int64]],
     progress: Progress,
+    pictures: Pictures | None = None,
 ) -> VprReport:
     """Choose landmarks, map the training traverse, query every test frame in order as one passive session.
 
     Args:
         landmarks: The landmark traverse; where it drove the mapped route, maps learn from it. None: the training one.
         true_images: For every test frame the map images that count as true.
+        pictures: Of the landmark traverse, for evaluators that are fitted to images.
     """
     progress.stage("describe")
+    fitter = Fitter(evaluator, pictures, config.seed)
     scores: dict[str, RetrievalScores] = {}
     built: dict[Relevance, Built] = {}
     model: LandmarkModel | None = None
@@ -125,25 +132,30 @@ def run_vpr(
             bars_own_place=config.bar_own_place,
         )
         chosen = landmarks if name is Relevance.COMPOSED or model is None else model
-        built[name] = build(plan, training, landmarks, chosen, config.n_landmarks, evaluator)
+        share = number / len(config.relevances)
+        built[name] = build(
+            *(plan, training, landmarks, chosen, config.n_landmarks, evaluator),
+            lambda done, share=share: progress.update(share + done / len(config.relevances)),  # type: ignore[misc]
+            fitter=fitter,
+        )
         if name is not Relevance.COMPOSED:
             model = built[name].map.landmark_model
-        progress.update((number + 1) / len(config.relevances))
     for name in config.relevances:
         progress.stage(f"query by {name.value}")
-        views = views_of(measured(test.drive, built[name].map.landmark_model, evaluator))
+        seen = measured(test.drive, built[name].map.landmark_model, evaluator)
+        views = views_of(seen)
         live = None if config.stateless else built[name].map.live_statistics
         worth = _worth_of_views(test.drive)
         scores[name.value] = _score(built[name].map, views, true_images, live, worth, progress.update)
         if name is Relevance.COMPOSED:
-            scores[BRUTE_FORCE_U] = score_by_all(built[name], test.drive, true_images, config.stateless)
+            scores[BRUTE_FORCE_U] = score_by_all(built[name], seen, true_images, config.stateless)
     passive: PassiveScores | None = None
     if _is_driven(config):
         progress.stage("drive")
         map_ = built[Relevance.COMPOSED].map
-        views = views_of(measured(test.drive, map_.landmark_model, evaluator))
-        by_all = relevances_by_all(built[Relevance.COMPOSED], test.drive, stateless=False)
-        passive = drive_in_order(map_, views, test.drive.position_m, by_all, true_images, progress.update)
+        seen = measured(test.drive, map_.landmark_model, evaluator)
+        by_all = relevances_by_all(built[Relevance.COMPOSED], seen, stateless=False)
+        passive = drive_in_order(map_, views_of(seen), test.drive.position_m, by_all, true_images, progress.update)
     stages = {stage.replace(" ", "_") for stage in vpr_stages(config)}
     seconds = {stage: took for stage, took in progress.seconds().items() if stage in stages}
     sized = built.get(DEFAULT_RELEVANCE, built[config.relevances[0]])
@@ -157,6 +169,8 @@ def run_vpr(
         bytes_per_encoding=test.drive.encoding_dim * (2 if is_halvable(test.drive.encodings) else 4),
         encode_ms=test.encode_ms,
         passive=passive,
+        fitting=sized.fitting,
+        warnings=sized.warnings,
     )
 
 

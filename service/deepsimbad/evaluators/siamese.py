@@ -1,0 +1,144 @@
+"""The deep Siamese of the paper (II-A, 1): a pairwise network d(x, p) on what a frozen extractor gives of both.
+
+d = softplus(a linear layer, and a small MLP beside it) of (|x - p|, x * p), of unit vectors x and p. The linear layer
+begins as squared L2 and the MLP as nothing, so training begins at plain L2; the epoch that validates best stays.
+"""
+
+import time
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deepsimbad.evaluators.base import Fitted, LandmarkModel, Lesson
+from deepsimbad.evaluators.lessons import PairScores, Split, UnitLesson, judged, squared_l2
+from deepsimbad.evaluators.trunk import Axes, Trunk
+
+_HIDDEN = 32
+_EPOCHS, _BATCH, _MOST_QUERIES = 40, 64, 4096  # queries: at once, and an epoch
+_HARD, _EASY, _RETRIEVED = 16, 16, 64  # wrong answers a query: of the nearest 64 that retrieval gives, and any
+_RATE, _DECAY = 2e-3, 1e-2
+_SHARPNESS = 10.0  # what a squared L2 of 1 counts in the softmax over dissimilarities, at the beginning
+_TRAINED = ("apart", "product", "bias", "out", "linear", "offset")
+
+
+class Siamese(Trunk):
+    """Dissimilarity = a trained network's, of a scene and each landmark: r of them in one pass."""
+
+    kind = "siamese"
+    axes: ClassVar[Axes] = {
+        "usual": ("two", "d"), "projection": ("d", "k"), "landmarks": ("r", "k"), "apart": ("k", "hidden"),
+        "product": ("k", "hidden"), "bias": ("hidden",), "out": ("hidden",), "linear": ("two", "k"), "offset": ("one",),
+    }  # fmt: skip
+
+    def fit(self, lesson: Lesson) -> Fitted:
+        """See `Evaluator.fit`."""
+        began = time.monotonic()
+        arrays, units = self.unit_lesson(lesson)
+        split = Split.of(units, lesson.seed)
+        trained, metrics = _train(units, split, lesson)
+        scores, warnings = judged(
+            self.kind, units, split.test, lambda x: _dissimilarities(x, units.prototypes, trained)
+        )
+        arrays |= {f"{self.kind}_{name}": array for name, array in trained.items()}
+        arrays[f"{self.kind}_landmarks"] = units.prototypes
+        metrics |= {**scores, "seed": lesson.seed, "seconds": time.monotonic() - began}
+        return Fitted(arrays, metrics, warnings)
+
+    def own_dissimilarities(self, encodings: NDArray[np.float32], model: LandmarkModel) -> NDArray[np.float32]:
+        """See `OwnDissimilarities`."""
+        trained = {name: np.asarray(model[f"{self.kind}_{name}"], np.float32) for name in _TRAINED}
+        landmarks = np.asarray(model[f"{self.kind}_landmarks"], np.float32)
+        return _dissimilarities(self.units(encodings, model), landmarks, trained)
+
+
+def _dissimilarities(
+    x: NDArray[np.float32], p: NDArray[np.float32], trained: Mapping[str, NDArray[np.float32]]
+) -> NDArray[np.float32]:
+    """[n, r] of unit vectors [n, k] and [r, k]; a scene at a time, so that company changes nothing."""
+    answer = np.empty((len(x), len(p)), np.float32)
+    for row, scene in enumerate(x):
+        apart, product = np.abs(scene - p), scene * p
+        hidden = np.maximum(apart @ trained["apart"] + product @ trained["product"] + trained["bias"], 0)
+        out = hidden @ trained["out"] + apart @ trained["linear"][0] + product @ trained["linear"][1]
+        answer[row] = np.logaddexp(0, out + trained["offset"][0])
+    return answer
+
+
+def _train(units: UnitLesson, split: Split, lesson: Lesson) -> tuple[dict[str, NDArray[np.float32]], dict[str, Any]]:
+    """The arrays of the best epoch, by their names, and how training went."""
+    import torch
+
+    rng, k = np.random.default_rng(lesson.seed), units.own.shape[1]
+    random = torch.Generator().manual_seed(lesson.seed)
+    layers: dict[str, Any] = {
+        "apart": torch.randn(k, _HIDDEN, generator=random) * k**-0.5,
+        "product": torch.randn(k, _HIDDEN, generator=random) * k**-0.5,
+        "bias": torch.zeros(_HIDDEN),
+        "out": torch.zeros(_HIDDEN),
+        "linear": torch.stack([torch.zeros(k), torch.full((k,), -2 * _SHARPNESS)]),
+        "offset": torch.full((1,), 2 * _SHARPNESS),
+    }
+    start = {name: layer.clone() for name, layer in layers.items()}
+    optimiser = torch.optim.Adam([layer.requires_grad_() for layer in layers.values()], _RATE)
+    own, queries, weight = (torch.from_numpy(array) for array in (units.own, units.queries, units.weight))
+    retrieved = _retrieved(units, split)
+
+    def measured(rows: NDArray[np.int64], compared: NDArray[np.int64]) -> Any:
+        """[q, c] of queries to some frames each, as `_dissimilarities` has it."""
+        x, p = queries[rows][:, None], own[compared]
+        apart, product = (x - p).abs(), x * p
+        hidden = torch.relu(apart @ layers["apart"] + product @ layers["product"] + layers["bias"])
+        out = hidden @ layers["out"] + apart @ layers["linear"][0] + product @ layers["linear"][1]
+        return torch.nn.functional.softplus(out + layers["offset"])
+
+    def batch_loss(some: NDArray[np.int64]) -> Any:
+        """How far the right frame is from being nearest among wrong ones, as a softmax sees it."""
+        rows, n = split.train[some], len(some)
+        hard = np.take_along_axis(retrieved[some], rng.integers(0, retrieved.shape[1], (n, _HARD)), 1)
+        true, easy = units.true[rows][:, np.newaxis], rng.choice(split.wrong, (n, _EASY))
+        others = np.concatenate([hard, easy], axis=1)
+        is_none = np.concatenate([np.zeros((n, 1), np.bool_), units.is_near(true, others)], axis=1)
+        d = measured(rows, np.concatenate([true, others], axis=1)).masked_fill(torch.from_numpy(is_none), torch.inf)
+        return (-torch.log_softmax(-d, 1)[:, 0] * weight[rows]).mean()
+
+    curve: list[dict[str, Any]] = []
+    best: dict[str, NDArray[np.float32]] = {}
+    n_evaluated = 0
+    for epoch in range(_EPOCHS + 1):
+        order = rng.permutation(len(split.train))[:_MOST_QUERIES] if epoch else np.empty(0, np.int64)
+        losses = []
+        for first in range(0, len(order), _BATCH):
+            lesson.on_progress((epoch - 1 + first / len(order)) / _EPOCHS)
+            loss = batch_loss(order[first : first + _BATCH])
+            drift = sum((layer - start[name]).square().sum() for name, layer in layers.items())
+            optimiser.zero_grad()
+            (loss + _DECAY * drift / len(split.train)).backward()
+            optimiser.step()
+            losses.append(float(loss.detach()))
+        now = {name: layer.detach().numpy().astype(np.float16).astype(np.float32) for name, layer in layers.items()}
+        scores = PairScores.of(
+            units,
+            split.validation,
+            lambda x, now=now: _dissimilarities(x, units.prototypes, now),  # type: ignore[misc]
+        )
+        if not best or scores.anr < min(point["anr"] for point in curve):
+            best = now
+        curve.append({"epoch": epoch, "loss": float(np.mean(losses)) if losses else None, "anr": scores.anr})
+        n_evaluated += len(order) * (1 + _HARD + _EASY) + scores.n_queries * len(units.landmarks)
+    lesson.on_progress(1.0)
+    n_train = {"n_queries": len(split.train), "n_dissimilarities": n_evaluated}
+    return best, {**n_train, "best_epoch": min(curve, key=lambda point: point["anr"])["epoch"], "curve": curve}
+
+
+def _retrieved(units: UnitLesson, split: Split) -> NDArray[np.int64]:
+    """[q, 64] the frames that plain L2 places nearest to each query of training, but for those of its own place."""
+    n = min(_RETRIEVED, len(split.wrong))
+    nearest = np.empty((len(split.train), n), np.int64)
+    for first in range(0, len(split.train), 1024):
+        rows = split.train[first : first + 1024]
+        apart = squared_l2(units.queries[rows], units.own[split.wrong])
+        apart[units.is_near(units.true[rows][:, np.newaxis], split.wrong)] = np.inf
+        nearest[first : first + 1024] = split.wrong[np.argpartition(apart, n - 1, axis=1)[:, :n]]
+    return nearest

@@ -1,0 +1,75 @@
+"""Where `composed` compares: unit vectors of encodings, or of dissimilarities to all landmarks (II-A)."""
+
+from abc import ABC, abstractmethod
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deepsimbad.core.composed import Moments, described, is_composed
+from deepsimbad.errors import InvalidEncodingError
+from deepsimbad.evaluators.base import Evaluator, LandmarkModel
+
+_MOST_DEVIATIONS = 1e12  # from what is usual; the square of more has no place in float32
+
+
+class OwnDissimilarities(ABC):
+    """An evaluator whose dissimilarity is no squared L2 of encodings; the composed arrays lie beside its own ones."""
+
+    is_squared_l2 = False
+
+    @abstractmethod
+    def own_dissimilarities(self, encodings: NDArray[np.float32], model: LandmarkModel) -> NDArray[np.float32]:
+        """[n, r] float32 to the fitted landmarks, at least 0 and finite; raises as `Evaluator.dissimilarities`."""
+
+    def dissimilarities(self, encodings: NDArray[np.float32], model: LandmarkModel) -> NDArray[np.float32]:
+        """See `Evaluator.dissimilarities`; of a composed model between unit vectors in the space of its own."""
+        own = self.own_dissimilarities(encodings, model)
+        return between_units(own, model) if is_composed(model) else own
+
+    def compared(self, encodings: NDArray[np.float32], model: LandmarkModel) -> NDArray[np.float32]:
+        """See `Evaluator.compared`."""
+        return self.own_dissimilarities(encodings, model)
+
+
+def seen(
+    evaluator: Evaluator, encodings: NDArray[np.float32], model: LandmarkModel
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Dissimilarities [n, r] of scenes, and what stands for their encodings where the map compares them."""
+    if not is_composed(model):
+        return evaluator.dissimilarities(encodings, model), encodings
+    vectors = evaluator.compared(encodings, model)
+    return between_units(vectors, model), vectors
+
+
+def between_units(vectors: NDArray[np.float32], model: LandmarkModel) -> NDArray[np.float32]:
+    """[n, r] squared distances between unit vectors of what is compared, [n, k], and a composed model's landmarks."""
+    usual, prototypes = (np.asarray(model[name], np.float32) for name in ("usual", "prototypes"))
+    if vectors.ndim != 2 or vectors.shape[1] != usual.shape[1]:
+        raise InvalidEncodingError(
+            f"an encoding of {vectors.shape[-1]} numbers cannot be compared with landmarks of {usual.shape[1]}: they "
+            "come from another encoder",
+            encoding_dim=usual.shape[1],
+        )
+    moments = Moments.from_mean_std(usual)
+    check_usable(vectors, moments)
+    projection = np.asarray(model["projection"], np.float32) if "projection" in model else None
+    u = described(vectors, moments, projection)
+    return np.asarray(np.clip(2 - 2 * (u @ prototypes.T), 0, 4), np.float32)
+
+
+def check_usable(vectors: NDArray[np.float32], usual: Moments) -> None:
+    """Raise InvalidEncodingError where vectors [n, k] hold NaN, infinity or what has no square in float32."""
+    farthest = np.maximum(vectors.max(axis=0) - usual.mean, usual.mean - vectors.min(axis=0))
+    if not (farthest <= _MOST_DEVIATIONS * usual.std).all():
+        raise InvalidEncodingError("an encoding holds NaN, infinity or numbers too large to compare")
+
+
+def check_units(model: LandmarkModel, n_landmarks: int) -> None:
+    """Raise InvalidEncodingError where the composed arrays of a model do not belong together."""
+    prototypes, usual, projection = model["prototypes"], model["usual"], model.get("projection")
+    k, d = prototypes.shape[-1], usual.shape[-1]
+    fits = prototypes.shape == (n_landmarks, k) and usual.shape == (2, d)
+    if not fits or (projection.shape if projection is not None else (k, k)) != (d, k):
+        raise InvalidEncodingError(f"landmarks [{n_landmarks}, {k}] with usual {usual.shape} fit no projection")
+    if not all(np.isfinite(array).all() for array in (prototypes, usual, projection) if array is not None):
+        raise InvalidEncodingError("a landmark model holds NaN or infinity")

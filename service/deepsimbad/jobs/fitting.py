@@ -1,0 +1,174 @@
+"""Fitting an evaluator to the landmarks, before anything is described by them: which they are, and what they look like.
+
+Landmarks are chosen by the paper's rule (II-B) from encodings. A fitted evaluator learns from the other drive of the
+route too where views agree that it is one, and, where it wants images, from augmented views of every landmark.
+"""
+
+from collections.abc import Callable
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deepsimbad.core.building import MapPlan
+from deepsimbad.core.drive import Drive, second_season
+from deepsimbad.core.landmark_model import select_landmarks
+from deepsimbad.evaluators.augmentation import VIEWS_A_LANDMARK, augmented
+from deepsimbad.evaluators.base import Evaluator, Fitted, Fitting, Image, Lesson
+from deepsimbad.evaluators.feature_l2 import squared_distances
+from deepsimbad.evaluators.image import decode_image
+from deepsimbad_client.recordings import Recording
+
+_LANDMARKS_AT_ONCE = 8  # whose views are encoded before they are kept
+_VIEWS_SHARE, _FIT_SHARE = 0.1, 0.6  # of progress: landmarks chosen, their views encoded
+
+
+class Pictures(Protocol):
+    """The images of a drive's frames, by the frames' indices, and encodings of views of them that were made before."""
+
+    def image(self, index: int) -> Image | None:
+        """The frame's image; None: it is not there."""
+
+    def views(self, index: int) -> NDArray[np.float32] | None:
+        """[a, d] that were kept; None: none were."""
+
+    def keep_views(self, views: dict[int, NDArray[np.float32]]) -> None:
+        """Keep encodings of views by frames' indices, for the next fit or for this one begun again."""
+
+
+class RecordingPictures:
+    """Those of a recording at hand; views are kept in memory."""
+
+    def __init__(self, recording: Recording, max_pixels: int) -> None:
+        self._recording, self._max_pixels = recording, max_pixels
+        self._frames = {frame.index: frame for frame in recording.frames}
+        self._views: dict[int, NDArray[np.float32]] = {}
+
+    def image(self, index: int) -> Image | None:
+        """See `Pictures`."""
+        if self._recording.encodings is not None:
+            return None
+        return decode_image(self._recording.image(self._frames[index], None).body, self._max_pixels)
+
+    def views(self, index: int) -> NDArray[np.float32] | None:
+        """See `Pictures`."""
+        return self._views.get(index)
+
+    def keep_views(self, views: dict[int, NDArray[np.float32]]) -> None:
+        """See `Pictures`."""
+        self._views |= views
+
+
+class Fitter:
+    """Fits one evaluator; the same landmarks of the same drives are learnt once.
+
+    Args:
+        pictures: Of the drive that landmarks are chosen from; None: there are no images.
+        seed: Of everything random.
+    """
+
+    def __init__(self, evaluator: Evaluator, pictures: Pictures | None = None, seed: int = 0) -> None:
+        self._evaluator, self._pictures, self._seed = evaluator, pictures, seed
+        self._last: tuple[tuple[Drive | int | None, ...], Fitted] | None = None
+
+    def fit(
+        self,
+        plan: MapPlan,
+        candidates: Drive,
+        n_landmarks: int,
+        other: Drive | None,
+        on_progress: Callable[[float], None],
+    ) -> Fitted:
+        """Choose r of the candidates and fit the evaluator to them; see `Evaluator.fit` and `select_landmarks`.
+
+        Args:
+            other: Another drive, perhaps of the same route.
+        """
+        fitting, asked = self._evaluator.fitting, (candidates, n_landmarks, other)
+        if self._last is not None and all(one is two for one, two in zip(asked, self._last[0], strict=True)):
+            return self._last[1]
+        to_choose = 1.0 if fitting is Fitting.NOTHING else _VIEWS_SHARE
+        rows = select_landmarks(candidates.encodings, n_landmarks, lambda share: on_progress(share * to_choose))
+        if fitting is Fitting.NOTHING:
+            return self._evaluator.fit(Lesson(candidates.encodings, rows))
+        views: NDArray[np.float32] | None = None
+        warnings: tuple[str, ...] = ()
+        if fitting is Fitting.IMAGES:
+            between = _FIT_SHARE - _VIEWS_SHARE
+            views, warnings = self._views(candidates, rows, lambda s: on_progress(_VIEWS_SHARE + s * between))
+        places = None if other is None else _same_places(plan, candidates, other, rows)
+        fitted = self._evaluator.fit(
+            Lesson(
+                candidates.encodings,
+                rows,
+                candidates.position_m,
+                None if places is None or other is None else other.encodings,
+                np.empty((0, 2), np.int64) if places is None else places,
+                views,
+                self._seed,
+                lambda share: on_progress(_FIT_SHARE + share * (1 - _FIT_SHARE)),
+            )
+        )
+        n_views = 0 if views is None else views.shape[0] * views.shape[1]
+        known = {"n_views": n_views, "n_shared_places": 0 if places is None else len(places)}
+        fitted = Fitted(fitted.model, {**known, **fitted.metrics}, (*warnings, *fitted.warnings))
+        self._last = asked, fitted
+        return fitted
+
+    def _views(
+        self, candidates: Drive, rows: NDArray[np.int64], on_progress: Callable[[float], None]
+    ) -> tuple[NDArray[np.float32] | None, tuple[str, ...]]:
+        """[r, a, d] encodings of augmented views, kept as they are made; where images are gone the landmark itself.
+
+        None where no landmark has any; and what to say of those that have none.
+        """
+        pictures, index = self._pictures, candidates.index[rows].tolist()
+        known = {at: None if pictures is None else pictures.views(at) for at in index}
+        to_do = [at for at in index if known[at] is None]
+        for first in range(0, len(to_do), _LANDMARKS_AT_ONCE):
+            if pictures is None:
+                break
+            on_progress(first / len(to_do))
+            images = {at: pictures.image(at) for at in to_do[first : first + _LANDMARKS_AT_ONCE]}
+            new = {at: self._encoded(augmented(image, at)) for at, image in images.items() if image is not None}
+            pictures.keep_views(new)
+            known |= new
+        without = [row for row, at in zip(rows.tolist(), index, strict=True) if known[at] is None]
+        warnings: tuple[str, ...] = ()
+        if without:
+            warnings = (
+                f"fitted_without_images: {len(without)} of {len(rows)} landmarks have no image waiting any more (or "
+                "came as encodings), and were fitted to the drive's encodings alone: upload the landmark drive anew "
+                "to fit to its images",
+            )
+        if len(without) == len(rows):
+            return None, warnings
+        own = {at: np.repeat(candidates.encodings[row][np.newaxis], VIEWS_A_LANDMARK, axis=0)
+               for row, at in zip(rows.tolist(), index, strict=True) if known[at] is None}  # fmt: skip
+        return np.stack([own[at] if views is None else views for at, views in known.items()]), warnings
+
+    def _encoded(self, images: list[Image]) -> NDArray[np.float32]:
+        """[a, d]."""
+        at_once = max(1, self._evaluator.largest_batch)
+        small = [self._evaluator.prepare(image) for image in images]
+        return np.concatenate(
+            [self._evaluator.encode(small[first : first + at_once]) for first in range(0, len(small), at_once)]
+        )
+
+
+def _same_places(plan: MapPlan, candidates: Drive, other: Drive, rows: NDArray[np.int64]) -> NDArray[np.int64] | None:
+    """[k, 2] (candidate, frame of the other drive) that saw one place; None where views say that the routes are two."""
+    landmarks = np.ascontiguousarray(candidates.encodings[rows])
+
+    def by_l2(drive: Drive) -> Drive:
+        encodings = np.ascontiguousarray(drive.encodings)
+        return Drive(
+            position_m=drive.position_m,
+            x_m=drive.x_m,
+            y_m=drive.y_m,
+            encodings=encodings,
+            dissimilarities=squared_distances(encodings, landmarks),
+        )
+
+    season, _, _ = second_season(by_l2(candidates), plan.closed, other, plan.same_route, by_l2)
+    return None if season is None else season.places
