@@ -196,7 +196,7 @@ def test_bodies_that_cannot_be(client):
             "invalid_request",
             ({}, '{"evaluator": {"\\ud800": 1}}', '{"evaluator": {"x": %s}}' % ("[" * 9000)),
         ),
-        ("PUT", BAD, "invalid_input", ({"evaluator": {}}, {"evaluator": {"kind": "siamese"}})),
+        ("PUT", BAD, "invalid_input", ({"evaluator": {}}, {"evaluator": {"kind": "telepathy"}})),
         ("PUT", BAD, "invalid_input", ({"evaluator": {**KIND, "extractor": "magic"}}, {"evaluator": {**KIND, "a": 1}})),
         ("PUT", BAD, "invalid_request", ({"evaluator": KIND, "actions_m": list(range(1, 100))},)),
         ("PUT", FRAME, "invalid_encoding", ({"encoding": [1.0]}, '{"encoding": [NaN]}')),
