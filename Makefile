@@ -10,7 +10,7 @@ PYTHON ?= $(shell for p in python3.11 python3.12 python3.13 python3 python; do \
 BIN := .venv/bin
 PYTEST = $(BIN)/pytest -n auto --dist loadfile --no-loadscope-reorder
 
-.PHONY: help install demo test pytest check lint bench soak load clean
+.PHONY: help install demo paper test pytest check lint bench soak load clean
 
 help: ## this list
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 10
@@ -27,6 +27,10 @@ install: .venv/.installed ## .venv with the service, the client and the tools fr
 
 demo: install ## renders a campus, maps it, localizes a drive of another season against a live server
 	@$(BIN)/python -m deepsimbad_client.commands.demo
+
+paper: install ## renders four seasons of a campus and runs the paper's section III on them, 20 minutes on two cores
+	@$(BIN)/python -m deepsimbad_campus paper-output/campus --frames 1500 --spacing-m 0.5 >&2
+	@$(BIN)/deepsimbad experiment paper --nclt paper-output/campus --out paper-output
 
 lint: install
 	$(BIN)/ruff check .
@@ -54,4 +58,4 @@ load: install ## an hour of 20 robots with remaps and rollbacks: docs/results/lo
 	$(BIN)/python -m bench.load --out docs/results/load.md
 
 clean: ## removes what the other targets made
-	rm -rf .venv demo-output .mypy_cache .ruff_cache .pytest_cache .import_linter_cache
+	rm -rf .venv demo-output paper-output .mypy_cache .ruff_cache .pytest_cache .import_linter_cache

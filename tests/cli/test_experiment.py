@@ -9,7 +9,17 @@ import pytest
 READY = ("--evaluator", "feature_l2:none", "--n-landmarks", 40)
 QUICK = (*READY, "--episodes", 6, "--training-episodes", 20)
 KEYS = {
-    *("anr", "recall_at_1", "recall_at_5", "default", "n_queries", "n_left_out", "index_bits_per_map_image", "seconds"),
+    *(
+        "anr",
+        "recall_at_1",
+        "recall_at_5",
+        "recall_at_10",
+        "default",
+        "n_queries",
+        "n_left_out",
+        "index_bits_per_map_image",
+        "seconds",
+    ),
     *("passive", "second_season", "config", "warnings", "encoding_dim", "bytes_per_encoding", "encode_ms"),
 }
 SEVEN = {"composed", "brute_force_u", "standardised", "rrf", "bag_of_landmarks", "simbad", "brute_force"}

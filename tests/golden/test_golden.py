@@ -37,7 +37,7 @@ COMMANDS = [
         ["experiment", "nbv"],
         ["settings"],
     ),
-    ["experiment", "calibration"],
+    *(["experiment", "calibration"], ["experiment", "paper"]),
     *(["backup"], ["restore"], ["export"], ["import"], ["check"], ["weights"], ["weights", "list"]),
     *(["weights", "pull"], ["weights", "verify"]),
 ]

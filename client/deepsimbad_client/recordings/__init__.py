@@ -65,6 +65,7 @@ class Recording:
     grey_levels: GreyLevels | None = None  # by which images of more than 8 bits are shown; None: by each one's own
     n_before_slice: int | None = None  # how many frames there were before a slice was taken; None: there was no slice
     camera: str | None = None  # what took the images, by its name
+    tolerance_m: float | None = None  # within which papers on this set count a match as true; None: no known set
 
     @property
     def left_out(self) -> dict[str, int]:

@@ -5,6 +5,7 @@
     rosbag:FILE[#topic]   a ROS bag; an MCAP file needs no prefix (`bag`)
     FILE.mp4 and others   a video (`video`)
     FILE.npy, FILE.csv    ready encodings [n, d], one row for each frame, in travel order
+    nordland:ROOT/summer  and other sets that others measure on (`benchmarks`)
 
 Each may end in #START:STOP or #START:STOP:STEP, Python's slice of its frames, which keep their places and positions.
 
@@ -23,6 +24,7 @@ from typing import Any
 from deepsimbad_client.errors import SourceError
 from deepsimbad_client.recordings import TURNS, Recording
 from deepsimbad_client.recordings.bag import BAG_PREFIX, BAG_SUFFIXES, METADATA, read_bag
+from deepsimbad_client.recordings.benchmarks import open_benchmark, recognised
 from deepsimbad_client.recordings.cuts import check_one_drive, thinned, turned_back
 from deepsimbad_client.recordings.encodings import ENCODING_SUFFIXES, read_encodings
 from deepsimbad_client.recordings.folder import read_folder
@@ -124,6 +126,8 @@ def _open_whole(place: str, how: _How) -> Recording:
         if not drive.name or drive.name == "..":
             raise SourceError(f"{place}: expected nclt:ROOT/DATE, for example nclt:/data/nclt/2012-01-22")
         return read_nclt(drive.parent, drive.name, camera=how.camera, undistortion=how.undistortion, rotate=how.rotate)
+    if (benchmark := open_benchmark(place, how.spacing_m, how.rotate or 0)) is not None:
+        return benchmark
     bag, _, topics = place.partition("#")
     if _is_bag(bag):
         bag_path = Path(bag.removeprefix(BAG_PREFIX)).expanduser()
@@ -137,9 +141,8 @@ def _open_whole(place: str, how: _How) -> Recording:
             "encodings in a .npy or .csv"
         )
     if path.is_dir():
-        return _nclt_camera(path, how) or read_folder(
-            path, how.spacing_m, how.rotate, how.time_offset_us, how.on_progress
-        )
+        known = _nclt_camera(path, how) or recognised(path, how.spacing_m, how.rotate or 0)
+        return known or read_folder(path, how.spacing_m, how.rotate, how.time_offset_us, how.on_progress)
     if path.suffix.lower() in VIDEO_SUFFIXES:
         return read_video(path, how.spacing_m, how.rotate or 0, how.time_offset_us)
     if path.suffix.lower() in ENCODING_SUFFIXES:

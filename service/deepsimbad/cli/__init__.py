@@ -10,6 +10,7 @@ import click
 
 from deepsimbad.cli.experiment import experiment
 from deepsimbad.cli.local import delete_domain, info, localize, map_
+from deepsimbad.cli.paper import paper
 from deepsimbad.cli.serve import init, keys, serve, settings
 from deepsimbad.cli.storage import backup, check, export, import_, restore
 from deepsimbad.cli.trial import try_
@@ -31,6 +32,7 @@ for command in (
     *(backup, restore, export, import_, check, weights),
 ):
     deepsimbad.add_command(command)
+experiment.add_command(paper)
 
 
 def run(arguments: Sequence[str] | None = None) -> int:

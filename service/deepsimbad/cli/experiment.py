@@ -39,7 +39,8 @@ from deepsimbad.jobs.passive import WINDOWS, PassiveScores
 from deepsimbad.jobs.progress import Progress
 from deepsimbad.jobs.remap import DEFAULT_TRAINING_EPISODES
 from deepsimbad.jobs.truth import known_drives, read_ground_truth
-from deepsimbad.jobs.vpr import VprConfig, VprReport, run_vpr, vpr_stages
+from deepsimbad.jobs.vpr import RANKS, VprConfig, VprReport, run_vpr, vpr_stages
+from deepsimbad_client.recordings import Recording
 from deepsimbad_client.recordings.left_out import left_out_lines
 from deepsimbad_client.recordings.sources import open_source
 
@@ -47,6 +48,7 @@ _N_LANDMARKS = 300
 _ROLES = ("landmarks", "training", "test")
 _READING_STAGES = {f"read {role}": 2.0 for role in _ROLES}
 STANDARD_OUTPUT = Path("-")
+DEFAULT_TOLERANCE_M = 2.0
 _Command = TypeVar("_Command", bound=Callable[..., Any])
 json_file_option = click.option(
     "--json",
@@ -59,9 +61,7 @@ json_file_option = click.option(
 tolerance_option = click.option(
     "--tolerance",
     type=click.FloatRange(min=0),
-    default=2.0,
-    show_default=True,
-    help="Metres within which a match is true.",
+    help=f"Metres within which a match is true.  [default: as papers on a known set, else {DEFAULT_TOLERANCE_M:g}]",
 )
 
 
@@ -121,7 +121,7 @@ def experiment() -> None:
 def vpr(
     evaluators: tuple[EvaluatorConfig, ...],
     names: tuple[str, ...],
-    tolerance: float,
+    tolerance: float | None,
     ground_truth: Path | None,
     **asked: Any,
 ) -> None:
@@ -139,7 +139,6 @@ def vpr(
         same_route = True  # test and training are scored by their positions: they count along one route
     config = VprConfig(
         list_length=asked["list_length"],
-        tolerance_m=tolerance,
         relevances=relevances,
         stateless=asked["stateless"],
         same_route=same_route,
@@ -151,9 +150,10 @@ def vpr(
         extractor = evaluator.extractor
         with progress_bar(_READING_STAGES | vpr_stages(config), extractor) as progress:
             read = _Triplet.read(asked, evaluator, progress)
-            config = replace(config, n_landmarks=read.n_landmarks)
+            tolerance_m = read.tolerance_m if tolerance is None else tolerance
+            config = replace(config, n_landmarks=read.n_landmarks, tolerance_m=tolerance_m)
             landmarks, training, test = read.drives
-            truth = true_images(test, training, tolerance, ground_truth)
+            truth = true_images(test, training, tolerance_m, ground_truth)
             report = run_vpr(*(config, read.evaluator, landmarks, training, read.test, truth, progress), read.pictures)
         sources = {**read.sources, "ground_truth": None if ground_truth is None else str(ground_truth)}
         documents[extractor] = {**report.as_dict(sources), "warnings": [*read.warnings, *report.warnings]}
@@ -239,6 +239,7 @@ class _Triplet:
     training: EncodedRecording
     test: EncodedRecording
     n_landmarks: int  # as many as are asked for, or fit
+    tolerance_m: float  # that papers on this set have, or ours
     sources: dict[str, Any]  # what was read, for the result's `config`
     warnings: list[str]
     pictures: Pictures  # of the landmark recording
@@ -267,12 +268,19 @@ class _Triplet:
             warnings += [f"{role}: {remark}" for remark in recording.remarks]
             warnings += [f"{role}: {line}" for line in left_out_lines(encoded.left_out_names, verbose=False)]
         pictures = RecordingPictures(opened[0], settings.max_pixels)
-        return cls(evaluator, landmarks, training, test, n_landmarks, sources, warnings, pictures)
+        tolerance_m = usual_tolerance_m(*opened)
+        return cls(evaluator, landmarks, training, test, n_landmarks, tolerance_m, sources, warnings, pictures)
 
     @property
     def drives(self) -> tuple[Drive, Drive, Drive]:
         """Landmarks, training, test."""
         return self.landmarks.drive, self.training.drive, self.test.drive
+
+
+def usual_tolerance_m(*recordings: Recording) -> float:
+    """What papers on a set that the recordings are of count as true, the strictest; else our own."""
+    known = [recording.tolerance_m for recording in recordings if recording.tolerance_m is not None]
+    return min(known, default=DEFAULT_TOLERANCE_M)
 
 
 def true_images(test: Drive, training: Drive, tolerance_m: float, file: Path | None) -> list[NDArray[np.int64]]:
@@ -295,24 +303,28 @@ def tell(document: dict[str, Any], json_file: Path | None, print_for_people: Cal
 def _print_extractors(reports: dict[str, VprReport]) -> None:
     """One extractor a row."""
     scores = next(iter(reports.values())).scores
-    titles = (f"{relevance}: ANR / R@1 / R@5" for relevance in scores)
+    titles = (f"{relevance}: ANR / R@1 / R@5 / R@10" for relevance in scores)
     table = Table("extractor", "numbers", "bytes", "ms an image", *titles)
     for extractor, report in reports.items():
         time_ms = "-" if report.encode_ms is None else f"{report.encode_ms:.1f}"
         cells = (
-            f"{score.anr:.2f} / {score.recall_at[1]:.0f} / {score.recall_at[5]:.0f}" for score in report.scores.values()
+            " / ".join([f"{score.anr:.2f}", *(f"{score.recall_at[k]:.0f}" for k in RANKS)])
+            for score in report.scores.values()
         )
         table.add_row(extractor, str(report.encoding_dim), str(report.bytes_per_encoding), time_ms, *cells)
     print_table(table, _queries(scores), numbers=True)
 
 
 def _print_relevances(report: VprReport) -> None:
-    table = Table("relevance", "ANR %", "R@1 %", "R@5 %")
+    table = Table("relevance", "ANR %", *(f"R@{k} %" for k in RANKS))
     for name, score in report.scores.items():
         shown = f"{name} (default)" if name == DEFAULT_RELEVANCE.value else name
-        table.add_row(shown, f"{score.anr:.2f}", f"{score.recall_at[1]:.1f}", f"{score.recall_at[5]:.1f}")
+        table.add_row(shown, f"{score.anr:.2f}", *(f"{score.recall_at[k]:.1f}" for k in RANKS))
     bits = f"{report.config.n_landmarks} landmarks; index {report.index_bits_per_map_image:.1f} bits a map image"
-    print_table(table, f"{_queries(report.scores)}; {bits}", *_no_second_season(report.same_route), numbers=True)
+    within = f"true within {report.config.tolerance_m:g} m"
+    print_table(
+        table, f"{_queries(report.scores)}; {within}; {bits}", *_no_second_season(report.same_route), numbers=True
+    )
     if report.passive is not None:
         _print_passive(report.passive)
 

@@ -7,7 +7,7 @@ from typing import Any
 import click
 from rich.table import Table
 
-from deepsimbad.cli.experiment import json_file_option, tell, tolerance_option, true_images
+from deepsimbad.cli.experiment import json_file_option, tell, tolerance_option, true_images, usual_tolerance_m
 from deepsimbad.cli.terminal import (
     data_dir_option,
     evaluator_option,
@@ -55,7 +55,7 @@ def try_(
     database: str,
     queries: str,
     landmarks: str | None,
-    tolerance: float,
+    tolerance: float | None,
     ground_truth: Path | None,
     evaluator: EvaluatorConfig,
     reading: dict[str, Any],
@@ -74,6 +74,7 @@ def try_(
     sources = {"database": database, "queries": queries} | ({} if landmarks is None else {"landmarks": landmarks})
     recordings = {role: opened(source, allow_missing, **reading) for role, source in sources.items()}
     names = {role: recording.name for role, recording in recordings.items()}
+    tolerance_m = usual_tolerance_m(*recordings.values()) if tolerance is None else tolerance
     out = out or Path(re.sub(r"[^\w.-]+", "_", f"try-{names['database']}-{names['queries']}"))
     stages = {f"read {role}": len(recording.frames) / _FRAMES_A_SECOND for role, recording in recordings.items()}
     encoded: dict[str, EncodedRecording] = {}
@@ -89,8 +90,8 @@ def try_(
                         allow_missing=allow_missing,
                     )
             drives = {role: each.drive for role, each in encoded.items()}
-            truth = true_images(drives["queries"], drives["database"], tolerance, ground_truth)
-            config = TrialConfig(tolerance, same_route=True if ground_truth is None else None)
+            truth = true_images(drives["queries"], drives["database"], tolerance_m, ground_truth)
+            config = TrialConfig(tolerance_m, same_route=True if ground_truth is None else None)
             ordered = (drives.get("landmarks"), drives["database"], drives["queries"])
             pictures = RecordingPictures(recordings["landmarks" if landmarks else "database"], settings.max_pixels)
             report = run_trial(config, measure, *ordered, truth, progress, pictures)

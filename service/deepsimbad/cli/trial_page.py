@@ -8,9 +8,9 @@ from typing import Any
 
 import cv2
 import numpy as np
-from jinja2 import Environment, PackageLoader, StrictUndefined
 from numpy.typing import NDArray
 
+from deepsimbad.cli.page import write_html
 from deepsimbad.core.drive import Drive
 from deepsimbad.errors import ImageTooLargeError, InvalidImageError
 from deepsimbad.evaluators.image import decode_image
@@ -78,10 +78,9 @@ def write_page(
 ) -> Path:
     """Write the page; `document` is the trial's JSON, and the albums hold the frames of both drives."""
     cards = _cards(report, places, queries, on_progress)
-    page = Environment(
-        loader=PackageLoader("deepsimbad.cli", "."), autoescape=True, undefined=StrictUndefined, trim_blocks=True
-    )
-    text = page.get_template("trial_page.html").render(
+    return write_html(
+        file,
+        "trial_page.html",
         **document,
         whole=BRUTE_FORCE_U,
         list_length=report.map.list_length,
@@ -94,9 +93,6 @@ def write_page(
         names=(queries.name, places.name),
         belief=_belief(report),
     )
-    file.parent.mkdir(parents=True, exist_ok=True)
-    file.write_text(text, encoding="utf-8")
-    return file
 
 
 def _cards(

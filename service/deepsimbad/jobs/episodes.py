@@ -58,14 +58,15 @@ class EpisodeRunner:
     drive: TestDrive  # the test traverse
     n_steps: int  # moves an episode
     action_std_m: float | None = None  # how far the filter trusts a move; None: as usual
+    until_sure: bool = True  # go on after so many moves, to 20, while it is not sure
 
     def run(self, episode: int, start: int, choose: Chooser) -> Episode:
-        """One episode from a test frame; on to 20 moves, while the drive lasts, where it is not sure before."""
+        """One episode from a test frame; on to 20 moves where it is not sure before, while the drive lasts."""
         shares, travelled = np.empty(self.n_steps), np.empty(self.n_steps)
         route, position_m = self.drive.route, float(self.drive.route.position_m[start])
         step = self.localizer.step(self.localizer.start(), self.drive.views.at(start))
         moved_m, sure = 0.0, self._sure(step, position_m, 1, 0.0)
-        for number in range(max(self.n_steps, MOST_MOVES)):
+        for number in range(max(self.n_steps, MOST_MOVES) if self.until_sure else self.n_steps):
             if number >= self.n_steps and sure is not None:
                 break
             action_m = choose(episode, step, position_m)

@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from deepsimbad.core.building import MapPlan
+from deepsimbad.core.building import Built, MapPlan
 from deepsimbad.core.drive import Drive, SameRoute
 from deepsimbad.core.experience.nnql import NnqlConfig
 from deepsimbad.core.localizer import ActiveLocalizer, LocalizerConfig
+from deepsimbad.core.map import Map
 from deepsimbad.core.metrics import mean_interval
 from deepsimbad.core.planners import CONSTANT, DEFAULT_PLANNER, NNQL, RANDOM
 from deepsimbad.core.relevance import DEFAULT_RELEVANCE, DEFAULT_UPDATE, Query, Relevance, UpdateRule
@@ -37,6 +38,7 @@ from deepsimbad.jobs.truth import nearest_images
 CLAIRVOYANT = "clairvoyant"
 BLOCK_M = 20.0  # starts nearer together have much the same episode
 DISTANCES_M = (10.0, 20.0, 50.0)
+_SETUPS = ("ours", "paper")
 
 
 @dataclass(frozen=True)
@@ -124,10 +126,21 @@ def _means(values: Mapping[str, NDArray[np.float64]]) -> dict[str, float]:
 def nbv_stages(config: NbvConfig) -> dict[str, float]:
     """The stages `run_nbv` reports, with their weights."""
     stages: dict[str, float] = {}
-    for setup in ("ours", "paper"):
+    for setup in _SETUPS:
         stages |= {f"map ({setup})": 1.0, f"train ({setup})": 4.0}
-        stages |= {f"{name} ({setup})": 4.0 if name in {RANDOM, CLAIRVOYANT} else 1.0 for name in _names(config)}
+        stages |= {f"{name} ({setup})": 4.0 if name in {RANDOM, CLAIRVOYANT} else 1.0 for name in planner_names(config)}
     return stages
+
+
+@dataclass(frozen=True)
+class Setup:
+    """A map with its experience database, and how beliefs on it change."""
+
+    name: str  # ours, or the paper's
+    map: Map
+    update: UpdateRule
+    action_std_m: float | None  # how far a move is trusted; None: as usual
+    same_route: SameRoute | None
 
 
 def run_nbv(
@@ -147,48 +160,79 @@ def run_nbv(
     Raises:
         InvalidMapConfigError: The test traverse is shorter than an episode.
     """
-    route, true_image = test.route(), nearest_images(test, training)
-    travel_m = config.n_steps * max(config.actions_m)
-    starts = TestDrive(Query.uninformative(1), route, true_image).starts(travel_m, config.episodes, config.seed)
-    if starts.size == 0:
-        raise InvalidMapConfigError(f"the test traverse is shorter than an episode of {travel_m:g} m")
-
-    fitter = Fitter(evaluator, pictures, config.seed)
-    setups = (
-        ("ours", config.relevance, config.update, None),
-        # With the blur that the reference figures of the paper's set-up have, metres.
-        ("paper", Relevance.RRF, UpdateRule.ADDITIVE_RELEVANCE, 0.7),
-    )
+    starts, fitter = starts_of(config, test), Fitter(evaluator, pictures, config.seed)
     results: dict[str, dict[str, list[Episode]]] = {}
     same_route = None
-    for setup, relevance, update, action_std_m in setups:
-        progress.stage(f"map ({setup})")
+    for name in _SETUPS:
+        progress.stage(f"map ({name})")
+        relevance, *_ = _setup(config, name)
         plan = MapPlan(relevance, config.list_length, config.actions_m, same_route=config.same_route)
         built = build(
             plan, training, landmarks, landmarks, config.n_landmarks, evaluator, progress.update, fitter=fitter
         )
-        drive = TestDrive(views_of(measured(test, built.map.landmark_model, evaluator)), route, true_image)
-        same_route = built.same_route
-        progress.stage(f"train ({setup})")
-        nnql = NnqlConfig(
-            config.training_episodes, config.n_steps, update=update, motion_std_m=action_std_m, seed=config.seed
-        )
-        q_values, _ = train_nnql(built.rehearsal, built.own, built.second, nnql, progress.update, available_cores())
-        map_ = replace(built.map, q_values=q_values)
-        results[setup] = {}
-        for name in _names(config):
-            progress.stage(f"{name} ({setup})")
-            # The localizer plans by itself alone; what only an experiment has is a chooser, and planning costs nothing.
-            planner = name if name in {NNQL, DEFAULT_PLANNER} else f"{CONSTANT}:{config.actions_m[0]:g}"
-            localizer = ActiveLocalizer(map_, LocalizerConfig(update=update, planner=planner))
-            runner = EpisodeRunner(localizer, drive, config.n_steps, action_std_m)
-            chooser = _chooser(name, runner, config)
-            results[setup][name] = _episodes(runner, starts, chooser, name == RANDOM, progress.update)
-    block = (route.position_m[starts] // BLOCK_M).astype(np.int64)
+        progress.stage(f"train ({name})")
+        setup = trained(config, name, built, progress.update)
+        same_route = setup.same_route
+        views = views_of(measured(test, setup.map.landmark_model, evaluator))
+        drive = TestDrive(views, test.route(), nearest_images(test, training))
+        results[name] = {}
+        for planner in planner_names(config):
+            progress.stage(f"{planner} ({name})")
+            results[name][planner] = drive_planner(config, setup, planner, drive, starts, progress.update)
+    block = (test.position_m[starts] // BLOCK_M).astype(np.int64)
     return NbvReport(config, results["ours"], results["paper"], block, same_route)
 
 
-def _names(config: NbvConfig) -> list[str]:
+def starts_of(config: NbvConfig, test: Drive) -> NDArray[np.int64]:
+    """The frames from which every planner starts.
+
+    Raises:
+        InvalidMapConfigError: The test traverse is shorter than an episode.
+    """
+    travel_m = config.n_steps * max(config.actions_m)
+    drive = TestDrive(Query.uninformative(1), test.route(), np.empty(0, np.int64))
+    starts = drive.starts(travel_m, config.episodes, config.seed)
+    if starts.size == 0:
+        raise InvalidMapConfigError(f"the test traverse is shorter than an episode of {travel_m:g} m")
+    return starts
+
+
+def _setup(config: NbvConfig, name: str) -> tuple[Relevance, UpdateRule, float | None]:
+    """Relevance, update, and how far a move is trusted: ours, or the paper's."""
+    if name == "ours":
+        return config.relevance, config.update, None
+    return Relevance.RRF, UpdateRule.ADDITIVE_RELEVANCE, 0.7  # metres: the blur of the paper's reference figures
+
+
+def trained(config: NbvConfig, name: str, built: Built, on_progress: Callable[[float], None]) -> Setup:
+    """A set-up whose map has learnt its Q-values."""
+    _, update, action_std_m = _setup(config, name)
+    nnql = NnqlConfig(
+        config.training_episodes, config.n_steps, update=update, motion_std_m=action_std_m, seed=config.seed
+    )
+    q_values, _ = train_nnql(built.rehearsal, built.own, built.second, nnql, on_progress, available_cores())
+    return Setup(name, replace(built.map, q_values=q_values), update, action_std_m, built.same_route)
+
+
+def drive_planner(
+    config: NbvConfig,
+    setup: Setup,
+    planner: str,
+    drive: TestDrive,
+    starts: NDArray[np.int64],
+    on_progress: Callable[[float], None],
+) -> list[Episode]:
+    """A planner's episodes."""
+    # The localizer plans by itself alone; what only an experiment has is a chooser, and planning costs nothing.
+    own = planner if planner in {NNQL, DEFAULT_PLANNER} else f"{CONSTANT}:{config.actions_m[0]:g}"
+    localizer = ActiveLocalizer(setup.map, LocalizerConfig(update=setup.update, planner=own))
+    # Of the paper's set-up only ranks are told, which additive updates hardly ever make sure
+    runner = EpisodeRunner(localizer, drive, config.n_steps, setup.action_std_m, until_sure=setup.name == "ours")
+    return _episodes(runner, starts, _chooser(planner, runner, config), planner == RANDOM, on_progress)
+
+
+def planner_names(config: NbvConfig) -> list[str]:
+    """In the order in which they are driven."""
     constants = (f"{CONSTANT}_{action_m:g}" for action_m in config.actions_m)
     return [RANDOM, *constants, CLAIRVOYANT, NNQL, DEFAULT_PLANNER]
 

@@ -4,16 +4,16 @@ One session over the test drive in order; and what the belief makes of it, besid
 """
 
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from deepsimbad.core.building import Built, MapPlan
-from deepsimbad.core.composed import unit_encodings
+from deepsimbad.core.building import Built, MapPlan, build_map
+from deepsimbad.core.composed import compose, unit_encodings
 from deepsimbad.core.drive import Drive, SameRoute
 from deepsimbad.core.index.retrieval import relevances
 from deepsimbad.core.map import Map
@@ -29,7 +29,8 @@ from deepsimbad.store.arrays import is_halvable
 from deepsimbad.store.map_file import index_bytes, seal, write_map
 
 _QUERIES_A_BLOCK = 64  # of brute force: large enough for a matrix product, small enough for memory
-_ACTIONS_M = tuple(float(metres) for metres in range(1, 11))  # over which views err alike is learnt so far
+ACTIONS_M = tuple(float(metres) for metres in range(1, 11))  # over which views err alike is learnt so far
+RANKS = (1, 5, 10)  # of recall
 BRUTE_FORCE_U = "brute_force_u"  # all of the unit vectors that composed lists stand for: the most they could tell
 
 
@@ -72,6 +73,7 @@ class VprReport:
             "anr": {name: score.anr for name, score in self.scores.items()},
             "recall_at_1": {name: score.recall_at[1] for name, score in self.scores.items()},
             "recall_at_5": {name: score.recall_at[5] for name, score in self.scores.items()},
+            "recall_at_10": {name: score.recall_at[10] for name, score in self.scores.items()},
             "default": DEFAULT_RELEVANCE.value,
             "n_queries": first.n_queries,
             "n_left_out": first.n_left_out,
@@ -119,43 +121,20 @@ def run_vpr(
         pictures: Of the landmark traverse, for evaluators that are fitted to images.
     """
     progress.stage("describe")
-    fitter = Fitter(evaluator, pictures, config.seed)
-    scores: dict[str, RetrievalScores] = {}
-    built: dict[Relevance, Built] = {}
-    model: LandmarkModel | None = None
-    for number, name in enumerate(config.relevances):
-        plan = MapPlan(
-            name,
-            config.list_length,
-            _ACTIONS_M,
-            same_route=config.same_route,
-            bars_own_place=config.bar_own_place,
-        )
-        chosen = landmarks if name is Relevance.COMPOSED or model is None else model
-        share = number / len(config.relevances)
-        built[name] = build(
-            *(plan, training, landmarks, chosen, config.n_landmarks, evaluator),
-            lambda done, share=share: progress.update(share + done / len(config.relevances)),  # type: ignore[misc]
-            fitter=fitter,
-        )
-        if name is not Relevance.COMPOSED:
-            model = built[name].map.landmark_model
-    for name in config.relevances:
-        progress.stage(f"query by {name.value}")
-        seen = measured(test.drive, built[name].map.landmark_model, evaluator)
-        views = views_of(seen)
-        live = None if config.stateless else built[name].map.live_statistics
-        worth = _worth_of_views(test.drive)
-        scores[name.value] = _score(built[name].map, views, true_images, live, worth, progress.update)
-        if name is Relevance.COMPOSED:
-            scores[BRUTE_FORCE_U] = score_by_all(built[name], seen, true_images, config.stateless)
+    built = build_maps(
+        config, Fitter(evaluator, pictures, config.seed), evaluator, landmarks, training, progress.update
+    )
+    views = ViewsOf(test.drive, evaluator)
+    scores = score_maps(config, built, views, [true_images], progress)[0]
     passive: PassiveScores | None = None
     if _is_driven(config):
         progress.stage("drive")
         map_ = built[Relevance.COMPOSED].map
-        seen = measured(test.drive, map_.landmark_model, evaluator)
+        seen = views.seen(map_.landmark_model)
         by_all = relevances_by_all(built[Relevance.COMPOSED], seen, stateless=False)
-        passive = drive_in_order(map_, views_of(seen), test.drive.position_m, by_all, true_images, progress.update)
+        passive = drive_in_order(
+            *(map_, views.by(map_.landmark_model), seen.position_m, by_all, true_images, progress.update)
+        )
     stages = {stage.replace(" ", "_") for stage in vpr_stages(config)}
     seconds = {stage: took for stage, took in progress.seconds().items() if stage in stages}
     sized = built.get(DEFAULT_RELEVANCE, built[config.relevances[0]])
@@ -166,12 +145,127 @@ def run_vpr(
         seconds,
         sized.same_route,
         encoding_dim=test.drive.encoding_dim,
-        bytes_per_encoding=test.drive.encoding_dim * (2 if is_halvable(test.drive.encodings) else 4),
+        bytes_per_encoding=bytes_per_encoding(test.drive),
         encode_ms=test.encode_ms,
         passive=passive,
         fitting=sized.fitting,
         warnings=sized.warnings,
     )
+
+
+def build_maps(
+    config: VprConfig,
+    fitter: Fitter,
+    evaluator: Evaluator,
+    landmarks: Drive | None,
+    training: Drive,
+    on_progress: Callable[[float], None] = lambda _: None,
+) -> dict[Relevance, Built]:
+    """A map of the training traverse for every relevance; all but `composed` share their landmarks."""
+    built: dict[Relevance, Built] = {}
+    model: LandmarkModel | None = None
+    for number, name in enumerate(config.relevances):
+        plan = MapPlan(
+            name,
+            config.list_length,
+            ACTIONS_M,
+            same_route=config.same_route,
+            bars_own_place=config.bar_own_place,
+        )
+        chosen = landmarks if name is Relevance.COMPOSED or model is None else model
+        share = number / len(config.relevances)
+        built[name] = build(
+            *(plan, training, landmarks, chosen, config.n_landmarks, evaluator),
+            lambda done, share=share: on_progress(share + done / len(config.relevances)),  # type: ignore[misc]
+            fitter=fitter,
+        )
+        if name is not Relevance.COMPOSED:
+            model = built[name].map.landmark_model
+    return built
+
+
+def listed_anew(built: Built, list_length: int) -> Map:
+    """The map with lists of another length, and nothing learnt anew: single views are compared by no more."""
+    map_ = built.map
+    if map_.relevance is Relevance.COMPOSED and built.places is not None:
+        return replace(map_, lists=compose(built.places, map_.landmark_model["prototypes"], list_length))
+    lists = build_map(map_.relevance, built.own, list_length)
+    return replace(lists, landmark_model=map_.landmark_model, actions_m=map_.actions_m)
+
+
+class ViewsOf:
+    """A test drive's frames as live views, measured once by the landmarks of every model.
+
+    Attributes:
+        drive: The drive.
+    """
+
+    def __init__(self, drive: Drive, evaluator: Evaluator) -> None:
+        self.drive, self._evaluator = drive, evaluator
+        self._known: list[tuple[LandmarkModel, Drive, Query]] = []
+
+    def seen(self, model: LandmarkModel) -> Drive:
+        """The drive, measured."""
+        return self._by(model)[0]
+
+    def by(self, model: LandmarkModel) -> Query:
+        """A batch."""
+        return self._by(model)[1]
+
+    def _by(self, model: LandmarkModel) -> tuple[Drive, Query]:
+        """Models are the same where their arrays are."""
+        for known, drive, views in self._known:
+            if known.keys() == model.keys() and all(known[name] is model[name] for name in known):
+                return drive, views
+        drive = measured(self.drive, model, self._evaluator)
+        self._known.append((model, drive, views_of(drive)))
+        return self._known[-1][1:]
+
+
+def score_maps(
+    config: VprConfig,
+    built: Mapping[Relevance, Built],
+    test: ViewsOf,
+    truths: Sequence[Sequence[NDArray[np.int64]]],
+    progress: Progress,
+    *,
+    bound: bool = True,
+) -> list[dict[str, RetrievalScores]]:
+    """Scores by relevance, and of what rivals `composed`, for each of several truths.
+
+    Args:
+        truths: For every test frame the map images that count as true; as often as somebody sees that otherwise.
+        bound: Whether `brute_force_u` is scored too, beside `composed`.
+    """
+    scores: list[dict[str, RetrievalScores]] = [{} for _ in truths]
+
+    def keep(name: str, rows: Iterable[NDArray[np.floating]]) -> None:
+        for each, score in zip(scores, _scores(rows, truths), strict=True):
+            each[name] = score
+
+    for name in config.relevances:
+        progress.stage(f"query by {name.value}")
+        map_ = built[name].map
+        live, worth = None if config.stateless else map_.live_statistics, _worth_of_views(test.drive)
+        keep(name.value, _relevances_in_order(map_, test.by(map_.landmark_model), live, worth, progress.update))
+        if name is Relevance.COMPOSED and bound:
+            keep(BRUTE_FORCE_U, relevances_by_all(built[name], test.seen(map_.landmark_model), config.stateless))
+    return scores
+
+
+def _scores(
+    rows: Iterable[NDArray[np.floating]], truths: Sequence[Sequence[NDArray[np.int64]]]
+) -> list[RetrievalScores]:
+    scorers = [RetrievalScorer(RANKS) for _ in truths]
+    for number, row in enumerate(rows):
+        for scorer, truth in zip(scorers, truths, strict=True):
+            scorer.add(row, truth[number])
+    return [scorer.result() for scorer in scorers]
+
+
+def bytes_per_encoding(drive: Drive) -> int:
+    """Of a frame in a traverse's file."""
+    return drive.encoding_dim * (2 if is_halvable(drive.encodings) else 4)
 
 
 def bits_per_map_image(map_: Map) -> float:
@@ -188,37 +282,30 @@ def _worth_of_views(drive: Drive) -> list[float]:
     return [1.0, *(worth_of_move(move_m) for move_m in np.diff(drive.position_m).tolist())]
 
 
-def _score(
+def _relevances_in_order(
     map_: Map,
     views: Query,
-    true_images: Sequence[NDArray[np.int64]],
     live: LiveStatistics | None,
     worth: Sequence[float],
     on_progress: Callable[[float], None],
-) -> RetrievalScores:
-    scorer = RetrievalScorer()
+) -> Iterator[NDArray[np.float32]]:
+    """[n] of every view, one after the other."""
     # Without a session's statistics every view is compared by itself; many at once are one matrix product.
     size = _QUERIES_A_BLOCK if map_.relevance is Relevance.BRUTE_FORCE else 1
-    for first in range(0, len(true_images), size):
+    for first in range(0, len(worth), size):
         asked = views.at(slice(first, first + size))
         if size == 1:
             asked = views.at(first)
         live = live.observing(asked, worth[first]) if live else None
-        rows = np.atleast_2d(relevances(map_, asked, live))
-        for row, truth in zip(rows, true_images[first : first + size], strict=True):
-            scorer.add(row, truth)
-        on_progress(min(1.0, (first + size) / len(true_images)))
-    return scorer.result()
+        yield from np.atleast_2d(relevances(map_, asked, live))
+        on_progress(min(1.0, (first + size) / len(worth)))
 
 
 def score_by_all(
     built: Built, test: Drive, true_images: Sequence[NDArray[np.int64]], stateless: bool
 ) -> RetrievalScores:
     """What unit vectors of places, `built.places`, score: those that lists stand for, or what else restores them."""
-    scorer = RetrievalScorer()
-    for relevance, truth in zip(relevances_by_all(built, test, stateless), true_images, strict=True):
-        scorer.add(relevance, truth)
-    return scorer.result()
+    return _scores(relevances_by_all(built, test, stateless), [true_images])[0]
 
 
 def relevances_by_all(built: Built, test: Drive, stateless: bool) -> Iterator[NDArray[np.float32]]:

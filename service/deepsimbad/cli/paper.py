@@ -1,0 +1,250 @@
+"""`deepsimbad experiment paper`: section III of the paper on four drives of NCLT, a page of it, tables and JSON."""
+
+import math
+import os
+import platform
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import click
+from rich.table import Table
+
+from deepsimbad.cli.experiment import DEFAULT_TOLERANCE_M, json_file_option, tell, tolerance_option
+from deepsimbad.cli.paper_page import write_report
+from deepsimbad.cli.terminal import data_dir_option, evaluator_option, given_settings, print_table, progress_bar
+from deepsimbad.core.drive import Drive
+from deepsimbad.errors import CancelledError, InvalidSourceError
+from deepsimbad.evaluators.base import Evaluator
+from deepsimbad.evaluators.compute import available_cores
+from deepsimbad.evaluators.registry import EvaluatorConfig, make_evaluator
+from deepsimbad.jobs.build import EncodedRecording, encode_recording
+from deepsimbad.jobs.fitting import RecordingPictures
+from deepsimbad.jobs.kept_encodings import Kept, kept_encodings
+from deepsimbad.jobs.paper import (
+    SEASONS,
+    TRIPLETS,
+    KeptResults,
+    PaperConfig,
+    Shares,
+    drive_digest,
+    in_threads,
+    measure_paper,
+    runnable,
+    seconds_to_measure,
+)
+from deepsimbad.jobs.paper_report import paper_document
+from deepsimbad.jobs.vpr import bytes_per_encoding
+from deepsimbad.release import release
+from deepsimbad_client.errors import SourceError
+from deepsimbad_client.recordings import Recording
+from deepsimbad_client.recordings.encodings import ENCODING_SUFFIXES
+from deepsimbad_client.recordings.options import opened, reading
+from deepsimbad_client.recordings.sources import NCLT_PREFIX
+
+_FRAMES_AT_ONCE = 2000  # that a run which is killed may have to encode again
+_ENCODE_S = 0.05  # a frame, on one core of a server's
+_MOST_POINTS = 400  # of a trajectory as it is drawn
+
+
+@click.command()
+@click.option(
+    "--nclt", "root", required=True, type=click.Path(file_okay=False, path_type=Path), help="Folder of drives."
+)
+@click.option(
+    "--out", type=click.Path(file_okay=False, path_type=Path), default=Path("paper-output"), show_default=True
+)
+@evaluator_option
+@click.option("--n-landmarks", type=click.IntRange(min=1), default=500, show_default=True)
+@click.option("--training-episodes", type=click.IntRange(min=0), default=10_000, show_default=True)
+@click.option("--episodes", type=click.IntRange(min=2), default=150, show_default=True, help="Of every planner, drawn.")
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
+@tolerance_option
+@reading
+@json_file_option
+@data_dir_option
+def paper(
+    root: Path,
+    out: Path,
+    evaluator: EvaluatorConfig,
+    tolerance: float | None,
+    reading: dict[str, Any],
+    json_file: Path | None,
+    **asked: Any,
+) -> None:
+    """The paper's section III: eight triplets of four drives, Fig. 5 to 7, and what is better.
+
+    ROOT holds NCLT as downloaded or rendered, or ready encodings DATE.npy, of 2012-01-22, 2012-03-31, 2012-08-04 and
+    2012-11-17. What lacks a drive is not run, and said. DIR gets index.html, report.md, figures.csv and paper.json, and
+    keeps what a second run need not do again. NCLT whole takes a night: --every-m 1 takes one frame a metre.
+    """
+    settings = given_settings()
+    first_m = DEFAULT_TOLERANCE_M if tolerance is None else tolerance
+    config = PaperConfig(
+        tolerances_m=tuple(sorted({first_m, 5.0, 10.0, 25.0}, key=lambda m: (m != first_m, m))), **asked
+    )
+    measure = make_evaluator(evaluator, settings.compute())
+    recordings, missing = _opened(root, reading)
+    triplets = runnable(recordings)
+    if not triplets:
+        raise InvalidSourceError(
+            f"{root} has the drives of no triplet: {'; '.join(f'{season}: {why}' for season, why in missing.items())}"
+        )
+    n_frames = {season: len(recording.frames) for season, recording in recordings.items()}
+    encode_s = sum(_ENCODE_S * n_frames[each] for each, drive in recordings.items() if drive.encodings is None)
+    measure_s = sum(seconds_to_measure(config, n_frames).values())
+    not_run = ["-".join(triplet) for triplet in TRIPLETS if triplet not in triplets]
+    _tell_plan(recordings, missing, not_run, (encode_s + measure_s) / available_cores(), out)
+    made_of = {"weights": measure.weights_sha256, **evaluator.as_dict(), **reading}
+    try:
+        with progress_bar({"encode": encode_s + 1, "measure": measure_s, "write": 2.0}, "paper") as progress:
+            progress.stage("encode")
+            encoded = _encoded(recordings, measure, settings.max_pixels, out / "encodings", made_of, progress.update)
+            drives = {season: each.drive for season, each in encoded.items()}
+            progress.stage("measure")
+            results = measure_paper(
+                *(config, measure, drives, out / "results", {"evaluator": evaluator.as_dict()}),
+                lambda _, share: progress.update(share),
+                {season: RecordingPictures(drive, settings.max_pixels) for season, drive in recordings.items()},
+            )
+            progress.stage("write")
+            document = {
+                **paper_document(config, results),
+                "seasons": {
+                    season: {
+                        "date": SEASONS[season],
+                        "n_frames": drive.n_frames,
+                        "length_m": float(drive.position_m[-1] - drive.position_m[0]),
+                        "left_out": encoded[season].left_out,
+                        "encode_ms": _encode_ms(out, season, encoded[season], made_of),
+                        "trajectory": _trajectory(drive),
+                    }
+                    for season, drive in drives.items()
+                },
+                "missing": missing,
+                "not_run": not_run,
+                "config": {
+                    **asdict(config),
+                    "nclt": str(root),
+                    "evaluator": evaluator.as_dict(),
+                    **{name: value for name, value in reading.items() if value is not None},
+                },
+                "bits_per_encoding": 8 * bytes_per_encoding(next(iter(drives.values()))),
+                "machine": machine(),
+                "release": release(),
+            }
+            document["files"] = [str(file) for file in write_report(out, document)]
+    except CancelledError as error:
+        raise CancelledError(
+            f"{error}; the same command goes on where it stopped ({out} keeps what is done)"
+        ) from error
+    tell(document, json_file, lambda: _print(document))
+
+
+def _opened(root: Path, reading: Mapping[str, Any]) -> tuple[dict[str, Recording], dict[str, str]]:
+    """The drives that are there, and why others are not."""
+    recordings, missing = dict[str, Recording](), dict[str, str]()
+    for season, date in SEASONS.items():
+        ready = (root / f"{date}{suffix}" for suffix in sorted(ENCODING_SUFFIXES, reverse=True))
+        source = next((str(file) for file in ready if file.is_file()), f"{NCLT_PREFIX}{root / date}")
+        try:
+            recordings[season] = opened(source, **reading)
+        except SourceError as error:
+            missing[season] = f"{date}: {' '.join(str(error).split())}"
+    return recordings, missing
+
+
+def _tell_plan(
+    recordings: Mapping[str, Recording], missing: Mapping[str, str], not_run: list[str], seconds: float, out: Path
+) -> None:
+    """What will be done, on standard error."""
+    for season, recording in recordings.items():
+        length_m = recording.frames[-1].position_m - recording.frames[0].position_m
+        click.echo(f"{season} {SEASONS[season]}: {len(recording.frames)} frames, {length_m:.0f} m", err=True)
+    for season, why in missing.items():
+        click.echo(f"{season} is missing: {why}", err=True)
+    run = ", ".join("-".join(triplet) for triplet in runnable(recordings))
+    click.echo(f"landmark-training-test: {run}" + (f"; not run: {', '.join(not_run)}" if not_run else ""), err=True)
+    minutes = f"{seconds / 60:.0f} minutes" if seconds < 5400 else f"{seconds / 3600:.0f} hours"
+    click.echo(f"about {minutes} on {available_cores()} cores, less what {out} keeps of earlier runs", err=True)
+
+
+def _encoded(
+    recordings: Mapping[str, Recording],
+    evaluator: Evaluator,
+    max_pixels: int,
+    folder: Path,
+    made_of: Mapping[str, Any],
+    on_progress: Callable[[float], None],
+) -> dict[str, EncodedRecording]:
+    """Every drive, some at once."""
+    shares = Shares(
+        lambda _, share: on_progress(share), {each: len(drive.frames) for each, drive in recordings.items()}
+    )
+    encoded: dict[str, EncodedRecording] = {}
+
+    def encode(season: str) -> None:
+        recording, report, all_kept = recordings[season], shares.report(season), Kept()
+        encodes = partial(encode_recording, evaluator=evaluator, max_pixels=max_pixels)
+        n, date = len(recording.frames), SEASONS[season]
+        for first in range(0, n if recording.encodings is None else 0, _FRAMES_AT_ONCE):
+            part = recording.sliced(slice(first, first + _FRAMES_AT_ONCE))
+
+            def so_far(share: float, first: int = first, part: Recording = part) -> None:
+                report((first + share * len(part.frames)) / n)
+
+            with kept_encodings(folder, f"{date}-{first}", source=date, **made_of) as kept:
+                encodes(part, kept=kept, on_progress=so_far)
+            all_kept |= kept
+        encoded[season] = encodes(recording, kept=all_kept, on_progress=lambda _: None)
+        report(1.0)
+
+    in_threads([partial(encode, season) for season in recordings])
+    return {season: encoded[season] for season in recordings}
+
+
+def _encode_ms(out: Path, season: str, encoded: EncodedRecording, made_of: Mapping[str, Any]) -> float | None:
+    """Of the run that encoded."""
+    digest = drive_digest(encoded.drive)
+    kept = KeptResults(out / "results", made_of)
+    took: float | None = kept.get(f"{season}-encode", lambda: {"ms": encoded.encode_ms}, digest=digest)["ms"]
+    return took
+
+
+def _trajectory(drive: Drive) -> list[list[float]]:
+    """Points [x, y] along it; none where it does not know them."""
+    step = -(-drive.n_frames // _MOST_POINTS)
+    points = zip(drive.x_m[::step].tolist(), drive.y_m[::step].tolist(), strict=True)
+    return [[x, y] for x, y in points if math.isfinite(x) and math.isfinite(y)]
+
+
+def machine() -> str:
+    """What it runs on, without its name."""
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text(encoding="utf-8").splitlines() if info.is_file() else []
+    model = next(
+        (line.partition(":")[2].strip() for line in lines if line.startswith("model name")), platform.machine()
+    )
+    return f"{model}, {available_cores()} of {os.cpu_count()} cores, Python {platform.python_version()}"
+
+
+def _print(document: dict[str, Any]) -> None:
+    h, lengths = str(document["list_length"]), list(document["anr"])
+    table = Table("ANR %, h =", *lengths)
+    for name in document["methods"]:
+        cells = (document["anr"][length].get(name) for length in lengths)
+        table.add_row(name, *("" if each is None else f"{each['mean']:.2f}" for each in cells))
+    bits = document["index_bits_per_map_image"]["rrf"]
+    print_table(
+        table,
+        f"{len(document['by_triplet'])} triplets, {document['n_queries']} queries, {document['n_left_out']} left out; "
+        f"rrf at h = {h}: {bits:.1f} bits a map image",
+        *(
+            f"{each['verdict']}: {each['claim']} ({each['n_agree']} of {each['n_triplets']} triplets)"
+            for each in document["claims"]
+        ),
+        f"page: {document['files'][0]}",
+        numbers=True,
+    )

@@ -1,0 +1,108 @@
+"""`deepsimbad experiment paper`: section III on what drives there are, kept, and told on one page."""
+
+import csv
+import json
+import re
+
+import numpy as np
+import pytest
+
+import deepsimbad.jobs.paper as job
+from deepsimbad.cli.paper_page import METHODS
+from deepsimbad.errors import CancelledError
+
+QUICK = ("--evaluator", "feature_l2:none", "--n-landmarks", 8, "--training-episodes", 20, "--episodes", 2)
+DATES = {"landmarks": "2012-01-22", "training": "2012-03-31", "test": "2012-08-04"}
+
+
+@pytest.fixture(scope="module")
+def encodings(tmp_path_factory):
+    """Three of the four drives, ready encoded; autumn is not there."""
+    folder = tmp_path_factory.mktemp("nclt")
+    rng = np.random.default_rng(2)
+    places = rng.normal(size=(112, 12))
+    for date in DATES.values():
+        season = rng.normal(size=12)
+        np.save(folder / f"{date}.npy", (places + season + 0.5 * rng.normal(size=places.shape)).astype(np.float32))
+    return folder
+
+
+def paper(deepsimbad, encodings, *more):
+    return deepsimbad("experiment", "paper", "--nclt", encodings, "--out", "out", *QUICK, *more)
+
+
+@pytest.mark.slow
+def test_figures_are_those_of_the_single_experiments_and_the_page_holds_them(deepsimbad, encodings, tmp_path):
+    ran = paper(deepsimbad, encodings, "--json", "paper.json")
+    assert ran.code == 0, ran.err
+    assert "AU is missing: 2012-11-17: no images of NCLT" in ran.err
+    document = json.loads((tmp_path / "paper.json").read_text())
+    assert list(document["by_triplet"]) == ["WI-SP-SU", "SP-SU-WI"]
+    assert set(document["not_run"]) == {"WI-SP-AU", "SP-SU-AU", "SU-AU-WI", "SU-AU-SP", "AU-WI-SP", "AU-WI-SU"}
+    assert list(document["anr"]) == ["1", "2", "4", "8"], "no list is longer than there are landmarks"
+
+    sources = [part for role, date in DATES.items() for part in (f"--{role}", encodings / f"{date}.npy")]
+    usual = (*sources, "--evaluator", "feature_l2:none", "--n-landmarks", 8)
+    triplet = document["by_triplet"]["WI-SP-SU"]
+    for h in (2, 4):
+        single = json.loads(deepsimbad("experiment", "vpr", *usual, "--list-length", h, "--json").out)
+        assert triplet["anr"][str(h)] == {name: single["anr"][name] for name in triplet["anr"][str(h)]}
+    assert triplet["recall"]["2"]["rrf"]["10"] == single["recall_at_10"]["rrf"]
+    assert document["index_bits_per_map_image"]["composed"] > 0
+    active = json.loads(deepsimbad("experiment", "nbv", *usual, *QUICK[4:], "--json").out)
+    for setup, part in (("ours", "anr"), ("paper", "anr_paper")):
+        assert triplet["active"][setup] == {name: active[part][name] for name in triplet["active"][setup]}
+        assert set(active[part]) - set(triplet["active"][setup]) == {"clairvoyant"}
+    assert triplet["views_to_confident"]["informed"] == active["views_to_confident"]["informed"]
+
+    mean = np.mean([each["anr"]["4"]["rrf"] for each in document["by_triplet"].values()])
+    assert document["anr"]["4"]["rrf"]["mean"] == pytest.approx(mean)
+    claim = document["claims"][0]
+    low, high = claim["difference"]["stretches"]
+    assert low <= claim["values"]["brute_force"] - claim["values"]["rrf"] <= high
+    verdicts = {"holds": high < 0, "the other way round": low > 0}
+    assert all(is_so for verdict, is_so in verdicts.items() if verdict == claim["verdict"])
+
+    page = (tmp_path / "out" / "index.html").read_text()
+    assert re.findall(r"(?:src|href)=\"(?!#)", page) == []
+    assert "<script" not in page
+    assert "prefers-color-scheme: dark" in page
+    assert all(label in page for label in METHODS.values())
+    assert "AU is missing" in page
+    rows = list(csv.DictReader((tmp_path / "out" / "figures.csv").read_text().splitlines()))
+    told = [row for row in rows if row["figure"] == "anr" and row["method"] == "rrf" and row["list_length"] == "4"]
+    assert {row["triplet"]: float(row["value"]) for row in told}["WI-SP-SU"] == triplet["anr"]["4"]["rrf"]
+    assert "| RRF |" in (tmp_path / "out" / "report.md").read_text()
+
+
+@pytest.mark.slow
+def test_a_run_that_was_stopped_goes_on_and_nothing_stale_is_taken(deepsimbad, encodings, monkeypatch):
+    done, score = [], job.score_maps
+
+    def stopped_at_the_third(*arguments, **options):
+        if len(done) == 3:
+            raise CancelledError("cancelled")
+        done.append(1)
+        return score(*arguments, **options)
+
+    monkeypatch.setattr(job, "available_cores", lambda: 1)
+    monkeypatch.setattr(job, "score_maps", stopped_at_the_third)
+    ran = paper(deepsimbad, encodings)
+    assert (ran.code, "goes on where it stopped" in ran.err) == (130, True)
+    counted = []
+    monkeypatch.setattr(job, "score_maps", lambda *a, **o: counted.append(1) or score(*a, **o))
+    assert paper(deepsimbad, encodings).code == 0
+    assert len(counted) == 2 * 4 - 3, "two triplets at four list lengths, less what was kept"
+    built, build = [], job.build_maps
+    monkeypatch.setattr(job, "build_maps", lambda *arguments: built.append(1) or build(*arguments))
+    assert paper(deepsimbad, encodings).code == 0
+    assert not built, "nothing was left to measure"
+    assert paper(deepsimbad, encodings, "--tolerance", 3).code == 0
+    assert len(built) == 2, "another tolerance is measured anew, on a map of each pair"
+
+
+def test_without_the_drives_of_a_triplet_it_says_which_are_missing(deepsimbad, tmp_path):
+    ran = deepsimbad("experiment", "paper", "--nclt", tmp_path, *QUICK)
+    assert ran.code == 1
+    assert "has the drives of no triplet" in ran.err
+    assert all(date in ran.err for date in DATES.values())
