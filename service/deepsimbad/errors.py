@@ -46,6 +46,10 @@ class InvalidInputError(DeepSimbadError, code="invalid_input"):
     """A value that can never be accepted as it stands."""
 
 
+class UnknownParameterError(InvalidInputError, code="unknown_parameter"):
+    """A query parameter that the call does not take."""
+
+
 class EmptyBodyError(InvalidInputError, code="empty_body"):
     """An observation or frame without content."""
 

@@ -358,17 +358,48 @@ def test_an_unknown_word_is_answered_with_the_nearest_and_with_what_there_is(cli
     assert "did you mean feature_l2?" in detail(made, 422, "invalid_input")
 
 
+def test_a_query_parameter_that_a_call_does_not_take_is_refused_by_every_one(client):
+    document = client.get("/openapi.json").json()
+    for method, path, *_ in operations(document):
+        refused = problem(client.request(method, f"{path.format(**NAMES)}&shortlis=3"), 422, "unknown_parameter")
+        assert refused["unknown"] == ["shortlis"]
+        listed = document["paths"][path.partition("?")[0]][method.lower()].get("parameters", ())
+        assert sorted(refused["allowed"]) == sorted(each["name"] for each in listed if each["in"] == "query")
+        assert ("did you mean shortlist?" in refused["detail"]) == ("shortlist" in refused["allowed"])
+    session = client.session()
+    problem(client.post(f"{session}/observations?action_m=3&shortlis=3", json=RANKS), 422, "unknown_parameter")
+    assert client.get(session).json()["n_observations"] == 0
+    mistyped = client.put(f"{FRAMES}/0?positon_m=1&position_m=1", json={"encoding": [0.5] * DIM})
+    assert "did you mean position_m?" in problem(mistyped, 422, "unknown_parameter")["detail"]
+    for path in ("/", "/openapi.json", "/docs"):
+        problem(client.get(f"{path}?v=2"), 422, "unknown_parameter")
+
+
 def test_remaps_that_fail_leave_the_map_that_serves(client):
     client.upload("ready", "backwards", ready_encodings()[:2], [5.0, 4.0])
     client.post(f"{ADMIN}/traverses", json={"name": "empty"})
     for config, code in (
         ({"training_traverse": "backwards"}, "invalid_route"),
-        ({"training_traverse": "empty"}, None),
-        ({"training_traverse": "drive", "list_length": N_LANDMARKS + 1}, "invalid_map_config"),
+        ({"training_traverse": "backwards", "landmark_traverse": "drive", "relevance": "rrf"}, "invalid_route"),
     ):
         job = client.remap("ready", **config)
         assert job["state"] == "failed"
-        assert code is None or job["error"]["code"] == code
+        assert job["error"]["code"] == code
+    n_jobs = len(client.get("/v1/admin/jobs?domain=ready").json()["jobs"])
+    for more, what in (  # what can be known before a job is made
+        ({"training_traverse": "empty"}, "no frames yet"),
+        ({"landmark_traverse": "empty"}, "no frames yet"),
+        ({"check_traverse": "empty"}, "no frames yet"),
+        ({"list_length": N_LANDMARKS + 1}, f"list_length {N_LANDMARKS + 1} is not within 1"),
+        ({"list_length": 5, "n_landmarks": 4}, "list_length"),
+        ({"n_landmarks": N_LANDMARKS - 1}, f"the active map has {N_LANDMARKS} landmarks"),
+        ({"landmark_traverse": "backwards"}, "list_length 4 is not within 1 and the number of landmarks, 2"),
+        ({"training_traverse": "backwards", "relevance": "rrf"}, "the number of landmarks, 2"),
+        ({"training_traverse": "backwards", "append": True, "list_length": 3}, "what is appended to it must be alike"),
+    ):
+        refused = problem(client.post(f"{ADMIN}/remaps", json={**REMAP, **more}), 422, "invalid_map_config")
+        assert what in refused["detail"]
+    assert len(client.get("/v1/admin/jobs?domain=ready").json()["jobs"]) == n_jobs
     too_many = {**REMAP, "landmark_traverse": "drive", "n_landmarks": N_READY + 1}
     assert problem(client.post(f"{ADMIN}/remaps", json=too_many), 422, "too_few_candidates")["n_candidates"] == N_READY
     assert client.get(READY).json()["map_version"] == 1
@@ -463,17 +494,14 @@ def test_a_number_that_stands_still_in_a_season_says_nothing(mapped, still):
         assert [place(live[frame])["belief"]["mode_m"] for frame in (30, 80)] == [30, 80]
 
 
-@pytest.mark.parametrize(
-    ("n_frames", "options", "code", "says"),
-    [
-        (3, {}, "invalid_map_config", "list_length 4"),
-        (1, {}, "invalid_map_config", "list_length 4"),
-    ],
-)
-def test_fewer_frames_than_a_list_takes_are_named(mapped, n_frames, options, code, says):
-    job, _ = mapped(season(1, n_frames), **options)
-    assert (job["state"], job["error"]["code"]) == ("failed", code)
-    assert says in job["error"]["detail"]
+@pytest.mark.parametrize("n_frames", [3, 1])
+def test_fewer_frames_than_a_list_takes_are_refused_at_once(client, n_frames):
+    base = f"/v1/admin/domains/few-{n_frames}"
+    assert client.put(base, json={"evaluator": {**KIND, "extractor": "none"}}).is_success
+    client.upload(f"few-{n_frames}", "drive", season(1, n_frames), np.arange(float(n_frames)))
+    refused = problem(client.post(f"{base}/remaps", json=REMAP), 422, "invalid_map_config")
+    assert "list_length 4" in refused["detail"]
+    assert client.delete(base).status_code == 204
 
 
 def test_a_short_drive_is_mapped_by_landmarks_of_a_longer_one(mapped):

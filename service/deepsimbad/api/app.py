@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from anyio.to_thread import run_sync
-from fastapi import APIRouter, FastAPI, Request, Response
+from fastapi import APIRouter, Depends, FastAPI, Request, Response
 from fastapi import Path as PathParameter
 from prometheus_client.exposition import CONTENT_TYPE_LATEST
 from pydantic import Field
@@ -27,7 +27,7 @@ from deepsimbad.api.door import STOPPING, Door
 from deepsimbad.api.keys import KeyRing
 from deepsimbad.api.metrics import Metrics, StateCollector
 from deepsimbad.api.problems import install_openapi, install_problem_handlers, problems
-from deepsimbad.api.requests import Answer, Running, Services, Slots
+from deepsimbad.api.requests import Answer, Running, Services, Slots, refuse_unknown_parameters
 from deepsimbad.engine.decoders import Decoders
 from deepsimbad.engine.localizer import warm_up
 from deepsimbad.engine.maps import Maps, Retention
@@ -94,6 +94,7 @@ def create_app(settings: Settings, run_job: RunJob | None = None) -> FastAPI:
         version=release(),
         description=_DESCRIPTION,
         lifespan=lifespan,
+        dependencies=[Depends(refuse_unknown_parameters)],
         redirect_slashes=False,
         openapi_url=None,  # `install_openapi` answers it
         docs_url=None,  # the framework's page loads its script from another host

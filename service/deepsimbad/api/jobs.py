@@ -4,6 +4,7 @@ import asyncio
 import logging
 import time
 from collections.abc import AsyncIterator
+from contextlib import suppress
 from typing import Annotated, Any, Literal
 
 from anyio.to_thread import run_sync
@@ -31,15 +32,14 @@ from deepsimbad.api.requests import (
     read_json,
 )
 from deepsimbad.api.sessions import TruePositions
-from deepsimbad.core.landmark_model import fitting_number
 from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Relevance
-from deepsimbad.errors import DeepSimbadError, NoActiveMapError, UnknownJobError
+from deepsimbad.errors import DeepSimbadError, NoActiveMapError, UnavailableError, UnknownJobError
 from deepsimbad.jobs.append import refuse_known_traverse
 from deepsimbad.jobs.remap import (
     DEFAULT_LIST_LENGTH,
-    DEFAULT_N_LANDMARKS,
     DEFAULT_TRAINING_EPISODES,
     RemapConfig,
+    refuse_impossible,
 )
 from deepsimbad.jobs.runner import REMAP
 from deepsimbad.jobs.versions import EXPERIENCE, TRAVERSE_ROLES, ExperienceConfig, keep_true_positions
@@ -189,20 +189,20 @@ async def post_remap(
         record = running.catalog.domain(domain)
         if config.camera_of is not None:
             running.catalog.domain(config.camera_of)
-        n_frames: dict[str | None, int] = {}
+        n_frames: dict[str, int] = {}
         for name in (getattr(config, role) for role in TRAVERSE_ROLES):
             if name is not None:
                 with Traverse.open(running.settings.data_dir, domain, name) as traverse:
                     n_frames[name] = traverse.n_frames
-        if config.landmark_traverse is not None or record.active_version is None:
-            candidates = config.landmark_traverse or config.training_traverse
-            fitting_number(config.n_landmarks, n_frames[candidates], DEFAULT_N_LANDMARKS)
         if config.append and record.active_version is None:
             what = "to append to: make one first, without append"
             raise NoActiveMapError(f"domain {domain} has no active map {what}", domain=domain)
         if config.append and record.active_version is not None:
             active = running.catalog.map(domain, record.active_version)
             refuse_known_traverse(active.config, active.version, config.training_traverse)
+        with suppress(NoActiveMapError, UnavailableError):  # a damaged one keeps nobody from making another
+            snapshot = None if record.active_version is None else running.maps.active(domain).snapshot
+            refuse_impossible(config, n_frames, snapshot)
         return JobAnswer.model_validate(running.runner.submit(domain, config, job_id))
 
     job = await run_sync(submit)

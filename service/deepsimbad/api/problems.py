@@ -332,12 +332,12 @@ def install_openapi(app: FastAPI, root_path: str) -> None:
     app.openapi = document  # type: ignore[method-assign]
     answers: list[Response] = []
 
-    async def answer(_: Request) -> Response:
+    async def answer() -> Response:
         if not answers:  # written once: anybody may ask, without a key
             answers.append(JSONResponse(document()))
         return answers[0]
 
-    app.add_route("/openapi.json", answer, include_in_schema=False)
+    app.add_api_route("/openapi.json", answer, include_in_schema=False)
 
 
 def _complete(document: dict[str, Any]) -> None:

@@ -11,11 +11,13 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Annotated, Any, NamedTuple, TypeVar, cast
 
 from anyio import CapacityLimiter
 from anyio.to_thread import run_sync
-from fastapi import Depends, Header, Path, Query, Request
+from fastapi import Depends, Header, Path, Query, Request, params
+from fastapi.dependencies.utils import get_dependant, get_flat_params
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import ErrorDetails, to_json
 
@@ -29,7 +31,13 @@ from deepsimbad.engine.sessions import Sessions
 from deepsimbad.engine.traverses import OpenTraverses
 from deepsimbad.engine.truths import Truths
 from deepsimbad.engine.worker import EvaluatorPool, InferenceWorker, Priority
-from deepsimbad.errors import EmptyBodyError, OverloadedError, UnsupportedMediaTypeError, nearest_of
+from deepsimbad.errors import (
+    EmptyBodyError,
+    OverloadedError,
+    UnknownParameterError,
+    UnsupportedMediaTypeError,
+    nearest_of,
+)
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.jobs.runner import JobRunner
 from deepsimbad.settings import Settings
@@ -54,6 +62,7 @@ GREATEST_ID = 2**31 - 1
 MAX_NUMBERS = 2**17  # in one body; about 20 ms to parse
 LONG_LIST = 1000  # entries; a list of so many takes some milliseconds
 _LONG_BYTES = 1 << 16
+_LONGEST_NAME, _MOST_NAMES = 100, 20  # that an answer repeats of what a sender chose
 _MAX_PARTS = 1000  # members, texts, lists: far more than any body here has
 
 # The running service
@@ -160,6 +169,24 @@ async def services_of(request: Request) -> Services:
 
 
 # Parameters
+
+
+@cache
+def _query_parameters(path: str, endpoint: Callable[..., Any]) -> tuple[str, ...]:
+    taken = get_flat_params(get_dependant(path=path, call=endpoint))
+    return tuple(each.alias for each in taken if isinstance(each.field_info, params.Query))
+
+
+async def refuse_unknown_parameters(request: Request) -> None:
+    """Refuse a query parameter that the route does not take, of every route; raises UnknownParameterError."""
+    route = request.scope["route"]
+    allowed = _query_parameters(route.path, route.endpoint)
+    if unknown := request.query_params.keys() - allowed:
+        named = sorted(name[:_LONGEST_NAME] for name in unknown)
+        what = nearest_of(named[0], allowed) if allowed else ": this call takes none"
+        what = f"there is no query parameter {named[0]}{what}"
+        raise UnknownParameterError(what, unknown=named[:_MOST_NAMES], allowed=list(allowed))
+
 
 Running = Annotated[Services, Depends(services_of)]
 Name = Annotated[

@@ -19,7 +19,6 @@ from deepsimbad.cli.terminal import (
     progress_bar,
     write_json,
 )
-from deepsimbad.core.landmark_model import fitting_number
 from deepsimbad.core.map import DEFAULT_ACTIONS_M, check_actions
 from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Relevance
 from deepsimbad.engine.decoders import remarks_on_shape
@@ -38,6 +37,7 @@ from deepsimbad.jobs.remap import (
     DEFAULT_N_LANDMARKS,
     DEFAULT_TRAINING_EPISODES,
     RemapConfig,
+    refuse_impossible,
     remap,
     remap_stages,
 )
@@ -131,7 +131,7 @@ def map_(
     sources = {"training": training} if landmarks is None else {"landmarks": landmarks, "training": training}
     recordings = {role: opened(source, allow_missing, closed=closed, **reading) for role, source in sources.items()}
     left_out = {}
-    fitting_number(config.n_landmarks, len(recordings[next(iter(sources))].frames), DEFAULT_N_LANDMARKS)
+    refuse_impossible(config, {role: len(recording.frames) for role, recording in recordings.items()}, None)
     with Catalog.open(settings.data_dir) as catalog:
         catalog.create_domain(domain, evaluator.as_dict(), closed, actions_m)
         with _nothing_kept(), progress_bar(_stages(config, recordings, measure), f"map {domain}") as progress:

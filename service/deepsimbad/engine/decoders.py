@@ -10,7 +10,7 @@ from deepsimbad.core.map import Map
 from deepsimbad.engine.worker import Priority, ready
 from deepsimbad.errors import OverloadedError
 from deepsimbad.evaluators.base import Evaluator, Image
-from deepsimbad.evaluators.grey_levels import FEW_GREYS, GreyLevels, holds_few_greys, in_eight_bits
+from deepsimbad.evaluators.grey_levels import CLIPPED, FEW_GREYS, GreyLevels, clips, holds_few_greys, in_eight_bits
 from deepsimbad.evaluators.image import KEPT_PIXELS, decode_deep, is_blank, picture_size
 from deepsimbad.evaluators.image_files import ImageFile
 
@@ -79,8 +79,10 @@ class Decoded(NamedTuple):
     def of(cls, file: ImageFile, body: bytes, evaluator: Evaluator, levels: GreyLevels | None) -> Self:
         """Decode the file in a body; takes milliseconds."""
         ready(evaluator)  # where it is not, decoding is in vain
-        pixels, shown_by = in_eight_bits(decode_deep(file), levels)
+        pixels = decode_deep(file)
+        remarks = [CLIPPED] if levels is not None and clips(pixels, levels) else []
+        pixels, shown_by = in_eight_bits(pixels, levels)
         image = evaluator.prepare(pixels)
         shows_nothing = is_blank(image)
-        remarks = [FEW_GREYS] if not shows_nothing and holds_few_greys(image) else []
+        remarks += [FEW_GREYS] if not shows_nothing and holds_few_greys(image) else []
         return cls(image, shows_nothing, picture_size(body), shown_by, remarks)

@@ -394,15 +394,27 @@ class Sessions:
         return _Move(after, answer, written)
 
     async def _published(self, live: LiveSession, moving: "Future[_Move]", watch: Stopwatch) -> SessionView:
-        """The answer after a move, once it is on the disk and the session has moved."""
+        """The answer after a move, once it is on the disk and the session has moved; the event loop is woken once."""
+        on_disk: Future[None] = Future()
+        on_disk.set_running_or_notify_cancel()
+
+        def settle(done: Future[Any]) -> None:
+            if (error := done.exception()) is not None:
+                on_disk.set_exception(error)
+            elif done is moving:
+                moving.result().written.add_done_callback(settle)
+            else:
+                on_disk.set_result(None)
+
+        moving.add_done_callback(settle)
         try:
-            move = await asyncio.wrap_future(moving)
-            await asyncio.wrap_future(move.written)
+            await asyncio.wrap_future(on_disk)
         except BaseException as error:
             was_refused = isinstance(error, DeepSimbadError | _CountedBefore) and moving.exception() is error
             if not was_refused:
                 live.state = None  # what the file holds is the truth: it is read again at the next touch
             raise
+        move = moving.result()
         live.expires_at, live.state = move.answer.expires_at, move.after
         watch.lap("commit")
         return move.answer

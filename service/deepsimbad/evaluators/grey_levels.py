@@ -23,6 +23,11 @@ _OUTSIDE = 0.001  # share of the pixels at either end that may be a lamp or a br
 _USED = 0.5  # of a depth that is well exposed: it is shown as a camera's own 8 bits would be
 _MARGIN = 0.05  # of the range that is used, at either end, for other exposures
 _LEAST_RANGE = 64  # counts: less is a sensor's noise, which no stretching turns into a picture
+_CLIPPED = 0.2
+CLIPPED = (
+    "much of the picture is as bright as what the map shows white, or brighter: is it overexposed, or of another bit "
+    "depth than the map's pictures?"
+)
 _FEW_GREYS = 8
 FEW_GREYS = (
     f"the picture lies within {_FEW_GREYS} grey levels of 256: is it of a few bits in more, or badly exposed? "
@@ -53,6 +58,11 @@ def shown(picture: NDArray[np.uint16], levels: GreyLevels) -> Image:
     black, white = levels
     table = np.clip((np.arange(DEEPEST + 1) - black) * 256 // (white + 1 - black), 0, 255).astype(np.uint8)
     return np.asarray(table[picture], np.uint8)
+
+
+def clips(picture: NDArray[Any], levels: GreyLevels) -> bool:
+    """Whether much of a picture of more than 8 bits is shown white; of what levels were measured on hardly any is."""
+    return picture.dtype == np.uint16 and bool((picture[::2, ::2] >= levels[1]).mean() > _CLIPPED)
 
 
 def in_eight_bits(picture: NDArray[Any], levels: GreyLevels | None) -> tuple[Image, GreyLevels | None]:

@@ -5,7 +5,7 @@ again, and where nothing is fused none is described again, and what two seasons 
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -13,7 +13,7 @@ from typing import Any, Self, TypeAlias
 
 import numpy as np
 
-from deepsimbad.core.building import MapPlan, SeenTwice
+from deepsimbad.core.building import MapPlan, SeenTwice, check_list_length
 from deepsimbad.core.camera import Camera
 from deepsimbad.core.composed import is_composed
 from deepsimbad.core.descriptor import MAX_LANDMARKS
@@ -311,7 +311,7 @@ class _Remap:
         if config.camera_of is not None:
             camera = seen_twice(self.catalog, config.camera_of, record, training)
         if config.landmark_traverse is None:
-            base = None if camera else self._active_map(record)
+            base = None if camera else self._base(record)
             if base is not None:
                 joining = f"traverse {config.training_traverse}"
                 WeightsDifferError.check("the active map", base.weights_sha256, joining, training.weights_sha256)
@@ -329,8 +329,7 @@ class _Remap:
     def _drive(self, name: str) -> Drive:
         with Traverse.open(self.catalog.data_dir, self.domain, name) as traverse:
             drive = traverse.read()
-        if drive.n_frames == 0:
-            raise InvalidMapConfigError(f"traverse {name} has no frames yet; upload some first", traverse=name)
+        _check_filled(name, drive.n_frames)
         drive.check_differs(f"traverse {name}")
         return drive
 
@@ -359,23 +358,12 @@ class _Remap:
                     return second  # else another encoder made it anew
         return None
 
-    def _active_map(self, record: DomainRecord) -> Map | None:
-        """The map whose landmarks stay; None: there is none, or its landmarks are of another kind than is asked for."""
-        config = self.config
+    def _base(self, record: DomainRecord) -> Map | None:
         if record.active_version is None:
-            if config.append:
+            if self.config.append:
                 raise InvalidMapConfigError(f"domain {record.name} has no active map that could be appended to")
             return None
-        base = read_map(self.catalog.map_path(record.name, record.active_version))
-        if not config.append and is_composed(base.landmark_model) != (config.relevance is Relevance.COMPOSED):
-            return None
-        if config.n_landmarks not in {None, base.n_landmarks}:
-            raise InvalidMapConfigError(
-                f"the active map has {base.n_landmarks} landmarks, not {config.n_landmarks}; give a landmark_traverse "
-                "to choose anew",
-                n_landmarks=base.n_landmarks,
-            )
-        return base
+        return _staying(self.config, read_map(self.catalog.map_path(record.name, record.active_version)))
 
     def _mapped(self, inputs: _Inputs) -> _Draft:
         """The training traverse as a map of its own."""
@@ -488,6 +476,45 @@ class _Remap:
         candidates = None if known.candidates is None else there[id(known.candidates)]
         seasons = tuple(there[id(season)] for season in known.seasons)
         return replace(known, seasons=seasons, candidates=candidates), there[id(drive)]
+
+
+def refuse_impossible(config: RemapConfig, n_frames: Mapping[str, int], active: Map | None) -> None:
+    """Say before the job what it would end with, as far as its traverses' numbers of frames and the active map tell.
+
+    Raises:
+        InvalidMapConfigError: A traverse is empty, there are too few landmarks, or the active map's do not fit.
+    """
+    for name, n in n_frames.items():
+        _check_filled(name, n)
+    if config.append and active is not None:
+        _check_alike(active, config)
+    elif config.landmark_traverse is not None or active is None:
+        n_candidates = n_frames[config.landmark_traverse or config.training_traverse]
+        check_list_length(config.list_length, fitting_number(config.n_landmarks, n_candidates, DEFAULT_N_LANDMARKS))
+    elif config.camera_of is None:  # else it shows only there whether they stay
+        base = _staying(config, active)
+        if base is None:
+            refuse_impossible(config, n_frames, None)
+        else:
+            check_list_length(config.list_length, base.n_landmarks)
+
+
+def _check_filled(name: str, n_frames: int) -> None:
+    if n_frames == 0:
+        raise InvalidMapConfigError(f"traverse {name} has no frames yet; upload some first", traverse=name)
+
+
+def _staying(config: RemapConfig, active: Map) -> Map | None:
+    """The active map, whose landmarks stay; None: they are of another kind than is asked for."""
+    if not config.append and is_composed(active.landmark_model) != (config.relevance is Relevance.COMPOSED):
+        return None
+    if config.n_landmarks not in {None, active.n_landmarks}:
+        raise InvalidMapConfigError(
+            f"the active map has {active.n_landmarks} landmarks, not {config.n_landmarks}; give a landmark_traverse "
+            "to choose anew",
+            n_landmarks=active.n_landmarks,
+        )
+    return active
 
 
 def _check_alike(before: Map, config: RemapConfig) -> None:

@@ -146,6 +146,7 @@ def test_views_of_more_than_eight_bits_are_shown_as_their_map_was(tmp_path, caps
         assert on_board.ranks(look, m=8) == on_board.ranks(decode_image(image, LIMIT, levels=levels), m=8)
         with client.session("yard") as session:
             in_session = session.observe(image=image)
+            bright = session.observe(image=cv2.imencode(".png", deep(105) + np.uint16(200))[1].tobytes())
             flat = session.observe(image=cv2.imencode(".png", scene(105) >> 5)[1].tobytes())
         capsys.readouterr()
         assert run(["localize", str(look), "--domain", "yard", "--server", url, "--json"]) == 0
@@ -165,5 +166,7 @@ def test_views_of_more_than_eight_bits_are_shown_as_their_map_was(tmp_path, caps
     assert by_curl["belief"]["mode_m"] == 5
     for other in (by_command, here):
         assert (other["belief"], other["retrieval"]) == (by_curl["belief"], by_curl["retrieval"])
+    assert any("another bit depth" in warning for warning in bright.warnings)
+    assert not any("bit depth" in warning for warning in [*in_session.warnings, *flat.warnings])
     assert any("8 grey levels of 256" in warning for warning in flat.warnings)
     assert not any("grey levels" in warning for warning in [*in_session.warnings, *by_curl["warnings"]])
