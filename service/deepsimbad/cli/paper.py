@@ -3,10 +3,13 @@
 import math
 import os
 import platform
+import sys
+import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import click
@@ -44,7 +47,7 @@ from deepsimbad_client.recordings.encodings import ENCODING_SUFFIXES
 from deepsimbad_client.recordings.options import opened, reading
 from deepsimbad_client.recordings.sources import NCLT_PREFIX
 
-_FRAMES_AT_ONCE = 2000  # that a run which is killed may have to encode again
+_FRAMES_AT_ONCE = 500  # that a run which is killed may have to encode again
 _ENCODE_S = 0.05  # a frame, on one core of a server's
 _MOST_POINTS = 400  # of a trajectory as it is drawn
 
@@ -101,12 +104,12 @@ def paper(
     try:
         with progress_bar({"encode": encode_s + 1, "measure": measure_s, "write": 2.0}, "paper") as progress:
             progress.stage("encode")
-            encoded = _encoded(recordings, measure, settings.max_pixels, out / "encodings", made_of, progress.update)
+            encoded = _encoded(recordings, measure, settings.max_pixels, out, made_of, progress.update)
             drives = {season: each.drive for season, each in encoded.items()}
             progress.stage("measure")
             results = measure_paper(
                 *(config, measure, drives, out / "results", {"evaluator": evaluator.as_dict()}),
-                lambda _, share: progress.update(share),
+                _telling(progress.update),
                 {season: RecordingPictures(drive, settings.max_pixels) for season, drive in recordings.items()},
             )
             progress.stage("write")
@@ -118,7 +121,7 @@ def paper(
                         "n_frames": drive.n_frames,
                         "length_m": float(drive.position_m[-1] - drive.position_m[0]),
                         "left_out": encoded[season].left_out,
-                        "encode_ms": _encode_ms(out, season, encoded[season], made_of),
+                        "encode_ms": encoded[season].encode_ms,
                         "trajectory": _trajectory(drive),
                     }
                     for season, drive in drives.items()
@@ -141,6 +144,21 @@ def paper(
             f"{error}; the same command goes on where it stopped ({out} keeps what is done)"
         ) from error
     tell(document, json_file, lambda: _print(document))
+
+
+def _telling(update: Callable[[float], None]) -> Callable[[str, float], None]:
+    """Tells a log how far it is, and what is left, every tenth; a terminal has its bar."""
+    began_s, told = time.monotonic(), [0]
+
+    def tell(name: str, share: float) -> None:
+        update(share)
+        tenth = int(10 * share)
+        if tenth > told[0] and not sys.stderr.isatty():
+            told[0] = tenth
+            left_s = (time.monotonic() - began_s) * (1 - share) / share
+            click.echo(f"{share:.0%} measured, at {name}; about {left_s / 60:.0f} minutes left", err=True)
+
+    return tell
 
 
 def _opened(root: Path, reading: Mapping[str, Any]) -> tuple[dict[str, Recording], dict[str, str]]:
@@ -175,7 +193,7 @@ def _encoded(
     recordings: Mapping[str, Recording],
     evaluator: Evaluator,
     max_pixels: int,
-    folder: Path,
+    out: Path,
     made_of: Mapping[str, Any],
     on_progress: Callable[[float], None],
 ) -> dict[str, EncodedRecording]:
@@ -188,28 +206,32 @@ def _encoded(
     def encode(season: str) -> None:
         recording, report, all_kept = recordings[season], shares.report(season), Kept()
         encodes = partial(encode_recording, evaluator=evaluator, max_pixels=max_pixels)
-        n, date = len(recording.frames), SEASONS[season]
+        n, date, took_ms = len(recording.frames), SEASONS[season], list[float | None]()
         for first in range(0, n if recording.encodings is None else 0, _FRAMES_AT_ONCE):
             part = recording.sliced(slice(first, first + _FRAMES_AT_ONCE))
 
             def so_far(share: float, first: int = first, part: Recording = part) -> None:
                 report((first + share * len(part.frames)) / n)
 
-            with kept_encodings(folder, f"{date}-{first}", source=date, **made_of) as kept:
-                encodes(part, kept=kept, on_progress=so_far)
+            with kept_encodings(out / "encodings", f"{date}-{first}", source=date, **made_of) as kept:
+                took_ms.append(encodes(part, kept=kept, on_progress=so_far).encode_ms)
             all_kept |= kept
-        encoded[season] = encodes(recording, kept=all_kept, on_progress=lambda _: None)
+        whole = encodes(recording, kept=all_kept, on_progress=lambda _: None)
+        encoded[season] = replace(whole, encode_ms=_encode_ms(out, season, whole.drive, took_ms, made_of))
         report(1.0)
 
     in_threads([partial(encode, season) for season in recordings])
     return {season: encoded[season] for season in recordings}
 
 
-def _encode_ms(out: Path, season: str, encoded: EncodedRecording, made_of: Mapping[str, Any]) -> float | None:
+def _encode_ms(
+    out: Path, season: str, drive: Drive, took_ms: list[float | None], made_of: Mapping[str, Any]
+) -> float | None:
     """Of the run that encoded."""
-    digest = drive_digest(encoded.drive)
+    new = [ms for ms in took_ms if ms is not None]
     kept = KeptResults(out / "results", made_of)
-    took: float | None = kept.get(f"{season}-encode", lambda: {"ms": encoded.encode_ms}, digest=digest)["ms"]
+    made = {"ms": median(new) if new else None}
+    took: float | None = kept.get(f"{season}-encode", lambda: made, digest=drive_digest(drive))["ms"]
     return took
 
 

@@ -125,7 +125,7 @@ def _panels(document: Document) -> list[dict[str, Any]]:
                 "title": title,
                 "text": text,
                 "unit": unit,
-                "most": most,
+                "digits": 2 if most > 1 else 3,
                 "rows": [
                     {
                         "name": name,
@@ -145,7 +145,7 @@ def planner_name(name: str) -> str:
     """As the page says it."""
     if name.startswith(f"{CONSTANT}_"):
         return f"{name.removeprefix(f'{CONSTANT}_')} m"
-    return {NNQL: "NNQL", DEFAULT_PLANNER: "informed, ours"}.get(name, name)
+    return {NNQL: "NNQL"}.get(name, name)
 
 
 def _trajectories(seasons: Mapping[str, Document]) -> dict[str, Any] | None:

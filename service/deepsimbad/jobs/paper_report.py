@@ -13,7 +13,7 @@ from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Relevance
 from deepsimbad.jobs.paper import SEASONS, SETUPS, Document, PaperConfig
 from deepsimbad.jobs.vpr import BRUTE_FORCE_U
 
-HOLDS, OTHERWISE, UNDECIDED = "holds", "the other way round", "cannot be told apart"
+HOLDS, OTHERWISE, UNDECIDED = "holds", "does not hold", "cannot be told apart"
 _CHANCE, _NEAR_CHANCE = 50.0, 45.0  # ANR, percent
 
 
@@ -200,13 +200,12 @@ def _claims_of_moves(moves: Mapping[str, Pooled], active: Mapping[str, Document]
         ),
     ]
     ends = [f"{CONSTANT}_1", f"{CONSTANT}_10"]
-    for claim in claims[:2]:
-        if claim["verdict"] != HOLDS:
-            claim["why"] = (
-                f"Constant moves score from {pooled.mean(ends[0]):.2f} % (1 m) to {pooled.mean(ends[1]):.2f} % (10 m), "
-                f"the best of them {pooled.mean(best):.2f} %; NNQL moved {move_m:.1f} m on average and scored "
-                f"{pooled.mean(NNQL):.2f} %."
-            )
+    for claim in [claim for claim in claims[:2] if claim["verdict"] != HOLDS][:1]:
+        claim["why"] = (
+            f"Constant moves score from {pooled.mean(ends[0]):.2f} % (1 m) to {pooled.mean(ends[1]):.2f} % (10 m), "
+            f"the best of them {pooled.mean(best):.2f} %; NNQL moved {move_m:.1f} m on average and scored "
+            f"{pooled.mean(NNQL):.2f} %."
+        )
     return claims
 
 
