@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import deepsimbad.jobs.paper as job
+import deepsimbad.jobs.progress as progress
 from deepsimbad.cli.paper_page import METHODS
 from deepsimbad.errors import CancelledError
 from deepsimbad.evaluators.feature_l2 import FeatureL2
@@ -87,7 +88,7 @@ def test_a_run_that_was_stopped_goes_on_and_nothing_stale_is_taken(deepsimbad, e
         done.append(1)
         return score(*arguments, **options)
 
-    monkeypatch.setattr(job, "available_cores", lambda: 1)
+    monkeypatch.setattr(progress, "available_cores", lambda: 1)
     monkeypatch.setattr(job, "score_maps", stopped_at_the_third)
     ran = paper(deepsimbad, encodings)
     assert (ran.code, "goes on where it stopped" in ran.err) == (130, True)
@@ -127,7 +128,7 @@ def test_nclt_as_downloaded_is_encoded_once_even_when_it_is_stopped(deepsimbad, 
 
     stop_at = 150
     monkeypatch.setattr(FeatureL2, "encode", counted)
-    monkeypatch.setattr(job, "available_cores", lambda: 1)
+    monkeypatch.setattr(progress, "available_cores", lambda: 1)
     asked = ("experiment", "paper", "--nclt", tmp_path / "nclt", "--out", "out", *QUICK[2:])
     assert deepsimbad(*asked, "--evaluator", "feature_l2:gradient_grid").code == 130
     stop_at = 10_000

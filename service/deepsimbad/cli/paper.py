@@ -18,6 +18,7 @@ from rich.table import Table
 from deepsimbad.cli.experiment import DEFAULT_TOLERANCE_M, json_file_option, tell, tolerance_option
 from deepsimbad.cli.paper_page import write_report
 from deepsimbad.cli.terminal import data_dir_option, evaluator_option, given_settings, print_table, progress_bar
+from deepsimbad.core.composed import MOST_DIMENSIONS
 from deepsimbad.core.drive import Drive
 from deepsimbad.errors import CancelledError, InvalidSourceError
 from deepsimbad.evaluators.base import Evaluator
@@ -25,20 +26,17 @@ from deepsimbad.evaluators.compute import available_cores
 from deepsimbad.evaluators.registry import EvaluatorConfig, make_evaluator
 from deepsimbad.jobs.build import EncodedRecording, encode_recording
 from deepsimbad.jobs.fitting import RecordingPictures
-from deepsimbad.jobs.kept_encodings import Kept, kept_encodings
+from deepsimbad.jobs.kept import Kept, KeptResults, drive_digest, kept_encodings
 from deepsimbad.jobs.paper import (
     SEASONS,
     TRIPLETS,
-    KeptResults,
     PaperConfig,
-    Shares,
-    drive_digest,
-    in_threads,
     measure_paper,
     runnable,
     seconds_to_measure,
 )
 from deepsimbad.jobs.paper_report import paper_document
+from deepsimbad.jobs.progress import Shares, in_threads
 from deepsimbad.jobs.vpr import bytes_per_encoding
 from deepsimbad.release import release
 from deepsimbad_client.errors import SourceError
@@ -135,6 +133,7 @@ def paper(
                     **{name: value for name, value in reading.items() if value is not None},
                 },
                 "bits_per_encoding": 8 * bytes_per_encoding(next(iter(drives.values()))),
+                "bits_per_unit_vector": 32 * min(MOST_DIMENSIONS, next(iter(drives.values())).encoding_dim),
                 "machine": machine(),
                 "release": release(),
             }

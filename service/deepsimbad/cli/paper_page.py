@@ -169,7 +169,10 @@ def _trajectories(seasons: Mapping[str, Document]) -> dict[str, Any] | None:
 def _method_rows(document: Document) -> Iterator[dict[str, Any]]:
     """A row a method: what a map image takes, and its figures at the one list length."""
     bits = {**document["index_bits_per_map_image"]}
-    bits[Relevance.BRUTE_FORCE.value] = bits[BRUTE_FORCE_U] = document["bits_per_encoding"]
+    bits |= {
+        Relevance.BRUTE_FORCE.value: document["bits_per_encoding"],
+        BRUTE_FORCE_U: document["bits_per_unit_vector"],
+    }
     for name, label in {**METHODS, BRUTE_FORCE_U: _BOUND}.items():
         yield {
             "name": name,

@@ -21,7 +21,7 @@ from deepsimbad.errors import CancelledError
 from deepsimbad.evaluators.registry import EvaluatorConfig, make_evaluator
 from deepsimbad.jobs.build import EncodedRecording, encode_recording
 from deepsimbad.jobs.fitting import RecordingPictures
-from deepsimbad.jobs.kept_encodings import kept_encodings
+from deepsimbad.jobs.kept import kept_encodings
 from deepsimbad.jobs.trial import TRIAL_STAGES, TrialConfig, TrialReport, run_trial
 from deepsimbad.jobs.truth import known_drives
 from deepsimbad.jobs.vpr import BRUTE_FORCE_U

@@ -4,21 +4,16 @@ Every figure comes from the functions that `experiment vpr` and `experiment nbv`
 landmark and training drive share their maps. What was measured is kept, so that a run that was stopped goes on.
 """
 
-import json
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
-from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property, partial
-from hashlib import sha256
 from pathlib import Path
-from threading import Lock
 from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-import deepsimbad
 from deepsimbad.core.building import Built
 from deepsimbad.core.drive import Drive
 from deepsimbad.core.landmark_model import fitting_number
@@ -27,10 +22,10 @@ from deepsimbad.core.planners import DEFAULT_PLANNER, NNQL
 from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Relevance
 from deepsimbad.core.route import true_images_of
 from deepsimbad.evaluators.base import Evaluator
-from deepsimbad.evaluators.compute import available_cores
 from deepsimbad.jobs.build import measured, views_of
 from deepsimbad.jobs.episodes import Episode, TestDrive
 from deepsimbad.jobs.fitting import Fitter, Pictures
+from deepsimbad.jobs.kept import KeptResults, code_digest, drive_digest
 from deepsimbad.jobs.nbv import (
     BLOCK_M,
     CLAIRVOYANT,
@@ -42,7 +37,7 @@ from deepsimbad.jobs.nbv import (
     starts_of,
     trained,
 )
-from deepsimbad.jobs.progress import Progress
+from deepsimbad.jobs.progress import Progress, Shares, in_threads
 from deepsimbad.jobs.truth import nearest_images
 from deepsimbad.jobs.vpr import (
     RANKS,
@@ -98,79 +93,6 @@ class PaperConfig:
         r = fitting_number(None, n_landmarks, self.n_landmarks)
         lengths = tuple(h for h in self.list_lengths if h <= r)
         return replace(self, n_landmarks=r, list_length=min(self.list_length, r), list_lengths=lengths)
-
-
-@dataclass(frozen=True)
-class KeptResults:
-    """Results in a folder, a file each, under a digest of all that they were made of: another never stands for one."""
-
-    folder: Path
-    made_of: Mapping[str, Any]  # by all of them
-
-    def file(self, name: str, **made_of: Any) -> Path:
-        """Where a result is, or will be."""
-        identity = json.dumps({**self.made_of, **made_of}, sort_keys=True, default=str)
-        return self.folder / f"{name}-{sha256(identity.encode()).hexdigest()[:16]}.json"
-
-    def get(self, name: str, make: Callable[[], Document], **made_of: Any) -> Document:
-        """What was kept, else what `make` makes, which is kept from now on."""
-        file = self.file(name, **made_of)
-        try:
-            kept: Document = json.loads(file.read_text(encoding="utf-8"))
-        except (OSError, ValueError):  # not there, or cut short
-            kept = make()
-            file.parent.mkdir(parents=True, exist_ok=True)
-            part = file.with_suffix(".part")
-            part.write_text(json.dumps(kept), encoding="utf-8")
-            part.replace(file)
-        return kept
-
-
-@dataclass
-class Shares:
-    """Pieces of work that several threads do, of known weight, told as one share."""
-
-    tell: Callable[[str, float], None]  # of the piece under way and the share that is done; may raise CancelledError
-    weights: Mapping[str, float]
-    _done: dict[str, float] = field(default_factory=dict)
-    _lock: Lock = field(default_factory=Lock)
-
-    def report(self, name: str) -> Callable[[float], None]:
-        """Takes the share of one piece."""
-
-        def update(share: float) -> None:
-            with self._lock:
-                self._done[name] = share
-                done = sum(self.weights[piece] * each for piece, each in self._done.items())
-            self.tell(name, done / max(sum(self.weights.values()), 1e-9))
-
-        return update
-
-
-def in_threads(pieces: Sequence[Callable[[], None]]) -> None:
-    """Do all, as many at once as there are cores; the first error ends them, and is raised."""
-    with ThreadPoolExecutor(available_cores()) as pool:
-        futures = [pool.submit(piece) for piece in pieces]
-        done, waiting = wait(futures, return_when=FIRST_EXCEPTION)
-        for future in waiting:
-            future.cancel()
-        for future in done:
-            future.result()
-
-
-def code_digest() -> str:
-    """Of the sources that figures depend on: a later release, or a line changed, measures anew."""
-    root = Path(deepsimbad.__file__).parent
-    files = sorted(file for part in ("core", "evaluators", "jobs") for file in (root / part).rglob("*.py"))
-    return sha256(b"".join(file.read_bytes() for file in files if file.stem != "paper_report")).hexdigest()
-
-
-def drive_digest(drive: Drive) -> str:
-    """Of all that figures depend on."""
-    digest = sha256()
-    for array in (drive.encodings, drive.position_m, drive.x_m, drive.y_m):
-        digest.update(np.ascontiguousarray(array).tobytes())
-    return digest.hexdigest()
 
 
 def pieces(config: PaperConfig, triplets: Sequence[Triplet], n_frames: Mapping[str, int]) -> dict[str, float]:

@@ -1,10 +1,13 @@
 """How long work tells what it is doing and learns that it should stop."""
 
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
+from dataclasses import dataclass, field
+from threading import Lock
 
 from deepsimbad.errors import CancelledError
+from deepsimbad.evaluators.compute import available_cores
 
 _INTERVAL_S = 0.2  # least time between two reports of one stage
 
@@ -91,3 +94,35 @@ class Progress:
         ends_s = [*list(self._began_s.values())[1:], self._clock()]
         stages = zip(self._began_s.items(), ends_s, strict=True)
         return {name.replace(" ", "_"): end_s - began_s for (name, began_s), end_s in stages}
+
+
+@dataclass
+class Shares:
+    """Pieces of work that several threads do, of known weight, told as one share."""
+
+    tell: Callable[[str, float], None]  # of the piece under way and the share that is done; may raise CancelledError
+    weights: Mapping[str, float]
+    _done: dict[str, float] = field(default_factory=dict)
+    _lock: Lock = field(default_factory=Lock)
+
+    def report(self, name: str) -> Callable[[float], None]:
+        """Takes the share of one piece."""
+
+        def update(share: float) -> None:
+            with self._lock:
+                self._done[name] = share
+                done = sum(self.weights[piece] * each for piece, each in self._done.items())
+            self.tell(name, done / max(sum(self.weights.values()), 1e-9))
+
+        return update
+
+
+def in_threads(pieces: Sequence[Callable[[], None]]) -> None:
+    """Do all, as many at once as there are cores; the first error ends them, and is raised."""
+    with ThreadPoolExecutor(available_cores()) as pool:
+        futures = [pool.submit(piece) for piece in pieces]
+        done, waiting = wait(futures, return_when=FIRST_EXCEPTION)
+        for future in waiting:
+            future.cancel()
+        for future in done:
+            future.result()
