@@ -1,5 +1,7 @@
 """A service that cannot start says why; over TLS it serves; its log lines are JSON, whatever is in them."""
 
+import asyncio
+import gc
 import json
 import logging
 import os
@@ -12,8 +14,10 @@ import time
 from pathlib import Path
 
 import pytest
+import uvicorn
+from fastapi import FastAPI
 
-from deepsimbad.api.server import JsonFormatter, PlainFormatter, configure_logging, serve
+from deepsimbad.api.server import JsonFormatter, PlainFormatter, _Server, configure_logging, serve
 from deepsimbad.errors import SettingsError, UnavailableError
 from deepsimbad.settings import Settings
 
@@ -95,6 +99,22 @@ def test_the_service_on_https(tmp_path):
     finally:
         process.kill()
         process.wait()
+
+
+def test_what_is_there_at_the_start_is_not_looked_through_again():
+    async def frozen_while_it_serves():
+        server = _Server(uvicorn.Config(FastAPI(), port=0, lifespan="off", log_config=None), FastAPI())
+        serving = asyncio.create_task(server.serve())
+        while not server.started:
+            await asyncio.sleep(0.01)
+        server.should_exit = True
+        await serving
+        return gc.get_freeze_count()
+
+    try:
+        assert asyncio.run(frozen_while_it_serves()) > 10_000
+    finally:
+        gc.unfreeze()
 
 
 def test_a_line_holds_message_extras_and_exception():

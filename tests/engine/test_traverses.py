@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from deepsimbad.core.drive import Drive
 from deepsimbad.engine.traverses import MAX_IDLE, OpenTraverses
 from deepsimbad.errors import UnknownTraverseError
 from deepsimbad.store.catalog import Catalog
@@ -14,7 +15,9 @@ from deepsimbad.store.traverses import Traverse
 
 from .conftest import add_domain
 
-ENCODING = np.ones(4, np.float32)
+
+def frame(index: int) -> Drive:
+    return Drive(index=np.array([index]), position_m=np.zeros(1), encodings=np.ones((1, 4), np.float32))
 
 
 @pytest.fixture
@@ -32,7 +35,7 @@ def test_one_file_serves_all_who_ask_and_idle_ones_are_closed_beyond_a_number(le
         for n in range(MAX_IDLE + 4):
             with lending.lend("d", f"t{n}") as traverse:
                 assert (traverse is oldest) == (n == 0)
-        oldest.put_frame(0, ENCODING, 0.0)  # in use, so still open
+        oldest.put_frames(frame(0))  # in use, so still open
     assert len(lending._open) <= MAX_IDLE + 1
     with lending.lend("d", "t0") as again:
         assert again is oldest
@@ -43,7 +46,7 @@ def test_one_file_serves_all_who_ask_and_idle_ones_are_closed_beyond_a_number(le
 def test_a_forgotten_file_is_closed_after_its_last_use(lending: OpenTraverses) -> None:
     with lending.lend("d", "t0") as traverse:
         lending.forget("d", "t0")
-        traverse.put_frame(0, ENCODING, 0.0)
+        traverse.put_frames(frame(0))
         with lending.lend("d", "t0") as other:
             assert other is not traverse
             assert other.n_frames == 1
@@ -51,10 +54,10 @@ def test_a_forgotten_file_is_closed_after_its_last_use(lending: OpenTraverses) -
 
 def test_one_deleted_by_another_process_is_not_lent_again(lending: OpenTraverses, tmp_path: Path) -> None:
     with lending.lend("d", "t0") as traverse:
-        traverse.put_frame(0, ENCODING, 0.0)
+        traverse.put_frames(frame(0))
     Traverse.delete(tmp_path, "d", "t0")
     with pytest.raises(UnknownTraverseError), lending.lend("d", "t0") as traverse:
-        traverse.put_frame(1, ENCODING, 0.0)
+        traverse.put_frames(frame(1))
     with pytest.raises(UnknownTraverseError), lending.lend("d", "t0"):
         pass
     Traverse.create(tmp_path, "d", "t0").close()
@@ -64,7 +67,7 @@ def test_one_deleted_by_another_process_is_not_lent_again(lending: OpenTraverses
         Traverse.create(tmp_path, "d", "t0").close()
         with lending.lend("d", "t0") as traverse:
             assert traverse is not old
-            traverse.put_frame(1, ENCODING, 0.0)
+            traverse.put_frames(frame(1))
     assert [loan.traverse for loan in lending._open.values()] == [traverse], "the old one is closed"
 
 
@@ -72,7 +75,7 @@ def test_many_threads(lending: OpenTraverses) -> None:
     def put(start: int) -> None:
         for n in range(start, start + 10):
             with lending.lend("d", f"t{n % 3}") as traverse:
-                traverse.put_frame(n, ENCODING, 0.0)
+                traverse.put_frames(frame(n))
             if n % 5 == 0:
                 lending.forget("d")
 

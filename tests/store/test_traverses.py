@@ -3,9 +3,11 @@ import sys
 import tracemalloc
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from deepsimbad.core.camera import Camera
 from deepsimbad.core.drive import MAX_POSITION_M, Drive
@@ -31,6 +33,11 @@ MakeFrames = Callable[..., Drive]
 def summer(campus: Catalog) -> Iterator[Traverse]:
     with Traverse.create(campus.data_dir, "campus", "summer") as traverse:
         yield traverse
+
+
+def frame(index: int, encoding: NDArray[np.floating], position_m: float, **known: Any) -> Drive:
+    rows = np.asarray(encoding, np.float32)[np.newaxis]
+    return Drive(index=np.array([index]), position_m=np.array([position_m]), encodings=rows, **known)
 
 
 def arrays_of(drive: Drive) -> dict[str, np.ndarray]:
@@ -93,8 +100,9 @@ def test_frames_come_back_exactly_and_in_index_order(
 
 
 def test_one_frame_is_new_once_and_then_replaced(summer: Traverse) -> None:
-    assert summer.put_frame(3, np.arange(4, dtype=np.float32), 1.5, 10, 0.5, None)
-    assert not summer.put_frame(3, np.ones(4, np.float32), 2.5)
+    known = {"timestamp_us": np.array([10]), "x_m": np.array([0.5])}
+    assert summer.put_frames(frame(3, np.arange(4), 1.5, **known)) == (1, 0)
+    assert summer.put_frames(frame(3, np.ones(4), 2.5)) == (0, 1)
     frames = summer.read()
     assert frames.n_frames == summer.n_frames == 1
     assert frames.encodings.tolist() == [[1, 1, 1, 1]]
@@ -187,10 +195,12 @@ WRITER = """
 import sys
 import numpy as np
 from pathlib import Path
+from deepsimbad.core.drive import Drive
 from deepsimbad.store.traverses import Traverse
 with Traverse.open(Path(sys.argv[1]), "campus", "summer") as traverse:
     for index in range(100_000):
-        traverse.put_frame(index, np.full(512, index, np.float32), float(index))
+        place = np.array([index])
+        traverse.put_frames(Drive(index=place, position_m=1.0 * place, encodings=np.full((1, 512), index, np.float32)))
         print(index, flush=True)
 """
 
@@ -249,7 +259,7 @@ def test_the_camera_of_an_unchanged_traverse_is_read_once(campus: Catalog, monke
     where = (campus.data_dir, "campus", "summer")
     with Traverse.create(*where) as summer:
         assert Traverse.main_camera(*where) is None
-        summer.put_frame(0, np.ones(4, np.float32), 0.0, camera=Camera(40, 30))
+        summer.put_frames(frame(0, np.ones(4), 0.0, camera=Camera(40, 30)))
         assert Traverse.main_camera(*where) == Camera(40, 30)
     assert Traverse.main_camera(*where) == Camera(40, 30)  # the file was closed meanwhile
     monkeypatch.setattr(Traverse, "open", None)

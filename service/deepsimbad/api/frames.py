@@ -29,7 +29,7 @@ from deepsimbad.api.requests import (
 )
 from deepsimbad.api.traverses import TraverseName
 from deepsimbad.core.camera import Camera
-from deepsimbad.core.drive import FRAME_NAME, MAX_POSITION_M
+from deepsimbad.core.drive import FRAME_NAME, MAX_POSITION_M, Drive
 from deepsimbad.core.frames import content_digest
 from deepsimbad.engine.decoders import Decoded
 from deepsimbad.engine.localizer import ready_encodings
@@ -125,19 +125,21 @@ async def put_frame(
     if media_type == JSON and camera is not None:
         raise InvalidInputError("camera is what took a picture, and the body is an encoding: leave it out")
     body = await read_bytes(request)
-    place = (position_m, timestamp_us, x_m, y_m)
+    place = {"index": index, "position_m": position_m, "timestamp_us": timestamp_us, "x_m": x_m, "y_m": y_m}
+    known: dict[str, Any] = {key: np.array([value]) for key, value in place.items() if value is not None}
+    known |= {} if frame_name is None else {"frame_name": np.array([frame_name])}
 
-    def store(encoding: NDArray[np.float32], **more: Any) -> tuple[bool, int]:
+    def store(encodings: NDArray[np.float32], **about: Any) -> tuple[bool, int]:
         with running.open_traverses.lend(domain, name) as traverse:
-            created = traverse.put_frame(index, encoding, *place, name=frame_name, replace=replace, **more)
-            return created, traverse.n_frames
+            n_new, _ = traverse.put_frames(Drive(**known, encodings=encodings, **about), replace)
+            return n_new == 1, traverse.n_frames
 
     def store_picture(encoded: EncodedImage, seen: Decoded) -> tuple[bool, int]:
         return store(
-            encoded.values,
+            encoded.values[np.newaxis],
             weights_sha256=encoded.weights_sha256,
-            content_digest=content_digest(body),
-            shows_nothing=seen.is_blank,
+            content_digest=np.array([content_digest(body)], np.uint64),
+            shows_nothing=np.array([seen.is_blank]),
             camera=None if seen.size is None else Camera(*seen.size, camera),
             grey_levels=None if seen.is_blank else seen.levels,
         )
@@ -149,7 +151,7 @@ async def put_frame(
 
     if media_type == JSON:
         values = np.array((await parse_json(body, EncodingBody, running)).encoding, np.float64)
-        created, n_frames = await run_sync(lambda: store(ready_encodings(values[np.newaxis])[0]))
+        created, n_frames = await run_sync(lambda: store(ready_encodings(values[np.newaxis])))
     else:
         try:
             created, n_frames = await stored(levels)

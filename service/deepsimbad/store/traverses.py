@@ -148,39 +148,6 @@ class Traverse(OpenFile):
     def _gone(self) -> UnknownTraverseError:
         return UnknownTraverseError(f"traverse {self.name} was deleted")
 
-    def put_frame(
-        self,
-        index: int,
-        encoding: NDArray[np.float32],
-        position_m: float,
-        timestamp_us: int | None = None,
-        x_m: float | None = None,
-        y_m: float | None = None,
-        weights_sha256: str | None = None,
-        name: str | None = None,
-        content_digest: int = UNKNOWN_CONTENT,
-        replace: bool = True,
-        shows_nothing: bool = False,
-        camera: Camera | None = None,
-        grey_levels: tuple[int, int] | None = None,
-    ) -> bool:
-        """As `put_frames` with one frame, of which None is unknown; answers whether it is new."""
-        frames = Drive(
-            index=np.array([index]),
-            position_m=np.array([position_m], np.float64),
-            timestamp_us=np.array([UNKNOWN_TIMESTAMP if timestamp_us is None else timestamp_us]),
-            x_m=np.array([np.nan if x_m is None else x_m], np.float64),
-            y_m=np.array([np.nan if y_m is None else y_m], np.float64),
-            frame_name=np.array([name or ""]),
-            content_digest=np.array([content_digest], np.uint64),
-            camera=camera,
-            encodings=np.asarray(encoding, np.float32)[np.newaxis],
-            weights_sha256=weights_sha256,
-            grey_levels=grey_levels,
-            shows_nothing=np.array([shows_nothing]),
-        )
-        return self.put_frames(frames, replace)[0] == 1
-
     def put_frames(self, frames: Drive, replace: bool = True) -> tuple[int, int]:
         """Store a batch in one transaction; never holds a second copy of it.
 
