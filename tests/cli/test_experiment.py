@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 
 import numpy as np
 import pytest
@@ -251,3 +252,19 @@ def test_the_corridor_by_its_own_ground_truth_as_a_process(process, real_data):
     assert set(document) == KEYS
     assert (document["n_queries"], document["n_left_out"]) == (111, 0)
     assert document["anr"]["standardised"] < 20
+
+
+def test_a_known_set_is_scored_as_its_papers_do_unless_told(deepsimbad, pictures, tmp_path):
+    for drive in ("day_left", "day_right"):
+        (tmp_path / drive).mkdir()
+        for place in range(12):
+            shutil.copy(pictures / f"{place}.png", tmp_path / drive / f"Image{place:03d}.png")
+    left, right = (f"gardens_point:{tmp_path}/{drive}" for drive in ("day_left", "day_right"))
+    asked = ("experiment", "vpr", "--landmarks", left, "--training", left, "--test", right, "--relevance", "rrf")
+    asked = (*asked, "--evaluator", "feature_l2:gradient_grid", "--n-landmarks", 8)
+    ran = deepsimbad(*asked)
+    assert ran.code == 0, ran.err
+    assert "true within 2.5 m" in ran.out
+    assert "R@10" in ran.out
+    assert "test: Gardens Point: 12 frames, true within 2 frames unless --tolerance says otherwise" in ran.err
+    assert json.loads(deepsimbad(*asked, "--tolerance", 0, "--json").out)["config"]["tolerance_m"] == 0
