@@ -68,6 +68,8 @@ class Settings(BaseSettings):
     """Largest JSON body, in bytes."""
     max_batch_bytes: PositiveInt = 1024 * MEBIBYTE
     """Largest batch of frames, in bytes: as sent, and again unpacked."""
+    max_spool_bytes: PositiveInt = 4096 * MEBIBYTE
+    """Images of one domain that may wait for its evaluator to be fitted, in bytes; with more, frames are refused."""
     max_pixels: PositiveInt = 50_000_000
     """Most pixels an image's header may claim (width times height)."""
 

@@ -84,7 +84,8 @@ def shelf(client, request):
     client.put(base, json=TAKES_ENCODINGS)
     made = client.post(f"{base}/traverses", json={"name": "t"})
     empty = dict.fromkeys(("length_m", "span_us", "digest", "grey_levels"))
-    empty |= {"name": "t", "n_frames": 0, "missing": [], "n_uninformative": 0, "cameras": [], "warnings": []}
+    empty |= {"name": "t", "n_frames": 0, "missing": [], "n_uninformative": 0, "n_spooled": 0}
+    empty |= {"spooled_bytes": 0, "cameras": [], "warnings": []}
     assert (made.status_code, made.json()) == (201, empty)
     return f"{base}/traverses"
 
@@ -121,6 +122,8 @@ def test_frames_twice_and_out_of_order(client, shelf):
         "length_m": 5.0,
         "span_us": [0, 5],
         "n_uninformative": 0,
+        "n_spooled": 0,
+        "spooled_bytes": 0,
         "grey_levels": None,
         "cameras": [],
         "warnings": [],

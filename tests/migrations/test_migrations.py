@@ -195,7 +195,7 @@ SESSION = [("a" * 32, {"filter": "grid", "seed": 7}, 3, 4630.0), (2, [0.25, 0.75
             )
             for version in (2, 3, 4, 5)
         ),
-        *((f"traverse_v{v}", "domains/campus/traverses/summer.sqlite", the_traverse, FRAMES) for v in range(1, 8)),
+        *((f"traverse_v{v}", "domains/campus/traverses/summer.sqlite", the_traverse, FRAMES) for v in range(1, 9)),
         *((f"session_v{version}", "sessions.sqlite", the_sessions, SESSION) for version in (1, 2, 3, 4, 5)),
         ("map_v1", MAP_FILE, the_map, [*MAP, [[0.0, 0.0, 0.0]] * 4]),
         *((f"map_v{version}", MAP_FILE, the_map, [*MAP, Q_VALUES]) for version in (2, 3, 4)),

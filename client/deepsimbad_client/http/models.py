@@ -195,6 +195,8 @@ class Traverse(Answer):
     warnings: tuple[str, ...] = ()  # what a person should know of its pictures, in sentences
     digest: str | None = None  # SHA-256 over indices, contents, places and times; one drive, one digest
     n_uninformative: int = 0  # frames whose pictures show nothing
+    n_spooled: int = 0  # pictures that wait for the domain's evaluator to be fitted
+    spooled_bytes: int = 0
     grey_levels: tuple[int, int] | None = None
     """What is shown black and white of pictures of more than 8 bits; None: none came."""
 

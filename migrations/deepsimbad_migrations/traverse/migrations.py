@@ -73,3 +73,17 @@ def m007_cameras(db: Database) -> None:
     db.execute("ALTER TABLE frame ADD COLUMN camera TEXT")
     db.execute("ALTER TABLE frame ADD COLUMN image_width INTEGER")
     db.execute("ALTER TABLE frame ADD COLUMN image_height INTEGER")
+
+
+@migrations()
+def m008_spool(db: Database) -> None:
+    """Pictures that wait to be fitted, as they were sent, and encodings (float32) of augmented views of frames."""
+    for table in ("spool", "view_encoding"):
+        db.execute(
+            f"""
+            CREATE TABLE {table} (
+                frame_index INTEGER PRIMARY KEY REFERENCES frame (frame_index) ON DELETE CASCADE,
+                body BLOB NOT NULL
+            )
+            """
+        )

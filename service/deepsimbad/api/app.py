@@ -10,6 +10,7 @@ import time
 from collections.abc import AsyncIterator, Callable, Mapping
 from concurrent.futures import TimeoutError as TookTooLong
 from contextlib import ExitStack, asynccontextmanager
+from dataclasses import replace
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Literal
@@ -32,7 +33,7 @@ from deepsimbad.engine.decoders import Decoders
 from deepsimbad.engine.localizer import warm_up
 from deepsimbad.engine.maps import Maps, Retention
 from deepsimbad.engine.sessions import Sessions
-from deepsimbad.engine.traverses import OpenTraverses
+from deepsimbad.engine.traverses import OpenTraverses, SpoolRoom
 from deepsimbad.engine.truths import Truths
 from deepsimbad.engine.worker import EvaluatorPool, InferenceWorker
 from deepsimbad.errors import DeepSimbadError, UnavailableError
@@ -68,7 +69,9 @@ def create_app(settings: Settings, run_job: RunJob | None = None) -> FastAPI:
         run_job: Does jobs; None: each in a process of its own (decision 0011).
     """
     if run_job is None:
-        run_job = InAnotherProcess(settings.data_dir, job_threads(settings.job_threads), settings.job_priority)
+        n_threads = job_threads(settings.job_threads)
+        compute = replace(settings.compute(), n_threads=n_threads)
+        run_job = InAnotherProcess(settings.data_dir, n_threads, settings.job_priority, compute=compute)
     metrics = Metrics()
     keys = KeyRing()
 
@@ -198,6 +201,7 @@ def _start(settings: Settings, metrics: Metrics, keys: KeyRing, run_job: RunJob,
         maps=maps_,
         evaluators=evaluators,
         open_traverses=open_traverses,
+        spools=SpoolRoom(settings.data_dir, settings.max_spool_bytes),
         sessions=live,
         session_store=store,
         retention=retention,

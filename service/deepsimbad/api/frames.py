@@ -35,6 +35,7 @@ from deepsimbad.engine.decoders import Decoded
 from deepsimbad.engine.localizer import ready_encodings
 from deepsimbad.engine.worker import EncodedImage, Priority
 from deepsimbad.errors import EmptyBodyError, GreyLevelsDifferError, InvalidInputError
+from deepsimbad.evaluators.base import Fitting
 from deepsimbad.evaluators.grey_levels import GreyLevels
 from deepsimbad.evaluators.image_files import MEDIA_TYPES
 from deepsimbad.store.durable import storage_faults
@@ -116,8 +117,9 @@ async def put_frame(
 ) -> FrameAnswer:
     """Store one frame, in any order; the same index again replaces it.
 
-    The body is the image, or its encoding where that is known. An image is encoded at once and not kept. Positions
-    that go backwards are accepted here and refused by the remap.
+    The body is the image, or its encoding where that is known. An image is encoded at once and not kept; where the
+    domain's evaluator is fitted to images it waits in the traverse's spool until a map is made of that. Positions that
+    go backwards are accepted here and refused by the remap.
     """
     evaluator = running.evaluators.evaluator((await run_sync(running.catalog.domain, domain)).evaluator)
     levels = await run_sync(_levels_of, running, domain, name)  # an unknown traverse should not cost an upload
@@ -129,14 +131,16 @@ async def put_frame(
     known: dict[str, Any] = {key: np.array([value]) for key, value in place.items() if value is not None}
     known |= {} if frame_name is None else {"frame_name": np.array([frame_name])}
 
-    def store(encodings: NDArray[np.float32], **about: Any) -> tuple[bool, int]:
+    def store(encodings: NDArray[np.float32], picture: bytes | None = None, **about: Any) -> tuple[bool, int]:
+        spooled = {} if picture is None else {index: picture}
         with running.open_traverses.lend(domain, name) as traverse:
-            n_new, _ = traverse.put_frames(Drive(**known, encodings=encodings, **about), replace)
+            n_new, _ = traverse.put_frames(Drive(**known, encodings=encodings, **about), replace, spooled)
             return n_new == 1, traverse.n_frames
 
     def store_picture(encoded: EncodedImage, seen: Decoded) -> tuple[bool, int]:
         return store(
             encoded.values[np.newaxis],
+            body if evaluator.fitting is Fitting.IMAGES else None,
             weights_sha256=encoded.weights_sha256,
             content_digest=np.array([content_digest(body)], np.uint64),
             shows_nothing=np.array([seen.is_blank]),
@@ -153,6 +157,8 @@ async def put_frame(
         values = np.array((await parse_json(body, EncodingBody, running)).encoding, np.float64)
         created, n_frames = await run_sync(lambda: store(ready_encodings(values[np.newaxis])))
     else:
+        if evaluator.fitting is Fitting.IMAGES:
+            await run_sync(running.spools.make_room, domain, len(body))
         try:
             created, n_frames = await stored(levels)
         except GreyLevelsDifferError:  # another frame came meanwhile, and its levels stay

@@ -28,7 +28,7 @@ from deepsimbad.engine.decoders import Decoders
 from deepsimbad.engine.localizer import View
 from deepsimbad.engine.maps import MappedDomain, Maps, Retention
 from deepsimbad.engine.sessions import Sessions
-from deepsimbad.engine.traverses import OpenTraverses
+from deepsimbad.engine.traverses import OpenTraverses, SpoolRoom
 from deepsimbad.engine.truths import Truths
 from deepsimbad.engine.worker import EvaluatorPool, InferenceWorker, Priority
 from deepsimbad.errors import (
@@ -113,6 +113,7 @@ class Services:
     Attributes:
         faults: What keeps the service from being ready, a sentence each; may wait for the disk.
         stopping: Set when shutdown begins; streams end on it.
+        spools: How much waits to be fitted, and may.
         batches: The thread that reads batches into memory.
         long_work: The thread that reads long bodies and writes long answers: two would end no sooner.
         health: Threads for questions about health, which should not wait behind what they ask about.
@@ -124,6 +125,7 @@ class Services:
     maps: Maps
     evaluators: EvaluatorPool
     open_traverses: OpenTraverses
+    spools: SpoolRoom
     sessions: Sessions
     session_store: SessionStore
     retention: Retention

@@ -86,6 +86,10 @@ class TraverseAnswer(Answer):
         Field(description="SHA-256 over indices, contents, places and times: one drive, one digest; null: unknown."),
     ]
     n_uninformative: Annotated[int, Field(description="Frames whose pictures show nothing: one grey, noise, the dark.")]
+    n_spooled: Annotated[
+        int, Field(description="Pictures that wait until a map is made of the traverse, for an evaluator to be fitted.")
+    ]
+    spooled_bytes: Annotated[int, Field(description="Of these.")]
     grey_levels: Annotated[
         GreyLevels | None,
         Field(description="By which pictures of more than 8 bits are shown as 8, black and white; null: none came."),

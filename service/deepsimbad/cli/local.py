@@ -32,6 +32,7 @@ from deepsimbad.evaluators.grey_levels import levels_in
 from deepsimbad.evaluators.image import decode_image, picture_size
 from deepsimbad.evaluators.registry import EvaluatorConfig, make_evaluator
 from deepsimbad.jobs.build import encode_recording
+from deepsimbad.jobs.fitting import RecordingPictures
 from deepsimbad.jobs.remap import (
     DEFAULT_LIST_LENGTH,
     DEFAULT_N_LANDMARKS,
@@ -145,7 +146,8 @@ def map_(
                     Traverse.delete(catalog.data_dir, domain, role)
                 with Traverse.create(catalog.data_dir, domain, role) as traverse:
                     traverse.put_frames(encoded.drive)
-            result = remap(catalog, domain, config, measure, progress, n_threads=available_cores())
+            pictures = RecordingPictures(recordings[next(iter(sources))], settings.max_pixels)
+            result = remap(catalog, domain, config, measure, progress, n_threads=available_cores(), pictures=pictures)
     for role, names in left_out.items():
         tell_left_out(names, role, verbose=verbose)
     if as_json:
@@ -165,7 +167,7 @@ def _stages(config: RemapConfig, recordings: Mapping[str, Recording], measure: E
     ready = recordings["training"].encodings
     dim = (measure.encoding_dim or 0) if ready is None else ready.shape[1]
     reading = {f"read {role}": n / _FRAMES_A_SECOND for role, n in n_frames.items()}
-    return reading | remap_stages(config, n_frames["training"], n_frames.get("landmarks", 0), dim)
+    return reading | remap_stages(config, n_frames["training"], n_frames.get("landmarks", 0), dim, measure.fitting)
 
 
 @contextmanager

@@ -1,13 +1,16 @@
-"""Traverse files kept open while frames arrive: opening and closing one costs many times what a frame does."""
+"""Traverse files kept open while frames arrive: opening and closing one costs many times what a frame does.
+
+And how many pictures may wait in them to be fitted.
+"""
 
 import threading
 from collections import OrderedDict
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from deepsimbad.errors import UnknownTraverseError
+from deepsimbad.errors import SpoolFullError, UnknownTraverseError
 from deepsimbad.store.traverses import Traverse
 
 MAX_IDLE = 16
@@ -75,3 +78,34 @@ class OpenTraverses:
         loan = self._open.pop(key)
         if not loan.n_users:
             loan.traverse.close()
+
+
+class SpoolRoom:
+    """How many bytes of pictures wait in the spools of every domain, and how many may."""
+
+    def __init__(self, data_dir: Path, max_bytes: int) -> None:
+        self._data_dir, self._max_bytes = data_dir, max_bytes
+        self._used: dict[str, int] = {}  # at least as much as there is: jobs empty spools in processes of their own
+        self._lock = threading.Lock()
+
+    def make_room(self, domain: str, n_bytes: int) -> None:
+        """Count a picture that is about to wait; raises SpoolFullError, and the traverse stays as it is."""
+        with self._lock:
+            waiting: dict[str, int] = {}
+            if domain not in self._used or self._used[domain] + n_bytes > self._max_bytes:
+                for name in Traverse.list(self._data_dir, domain):
+                    with suppress(UnknownTraverseError), Traverse.open(self._data_dir, domain, name) as traverse:
+                        waiting[name] = traverse.spooled_bytes
+                self._used[domain] = sum(waiting.values())
+            if self._used[domain] + n_bytes > self._max_bytes:
+                fullest = max(waiting, key=lambda name: waiting[name])
+                raise SpoolFullError(
+                    f"{self._used[domain]} bytes of images wait in domain {domain} for its evaluator to be fitted, and "
+                    f"{self._max_bytes} are the most: remap with the traverse that holds most of them, {fullest}, or "
+                    "delete it, or raise the setting max_spool_bytes; the frame was not stored",
+                    limit="max_spool_bytes",
+                    max_spool_bytes=self._max_bytes,
+                    spooled_bytes=self._used[domain],
+                    traverse=fullest,
+                )
+            self._used[domain] += n_bytes

@@ -325,6 +325,8 @@ def train_nnql(
     return q_values, {
         "live_images": HELD_OUT if second is None else SECOND_DRIVE,
         "n_episodes": n_episodes,
+        # As the paper counts them: of every viewpoint of every episode to every landmark. Here each frame's are kept.
+        "n_dissimilarities": n_episodes * config.n_actions_per_episode * map_.n_landmarks,
         "curves": [curve.as_dict() for curve in curves],
         "hyperparameters": asdict(config),
         "seconds": time.perf_counter() - started,

@@ -100,11 +100,23 @@ def main() -> None:
     logging.captureWarnings(True)
 
     from deepsimbad.errors import DeepSimbadError  # noqa: PLC0415 - nothing heavy before the priority is low
+    from deepsimbad.evaluators.compute import Compute, Device, Runtime  # noqa: PLC0415
     from deepsimbad.jobs.runner import InThisProcess  # noqa: PLC0415
     from deepsimbad.store.records import JobRecord, JobState  # noqa: PLC0415
 
     job = JobRecord(**{**order["job"], "state": JobState(order["job"]["state"])})
-    run_job = InThisProcess(Path(order["data_dir"]), order["n_threads"])
+    compute = order["compute"]
+    run_job = InThisProcess(
+        Path(order["data_dir"]),
+        order["n_threads"],
+        Compute(
+            Runtime(compute["runtime"]),
+            Device(compute["device"]),
+            compute["n_threads"],
+            compute["largest_batch"],
+            Path(compute["weights_dir"]),
+        ),
+    )
     try:
         result = run_job(job, lambda state: _tell(progress=vars(state)), cancelled.is_set)
     except DeepSimbadError as error:

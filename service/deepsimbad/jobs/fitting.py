@@ -17,9 +17,11 @@ from deepsimbad.evaluators.augmentation import VIEWS_A_LANDMARK, augmented
 from deepsimbad.evaluators.base import Evaluator, Fitted, Fitting, Image, Lesson
 from deepsimbad.evaluators.feature_l2 import squared_distances
 from deepsimbad.evaluators.image import decode_image
+from deepsimbad.store.traverses import Traverse
 from deepsimbad_client.recordings import Recording
 
 _LANDMARKS_AT_ONCE = 8  # whose views are encoded before they are kept
+_ANY_SIZE = 1 << 31  # pixels
 _VIEWS_SHARE, _FIT_SHARE = 0.1, 0.6  # of progress: landmarks chosen, their views encoded
 
 
@@ -57,6 +59,32 @@ class RecordingPictures:
     def keep_views(self, views: dict[int, NDArray[np.float32]]) -> None:
         """See `Pictures`."""
         self._views |= views
+
+
+class SpooledPictures:
+    """Those that wait with a traverse, where views of them are kept too.
+
+    Args:
+        elsewhere: Where a picture is that does not wait; None: nowhere.
+    """
+
+    def __init__(self, traverse: Traverse, drive: Drive, elsewhere: Pictures | None = None) -> None:
+        self._traverse, self._levels, self._dim = traverse, drive.grey_levels, drive.encoding_dim
+        self._elsewhere = elsewhere
+
+    def image(self, index: int) -> Image | None:
+        """See `Pictures`."""
+        if (body := self._traverse.picture(index)) is not None:
+            return decode_image(body, _ANY_SIZE, levels=self._levels)  # one that was taken when it was sent
+        return None if self._elsewhere is None else self._elsewhere.image(index)
+
+    def views(self, index: int) -> NDArray[np.float32] | None:
+        """See `Pictures`."""
+        return self._traverse.views(index, self._dim)
+
+    def keep_views(self, views: dict[int, NDArray[np.float32]]) -> None:
+        """See `Pictures`."""
+        self._traverse.keep_views(views)
 
 
 class Fitter:

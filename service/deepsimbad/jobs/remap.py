@@ -6,6 +6,7 @@ again, and where nothing is fused none is described again, and what two seasons 
 
 import math
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -22,8 +23,14 @@ from deepsimbad.core.experience.nnql import NnqlConfig
 from deepsimbad.core.landmark_model import fitting_number
 from deepsimbad.core.map import Map
 from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Relevance
-from deepsimbad.errors import InvalidEncodingError, InvalidMapConfigError, LostActivationError, WeightsDifferError
-from deepsimbad.evaluators.base import Evaluator
+from deepsimbad.errors import (
+    InvalidEncodingError,
+    InvalidMapConfigError,
+    LostActivationError,
+    UnknownTraverseError,
+    WeightsDifferError,
+)
+from deepsimbad.evaluators.base import Evaluator, Fitting
 from deepsimbad.evaluators.grey_levels import with_levels
 from deepsimbad.jobs.append import (
     ACTIVE_MAP,
@@ -38,7 +45,7 @@ from deepsimbad.jobs.append import (
 from deepsimbad.jobs.build import EPISODES_A_MAP_IMAGE, build, compared, measured, train_nnql
 from deepsimbad.jobs.camera import seen_twice
 from deepsimbad.jobs.check import CheckFrames, check_map
-from deepsimbad.jobs.fitting import Fitter
+from deepsimbad.jobs.fitting import Fitter, Pictures, SpooledPictures
 from deepsimbad.jobs.progress import Progress
 from deepsimbad.jobs.versions import activate_once, seal_version
 from deepsimbad.store.catalog import ANY, Catalog
@@ -46,6 +53,7 @@ from deepsimbad.store.map_file import read_map
 from deepsimbad.store.records import DomainRecord, MapRecord
 from deepsimbad.store.traverses import Traverse
 
+FIT = "fit"  # the stage of evaluators that must be fitted
 DEFAULT_N_LANDMARKS = 500
 DEFAULT_LIST_LENGTH = 4
 DEFAULT_TRAINING_EPISODES = 10_000
@@ -120,21 +128,26 @@ class RemapConfig:
         return cls(**{**stored, "relevance": Relevance(stored["relevance"])})
 
 
-def remap_stages(config: RemapConfig, n_frames: int, n_candidates: int, encoding_dim: int) -> dict[str, float]:
+def remap_stages(
+    config: RemapConfig, n_frames: int, n_candidates: int, encoding_dim: int, fitting: Fitting = Fitting.NOTHING
+) -> dict[str, float]:
     """Every stage in order, with the seconds it takes on one core of 2026; what counts is their ratio.
 
     Measured with 2,000 to 26,000 frames of 64 to 4,096 numbers (docs/results/bench.md has one of them).
 
     Args:
         n_candidates: Frames that landmarks are selected from; 0: they stay.
+        fitting: What the evaluator learns from.
     """
     n, m, dim = n_frames, n_candidates, encoding_dim
     n_landmarks = config.n_landmarks or min(DEFAULT_N_LANDMARKS, m or DEFAULT_N_LANDMARKS)
     n_episodes = min(config.training_episodes, EPISODES_A_MAP_IMAGE * n)
     if config.append or config.relevance is Relevance.BRUTE_FORCE:
         n_episodes = 0
+    fit_s = {Fitting.NOTHING: 0.0, Fitting.ENCODINGS: 10.0, Fitting.IMAGES: 10.0 + 0.3 * n_landmarks}[fitting]
     return {
         "read frames": 0.05 + 1e-8 * (n + m) * dim,
+        **({FIT: fit_s} if fit_s else {}),
         "describe": 0.1 + (n + m) * (2e-8 * dim * 96 + 4e-7 * n_landmarks),
         "train": 0.01 + n_episodes * (4e-4 + 8e-8 * n),
         "check": 0.1 + 5e-6 * n,
@@ -147,7 +160,7 @@ def remap_stages(config: RemapConfig, n_frames: int, n_candidates: int, encoding
 REMAP_STAGES = remap_stages(RemapConfig("drive", "another"), 5_000, 5_000, 1_000)
 
 
-def stages_in(data_dir: Path, domain: str, config: RemapConfig) -> dict[str, float]:
+def stages_in(data_dir: Path, domain: str, config: RemapConfig, fitting: Fitting = Fitting.NOTHING) -> dict[str, float]:
     """The stages of a remap of a domain's traverses, of which no encoding is read.
 
     Raises:
@@ -160,7 +173,7 @@ def stages_in(data_dir: Path, domain: str, config: RemapConfig) -> dict[str, flo
     if config.landmark_traverse is not None:
         with Traverse.open(data_dir, domain, config.landmark_traverse) as landmarks:
             n_candidates = landmarks.n_frames
-    return remap_stages(config, n_frames, n_candidates, dim)
+    return remap_stages(config, n_frames, n_candidates, dim, fitting)
 
 
 def remap(
@@ -171,6 +184,7 @@ def remap(
     progress: Progress,
     n_threads: int = 1,
     job_id: str | None = None,
+    pictures: Pictures | None = None,
 ) -> dict[str, Any]:
     """Build, seal and, if asked, activate the next map version of a domain.
 
@@ -182,6 +196,7 @@ def remap(
     Args:
         progress: Reports the stages of REMAP_STAGES; may cancel.
         job_id: The job that this is: one that was interrupted after it sealed its version makes no other. None: none.
+        pictures: Of the drive that landmarks are chosen from, beside those that wait in its traverse.
 
     Returns:
         `{"map_version", "active", "metrics"}`, as the job's result.
@@ -191,8 +206,11 @@ def remap(
     """
     sealed = None if job_id is None else catalog.map_of_job(domain, job_id)
     if sealed is None:
-        sealed = _Remap(catalog, domain, config, evaluator, progress, n_threads).sealed(job_id)
+        sealed = _Remap(catalog, domain, config, evaluator, progress, n_threads, pictures).sealed(job_id)
     progress.stage("activate")
+    for name in {config.training_traverse, config.landmark_traverse, config.check_traverse} - {None}:
+        with suppress(UnknownTraverseError), Traverse.open(catalog.data_dir, domain, str(name)) as traverse:
+            traverse.empty_spool()
     check = sealed.metrics["check"]
     active = config.activate and check["passed"] is not False
     if active:
@@ -237,6 +255,7 @@ class _Remap:
     evaluator: Evaluator
     progress: Progress
     n_threads: int
+    pictures: Pictures | None
 
     def sealed(self, job_id: str | None) -> MapRecord:
         """The next version, sealed; what is decided of it later must stand in its metrics."""
@@ -264,7 +283,9 @@ class _Remap:
             self.evaluator,
             progress.update,
         )
-        seconds = {name: took for name, took in progress.seconds().items() if name.replace("_", " ") in REMAP_STAGES}
+        seconds = {
+            name: took for name, took in progress.seconds().items() if name.replace("_", " ") in {*REMAP_STAGES, FIT}
+        }
         metrics = {
             "n_map_images": map_.n_images,
             "n_uninformative": int(inputs.training.shows_nothing.sum()),
@@ -368,7 +389,6 @@ class _Remap:
     def _mapped(self, inputs: _Inputs) -> _Draft:
         """The training traverse as a map of its own."""
         config, domain, training = self.config, inputs.domain, inputs.training
-        self.progress.stage("describe")
         landmarks = inputs.candidates if inputs.base is None else inputs.base.landmark_model
         n_candidates = (inputs.candidates or training).n_frames
         n_landmarks = (
@@ -376,17 +396,26 @@ class _Remap:
             if inputs.base is None
             else inputs.base.n_landmarks
         )
-        built = build(
-            MapPlan(config.relevance, config.list_length, domain.actions_m, domain.closed, config.same_route),
-            training,
-            inputs.second,
-            landmarks,
-            n_landmarks,
-            self.evaluator,
-            self.progress.update,
-            inputs.camera,
-            Fitter(self.evaluator, seed=config.seed),
-        )
+        plan = MapPlan(config.relevance, config.list_length, domain.actions_m, domain.closed, config.same_route)
+        candidates = inputs.candidates or training
+        with Traverse.open(self.catalog.data_dir, self.domain, candidates.name or "") as traverse:
+            fitter = Fitter(self.evaluator, SpooledPictures(traverse, candidates, self.pictures), config.seed)
+            if inputs.base is None and self.evaluator.fitting is not Fitting.NOTHING:
+                self.progress.stage(FIT)
+                other = inputs.second if candidates is training else training
+                fitter.fit(plan, candidates, n_landmarks, other, self.progress.update)
+            self.progress.stage("describe")
+            built = build(
+                plan,
+                training,
+                inputs.second,
+                landmarks,
+                n_landmarks,
+                self.evaluator,
+                self.progress.update,
+                inputs.camera,
+                fitter,
+            )
         q_values = learning = None
         # The baseline that compares whole encodings would need hours for it, and serves no robot.
         if config.training_episodes and config.relevance is not Relevance.BRUTE_FORCE:

@@ -14,7 +14,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
 
@@ -30,7 +30,7 @@ from deepsimbad.errors import (
     UnavailableError,
     UnknownJobError,
 )
-from deepsimbad.evaluators.compute import available_cores
+from deepsimbad.evaluators.compute import Compute, available_cores
 from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
 from deepsimbad.jobs.child import JobPriority
 from deepsimbad.jobs.progress import Progress, ProgressState
@@ -272,6 +272,7 @@ class InThisProcess:
 
     data_dir: Path  # the catalog and the sessions in it are opened anew
     n_threads: int = 1  # to compute in
+    compute: Compute = field(default_factory=Compute)  # how networks are computed, where an evaluator is fitted
 
     def __call__(
         self, job: JobRecord, on_progress: Callable[[ProgressState], None], is_cancelled: Callable[[], bool]
@@ -283,14 +284,14 @@ class InThisProcess:
             if job.kind == EXPERIENCE:
                 return self._learn(job, Progress(LEARN_STAGES, on_progress, is_cancelled))
             config = RemapConfig.from_dict(job.config)
-            try:
-                stages = stages_in(self.data_dir, job.domain, config)
-            except DeepSimbadError:  # the stage that needs the traverse will say so
-                stages = REMAP_STAGES
-            progress = Progress(stages, on_progress, is_cancelled)
             with Catalog.open(self.data_dir) as catalog:
-                progress.check()
-                evaluator = make_evaluator(evaluator_config(catalog.domain(job.domain).evaluator))
+                Progress({}, None, is_cancelled).check()
+                evaluator = make_evaluator(evaluator_config(catalog.domain(job.domain).evaluator), self.compute)
+                try:
+                    stages = stages_in(self.data_dir, job.domain, config, evaluator.fitting)
+                except DeepSimbadError:  # the stage that needs the traverse will say so
+                    stages = REMAP_STAGES
+                progress = Progress(stages, on_progress, is_cancelled)
                 return remap(catalog, job.domain, config, evaluator, progress, self.n_threads, job.job_id)
         except MemoryError as error:
             raise OutOfMemoryError("too little memory is left for the job") from error
@@ -323,6 +324,7 @@ class InAnotherProcess:
     stops_within_s: float = (
         3.0  # a child that does not stop so soon after a cancel is killed, which harms nothing either
     )
+    compute: Compute = field(default_factory=Compute)  # how it computes networks
 
     def __call__(
         self, job: JobRecord, on_progress: Callable[[ProgressState], None], is_cancelled: Callable[[], bool]
@@ -357,6 +359,7 @@ class InAnotherProcess:
             "job": dataclasses.asdict(job),
             "data_dir": str(self.data_dir.resolve()),
             "n_threads": self.n_threads,
+            "compute": {**dataclasses.asdict(self.compute), "weights_dir": str(self.compute.weights_dir.resolve())},
             "parent_pid": os.getpid(),
             "log_level": logging.getLogger("deepsimbad").getEffectiveLevel(),
         }

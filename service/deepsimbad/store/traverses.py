@@ -1,15 +1,16 @@
-"""One recorded drive on the disk: its frames' encodings and places, not its images."""
+"""One recorded drive on the disk: its frames' encodings and places; images alone that wait to be fitted."""
 
 import dataclasses
 import fcntl
 import hashlib
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import repeat
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Self
 
 import numpy as np
@@ -34,7 +35,6 @@ from deepsimbad.store import layout
 from deepsimbad.store.arrays import is_halvable
 from deepsimbad.store.connection import (
     FileState,
-    OpenFile,
     file_state,
     open_database,
     open_working_file,
@@ -42,6 +42,7 @@ from deepsimbad.store.connection import (
 )
 from deepsimbad.store.durable import lock_folder, remove_database, storage_faults, sync
 from deepsimbad.store.records import now, to_json
+from deepsimbad.store.spool import Spool, clear_spool, spool_pictures, spooled
 from deepsimbad_migrations.traverse.migrations import migrations
 
 _NAMED_INDICES = 100  # most that an error names
@@ -59,12 +60,14 @@ class TraverseSummary:
     span_us: tuple[int, int] | None  # the first and the last known time of a frame
     digest: str | None  # SHA-256 in hex of all that its frames are known by; None: none are there, or one is unknown
     n_uninformative: int  # frames whose pictures show nothing
+    n_spooled: int  # pictures that wait to be fitted
+    spooled_bytes: int
     grey_levels: tuple[int, int] | None  # what is shown black and white of more than 8 bits; None: nobody said yet
     cameras: tuple[Camera, ...]  # which took its pictures, the one of most first
     warnings: tuple[str, ...]  # what a person should know of its pictures, in sentences
 
 
-class Traverse(OpenFile):
+class Traverse(Spool):
     """One traverse file; usable from any thread and several processes.
 
     A put that returned survives kill -9 and a power cut; one that did not is there whole or not at all. Every method
@@ -148,11 +151,14 @@ class Traverse(OpenFile):
     def _gone(self) -> UnknownTraverseError:
         return UnknownTraverseError(f"traverse {self.name} was deleted")
 
-    def put_frames(self, frames: Drive, replace: bool = True) -> tuple[int, int]:
+    def put_frames(
+        self, frames: Drive, replace: bool = True, pictures: Mapping[int, bytes] = MappingProxyType({})
+    ) -> tuple[int, int]:
         """Store a batch in one transaction; never holds a second copy of it.
 
         Args:
             replace: Whether they take the place of those of the same index; else equal ones are passed over.
+            pictures: As they were sent, by index, of those frames whose pictures shall wait in the spool.
 
         Returns:
             (n_new, n_replaced).
@@ -198,6 +204,8 @@ class Traverse(OpenFile):
                 frames.content_digest.view(np.int64),  # SQLite's integers have a sign
                 frames.shows_nothing.astype(np.int64),
             )
+            indices = frames.index[rows].tolist()
+            clear_spool(db, indices, frames.content_digest.view(np.int64)[rows].tolist())
             camera = frames.camera
             taken_by = (None,) * 3 if camera is None else (camera.name, camera.width, camera.height)
             db.conn.executemany(  # NaN becomes NULL
@@ -224,6 +232,7 @@ class Traverse(OpenFile):
                 """,
                 ((int(frames.index[row]), _packed(frames.encodings[row])) for row in rows),
             )
+            spool_pictures(db, indices, pictures)
             n_new = _count(db) - n_before
         return n_new, rows.size - n_new
 
@@ -280,6 +289,7 @@ class Traverse(OpenFile):
             cameras = _cameras(db)
             unlike = (camera.unlike(cameras[:1], "most") for camera in cameras[1:])
             whys = [f"some of its pictures are not like the others: {why}" for why in unlike if why is not None]
+            n_spooled, spooled_bytes = spooled(db)
             return TraverseSummary(
                 name=self.name,
                 n_frames=n_frames,
@@ -288,6 +298,8 @@ class Traverse(OpenFile):
                 span_us=None if span_us[0] is None else (span_us[0], span_us[1]),
                 digest=_digest(_known(db)),
                 n_uninformative=n_uninformative,
+                n_spooled=n_spooled,
+                spooled_bytes=spooled_bytes,
                 grey_levels=_levels(db),
                 cameras=cameras,
                 warnings=tuple(whys[:1]),

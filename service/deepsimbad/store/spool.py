@@ -1,0 +1,82 @@
+"""What waits in a traverse's file to be fitted: pictures as they were sent, and encodings of views of them."""
+
+import sqlite3
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+
+import numpy as np
+from numpy.typing import NDArray
+from sqlite_utils import Database
+
+from deepsimbad.errors import DamagedFileError
+from deepsimbad.store.connection import OpenFile
+
+
+class Spool(OpenFile):
+    """The spool of a traverse; pictures are put there with their frames, in one transaction (`Traverse.put_frames`)."""
+
+    @property
+    def spooled_bytes(self) -> int:
+        """Of all pictures that wait."""
+        with self._reading() as db:
+            return spooled(db)[1]
+
+    def picture(self, index: int) -> bytes | None:
+        """A frame's picture as it was sent; None: it does not wait here."""
+        with self._reading() as db:
+            row = db.execute("SELECT body FROM spool WHERE frame_index = ?", [index]).fetchone()
+            return None if row is None else bytes(row[0])
+
+    def views(self, index: int, dim: int) -> NDArray[np.float32] | None:
+        """[a, d] encodings of views of a frame; None: none were kept. Raises DamagedFileError."""
+        with self._reading() as db:
+            row = db.execute("SELECT body FROM view_encoding WHERE frame_index = ?", [index]).fetchone()
+        if row is None:
+            return None
+        if not row[0] or len(row[0]) % (4 * dim):
+            raise DamagedFileError(f"the views of frame {index} have another length: delete the traverse, upload anew")
+        return np.frombuffer(row[0], "<f4").reshape(-1, dim).astype(np.float32)
+
+    def keep_views(self, views: Mapping[int, NDArray[np.float32]]) -> None:
+        """Keep encodings of views, [a, d] by frames' indices, until their frames change."""
+        with self._writing() as db:
+            db.conn.executemany(
+                "INSERT OR REPLACE INTO view_encoding (frame_index, body) "
+                "SELECT frame_index, ? FROM frame WHERE frame_index = ?",
+                ((np.ascontiguousarray(body, "<f4").tobytes(), index) for index, body in views.items()),
+            )
+
+    def empty_spool(self) -> None:
+        """Delete all pictures, and give their room on the disk back unless somebody is at the file just now."""
+        with self._writing() as db:
+            n_deleted = db.execute("DELETE FROM spool").rowcount
+        if n_deleted:
+            with self._lock, suppress(sqlite3.OperationalError):
+                self._db.conn.execute("VACUUM")
+                self._db.conn.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+
+
+def spooled(db: Database) -> tuple[int, int]:
+    """How many pictures wait, and their bytes."""
+    n_spooled, n_bytes = db.execute("SELECT count(*), coalesce(sum(length(body)), 0) FROM spool").fetchone()
+    return n_spooled, n_bytes
+
+
+def clear_spool(db: Database, indices: Sequence[int], contents: Sequence[int]) -> None:
+    """Before frames are written: what waits for frames of those indices gives way, views of equal pictures stay."""
+    db.conn.executemany(
+        """
+        DELETE FROM view_encoding WHERE frame_index = ?1
+            AND (SELECT content_digest FROM frame WHERE frame_index = ?1) IS NOT ?2
+        """,
+        zip(indices, contents, strict=True),
+    )
+    db.conn.executemany("DELETE FROM spool WHERE frame_index = ?", ([index] for index in indices))
+
+
+def spool_pictures(db: Database, indices: Sequence[int], pictures: Mapping[int, bytes]) -> None:
+    """After frames were written: their pictures wait."""
+    db.conn.executemany(
+        "INSERT INTO spool (frame_index, body) VALUES (?, ?)",
+        ((index, pictures[index]) for index in indices if index in pictures),
+    )
