@@ -1,6 +1,7 @@
 """Fixtures shared by every test."""
 
 import fcntl
+import logging
 import os
 import signal
 from pathlib import Path
@@ -47,6 +48,17 @@ def rendered(tmp_path_factory) -> Path:
         fcntl.flock(lock, fcntl.LOCK_EX)
         write_campus(shared / "campus", n_frames=36)  # what is there already is left as it is
     return shared / "campus"
+
+
+@pytest.fixture
+def _logging_as_before():
+    """For tests that configure logging as a service does."""
+    loggers = [logging.getLogger(name) for name in (None, "deepsimbad", "uvicorn", "uvicorn.error", "uvicorn.access")]
+    levels, handlers = [logger.level for logger in loggers], logging.getLogger().handlers[:]
+    yield
+    logging.getLogger().handlers[:] = handlers
+    for logger, level in zip(loggers, levels, strict=True):
+        logger.setLevel(level)
 
 
 @pytest.hookimpl(optionalhook=True)

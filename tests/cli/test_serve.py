@@ -32,15 +32,6 @@ def wait_until_ready(port, running):
     raise AssertionError("the service did not become ready")
 
 
-def assert_it_cannot_start(err, code, why):
-    """One record for what reads the log, then the line that every named error is."""
-    *_, record, line = err.splitlines()
-    logged = json.loads(record)
-    assert (logged["level"], logged["message"], logged["code"]) == ("ERROR", "cannot start", code)
-    assert why in logged["why"]
-    assert line == f"deepsimbad: {code}: {' '.join(logged['why'].split())}"
-
-
 @pytest.mark.parametrize(("by", "code", "is_made"), [(signal.SIGTERM, 0, False), (signal.SIGINT, 130, True)])
 def test_it_serves_until_it_is_stopped(deepsimbad, process, tmp_path, by, code, is_made):
     """In a directory that it makes, told by flags; in one that was made before, told by the environment."""
@@ -61,29 +52,27 @@ def test_it_serves_until_it_is_stopped(deepsimbad, process, tmp_path, by, code, 
     assert stat.S_IMODE(folder.stat().st_mode) == 0o700
 
 
-def test_a_data_directory_must_be_there(process, tmp_path):
-    running = process("serve", "--port", 0)
-    _, err = running.communicate(timeout=60)
-    assert running.returncode == 1
-    assert_it_cannot_start(err, "invalid_settings", "there is no data directory deepsimbad-data")
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_other_machines_are_refused_while_there_are_no_keys(process):
-    running = process("serve", "--host", "0.0.0.0", "--port", free_port())
-    out, err = running.communicate(timeout=60)
-    assert (running.returncode, out) == (1, "")
-    assert_it_cannot_start(err, "invalid_settings", "DEEPSIMBAD_ALLOW_OPEN")
-    assert len(err.splitlines()) == 2
-
-
-def test_settings_that_cannot_be_used_are_logged_too(process, tmp_path):
+@pytest.mark.usefixtures("_logging_as_before")
+@pytest.mark.parametrize(
+    ("arguments", "code", "why"),
+    [
+        (("--port", 0), "invalid_settings", "there is no data directory deepsimbad-data"),
+        (("--host", "0.0.0.0", "--port", 0), "invalid_settings", "DEEPSIMBAD_ALLOW_OPEN"),
+        (("--config", "bad.toml"), "invalid_settings", "there is no setting 'data_dri'"),
+        (("--create", "--data-dir", "here", "--port", "taken"), "unavailable", "cannot listen on"),
+    ],
+)
+def test_a_start_that_fails_is_told_in_one_record_and_one_line(deepsimbad, tmp_path, arguments, code, why):
     (tmp_path / "bad.toml").write_text("data_dri = 'there'")
-    running = process("serve", "--config", "bad.toml")
-    out, err = running.communicate(timeout=60)
-    assert (running.returncode, out) == (1, "")
-    assert_it_cannot_start(err, "invalid_settings", "there is no setting 'data_dri'")
-    assert [path.name for path in tmp_path.iterdir()] == ["bad.toml"]
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        ran = deepsimbad("serve", *(taken.getsockname()[1] if word == "taken" else word for word in arguments))
+    assert (ran.code, ran.out) == (1, "")
+    *_, record, line = ran.err.splitlines()
+    logged = json.loads(record)
+    assert (logged["level"], logged["message"], logged["code"]) == ("ERROR", "cannot start", code)
+    assert why in logged["why"]
+    assert line == f"deepsimbad: {code}: {' '.join(logged['why'].split())}"
+    assert {path.name for path in tmp_path.iterdir()} <= {"bad.toml", "here"}
 
 
 def test_with_a_key_other_machines_may_reach_it(deepsimbad, process, tmp_path):
@@ -99,14 +88,3 @@ def test_with_a_key_other_machines_may_reach_it(deepsimbad, process, tmp_path):
     assert "asks for keys" in err
     assert "runs open" not in err
     assert key not in err
-
-
-def test_a_port_that_is_taken_is_an_error(process):
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        taken.listen()
-        running = process("serve", "--create", "--port", taken.getsockname()[1])
-        _, err = running.communicate(timeout=60)
-    assert running.returncode == 1
-    assert "address already in use" in err.lower()
-    assert_it_cannot_start(err, "unavailable", "cannot listen on")

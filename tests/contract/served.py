@@ -3,67 +3,26 @@
 import contextlib
 import http.client
 import json
-import os
 import socket
-import subprocess
 import sys
 import threading
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import httpx2
+from deepsimbad_client.http.local_server import LocalServer
 
 from .conftest import until
 
 
-def free_port():
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
-
-
-class Served:
-    """The process.
-
-    Args:
-        data_dir: Its log lies beside it.
-        program: Given the data directory and the port as arguments, where it is not the command itself.
-        **settings: By name.
-    """
+class Served(LocalServer):
+    """The process; `program` stands in for the command; it is given the data directory first and the port last."""
 
     def __init__(self, data_dir, program=None, **settings):
-        self.port = free_port()
-        self.url = f"http://127.0.0.1:{self.port}"
-        self.log = data_dir.parent / "log"
-        command = ["-m", "deepsimbad", "serve", "--create", "--port", str(self.port)]
-        command = [*command, "--data-dir", str(data_dir)]
-        if program is not None:
-            command = ["-c", program, str(data_dir), str(self.port)]
         variables = {f"DEEPSIMBAD_{name.upper()}": str(value) for name, value in settings.items()}
-        with self.log.open("ab") as stderr:
-            self.process = subprocess.Popen(
-                [sys.executable, *command], stderr=stderr, env={**os.environ, **variables}, cwd=self.log.parent
-            )
-
-    def __enter__(self):
-        try:
-            until(self._is_ready)
-        except BaseException:
-            self.__exit__()
-            raise
-        return self
-
-    def __exit__(self, *_):
-        if self.process.poll() is None:
-            self.process.kill()
-        self.process.wait()
-
-    def _is_ready(self):
-        assert self.process.poll() is None, self.log.read_text()
-        with contextlib.suppress(httpx2.TransportError):
-            return httpx2.get(f"{self.url}/readyz").status_code == 200
-        return False
+        super().__init__(data_dir, data_dir.parent / "log", variables)
+        if program is not None:
+            self.command = [sys.executable, "-c", program, str(data_dir)]
 
     def connect(self):
         return socket.create_connection(("127.0.0.1", self.port), timeout=30)
@@ -81,11 +40,11 @@ class Served:
 
     def forget_peak(self):
         """Let the peak of memory be what it is now."""
-        Path(f"/proc/{self.process.pid}/clear_refs").write_text("5")
+        Path(f"/proc/{self.pid}/clear_refs").write_text("5")
 
     def mib(self, name="VmRSS"):
         """Memory held now; `VmHWM`: its peak."""
-        for line in Path(f"/proc/{self.process.pid}/status").read_text().splitlines():
+        for line in Path(f"/proc/{self.pid}/status").read_text().splitlines():
             if line.startswith(f"{name}:"):
                 return int(line.split()[1]) / 1024
         raise AssertionError(f"no {name}")
@@ -102,7 +61,7 @@ class Served:
     def n_sockets(self):
         """Open sockets: connections, and the few of its own."""
         n_open = 0
-        for descriptor in Path(f"/proc/{self.process.pid}/fd").iterdir():
+        for descriptor in Path(f"/proc/{self.pid}/fd").iterdir():
             with contextlib.suppress(FileNotFoundError):
                 n_open += str(descriptor.readlink()).startswith("socket:")
         return n_open

@@ -430,6 +430,7 @@ def test_a_damaged_map(client, domain, data_dir):
         assert problem(answer, 503, "damaged_map")["map_version"] == 2
         assert int(answer.headers["retry-after"]) > 0
         assert str(data_dir) not in answer.text
+        problem(client.get(f"/v1/domains/{domain}/landmark-model"), 503, "damaged_map")
     told = client.get(f"/v1/domains/{domain}").json()
     assert (told["map_version"], told["map_problem"], told["n_map_images"]) == (2, "damaged_map", None)
     assert client.put(active, json={"version": 1, "expected": 2}).status_code == 200

@@ -9,7 +9,7 @@ import pytest
 from deepsimbad.api import app as application
 from deepsimbad.store.layout import catalog_path, sessions_path
 
-from .conftest import RANKS, problem, service
+from .conftest import problem, service
 
 
 def test_health_readiness_and_documents(client):
@@ -60,16 +60,6 @@ def test_a_service_is_shown_below_a_path(tmp_path):
         client.services.keys.by_id["k"] = None  # one was made: who has none is let nowhere
         for path in ("/v1/domains", "/v1/admin/jobs"):
             problem(client.get(f"/robots/simbad{path}"), 401, "unauthorized")
-
-
-def test_what_was_acknowledged_is_there_after_a_restart(tmp_path):
-    path = "/v1/domains/kept/localizations"
-    with service(tmp_path) as client:
-        client.make_ready_domain("kept")
-        before = client.post(path, json=RANKS).json()
-    with service(tmp_path) as client:
-        after = client.post(path, json=RANKS).json()
-    assert {**after, "timings_ms": {}} == {**before, "timings_ms": {}}
 
 
 def test_not_ready_while_stopping(tmp_path):

@@ -40,7 +40,7 @@ def served(tmp_path_factory):
             client.put("/v1/admin/domains/seen", json={"evaluator": {"kind": "feature_l2"}})
             client.post("/v1/admin/domains/seen/traverses", json={"name": "t"})
         yield served
-        assert b"Traceback" not in served.log.read_bytes()
+        assert b"Traceback" not in served.log_path.read_bytes()
 
 
 @pytest.fixture(scope="module")

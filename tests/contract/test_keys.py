@@ -153,18 +153,6 @@ def test_keys_made_and_revoked_beside_a_running_service_count(tmp_path, capsys):
         assert client.get("/v1/domains").status_code == 401, "all revoked is closed, after a restart too"
 
 
-@pytest.mark.parametrize("has_key", [True, False])
-def test_the_start_up_log_says_whether_it_runs_open(tmp_path, caplog, has_key):
-    if has_key:
-        new_key(tmp_path, KeyScope.ADMIN)
-    with caplog.at_level(logging.INFO, "deepsimbad"), service(tmp_path):
-        pass
-    (line,) = [record for record in caplog.records if hasattr(record, "n_keys")]
-    assert ("open" in line.getMessage()) == (not has_key)
-    assert line.levelno == (logging.INFO if has_key else logging.WARNING)
-    assert vars(line)["n_keys"] == int(has_key)
-
-
 def test_sessions_belong_to_the_key_that_began_them(tmp_path):
     secrets = [new_key(tmp_path, scope) for scope in (KeyScope.ADMIN, KeyScope.LOCALIZE, KeyScope.LOCALIZE)]
     admin, robot, other = ({"X-API-Key": secret} for secret in secrets)

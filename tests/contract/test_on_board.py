@@ -98,17 +98,6 @@ def test_another_version_may_be_asked_for_and_a_session_keeps_its_own(rebuilt):
     assert problem(answer, 409, "landmark_model_differs")["map_version"] == 2
 
 
-def test_where_the_map_is_damaged_there_is_no_landmark_model(tmp_path):
-    with service(tmp_path) as client:
-        client.make_ready_domain("ready")
-    (damaged,) = (tmp_path / "domains" / "ready" / "maps").glob("*.sqlite")
-    damaged.chmod(0o644)
-    damaged.write_bytes(damaged.read_bytes()[:-100])
-    with service(tmp_path) as client:
-        problem(client.get(MODEL), 503, "damaged_map")
-        problem(client.get(MODEL, params={"map_version": 1}), 503, "damaged_map")
-
-
 def test_ranks_by_hand(client):
     assert pack_ranked_landmarks([7, 2, 9], N_LANDMARKS) == BY_HAND
     packed = client.post(READY, content=BY_HAND, headers=PACKED)

@@ -2,6 +2,7 @@
 
 import http.client
 import json
+import os
 import signal
 
 import httpx2
@@ -54,16 +55,16 @@ def test_a_head_is_answered_and_leaves_no_error_in_the_log(server):
         answer = connection.getresponse()
         assert (answer.status, answer.read()) == (200, b"")
     connection.close()
-    assert '"ERROR"' not in server.log.read_text()
+    assert '"ERROR"' not in server.log_path.read_text()
 
 
 def test_a_sender_who_leaves_early_is_no_fault_of_ours_and_it_ends_well_when_asked(server):
     with server.connect() as connection:
         connection.sendall(HEAD + b"X-Request-ID: left\r\nContent-Length: 1000\r\n\r\nabc")
-    until(lambda: '"left"' in server.log.read_text())
-    lines = [json.loads(line) for line in server.log.read_text().splitlines()]
+    until(lambda: '"left"' in server.log_path.read_text())
+    lines = [json.loads(line) for line in server.log_path.read_text().splitlines()]
     assert not [line for line in lines if "exception" in line]
     assert [line["status"] for line in lines if line.get("request_id") == "left"] == [499]
     assert any(line["message"].startswith("runs open") and line["level"] == "WARNING" for line in lines)
-    server.process.send_signal(signal.SIGTERM)
-    assert server.process.wait(60) == 0
+    os.kill(server.pid, signal.SIGTERM)
+    assert server.wait(60) == 0

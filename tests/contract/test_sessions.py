@@ -98,6 +98,8 @@ def test_a_session_from_beginning_to_end(client):
     assert prior.status_code == 200
     assert set(prior.json()) == STATE
     assert (prior.json()["belief"]["mode_m"], prior.json()["n_observations"]) == (30, 2)
+    beside = client.put(f"{path}/prior", json={"position_m": -2, "std_m": 1})
+    assert beside.json()["belief"]["mode_m"] == 0, "a little beside the route is allowed"
 
     assert client.delete(path).status_code == 204
     for gone in (client.get(path), client.delete(path), observe(client, path)):

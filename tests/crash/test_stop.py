@@ -6,8 +6,6 @@ import os
 import shutil
 import signal
 import socket
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -19,47 +17,22 @@ from typing import Any
 import numpy as np
 import pytest
 
+from deepsimbad_client.http.local_server import LocalServer
+
 pytestmark = pytest.mark.slow
 
 N_LANDMARKS = 30
 
 
-class Service:
+class Service(LocalServer):
     """`deepsimbad serve` on a data directory, again and again."""
 
     def __init__(self, data_dir: Path) -> None:
-        with closing(socket.socket()) as probe:
-            probe.bind(("127.0.0.1", 0))
-            self.port: int = probe.getsockname()[1]
+        super().__init__(data_dir)
         self.data_dir = data_dir
-        self.log = data_dir.parent / "log"
-        self.process: subprocess.Popen[bytes] | None = None
-
-    def start(self, **settings: object) -> None:
-        command = [sys.executable, "-m", "deepsimbad", "serve", "--create", "--data-dir", self.data_dir]
-        command += ["--port", str(self.port)]
-        given = {f"DEEPSIMBAD_{name.upper()}": str(value) for name, value in settings.items()}
-        with self.log.open("ab") as stderr:
-            self.process = subprocess.Popen(
-                command, stderr=stderr, env={**os.environ, **given}, cwd=self.data_dir.parent
-            )
-        until(self._is_ready)
-
-    def _is_ready(self) -> bool:
-        assert self.process is not None
-        assert self.process.poll() is None, self.log.read_text()
-        try:
-            return self.request("GET", "/readyz")[0] == 200
-        except OSError:
-            return False
 
     def signal(self, number: int) -> None:
-        assert self.process is not None
-        self.process.send_signal(number)
-
-    def ended(self) -> int:
-        assert self.process is not None
-        return self.process.wait(60)
+        os.kill(self.pid, number)
 
     def connect(self) -> socket.socket:
         return socket.create_connection(("127.0.0.1", self.port), timeout=60)
@@ -95,7 +68,7 @@ def mapped(tmp_path_factory: pytest.TempPathFactory) -> Path:
         make_map(service)
     finally:
         service.signal(signal.SIGTERM)
-    assert service.ended() == 0
+    assert service.wait(60) == 0
     return service.data_dir
 
 
@@ -105,11 +78,9 @@ def service(mapped: Path, tmp_path: Path) -> Iterator[Service]:
     service = Service(shutil.copytree(mapped, tmp_path / "data"))
     try:
         yield service
-        assert "Traceback" not in service.log.read_text()
+        assert "Traceback" not in service.log_path.read_text()
     finally:
-        if service.process is not None and service.process.poll() is None:
-            service.process.kill()
-            service.process.wait()
+        service.kill()
 
 
 def make_map(service: Service) -> None:
@@ -181,7 +152,7 @@ def test_what_was_acknowledged_is_there_afterwards(service: Service, by: int, co
             thread.start()
         until(lambda least=before + 100: sum(robot.n_told for robot in robots) >= least)
         service.signal(by)
-        assert service.ended() == code
+        assert service.wait(60) == code
         for thread in threads:
             thread.join(60)
         service.start()
@@ -229,18 +200,19 @@ def test_what_is_under_way_is_finished_and_what_is_idle_is_closed(service: Servi
         under_way.sendall(json.dumps({"encoding": [1.0] * 8}).encode()[5:])
         answer = read_all(under_way)
         assert answer.startswith(b"HTTP/1.1 200 ")
-    assert service.ended() == 0
+    assert service.wait(60) == 0
 
 
 def test_who_takes_too_long_is_told_so(service: Service) -> None:
-    service.start(shutdown_grace_s=1)
+    service.environment = {"DEEPSIMBAD_SHUTDOWN_GRACE_S": "1"}
+    service.start()
     with send_frame(service, 5) as under_way:
         time.sleep(0.1)
         service.signal(signal.SIGTERM)
         head, _, content = read_all(under_way).partition(b"\r\n\r\n")
         assert head.startswith(b"HTTP/1.1 503 ")
         assert json.loads(content)["code"] == "unavailable"
-    assert service.ended() == 0
+    assert service.wait(60) == 0
 
 
 def test_event_streams_end(service: Service) -> None:
@@ -254,7 +226,7 @@ def test_event_streams_end(service: Service) -> None:
             begun += stream.recv(65536)
         service.signal(signal.SIGTERM)
         assert read_all(stream).endswith(b"0\r\n\r\n")
-    assert service.ended() == 0
+    assert service.wait(60) == 0
     service.start()
     assert service.ask("GET", f"/v1/admin/jobs/{job['job_id']}")["state"] in {"queued", "running", "succeeded"}
     service.ask("DELETE", f"/v1/admin/jobs/{job['job_id']}")
@@ -262,7 +234,8 @@ def test_event_streams_end(service: Service) -> None:
 
 @pytest.mark.parametrize(("by", "code"), [(signal.SIGTERM, 0), (signal.SIGINT, 130)])
 def test_a_second_signal_does_not_wait(service: Service, by: int, code: int) -> None:
-    service.start(shutdown_grace_s=600)
+    service.environment = {"DEEPSIMBAD_SHUTDOWN_GRACE_S": "600"}
+    service.start()
     robot = Robot(service, 1)
     robot.begin()
     with send_frame(service, 5):
@@ -270,6 +243,6 @@ def test_a_second_signal_does_not_wait(service: Service, by: int, code: int) -> 
         service.signal(by)
         until(lambda: is_stopping(service))
         service.signal(by)
-        assert service.ended() == code
+        assert service.wait(60) == code
     service.start()
     assert service.ask("GET", f"/v1/sessions/{robot.session_id}")["n_observations"] == 0

@@ -7,28 +7,12 @@ import pytest
 
 from deepsimbad.core.belief import TRUSTS
 from deepsimbad.core.relevance import OTHER_LIKELIHOOD_SCALE, Relevance
-from deepsimbad.engine.localizer import Dissimilarities, RankedLandmarks, ReadyEncoding, View, describe, localize
-from deepsimbad.errors import (
-    InvalidDissimilaritiesError,
-    InvalidEncodingError,
-    InvalidInputError,
-    InvalidRankedLandmarksError,
-)
+from deepsimbad.engine.localizer import Dissimilarities, RankedLandmarks, ReadyEncoding, describe, localize
 from deepsimbad.evaluators.feature_l2 import FeatureL2
 
 from .conftest import DIM, LIST_LENGTH, N_IMAGES, N_LANDMARKS, map_contents
 
 EVALUATOR = FeatureL2("none")
-
-
-def test_rrf_is_the_papers_inner_product() -> None:
-    snapshot = map_contents(relevance=Relevance.RRF)
-    ranked = np.random.default_rng(3).permutation(N_LANDMARKS)
-    localization = localize(snapshot, EVALUATOR, RankedLandmarks(tuple(ranked.tolist())))
-    rank = {int(landmark): place + 1 for place, landmark in enumerate(ranked)}
-    lists = snapshot.lists
-    slow = [sum(1 / (j + 1) * 1 / rank[int(lists[j, image])] for j in range(LIST_LENGTH)) for image in range(N_IMAGES)]
-    np.testing.assert_allclose(localization.relevance, slow, rtol=1e-6)
 
 
 def test_standardised_belief_is_the_normalised_exponential() -> None:
@@ -63,28 +47,3 @@ def test_every_relevance_finds_its_own_image(relevance: Relevance, closed: bool)
 def test_huge_dissimilarities_are_ranked_all_the_same() -> None:
     query = describe(map_contents(relevance=Relevance.SIMBAD), EVALUATOR, Dissimilarities(np.linspace(1e300, 1, 9)))
     assert query.ranks.tolist() == list(range(9, 0, -1))
-
-
-@pytest.mark.parametrize(
-    ("view", "error"),
-    [
-        (RankedLandmarks(()), InvalidRankedLandmarksError),
-        (RankedLandmarks((0, 0)), InvalidRankedLandmarksError),
-        (RankedLandmarks((N_LANDMARKS,)), InvalidRankedLandmarksError),
-        (Dissimilarities(np.ones(N_LANDMARKS - 1)), InvalidDissimilaritiesError),
-        (Dissimilarities(np.full(N_LANDMARKS, np.nan)), InvalidDissimilaritiesError),
-        (ReadyEncoding(np.ones(DIM + 1)), InvalidEncodingError),
-        (ReadyEncoding(np.full(DIM, np.inf)), InvalidEncodingError),
-        (ReadyEncoding(np.ones(0)), InvalidEncodingError),
-    ],
-)
-def test_views_that_do_not_fit(view: View, error: type[Exception]) -> None:
-    with pytest.raises(error):
-        localize(map_contents(), EVALUATOR, view)
-
-
-@pytest.mark.parametrize("length", [0, N_IMAGES + 1])
-def test_a_shortlist_that_does_not_fit(length: int) -> None:
-    with pytest.raises(InvalidInputError) as caught:
-        localize(map_contents(), EVALUATOR, RankedLandmarks((0,)), length)
-    assert caught.value.hints == {"minimum": 1, "maximum": N_IMAGES}

@@ -2,7 +2,6 @@
 
 import asyncio
 import errno
-import logging
 import sqlite3
 import threading
 from contextlib import closing, suppress
@@ -122,19 +121,6 @@ def test_domain_and_version_are_the_catalogs_and_not_the_files(catalog: Catalog,
     add_map(catalog, contents=map_contents("elsewhere", 7))
     snapshot = maps.active("d").snapshot
     assert (snapshot.domain, snapshot.version) == ("d", 2)
-
-
-def test_which_version_serves_is_logged_when_it_changes(
-    catalog: Catalog, maps: Maps, caplog: pytest.LogCaptureFixture
-) -> None:
-    caplog.set_level(logging.INFO)
-    maps.load_all()
-    add_map(catalog)
-    maps.refresh("d")
-    catalog.activate("d", 1, 2)
-    maps.refresh("d")
-    maps.refresh("d")
-    assert [record.getMessage() for record in caplog.records] == ["map activated", "map rolled back"]
 
 
 # Which are kept

@@ -22,7 +22,6 @@ from deepsimbad.errors import (
     EndedSessionError,
     IdempotencyKeyReusedError,
     InvalidInputError,
-    InvalidPriorError,
     RetiredMapError,
     TooManySessionsError,
     UnavailableError,
@@ -384,26 +383,6 @@ def test_only_so_many_live_at_once(mapped: Catalog, clock: Clock) -> None:
     run(mapped, body, clock, max_sessions=4)
 
 
-def test_a_session_keeps_the_map_it_began_on(mapped: Catalog) -> None:
-    first = ""
-
-    async def body(live: Live) -> None:
-        nonlocal first
-        first = await live.begin()
-        await live.sessions.observe(first, ranked(1))
-        add_map(mapped)
-        live.maps.refresh("d")
-        assert (await live.sessions.observe(first, ranked(2))).snapshot.version == 1
-        second = await live.begin()
-        assert (await live.sessions.view(second)).snapshot.version == 2
-
-    run(mapped, body)
-    assert run(mapped, lambda live: live.sessions.observe(first, ranked(3))).snapshot.version == 1
-    mapped.map_path("d", 1).unlink()
-    with pytest.raises(RetiredMapError, match="begin a new session"):
-        run(mapped, lambda live: live.sessions.observe(first, ranked(4)))
-
-
 def test_a_domain_made_anew_has_other_maps(mapped: Catalog) -> None:
     session_id = run(mapped, lambda live: live.begin())
     mapped.delete_domain("d")
@@ -413,17 +392,3 @@ def test_a_domain_made_anew_has_other_maps(mapped: Catalog) -> None:
     add_map(mapped, contents=map_contents(relevance=Relevance.RRF))
     with pytest.raises(RetiredMapError):
         run(mapped, lambda live: live.sessions.view(session_id))
-
-
-def test_a_prior_replaces_the_belief(mapped: Catalog) -> None:
-    async def body(live: Live) -> None:
-        session_id = await live.begin(start_position_m=6.0, start_std_m=0.2)
-        for beyond_m in (-4.0, 47.0):
-            with pytest.raises(InvalidPriorError):
-                await live.sessions.set_prior(session_id, beyond_m, 1.0)
-        view = await live.sessions.set_prior(session_id, 30.0, 1.0)
-        assert view.belief.mode_m == 30.0
-        assert view.n_observations == 0
-        assert (await live.sessions.set_prior(session_id, -2.0, 1.0)).belief.mode_m == 0.0  # a little beside is allowed
-
-    run(mapped, body)

@@ -14,10 +14,9 @@ from deepsimbad.engine import session as session_module
 from deepsimbad.engine.session import Observation
 from deepsimbad.engine.truths import Truths, true_images
 from deepsimbad.engine.worker import Priority
-from deepsimbad.errors import UnknownSessionError
 from deepsimbad.store.catalog import Catalog
 
-from .conftest import KEEP_ENDED_S, Clock, Live, add_domain, add_map, encoded, map_contents, ranked, run
+from .conftest import Clock, Live, add_domain, add_map, encoded, map_contents, ranked, run
 
 NAN = math.nan
 
@@ -97,22 +96,6 @@ def test_truths_are_kept_and_what_was_told_before_is_answered(mapped: Catalog) -
         np.testing.assert_array_equal(stored, [1.0, 1.25, 2.0, NAN, 3.0])
 
     run(mapped, body)
-
-
-def test_an_ended_session_may_be_told_of_until_it_is_forgotten(mapped: Catalog, clock: Clock) -> None:
-    async def body(live: Live) -> None:
-        session_id, masses = await driven(live, [ranked(1), ranked(2)])
-        await live.sessions.end(session_id)
-        route = live.maps.active("d").snapshot.route
-        truths = await truths_of(live).rank(session_id, [3.0, 4.6])
-        expected = [slow_share(mass, route, at) for mass, at in zip(masses, (3.0, 4.6), strict=True)]
-        np.testing.assert_allclose(truths.rank_share, expected)
-        clock.now += KEEP_ENDED_S + 1
-        await live.sessions.sweep()
-        with pytest.raises(UnknownSessionError):
-            await truths_of(live).rank(session_id, [3.0, 4.6])
-
-    run(mapped, body, clock)
 
 
 def test_a_live_view_goes_before_the_rest_of_a_replay(mapped: Catalog, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,11 +7,7 @@ import hashlib
 import io
 import json
 import os
-import signal
-import socket
 import sqlite3
-import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -23,6 +19,7 @@ from click.testing import CliRunner
 from deepsimbad.cli import deepsimbad as commands
 from deepsimbad.cli import run
 from deepsimbad_client.commands import cli
+from deepsimbad_client.http.local_server import LocalServer
 
 GOLDEN = Path(__file__).parent
 COMMANDS = [
@@ -62,33 +59,7 @@ def sha256(body):
     return hashlib.sha256(body).hexdigest()
 
 
-class Server:
-    def __init__(self, folder):
-        with socket.socket() as probe:
-            probe.bind(("127.0.0.1", 0))
-            port = probe.getsockname()[1]
-        self.url = f"http://127.0.0.1:{port}"
-        command = [sys.executable, "-m", "deepsimbad", "serve", "--create", "--port", str(port)]
-        command += ["--data-dir", str(folder / "data")]
-        with (folder / "log").open("ab") as log:
-            self.process = subprocess.Popen(command, stderr=log, stdout=log, cwd=folder)
-        for _ in range(2400):
-            assert self.process.poll() is None, (folder / "log").read_text()
-            try:
-                if httpx2.get(f"{self.url}/readyz").status_code == 200:
-                    return
-            except httpx2.TransportError:
-                pass
-            time.sleep(0.05)
-        raise AssertionError("not ready")
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *_):
-        self.process.send_signal(signal.SIGKILL)
-        self.process.wait()
-
+class Server(LocalServer):
     def call(self, method, path, **request):
         answer = httpx2.request(method, f"{self.url}{path}", timeout=60, **request)
         assert answer.status_code < 300, answer.text
@@ -174,7 +145,7 @@ def npz(**arrays):
 def test_answers_and_a_replayed_journal(drives, tmp_path):
     binary = {"Content-Type": "application/octet-stream"}
     autumn, summer, winter = (np.load(drives / f"{name}.npy") for name in ("autumn", "summer", "winter"))
-    with Server(tmp_path) as server:
+    with Server(tmp_path / "data") as server:
         domain = {"evaluator": {"kind": "feature_l2", "extractor": "none"}}
         server.call("PUT", "/v1/admin/domains/route", json=domain)
         for name, drive in (("autumn", autumn), ("summer", summer)):
@@ -211,7 +182,8 @@ def test_answers_and_a_replayed_journal(drives, tmp_path):
             for name, path in paths.items()
         }
         answers |= {f"belief of {name}": sha256(body) for name, body in before.items()}
-    with Server(tmp_path) as server:
+        server.kill()
+    with Server(tmp_path / "data") as server:
         for name, path in paths.items():
             after = server.call("GET", f"{path}/belief", headers={"Accept": "application/octet-stream"}).content
             assert after == before[name], f"{name} went on otherwise after a restart"

@@ -1,15 +1,14 @@
 """Kills a service at its n-th step of storage within a job, for every n, and lets the next service finish the job.
 
-Run by test_killed.py in a process of its own, so that forking is sound. After each death the job must be done once: one
-new map, active, with the same content as if nothing had happened.
+Run by test_killed.py. After each death the job must be done once: one new map, active, with the same content as if
+nothing had happened. An import that dies leaves its map whole or not at all.
 """
 
-import os
 import shutil
-import signal
 import sys
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -22,12 +21,14 @@ from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
 from deepsimbad.jobs.progress import Progress
 from deepsimbad.jobs.remap import REMAP_STAGES, RemapConfig, remap
 from deepsimbad.jobs.runner import InThisProcess, JobRunner
-from deepsimbad.jobs.versions import ExperienceConfig
+from deepsimbad.jobs.versions import ExperienceConfig, import_map
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.map_file import read_map, verify
 from deepsimbad.store.records import JobState, MapState
 from deepsimbad.store.sessions import ObservedRow, SessionRecord, SessionStore
 from deepsimbad.store.traverses import Traverse
+
+from ..killing import FILE_STEPS, SQL_STEPS, Told, expect, kill_at_every_step
 
 DOMAIN, SESSION = "route", "s" * 32
 READY = {"kind": "feature_l2", "extractor": "none"}
@@ -36,8 +37,6 @@ CONFIGS = {
     "remap": RemapConfig("drive", "other", n_landmarks=8, training_episodes=60),
     "experience": ExperienceConfig.of(SESSION, np.arange(0, 20, 2.0).tolist()),
 }
-FILE_STEPS = {"rename", "unlink", "rmtree", "fsync", "mkdir", "rmdir", "chmod", "flock", "open", "close"}
-SQL_STEPS = {"execute", "executemany"}
 WITHIN_S = 60
 
 
@@ -67,7 +66,7 @@ def prepare(data_dir: Path) -> None:
         store.save_true_positions(number, np.arange(0, 20, 2.0), 0.0).result()
 
 
-def serve(data_dir: Path, kind: str | None, pipe: int | None) -> None:
+def serve(data_dir: Path, kind: str | None = None, tell: Callable[[str], None] | None = None) -> None:
     """A service as far as jobs go: takes up what was left, submits a job if told to, ends when all jobs have."""
     with Catalog.open(data_dir) as catalog:
         catalog.discard_unfinished()
@@ -75,8 +74,8 @@ def serve(data_dir: Path, kind: str | None, pipe: int | None) -> None:
         try:
             if kind is not None:
                 runner.submit(DOMAIN, CONFIGS[kind])
-            if pipe is not None:
-                os.write(pipe, b"submitted")
+            if tell is not None:
+                tell("submitted")
             give_up = time.monotonic() + WITHIN_S
             while not all(job.state.is_final for job in catalog.jobs()):
                 expect(time.monotonic() < give_up, "the job ends")
@@ -85,31 +84,17 @@ def serve(data_dir: Path, kind: str | None, pipe: int | None) -> None:
             runner.close()
 
 
-def serve_until(data_dir: Path, kind: str, fatal_step: int, steps: set[str], pipe: int) -> None:
-    """The service, killed at a step."""
-    n_steps = 0
-
-    def hook(_frame: object, event: str, function: object) -> None:
-        nonlocal n_steps
-        if event == "c_call" and getattr(function, "__name__", "") in steps:
-            n_steps += 1
-            if n_steps == fatal_step:
-                os.kill(os.getpid(), signal.SIGKILL)
-
-    threading.setprofile(hook)  # jobs have a thread of their own; what the main thread does is the store's own test
-    serve(data_dir, kind, pipe)
-
-
 def content(catalog: Catalog, version: int) -> dict[str, Any]:
     """All that a map holds but what tells when it was made."""
     return asdict(replace(read_map(catalog.map_path(DOMAIN, version)), version=0, created_at=""))
 
 
-def check(data_dir: Path, submitted: bool, wanted: dict[str, Any]) -> None:
-    """Once and only once."""
+def check(data_dir: Path, told: Told, wanted: dict[str, Any]) -> None:
+    """Once and only once, by the next service."""
+    serve(data_dir)
     with Catalog.open(data_dir) as catalog:
         jobs = catalog.jobs()
-        expect(len(jobs) == 1 or (not jobs and not submitted), "the job is there")
+        expect(len(jobs) == 1 or (not jobs and not told), "the job is there")
         expect(catalog.discard_unfinished() == [], "nothing is left to clear away")
         maps = {record.version: record for record in catalog.maps(DOMAIN)}
         expect(len(maps) == 1 + len(jobs), f"one job, one map: {sorted(maps)}")
@@ -124,45 +109,44 @@ def check(data_dir: Path, submitted: bool, wanted: dict[str, Any]) -> None:
         expect(files == [f"{version:06d}.sqlite" for version in sorted(maps)], f"no file is left over: {files}")
 
 
-def expect(truth: bool, what: str) -> None:
-    if not truth:
-        raise SystemExit(f"broken: {what}")
+def check_imported(data_dir: Path, whole: bytes) -> None:
+    """The map with its bytes, or nothing of it."""
+    with Catalog.open(data_dir) as catalog:
+        catalog.discard_unfinished()
+        maps = catalog.maps(DOMAIN) if catalog.domains() else []
+        files = sorted(path.name for path in data_dir.glob("domains/*/maps/*"))
+        expect(files == [f"{record.version:06d}.sqlite" for record in maps], f"no file is left over: {files}")
+        expect(all(catalog.map_path(DOMAIN, record.version).read_bytes() == whole for record in maps), "whole")
+
+
+def import_it(data_dir: Path, file: Path) -> None:
+    with Catalog.open(data_dir) as catalog:
+        import_map(catalog, file)
 
 
 def main(folder: Path, kind: str, file_stride: int, stride: int) -> None:
     """Kill at every `file_stride`-th file step, and at every `stride`-th step of either kind."""
-    ready = folder / "ready"
-    prepare(ready)
-    whole = folder / "whole"
-    shutil.copytree(ready, whole)
-    serve(whole, kind, None)
-    with Catalog.open(whole) as catalog:
+    prepare(ready := folder / "ready")
+    if kind == "import":
+        file = ready / "domains" / DOMAIN / "maps" / "000001.sqlite"
+        plans = [({"rename", "fsync", "chmod", "unlink"}, file_stride)]
+        kill_at_every_step(
+            *(folder, plans, lambda data_dir: Catalog.open(data_dir).close()),
+            lambda data_dir, tell: import_it(data_dir, file),
+            lambda data_dir, told: check_imported(data_dir, file.read_bytes()),
+        )
+        return
+    shutil.copytree(ready, folder / "whole")
+    serve(folder / "whole", kind)
+    with Catalog.open(folder / "whole") as catalog:
         wanted = content(catalog, 2)
-    for steps, step_by in ((FILE_STEPS, file_stride), (FILE_STEPS | SQL_STEPS, stride)):
-        fatal_step, survived = 1, False
-        while not survived:
-            data_dir = folder / "killed"
-            shutil.copytree(ready, data_dir)
-            reader, writer = os.pipe()
-            child = os.fork()
-            if child == 0:
-                serve_until(data_dir, kind, fatal_step, steps, writer)
-                os._exit(0)
-            os.close(writer)
-            _, status = os.waitpid(child, 0)
-            submitted = bool(os.read(reader, 100))
-            os.close(reader)
-            survived = not os.WIFSIGNALED(status)
-            expect(survived or os.WTERMSIG(status) == signal.SIGKILL, f"the child died of {status}")
-            expect(not survived or status == 0, f"the child ended with {status}")
-            try:
-                serve(data_dir, None, None)
-                check(data_dir, submitted, wanted)
-            except BaseException as error:
-                raise SystemExit(f"killed at step {fatal_step} of {len(steps)} kinds: {error!r}") from error
-            shutil.rmtree(data_dir)
-            fatal_step += step_by
-        print(fatal_step - step_by, end=" ", flush=True)
+    kill_at_every_step(
+        *(folder, ((FILE_STEPS, file_stride), (FILE_STEPS | SQL_STEPS, stride))),
+        lambda data_dir: shutil.copytree(ready, data_dir),
+        lambda data_dir, tell: serve(data_dir, kind, tell),
+        lambda data_dir, told: check(data_dir, told, wanted),
+        threading.setprofile,  # jobs have a thread of their own; what the main thread does is the store's own test
+    )
 
 
 if __name__ == "__main__":

@@ -7,7 +7,6 @@ import pytest
 
 from deepsimbad.core.descriptor import rank_landmarks
 from deepsimbad.core.drive import Drive
-from deepsimbad.core.experience.nnql import NnqlConfig
 from deepsimbad.core.index.retrieval import relevances
 from deepsimbad.core.relevance import Query, Relevance
 from deepsimbad.engine.maps import load_snapshot
@@ -92,31 +91,6 @@ def rank(snapshot, evaluator, encoding, image):
     dissimilarities = evaluator.dissimilarities(encoding[np.newaxis], snapshot.landmark_model)[0]
     relevance = relevances(snapshot, Query(rank_landmarks(dissimilarities), dissimilarities, encoding))
     return np.count_nonzero(relevance > relevance[image])
-
-
-def test_experience_comes_from_the_nearest_old_image(first, run, catalog):
-    """New images at 45 m and on are further from all old ones than the longest move."""
-    first(training_episodes=200)
-    run("more", append=True)
-    before, after = contents(catalog, 1), contents(catalog, 2)
-    is_old = np.isin(after.position_m, np.arange(40.0))
-    step = float(np.ptp(before.q_values) + np.ptp(after.q_values)) / 65_535  # as fine as the file keeps them
-    assert after.q_values[is_old] == pytest.approx(before.q_values, abs=step)
-    near, far = after.q_values[~is_old][:10], after.q_values[~is_old][10:]
-    assert near == pytest.approx(before.q_values[20:30], abs=step)
-    assert far == pytest.approx(np.full_like(far, NnqlConfig().initial_q), abs=step)
-
-
-def test_times_and_coordinates_are_merged(drive, run, catalog):
-    drive("landmarks", 30, seed=1)
-    drive("drive", 4, timestamp_us=np.arange(4) + 100, x_m=np.arange(4.0), y_m=np.zeros(4))
-    run("drive", landmark_traverse="landmarks", n_landmarks=8, training_episodes=0)
-    drive("more", 2, seed=3, position_m=[1.5, 2.5], timestamp_us=[7, 8], x_m=[1.5, np.nan], y_m=[0.0, np.nan])
-    run("more", append=True)
-    after = contents(catalog, 2)
-    assert after.timestamp_us.tolist() == [100, 101, 7, 102, 8, 103]
-    assert after.x_m[:4].tolist() == [0.0, 1.0, 1.5, 2.0]
-    assert np.isnan(after.x_m[4])
 
 
 def test_the_config_records_what_was_appended(first, run, catalog, drive):
@@ -218,14 +192,6 @@ def test_an_imported_map_is_appended_to_under_the_names_of_here(first, run, cata
     for config in (catalog.map(DOMAIN, 4).config, contents(catalog, 4).config):
         assert (config["training_traverse"], config["imported"]["version"]) == (None, 2)
         assert config["appended"] == [{"traverse": "more", "n_frames": 15, "to_version": 3, "fused": False}]
-
-
-def test_there_must_be_a_map_to_append_to(drive, run):
-    drive("more", 5)
-    with pytest.raises(InvalidMapConfigError, match="no active map that could be appended to"):
-        run("more", append=True)
-    with pytest.raises(InvalidMapConfigError, match="landmark_traverse must be null"):
-        RemapConfig("more", "landmarks", append=True)
 
 
 def test_a_loop_takes_the_frames_of_any_turn(catalog, evaluator, drive):

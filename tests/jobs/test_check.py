@@ -101,21 +101,6 @@ def test_without_a_gate_nothing_is_judged(seasons, remapped):
     assert check["active_version"] == 1
 
 
-def test_a_worse_map_is_sealed_but_does_not_serve(seasons, remapped, catalog):
-    remapped(training_traverse="good")
-    result = remapped(training_traverse="bad", check_traverse="day", gate_margin=1.0)
-    check = result["metrics"]["check"]
-    assert result["active"] is False
-    assert check["passed"] is False
-    assert f"{check['anr']:.2f} %, more than 1 above the {check['anr_active']:.2f} % of map 1" in check["why"]
-    assert (check["frames"], check["traverse"], check["n_queries"]) == ("traverse", "day", PLACES)
-    assert catalog.domain(DOMAIN).active_version == 1
-    record = catalog.map(DOMAIN, 2)
-    assert record.state is MapState.SEALED
-    assert record.metrics["check"] == check
-    assert catalog.activate(DOMAIN, 2, 1).state is MapState.ACTIVE  # by hand it may
-
-
 @pytest.mark.parametrize("relevance", list(Relevance))
 def test_the_figure_is_that_of_localizations_one_by_one(seasons, remapped, catalog, evaluator, relevance):
     """Against the slow obvious way: every frame of the drive by itself, on the map as it is served."""

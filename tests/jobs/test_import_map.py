@@ -1,11 +1,7 @@
 """A map moved between servers: the same bytes, checked, or nothing."""
 
 import hashlib
-import os
-import signal
 import sqlite3
-import subprocess
-import sys
 from contextlib import closing
 
 import numpy as np
@@ -204,25 +200,6 @@ def test_an_import_that_fails_leaves_what_others_began_in_its_domain(exported, h
     assert Traverse.list(here.data_dir, "campus") == (["mine"] if is_used else [])
 
 
-KILLED = """
-import os, signal, sys
-from pathlib import Path
-from deepsimbad.jobs.versions import import_map
-from deepsimbad.store.catalog import Catalog
-n_calls = 0
-def hook(_frame, event, function):
-    global n_calls
-    if event == "c_call" and getattr(function, "__name__", "") in {"rename", "fsync", "chmod", "unlink"}:
-        n_calls += 1
-        if n_calls == int(sys.argv[3]):
-            os.kill(os.getpid(), signal.SIGKILL)
-catalog = Catalog.open(Path(sys.argv[1]))
-sys.setprofile(hook)
-import_map(catalog, Path(sys.argv[2]))
-"""
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "changes",
     [
@@ -262,28 +239,3 @@ def test_a_map_whose_schema_would_run_something_is_refused(exported, here, state
     with pytest.raises(InvalidArchiveError, match="what no release writes"):
         import_map(here, exported)
     assert here.domains() == []
-
-
-def test_an_import_that_is_killed_leaves_nothing_of_its_map(exported, tmp_path):
-    n_killed = 0
-    for step in range(1, 30):
-        data_dir = tmp_path / f"killed-{step}"
-        done = subprocess.run(
-            [sys.executable, "-c", KILLED, str(data_dir), str(exported), str(step)],
-            check=False,
-            env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
-        )
-        with Catalog.open(data_dir) as catalog:
-            catalog.discard_unfinished()
-            names = [record.name for record in catalog.domains()]
-            maps = catalog.maps("campus") if names else []
-            files = sorted(path.name for path in data_dir.glob("domains/*/maps/*"))
-            assert files == [f"{record.version:06d}.sqlite" for record in maps]
-            for record in maps:
-                assert catalog.map_path("campus", record.version).read_bytes() == exported.read_bytes()
-        if done.returncode == 0:
-            break
-        assert done.returncode == -signal.SIGKILL
-        n_killed += 1
-    assert n_killed > 4
-    assert maps[0].state is MapState.ACTIVE

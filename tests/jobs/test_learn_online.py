@@ -10,8 +10,7 @@ from deepsimbad.errors import CancelledError
 from deepsimbad.jobs.progress import Progress
 from deepsimbad.jobs.remap import RemapConfig, remap
 from deepsimbad.jobs.versions import LEARN_STAGES, learn_online
-from deepsimbad.store.map_file import read_map, verify
-from deepsimbad.store.records import MapState
+from deepsimbad.store.map_file import read_map
 
 DOMAIN = "route"
 
@@ -27,29 +26,6 @@ def walk(catalog, drive, evaluator, quiet):
     frames = np.arange(3, 33, 2)
     ranks = rank_landmarks(evaluator.dissimilarities(encodings[frames], model))
     return KnownWalk([Query(each) for each in ranks], np.full(frames.size, 2.0), frames.astype(float))
-
-
-def test_the_next_version_knows_more(catalog, walk):
-    before = catalog.map_path(DOMAIN, 1).read_bytes()
-    stages = []
-    progress = Progress(LEARN_STAGES, lambda state: stages.append(state.stage))
-    result = learn_online(catalog, DOMAIN, [walk], progress)
-    assert result["map_version"] == 2
-    assert result["metrics"]["experience"] == {"from_version": 1, "n_walks": 1, "n_moves": 14}
-    assert list(dict.fromkeys(stages)) == list(LEARN_STAGES)
-    assert catalog.domain(DOMAIN).active_version == 2
-    assert catalog.map_path(DOMAIN, 1).read_bytes() == before
-    record = catalog.map(DOMAIN, 2)
-    assert record.state is MapState.ACTIVE
-    verify(catalog.map_path(DOMAIN, 2), record.sha256)
-    first, second = (read_map(catalog.map_path(DOMAIN, version)) for version in (1, 2))
-    assert first.q_values is None
-    assert second.version == 2
-    assert np.array_equal(second.lists, first.lists)
-    assert second.q_values.max() > 9  # a tenth of the reward, at least once
-    assert (second.q_values[:, 0] == second.q_values.min()).all(), "nobody moved one metre"
-    third = learn_online(catalog, DOMAIN, [walk], Progress(LEARN_STAGES))["map_version"]
-    assert read_map(catalog.map_path(DOMAIN, third)).q_values.sum() > second.q_values.sum()
 
 
 def test_a_cancel_leaves_nothing(catalog, walk):

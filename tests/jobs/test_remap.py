@@ -12,7 +12,6 @@ from deepsimbad.errors import (
     CancelledError,
     InvalidEncodingError,
     InvalidMapConfigError,
-    InvalidRouteError,
 )
 from deepsimbad.jobs.progress import Progress
 from deepsimbad.jobs.remap import REMAP_STAGES, RemapConfig, remap, remap_stages, stages_in
@@ -61,21 +60,6 @@ def test_a_map_is_sealed_active_and_holds_the_lists_of_its_landmarks(catalog, dr
     assert contents.config["landmark_traverse"] == "other"
 
 
-def test_without_a_landmark_traverse_the_active_maps_landmarks_stay(catalog, drive, evaluator, quiet):
-    drive("other", 30, seed=1)
-    drive("drive", 12)
-    remap(catalog, DOMAIN, config(), evaluator, quiet)
-    drive("later", 9, seed=2)
-    again = config(training_traverse="later", landmark_traverse=None, n_landmarks=None)
-    assert remap(catalog, DOMAIN, again, evaluator, Progress(REMAP_STAGES))["map_version"] == 2
-    first, second = (read_map(catalog.map_path(DOMAIN, version)) for version in (1, 2))
-    assert np.array_equal(first.landmark_model["prototypes"], second.landmark_model["prototypes"])
-    assert second.lists.shape == (4, 9)
-    assert second.config["n_landmarks"] == 8
-    assert catalog.domain(DOMAIN).active_version == 2
-    assert catalog.map(DOMAIN, 1).state is MapState.RETIRED
-
-
 def test_kept_landmarks_have_the_number_they_have(catalog, drive, evaluator, quiet):
     drive("other", 30, seed=1)
     drive("drive", 12)
@@ -87,34 +71,6 @@ def test_kept_landmarks_have_the_number_they_have(catalog, drive, evaluator, qui
     with pytest.raises(InvalidMapConfigError, match="list_length 9"):
         remap(catalog, DOMAIN, too_long, evaluator, Progress(REMAP_STAGES))
     assert [record.version for record in catalog.maps(DOMAIN)] == [1]
-
-
-@pytest.mark.parametrize(("position_m", "frame"), [([0.0, 1.0, 0.5, 2.0, 3.0], 2), ([0.0, 1.0, 2.0, 3.0, 2.999], 4)])
-def test_positions_that_go_backwards_leave_nothing_behind(catalog, drive, evaluator, quiet, position_m, frame):
-    drive("other", 30, seed=1)
-    drive("drive", 5, position_m=position_m)
-    with pytest.raises(InvalidRouteError, match=f"backwards at frame {frame}"):
-        remap(catalog, DOMAIN, config(), evaluator, quiet)
-    assert catalog.maps(DOMAIN) == []
-    assert files_of(catalog) == []
-    assert catalog.domain(DOMAIN).active_version is None
-
-
-@pytest.mark.parametrize("role", ["drive", "other"])
-def test_a_traverse_without_frames_is_named(catalog, drive, evaluator, quiet, role):
-    drive("other", 0 if role == "other" else 30, seed=1)
-    drive("drive", 0 if role == "drive" else 5)
-    with pytest.raises(InvalidMapConfigError, match=f"traverse {role} has no frames yet"):
-        remap(catalog, DOMAIN, config(), evaluator, quiet)
-    assert catalog.maps(DOMAIN) == []
-
-
-def test_traverses_of_two_encoders_are_named(catalog, drive, evaluator, quiet):
-    drive("winter", 8, d=4)
-    drive("summer", 8)
-    with pytest.raises(InvalidEncodingError, match="winter holds encodings of 4 numbers, traverse summer of 6"):
-        remap(catalog, DOMAIN, RemapConfig("summer", "winter", n_landmarks=5), evaluator, quiet)
-    assert catalog.domain(DOMAIN).active_version is None
 
 
 def test_the_active_maps_landmarks_may_come_from_another_encoder(catalog, drive, evaluator, quiet):
@@ -196,19 +152,20 @@ def route(catalog):
 
 
 @pytest.mark.parametrize(
-    ("plane", "asked", "accepted", "why"),
+    ("relevance", "plane", "asked", "accepted", "why"),
     [
-        (False, {}, False, "without x, y of both drives nothing says"),
-        (False, {"same_route": True}, True, None),
-        (True, {}, True, None),
-        (True, {"same_route": False}, False, "are said not to share their positions"),
-        (False, {"same_route": True, "landmark_traverse": "strange"}, False, "agree no better"),
-        (True, {"landmark_traverse": "strange"}, False, "agree no better"),
+        (Relevance.COMPOSED, False, {}, False, "without x, y of both drives nothing says"),
+        (Relevance.COMPOSED, False, {"same_route": True}, True, None),
+        (Relevance.COMPOSED, True, {}, True, None),
+        (Relevance.COMPOSED, True, {"same_route": False}, False, "are said not to share their positions"),
+        (Relevance.COMPOSED, False, {"same_route": True, "landmark_traverse": "strange"}, False, "agree no better"),
+        (Relevance.STANDARDISED, True, {}, True, None),
+        (Relevance.STANDARDISED, True, {"landmark_traverse": "strange"}, False, "agree no better"),
+        (Relevance.RRF, True, {}, True, None),
     ],
 )
-@pytest.mark.parametrize("relevance", [Relevance.COMPOSED, Relevance.STANDARDISED, Relevance.RRF])
 def test_a_second_drive_is_learnt_from_only_on_the_same_route(
-    catalog, route, evaluator, plane, asked, accepted, why, relevance
+    catalog, route, evaluator, relevance, plane, asked, accepted, why
 ):
     """One verdict holds for the likelihood, for whitening, and for the live images of training."""
     route(plane)

@@ -60,20 +60,6 @@ def drives(drive):
     drive("drive", 12)
 
 
-def test_a_job_succeeds_and_its_map_is_announced(catalog, drives):
-    activated = []
-    with running(catalog, on_activated=activated.append) as runner:
-        queued = runner.submit(DOMAIN, CONFIG)
-        assert queued.domain == DOMAIN
-        job = ended(catalog, queued.job_id)
-    assert job.state is JobState.SUCCEEDED
-    assert job.result["map_version"] == 1
-    assert job.result["active"] is True
-    assert (job.progress, job.eta_s, job.error) == (1.0, None, None)
-    assert job.created_at <= job.started_at <= job.finished_at
-    assert activated == [DOMAIN]
-
-
 def test_jobs_run_in_the_order_they_came(catalog, drives):
     gate = Gate(catalog.data_dir)
     with running(catalog, gate) as runner:
@@ -127,19 +113,6 @@ def test_a_job_that_meets_damage_says_in_which_traverse(catalog, drives):
         job = ended(catalog, runner.submit(DOMAIN, CONFIG).job_id)
     assert (job.state, job.error["code"], job.error["file"]) == (JobState.FAILED, "damaged_file", "other.sqlite")
     assert job.error["message"].startswith("other.sqlite is damaged")
-
-
-def test_a_queued_job_is_cancelled_at_once_and_never_runs(catalog, drives):
-    gate = Gate(catalog.data_dir)
-    with running(catalog, gate) as runner:
-        first, second, third = (runner.submit(DOMAIN, CONFIG) for _ in range(3))
-        assert gate.entered.wait(WITHIN_S)
-        assert runner.cancel(second.job_id).state is JobState.CANCELLED
-        gate.open.set()
-        assert ended(catalog, third.job_id).state is JobState.SUCCEEDED
-    assert catalog.job(second.job_id).state is JobState.CANCELLED
-    assert [record.version for record in catalog.maps(DOMAIN)] == [1, 2]
-    assert catalog.job(first.job_id).state is JobState.SUCCEEDED
 
 
 def test_a_running_job_is_cancelled_at_its_next_report_and_leaves_no_map(catalog, drives):

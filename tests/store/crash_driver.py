@@ -1,12 +1,5 @@
-"""Kills a child at its n-th step of storage, for every n, and checks after each death that nothing is half done.
+"""Kills who uploads, maps, activates and deletes at every step of storage: nothing is half done (test_crash.py)."""
 
-Run by test_crash.py in a process of its own (one thread, so that forking is sound). A step is one call that may change
-the disk: a SQL statement, a rename, an unlink, a sync, ... seen by the interpreter's profile hook, not by stand-ins.
-"""
-
-import os
-import shutil
-import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -20,10 +13,9 @@ from deepsimbad.store.map_file import read_map, seal, verify, write_map
 from deepsimbad.store.records import JobState, MapState
 from deepsimbad.store.traverses import Traverse
 
-FILE_STEPS = {"rename", "unlink", "fsync", "mkdir", "rmdir", "chmod", "flock", "open", "close"}
-SQL_STEPS = {"execute", "executemany"}
+from ..killing import FILE_STEPS, SQL_STEPS, expect, kill_at_every_step
+
 N_FRAMES = 5
-DONE = ["traverse", "frames", "job", "begun", "written", "sealed", "noted", "active", "finished", "deleted"]
 
 
 def frames() -> Drive:
@@ -124,55 +116,11 @@ def check(data_dir: Path, done: list[str]) -> None:
         Traverse.create(data_dir, "campus", "summer").close()
 
 
-def expect(truth: bool, what: str) -> None:
-    if not truth:
-        raise SystemExit(f"broken: {what}")
-
-
-def run_until(data_dir: Path, fatal_step: int, steps: set[str], pipe: int) -> None:
-    n_steps = 0
-
-    def hook(_frame: object, event: str, function: object) -> None:
-        nonlocal n_steps
-        if event == "c_call" and getattr(function, "__name__", "") in steps:
-            n_steps += 1
-            if n_steps == fatal_step:
-                os.kill(os.getpid(), signal.SIGKILL)
-
-    sys.setprofile(hook)
-    scenario(data_dir, lambda word: os.write(pipe, f"{word} ".encode()) and None)
-    sys.setprofile(None)
-
-
 def main(folder: Path, stride: int) -> None:
     """Kill at every file step, and at every `stride`-th step of either kind."""
     write_map(folder / "warm", contents(1))  # compiles once, before forking
-    for steps, step_by in ((FILE_STEPS, 1), (FILE_STEPS | SQL_STEPS, stride)):
-        fatal_step, survived = 1, False
-        while not survived:
-            data_dir = folder / f"{step_by}-{fatal_step}"
-            prepare(data_dir)
-            reader, writer = os.pipe()
-            child = os.fork()
-            if child == 0:
-                run_until(data_dir, fatal_step, steps, writer)
-                os._exit(0)
-            os.close(writer)
-            _, status = os.waitpid(child, 0)
-            done = os.read(reader, 1000).decode().split()
-            os.close(reader)
-            survived = not os.WIFSIGNALED(status)
-            expect(survived or os.WTERMSIG(status) == signal.SIGKILL, f"the child died of {status}")
-            expect(not survived or (status == 0 and done == DONE), f"the child ended with {status}, {done}")
-            try:
-                check(data_dir, done)
-            except BaseException as error:
-                raise SystemExit(
-                    f"killed at step {fatal_step} of {len(steps)} kinds after {done}: {error!r}"
-                ) from error
-            shutil.rmtree(data_dir)
-            fatal_step += step_by
-        print(fatal_step - step_by, end=" ", flush=True)
+    plans = ((FILE_STEPS, 1), (FILE_STEPS | SQL_STEPS, stride))
+    kill_at_every_step(folder, plans, prepare, scenario, check)
 
 
 if __name__ == "__main__":

@@ -53,13 +53,6 @@ def test_a_session_is_found_again_as_it_was(store: SessionStore, tmp_path: Path)
         assert again.find("s1") == replace(session, expires_at=333.0, n_events=2)
 
 
-@pytest.mark.parametrize("name", ["s2", "", "\ud800", "s1 "])
-def test_an_unknown_session(store: SessionStore, name: str) -> None:
-    store.create(RECORD).result()
-    with pytest.raises(UnknownSessionError):
-        store.find(name)
-
-
 def test_rows_come_back_bit_for_bit(store: SessionStore) -> None:
     number = store.create(RECORD).result().number
     rng = np.random.default_rng(0)
@@ -161,20 +154,6 @@ def test_a_long_journal_is_forgotten_in_pieces(store: SessionStore, monkeypatch:
     with pytest.raises(UnknownSessionError):
         store.find("s1")
     assert store.n_observations(other) == 10
-
-
-def test_true_positions(store: SessionStore) -> None:
-    number = store.create(RECORD).result().number
-    store.append(number, observed(1), 1.0).result()
-    store.append(number, PriorRow(2, 1.0, 1.0, 1.0), 1.0).result()
-    store.append(number, observed(3), 1.0).result()
-    assert store.n_observations(number) == 2
-    assert store.true_positions(number) is None
-    for position_m in ([1.0, 2.0], [1.0, 2.5]):
-        store.save_true_positions(number, np.array(position_m), 5.0).result()
-    positions = store.true_positions(number)
-    assert positions is not None
-    assert positions.tolist() == [1.0, 2.5]
 
 
 def test_a_damaged_row_is_named(store: SessionStore, tmp_path: Path) -> None:

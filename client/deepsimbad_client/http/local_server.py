@@ -25,11 +25,11 @@ class LocalServer:
     """
 
     def __init__(self, data_dir: Path, log_path: Path | None = None, environment: dict[str, str] | None = None) -> None:
-        self._data_dir = data_dir
         self.log_path = log_path or data_dir.with_name("server.log")
-        self._environment = environment or {}
-        self._port = _free_port()
-        self.url = f"http://127.0.0.1:{self._port}"
+        self.environment = environment or {}
+        self.port = _free_port()
+        self.url = f"http://127.0.0.1:{self.port}"
+        self.command = [sys.executable, "-m", "deepsimbad", "serve", "--create", "--data-dir", str(data_dir)]
         self._process: subprocess.Popen[bytes] | None = None
 
     def __enter__(self) -> Self:
@@ -43,15 +43,14 @@ class LocalServer:
 
     def start(self) -> None:
         """Start it and wait until it is ready; raises DeepSimbadClientError with the log's last lines."""
-        command = [sys.executable, "-m", "deepsimbad", "serve", "--create", "--data-dir", str(self._data_dir)]
         self.log_path.parent.mkdir(parents=True, exist_ok=True)
         with self.log_path.open("ab") as log:
             self._process = subprocess.Popen(  # noqa: S603 - our own interpreter and module
-                [*command, "--port", str(self._port)],
+                [*self.command, "--port", str(self.port)],
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=log,
-                env={**os.environ, **self._environment},
+                env={**os.environ, **self.environment},
             )
         give_up_at = time.monotonic() + _READY_WITHIN_S
         try:
@@ -71,10 +70,9 @@ class LocalServer:
             raise DeepSimbadClientError("the service is not up")
         return self._process.pid
 
-    def wait(self) -> None:
-        """Wait until the process ends by itself."""
-        if self._process is not None:
-            self._process.wait()
+    def wait(self, within_s: float | None = None) -> int | None:
+        """Wait until the process ends by itself; its exit status, None where it is not up."""
+        return None if self._process is None else self._process.wait(within_s)
 
     def stop(self) -> None:
         """Ask it to end, then insist."""

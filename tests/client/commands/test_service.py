@@ -10,13 +10,13 @@ import pytest
 
 from deepsimbad_client import errors
 from deepsimbad_client.commands import run
-from deepsimbad_client.http.admin import follow_job, remap
+from deepsimbad_client.http.admin import remap
 from deepsimbad_client.http.upload import in_order, upload
 from deepsimbad_client.recordings.sources import open_source
 from deepsimbad_client.replay.passive import replay
 from deepsimbad_client.replay.report import summarise
 
-from ..conftest import ENCODINGS, mapped
+from ..conftest import ENCODINGS
 
 
 def test_an_upload_goes_on_where_it_stopped(client, encodings, monkeypatch):
@@ -142,38 +142,6 @@ def test_images_with_a_broken_one_among_them(client, tmp_path, capsys):
         assert "images: left out: 1 undecodable (3.jpg)" in capsys.readouterr().err
     answer = client.localize("pictures", folder / "5.jpg", shortlist=3)
     assert len(answer.retrieval) == 3
-
-
-def test_errors_arrive_with_their_names(client, encodings):
-    with pytest.raises(errors.UnknownDomainError) as unknown:
-        client.domain("nowhere")
-    assert unknown.value.request_id
-    client.admin.put_domain("empty", ENCODINGS)
-    with pytest.raises(errors.DomainDiffersError):
-        client.admin.put_domain("empty", ENCODINGS, closed=True)
-    with pytest.raises(errors.NoActiveMapError):
-        client.localize("empty", ranked_landmarks=[0])
-    with pytest.raises(errors.UnknownTraverseError):
-        client.admin.traverse("empty", "none")
-    with pytest.raises(errors.UnknownJobError):
-        client.admin.job("none")
-    upload(client, open_source(str(encodings / "summer.npy")), "empty", "summer")
-    with pytest.raises(errors.InvalidInputError, match="120 is the most that fit"):
-        remap(client, "empty", "summer", landmark_traverse="summer", n_landmarks=500)
-    client.admin.delete_traverse("empty", "summer")
-    client.admin.delete_domain("empty")
-    with pytest.raises(errors.UnknownDomainError):
-        client.admin.delete_domain("empty")
-
-
-def test_what_became_known_later_improves_the_next_map(client, encodings, views):
-    mapped(client, "learning", encodings, training_episodes=20)
-    with client.session("learning") as session:
-        for at in (40, 43, 46):
-            session.observe(encoding=views[at], action_m=3)
-    job = client.admin.feed_experience("learning", session.session_id, [40.0, None, 46.0])
-    assert (follow_job(client, job.job_id).result or {})["map_version"] == 2
-    assert client.domain("learning").map_version == 2
 
 
 def test_the_command_line_end_to_end(service, encodings, tmp_path, capsys, monkeypatch):

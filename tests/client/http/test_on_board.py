@@ -114,14 +114,6 @@ def test_landmarks_that_are_unit_vectors_are_ranked_by_what_is_usual_of_encoding
         OnBoardEncoder(unfit)
 
 
-def test_a_maps_own_landmarks_rank_a_view_as_the_service_does(route, encodings):
-    encoding = np.load(encodings / "summer.npy")[33]
-    with Client(route) as client:
-        seen = client.on_board("route").ranks(encoding=encoding, m=50)
-        ranked = client.localize("route", ranked=seen)
-        assert ranked.retrieval[0].map_image == client.localize("route", encoding=encoding).retrieval[0].map_image == 33
-
-
 def test_arguments_that_cannot_be(content, tmp_path):
     encoder = OnBoardEncoder(content)
     for m in (0, -1, N_LANDMARKS + 1):

@@ -142,16 +142,6 @@ def test_what_is_refused(client, views, act, error):
         assert session.state().n_observations == 1
 
 
-def test_sessions_that_cannot_begin(client):
-    for domain, wishes, error in (
-        ("route", {"start_position_m": -500}, errors.InvalidPriorError),
-        ("route", {"planner": "nonsense"}, errors.InvalidInputError),
-        ("nowhere", {}, errors.UnknownDomainError),
-    ):
-        with pytest.raises(error):
-            client.session(domain, **wishes)
-
-
 def test_truths_are_told_and_experience_is_fed_back():
     places, plain = np.array([1.0, np.nan, 4.5]), [1.0, None, 4.5]
     score = {"n_scored": 2, "n_left_out": 1, "anr": 3.5, "map_version": 4}
