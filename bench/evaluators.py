@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from deepsimbad.jobs.kept_encodings import kept_encodings
 from numpy.typing import NDArray
 
 from bench.common import duration, machine, markdown, real_recordings, write_page
@@ -30,6 +29,7 @@ from deepsimbad.evaluators.registry import EvaluatorKind, evaluator_config, make
 from deepsimbad.evaluators.trunk import Trunk
 from deepsimbad.jobs.build import EncodedRecording, encode_recording
 from deepsimbad.jobs.fitting import RecordingPictures
+from deepsimbad.jobs.kept import kept_encodings
 from deepsimbad.jobs.progress import Progress
 from deepsimbad.jobs.truth import read_ground_truth
 from deepsimbad.jobs.vpr import VprConfig, VprReport, run_vpr, vpr_stages

@@ -118,13 +118,13 @@ def _evaluators(context: click.Context, parameter: click.Parameter, value: str) 
     return tuple(evaluator_config({"kind": EvaluatorKind.FEATURE_L2.value, "extractor": name}) for name in extractors)
 
 
-_NAMES = ", ".join(f"{EvaluatorKind.FEATURE_L2}:{extractor}" for extractor in EXTRACTOR_FORMS)
+_NAMES = f"{', '.join(EvaluatorKind)}, alone or with a colon and an extractor: {', '.join(EXTRACTOR_FORMS)}"
 evaluator_option = click.option(  # given on as an EvaluatorConfig
     "--evaluator",
     default=EvaluatorKind.FEATURE_L2.value,
     show_default=True,
     callback=_evaluator,
-    help=f"How images are compared with landmarks: a kind, or one of {_NAMES}.",
+    help=f"How images are compared with landmarks: a kind of {_NAMES}.",
 )
 evaluators_option = click.option(  # or `all`; given on as EvaluatorConfigs
     "--evaluator",

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 _BLOCKS, _VALIDATION, _TEST = 10, (2, 7), (4, 9)  # neighbouring frames are alike, so whole stretches are held out
-_MOST_SCORED = 512  # queries
+_MOST_SCORED = 256  # queries
 _NEAR_STEPS = 3.0
 Measure = Callable[[NDArray[np.float32]], NDArray[np.float32]]
 """Dissimilarities [q, r] of unit vectors [q, k] to the landmarks."""

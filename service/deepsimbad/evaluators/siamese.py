@@ -16,7 +16,7 @@ from deepsimbad.evaluators.lessons import PairScores, Split, UnitLesson, judged,
 from deepsimbad.evaluators.trunk import Axes, Trunk
 
 _HIDDEN = 32
-_EPOCHS, _BATCH, _MOST_QUERIES = 40, 64, 4096  # queries: at once, and an epoch
+_EPOCHS, _BATCH, _MOST_QUERIES = 40, 64, 2048  # queries: at once, and an epoch
 _HARD, _EASY, _RETRIEVED = 16, 16, 64  # wrong answers a query: of the nearest 64 that retrieval gives, and any
 _RATE, _DECAY = 2e-3, 1e-2
 _SHARPNESS = 10.0  # what a squared L2 of 1 counts in the softmax over dissimilarities, at the beginning
