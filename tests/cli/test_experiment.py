@@ -268,3 +268,12 @@ def test_a_known_set_is_scored_as_its_papers_do_unless_told(deepsimbad, pictures
     assert "R@10" in ran.out
     assert "test: Gardens Point: 12 frames, true within 2 frames unless --tolerance says otherwise" in ran.err
     assert json.loads(deepsimbad(*asked, "--tolerance", 0, "--json").out)["config"]["tolerance_m"] == 0
+
+
+def test_an_evaluator_that_is_fitted_tells_how(measured, route):
+    only = ("--relevance", "rrf", "--relevance", "composed")
+    document = measured("vpr", *route, "--evaluator", "autoencoder:none", "--n-landmarks", 40, *only)
+    assert document["config"]["evaluator"] == {"kind": "autoencoder", "extractor": "none"}
+    assert document["fitting"]["n_shared_places"] == 130
+    assert set(document["fitting"]["held_out"]) == {"autoencoder", "l2"}
+    assert max(document["anr"][name] for name in ("rrf", "composed")) < 10
