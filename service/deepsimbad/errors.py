@@ -142,6 +142,10 @@ class UnknownDomainError(NotFoundError, code="unknown_domain"):
     """No such domain."""
 
 
+class UnknownThumbnailError(NotFoundError, code="unknown_thumbnail"):
+    """No picture of a map image was kept."""
+
+
 class UnknownTraverseError(NotFoundError, code="unknown_traverse"):
     """No such traverse in the domain."""
 
@@ -263,6 +267,10 @@ class BodyTooLargeError(TooLargeError, code="body_too_large"):
 
 class ImageTooLargeError(TooLargeError, code="image_too_large"):
     """An image whose header claims more pixels than the limit."""
+
+
+class NotAcceptableError(DeepSimbadError, code="not_acceptable"):
+    """No answer of the kind that was asked for can be given."""
 
 
 class UnsupportedMediaTypeError(DeepSimbadError, code="unsupported_media_type"):

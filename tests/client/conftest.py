@@ -22,9 +22,9 @@ ENCODINGS = {"kind": "feature_l2", "extractor": "none"}
 
 
 @contextmanager
-def serving(data_dir):
+def serving(data_dir, port=0):
     app = create_app(Settings(data_dir=data_dir), InThisProcess(data_dir))
-    config = uvicorn.Config(app, host="127.0.0.1", port=0, log_level="warning", ws="none", lifespan="on")
+    config = uvicorn.Config(app, host="127.0.0.1", port=port, log_level="warning", ws="none", lifespan="on")
     server = uvicorn.Server(config)
     thread = threading.Thread(target=server.run)
     thread.start()

@@ -20,7 +20,7 @@ from deepsimbad.store.traverses import Traverse
 
 SETS = {
     name: import_module(f"deepsimbad_migrations.{name}.migrations").migrations
-    for name in ("catalog", "map", "traverse", "session")
+    for name in ("catalog", "map", "traverse", "session", "thumbnail")
 }
 SCHEMAS = Path(__file__).parent / "schemas"
 FROZEN = sorted(SCHEMAS.glob("*.sql"))
@@ -66,7 +66,14 @@ def test_the_command_reaches_the_schema_that_the_service_makes(kind: str, tmp_pa
     apply(ours, SETS[kind])
     run_command(theirs, MIGRATIONS / kind)
     assert schema_of(theirs) == schema_of(ours)
-    assert {"catalog": "domain", "map": "posting", "traverse": "frame", "session": "journal"}[kind] in schema_of(ours)
+    tables = {
+        "catalog": "domain",
+        "map": "posting",
+        "traverse": "frame",
+        "session": "journal",
+        "thumbnail": "thumbnail",
+    }
+    assert tables[kind] in schema_of(ours)
     before = rows_of(theirs)
     run_command(theirs, MIGRATIONS / kind)  # again changes nothing
     assert rows_of(theirs) == before
@@ -193,7 +200,7 @@ SESSION = [("a" * 32, {"filter": "grid", "seed": 7}, 3, 4630.0), (2, [0.25, 0.75
                 *(f"catalog_v{version}", "catalog.sqlite", the_catalog),
                 [(1, {"anr": 4.5}, "2026-11-20T10:00:00.000Z"), [(JobState.SUCCEEDED, 2)]],
             )
-            for version in (2, 3, 4, 5)
+            for version in (2, 3, 4, 5, 6)
         ),
         *((f"traverse_v{v}", "domains/campus/traverses/summer.sqlite", the_traverse, FRAMES) for v in range(1, 9)),
         *((f"session_v{version}", "sessions.sqlite", the_sessions, SESSION) for version in (1, 2, 3, 4, 5)),

@@ -100,3 +100,9 @@ def m004_without_owners_and_row_checksums(db: Database) -> None:
 def m005_domains_of_keys(db: Database) -> None:
     """The domains that a key opens, a JSON list; NULL: all."""
     db.execute("ALTER TABLE api_key ADD COLUMN domains TEXT")
+
+
+@migrations()
+def m006_options_of_domains(db: Database) -> None:
+    """What of a domain is shown and how, a JSON object: `thumbnails`, `anchor`."""
+    db.execute("ALTER TABLE domain ADD COLUMN options TEXT NOT NULL DEFAULT '{}'")

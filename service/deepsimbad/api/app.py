@@ -23,15 +23,17 @@ from pydantic import Field
 from starlette.responses import FileResponse, JSONResponse, PlainTextResponse
 from starlette.routing import Route
 
-from deepsimbad.api import domains, frames, jobs, localizations, maps, sessions, traverses
+from deepsimbad.api import console, coverage, domains, events, frames, jobs, localizations, maps, sessions, traverses
 from deepsimbad.api.door import STOPPING, Door
 from deepsimbad.api.keys import KeyRing
 from deepsimbad.api.metrics import Metrics, StateCollector
 from deepsimbad.api.problems import install_openapi, install_problem_handlers, problems
 from deepsimbad.api.requests import Answer, Running, Services, Slots, refuse_unknown_parameters
 from deepsimbad.engine.decoders import Decoders
+from deepsimbad.engine.events import SessionEvents
 from deepsimbad.engine.localizer import warm_up
 from deepsimbad.engine.maps import Maps, Retention
+from deepsimbad.engine.pictures import Pictures
 from deepsimbad.engine.sessions import Sessions
 from deepsimbad.engine.traverses import OpenTraverses, SpoolRoom
 from deepsimbad.engine.truths import Truths
@@ -54,6 +56,7 @@ _WRITE_TIMEOUT_S = 2.0
 _ROUTERS = (  # routes are tried in this order: those that robots ask come first
     *(sessions.router, localizations.router, router, domains.router, domains.admin),
     *(traverses.router, frames.router, jobs.making, jobs.router, maps.router, sessions.listing),
+    *(events.router, coverage.router, console.router),
 )
 _DESCRIPTION = (
     "Where on a prelearned route a robot is, from what it sees; every error is an RFC 9457 problem document. "
@@ -206,6 +209,8 @@ def _start(settings: Settings, metrics: Metrics, keys: KeyRing, run_job: RunJob,
         session_store=store,
         retention=retention,
         truths=Truths(store, worker, live),
+        pictures=Pictures(settings.data_dir, settings.max_pixels),
+        session_events=SessionEvents(store, worker, live, settings.event_poll_s),
         worker=worker,
         decoders=Decoders(settings.max_pixels),
         runner=runner,
@@ -345,7 +350,13 @@ _POLICY = (
 _KEPT = {"Cache-Control": "public, max-age=3600"}
 
 
-_LINKS = {"documentation": "docs", "openapi": "openapi.json", "domains": "v1/domains", "ready": "readyz"}
+_LINKS = {
+    "console": "console",
+    "documentation": "docs",
+    "openapi": "openapi.json",
+    "domains": "v1/domains",
+    "ready": "readyz",
+}
 _ROOT = (
     '<!DOCTYPE html><html lang="en"><meta charset="utf-8"><meta name="color-scheme" content="light dark">'
     "<title>Deep SIMBAD</title><h1>Deep SIMBAD</h1><ul>"

@@ -8,6 +8,7 @@ from anyio.to_thread import run_sync
 from fastapi import APIRouter, Query, Request, Response
 from pydantic import Field, model_validator
 
+from deepsimbad.api.geopose import AnchorBody
 from deepsimbad.api.problems import binary, declare_json, problems
 from deepsimbad.api.requests import BINARY, GREATEST_ID, KEPT, Answer, DomainName, JsonBody, Running, names, read_json
 from deepsimbad.core.map import DEFAULT_ACTIONS_M, MOST_ACTION_M, check_actions
@@ -47,6 +48,17 @@ class DomainBody(JsonBody):
         tuple[Annotated[float, Field(strict=True, ge=-MOST_ACTION_M, le=MOST_ACTION_M, allow_inf_nan=False)], ...],
         Field(min_length=1, max_length=64, description="Moves in metres, ascending; backward ones are negative."),
     ] = DEFAULT_ACTIONS_M
+    thumbnails: Annotated[
+        bool | None,
+        Field(
+            strict=True, description="Whether a small picture of every map image is kept, for people. May be changed."
+        ),
+    ] = None
+    anchor: Annotated[AnchorBody | None, Field(description="Where x and y lie on Earth. May be changed.")] = None
+
+    def options(self) -> dict[str, Any]:
+        """What may be changed, as far as it was named."""
+        return self.model_dump(include=self.model_fields_set & {"thumbnails", "anchor"})
 
     @model_validator(mode="after")
     def _moves(self) -> Self:
@@ -70,6 +82,8 @@ class DomainAnswer(Answer):
     weights_sha256: Annotated[str | None, Field(description="Of the file that images are encoded by; null: of none.")]
     closed: Annotated[bool, Field(description="Whether the end of the route joins its start.")]
     actions_m: Annotated[list[float], Field(description="The moves a planner may choose, in metres.")]
+    thumbnails: Annotated[bool, Field(description="Whether a small picture of every new map image is kept.")]
+    anchor: Annotated[AnchorBody | None, Field(description="Where x and y lie on Earth; null: nobody said.")]
     created_at: str
     map_version: Annotated[int | None, Field(description="The active one.")]
     map_problem: Annotated[str | None, Field(description="Code of what keeps the active map from answering.")]
@@ -121,6 +135,8 @@ def describe_domain(record: DomainRecord, evaluators: EvaluatorPool, maps: Maps)
         weights_sha256=evaluator and evaluator.weights_sha256,
         closed=record.closed,
         actions_m=list(record.actions_m),
+        thumbnails=bool(record.options.get("thumbnails")),
+        anchor=record.options.get("anchor"),
         created_at=record.created_at,
         map_version=snapshot.version if snapshot else record.active_version,
         map_problem=map_problem,
@@ -214,7 +230,7 @@ async def get_landmark_model(
     openapi_extra=declare_json(DomainBody),
 )
 async def put_domain(domain: DomainName, request: Request, response: Response, running: Running) -> DomainAnswer:
-    """Make a domain; the same again changes nothing, a different one is a 409."""
+    """Make a domain; the same again changes nothing, a different one is a 409, but for what may be changed."""
     body = await read_json(request, DomainBody)
     evaluator = evaluator_config(body.evaluator)
 
@@ -230,6 +246,8 @@ async def put_domain(domain: DomainName, request: Request, response: Response, r
         record, created = running.catalog.create_domain(
             domain, dict(evaluator.as_dict()), body.closed, body.actions_m, running.settings.max_domains
         )
+        if (options := body.options()) and {**record.options, **options} != record.options:
+            record = running.catalog.set_options(domain, options)
         return describe_domain(record, running.evaluators, running.maps), created
 
     answer, created = await run_sync(make)

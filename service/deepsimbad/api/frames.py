@@ -121,7 +121,8 @@ async def put_frame(
     domain's evaluator is fitted to images it waits in the traverse's spool until a map is made of that. Positions that
     go backwards are accepted here and refused by the remap.
     """
-    evaluator = running.evaluators.evaluator((await run_sync(running.catalog.domain, domain)).evaluator)
+    record = await run_sync(running.catalog.domain, domain)
+    evaluator = running.evaluators.evaluator(record.evaluator)
     levels = await run_sync(_levels_of, running, domain, name)  # an unknown traverse should not cost an upload
     media_type = media_type_of(request, FRAME_TYPES)
     if media_type == JSON and camera is not None:
@@ -138,6 +139,8 @@ async def put_frame(
             return n_new == 1, traverse.n_frames
 
     def store_picture(encoded: EncodedImage, seen: Decoded) -> tuple[bool, int]:
+        if record.options.get("thumbnails"):
+            running.pictures.keep(domain, content_digest(np.ascontiguousarray(encoded.values, "<f4").tobytes()), body)
         return store(
             encoded.values[np.newaxis],
             body if evaluator.fitting is Fitting.IMAGES else None,

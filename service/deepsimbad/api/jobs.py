@@ -251,7 +251,7 @@ async def _job(job_id: JobId, running: Running) -> JobRecord:
     return await run_sync(running.catalog.job, job_id)
 
 
-async def _stream(running: Running) -> AsyncIterator[None]:
+async def room_for_a_stream(running: Running) -> AsyncIterator[None]:
     """Room for one more stream, until it ends."""
     with running.event_streams.taken():
         yield
@@ -273,7 +273,7 @@ async def get_job(job: Annotated[JobRecord, Depends(_job)]) -> JobAnswer:
 @router.get(
     "/{job_id}/events",
     response_class=EventSourceResponse,
-    dependencies=[Depends(_stream)],
+    dependencies=[Depends(room_for_a_stream)],
     responses={
         200: {"description": "`progress` events holding the job whenever it changed, and `done` at its end."},
         **problems(404, 422),

@@ -5,11 +5,14 @@ from io import BytesIO
 from typing import Annotated, Any
 
 import numpy as np
+from anyio.to_thread import run_sync
 from fastapi import APIRouter, Query, Request, Response
 from numpy.typing import NDArray
 from pydantic import FailFast, Field, StrictFloat, StrictInt
+from pydantic_core import to_json
 from typing_extensions import TypedDict
 
+from deepsimbad.api.geopose import GEOPOSE, AnchorBody, render_geopose, wants_geopose
 from deepsimbad.api.problems import binary, declare, invalid_body, problems
 from deepsimbad.api.requests import (
     BINARY,
@@ -24,6 +27,7 @@ from deepsimbad.api.requests import (
     insisted_on,
     media_type_of,
     parse_json,
+    prefers,
     read_bytes,
 )
 from deepsimbad.core.map import Map
@@ -264,8 +268,13 @@ def render_belief(snapshot: Map, belief: BeliefSummary, is_confident: bool) -> B
     "/{domain}/localizations",
     response_model=LocalizationAnswer,
     responses={
-        200: {"content": binary("float32 npy [n]: the relevance of every map image, in route order")},
-        **problems(404, 409, 413, 415, 422),
+        200: {
+            "content": {
+                **binary("float32 npy [n]: the relevance of every map image, in route order"),
+                GEOPOSE: {"schema": {"type": "object", "required": ["position", "angles"]}},
+            }
+        },
+        **problems(404, 406, 409, 413, 415, 422),
     },
     openapi_extra=OBSERVATION_BODY,
 )
@@ -278,7 +287,8 @@ async def post_localization(
 ) -> Response:
     """Localize one view: an image, whatever image type the header names, or what a robot made of it on board.
 
-    With `Accept: application/octet-stream` the answer is the relevance of every map image.
+    With `Accept: application/octet-stream` the answer is the relevance of every map image; with
+    `application/geopose+json` the likeliest place on Earth, where the domain has an anchor.
     """
     watch = Stopwatch()
     active = await running.active(domain)
@@ -290,7 +300,7 @@ async def post_localization(
     watch.lap("receive")
     evaluator = running.evaluators.evaluator(active.record.evaluator)
     view, remarks = await view_in(body, running, media_type, evaluator, snapshot)
-    if prefers_binary(request):
+    if prefers(request, BINARY):
 
         def compare(view: View) -> NDArray[np.float32]:
             snapshot.check_landmark_model(landmark_models)
@@ -305,6 +315,12 @@ async def post_localization(
         return localize(snapshot, evaluator, view, shortlist, watch)
 
     localization = await running.look(evaluator, view, look)
+    if wants_geopose(request):
+        record = await run_sync(running.catalog.domain, domain)  # as it is now
+        anchor = record.options.get("anchor")
+        mode = int(localization.belief.top[0])
+        posed = render_geopose(snapshot, None if anchor is None else AnchorBody(**anchor), mode)
+        return Response(to_json(posed), media_type=GEOPOSE)
     answer, body = await running.written(
         localization.belief.top.size, render_localization, localization, watch, remarks
     )
@@ -334,19 +350,6 @@ async def view_in(
     decoded = await running.decoders.decoded(body, evaluator, Priority.LIVE, levels)
     remarks = [*decoded.remarks, *remarks_on_shape(snapshot, decoded.size)]
     return NothingSeen() if decoded.is_blank else decoded.image, remarks
-
-
-def prefers_binary(request: Request) -> bool:
-    """Whether `Accept` asks for the npy rather than for JSON."""
-    quality_of = {}
-    for part in request.headers.get("accept", "").split(","):
-        media_type, *parameters = (piece.strip().lower() for piece in part.split(";"))
-        quality = next((piece[2:] for piece in parameters if piece.startswith("q=")), "1")
-        try:
-            quality_of[media_type] = float(quality)
-        except ValueError:
-            quality_of[media_type] = 0.0
-    return quality_of.get(BINARY, 0.0) > quality_of.get(JSON, 0.0)
 
 
 def npy_response(values: NDArray[np.floating]) -> Response:

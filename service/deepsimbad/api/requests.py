@@ -25,8 +25,10 @@ from deepsimbad.api.keys import KeyRing
 from deepsimbad.api.metrics import Metrics
 from deepsimbad.api.problems import InvalidRequestError, invalid_body, invalid_request
 from deepsimbad.engine.decoders import Decoders
+from deepsimbad.engine.events import SessionEvents
 from deepsimbad.engine.localizer import View
 from deepsimbad.engine.maps import MappedDomain, Maps, Retention
+from deepsimbad.engine.pictures import Pictures
 from deepsimbad.engine.sessions import Sessions
 from deepsimbad.engine.traverses import OpenTraverses, SpoolRoom
 from deepsimbad.engine.truths import Truths
@@ -130,6 +132,8 @@ class Services:
     session_store: SessionStore
     retention: Retention
     truths: Truths
+    session_events: SessionEvents
+    pictures: Pictures
     worker: InferenceWorker
     decoders: Decoders
     runner: JobRunner
@@ -168,6 +172,19 @@ class Services:
 async def services_of(request: Request) -> Services:
     """The running service, for routes. A coroutine, because a plain function would be sent to a thread."""
     return cast("Services", request.app.state.services)
+
+
+def prefers(request: Request, media_type: str, other: str = JSON) -> bool:
+    """Whether `Accept` asks for one type of answer rather than for another."""
+    quality_of = {}
+    for part in request.headers.get("accept", "").split(","):
+        name, *parameters = (piece.strip().lower() for piece in part.split(";"))
+        quality = next((piece[2:] for piece in parameters if piece.startswith("q=")), "1")
+        try:
+            quality_of[name] = float(quality)
+        except ValueError:
+            quality_of[name] = 0.0
+    return quality_of.get(media_type, 0.0) > quality_of.get(other, 0.0)
 
 
 # Parameters

@@ -20,7 +20,6 @@ from deepsimbad.api.localizations import (
     Shortlist,
     Timings,
     npy_response,
-    prefers_binary,
     render_belief,
     render_plan,
     render_shortlist,
@@ -29,6 +28,7 @@ from deepsimbad.api.localizations import (
 )
 from deepsimbad.api.problems import binary, declare_json, location, problems
 from deepsimbad.api.requests import (
+    BINARY,
     GREATEST_EXACT_INTEGER,
     GREATEST_ID,
     JSON,
@@ -50,6 +50,7 @@ from deepsimbad.api.requests import (
     key_id_of,
     media_type_of,
     page_of,
+    prefers,
     read_bytes,
     read_json,
     robot_of,
@@ -60,6 +61,7 @@ from deepsimbad.core.summary import DEFAULT_CONFIDENCE
 from deepsimbad.engine.session import DEFAULT_START_STD_M, Observation, SessionConfig, SessionView
 from deepsimbad.engine.worker import Stopwatch
 from deepsimbad.errors import DeepSimbadError
+from deepsimbad.evaluators.image_files import MEDIA_TYPES
 from deepsimbad.store.sessions import IdempotencyKey, ListedSession
 
 router = APIRouter(prefix="/v1", tags=["sessions"])
@@ -306,6 +308,8 @@ async def post_observation(
     except DeepSimbadError as error:
         running.metrics.observed(error.code)
         raise
+    if media_type in MEDIA_TYPES:
+        running.pictures.saw(session_id, body)
     answer, body = await running.written(view.belief.top.size, render_observation, view, watch)
     domain = request.scope["state"]["domain"] = answer["domain"]
     outcome = "repeated" if view.is_repeated else "accepted"
@@ -333,7 +337,7 @@ async def get_belief(
     session_id: SessionId, request: Request, running: Running, shortlist: Shortlist = None
 ) -> Response:
     """The belief alone; with `Accept: application/octet-stream` the mass of every map image."""
-    if prefers_binary(request):
+    if prefers(request, BINARY):
         return npy_response(await running.sessions.mass(session_id, robot_of(request)))
     view = await running.sessions.view(session_id, shortlist, robot_of(request))
     _, body = await running.written(view.belief.top.size, render_belief, view.snapshot, view.belief, view.is_confident)

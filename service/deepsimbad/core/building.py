@@ -22,6 +22,7 @@ from deepsimbad.core.composed import (
     unit,
     within_place_whitening,
 )
+from deepsimbad.core.coverage import placed_rightly
 from deepsimbad.core.descriptor import LandmarkStatistics, common_factors, nearest_landmarks, rank_landmarks
 from deepsimbad.core.drive import Drive, SameRoute, SecondSeason, second_season
 from deepsimbad.core.landmark_model import farthest_first
@@ -251,7 +252,11 @@ def taught(
     map_, rehearsal = replace(map_, **learnt), replace(rehearsal, **learnt)
     first, *others = (drive.encodings for drive in drives)
     strangest = max([most_strange(first), *(most_strange(first, other) for other in others)])
-    learnt = {"view_bits": view_bits(map_, places, rehearsal, season), "most_strange": np.array([strangest])}
+    learnt = {
+        "view_bits": view_bits(map_, places, rehearsal, season),
+        "coverage": placed_rightly(rehearsal, own, season),
+        "most_strange": np.array([strangest]),
+    }
     return replace(map_, **learnt), replace(rehearsal, **learnt)
 
 

@@ -80,6 +80,7 @@ class Map:
         most_strange: How strange a view of a place may be (`relevance.strangeness`), where encodings are compared.
         novelty: How much alike two views err that are 0, 1, 2.. m apart, 1 to 0.
         view_bits: By how many bits a view from a place narrows the map down.
+        coverage: The chance that a single view from a place is placed rightly, NaN where unknown (`composed`).
         timestamp_us: Microseconds since 1970, -1 where unknown.
         frame_digest: Which frame every image was made of (`Drive.digests`), 0 where nobody noted it.
         x_m, y_m: East and north, NaN where unknown.
@@ -111,6 +112,7 @@ class Map:
     most_strange: NDArray[np.float64] | None = field(default=None, metadata=_row(np.float64, 1))
     novelty: NDArray[np.float64] | None = field(default=None, metadata=_row(np.float64, "*"))
     view_bits: NDArray[np.float32] | None = field(default=None, metadata=_row(np.float32, "n"))
+    coverage: NDArray[np.float32] | None = field(default=None, metadata=_row(np.float32, "n", unknown=np.nan))
     timestamp_us: NDArray[np.int64] | None = field(default=None, metadata=_row(np.int64, "n", unknown=-1))
     frame_digest: NDArray[np.uint64] | None = field(default=None, metadata=_row(np.uint64, "n", unknown=UNKNOWN_FRAME))
     x_m: NDArray[np.float64] | None = field(default=None, metadata=_row(np.float64, "n", unknown=np.nan))

@@ -95,6 +95,11 @@ class Sessions:
         """How many sessions have not ended, as far as is known without looking."""
         return len(self._living)
 
+    def living(self, session_id: str) -> LiveSession | None:
+        """A session that has not ended, as far as is known without looking; None: there is none such."""
+        live = self._living.get(session_id)
+        return None if live is None or live.ending is not None else live
+
     def close(self) -> None:
         """End the thread of summaries."""
         self._summaries.shutdown()

@@ -2,7 +2,7 @@
 
 import fcntl
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from enum import Enum
 from pathlib import Path
 from typing import Any, Final, Self
@@ -153,6 +153,13 @@ class Catalog(JobCatalog, KeyCatalog):
             record = get_domain(db, name)
         empty_graves(folder.parent)
         return record, True
+
+    def set_options(self, name: str, options: Mapping[str, Any]) -> DomainRecord:
+        """Change what of a domain is shown and how; what is not named stays. Raises UnknownDomainError."""
+        with self._writing() as db:
+            before = get_domain(db, name)
+            db.execute("UPDATE domain SET options = ? WHERE name = ?", [to_json({**before.options, **options}), name])
+            return get_domain(db, name)
 
     def domain(self, name: str) -> DomainRecord:
         """One domain; raises UnknownDomainError."""

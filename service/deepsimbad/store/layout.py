@@ -59,6 +59,11 @@ def traverse_path(data_dir: Path, domain: str, name: str) -> Path:
     return traverses_folder(data_dir, domain) / f"{checked_name(name, 'traverse')}.sqlite"
 
 
+def thumbnails_path(data_dir: Path, domain: str) -> Path:
+    """The file of a domain's small pictures."""
+    return domain_folder(data_dir, domain) / "thumbnails.sqlite"
+
+
 def maps_folder(data_dir: Path, domain: str) -> Path:
     """The folder of a domain's maps."""
     return domain_folder(data_dir, domain) / "maps"

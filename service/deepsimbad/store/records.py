@@ -56,7 +56,7 @@ class KeyScope(StrEnum):
 
 @dataclass(frozen=True)
 class DomainRecord:
-    """One domain: `evaluator` as it was given, `closed` where the route is a loop, moves in metres."""
+    """One domain: `evaluator` as it was given, `closed` where the route is a loop, moves in metres; what it shows."""
 
     name: str
     evaluator: dict[str, Any]
@@ -64,6 +64,7 @@ class DomainRecord:
     actions_m: tuple[float, ...]
     active_version: int | None
     created_at: str
+    options: dict[str, Any]
 
 
 def read_domains(db: Database, name: str | None = None) -> list[DomainRecord]:
@@ -72,15 +73,17 @@ def read_domains(db: Database, name: str | None = None) -> list[DomainRecord]:
         return []
     rows = db.execute(
         """
-        SELECT domain.name, evaluator, closed, actions_m, active.version, domain.created_at
+        SELECT domain.name, evaluator, closed, actions_m, active.version, domain.created_at, options
         FROM domain LEFT JOIN map AS active ON active.domain = domain.name AND active.state = 'active'
         WHERE domain.name = coalesce(?, domain.name) ORDER BY domain.name
         """,
         [name],
     )
     return [
-        DomainRecord(name, from_json(evaluator), bool(closed), tuple(from_json(actions_m)), *rest)
-        for name, evaluator, closed, actions_m, *rest in rows
+        DomainRecord(
+            name, from_json(evaluator), bool(closed), tuple(from_json(actions_m)), version, at, from_json(options)
+        )
+        for name, evaluator, closed, actions_m, version, at, options in rows
     ]
 
 

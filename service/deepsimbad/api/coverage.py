@@ -1,0 +1,145 @@
+"""Where on its route a domain's map can be trusted."""
+
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from anyio.to_thread import run_sync
+from fastapi import APIRouter, Query, Response
+from fastapi import Path as PathParameter
+from numpy.typing import NDArray
+from pydantic import Field
+from typing_extensions import TypedDict
+
+from deepsimbad.api.localizations import FrameName
+from deepsimbad.api.problems import problems
+from deepsimbad.api.requests import GREATEST_ID, JSON, DomainName, Running, Services
+from deepsimbad.core.coverage import WITHIN_M, worst_stretches
+from deepsimbad.core.map import Map
+
+router = APIRouter(prefix="/v1/domains", tags=["domains"])
+
+PinnedVersion = Annotated[
+    int | None, Query(ge=1, le=GREATEST_ID, description="One a session is pinned to; absent: the active one.")
+]
+Metres = list[float | None] | None
+
+
+class StretchAnswer(TypedDict):
+    """A part of the route where views are placed rightly less often than elsewhere."""
+
+    from_m: float
+    to_m: float
+    chance: Annotated[float, Field(description="Mean over its map images.", ge=0, le=1)]
+    first_map_image: int
+    last_map_image: int
+    first_frame: FrameName
+    last_frame: FrameName
+    worst_map_image: int
+    worst_frame: FrameName
+
+
+class CoverageAnswer(TypedDict):
+    """Every map image, and how surely its place is recognised; columns are in route order."""
+
+    domain: str
+    map_version: int
+    thumbnail_bytes: Annotated[int, Field(description="Of all small pictures that the domain keeps; 0: it keeps none.")]
+    within_m: Annotated[float, Field(description="A view is placed rightly so near to its place.")]
+    basis: Annotated[
+        Literal["two_seasons", "one_season"] | None,
+        Field(description="What it was learnt from; null: the map is an earlier release's, or not `composed`."),
+    ]
+    stretches: Annotated[list[StretchAnswer], Field(description="Where it is well below the mean, worst first.")]
+    route_position_m: list[float]
+    x_m: Annotated[Metres, Field(description="null where the map knows none.")]
+    y_m: Metres
+    chance: Annotated[
+        list[float | None] | None, Field(description="That one view alone is placed rightly; null where unknown.")
+    ]
+
+
+@router.get("/{domain}/coverage", response_model=CoverageAnswer, responses=problems(404, 409, 410, 422))
+async def get_coverage(
+    domain: DomainName,
+    running: Running,
+    map_version: PinnedVersion = None,
+) -> Response:
+    """For every map image the chance that a single view there is placed rightly; worst stretches first."""
+    snapshot = await _snapshot(running, domain, map_version)
+    record = await run_sync(running.catalog.map, domain, snapshot.version)
+    n_bytes = await run_sync(running.pictures.n_bytes, domain)
+    _, body = await running.written(snapshot.n_images, render_coverage, snapshot, record.metrics, n_bytes)
+    return Response(body, media_type=JSON)
+
+
+async def _snapshot(running: Services, domain: str, version: int | None) -> Map:
+    if version is None:
+        return (await running.active(domain)).snapshot
+    return await run_sync(running.maps.snapshot, domain, version)
+
+
+def render_coverage(snapshot: Map, metrics: Mapping[str, Any], thumbnail_bytes: int) -> CoverageAnswer:
+    """A map's coverage, with what was measured when it was made; takes some milliseconds for a long route."""
+    at_m, frames, chance = snapshot.position_m, snapshot.frames, snapshot.coverage
+    stretches: list[StretchAnswer] = []
+    for stretch in () if chance is None else worst_stretches(at_m, chance):
+        first, last, worst = stretch.first, stretch.last, stretch.worst
+        stretches.append(
+            {
+                "from_m": float(at_m[first]),
+                "to_m": float(at_m[last]),
+                "chance": stretch.chance,
+                "first_map_image": first,
+                "last_map_image": last,
+                "first_frame": frames[first],
+                "last_frame": frames[last],
+                "worst_map_image": worst,
+                "worst_frame": frames[worst],
+            }
+        )
+    basis: Literal["two_seasons", "one_season"] | None = None
+    if chance is not None:
+        season = metrics.get("second_season") or {}
+        basis = "two_seasons" if season.get("accepted") else "one_season"
+    return {
+        "domain": snapshot.domain,
+        "map_version": snapshot.version,
+        "thumbnail_bytes": thumbnail_bytes,
+        "within_m": WITHIN_M,
+        "basis": basis,
+        "stretches": stretches,
+        "route_position_m": at_m.round(3).tolist(),
+        "x_m": _known(snapshot.x_m, 3),
+        "y_m": _known(snapshot.y_m, 3),
+        "chance": _known(chance, 4),
+    }
+
+
+def _known(values: NDArray[np.floating] | None, digits: int) -> Metres:
+    if values is None or not np.isfinite(values).any():
+        return None
+    rounded = values.astype(np.float64).round(digits).astype(object)
+    rounded[~np.isfinite(values)] = None
+    known: list[float | None] = rounded.tolist()
+    return known
+
+
+@router.get(
+    "/{domain}/map-images/{index}/thumbnail",
+    response_class=Response,
+    responses={
+        200: {"content": {"image/jpeg": {"schema": {"type": "string", "format": "binary"}}}},
+        **problems(404, 409, 410, 422),
+    },
+)
+async def get_thumbnail(
+    domain: DomainName,
+    index: Annotated[int, PathParameter(ge=0, le=GREATEST_ID, description="In route order, from 0.")],
+    running: Running,
+    map_version: PinnedVersion = None,
+) -> Response:
+    """A small picture of a map image, where the domain keeps them (`thumbnails`)."""
+    snapshot = await _snapshot(running, domain, map_version)
+    content = await run_sync(running.pictures.of_image, snapshot, index)
+    return Response(content, media_type="image/jpeg")

@@ -1,0 +1,84 @@
+"""A session followed while its robot drives, or gone through again afterwards."""
+
+from collections.abc import AsyncIterator
+from typing import Annotated
+
+from anyio.to_thread import run_sync
+from fastapi import APIRouter, Depends, Header, Query, Request, Response
+from fastapi.sse import EventSourceResponse, ServerSentEvent
+
+from deepsimbad.api.jobs import room_for_a_stream
+from deepsimbad.api.problems import problems
+from deepsimbad.api.requests import GREATEST_ID, Running, SessionId, key_id_of, robot_of
+from deepsimbad.api.sessions import SessionAnswer, render_observation, render_session
+from deepsimbad.engine.session import SessionView
+from deepsimbad.engine.worker import Stopwatch
+from deepsimbad.store.sessions import SessionRecord
+
+router = APIRouter(prefix="/v1/sessions", tags=["sessions"])
+
+
+async def _session(session_id: SessionId, request: Request, running: Running) -> SessionRecord:
+    """The session of the path, so that an unknown one is refused before a stream begins."""
+    return await run_sync(running.session_events.find, session_id, robot_of(request))
+
+
+def _observed(view: SessionView) -> SessionAnswer:
+    return render_observation(view, Stopwatch())
+
+
+@router.get(
+    "/{session_id}/events",
+    response_class=EventSourceResponse,
+    dependencies=[Depends(room_for_a_stream)],
+    responses={
+        200: {
+            "description": "`observation` events: what each observation was answered, its timings apart; `prior` "
+            "events with the session as somebody's word left it; `done` when the session has ended. Ids count from 1."
+        },
+        **problems(404, 410, 422),
+    },
+)
+async def get_session_events(
+    session: Annotated[SessionRecord, Depends(_session)],
+    request: Request,
+    running: Running,
+    after: Annotated[
+        int | None,
+        Query(ge=0, le=GREATEST_ID, description="Begin behind the event of this id; 0: from the first; absent: now."),
+    ] = None,
+    last_event_id: Annotated[
+        str | None, Header(pattern=r"^\d{1,9}$", description="The same, as a browser says that was cut off.")
+    ] = None,
+) -> AsyncIterator[ServerSentEvent]:
+    """Follow a session: an event for every observation, whoever sends them; the last one that there was comes at once.
+
+    What has passed can be had again, of a session that has ended too, as long as it is known. The stream may end
+    earlier, when the service shuts down or the key is revoked: ask again, behind the last event that came.
+    """
+    begin = int(last_event_id) if last_event_id is not None else after
+    key_id = key_id_of(request)
+    async for event in running.session_events.follow(session, begin):
+        if running.stopping.is_set() or not running.keys.still_opens(key_id):
+            return
+        if event is None:
+            continue
+        render = _observed if event.is_observation else render_session
+        name = "observation" if event.is_observation else "prior"
+        yield ServerSentEvent(data=render(event.view), event=name, id=str(event.sequence))
+    yield ServerSentEvent(data={"session_id": session.session_id}, event="done")
+
+
+@router.get(
+    "/{session_id}/view",
+    response_class=Response,
+    responses={
+        200: {"content": {"image/jpeg": {"schema": {"type": "string", "format": "binary"}}}},
+        204: {"description": "It is not held: nothing was seen yet, or long ago, or no image was sent."},
+        **problems(404, 410, 422),
+    },
+)
+async def get_view(session: Annotated[SessionRecord, Depends(_session)], running: Running) -> Response:
+    """What the robot saw last, as a small picture; held in memory alone, for people who look on."""
+    content = await run_sync(running.pictures.seen, session.session_id)
+    return Response(status_code=204) if content is None else Response(content, media_type="image/jpeg")

@@ -1,0 +1,106 @@
+"""A place on the route as a GeoPose (OGC 21-056r11, Basic-YPR): where on Earth, and which way."""
+
+import math
+from typing import Annotated
+
+from fastapi import Request
+from pydantic import Field
+from typing_extensions import TypedDict
+
+from deepsimbad.api.requests import JsonBody, prefers
+from deepsimbad.core.map import Map
+from deepsimbad.errors import NotAcceptableError
+
+GEOPOSE = "application/geopose+json"
+_EQUATOR_M, _FLATTENING = 6_378_137.0, 1 / 298.257_223_563  # WGS 84
+_HEADING_OVER_M = 1.0  # to either side: neighbours alone are as noisy as their positions
+
+Degrees = Annotated[float, Field(strict=True, allow_inf_nan=False)]
+
+
+class AnchorBody(JsonBody):
+    """Where the origin of x and y lies on Earth, and how they are turned."""
+
+    lat_deg: Annotated[Degrees, Field(ge=-90, le=90)]
+    lon_deg: Annotated[Degrees, Field(ge=-180, le=180)]
+    bearing_deg: Annotated[Degrees, Field(ge=0, lt=360, description="Of the axis y, clockwise from north.")] = 0.0
+    height_m: Annotated[float, Field(strict=True, allow_inf_nan=False, description="Above the ellipsoid.")] = 0.0
+
+
+class Position(TypedDict):
+    """Degrees, and metres above the ellipsoid."""
+
+    lat: float
+    lon: float
+    h: float
+
+
+class Angles(TypedDict):
+    """Degrees; yaw from east towards north."""
+
+    yaw: float
+    pitch: float
+    roll: float
+
+
+class GeoPoseAnswer(TypedDict):
+    """The likeliest place, with the direction of the route there."""
+
+    position: Position
+    angles: Angles
+
+
+def wants_geopose(request: Request) -> bool:
+    """Whether `Accept` asks for a GeoPose rather than for JSON."""
+    return prefers(request, GEOPOSE)
+
+
+def render_geopose(snapshot: Map, anchor: AnchorBody | None, image: int) -> GeoPoseAnswer:
+    """The pose of a map image.
+
+    Raises:
+        NotAcceptableError: The domain has no anchor, or nobody knows where that image was taken, or which way.
+    """
+    if anchor is None:
+        raise NotAcceptableError(
+            f"domain {snapshot.domain} has no anchor: PUT it with anchor {{lat_deg, lon_deg, bearing_deg}} first",
+            reason="no_anchor",
+        )
+    route = snapshot.route
+    heading = heading_at(snapshot, image)
+    if route.x_m is None or route.y_m is None or heading is None:
+        raise NotAcceptableError(
+            f"map {snapshot.version} of domain {snapshot.domain} knows no x and y there: map a traverse that has them",
+            reason="no_heading",
+        )
+    turned = math.radians(anchor.bearing_deg)
+    x_m, y_m = float(route.x_m[image]), float(route.y_m[image])
+    east_m = x_m * math.cos(turned) + y_m * math.sin(turned)
+    north_m = y_m * math.cos(turned) - x_m * math.sin(turned)
+    latitude = math.radians(anchor.lat_deg)
+    eccentricity = _FLATTENING * (2 - _FLATTENING)
+    bulge = 1 - eccentricity * math.sin(latitude) ** 2
+    meridian_m = _EQUATOR_M * (1 - eccentricity) / bulge**1.5 + anchor.height_m
+    parallel_m = (_EQUATOR_M / math.sqrt(bulge) + anchor.height_m) * math.cos(latitude)
+    longitude = anchor.lon_deg + math.degrees(east_m / max(parallel_m, 1e-6))
+    return {
+        "position": {
+            "lat": anchor.lat_deg + math.degrees(north_m / meridian_m),
+            "lon": (longitude + 180) % 360 - 180,
+            "h": anchor.height_m,
+        },
+        "angles": {"yaw": (math.degrees(heading - turned) + 180) % 360 - 180, "pitch": 0.0, "roll": 0.0},
+    }
+
+
+def heading_at(snapshot: Map, image: int) -> float | None:
+    """Which way the route leads at a map image, in radians from x towards y; None where it is not known."""
+    route = snapshot.route
+    if route.x_m is None or route.y_m is None:
+        return None
+    at_m = route.position_m
+    first = int(at_m.searchsorted(at_m[image] - _HEADING_OVER_M, side="left"))
+    last = int(at_m.searchsorted(at_m[image] + _HEADING_OVER_M, side="right")) - 1
+    first, last = min(first, max(image - 1, 0)), max(last, min(image + 1, at_m.size - 1))
+    x_m, y_m = (float(values[last] - values[first]) for values in (route.x_m, route.y_m))
+    return math.atan2(y_m, x_m) if math.isfinite(x_m) and math.isfinite(y_m) and (x_m, y_m) != (0.0, 0.0) else None

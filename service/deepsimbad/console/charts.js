@@ -1,0 +1,283 @@
+// The route with what is believed of it, the belief along it, and how that came about. Colours are the page's own.
+
+import { html, useEffect, useRef } from "./preact.js";
+
+const MOST_POINTS = 3000; // of a drawn route: more cannot be told apart
+const dark = matchMedia("(prefers-color-scheme: dark)");
+
+export function colour(name) {
+  return getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
+}
+
+function parts(text) {
+  const n = parseInt(text.slice(1), 16);
+  return [(n >> 16) & 255, (n >> 8) & 255, n & 255];
+}
+
+export function between(one, other, share) {
+  const [a, b] = [parts(one), parts(other)];
+  return `rgb(${a.map((value, i) => Math.round(value + (b[i] - value) * share)).join(" ")})`;
+}
+
+// Draws again when its element changes its size, or the page its theme.
+export function useDrawing(ref, draw) {
+  const latest = useRef(draw);
+  latest.current = draw;
+  useEffect(() => {
+    const again = () => latest.current();
+    const observer = new ResizeObserver(again);
+    observer.observe(ref.current);
+    dark.addEventListener("change", again);
+    return () => {
+      observer.disconnect();
+      dark.removeEventListener("change", again);
+    };
+  }, []);
+  useEffect(() => latest.current());
+}
+
+function sized(canvas) {
+  const scale = devicePixelRatio || 1;
+  const { width, height } = canvas.getBoundingClientRect();
+  canvas.width = Math.max(1, Math.round(width * scale));
+  canvas.height = Math.max(1, Math.round(height * scale));
+  const context = canvas.getContext("2d");
+  context.setTransform(scale, 0, 0, scale, 0, 0);
+  return { context, width, height };
+}
+
+// A route for drawing: points to scale where x and y are known, else along a line.
+export class Route {
+  constructor({ route_position_m: at_m, x_m, y_m, chance, closed }) {
+    this.isPlane = Boolean(x_m && y_m && x_m.some((x) => x !== null));
+    const step = Math.max(1, Math.ceil(at_m.length / MOST_POINTS));
+    this.points = [];
+    for (let i = 0; i < at_m.length; i = i === at_m.length - 1 ? i + 1 : Math.min(i + step, at_m.length - 1)) {
+      if (this.isPlane && (x_m[i] === null || y_m[i] === null)) continue;
+      let low = 1;
+      if (chance) for (let j = i; j < Math.min(i + step, at_m.length); j += 1) low = Math.min(low, chance[j]);
+      this.points.push({ at_m: at_m[i], x: this.isPlane ? x_m[i] : at_m[i], y: this.isPlane ? y_m[i] : 0, chance: chance ? low : null });
+    }
+    this.closed = Boolean(closed);
+    this.start_m = at_m[0];
+    this.end_m = at_m[at_m.length - 1];
+    const [xs, ys] = ["x", "y"].map((axis) => this.points.map((point) => point[axis]));
+    this.box = [Math.min(...xs), Math.min(...ys), Math.max(...xs), Math.max(...ys)];
+  }
+
+  // From metres to pixels of a picture of that size, one scale both ways.
+  fitted(width, height, margin = 18) {
+    const [left, bottom, right, top] = this.box;
+    const scale = Math.min((width - 2 * margin) / Math.max(right - left, 1e-6), (height - 2 * margin) / Math.max(top - bottom, 1e-6));
+    const x0 = (width - scale * (right - left)) / 2;
+    const y0 = (height - scale * (top - bottom)) / 2;
+    return { scale, place: ({ x, y }) => [x0 + scale * (x - left), height - y0 - scale * (y - bottom)] };
+  }
+
+  // The index of the last point before a position, by halves.
+  before(at_m) {
+    let [low, high] = [0, this.points.length - 1];
+    while (high - low > 1) {
+      const middle = (low + high) >> 1;
+      if (this.points[middle].at_m <= at_m) low = middle;
+      else high = middle;
+    }
+    return low;
+  }
+
+  at(at_m) {
+    const i = this.before(at_m);
+    const [one, other] = [this.points[i], this.points[Math.min(i + 1, this.points.length - 1)]];
+    const share = other.at_m > one.at_m ? Math.min(1, Math.max(0, (at_m - one.at_m) / (other.at_m - one.at_m))) : 0;
+    return { x: one.x + (other.x - one.x) * share, y: one.y + (other.y - one.y) * share };
+  }
+
+  // A robot's place after a move: round a loop, and never past an end.
+  moved(at_m, action_m) {
+    const length_m = this.end_m - this.start_m;
+    if (!this.closed || length_m <= 0) return Math.min(this.end_m, Math.max(this.start_m, at_m + action_m));
+    return this.start_m + ((((at_m + action_m - this.start_m) % length_m) + length_m) % length_m);
+  }
+}
+
+function drawRoute(canvas, route) {
+  const { context, width, height } = sized(canvas);
+  const { place, scale } = route.fitted(width, height);
+  const [line, low, high] = [colour("line"), colour("low"), colour("high")];
+  context.lineCap = "round";
+  for (let i = 0; i + 1 < route.points.length; i += 1) {
+    const [one, other] = [route.points[i], route.points[i + 1]];
+    context.beginPath();
+    context.moveTo(...place(one));
+    context.lineTo(...place(other));
+    const chance = one.chance;
+    context.strokeStyle = chance === null ? line : between(low, high, chance);
+    context.lineWidth = chance === null ? 4 : 3 + 5 * (1 - chance); // not by colour alone
+    context.stroke();
+  }
+  context.fillStyle = context.strokeStyle = colour("quiet");
+  context.font = "12px system-ui, sans-serif";
+  for (const [name, point] of [["start", route.points[0]], ["end", route.points[route.points.length - 1]]]) {
+    const [x, y] = place(point);
+    context.fillText(name, Math.min(Math.max(x - 12, 2), width - 30), y + (y > height - 30 ? -12 : 22));
+  }
+  if (!route.isPlane) return;
+  const metres = [1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000].find((m) => m * scale >= 60) ?? 10000;
+  context.lineWidth = 2;
+  context.beginPath();
+  context.moveTo(14, height - 14);
+  context.lineTo(14 + metres * scale, height - 14);
+  context.stroke();
+  context.fillText(metres >= 1000 ? `${metres / 1000} km` : `${metres} m`, 14, height - 20);
+}
+
+// Paths of the histogram's bins along the route; made once a route and size, drawn ten times a second.
+function binPaths(route, place, edges_m) {
+  const paths = [];
+  for (let bin = 0; bin + 1 < edges_m.length; bin += 1) {
+    const [from_m, to_m] = [edges_m[bin], edges_m[bin + 1]];
+    const path = new Path2D();
+    path.moveTo(...place(route.at(from_m)));
+    for (let i = route.before(from_m) + 1; i < route.points.length && route.points[i].at_m < to_m; i += 1) path.lineTo(...place(route.points[i]));
+    path.lineTo(...place(route.at(to_m)));
+    paths.push(path);
+  }
+  return paths;
+}
+
+function dot(context, [x, y], radius, fill, ring) {
+  context.beginPath();
+  context.arc(x, y, radius, 0, 2 * Math.PI);
+  context.fillStyle = fill;
+  context.fill();
+  context.lineWidth = 2;
+  context.strokeStyle = ring;
+  context.stroke();
+}
+
+function drawBelief(canvas, route, belief, next, kept) {
+  const { context, width, height } = sized(canvas);
+  if (!belief) return;
+  const { place } = route.fitted(width, height);
+  const { edges_m, mass } = belief.histogram;
+  const of = `${width} ${height} ${edges_m.length} ${edges_m[0]} ${edges_m[edges_m.length - 1]}`;
+  if (kept.of !== of || kept.route !== route) Object.assign(kept, { of, route, paths: binPaths(route, place, edges_m) });
+  const most = Math.max(...mass);
+  context.lineCap = "butt";
+  context.strokeStyle = colour("blue");
+  kept.paths.forEach((path, bin) => {
+    const share = mass[bin] / most;
+    if (share < 0.002) return;
+    context.globalAlpha = 0.15 + 0.85 * Math.sqrt(share);
+    context.lineWidth = 5 + 9 * Math.sqrt(share);
+    context.stroke(path);
+  });
+  context.globalAlpha = 1;
+  const card = colour("card");
+  if (next) dot(context, place(route.at(route.moved(belief.mode_m, next.action_m))), 5, colour("mark"), card);
+  dot(context, place(route.at(belief.mode_m)), 7, colour("blue"), card);
+}
+
+export function RouteMap({ route, belief, next, label }) {
+  const [below, above, kept] = [useRef(), useRef(), useRef({})];
+  const drawn = useRef();
+  useDrawing(below, () => {
+    const now = `${route.start_m} ${below.current.getBoundingClientRect().width} ${below.current.getBoundingClientRect().height} ${dark.matches}`;
+    if (drawn.current?.now !== now || drawn.current.route !== route) drawRoute(below.current, route);
+    drawn.current = { now, route };
+    drawBelief(above.current, route, belief, next, kept.current);
+  });
+  return html`<div class=${route.isPlane ? "map" : "map straight"} role="img" aria-label=${label}>
+    <canvas ref=${below}></canvas><canvas ref=${above}></canvas>
+  </div>`;
+}
+
+// A chart of the library, in the page's colours, as wide as its place.
+export function Plot({ series, values, label, axes = [{}, {}], scales = { x: { time: false } }, height = 150, bands = [], hooks = {} }) {
+  const [ref, chart] = [useRef(), useRef()];
+  const theme = useRef();
+  useDrawing(ref, () => {
+    const width = Math.max(200, Math.floor(ref.current.getBoundingClientRect().width));
+    const [ink, line] = [colour("quiet"), colour("line")];
+    const look = `${ink} ${series.length}`;
+    if (chart.current && theme.current !== look) chart.current = chart.current.destroy();
+    if (!chart.current) {
+      theme.current = look;
+      const axis = { stroke: ink, grid: { stroke: line, width: 1 }, ticks: { stroke: line, width: 1 }, font: "12px system-ui, sans-serif", size: 44 };
+      chart.current = new globalThis.uPlot({
+        width, height, scales, bands, hooks,
+        cursor: { y: false, drag: { x: false, y: false } },
+        axes: axes.map((own, i) => ({ ...axis, ...(i ? {} : { size: 34 }), ...own })),
+        series: [{}, ...series.map((own) => ({ width: 2, points: { show: false }, ...own, stroke: colour(own.stroke), fill: own.fill ? `${colour(own.fill)}55` : undefined }))],
+      }, values, ref.current);
+    } else {
+      if (chart.current.width !== width) chart.current.setSize({ width, height });
+      chart.current.setData(values);
+    }
+  });
+  useEffect(() => () => chart.current?.destroy(), []);
+  return html`<div class="plot" ref=${ref} role="img" aria-label=${label}></div>`;
+}
+
+// The belief along the route: its mass a bin, what the smallest credible set covers, where each move would lead.
+export function Strip({ belief, next, route, label }) {
+  const { edges_m, mass } = belief.histogram;
+  const shown = useRef();
+  shown.current = { belief, next };
+  const drawn = (plot) => {
+    const { belief: now, next: move } = shown.current;
+    const { ctx, bbox } = plot;
+    const scale = devicePixelRatio || 1;
+    const x = (at_m) => plot.valToPos(at_m, "x", true);
+    ctx.save();
+    ctx.fillStyle = colour("soft");
+    for (const [from_m, to_m] of now.credible_95_sets_m) {
+      const pieces = from_m <= to_m ? [[from_m, to_m]] : [[edges_m[0], to_m], [from_m, edges_m[edges_m.length - 1]]];
+      for (const [one, other] of pieces) ctx.fillRect(x(one) - scale, bbox.top, Math.max(x(other) - x(one), 0) + 2 * scale, bbox.height);
+    }
+    ctx.fillStyle = colour("mark");
+    for (const { action_m } of move?.actions ?? []) {
+      const at = x(route.moved(now.mode_m, action_m));
+      const isChosen = action_m === move.action_m;
+      ctx.fillRect(at - scale, bbox.top, (isChosen ? 3 : 1) * scale, isChosen ? bbox.height : 8 * scale);
+    }
+    ctx.restore();
+  };
+  const middles = edges_m.slice(1).map((edge, i) => (edge + edges_m[i]) / 2);
+  return html`<${Plot} label=${label} values=${[middles, mass.map((share) => 100 * share)]}
+    series=${[{ stroke: "blue", fill: "blue", paths: globalThis.uPlot.paths.stepped({ align: 0 }) }]} axes=${[{ label: "metres along the route", labelSize: 20, size: 36 }, { values: (_, ticks) => ticks.map((tick) => `${tick} %`) }]}
+    scales=${{ x: { time: false, range: [edges_m[0], edges_m[edges_m.length - 1]] }, y: { range: (_, __, most) => [0, Math.max(most, 0.01) * 1.08] } }}
+    hooks=${{ drawAxes: [drawn] }} />`;
+}
+
+// How the belief came about: a row an event, newest below; a click goes there.
+export function History({ events, current, onPick, label }) {
+  const ref = useRef();
+  useDrawing(ref, () => {
+    const canvas = ref.current;
+    const n_bins = Math.max(1, ...events.map(({ answer }) => answer.belief.histogram.mass.length));
+    canvas.width = n_bins;
+    canvas.height = Math.max(1, events.length);
+    const context = canvas.getContext("2d");
+    const image = context.createImageData(canvas.width, canvas.height);
+    const [paper, ink, mark] = [parts(colour("soft")), parts(colour("blue")), parts(colour("mark"))];
+    events.forEach(({ answer }, row) => {
+      const { mass } = answer.belief.histogram;
+      const most = Math.max(...mass);
+      mass.forEach((value, bin) => {
+        const share = Math.sqrt(value / most);
+        const at = 4 * (row * n_bins + bin);
+        const to = row === current && share < 0.05 ? mark : ink;
+        const weight = row === current ? Math.max(share, 0.25) : share;
+        for (let part = 0; part < 3; part += 1) image.data[at + part] = paper[part] + (to[part] - paper[part]) * weight;
+        image.data[at + 3] = 255;
+      });
+    });
+    context.putImageData(image, 0, 0);
+  });
+  const pick = (event) => {
+    const box = ref.current.getBoundingClientRect();
+    onPick(Math.min(events.length - 1, Math.max(0, Math.floor(((event.clientY - box.top) / box.height) * events.length))));
+  };
+  return html`<div class="history"><canvas ref=${ref} role="img" aria-label=${label} onClick=${pick}></canvas></div>`;
+}

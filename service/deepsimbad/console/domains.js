@@ -1,0 +1,150 @@
+// What is mapped: all domains; one with its route, how surely it is recognised, and its map versions.
+
+import { html, useEffect, useMemo, useState } from "./preact.js";
+import { json } from "./http.js";
+import { Route, RouteMap } from "./charts.js";
+import { Fault, Loading, Thumbnail, bytes, confirmed, metres, percent, useAnswer, when } from "./parts.js";
+
+export function Domains() {
+  const { answer, problem } = useAnswer("v1/domains", 5000);
+  return html`<div class="head"><h1>Domains</h1></div>
+    <${Fault} problem=${problem} />
+    ${!answer && !problem && html`<${Loading} what="domains" />`}
+    ${answer?.domains.length === 0 && html`<div class="card empty"><h2>Nothing is mapped yet</h2>
+      <p>Map a recorded drive, a folder of images in order, and it stands here:</p>
+      <pre>deepsimbad map my-route --training path/to/images</pre></div>`}
+    <div class="grid">${answer?.domains.map((domain) => html`<${Card} domain=${domain} />`)}</div>`;
+}
+
+function Card({ domain }) {
+  const state = domain.map_problem ?? domain.evaluator_problem;
+  return html`<a class="card" href=${`#domains/${domain.name}`}>
+    <header class="row"><h2>${domain.name}</h2>
+      ${state ? html`<span class="badge bad">${state}</span>` : domain.map_version === null ? html`<span class="badge so">no map yet</span>` : html`<span class="badge good">map ${domain.map_version}</span>`}</header>
+    <dl class="figures">
+      <div><dt>Route</dt><dd>${metres(domain.route_length_m, 0)}</dd></div>
+      <div><dt>Map images</dt><dd>${domain.n_map_images?.toLocaleString() ?? "–"}</dd></div>
+      <div><dt>Index</dt><dd>${domain.index_bits_per_map_image?.toFixed(1) ?? "–"} <small>bit/image</small></dd></div>
+    </dl>
+  </a>`;
+}
+
+// A domain with its route; what both sessions and trials draw on.
+export function useRoute(name, version) {
+  const domain = useAnswer(`v1/domains/${name}`);
+  const coverage = useAnswer(domain.answer?.map_version ? `v1/domains/${name}/coverage${version ? `?map_version=${version}` : ""}` : null);
+  const route = useMemo(() => coverage.answer && new Route({ ...coverage.answer, closed: domain.answer?.closed }), [coverage.answer]);
+  return { domain, coverage, route };
+}
+
+export function Domain({ names: [name] }) {
+  const { domain, coverage, route } = useRoute(name);
+  const maps = useAnswer(`v1/admin/domains/${name}/maps`, 5000);
+  const { answer } = domain;
+  const active = maps.answer?.maps.find((map) => map.state === "active")?.version;
+  useEffect(() => {
+    if (answer && active !== undefined && active !== answer.map_version) domain.again(); // somebody else switched
+  }, [active]);
+  return html`<div class="head"><h1>${name}</h1>
+      ${answer && html`<span class="quiet">${answer.evaluator.extractor ?? answer.evaluator.kind}${answer.relevance ? `, ${answer.relevance}` : ""}${answer.closed ? ", closed route" : ""}</span>`}
+      <span class="row"><a class="button" href=${`#try/${name}`}>Try an image</a><a class="button" href=${`#domains/${name}/upload`}>Upload a traverse</a></span></div>
+    <${Fault} problem=${domain.problem} /><${Fault} problem=${coverage.problem} />
+    ${answer?.map_version === null && html`<div class="card empty"><h2>No map yet</h2><p>Upload a traverse, then remap: the map made of it is activated when it is whole.</p></div>`}
+    <div class="columns">
+      <div class="stack">
+        ${answer?.map_version && !route && !coverage.problem && html`<${Loading} what="the route" />`}
+        ${route && html`<${Covered} name=${name} route=${route} coverage=${coverage.answer} domain=${answer} />`}
+      </div>
+      <div class="stack">
+        ${answer?.map_version && html`<${Active} domain=${answer} thumbnail_bytes=${coverage.answer?.thumbnail_bytes} />`}
+        <${Worst} name=${name} coverage=${coverage.answer} />
+      </div>
+    </div>
+    <${Versions} name=${name} maps=${maps} onSwitch=${() => { maps.again(); domain.again(); coverage.again(); }} />`;
+}
+
+function Covered({ name, route, coverage, domain }) {
+  if (!coverage.chance) return html`<section class="card"><h2>The route</h2><${RouteMap} route=${route} label=${`The route of ${name}`} />
+    <p class="quiet">How surely its places are recognised is not known of this map: a new one will tell.</p></section>`;
+  const mean = coverage.chance.reduce((sum, chance) => sum + chance, 0) / coverage.chance.length;
+  const label = `The route of ${name}, ${metres(domain.route_length_m, 0)} long; a single view is placed rightly in ${percent(mean)} of places.`;
+  return html`<section class="card"><header><h2>How surely a place is recognised</h2>
+      <span class="legend"><span>rarely, thick <i class="swatch scale"></i> always, thin</span></span></header>
+    <${RouteMap} route=${route} label=${label} />
+    <p class="quiet">The chance that one view alone is placed within ${coverage.within_m} m: ${percent(mean)} on average.
+    ${coverage.basis === "two_seasons" ? " Learnt from two seasons of this route." : " Guessed from how alike its places are: a second season of the route would tell."}</p>
+  </section>`;
+}
+
+function Active({ domain, thumbnail_bytes }) {
+  return html`<section class="card"><h2>Active map</h2><dl class="figures">
+    <div><dt>Version</dt><dd>${domain.map_version}</dd></div>
+    <div><dt>Route</dt><dd>${metres(domain.route_length_m, 0)}</dd></div>
+    <div><dt>Map images</dt><dd>${domain.n_map_images?.toLocaleString()}</dd></div>
+    <div><dt>Landmarks</dt><dd>${domain.n_landmarks} <small>${domain.list_length} an image</small></dd></div>
+    <div><dt>Index</dt><dd>${domain.index_bits_per_map_image?.toFixed(1)} <small>bit/image</small></dd></div>
+    <div><dt>Pictures kept</dt><dd>${thumbnail_bytes ? bytes(thumbnail_bytes) : "none"}</dd></div>
+    <div><dt>Moves</dt><dd>${domain.actions_m[0]} … ${domain.actions_m[domain.actions_m.length - 1]} <small>m</small></dd></div>
+  </dl></section>`;
+}
+
+function Worst({ name, coverage }) {
+  if (!coverage?.chance) return null;
+  return html`<section class="card"><h2>Worst stretches</h2>
+    ${coverage.stretches.length === 0 && html`<p class="quiet">None stands out.</p>`}
+    <ol class="places">${coverage.stretches.slice(0, 6).map((stretch) => html`<li>
+      <${Thumbnail} domain=${name} version=${coverage.map_version} image=${stretch.worst_map_image} alt="" isKept=${coverage.thumbnail_bytes > 0} />
+      <div><b>${metres(stretch.from_m, 0)} – ${metres(stretch.to_m, 0)}</b><br />${percent(stretch.chance)} placed rightly<br /><span class="quiet">${stretch.worst_frame ?? `map image ${stretch.worst_map_image}`}</span></div>
+    </li>`)}</ol></section>`;
+}
+
+const FIGURES = [
+  ["ANR of its check, %", (metrics) => metrics.check?.anr],
+  ["ANR of the map before, %", (metrics) => metrics.check?.anr_active],
+  ["Index, bit/image", (metrics) => metrics.index_bits_per_map_image],
+];
+
+function Versions({ name, maps, onSwitch }) {
+  const [problem, setProblem] = useState(null);
+  const [isBusy, setBusy] = useState(false);
+  if (maps.problem && !maps.answer) return maps.problem.status === 403 || maps.problem.status === 401 ? html`<p class="quiet">Map versions are shown to keys of the scope admin.</p>` : html`<${Fault} problem=${maps.problem} />`;
+  if (!maps.answer) return null;
+  const list = maps.answer.maps;
+  const active = list.find((map) => map.state === "active")?.version ?? null;
+  const columns = FIGURES.filter(([, figure]) => list.some((map) => typeof figure(map.metrics) === "number"));
+  const activate = async (map) => {
+    const isBack = active !== null && map.version < active;
+    const sure = await confirmed(
+      `${isBack ? "Roll back" : "Switch"} ${name} to map ${map.version}?`,
+      [
+        `New sessions and single views are answered by map ${map.version} of ${when(map.created_at)} at once${active === null ? "" : `, no longer by map ${active}`}.`,
+        "Sessions that run keep the map they began on. The same switch leads back.",
+      ],
+      isBack ? "Roll back" : "Activate",
+    );
+    if (!sure) return;
+    setBusy(true);
+    try {
+      await json(`v1/admin/domains/${name}/active-map`, { method: "PUT", body: { version: map.version, expected: active } });
+      setProblem(null);
+    } catch (fault) {
+      setProblem(fault);
+    }
+    setBusy(false);
+    onSwitch();
+  };
+  return html`<section class="card below"><h2>Map versions</h2>
+    <${Fault} problem=${problem} />
+    ${list.length === 0 ? html`<p class="quiet">None yet.</p>` : html`<div class="wide"><table>
+      <thead><tr><th>Version</th><th>State</th><th>Made</th><th class="n">Images</th><th>Relevance</th>${columns.map(([name]) => html`<th class="n">${name}</th>`)}<th><span class="hidden-text">Switch</span></th></tr></thead>
+      <tbody>${list.map((map) => html`<tr>
+        <td><b>${map.version}</b></td>
+        <td><span class=${`badge ${map.state === "active" ? "good" : "plain"}`}>${map.state}</span></td>
+        <td>${when(map.created_at)}</td>
+        <td class="n">${map.metrics.n_map_images?.toLocaleString() ?? "–"}</td>
+        <td>${map.config.relevance ?? "–"}</td>
+        ${columns.map(([, figure]) => html`<td class="n">${figure(map.metrics)?.toFixed(2) ?? "–"}</td>`)}
+        <td class="n">${map.version !== active && ["sealed", "retired"].includes(map.state) && html`<button class="small" disabled=${isBusy} onClick=${() => activate(map)}>${active !== null && map.version < active ? "Roll back" : "Activate"}</button>`}</td>
+      </tr>`)}</tbody></table></div>`}
+  </section>`;
+}

@@ -1,0 +1,87 @@
+// Work in the background: all jobs; one with its stage, how far it is, and how it ended.
+
+import { html, useEffect, useState } from "./preact.js";
+import { follow, json } from "./http.js";
+import { Fault, Loading, confirmed, percent, span, useAnswer, when } from "./parts.js";
+
+const TONES = { succeeded: "good", failed: "bad", cancelled: "plain", running: "so", queued: "plain" };
+
+export function Jobs() {
+  const { answer, problem } = useAnswer("v1/admin/jobs", 1500);
+  return html`<div class="head"><h1>Jobs</h1></div>
+    <${Fault} problem=${problem} />
+    ${!answer && !problem && html`<${Loading} what="jobs" />`}
+    ${answer?.jobs.length === 0 && html`<div class="card empty"><h2>No job yet</h2><p>A remap makes a map of an uploaded traverse: choose a <a href="#">domain</a>, and upload one.</p></div>`}
+    ${answer?.jobs.length > 0 && html`<div class="card wide"><table>
+      <thead><tr><th>Job</th><th>Domain</th><th>State</th><th>Progress</th><th>Made</th></tr></thead>
+      <tbody>${answer.jobs.map((job) => html`<tr><td class="name"><a href=${`#jobs/${job.job_id}`}>${job.kind} ${job.job_id.slice(0, 8)}</a></td>
+        <td><a href=${`#domains/${job.domain}`}>${job.domain}</a></td><td><span class=${`badge ${TONES[job.state]}`}>${job.state}</span></td>
+        <td>${job.state === "running" ? html`<progress max="1" value=${job.progress} aria-label="Progress"></progress> <small>${job.stage}</small>` : job.result ? `map ${job.result.map_version}` : job.error?.code ?? ""}</td>
+        <td>${when(job.created_at)}</td></tr>`)}</tbody></table></div>`}`;
+}
+
+export function Job({ names: [id] }) {
+  const [job, setJob] = useState(null);
+  const [log, setLog] = useState([]);
+  const [state, setState] = useState("connecting");
+  const [problem, setProblem] = useState(null);
+  useEffect(() => {
+    const stop = new AbortController();
+    follow(`v1/admin/jobs/${id}/events`, {
+      signal: stop.signal,
+      onEvent: (name, now) => {
+        setJob(now);
+        setLog((lines) => {
+          const line = now.stage ? `${now.stage}` : now.state;
+          return lines.length && lines[lines.length - 1].line === line ? lines : [...lines, { line, at: new Date() }];
+        });
+      },
+      onState: (now, fault) => {
+        setState(now);
+        setProblem(fault ?? null);
+      },
+    });
+    return () => stop.abort();
+  }, [id]);
+  const cancel = async () => {
+    if (!(await confirmed("Cancel this job?", ["What it has made so far is discarded; the active map stays as it is."], "Cancel the job"))) return;
+    try {
+      await json(`v1/admin/jobs/${id}`, { method: "DELETE" });
+    } catch (fault) {
+      setProblem(fault);
+    }
+  };
+  const isOver = job && !["queued", "running"].includes(job.state);
+  return html`<div class="head"><h1>${job?.kind ?? "Job"}</h1>${job && html`<a href=${`#domains/${job.domain}`}>${job.domain}</a>`}<code>${id}</code>
+      ${job && html`<span class=${`badge ${TONES[job.state]}`} role="status">${job.state}</span>`}</div>
+    <${Fault} problem=${problem} />
+    ${state === "lost" && !isOver && html`<p class="notice so" role="status">The connection was lost; the job goes on. Trying again …</p>`}
+    ${!job && !problem && html`<${Loading} what="the job" />`}
+    ${job && html`<div class="columns"><div class="stack">
+      <section class="card"><h2>${isOver ? "Done" : job.stage?.replaceAll("_", " ") ?? (job.state === "queued" ? "Waiting for its turn" : "Starting")}</h2>
+        <progress max="1" value=${job.progress} aria-label="Progress"></progress>
+        <p class="number">${percent(job.progress)}${!isOver && job.eta_s !== null ? `, about ${span(job.eta_s)} left` : ""}</p>
+        ${job.error && html`<p class="notice bad"><b>${job.error.detail}</b> <code>${job.error.code}</code></p>`}
+        ${job.result && html`<p>Map version ${job.result.map_version} ${job.result.active ? "answers now." : "is sealed, and not active."} <a href=${`#domains/${job.domain}`}>See it</a></p>`}
+        ${!isOver && html`<button onClick=${cancel}>Cancel</button>`}</section>
+      ${job.result && html`<section class="card"><h2>What was measured</h2><${Measured} values=${job.result.metrics} /></section>`}
+    </div><div class="stack">
+      <section class="card"><h2>Log</h2><ol>${log.map(({ line, at }) => html`<li><span class="quiet number">${at.toLocaleTimeString()}</span> ${line}</li>`)}</ol></section>
+      <section class="card"><h2>Asked for</h2><${Measured} values=${job.config} /></section>
+    </div></div>`}`;
+}
+
+// Named values, those of one part after another; curves and the like are left to the call.
+function rows(values, prefix = "") {
+  return Object.entries(values).flatMap(([name, value]) => {
+    const full = `${prefix}${name.replaceAll("_", " ")}`;
+    if (Array.isArray(value)) return value.length && value.every((each) => typeof each === "string") ? [[full, value.join("; ")]] : [];
+    if (value !== null && typeof value === "object") return rows(value, `${full}, `);
+    return value === null ? [] : [[full, value]];
+  });
+}
+
+function Measured({ values }) {
+  const text = (value) => (typeof value === "number" && !Number.isInteger(value) ? value.toPrecision(4) : typeof value === "boolean" ? (value ? "yes" : "no") : String(value));
+  return html`<div class="wide"><table><tbody>${rows(values).map(([name, value]) => html`<tr><th scope="row">${name}</th><td class="name">${text(value)}</td></tr>`)}</tbody></table></div>`;
+}

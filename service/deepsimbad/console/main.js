@@ -1,0 +1,89 @@
+// The frame of all pages: where somebody is, the key, and which page the address names.
+
+import { html, render, useEffect, useRef, useState } from "./preact.js";
+import { key } from "./http.js";
+import { Domain, Domains } from "./domains.js";
+import { Job, Jobs } from "./jobs.js";
+import { Session, Sessions } from "./sessions.js";
+import { Trial } from "./trial.js";
+import { Upload } from "./upload.js";
+
+const PAGES = [
+  [/^$/, Domains],
+  [/^domains\/([^/]+)$/, Domain],
+  [/^domains\/([^/]+)\/upload$/, Upload],
+  [/^sessions$/, Sessions],
+  [/^sessions\/([^/]+)$/, Session],
+  [/^try(?:\/([^/]+))?$/, Trial],
+  [/^jobs$/, Jobs],
+  [/^jobs\/([^/]+)$/, Job],
+  [/^report$/, Report],
+];
+const LINKS = [["", "Domains"], ["sessions", "Sessions"], ["try", "Try it"], ["jobs", "Jobs"], ["report", "Reports"]];
+
+function Report() {
+  return html`<div class="head"><h1>Reports</h1></div>
+    <p>A page that <code>deepsimbad try</code>, <code>deepsimbad experiment paper</code> or <code>deepsimbad-client replay</code> wrote.
+    It is shown in a frame that reaches neither this page, nor your key, nor any host; it is not uploaded.</p>
+    <iframe src="console/report.html" title="The report" sandbox="allow-scripts"></iframe>`;
+}
+
+function Missing() {
+  return html`<div class="empty"><h1>There is no such page</h1><p><a href="#">All domains</a></p></div>`;
+}
+
+function KeyDialog({ onClose }) {
+  const ref = useRef();
+  useEffect(() => ref.current.showModal(), []);
+  const keep = (event) => {
+    event.preventDefault();
+    key.set(event.target.elements.key.value.trim());
+    onClose();
+  };
+  return html`<dialog ref=${ref} onClose=${onClose} aria-labelledby="key-title">
+    <h2 id="key-title">API key</h2>
+    <p>Made by <code>deepsimbad keys create --scope admin</code>. It stays in this tab, and is forgotten with it.</p>
+    <form onSubmit=${keep}>
+      <label>Key <input type="password" name="key" autocomplete="off" value=${key.get()} autofocus /></label>
+      <div class="row"><button type="button" onClick=${() => ref.current.close()}>Cancel</button><button class="first">Use it</button></div>
+    </form>
+  </dialog>`;
+}
+
+function Frame() {
+  const here = () => location.hash.replace(/^#\/?/, "").replace(/\/$/, "");
+  const [at, setAt] = useState(here());
+  const [isAsking, setAsking] = useState(false);
+  const [generation, setGeneration] = useState(0);
+  const main = useRef();
+  useEffect(() => {
+    const moved = () => {
+      setAt(here());
+      scrollTo(0, 0);
+      main.current?.focus({ preventScroll: true });
+    };
+    addEventListener("hashchange", moved);
+    return () => removeEventListener("hashchange", moved);
+  }, []);
+  const path = at.split("?")[0];
+  const [pattern, Page] = PAGES.find(([each]) => each.test(path)) ?? [/.*/, Missing];
+  const names = (pattern.exec(path) ?? []).slice(1).map((name) => name && decodeURIComponent(name));
+  useEffect(() => {
+    document.title = path ? `${path.split("/").map(decodeURIComponent).join(" · ")} – Deep SIMBAD` : "Deep SIMBAD";
+  }, [path]);
+  const section = path.startsWith("domains/") ? "" : path.split("/")[0];
+  const closed = () => {
+    setAsking(false);
+    setGeneration((n) => n + 1); // everything is asked anew, with the key there is now
+  };
+  return html`<a class="skip" href="#main" onClick=${(event) => { event.preventDefault(); main.current.focus(); }}>Skip to the content</a>
+    <header class="bar">
+      <a class="name" href="#"><img src="console/icon.svg" alt="" />Deep SIMBAD</a>
+      <nav aria-label="Pages">${LINKS.map(([link, text]) => html`<a href=${`#${link}`} aria-current=${section === link ? "page" : undefined}>${text}</a>`)}</nav>
+      <button class="small" onClick=${() => setAsking(true)}>${key.get() ? "Key: in use" : "Enter a key"}</button>
+    </header>
+    <main id="main" ref=${main} tabindex="-1"><${Page} key=${`${path} ${generation}`} names=${names} /></main>
+    ${isAsking && html`<${KeyDialog} onClose=${closed} />`}`;
+}
+
+render(html`<${Frame} />`, document.body);

@@ -1,0 +1,109 @@
+// What several pages show alike.
+
+import { html, useEffect, useState } from "./preact.js";
+import { ask, json } from "./http.js";
+
+export const metres = (value, digits = 1) => (value === null || value === undefined ? "–" : `${value.toFixed(Math.abs(value) >= 100 ? 0 : digits)} m`);
+export const percent = (share, digits = 0) => `${(100 * share).toFixed(digits)} %`;
+export const bytes = (n) => (n < 1e3 ? `${n} B` : n < 1e6 ? `${(n / 1e3).toFixed(1)} kB` : n < 1e9 ? `${(n / 1e6).toFixed(1)} MB` : `${(n / 1e9).toFixed(1)} GB`);
+export const when = (text) => new Date(text).toLocaleString([], { dateStyle: "medium", timeStyle: "short" });
+
+export function span(seconds) {
+  if (seconds === null || seconds === undefined) return "unknown";
+  if (seconds < 90) return `${Math.round(seconds)} s`;
+  return seconds < 5400 ? `${Math.round(seconds / 60)} min` : `${(seconds / 3600).toFixed(1)} h`;
+}
+
+// What a call answers, asked again when `every_ms` has passed or `again` is called; the last answer stays on a fault.
+export function useAnswer(path, every_ms = 0) {
+  const [state, setState] = useState({ answer: null, problem: null, path: null });
+  const [count, setCount] = useState(0);
+  useEffect(() => {
+    if (!path) return undefined;
+    const stop = new AbortController();
+    let timer;
+    const look = async () => {
+      try {
+        const answer = await json(path, { signal: stop.signal });
+        setState({ answer, problem: null, path });
+      } catch (problem) {
+        if (problem.name === "AbortError") return;
+        setState((before) => ({ answer: before.path === path ? before.answer : null, problem, path }));
+      }
+      if (every_ms) timer = setTimeout(look, document.hidden ? 5 * every_ms : every_ms);
+    };
+    look();
+    return () => {
+      stop.abort();
+      clearTimeout(timer);
+    };
+  }, [path, every_ms, count]);
+  const isOf = state.path === path;
+  return { answer: isOf ? state.answer : null, problem: isOf ? state.problem : null, again: () => setCount((n) => n + 1) };
+}
+
+const ADVICE = {
+  no_connection: "It is asked again in a moment.",
+  unauthorized: "This service asks for a key: enter one above.",
+  forbidden: "The key does not open this: it takes one of the scope admin.",
+  no_active_map: "Upload a traverse and remap, or activate a map version.",
+};
+
+export function Fault({ problem }) {
+  if (!problem) return null;
+  return html`<div class="notice bad" role="alert"><b>${problem.message}</b>${" "}
+    <span class="quiet">${ADVICE[problem.code] ?? ""} ${problem.code ? html`<code>${problem.code}</code>` : ""}</span></div>`;
+}
+
+export function Loading({ what }) {
+  return html`<p class="quiet" role="status">Loading ${what} …</p>`;
+}
+
+// A question before something is done; what it names is what changes.
+export function confirmed(title, sentences, button) {
+  const dialog = document.createElement("dialog");
+  const heading = Object.assign(document.createElement("h2"), { textContent: title });
+  const texts = sentences.map((text) => Object.assign(document.createElement("p"), { textContent: text }));
+  const row = Object.assign(document.createElement("div"), { className: "row" });
+  const no = Object.assign(document.createElement("button"), { textContent: "Cancel" });
+  const yes = Object.assign(document.createElement("button"), { textContent: button, className: "first" });
+  row.append(no, yes);
+  dialog.append(heading, ...texts, row);
+  dialog.setAttribute("aria-label", title);
+  document.body.append(dialog);
+  return new Promise((answer) => {
+    yes.onclick = () => dialog.close("yes");
+    no.onclick = () => dialog.close();
+    dialog.onclose = () => {
+      dialog.remove();
+      answer(dialog.returnValue === "yes");
+    };
+    dialog.showModal();
+  });
+}
+
+// Map images' thumbnails, asked for once each, the few last ones kept.
+const pictures = new Map();
+function picture(path) {
+  if (!pictures.has(path)) {
+    const uri = ask(path, { accept: "image/jpeg" }).then(async (answer) => URL.createObjectURL(await answer.blob()), () => null);
+    pictures.set(path, uri);
+    if (pictures.size > 400) pictures.delete(pictures.keys().next().value);
+  }
+  return pictures.get(path);
+}
+
+export function Thumbnail({ domain, version, image, alt, isKept }) {
+  const path = isKept && `v1/domains/${domain}/map-images/${image}/thumbnail?map_version=${version}`;
+  const [uri, setUri] = useState(undefined);
+  useEffect(() => {
+    if (!path) return undefined;
+    let isOver = false;
+    picture(path).then((found) => isOver || setUri(found));
+    return () => {
+      isOver = true;
+    };
+  }, [path]);
+  if (!uri) return html`<p class="gone">${path && uri === undefined ? "" : "no picture kept"}</p>`;
+  return html`<img src=${uri} alt=${alt} loading="lazy" />`;
+}

@@ -1,0 +1,140 @@
+// Robots that are driving: all of them; one with its belief as it moves, and every step that led there.
+
+import { html, useEffect, useMemo, useRef, useState } from "./preact.js";
+import { ask, follow } from "./http.js";
+import { History, Plot } from "./charts.js";
+import { useRoute } from "./domains.js";
+import { Believed, Figures, NextMove, Places } from "./answer.js";
+import { Fault, Loading, span, useAnswer, when } from "./parts.js";
+
+const MOST_EVENTS = 2000; // kept of a long session, the newest
+const FRAME_MS = 80; // at most so often is the page drawn anew
+
+export function Sessions() {
+  const { answer, problem } = useAnswer("v1/admin/sessions", 2000);
+  const open = (event) => {
+    event.preventDefault();
+    location.hash = `sessions/${encodeURIComponent(event.target.elements.id.value.trim())}`;
+  };
+  return html`<div class="head"><h1>Sessions</h1></div>
+    ${problem?.status === 403 || problem?.status === 401 ? html`<p class="quiet">All sessions are shown to keys of the scope admin; yours opens its own, by id.</p>` : html`<${Fault} problem=${problem} />`}
+    <form class="row below" onSubmit=${open}><label>Session id <input type="text" name="id" required /></label><button>Open</button></form>
+    ${answer?.sessions.length === 0 && html`<div class="card empty below"><h2>No robot is driving</h2>
+      <p>A session begins when a robot, or a replay, asks for one:</p><pre>deepsimbad-client replay path/to/images --domain my-route</pre></div>`}
+    ${answer?.sessions.length > 0 && html`<div class="card below wide"><table>
+      <thead><tr><th>Session</th><th>Domain</th><th class="n">Map</th><th class="n">Views</th><th>Begun</th><th>Ends unless it moves</th></tr></thead>
+      <tbody>${answer.sessions.map((session) => html`<tr>
+        <td class="name"><a href=${`#sessions/${session.session_id}`}>${session.session_id}</a></td><td>${session.domain}</td><td class="n">${session.map_version}</td>
+        <td class="n">${session.n_observations}</td><td>${when(session.created_at)}</td><td>in ${span((new Date(session.expires_at) - Date.now()) / 1000)}</td></tr>`)}</tbody></table></div>`}`;
+}
+
+const WORDS = {
+  connecting: ["plain", "connecting"], connected: ["good", "live"], lost: ["so", "connection lost, trying again"], ended: ["plain", "the session has ended"], refused: ["bad", "refused"],
+};
+
+export function Session({ names: [id] }) {
+  const events = useRef([]);
+  const [, setDrawn] = useState(0);
+  const [state, setState] = useState("connecting");
+  const [problem, setProblem] = useState(null);
+  const [chosen, setChosen] = useState(null); // an event's index; null: the newest
+  useEffect(() => {
+    const stop = new AbortController();
+    let timer = 0;
+    const drawSoon = () => {
+      timer ||= setTimeout(() => {
+        timer = 0;
+        setDrawn((n) => n + 1);
+      }, FRAME_MS);
+    };
+    follow(`v1/sessions/${encodeURIComponent(id)}/events`, {
+      signal: stop.signal,
+      after: 0,
+      onEvent: (name, answer, number) => {
+        if (name === "done") return;
+        events.current.push({ number, name, answer });
+        if (events.current.length > MOST_EVENTS) events.current.shift();
+        drawSoon();
+      },
+      onState: (now, fault) => {
+        setState(now);
+        setProblem(fault ?? null);
+      },
+    });
+    return () => {
+      stop.abort();
+      clearTimeout(timer);
+    };
+  }, [id]);
+  const all = events.current;
+  const at = chosen === null ? all.length - 1 : Math.min(chosen, all.length - 1);
+  const event = all[at];
+  const [tone, word] = WORDS[state];
+  return html`<div class="head"><h1>Session</h1><code>${id}</code>
+      ${event && html`<span>on <a href=${`#domains/${event.answer.domain}`}>${event.answer.domain}</a>, map ${event.answer.map_version}</span>`}
+      <span class=${`badge ${tone}`} role="status">${word}</span></div>
+    <${Fault} problem=${problem} />
+    ${!event && !problem && (state === "ended" ? html`<p class="quiet">It ended before any view.</p>` : html`<p class="quiet" role="status">Waiting for its first view …</p>`)}
+    ${event && html`<${Steps} all=${all} at=${at} isLive=${chosen === null} onPick=${setChosen} state=${state} /><${Live} events=${all} at=${at} onPick=${setChosen} />`}`;
+}
+
+function Steps({ all, at, isLive, onPick, state }) {
+  const { number, name, answer } = all[at];
+  const go = (index) => onPick(index >= all.length - 1 ? null : Math.max(0, index));
+  return html`<section class="card" aria-label="Steps"><div class="steps">
+    <span class="row"><button class="small" aria-label="One step back" disabled=${at === 0} onClick=${() => go(at - 1)}>←</button>
+      <button class="small" aria-label="One step on" disabled=${at === all.length - 1} onClick=${() => go(at + 1)}>→</button></span>
+    <input type="range" min="0" max=${Math.max(all.length - 1, 1)} value=${at} aria-label="Step shown" aria-valuetext=${`event ${number}`} onInput=${(event) => go(Number(event.target.value))} />
+    <span class="number">${name === "prior" ? `told its place, event ${number}` : `view ${answer.n_observations}`}</span>
+    <button class="small" disabled=${isLive} onClick=${() => onPick(null)}>${state === "ended" ? "Last step" : "Follow live"}</button>
+  </div></section>`;
+}
+
+function Live({ events, at, onPick }) {
+  const { answer } = events[at];
+  const { route, coverage } = useRoute(answer.domain, answer.map_version);
+  const view = useView(answer.session_id, at === events.length - 1 ? answer.n_observations : null);
+  const steps = useMemo(() => {
+    const numbers = events.map((event) => event.number);
+    return [numbers, events.map((event) => event.answer.belief.entropy_bits), events.map((event) => 100 * event.answer.belief.off_route)];
+  }, [events.length, events[0]?.number]);
+  const title = `After ${answer.n_observations} view${answer.n_observations === 1 ? "" : "s"}`;
+  return html`<div class="columns below"><div class="stack">
+      <${Believed} answer=${answer} route=${route} title=${title} />
+      <section class="card"><header><h2>How it came about</h2><span class="quiet">a row a step, newest below; choose one to go there</span></header>
+        <${History} events=${events} current=${at} onPick=${(index) => onPick(index >= events.length - 1 ? null : index)} label="The belief along the route after every step" /></section>
+      <section class="card"><header><h2>Entropy and the chance to be lost</h2><span class="legend"><span><i class="swatch belief"></i>entropy, bits</span><span><i class="swatch move"></i>off the route, %</span></span></header>
+        <${Plot} label=${`Entropy now ${answer.belief.entropy_bits.toFixed(1)} bits`} values=${steps} height=${140}
+          series=${[{ stroke: "blue", scale: "y" }, { stroke: "mark", scale: "lost", dash: [6, 4] }]}
+          scales=${{ x: { time: false }, y: { range: (_, __, most) => [0, Math.max(1, most) * 1.05] }, lost: { range: [0, 100] } }}
+          axes=${[{ label: "event", labelSize: 20, size: 36 }, {}, { scale: "lost", side: 1, grid: { show: false } }]} /></section>
+    </div><div class="stack">
+      <${Figures} answer=${answer} /><${NextMove} next=${answer.next_best_view} />
+      <${Places} answer=${answer} domain=${answer.domain} version=${answer.map_version} view=${view} isKept=${coverage.answer?.thumbnail_bytes > 0} />
+    </div></div>`;
+}
+
+// What the robot saw last, where the service still holds it.
+function useView(session_id, n_observations) {
+  const [uri, setUri] = useState(null);
+  const isAsking = useRef(false);
+  useEffect(() => {
+    if (n_observations === null) return setUri(null);
+    if (isAsking.current) return undefined;
+    isAsking.current = true;
+    ask(`v1/sessions/${session_id}/view`, { accept: "image/jpeg" })
+      .then(async (answer) => {
+        if (answer.status === 204) return setUri(null);
+        const blob = await answer.blob();
+        return setUri((before) => {
+          if (before) URL.revokeObjectURL(before);
+          return URL.createObjectURL(blob);
+        });
+      }, () => setUri(null))
+      .finally(() => {
+        isAsking.current = false;
+      });
+    return undefined;
+  }, [session_id, n_observations]);
+  return uri;
+}

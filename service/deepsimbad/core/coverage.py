@@ -1,0 +1,94 @@
+"""How surely a place is recognised: the chance that one view there is placed rightly (ours).
+
+A view of a place as it is in the map, were seasons as alike as they usually are, has some of its likelihood there: that
+is known of every map. Where a second season of the route is known, its views are looked up too, and counted.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deepsimbad.core.drive import SecondSeason
+from deepsimbad.core.index.retrieval import relevances
+from deepsimbad.core.map import Map
+from deepsimbad.core.rehearsal import SEASONS_ALIKE
+
+WITHIN_M = 5.0  # of its true place: as `confident` takes a place
+_SMOOTHED_OVER_M = 5.0  # a view is placed rightly or not: neighbours tell of how often
+_PRIOR_VIEWS = 1.0  # weight of the route's mean where few views are near
+_MOST_VIEWS = 5000  # more would only take longer
+_AT_ONCE = 256
+_LEAST_STRETCH_M = 2 * WITHIN_M
+_BELOW_MEAN = 0.75  # a stretch stands out where its chance is less than so much of the route's mean
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """A part of the route where views are placed rightly less often than elsewhere."""
+
+    first: int  # map image
+    last: int
+    worst: int
+    chance: float  # mean over its images
+
+
+def placed_rightly(map_: Map, own: NDArray[np.float32], season: SecondSeason | None) -> NDArray[np.float32]:
+    """[n] the chance, 0 to 1, that a single view from a map image's place is placed within 5 m of it.
+
+    Args:
+        map_: Its lists must not know the second season, and its relevance is `composed`.
+        own: [n, r] dissimilarities of the map images themselves.
+        season: None: there is no other.
+    """
+    images = np.linspace(0, map_.n_images - 1, min(map_.n_images, _MOST_VIEWS)).astype(np.int64)
+    expected = _found(map_, SecondSeason(own, np.stack([images, images], axis=1)), is_counted=False)
+    if season is None:
+        return expected.astype(np.float32)
+    pairs = season.places[:: -(-len(season.places) // _MOST_VIEWS)]
+    counted = _found(map_, SecondSeason(season.dissimilarities, pairs), is_counted=True)
+    return ((expected + counted) / 2).astype(np.float32)  # which of them orders places better no recording decided
+
+
+def _found(map_: Map, season: SecondSeason, *, is_counted: bool) -> NDArray[np.float64]:
+    """[n] share of views placed rightly, or of their likelihood, smoothed along the route."""
+    images, frames = season.places.T
+    found, route = np.empty(images.size), map_.route
+    for first in range(0, images.size, _AT_ONCE):
+        some = slice(first, first + _AT_ONCE)
+        relevance = relevances(map_, season.views(frames[some])).astype(np.float64)
+        at_m = route.position_m[images[some]]
+        if is_counted:
+            best_m = route.position_m[relevance.argmax(axis=1)]
+            found[some] = np.abs(route.offset_m(best_m, at_m)) <= WITHIN_M
+        else:
+            scale = SEASONS_ALIKE * map_.log_likelihood_scale
+            likelihood = np.exp(scale * (relevance - relevance.max(axis=1, keepdims=True)))
+            is_near = np.abs(route.offset_m(route.position_m[np.newaxis], at_m[:, np.newaxis])) <= WITHIN_M
+            found[some] = (likelihood * is_near).sum(axis=1) / likelihood.sum(axis=1)
+    return _smoothed(route.position_m, route.position_m[images], found)
+
+
+def worst_stretches(position_m: NDArray[np.float64], chance: NDArray[np.floating]) -> list[Stretch]:
+    """Where the chance [n], perhaps NaN, is well below the route's mean, worst first."""
+    is_low = chance < _BELOW_MEAN * np.nanmean(chance)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], is_low, [False]]).astype(int)))
+    stretches = []
+    for first, stop in edges.reshape(-1, 2):
+        if position_m[stop - 1] - position_m[first] >= _LEAST_STRETCH_M or stop - first == chance.size:
+            some = chance[first:stop]
+            stretches.append(Stretch(int(first), int(stop - 1), int(first + np.nanargmin(some)), float(some.mean())))
+    return sorted(stretches, key=lambda stretch: stretch.chance)
+
+
+def _smoothed(to_m: NDArray[np.float64], at_m: NDArray[np.float64], found: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[n] local means of found measured at `at_m`, near their overall mean where there are few."""
+    order = np.argsort(at_m, kind="stable")
+    at_m, found, mean = at_m[order], found[order], found.mean()
+    first = np.searchsorted(at_m, to_m - 3 * _SMOOTHED_OVER_M)
+    stop = np.searchsorted(at_m, to_m + 3 * _SMOOTHED_OVER_M, side="right")
+    smoothed = np.empty(to_m.size)
+    for image, (low, high) in enumerate(zip(first, stop, strict=True)):
+        weight = np.exp(-0.5 * np.square((at_m[low:high] - to_m[image]) / _SMOOTHED_OVER_M))
+        smoothed[image] = (weight @ found[low:high] + _PRIOR_VIEWS * mean) / (weight.sum() + _PRIOR_VIEWS)
+    return smoothed

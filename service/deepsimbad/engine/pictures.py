@@ -1,0 +1,69 @@
+"""Pictures for people: of a domain's frames where it keeps them, and of what every robot saw last."""
+
+import threading
+from collections import OrderedDict
+from pathlib import Path
+
+from deepsimbad.core.map import Map
+from deepsimbad.errors import UnknownThumbnailError
+from deepsimbad.evaluators.thumbnails import thumbnail
+from deepsimbad.store.thumbnails import Thumbnails
+
+_MOST_VIEWS = 100  # of sessions, the latest
+_MOST_VIEW_BYTES = 1 << 20  # a larger one is not held
+_VIEW_HEIGHT = 240
+
+
+class Pictures:
+    """All of one service; usable from any thread."""
+
+    def __init__(self, data_dir: Path, max_pixels: int) -> None:
+        self._data_dir = data_dir
+        self._max_pixels = max_pixels
+        self._views: OrderedDict[str, bytes] = OrderedDict()  # by session, as they came
+        self._lock = threading.Lock()
+
+    def keep(self, domain: str, frame_digest: int, body: bytes) -> None:
+        """Keep a small picture of a frame."""
+        small = thumbnail(body, self._max_pixels)
+        if small is None:
+            return
+        with self._open(domain, create=True) as file:
+            file.put(frame_digest, small)
+
+    def of_image(self, snapshot: Map, image: int) -> bytes:
+        """The JPEG of a map image; raises UnknownThumbnailError."""
+        if not 0 <= image < snapshot.n_images or snapshot.frame_digest is None:
+            raise UnknownThumbnailError(f"map {snapshot.version} of domain {snapshot.domain} has no picture {image}")
+        with self._open(snapshot.domain) as file:
+            return file.get(int(snapshot.frame_digest[image]))
+
+    def n_bytes(self, domain: str) -> int:
+        """Of all small pictures of a domain."""
+        try:
+            with self._open(domain) as file:
+                return file.n_bytes
+        except UnknownThumbnailError:
+            return 0
+
+    def saw(self, session_id: str, body: bytes) -> None:
+        """Hold what a robot saw last, in memory alone."""
+        with self._lock:
+            self._views.pop(session_id, None)
+            if len(body) <= _MOST_VIEW_BYTES:
+                self._views[session_id] = body
+            while len(self._views) > _MOST_VIEWS:
+                self._views.popitem(last=False)
+
+    def seen(self, session_id: str) -> bytes | None:
+        """A small JPEG of that; None: it is not held."""
+        body = self._views.get(session_id)
+        return None if body is None else thumbnail(body, self._max_pixels, _VIEW_HEIGHT)
+
+    def _open(self, domain: str, *, create: bool = False) -> Thumbnails:
+        file = Thumbnails.open(self._data_dir, domain, create=create)
+        if file is None:
+            raise UnknownThumbnailError(
+                f"domain {domain} keeps no pictures: PUT it with thumbnails: true, and map anew"
+            )
+        return file

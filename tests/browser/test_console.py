@@ -1,0 +1,196 @@
+"""The console as people use it: every page, a robot that drives, a remap, a lost connection, a refused key."""
+
+import threading
+from importlib import resources
+from pathlib import Path
+
+import httpx2
+import pytest
+
+from deepsimbad.store.catalog import Catalog
+from deepsimbad.store.records import KeyScope
+from deepsimbad_client import Client
+from tests.client.conftest import serving
+
+from .conftest import N_FRAMES, make_domain
+
+pytestmark = pytest.mark.slow
+PHONE, DESK = {"width": 390, "height": 844}, {"width": 1440, "height": 900}
+TOO_WIDE = """document.documentElement.scrollWidth <= innerWidth ? [] : [...document.querySelectorAll("body *")]
+    .filter((part) => part.getBoundingClientRect().right > innerWidth).map((part) => part.outerHTML.slice(0, 80))"""
+PAGES = {
+    "": "Domains",
+    "domains/route": "How surely a place is recognised",
+    "domains/route/upload": "A recorded drive",
+    "sessions": "Sessions",
+    "try/route": "Drop an image of the route here",
+    "jobs": "succeeded",
+    "report": "Reports",
+    "no/such/page": "There is no such page",
+}
+
+
+def drive(client, session, drive, frames):
+    for frame in frames:
+        session.observe(image=drive / f"{frame:03d}.jpg", action_m=2.0)
+
+
+@pytest.fixture
+def session(service, drives):
+    """A session after three views."""
+    with Client(service) as client, client.session("route") as live:
+        drive(client, live, drives["winter"], range(5, 8))
+        yield live
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_every_page_is_whole_and_accessible(open_page, session, scheme):
+    axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason="axe is not installed").Axe()
+    page = open_page(color_scheme=scheme, viewport=DESK, bypass_csp=True)
+    for where, text in {**PAGES, f"sessions/{session.session_id}": "After 3 views"}.items():
+        page.goto(page.url.partition("#")[0] + f"#{where}")
+        page.get_by_text(text).first.wait_for()
+        for width in (PHONE, DESK):
+            page.set_viewport_size(width)
+            assert page.evaluate(TOO_WIDE) == [], where
+        found = axe.run(page)
+        assert found.violations_count == 0, f"{where}: {found.generate_report()}"
+
+
+def test_a_robot_that_drives_is_seen_and_gone_through_step_by_step(open_page, service, drives):
+    with Client(service) as client, client.session("route") as live:
+        page = open_page(f"sessions/{live.session_id}")
+        page.get_by_text("Waiting for its first view").wait_for()
+        robot = threading.Thread(target=drive, args=(client, live, drives["winter"], range(4, 16)))
+        robot.start()
+        page.get_by_text("After 12 views").wait_for()
+        robot.join()
+        answer = live.state()
+        figures = page.locator("dl.figures").first.inner_text()
+        assert f"{answer.belief.mode_m:.1f} m" in figures
+        assert f"{answer.belief.entropy_bits:.1f}" in figures
+        page.get_by_role("button", name="One step back").click()
+        page.get_by_text("After 11 views").wait_for()
+        page.get_by_label("Step shown").press("Home")
+        page.get_by_text("After 1 view", exact=True).wait_for()
+        assert page.get_by_role("button", name="One step back").is_disabled()
+        page.get_by_role("button", name="Follow live").click()
+        page.get_by_text("After 12 views").wait_for()
+        assert page.locator(".places img").count() > 0, "thumbnails of the places"
+        with httpx2.Client(base_url=service) as caller:
+            caller.delete(f"/v1/sessions/{live.session_id}")
+        page.get_by_text("the session has ended").wait_for()
+
+
+def test_an_image_is_tried_and_an_episode_gone_through(open_page, drives):
+    page = open_page("try/route")
+    page.set_input_files("input[type=file]", drives["winter"] / "009.jpg")
+    page.get_by_text("After this one view").wait_for()
+    assert page.get_by_alt_text("The view").is_visible()
+    page.get_by_role("button", name="Go through an episode, view by view").click()
+    page.get_by_text("Nothing is known yet").wait_for()
+    page.set_input_files("input[type=file]", drives["winter"] / "009.jpg")
+    page.get_by_text("After 1 view", exact=True).wait_for()
+    page.get_by_label("Metres driven since the last view").fill("2")
+    page.set_input_files("input[type=file]", drives["winter"] / "010.jpg")
+    page.get_by_text("After 2 views").wait_for()
+    page.get_by_role("button", name="End the episode").click()
+    page.get_by_text("Drop an image of the route here").wait_for()
+    (drives["winter"].parent / "broken.jpg").write_bytes(b"no picture")
+    page = open_page("try/route", expected="422")
+    page.set_input_files("input[type=file]", drives["winter"].parent / "broken.jpg")
+    page.get_by_role("alert").get_by_text("undecodable_image").wait_for()
+
+
+def test_a_folder_is_uploaded_mapped_and_rolled_back(open_page, service, drives):
+    make_domain(service, "made", drives["summer"])
+    page = open_page("domains/made/upload")
+    page.set_input_files("input[type=file]", drives["winter"])
+    page.get_by_text(f"{N_FRAMES} images").wait_for()
+    page.get_by_label("Metres between images").fill("2")
+    page.get_by_role("button", name="Upload").click()
+    page.get_by_text(f"{N_FRAMES} of {N_FRAMES} images").wait_for()
+    page.get_by_label("Drive that becomes the map").select_option("winter")
+    page.get_by_role("button", name="Remap").click()
+    page.get_by_text("Map version 2 answers now.").wait_for()
+    page.get_by_role("link", name="See it").click()
+    page.get_by_role("button", name="Roll back").click()
+    dialog = page.get_by_role("dialog", name="Roll back made to map 1?")
+    assert "no longer by map 2" in dialog.inner_text()
+    dialog.get_by_role("button", name="Roll back").click()
+    page.get_by_role("row", name="1 active").wait_for()
+    with httpx2.Client(base_url=service) as caller:
+        assert caller.get("/v1/domains/made").json()["map_version"] == 1
+
+
+def test_an_upload_goes_on_where_it_was_cut(open_page, service, drives):
+    make_domain(service, "cut", None)
+    frames = sorted(drives["summer"].iterdir())
+    base = "/v1/admin/domains/cut/traverses"
+    with httpx2.Client(base_url=service) as caller:
+        caller.post(base, json={"name": "summer"})
+        for index in (0, 1, 4):  # what was under way is missing between
+            query = f"position_m={index}&name={frames[index].name}"
+            caller.put(
+                f"{base}/summer/frames/{index}?{query}",
+                content=frames[index].read_bytes(),
+                headers={"Content-Type": "image/jpeg"},
+            ).raise_for_status()
+        page = open_page("domains/cut/upload")
+        sent = []
+        page.on("request", lambda request: sent.append(request.url) if request.method == "PUT" else None)
+        page.set_input_files("input[type=file]", drives["summer"])
+        page.get_by_role("button", name="Upload").click()
+        page.get_by_text(f"{N_FRAMES} of {N_FRAMES} images").wait_for()
+        assert len(sent) == N_FRAMES - 3
+        stored = caller.get(f"{base}/summer").json()
+        assert (stored["n_frames"], stored["missing"]) == (N_FRAMES, [])
+
+
+def test_a_lost_connection_is_said_and_mended(open_page, tmp_path, drives):
+    with serving(tmp_path) as url:
+        make_domain(url, "route", drives["summer"])
+        port = int(url.rpartition(":")[2])
+        with Client(url) as client:
+            live = client.session("route", keep=True)
+            drive(client, live, drives["winter"], range(5, 8))
+        page = open_page(f"sessions/{live.session_id}", url, expected="net::ERR")
+        page.get_by_text("After 3 views").wait_for()
+    page.get_by_text("connection lost, trying again").wait_for()
+    with serving(tmp_path, port) as url, Client(url) as client:
+        page.get_by_text("live", exact=True).wait_for()
+        client.attach_session(live.session_id).observe(image=drives["winter"] / "008.jpg", action_m=2.0)
+        page.get_by_text("After 4 views").wait_for()
+        assert page.get_by_label("Step shown").get_attribute("max") == "3", "no step came twice"
+
+
+def test_a_key_is_asked_refused_and_kept_in_the_tab_alone(open_page, tmp_path, drives):
+    with Catalog.open(tmp_path) as catalog:
+        key = catalog.create_key(KeyScope.ADMIN)[1].text
+    with serving(tmp_path) as url:
+        make_domain(url, "route", drives["summer"], **{"X-API-Key": key})
+        page = open_page("domains/route", url, expected="401")
+        page.get_by_text("This service asks for a key").first.wait_for()
+        for text, answer in (("wrong", "unauthorized"), (key, "How surely a place is recognised")):
+            page.get_by_role("button", name="key").click()
+            page.get_by_role("textbox", name="Key").fill(text)
+            page.get_by_role("button", name="Use it").click()
+            page.get_by_text(answer).first.wait_for()
+        assert page.evaluate("Object.keys(localStorage).length") == 0
+        assert page.context.cookies() == []
+
+
+def test_a_report_is_opened_in_a_frame_of_its_own(open_page, tmp_path):
+    text = "<!doctype html><title>r</title><b>A report</b><script>document.body.append(' drawn')</script>"
+    (tmp_path / "report.html").write_text(text)
+    page = open_page("report")
+    frame = page.frame_locator("iframe")
+    frame.locator("input[type=file]").set_input_files(tmp_path / "report.html")
+    frame.get_by_text("A report").wait_for()
+    frame.get_by_text("drawn").wait_for()
+
+
+def test_licences_are_beside_what_was_not_made_here():
+    licences = Path(str(resources.files("deepsimbad") / "console" / "licences.txt")).read_text()
+    for name in ("Preact", "htm", "uPlot"):
+        assert name in licences

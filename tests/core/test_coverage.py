@@ -1,0 +1,58 @@
+"""How surely a place is recognised."""
+
+import numpy as np
+
+from deepsimbad.core.building import MapPlan, compose_map
+from deepsimbad.core.coverage import placed_rightly, worst_stretches
+from deepsimbad.core.drive import Drive, SecondSeason
+from deepsimbad.core.relevance import Relevance
+
+N, D = 120, 32
+
+
+def mapped(rng, first, stop):
+    """Places [n, d] that all look different, but for those of one stretch; and the map of them."""
+    places = rng.normal(size=(N, D))
+    places[first:stop] = places[first]
+    drive = Drive(position_m=2.0 * np.arange(N), encodings=seen(rng, places))
+    built = compose_map(MapPlan(Relevance.COMPOSED, 4, (1.0,)), drive, None, None, 60)
+    return places, built.map, built.own
+
+
+def seen(rng, places):
+    return (places + 0.3 * rng.normal(size=places.shape)).astype(np.float32)
+
+
+def measured(map_, encodings):
+    """Squared distances [n, r] of unit encodings to the landmarks, by the season's own statistics."""
+    z = (encodings - encodings.mean(axis=0)) / encodings.std(axis=0)
+    z /= np.linalg.norm(z, axis=1, keepdims=True)
+    return (2 - 2 * z @ map_.landmark_model["prototypes"].T).astype(np.float32)
+
+
+def test_places_that_look_alike_are_recognised_less_often():
+    rng = np.random.default_rng(0)
+    places, map_, own = mapped(rng, 40, 80)
+    season = SecondSeason(measured(map_, seen(rng, places)), np.stack(2 * [np.arange(N)], 1))
+    for second in (None, season):
+        chance = placed_rightly(map_, own.dissimilarities, second)
+        assert chance.shape == (N,)
+        assert chance[45:75].max() < chance[:35].min()
+        (stretch,) = worst_stretches(map_.position_m, chance)
+        assert 35 <= stretch.first <= 45
+        assert 75 <= stretch.last <= 85
+        assert chance[stretch.worst] == chance[stretch.first : stretch.last + 1].min()
+        assert np.isclose(stretch.chance, chance[stretch.first : stretch.last + 1].mean())
+    assert np.array_equal(map_.coverage, placed_rightly(map_, own.dissimilarities, None)), "the map knows it"
+
+
+def test_a_season_that_is_alike_nowhere_lowers_every_chance():
+    rng = np.random.default_rng(1)
+    _, map_, own = mapped(rng, 0, 1)
+    strange = SecondSeason(measured(map_, rng.normal(size=(N, D))), np.stack(2 * [np.arange(N)], 1))
+    alone, both = (placed_rightly(map_, own.dissimilarities, second).mean() for second in (None, strange))
+    assert both < 0.7 * alone
+
+
+def test_no_stretch_stands_out_of_an_even_route():
+    assert worst_stretches(np.arange(50.0), np.full(50, 0.4)) == []
