@@ -63,7 +63,7 @@ class Recording:
     encodings: NDArray[np.float32] | None = None  # [n, d], row i of frame i; None where the frames are images
     remarks: Sequence[str] = ()  # what the reader took the recording for, where that is not plain
     grey_levels: GreyLevels | None = None  # by which images of more than 8 bits are shown; None: by each one's own
-    n_before_slice: int | None = None  # how many frames there were before a slice was taken; None: there was no slice
+    n_before_slice: int | None = None  # how many frames there were before some were taken; None: all are
     camera: str | None = None  # what took the images, by its name
     tolerance_m: float | None = None  # within which papers on this set count a match as true; None: no known set
 
@@ -74,7 +74,7 @@ class Recording:
 
     @property
     def n_whole(self) -> int:
-        """Frames that could be used before any slice was taken."""
+        """Frames that could be used before any slice, or every few of them, was taken."""
         return len(self.frames) if self.n_before_slice is None else self.n_before_slice
 
     def image(self, frame: Frame, input_size: tuple[int, int] | None) -> EncodedImage:  # noqa: ARG002

@@ -32,7 +32,7 @@ def thinned(recording: Recording, every_s: float | None, every_m: float | None) 
     rows = np.flatnonzero(np.diff(steps, prepend=np.nan) != 0)
     frames = tuple(dataclasses.replace(recording.frames[row], index=index) for index, row in enumerate(rows.tolist()))
     encodings = None if recording.encodings is None else recording.encodings[rows]
-    return dataclasses.replace(recording, frames=frames, encodings=encodings)
+    return dataclasses.replace(recording, frames=frames, encodings=encodings, n_before_slice=recording.n_whole)
 
 
 def one_turn(recording: Recording) -> Recording:

@@ -173,13 +173,7 @@ def read_nclt(
         for above in (root, root / "images"):
             places += sorted((above / date).glob(f"lb3*/Cam{camera}*"))
         folder = _first(f"images of NCLT {date}", places, Path.is_dir)
-    truths = [
-        root / "ground_truth" / f"groundtruth_{date}.csv",
-        root / date / f"groundtruth_{date}.csv",
-        root / date / "groundtruth.csv",
-        root / "ground_truth" / f"{date}.csv",
-    ]
-    truth = read_ground_truth(_first(f"ground truth of NCLT {date}", truths, Path.is_file))
+    truth = read_ground_truth(_first(f"ground truth of NCLT {date}", ground_truth_files(root, date), Path.is_file))
     names, not_times = _images_by_time(folder)
     if not names:
         raise SourceError(f"{folder} holds no image named <utime>.tiff (nor .jpg, .png or another format)")
@@ -200,6 +194,16 @@ def read_nclt(
         rotate=rotate,
         camera=f"Cam{camera}",
     )
+
+
+def ground_truth_files(root: Path, date: str) -> list[Path]:
+    """Where a date's ground truth may lie."""
+    return [
+        root / "ground_truth" / f"groundtruth_{date}.csv",
+        root / date / f"groundtruth_{date}.csv",
+        root / date / "groundtruth.csv",
+        root / "ground_truth" / f"{date}.csv",
+    ]
 
 
 def _first(what: str, places: Sequence[Path], is_there: Callable[[Path], bool]) -> Path:

@@ -28,7 +28,7 @@ from deepsimbad_client.recordings.benchmarks import open_benchmark, recognised
 from deepsimbad_client.recordings.cuts import check_one_drive, thinned, turned_back
 from deepsimbad_client.recordings.encodings import ENCODING_SUFFIXES, read_encodings
 from deepsimbad_client.recordings.folder import read_folder
-from deepsimbad_client.recordings.nclt import FRONT_CAMERA, read_nclt
+from deepsimbad_client.recordings.nclt import FRONT_CAMERA, ground_truth_files, read_nclt
 from deepsimbad_client.recordings.positions import POSITIONS_FILE
 from deepsimbad_client.recordings.video import VIDEO_SUFFIXES, read_video
 
@@ -159,16 +159,16 @@ def _is_bag(place: str) -> bool:
 
 
 def _nclt_camera(folder: Path, how: _How) -> Recording | None:
-    """The recording of a camera's folder in NCLT's layout (ROOT/DATE/lb3/Cam5); None: it is none, or has no poses."""
+    """The recording of a camera's folder in NCLT's layout (ROOT/DATE/lb3/Cam5); None: it is none, or has no poses. Raises SourceError."""
     drive = folder.resolve().parent.parent
     camera = re.fullmatch(r"Cam([0-5]).*", folder.resolve().name)
     if camera is None or not folder.resolve().parent.name.startswith("lb3") or (folder / POSITIONS_FILE).exists():
         return None
     root = drive.parent.parent if drive.parent.name == "images" else drive.parent
-    options: dict[str, Any] = {"undistortion": how.undistortion, "rotate": how.rotate, "folder": folder}
-    try:
-        recording = read_nclt(root, drive.name, camera=int(camera[1]), **options)
-    except SourceError:
+    if not any(path.is_file() for path in ground_truth_files(root, drive.name)):
         return None
-    said = f"NCLT's layout: read as {NCLT_PREFIX}{root / drive.name}, camera {camera[1]}, upright"
-    return dataclasses.replace(recording, remarks=[said])
+    options: dict[str, Any] = {"undistortion": how.undistortion, "rotate": how.rotate, "folder": folder}
+    recording = read_nclt(root, drive.name, camera=int(camera[1]), **options)
+    turn = "upright" if how.rotate is None else f"turned by {how.rotate} degrees"
+    said = f"NCLT's layout: read as {NCLT_PREFIX}{root / drive.name}, camera {camera[1]}, {turn}"
+    return dataclasses.replace(recording, remarks=[said, *recording.remarks])

@@ -52,9 +52,9 @@ class _Decoder:
                 decoded, image = self._capture.retrieve()
                 if decoded:
                     self._kept[self._next] = np.asarray(image, dtype=np.uint8)
+                if len(self._kept) > N_KEPT:
+                    self._kept.popitem(last=False)
             self._next += 1
-        while len(self._kept) > N_KEPT:
-            self._kept.popitem(last=False)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -6,7 +6,8 @@ import pytest
 
 from deepsimbad_client.errors import SourceError
 from deepsimbad_client.recordings import Frame, Recording
-from deepsimbad_client.recordings.cuts import check_one_drive, one_turn
+from deepsimbad_client.recordings.cuts import check_one_drive, one_turn, thinned
+from deepsimbad_client.recordings.left_out import LeftOut
 
 
 def loop(n, noise_m=0.0):
@@ -56,3 +57,10 @@ def test_several_drives_in_one_recording_are_refused_and_a_rest_is_not():
     for hours, apart_m in ((0.5, 300), (24, 3)):
         check_one_drive(paused(hours, apart_m))
     check_one_drive(paused(24, 300).sliced(slice(40, None)))
+
+
+def test_what_is_left_out_is_measured_against_all_frames_not_those_taken():
+    recording = dataclasses.replace(loop(95), left_out_names={"lost": list("abc")})
+    few = thinned(recording, None, 10)
+    assert len(few.frames) == 10
+    assert LeftOut(few, allow_missing=False).counts == {"lost": 3}

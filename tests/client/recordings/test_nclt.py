@@ -260,6 +260,12 @@ def test_a_cameras_folder_is_recognised_with_its_poses_and_without(nclt_tree):
     whole, found = open_source(nclt_tree.source), open_source(str(camera))
     assert found.frames == whole.frames
     assert found.remarks == [f"NCLT's layout: read as {nclt_tree.source}, camera 5, upright"]
+    assert open_source(str(camera), rotate=0).remarks[0].endswith("camera 5, turned by 0 degrees")
+    with pytest.raises(SourceError, match="no undistortion table"):
+        open_source(str(camera), undistortion=nclt_tree.root)
+    nclt_tree.truth(["no", "numbers"])
+    with pytest.raises(SourceError, match="fewer than 2 usable rows"):
+        open_source(str(camera))
     shutil.rmtree(nclt_tree.root / "ground_truth")
     found = open_source(f"{camera}#:")
     assert "turned upright" in found.remarks[0]

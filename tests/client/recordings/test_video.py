@@ -1,9 +1,12 @@
+from collections import OrderedDict
+
 import cv2
 import numpy as np
 import pytest
 
 from deepsimbad_client.errors import BrokenFrameError, SourceError
 from deepsimbad_client.http.upload import in_order
+from deepsimbad_client.recordings import video as videos
 from deepsimbad_client.recordings.sources import open_source
 
 
@@ -79,3 +82,18 @@ def test_a_video_cut_short_has_broken_frames_and_none_at_all_is_named(video, cap
     with pytest.raises(SourceError, match=r"drive\.avi is no video"):
         open_source(str(video))
     capfd.readouterr()  # FFmpeg's own words
+
+
+def test_a_jump_ahead_keeps_few_frames_at_any_time(video, monkeypatch):
+    class Counted(OrderedDict):
+        most = 0
+
+        def __setitem__(self, key, value):
+            super().__setitem__(key, value)
+            Counted.most = max(Counted.most, len(self))
+
+    monkeypatch.setattr(videos, "N_KEPT", 4)
+    recording = open_source(str(video))
+    monkeypatch.setattr(recording.decoder, "_kept", Counted())
+    assert grey(recording, recording.frames[29]) == pytest.approx(145, abs=2)
+    assert Counted.most == 5
