@@ -28,7 +28,7 @@ Image = NDArray[np.uint8]  # [height, width, 3] BGR
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", ".pgm", ".ppm"}) | HEIC_SUFFIXES
 TURNS = {0: None, 90: cv2.ROTATE_90_CLOCKWISE, 180: cv2.ROTATE_180, 270: cv2.ROTATE_90_COUNTERCLOCKWISE}
 
-_N_LEVEL_PROBES, _N_SURE = 16, 3  # images that tell the grey levels; so many of 8 bits, and the others are too
+_N_PROBES, _N_SURE = 16, 3  # images that tell what all are; so many of 8 bits, and the others are too
 _MAX_PIXELS = 1 << 30  # the picture is the caller's own
 
 
@@ -173,15 +173,18 @@ def decode_deep(body: bytes, path: Path, *, as_stored: bool = True) -> NDArray[A
     return np.asarray(image)
 
 
+def spread(n: int) -> list[int]:
+    """A few places among n, from the first to the last."""
+    return [round(at) for at in np.linspace(0, max(0, n - 1), min(n, _N_PROBES)).tolist()]
+
+
 def with_grey_levels(recording: AnyRecording, image: Callable[[int], NDArray[Any]]) -> AnyRecording:
     """The recording, shown by the grey levels that suit its images, where these have more than 8 bits; which is said.
 
     They are measured on a few spread over it; `image` gives one by its place, as `decode_deep` does.
     """
-    n = len(recording.frames)
-    at = np.unique(np.linspace(0, max(0, n - 1), min(n, _N_LEVEL_PROBES)).round().astype(int))
     pictures: list[NDArray[np.uint16]] = []
-    for number, place in enumerate(at.tolist()):
+    for number, place in enumerate(spread(len(recording.frames))):
         if number == _N_SURE and not pictures:
             return recording
         try:

@@ -104,10 +104,14 @@ class BagRecording(Recording):
         """A frame's message and its type. Raises BrokenFrameError."""
         at = self.received_ns[frame.name]
         with self.turn:
-            of_topic = [connection for connection in self._reader.connections if connection.topic == self.topic]
-            for connection, _, raw in self._reader.messages(of_topic, start=at, stop=at + 1):
-                return connection.msgtype, _message(self._reader, raw, connection.msgtype, frame.name)
-        raise BrokenFrameError(f"{frame.name} is not in {self.path} any more", "unreadable file")
+            try:
+                found = next(_messages(self._reader, {self.topic}, start=at, stop=at + 1), None)
+            except SourceError as error:
+                raise BrokenFrameError(f"{frame.name}: {error}", "undecodable") from error
+            if found is None:
+                raise BrokenFrameError(f"{frame.name} is not in {self.path} any more", "unreadable file")
+            _, kind, _, raw = found
+            return kind, _message(self._reader, raw, kind, frame.name)
 
     @cached_property
     def _reader(self) -> "AnyReader":
@@ -143,39 +147,21 @@ def read_bag(
             remarks.append(f"images of {image_topic}, positions of {position_topic}{others}")
         else:
             remarks.append(f"images of {image_topic}, {spacing_m:g} m apart: there are no poses, fixes or odometry")
-        received_ns: dict[str, int] = {}
-        images: list[tuple[str, int]] = []
-        rows: _Rows = []
-        unreadable: list[str] = []
+        heard = _Heard(image_topic, position_topic, time_offset_us)
         span = max(1, reader.end_time - reader.start_time)
         for topic, kind, received, raw in _messages(reader, {image_topic, position_topic}):
             on_progress((received - reader.start_time) / span)
-            name = f"{path.name}{topic}/{received}"
-            try:
-                message: Any = _message(reader, raw, kind, name)
-            except BrokenFrameError:
-                if topic == image_topic:
-                    unreadable.append(name)
-                continue
-            header = message.header.stamp
-            stamped_us = (header.sec * 10**9 + header.nanosec) // 1000
-            time_us = stamped_us or received // 1000
-            if topic == position_topic:
-                rows.append((time_us, *_place(message, kind)))
-            elif name in received_ns:
-                unreadable.append(name)
-            else:
-                received_ns[name] = received
-                images.append((name, time_us + time_offset_us))
+            heard.take(reader, topic, kind, received, raw, f"{path.name}{topic}/{received}")
+    images = sorted(heard.images, key=lambda image: image[1])
     if not images:
         raise SourceError(f"{path}: {image_topic} holds no image that can be read")
-    images.sort(key=lambda image: image[1])
     if position_topic:
-        result = _placed(images, rows, types[position_topic], f"{path}, {position_topic}")
+        result = _placed(images, heard.rows, types[position_topic], f"{path}, {position_topic}")
     else:
         result = Placed([Frame(i, name, i * spacing_m, time_us) for i, (name, time_us) in enumerate(images)])
-    if unreadable:
-        result.left_out_names["unreadable message"] = unreadable
+    result.left_out_names |= heard.lost
+    if heard.n_lost_positions:
+        remarks.append(f"{heard.n_lost_positions} messages of {position_topic} cannot be read and are not used")
     recording = BagRecording(
         path.stem,
         tuple(result.frames),
@@ -183,10 +169,44 @@ def read_bag(
         remarks=[*remarks, *result.remarks],
         path=path,
         topic=image_topic,
-        received_ns=received_ns,
+        received_ns=heard.received_ns,
         rotate=rotate,
     )
     return with_grey_levels(recording, recording.deep)
+
+
+@dataclass
+class _Heard:
+    """What the messages of both topics say."""
+
+    image_topic: str
+    position_topic: str
+    time_offset_us: int
+    received_ns: dict[str, int] = field(default_factory=dict)
+    images: list[tuple[str, int]] = field(default_factory=list)
+    rows: _Rows = field(default_factory=list)
+    lost: dict[str, list[str]] = field(default_factory=dict)  # images, by reason
+    n_lost_positions: int = 0
+
+    def take(self, reader: "AnyReader", topic: str, kind: str, received: int, raw: bytes, name: str) -> None:
+        """One more message."""
+        try:
+            message: Any = _message(reader, raw, kind, name)
+        except BrokenFrameError:
+            if topic == self.image_topic:
+                self.lost.setdefault("unreadable message", []).append(name)
+            else:
+                self.n_lost_positions += 1
+            return
+        header = message.header.stamp
+        time_us = (header.sec * 10**9 + header.nanosec) // 1000 or received // 1000
+        if topic == self.position_topic:
+            self.rows.append((time_us, *_place(message, kind)))
+        elif name in self.received_ns:
+            self.lost.setdefault("received at the time of another", []).append(name)
+        else:
+            self.received_ns[name] = received
+            self.images.append((name, time_us + self.time_offset_us))
 
 
 def _opened(path: Path) -> "AnyReader":
@@ -210,10 +230,14 @@ def _opened(path: Path) -> "AnyReader":
         raise SourceError(f"{path} cannot be read as a bag: {error}") from error
 
 
-def _messages(reader: "AnyReader", topics: set[str]) -> Iterator[tuple[str, str, int, bytes]]:
+def _messages(reader: "AnyReader", topics: set[str], **between_ns: int) -> Iterator[tuple[str, str, int, bytes]]:
+    """Topic, type, when it was received and body of every message. Raises SourceError (the bag is damaged)."""
     connections = [connection for connection in reader.connections if connection.topic in topics]
-    for connection, received, raw in reader.messages(connections):
-        yield connection.topic, connection.msgtype, received, raw
+    try:
+        for connection, received, raw in reader.messages(connections, **between_ns):
+            yield connection.topic, connection.msgtype, received, raw
+    except Exception as error:  # rosbags lets struct's, sqlite's and its own through
+        raise SourceError(f"{reader.paths[0]} is damaged: its messages cannot be read: {error}") from error
 
 
 def _message(reader: "AnyReader", raw: bytes, kind: str, name: str) -> object:

@@ -1,6 +1,7 @@
 """Times as recordings write them: seconds, milli-, micro- or nanoseconds, or a date; told by their magnitude."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from datetime import UTC, datetime
 from decimal import Decimal, InvalidOperation
 
@@ -36,18 +37,22 @@ def times_us(cells: Sequence[str], unit: str | None, where: Sequence[str]) -> tu
     if unit is None:
         return [None] * len(cells), None
     since_1970 = unit in units  # there 0 is no time but its absence
-    return [
-        None if number is None or (since_1970 and not number) else round(number * UNITS[unit]) for number in numbers
-    ], unit
+    times: list[int | None] = []
+    for number, place in zip(numbers, where, strict=True):
+        if number is not None and abs(number) * UNITS[unit] >= LAST_US:
+            raise SourceError(f"{place}: {number} {unit} is no time, it is after the year 2100")
+        times.append(None if number is None or (since_1970 and not number) else round(number * UNITS[unit]))
+    return times, unit
 
 
 def _number(cell: str, where: str) -> Decimal | None:
     if cell.lower() in UNKNOWN:
         return None
-    try:
-        return Decimal(cell)
-    except InvalidOperation:
-        pass
+    with suppress(InvalidOperation):
+        number = Decimal(cell)
+        if not number.is_finite():
+            raise SourceError(f"{where}: {cell!r} is not a time")
+        return number
     try:
         date = datetime.fromisoformat(cell)
     except ValueError as error:

@@ -17,6 +17,7 @@ from deepsimbad_client.recordings import (
     decode_deep,
     read_file,
     ready,
+    spread,
     stamp_of,
     with_grey_levels,
 )
@@ -26,7 +27,7 @@ from deepsimbad_client.recordings.names import in_order, times_of
 from deepsimbad_client.recordings.nclt import TURNED_UPRIGHT, UPRIGHT_TURN, lies_on_its_side
 from deepsimbad_client.recordings.placing import UNPLACED, Placed, placed, placed_on
 from deepsimbad_client.recordings.plane import GPS_DEADBAND_M, utm
-from deepsimbad_client.recordings.positions import POSITIONS_FILE, read_positions
+from deepsimbad_client.recordings.positions import POSITIONS_FILE, positions_file, read_positions
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -88,17 +89,21 @@ def read_folder(
     told_us: Sequence[int | None] = times_of(names) or [None] * len(names)
     times_us = [None if time is None else time + time_offset_us for time in told_us]
     tracks = sorted(path for path in paths if path.suffix.lower() in TRACK_SUFFIXES)
-    table = folder / POSITIONS_FILE
-    if table.is_file():
+    table = positions_file(folder)
+    if table is not None:
         result = read_positions(table, names, times_us)
         result.follow(placed(result.frames, str(table), result.deadband_m))
     elif tracks:
         result = _on_track(tracks, names, times_us, folder, time_offset_us)
-    elif any(math.isfinite(read_exif(folder / names[at]).latitude) for at in (0, len(names) // 2, -1)):
+    elif any(math.isfinite(read_exif(folder / names[at]).latitude) for at in spread(len(names))):
         result = _by_exif(names, times_us, folder, time_offset_us, on_progress)
     else:
         frames = zip(names, times_us, strict=True)
         result = Placed([Frame(i, name, i * spacing_m, timestamp_us=time) for i, (name, time) in enumerate(frames)])
+        result.remarks.append(
+            f"{len(names)} images are taken {spacing_m:g} m apart: there is no {POSITIONS_FILE} and no track (.gpx, "
+            ".nmea) beside them, and no EXIF among them says a place"
+        )
     recording = FolderRecording(
         folder.resolve().name, tuple(result.frames), result.left_out_names, remarks=result.remarks, folder=folder
     )

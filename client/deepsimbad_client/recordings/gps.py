@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from functools import reduce
 from operator import xor
@@ -30,51 +30,60 @@ _Fix = tuple[int, float, float]  # microseconds, degrees north, degrees east
 def read_track(path: Path) -> Track:
     """Read a GPX or NMEA file; raises SourceError (it is none, or fewer than two of its fixes can be used)."""
     try:
-        fixes = list(_gpx(path) if path.suffix.lower() == ".gpx" else _nmea(path))
+        rows = list(_gpx(path) if path.suffix.lower() == ".gpx" else _nmea(path))
     except (OSError, ParseError, ValueError) as error:
         raise SourceError(f"{path} cannot be read as a track: {error}") from error
+    fixes = [fix for fix in rows if fix is not None]
     time_us = np.array([fix[0] for fix in fixes], np.int64)
     degrees = np.array([fix[1:] for fix in fixes], np.float64).reshape(-1, 2)
     track = track_of(time_us, *utm(degrees[:, 0], degrees[:, 1]), deadband_m=GPS_DEADBAND_M)
     if track is None:
         raise SourceError(f"{path}: fewer than two of its {len(fixes)} fixes with a time can be used")
-    return track
+    return replace(track, n_skipped_rows=track.n_skipped_rows + len(rows) - len(fixes))
 
 
-def _gpx(path: Path) -> Iterator[_Fix]:
-    """Track points that have a time, of every version's namespace."""
+def _gpx(path: Path) -> Iterator[_Fix | None]:
+    """Track points of every version's namespace; None: one without a time and a place that can be read."""
     with path.open("rb") as file:
         for _, point in iterparse(file):  # noqa: S314 - expat itself stops entities that grow
             if point.tag.rpartition("}")[2] == "trkpt":
-                times = [part.text for part in point if part.tag.rpartition("}")[2] == "time"]
-                if times and times[0]:
-                    yield _microseconds(datetime.fromisoformat(times[0].strip())), *_degrees_of(point)
+                yield _gpx_fix(point)
                 point.clear()
 
 
-def _degrees_of(point: Any) -> tuple[float, float]:
-    return float(point.get("lat", "nan")), float(point.get("lon", "nan"))
+def _gpx_fix(point: Any) -> _Fix | None:
+    times = [part.text or "" for part in point if part.tag.rpartition("}")[2] == "time"]
+    with suppress(ValueError, KeyError, IndexError):
+        time = datetime.fromisoformat(times[0].strip())
+        return _microseconds(time), float(point.attrib["lat"]), float(point.attrib["lon"])
+    return None
 
 
-def _nmea(path: Path) -> Iterator[_Fix]:
-    """Recommended minimum sentences (RMC), which alone say the date; those without a fix or damaged are passed over."""
+def _nmea(path: Path) -> Iterator[_Fix | None]:
+    """Recommended minimum sentences (RMC), which alone say the date; None: one without a fix, or damaged."""
     for line in path.read_text(encoding="ascii", errors="replace").splitlines():
         sentence, _, checksum = line.strip().lstrip("$").partition("*")
         cells = sentence.split(",")
-        if not cells[0].endswith("RMC") or len(cells) < 10 or cells[2] != "A":
-            continue
-        with suppress(ValueError):
-            if checksum and int(checksum[:2], 16) != reduce(xor, sentence.encode(), 0):
-                continue
-            time = datetime.strptime(f"{cells[9]} {cells[1][:6]}", "%d%m%y %H%M%S").replace(tzinfo=UTC)
-            since = timedelta(seconds=float(f"0{cells[1][6:]}"))
-            yield _microseconds(time + since), _angle(*cells[3:5]), _angle(*cells[5:7])
+        if cells[0].endswith("RMC"):
+            yield _nmea_fix(sentence, cells, checksum)
+
+
+def _nmea_fix(sentence: str, cells: list[str], checksum: str) -> _Fix | None:
+    if len(cells) < 10 or cells[2] != "A":
+        return None
+    with suppress(ValueError, KeyError):
+        if checksum and int(checksum[:2], 16) != reduce(xor, sentence.encode(), 0):
+            return None
+        time = datetime.strptime(f"{cells[9]} {cells[1][:6]}", "%d%m%y %H%M%S").replace(tzinfo=UTC)
+        since = timedelta(seconds=float(f"0{cells[1][6:]}"))
+        return _microseconds(time + since), _angle(*cells[3:5]), _angle(*cells[5:7])
+    return None
 
 
 def _angle(text: str, side: str) -> float:
     """Degrees of DDDMM.MMMM and N, S, E or W."""
     whole, minutes = divmod(float(text), 100)
-    return (whole + minutes / 60) * (-1 if side in "SW" else 1)
+    return (whole + minutes / 60) * {"N": 1, "E": 1, "S": -1, "W": -1}[side]
 
 
 def _microseconds(time: datetime) -> int:

@@ -16,7 +16,6 @@ east, z down), radians. Rows that are not seven finite numbers are counted and n
 the track, unmoved by a robot that stands still: see `arc_length_m`.
 """
 
-import logging
 import re
 import warnings
 from collections import Counter
@@ -58,8 +57,6 @@ SHAPE_TOLERANCE = 0.01  # of width / height, by which a copy is told from other 
 TIFF_SUFFIXES = frozenset({".tiff", ".tif"})
 _CAMERA = re.compile(r"Cam[0-5].*")
 _UTIME = re.compile(r"[0-9]{16}")
-
-logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,6 +185,7 @@ def read_nclt(
         name=date,
         frames=tuple(result.frames),
         left_out_names={reason: files for reason, files in left_out.items() if files},
+        remarks=result.remarks,
         folder=folder,
         probes=[result.frames[place].name for place in probed],
         undistortion=None if undistortion is None else read_undistortion(undistortion, camera),
@@ -280,10 +278,7 @@ def read_ground_truth(path: Path) -> Track:
             f"{path}: fewer than 2 usable rows among {len(rows)}; ground truth needs at least two rows of "
             "utime,x,y,z,roll,pitch,yaw without NaN"
         )
-    n_skipped = track.n_skipped_rows + len(rows) - len(usable)
-    if n_skipped:
-        logger.info("%s: %d of %d rows skipped (NaN, unreadable or far off the track)", path, n_skipped, len(rows))
-    return replace(track, n_skipped_rows=n_skipped)
+    return replace(track, n_skipped_rows=track.n_skipped_rows + len(rows) - len(usable))
 
 
 def _rows(path: Path) -> Reals:

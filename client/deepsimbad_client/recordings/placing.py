@@ -75,7 +75,7 @@ def placed(frames: Sequence[Frame], where: str, deadband_m: float = DEADBAND_M) 
         _use_stated(result, time_us, where)
     else:
         _measure(result, time_us)
-    result.frames = [dataclasses.replace(frame, index=index) for index, frame in enumerate(result.frames)]
+    result.number()
     return result
 
 
@@ -110,6 +110,11 @@ def placed_on(
         ],
         remarks=remarks,
     )
+    if track.n_skipped_rows:
+        result.remarks.append(
+            f"{track.n_skipped_rows} rows of {what} are not used (unreadable, without a place or a time, or where no "
+            "robot can have been)"
+        )
     result.leave_out(poses.covered.tolist(), f"before or after {what}")
     result.leave_out((~poses.in_gap[poses.covered]).tolist(), f"gap in {what}")
     result.number()

@@ -102,6 +102,12 @@ class _Table:
         return times, [f"times in {self.path.name} are taken for {unit}"] if differs else []
 
 
+def positions_file(folder: Path) -> Path | None:
+    """A folder's `positions.csv`, in whatever letter case, that of the documentation first; None: there is none."""
+    named = [path for path in folder.iterdir() if path.name.lower() == POSITIONS_FILE and path.is_file()]
+    return max(named, default=None)  # small letters come after capital ones
+
+
 def read_positions(path: Path, names: Sequence[str], name_times_us: Sequence[int | None]) -> Placed:
     """What `positions.csv` says of images, given in their order, with the times that their names tell.
 

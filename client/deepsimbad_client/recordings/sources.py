@@ -29,7 +29,7 @@ from deepsimbad_client.recordings.cuts import check_one_drive, thinned, turned_b
 from deepsimbad_client.recordings.encodings import ENCODING_SUFFIXES, read_encodings
 from deepsimbad_client.recordings.folder import read_folder
 from deepsimbad_client.recordings.nclt import FRONT_CAMERA, ground_truth_files, read_nclt
-from deepsimbad_client.recordings.positions import POSITIONS_FILE
+from deepsimbad_client.recordings.positions import positions_file
 from deepsimbad_client.recordings.video import VIDEO_SUFFIXES, read_video
 
 NCLT_PREFIX = "nclt:"
@@ -159,10 +159,13 @@ def _is_bag(place: str) -> bool:
 
 
 def _nclt_camera(folder: Path, how: _How) -> Recording | None:
-    """The recording of a camera's folder in NCLT's layout (ROOT/DATE/lb3/Cam5); None: it is none, or has no poses. Raises SourceError."""
+    """The recording of a camera's folder in NCLT's layout (ROOT/DATE/lb3/Cam5); None: it is none, or has no poses.
+
+    Raises SourceError (what is there cannot be read).
+    """
     drive = folder.resolve().parent.parent
     camera = re.fullmatch(r"Cam([0-5]).*", folder.resolve().name)
-    if camera is None or not folder.resolve().parent.name.startswith("lb3") or (folder / POSITIONS_FILE).exists():
+    if camera is None or not folder.resolve().parent.name.startswith("lb3") or positions_file(folder):
         return None
     root = drive.parent.parent if drive.parent.name == "images" else drive.parent
     if not any(path.is_file() for path in ground_truth_files(root, drive.name)):

@@ -1,5 +1,6 @@
 import math
 import shutil
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -218,3 +219,29 @@ def test_what_is_no_bag_is_named(tmp_path, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "rosbags.highlevel", None)
     with pytest.raises(MissingExtraError, match=r"deep-simbad\[rosbag\]"):
         open_source(str(tmp_path / "a.mcap"))
+
+
+def test_messages_that_cannot_be_used_are_counted_each_for_its_reason(bag):
+    def broken(made):
+        for topic in ("/front", "/pose"):
+            for k in range(2):
+                made.writer.write(made.topics[topic], START_NS + 3_900_000_000 + k, b"\0\1")
+        made.image(START_NS)
+
+    recording = open_source(bag("mcap", images, Bag.poses, broken))
+    assert recording.left_out == {"unreadable message": 2, "received at the time of another": 1}
+    assert "2 messages of /pose cannot be read and are not used" in recording.remarks
+
+
+@pytest.mark.parametrize("kind", ["bag", "mcap"])
+def test_a_bag_damaged_in_its_middle_is_named(bag, kind):
+    source = bag(kind, images, Bag.poses)
+    whole, path = open_source(source), Path(source.removeprefix("rosbag:"))
+    body = bytearray(path.read_bytes())
+    body[200 : len(body) // 2] = b"\xff" * (len(body) // 2 - 200)
+    path.write_bytes(body)
+    with pytest.raises(SourceError, match=r"drive\.\w+ (is damaged: its messages )?cannot be read"):
+        open_source(source)
+    if kind == "mcap":  # the other's reader holds what it has read
+        with pytest.raises(BrokenFrameError, match="is damaged"):
+            whole.image(whole.frames[0], None)

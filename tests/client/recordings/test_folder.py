@@ -23,6 +23,13 @@ def placed(folder):
     return [(frame.name, frame.position_m) for frame in open_source(str(folder)).frames]
 
 
+def test_the_table_is_found_in_any_letter_case(folder):
+    (folder / "Positions.CSV").write_text("position_m\n0\n1\n2\n3\n")
+    assert [at for _, at in placed(folder)] == [0, 1, 2, 3]
+    positions(folder, "position_m", "0", "2", "4", "6")
+    assert [at for _, at in placed(folder)] == [0, 2, 4, 6]
+
+
 def test_images_come_in_name_order_evenly_spaced(folder):
     (folder / "inner.png").mkdir()
     (folder / ".hidden.png").write_bytes(b"")
@@ -34,6 +41,7 @@ def test_images_come_in_name_order_evenly_spaced(folder):
     assert recording.frames[0].x_m is None
     assert recording.left_out == {}
     assert recording.encodings is None
+    assert ["4 images are taken 2.5 m apart" in remark for remark in recording.remarks] == [True]
 
 
 @pytest.mark.parametrize(
@@ -243,3 +251,10 @@ def test_a_folder_without_images_says_what_it_looked_for(tmp_path):
     (tmp_path / "lb3").mkdir()
     with pytest.raises(SourceError, match=f"for NCLT write nclt:{tmp_path}"):
         open_source(str(tmp_path))
+
+
+@pytest.mark.parametrize("time", ["Infinity", "sNaN", "1e400", "1e17"])
+def test_a_number_that_is_no_time_is_named(folder, time):
+    positions(folder, "position_m,timestamp_s", "0,1", "1,2", f"2,{time}", "3,4")
+    with pytest.raises(SourceError, match=r"line 4"):
+        open_source(str(folder))

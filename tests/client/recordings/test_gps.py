@@ -49,6 +49,10 @@ def test_images_with_times_for_names_are_placed_by_the_gpx_beside_them(tmp_path)
     ahead = np.diff([frame.position_m for frame in recording.frames])
     np.testing.assert_allclose(ahead, 4, atol=0.02)
     assert recording.frames[0].x_m == pytest.approx(5_650_300, abs=600)
+    track = (tmp_path / "drive" / "a.gpx").read_text()
+    track = track.replace("2011-05-10T12:38:40Z", "at noon").replace("<time>2011-05-10T12:38:50Z</time>", "")
+    (tmp_path / "drive" / "a.gpx").write_text(track)
+    assert any("3 rows of the track are not used" in remark for remark in open_source(source).remarks)
     assert open_source(source, time_offset_s=10).frames[0].position_m == pytest.approx(17, abs=0.1)
     gpx(tmp_path / "drive" / "b.gpx")
     with pytest.raises(SourceError, match=r"several tracks \(a\.gpx, b\.gpx\)"):
@@ -92,8 +96,11 @@ def test_nmea_is_read_without_what_is_damaged_or_has_no_fix(tmp_path):
     source = pictures(tmp_path / "drive", [f"{START + k}.png" for k in range(5)])
     lines = [nmea(23 + k, 51 + k / 111_270, "V" if k == 2 else "A") for k in range(30)]
     lines[3] = lines[3].replace("51", "57", 1)  # its checksum no longer fits
+    lines[29] = lines[29].partition("*")[0].replace(",N,", ",,")  # says neither north nor south, and has no checksum
     (tmp_path / "drive" / "log.nmea").write_text("\r\n".join(["$GPGSV,1", *lines, "$GPRM"]))
-    assert [frame.position_m for frame in open_source(source).frames] == pytest.approx([0, 1, 2, 3, 4], abs=0.02)
+    recording = open_source(source)
+    assert [frame.position_m for frame in recording.frames] == pytest.approx([0, 1, 2, 3, 4], abs=0.02)
+    assert "3 rows of the track are not used" in recording.remarks[1]
     (tmp_path / "drive" / "log.nmea").write_text("nothing")
     with pytest.raises(SourceError, match="fewer than two of its 0 fixes"):
         open_source(source)
