@@ -80,8 +80,14 @@ def upload(
 
     Interrupted, the same command goes on where it stopped.
     """
+    try:
+        there = client.domain(domain)
+    except UnknownDomainError:
+        there = None
+    closed = closed if there is None else there.closed
     recording = opened(source, allow_missing, closed=closed, **reading)
-    _make_domain_if_missing(client, domain, recording, closed, evaluator, actions_m)
+    if there is None:
+        _make_domain(client, domain, recording, closed, evaluator, actions_m)
     with UploadBar(f"{recording.name} to {domain}/{traverse}", len(recording.frames)) as bar:
         report = upload_recording(
             *(client, recording, domain, traverse),
@@ -136,30 +142,28 @@ def _views(images: Iterable[str], domain: Domain, rotate: int | None) -> Iterato
             tell_remarks(recording)
         else:
             recording = opened(name, rotate=rotate)
+            tell_left_out(recording.left_out_names, recording.name, verbose=False)
         recording = recording.shown_by(domain.grey_levels)
         for row, frame in enumerate(recording.frames):
             yield name if is_image else frame.name, recording.view(row, domain.input_size)
 
 
-def _make_domain_if_missing(
+def _make_domain(
     client: Client, name: str, recording: Recording, closed: bool, evaluator: str | None, actions_m: str | None
 ) -> None:
-    try:
-        client.domain(name)
-    except UnknownDomainError:
-        config = IMAGE_EVALUATOR if recording.encodings is None else ENCODING_EVALUATOR
-        if evaluator is not None:
-            try:
-                config = dict(json.loads(evaluator))
-            except (TypeError, ValueError) as error:
-                example = 'give a JSON object such as {"kind": "feature_l2"}'
-                raise click.BadParameter(example, param_hint="--evaluator") from error
+    config = IMAGE_EVALUATOR if recording.encodings is None else ENCODING_EVALUATOR
+    if evaluator is not None:
         try:
-            moves_m = None if actions_m is None else [float(metres) for metres in actions_m.split(",")]
-        except ValueError as error:
-            raise click.BadParameter("give metres as -5,0,1,10", param_hint="--actions-m") from error
-        client.admin.put_domain(name, config, closed=closed, actions_m=moves_m)
-        REMARKS.print(f"made domain {name} ({json.dumps(config)})", soft_wrap=True)
+            config = dict(json.loads(evaluator))
+        except (TypeError, ValueError) as error:
+            example = 'give a JSON object such as {"kind": "feature_l2"}'
+            raise click.BadParameter(example, param_hint="--evaluator") from error
+    try:
+        moves_m = None if actions_m is None else [float(metres) for metres in actions_m.split(",")]
+    except ValueError as error:
+        raise click.BadParameter("give metres as -5,0,1,10", param_hint="--actions-m") from error
+    client.admin.put_domain(name, config, closed=closed, actions_m=moves_m)
+    REMARKS.print(f"made domain {name} ({json.dumps(config)})", soft_wrap=True)
 
 
 @click.command()
@@ -311,5 +315,6 @@ def watch(
     if source is None or domain is None:
         raise click.UsageError("give SOURCE and --domain, or --session")
     recording = opened(source, **reading)
+    tell_left_out(recording.left_out_names, recording.name, verbose=False)
     stage = Stage(client, recording, domain)
     watch_episode(stage, console, planner=planner, steps=steps, seed=seed, pause_s=pause_s)

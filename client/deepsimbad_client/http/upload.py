@@ -1,5 +1,6 @@
 """Send a recording to a traverse, going on where an earlier attempt stopped."""
 
+import dataclasses
 import math
 import time
 from collections import Counter, deque
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 from deepsimbad.core.frames import IDENTITY, UNKNOWN_CONTENT, UNKNOWN_TIMESTAMP, content_digest, differences
 from deepsimbad_client.errors import BrokenFrameError, InvalidInputError, OtherFramesError, SourceError
 from deepsimbad_client.http.client import Client
-from deepsimbad_client.recordings import Frame, Recording
+from deepsimbad_client.recordings import Frame, Recording, spread
 from deepsimbad_client.recordings.left_out import LeftOut, shown
 
 BATCH_BYTES = 8 * 2**20  # Size of a batch of ready encodings: worth its round trip, and lost cheaply on a thin link
@@ -88,11 +89,13 @@ def upload(
             on_progress(report)
 
     tell()
-    there = Comparison(recording, client.admin.frames(domain, traverse))
+    known = client.admin.frames(domain, traverse)
+    there = Comparison(recording, known)
     for _ in there.reading(input_size, concurrency):
         report.n_skipped += 1
         tell()
     others = there.others(f"{domain}/{traverse}", replace=replace)
+    _check_beside(recording, known, f"{domain}/{traverse}", input_size)
     equal = set(there.rows) - others
     rows = [row for row in range(len(recording.frames)) if row not in equal]
     report.n_skipped = len(equal)
@@ -139,8 +142,13 @@ class Comparison:
         own = {name: [_UNKNOWN.get(name, math.nan)] * len(frames) for name in IDENTITY} | _columns(frames)
         self._own = {name: np.array(own[name], self._stored[name].dtype) for name in IDENTITY}
 
-    def reading(self, input_size: tuple[int, int] | None, concurrency: int) -> Iterator[int]:
-        """Take the digest of every frame whose stored one is known, and tell its row; a broken one stays unknown."""
+    def reading(
+        self, input_size: tuple[int, int] | None, concurrency: int, places: Sequence[int] | None = None
+    ) -> Iterator[int]:
+        """Take the digest of every frame whose stored one is known, and tell its row; a broken one stays unknown.
+
+        `places` are those of `rows` that are read; None: all.
+        """
 
         def digest(place: int) -> int:
             row = self.rows[place]
@@ -153,34 +161,73 @@ class Comparison:
             except BrokenFrameError:
                 return UNKNOWN_CONTENT
 
-        for place, found in in_order(digest, range(len(self.rows)), concurrency):
+        for place, found in in_order(digest, range(len(self.rows)) if places is None else places, concurrency):
             self._own["content_digest"][place] = found
             yield self.rows[place]
+
+    def differing(self) -> dict[str, NDArray[np.bool_]]:
+        """In what which of `rows` differ from those there."""
+        return differences(self._own, self._stored)
 
     def others(self, traverse: str, *, replace: bool) -> set[int]:
         """Rows of the frames that differ from those there; raises OtherFramesError where these may not be replaced.
 
         Nor may they where the traverse holds frames that the recording lacks: it would be made of two.
         """
-        differ = differences(self._own, self._stored)
+        differ = self.differing()
         if not differ:
             return set()
         rows = [self.rows[place] for place in np.flatnonzero(np.any(list(differ.values()), axis=0))]
         names = [self._recording.frames[row].name for row in rows]
         if replace and not self._n_beside:
             return set(rows)
-        domain, _, name = traverse.partition("/")
         raise OtherFramesError(
             f"traverse {traverse} holds other frames than {self._recording.name}: {len(rows)} of the {len(self.rows)} "
             f"that both have differ in {', '.join(differ)} ({shown(names)}), and nothing was sent: "
             + (
-                f"{self._n_beside} frames there are not of this recording, so delete it first (`deepsimbad-client "
-                f"delete-traverse {domain} {name}`) or choose another --traverse"
+                f"{self._n_beside} frames there are not of this recording, so {_apart(traverse)}"
                 if replace
                 else "--replace puts these in their place, or choose another --traverse"
             ),
             names,
         )
+
+
+def _check_beside(
+    recording: Recording, known: Mapping[str, NDArray[Any]], traverse: str, input_size: tuple[int, int] | None
+) -> None:
+    """Refuse a slice where the frames stored beside it are another recording's than the rest of its own.
+
+    They must be equal by place and time, a few also by content. Raises OtherFramesError.
+    """
+    whole, sliced = recording.whole or recording, {frame.index for frame in recording.frames}
+    beside = [row for row, index in enumerate(known["index"].tolist()) if index not in sliced]
+    if not beside:
+        return
+    stored = {name: known[name][beside] for name in ("index", *IDENTITY)}
+    indices = set(stored["index"].tolist())
+    rest = [row for row, frame in enumerate(whole.frames) if frame.index in indices]
+    if not rest and len(beside) < len(known["index"]):
+        return  # the stored ones go on behind the recording's end, and what both have is compared
+    if rest:
+        frames = [whole.frames[row] for row in rest]
+        encodings = None if whole.encodings is None else whole.encodings[rest]
+        other = Comparison(dataclasses.replace(whole, frames=frames, encodings=encodings, whole=None), stored)
+        for _ in other.reading(input_size, 1, spread(len(rest))):
+            pass
+        if not other.differing():
+            return
+    names = [frame.name for frame in recording.frames[:1]]
+    raise OtherFramesError(
+        f"traverse {traverse} holds frames of another recording than {recording.name}: {len(beside)} beside those to "
+        f"be sent, which the rest of it does not equal, and nothing was sent: {_apart(traverse)}",
+        names,
+    )
+
+
+def _apart(traverse: str) -> str:
+    domain, _, name = traverse.partition("/")
+    return f"delete it first (`deepsimbad-client delete-traverse {domain} {name}`) or choose another --traverse"
 
 
 def in_order(

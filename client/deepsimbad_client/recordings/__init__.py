@@ -65,6 +65,7 @@ class Recording:
     grey_levels: GreyLevels | None = None  # by which images of more than 8 bits are shown; None: by each one's own
     n_before_slice: int | None = None  # how many frames there were before some were taken; None: all are
     camera: str | None = None  # what took the images, by its name
+    whole: "Recording | None" = None  # of whose frames these are a slice; None: these are all
     tolerance_m: float | None = None  # within which papers on this set count a match as true; None: no known set
 
     @property
@@ -88,7 +89,10 @@ class Recording:
 
     def shown_by(self, levels: GreyLevels | None) -> Self:
         """The recording shown by the grey levels of the traverse or the map that it goes to; None: by its own."""
-        return self if levels is None else dataclasses.replace(self, grey_levels=levels)
+        if levels is None:
+            return self
+        whole = None if self.whole is None else self.whole.shown_by(levels)
+        return dataclasses.replace(self, grey_levels=levels, whole=whole)
 
     def stamp(self, frame: Frame) -> str:
         """What changes when a frame's image does: its name, and of a file its size and time."""
@@ -114,7 +118,8 @@ class Recording:
             text = "#" + ":".join("" if end is None else str(end) for end in ends)
             raise SourceError(f"the slice {text} leaves none of the {len(self.frames)} frames of {self.name}")
         encodings = None if self.encodings is None else self.encodings[part]
-        return dataclasses.replace(self, frames=frames, encodings=encodings, n_before_slice=self.n_whole)
+        whole = self.whole or self
+        return dataclasses.replace(self, frames=frames, encodings=encodings, n_before_slice=self.n_whole, whole=whole)
 
 
 AnyRecording = TypeVar("AnyRecording", bound=Recording)

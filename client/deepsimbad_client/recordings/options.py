@@ -9,6 +9,7 @@ import click
 from rich.console import Console
 from rich.progress import Progress
 
+from deepsimbad_client.errors import InvalidArgumentError
 from deepsimbad_client.recordings import Recording
 from deepsimbad_client.recordings.cuts import one_turn
 from deepsimbad_client.recordings.left_out import MOST_LEFT_OUT, LeftOut, left_out_lines
@@ -77,12 +78,15 @@ def accounting(command: Command) -> Command:
 def opened(source: str, allow_missing: bool = True, *, closed: bool = False, **reading: Any) -> Recording:
     """Open a SOURCE, one turn of a closed route, telling on standard error what it was taken for.
 
-    Raises SourceError, TooManyLeftOutError.
+    Raises SourceError, TooManyLeftOutError, click.UsageError (an option does not go with the recording).
     """
     console = Console(stderr=True)
     with Progress(console=console, transient=True, disable=not console.is_terminal) as bars:
         task = bars.add_task(f"open {source}", total=1.0)
-        recording = open_source(source, on_progress=lambda share: bars.update(task, completed=share), **reading)
+        try:
+            recording = open_source(source, on_progress=lambda share: bars.update(task, completed=share), **reading)
+        except InvalidArgumentError as error:
+            raise click.UsageError(error.message) from error
     recording = one_turn(recording) if closed else recording
     tell_remarks(recording)
     LeftOut(recording, allow_missing=allow_missing)

@@ -21,14 +21,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from deepsimbad_client.errors import SourceError
+from deepsimbad_client.errors import InvalidArgumentError, SourceError
 from deepsimbad_client.recordings import TURNS, Recording
 from deepsimbad_client.recordings.bag import BAG_PREFIX, BAG_SUFFIXES, METADATA, read_bag
 from deepsimbad_client.recordings.benchmarks import open_benchmark, recognised
 from deepsimbad_client.recordings.cuts import check_one_drive, thinned, turned_back
 from deepsimbad_client.recordings.encodings import ENCODING_SUFFIXES, read_encodings
 from deepsimbad_client.recordings.folder import read_folder
-from deepsimbad_client.recordings.nclt import FRONT_CAMERA, ground_truth_files, read_nclt
+from deepsimbad_client.recordings.nclt import FRONT_CAMERA, NcltRecording, ground_truth_files, read_nclt
 from deepsimbad_client.recordings.positions import positions_file
 from deepsimbad_client.recordings.video import VIDEO_SUFFIXES, read_video
 
@@ -68,6 +68,7 @@ def open_source(
 
     Raises:
         SourceError: There is no such recording, it makes no sense, or positions fall along the drive.
+        InvalidArgumentError: What was asked does not go with a recording of this kind.
     """
     if not (math.isfinite(spacing_m) and spacing_m > 0):
         raise SourceError(f"a spacing of {spacing_m} m: frames must be more than 0 m apart")
@@ -76,6 +77,7 @@ def open_source(
     place, part = split_slice(source)
     how = _How(spacing_m, camera, undistortion, rotate, round(time_offset_s * 1e6), on_progress)
     recording = _open_whole(place, how)
+    _check_options(recording, how)
     first, last = recording.frames[0], recording.frames[-1]
     if reverse:
         recording = turned_back(recording)
@@ -100,6 +102,19 @@ class _How:
     rotate: int | None
     time_offset_us: int
     on_progress: Callable[[float], None]
+
+
+def _check_options(recording: Recording, how: _How) -> None:
+    """Raises InvalidArgumentError: what was asked would change nothing in a recording of this kind."""
+    is_nclt, is_set = isinstance(recording, NcltRecording), recording.tolerance_m is not None
+    has_images = recording.encodings is None
+    for option, is_asked, fits in (
+        ("--undistortion", how.undistortion is not None, is_nclt),
+        ("--rotate", bool(how.rotate), has_images),
+        ("--time-offset-s", how.time_offset_us != 0, has_images and not is_nclt and not is_set),
+    ):
+        if is_asked and not fits:
+            raise InvalidArgumentError(f"{option} does not go with a recording such as {recording.name}: leave it out")
 
 
 def split_slice(source: str) -> tuple[str, slice | None]:

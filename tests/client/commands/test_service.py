@@ -230,3 +230,16 @@ def test_places_on_the_command_line(client, encodings, tmp_path, capsys):
     assert re.search(r"4\.png +│ 4\.png +│ +4\.0", shown), shown
     assert run([*command, "--domain", "places", str(folder / "9.png")]) == 1
     assert "no recording" in capsys.readouterr().err
+
+
+def test_a_second_drive_that_shares_no_frame_with_the_first_is_refused_and_a_part_of_one_goes_on(client, encodings):
+    client.admin.put_domain("parts", ENCODINGS)
+    summer, winter = (str(encodings / f"{season}.npy") for season in ("summer", "winter"))
+    upload(client, open_source(f"{summer}#:60"), "parts", "t")
+    there = client.admin.traverse("parts", "t")
+    for replace in (False, True):
+        with pytest.raises(errors.OtherFramesError, match="another recording than winter: 60 beside"):
+            upload(client, open_source(f"{winter}#60:"), "parts", "t", replace=replace)
+    assert client.admin.traverse("parts", "t") == there
+    assert upload(client, open_source(f"{summer}#60:"), "parts", "t").n_sent == 60
+    assert upload(client, open_source(f"{summer}#100:"), "parts", "t").n_skipped == 20

@@ -1,9 +1,11 @@
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deepsimbad_client.errors import SourceError
+from deepsimbad_client.errors import InvalidArgumentError, SourceError
 from deepsimbad_client.recordings import Frame, Recording
 from deepsimbad_client.recordings.sources import open_source, split_slice
 
@@ -136,3 +138,17 @@ def test_a_bad_csv_is_refused_with_its_line(tmp_path, text, message):
     (tmp_path / "e.csv").write_text(text)
     with pytest.raises(SourceError, match=message):
         open_source(str(tmp_path / "e.csv"))
+
+
+@pytest.mark.parametrize(
+    ("options", "option"),
+    [
+        ({"time_offset_s": 1}, "time-offset-s"),
+        ({"rotate": 90}, "rotate"),
+        ({"undistortion": Path("/")}, "undistortion"),
+    ],
+)
+def test_an_option_that_does_not_go_with_the_recording_is_refused(tmp_path, options, option):
+    np.save(tmp_path / "a.npy", np.ones((3, 2)))
+    with pytest.raises(InvalidArgumentError, match=f"--{option} does not go with"):
+        open_source(str(tmp_path / "a.npy"), **options)
