@@ -79,9 +79,9 @@ def turned_back(recording: Recording) -> Recording:
 
 def check_one_drive(recording: Recording) -> None:
     """Refuse what was recorded in several goes, elsewhere each: the way between was not recorded, nor is its length."""
-    frames = recording.frames
+    frames = [frame for frame in recording.frames if frame.timestamp_us is not None]
     times = [frame.timestamp_us for frame in frames if frame.timestamp_us is not None]
-    if len(times) < len(frames) or len(times) < 3:
+    if len(times) < 3:
         return
     pauses_s = np.abs(np.diff(np.array(times, np.int64))) / 1e6
     longest = int(np.argmax(pauses_s))
@@ -94,5 +94,5 @@ def check_one_drive(recording: Recording) -> None:
             return
     raise SourceError(
         f"{recording.name}: between {before.name} and {after.name} pass {pauses_s[longest] / 3600:.1f} hours: these "
-        f"are several drives. Name one of them by a slice (#:{longest + 1} or #{longest + 1}:), or move them apart"
+        f"are several drives. Name one of them by a slice (#:{after.index} or #{after.index}:), or move them apart"
     )

@@ -62,8 +62,10 @@ class Placed:
 def placed(frames: Sequence[Frame], where: str, deadband_m: float = DEADBAND_M) -> Placed:
     """Put frames on the route, by their stated `position_m` where any has one, else by the distance along x_m, y_m.
 
-    Frames whose times are all known come in the order of their times. Indices count anew from 0. Stated positions that
-    fall along the drive stay falling. Raises SourceError (no frame has a position, or positions go to and fro).
+    Frames come in the order of their times, where half of them and more are known. Indices count anew from 0. Stated
+    positions that fall along the drive stay falling.
+
+    Raises SourceError (no frame has a position, or positions go to and fro).
     """
     result = Placed(frames, deadband_m=deadband_m)
     stated = any(math.isfinite(frame.position_m) for frame in frames)
@@ -131,10 +133,14 @@ def _has_place(frame: Frame, stated: bool) -> bool:
 
 
 def _in_time_order(result: Placed) -> Times | None:
-    """Sort the frames by time where every one has one and they differ; these times."""
-    times = [frame.timestamp_us for frame in result.frames if frame.timestamp_us is not None]
-    if len(times) < len(result.frames) or len(set(times)) < 2:
+    """Sort the frames by time where half of them and more have one and these differ; the times, filled in between."""
+    known = [(place, frame.timestamp_us) for place, frame in enumerate(result.frames) if frame.timestamp_us is not None]
+    if 2 * len(known) < len(result.frames) or len({time for _, time in known}) < 2:
         return None
+    place, known_us = np.array(known, np.int64).T
+    times = _filled(place, known_us, len(result.frames)).tolist()
+    if len(known) < len(times):
+        result.remarks.append(f"{len(times) - len(known)} frames say no time: they are taken between their neighbours")
     time_us = np.array(times, dtype=np.int64)
     fits = np.isin(np.arange(len(times)), longest_rising(times))
     if 0 < (~fits).sum() <= MOST_LEFT_OUT * len(times):  # a few wrong times, not wrong names
@@ -145,6 +151,15 @@ def _in_time_order(result: Placed) -> Times | None:
         result.frames = [result.frames[place] for place in order]
         result.remarks.append("frames are taken in the order of their times, which is not that of their names")
     return np.asarray(time_us[order])
+
+
+def _filled(place: Times, time_us: Times, n: int) -> Times:
+    """The times of all n frames, those at `place` known: the others evenly between, at the ends a usual step apart."""
+    step_us = float(np.median(np.abs(np.diff(time_us)) / np.diff(place)))
+    at = np.arange(n)
+    filled = np.interp(at, place, time_us - time_us[0]) - step_us * np.maximum(place[0] - at, 0)
+    filled += step_us * np.maximum(at - place[-1], 0)
+    return np.asarray(time_us[0] + np.round(filled), np.int64)
 
 
 def _measure(result: Placed, time_us: Times | None) -> None:

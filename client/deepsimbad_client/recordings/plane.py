@@ -17,7 +17,7 @@ GPS_DEADBAND_M = 3.0  # A receiver's fix wanders by so much while it stands
 
 
 def utm(latitude: Reals, longitude: Reals) -> tuple[Reals, Reals]:
-    """North and east [n] in metres of places [n] in degrees, all in the first usable place's zone; NaN stays NaN.
+    """North and east [n] in metres of places [n] in degrees, all in the zone of their median; NaN stays NaN.
 
     Places south of the equator have negative norths. 0, 0 is what receivers say that know nothing: it becomes NaN.
     """
@@ -25,8 +25,7 @@ def utm(latitude: Reals, longitude: Reals) -> tuple[Reals, Reals]:
     unknown |= (np.abs(latitude) > 90) | (np.abs(longitude) > 180)
     if unknown.all():
         return np.full(len(latitude), np.nan), np.full(len(latitude), np.nan)
-    first = longitude[np.flatnonzero(~unknown)[0]]
-    centre = np.floor(first / 6) * 6 + 3
+    centre = np.floor(np.median(longitude[~unknown]) / 6) * 6 + 3
     phi, lam = np.radians(np.where(unknown, np.nan, latitude)), np.radians(longitude - centre)
     # Karney, Transverse Mercator with an accuracy of a few nanometers, 2011, equations 7 to 11
     e = 2 * np.sqrt(_N) / (1 + _N)

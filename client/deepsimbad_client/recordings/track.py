@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 DEADBAND_M = 0.25
 DEADBAND_NOISES = 6.0
 SMOOTHING_HALF_WIDTH_US = 250_000
+WANDER_S, WANDER_M_S = 30.0, 0.4  # A standing receiver gets no farther than so fast within so long
 MAX_GAP_S = 1.0  # Between rows of a track farther apart than this nothing is interpolated: the robot may have turned
 FEWEST_FOR_NOISE = 16  # positions of which noise can be told
 MOST_NOISE_M = 10.0  # What leaps farther, as frames of two drives by turns, is none
@@ -171,7 +172,35 @@ def arc_length_m(x_m: Reals, y_m: Reals, time_us: Times | None = None, deadband_
         n_averaged = _window(time_us)
         x_m, y_m = _averaged(x_m, *n_averaged), _averaged(y_m, *n_averaged)
         noise /= float(np.sqrt(np.median(n_averaged[1] - n_averaged[0])))
+        if deadband_m > DEADBAND_M:
+            x_m, y_m = _stood_still(x_m, y_m, time_us)
     return walked_m(x_m, y_m, max(deadband_m, DEADBAND_NOISES * noise))
+
+
+def _stood_still(x_m: Reals, y_m: Reals, time_us: Times) -> tuple[Reals, Reals]:
+    """A receiver's track [n] with each standstill a straight line from its beginning to its end.
+
+    One that stands wanders by metres over minutes. It stands where it is slower than `WANDER_M_S` and a third of the
+    usual speed, that at which half of the way was made, over half a minute, and than three quarters over six seconds,
+    for a robot may drive in circles.
+    """
+    seconds = (time_us - time_us[0]) / 1e6
+
+    def speed(over_s: float) -> Reals:
+        before, after = (np.clip(seconds + half, 0, seconds[-1]) for half in (-over_s / 2, over_s / 2))
+        apart = (np.interp(after, seconds, axis) - np.interp(before, seconds, axis) for axis in (x_m, y_m))
+        return np.asarray(np.hypot(*apart) / np.maximum(after - before, 1e-6))
+
+    quick = speed(6.0)
+    order = np.argsort(quick)
+    way = np.cumsum(quick[order])
+    usual = float(quick[order][np.searchsorted(way, way[-1] / 2)])
+    still = (speed(WANDER_S) < min(WANDER_M_S, usual / 3)) & (quick < 0.75 * usual)
+    kept = ~still
+    kept[1:] |= ~still[:-1]
+    kept[:-1] |= ~still[1:]
+    kept[[0, -1]] = True
+    return np.interp(seconds, seconds[kept], x_m[kept]), np.interp(seconds, seconds[kept], y_m[kept])
 
 
 def walked_m(x_m: Reals, y_m: Reals, deadband_m: float) -> Reals:

@@ -258,3 +258,22 @@ def test_a_number_that_is_no_time_is_named(folder, time):
     positions(folder, "position_m,timestamp_s", "0,1", "1,2", f"2,{time}", "3,4")
     with pytest.raises(SourceError, match=r"line 4"):
         open_source(str(folder))
+
+
+def test_one_missing_time_leaves_the_others_in_use(tmp_path):
+    for number in range(40):
+        (tmp_path / f"{number:02d}.png").write_bytes(b"")
+    rng = np.random.default_rng(3)
+    rows = [
+        [f"{k:02d}.png", f"{k + rng.normal(0, 0.02):.3f}", "0", str(1_700_000_000_000_000 + k * 100_000)]
+        for k in range(40)
+    ]
+    rows[7][3] = rows[39][3] = ""
+    rows[20][1] = "900"  # a spike
+    rows[3][3], rows[4][3] = rows[4][3], rows[3][3]
+    positions(tmp_path, "name,x_m,y_m,timestamp_us", *map(",".join, rows))
+    recording = open_source(str(tmp_path))
+    assert recording.left_out == {"where no robot can have been": 1, "whose time goes back": 1}
+    assert any("2 frames say no time" in remark for remark in recording.remarks)
+    assert recording.frames[-1].position_m == pytest.approx(39, abs=1)
+    assert [frame.timestamp_us for frame in recording.frames if frame.name in ("07.png", "39.png")] == [None, None]

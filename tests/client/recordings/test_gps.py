@@ -4,8 +4,9 @@ import pytest
 from PIL import Image
 
 from deepsimbad_client.errors import MissingExtraError, SourceError
-from deepsimbad_client.recordings.plane import utm
+from deepsimbad_client.recordings.plane import GPS_DEADBAND_M, utm
 from deepsimbad_client.recordings.sources import open_source
+from deepsimbad_client.recordings.track import arc_length_m
 
 START = 1_305_031_103  # 2011-05-10T12:38:23Z
 DEGREE_M = 111_320  # of latitude, roughly; of longitude at the equator
@@ -167,3 +168,22 @@ def test_heic_is_read_or_its_library_is_named(tmp_path, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "pillow_heif", None)
     with pytest.raises(MissingExtraError, match=r"deep-simbad\[heic\]"):
         open_source(str(tmp_path))
+
+
+def test_a_receiver_that_wanders_over_minutes_hardly_gets_on_and_circles_are_driven():
+    rng = np.random.default_rng(1)
+    along = np.concatenate([np.arange(200), np.full(300, 199), np.arange(199, 400)])
+    wander = rng.normal(0, 2, (2, len(along)))
+    for k in range(1, len(along)):  # correlated over a minute, 2 m
+        wander[:, k] = np.exp(-1 / 60) * wander[:, k - 1] + np.sqrt(1 - np.exp(-2 / 60)) * wander[:, k]
+    time_us = np.arange(len(along)) * 1_000_000
+    assert arc_length_m(along + wander[0], wander[1], time_us, GPS_DEADBAND_M)[-1] == pytest.approx(399, abs=20)
+    turn = np.arange(600) / 8
+    circles = arc_length_m(8 * np.cos(turn), 8 * np.sin(turn), np.arange(600) * 1_000_000, GPS_DEADBAND_M)
+    assert circles[-1] == pytest.approx(599, abs=12)
+
+
+def test_the_zone_is_that_of_most_places():
+    x_m, y_m = utm(np.full(5, 51.0), np.array([11.9999, 12.0001, 12.0002, 12.0003, 12.0004]))
+    assert y_m[0] < y_m[1] < 300_000, "all in zone 33"
+    assert np.ptp(x_m) < 5
