@@ -1,7 +1,7 @@
 """`positions.csv`: where the images beside it were taken.
 
-A header and one line for each image, cells between commas, semicolons or tabs. Columns, in any order,
-others are ignored:
+A header and one line for each image, cells between commas, or semicolons or tabs (then 0,5 is a half). Columns, in any
+order, others are ignored:
 
     name          the image's file name: folders before it, letter case and its ending do not matter; without this
                   column (and without `index`) the lines go with the images in name order and there must be as many
@@ -19,6 +19,7 @@ are not listed, lines whose image does not exist, and images whose place is empt
 import csv
 import dataclasses
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -55,6 +56,7 @@ _SPELLINGS = {
     ),
 }
 _COLUMN_OF = {spelling: column for column, spellings in _SPELLINGS.items() for spelling in spellings}
+_DECIMAL_COMMA = re.compile(r"[+-]?[0-9]+,[0-9]+")
 _PLANES = ({"x_m", "y_m"}, {"latitude", "longitude"})
 _WITHOUT_HEADER = {
     (1, False): ["position_m"],
@@ -233,8 +235,14 @@ def _lines(path: Path) -> list[tuple[int, list[str]]]:
         with path.open(encoding="utf-8-sig", newline="") as text:
             first = text.readline()
             text.seek(0)
-            reader = csv.reader(text, delimiter=max(",;\t", key=first.count))
+            delimiter = max(",;\t", key=first.count)
+            reader = csv.reader(text, delimiter=delimiter)
             lines = [(reader.line_num, [cell.strip() for cell in cells]) for cells in reader if cells]
+            if delimiter != ",":
+                lines = [
+                    (at, [cell.replace(",", ".") if _DECIMAL_COMMA.fullmatch(cell) else cell for cell in cells])
+                    for at, cells in lines
+                ]
             while lines and not any(lines[-1][1]):
                 lines.pop()
     except OSError as error:

@@ -33,6 +33,7 @@ from deepsimbad_client.recordings.positions import positions_file
 from deepsimbad_client.recordings.video import VIDEO_SUFFIXES, read_video
 
 NCLT_PREFIX = "nclt:"
+MOST_OFFSET_S = 1e10  # three centuries
 RECORDING_SUFFIXES = ENCODING_SUFFIXES | VIDEO_SUFFIXES | BAG_SUFFIXES
 """Of files that hold many frames."""
 
@@ -72,6 +73,8 @@ def open_source(
     """
     if not (math.isfinite(spacing_m) and spacing_m > 0):
         raise SourceError(f"a spacing of {spacing_m} m: frames must be more than 0 m apart")
+    if not abs(time_offset_s) < MOST_OFFSET_S:
+        raise InvalidArgumentError(f"a time offset of {time_offset_s} s: clocks are not so far apart")
     if rotate is not None and rotate not in TURNS:
         raise SourceError(f"images cannot be turned by {rotate} degrees: give 0, 90, 180 or 270")
     place, part = split_slice(source)

@@ -243,3 +243,16 @@ def test_a_second_drive_that_shares_no_frame_with_the_first_is_refused_and_a_par
     assert client.admin.traverse("parts", "t") == there
     assert upload(client, open_source(f"{summer}#60:"), "parts", "t").n_sent == 60
     assert upload(client, open_source(f"{summer}#100:"), "parts", "t").n_skipped == 20
+
+
+def test_a_closed_domain_takes_one_turn_unasked(client, tmp_path, capsys):
+    lines = ["name,x_m,y_m"]
+    for number in range(60):
+        turn = 2 * np.pi * number / 40
+        cv2.imwrite(str(tmp_path / f"{number:02d}.png"), np.full((48, 64, 3), number, np.uint8))
+        lines.append(f"{number:02d}.png,{20 * np.cos(turn):.3f},{20 * np.sin(turn):.3f}")
+    (tmp_path / "positions.csv").write_text("\n".join(lines))
+    client.admin.put_domain("ring", {"kind": "feature_l2", "extractor": "gradient_grid"}, closed=True)
+    assert run(["upload", str(tmp_path), "--server", client.url, "--domain", "ring", "--traverse", "t"]) == 0
+    assert "19 frames of a second turn are not used" in capsys.readouterr().err
+    assert client.admin.traverse("ring", "t").n_frames == 41

@@ -2,7 +2,7 @@ import cv2
 import numpy as np
 import pytest
 
-from deepsimbad_client.errors import BrokenFrameError, SourceError
+from deepsimbad_client.errors import BrokenFrameError, InvalidArgumentError, SourceError
 from deepsimbad_client.recordings.sources import open_source
 
 
@@ -258,6 +258,19 @@ def test_a_number_that_is_no_time_is_named(folder, time):
     positions(folder, "position_m,timestamp_s", "0,1", "1,2", f"2,{time}", "3,4")
     with pytest.raises(SourceError, match=r"line 4"):
         open_source(str(folder))
+
+
+def test_decimal_commas_between_semicolons_are_read(folder):
+    (folder / "positions.csv").write_bytes(b"\xef\xbb\xbf" + b"position_m\r\n0\r\n1\r\n2\r\n3\r\n")
+    assert [at for _, at in placed(folder)] == [0, 1, 2, 3]
+    positions(folder, "position_m;x_m", "0,25;1", "1,5;2", "2,75;2", "3;2")
+    assert [at for _, at in placed(folder)] == [0.25, 1.5, 2.75, 3]
+
+
+@pytest.mark.parametrize("offset_s", [float("nan"), 1e30])
+def test_an_offset_that_is_none_is_refused(folder, offset_s):
+    with pytest.raises(InvalidArgumentError, match="clocks are not so far apart"):
+        open_source(str(folder), time_offset_s=offset_s)
 
 
 def test_one_missing_time_leaves_the_others_in_use(tmp_path):
