@@ -4,6 +4,9 @@ The robot is somewhere on the route or lost: off it, or anywhere on it after hav
 at a small rate a metre and left to anywhere, and how well the believed places explain a view, against the map on the
 whole, decides between the two.
 
+The grid has equal cells along the route (`core.cells`). A move shifts them all, and its error is one short row of
+weights, the same everywhere; a view is heard of at cells, between two map images as the way leads to the other.
+
 Views err alike where they are near each other, so a view counts by what it says beyond the one before, carried along by
 the move; this is generalised least squares for errors that are autoregressive along the route. And how far this season
 can be trusted nobody knows before: the belief is a mixture of three, which trust a view half, once and twice as much as
@@ -19,6 +22,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from deepsimbad.core.cells import Cells
 from deepsimbad.core.relevance import UpdateRule, mean_ranks
 from deepsimbad.core.route import Route
 from deepsimbad.errors import PastTheEndError
@@ -38,9 +42,8 @@ LEAST_SURVIVING_SHARE = 1e-9  # of a belief before a move; with less it leads pa
 _DOUBTING = 0.01  # a belief that takes the robot for lost by more refuses no move
 SIGMAS = 4.0  # a move's error is cut off here
 SLIPS = 0.3  # how often odometry is wrong by more than it says
-_CELLS_A_SIGMA = 1024.0  # of the table that stands for the normal curve; exact to 1e-7
-_NORMAL = np.exp(-0.5 * np.square(np.arange(int(SIGMAS * _CELLS_A_SIGMA) + 3) / _CELLS_A_SIGMA))
-_NEGLIGIBLE = 1e-3  # of the mean mass: a place with less moves, but its error is not spread
+_BLOCK = 2048  # cells whose sums stay in the first-level cache
+_NARROW = 0.6  # cells; a narrower normal curve is not sampled, but has its variance all the same
 
 
 class FilterKind(StrEnum):
@@ -87,14 +90,13 @@ class ViewEvidence:
             return self.values
         return (self.values - self.shared * last) / (1 + self.shared)
 
-    def likelihood(self, last: NDArray[np.float64] | None) -> NDArray[np.float64]:
+    def likelihood(self, news: NDArray[np.float64]) -> NDArray[np.float64]:
         """[n] of the least trust, the greatest 1: whatever the relevances are, none overflows."""
-        news = self.news(last)
         return np.asarray(np.exp(TRUSTS_OF[self.rule][0] * (news - news.max())))
 
-    def least_told(self, last: NDArray[np.float64] | None) -> float:
+    def least_told(self, news: NDArray[np.float64]) -> float:
         """The mass that its news would at least have moved elsewhere where nothing was known, when it is small."""
-        return 0.0 if self.is_added else 0.5 * TRUSTS_OF[self.rule][0] * float(np.abs(self.news(last)).mean())
+        return 0.0 if self.is_added else 0.5 * TRUSTS_OF[self.rule][0] * float(np.abs(news).mean())
 
     @property
     def is_added(self) -> bool:
@@ -155,44 +157,57 @@ def moved_along(route: Route, values: NDArray[np.float64], action_m: float) -> N
 
 @dataclass(frozen=True)
 class GridFilter:
-    """Masses of the map images."""
+    """Masses of cells."""
 
     route: Route
-    masses: NDArray[np.float64]  # [t, n] by trust; with `doubt.lost` each row sums to 1
-    doubt: Doubt
+    masses: NDArray[np.float64]  # [t, c] by trust; with `doubt.lost` each row sums to 1
+    offset_m: float  # by which all cells are ahead of where they began, at most half a cell
+    doubt: Doubt  # its last view at the cells
+    told: float = 0.0  # share of the mass that the last view moved elsewhere, or would have where nothing was known
 
     @classmethod
     def uniform(cls, route: Route, rule: UpdateRule = UpdateRule.MIXTURE) -> Self:
-        """No knowledge: every metre of the route alike, so images of one long stop share one place's mass."""
-        return cls._of(route, route.cell_m, rule, LOST_AT_START)
+        """No knowledge: every metre of the route alike."""
+        return cls._of(route, np.ones(route.cells.n_cells), 0.0, rule, LOST_AT_START)
 
     @classmethod
     def around(cls, route: Route, position_m: float, std_m: float, rule: UpdateRule = UpdateRule.MIXTURE) -> Self:
         """A normal belief around a position, cut off at the ends of an open route."""
-        offset = route.offset_m(route.position_m, position_m)
-        nearest = np.abs(offset).min()  # a prior narrower than the spacing still has its nearest image
-        log_mass = -0.5 * (np.square(offset) - nearest**2) / max(std_m, 1e-3) ** 2
-        return cls._of(route, route.cell_m * np.exp(log_mass), rule, LOST_AT_FIX)
+        cells = route.cells
+        _, offset_m = cells.shifted(position_m - cells.start_m)  # one cell is where the robot is said to be
+        apart_m = route.offset_m(cells.position_m + offset_m, position_m)
+        nearest = np.abs(apart_m).min()  # a prior narrower than a cell still has its nearest one
+        log_mass = -0.5 * (np.square(apart_m) - nearest**2) / max(std_m, 1e-3) ** 2
+        return cls._of(route, np.exp(log_mass), offset_m, rule, LOST_AT_FIX)
 
     @classmethod
-    def _of(cls, route: Route, mass: NDArray[np.float64], rule: UpdateRule, lost: float) -> Self:
+    def _of(cls, route: Route, mass: NDArray[np.float64], offset_m: float, rule: UpdateRule, lost: float) -> Self:
         doubt = Doubt.at_start(rule, lost)
-        return cls(route, np.outer(1 - doubt.lost, mass / mass.sum()), doubt)
+        return cls(route, np.outer(1 - doubt.lost, mass / mass.sum()), offset_m, doubt)
 
     @classmethod
     def from_arrays(cls, route: Route, arrays: dict[str, NDArray[np.float64]]) -> Self:
-        """Restore what `arrays` gave."""
-        return cls(route, arrays["masses"], Doubt.from_arrays(arrays))
+        """Restore what `arrays` gave; raises KeyError where an earlier release did."""
+        return cls(route, arrays["masses"], float(arrays["offset_m"][0]), Doubt.from_arrays(arrays))
 
     def arrays(self) -> dict[str, NDArray[np.float64]]:
         """All state."""
-        return {"masses": self.masses, **self.doubt.arrays()}
+        return {"masses": self.masses, "offset_m": np.array([self.offset_m]), **self.doubt.arrays()}
+
+    @cached_property
+    def _believed(self) -> NDArray[np.float64]:
+        """[c] of the cells, if the robot is on the route; sums to 1."""
+        believed = self.doubt.trust @ self.masses
+        return np.asarray(believed / max(believed.sum(), 1e-300))
 
     @cached_property
     def mass(self) -> NDArray[np.float64]:
-        """[n] of the map images, if the robot is on the route; sums to 1."""
-        mass = self.doubt.trust @ self.masses
-        return np.asarray(mass / max(mass.sum(), 1e-300))
+        """[n] of the map images, if the robot is on the route; sums to 1. Images of one stop share its mass."""
+        places = self.route.places
+        on_places = self.route.cells.to_places(self._believed, self.offset_m)
+        if places.position_m.size == self.route.n_images:
+            return on_places
+        return np.asarray(on_places[places.of_image] / places.n_images[places.of_image])
 
     @property
     def off_route(self) -> float:
@@ -212,44 +227,47 @@ class GridFilter:
         Raises:
             PastTheEndError: No place of the belief has that much open route before it.
         """
-        route, places = self.route, self.route.places
-        closed_m, reach_m = route.length_m if route.closed else 0.0, SIGMAS * action_std_m
-        shared = places.position_m.size < route.n_images  # some images show one place
-        moved = _summed(self.masses, places.of_image, places.position_m.size) if shared else self.masses
-        before = moved
-        if action_m != 0:
-            within_m = reach_m if self.doubt.is_mixture else 0.0
-            moved = _shift(before, places.position_m, action_m, closed_m, within_m)
-            if not moved.any():  # it may still have stopped at the end
-                moved = _shift(before, places.position_m, action_m, closed_m, reach_m)
-        on_route, surviving = before.sum(axis=1), moved.sum(axis=1)
-        check_ahead(route, self.doubt, on_route, surviving, action_m)
-        slipping_m = slipping_std_m(action_m, action_std_m, self.doubt)
-        spread = _spread(moved, places.position_m, action_std_m, slipping_m, closed_m)
-        if not shared:
-            masses = spread
-        elif action_m != 0:  # which of a stop's images comes next is open again
-            masses = spread[:, places.of_image] / places.n_images[places.of_image]
-        else:
-            stayed = np.where(before > 0, spread / np.where(before > 0, before, 1.0), 0.0)
-            fresh = np.where(before > 0, 0.0, spread / places.n_images)
-            masses = self.masses * stayed[:, places.of_image] + fresh[:, places.of_image]
-        lost, staying, found = leaving_and_found(self.doubt, self.doubt.lost, on_route, surviving, action_m)
-        masses = masses * staying[:, np.newaxis] + np.outer(found, route.cell_m / route.cell_m.sum())
-        total = masses.sum(axis=1) + lost
-        last = self.doubt.last
-        last = last if last is None else moved_along(route, last, action_m)
-        doubt = replace(self.doubt, lost=lost / total, last=last)
-        return replace(self, masses=masses / total[:, np.newaxis], doubt=doubt)
+        cells, doubt, reach_m = self.route.cells, self.doubt, SIGMAS * action_std_m
+        shift, offset_m = cells.shifted(self.offset_m + action_m)
+        some = cells.sources(shift, offset_m, reach_m if doubt.is_mixture or action_m == 0 else 0.0)
+        if not self.masses[:, some].any():  # it may still have stopped at the end
+            some = cells.sources(shift, offset_m, reach_m)
+        on_route = 1 - doubt.lost
+        surviving = on_route - self.masses[:, : some.start].sum(axis=1) - self.masses[:, some.stop :].sum(axis=1)
+        check_ahead(self.route, doubt, on_route, surviving, action_m)
+        lost, staying, found = leaving_and_found(doubt, doubt.lost, on_route, surviving, action_m)
+        total = surviving * staying + found + lost
+        masses = _moved(
+            self.masses,
+            (int(some.start), int(some.stop), shift),
+            move_error(cells, action_std_m, slipping_std_m(action_m, action_std_m, doubt)),
+            staying / total,
+            found / (total * cells.n_cells),
+            cells.closed,
+        )
+        last = None if doubt.last is None else _carried(doubt.last, shift, cells.closed)
+        return replace(self, masses=masses, offset_m=offset_m, doubt=replace(doubt, lost=lost / total, last=last))
 
     def updated(self, seen: ViewEvidence, step: int) -> Self:  # noqa: ARG002
         """The belief after a view."""
+        at_cells = replace(seen, values=self._at_cells(seen.values))
+        news = at_cells.news(self.doubt.last)
         if seen.is_added:
-            mass = added(self.mass, seen.values)
-            return replace(self, masses=np.outer(1 - self.doubt.lost, mass))
-        likelihood = seen.likelihood(self.doubt.last)
-        masses, lost, log_trust = _see(self.masses, self.doubt.lost, self.doubt.log_trust, likelihood)
-        return replace(self, masses=masses, doubt=Doubt(lost, log_trust, seen.values))
+            mass = added(self._believed, at_cells.values)
+            masses, doubt = np.outer(1 - self.doubt.lost, mass), self.doubt
+        else:
+            masses, *rest = _see(self.masses, self.doubt.lost, self.doubt.log_trust, at_cells.likelihood(news))
+            doubt = Doubt(*rest, at_cells.values)
+        after = replace(self, masses=masses, doubt=doubt)
+        moved = 0.5 * float(_apart(after._believed, self._believed))
+        return replace(after, told=max(moved, at_cells.least_told(news)))
+
+    def _at_cells(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """[c] what is known of map images [n]; the images of one stop say what they say on average."""
+        places = self.route.places
+        if places.position_m.size < values.size:
+            values = np.bincount(places.of_image, values) / places.n_images
+        return self.route.cells.of_places(values, self.offset_m)
 
 
 def check_ahead(
@@ -296,12 +314,19 @@ def added(mass: NDArray[np.float64], seen: NDArray[np.float64]) -> NDArray[np.fl
 
 
 @njit(cache=True, nogil=True)
-def _summed(masses: NDArray[np.float64], group: NDArray[np.intp], n_groups: int) -> NDArray[np.float64]:
-    sums = np.zeros((len(masses), n_groups))
-    for t in range(len(masses)):
-        for i in range(group.size):
-            sums[t, group[i]] += masses[t, i]
-    return sums
+def _dot(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
+    """Sum of products, in eight parts of a fixed order: one part alone would wait for every addition before it."""
+    parts = np.zeros(8)
+    whole = one.size // 8
+    for i in range(whole):
+        for part in range(8):
+            parts[part] += one[8 * i + part] * other[8 * i + part]
+    total = 0.0
+    for i in range(8 * whole, one.size):
+        total += one[i] * other[i]
+    for part in range(8):
+        total += parts[part]
+    return total
 
 
 @njit(cache=True, nogil=True)
@@ -311,140 +336,124 @@ def _see(
     log_trust: NDArray[np.float64],
     likelihood: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Multiply by likelihoods, normalise, and weigh the trusts; `likelihood` [n], of the least trust, is used up.
+    """Multiply by likelihoods, normalise, and weigh the trusts; `likelihood` [c], of the least trust, is used up.
 
     Where a view allows nothing that a trust still believes, that trust keeps what it knew.
     """
     n_trusts, n = masses.shape
-    after = np.empty((n_trusts, n))
-    believed, average = np.zeros(n_trusts), np.zeros(n_trusts)
-    for t in range(n_trusts):  # the next trust is twice the one before
-        for i in range(n):
-            if t > 0:
-                likelihood[i] *= likelihood[i]
-            after[t, i] = masses[t, i] * likelihood[i]
-            believed[t] += after[t, i]
-            average[t] += likelihood[i]
-    average /= n
+    after, ones = np.empty((n_trusts, n)), np.ones(n)
     lost_after, log_trust_after = lost.copy(), log_trust.copy()
     for t in range(n_trusts):
-        total = believed[t] + lost[t] * average[t]
+        before, row = masses[t], after[t]
+        if t > 0:  # this trust is twice the one before
+            for i in range(n):
+                likelihood[i] *= likelihood[i]
+        average = _dot(likelihood, ones) / n
+        total = _dot(before, likelihood) + lost[t] * average
         if total <= 0:
-            after[t] = masses[t]
+            row[:] = before
             continue
         for i in range(n):
-            after[t, i] /= total
-        lost_after[t] = lost[t] * average[t] / total
-        log_trust_after[t] += np.log(total / average[t])
+            row[i] = before[i] * likelihood[i] / total
+        lost_after[t] = lost[t] * average / total
+        log_trust_after[t] += np.log(total / average)
     return after, lost_after, log_trust_after
 
 
 @njit(cache=True, nogil=True)
-def _shift(
-    masses: NDArray[np.float64], position_m: NDArray[np.float64], action_m: float, length_m: float, reach_m: float
-) -> NDArray[np.float64]:
-    """Move every place's masses; between two places they are shared by nearness. length_m > 0: a closed route.
+def _apart(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
+    """Sum of differences, as `_dot` sums."""
+    parts = np.zeros(8)
+    whole = one.size // 8
+    for i in range(whole):
+        for part in range(8):
+            parts[part] += abs(one[8 * i + part] - other[8 * i + part])
+    total = 0.0
+    for i in range(8 * whole, one.size):
+        total += abs(one[i] - other[i])
+    for part in range(8):
+        total += parts[part]
+    return total
 
-    What would be up to `reach_m` beyond an end of an open route stops there, and what would be farther is dropped.
-    """
-    n_trusts, n = masses.shape
-    moved = np.zeros((n_trusts, n))
-    after = 0
-    start, end = position_m[0], position_m[n - 1]
-    last_target = -np.inf
-    for i in range(n):
-        target = position_m[i] + action_m
-        if length_m > 0:
-            target = start + (target - start) % length_m
-        elif target > end + reach_m + 1e-9 or target < start - reach_m - 1e-9:
-            continue
+
+def move_error(cells: Cells, std_m: float, slipping_m: float) -> NDArray[np.float64]:
+    """[2 w + 1] a move's error, from w cells behind to w ahead: mostly normal, now and then of a wheel that slips."""
+    reach = min(int(SIGMAS * slipping_m / cells.step_m), cells.n_cells - 1)
+    reach = max(reach, min(1, cells.n_cells - 1)) if slipping_m > 0 else 0
+    taps = np.zeros(2 * reach + 1)
+    for share, deviation in ((1 - SLIPS, std_m / cells.step_m), (SLIPS, slipping_m / cells.step_m)):
+        if deviation < _NARROW:
+            half = min(deviation**2 / 2, 0.5) if reach else 0.0
+            taps[reach] += share * (1 - 2 * half)
+            taps[reach - 1 : reach + 2 : 2] += share * half
         else:
-            target = min(max(target, start), end)
-        if target < last_target:  # wrapped round
-            after = 0
-        last_target = target
-        while after < n and position_m[after] < target:
-            after += 1
-        if after == n:  # closed: between the last place and the first
-            gap = length_m - (end - start)
-            share = (target - end) / gap if gap > 0 and length_m > 0 else 0.0
-            one, other = n - 1, 0
-        elif after == 0 or position_m[after] == target:
-            share, one, other = 1.0, after, after
-        else:
-            share = (target - position_m[after - 1]) / (position_m[after] - position_m[after - 1])
-            one, other = after - 1, after
-        for t in range(n_trusts):
-            moved[t, one] += masses[t, i] * (1 - share)
-            moved[t, other] += masses[t, i] * share
-    return moved
-
-
-@njit(cache=True, nogil=True, inline="always")
-def _normal(deviations: float) -> float:
-    """`exp(-x^2 / 2)` for x in 0..4, from a table: exponentials would be most of a step's time."""
-    place = deviations * _CELLS_A_SIGMA
-    cell = int(place)
-    share = place - cell
-    weight: float = _NORMAL[cell] * (1 - share) + _NORMAL[cell + 1] * share
-    return weight
-
-
-@njit(cache=True, nogil=True, inline="always")
-def _error(off_m: float, std_m: float, slipping_m: float) -> float:
-    """Density of a move's error, but for a constant: mostly normal, now and then of a wheel that slips."""
-    density = SLIPS * std_m / slipping_m * _normal(off_m / slipping_m)
-    if off_m < SIGMAS * std_m:
-        density += (1 - SLIPS) * _normal(off_m / std_m)
-    return density
+            off = np.arange(-reach, reach + 1) / deviation
+            weights = np.where(np.abs(off) <= SIGMAS, np.exp(-0.5 * np.square(off)), 0.0)
+            taps += share * weights / weights.sum()
+    return taps
 
 
 @njit(cache=True, nogil=True)
-def _spread(  # noqa: PLR0912 - one pass over a band and its two wrapped ends
-    masses: NDArray[np.float64], position_m: NDArray[np.float64], std_m: float, slipping_m: float, length_m: float
+def _moved(
+    masses: NDArray[np.float64],
+    move: tuple[int, int, int],
+    taps: NDArray[np.float64],
+    gain: NDArray[np.float64],
+    found: NDArray[np.float64],
+    closed: bool,
 ) -> NDArray[np.float64]:
-    """Blur by a normal error; none is lost at the ends."""
+    """Shift the masses [t, c] of some cells, spread them by a move's error, and add what was found everywhere.
+
+    Args:
+        move: The first cell that is shifted, the first that is not any more, and by how many cells.
+        taps: [2 w + 1] the error. Of what it would carry past an end of an open route none is lost.
+        gain: [t] that masses are multiplied by.
+        found: [t] added to every cell.
+    """
     n_trusts, n = masses.shape
-    if std_m <= 0 or n == 1:
-        return masses
-    reach = SIGMAS * slipping_m
-    spread = np.zeros((n_trusts, n))
-    least = _NEGLIGIBLE / n
-    weights = np.empty(n)
-    for i in range(n):
-        held = 0.0
-        for t in range(n_trusts):
-            held += float(masses[t, i])
-        if held < least:
-            for t in range(n_trusts):
-                spread[t, i] += masses[t, i]
-            continue
-        first = i
-        while first > 0 and position_m[i] - position_m[first - 1] <= reach:
-            first -= 1
-        stop = i + 1
-        while stop < n and position_m[stop] - position_m[i] <= reach:
-            stop += 1
-        total: float = 0.0
-        for j in range(first, stop):
-            weights[j] = _error(abs(position_m[j] - position_m[i]), std_m, slipping_m)
-            total += float(weights[j])
-        around_first, around_stop = n, 0
-        if length_m > 0:  # beyond a closed route's ends
-            while around_stop < first and position_m[around_stop] + length_m - position_m[i] <= reach:
-                weights[around_stop] = _error(position_m[around_stop] + length_m - position_m[i], std_m, slipping_m)
-                total += float(weights[around_stop])
-                around_stop += 1
-            while around_first > stop and position_m[i] + length_m - position_m[around_first - 1] <= reach:
-                around_first -= 1
-                weights[around_first] = _error(position_m[i] + length_m - position_m[around_first], std_m, slipping_m)
-                total += float(weights[around_first])
-        for t in range(n_trusts):
-            share = masses[t, i] / total
-            for j in range(first, stop):
-                spread[t, j] += share * weights[j]
-            for j in range(around_stop):
-                spread[t, j] += share * weights[j]
-            for j in range(around_first, n):
-                spread[t, j] += share * weights[j]
-    return spread
+    first, stop, shift = move
+    width = taps.size // 2
+    moved = np.empty((n_trusts, n))
+    source = np.empty(n + 2 * width)
+    on_route = source[width : width + n]
+    for t in range(n_trusts):
+        source[:] = 0.0
+        if closed:
+            turn = shift % n
+            on_route[turn:] = masses[t, : n - turn]
+            on_route[:turn] = masses[t, n - turn :]
+            source[:width] = source[n : n + width]
+            source[width + n :] = source[width : 2 * width]
+        else:
+            least, most = max(first, -shift), min(stop, n - shift)  # cells that need not be held at an end
+            if most > least:
+                on_route[least + shift : most + shift] = masses[t, least:most]
+            for i in range(first, min(least, stop)):
+                on_route[0] += masses[t, i]
+            for i in range(max(most, first), stop):
+                on_route[n - 1] += masses[t, i]
+            for i in range(min(width, n)):  # of what is near an end, the part that stays on the route is all
+                on_route[i] /= 1.0 - taps[: width - i].sum()
+            for i in range(min(width, n)):
+                on_route[n - 1 - i] /= 1.0 - taps[width + i + 1 :].sum()
+        for begin in range(0, n, _BLOCK):
+            row = moved[t, begin : begin + _BLOCK]
+            row[:] = found[t]
+            for tap in range(taps.size):
+                weight = taps[tap] * gain[t]
+                behind = source[begin + taps.size - 1 - tap : n + 2 * width]
+                for i in range(row.size):
+                    row[i] += weight * behind[i]
+    return moved
+
+
+def _carried(values: NDArray[np.float64], shift: int, closed: bool) -> NDArray[np.float64]:
+    """[c] what was seen at cells, where a robot that moves has it next; what lies before an open route is 0."""
+    if closed:
+        return np.roll(values, shift)
+    carried = np.zeros_like(values)
+    if 0 <= shift < values.size:
+        carried[shift:] = values[: values.size - shift]
+    elif -values.size < shift < 0:
+        carried[:shift] = values[-shift:]
+    return carried

@@ -95,7 +95,7 @@ class ActiveLocalizer:
         """
         laps = [self._clock()]
         map_, number = self._map, state.n_observations
-        std_m = motion_std_m(action_m) if action_std_m is None else action_std_m
+        std_m = action_std_m if action_std_m is not None else motion_std_m(action_m) if action_m != 0 else 0.0
         jitters = not map_.goes_backward and -SIGMAS * std_m <= action_m < 0
         moved_m = 0.0 if number == 0 or jitters else action_m
 
@@ -113,8 +113,8 @@ class ActiveLocalizer:
         if query.is_informative and not is_strange:
             shared = map_.shared_error_after(moved_m) if number > 0 else 0.0
             seen = ViewEvidence.of(relevance, self._update, map_.log_likelihood_scale, shared)
-            before, belief = belief, belief.updated(seen, number)
-            told = max(0.5 * float(np.abs(belief.mass - before.mass).sum()), seen.least_told(before.doubt.last))
+            belief = belief.updated(seen, number)
+            told = belief.told
         laps.append(self._clock())
 
         after = LocalizerState(belief, live, relevance, number + 1)

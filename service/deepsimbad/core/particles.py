@@ -39,6 +39,7 @@ class ParticleFilter:
     found: NDArray[np.float64]  # [t] what may be anywhere again; the next view says where
     doubt: Doubt
     seed: int  # of all draws
+    told: float = 0.0  # as `GridFilter.told`
 
     @classmethod
     def uniform(
@@ -133,23 +134,25 @@ class ParticleFilter:
     def updated(self, seen: ViewEvidence, step: int) -> Self:
         """As `GridFilter.updated`; the paper's particles are drawn anew at once where their weights ask for it."""
         images = self.route.nearest_image(self.position_m)
-        trust = self.doubt.trust
+        trust, news = self.doubt.trust, seen.news(self.doubt.last)
         if seen.is_added:
             on_route = 1 - self.doubt.lost
             weights = np.outer(on_route, added(trust @ self.weights / on_route.mean(), seen.values[images]))
             weighed = replace(self, weights=weights, found=np.zeros_like(self.found))
         else:
-            least = seen.likelihood(self.doubt.last)
+            least = seen.likelihood(news)
             factors = np.stack([least ** (2**t) for t in range(trust.size)])  # each twice the one before
             average = factors.mean(axis=1)
             weights, found, lost = self.weights * factors[:, images], self.found * average, self.doubt.lost * average
             total = weights.sum(axis=1) + found + lost
             if (total <= 0).any():  # the view allows nothing that is still believed: what was known stays
-                return self
+                return replace(self, told=0.0)
             doubt = Doubt(lost / total, self.doubt.log_trust + np.log(total / average), seen.values)
             weighed = replace(self, weights=weights / total[:, np.newaxis], found=found / total, doubt=doubt)
             weighed = weighed._placed(factors * self.route.cell_m, step)
-        return weighed if self.doubt.is_mixture else weighed._evened_out(step)
+        after = weighed if self.doubt.is_mixture else weighed._evened_out(step)
+        moved = 0.5 * float(np.abs(after.mass - self.mass).sum())
+        return replace(after, told=max(moved, seen.least_told(news)))
 
     def _evened_out(self, step: int) -> Self:
         """Resampled where the effective sample size has fallen below half the particles."""

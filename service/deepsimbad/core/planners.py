@@ -18,6 +18,7 @@ NNQL, INFORMED, RANDOM, CONSTANT = "nnql", "informed", "random", "constant"
 DEFAULT_PLANNER = INFORMED
 NNQL_NEIGHBOURS = 4  # k of the paper
 _DISCOUNT, _SWEEPS = 0.9, 60
+_NOTHING = 1e-12  # of a belief: a place that holds less moves no average
 _MOST_PRICES = 8  # whose tables are kept: of 26,000 images each takes 2 MB
 
 
@@ -146,6 +147,8 @@ def _averaged(mass: NDArray[np.float64], rows: NDArray[np.float32]) -> NDArray[n
     """[a] rows averaged by mass. A loop of our own: BLAS would wake its threads for this."""
     averages = np.zeros(rows.shape[1])
     for image in range(mass.size):
+        if mass[image] < _NOTHING:
+            continue
         for place in range(averages.size):
             averages[place] += mass[image] * rows[image, place]
     return averages

@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from deepsimbad.core.cells import Cells
 from deepsimbad.errors import InvalidRouteError
 
 _NearPoint = Callable[[float, float], NDArray[np.intp]]
@@ -123,6 +124,12 @@ class Route:
         """The distinct positions."""
         position_m, of_image, n_images = np.unique(self.position_m, return_inverse=True, return_counts=True)
         return Places(position_m, of_image, n_images)
+
+    @cached_property
+    def cells(self) -> Cells:
+        """Of equal length, for a grid belief."""
+        width_m = np.bincount(self.places.of_image, self.cell_m)
+        return Cells.along(self.places.position_m, width_m, self.length_m, self.closed)
 
     def nearest_image(self, position_m: NDArray[np.float64]) -> NDArray[np.intp]:
         """The map image nearest to each position along the route; of two equally near the earlier."""

@@ -65,8 +65,18 @@ def summarise(route: Route, mass: NDArray[np.float64], n_top: int, off_route: fl
 
 def near_mode(route: Route, mass: NDArray[np.float64], mode: int) -> float:
     """The share of masses [n] no farther than 5 m from an image."""
-    near = np.abs(route.offset_m(route.position_m, float(route.position_m[mode]))) <= CONFIDENT_WITHIN_M
-    return float(mass[near].sum())
+    if route.closed and route.length_m <= 2 * CONFIDENT_WITHIN_M:
+        return float(mass.sum())
+    turns_m = (-route.length_m, 0.0, route.length_m) if route.closed else (0.0,)
+    at_m, near = route.position_m[mode], 0.0
+    for turn_m in turns_m:
+        window_m = (at_m + turn_m - CONFIDENT_WITHIN_M, at_m + turn_m + CONFIDENT_WITHIN_M)
+        first, last = (
+            np.searchsorted(route.position_m, window_m[0]),
+            np.searchsorted(route.position_m, window_m[1], "right"),
+        )
+        near += float(mass[first:last].sum())
+    return near
 
 
 def _moments(route: Route, mass: NDArray[np.float64]) -> tuple[float, float]:

@@ -1,0 +1,110 @@
+"""A route in cells of one length, which all move together: where a grid belief lives."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Self
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+_MOST_PER_PLACE = 4  # cells, where a few places are far apart and the others near each other
+_ROUNDING = 1e-9  # of a cell
+
+
+@dataclass(frozen=True)
+class Cells:
+    """Equal cells along a route, whose places stand for some of its metres each.
+
+    Where places stand at equal distances, cells are places. All cells may be ahead of where they began by one offset
+    of at most half a cell: a move is a shift by whole cells and an offset, and blurs nothing.
+    """
+
+    start_m: float  # where the first begins, at offset 0
+    step_m: float  # their length
+    n_cells: int  # c
+    closed: bool  # the last joins the first
+    place_m: NDArray[np.float64]  # [p] distinct positions of map images, ascending
+    place_width_m: NDArray[np.float64]  # [p] metres that each stands for
+
+    @classmethod
+    def along(cls, place_m: NDArray[np.float64], width_m: NDArray[np.float64], length_m: float, closed: bool) -> Self:
+        """As long as neighbouring places are usually apart."""
+        if place_m.size == 1 or length_m <= 0:
+            return cls(float(place_m[0]), 1.0, 1, False, place_m, width_m)
+        usual_m = max(float(np.median(np.diff(place_m))), length_m / (_MOST_PER_PLACE * place_m.size))
+        n_steps = max(1, round(length_m / usual_m))
+        return cls(float(place_m[0]), length_m / n_steps, n_steps if closed else n_steps + 1, closed, place_m, width_m)
+
+    @cached_property
+    def position_m(self) -> NDArray[np.float64]:
+        """[c] of their middles, at offset 0."""
+        return self.start_m + self.step_m * np.arange(self.n_cells)
+
+    def shifted(self, metres: float) -> tuple[int, float]:
+        """A way in whole cells, and the rest."""
+        whole = round(metres / self.step_m)
+        return whole, metres - whole * self.step_m
+
+    def sources(self, shift: int, offset_m: float, reach_m: float) -> slice:
+        """The cells that a move leaves on the route, or beyond an end by no more than half a cell and a reach."""
+        if self.closed:
+            return slice(0, self.n_cells)
+        beyond = 0.5 + (reach_m - offset_m) / self.step_m
+        before = 0.5 + (reach_m + offset_m) / self.step_m
+        last = self.n_cells - 1 + int(np.floor(beyond + _ROUNDING)) - shift
+        first = -int(np.floor(before + _ROUNDING)) - shift
+        first = min(max(first, 0), self.n_cells)
+        return slice(first, min(max(last + 1, first), self.n_cells))
+
+    def of_places(self, values: NDArray[np.float64], offset_m: float) -> NDArray[np.float64]:
+        """[c] values at cells from those at places [p]: between two places the way leads from one to the other."""
+        length_m = self.step_m * self.n_cells if self.closed else 0.0
+        return _interpolated(values, self.place_m, self.start_m + offset_m, self.step_m, self.n_cells, length_m)
+
+    def to_places(self, mass: NDArray[np.float64], offset_m: float) -> NDArray[np.float64]:
+        """[p] masses of places, summing to 1, from those of cells [c]: as dense as cells are there."""
+        dense = _dense_at(mass, (self.place_m - self.start_m - offset_m) / self.step_m, self.closed)
+        on_places = dense * self.place_width_m
+        return np.asarray(on_places / max(on_places.sum(), 1e-300), np.float64)
+
+
+@njit(cache=True, nogil=True)
+def _interpolated(
+    values: NDArray[np.float64], at_m: NDArray[np.float64], from_m: float, step_m: float, n: int, length_m: float
+) -> NDArray[np.float64]:
+    """[n] linear between values at ascending positions, constant beyond the ends; round a loop of length_m > 0."""
+    into = np.empty(n)
+    last = at_m.size - 1
+    after = 0
+    for cell in range(n):
+        metres = from_m + cell * step_m
+        while after <= last and at_m[after] < metres:
+            after += 1
+        if 0 < after <= last:
+            share = (metres - at_m[after - 1]) / (at_m[after] - at_m[after - 1])
+            into[cell] = values[after - 1] + (values[after] - values[after - 1]) * share
+        elif length_m > 0:  # between the last place and the first
+            gap_m = at_m[0] + length_m - at_m[last]
+            beyond_m = metres - at_m[last] if after > last else metres + length_m - at_m[last]
+            into[cell] = values[last] + (values[0] - values[last]) * (beyond_m / gap_m if gap_m > 0 else 0.0)
+        else:
+            into[cell] = values[min(after, last)]
+    return into
+
+
+@njit(cache=True, nogil=True)
+def _dense_at(mass: NDArray[np.float64], at: NDArray[np.float64], closed: bool) -> NDArray[np.float64]:
+    """[p] the mass of a cell there, linear between the middles of cells."""
+    n = mass.size
+    dense = np.empty(at.size)
+    for place in range(at.size):
+        below = int(np.floor(at[place]))
+        share = at[place] - below
+        one, other = below, below + 1
+        if closed:
+            one, other = one % n, other % n
+        else:
+            one, other = min(max(one, 0), n - 1), min(max(other, 0), n - 1)
+        dense[place] = mass[one] + (mass[other] - mass[one]) * share
+    return dense
