@@ -95,7 +95,7 @@ def test_a_step_is_describe_retrieve_predict_update_plan(snapshots, queries, clo
         answered = relevances(map_, query, live)
         shared = 0.0
         if number:
-            belief = belief.predicted(action_m, math.sqrt(0.0025 + 0.01 * action_m), number)
+            belief = belief.predicted(action_m, math.sqrt(0.0025 + 0.01 * action_m) if action_m else 0.0, number)
             shared = map_.shared_error_after(action_m)
         belief = belief.updated(ViewEvidence.of(answered, map_.update_rule, map_.log_likelihood_scale, shared), number)
         np.testing.assert_allclose(step.state.relevance, answered)

@@ -41,7 +41,7 @@ FOUND_A_VIEW = 0.02  # of what is lost, spread over the route when the robot has
 LEAST_SURVIVING_SHARE = 1e-9  # of a belief before a move; with less it leads past the end wherever the robot may be
 _DOUBTING = 0.01  # a belief that takes the robot for lost by more refuses no move
 SIGMAS = 4.0  # a move's error is cut off here
-SLIPS = 0.3  # how often odometry is wrong by more than it says
+_TENTH = 0.1  # of a move: how far off odometry is when a wheel slips or its size is not what it was
 _BLOCK = 2048  # cells whose sums stay in the first-level cache
 _NARROW = 0.6  # cells; a narrower normal curve is not sampled, but has its variance all the same
 
@@ -61,9 +61,9 @@ def motion_std_m(action_m: float) -> float:
     return float(np.sqrt(0.05**2 + 0.01 * abs(action_m)))
 
 
-def slipping_std_m(action_m: float, action_std_m: float, doubt: "Doubt") -> float:
-    """Standard deviation of a move whose odometry is wrong by a tenth, which it is now and then."""
-    return float(np.hypot(action_std_m, 0.1 * action_m)) if doubt.is_mixture else action_std_m
+def moving_std_m(action_m: float, action_std_m: float, doubt: "Doubt") -> float:
+    """Standard deviation of a move whose odometry may be off by a tenth, as a mixture takes every one to be."""
+    return float(np.hypot(action_std_m, _TENTH * action_m)) if doubt.is_mixture else action_std_m
 
 
 @dataclass(frozen=True)
@@ -240,7 +240,7 @@ class GridFilter:
         masses = _moved(
             self.masses,
             (int(some.start), int(some.stop), shift),
-            move_error(cells, action_std_m, slipping_std_m(action_m, action_std_m, doubt)),
+            move_error(cells, moving_std_m(action_m, action_std_m, doubt)),
             staying / total,
             found / (total * cells.n_cells),
             cells.closed,
@@ -256,8 +256,9 @@ class GridFilter:
             mass = added(self._believed, at_cells.values)
             masses, doubt = np.outer(1 - self.doubt.lost, mass), self.doubt
         else:
-            masses, *rest = _see(self.masses, self.doubt.lost, self.doubt.log_trust, at_cells.likelihood(news))
-            doubt = Doubt(*rest, at_cells.values)
+            seeing = self.masses, self.doubt.lost, self.doubt.log_trust, at_cells.likelihood(news)
+            masses, lost, log_trust = _see(*seeing)
+            doubt = Doubt(lost, log_trust, at_cells.values)
         after = replace(self, masses=masses, doubt=doubt)
         moved = 0.5 * float(_apart(after._believed, self._believed))
         return replace(after, told=max(moved, at_cells.least_told(news)))
@@ -376,21 +377,15 @@ def _apart(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
     return total
 
 
-def move_error(cells: Cells, std_m: float, slipping_m: float) -> NDArray[np.float64]:
-    """[2 w + 1] a move's error, from w cells behind to w ahead: mostly normal, now and then of a wheel that slips."""
-    reach = min(int(SIGMAS * slipping_m / cells.step_m), cells.n_cells - 1)
-    reach = max(reach, min(1, cells.n_cells - 1)) if slipping_m > 0 else 0
-    taps = np.zeros(2 * reach + 1)
-    for share, deviation in ((1 - SLIPS, std_m / cells.step_m), (SLIPS, slipping_m / cells.step_m)):
-        if deviation < _NARROW:
-            half = min(deviation**2 / 2, 0.5) if reach else 0.0
-            taps[reach] += share * (1 - 2 * half)
-            taps[reach - 1 : reach + 2 : 2] += share * half
-        else:
-            off = np.arange(-reach, reach + 1) / deviation
-            weights = np.where(np.abs(off) <= SIGMAS, np.exp(-0.5 * np.square(off)), 0.0)
-            taps += share * weights / weights.sum()
-    return taps
+def move_error(cells: Cells, std_m: float) -> NDArray[np.float64]:
+    """[2 w + 1] a move's normal error, from w cells behind to w ahead."""
+    deviation = std_m / cells.step_m
+    if deviation < _NARROW:
+        half = deviation**2 / 2 if cells.n_cells > 1 else 0.0
+        return np.array([half, 1 - 2 * half, half]) if half > 0 else np.ones(1)
+    reach = min(int(SIGMAS * deviation), cells.n_cells - 1)
+    weights = np.exp(-0.5 * np.square(np.arange(-reach, reach + 1) / deviation))
+    return np.asarray(weights / weights.sum())
 
 
 @njit(cache=True, nogil=True)

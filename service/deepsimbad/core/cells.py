@@ -39,7 +39,7 @@ class Cells:
     @cached_property
     def position_m(self) -> NDArray[np.float64]:
         """[c] of their middles, at offset 0."""
-        return self.start_m + self.step_m * np.arange(self.n_cells)
+        return np.asarray(self.start_m + self.step_m * np.arange(self.n_cells), np.float64)
 
     def shifted(self, metres: float) -> tuple[int, float]:
         """A way in whole cells, and the rest."""

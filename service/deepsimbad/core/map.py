@@ -32,7 +32,7 @@ UNKNOWN_FRAME = 0  # no digest was kept of what an image was made of
 DEFAULT_ACTIONS_M = tuple(float(metres) for metres in range(1, 11))
 MOST_ACTION_M = 1000.0
 _USUAL_NOVELTY_M = 3.0  # over which views stop to err alike, where nobody measured it
-_SHARED = 0.5  # of the novelty curve
+_SHARED = 0.5  # of the novelty curve, where nobody measured it
 _SAME_PLACE_M = 0.3
 
 # A relevance compares more than lists.
@@ -79,6 +79,7 @@ class Map:
         likelihood_scale: What a relevance counts as a log-likelihood, where two seasons taught it.
         most_strange: How strange a view of a place may be (`relevance.strangeness`), where encodings are compared.
         novelty: How much alike two views err that are 0, 1, 2.. m apart, 1 to 0.
+        repeated: How much of what a view says of wrong places the view 0, 1, 2.. m before has said too, 1 to 0.
         view_bits: By how many bits a view from a place narrows the map down.
         coverage: The chance that a single view from a place is placed rightly, NaN where unknown (`composed`).
         timestamp_us: Microseconds since 1970, -1 where unknown.
@@ -111,6 +112,7 @@ class Map:
     likelihood_scale: NDArray[np.float64] | None = field(default=None, metadata=_row(np.float64, 1))
     most_strange: NDArray[np.float64] | None = field(default=None, metadata=_row(np.float64, 1))
     novelty: NDArray[np.float64] | None = field(default=None, metadata=_row(np.float64, "*"))
+    repeated: NDArray[np.float64] | None = field(default=None, metadata=_row(np.float64, "*"))
     view_bits: NDArray[np.float32] | None = field(default=None, metadata=_row(np.float32, "n"))
     coverage: NDArray[np.float32] | None = field(default=None, metadata=_row(np.float32, "n", unknown=np.nan))
     timestamp_us: NDArray[np.int64] | None = field(default=None, metadata=_row(np.int64, "n", unknown=-1))
@@ -351,7 +353,11 @@ class Map:
 
     def shared_error_after(self, action_m: float) -> float:
         """How much of a view's error is that of the view before: of one from the same place nearly all of it."""
-        shared = _SHARED * self.alike_after(action_m)
+        shared = self.alike_after(action_m)
+        if self.repeated is None:
+            shared *= _SHARED
+        else:
+            shared *= float(np.interp(abs(action_m), np.arange(self.repeated.size), self.repeated))
         return float(shared + (1 - shared) * np.exp(-abs(action_m) / _SAME_PLACE_M))
 
     @cached_property

@@ -18,7 +18,7 @@ from deepsimbad.core.belief import (
     check_ahead,
     leaving_and_found,
     moved_along,
-    slipping_std_m,
+    moving_std_m,
 )
 from deepsimbad.core.relevance import UpdateRule
 from deepsimbad.core.route import Route
@@ -122,8 +122,7 @@ class ParticleFilter:
         lost, staying, found = leaving_and_found(
             self.doubt, self.doubt.lost + self.found, on_route, surviving, action_m
         )
-        # The grid's moves are blurred by its spacing, these are not: every one may be wrong by a tenth.
-        std_m = slipping_std_m(action_m, action_std_m, self.doubt)
+        std_m = moving_std_m(action_m, action_std_m, self.doubt)
         moved = _onto(route, target_m + std_m * rng.standard_normal(target_m.size))
         last = self.doubt.last
         last = last if last is None else moved_along(route, last, action_m)

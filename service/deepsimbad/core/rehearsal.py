@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from deepsimbad.core.belief import moved_along
 from deepsimbad.core.descriptor import normal_scores, rank_landmarks
 from deepsimbad.core.drive import SecondSeason
 from deepsimbad.core.index.retrieval import relevances
@@ -18,10 +19,13 @@ _LIKELIHOOD_VIEWS = 400
 _NEAR_M = 2.0  # views of places no farther apart are of one place
 _LEAST_SCALE, _MOST_SCALE = 2.0, 60.0
 _DISTINCT_PLACES = 5000
+_REPEATED_VIEWS = 150
+_NEAR_LAG = 0.5  # of a lag: how far off it a pair of views may be
+_OWN_PLACE_M = 4.0
 
 
 def rehearsed(map_: Map, own: NDArray[np.float32], season: SecondSeason | None) -> dict[str, Any]:
-    """The named arrays that say how views err: `novelty`, and `likelihood_scale` where a season teaches it.
+    """The named arrays that say how views err: `novelty`, `repeated`, and `likelihood_scale` of a second season.
 
     Args:
         map_: Its lists must not know the second season, as no list knows the season to come.
@@ -30,12 +34,15 @@ def rehearsed(map_: Map, own: NDArray[np.float32], season: SecondSeason | None) 
     """
     longest_m = float(np.abs(map_.actions_m).max(initial=1.0))
     scores = _scores(map_, own)
+    repeated = repeated_after(map_, own)
     if season is None:
-        return {"novelty": novelty_curve(map_.position_m, scores - scores.mean(axis=0), longest_m)}
+        novelty = novelty_curve(map_.position_m, scores - scores.mean(axis=0), longest_m)
+        return {"novelty": novelty, "repeated": repeated}
     images, frames = season.places.T
     difference = _scores(map_, season.dissimilarities[frames]) - scores[images]
     arrays: dict[str, Any] = {
-        "novelty": novelty_curve(map_.position_m[images], difference - difference.mean(axis=0), longest_m)
+        "novelty": novelty_curve(map_.position_m[images], difference - difference.mean(axis=0), longest_m),
+        "repeated": repeated,
     }
     if map_.relevance is Relevance.COMPOSED:
         arrays["likelihood_scale"] = np.array([likelihood_scale(map_, season)])
@@ -100,6 +107,45 @@ def novelty_curve(at_m: NDArray[np.float64], difference: NDArray[np.floating], l
     if correlation[0] <= 0:
         return np.exp(-lags_m / _SMOOTHED_OVER_M)
     return np.minimum.accumulate(np.clip(correlation / correlation[0], 0.0, 1.0))
+
+
+def repeated_after(map_: Map, own: NDArray[np.float32]) -> NDArray[np.float64]:
+    """How much of what a view says of wrong places a view 0, 1, 2.. m before has said too, 1 to 0.
+
+    Views of a route repeat themselves by as much as its scenes are long, whatever the season: so the map's own images
+    tell, each but for its own place. It is the slope by which what was said, carried along by the move, predicts what
+    is said; at 0 m as after 1.
+
+    Args:
+        map_: A view's relevances are compared with its lists.
+        own: [n, r] dissimilarities of the map images themselves.
+    """
+    route, at_m = map_.route, map_.position_m
+    n_lags = int(np.ceil(np.abs(map_.actions_m).max(initial=1.0)))
+    images = np.linspace(0, map_.n_images - 1, min(map_.n_images, _REPEATED_VIEWS)).astype(np.int64)
+    slopes = np.zeros(n_lags + 1)
+    said = _views_said(map_, own, images)
+    for lag in range(1, n_lags + 1):
+        later = route.nearest_image(route.wrapped(at_m[images] + lag))
+        moved_m = route.offset_m(at_m[later], at_m[images])
+        pairs = np.flatnonzero(np.abs(moved_m - lag) <= _NEAR_LAG * lag)
+        says = _views_said(map_, own, later[pairs])
+        product = square = 0.0
+        for pair, now in zip(pairs, says, strict=True):
+            before = moved_along(route, said[pair], float(moved_m[pair]))
+            wrong = np.abs(route.offset_m(at_m, float(at_m[later[pair]]))) > _OWN_PLACE_M
+            product += float(before[wrong] @ now[wrong])
+            square += float(before[wrong] @ before[wrong])
+        slopes[lag] = product / square if square > 0 else slopes[lag - 1]
+    slopes[0] = slopes[1]
+    return np.minimum.accumulate(np.clip(slopes, 0.0, 1.0))
+
+
+def _views_said(map_: Map, own: NDArray[np.float32], images: NDArray[np.int64]) -> NDArray[np.float64]:
+    """[v, n] relevances of the map's own images, less their mean over the map."""
+    views = SecondSeason(own, np.stack([images, images], axis=1))
+    relevance = relevances(map_, views.views(images)).astype(np.float64)
+    return np.asarray(relevance - relevance.mean(axis=1, keepdims=True))
 
 
 def _smooth_to(
