@@ -22,7 +22,6 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from deepsimbad.core.cells import Cells
 from deepsimbad.core.relevance import UpdateRule, mean_ranks
 from deepsimbad.core.route import Route
 from deepsimbad.errors import PastTheEndError
@@ -240,7 +239,7 @@ class GridFilter:
         masses = _moved(
             self.masses,
             (int(some.start), int(some.stop), shift),
-            move_error(cells, moving_std_m(action_m, action_std_m, doubt)),
+            move_error(cells.step_m, cells.n_cells, moving_std_m(action_m, action_std_m, doubt)),
             staying / total,
             found / (total * cells.n_cells),
             cells.closed,
@@ -377,13 +376,13 @@ def _apart(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
     return total
 
 
-def move_error(cells: Cells, std_m: float) -> NDArray[np.float64]:
-    """[2 w + 1] a move's normal error, from w cells behind to w ahead."""
-    deviation = std_m / cells.step_m
+def move_error(step_m: float, n_cells: int, std_m: float) -> NDArray[np.float64]:
+    """[2 w + 1] a move's normal error, from w cells of `step_m` behind to w ahead."""
+    deviation = std_m / step_m
     if deviation < _NARROW:
-        half = deviation**2 / 2 if cells.n_cells > 1 else 0.0
+        half = deviation**2 / 2 if n_cells > 1 else 0.0
         return np.array([half, 1 - 2 * half, half]) if half > 0 else np.ones(1)
-    reach = min(int(SIGMAS * deviation), cells.n_cells - 1)
+    reach = min(int(SIGMAS * deviation), n_cells - 1)
     weights = np.exp(-0.5 * np.square(np.arange(-reach, reach + 1) / deviation))
     return np.asarray(weights / weights.sum())
 

@@ -123,21 +123,25 @@ def repeated_after(map_: Map, own: NDArray[np.float32]) -> NDArray[np.float64]:
     route, at_m = map_.route, map_.position_m
     n_lags = int(np.ceil(np.abs(map_.actions_m).max(initial=1.0)))
     images = np.linspace(0, map_.n_images - 1, min(map_.n_images, _REPEATED_VIEWS)).astype(np.int64)
-    slopes = np.zeros(n_lags + 1)
+    slopes = np.full(n_lags + 1, np.nan)
     said = _views_said(map_, own, images)
     for lag in range(1, n_lags + 1):
         later = route.nearest_image(route.wrapped(at_m[images] + lag))
         moved_m = route.offset_m(at_m[later], at_m[images])
         pairs = np.flatnonzero(np.abs(moved_m - lag) <= _NEAR_LAG * lag)
-        says = _views_said(map_, own, later[pairs])
+        says = _views_said(map_, own, later[pairs]) if pairs.size else ()
         product = square = 0.0
         for pair, now in zip(pairs, says, strict=True):
             before = moved_along(route, said[pair], float(moved_m[pair]))
             wrong = np.abs(route.offset_m(at_m, float(at_m[later[pair]]))) > _OWN_PLACE_M
             product += float(before[wrong] @ now[wrong])
             square += float(before[wrong] @ before[wrong])
-        slopes[lag] = product / square if square > 0 else slopes[lag - 1]
-    slopes[0] = slopes[1]
+        if square > 0:
+            slopes[lag] = product / square
+    lags, is_measured = np.arange(n_lags + 1), np.isfinite(slopes)
+    if not is_measured.any():  # no two images are so near each other
+        return np.exp(-lags / _SMOOTHED_OVER_M)
+    slopes = np.interp(lags, lags[is_measured], slopes[is_measured])
     return np.minimum.accumulate(np.clip(slopes, 0.0, 1.0))
 
 

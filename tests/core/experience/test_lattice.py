@@ -25,10 +25,12 @@ def slow_move(mass: np.ndarray, cells: float, std_cells: float, closed: bool) ->
         for to, share in ((c + whole, 1 - part), (c + whole + 1, part)):
             if share > 1e-4 and (closed or (c + whole >= 0 and c + whole + (part > 1e-4) < n)):
                 moved[to % n] += mass[c] * share
-    reach = int(4 * std_cells + 1e-9)
+    reach = max(1, int(4 * std_cells))
     for c in range(n):
         to = np.array([d for d in range(-reach, reach + 1) if closed or 0 <= c + d < n])
         weight = np.exp(-0.5 * np.square(to / std_cells))
+        if std_cells < 0.6:  # three weights of that variance
+            weight = np.where(to == 0, 1 - std_cells**2, np.where(np.abs(to) == 1, std_cells**2 / 2, 0))
         np.add.at(spread, (c + to) % n, moved[c] * weight / weight.sum())
     return spread / spread.sum()
 

@@ -33,7 +33,7 @@ def random_world(
 
 def moved(mass: np.ndarray, metres: int, std_m: float, closed: bool) -> np.ndarray:
     """A metre an image; what would be past an end of an open route is dropped."""
-    n, reach = len(mass), int(4 * std_m)
+    n, reach = len(mass), max(1, int(4 * std_m))
     shifted = np.roll(mass, metres)
     if not closed and metres > 0:
         shifted[:metres] = 0
@@ -42,7 +42,8 @@ def moved(mass: np.ndarray, metres: int, std_m: float, closed: bool) -> np.ndarr
     spread = np.zeros(n)
     for image in range(n):
         to = [d for d in range(-reach, reach + 1) if closed or 0 <= image + d < n]
-        weight = [np.exp(-0.5 * (d / std_m) ** 2) for d in to]
+        narrow = {0: 1 - std_m**2, 1: std_m**2 / 2}
+        weight = [narrow.get(abs(d), 0.0) if std_m < 0.6 else np.exp(-0.5 * (d / std_m) ** 2) for d in to]
         for d, w in zip(to, weight, strict=True):
             spread[(image + d) % n] += shifted[image] * w / sum(weight)
     return spread / spread.sum()

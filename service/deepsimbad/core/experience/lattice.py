@@ -12,9 +12,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from deepsimbad.core.belief import move_error
 from deepsimbad.core.route import Route
 
-_SIGMAS = 4.0  # as in the grid filter
 _TAPS_AT_ONCE = 4
 _WHOLE = 1e-4  # of a cell; a lesser part of one is a rounding of positions
 _BLOCK = 2048  # cells whose sums stay in the first-level cache
@@ -71,10 +71,7 @@ class Lattice:
 
     def taps(self, std_m: float) -> NDArray[np.float32]:
         """[2w + 1] weights of a normal error, from w cells behind to w ahead; one tap of weight 1 for none."""
-        reach = min(int(_SIGMAS * std_m / self.step_m + 1e-9), self.n_cells - 1)
-        off = np.arange(-reach, reach + 1) * self.step_m / max(std_m, 1e-9)
-        weights = np.exp(-0.5 * off * off)
-        return np.asarray(weights / weights.sum(), np.float32)
+        return move_error(self.step_m, self.n_cells, std_m).astype(np.float32)
 
 
 def moves_along(lattice: Lattice, actions_m: Sequence[float], stds_m: Sequence[float]) -> Moves:
