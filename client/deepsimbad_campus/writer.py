@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from deepsimbad_campus.observer import CAPTIONS, DETECTIONS, Observer
 from deepsimbad_campus.renderer import Renderer
 from deepsimbad_campus.route import Drive, drive_length_m
 from deepsimbad_campus.season import PAPER_DATES, CampusError, drive_date
@@ -31,7 +32,8 @@ def write_campus(
     """Render a drive for every season or ISO date (each once) along one route; returns them as sources.
 
     Pictures go to `<root>/<date>/lb3/Cam5/<utime>.tiff`, 1616 x 1232 as stored (turn them 90 degrees clockwise),
-    and poses to `<root>/ground_truth/groundtruth_<date>.csv`. Equal arguments give equal bytes. A call that was cut
+    what is told of them to `detections.jsonl` and `captions.csv` in `<root>/<date>`, and poses to
+    `<root>/ground_truth/groundtruth_<date>.csv`. Equal arguments give equal bytes. A call that was cut
     short goes on where it stopped, and a call with more frames adds to those that are there.
 
     Raises:
@@ -82,6 +84,7 @@ def _write_drive(root: Path, world: World, drive: Drive) -> Iterator[None]:
     for left in folder.glob(".*.part"):  # of a call that was cut short
         left.unlink(missing_ok=True)
     files = [folder / f"{utime}.tiff" for utime in drive.utime]
+    _tell(root / f"{drive.date}", world, drive, [file.name for file in files])
     missing = [frame for frame, file in enumerate(files) if not file.exists()]
     yield from [None] * (len(files) - len(missing))
     if missing:
@@ -92,6 +95,15 @@ def _write_drive(root: Path, world: World, drive: Drive) -> Iterator[None]:
 
         with ThreadPoolExecutor(os.cpu_count(), thread_name_prefix="campus") as pool:
             yield from pool.map(write, missing)
+
+
+def _tell(folder: Path, world: World, drive: Drive, names: list[str]) -> None:
+    """Write what a detector and a person say of the pictures, where that is not there of so many."""
+    files = folder / DETECTIONS, folder / CAPTIONS
+    said = [file.read_bytes().count(b"\n") if file.exists() else 0 for file in files]
+    if said != [len(names), len(names) + 1]:
+        for file, body in zip(files, Observer(world, drive).files(names), strict=True):
+            _replace(file, body)
 
 
 def _replace(file: Path, body: bytes) -> None:

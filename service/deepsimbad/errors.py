@@ -66,6 +66,10 @@ class InvalidEncodingError(InvalidInputError, code="invalid_encoding"):
     """An encoding of the wrong length, or with NaN or infinity in it."""
 
 
+class InvalidSceneError(InvalidInputError, code="invalid_scene"):
+    """Objects or a text that tell no scene."""
+
+
 class InvalidDissimilaritiesError(InvalidInputError, code="invalid_dissimilarities"):
     """Dissimilarities that are not r finite numbers."""
 

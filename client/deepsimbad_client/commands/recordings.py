@@ -25,10 +25,11 @@ from deepsimbad_client.errors import UnknownDomainError
 from deepsimbad_client.http.client import Client
 from deepsimbad_client.http.models import Domain
 from deepsimbad_client.http.upload import upload as upload_recording
-from deepsimbad_client.recordings import Recording
+from deepsimbad_client.recordings import Recording, read_file
 from deepsimbad_client.recordings.folder import single
 from deepsimbad_client.recordings.options import accounting, opened, reading, rotate_option, tell_left_out, tell_remarks
 from deepsimbad_client.recordings.sources import RECORDING_SUFFIXES
+from deepsimbad_client.recordings.told import TOLD_SUFFIXES, as_taken
 from deepsimbad_client.replay import DEFAULT_PLANNER
 from deepsimbad_client.replay.active import EPISODES, STEPS, Stage, active_replay
 from deepsimbad_client.replay.passive import TOLERANCE_M
@@ -120,7 +121,8 @@ def localize(
 ) -> None:
     """Say where images were probably taken.
 
-    IMAGE is a file, or a SOURCE such as nclt:ROOT/DATE#40:41 or a folder; each image is placed on its own.
+    IMAGE is a file, or a SOURCE such as nclt:ROOT/DATE#40:41 or a folder; each image is placed on its own. Where the
+    domain takes them it may be a .txt that says what is seen, or a .json of {"objects": [...]}.
     """
     described = client.domain(domain)
     shortlist = min(shortlist, described.n_map_images or shortlist)
@@ -136,6 +138,9 @@ def _views(images: Iterable[str], domain: Domain, rotate: int | None) -> Iterato
     """Every view with its name, made ready as an upload would make it, so that it is encoded like a map's own."""
     for name in images:
         path = Path(name)
+        if path.is_file() and path.suffix.lower() in TOLD_SUFFIXES:
+            yield name, {"image": read_file(path), "content_type": TOLD_SUFFIXES[path.suffix.lower()]}
+            continue
         is_image = path.is_file() and path.suffix.lower() not in RECORDING_SUFFIXES
         if is_image:
             recording: Recording = single(path, rotate)
@@ -143,7 +148,7 @@ def _views(images: Iterable[str], domain: Domain, rotate: int | None) -> Iterato
         else:
             recording = opened(name, rotate=rotate)
             tell_left_out(recording.left_out_names, recording.name, verbose=False)
-        recording = recording.shown_by(domain.grey_levels)
+        recording = as_taken(recording, domain.takes).shown_by(domain.grey_levels)
         for row, frame in enumerate(recording.frames):
             yield name if is_image else frame.name, recording.view(row, domain.input_size)
 

@@ -1,5 +1,6 @@
 """What one request of the contract says, and how its answer is read; nothing here sends."""
 
+import hashlib
 import json
 import math
 import re
@@ -148,6 +149,8 @@ class ViewForm(TypedDict, total=False):
     ranked_landmarks: Numbers | None  # landmark ids, nearest first, 1..r of them
     dissimilarities: Numbers | None  # r finite numbers in landmark order, smaller is nearer
     encoding: Numbers | None  # a ready encoding, where the domain takes them
+    objects: Iterable[Mapping[str, Any]] | None  # {"label", "box", "score"} each, where the domain takes them
+    text: str | None  # what is seen in words, where the domain takes them
     ranked: Observation | None  # what an `OnBoardEncoder` made of an image, a few bytes
 
 
@@ -160,8 +163,14 @@ def observation(image: Image | None = None, **view: Unpack[ViewForm]) -> Observa
     """Make the body of one observation; raises InvalidArgumentError, BrokenFrameError (the file cannot be read)."""
     content_type = view.pop("content_type", None)
     forms = {name: form for name, form in view.items() if form is not None}
+    told: dict[str, Any] = {name: forms[name] for name in ("objects", "text") if name in forms}
+    if told and len(told) == len(forms):
+        return observed(told, None if image is None else image_bytes(image))
     if len(forms) + (image is not None) != 1:
-        raise InvalidArgumentError("give exactly one of image, ranked, ranked_landmarks, dissimilarities and encoding")
+        raise InvalidArgumentError(
+            "give exactly one of image, ranked, ranked_landmarks, dissimilarities and encoding; or objects and text, "
+            "beside an image where the domain takes both"
+        )
     if image is not None:
         body = image_bytes(image)
         media_type = content_type or media_type_of(body)
@@ -177,6 +186,25 @@ def observation(image: Image | None = None, **view: Unpack[ViewForm]) -> Observa
     except (TypeError, ValueError) as error:
         raise InvalidArgumentError(f"{name} must be plain numbers without NaN or infinity: {error}") from error
     return Observation(text.encode(), "application/json")
+
+
+def observed(told: Mapping[str, Any], image: bytes | None = None) -> Observation:
+    """The body of a view that is told by objects, a text, or both; a form where an image goes with it."""
+    told = {name: value if isinstance(value, str) else list(value) for name, value in told.items()}
+    try:
+        if image is None:
+            return Observation(json.dumps(told, allow_nan=False).encode(), "application/json")
+        parts = {name: value if isinstance(value, str) else json.dumps(value, allow_nan=False)
+                 for name, value in told.items()}  # fmt: skip
+    except (TypeError, ValueError) as error:
+        raise InvalidArgumentError(f"objects and text must be plain JSON: {error}") from error
+    content = {"image": image, **{name: value.encode() for name, value in parts.items()}}
+    boundary = hashlib.sha256(b"".join(content.values())).hexdigest()[:40]  # equal views, equal bytes
+    body = b"".join(
+        b'--%s\r\nContent-Disposition: form-data; name="%s"\r\n\r\n%s\r\n' % (boundary.encode(), name.encode(), value)
+        for name, value in content.items()
+    )
+    return Observation(body + f"--{boundary}--\r\n".encode(), f"multipart/form-data; boundary={boundary}")
 
 
 def image_bytes(image: Image) -> bytes:

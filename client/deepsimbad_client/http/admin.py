@@ -1,7 +1,7 @@
 """What an administrator asks for, on the blocking and the async client: domains, traverses, jobs, maps, sessions."""
 
 import time
-from collections.abc import AsyncGenerator, Callable, Mapping, Sequence
+from collections.abc import AsyncGenerator, Callable, Iterable, Mapping, Sequence
 from contextlib import aclosing, suppress
 from io import BytesIO
 from pathlib import Path
@@ -135,14 +135,16 @@ class AdminCalls(Face):
         replace: bool = True,
         content_type: str | None = None,
         encoding: Numbers | None = None,
+        objects: Iterable[Mapping[str, Any]] | None = None,
+        text: str | None = None,
     ) -> FrameStored:
-        """Send one frame, an image as `Client.localize` takes it or a ready encoding; the same index again replaces it.
+        """Send one frame, as `Client.localize` takes it or a ready encoding; the same index again replaces it.
 
         `index` is its place in the recording, from 0; `position_m` its distance along the route. Answers show
         the `name`, as of its file; `camera` names what took it. Without `replace` an equal frame stays, and another one
         raises FramesDifferError.
         """
-        view = observation(image, content_type=content_type, encoding=encoding)
+        view = observation(image, content_type=content_type, encoding=encoding, objects=objects, text=text)
         place: dict[str, float | str | None] = {"position_m": position_m, "timestamp_us": timestamp_us}
         place |= {"x_m": x_m, "y_m": y_m, "name": None if name is None else text_of(name)}
         place |= {"camera": None if camera is None else text_of(camera), **_keeping(replace)}

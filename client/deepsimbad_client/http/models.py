@@ -53,6 +53,7 @@ class Domain(Answer):
     """(width, height) an image is best resized to before it is sent; None: as it is, or no images at all."""
     grey_levels: tuple[int, int] | None = None
     """What is shown black and white of views of more than 8 bits, as of the map's pictures; None: those had 8."""
+    takes: tuple[str, ...] = ("image",)
     encoding_dim: int | None = None
     """Length of an image's encoding; None: no images are taken. Ready ones may have any one length."""
     relevance: str | None = None

@@ -18,10 +18,11 @@ from deepsimbad_client.errors import BrokenFrameError, InvalidInputError, OtherF
 from deepsimbad_client.http.client import Client
 from deepsimbad_client.recordings import Frame, Recording, spread
 from deepsimbad_client.recordings.left_out import LeftOut, shown
+from deepsimbad_client.recordings.told import as_taken
 
 BATCH_BYTES = 8 * 2**20  # Size of a batch of ready encodings: worth its round trip, and lost cheaply on a thin link
 CONCURRENCY = 4
-UNUSABLE_IMAGE_CODES = frozenset({"undecodable_image", "truncated_image", "empty_body"})
+UNUSABLE_IMAGE_CODES = frozenset({"undecodable_image", "truncated_image", "empty_body", "invalid_scene"})
 
 _UNKNOWN = {"timestamp_us": UNKNOWN_TIMESTAMP, "content_digest": UNKNOWN_CONTENT}
 
@@ -79,7 +80,8 @@ def upload(
         raise SourceError(f"{recording.name} has no frames to send")
     left_out = LeftOut(recording, allow_missing=allow_missing)
     started = time.monotonic()
-    input_size = client.domain(domain).input_size
+    described = client.domain(domain)
+    recording, input_size = as_taken(recording, described.takes), described.input_size
     stored = client.admin.create_traverse(domain, traverse, grey_levels=recording.grey_levels)
     recording = recording.shown_by(stored.grey_levels)
     report = UploadReport(len(recording.frames), left_out=recording.left_out, left_out_names=left_out.names)
@@ -274,7 +276,7 @@ def _send_image(
             x_m=frame.x_m,
             y_m=frame.y_m,
             name=frame.name,
-            camera=recording.camera,
+            camera=recording.camera if image.content_type.startswith("image/") else None,
             replace=replace,
         )
     except BrokenFrameError as error:

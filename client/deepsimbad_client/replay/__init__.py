@@ -24,6 +24,7 @@ from deepsimbad_client.http.client import Client, Session
 from deepsimbad_client.http.models import Domain, Localization, SessionAnswer
 from deepsimbad_client.http.upload import UNUSABLE_IMAGE_CODES
 from deepsimbad_client.recordings import Recording
+from deepsimbad_client.recordings.told import as_taken
 
 Record = TypeVar("Record")
 
@@ -63,7 +64,7 @@ class Scene:
         if not recording.frames:
             raise ReplayError(f"{recording.name} has no frames to replay")
         described = client.domain(domain)
-        recording = recording.shown_by(described.grey_levels)
+        recording = as_taken(recording, described.takes).shown_by(described.grey_levels)
         if described.map_version is None or described.n_map_images is None:
             raise ReplayError(f"domain {domain} has no active map to replay against: remap it first")
         position_m = np.array([frame.position_m for frame in recording.frames], np.float64)

@@ -16,7 +16,7 @@ from deepsimbad.engine.maps import Maps
 from deepsimbad.engine.worker import EvaluatorPool, ready
 from deepsimbad.errors import InvalidMapConfigError, NoActiveMapError, UnavailableError, UnknownDomainError
 from deepsimbad.evaluators.grey_levels import GreyLevels, levels_in
-from deepsimbad.evaluators.registry import EXTRACTOR_PATTERN, EvaluatorKind, evaluator_config
+from deepsimbad.evaluators.registry import EXTRACTOR_PATTERNS, EvaluatorKind, evaluator_config
 from deepsimbad.store.records import DomainRecord
 
 router = APIRouter(prefix="/v1/domains", tags=["domains"])
@@ -31,7 +31,8 @@ _EVALUATOR_SCHEMA = {
     "required": ["kind"],
     "properties": {
         "kind": {"enum": [kind.value for kind in EvaluatorKind]},
-        "extractor": {"type": "string", "pattern": EXTRACTOR_PATTERN},
+        "of": {"type": "array", "minItems": 2, "maxItems": 2, "items": {"type": "object"}},
+        "extractor": {"type": "string", "anyOf": [{"pattern": pattern} for pattern in EXTRACTOR_PATTERNS]},
     },
     "additionalProperties": False,
 }
@@ -77,6 +78,9 @@ class DomainAnswer(Answer):
     evaluator_problem: Annotated[str | None, Field(description="Code of what keeps it from being loaded.")]
     input_size: Annotated[
         tuple[int, int] | None, Field(description="[width, height] in pixels to resize an image to; null: to none.")
+    ]
+    takes: Annotated[
+        list[str], Field(description="Forms of an observation, beside what is encoded elsewhere: image, objects, text.")
     ]
     encoding_dim: Annotated[int | None, Field(description="Of an image's encoding; null: no images are taken.")]
     weights_sha256: Annotated[str | None, Field(description="Of the file that images are encoded by; null: of none.")]
@@ -131,6 +135,7 @@ def describe_domain(record: DomainRecord, evaluators: EvaluatorPool, maps: Maps)
         evaluator=record.evaluator,
         evaluator_problem=evaluator_problem,
         input_size=evaluator and evaluator.input_size,
+        takes=sorted(evaluator.forms) if evaluator else [],
         encoding_dim=evaluator and evaluator.encoding_dim,
         weights_sha256=evaluator and evaluator.weights_sha256,
         closed=record.closed,

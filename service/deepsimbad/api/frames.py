@@ -13,7 +13,7 @@ from pydantic import FailFast, Field, StrictFloat
 
 from deepsimbad.api.batches import read_batch
 from deepsimbad.api.localizations import IMAGE_SCHEMA, only
-from deepsimbad.api.problems import binary, declare, problems
+from deepsimbad.api.problems import binary, declare, invalid_body, problems
 from deepsimbad.api.requests import (
     BINARY,
     GREATEST_EXACT_INTEGER,
@@ -27,6 +27,7 @@ from deepsimbad.api.requests import (
     parse_json,
     read_bytes,
 )
+from deepsimbad.api.scenes import MOST_PARTS, TOLD, TOLD_BODIES, TOLD_SCHEMA, scene_in
 from deepsimbad.api.traverses import TraverseName
 from deepsimbad.core.camera import Camera
 from deepsimbad.core.drive import FRAME_NAME, MAX_POSITION_M, Drive
@@ -38,23 +39,29 @@ from deepsimbad.errors import EmptyBodyError, GreyLevelsDifferError, InvalidInpu
 from deepsimbad.evaluators.base import Fitting
 from deepsimbad.evaluators.grey_levels import GreyLevels
 from deepsimbad.evaluators.image_files import MEDIA_TYPES
+from deepsimbad.evaluators.scenes import Scene, check_whole
 from deepsimbad.store.durable import storage_faults
 
 router = APIRouter(prefix="/v1/admin/domains/{domain}/traverses/{name}/frames", tags=["admin: traverses"])
 
-FRAME_TYPES = (*MEDIA_TYPES, JSON)
+FRAME_TYPES = (*MEDIA_TYPES, JSON, *TOLD_BODIES)
 _SPOOL_CHUNK_BYTES = 1 << 20
 
 # Bodies and answers
 
 
-class EncodingBody(JsonBody):
-    """A frame that was encoded elsewhere."""
+class FrameBody(JsonBody):
+    """A frame that was encoded elsewhere, or is told."""
 
-    encoding: Annotated[list[StrictFloat], FailFast()]
+    most_parts = MOST_PARTS
+
+    encoding: Annotated[tuple[StrictFloat, ...], FailFast()] = ()
+    objects: Any = None
+    text: Any = None
 
 
 _ENCODING_SCHEMA = only("encoding", {"type": "number"}, "A ready encoding, as long as the others of the traverse.")
+_FRAME_SCHEMA = {"oneOf": [_ENCODING_SCHEMA, TOLD_SCHEMA]}
 
 
 class FrameAnswer(Answer):
@@ -91,7 +98,7 @@ def _metres(description: str) -> Any:
         200: {"model": FrameAnswer, "description": "It replaced the frame of that index"},
         **problems(404, 409, 413, 415, 422),
     },
-    openapi_extra=declare({**dict.fromkeys(MEDIA_TYPES, IMAGE_SCHEMA), JSON: _ENCODING_SCHEMA}),
+    openapi_extra=declare({**dict.fromkeys(MEDIA_TYPES, IMAGE_SCHEMA), JSON: _FRAME_SCHEMA, **TOLD_BODIES}),
 )
 async def put_frame(
     domain: DomainName,
@@ -117,9 +124,9 @@ async def put_frame(
 ) -> FrameAnswer:
     """Store one frame, in any order; the same index again replaces it.
 
-    The body is the image, or its encoding where that is known. An image is encoded at once and not kept; where the
-    domain's evaluator is fitted to images it waits in the traverse's spool until a map is made of that. Positions that
-    go backwards are accepted here and refused by the remap.
+    The body is the image, its encoding where that is known, or what is told of it. An image is encoded at once and
+    not kept; where the domain's evaluator is fitted to images it waits in the traverse's spool until a map is made of
+    that. Positions that go backwards are accepted here and refused by the remap.
     """
     record = await run_sync(running.catalog.domain, domain)
     evaluator = running.evaluators.evaluator(record.evaluator)
@@ -156,10 +163,34 @@ async def put_frame(
         encoded = cast("EncodedImage", await running.look(evaluator, seen.image, lambda view: view, Priority.BATCH))
         return await run_sync(store_picture, encoded, seen)
 
+    async def stored_as_told(document: dict[str, Any]) -> tuple[bool, int]:
+        scene, picture = await scene_in(body, media_type, document, running, evaluator, Priority.BATCH, levels)
+        check_whole(evaluator, scene)
+        encoded = cast("EncodedImage", await running.look(evaluator, scene, lambda view: view, Priority.BATCH))
+        more = {} if picture is None or picture.size is None else {"camera": Camera(*picture.size, camera)}
+        return await run_sync(
+            lambda: store(
+                encoded.values[np.newaxis],
+                weights_sha256=encoded.weights_sha256,
+                content_digest=np.array([content_digest(body)], np.uint64),
+                shows_nothing=np.array([scene.is_blank]),
+                **more,
+            )
+        )
+
     if media_type == JSON:
-        values = np.array((await parse_json(body, EncodingBody, running)).encoding, np.float64)
-        created, n_frames = await run_sync(lambda: store(ready_encodings(values[np.newaxis])))
+        frame = await parse_json(body, FrameBody, running)
+        if frame.model_fields_set == {"encoding"}:
+            values = np.array(frame.encoding, np.float64)
+            created, n_frames = await run_sync(lambda: store(ready_encodings(values[np.newaxis])))
+        elif frame.model_fields_set and frame.model_fields_set <= TOLD:
+            created, n_frames = await stored_as_told({name: getattr(frame, name) for name in TOLD})
+        else:
+            raise invalid_body("give encoding; or objects, text, or both")
+    elif media_type not in MEDIA_TYPES:
+        created, n_frames = await stored_as_told({})
     else:
+        check_whole(evaluator, Scene(image=np.empty(0, np.uint8)))
         if evaluator.fitting is Fitting.IMAGES:
             await run_sync(running.spools.make_room, domain, len(body))
         try:

@@ -30,6 +30,7 @@ from deepsimbad.api.requests import (
     prefers,
     read_bytes,
 )
+from deepsimbad.api.scenes import MOST_PARTS, TOLD, TOLD_BODIES, TOLD_SCHEMA, scene_in
 from deepsimbad.core.map import Map
 from deepsimbad.core.planners import Plan
 from deepsimbad.core.summary import DEFAULT_CONFIDENCE, BeliefSummary
@@ -62,11 +63,18 @@ MAX_LANDMARKS = 0xFFFF
 
 
 class ObservationBody(JsonBody):
-    """What a robot made of a view on board: exactly one of the three. The engine refuses NaN and infinity."""
+    """What a robot made of a view on board: exactly one of the first three, or what it tells of it.
+
+    The engine refuses NaN and infinity.
+    """
+
+    most_parts = MOST_PARTS
 
     ranked_landmarks: Annotated[tuple[StrictInt, ...], FailFast()] = ()
     dissimilarities: Annotated[tuple[StrictFloat, ...], FailFast()] = ()
     encoding: Annotated[tuple[StrictFloat, ...], FailFast()] = ()
+    objects: Any = None
+    text: Any = None
 
 
 def only(name: str, items: dict[str, Any], description: str) -> dict[str, Any]:
@@ -85,6 +93,7 @@ _OBSERVATION_SCHEMA = {
         ),
         only("dissimilarities", {"type": "number"}, "r finite numbers in landmark order, smaller is nearer."),
         only("encoding", {"type": "number"}, "A ready encoding, as long as those the map was made of."),
+        TOLD_SCHEMA,
     ]
 }
 _RANKS_SCHEMA: dict[str, Any] = {
@@ -92,9 +101,9 @@ _RANKS_SCHEMA: dict[str, Any] = {
     "description": "The same in fewest bytes: their number m in two, big-endian, then m landmark ids, nearest first, "
     "of ceil(log2 r) bits each, most significant bit first; zero bits fill the last byte.",
 }
-OBSERVATION_TYPES = (*MEDIA_TYPES, JSON, RANKS)
+OBSERVATION_TYPES = (*MEDIA_TYPES, JSON, RANKS, *TOLD_BODIES)
 OBSERVATION_BODY = declare(
-    {**dict.fromkeys(MEDIA_TYPES, IMAGE_SCHEMA), JSON: _OBSERVATION_SCHEMA, RANKS: _RANKS_SCHEMA}
+    {**dict.fromkeys(MEDIA_TYPES, IMAGE_SCHEMA), JSON: _OBSERVATION_SCHEMA, RANKS: _RANKS_SCHEMA, **TOLD_BODIES}
 )
 Shortlist = Annotated[
     int | None, Query(ge=1, le=GREATEST_ID, description="Length of `retrieval` and `top`; absent: 10 or all.")
@@ -335,18 +344,28 @@ async def view_in(
 
     An image comes at its evaluator's size, shown by its map's grey levels.
     """
+    document: dict[str, Any] = {}
     if media_type == JSON:
         observation = await parse_json(body, ObservationBody, running)
-        if len(observation.model_fields_set) != 1:
-            raise invalid_body("give exactly one of ranked_landmarks, dissimilarities, encoding")
+        is_told = bool(observation.model_fields_set) and observation.model_fields_set <= TOLD
+        document = {name: getattr(observation, name) for name in TOLD}
+        if not is_told and len(observation.model_fields_set) != 1:
+            raise invalid_body(
+                "give exactly one of ranked_landmarks, dissimilarities, encoding; or objects, text, or both"
+            )
         if "ranked_landmarks" in observation.model_fields_set:
             return RankedLandmarks(observation.ranked_landmarks), []
         if "dissimilarities" in observation.model_fields_set:
             return Dissimilarities(np.array(observation.dissimilarities, np.float64)), []
-        return ReadyEncoding(np.array(observation.encoding, np.float64)), []
+        if "encoding" in observation.model_fields_set:
+            return ReadyEncoding(np.array(observation.encoding, np.float64)), []
     if media_type == RANKS:
         return PackedRanks(body), []
     levels = levels_in(snapshot.landmark_model)
+    if media_type not in MEDIA_TYPES:
+        scene, picture = await scene_in(body, media_type, document, running, evaluator, Priority.LIVE, levels)
+        seen = [] if picture is None else [*picture.remarks, *remarks_on_shape(snapshot, picture.size)]
+        return NothingSeen() if scene.is_blank else scene, [*scene.remarks, *seen]
     decoded = await running.decoders.decoded(body, evaluator, Priority.LIVE, levels)
     remarks = [*decoded.remarks, *remarks_on_shape(snapshot, decoded.size)]
     return NothingSeen() if decoded.is_blank else decoded.image, remarks

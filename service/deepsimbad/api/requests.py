@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cache
-from typing import Annotated, Any, NamedTuple, TypeVar, cast
+from typing import Annotated, Any, ClassVar, NamedTuple, TypeVar, cast
 
 from anyio import CapacityLimiter
 from anyio.to_thread import run_sync
@@ -320,6 +320,7 @@ class JsonBody(BaseModel):
     """Root of the JSON bodies: unknown members are errors, so a typing mistake is never silent."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
+    most_parts: ClassVar[int] = _MAX_PARTS
 
 
 class Answer(BaseModel):
@@ -376,8 +377,10 @@ async def parse_json(body: bytes, kind: type[Body], running: Services) -> Body:
 def _parsed(body: bytes, kind: type[Body]) -> Body:
     # All but numbers costs the parser a hundred times its bytes, and an error of its own where it is wrong: megabytes
     # of it would take seconds and gigabytes.
-    if len(body) > _MAX_PARTS and any(body.count(mark) > _MAX_PARTS for mark in (b":", b'"', b"{", b"[")):
-        raise invalid_body(f"more than {_MAX_PARTS} members, texts or lists, which no body here has", "too_many_parts")
+    if len(body) > kind.most_parts and any(body.count(mark) > kind.most_parts for mark in (b":", b'"', b"{", b"[")):
+        raise invalid_body(
+            f"more than {kind.most_parts} members, texts or lists, which no body here has", "too_many_parts"
+        )
     # The parser lets no other thread run until it has read all: millions of numbers would hold the event loop up.
     if body.count(b",") >= MAX_NUMBERS:
         raise invalid_body(f"more than {MAX_NUMBERS} numbers", "too_many_numbers")

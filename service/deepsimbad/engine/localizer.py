@@ -26,6 +26,7 @@ from deepsimbad.errors import (
 from deepsimbad.evaluators.base import Evaluator, Image
 from deepsimbad.evaluators.feature_l2 import FeatureL2
 from deepsimbad.evaluators.image import is_blank
+from deepsimbad.evaluators.scenes import Scene
 from deepsimbad.evaluators.space import seen
 
 DEFAULT_SHORTLIST = 10
@@ -67,8 +68,10 @@ class NothingSeen:
     """An image that shows nothing: one grey wall, the dark."""
 
 
-View: TypeAlias = NothingSeen | Image | EncodedImage | ReadyEncoding | Dissimilarities | RankedLandmarks | PackedRanks
-"""One observation: an image [height, width, 3] uint8 BGR, or what was made of one here or on board."""
+View: TypeAlias = (
+    NothingSeen | Image | Scene | EncodedImage | ReadyEncoding | Dissimilarities | RankedLandmarks | PackedRanks
+)
+"""One observation: an image [height, width, 3] uint8 BGR, a scene told, or what was made of one here or on board."""
 
 
 @dataclass(frozen=True)
@@ -147,6 +150,8 @@ def describe(snapshot: Map, evaluator: Evaluator, view: View) -> Query:
     if isinstance(view, np.ndarray):
         view = evaluator.prepare(view)
         view = NothingSeen() if is_blank(view) else encode_images(evaluator, [view])[0]
+    if isinstance(view, Scene):
+        view = NothingSeen() if view.is_blank else encode_images(evaluator, [view.of(evaluator.forms)])[0]
     if isinstance(view, NothingSeen):
         return Query.uninformative(n_landmarks)
     if isinstance(view, EncodedImage):

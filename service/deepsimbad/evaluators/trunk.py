@@ -16,6 +16,7 @@ from deepsimbad.evaluators.base import Fitting, Image, LandmarkModel, Lesson
 from deepsimbad.evaluators.compute import Compute
 from deepsimbad.evaluators.feature_l2 import FeatureL2, checked_encodings
 from deepsimbad.evaluators.lessons import UnitLesson
+from deepsimbad.evaluators.scenes import Form, Scene
 from deepsimbad.evaluators.space import OwnDissimilarities, check_units, check_usable
 
 LEAST_FRAMES = 10  # of the drive that landmarks are chosen from: ten stretches of route
@@ -38,6 +39,15 @@ class Trunk(OwnDissimilarities):
     def fitting(self) -> Fitting:
         """See `Evaluator`: ready encodings have no images."""
         return Fitting.IMAGES if self.takes_images else Fitting.ENCODINGS
+
+    @property
+    def forms(self) -> frozenset[Form]:
+        """See `Evaluator`."""
+        return self._trunk.forms
+
+    def lacking(self, forms: frozenset[Form]) -> frozenset[Form]:
+        """See `Evaluator`."""
+        return self._trunk.lacking(forms)
 
     @property
     def takes_images(self) -> bool:
@@ -72,7 +82,7 @@ class Trunk(OwnDissimilarities):
         """See `Evaluator`."""
         return self._trunk.prepare(image)
 
-    def encode(self, images: Sequence[Image]) -> NDArray[np.float32]:
+    def encode(self, images: Sequence[Image | Scene]) -> NDArray[np.float32]:
         """See `Evaluator`."""
         return self._trunk.encode(images)
 

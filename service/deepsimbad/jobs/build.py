@@ -25,13 +25,15 @@ from deepsimbad.core.relevance import Query, Relevance
 from deepsimbad.core.route import same_places
 from deepsimbad.errors import InvalidSourceError
 from deepsimbad.evaluators.base import Evaluator, Image, LandmarkModel
-from deepsimbad.evaluators.image import decode_image, is_blank, picture_size
+from deepsimbad.evaluators.image import picture_size
+from deepsimbad.evaluators.scenes import Scene, check_whole, seen_in, shows_none
 from deepsimbad.evaluators.space import seen
 from deepsimbad.jobs.fitting import Fitter
 from deepsimbad_client.errors import BrokenFrameError
 from deepsimbad_client.http import text_of
 from deepsimbad_client.recordings import Frame, Recording
 from deepsimbad_client.recordings.left_out import LeftOut
+from deepsimbad_client.recordings.told import as_taken
 
 _FRAMES_A_BLOCK = 1024
 EPISODES_A_MAP_IMAGE = 25  # more would visit every entry of a small map again and again
@@ -74,6 +76,7 @@ def encode_recording(
         InvalidRouteError: The positions go backwards or are NaN.
         InvalidEncodingError: All frames have one encoding.
     """
+    recording = as_taken(recording, evaluator.forms)
     frames, left_out = list(recording.frames), LeftOut(recording, allow_missing=allow_missing)
     encodings, encode_ms, weights_sha256 = recording.encodings, None, None
     shows_nothing = np.zeros(len(frames), np.bool_)
@@ -121,13 +124,13 @@ def _encode_images(
 
     Broken ones are counted.
     """
-    if not evaluator.takes_images or evaluator.encoding_dim is None:
+    if not evaluator.forms or evaluator.encoding_dim is None:
         raise InvalidSourceError("this evaluator takes ready encodings alone; give a .npy or .csv file")
     encodings = np.empty((len(recording.frames), evaluator.encoding_dim), np.float32)
     shows_nothing = np.zeros(len(recording.frames), np.bool_)
     places: list[int] = []
     kept = {} if kept is None else kept
-    waiting: list[Image] = []  # as many as are best encoded at once
+    waiting: list[Image | Scene] = []  # as many as are best encoded at once
     rows: list[int] = []  # where their encodings belong
     stamps: list[str] = []  # and what they are kept by
     took_ms: list[float] = []
@@ -139,13 +142,14 @@ def _encode_images(
             places.append(place)
         else:
             try:
-                body = recording.image(frame, evaluator.input_size).body
+                body = recording.image(frame, evaluator.input_size)
             except BrokenFrameError as error:
                 left_out.add(error.reason, frame.name)
             else:
                 began = began if waiting else time.perf_counter()
-                waiting.append(evaluator.prepare(decode_image(body, max_pixels)))
-                shows_nothing[len(places)] = is_blank(waiting[-1])
+                waiting.append(seen_in(body.body, body.content_type, evaluator, max_pixels))
+                check_whole(evaluator, waiting[-1])
+                shows_nothing[len(places)] = shows_none(waiting[-1])
                 rows.append(len(places))
                 stamps.append(stamp)
                 places.append(place)

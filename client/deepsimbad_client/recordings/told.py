@@ -1,0 +1,107 @@
+"""What is told beside a recording's images: `detections.jsonl`, objects a picture, and `captions.csv`, words a picture.
+
+They lie with the images or, in NCLT's layout, in the drive's folder. A line of detections is `{"name": "1.jpg",
+"objects": [{"label": "car", "box": [left, top, right, bottom], "score": 0.9}]}`; captions have the columns name and
+text. Names are the image files'.
+"""
+
+import csv
+import dataclasses
+import json
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from deepsimbad.evaluators.grey_levels import GreyLevels
+from deepsimbad_client.errors import BrokenFrameError, SourceError
+from deepsimbad_client.http import observed
+from deepsimbad_client.recordings import EncodedImage, Frame, Recording
+
+DETECTIONS, CAPTIONS = "detections.jsonl", "captions.csv"
+TOLD_SUFFIXES = {".txt": "text/plain", ".json": "application/json"}
+"""Of files that tell of one view, and how they are posted."""
+FORMS = {"objects": DETECTIONS, "text": CAPTIONS}
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ToldRecording(Recording):
+    """A recording whose frames are seen by what is told of them, beside their images or in their place."""
+
+    whole: Recording
+    told: Mapping[str, Mapping[str, Any]]  # by form, by the frame's name
+    with_image: bool
+
+    def stamp(self, frame: Frame) -> str:
+        """See `Recording.stamp`."""
+        said = json.dumps([by_name.get(frame.name) for by_name in self.told.values()])
+        return f"{self.whole.stamp(frame) if self.with_image else frame.name} {said}"
+
+    def shown_by(self, levels: GreyLevels | None) -> "ToldRecording":
+        """See `Recording.shown_by`."""
+        return dataclasses.replace(self, whole=self.whole.shown_by(levels))
+
+    def image(self, frame: Frame, input_size: tuple[int, int] | None) -> EncodedImage:
+        """The body of what is seen and told; raises BrokenFrameError also where nothing is told of the frame."""
+        for form, by_name in self.told.items():
+            if frame.name not in by_name:
+                raise BrokenFrameError(f"{FORMS[form]} says nothing of {frame.name}", f"not in {FORMS[form]}")
+        picture = self.whole.image(frame, input_size).body if self.with_image else None
+        body = observed({form: by_name[frame.name] for form, by_name in self.told.items()}, picture)
+        return EncodedImage(body.body, body.content_type)
+
+
+def as_taken(recording: Recording, takes: Collection[str]) -> Recording:
+    """The recording in the forms that a domain takes, as `Domain.takes` names them; ready encodings as they are.
+
+    Raises SourceError: what should be told of its images is not there, or cannot be understood.
+    """
+    forms = [form for form in FORMS if form in takes]
+    if recording.encodings is not None or not forms or isinstance(recording, ToldRecording):
+        return recording
+    folder, told = getattr(recording, "folder", None), dict[str, Mapping[str, Any]]()
+    for form in forms:
+        file = None if folder is None else _file(folder, FORMS[form])
+        if file is not None:
+            told[form] = dict(_read(file, form))
+    if not told and "image" in takes:
+        return recording
+    if not told:
+        raise SourceError(
+            f"{recording.name} has no {' nor '.join(FORMS[form] for form in forms)} beside its images, and the domain "
+            f"takes {' and '.join(sorted(takes))}"
+        )
+    return ToldRecording(
+        **{field.name: getattr(recording, field.name) for field in dataclasses.fields(Recording)},
+        whole=recording,
+        told=told,
+        with_image="image" in takes,
+    )
+
+
+def _file(folder: Path, name: str) -> Path | None:
+    places = [folder, *folder.parents[:2]] if folder.parent.name.startswith("lb3") else [folder]
+    return next((place / name for place in places if (place / name).is_file()), None)
+
+
+def _read(file: Path, form: str) -> Iterator[tuple[str, Any]]:
+    try:
+        with file.open(encoding="utf-8-sig", newline="") as lines:
+            if form == "text":
+                table = csv.DictReader(lines)
+                if not {"name", "text"} <= set(table.fieldnames or ()):
+                    raise SourceError(f"{file}: its first line names the columns name and text")
+                yield from ((row["name"], row["text"] or "") for row in table)
+                return
+            for number, line in enumerate(lines, 1):
+                if not line.strip():
+                    continue
+                try:
+                    row = json.loads(line)
+                    yield row["name"], row["objects"]
+                except (ValueError, KeyError, TypeError) as error:
+                    raise SourceError(
+                        f'{file}, line {number}: expected {{"name": "1.jpg", "objects": [...]}}'
+                    ) from error
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise SourceError(f"{file} cannot be read: {error}") from error

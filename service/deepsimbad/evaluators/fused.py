@@ -1,0 +1,151 @@
+"""Two evaluators of one domain: an encoding is both of theirs, side by side, and a view is judged by what it brings.
+
+A dissimilarity is the weighted mean of the halves' squared L2. Their weight is learnt with the landmarks, by how well
+either half alone and both together find the places that the other drive saw; a half that is missing of a view is all
+zeros, and left out. Where `composed` compares, within-place whitening weighs the halves number by number, and a missing
+half is taken to be as usual.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deepsimbad.core.composed import is_composed
+from deepsimbad.errors import InvalidEncodingError
+from deepsimbad.evaluators.base import Evaluator, Fitted, Image, LandmarkModel, Lesson
+from deepsimbad.evaluators.feature_l2 import FeatureL2, checked_encodings
+from deepsimbad.evaluators.scenes import Form, Scene
+from deepsimbad.evaluators.space import between_units
+
+_WEIGHT = "fused_weight"
+_TRIED = np.linspace(0.1, 0.9, 9)  # of the first half
+_EVEN = 0.5
+_NEAR_FRAMES = 2  # of a drive that count as one place
+
+
+class Fused(FeatureL2):
+    """Squared L2 of two halves; each gives encodings of unit length."""
+
+    def __init__(self, halves: Sequence[Evaluator]) -> None:
+        super().__init__("none")
+        self._halves = tuple(halves)
+
+    @property
+    def forms(self) -> frozenset[Form]:
+        """See `Evaluator`."""
+        return frozenset().union(*(half.forms for half in self._halves))
+
+    @property
+    def takes_images(self) -> bool:
+        """See `Evaluator`."""
+        return Form.IMAGE in self.forms
+
+    @property
+    def input_size(self) -> tuple[int, int] | None:
+        """See `Evaluator`."""
+        return next((half.input_size for half in self._halves if half.takes_images), None)
+
+    @property
+    def encoding_dim(self) -> int:
+        """See `Evaluator`."""
+        return sum(half.encoding_dim or 0 for half in self._halves)
+
+    @property
+    def weights_sha256(self) -> str | None:
+        """See `Evaluator`."""
+        known = [half.weights_sha256 for half in self._halves if half.weights_sha256]
+        return "+".join(known) or None
+
+    @property
+    def largest_batch(self) -> int:
+        """See `Evaluator`."""
+        return max(half.largest_batch for half in self._halves)
+
+    def load(self) -> None:
+        """See `Evaluator`."""
+        for half in self._halves:
+            half.load()
+
+    def prepare(self, image: Image) -> Image:
+        """See `Evaluator`."""
+        taking = next((half for half in self._halves if half.takes_images), self._halves[0])
+        return taking.prepare(image)
+
+    def lacking(self, forms: frozenset[Form]) -> frozenset[Form]:
+        """See `Evaluator`."""
+        return frozenset().union(*(half.forms for half in self._halves if not half.forms & forms))
+
+    def encode(self, images: Sequence[Image | Scene]) -> NDArray[np.float32]:
+        """See `Evaluator`: zeros in the place of a half that a view does not bring."""
+        scenes = [seen if isinstance(seen, Scene) else Scene(image=seen) for seen in images]
+        encodings, at = np.zeros((len(scenes), self.encoding_dim), np.float32), 0
+        for half in self._halves:
+            rows = [row for row, scene in enumerate(scenes) if half.forms & scene.forms]
+            width = half.encoding_dim or 0
+            if rows:
+                encodings[rows, at : at + width] = half.encode([scenes[row] for row in rows])
+            at += width
+        return encodings
+
+    def fit(self, lesson: Lesson) -> Fitted:
+        """See `Evaluator.fit`: landmarks are the model, and the weight of the first half."""
+        own = checked_encodings(lesson.encodings)
+        model = dict(self.fit_landmarks(own[lesson.landmarks]))
+        weight, metrics = _EVEN, dict[str, Any]()
+        if lesson.other is not None and len(lesson.places):
+            apart = self._apart(lesson.other[lesson.places[:, 1]], own)
+            scores = {share: _anr(share * apart[0] + (1 - share) * apart[1], lesson.places[:, 0]) for share in _TRIED}
+            weight = float(min(scores, key=lambda share: scores[share]))
+            metrics = {"weight": weight, "anr": {f"{share:.1f}": score for share, score in scores.items()}}
+        return Fitted({**model, _WEIGHT: np.array([weight], np.float32)}, metrics)
+
+    def check_model(self, model: LandmarkModel, n_landmarks: int) -> None:
+        """See `Evaluator.check_model`."""
+        super().check_model(model, n_landmarks)
+        weight = np.asarray(model.get(_WEIGHT, [_EVEN]), np.float32)
+        if weight.shape != (1,) or not 0 <= weight[0] <= 1:
+            raise InvalidEncodingError("the weight of a fused landmark model is one number within 0 and 1")
+
+    def dissimilarities(self, encodings: NDArray[np.float32], model: LandmarkModel) -> NDArray[np.float32]:
+        """See `Evaluator.dissimilarities`."""
+        if is_composed(model):
+            return between_units(self.compared(encodings, model), model)
+        super().dissimilarities(encodings, model)  # which refuses what cannot be compared
+        share = float(np.asarray(model.get(_WEIGHT, [_EVEN]), np.float32)[0])
+        first, second = self._apart(encodings, np.asarray(model["prototypes"], np.float32))
+        has_first, has_second = (np.any(half, axis=1, keepdims=True) for half in self._split(encodings))
+        both = share * first + (1 - share) * second
+        return np.asarray(np.where(has_first & has_second, both, np.where(has_first, first, second)), np.float32)
+
+    def compared(self, encodings: NDArray[np.float32], model: LandmarkModel) -> NDArray[np.float32]:
+        """See `Evaluator.compared`: what a view lacks is as usual on the map."""
+        if not is_composed(model) or encodings.ndim != 2 or encodings.shape[1] != model["usual"].shape[1]:
+            return encodings
+        usual, filled = np.asarray(model["usual"], np.float32)[0], encodings.copy()
+        for half, mean in zip(self._split(filled), self._split(usual[np.newaxis]), strict=True):
+            half[~np.any(half, axis=1)] = mean
+        return filled
+
+    def _split(self, encodings: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        at = self._halves[0].encoding_dim or 0
+        return encodings[:, :at], encodings[:, at:]
+
+    def _apart(
+        self, scenes: NDArray[np.float32], landmarks: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """[n, r] squared L2 of either half."""
+        first, second = (
+            np.asarray(np.clip(2 - 2 * (a @ b.T), 0, 4), np.float32)
+            for a, b in zip(self._split(scenes), self._split(landmarks), strict=True)
+        )
+        return first, second
+
+
+def _anr(apart: NDArray[np.float32], true: NDArray[np.int64]) -> float:
+    """In percent, of queries among all frames of the other drive [n, m], by their own frames [n] or those beside."""
+    frames = np.arange(apart.shape[1])
+    near = np.abs(frames - true[:, np.newaxis]) <= _NEAR_FRAMES
+    best = np.where(near, apart, np.inf).min(axis=1, keepdims=True)
+    return float(100 * ((apart < best) & ~near).sum(axis=1).mean() / apart.shape[1])

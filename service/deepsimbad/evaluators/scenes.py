@@ -1,0 +1,207 @@
+"""What is told of a scene beside its image, or in its place: the objects that a detector finds, a text.
+
+A label is any word; a box is left, top, right, bottom in shares of the image's sides; a text is of any length that a
+person would speak.
+"""
+
+import json
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deepsimbad.errors import InvalidSceneError, UnsupportedMediaTypeError
+from deepsimbad.evaluators.base import Evaluator, Image
+from deepsimbad.evaluators.image import decode_image, is_blank
+from deepsimbad.evaluators.image_files import MEDIA_TYPES
+
+TEXT, FORM_DATA = "text/plain", "multipart/form-data"
+MOST_OBJECTS, LONGEST_LABEL, LONGEST_TEXT = 1000, 100, 4000
+_LATIN_BELOW, _FOREIGN_SHARE = "\u0250", 0.5
+
+
+class Form(StrEnum):
+    """The forms of an observation that evaluators make encodings of; members of a `Scene`."""
+
+    IMAGE = "image"
+    OBJECTS = "objects"
+    TEXT = "text"
+
+
+_MEDIA_TYPES = {
+    Form.IMAGE: MEDIA_TYPES,
+    Form.OBJECTS: ("application/json",),
+    Form.TEXT: (TEXT, "application/json"),
+}
+
+
+@dataclass(frozen=True)
+class Objects:
+    """What a detector finds in an image, in any order."""
+
+    labels: tuple[str, ...]
+    boxes: NDArray[np.float64]  # [n, 4] left, top, right, bottom, 0..1
+    scores: NDArray[np.float64]  # [n] 0..1
+
+    @classmethod
+    def read(cls, raw: Any) -> Self:
+        """Of a JSON list of {"label", "box", "score"}, a score of 1 where none is said; raises InvalidSceneError."""
+        if not isinstance(raw, Sequence) or isinstance(raw, str):
+            raise InvalidSceneError('objects is a list of {"label": "car", "box": [x0, y0, x1, y1], "score": 0.9}')
+        if len(raw) > MOST_OBJECTS:
+            raise InvalidSceneError(
+                f"{len(raw)} objects: send the {MOST_OBJECTS} of highest score", most_objects=MOST_OBJECTS
+            )
+        rows = [_checked(number, each) for number, each in enumerate(raw)]
+        boxes = np.array([row[1] for row in rows], np.float64).reshape(-1, 4)
+        return cls(tuple(row[0] for row in rows), boxes, np.array([row[2] for row in rows], np.float64))
+
+
+def _checked(number: int, raw: Any) -> tuple[str, list[float], float]:
+    if not isinstance(raw, Mapping) or not {"label", "box"} <= set(raw) <= {"label", "box", "score"}:
+        raise InvalidSceneError(
+            f"object {number} has not the members label, box and, where known, score", object=number
+        )
+    label, box, score = raw["label"], raw["box"], raw.get("score", 1.0)
+    if not isinstance(label, str) or not 1 <= len(label.strip()) <= LONGEST_LABEL:
+        raise InvalidSceneError(f"object {number}: a label is a text of 1 to {LONGEST_LABEL} characters", object=number)
+    if not _is_share(score):
+        raise InvalidSceneError(f"object {number}: a score is a number within 0 and 1", object=number)
+    if not isinstance(box, Sequence) or len(box) != 4 or not all(map(_is_share, box)):
+        raise InvalidSceneError(
+            f"object {number}: a box is [left, top, right, bottom] in shares of the image's sides, each within 0 and "
+            "1: divide pixels by the image's width and height",
+            object=number,
+        )
+    if not (box[0] < box[2] and box[1] < box[3]):
+        raise InvalidSceneError(f"object {number}: its box is empty: left < right and top < bottom", object=number)
+    return label, [float(side) for side in box], float(score)
+
+
+def _is_share(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value) and 0 <= value <= 1
+
+
+@dataclass(frozen=True)
+class Scene:
+    """One observation by its forms; None: not told."""
+
+    image: Image | None = None
+    objects: Objects | None = None
+    text: str | None = None
+
+    @classmethod
+    def read(cls, document: Mapping[str, Any]) -> Self:
+        """Of JSON members `objects` and `text`; raises InvalidSceneError."""
+        text, objects = document.get("text"), document.get("objects")
+        if text is not None and (not isinstance(text, str) or not text.strip()):
+            raise InvalidSceneError("the text is empty: say what is seen, in a sentence or two")
+        if text is not None and len(text) > LONGEST_TEXT:
+            raise InvalidSceneError(
+                f"a text of {len(text)} characters: at most {LONGEST_TEXT} are taken", most_characters=LONGEST_TEXT
+            )
+        return cls(None, None if objects is None else Objects.read(objects), text)
+
+    @classmethod
+    def of_body(cls, body: bytes, media_type: str) -> Self:
+        """Of a body `text/plain`, or else `application/json`; raises InvalidSceneError."""
+        try:
+            text = body.decode("utf-8-sig")
+            return cls.read({"text": text} if media_type == TEXT else json.loads(text))
+        except (UnicodeDecodeError, RecursionError, ValueError) as error:
+            raise InvalidSceneError(f"this is no {media_type} in UTF-8 that can be read") from error
+
+    @classmethod
+    def of_form(cls, body: bytes) -> tuple[Self, bytes | None]:
+        """Of `multipart/form-data` (RFC 7578), and the image file in it; raises InvalidSceneError."""
+        delimiter = body.partition(b"\r\n")[0]
+        pieces = (b"\r\n" + body).split(b"\r\n" + delimiter)
+        if not delimiter.startswith(b"--") or len(pieces) < 3 or not pieces[-1].startswith(b"--"):
+            raise InvalidSceneError("this is no whole multipart/form-data: send its parts as curl -F does")
+        told: dict[str, bytes] = {}
+        for piece in pieces[1:-1]:
+            head, _, content = piece.partition(b"\r\n\r\n")
+            name = re.search(rb'\bname="?([a-z]{1,20})\b', head)
+            word = "" if name is None else name[1].decode()
+            if word not in set(Form) or word in told:
+                raise InvalidSceneError("the parts of a form are image, objects and text, each once")
+            told[word] = content
+        try:
+            text = told["text"].decode("utf-8-sig") if "text" in told else None
+            objects = json.loads(told["objects"]) if "objects" in told else None
+        except (RecursionError, ValueError) as error:
+            raise InvalidSceneError("objects is no JSON, or the text no UTF-8") from error
+        return cls.read({"text": text, "objects": objects}), told.get("image")
+
+    def beside(self, image: Image | None) -> Self:
+        """The scene with an image, or without."""
+        return replace(self, image=None if image is None or is_blank(image) else image)
+
+    @property
+    def forms(self) -> frozenset[Form]:
+        """Those it is told in."""
+        return frozenset(form for form in Form if getattr(self, form.value) is not None)
+
+    @property
+    def is_blank(self) -> bool:
+        """Whether it tells nothing: no object, and nothing else."""
+        return self.image is None and self.text is None and (self.objects is None or not self.objects.labels)
+
+    def of(self, taken: frozenset[Form]) -> Self:
+        """The scene; raises UnsupportedMediaTypeError where it is told in a form that an evaluator does not take."""
+        if others := self.forms - taken:
+            takes = " and ".join(sorted(taken)) or "ready encodings alone"
+            allowed = [media_type for form in Form if form in taken for media_type in _MEDIA_TYPES[form]]
+            raise UnsupportedMediaTypeError(
+                f"this domain takes {takes}, not {' or '.join(sorted(others))}", allowed=allowed or ["application/json"]
+            )
+        return self
+
+    @property
+    def remarks(self) -> list[str]:
+        """What a person should know of it."""
+        letters = [letter for letter in self.text or "" if letter.isalpha()]
+        if letters and sum(letter >= _LATIN_BELOW for letter in letters) > _FOREIGN_SHARE * len(letters):
+            return ["the text is of another script than the language model knows best: English finds more"]
+        return []
+
+
+def picture_in(seen: Image | Scene) -> Image | None:
+    """The image of an observation."""
+    return seen.image if isinstance(seen, Scene) else seen
+
+
+def seen_in(body: bytes, media_type: str, evaluator: Evaluator, max_pixels: int) -> Image | Scene:
+    """What a body shows or tells, an image at its evaluator's size.
+
+    Raises:
+        InvalidImageError, InvalidSceneError: It cannot be read.
+        UnsupportedMediaTypeError: The evaluator does not take it in this form.
+    """
+    if media_type.startswith("image/"):
+        return evaluator.prepare(decode_image(body, max_pixels))
+    scene, image = Scene.of_form(body) if media_type.startswith(FORM_DATA) else (Scene.of_body(body, media_type), None)
+    return scene.of(evaluator.forms).beside(
+        None if image is None else evaluator.prepare(decode_image(image, max_pixels))
+    )
+
+
+def shows_none(seen: Image | Scene) -> bool:
+    """Whether nothing is seen."""
+    return seen.is_blank if isinstance(seen, Scene) else is_blank(seen)
+
+
+def check_whole(evaluator: Evaluator, seen: Image | Scene) -> None:
+    """Raise InvalidSceneError where a map's frame is not told in every form that its encoding is made of."""
+    told = seen.forms if isinstance(seen, Scene) else frozenset({Form.IMAGE})
+    if lacking := evaluator.lacking(told):
+        raise InvalidSceneError(
+            f"a frame of a map has every half of its evaluator, and this one lacks {' or '.join(sorted(lacking))}: "
+            "send multipart/form-data, or JSON with objects and text",
+            missing=sorted(lacking),
+        )
