@@ -167,7 +167,9 @@ async def put_frame(
         scene, picture = await scene_in(body, media_type, document, running, evaluator, Priority.BATCH, levels)
         check_whole(evaluator, scene)
         encoded = cast("EncodedImage", await running.look(evaluator, scene, lambda view: view, Priority.BATCH))
-        more = {} if picture is None or picture.size is None else {"camera": Camera(*picture.size, camera)}
+        more: dict[str, Any] = {}
+        if picture is not None and picture.size is not None:
+            more = {"camera": Camera(*picture.size, camera)}
         return await run_sync(
             lambda: store(
                 encoded.values[np.newaxis],

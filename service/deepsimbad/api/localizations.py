@@ -348,7 +348,6 @@ async def view_in(
     if media_type == JSON:
         observation = await parse_json(body, ObservationBody, running)
         is_told = bool(observation.model_fields_set) and observation.model_fields_set <= TOLD
-        document = {name: getattr(observation, name) for name in TOLD}
         if not is_told and len(observation.model_fields_set) != 1:
             raise invalid_body(
                 "give exactly one of ranked_landmarks, dissimilarities, encoding; or objects, text, or both"
@@ -359,6 +358,7 @@ async def view_in(
             return Dissimilarities(np.array(observation.dissimilarities, np.float64)), []
         if "encoding" in observation.model_fields_set:
             return ReadyEncoding(np.array(observation.encoding, np.float64)), []
+        document = observation.model_dump(include=set(TOLD))
     if media_type == RANKS:
         return PackedRanks(body), []
     levels = levels_in(snapshot.landmark_model)
