@@ -26,7 +26,14 @@ EXTRACTORS = (
     *("efficientnet_lite0", "gradient_grid", "squeezenet:small.npz", "netvlad:small.mat", "onnx:small.onnx", "none"),
 )
 KINDS = [("feature_l2", extractor) for extractor in EXTRACTORS]
-KINDS += [(kind.value, name) for kind in EvaluatorKind if kind != "feature_l2" for name in ("gradient_grid", "none")]
+TOLD = {"objects", "language", "fused"}  # tests of their own: what they encode is no image
+OF_IMAGES = [kind.value for kind in EvaluatorKind if kind not in {"feature_l2", *TOLD}]
+KINDS += [
+    (kind.value, name)
+    for kind in EvaluatorKind
+    if kind not in {"feature_l2", *TOLD}
+    for name in ("gradient_grid", "none")
+]
 
 
 @pytest.fixture(scope="module")
