@@ -67,6 +67,7 @@ def claimed_png(width, height):
 
 IMAGES = ["image/jpeg", "image/png", "image/tiff", "image/webp"]
 TAKEN = {"allowed": [*IMAGES, "application/json", "application/vnd.deepsimbad.ranks"]}
+KNOWN = {"allowed": [*TAKEN["allowed"], "text/plain", "multipart/form-data"]}
 
 
 @pytest.mark.parametrize(
@@ -81,9 +82,9 @@ TAKEN = {"allowed": [*IMAGES, "application/json", "application/vnd.deepsimbad.ra
         ("seen", bytes(200_001), "image/jpeg", 413, "body_too_large", {"max_bytes": 200_000}),
         ("seen", b"x" * 50_001, "application/json", 413, "body_too_large", {"max_bytes": 50_000}),
         ("seen", b"x", "text/plain", 415, "unsupported_media_type", TAKEN),
-        ("seen", b"x", "image/bmp", 415, "unsupported_media_type", TAKEN),
-        ("seen", b"x", "x", 415, "unsupported_media_type", TAKEN),
-        ("seen", b"x", None, 415, "unsupported_media_type", TAKEN),
+        ("seen", b"x", "image/bmp", 415, "unsupported_media_type", KNOWN),
+        ("seen", b"x", "x", 415, "unsupported_media_type", KNOWN),
+        ("seen", b"x", None, 415, "unsupported_media_type", KNOWN),
         ("ready", encoded(picture(1)), "image/jpeg", 415, "unsupported_media_type", {"allowed": ["application/json"]}),
     ],
 )

@@ -52,7 +52,6 @@ from deepsimbad.engine.worker import EncodedImage, Priority, Stopwatch
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.grey_levels import levels_in
 from deepsimbad.evaluators.image_files import MEDIA_TYPES
-from deepsimbad.evaluators.scenes import FORM_DATA, TEXT, Form
 
 PROBABLY = 0.5
 router = APIRouter(prefix="/v1/domains", tags=["localization"])
@@ -303,12 +302,12 @@ async def post_localization(
     watch = Stopwatch()
     active = await running.active(domain)
     snapshot = active.snapshot
-    evaluator = running.evaluators.evaluator(active.record.evaluator)
-    media_type = media_type_of(request, types_for(evaluator))
+    media_type = media_type_of(request, OBSERVATION_TYPES)
     shortlist_length(snapshot, shortlist)  # a bad query should not cost an upload
     landmark_models = None if if_match is None else insisted_on(if_match)
     body = await read_bytes(request)
     watch.lap("receive")
+    evaluator = running.evaluators.evaluator(active.record.evaluator)
     view, remarks = await view_in(body, running, media_type, evaluator, snapshot)
     if prefers(request, BINARY):
 
@@ -336,12 +335,6 @@ async def post_localization(
     )
     running.metrics.localized(domain, answer["timings_ms"], answer["belief"]["entropy_bits"])
     return Response(body, media_type=JSON)
-
-
-def types_for(evaluator: Evaluator) -> tuple[str, ...]:
-    """The media types that a domain takes, besides those of images, which it refuses itself where it takes none."""
-    others = {TEXT: Form.TEXT in evaluator.forms, FORM_DATA: len(evaluator.forms) > 1}
-    return tuple(each for each in OBSERVATION_TYPES if others.get(each, True))
 
 
 async def view_in(

@@ -33,11 +33,7 @@ class Form(StrEnum):
     TEXT = "text"
 
 
-_MEDIA_TYPES = {
-    Form.IMAGE: MEDIA_TYPES,
-    Form.OBJECTS: ("application/json",),
-    Form.TEXT: (TEXT, "application/json"),
-}
+_OTHERS = ("application/json", "application/vnd.deepsimbad.ranks")  # that every domain takes
 
 
 @dataclass(frozen=True)
@@ -156,9 +152,13 @@ class Scene:
         """The scene; raises UnsupportedMediaTypeError where it is told in a form that an evaluator does not take."""
         if others := self.forms - taken:
             takes = " and ".join(sorted(taken)) or "ready encodings alone"
-            allowed = [media_type for form in Form if form in taken for media_type in _MEDIA_TYPES[form]]
+            allowed = [
+                *(MEDIA_TYPES if Form.IMAGE in taken else ()),
+                *_OTHERS,
+                *((TEXT,) if Form.TEXT in taken else ()),
+            ]
             raise UnsupportedMediaTypeError(
-                f"this domain takes {takes}, not {' or '.join(sorted(others))}", allowed=allowed or ["application/json"]
+                f"this domain takes {takes}, not {' or '.join(sorted(others))}", allowed=allowed
             )
         return self
 
