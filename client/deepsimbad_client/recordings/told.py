@@ -28,25 +28,25 @@ FORMS = {"objects": DETECTIONS, "text": CAPTIONS}
 class ToldRecording(Recording):
     """A recording whose frames are seen by what is told of them, beside their images or in their place."""
 
-    whole: Recording
+    pictured: Recording
     told: Mapping[str, Mapping[str, Any]]  # by form, by the frame's name
     with_image: bool
 
     def stamp(self, frame: Frame) -> str:
         """See `Recording.stamp`."""
         said = json.dumps([by_name.get(frame.name) for by_name in self.told.values()])
-        return f"{self.whole.stamp(frame) if self.with_image else frame.name} {said}"
+        return f"{self.pictured.stamp(frame) if self.with_image else frame.name} {said}"
 
     def shown_by(self, levels: GreyLevels | None) -> "ToldRecording":
         """See `Recording.shown_by`."""
-        return dataclasses.replace(self, whole=self.whole.shown_by(levels))
+        return dataclasses.replace(self, pictured=self.pictured.shown_by(levels))
 
     def image(self, frame: Frame, input_size: tuple[int, int] | None) -> EncodedImage:
         """The body of what is seen and told; raises BrokenFrameError also where nothing is told of the frame."""
         for form, by_name in self.told.items():
             if frame.name not in by_name:
                 raise BrokenFrameError(f"{FORMS[form]} says nothing of {frame.name}", f"not in {FORMS[form]}")
-        picture = self.whole.image(frame, input_size).body if self.with_image else None
+        picture = self.pictured.image(frame, input_size).body if self.with_image else None
         body = observed({form: by_name[frame.name] for form, by_name in self.told.items()}, picture)
         return EncodedImage(body.body, body.content_type)
 
@@ -73,7 +73,7 @@ def as_taken(recording: Recording, takes: Collection[str]) -> Recording:
         )
     return ToldRecording(
         **{field.name: getattr(recording, field.name) for field in dataclasses.fields(Recording)},
-        whole=recording,
+        pictured=recording,
         told=told,
         with_image="image" in takes,
     )
