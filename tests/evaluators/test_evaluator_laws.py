@@ -27,13 +27,8 @@ EXTRACTORS = (
 )
 KINDS = [("feature_l2", extractor) for extractor in EXTRACTORS]
 TOLD = {"objects", "language", "fused"}  # tests of their own: what they encode is no image
-OF_IMAGES = [kind.value for kind in EvaluatorKind if kind not in {"feature_l2", *TOLD}]
-KINDS += [
-    (kind.value, name)
-    for kind in EvaluatorKind
-    if kind not in {"feature_l2", *TOLD}
-    for name in ("gradient_grid", "none")
-]
+FITTED = [kind for kind in EvaluatorKind if kind not in {"feature_l2", *TOLD}]
+KINDS += [(kind.value, name) for kind in FITTED for name in ("gradient_grid", "none")]
 
 
 @pytest.fixture(scope="module")
@@ -200,7 +195,7 @@ def _route(n=60, d=24, seed=0):
     return (array.astype(np.float32) for array in (places, season, views))
 
 
-@pytest.mark.parametrize("kind", [kind for kind in EvaluatorKind if kind != "feature_l2"])
+@pytest.mark.parametrize("kind", FITTED)
 def test_what_is_fitted_learns_from_a_second_season_and_is_the_same_again(kind):
     evaluator = make_evaluator(evaluator_config({"kind": kind.value, "extractor": "none"}))
     assert evaluator.fitting is not Fitting.NOTHING
