@@ -4,7 +4,6 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -13,12 +12,7 @@ import pytest
 
 from deepsimbad.cli import run
 
-
-@dataclass(frozen=True)
-class Ran:
-    code: int
-    out: str
-    err: str
+from ..commands import Ran
 
 
 @pytest.fixture

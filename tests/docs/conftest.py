@@ -11,6 +11,8 @@ import pytest
 
 from deepsimbad_client.http.local_server import LocalServer
 
+from ..commands import is_plain, ran
+
 PROJECT = Path(__file__).resolve().parents[2]
 FENCE = re.compile(r"^```(\w+)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 NOT_RUN = ("make ", "pip install ")  # compared in test_references instead
@@ -71,13 +73,18 @@ class Workplace:
         here = text
         for there, word in {"http://127.0.0.1:8000": self.url, **self.words}.items():
             here = here.replace(there, str(word))
-        path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
-        environment = {**os.environ, "PATH": path, "DEEPSIMBAD_URL": self.url}
+        environment = {"DEEPSIMBAD_URL": self.url}
         if (key := self.folder / "operator.key").is_file():
             environment["DEEPSIMBAD_API_KEY"] = key.read_text().strip()
-        options = {"cwd": self.folder, "env": environment, "timeout": 400, "capture_output": True, "text": True}
+        if is_plain(text) and not program:
+            plain = ran(here, self.folder, **environment)
+            assert plain.code == 0, f"{text}\n{plain.out}{plain.err}"
+            self.output[text] = plain.out
+            return plain.out
+        path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+        options = {"cwd": self.folder, "env": {**os.environ, "PATH": path, **environment}, "timeout": 400}
         command = [*(program or ("bash", "-c")), fails + here]
-        ended = subprocess.run(command, errors="replace", check=False, **options)
+        ended = subprocess.run(command, capture_output=True, text=True, errors="replace", check=False, **options)
         assert ended.returncode == 0, f"{text}\n{ended.stdout}{ended.stderr}"
         self.output[text] = ended.stdout
         return ended.stdout

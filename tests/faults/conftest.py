@@ -1,7 +1,6 @@
 """A small mapped data directory, and the service as a process whose disk can be taken away from it."""
 
 import io
-import re
 import shutil
 import socket
 import subprocess
@@ -11,7 +10,6 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
@@ -19,28 +17,17 @@ import httpx2
 import numpy as np
 import pytest
 
+from ..commands import Ran, ran
+
 READY_WITHIN_S = 180.0
 N_PLACES, DIM, N_LANDMARKS = 60, 8, 12
 NPZ = {"Content-Type": "application/octet-stream"}
 
 
-@dataclass(frozen=True)
-class Ran:
-    code: int
-    out: str
-    err: str
-
-    @property
-    def line(self) -> str:
-        """The one line on standard error that a named error is."""
-        assert (self.code, self.out) == (1, ""), self
-        (line,) = self.err.splitlines()
-        assert re.match(r"deepsimbad: [a-z_]+: ", line)
-        return line
-
-
 def command(*arguments: object) -> Ran:
-    """Run `deepsimbad` in a process of its own."""
+    """Run `deepsimbad`; a service in a process of its own."""
+    if arguments[0] != "serve":
+        return ran(["deepsimbad", *arguments])
     done = subprocess.run(
         [sys.executable, "-m", "deepsimbad", *map(str, arguments)],
         capture_output=True,

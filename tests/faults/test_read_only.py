@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from .conftest import Ran, command
+from ..commands import Ran
+from .conftest import command
 
 pytestmark = pytest.mark.slow
 # Root may write everywhere, unless it gives that right up before it becomes the command.
