@@ -5,6 +5,7 @@ from functools import cached_property
 from typing import Self, TypeAlias
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from deepsimbad.core.belief import (
@@ -138,20 +139,29 @@ class ParticleFilter:
             on_route = 1 - self.doubt.lost
             weights = np.outer(on_route, added(trust @ self.weights / on_route.mean(), seen.values[images]))
             weighed = replace(self, weights=weights, found=np.zeros_like(self.found))
+            after = weighed if self.doubt.is_mixture else weighed._evened_out(step)
         else:
             least = seen.likelihood(news)
-            factors = np.stack([least ** (2**t) for t in range(trust.size)])  # each twice the one before
-            average = factors.mean(axis=1)
-            weights, found, lost = self.weights * factors[:, images], self.found * average, self.doubt.lost * average
+            average = _averages(least, trust.size)
+            weights, found, lost = (
+                self.weights * _by_trust(least[images], trust.size),
+                self.found * average,
+                self.doubt.lost * average,
+            )
             total = weights.sum(axis=1) + found + lost
             if (total <= 0).any():  # the view allows nothing that is still believed: what was known stays
                 return replace(self, told=0.0)
             doubt = Doubt(lost / total, self.doubt.log_trust + np.log(total / average), seen.values)
             weighed = replace(self, weights=weights / total[:, np.newaxis], found=found / total, doubt=doubt)
-            weighed = weighed._placed(factors * self.route.cell_m, step)
-        after = weighed if self.doubt.is_mixture else weighed._evened_out(step)
-        moved = 0.5 * float(np.abs(after.mass - self.mass).sum())
+            after = weighed._placed(least, step) if doubt.is_mixture else weighed._evened_out(step)
+        moved = 0.5 * float(np.abs(weighed._believed - self._believed).sum())
         return replace(after, told=max(moved, seen.least_told(news)))
+
+    @property
+    def _believed(self) -> NDArray[np.float64]:
+        """[m + 1] of the particles and of what was found, if the robot is on the route; sums to 1."""
+        believed = np.append(self.doubt.trust @ self.weights, self.doubt.trust @ self.found)
+        return np.asarray(believed / max(believed.sum(), 1e-300))
 
     def _evened_out(self, step: int) -> Self:
         """Resampled where the effective sample size has fallen below half the particles."""
@@ -159,8 +169,13 @@ class ParticleFilter:
         effective = np.square(together.sum()) / max(np.square(together).sum(), 1e-300)
         return self if effective >= together.size / 2 else self._resampled(step)
 
-    def _placed(self, likelihood: NDArray[np.float64], step: int) -> Self:
-        """What was found gets particles where the view says it may be, a few at least, in place of the lightest."""
+    def _placed(self, least: NDArray[np.float64], step: int) -> Self:
+        """What was found gets particles where the view says it may be, a few at least, in place of the lightest.
+
+        Args:
+            least: [n] likelihood of the least trust.
+            step: Number of this step in the session.
+        """
         trust, m = self.doubt.trust, self.position_m.size
         if not self.found.any():
             return self
@@ -168,8 +183,8 @@ class ParticleFilter:
         if n_placed == 0:
             return replace(self, doubt=replace(self.doubt, lost=self.doubt.lost + self.found), found=0 * self.found)
         rng = np.random.default_rng([self.seed, step, _RETURN])
-        density = (trust * self.found) @ (likelihood / likelihood.sum(axis=1, keepdims=True))
-        images = _comb(density, n_placed, rng.random())
+        cumulated = _cumulated(least, self.route.cell_m, trust * self.found)
+        images = _comb(cumulated, n_placed, rng.random())
         together = trust @ self.weights
         heaviest = np.argsort(together, kind="stable")[n_placed:]
         if together[heaviest].sum() >= (1 - _NEGLIGIBLE) * together.sum():
@@ -178,7 +193,8 @@ class ParticleFilter:
             kept = self._resampled(step, m - n_placed)
         half_m = self.route.cell_m[images] * (rng.random(n_placed) - 0.5)
         position_m = np.concatenate([kept.position_m, _onto(self.route, self.route.position_m[images] + half_m)])
-        placed = np.ascontiguousarray(likelihood[:, images]) / density[images]
+        density = cumulated[images] - np.where(images > 0, cumulated[images - 1], 0.0)
+        placed = _by_trust(least[images], trust.size) * self.route.cell_m[images] / density
         placed *= (self.found / np.maximum(placed.sum(axis=1), 1e-300))[:, np.newaxis]
         weights = np.concatenate([kept.weights, placed], axis=1)
         return replace(self, position_m=position_m, weights=weights, found=np.zeros_like(self.found))
@@ -195,12 +211,12 @@ class ParticleFilter:
         rng = np.random.default_rng([self.seed, step, _RESAMPLE])
         if self.doubt.is_mixture:
             order = np.argsort(self.position_m, kind="stable")
-            chosen = _comb(together[order], n, rng.random())
+            chosen = _comb(np.cumsum(together[order]), n, rng.random())
             low_m, high_m = _stretches(self.route, self.position_m[order])
             position_m = low_m[chosen] + rng.random(n) * (high_m - low_m)[chosen]
             chosen = order[chosen]
         else:
-            chosen = _comb(together, n, rng.random())
+            chosen = _comb(np.cumsum(together), n, rng.random())
             position_m = self.position_m[chosen]
         return self._of(position_m, np.ascontiguousarray(self.weights[:, chosen]) / together[chosen])
 
@@ -210,11 +226,51 @@ class ParticleFilter:
         return replace(self, position_m=position_m, weights=weights * (self.weights.sum(axis=1) / total)[:, np.newaxis])
 
 
-def _comb(weight: NDArray[np.float64], count: int, offset: float) -> NDArray[np.intp]:
+def _by_trust(least: NDArray[np.float64], n_trusts: int) -> NDArray[np.float64]:
+    """[t, m] likelihoods from those of the least trust [m]: every trust is twice the one before."""
+    rows = [least]
+    for _ in range(1, n_trusts):
+        rows.append(np.square(rows[-1]))
+    return np.array(rows)
+
+
+@njit(cache=True, nogil=True)
+def _averages(least: NDArray[np.float64], n_trusts: int) -> NDArray[np.float64]:
+    """[t] of the likelihoods [n], by trust."""
+    sums = np.zeros(n_trusts)
+    for image in range(least.size):
+        likelihood = least[image]
+        for t in range(n_trusts):
+            sums[t] += likelihood
+            likelihood *= likelihood
+    return sums / least.size
+
+
+@njit(cache=True, nogil=True)
+def _cumulated(
+    least: NDArray[np.float64], cell_m: NDArray[np.float64], found: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """[n] how much of what was found [t] may be at an image or before it, each part spread by its likelihood."""
+    sums = np.zeros(found.size)
+    for image in range(least.size):
+        likelihood = least[image]
+        for t in range(found.size):
+            sums[t] += likelihood * cell_m[image]
+            likelihood *= likelihood
+    shares, cumulated, total = found / sums, np.empty(least.size), 0.0
+    for image in range(least.size):
+        likelihood = least[image]
+        for t in range(found.size):
+            total += shares[t] * likelihood * cell_m[image]
+            likelihood *= likelihood
+        cumulated[image] = total
+    return cumulated
+
+
+def _comb(cumulated: NDArray[np.float64], count: int, offset: float) -> NDArray[np.intp]:
     """[count] ids, each as often as its weight asks for."""
-    cumulated = np.cumsum(weight)
-    chosen = np.searchsorted(cumulated / cumulated[-1], (np.arange(count) + offset) / count, side="right")
-    return np.minimum(chosen, weight.size - 1)
+    chosen = np.searchsorted(cumulated, cumulated[-1] * (np.arange(count) + offset) / count, side="right")
+    return np.minimum(chosen, cumulated.size - 1)
 
 
 def _stretches(route: Route, position_m: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -222,7 +278,7 @@ def _stretches(route: Route, position_m: NDArray[np.float64]) -> tuple[NDArray[n
 
     They go half the way to the next particles, no farther than a particle of a belief that knows nothing.
     """
-    reach_m = max(route.length_m / position_m.size, float(np.median(route.cell_m))) / 2
+    reach_m = max(route.length_m / position_m.size, route.cells.step_m) / 2
     half_m = np.minimum(np.diff(position_m) / 2, reach_m)
     low_m, high_m = position_m - np.r_[reach_m, half_m], position_m + np.r_[half_m, reach_m]
     end_m = route.start_m + route.length_m
@@ -237,14 +293,28 @@ def _on_images(
     middle_m = (places.position_m[1:] + places.position_m[:-1]) / 2
     last_m = route.start_m + route.length_m
     if route.closed:  # behind the last image the first may be nearer
-        middle_m = np.r_[middle_m, (places.position_m[-1] + last_m) / 2]
-    bounds_m, cumulated = np.stack([low_m, high_m], 1).ravel(), np.cumsum(weight)
-    share = np.interp(middle_m, bounds_m, np.stack([cumulated - weight, cumulated], 1).ravel())
-    share = np.r_[0.0, share, cumulated[-1]]
-    mass = np.diff(share)
+        middle_m = np.append(middle_m, (places.position_m[-1] + last_m) / 2)
+    below = _below(middle_m, low_m, high_m, weight)
+    mass = np.diff(below, prepend=0.0, append=weight.sum())
     if route.closed:
-        mass = np.r_[mass[0] + mass[-1], mass[1:-1]]
-    return np.asarray(mass[places.of_image] / places.n_images[places.of_image])
+        mass = np.concatenate([mass[:1] + mass[-1:], mass[1:-1]])
+    return mass if mass.size == route.n_images else np.asarray(mass[places.of_image] / places.n_images[places.of_image])
+
+
+@njit(cache=True, nogil=True)
+def _below(
+    at_m: NDArray[np.float64], low_m: NDArray[np.float64], high_m: NDArray[np.float64], weight: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """[k] how much of the weights lies below ascending positions [k]."""
+    below, whole, part = np.empty(at_m.size), 0.0, 0
+    for at in range(at_m.size):
+        while part < weight.size and high_m[part] <= at_m[at]:
+            whole += weight[part]
+            part += 1
+        below[at] = whole
+        if part < weight.size and at_m[at] > low_m[part]:
+            below[at] += weight[part] * (at_m[at] - low_m[part]) / (high_m[part] - low_m[part])
+    return below
 
 
 def _onto(route: Route, position_m: NDArray[np.float64]) -> NDArray[np.float64]:
