@@ -246,6 +246,20 @@ def test_images_of_one_stop_share_what_arrives_there():
     np.testing.assert_allclose(stood.mass, moved.mass, atol=1e-9)
 
 
+@pytest.mark.parametrize("n_gaps", [3, 20])
+def test_gaps_of_a_kilometre_leave_neighbouring_images_apart(n_gaps):
+    """A tracked robot is still told from its neighbour a metre on, and the route needs no million cells."""
+    steps_m = np.ones(300)
+    steps_m[np.linspace(20, 250, n_gaps).astype(int)] = 1000.0
+    route = Route(np.cumsum(steps_m))
+    belief = GridFilter.around(route, float(route.position_m[270]), 0.5)
+    for step, at in enumerate(range(271, 280), start=1):
+        belief = belief.predicted(1.0, 0.1, step).updated(seen(4.0 * (np.arange(300) == at)), step)
+    assert belief.mass.argmax() == 279
+    assert belief.mass[279] > 0.9
+    assert belief.masses.shape[1] < 40_000
+
+
 def test_a_prior_narrower_than_the_spacing_keeps_its_nearest_image(route):
     mass = GridFilter.around(route, 40.4, 0.01).mass
     assert (mass[40], mass[41]) == pytest.approx((0.6, 0.4))

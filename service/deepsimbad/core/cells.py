@@ -9,6 +9,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 _MOST_PER_PLACE = 4  # cells, where a few places are far apart and the others near each other
+_MOST_IN_GAPS, _LEAST_STEP_M = 32768, 0.25  # more than that, but no shorter ones: gaps must not make cells coarse
 _ROUNDING = 1e-9  # of a cell
 
 
@@ -32,7 +33,8 @@ class Cells:
         """As long as neighbouring places are usually apart."""
         if place_m.size == 1 or length_m <= 0:
             return cls(float(place_m[0]), 1.0, 1, False, place_m, width_m)
-        usual_m = max(float(np.median(np.diff(place_m))), length_m / (_MOST_PER_PLACE * place_m.size))
+        most = max(_MOST_PER_PLACE * place_m.size, min(_MOST_IN_GAPS, length_m / _LEAST_STEP_M))
+        usual_m = max(float(np.median(np.diff(place_m))), length_m / most)
         n_steps = max(1, round(length_m / usual_m))
         return cls(float(place_m[0]), length_m / n_steps, n_steps if closed else n_steps + 1, closed, place_m, width_m)
 
