@@ -270,7 +270,7 @@ def _cumulated(
 def _comb(cumulated: NDArray[np.float64], count: int, offset: float) -> NDArray[np.intp]:
     """[count] ids, each as often as its weight asks for."""
     chosen = np.searchsorted(cumulated, cumulated[-1] * (np.arange(count) + offset) / count, side="right")
-    return np.minimum(chosen, cumulated.size - 1)
+    return np.asarray(np.minimum(chosen, cumulated.size - 1), np.intp)
 
 
 def _stretches(route: Route, position_m: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
