@@ -260,6 +260,22 @@ def test_gaps_of_a_kilometre_leave_neighbouring_images_apart(n_gaps):
     assert belief.masses.shape[1] < 40_000
 
 
+@pytest.mark.parametrize("closed", [False, True])
+def test_a_robot_in_a_gap_is_by_the_nearest_image(closed):
+    route = Route(np.concatenate([np.arange(20.0), np.arange(1000.0, 1020.0)]), closed)
+    for at_m, nearest in ((500.0, 19), (520.0, 20)):
+        belief = GridFilter.around(route, at_m, 1.0).predicted(1.0, 0.1, step=1)
+        assert belief.mass[nearest] == pytest.approx(1, abs=1e-3)  # a little is found anywhere
+        assert belief.mass.sum() == pytest.approx(1)
+
+
+@pytest.mark.parametrize("kind", list(FilterKind))
+def test_a_closed_route_of_no_length_is_moved_along(kind):
+    belief = FILTERS[kind].uniform(Route(np.array([5.0, 5.0]), closed=True)).updated(seen([0.0, 1.0]), 0)
+    after = belief.predicted(1.0, 0.1, 1).updated(seen([0.0, 1.0], shared=0.5), 1)
+    np.testing.assert_allclose(after.mass, 0.5)
+
+
 def test_a_prior_narrower_than_the_spacing_keeps_its_nearest_image(route):
     mass = GridFilter.around(route, 40.4, 0.01).mass
     assert (mass[40], mass[41]) == pytest.approx((0.6, 0.4))

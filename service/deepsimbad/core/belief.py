@@ -146,7 +146,7 @@ class Doubt:
 
 def moved_along(route: Route, values: NDArray[np.float64], action_m: float) -> NDArray[np.float64]:
     """[n] values of map images, where a robot that moves sees them next; what lies before an open route is 0."""
-    if action_m == 0:
+    if action_m == 0 or route.length_m == 0:
         return values
     from_m = route.wrapped(route.position_m - action_m)
     if route.closed:

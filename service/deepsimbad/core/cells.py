@@ -15,7 +15,7 @@ _ROUNDING = 1e-9  # of a cell
 
 @dataclass(frozen=True)
 class Cells:
-    """Equal cells along a route, whose places stand for some of its metres each.
+    """Equal cells along a route, whose places stand for the metres nearest to them.
 
     Where places stand at equal distances, cells are places. All cells may be ahead of where they began by one offset
     of at most half a cell: a move is a shift by whole cells and an offset, and blurs nothing.
@@ -26,17 +26,16 @@ class Cells:
     n_cells: int  # c
     closed: bool  # the last joins the first
     place_m: NDArray[np.float64]  # [p] distinct positions of map images, ascending
-    place_width_m: NDArray[np.float64]  # [p] metres that each stands for
 
     @classmethod
-    def along(cls, place_m: NDArray[np.float64], width_m: NDArray[np.float64], length_m: float, closed: bool) -> Self:
+    def along(cls, place_m: NDArray[np.float64], length_m: float, closed: bool) -> Self:
         """As long as neighbouring places are usually apart."""
         if place_m.size == 1 or length_m <= 0:
-            return cls(float(place_m[0]), 1.0, 1, False, place_m, width_m)
+            return cls(float(place_m[0]), 1.0, 1, False, place_m)
         most = max(_MOST_PER_PLACE * place_m.size, min(_MOST_IN_GAPS, length_m / _LEAST_STEP_M))
         usual_m = max(float(np.median(np.diff(place_m))), length_m / most)
         n_steps = max(1, round(length_m / usual_m))
-        return cls(float(place_m[0]), length_m / n_steps, n_steps if closed else n_steps + 1, closed, place_m, width_m)
+        return cls(float(place_m[0]), length_m / n_steps, n_steps if closed else n_steps + 1, closed, place_m)
 
     @cached_property
     def position_m(self) -> NDArray[np.float64]:
@@ -65,10 +64,19 @@ class Cells:
         return _interpolated(values, self.place_m, self.start_m + offset_m, self.step_m, self.n_cells, length_m)
 
     def to_places(self, mass: NDArray[np.float64], offset_m: float) -> NDArray[np.float64]:
-        """[p] masses of places, summing to 1, from those of cells [c]: as dense as cells are there."""
-        dense = _dense_at(mass, (self.place_m - self.start_m - offset_m) / self.step_m, self.closed)
-        on_places = dense * self.place_width_m
+        """[p] masses of places, summing to 1, from those of cells [c]: of the stretch that is nearest to each."""
+        on_places = _within(mass, (self._bounds_m - self.start_m - offset_m) / self.step_m + 0.5, self.closed)
         return np.asarray(on_places / max(on_places.sum(), 1e-300), np.float64)
+
+    @cached_property
+    def _bounds_m(self) -> NDArray[np.float64]:
+        """[p + 1] half the way between neighbouring places; an open route's ends have all that is beyond them."""
+        between_m = (self.place_m[1:] + self.place_m[:-1]) / 2
+        if not self.closed:
+            return np.concatenate([[-np.inf], between_m, [np.inf]])
+        length_m = self.step_m * self.n_cells
+        last_m = (self.place_m[-1] + self.place_m[0] + length_m) / 2
+        return np.concatenate([[last_m - length_m], between_m, [last_m]])
 
 
 @njit(cache=True, nogil=True)
@@ -96,17 +104,17 @@ def _interpolated(
 
 
 @njit(cache=True, nogil=True)
-def _dense_at(mass: NDArray[np.float64], at: NDArray[np.float64], closed: bool) -> NDArray[np.float64]:
-    """[p] the mass of a cell there, linear between the middles of cells."""
+def _within(mass: NDArray[np.float64], bounds: NDArray[np.float64], closed: bool) -> NDArray[np.float64]:
+    """[p] the masses between ascending bounds [p + 1], in cells from where the first begins; cells are evenly full."""
     n = mass.size
-    dense = np.empty(at.size)
-    for place in range(at.size):
-        below = int(np.floor(at[place]))
-        share = at[place] - below
-        one, other = below, below + 1
-        if closed:
-            one, other = one % n, other % n
-        else:
-            one, other = min(max(one, 0), n - 1), min(max(other, 0), n - 1)
-        dense[place] = mass[one] + (mass[other] - mass[one]) * share
-    return dense
+    within = np.empty(bounds.size - 1)
+    cell = int(np.floor(bounds[0])) if closed else 0
+    held = mass[cell % n] * (bounds[0] - cell) if closed else 0.0  # of the cell, what earlier places have
+    for place in range(within.size):
+        last, total = bounds[place + 1], -held
+        while cell + 1 <= last and (closed or cell < n):
+            total += mass[cell % n]
+            cell += 1
+        held = mass[cell % n] * max(last - cell, 0.0) if closed or cell < n else 0.0
+        within[place] = total + held
+    return within

@@ -128,8 +128,7 @@ class Route:
     @cached_property
     def cells(self) -> Cells:
         """Of equal length, for a grid belief."""
-        width_m = np.bincount(self.places.of_image, self.cell_m).astype(np.float64)
-        return Cells.along(self.places.position_m, width_m, self.length_m, self.closed)
+        return Cells.along(self.places.position_m, self.length_m, self.closed)
 
     def nearest_image(self, position_m: NDArray[np.float64]) -> NDArray[np.intp]:
         """The map image nearest to each position along the route; of two equally near the earlier."""
