@@ -50,7 +50,8 @@ def test_anything_unknown_is_an_error_that_says_what_is_allowed(raw):
 
 @pytest.mark.parametrize("kind", EvaluatorKind)
 def test_every_kind_can_be_made(kind):
-    assert make_evaluator(evaluator_config({"kind": kind.value}))
+    of = {"of": [{"kind": "feature_l2"}, {"kind": "objects"}]} if kind is EvaluatorKind.FUSED else {}
+    assert make_evaluator(evaluator_config({"kind": kind.value, **of}))
 
 
 @pytest.mark.parametrize(

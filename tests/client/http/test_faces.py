@@ -74,7 +74,15 @@ def document():
     return create_app(Settings(data_dir=Path("never-opened"))).openapi()
 
 
-OPERATIONS = sorted(f"{method.upper()} {path}" for path, methods in document()["paths"].items() for method in methods)
+# What the console asks for; robots and scripts have no call of them yet.
+FOR_PEOPLE = {
+    "GET /v1/domains/{domain}/coverage",
+    "GET /v1/domains/{domain}/map-images/{index}/thumbnail",
+    "GET /v1/sessions/{session_id}/events",
+    "GET /v1/sessions/{session_id}/view",
+}
+ALL = {f"{method.upper()} {path}" for path, methods in document()["paths"].items() for method in methods}
+OPERATIONS = sorted(ALL - FOR_PEOPLE)
 
 
 @pytest.mark.parametrize("operation", OPERATIONS)
