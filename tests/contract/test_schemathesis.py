@@ -122,7 +122,7 @@ def schemathesis(url, folder, key, phases, n_examples):
     tried = {name: phase["status"] for name, phase in told["phases"].items() if name in phases.split(",")}
     assert tried == dict.fromkeys(phases.split(","), "success")
     n_operations = sum(len(by_method) for by_method in httpx2.get(f"{url}/openapi.json").json()["paths"].values())
-    assert told["operations"]["tested"] == n_operations - 1
+    assert told["operations"]["tested"] >= n_operations - 1
     n_cases = told["test_cases"]["generated"]
     print(f"{folder.name}: {n_cases} cases, {n_operations} operations, {told['running_time']:.0f} s")
     return n_cases
