@@ -4,7 +4,8 @@ import asyncio
 import math
 import random
 import time
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import AsyncGenerator, Awaitable, Callable, Sequence
+from contextlib import aclosing
 from typing import TYPE_CHECKING, Any, Generic, TypeVar, Unpack
 
 import httpx2
@@ -28,6 +29,7 @@ from deepsimbad_client.http import (
 )
 from deepsimbad_client.http.admin import Admin, AsyncAdmin
 from deepsimbad_client.http.models import (
+    Coverage,
     Domain,
     Health,
     Localization,
@@ -47,6 +49,7 @@ from deepsimbad_client.http.wire import (
     Wire,
     finished,
     shared,
+    shared_stream,
     speaking_to,
 )
 
@@ -133,6 +136,28 @@ class SessionCalls(Face):
         """The move that would tell most, without another view; None where the map can name none."""
         response = await self._wire.send(Call("GET", f"{self._path}/next-best-view"))
         return None if response.content.strip() == b"null" else model_of(NextBestView, response)
+
+    @shared_stream
+    async def events(self, after: int | None = None) -> AsyncGenerator[SessionAnswer, None]:
+        """Yield what every observation is answered, until the session ends; one connection, not renewed when it breaks.
+
+        Begins with the last answer that there was, or behind event `after`; 0: with the first. Raises
+        TransportError (the connection failed or broke off).
+        """
+        call = Call(
+            "GET", f"{self._path}/events", {"after": after}, {"Accept": "text/event-stream"}, repeat=Repeat.NEVER
+        )
+        async with aclosing(self._wire.events(call)) as events:
+            async for event in events:
+                if event.event == "observation":
+                    yield SessionAnswer.model_validate_json(event.data)
+                elif event.event == "done":
+                    return
+
+    @shared
+    async def view(self) -> bytes | None:
+        """What the robot saw last, as a small JPEG; None where the service holds it no more."""
+        return (await self._wire.send(Call("GET", f"{self._path}/view"))).content or None
 
     @shared
     async def set_prior(self, position_m: float, std_m: float) -> SessionState:
@@ -242,6 +267,18 @@ class ClientCalls(Face, Generic[AnySession]):
 
         call = Call("GET", f"{domain_path(domain)}/landmark-model", {"map_version": map_version}, BINARY)
         return OnBoardEncoder((await self._wire.send(call)).content)
+
+    @shared
+    async def coverage(self, domain: str, *, map_version: int | None = None) -> Coverage:
+        """Where on its route a map can be trusted. Raises UnknownDomainError, NoActiveMapError, RetiredMapError."""
+        call = Call("GET", f"{domain_path(domain)}/coverage", {"map_version": map_version})
+        return model_of(Coverage, await self._wire.send(call))
+
+    @shared
+    async def thumbnail(self, domain: str, map_image: int, *, map_version: int | None = None) -> bytes:
+        """A small JPEG of a map image. Raises NotFoundError (the domain keeps none)."""
+        path = f"{domain_path(domain)}/map-images/{map_image}/thumbnail"
+        return (await self._wire.send(Call("GET", path, {"map_version": map_version}))).content
 
     @shared
     async def localize(

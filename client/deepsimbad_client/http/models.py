@@ -134,6 +134,27 @@ class Localization(Answer):
     next_best_view: NextBestView | None = None
 
 
+class Stretch(Answer):
+    """A part of a route where views are placed rightly less often than elsewhere."""
+
+    from_m: float
+    to_m: float
+    chance: float
+    worst_map_image: int
+    worst_frame: str | None = None
+
+
+class Coverage(Answer):
+    """`GET /v1/domains/{domain}/coverage`: how surely every map image's place is recognised; columns in route order."""
+
+    map_version: int
+    within_m: float
+    basis: str | None
+    stretches: tuple[Stretch, ...]  # worst first
+    route_position_m: tuple[float, ...]
+    chance: tuple[float | None, ...] | None
+
+
 class SessionState(Answer):
     """A live session between two observations."""
 

@@ -6,6 +6,7 @@ from typing import Annotated
 
 from fastapi import APIRouter, Response
 from fastapi import Path as PathParameter
+from starlette.exceptions import HTTPException
 from starlette.responses import FileResponse, RedirectResponse
 
 router = APIRouter(include_in_schema=False)
@@ -53,5 +54,5 @@ async def report() -> Response:
 async def asset(name: Annotated[str, PathParameter(pattern=r"^[a-z][A-Za-z0-9.]*\.(js|css|svg|txt)$")]) -> Response:
     """What the page is made of."""
     if not (_FILES / name).is_file():
-        return Response(status_code=404)
+        raise HTTPException(404)
     return _file(name)

@@ -13,7 +13,6 @@ from deepsimbad.errors import NotAcceptableError
 
 GEOPOSE = "application/geopose+json"
 _EQUATOR_M, _FLATTENING = 6_378_137.0, 1 / 298.257_223_563  # WGS 84
-_HEADING_OVER_M = 1.0  # to either side: neighbours alone are as noisy as their positions
 
 Degrees = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 
@@ -67,8 +66,8 @@ def render_geopose(snapshot: Map, anchor: AnchorBody | None, image: int) -> GeoP
             reason="no_anchor",
         )
     route = snapshot.route
-    heading = heading_at(snapshot, image)
-    if route.x_m is None or route.y_m is None or heading is None:
+    heading = float(route.heading_rad[image])
+    if route.x_m is None or route.y_m is None or not math.isfinite(heading):
         raise NotAcceptableError(
             f"map {snapshot.version} of domain {snapshot.domain} knows no x and y there: map a traverse that has them",
             reason="no_heading",
@@ -91,16 +90,3 @@ def render_geopose(snapshot: Map, anchor: AnchorBody | None, image: int) -> GeoP
         },
         "angles": {"yaw": (math.degrees(heading - turned) + 180) % 360 - 180, "pitch": 0.0, "roll": 0.0},
     }
-
-
-def heading_at(snapshot: Map, image: int) -> float | None:
-    """Which way the route leads at a map image, in radians from x towards y; None where it is not known."""
-    route = snapshot.route
-    if route.x_m is None or route.y_m is None:
-        return None
-    at_m = route.position_m
-    first = int(at_m.searchsorted(at_m[image] - _HEADING_OVER_M, side="left"))
-    last = int(at_m.searchsorted(at_m[image] + _HEADING_OVER_M, side="right")) - 1
-    first, last = min(first, max(image - 1, 0)), max(last, min(image + 1, at_m.size - 1))
-    x_m, y_m = (float(values[last] - values[first]) for values in (route.x_m, route.y_m))
-    return math.atan2(y_m, x_m) if math.isfinite(x_m) and math.isfinite(y_m) and (x_m, y_m) != (0.0, 0.0) else None

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from deepsimbad.core.drive import SecondSeason
 from deepsimbad.core.index.retrieval import relevances
 from deepsimbad.core.map import Map
-from deepsimbad.core.rehearsal import SEASONS_ALIKE
+from deepsimbad.core.rehearsal import SEASONS_ALIKE, smoothed
 
 WITHIN_M = 5.0  # of its true place: as `confident` takes a place
 _SMOOTHED_OVER_M = 5.0  # a view is placed rightly or not: neighbours tell of how often
@@ -66,7 +66,9 @@ def _found(map_: Map, season: SecondSeason, *, is_counted: bool) -> NDArray[np.f
             likelihood = np.exp(scale * (relevance - relevance.max(axis=1, keepdims=True)))
             is_near = np.abs(route.offset_m(route.position_m[np.newaxis], at_m[:, np.newaxis])) <= WITHIN_M
             found[some] = (likelihood * is_near).sum(axis=1) / likelihood.sum(axis=1)
-    return _smoothed(route.position_m, route.position_m[images], found)
+    order = np.argsort(images, kind="stable")
+    at_m = route.position_m[images[order]]
+    return smoothed(route.position_m, at_m, found[order], _SMOOTHED_OVER_M, _PRIOR_VIEWS)
 
 
 def worst_stretches(position_m: NDArray[np.float64], chance: NDArray[np.floating]) -> list[Stretch]:
@@ -79,16 +81,3 @@ def worst_stretches(position_m: NDArray[np.float64], chance: NDArray[np.floating
             some = chance[first:stop]
             stretches.append(Stretch(int(first), int(stop - 1), int(first + np.nanargmin(some)), float(some.mean())))
     return sorted(stretches, key=lambda stretch: stretch.chance)
-
-
-def _smoothed(to_m: NDArray[np.float64], at_m: NDArray[np.float64], found: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[n] local means of found measured at `at_m`, near their overall mean where there are few."""
-    order = np.argsort(at_m, kind="stable")
-    at_m, found, mean = at_m[order], found[order], found.mean()
-    first = np.searchsorted(at_m, to_m - 3 * _SMOOTHED_OVER_M)
-    stop = np.searchsorted(at_m, to_m + 3 * _SMOOTHED_OVER_M, side="right")
-    smoothed = np.empty(to_m.size)
-    for image, (low, high) in enumerate(zip(first, stop, strict=True)):
-        weight = np.exp(-0.5 * np.square((at_m[low:high] - to_m[image]) / _SMOOTHED_OVER_M))
-        smoothed[image] = (weight @ found[low:high] + _PRIOR_VIEWS * mean) / (weight.sum() + _PRIOR_VIEWS)
-    return smoothed

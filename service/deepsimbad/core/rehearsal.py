@@ -101,8 +101,8 @@ def novelty_curve(at_m: NDArray[np.float64], difference: NDArray[np.floating], l
     grid_m = np.arange(at_m[0], at_m[-1] + 0.5)
     if grid_m.size <= lags_m.size:
         return np.exp(-lags_m / _SMOOTHED_OVER_M)
-    smoothed = _smooth_to(grid_m, at_m, difference)
-    spectrum = np.square(np.abs(np.fft.rfft(smoothed - smoothed.mean(axis=0), 2 * grid_m.size, axis=0))).sum(axis=1)
+    smooth = smoothed(grid_m, at_m, difference)
+    spectrum = np.square(np.abs(np.fft.rfft(smooth - smooth.mean(axis=0), 2 * grid_m.size, axis=0))).sum(axis=1)
     correlation = np.fft.irfft(spectrum)[: lags_m.size]
     if correlation[0] <= 0:
         return np.exp(-lags_m / _SMOOTHED_OVER_M)
@@ -152,20 +152,29 @@ def _views_said(map_: Map, own: NDArray[np.float32], images: NDArray[np.int64]) 
     return np.asarray(relevance - relevance.mean(axis=1, keepdims=True))
 
 
-def _smooth_to(
-    grid_m: NDArray[np.float64], at_m: NDArray[np.float64], values: NDArray[np.floating]
+def smoothed(
+    grid_m: NDArray[np.float64],
+    at_m: NDArray[np.float64],
+    values: NDArray[np.floating],
+    over_m: float = _SMOOTHED_OVER_M,
+    mean_weight: float = 0.0,
 ) -> NDArray[np.float64]:
-    """[g, ...] local means of values measured at ascending positions; far from all of them their overall mean."""
-    reach = 3 * _SMOOTHED_OVER_M
+    """[g, ...] local means of values measured at ascending positions; far from all of them their overall mean.
+
+    Args:
+        over_m: How far away a value counts, as a standard deviation.
+        mean_weight: Of the overall mean, which draws where few values are near, in values.
+    """
+    reach, mean = 3 * over_m, values.mean(axis=0)
     first = np.searchsorted(at_m, grid_m - reach)
     stop = np.searchsorted(at_m, grid_m + reach, side="right")
-    smoothed = np.empty((grid_m.size, *values.shape[1:]))
-    smoothed[:] = values.mean(axis=0)
+    means = np.empty((grid_m.size, *values.shape[1:]))
+    means[:] = mean
     for row, (low, high) in enumerate(zip(first, stop, strict=True)):
         if high > low:
-            near = np.exp(-0.5 * np.square((at_m[low:high] - grid_m[row]) / _SMOOTHED_OVER_M))
-            smoothed[row] = near @ values[low:high] / near.sum()
-    return smoothed
+            near = np.exp(-0.5 * np.square((at_m[low:high] - grid_m[row]) / over_m))
+            means[row] = (near @ values[low:high] + mean_weight * mean) / (near.sum() + mean_weight)
+    return means
 
 
 def _scores(map_: Map, dissimilarities: NDArray[np.float32]) -> NDArray[np.floating]:
@@ -185,7 +194,7 @@ def _seen_bits(map_: Map, season: SecondSeason) -> NDArray[np.float64]:
     places = places[np.argsort(map_.position_m[places[:, 0]], kind="stable")]
     scale = map_.log_likelihood_scale
     bits = [_bits(map_, scale * relevances(map_, season.views(frame)), image) for image, frame in places]
-    return _smooth_to(map_.position_m, map_.position_m[places[:, 0]], np.array(bits))
+    return smoothed(map_.position_m, map_.position_m[places[:, 0]], np.array(bits))
 
 
 def _distinct_bits(map_: Map, places: NDArray[np.float32]) -> NDArray[np.float64]:
@@ -194,7 +203,7 @@ def _distinct_bits(map_: Map, places: NDArray[np.float32]) -> NDArray[np.float64
     scale = SEASONS_ALIKE * map_.log_likelihood_scale
     views = SecondSeason(places, np.stack([images, images], axis=1))
     bits = [_bits(map_, scale * relevances(map_, views.views(image)), image) for image in images]
-    return _smooth_to(map_.position_m, map_.position_m, np.interp(np.arange(map_.n_images), images, bits))
+    return smoothed(map_.position_m, map_.position_m, np.interp(np.arange(map_.n_images), images, bits))
 
 
 def _bits(map_: Map, log_likelihood: NDArray[np.floating], image: int) -> float:

@@ -130,6 +130,11 @@ class Route:
         """Of equal length, for a grid belief."""
         return Cells.along(self.places.position_m, self.length_m, self.closed)
 
+    @cached_property
+    def heading_rad(self) -> NDArray[np.float64]:
+        """[n] direction of travel in the plane at every map image, from x towards y; NaN where unknown."""
+        return _headings(self)
+
     def nearest_image(self, position_m: NDArray[np.float64]) -> NDArray[np.intp]:
         """The map image nearest to each position along the route; of two equally near the earlier."""
         images_m = self.position_m
@@ -174,8 +179,8 @@ def true_images_of(
     asked = np.arange(query.n_images) if frames is None else frames
     if query.x_m is None or query.y_m is None or map_route.x_m is None or map_route.y_m is None:
         return [_near_along(map_route, float(query.position_m[frame]), tolerance_m) for frame in asked]
-    x_m, y_m, headings = query.x_m, query.y_m, _headings(query)
-    map_x_m, map_y_m, map_headings = map_route.x_m, map_route.y_m, _headings(map_route)
+    x_m, y_m, headings = query.x_m, query.y_m, query.heading_rad
+    map_x_m, map_y_m, map_headings = map_route.x_m, map_route.y_m, map_route.heading_rad
     candidates = _near_in_plane(map_x_m, map_y_m, tolerance_m)
     near_frames = []
     for frame in asked:
@@ -240,9 +245,11 @@ def _near_in_plane(x_m: NDArray[np.float64], y_m: NDArray[np.float64], tolerance
 
 
 def _headings(route: Route, over_m: float = 1.0) -> NDArray[np.float64]:
-    """[n] direction of travel in the plane, from the chord over about a metre to either side; NaN if unknown."""
+    """[n] direction of travel in the plane, by the chord over a metre to either side or a neighbour; NaN if unknown."""
+    image, last = np.arange(route.n_images), route.n_images - 1
     before = np.searchsorted(route.position_m, route.position_m - over_m, side="left")
     after = np.searchsorted(route.position_m, route.position_m + over_m, side="right") - 1
+    before, after = np.minimum(before, np.maximum(image - 1, 0)), np.maximum(after, np.minimum(image + 1, last))
     x, y = route.x_m, route.y_m
     if x is None or y is None:
         return np.full(route.n_images, np.nan)

@@ -6,10 +6,10 @@ from pathlib import Path
 
 from deepsimbad.core.map import Map
 from deepsimbad.errors import UnknownThumbnailError
-from deepsimbad.evaluators.thumbnails import thumbnail
+from deepsimbad.evaluators.image import thumbnail
 from deepsimbad.store.thumbnails import Thumbnails
 
-_MOST_VIEWS = 100  # of sessions, the latest
+_MOST_VIEWS = 32  # of sessions, the latest
 _MOST_VIEW_BYTES = 1 << 20  # a larger one is not held
 _VIEW_HEIGHT = 240
 

@@ -18,7 +18,7 @@ import PIL.Image
 import simplejpeg
 from numpy.typing import NDArray
 
-from deepsimbad.errors import InvalidImageError
+from deepsimbad.errors import DeepSimbadError, InvalidImageError
 from deepsimbad.evaluators.base import Image, named_lack_of_memory
 from deepsimbad.evaluators.grey_levels import GreyLevels, in_eight_bits
 from deepsimbad.evaluators.image_files import JPEG, ImageFile, truncated
@@ -30,6 +30,8 @@ cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
 
 _BLANK_BELOW_STD = 1.0  # grey levels of 256
 _FIELDS, _BLANK_BELOW_SHARE = 8, 0.25  # a side; of all variation, how much is left between the means of fields
+THUMBNAIL_HEIGHT = 96  # pixels; of a JPEG of some 2 kB
+_WIDEST, _THUMBNAIL_QUALITY = 2.0, 60  # its width by its height
 _DECODER_BYTES = 9  # a pixel: the picture, and the coefficients of a progressive JPEG
 _DTYPES = (np.uint8, np.uint16)
 _UPRIGHT: Mapping[int, Callable[[cv2.typing.MatLike], cv2.typing.MatLike]] = {  # by Exif's orientation
@@ -114,6 +116,18 @@ def resized(image: Image, size: tuple[int, int]) -> Image:
         return image
     shrinks = width >= size[0] and height >= size[1]
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR), np.uint8)
+
+
+def thumbnail(body: bytes, max_pixels: int, high: int = THUMBNAIL_HEIGHT) -> bytes | None:
+    """A small JPEG of an image however it came, upright, its pixels square; None where it cannot be decoded."""
+    try:
+        image = decode_image(body, max_pixels)
+    except DeepSimbadError:
+        return None
+    width, height = picture_size(body) or image.shape[1::-1]
+    size = (max(1, round(high * min(_WIDEST, width / height))), high)
+    was_encoded, content = cv2.imencode(".jpg", resized(image, size), [cv2.IMWRITE_JPEG_QUALITY, _THUMBNAIL_QUALITY])
+    return np.asarray(content).tobytes() if was_encoded else None
 
 
 def is_blank(image: Image) -> bool:

@@ -113,7 +113,9 @@ class Fitter:
             other: Another drive, perhaps of the same route.
         """
         fitting, asked = self._evaluator.fitting, (candidates, n_landmarks, other)
-        if self._last is not None and all(one is two for one, two in zip(asked, self._last[0], strict=True)):
+        if self._last is not None and all(
+            one is two or (one == two and isinstance(one, int)) for one, two in zip(asked, self._last[0], strict=True)
+        ):
             return self._last[1]
         to_choose = 1.0 if fitting is Fitting.NOTHING else _VIEWS_SHARE
         rows = select_landmarks(candidates.encodings, n_landmarks, lambda share: on_progress(share * to_choose))
