@@ -160,6 +160,39 @@ def test_a_fused_view_brings_either_half_or_both(client, fused):
     assert client.post(fused, content=blank.body, headers=blank.headers).json()["informative"] is False
 
 
+def form(**parts):
+    """A multipart body of the parts, of whatever names."""
+    pieces = [
+        f'--x\r\nContent-Disposition: form-data; name="{name}"\r\n\r\n'.encode() + part for name, part in parts.items()
+    ]
+    return {
+        "content": b"\r\n".join([*pieces, b"--x--\r\n"]),
+        "headers": {"Content-Type": "multipart/form-data; boundary=x"},
+    }
+
+
+def test_an_image_alone_in_a_form_is_that_image(client):
+    client.put("/v1/admin/domains/formed", json={"evaluator": {"kind": "feature_l2", "extractor": "gradient_grid"}})
+    client.post("/v1/admin/domains/formed/traverses", json={"name": "drive"})
+    frame = "/v1/admin/domains/formed/traverses/drive/frames/{0}?position_m={0}"
+    blank = encoded(np.full((60, 80, 3), 90, np.uint8))
+    assert client.put(frame.format(0), **form(image=blank)).status_code == 201
+    assert client.put(frame.format(1), **form(image=encoded(picture(1)))).status_code == 201
+    assert client.post("/v1/domains/seen/localizations", **form(image=blank)).json()["informative"] is False
+    assert client.post("/v1/domains/seen/localizations", **form(image=encoded(picture(1)))).json()["informative"]
+
+
+@pytest.mark.parametrize("told", [form(), form(text=b""), form(objects=b"null"), {"json": {"objects": None}}])
+def test_what_tells_nothing_is_named_and_harms_nobody(client, told):
+    for kind in ("seen", "objects"):
+        problem(client.post(f"/v1/domains/{kind}/localizations", **told), 422, "invalid_scene")
+    client.put("/v1/admin/domains/hollow", json={"evaluator": {"kind": "feature_l2", "extractor": "gradient_grid"}})
+    client.post("/v1/admin/domains/hollow/traverses", json={"name": "drive"})
+    frame = "/v1/admin/domains/hollow/traverses/drive/frames/0?position_m=0"
+    problem(client.put(frame, **told), 422, "invalid_scene")
+    assert client.put(frame, content=encoded(picture(1)), headers=JPEG).is_success
+
+
 def test_a_frame_of_a_fused_map_has_both_halves(client, fused):
     frame = "/v1/admin/domains/fused/traverses/drive/frames/99?position_m=99"
     assert problem(client.put(frame, json={"objects": objects_at(9)}), 422, "invalid_scene")["missing"] == ["image"]

@@ -125,6 +125,17 @@ def test_an_image_waits_for_company_no_longer_than_it_may() -> None:
         worker.close()
 
 
+def test_an_evaluator_that_gives_too_few_encodings_fails_its_views_and_no_others(worker: InferenceWorker) -> None:
+    eyes = Eyes(largest_batch=3)
+    eyes.encode = lambda images: np.zeros((len(images) - 1, 1), np.float32)
+    gate, answers = looked(worker, eyes, range(3))
+    gate.set()
+    for answer in answers:
+        with pytest.raises(ValueError, match="shorter"):
+            answer.result(60)
+    assert worker.submit(lambda: 7).result(60) == 7
+
+
 def test_a_batch_takes_live_views_first_and_is_of_one_evaluator(worker: InferenceWorker) -> None:
     eyes, others, order = Eyes(3), Eyes(3), []
     gate = threading.Event()

@@ -139,66 +139,56 @@ async def put_frame(
     known: dict[str, Any] = {key: np.array([value]) for key, value in place.items() if value is not None}
     known |= {} if frame_name is None else {"frame_name": np.array([frame_name])}
 
-    def store(encodings: NDArray[np.float32], picture: bytes | None = None, **about: Any) -> tuple[bool, int]:
-        spooled = {} if picture is None else {index: picture}
+    def store(encodings: NDArray[np.float32], spooled: bytes | None = None, **about: Any) -> tuple[bool, int]:
+        pictures = {} if spooled is None else {index: spooled}
         with running.open_traverses.lend(domain, name) as traverse:
-            n_new, _ = traverse.put_frames(Drive(**known, encodings=encodings, **about), replace, spooled)
+            n_new, _ = traverse.put_frames(Drive(**known, encodings=encodings, **about), replace, pictures)
             return n_new == 1, traverse.n_frames
 
-    def store_picture(encoded: EncodedImage, seen: Decoded) -> tuple[bool, int]:
-        if record.options.get("thumbnails"):
-            running.pictures.keep(domain, content_digest(np.ascontiguousarray(encoded.values, "<f4").tobytes()), body)
+    def store_seen(encoded: EncodedImage, shows_nothing: bool, picture: Decoded | None) -> tuple[bool, int]:
+        about: dict[str, Any] = {}
+        if picture is not None:
+            if record.options.get("thumbnails"):
+                digest = content_digest(np.ascontiguousarray(encoded.values, "<f4").tobytes())
+                running.pictures.keep(domain, digest, picture.body)
+            about = {
+                "spooled": picture.body if evaluator.fitting is Fitting.IMAGES else None,
+                "camera": None if picture.size is None else Camera(*picture.size, camera),
+                "grey_levels": None if picture.is_blank else picture.levels,
+            }
         return store(
             encoded.values[np.newaxis],
-            body if evaluator.fitting is Fitting.IMAGES else None,
             weights_sha256=encoded.weights_sha256,
             content_digest=np.array([content_digest(body)], np.uint64),
-            shows_nothing=np.array([seen.is_blank]),
-            camera=None if seen.size is None else Camera(*seen.size, camera),
-            grey_levels=None if seen.is_blank else seen.levels,
+            shows_nothing=np.array([shows_nothing]),
+            **about,
         )
 
-    async def stored(levels: GreyLevels | None) -> tuple[bool, int]:
-        seen = await running.decoders.decoded(body, evaluator, Priority.BATCH, levels)
-        encoded = cast("EncodedImage", await running.look(evaluator, seen.image, lambda view: view, Priority.BATCH))
-        return await run_sync(store_picture, encoded, seen)
-
-    async def stored_as_told(document: dict[str, Any]) -> tuple[bool, int]:
-        scene, picture = await scene_in(body, media_type, document, running, evaluator, Priority.BATCH, levels)
-        check_whole(evaluator, scene)
-        encoded = cast("EncodedImage", await running.look(evaluator, scene, lambda view: view, Priority.BATCH))
-        more: dict[str, Any] = {}
-        if picture is not None and picture.size is not None:
-            more = {"camera": Camera(*picture.size, camera)}
-        return await run_sync(
-            lambda: store(
-                encoded.values[np.newaxis],
-                weights_sha256=encoded.weights_sha256,
-                content_digest=np.array([content_digest(body)], np.uint64),
-                shows_nothing=np.array([scene.is_blank]),
-                **more,
-            )
-        )
-
-    if media_type == JSON:
-        frame = await parse_json(body, FrameBody, running)
-        if frame.model_fields_set == {"encoding"}:
-            values = np.array(frame.encoding, np.float64)
-            created, n_frames = await run_sync(lambda: store(ready_encodings(values[np.newaxis])))
-        elif frame.model_fields_set and frame.model_fields_set <= TOLD:
-            created, n_frames = await stored_as_told({name: getattr(frame, name) for name in TOLD})
+    async def stored(document: dict[str, Any], levels: GreyLevels | None) -> tuple[bool, int]:
+        picture: Decoded | None
+        if media_type in MEDIA_TYPES:
+            picture = await running.decoders.decoded(body, evaluator, Priority.BATCH, levels)
+            scene = Scene(image=picture.image)
         else:
-            raise invalid_body("give encoding; or objects, text, or both")
-    elif media_type not in MEDIA_TYPES:
-        created, n_frames = await stored_as_told({})
+            scene, picture = await scene_in(body, media_type, document, running, evaluator, Priority.BATCH, levels)
+        check_whole(evaluator, scene)
+        encoded = cast("EncodedImage", await running.look(evaluator, scene, lambda seen: seen, Priority.BATCH))
+        return await run_sync(store_seen, encoded, scene.is_blank, picture)
+
+    frame = await parse_json(body, FrameBody, running) if media_type == JSON else FrameBody()
+    if "encoding" in frame.model_fields_set and len(frame.model_fields_set) == 1:
+        values = np.array(frame.encoding, np.float64)
+        created, n_frames = await run_sync(lambda: store(ready_encodings(values[np.newaxis])))
+    elif media_type == JSON and not (frame.model_fields_set and frame.model_fields_set <= TOLD):
+        raise invalid_body("give encoding; or objects, text, or both")
     else:
-        check_whole(evaluator, Scene(image=np.empty(0, np.uint8)))
+        told = frame.model_dump(include=set(TOLD))
         if evaluator.fitting is Fitting.IMAGES:
             await run_sync(running.spools.make_room, domain, len(body))
         try:
-            created, n_frames = await stored(levels)
+            created, n_frames = await stored(told, levels)
         except GreyLevelsDifferError:  # another frame came meanwhile, and its levels stay
-            created, n_frames = await stored(await run_sync(_levels_of, running, domain, name))
+            created, n_frames = await stored(told, await run_sync(_levels_of, running, domain, name))
     response.status_code = 201 if created else 200
     return FrameAnswer(index=index, n_frames=n_frames)
 

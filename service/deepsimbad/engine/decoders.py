@@ -74,6 +74,7 @@ class Decoded(NamedTuple):
     size: tuple[int, int] | None  # (width, height) as it was sent, upright; None where nobody can tell
     levels: GreyLevels | None  # by which it is shown; None: it had 8 bits
     remarks: list[str]  # what a person should know of it
+    body: bytes  # the file it came in
 
     @classmethod
     def of(cls, file: ImageFile, body: bytes, evaluator: Evaluator, levels: GreyLevels | None) -> Self:
@@ -85,4 +86,4 @@ class Decoded(NamedTuple):
         image = evaluator.prepare(pixels)
         shows_nothing = is_blank(image)
         remarks += [FEW_GREYS] if not shows_nothing and holds_few_greys(image) else []
-        return cls(image, shows_nothing, picture_size(body), shown_by, remarks)
+        return cls(image, shows_nothing, picture_size(body), shown_by, remarks, body)

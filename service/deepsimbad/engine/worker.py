@@ -259,13 +259,13 @@ class InferenceWorker:
 def _encoded(encoder: Evaluator, batch: list[_Work]) -> list[_Work]:
     """The batch with encodings in the place of its images; those that cannot be encoded fail, and alone."""
     try:
-        images = encode_images(encoder, [work.view for work in batch])
+        encoded = list(zip(batch, encode_images(encoder, [work.view for work in batch]), strict=True))
     except BaseException as error:
         if len(batch) > 1:
-            return [encoded for work in batch for encoded in _encoded(encoder, [work])]
+            return [alone for work in batch for alone in _encoded(encoder, [work])]
         batch[0].answer.set_exception(error)
         return []
-    for work, image in zip(batch, images, strict=True):
+    for work, image in encoded:
         work.view = image
     return batch
 

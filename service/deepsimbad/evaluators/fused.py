@@ -82,7 +82,7 @@ class Fused(FeatureL2):
         scenes = [seen if isinstance(seen, Scene) else Scene(image=seen) for seen in images]
         encodings, at = np.zeros((len(scenes), self.encoding_dim), np.float32), 0
         for half in self._halves:
-            rows = [row for row, scene in enumerate(scenes) if half.forms & scene.forms]
+            rows = [row for row, scene in enumerate(scenes) if half.forms & scene.telling]
             width = half.encoding_dim or 0
             if rows:
                 encodings[rows, at : at + width] = half.encode([scenes[row] for row in rows])

@@ -93,8 +93,10 @@ class Scene:
 
     @classmethod
     def read(cls, document: Mapping[str, Any]) -> Self:
-        """Of JSON members `objects` and `text`; raises InvalidSceneError."""
+        """Of JSON members `objects` and `text`, one at least; raises InvalidSceneError."""
         text, objects = document.get("text"), document.get("objects")
+        if text is None and objects is None:
+            raise InvalidSceneError("nothing is told: give objects, text, or both")
         if text is not None and (not isinstance(text, str) or not text.strip()):
             raise InvalidSceneError("the text is empty: say what is seen, in a sentence or two")
         if text is not None and len(text) > LONGEST_TEXT:
@@ -132,11 +134,12 @@ class Scene:
             objects = json.loads(told["objects"]) if "objects" in told else None
         except (RecursionError, ValueError) as error:
             raise InvalidSceneError("objects is no JSON, or the text no UTF-8") from error
-        return cls.read({"text": text, "objects": objects}), told.get("image")
+        scene = cls() if set(told) == {"image"} else cls.read({"text": text, "objects": objects})
+        return scene, told.get("image")
 
-    def beside(self, image: Image | None) -> Self:
-        """The scene with an image, or without."""
-        return replace(self, image=None if image is None or is_blank(image) else image)
+    def beside(self, image: Image) -> Self:
+        """The scene with an image."""
+        return replace(self, image=image)
 
     @property
     def forms(self) -> frozenset[Form]:
@@ -144,9 +147,14 @@ class Scene:
         return frozenset(form for form in Form if getattr(self, form.value) is not None)
 
     @property
+    def telling(self) -> frozenset[Form]:
+        """Those that tell something: an image may be blank."""
+        return self.forms - ({Form.IMAGE} if self.image is not None and is_blank(self.image) else frozenset())
+
+    @property
     def is_blank(self) -> bool:
         """Whether it tells nothing: no object, and nothing else."""
-        return self.image is None and self.text is None and (self.objects is None or not self.objects.labels)
+        return self.telling <= {Form.OBJECTS} and (self.objects is None or not self.objects.labels)
 
     def of(self, taken: frozenset[Form]) -> Self:
         """The scene; raises UnsupportedMediaTypeError where it is told in a form that an evaluator does not take."""
@@ -186,9 +194,8 @@ def seen_in(body: bytes, media_type: str, evaluator: Evaluator, max_pixels: int)
     if media_type.startswith("image/"):
         return evaluator.prepare(decode_image(body, max_pixels))
     scene, image = Scene.of_form(body) if media_type.startswith(FORM_DATA) else (Scene.of_body(body, media_type), None)
-    return scene.of(evaluator.forms).beside(
-        None if image is None else evaluator.prepare(decode_image(image, max_pixels))
-    )
+    scene.of(evaluator.forms)
+    return scene if image is None else scene.beside(evaluator.prepare(decode_image(image, max_pixels)))
 
 
 def shows_none(seen: Image | Scene) -> bool:
