@@ -236,10 +236,24 @@ def test_own_places_landmarks_can_be_barred_from_all_lists(seasons, landmarks):
 
 
 def _frames_of(built, second):
-    """Which frame each landmark was."""
-    model = built.map.landmark_model
+    """Which frame each landmark was chosen as, which it still is in the rehearsal."""
+    model = built.rehearsal.landmark_model
     u = unit(composed.described(second.encodings, Moments.of(second.encodings), None) @ model["projection"])
     return (model["prototypes"] @ u.T).argmax(axis=1)
+
+
+def test_landmarks_move_to_where_their_sums_come_nearer_to_places(seasons):
+    own, r = drive_of(seasons[1]), 40
+    built = compose_map(PLAN, own, None, None, r)
+    u = composed.described(own.encodings, Moments.of(own.encodings), None)
+    frames, learnt = u[farthest_first(u, r)], built.map.landmark_model["prototypes"]
+
+    def nearness(lists, landmarks):
+        sums = sum(weight * landmarks[ids] for weight, ids in zip(WEIGHTS, lists, strict=True))
+        return (unit(sums) * built.places).sum(axis=1).mean()
+
+    assert nearness(built.map.lists, learnt) > nearness(compose(u, frames, 4), frames) + 0.05
+    np.testing.assert_allclose(np.linalg.norm(learnt, axis=1), 1, atol=1e-5)
 
 
 def test_landmarks_that_stay_are_compared_with_what_is_usual_now(seasons):

@@ -18,6 +18,7 @@ from deepsimbad.core.composed import (
     Moments,
     compose,
     described,
+    learnt_landmarks,
     principal_directions,
     unit,
     within_place_whitening,
@@ -120,11 +121,38 @@ class _Space:
     chosen: NDArray[np.int64] | None = None  # [r] which candidates they were; None: they stay those of another map
 
     @classmethod
+    def first(
+        cls,
+        training: Drive,
+        candidates: Drive | Mapping[str, NDArray[Any]],
+        n_landmarks: int,
+        on_progress: Callable[[float], None],
+    ) -> Self:
+        """Before seasons are known: with landmarks chosen from a drive, or those of another map's model."""
+        if isinstance(candidates, Drive):
+            drives = {id(drive): drive.encodings for drive in (training, candidates)}
+            return cls.among(candidates, principal_directions(*drives.values(), on_progress=on_progress), n_landmarks)
+        if (d := candidates["usual"].shape[1]) != training.encoding_dim:
+            raise InvalidEncodingError(
+                f"encodings of {training.encoding_dim} numbers cannot be compared with landmarks of {d}"
+            )
+        return cls(candidates.get("projection"), np.asarray(candidates["prototypes"], np.float32))
+
+    @classmethod
     def among(cls, candidates: Drive, projection: NDArray[np.float32] | None, n_landmarks: int) -> Self:
         """With landmarks chosen from a drive."""
         u = _unit_vectors(candidates, projection)
         chosen = farthest_first(u, n_landmarks)
         return cls(projection, u[chosen], chosen)
+
+    def fitted(self, places: NDArray[np.float32], list_length: int, barred: NDArray[np.bool_] | None) -> Self:
+        """Landmarks moved to where sums of them come nearer to places [n, k]."""
+        return replace(self, prototypes=learnt_landmarks(places, self.prototypes, list_length, barred))
+
+    def described_in(self, map_: Map, places: NDArray[np.float32], barred: NDArray[np.bool_] | None) -> Map:
+        """The map with lists of other places [n, k], and of these landmarks."""
+        lists = compose(places, self.prototypes, map_.list_length, barred)
+        return replace(map_, lists=lists, landmark_model={**map_.landmark_model, "prototypes": self.prototypes})
 
     def model(self, usual: Moments) -> dict[str, NDArray[Any]]:
         """As a robot needs it: the landmarks, and what makes an encoding a unit vector."""
@@ -180,17 +208,7 @@ def compose_map(
         InvalidEncodingError: The model is of other encodings.
     """
     candidates = training if landmarks is None else landmarks
-    if isinstance(candidates, Drive):
-        drives = {id(drive): drive.encodings for drive in (training, candidates)}
-        directions = principal_directions(*drives.values(), on_progress=lambda share: on_progress(0.6 * share))
-        on_progress(0.6)
-        space = _Space.among(candidates, directions, n_landmarks)
-    else:
-        space = _Space(candidates.get("projection"), np.asarray(candidates["prototypes"], np.float32))
-        if (d := candidates["usual"].shape[1]) != training.encoding_dim:
-            raise InvalidEncodingError(
-                f"encodings of {training.encoding_dim} numbers cannot be compared with landmarks of {d}"
-            )
+    space = _Space.first(training, candidates, n_landmarks, lambda share: on_progress(0.6 * share))
     check_list_length(plan.list_length, len(space.prototypes))
     on_progress(0.7)
     own, season, verdict = space.seen(training), None, None
@@ -203,10 +221,6 @@ def compose_map(
         seen_twice, by_camera = (SeenTwice(training, other, season.places),), False
     if seen_twice and isinstance(candidates, Drive):
         space = space.whitened(seen_twice, candidates)
-        own = space.seen(training)
-        if season is not None and other is not None:
-            other = space.seen(other)
-            season = SecondSeason(measured_dissimilarities(other), season.places)
     on_progress(0.85)
     usual, places = Moments.of(training.encodings), space.unit_vectors(training)
     fused = places
@@ -214,22 +228,26 @@ def compose_map(
         usual, fused = Moments.of(training.encodings, other.encodings), places.copy()
         images, frames = season.places.T
         fused[images] = unit(places[images] + SECOND_SEASON_WEIGHT * space.unit_vectors(other)[frames])
-    # Landmarks may stay; what is usual is of this map, for robots that encode on board as here
-    model = space.model(usual) if isinstance(candidates, Drive) else {**candidates, "usual": usual.mean_std()}
     seen_from = space.chosen if candidates is training else None
     if candidates is second and season is not None and space.chosen is not None:
         seen_from = _images_of(season.places, space.chosen)
     own_places = None if seen_from is None else _own_places(own.route(plan.closed), seen_from)
-    map_ = composed_map(plan, own, fused, usual, model, own_places if plan.bars_own_place else None)
-    rehearsal = map_
-    if season is not None:
-        barred = own_places if candidates is second or plan.bars_own_place else None
-        rehearsal = replace(map_, lists=compose(places, space.prototypes, plan.list_length, barred))
+    barred, as_chosen = own_places if plan.bars_own_place else None, space
+    if isinstance(candidates, Drive):
+        space = space.fitted(fused, plan.list_length, barred)
+        own, other = space.seen(training), None if other is None else space.seen(other)
+    # Landmarks may stay; what is usual is of this map, for robots that encode on board as here
+    model = space.model(usual) if isinstance(candidates, Drive) else {**candidates, "usual": usual.mean_std()}
+    map_ = composed_map(plan, own, fused, usual, model, barred)
+    rehearsal, seen_before = map_, measured_dissimilarities(own)
+    if season is not None and second is not None:
+        # By landmarks as they were chosen: moved to what both seasons saw, they would know the second one
+        rehearsal = as_chosen.described_in(map_, places, own_places if candidates is second else barred)
+        seen_before = as_chosen.dissimilarities(places)
+        season = SecondSeason(as_chosen.dissimilarities(as_chosen.unit_vectors(second)), season.places)
     on_progress(0.92)
     known = (training,) if other is None else (training, other)
-    map_, rehearsal = taught(
-        map_, rehearsal, measured_dissimilarities(own), space.dissimilarities(fused), season, known
-    )
+    map_, rehearsal = taught(map_, rehearsal, seen_before, space.dissimilarities(fused), season, known)
     on_progress(1.0)
     return Built(map_, rehearsal, own, other, verdict, fused, by_camera)
 
@@ -245,7 +263,9 @@ def taught(
     """A `composed` map and its rehearsal with what a further season, or the map itself, tells of views to come.
 
     Args:
-        own, places: [n, r] dissimilarities of the map images, and of what the lists stand for.
+        own, places: [n, r] dissimilarities of the map images to the rehearsal's landmarks, and of what the map's lists
+            stand for to the map's.
+        season: Measured by the rehearsal's landmarks.
         drives: Every season of the route.
     """
     learnt = rehearsed(rehearsal, own, season)

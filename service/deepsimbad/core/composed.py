@@ -4,6 +4,7 @@ A season is mostly a shift and a scale of every dimension of an encoding, so enc
 drive's statistics and brought to unit length: u. Where two seasons of a route are known a place is the mean direction
 of both, and what a season changes counts less (within-place whitening). The h landmarks of a place are those whose sum,
 weighted by list position, comes nearest to it in direction; a view answers a place by its cosine with that sum.
+Landmarks begin as frames and are moved to where the sums come nearer still.
 """
 
 from collections.abc import Callable, Mapping
@@ -27,6 +28,8 @@ _BEAM = 8  # partial lists that are followed at once
 _STILL, _MUTE = 1e-6, 1e6  # of the greatest deviation: what moves less tells nothing, and is divided by so much
 _BARRED = np.float32(-1e9)
 _ROWS_AT_ONCE = 1024
+_SWEEPS, _INERTIA = 4, 0.5  # over which landmarks move to what lists them, and what where they stand counts beside that
+_MOST_TAUGHT_BY = 4096  # places that landmarks are moved by
 _MOST_FRAMES = 2048  # that principal directions are found from
 
 
@@ -194,6 +197,33 @@ def compose(
             products[barred[some]] = _BARRED
         _search(products, gram, weights, lists[some])
     return np.ascontiguousarray(lists.T)
+
+
+def learnt_landmarks(
+    places: NDArray[np.float32],
+    landmarks: NDArray[np.float32],
+    list_length: int,
+    barred: NDArray[np.bool_] | None = None,
+) -> NDArray[np.float32]:
+    """[r, k] unit landmarks whose weighted sums come nearer to the places than those of the frames they begin as.
+
+    Lists are composed and landmarks moved in turns, to the least squares of what the sums leave over (dictionary
+    learning by the method of optimal directions: Engan, Aase and Husoy 1999). Arguments as of `compose`.
+    """
+    some = np.linspace(0, len(places) - 1, min(len(places), _MOST_TAUGHT_BY)).astype(np.intp)
+    places, barred = places[some], None if barred is None else barred[some]
+    weights, rows = list_weights(list_length), np.arange(len(places))
+    for _ in range(_SWEEPS):
+        lists = compose(places, landmarks, list_length, barred)
+        sums = np.tensordot(weights, landmarks[lists], axes=1)
+        amplitudes = np.einsum("nk,nk->n", places, sums) / np.maximum(np.einsum("nk,nk->n", sums, sums), 1e-9)
+        shares = np.zeros((len(places), len(landmarks)), np.float32)
+        for weight, ids in zip(weights, lists, strict=True):
+            shares[rows, ids] = weight * amplitudes  # no landmark is twice in a list
+        squares = (shares.T @ shares).astype(np.float64)
+        squares[np.diag_indices_from(squares)] += _INERTIA
+        landmarks = unit(np.linalg.solve(squares, shares.T @ places + _INERTIA * landmarks))
+    return landmarks
 
 
 @njit(cache=True, nogil=True)
