@@ -18,6 +18,7 @@ from deepsimbad.core.composed import (
     Moments,
     compose,
     described,
+    learnt_landmarks,
     principal_directions,
     unit,
     within_place_whitening,
@@ -145,7 +146,7 @@ class Fused:
     base: Map  # before new images
     drive: Drive
     new: NDArray[np.int64]  # frames that became images
-    new_lists: NDArray[np.uint16]
+    landmarks: NDArray[np.float32]  # [r, k] before they were moved to what the drive saw
     before: NDArray[np.float32]  # [n, k] sums over the earlier seasons
     u: NDArray[np.float32]  # [m, k] of the drive
     pairs: NDArray[np.int64]  # [p, 2] (map image, frame)
@@ -153,8 +154,12 @@ class Fused:
     def without(self, withheld: NDArray[np.int64]) -> Map:
         """The same map, had the drive's withheld frames not been fused."""
         others = self.pairs[~np.isin(self.pairs[:, 1], withheld)]
-        lists = _lists(self.base, unit(self.before + _season(self.u, others, self.base.n_images)))
-        return _with_new(replace(self.base, lists=lists), self.drive, self.new, self.new_lists)
+        places = unit(self.before + _season(self.u, others, self.base.n_images))
+        learnt = learnt_landmarks(places, self.landmarks, self.base.list_length)
+        base = replace(self.base, landmark_model={**self.base.landmark_model, "prototypes": learnt})
+        return _with_new(
+            replace(base, lists=_lists(base, places)), self.drive, self.new, _lists(base, self.u[self.new])
+        )
 
 
 def fuse(map_: Map, known: KnownDrives, drive: Drive, same_route: bool | None) -> tuple[Fused | None, SameRoute]:
@@ -206,22 +211,22 @@ def fuse(map_: Map, known: KnownDrives, drive: Drive, same_route: bool | None) -
     for units, shared in zip(u[:-1], pairs[:-1], strict=True):
         before = before + _season(units, shared, map_.n_images)
     places = unit(before + _season(u[-1], pairs[-1], map_.n_images))
+    before_it, prototypes = prototypes, learnt_landmarks(places, prototypes, map_.list_length)
     usual = Moments.of(*(other.encodings for other in seasons))
     model = {**map_.landmark_model, "prototypes": prototypes, "usual": usual.mean_std()}
     model |= {} if projection is None else {"projection": projection}
-    own_dissimilarities = _dissimilarities(own_rows, whitening, prototypes)
-    own = replace(own, dissimilarities=own_dissimilarities)
+    own = replace(own, dissimilarities=_dissimilarities(own_rows, whitening, prototypes))
     made = composed_map(plan, own, places, usual, model)
-    rehearsal = replace(made, lists=_lists(made, unit(before)))
-    season = SecondSeason(_dissimilarities(rows[-1], whitening, prototypes), pairs[-1])
-    stands_for = _dissimilarities(places, None, prototypes)
-    made, _ = taught(made, rehearsal, own_dissimilarities, stands_for, season, seasons)
+    rehearsal = replace(made, landmark_model={**model, "prototypes": before_it})
+    rehearsal = replace(rehearsal, lists=_lists(rehearsal, unit(before)))
+    own_before, seen_before = (_dissimilarities(row, whitening, before_it) for row in (own_rows, rows[-1]))
+    season = SecondSeason(seen_before, pairs[-1])
+    made, _ = taught(made, rehearsal, own_before, _dissimilarities(places, None, prototypes), season, seasons)
     arrays: dict[str, Any] = dict(made.arrays())
     base = replace(map_, landmark_model=model, **arrays)
     new = np.setdiff1d(np.arange(drive.n_frames), pairs[-1][:, 1])
-    new_lists = compose(u[-1][new], prototypes, map_.list_length)
-    longer = _with_new(base, drive, new, new_lists)
-    return Fused(longer, base, drive, new, new_lists, before, u[-1], pairs[-1]), verdict
+    longer = _with_new(base, drive, new, _lists(base, u[-1][new]))
+    return Fused(longer, base, drive, new, before_it, before, u[-1], pairs[-1]), verdict
 
 
 def _units(rows: NDArray[np.float32], whitening: NDArray[np.float64] | None) -> NDArray[np.float32]:
