@@ -89,7 +89,7 @@ def test_vpr_drives_in_order_unless_every_view_is_by_itself(measured, deepsimbad
 
 
 def test_how_much_lists_owe_to_their_own_places_landmarks(measured, deepsimbad, route):
-    asked = (*route, *READY[:2], "--n-landmarks", 120, "--relevance", "composed")
+    asked = (*route, *READY[:2], "--n-landmarks", 60, "--relevance", "composed")
     usual, barred = measured("vpr", *asked), measured("vpr", *asked, "--bar-own-place")
     assert set(barred["anr"]) == {"composed", "brute_force_u"}
     assert barred["anr"]["composed"] > usual["anr"]["composed"]

@@ -156,7 +156,8 @@ def test_a_move_wholly_past_the_end_is_refused_unless_the_robot_is_lost(client, 
     assert problem(observe(client, path, 50), 422, "past_the_end")["route_end_m"] == 78
     assert client.get(path).json()["n_observations"] == 1
     carried = client.session(start_position_m=78, start_std_m=0.5, belief=belief)
-    assert see(client, carried, 11)["belief"]["off_route"] > 0.05
+    see(client, carried, 10)
+    assert see(client, carried, 11, 2)["belief"]["off_route"] > 0.05
     assert observe(client, carried, 50).status_code == 200
 
 
