@@ -1,0 +1,142 @@
+"""An experiment on three drives of one route in each of their six orders, and what the six come to.
+
+    python -m bench.orders vpr|nbv|calibration DRIVE DRIVE DRIVE --keep FOLDER [-- OPTION ...]
+
+Options go to `deepsimbad experiment`. What an order came to is kept in the folder, so that a run goes on where it ended;
+`MAP` in an option stands for the drive that is mapped.
+"""
+
+import argparse
+import itertools
+import json
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bench.common import machine, markdown
+
+Documents = Mapping[str, dict[str, Any]]  # by landmarks-map-test
+READY = ("--evaluator", "feature_l2:none")
+
+
+def measured(part: str, drives: list[Path], folder: Path, options: list[str]) -> dict[str, dict[str, Any]]:
+    """What the experiment prints of every order."""
+    folder.mkdir(parents=True, exist_ok=True)
+    documents = {}
+    for landmarks, training, test in itertools.permutations(drives):
+        name = "-".join(drive.stem for drive in (landmarks, training, test))
+        path = folder / f"{part}-{name}.json"
+        if not path.exists():
+            given = ["--landmarks", landmarks, "--training", training, "--test", test, *READY]
+            given += [option.replace("MAP", str(training)) for option in options]
+            command = [sys.executable, "-m", "deepsimbad", "experiment", part, *map(str, given), "--json", str(path)]
+            subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+        documents[name] = json.loads(path.read_text(encoding="utf-8"))
+        print(f"{len(documents)} of 6: {name}", file=sys.stderr)
+    return documents
+
+
+def vpr_lines(documents: Documents) -> Iterator[str]:
+    """By relevance; and what a drive in order comes to, by window."""
+    for title, of in (("R@1 %", "recall_at_1"), ("R@5 %", "recall_at_5")):
+        rows = []
+        for name in next(iter(documents.values()))["anr"]:
+            anr = [document["anr"][name] for document in documents.values()]
+            recall = [document[of][name] for document in documents.values()]
+            rows.append([name, f"{np.mean(anr):.2f}", f"{np.mean(recall):.1f}", *(f"{each:.2f}" for each in anr)])
+        yield from markdown(["relevance", "ANR %", title, *documents], rows)
+        yield ""
+    passive = [document["passive"] for document in documents.values() if document["passive"]]
+    if passive:
+        windows = list(passive[0]["n_queries"])
+        rows = [
+            [
+                name,
+                *(
+                    " / ".join(
+                        f"{np.average([each[of][name][w] for each in passive], weights=[each['n_queries'][w] for each in passive]):.{digits}f}"
+                        for of, digits in (("anr", 3), ("recall_at_1", 1))
+                    )
+                    for w in windows
+                ),
+            ]
+            for name in passive[0]["anr"]
+        ]
+        yield from markdown(["ANR / R@1 in percent, views", *windows], rows)
+
+
+def nbv_lines(documents: Documents) -> Iterator[str]:
+    """By planner; and the default against each order's best constant move."""
+    tables = ("views_to_confident", "metres_to_confident", "wrong_when_confident", "anr", "anr_paper")
+    planners = list(next(iter(documents.values()))["anr"])
+    means = {
+        of: {name: np.mean([document[of][name] for document in documents.values()]) for name in planners}
+        for of in tables
+    }
+    rows = [
+        [name, *(f"{means[of][name]:.{digits}f}" for of, digits in zip(tables, (2, 1, 1, 3, 2), strict=True))]
+        for name in planners
+    ]
+    yield from markdown(["planner", "views", "metres", "sure and wrong, %", "ANR, %", "ANR as in the paper, %"], rows)
+    yield ""
+    rows = []
+    for order, document in documents.items():
+        best, default, views = document["best_constant"], document["default"], document["views_to_confident"]
+        low, high = document["views_difference_95"][f"{default} - {best}"]
+        rows.append([order, best, f"{views[best]:.2f}", f"{views[default]:.2f}", f"{low:+.2f} .. {high:+.2f}"])
+    yield from markdown(["order", "best constant", "views it takes", "the default", "difference, 95 %"], rows)
+
+
+def calibration_lines(documents: Documents) -> Iterator[str]:
+    """Coverage by move length; reliability; and every other figure by order."""
+    all_of, first = list(documents.values()), next(iter(documents.values()))
+    views = list(next(iter(first["coverage_95"].values())))
+    rows = []
+    for move, wrong_of in zip(first["coverage_95"], first["wrong_when_confident"], strict=True):
+        covered = {view: [document["coverage_95"][move][view] for document in all_of] for view in views}
+        metres = {view: np.mean([document["set_m"][move][view] for document in all_of]) for view in views}
+        wrong = [document["wrong_when_confident"][wrong_of] for document in all_of]
+        rows.append(
+            [
+                f"{move} m",
+                *(f"{np.mean(covered[view]):.1f}, {min(covered[view]):.1f}; {metres[view]:.0f} m" for view in views),
+                f"{np.mean(wrong):.1f}, {max(wrong):.1f}",
+            ]
+        )
+    yield from markdown(["moves", *(f"after {view}" for view in views), "wrong, %"], rows)
+    yield ""
+    held, near = (
+        np.nanmean(np.array([document["reliability"][of] for document in all_of], float), axis=0)
+        for of in ("near_mode", "within_5_m")
+    )
+    yield from markdown(
+        ["held, %", *(f"{each:.0f}" for each in held)], [["true, %", *(f"{each:.0f}" for each in near)]]
+    )
+    yield ""
+    rows = []
+    for of in ("standing_coverage_95", "lost_their_place", "carried", "off_route", "odometry_coverage_95"):
+        for key in first[of] if isinstance(first[of], dict) else [None]:
+            each = [document[of] if key is None else document[of][key] for document in all_of]
+            row = [of if key is None else f"{of}: {key}", f"{np.mean(each):.1f}", *(f"{value:.1f}" for value in each)]
+            rows.append(row)
+    refused = [sum(document["views_refused"].values()) for document in all_of]
+    rows.append(["views_refused", sum(refused), *refused])
+    yield from markdown(["", "mean", *documents], rows)
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    lines = {"vpr": vpr_lines, "nbv": nbv_lines, "calibration": calibration_lines}
+    parser.add_argument("part", choices=lines)
+    parser.add_argument("drives", type=Path, nargs=3)
+    parser.add_argument("--keep", type=Path, required=True, metavar="FOLDER")
+    own, _, passed_on = " ".join(sys.argv[1:]).partition(" -- ")
+    arguments = parser.parse_args(own.split())
+    print(machine())
+    print()
+    for line in lines[arguments.part](measured(arguments.part, arguments.drives, arguments.keep, passed_on.split())):
+        print(line)
