@@ -2,8 +2,8 @@
 
     python -m bench.orders vpr|nbv|calibration DRIVE DRIVE DRIVE --keep FOLDER [-- OPTION ...]
 
-Options go to `deepsimbad experiment`. What an order came to is kept in the folder, so that a run goes on where it ended;
-`MAP` in an option stands for the drive that is mapped.
+Options go to `deepsimbad experiment`; MAP in one stands for the drive that is mapped. What an order came to is kept in
+the folder, so that a run goes on where it ended.
 """
 
 import argparse
@@ -11,7 +11,7 @@ import itertools
 import json
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +34,7 @@ def measured(part: str, drives: list[Path], folder: Path, options: list[str]) ->
             given = ["--landmarks", landmarks, "--training", training, "--test", test, *READY]
             given += [option.replace("MAP", str(training)) for option in options]
             command = [sys.executable, "-m", "deepsimbad", "experiment", part, *map(str, given), "--json", str(path)]
-            subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+            subprocess.run(command, check=True, stdout=subprocess.DEVNULL)  # noqa: S603 - our own command
         documents[name] = json.loads(path.read_text(encoding="utf-8"))
         print(f"{len(documents)} of 6: {name}", file=sys.stderr)
     return documents
@@ -52,21 +52,18 @@ def vpr_lines(documents: Documents) -> Iterator[str]:
         yield ""
     passive = [document["passive"] for document in documents.values() if document["passive"]]
     if passive:
-        windows = list(passive[0]["n_queries"])
-        rows = [
-            [
-                name,
-                *(
-                    " / ".join(
-                        f"{np.average([each[of][name][w] for each in passive], weights=[each['n_queries'][w] for each in passive]):.{digits}f}"
-                        for of, digits in (("anr", 3), ("recall_at_1", 1))
-                    )
-                    for w in windows
-                ),
-            ]
-            for name in passive[0]["anr"]
-        ]
+        windows = passive[0]["n_queries"]
+        rows = [[name, *(_of_window(passive, name, window) for window in windows)] for name in passive[0]["anr"]]
         yield from markdown(["ANR / R@1 in percent, views", *windows], rows)
+
+
+def _of_window(passive: Sequence[dict[str, Any]], name: str, window: str) -> str:
+    """Means over all windows of all orders."""
+    n_queries = [each["n_queries"][window] for each in passive]
+    anr, recall = (
+        np.average([each[of][name][window] for each in passive], weights=n_queries) for of in ("anr", "recall_at_1")
+    )
+    return f"{anr:.3f} / {recall:.1f}"
 
 
 def nbv_lines(documents: Documents) -> Iterator[str]:
