@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterable, Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +31,7 @@ from deepsimbad_client.recordings.folder import single
 from deepsimbad_client.recordings.options import accounting, opened, reading, rotate_option, tell_left_out, tell_remarks
 from deepsimbad_client.recordings.sources import RECORDING_SUFFIXES
 from deepsimbad_client.recordings.told import TOLD_SUFFIXES, as_taken
-from deepsimbad_client.replay import DEFAULT_PLANNER
+from deepsimbad_client.replay import DEFAULT_PLANNER, Viewer
 from deepsimbad_client.replay.active import EPISODES, STEPS, Stage, active_replay
 from deepsimbad_client.replay.passive import TOLERANCE_M
 from deepsimbad_client.replay.passive import replay as passive_replay
@@ -198,6 +199,8 @@ def _make_domain(
 @click.option("--seed", type=click.IntRange(min=0), help="Of the starts and the sessions.  [default: 0]")
 @click.option("--restart", is_flag=True, help="Throw away what an earlier replay left in the folder.")
 @click.option("--plots/--no-plots", default=True, show_default=True)
+@click.option("--rerun", is_flag=True, help="Show it in the Rerun viewer as it goes.")
+@click.option("--mcap", type=click.Path(dir_okay=False, path_type=Path), help="Write what Foxglove opens.")
 @at_once
 @reading
 @accounting
@@ -215,6 +218,8 @@ def replay(
     seed: int | None,
     restart: bool,
     plots: bool,
+    rerun: bool,
+    mcap: Path | None,
     concurrency: int,
     reading: dict[str, Any],
     allow_missing: bool,
@@ -235,32 +240,34 @@ def replay(
     recording = opened(source, allow_missing, **reading)
     folder = out or Path("replays") / f"{domain}-{recording.name}{'-active' if planners else ''}"
     name = f"{recording.name} against {domain}"
-    common: dict[str, Any] = {"concurrency": concurrency, "restart": restart}
-    if planners:
-        episodes = EPISODES if episodes is None else episodes
-        with EpisodeBar(name, len(dict.fromkeys(planners)) * episodes) as bar:
-            driven = active_replay(
-                *(client, recording, domain, folder),
-                planners=planners,
-                episodes=episodes,
-                steps=STEPS if steps is None else steps,
-                seed=seed or 0,
-                on_progress=bar,
-                **common,
-            )
-        summary = summarise_active(driven)
-        tables = active_tables(summary)
-    else:
-        with ReplayBar(name, len(recording.frames)) as bar:
-            replayed = passive_replay(
-                *(client, recording, domain, folder),
-                tolerance_m=TOLERANCE_M if tolerance_m is None else tolerance_m,
-                allow_missing=allow_missing,
-                on_progress=bar,
-                **common,
-            )
-        summary = summarise(replayed)
-        tables = [table(summary)]
+    with ExitStack() as open_ones:
+        viewers = _viewers(rerun, mcap, open_ones)
+        common: dict[str, Any] = {"concurrency": concurrency, "restart": restart, "viewers": viewers}
+        if planners:
+            episodes = EPISODES if episodes is None else episodes
+            with EpisodeBar(name, len(dict.fromkeys(planners)) * episodes) as bar:
+                driven = active_replay(
+                    *(client, recording, domain, folder),
+                    planners=planners,
+                    episodes=episodes,
+                    steps=STEPS if steps is None else steps,
+                    seed=seed or 0,
+                    on_progress=bar,
+                    **common,
+                )
+            summary = summarise_active(driven)
+            tables = active_tables(summary)
+        else:
+            with ReplayBar(name, len(recording.frames)) as bar:
+                replayed = passive_replay(
+                    *(client, recording, domain, folder),
+                    tolerance_m=TOLERANCE_M if tolerance_m is None else tolerance_m,
+                    allow_missing=allow_missing,
+                    on_progress=bar,
+                    **common,
+                )
+            summary = summarise(replayed)
+            tables = [table(summary)]
     write_summary(summary, folder)
     if plots:
         from deepsimbad_client.replay.plots import draw_active, draw_passive  # noqa: PLC0415 - matplotlib takes its time
@@ -277,6 +284,20 @@ def replay(
     names = recording.left_out_names if planners else replayed.left_out_names
     tell_left_out(names, recording.name, verbose=verbose)
     REMARKS.print(f"results in {folder}", soft_wrap=True)
+
+
+def _viewers(rerun: bool, mcap: Path | None, open_ones: ExitStack) -> list[Viewer]:
+    """What shows a replay; raises MissingExtraError, ReplayError (the file is there already)."""
+    viewers: list[Viewer] = []
+    if rerun:
+        from deepsimbad_client.replay.rerun_viewer import RerunViewer  # noqa: PLC0415 - an extra
+
+        viewers.append(open_ones.enter_context(RerunViewer()))
+    if mcap is not None:
+        from deepsimbad_client.replay.mcap_file import McapFile  # noqa: PLC0415 - an extra
+
+        viewers.append(open_ones.enter_context(McapFile(mcap)))
+    return viewers
 
 
 @click.command()

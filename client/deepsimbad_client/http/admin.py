@@ -77,14 +77,20 @@ class AdminCalls(Face):
         *,
         closed: bool = False,
         actions_m: Sequence[float] | None = None,
+        thumbnails: bool | None = None,
+        anchor: Mapping[str, float] | None = None,
     ) -> Domain:
         """Make a domain; the same again changes nothing, another configuration raises ConflictError.
 
         `evaluator` is `{"kind": ..., ...}`, how observations are compared with landmarks; `closed` says that the
         route's end is its start; `actions_m` are the moves a robot may be told to make, absent: the service's default.
+        Whether pictures are kept (`thumbnails`) and where x = y = 0 lies (`anchor`: `{"lat_deg": ..., "lon_deg": ...}`)
+        may be changed later; None leaves it as it is.
         """
         actions = None if actions_m is None else [float(action) for action in actions_m]
-        document = {"evaluator": dict(evaluator), "closed": closed, "actions_m": actions}
+        document: dict[str, Any] = {"evaluator": dict(evaluator), "closed": closed, "actions_m": actions}
+        document |= {} if thumbnails is None else {"thumbnails": thumbnails}
+        document |= {} if anchor is None else {"anchor": dict(anchor)}
         return model_of(Domain, await self._wire.send(Call.with_json("PUT", _domain(name), document)))
 
     @shared

@@ -61,6 +61,7 @@ class Domain(Answer):
     landmark_model_digest: str | None = None  # SHA-256 of the landmarks that `Client.on_board` fetches
     actions_m: tuple[float, ...] = ()
     closed: bool = False
+    anchor: dict[str, float] | None = None  # where x = y = 0 is on Earth: lat_deg, lon_deg, bearing_deg, height_m
 
 
 class Histogram(Answer):

@@ -3,11 +3,11 @@
 import json
 import os
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Generic, Self, TypeVar
+from typing import Any, Generic, Protocol, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,6 +42,16 @@ class Seen:
     forgot: bool  # the belief had no room for the move, so the session was set back to knowing nothing
 
 
+class Viewer(Protocol):
+    """Shows a replay to people as it goes; one view after another, of one thread at a time."""
+
+    def begin(self, scene: "Scene") -> None:
+        """Show what stays: the route."""
+
+    def show(self, row: int, view: Mapping[str, Any], seen: Seen) -> None:
+        """Show what was seen from a frame, and what is believed after it."""
+
+
 @dataclass(frozen=True)
 class Scene:
     """A recording before a domain's active map."""
@@ -52,10 +62,13 @@ class Scene:
     position_m: NDArray[np.float64]  # [m] along the recording's own route
     route: Route  # the map's images
     right: list[NDArray[np.int64]]  # for each frame the map images that are right answers
+    viewers: Sequence[Viewer] = ()
 
     @classmethod
-    def of(cls, client: Client, recording: Recording, domain: str, within_m: float) -> Self:
-        """Learn what is needed of a domain.
+    def of(
+        cls, client: Client, recording: Recording, domain: str, within_m: float, viewers: Sequence[Viewer] = ()
+    ) -> Self:
+        """Learn what is needed of a domain, and show viewers where it leads.
 
         A right answer may be `within_m`, in the plane where both sides know x and y, else along the route.
         Raises ReplayError: it has no active map, one that changed meanwhile, or the recording has no frame of
@@ -69,7 +82,11 @@ class Scene:
             raise ReplayError(f"domain {domain} has no active map to replay against: remap it first")
         position_m = np.array([frame.position_m for frame in recording.frames], np.float64)
         route = _map_route(client, described, recording)
-        return cls(client, described, recording, position_m, route, right_answers(recording, route, within_m))
+        right = right_answers(recording, route, within_m)
+        scene = cls(client, described, recording, position_m, route, right, viewers)
+        for viewer in viewers:
+            viewer.begin(scene)
+        return scene
 
     @property
     def identity(self) -> dict[str, Any]:
@@ -101,11 +118,14 @@ class Scene:
         except BrokenFrameError as error:
             return error.reason
 
-    def look(self, session: Session, view: dict[str, Any], action_m: float | None, **options: Any) -> Seen | str:
+    def look(
+        self, session: Session, row: int, view: dict[str, Any], action_m: float | None, **options: Any
+    ) -> Seen | str:
         """Tell a session of a move and the view after it; returns the answer, or why the service cannot use the view.
 
-        A belief that is wrong may leave no room for the move that was really made, and a recording may jump or go
-        backwards; the robot then starts anew from knowing nothing. `options` are those of `Session.observe`.
+        Viewers are shown it. A belief that is wrong may leave no room for the move that was really made, and a
+        recording may jump or go backwards; the robot then starts anew from knowing nothing. `options` are those of
+        `Session.observe`.
         """
         began, forgot = time.perf_counter(), False
         try:
@@ -120,7 +140,10 @@ class Scene:
             if error.code not in UNUSABLE_IMAGE_CODES:
                 raise
             return f"refused by the service as {error.code}"
-        return Seen(answer, round(1000 * (time.perf_counter() - began), 3), forgot)
+        seen = Seen(answer, round(1000 * (time.perf_counter() - began), 3), forgot)
+        for viewer in self.viewers:
+            viewer.show(row, view, seen)
+        return seen
 
     def apart_m(self, row: int, images: NDArray[np.int64]) -> NDArray[np.float64]:
         """[k] distance from a frame to map images, in the plane where both know it, else along the route."""

@@ -13,7 +13,16 @@ from deepsimbad_client.errors import ReplayError
 from deepsimbad_client.http.client import Client, Session
 from deepsimbad_client.http.upload import CONCURRENCY, in_order
 from deepsimbad_client.recordings import Recording
-from deepsimbad_client.replay import DEFAULT_PLANNER, MASS_DIGITS, Journal, Scene, Seen, changed_map, write_lines
+from deepsimbad_client.replay import (
+    DEFAULT_PLANNER,
+    MASS_DIGITS,
+    Journal,
+    Scene,
+    Seen,
+    Viewer,
+    changed_map,
+    write_lines,
+)
 
 EPISODES = 20
 STEPS = 10
@@ -88,6 +97,7 @@ def active_replay(
     concurrency: int = CONCURRENCY,
     seed: int = 0,
     restart: bool = False,
+    viewers: Sequence[Viewer] = (),
     on_progress: Callable[[Episode, int], None] | None = None,
 ) -> ActiveReplay:
     """Drive episodes from random starts and compare what planners come to know.
@@ -97,10 +107,12 @@ def active_replay(
     `default` is the one that ships. `folder` takes `replay.json`, `episodes.jsonl` and `steps.jsonl`; interrupted at
     any moment, the same call goes on after the last episode written down, and more planners and episodes can be added
     later; `restart` throws away what is there. `concurrency` episodes are under way at once, and `on_progress` is told
-    of every one, and how many there are. Raises ReplayError, ApiError, TransportError.
+    of every one, and how many there are; where there are `viewers`, one episode is under way at a time. Raises
+    ReplayError, ApiError, TransportError.
     """
     started = time.perf_counter()
-    stage = Stage(client, recording, domain)
+    concurrency = 1 if viewers else concurrency
+    stage = Stage(client, recording, domain, viewers)
     starts = [stage.start(steps, seed, episode) for episode in range(episodes)]
     planners = tuple(dict.fromkeys(planners))
     identity = {"kind": "active", **stage.scene.identity, "steps": steps, "seed": seed}
@@ -139,8 +151,8 @@ def active_replay(
 class Stage:
     """A recording driven as an active robot drives: where it may start, where it comes to, what it sees."""
 
-    def __init__(self, client: Client, recording: Recording, domain: str) -> None:
-        self.scene = Scene.of(client, recording, domain, TRUTH_WITHIN_M)
+    def __init__(self, client: Client, recording: Recording, domain: str, viewers: Sequence[Viewer] = ()) -> None:
+        self.scene = Scene.of(client, recording, domain, TRUTH_WITHIN_M, viewers)
         self.position_m = self.scene.position_m
         if (np.diff(self.position_m) < 0).any():
             raise ReplayError(f"the positions of {recording.name} go backwards: a robot cannot drive along it")
@@ -189,7 +201,9 @@ class Stage:
             while True:
                 action_m = float(self.position_m[row]) - here_m
                 view = self.scene.view(row)
-                seen = view if isinstance(view, str) else self.scene.look(session, view, action_m if step else None)
+                seen = (
+                    view if isinstance(view, str) else self.scene.look(session, row, view, action_m if step else None)
+                )
                 if not isinstance(seen, str):
                     break
                 broken |= {row}

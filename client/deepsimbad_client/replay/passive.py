@@ -1,7 +1,7 @@
 """Drive a recording against a map as one session, in order; the service ranks the truth when it is told."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -15,7 +15,7 @@ from deepsimbad_client.http.client import Client, Session
 from deepsimbad_client.http.upload import CONCURRENCY, in_order
 from deepsimbad_client.recordings import Recording
 from deepsimbad_client.recordings.left_out import LeftOut
-from deepsimbad_client.replay import MASS_DIGITS, Journal, Scene, Seen, write_lines
+from deepsimbad_client.replay import MASS_DIGITS, Journal, Scene, Seen, Viewer, write_lines
 
 TOLERANCE_M = 2.0
 VIEWS_A_TRUTH, IMAGES_A_TRUTH = 20, 50_000  # So many views' truths are told at once, or of so many right map images
@@ -73,20 +73,22 @@ def replay(
     concurrency: int = CONCURRENCY,
     restart: bool = False,
     allow_missing: bool = True,
+    viewers: Sequence[Viewer] = (),
     on_progress: Callable[[Step, int], None] | None = None,
 ) -> Replay:
     """Ask the service for the place of every frame in order, in one session, and compare with the truth.
 
     A right answer lies within `tolerance_m`, in the plane where both sides know x and y, else along the route.
-    `folder` takes `replay.json`, `views.jsonl` (the journal) and `steps.jsonl` (all steps, at the end); interrupted at
-    any moment, the same call goes on after the last answer written down, while the session lives; `restart` throws away
-    what is there. `concurrency` images are made ready at once, and posted in order all the same. `on_progress` is told
-    of every step, those of an earlier run first, and how many there are. Raises ReplayError, ApiError, TransportError,
-    TooManyLeftOutError (without `allow_missing`: more than a twentieth of the recording is left out).
+    `folder` takes `replay.json`, `views.jsonl` (the journal) and `steps.jsonl` (all steps, at the end); interrupted
+    at any moment, the same call goes on after the last answer written down, while the session lives; `restart`
+    throws away what is there. `concurrency` images are made ready at once, and posted in order all the same.
+    `on_progress` is told of every step, those of an earlier run first, and how many there are; `viewers` of those
+    that this run asks. Raises ReplayError, ApiError, TransportError, TooManyLeftOutError (without `allow_missing`:
+    more than a twentieth of the recording is left out).
     """
     left_out = LeftOut(recording, allow_missing=allow_missing)
     started = time.perf_counter()
-    scene = Scene.of(client, recording, domain, tolerance_m)
+    scene = Scene.of(client, recording, domain, tolerance_m, viewers)
     identity = {"kind": "passive", **scene.identity, "tolerance_m": tolerance_m}
     with Journal(folder, "views.jsonl", identity, _record, "view", restart=restart) as journal:
         drive = _Drive(scene, journal, on_progress)
@@ -145,7 +147,7 @@ class _Drive:
         action_m = None if self._last is None else float(scene.position_m[row] - scene.position_m[self._last])
         # Under a key of its own: one that was answered, but not written down, is told again and counts once.
         named: dict[str, Any] = {"idempotency_key": f"view-{row}", "shortlist": 1}
-        seen = view if isinstance(view, str) else scene.look(self._session, view, action_m, **named)
+        seen = view if isinstance(view, str) else scene.look(self._session, row, view, action_m, **named)
         if isinstance(seen, str):
             step = replace(step, broken=seen)
         else:

@@ -8,11 +8,11 @@ from pydantic import Field
 from typing_extensions import TypedDict
 
 from deepsimbad.api.requests import JsonBody, prefers
+from deepsimbad.core.earth import on_earth
 from deepsimbad.core.map import Map
 from deepsimbad.errors import NotAcceptableError
 
 GEOPOSE = "application/geopose+json"
-_EQUATOR_M, _FLATTENING = 6_378_137.0, 1 / 298.257_223_563  # WGS 84
 
 Degrees = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 
@@ -72,20 +72,12 @@ def render_geopose(snapshot: Map, anchor: AnchorBody | None, image: int) -> GeoP
             f"map {snapshot.version} of domain {snapshot.domain} knows no x and y there: map a traverse that has them",
             reason="no_heading",
         )
+    latitude, longitude = on_earth(float(route.x_m[image]), float(route.y_m[image]), **anchor.model_dump())
     turned = math.radians(anchor.bearing_deg)
-    x_m, y_m = float(route.x_m[image]), float(route.y_m[image])
-    east_m = x_m * math.cos(turned) + y_m * math.sin(turned)
-    north_m = y_m * math.cos(turned) - x_m * math.sin(turned)
-    latitude = math.radians(anchor.lat_deg)
-    eccentricity = _FLATTENING * (2 - _FLATTENING)
-    bulge = 1 - eccentricity * math.sin(latitude) ** 2
-    meridian_m = _EQUATOR_M * (1 - eccentricity) / bulge**1.5 + anchor.height_m
-    parallel_m = (_EQUATOR_M / math.sqrt(bulge) + anchor.height_m) * math.cos(latitude)
-    longitude = anchor.lon_deg + math.degrees(east_m / max(parallel_m, 1e-6))
     return {
         "position": {
-            "lat": anchor.lat_deg + math.degrees(north_m / meridian_m),
-            "lon": (longitude + 180) % 360 - 180,
+            "lat": latitude,
+            "lon": longitude,
             "h": anchor.height_m,
         },
         "angles": {"yaw": (math.degrees(heading - turned) + 180) % 360 - 180, "pitch": 0.0, "roll": 0.0},

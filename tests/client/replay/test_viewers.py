@@ -1,0 +1,117 @@
+"""Replays as other programs show them: an MCAP file read back by its library, and what Rerun is sent."""
+
+import base64
+import importlib
+import json
+import sys
+
+import cv2
+import numpy as np
+import pytest
+
+from deepsimbad_client.commands import run
+from deepsimbad_client.http.admin import remap
+from deepsimbad_client.http.upload import upload
+from deepsimbad_client.recordings.sources import open_source
+
+ANCHOR = {"lat_deg": 42.29, "lon_deg": -83.71, "bearing_deg": 0.0, "height_m": 270.0}
+N_FRAMES = 12
+
+
+@pytest.fixture
+def seen_route(client, tmp_path):
+    """A folder of images on a quarter of a circle, mapped as a domain with an anchor."""
+    folder = tmp_path / "drive"
+    folder.mkdir()
+    rng = np.random.default_rng(3)
+    lines = ["name,position_m,x_m,y_m"]
+    for number in range(N_FRAMES):
+        picture = cv2.resize(rng.integers(0, 255, (6, 8, 3), np.uint8), (160, 120), interpolation=cv2.INTER_CUBIC)
+        cv2.imwrite(str(folder / f"{number:02d}.jpg"), picture)
+        x_m, y_m = 40 * np.cos(number / 8), 40 * np.sin(number / 8)
+        lines.append(f"{number:02d}.jpg,{5 * number},{x_m},{y_m}")
+    (folder / "positions.csv").write_text("\n".join(lines))
+    client.admin.put_domain("shown", {"kind": "feature_l2", "extractor": "gradient_grid"}, anchor=ANCHOR)
+    upload(client, open_source(str(folder)), "shown", "t")
+    remap(client, "shown", "t", list_length=2, training_episodes=10)
+    yield folder
+    client.admin.delete_domain("shown")
+
+
+def replayed(client, folder, out, *options):
+    command = ["replay", str(folder), "--domain", "shown", "--server", client.url, "--out", str(out), "--no-plots"]
+    return run([*command, *map(str, options)])
+
+
+def messages(path):
+    reader = pytest.importorskip("mcap.reader")
+    told = {}
+    with path.open("rb") as file:
+        for schema, channel, message in reader.make_reader(file).iter_messages():
+            assert (schema.encoding, channel.message_encoding) == ("jsonschema", "json")
+            document = json.loads(message.data)
+            assert set(document) <= set(json.loads(schema.data)["properties"])
+            told.setdefault((channel.topic, schema.name), []).append((message.log_time, document))
+    return told
+
+
+def test_an_mcap_file_holds_what_foxglove_shows(client, seen_route, tmp_path, capsys):
+    pytest.importorskip("mcap")
+    path = tmp_path / "new" / "drive.mcap"
+    assert replayed(client, seen_route, tmp_path / "out", "--mcap", path) == 0
+    told = messages(path)
+    poses = told["/pose", "foxglove.PoseInFrame"]
+    assert len(poses) == N_FRAMES
+    assert [time for time, _ in poses] == sorted({time for time, _ in poses}), "every view has a later time"
+    scenes = [document for _, document in told["/scene", "foxglove.SceneUpdate"]]
+    (line,) = scenes[0]["entities"][0]["lines"]
+    assert [point["x"] for point in line["points"]] == pytest.approx(40 * np.cos(np.arange(N_FRAMES) / 8), abs=1e-3)
+    last = {entity["id"]: entity for entity in scenes[-1]["entities"]}
+    assert {"belief", "likeliest", "truth", "next_move"} == set(last)
+    assert max(cube["size"]["z"] for cube in last["belief"]["cubes"]) > 1
+    assert last["next_move"]["texts"][0]["text"]
+    final = poses[-1][1]["pose"]["position"]
+    assert (final["x"], final["y"]) == pytest.approx((40 * np.cos(11 / 8), 40 * np.sin(11 / 8)), abs=3), "it knows"
+    places = [place for _, place in told["/location", "foxglove.LocationFix"]]
+    assert places[-1]["latitude"] == pytest.approx(42.29 + 40 * np.sin(11 / 8) / 111_077, abs=4e-5)
+    images = [document for _, document in told["/image", "foxglove.CompressedImage"]]
+    body = base64.b64decode(images[4]["data"])
+    assert (images[4]["format"], body) == ("jpeg", (seen_route / "04.jpg").read_bytes())
+    figures = [document for _, document in told["/figures", "deepsimbad.Figures"]]
+    assert figures[-1]["entropy_bits"] < figures[0]["entropy_bits"]
+    capsys.readouterr()
+    assert replayed(client, seen_route, tmp_path / "again", "--mcap", path) == 1
+    assert "is there already: name another file" in capsys.readouterr().err
+
+
+def test_episodes_of_an_active_replay_follow_each_other(client, seen_route, tmp_path):
+    pytest.importorskip("mcap")
+    moves = ("--planner", "constant:5", "--episodes", 3, "--steps", 2)
+    assert replayed(client, seen_route, tmp_path / "out", *moves, "--mcap", tmp_path / "a.mcap") == 0
+    assert len(messages(tmp_path / "a.mcap")["/figures", "deepsimbad.Figures"]) == 3 * 3
+
+
+def test_rerun_is_sent_the_route_the_belief_the_images_and_the_next_move(client, seen_route, tmp_path, monkeypatch):
+    chunk = pytest.importorskip("rerun.chunk", reason="rerun-sdk is not installed")
+    viewer = importlib.import_module("deepsimbad_client.replay.rerun_viewer")
+    path = tmp_path / "drive.rrd"
+    monkeypatch.setattr(viewer, "show_window", lambda stream, layout: stream.save(path, layout))
+    assert replayed(client, seen_route, tmp_path / "out", "--rerun") == 0
+    store = chunk.RrdReader(str(path)).store()
+    paths = {str(each) for each in store.schema().entity_paths()}
+    assert {"/world/route", "/world/belief", "/world/next_move", "/view", "/moves"} <= paths
+
+
+@pytest.mark.parametrize(("option", "module"), [("rerun", "rerun_viewer"), ("mcap", "mcap_file")])
+def test_without_the_library_one_line_says_what_to_install(
+    client, seen_route, tmp_path, monkeypatch, capsys, option, module
+):
+    monkeypatch.setitem(sys.modules, {"rerun": "rerun", "mcap": "mcap.writer"}[option], None)
+    monkeypatch.delitem(sys.modules, f"deepsimbad_client.replay.{module}", raising=False)
+    given = ["--rerun"] if option == "rerun" else ["--mcap", tmp_path / "x.mcap"]
+    assert replayed(client, seen_route, tmp_path / "out", *given) == 1
+    assert capsys.readouterr().err == (
+        f"deepsimbad-client: missing_extra: --{option} needs "
+        + {"rerun": "Rerun's viewer", "mcap": "the library mcap"}[option]
+        + f": pip install 'deep-simbad[{option}]'\n"
+    )
