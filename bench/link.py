@@ -69,11 +69,13 @@ class Link:
             raise RefusedError(f"{method} {path}", response.status, problem)
         return json.loads(answer) if is_json and answer else answer or None
 
-    def upload(self, domain: str, traverse: str, position_m: np.ndarray, encodings: np.ndarray) -> None:
-        """Make a traverse of frames 0, 1, ..."""
+    def upload(
+        self, domain: str, traverse: str, position_m: np.ndarray, encodings: np.ndarray, **more: np.ndarray
+    ) -> None:
+        """Make a traverse of frames 0, 1, ..., of which perhaps more is known."""
         path = f"/v1/admin/domains/{domain}/traverses"
         self.ask("POST", path, {"name": traverse})
-        batch = packed(encodings=encodings, index=np.arange(len(encodings)), position_m=position_m)
+        batch = packed(encodings=encodings, index=np.arange(len(encodings)), position_m=position_m, **more)
         self.ask("POST", f"{path}/{traverse}/frames", batch, NPZ)
 
     def remap(self, domain: str, config: Mapping[str, Any]) -> dict[str, Any]:

@@ -20,15 +20,15 @@ ROBOTS, _KILLS, _DIM = 50, 7, 64  # short encodings: what is measured never sees
 
 
 @contextmanager
-def mapped_service() -> Iterator[LocalServer]:
-    """A service with a wandering drive mapped, through the same calls a user has."""
+def mapped_service(**more: np.ndarray) -> Iterator[LocalServer]:
+    """A service with a wandering drive mapped, of whose frames perhaps more is known, by the calls a user has."""
     wander = np.cumsum(np.random.default_rng(0).normal(size=(NCLT_IMAGES, _DIM)), axis=0)
     encodings = (wander / np.linalg.norm(wander, axis=1, keepdims=True)).astype(np.float32)
     with tempfile.TemporaryDirectory() as folder, LocalServer(Path(folder) / "data") as server:
         with Link(server.url) as link:
             link.ask("PUT", "/v1/admin/domains/bench", {"evaluator": {"kind": "feature_l2", "extractor": "none"}})
-            for name, rows in (("landmarks", encodings[::5]), ("training", encodings)):
-                link.upload("bench", name, np.arange(len(rows)) * 0.2, rows)
+            link.upload("bench", "landmarks", np.arange(len(encodings[::5])) * 0.2, encodings[::5])
+            link.upload("bench", "training", np.arange(NCLT_IMAGES) * 0.2, encodings, **more)
             config = {"training_traverse": "training", "landmark_traverse": "landmarks", "n_landmarks": N_LANDMARKS}
             link.remap("bench", config)
         yield server

@@ -250,28 +250,36 @@ export function Strip({ belief, next, route, label }) {
     hooks=${{ drawAxes: [drawn] }} />`;
 }
 
-// How the belief came about: a row an event, newest below; a click goes there.
+// A belief as a row of pixels; the one that is shown stands on a line of its own colour.
+function painted(mass, n_bins, [paper, ink, mark], isCurrent) {
+  const row = new Uint8ClampedArray(4 * n_bins);
+  const most = Math.max(...mass);
+  mass.forEach((value, bin) => {
+    const share = Math.sqrt(value / most);
+    const to = isCurrent && share < 0.05 ? mark : ink;
+    const weight = isCurrent ? Math.max(share, 0.25) : share;
+    for (let part = 0; part < 3; part += 1) row[4 * bin + part] = paper[part] + (to[part] - paper[part]) * weight;
+    row[4 * bin + 3] = 255;
+  });
+  return row;
+}
+
+// How the belief came about: a row an event, newest below; a click goes there. Every row is painted once.
 export function History({ events, current, onPick, label }) {
-  const ref = useRef();
+  const [ref, kept] = [useRef(), useRef({})];
   useDrawing(ref, () => {
     const canvas = ref.current;
-    const n_bins = Math.max(1, ...events.map(({ answer }) => answer.belief.histogram.mass.length));
-    canvas.width = n_bins;
-    canvas.height = Math.max(1, events.length);
+    const n_bins = events.reduce((most, { answer }) => Math.max(most, answer.belief.histogram.mass.length), 1);
+    const names = ["soft", "blue", "mark"].map(colour);
+    if (kept.current.of !== `${names} ${n_bins}`) kept.current = { of: `${names} ${n_bins}`, rows: new WeakMap(), colours: names.map(parts) };
+    const { rows, colours } = kept.current;
+    [canvas.width, canvas.height] = [n_bins, Math.max(1, events.length)];
     const context = canvas.getContext("2d");
     const image = context.createImageData(canvas.width, canvas.height);
-    const [paper, ink, mark] = [parts(colour("soft")), parts(colour("blue")), parts(colour("mark"))];
     events.forEach(({ answer }, row) => {
       const { mass } = answer.belief.histogram;
-      const most = Math.max(...mass);
-      mass.forEach((value, bin) => {
-        const share = Math.sqrt(value / most);
-        const at = 4 * (row * n_bins + bin);
-        const to = row === current && share < 0.05 ? mark : ink;
-        const weight = row === current ? Math.max(share, 0.25) : share;
-        for (let part = 0; part < 3; part += 1) image.data[at + part] = paper[part] + (to[part] - paper[part]) * weight;
-        image.data[at + 3] = 255;
-      });
+      if (!rows.has(answer)) rows.set(answer, painted(mass, n_bins, colours, false));
+      image.data.set(row === current ? painted(mass, n_bins, colours, true) : rows.get(answer), 4 * row * n_bins);
     });
     context.putImageData(image, 0, 0);
   });

@@ -32,14 +32,16 @@ const WORDS = {
   connecting: ["plain", "connecting"], connected: ["good", "live"], lost: ["so", "connection lost, trying again"], ended: ["plain", "the session has ended"], refused: ["bad", "refused"],
 };
 
-export function Session({ names: [id] }) {
-  const events = useRef([]);
+// A session's events: the newest at once and as they come, those before it behind them.
+function useEvents(id) {
+  const live = useRef([]);
+  const earlier = useRef([]);
   const [, setDrawn] = useState(0);
   const [state, setState] = useState("connecting");
   const [problem, setProblem] = useState(null);
-  const [chosen, setChosen] = useState(null); // an event's index; null: the newest
   useEffect(() => {
-    const stop = new AbortController();
+    const [stop, behind] = [new AbortController(), new AbortController()];
+    const path = `v1/sessions/${encodeURIComponent(id)}/events`;
     let timer = 0;
     const drawSoon = () => {
       timer ||= setTimeout(() => {
@@ -47,13 +49,24 @@ export function Session({ names: [id] }) {
         setDrawn((n) => n + 1);
       }, FRAME_MS);
     };
-    follow(`v1/sessions/${encodeURIComponent(id)}/events`, {
+    const fetchEarlier = (first) =>
+      follow(path, {
+        signal: behind.signal,
+        after: Math.max(0, first - 1 - MOST_EVENTS),
+        onEvent: (name, answer, number) => {
+          if (name !== "done" && number < first) earlier.current.push({ number, name, answer });
+          if (name === "done" || number >= first - 1) behind.abort();
+          drawSoon();
+        },
+      });
+    follow(path, {
       signal: stop.signal,
-      after: 0,
       onEvent: (name, answer, number) => {
         if (name === "done") return;
-        events.current.push({ number, name, answer });
-        if (events.current.length > MOST_EVENTS) events.current.shift();
+        live.current.push({ number, name, answer });
+        if (live.current.length === 1 && number > 1) fetchEarlier(number);
+        if (live.current.length > MOST_EVENTS) live.current.shift();
+        else if (live.current.length + earlier.current.length > MOST_EVENTS) earlier.current.shift();
         drawSoon();
       },
       onState: (now, fault) => {
@@ -63,11 +76,19 @@ export function Session({ names: [id] }) {
     });
     return () => {
       stop.abort();
+      behind.abort();
       clearTimeout(timer);
     };
   }, [id]);
-  const all = events.current;
-  const at = chosen === null ? all.length - 1 : Math.min(chosen, all.length - 1);
+  return { all: [...earlier.current, ...live.current], state, problem };
+}
+
+export function Session({ names: [id] }) {
+  const { all, state, problem } = useEvents(id);
+  const [chosen, setChosen] = useState(null); // an event's number; null: the newest
+  const found = chosen === null ? all.length - 1 : all.findIndex(({ number }) => number >= chosen);
+  const at = found < 0 ? all.length - 1 : found;
+  const pick = (index) => setChosen(index >= all.length - 1 ? null : all[Math.max(0, index)].number);
   const event = all[at];
   const [tone, word] = WORDS[state];
   return html`<div class="head"><h1>Session</h1><code>${id}</code>
@@ -75,18 +96,17 @@ export function Session({ names: [id] }) {
       <span class=${`badge ${tone}`} role="status">${word}</span></div>
     <${Fault} problem=${problem} />
     ${!event && !problem && (state === "ended" ? html`<p class="quiet">It ended before any view.</p>` : html`<p class="quiet" role="status">Waiting for its first view …</p>`)}
-    ${event && html`<${Steps} all=${all} at=${at} isLive=${chosen === null} onPick=${setChosen} state=${state} /><${Live} events=${all} at=${at} onPick=${setChosen} />`}`;
+    ${event && html`<${Steps} all=${all} at=${at} isLive=${chosen === null} onPick=${pick} state=${state} /><${Live} events=${all} at=${at} onPick=${pick} />`}`;
 }
 
 function Steps({ all, at, isLive, onPick, state }) {
   const { number, name, answer } = all[at];
-  const go = (index) => onPick(index >= all.length - 1 ? null : Math.max(0, index));
   return html`<section class="card" aria-label="Steps"><div class="steps">
-    <span class="row"><button class="small" aria-label="One step back" disabled=${at === 0} onClick=${() => go(at - 1)}>←</button>
-      <button class="small" aria-label="One step on" disabled=${at === all.length - 1} onClick=${() => go(at + 1)}>→</button></span>
-    <input type="range" min="0" max=${Math.max(all.length - 1, 1)} value=${at} aria-label="Step shown" aria-valuetext=${`event ${number}`} onInput=${(event) => go(Number(event.target.value))} />
+    <span class="row"><button class="small" aria-label="One step back" disabled=${at === 0} onClick=${() => onPick(at - 1)}>←</button>
+      <button class="small" aria-label="One step on" disabled=${at === all.length - 1} onClick=${() => onPick(at + 1)}>→</button></span>
+    <input type="range" min="0" max=${Math.max(all.length - 1, 1)} value=${at} aria-label="Step shown" aria-valuetext=${`event ${number}`} onInput=${(event) => onPick(Number(event.target.value))} />
     <span class="number">${name === "prior" ? `told its place, event ${number}` : `view ${answer.n_observations}`}</span>
-    <button class="small" disabled=${isLive} onClick=${() => onPick(null)}>${state === "ended" ? "Last step" : "Follow live"}</button>
+    <button class="small" disabled=${isLive} onClick=${() => onPick(all.length - 1)}>${state === "ended" ? "Last step" : "Follow live"}</button>
   </div></section>`;
 }
 
@@ -102,7 +122,7 @@ function Live({ events, at, onPick }) {
   return html`<div class="columns below"><div class="stack">
       <${Believed} answer=${answer} route=${route} title=${title} />
       <section class="card"><header><h2>How it came about</h2><span class="quiet">a row a step, newest below; choose one to go there</span></header>
-        <${History} events=${events} current=${at} onPick=${(index) => onPick(index >= events.length - 1 ? null : index)} label="The belief along the route after every step" /></section>
+        <${History} events=${events} current=${at} onPick=${onPick} label="The belief along the route after every step" /></section>
       <section class="card"><header><h2>Entropy and the chance to be lost</h2><span class="legend"><span><i class="swatch belief"></i>entropy, bits</span><span><i class="swatch move"></i>off the route, %</span></span></header>
         <${Plot} label=${`Entropy now ${answer.belief.entropy_bits.toFixed(1)} bits`} values=${steps} height=${140}
           series=${[{ stroke: "blue", scale: "y" }, { stroke: "mark", scale: "lost", dash: [6, 4] }]}
