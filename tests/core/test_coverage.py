@@ -1,10 +1,14 @@
 """How surely a place is recognised."""
 
-import numpy as np
+from dataclasses import replace
 
-from deepsimbad.core.building import MapPlan, compose_map
+import numpy as np
+import pytest
+
+from deepsimbad.core.building import MapPlan, build_from_dissimilarities, compose_map
 from deepsimbad.core.coverage import placed_rightly, worst_stretches
 from deepsimbad.core.drive import Drive, SecondSeason
+from deepsimbad.core.rehearsal import own_views
 from deepsimbad.core.relevance import Relevance
 
 N, D = 120, 32
@@ -35,7 +39,7 @@ def test_places_that_look_alike_are_recognised_less_often():
     places, map_, own = mapped(rng, 40, 80)
     season = SecondSeason(measured(map_, seen(rng, places)), np.stack(2 * [np.arange(N)], 1))
     for second in (None, season):
-        chance = placed_rightly(map_, own.dissimilarities, second)
+        chance = placed_rightly(map_, own_views(map_, own.dissimilarities), second)
         assert chance.shape == (N,)
         assert chance[45:75].max() < chance[:35].min()
         (stretch,) = worst_stretches(map_.position_m, chance)
@@ -43,14 +47,42 @@ def test_places_that_look_alike_are_recognised_less_often():
         assert 75 <= stretch.last <= 85
         assert chance[stretch.worst] == chance[stretch.first : stretch.last + 1].min()
         assert np.isclose(stretch.chance, chance[stretch.first : stretch.last + 1].mean())
-    assert np.array_equal(map_.coverage, placed_rightly(map_, own.dissimilarities, None)), "the map knows it"
+    assert np.array_equal(map_.coverage, placed_rightly(map_, own_views(map_, own.dissimilarities), None)), (
+        "the map knows it"
+    )
+
+
+@pytest.mark.parametrize("relevance", [each for each in Relevance if each is not Relevance.COMPOSED])
+@pytest.mark.parametrize("knows_a_season", [False, True])
+def test_every_relevance_tells_where_it_can_be_trusted(relevance, knows_a_season):
+    rng = np.random.default_rng(2)
+    places = rng.normal(size=(N, D))
+    places[40:80] = places[40]
+    model = {"prototypes": rng.normal(size=(60, D)).astype(np.float32)}
+
+    def drive():
+        return Drive(position_m=2.0 * np.arange(N), encodings=seen(rng, places))
+
+    def measure(some, landmarks):
+        apart = np.linalg.norm(some.encodings[:, np.newaxis] - landmarks["prototypes"], axis=2)
+        return replace(some, dissimilarities=apart.astype(np.float32))
+
+    plan = MapPlan(relevance, 4, (1.0,), same_route=True)
+    built = build_from_dissimilarities(plan, drive(), drive() if knows_a_season else None, model, measure)
+    chance = built.map.coverage
+    assert ((chance >= 0) & (chance <= 1)).all()
+    assert chance[45:75].max() < 0.75 * chance[:35].mean()
+    (stretch, *_) = worst_stretches(built.map.position_m, chance)
+    assert 40 <= stretch.worst < 80
 
 
 def test_a_season_that_is_alike_nowhere_lowers_every_chance():
     rng = np.random.default_rng(1)
     _, map_, own = mapped(rng, 0, 1)
     strange = SecondSeason(measured(map_, rng.normal(size=(N, D))), np.stack(2 * [np.arange(N)], 1))
-    alone, both = (placed_rightly(map_, own.dissimilarities, second).mean() for second in (None, strange))
+    alone, both = (
+        placed_rightly(map_, own_views(map_, own.dissimilarities), second).mean() for second in (None, strange)
+    )
     assert both < 0.7 * alone
 
 

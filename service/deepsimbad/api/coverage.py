@@ -14,8 +14,9 @@ from typing_extensions import TypedDict
 from deepsimbad.api.localizations import FrameName
 from deepsimbad.api.problems import problems
 from deepsimbad.api.requests import GREATEST_ID, JSON, DomainName, Running, Services
-from deepsimbad.core.coverage import WITHIN_M, worst_stretches
+from deepsimbad.core.coverage import worst_stretches
 from deepsimbad.core.map import Map
+from deepsimbad.core.rehearsal import WITHIN_M
 
 router = APIRouter(prefix="/v1/domains", tags=["domains"])
 
@@ -48,7 +49,7 @@ class CoverageAnswer(TypedDict):
     within_m: Annotated[float, Field(description="A view is placed rightly so near to its place.")]
     basis: Annotated[
         Literal["two_seasons", "one_season"] | None,
-        Field(description="What it was learnt from; null: the map is an earlier release's, or not `composed`."),
+        Field(description="What it was learnt from; null: an earlier release made the map."),
     ]
     stretches: Annotated[list[StretchAnswer], Field(description="Where it is well below the mean, worst first.")]
     route_position_m: list[float]

@@ -94,7 +94,8 @@ function Worst({ name, coverage }) {
     ${coverage.stretches.length === 0 && html`<p class="quiet">None stands out.</p>`}
     <ol class="places">${coverage.stretches.slice(0, 6).map((stretch) => html`<li>
       <${Thumbnail} domain=${name} version=${coverage.map_version} image=${stretch.worst_map_image} alt="" isKept=${coverage.thumbnail_bytes > 0} />
-      <div><b>${metres(stretch.from_m, 0)} – ${metres(stretch.to_m, 0)}</b><br />${percent(stretch.chance)} placed rightly<br /><span class="quiet">${stretch.worst_frame ?? `map image ${stretch.worst_map_image}`}</span></div>
+      <div><b>${metres(stretch.from_m, 0)} – ${metres(stretch.to_m, 0)}</b><br />${percent(stretch.chance)} placed rightly<br />
+        <span class="quiet">worst: ${stretch.worst_frame ?? `map image ${stretch.worst_map_image}`}${stretch.last_map_image > stretch.first_map_image ? html`<br />from ${stretch.first_frame ?? stretch.first_map_image} to ${stretch.last_frame ?? stretch.last_map_image}` : ""}</span></div>
     </li>`)}</ol></section>`;
 }
 

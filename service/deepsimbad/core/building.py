@@ -28,7 +28,7 @@ from deepsimbad.core.descriptor import LandmarkStatistics, common_factors, neare
 from deepsimbad.core.drive import Drive, SameRoute, SecondSeason, second_season
 from deepsimbad.core.landmark_model import farthest_first
 from deepsimbad.core.map import Map
-from deepsimbad.core.rehearsal import rehearsed, view_bits
+from deepsimbad.core.rehearsal import own_views, rehearsed, view_bits
 from deepsimbad.core.relevance import Relevance, most_strange
 from deepsimbad.core.route import Route
 from deepsimbad.errors import InvalidEncodingError, InvalidMapConfigError
@@ -96,9 +96,15 @@ def build_from_dissimilarities(
     on_progress(0.7)
     map_ = build_map(plan.relevance, own, plan.list_length, plan.closed)
     map_ = replace(map_, landmark_model=model, actions_m=np.array(sorted(plan.actions_m)))
-    if plan.relevance is Relevance.STANDARDISED and own.dissimilarities is not None:
-        map_ = replace(map_, **rehearsed(map_, own.dissimilarities, season))
-        map_ = replace(map_, view_bits=view_bits(map_, own.dissimilarities, map_, season))
+    dissimilarities = measured_dissimilarities(own)
+    if plan.relevance is Relevance.STANDARDISED:
+        map_ = replace(map_, **rehearsed(map_, dissimilarities, season))
+    told = own_views(map_, dissimilarities)
+    if plan.relevance is Relevance.STANDARDISED:
+        map_ = replace(map_, view_bits=view_bits(map_, told, map_, season))
+    if season is not None and other is not None and plan.relevance is Relevance.BRUTE_FORCE:
+        season = replace(season, encodings=other.encodings)
+    map_ = replace(map_, coverage=placed_rightly(map_, told, season))
     on_progress(1.0)
     return Built(map_, map_, own, other, verdict)
 
@@ -270,11 +276,12 @@ def taught(
     """
     learnt = rehearsed(rehearsal, own, season)
     map_, rehearsal = replace(map_, **learnt), replace(rehearsal, **learnt)
+    told = own_views(map_, places)
     first, *others = (drive.encodings for drive in drives)
     strangest = max([most_strange(first), *(most_strange(first, other) for other in others)])
     learnt = {
-        "view_bits": view_bits(map_, places, rehearsal, season),
-        "coverage": placed_rightly(rehearsal, own, season),
+        "view_bits": view_bits(map_, told, rehearsal, season),
+        "coverage": placed_rightly(rehearsal, told, season),
         "most_strange": np.array([strangest]),
     }
     return replace(map_, **learnt), replace(rehearsal, **learnt)

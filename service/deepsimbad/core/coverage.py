@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 from deepsimbad.core.drive import SecondSeason
 from deepsimbad.core.index.retrieval import relevances
 from deepsimbad.core.map import Map
-from deepsimbad.core.rehearsal import SEASONS_ALIKE, smoothed
+from deepsimbad.core.rehearsal import WITHIN_M, OwnViews, smoothed
 
-WITHIN_M = 5.0  # of its true place: as `confident` takes a place
 _SMOOTHED_OVER_M = 5.0  # a view is placed rightly or not: neighbours tell of how often
 _PRIOR_VIEWS = 1.0  # weight of the route's mean where few views are near
 _MOST_VIEWS = 5000  # more would only take longer
@@ -33,42 +32,32 @@ class Stretch:
     chance: float  # mean over its images
 
 
-def placed_rightly(map_: Map, own: NDArray[np.float32], season: SecondSeason | None) -> NDArray[np.float32]:
+def placed_rightly(rehearsal: Map, own: OwnViews, season: SecondSeason | None) -> NDArray[np.float32]:
     """[n] the chance, 0 to 1, that a single view from a map image's place is placed within 5 m of it.
 
     Args:
-        map_: Its lists must not know the second season, and its relevance is `composed`.
-        own: [n, r] dissimilarities of the map images themselves.
+        rehearsal: The map whose lists do not know the second season.
+        own: What its places' own views tell.
         season: None: there is no other.
     """
-    images = np.linspace(0, map_.n_images - 1, min(map_.n_images, _MOST_VIEWS)).astype(np.int64)
-    expected = _found(map_, SecondSeason(own, np.stack([images, images], axis=1)), is_counted=False)
+    expected = _along(rehearsal, own.images, own.found)
     if season is None:
         return expected.astype(np.float32)
-    pairs = season.places[:: -(-len(season.places) // _MOST_VIEWS)]
-    counted = _found(map_, SecondSeason(season.dissimilarities, pairs), is_counted=True)
+    images, frames = season.places[:: -(-len(season.places) // _MOST_VIEWS)].T
+    found, route = np.empty(images.size), rehearsal.route
+    for first in range(0, images.size, _AT_ONCE):
+        some = slice(first, first + _AT_ONCE)
+        best = relevances(rehearsal, season.views(frames[some])).argmax(axis=1)
+        found[some] = np.abs(route.offset_m(route.position_m[best], route.position_m[images[some]])) <= WITHIN_M
+    counted = _along(rehearsal, images, found)
     return ((expected + counted) / 2).astype(np.float32)  # which of them orders places better no recording decided
 
 
-def _found(map_: Map, season: SecondSeason, *, is_counted: bool) -> NDArray[np.float64]:
-    """[n] share of views placed rightly, or of their likelihood, smoothed along the route."""
-    images, frames = season.places.T
-    found, route = np.empty(images.size), map_.route
-    for first in range(0, images.size, _AT_ONCE):
-        some = slice(first, first + _AT_ONCE)
-        relevance = relevances(map_, season.views(frames[some])).astype(np.float64)
-        at_m = route.position_m[images[some]]
-        if is_counted:
-            best_m = route.position_m[relevance.argmax(axis=1)]
-            found[some] = np.abs(route.offset_m(best_m, at_m)) <= WITHIN_M
-        else:
-            scale = SEASONS_ALIKE * map_.log_likelihood_scale
-            likelihood = np.exp(scale * (relevance - relevance.max(axis=1, keepdims=True)))
-            is_near = np.abs(route.offset_m(route.position_m[np.newaxis], at_m[:, np.newaxis])) <= WITHIN_M
-            found[some] = (likelihood * is_near).sum(axis=1) / likelihood.sum(axis=1)
+def _along(map_: Map, images: NDArray[np.int64], found: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[n] share of views placed rightly, of views [k] from some images, smoothed along the route."""
     order = np.argsort(images, kind="stable")
-    at_m = route.position_m[images[order]]
-    return smoothed(route.position_m, at_m, found[order], _SMOOTHED_OVER_M, _PRIOR_VIEWS)
+    at_m = map_.position_m[images[order]]
+    return smoothed(map_.position_m, at_m, found[order], _SMOOTHED_OVER_M, _PRIOR_VIEWS)
 
 
 def worst_stretches(position_m: NDArray[np.float64], chance: NDArray[np.floating]) -> list[Stretch]:

@@ -241,10 +241,12 @@ class SecondSeason:
 
     dissimilarities: NDArray[np.float32]  # [m, r] of its frames to the landmarks
     places: NDArray[np.int64]  # [k, 2] int64, (map image, its frame) where both saw the same place; some
+    encodings: NDArray[np.float32] | None = None  # [m, d], for maps that compare them whole
 
     def views(self, frames: NDArray[np.int64]) -> Query:
         """Some of its frames as live views, a batch."""
-        return Query(rank_landmarks(self.dissimilarities[frames]), self.dissimilarities[frames])
+        encodings = None if self.encodings is None else self.encodings[frames]
+        return Query(rank_landmarks(self.dissimilarities[frames]), self.dissimilarities[frames], encodings)
 
 
 @dataclass(frozen=True)

@@ -81,7 +81,7 @@ class Map:
         novelty: How much alike two views err that are 0, 1, 2.. m apart, 1 to 0.
         repeated: How much of what a view says of wrong places the view 0, 1, 2.. m before has said too, 1 to 0.
         view_bits: By how many bits a view from a place narrows the map down.
-        coverage: The chance that a single view from a place is placed rightly, NaN where unknown (`composed`).
+        coverage: The chance that a single view from a place is placed rightly, NaN where unknown.
         timestamp_us: Microseconds since 1970, -1 where unknown.
         frame_digest: Which frame every image was made of (`Drive.digests`), 0 where nobody noted it.
         x_m, y_m: East and north, NaN where unknown.

@@ -1,5 +1,6 @@
 """What a map expects of views to come (ours), rehearsed on another season of its route or guessed from itself."""
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -13,12 +14,15 @@ from deepsimbad.core.map import Map
 from deepsimbad.core.relevance import Relevance
 
 SEASONS_ALIKE = 0.6  # correlation of a landmark's scores in two seasons: what development recordings show on average
+_SURE = np.pi / np.sqrt(6 * (1 - SEASONS_ALIKE**2))  # a softmax at this scale is the best of scores with noise
 _SMOOTHED_OVER_M = 1.0  # one view is a noisy measurement of its place; neighbours show much the same
 _MAX_VIEWS = 20_000  # more would only take longer
 _LIKELIHOOD_VIEWS = 400
 _NEAR_M = 2.0  # views of places no farther apart are of one place
+WITHIN_M = 5.0  # a view is placed rightly so near to its place: as `confident` takes one
 _LEAST_SCALE, _MOST_SCALE = 2.0, 60.0
-_DISTINCT_PLACES = 5000
+_DISTINCT_PLACES, _WHOLE_PLACES = 5000, 1000  # more would only take longer, most of all by whole encodings
+_AT_ONCE = 256
 _REPEATED_VIEWS = 150
 _NEAR_LAG = 0.5  # of a lag: how far off it a pair of views may be
 _OWN_PLACE_M = 4.0
@@ -49,20 +53,54 @@ def rehearsed(map_: Map, own: NDArray[np.float32], season: SecondSeason | None) 
     return arrays
 
 
-def view_bits(
-    map_: Map, places: NDArray[np.float32], rehearsal: Map, season: SecondSeason | None
-) -> NDArray[np.float32]:
+@dataclass(frozen=True)
+class OwnViews:
+    """What views that are like a map's places themselves would tell, were seasons as alike as they usually are."""
+
+    images: NDArray[np.int64]  # [k] some of the map's, in order
+    bits: NDArray[np.float64]  # [k] by which they make the surroundings of their place likelier than the map
+    found: NDArray[np.float64]  # [k] share of the likelihood within 5 m of their place
+
+
+def own_views(map_: Map, places: NDArray[np.float32]) -> OwnViews:
+    """Look up a map's own places in it.
+
+    Args:
+        map_: As it will serve. What is found counts relevances but `composed`'s, which alone are scaled to this
+            camera, by each view's own standard deviation.
+        places: [n, r] dissimilarities of what its lists stand for.
+    """
+    is_whole, route = map_.relevance is Relevance.BRUTE_FORCE, map_.route
+    most = _WHOLE_PLACES if is_whole else _DISTINCT_PLACES
+    images = np.linspace(0, map_.n_images - 1, min(map_.n_images, most)).astype(np.int64)
+    views = SecondSeason(places, np.stack([images, images], axis=1), map_.encodings)
+    bits, found = np.empty((2, images.size))
+    for first in range(0, images.size, _AT_ONCE):
+        some = slice(first, first + _AT_ONCE)
+        relevance = relevances(map_, views.views(images[some])).astype(np.float64)
+        ahead = SEASONS_ALIKE * (relevance - relevance.max(axis=1, keepdims=True))
+        likelihood = np.exp(map_.log_likelihood_scale * ahead)
+        apart_m = np.abs(route.offset_m(route.position_m[np.newaxis], route.position_m[images[some], np.newaxis]))
+        is_near = apart_m <= _NEAR_M
+        near = (likelihood * is_near).sum(axis=1) / is_near.sum(axis=1)
+        bits[some] = np.log2(near / likelihood.mean(axis=1) + 1e-300)
+        if map_.relevance is not Relevance.COMPOSED:
+            likelihood = np.exp(_SURE * ahead / np.maximum(relevance.std(axis=1, keepdims=True), 1e-9))
+        found[some] = (likelihood * (apart_m <= WITHIN_M)).sum(axis=1) / likelihood.sum(axis=1)
+    return OwnViews(images, bits, found)
+
+
+def view_bits(map_: Map, own: OwnViews, rehearsal: Map, season: SecondSeason | None) -> NDArray[np.float32]:
     """[n] bits that a view is expected to tell of its place, smoothed along the route.
 
     What the second season's views told, and how distinct the place is in the map alone, weigh alike.
 
     Args:
-        map_: As it will serve, but for these bits.
-        places: [n, r] dissimilarities of what its lists stand for.
         rehearsal: The map whose lists do not know the second season.
         season: None: there is no other.
     """
-    distinct = _distinct_bits(map_, places)
+    own_bits = np.interp(np.arange(map_.n_images), own.images, own.bits)
+    distinct = smoothed(map_.position_m, map_.position_m, own_bits)
     if season is None:
         return distinct.astype(np.float32)
     seen = _seen_bits(rehearsal, season)
@@ -195,15 +233,6 @@ def _seen_bits(map_: Map, season: SecondSeason) -> NDArray[np.float64]:
     scale = map_.log_likelihood_scale
     bits = [_bits(map_, scale * relevances(map_, season.views(frame)), image) for image, frame in places]
     return smoothed(map_.position_m, map_.position_m[places[:, 0]], np.array(bits))
-
-
-def _distinct_bits(map_: Map, places: NDArray[np.float32]) -> NDArray[np.float64]:
-    """[n] the same of views that are like the places themselves, whose relevances count as far as seasons are alike."""
-    images = np.linspace(0, map_.n_images - 1, min(map_.n_images, _DISTINCT_PLACES)).astype(np.int64)
-    scale = SEASONS_ALIKE * map_.log_likelihood_scale
-    views = SecondSeason(places, np.stack([images, images], axis=1))
-    bits = [_bits(map_, scale * relevances(map_, views.views(image)), image) for image in images]
-    return smoothed(map_.position_m, map_.position_m, np.interp(np.arange(map_.n_images), images, bits))
 
 
 def _bits(map_: Map, log_likelihood: NDArray[np.floating], image: int) -> float:

@@ -304,6 +304,7 @@ def with_frames(map_: Map, drive: Drive, lists: NDArray[np.uint16]) -> Map:
         q_values = np.where(is_near[:, np.newaxis], q_values[nearest], np.float32(NnqlConfig().initial_q))
     if bits is not None:
         bits = np.where(is_near, bits[nearest], bits.mean(dtype=np.float32))
+    chance = None if map_.coverage is None else np.where(is_near, map_.coverage[nearest], np.float32(np.nan))
     return map_.with_images(
         {
             "lists": lists,
@@ -311,6 +312,7 @@ def with_frames(map_: Map, drive: Drive, lists: NDArray[np.uint16]) -> Map:
             "values": None if map_.values is None else listed(measured_dissimilarities(drive), lists),
             "encodings": None if map_.encodings is None else drive.encodings,
             "view_bits": bits,
+            "coverage": chance,
             **drive.origins(),
             "x_m": route.x_m,
             "y_m": route.y_m,
