@@ -1,5 +1,6 @@
 """`deepsimbad map`, `info` and `localize`: a route mapped and asked without a server."""
 
+import dataclasses
 import json
 import re
 import shutil
@@ -10,7 +11,9 @@ import cv2
 import numpy as np
 import pytest
 
+from deepsimbad.engine.pictures import Pictures
 from deepsimbad.store.catalog import Catalog
+from deepsimbad.store.layout import thumbnails_path
 from deepsimbad.store.map_file import read_map
 
 READY = ("--evaluator", "feature_l2:none")
@@ -53,6 +56,32 @@ def test_a_map_is_made_and_described(deepsimbad, drives, tmp_path):
     made = contents(tmp_path / "here", 2)
     assert made.position_m.tolist() == list(range(10, 40, 2)), "a slice keeps its frames' positions"
     assert made.n_landmarks == 60, "landmarks default to every frame of a short recording"
+
+
+def test_pictures_are_kept_where_the_domain_says_so_and_go_into_backups(deepsimbad, tmp_path):
+    rng = np.random.default_rng(4)
+    for drive in ("one", "two"):
+        (tmp_path / drive).mkdir()
+        for number in range(6):
+            picture = cv2.resize(rng.integers(0, 255, (6, 8, 3), np.uint8), (160, 120))
+            cv2.imwrite(str(tmp_path / drive / f"{number}.jpg"), picture)
+    small = ("--evaluator", "feature_l2:gradient_grid", "--n-landmarks", 4, "--training-episodes", 0)
+    assert deepsimbad("map", "plain", "--training", "one", *small, "--data-dir", "here").code == 0
+    assert not thumbnails_path(tmp_path / "here", "plain").exists()
+    assert deepsimbad("map", "route", "--training", "one", *small, "--thumbnails", "--data-dir", "here").code == 0
+    assert deepsimbad("map", "route", "--training", "two", *small, "--data-dir", "here").code == 0, "as the domain does"
+    assert deepsimbad("backup", "b.tar", "--data-dir", "here").code == 0
+    assert deepsimbad("restore", "b.tar", "--data-dir", "there").code == 0
+    assert deepsimbad("check", "--data-dir", "there").code == 0
+    for drive, version in (("one", 1), ("two", 2)):
+        map_ = contents(tmp_path / "there", version)
+        map_ = dataclasses.replace(map_, domain="route", version=version)
+        for image in range(6):
+            seen = Pictures(tmp_path / "there", 1 << 24).of_image(map_, image)
+            whole = cv2.imread(str(tmp_path / drive / map_.frames[image]))
+            shown = cv2.imdecode(np.frombuffer(seen, np.uint8), cv2.IMREAD_COLOR)
+            assert shown.shape == (96, 128, 3)
+            assert np.abs(cv2.resize(whole, (128, 96)).astype(int) - shown).mean() < 12
 
 
 def test_every_option_of_a_map_is_heeded(deepsimbad, drives, tmp_path):

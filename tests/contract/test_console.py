@@ -11,7 +11,7 @@ import pytest
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.records import KeyScope
 
-from .conftest import RANKS, TAKES_ENCODINGS, path_of, problem, service
+from .conftest import JPEG, RANKS, TAKES_ENCODINGS, encoded, path_of, picture, problem, service
 
 FILES = Path(str(resources.files("deepsimbad") / "console"))
 
@@ -86,6 +86,13 @@ def test_a_sessions_events_are_what_its_observations_were_answered(client):
     assert [number for _, number, _ in later] == ["3", "4", None]
     assert later[0][2]["belief"] == told[2][2]["belief"]
     assert [number for _, number, _ in events(client, path)] == ["4", None], "the last one, where nobody said from when"
+
+
+def test_what_a_robot_saw_is_not_held_for_a_domain_that_keeps_no_pictures(client):
+    path = client.session("seen")
+    answer = client.post(f"{path}/observations", content=encoded(picture(3)), headers=JPEG)
+    assert answer.status_code == 200
+    assert client.get(f"{path}/view").status_code == 204
 
 
 def test_events_come_while_a_session_lives(client):

@@ -150,7 +150,7 @@ async def put_frame(
         if picture is not None:
             if record.options.get("thumbnails"):
                 digest = content_digest(np.ascontiguousarray(encoded.values, "<f4").tobytes())
-                running.pictures.keep(domain, digest, picture.body)
+                running.pictures.keep(domain, [(digest, picture.body)])
             about = {
                 "spooled": picture.body if evaluator.fitting is Fitting.IMAGES else None,
                 "camera": None if picture.size is None else Camera(*picture.size, camera),

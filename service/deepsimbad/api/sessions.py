@@ -308,13 +308,21 @@ async def post_observation(
     except DeepSimbadError as error:
         running.metrics.observed(error.code)
         raise
-    if media_type in MEDIA_TYPES:
+    if media_type in MEDIA_TYPES and await _keeps_pictures(running, view.snapshot.domain):
         running.pictures.saw(session_id, body)
     answer, body = await running.written(view.belief.top.size, render_observation, view, watch)
     domain = request.scope["state"]["domain"] = answer["domain"]
     outcome = "repeated" if view.is_repeated else "accepted"
     running.metrics.localized(domain, answer["timings_ms"], answer["belief"]["entropy_bits"], outcome)
     return Response(body, media_type=JSON)
+
+
+async def _keeps_pictures(running: Services, domain: str) -> bool:
+    """As its options say; where no map answers any more there is nothing to look beside."""
+    try:
+        return bool((await running.active(domain)).record.options.get("thumbnails"))
+    except DeepSimbadError:
+        return False
 
 
 @router.get("/sessions/{session_id}", response_model=SessionAnswer, responses=problems(404, 410, 422))

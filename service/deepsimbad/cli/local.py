@@ -1,7 +1,7 @@
 """`deepsimbad map`, `localize` and `info`: the same data directory as the server's, without a server."""
 
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +19,13 @@ from deepsimbad.cli.terminal import (
     progress_bar,
     write_json,
 )
+from deepsimbad.core.drive import Drive
 from deepsimbad.core.map import DEFAULT_ACTIONS_M, check_actions
 from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Relevance
 from deepsimbad.engine.decoders import remarks_on_shape
 from deepsimbad.engine.localizer import localize as localize_view
 from deepsimbad.engine.maps import Maps
+from deepsimbad.engine.pictures import Pictures
 from deepsimbad.engine.worker import EvaluatorPool, Stopwatch
 from deepsimbad.errors import CancelledError, ImageTooLargeError, InvalidImageError, InvalidSourceError
 from deepsimbad.evaluators.base import Evaluator
@@ -45,6 +47,7 @@ from deepsimbad.jobs.remap import (
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.layout import checked_name
 from deepsimbad.store.traverses import Traverse
+from deepsimbad_client.errors import BrokenFrameError
 from deepsimbad_client.recordings import Recording, turned
 from deepsimbad_client.recordings.nclt import TURNED_UPRIGHT, UPRIGHT_TURN, lies_on_its_side
 from deepsimbad_client.recordings.options import accounting, opened, reading, rotate_option, tell_left_out
@@ -89,6 +92,11 @@ def _actions_m(_context: click.Context, _parameter: click.Parameter, value: str 
 )
 @click.option("--closed", is_flag=True, help="The end of the route joins its start.")
 @click.option(
+    "--thumbnails/--no-thumbnails",
+    default=None,
+    help="Keep a small picture of every frame, for the console, also of later drives.  [default: as the domain does]",
+)
+@click.option(
     "--actions-m",
     metavar="METRES",
     callback=_actions_m,
@@ -105,6 +113,7 @@ def map_(
     evaluator: EvaluatorConfig,
     relevance: str,
     closed: bool,
+    thumbnails: bool | None,
     actions_m: tuple[float, ...],
     reading: dict[str, Any],
     allow_missing: bool,
@@ -134,8 +143,12 @@ def map_(
     left_out = {}
     refuse_impossible(config, {role: len(recording.frames) for role, recording in recordings.items()}, None)
     with Catalog.open(settings.data_dir) as catalog:
-        catalog.create_domain(domain, evaluator.as_dict(), closed, actions_m)
-        with _nothing_kept(), progress_bar(_stages(config, recordings, measure), f"map {domain}") as progress:
+        record, _ = catalog.create_domain(domain, evaluator.as_dict(), closed, actions_m)
+        if thumbnails is not None:
+            record = catalog.set_options(domain, {"thumbnails": thumbnails})
+        shown = Pictures(settings.data_dir, settings.max_pixels) if record.options.get("thumbnails") else None
+        stages = _stages(config, recordings, measure, keeps_pictures=shown is not None)
+        with _nothing_kept(), progress_bar(stages, f"map {domain}") as progress:
             for role, recording in recordings.items():
                 progress.stage(f"read {role}")
                 encoded = encode_recording(
@@ -146,6 +159,9 @@ def map_(
                     Traverse.delete(catalog.data_dir, domain, role)
                 with Traverse.create(catalog.data_dir, domain, role) as traverse:
                     traverse.put_frames(encoded.drive)
+                if shown is not None and recording.encodings is None:
+                    progress.stage(f"keep pictures of {role}")
+                    shown.keep(domain, _seen(recording, encoded.drive, progress.update))
             pictures = RecordingPictures(recordings[next(iter(sources))], settings.max_pixels)
             result = remap(catalog, domain, config, measure, progress, n_threads=available_cores(), pictures=pictures)
     for role, names in left_out.items():
@@ -161,12 +177,25 @@ def map_(
         click.echo(f"it learnt nothing of a second season: {season['why']}", err=True)
 
 
-def _stages(config: RemapConfig, recordings: Mapping[str, Recording], measure: Evaluator) -> dict[str, float]:
+def _seen(recording: Recording, drive: Drive, on_progress: Callable[[float], None]) -> Iterator[tuple[int, bytes]]:
+    """The images of a drive's frames, by what pictures are known by."""
+    frames = {frame.index: frame for frame in recording.frames}
+    for row, (index, digest) in enumerate(zip(drive.index.tolist(), drive.digests().tolist(), strict=True)):
+        on_progress(row / drive.n_frames)
+        with suppress(BrokenFrameError):  # it was read a moment ago
+            yield digest, recording.image(frames[index], None).body
+
+
+def _stages(
+    config: RemapConfig, recordings: Mapping[str, Recording], measure: Evaluator, *, keeps_pictures: bool
+) -> dict[str, float]:
     """What is to be done, with about the seconds it takes."""
     n_frames = {role: len(recording.frames) for role, recording in recordings.items()}
     ready = recordings["training"].encodings
     dim = (measure.encoding_dim or 0) if ready is None else ready.shape[1]
     reading = {f"read {role}": n / _FRAMES_A_SECOND for role, n in n_frames.items()}
+    if keeps_pictures:
+        reading |= {f"keep pictures of {role}": n / _FRAMES_A_SECOND for role, n in n_frames.items()}
     return reading | remap_stages(config, n_frames["training"], n_frames.get("landmarks", 0), dim, measure.fitting)
 
 

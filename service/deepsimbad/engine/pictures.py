@@ -2,6 +2,7 @@
 
 import threading
 from collections import OrderedDict
+from collections.abc import Iterable
 from pathlib import Path
 
 from deepsimbad.core.map import Map
@@ -23,13 +24,12 @@ class Pictures:
         self._views: OrderedDict[str, bytes] = OrderedDict()  # by session, as they came
         self._lock = threading.Lock()
 
-    def keep(self, domain: str, frame_digest: int, body: bytes) -> None:
-        """Keep a small picture of a frame."""
-        small = thumbnail(body, self._max_pixels)
-        if small is None:
-            return
+    def keep(self, domain: str, seen: Iterable[tuple[int, bytes]]) -> None:
+        """Keep small pictures of frames, by their digests; what is no image is passed over."""
         with self._open(domain, create=True) as file:
-            file.put(frame_digest, small)
+            for frame_digest, body in seen:
+                if (small := thumbnail(body, self._max_pixels)) is not None:
+                    file.put(frame_digest, small)
 
     def of_image(self, snapshot: Map, image: int) -> bytes:
         """The JPEG of a map image; raises UnknownThumbnailError."""
@@ -47,7 +47,7 @@ class Pictures:
             return 0
 
     def saw(self, session_id: str, body: bytes) -> None:
-        """Hold what a robot saw last, in memory alone."""
+        """Hold what a robot saw last, in memory alone; for domains that keep pictures."""
         with self._lock:
             self._views.pop(session_id, None)
             if len(body) <= _MOST_VIEW_BYTES:

@@ -34,6 +34,7 @@ from deepsimbad.store.records import now
 from deepsimbad_migrations.catalog.migrations import migrations as of_catalog
 from deepsimbad_migrations.map.migrations import migrations as of_map
 from deepsimbad_migrations.session.migrations import migrations as of_sessions
+from deepsimbad_migrations.thumbnail.migrations import migrations as of_thumbnails
 from deepsimbad_migrations.traverse.migrations import migrations as of_traverse
 
 Progress = Callable[[float], None]
@@ -48,6 +49,7 @@ _MEMBERS: dict[str, Migrations] = {
     r"sessions\.sqlite": of_sessions,
     rf"domains/{NAME_PATTERN}/traverses/{NAME_PATTERN}\.sqlite": of_traverse,
     rf"domains/{NAME_PATTERN}/maps/\d{{6,16}}\.sqlite": of_map,
+    rf"domains/{NAME_PATTERN}/thumbnails\.sqlite": of_thumbnails,
 }
 _MOST_TRIES = 10
 _MOST_LINES = 20
@@ -141,7 +143,7 @@ def back_up(data_dir: Path, file: Path, release: str, on_progress: Progress) -> 
                         if version > 0:
                             members.append(_add_map(tar, data_dir, domain, version, digest))
                         else:
-                            members += _add_traverses(tar, data_dir, domain, new.parent)
+                            members += _add_files(tar, data_dir, domain, new.parent)
                 except UnavailableError as error:
                     problem = error
                 about = {**_FORMAT, "release": release, "created_at": created_at, "files": members}
@@ -176,8 +178,11 @@ def _add_copy(tar: tarfile.TarFile, data_dir: Path, path: Path, folder: Path) ->
     return _add(tar, path.relative_to(data_dir).as_posix(), copy)
 
 
-def _add_traverses(tar: tarfile.TarFile, data_dir: Path, domain: str, folder: Path) -> Iterator[dict[str, Any]]:
-    for path in sorted(layout.traverses_folder(data_dir, domain).glob("*.sqlite")):
+def _add_files(tar: tarfile.TarFile, data_dir: Path, domain: str, folder: Path) -> Iterator[dict[str, Any]]:
+    """A domain's traverses, and the pictures that it keeps."""
+    pictures = layout.thumbnails_path(data_dir, domain)
+    traverses = sorted(layout.traverses_folder(data_dir, domain).glob("*.sqlite"))
+    for path in [*traverses, pictures] if pictures.exists() else traverses:
         try:
             yield _add_copy(tar, data_dir, path, folder)
         except UnavailableError:
@@ -357,7 +362,8 @@ def _files(data_dir: Path) -> dict[Path, str | None]:
     files: dict[Path, str | None] = {catalog: None}
     if sessions.exists():
         files[sessions] = None
-    files |= dict.fromkeys(sorted(data_dir.glob("domains/*/traverses/*.sqlite")), None)
+    for working in ("traverses/*.sqlite", "thumbnails.sqlite"):
+        files |= dict.fromkeys(sorted(data_dir.glob(f"domains/*/{working}")), None)
     with suppress(DeepSimbadError):
         for domain, version, digest in sorted(_listed_in(catalog)):
             if version > 0:
@@ -374,7 +380,7 @@ def _problems(data_dir: Path, path: Path, digest: str | None) -> list[str]:
             lines.append(f"row {row} of {table} refers to a row of {parent} that is not there")
         migrations = migrations_of(path.relative_to(data_dir).as_posix())
         if migrations is None:
-            lines.append("no traverse has such a name")
+            lines.append("no file of a data directory has such a name")
         else:
             pending_migrations(db, migrations, path)
         return [" ".join(line.split()) for line in lines]
