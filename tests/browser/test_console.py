@@ -5,11 +5,14 @@ from importlib import resources
 from pathlib import Path
 
 import httpx2
+import numpy as np
 import pytest
 
+from deepsimbad.cli import run as deepsimbad
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.records import KeyScope
 from deepsimbad_client import Client
+from deepsimbad_client.commands import run as deepsimbad_client
 from tests.client.conftest import serving
 
 from .conftest import N_FRAMES, make_domain
@@ -181,14 +184,51 @@ def test_a_key_is_asked_refused_and_kept_in_the_tab_alone(open_page, tmp_path, d
         assert page.context.cookies() == []
 
 
-def test_a_report_is_opened_in_a_frame_of_its_own(open_page, tmp_path):
-    text = "<!doctype html><title>r</title><b>A report</b><script>document.body.append(' drawn')</script>"
-    (tmp_path / "report.html").write_text(text)
+def tried(folder, drives, url):
+    given = ("--evaluator", "feature_l2:gradient_grid", "--out", folder)
+    assert deepsimbad(["try", *map(str, (drives["summer"], drives["winter"], *given))]) == 0
+
+
+def replayed(folder, drives, url):
+    given = ("--domain", "route", "--server", url, "--out", folder)
+    assert deepsimbad_client(["replay", *map(str, (drives["winter"], *given))]) == 0
+
+
+def told_of_the_paper(folder, drives, url):
+    rng, nclt = np.random.default_rng(2), folder / "nclt"
+    nclt.mkdir(parents=True)
+    places = rng.normal(size=(112, 12))
+    for date in ("2012-01-22", "2012-03-31", "2012-08-04"):
+        np.save(nclt / f"{date}.npy", (places + 0.5 * rng.normal(size=places.shape)).astype(np.float32))
+    small = ("--n-landmarks", 8, "--training-episodes", 20, "--episodes", 2, "--evaluator", "feature_l2:none")
+    given = ("--nclt", nclt, "--out", folder, *small)
+    assert deepsimbad(["experiment", "paper", *map(str, given)]) == 0
+
+
+@pytest.mark.parametrize(
+    ("write", "text"),
+    [
+        (tried, "find their place at first sight"),
+        (replayed, "winter against route"),
+        (told_of_the_paper, "Brute force"),
+    ],
+)
+def test_every_report_is_opened_in_a_frame_of_its_own(open_page, service, drives, tmp_path, write, text):
+    write(tmp_path / "out", drives, service)
     page = open_page("report")
     frame = page.frame_locator("iframe")
-    frame.locator("input[type=file]").set_input_files(tmp_path / "report.html")
-    frame.get_by_text("A report").wait_for()
-    frame.get_by_text("drawn").wait_for()
+    frame.locator("input[type=file]").set_input_files(tmp_path / "out" / "index.html")
+    frame.get_by_text(text).first.wait_for()
+    (inner,) = page.frames[1:]
+    for picture in frame.locator("img").all()[:1]:
+        picture.scroll_into_view_if_needed()
+        assert picture.evaluate("(picture) => picture.decode().then(() => picture.naturalWidth)") > 0
+    assert inner.evaluate("(() => { try { return parent.document.title } catch { return null } })()") is None
+    page.get_by_role("button", name="Open another").click()
+    frame.get_by_text("Drop a report here").wait_for()
+    (tmp_path / "notes.txt").write_text("nothing of the kind")
+    frame.locator("input[type=file]").set_input_files(tmp_path / "notes.txt")
+    frame.get_by_text("notes.txt is no page").wait_for()
 
 
 def test_licences_are_beside_what_was_not_made_here():

@@ -33,6 +33,7 @@ from deepsimbad_client.recordings.sources import RECORDING_SUFFIXES
 from deepsimbad_client.recordings.told import TOLD_SUFFIXES, as_taken
 from deepsimbad_client.replay import DEFAULT_PLANNER, Viewer
 from deepsimbad_client.replay.active import EPISODES, STEPS, Stage, active_replay
+from deepsimbad_client.replay.page import write_page
 from deepsimbad_client.replay.passive import TOLERANCE_M
 from deepsimbad_client.replay.passive import replay as passive_replay
 from deepsimbad_client.replay.report import active_tables, summarise, summarise_active, table, write_summary
@@ -229,8 +230,8 @@ def replay(
     """Localize every frame of a recording, score the answers; with --planner, drive along it as an active robot.
 
     An active robot starts at a random frame, looks, asks for the next-best view, goes to the recorded frame nearest to
-    it, and looks again. Writes steps.jsonl, summary.json and pictures; interrupted, the same command goes on where it
-    stopped.
+    it, and looks again. Writes steps.jsonl, summary.json, pictures, and index.html, a page of all; interrupted, the
+    same command goes on where it stopped.
     """
     active_only = {"--episodes": episodes, "--steps": steps, "--seed": seed}
     if not planners and any(value is not None for value in active_only.values()):
@@ -269,13 +270,12 @@ def replay(
             summary = summarise(replayed)
             tables = [table(summary)]
     write_summary(summary, folder)
+    pictures: list[Path] = []
     if plots:
         from deepsimbad_client.replay.plots import draw_active, draw_passive  # noqa: PLC0415 - matplotlib takes its time
 
-        if planners:
-            draw_active(driven, summary, folder)
-        else:
-            draw_passive(replayed, folder)
+        pictures = draw_active(driven, summary, folder) if planners else draw_passive(replayed, folder)
+    page = write_page(folder, name, tables, pictures)
     if json_output:
         click.echo(as_json(summary))
     else:
@@ -283,7 +283,7 @@ def replay(
             show(shown)
     names = recording.left_out_names if planners else replayed.left_out_names
     tell_left_out(names, recording.name, verbose=verbose)
-    REMARKS.print(f"results in {folder}", soft_wrap=True)
+    REMARKS.print(f"results in {folder}; all on one page: {page}", soft_wrap=True)
 
 
 def _viewers(rerun: bool, mcap: Path | None, open_ones: ExitStack) -> list[Viewer]:

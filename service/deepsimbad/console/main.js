@@ -22,10 +22,11 @@ const PAGES = [
 const LINKS = [["", "Domains"], ["sessions", "Sessions"], ["try", "Try it"], ["jobs", "Jobs"], ["report", "Reports"]];
 
 function Report() {
-  return html`<div class="head"><h1>Reports</h1></div>
-    <p>A page that <code>deepsimbad try</code>, <code>deepsimbad experiment paper</code> or <code>deepsimbad-client replay</code> wrote.
-    It is shown in a frame that reaches neither this page, nor your key, nor any host; it is not uploaded.</p>
-    <iframe src="console/report.html" title="The report" sandbox="allow-scripts"></iframe>`;
+  const [n_opened, setOpened] = useState(0);
+  return html`<div class="head"><h1>Reports</h1><button onClick=${() => setOpened((n) => n + 1)}>Open another</button></div>
+    <p>The page that <code>deepsimbad try</code>, <code>deepsimbad experiment paper</code> or <code>deepsimbad-client replay</code> wrote: the
+    file <code>index.html</code> of its folder. It is shown in a frame that reaches neither this page, nor your key, nor any host; it is not uploaded.</p>
+    <iframe key=${n_opened} src="console/report.html" title="The report" sandbox="allow-scripts"></iframe>`;
 }
 
 function Missing() {
