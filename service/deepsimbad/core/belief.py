@@ -40,7 +40,8 @@ FOUND_A_VIEW = 0.02  # of what is lost, spread over the route when the robot has
 LEAST_SURVIVING_SHARE = 1e-9  # of a belief before a move; with less it leads past the end wherever the robot may be
 _DOUBTING = 0.01  # a belief that takes the robot for lost by more refuses no move
 SIGMAS = 4.0  # a move's error is cut off here
-_TENTH = 0.1  # of a move: how far off odometry is when a wheel slips or its size is not what it was
+_AS_TOLD = 0.6  # of moves: how many err by no more than odometry says of itself
+_SLIPPING = 0.2  # of a move: how far off the others are, for a wheel slips or its size is not what it was
 _BLOCK = 2048  # cells whose sums stay in the first-level cache
 _NARROW = 0.6  # cells; a narrower normal curve is not sampled, but has its variance all the same
 
@@ -60,9 +61,11 @@ def motion_std_m(action_m: float) -> float:
     return float(np.sqrt(0.05**2 + 0.01 * abs(action_m)))
 
 
-def moving_std_m(action_m: float, action_std_m: float, doubt: "Doubt") -> float:
-    """Standard deviation of a move whose odometry may be off by a tenth, as a mixture takes every one to be."""
-    return float(np.hypot(action_std_m, _TENTH * action_m)) if doubt.is_mixture else action_std_m
+def move_stds_m(action_m: float, action_std_m: float, doubt: "Doubt") -> dict[float, float]:
+    """Deviations of a move by how probable each is: a mixture takes some to be farther off than told."""
+    if not doubt.is_mixture:
+        return {1.0: action_std_m}
+    return {_AS_TOLD: action_std_m, 1 - _AS_TOLD: float(np.hypot(action_std_m, _SLIPPING * action_m))}
 
 
 @dataclass(frozen=True)
@@ -239,7 +242,7 @@ class GridFilter:
         masses = _moved(
             self.masses,
             (int(some.start), int(some.stop), shift),
-            move_error(cells.step_m, cells.n_cells, moving_std_m(action_m, action_std_m, doubt)),
+            mixed_error(cells.step_m, cells.n_cells, move_stds_m(action_m, action_std_m, doubt)),
             staying / total,
             found / (total * cells.n_cells),
             cells.closed,
@@ -385,6 +388,14 @@ def move_error(step_m: float, n_cells: int, std_m: float) -> NDArray[np.float64]
     reach = min(int(SIGMAS * deviation), n_cells - 1)
     weights = np.exp(-0.5 * np.square(np.arange(-reach, reach + 1) / deviation))
     return np.asarray(weights / weights.sum())
+
+
+def mixed_error(step_m: float, n_cells: int, stds_m: dict[float, float]) -> NDArray[np.float64]:
+    """[2 w + 1] as `move_error`, of deviations by how probable each is."""
+    errors = {share: move_error(step_m, n_cells, std_m) for share, std_m in stds_m.items()}
+    widest = max(error.size for error in errors.values())
+    padded = [share * np.pad(error, (widest - error.size) // 2) for share, error in errors.items()]
+    return np.asarray(np.sum(padded, axis=0), np.float64)
 
 
 @njit(cache=True, nogil=True)

@@ -18,8 +18,8 @@ from deepsimbad.core.belief import (
     added,
     check_ahead,
     leaving_and_found,
+    move_stds_m,
     moved_along,
-    moving_std_m,
 )
 from deepsimbad.core.relevance import UpdateRule
 from deepsimbad.core.route import Route
@@ -123,7 +123,8 @@ class ParticleFilter:
         lost, staying, found = leaving_and_found(
             self.doubt, self.doubt.lost + self.found, on_route, surviving, action_m
         )
-        std_m = moving_std_m(action_m, action_std_m, self.doubt)
+        stds_m = move_stds_m(action_m, action_std_m, self.doubt)
+        std_m = rng.choice(list(stds_m.values()), target_m.size, p=list(stds_m))
         moved = _onto(route, target_m + std_m * rng.standard_normal(target_m.size))
         last = self.doubt.last
         last = last if last is None else moved_along(route, last, action_m)
