@@ -15,7 +15,7 @@ was learnt, weighed by how well each has predicted the views so far (`mixture`, 
 
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Self
 
 import numpy as np
@@ -242,7 +242,7 @@ class GridFilter:
         masses = _moved(
             self.masses,
             (int(some.start), int(some.stop), shift),
-            mixed_error(cells.step_m, cells.n_cells, move_stds_m(action_m, action_std_m, doubt)),
+            mixed_error(cells.step_m, cells.n_cells, *move_stds_m(action_m, action_std_m, doubt).items()),
             staying / total,
             found / (total * cells.n_cells),
             cells.closed,
@@ -390,12 +390,12 @@ def move_error(step_m: float, n_cells: int, std_m: float) -> NDArray[np.float64]
     return np.asarray(weights / weights.sum())
 
 
-def mixed_error(step_m: float, n_cells: int, stds_m: dict[float, float]) -> NDArray[np.float64]:
-    """[2 w + 1] as `move_error`, of deviations by how probable each is."""
-    errors = {share: move_error(step_m, n_cells, std_m) for share, std_m in stds_m.items()}
-    widest = max(error.size for error in errors.values())
-    padded = [share * np.pad(error, (widest - error.size) // 2) for share, error in errors.items()]
-    return np.asarray(np.sum(padded, axis=0), np.float64)
+@lru_cache(maxsize=64)  # robots make the same moves again and again
+def mixed_error(step_m: float, n_cells: int, *stds_m: tuple[float, float]) -> NDArray[np.float64]:
+    """[2 w + 1] as `move_error`, of deviations after how probable each is; not to be written to."""
+    errors = [share * move_error(step_m, n_cells, std_m) for share, std_m in stds_m]
+    widest = max(error.size for error in errors)
+    return np.asarray(np.sum([np.pad(error, (widest - error.size) // 2) for error in errors], axis=0), np.float64)
 
 
 @njit(cache=True, nogil=True)
