@@ -1,7 +1,7 @@
 """From positions as they were recorded, with jitter, spikes and gaps, to metres along the route: every reader's rules.
 
-A spike is what nothing on the ground drives: a position that cannot be reached from those before it at five times the
-recording's own speed. Noise is told by third differences, which neither driving nor turning makes large.
+A spike is what nothing on the ground drives: positions that cannot be reached from those before and after them at five
+times the recording's own speed. Noise is told by third differences, which neither driving nor turning makes large.
 """
 
 from bisect import bisect_right
@@ -15,9 +15,11 @@ from numpy.typing import NDArray
 DEADBAND_M = 0.25
 DEADBAND_NOISES = 6.0
 SMOOTHING_HALF_WIDTH_US = 250_000
+MOST_TREMBLE_M = 0.025  # of poses; what trembles more is a receiver's, and wanders too
 WANDER_S, WANDER_M_S = 30.0, 0.4  # A standing receiver gets no farther than so fast within so long
 MAX_GAP_S = 1.0  # Between rows of a track farther apart than this nothing is interpolated: the robot may have turned
 FEWEST_FOR_NOISE = 16  # positions of which noise can be told
+MOST_SPIKES = 1000  # in a row, after which a track goes on
 MOST_NOISE_M = 10.0  # What leaps farther, as frames of two drives by turns, is none
 SPIKE_M, SPIKE_NOISES, SPIKE_SPEEDS = 0.5, 8.0, 5.0
 SLOWEST_LIMIT_M_S, FASTEST_M_S = (
@@ -121,8 +123,8 @@ def noise_m(*axes: Reals) -> float:
 def on_track(x_m: Reals, y_m: Reals, time_us: Times | None, speeds: float = SPIKE_SPEEDS) -> NDArray[np.bool_]:
     """Which positions [n], in travel order, a robot can have been at; False: a spike.
 
-    From the longest stretch without a jump it goes forwards and backwards, and takes each position that can be reached
-    from the last one in the time between, at `speeds` times the usual speed. Without times a frame is the unit.
+    Jumps cut the track into stretches; those are kept that make the longest way on which each is reached from the end
+    of the one before, in the time between, at `speeds` times the usual speed. Without times a frame is the unit.
     """
     n = len(x_m)
     if n < 3:
@@ -131,28 +133,34 @@ def on_track(x_m: Reals, y_m: Reals, time_us: Times | None, speeds: float = SPIK
     clock = np.arange(n, dtype=np.float64) if time_us is None else (time_us - time_us[0]) / 1e6
     ticks = np.abs(np.diff(clock))
     tick = float(np.median(ticks[ticks > 0])) if (ticks > 0).any() else 1.0
-    apart = min(10, n // 3)
-    moved = np.hypot(x_m[apart:] - x_m[:-apart], y_m[apart:] - y_m[:-apart]) - DEADBAND_NOISES * noise
-    speed = moved / np.maximum(np.abs(clock[apart:] - clock[:-apart]), tick)
-    limit = speeds * float(np.median(speed[speed > 0])) if (speed > 0).any() else 0.0
-    if time_us is not None:
+
+    def usual(apart: int, above: float) -> float:
+        moved = np.hypot(x_m[apart:] - x_m[:-apart], y_m[apart:] - y_m[:-apart]) - DEADBAND_NOISES * noise
+        speed = moved / np.maximum(np.abs(clock[apart:] - clock[:-apart]), tick)
+        return float(np.median(speed[speed > above])) if (speed > above).any() else 0.0
+
+    limit = speeds * usual(min(10, n // 3), 0.0)
+    if time_us is not None:  # most of the time it may have stood
+        limit = max(limit, speeds * usual(min(max(10, int(WANDER_S / tick)), n // 3), WANDER_M_S))
         limit = min(max(limit, SLOWEST_LIMIT_M_S), FASTEST_M_S)
     slack = SPIKE_M + SPIKE_NOISES * noise + limit * tick
     jumps = np.flatnonzero(np.hypot(np.diff(x_m), np.diff(y_m)) > slack + limit * ticks)
-    ok = np.ones(n, dtype=np.bool_)
-    if not len(jumps):
-        return ok
     starts = np.concatenate(([0], jumps + 1))
-    ends = np.concatenate((jumps + 1, [n]))
-    longest = int(np.argmax(ends - starts))
-    xs, ys, at = x_m.tolist(), y_m.tolist(), clock.tolist()
-    for order in (range(int(ends[longest]) - 1, n), range(int(starts[longest]), -1, -1)):
-        last = order[0]
-        for i in order[1:]:
-            if hypot(xs[i] - xs[last], ys[i] - ys[last]) <= slack + limit * abs(at[i] - at[last]):
-                last = i
-            else:
-                ok[i] = False
+    ends = np.concatenate((jumps, [n - 1]))
+    best = ends - starts + 1  # positions on the longest way that ends with each stretch
+    before = np.full(len(starts), -1)
+    for stretch in range(1, len(starts)):
+        known = slice(max(0, stretch - MOST_SPIKES), stretch)
+        last, start = ends[known], starts[stretch]
+        away_m = np.hypot(x_m[last] - x_m[start], y_m[last] - y_m[start])
+        reached = np.where(away_m <= slack + limit * np.abs(clock[start] - clock[last]), best[known], 0)
+        if reached.any():
+            before[stretch] = known.start + int(np.argmax(reached))
+            best[stretch] += reached.max()
+    ok, stretch = np.zeros(n, dtype=np.bool_), int(np.argmax(best))
+    while stretch >= 0:
+        ok[starts[stretch] : ends[stretch] + 1] = True
+        stretch = int(before[stretch])
     return ok
 
 
@@ -168,11 +176,12 @@ def arc_length_m(x_m: Reals, y_m: Reals, time_us: Times | None = None, deadband_
     if len(x_m) == 0:
         return np.zeros(0, dtype=np.float64)
     noise = noise_m(x_m, y_m)
+    of_receiver = deadband_m > DEADBAND_M or noise > MOST_TREMBLE_M
     if time_us is not None:
         n_averaged = _window(time_us)
         x_m, y_m = _averaged(x_m, *n_averaged), _averaged(y_m, *n_averaged)
         noise /= float(np.sqrt(np.median(n_averaged[1] - n_averaged[0])))
-        if deadband_m > DEADBAND_M:
+        if of_receiver:
             x_m, y_m = _stood_still(x_m, y_m, time_us)
     return walked_m(x_m, y_m, max(deadband_m, DEADBAND_NOISES * noise))
 

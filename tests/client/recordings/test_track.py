@@ -95,6 +95,7 @@ SPIKES = {
     "no fix for a while": (range(100, 112), lambda x, y, at: (x.put(at, 0), y.put(at, 0))),
     "80 m aside": ([300], lambda x, y, at: y.put(at, y[at] + 80)),
     "ever elsewhere": (range(20, 700, 60), lambda x, y, at: y.put(at, y[at] + 15 + np.arange(len(at)))),
+    "aside for two seconds": (range(100, 120), lambda x, y, at: y.put(at, y[at] + 60)),
     "at the end": ([699, 700], lambda x, y, at: x.put(at, x[at] - 9_999)),
 }
 
@@ -107,6 +108,17 @@ def test_spikes_alone_are_off_the_track(hz, spikes):
         places, spoil = SPIKES[spikes]
         spoil(x, y, np.array(places))
         assert np.flatnonzero(~on_track(x, y, time_us)).tolist() == list(places)
+
+
+def test_a_robot_that_mostly_stood_may_drive_fast_and_its_receiver_wander():
+    rng = np.random.default_rng(1)
+    along = np.concatenate((np.arange(0, 200, 2.0), np.full(3000, 200.0), np.arange(200, 400, 2.0)))  # 20 m/s, 10 Hz
+    wander = rng.normal(0, 1, (2, len(along)))
+    for k in range(1, len(along)):  # correlated over a minute
+        wander[:, k] = np.exp(-1 / 600) * wander[:, k - 1] + np.sqrt(1 - np.exp(-1 / 300)) * wander[:, k]
+    x, y, time_us = along + wander[0], wander[1], np.arange(len(along)) * 100_000
+    assert on_track(x, y, time_us).all()
+    assert 390 < arc_length_m(x, y, time_us)[-1] < 415
 
 
 def test_two_drives_by_turns_are_one_and_spikes():
