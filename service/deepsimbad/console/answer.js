@@ -48,15 +48,16 @@ export function Figures({ answer }) {
 export function NextMove({ next }) {
   if (!next) return html`<section class="card"><h2>Next best view</h2><p class="quiet">The map names no move: it was made with none to plan.</p></section>`;
   const hasBits = next.actions.some((action) => action.expected_bits !== null);
-  const value = (action) => (hasBits ? action.expected_bits : action.q_value) ?? 0;
-  const most = Math.max(...next.actions.map(value), 1e-9);
-  const least = Math.min(...next.actions.map(value), 0);
+  const value = (action) => action.q_value ?? action.expected_bits ?? 0;
+  const [least, most] = [Math.min(...next.actions.map(value)), Math.max(...next.actions.map(value))];
+  const share = (action) => 0.04 + (0.96 * (value(action) - least)) / (most - least || 1);
   return html`<section class="card"><header><h2>Next best view</h2><span class="quiet">${next.planner}</span></header>
     <p class="advice">${next.stop ? "Stop: it knows where it is" : next.action_m < 0 ? `Drive back ${metres(-next.action_m)}` : next.action_m === 0 ? "Stay and look again" : `Drive on ${metres(next.action_m)}`}</p>
-    <ul class="moves" aria-label=${hasBits ? "Bits that the view after each move would tell" : "Value of each move"}>${next.actions.map((action) => html`<li>
+    <ul class="moves" aria-label="What each move is worth">${next.actions.map((action) => html`<li>
       <span class=${`number ${action.action_m === next.action_m ? "chosen" : ""}`}>${metres(action.action_m)}${action.action_m === next.action_m ? html`<span class="hidden-text"> chosen</span>` : ""}</span>
-      <span class=${`track ${action.action_m === next.action_m ? "chosen" : ""}`}><span class="fill" style=${{ width: `${(100 * (value(action) - least)) / (most - least)}%` }}></span></span>
-      <span class="number">${value(action).toFixed(2)} ${hasBits ? html`<small>bits</small>` : ""}</span></li>`)}</ul>
+      <span class=${`track ${action.action_m === next.action_m ? "chosen" : ""}`}><span class="fill" style=${{ width: `${100 * share(action)}%` }}></span></span>
+      <span class="number">${hasBits ? html`${action.expected_bits.toFixed(2)} <small>bits</small>` : value(action).toFixed(2)}</span></li>`)}</ul>
+    <p class="quiet"><small>${hasBits ? "Bars: what a move is worth, all views after it counted. Bits: what the view right after it should tell." : "Bars: what a move is worth, all views after it counted."}</small></p>
   </section>`;
 }
 
@@ -67,7 +68,7 @@ export function Places({ answer, domain, version, view, isKept }) {
     ${view && html`<figure class="view"><img src=${view} alt="The view" /><figcaption class="quiet">The view</figcaption></figure>`}
     <ol class="places">${shown.slice(0, 8).map((place) => html`<li>
       <${Thumbnail} domain=${domain} version=${version} isKept=${isKept} image=${place.map_image} alt=${`Map image at ${metres(place.route_position_m)}`} />
-      <div><b>${metres(place.route_position_m)}</b> ${of_view ? html`<span class="quiet number">${place.relevance.toFixed(2)}</span>` : html`<span class="quiet number">${percent(place.mass, 1)}</span>`}<br />
+      <div><b>${metres(place.route_position_m)}</b> ${of_view ? html`<span class="quiet number" title="Relevance: larger is more alike">relevance ${place.relevance.toFixed(2)}</span>` : html`<span class="quiet number">${percent(place.mass, 1)}</span>`}<br />
       <span class="quiet">${place.frame ?? `map image ${place.map_image}`}</span></div></li>`)}</ol>
   </section>`;
 }

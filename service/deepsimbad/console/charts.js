@@ -2,6 +2,7 @@
 
 import { html, useEffect, useRef } from "./preact.js";
 
+const SCALE_HEIGHT = 30; // pixels under a route
 const MOST_POINTS = 3000; // of a drawn route: more cannot be told apart
 const dark = matchMedia("(prefers-color-scheme: dark)");
 
@@ -66,12 +67,14 @@ export class Route {
   }
 
   // From metres to pixels of a picture of that size, one scale both ways.
-  fitted(width, height, margin = 18) {
+  // Room is left for the names of its ends, and under it for the scale.
+  fitted(width, height, margin = 34) {
     const [left, bottom, right, top] = this.box;
-    const scale = Math.min((width - 2 * margin) / Math.max(right - left, 1e-6), (height - 2 * margin) / Math.max(top - bottom, 1e-6));
+    const high = height - (this.isPlane ? SCALE_HEIGHT : 0);
+    const scale = Math.min((width - 2 * margin) / Math.max(right - left, 1e-6), (high - 2 * margin) / Math.max(top - bottom, 1e-6));
     const x0 = (width - scale * (right - left)) / 2;
-    const y0 = (height - scale * (top - bottom)) / 2;
-    return { scale, place: ({ x, y }) => [x0 + scale * (x - left), height - y0 - scale * (y - bottom)] };
+    const y0 = (high - scale * (top - bottom)) / 2;
+    return { scale, place: ({ x, y }) => [x0 + scale * (x - left), high - y0 - scale * (y - bottom)] };
   }
 
   // The index of the last point before a position, by halves.
@@ -117,10 +120,16 @@ function drawRoute(canvas, route) {
   }
   context.fillStyle = context.strokeStyle = colour("quiet");
   context.font = "12px system-ui, sans-serif";
-  for (const [name, point] of [["start", route.points[0]], ["end", route.points[route.points.length - 1]]]) {
-    const [x, y] = place(point);
-    context.fillText(name, Math.min(Math.max(x - 12, 2), width - 30), y + (y > height - 30 ? -12 : 22));
+  context.textAlign = "center";
+  context.textBaseline = "middle";
+  const last = route.points.length - 1;
+  for (const [name, end, inner] of [["start", 0, Math.min(8, last)], ["end", last, Math.max(0, last - 8)]]) {
+    const [[x, y], [towards_x, towards_y]] = [place(route.points[end]), place(route.points[inner])];
+    const away = Math.hypot(x - towards_x, y - towards_y) || 1; // names stand beyond the ends
+    context.fillText(name, x + (22 * (x - towards_x)) / away, y + (16 * (y - towards_y)) / away);
   }
+  context.textAlign = "start";
+  context.textBaseline = "alphabetic";
   if (!route.isPlane) return;
   const metres = [1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000].find((m) => m * scale >= 60) ?? 10000;
   context.lineWidth = 2;

@@ -24,7 +24,7 @@ function Card({ domain }) {
     <dl class="figures">
       <div><dt>Route</dt><dd>${metres(domain.route_length_m, 0)}</dd></div>
       <div><dt>Map images</dt><dd>${domain.n_map_images?.toLocaleString() ?? "–"}</dd></div>
-      <div><dt>Index</dt><dd>${domain.index_bits_per_map_image?.toFixed(1) ?? "–"} <small>bit/image</small></dd></div>
+      <div><dt>Index</dt><dd>${domain.index_bits_per_map_image ? html`${domain.index_bits_per_map_image.toFixed(1)} <small>bit/image</small>` : "–"}</dd></div>
     </dl>
   </a>`;
 }
@@ -47,7 +47,7 @@ export function Domain({ names: [name] }) {
   }, [active]);
   return html`<div class="head"><h1>${name}</h1>
       ${answer && html`<span class="quiet">${answer.evaluator.extractor ?? answer.evaluator.kind}${answer.relevance ? `, ${answer.relevance}` : ""}${answer.closed ? ", closed route" : ""}</span>`}
-      <span class="row"><a class="button" href=${`#try/${name}`}>Try an image</a><a class="button" href=${`#domains/${name}/upload`}>Upload a traverse</a></span></div>
+      <span class="row">${answer?.map_version && html`<a class="button" href=${`#try/${name}`}>Try an image</a>`}<a class="button" href=${`#domains/${name}/upload`}>Upload a traverse</a></span></div>
     <${Fault} problem=${domain.problem} /><${Fault} problem=${coverage.problem} />
     ${answer?.map_version === null && html`<div class="card empty"><h2>No map yet</h2><p>Upload a traverse, then remap: the map made of it is activated when it is whole.</p></div>`}
     <div class="columns">
@@ -95,7 +95,8 @@ function Worst({ name, coverage }) {
     <ol class="places">${coverage.stretches.slice(0, 6).map((stretch) => html`<li>
       <${Thumbnail} domain=${name} version=${coverage.map_version} image=${stretch.worst_map_image} alt="" isKept=${coverage.thumbnail_bytes > 0} />
       <div><b>${metres(stretch.from_m, 0)} – ${metres(stretch.to_m, 0)}</b><br />${percent(stretch.chance)} placed rightly<br />
-        <span class="quiet">worst: ${stretch.worst_frame ?? `map image ${stretch.worst_map_image}`}${stretch.last_map_image > stretch.first_map_image ? html`<br />from ${stretch.first_frame ?? stretch.first_map_image} to ${stretch.last_frame ?? stretch.last_map_image}` : ""}</span></div>
+        <small>worst at ${stretch.worst_frame ?? `map image ${stretch.worst_map_image}`}</small>
+        <small>from ${stretch.first_frame ?? `map image ${stretch.first_map_image}`}</small><small>to ${stretch.last_frame ?? `map image ${stretch.last_map_image}`}</small></div>
     </li>`)}</ol></section>`;
 }
 

@@ -64,11 +64,30 @@ export function Job({ names: [id] }) {
         ${job.error && html`<p class="notice bad"><b>${job.error.detail}</b> <code>${job.error.code}</code></p>`}
         ${job.result && html`<p>Map version ${job.result.map_version} ${job.result.active ? "answers now." : "is sealed, and not active."} <a href=${`#domains/${job.domain}`}>See it</a></p>`}
         ${!isOver && html`<button onClick=${cancel}>Cancel</button>`}</section>
-      ${job.result && html`<section class="card"><h2>What was measured</h2><${Measured} values=${job.result.metrics} /></section>`}
+      ${job.result && html`<section class="card"><h2>What was measured</h2><${Headline} metrics=${job.result.metrics} />
+        <details><summary>All figures</summary><${Measured} values=${job.result.metrics} /></details></section>`}
     </div><div class="stack">
-      <section class="card"><h2>Log</h2><ol>${log.map(({ line, at }) => html`<li><span class="quiet number">${at.toLocaleTimeString()}</span> ${line}</li>`)}</ol></section>
+      <section class="card"><h2>Log</h2>${isOver && job.result?.metrics.seconds && html`<${Stages} seconds=${job.result.metrics.seconds} />`}
+        <ol>${log.map(({ line, at }) => html`<li><span class="quiet number">${at.toLocaleTimeString()}</span> ${line}</li>`)}</ol></section>
       <section class="card"><h2>Asked for</h2><${Measured} values=${job.config} /></section>
     </div></div>`}`;
+}
+
+function Headline({ metrics }) {
+  const { check } = metrics;
+  const figures = [
+    ["Map images", metrics.n_map_images?.toLocaleString()],
+    ["Landmarks", metrics.n_landmarks?.toLocaleString()],
+    ["Index", metrics.index_bits_per_map_image && html`${metrics.index_bits_per_map_image.toFixed(1)} <small>bit/image</small>`],
+    ["ANR of its check", typeof check?.anr === "number" && html`${check.anr.toFixed(2)} <small>%, 0 is perfect</small>`],
+    ["The map before", typeof check?.anr_active === "number" && html`${check.anr_active.toFixed(2)} <small>%</small>`],
+  ].filter(([, figure]) => figure);
+  return html`<dl class="figures">${figures.map(([name, figure]) => html`<div><dt>${name}</dt><dd>${figure}</dd></div>`)}</dl>`;
+}
+
+// How long every stage took, of a job that is over.
+function Stages({ seconds }) {
+  return html`<table><tbody>${Object.entries(seconds).map(([stage, taken_s]) => html`<tr><th scope="row">${stage.replaceAll("_", " ")}</th><td class="n">${taken_s < 10 ? `${taken_s.toFixed(1)} s` : span(taken_s)}</td></tr>`)}</tbody></table>`;
 }
 
 // Named values, those of one part after another; curves and the like are left to the call.

@@ -18,14 +18,14 @@ export function Sessions() {
   };
   return html`<div class="head"><h1>Sessions</h1></div>
     ${problem?.status === 403 || problem?.status === 401 ? html`<p class="quiet">All sessions are shown to keys of the scope admin; yours opens its own, by id.</p>` : html`<${Fault} problem=${problem} />`}
-    <form class="row below" onSubmit=${open}><label>Session id <input type="text" name="id" required /></label><button>Open</button></form>
     ${answer?.sessions.length === 0 && html`<div class="card empty below"><h2>No robot is driving</h2>
       <p>A session begins when a robot, or a replay, asks for one:</p><pre>deepsimbad-client replay path/to/images --domain my-route</pre></div>`}
     ${answer?.sessions.length > 0 && html`<div class="card below wide"><table>
       <thead><tr><th>Session</th><th>Domain</th><th class="n">Map</th><th class="n">Views</th><th>Begun</th><th>Ends unless it moves</th></tr></thead>
       <tbody>${answer.sessions.map((session) => html`<tr>
         <td class="name"><a href=${`#sessions/${session.session_id}`}>${session.session_id}</a></td><td>${session.domain}</td><td class="n">${session.map_version}</td>
-        <td class="n">${session.n_observations}</td><td>${when(session.created_at)}</td><td>in ${span((new Date(session.expires_at) - Date.now()) / 1000)}</td></tr>`)}</tbody></table></div>`}`;
+        <td class="n">${session.n_observations}</td><td>${when(session.created_at)}</td><td>in ${span((new Date(session.expires_at) - Date.now()) / 1000)}</td></tr>`)}</tbody></table></div>`}
+    <form class="row below" onSubmit=${open}><label>A session by its id, also one that has ended <input type="text" name="id" required /></label><button>Open</button></form>`;
 }
 
 const WORDS = {

@@ -92,7 +92,7 @@ export function Upload({ names: [domain] }) {
       <form onSubmit=${upload}>
         <label>Folder <input type="file" webkitdirectory multiple onChange=${choose} disabled=${isBusy} /></label>
         ${frames && html`<p><b>${frames.list.length.toLocaleString()} images</b>${leftOut.length ? html`, <span class="badge so">${leftOut.length} without a position left out</span>: ${leftOut.slice(0, 3).join(", ")}${leftOut.length > 3 ? ", …" : ""}` : ""}</p>`}
-        <div class="row"><label>Traverse <input type="text" value=${name} pattern="[A-Za-z0-9][A-Za-z0-9._\\-]*" maxlength="64" required onInput=${(event) => setName(event.target.value)} disabled=${isBusy} /></label>
+        <div class="row below"><label>Traverse <input type="text" value=${name} pattern="[A-Za-z0-9][A-Za-z0-9._\\-]*" maxlength="64" required onInput=${(event) => setName(event.target.value)} disabled=${isBusy} /></label>
         ${frames?.isSpaced && html`<label>Metres between images <input type="number" min="0.01" step="any" value=${spacing_m} required onInput=${(event) => setSpacing(event.target.value)} disabled=${isBusy} /></label>`}
         <button class="first" disabled=${!frames?.list.length || isBusy}>Upload</button>
         ${isBusy && html`<button type="button" onClick=${() => stop.current?.abort()}>Pause</button>`}</div>

@@ -11,7 +11,7 @@ from deepsimbad.evaluators.image import thumbnail
 from deepsimbad.store.thumbnails import Thumbnails
 
 _MOST_VIEWS = 32  # of sessions, the latest
-_MOST_VIEW_BYTES = 1 << 20  # a larger one is not held
+_MOST_VIEW_BYTES = 64 << 20  # of all of them
 _VIEW_HEIGHT = 240
 
 
@@ -50,9 +50,8 @@ class Pictures:
         """Hold what a robot saw last, in memory alone; for domains that keep pictures."""
         with self._lock:
             self._views.pop(session_id, None)
-            if len(body) <= _MOST_VIEW_BYTES:
-                self._views[session_id] = body
-            while len(self._views) > _MOST_VIEWS:
+            self._views[session_id] = body
+            while len(self._views) > _MOST_VIEWS or sum(map(len, self._views.values())) > _MOST_VIEW_BYTES:
                 self._views.popitem(last=False)
 
     def seen(self, session_id: str) -> bytes | None:
