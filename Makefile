@@ -10,7 +10,7 @@ PYTHON ?= $(shell for p in python3.11 python3.12 python3.13 python3 python; do \
 BIN := .venv/bin
 PYTEST = $(BIN)/pytest -n auto --dist loadfile --no-loadscope-reorder
 
-.PHONY: help install demo paper test pytest check lint bench soak load clean
+.PHONY: help install demo paper test pytest check lint bench soak load screenshots clean
 
 help: ## this list
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 10
@@ -56,6 +56,9 @@ soak: install ## kills the service 200 times under load and looks for what it ac
 
 load: install ## an hour of 20 robots with remaps and rollbacks: docs/results/load.md
 	$(BIN)/python -m bench.load --out docs/results/load.md
+
+screenshots: install ## pictures of the console before a rendered campus, for README: docs/images
+	$(BIN)/python -m tests.browser.screenshots
 
 clean: ## removes what the other targets made
 	rm -rf .venv demo-output paper-output .mypy_cache .ruff_cache .pytest_cache .import_linter_cache

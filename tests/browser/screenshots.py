@@ -27,6 +27,7 @@ from .conftest import CHROMIUM, QUIET
 IMAGES = Path(__file__).resolve().parents[2] / "docs" / "images"
 SEASONS, N_FRAMES, N_VIEWS, STEP = ("winter", "spring", "summer"), 300, 14, 3
 DESK, PHONE = {"width": 1360, "height": 900}, {"width": 390, "height": 844}
+HEIGHT_SHOWN = 1260  # README's: down to the places that are most like a view
 _QUALITY = 82
 
 
@@ -86,7 +87,8 @@ def main() -> None:
                 ("console-domain", "domains/campus", "light"),
                 ("console-session", f"sessions/{session}", "dark"),
             ):
-                page = browser.new_context(viewport=DESK, color_scheme=scheme).new_page()
+                tall = {**DESK, "height": HEIGHT_SHOWN}
+                page = browser.new_context(viewport=tall, color_scheme=scheme).new_page()
                 shown(page, url, where)
                 small(page.screenshot(), IMAGES / f"{name}.webp")
             page = browser.new_context(viewport=PHONE, color_scheme="light", device_scale_factor=1.5).new_page()

@@ -47,10 +47,13 @@ def session(service, drives):
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_every_page_is_whole_and_accessible(open_page, session, scheme):
+def test_every_page_is_whole_and_accessible(open_page, service, session, scheme):
     axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason="axe is not installed").Axe()
     page = open_page(color_scheme=scheme, viewport=DESK, bypass_csp=True)
-    for where, text in {**PAGES, f"sessions/{session.session_id}": "After 3 views"}.items():
+    with httpx2.Client(base_url=service) as caller:
+        job = caller.get("/v1/admin/jobs").json()["jobs"][0]["job_id"]
+    of_one = {f"sessions/{session.session_id}": "After 3 views", f"jobs/{job}": "What was measured"}
+    for where, text in {**PAGES, **of_one}.items():
         page.goto(page.url.partition("#")[0] + f"#{where}")
         page.get_by_text(text).first.wait_for()
         for width in (PHONE, DESK):

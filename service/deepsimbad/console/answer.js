@@ -65,10 +65,10 @@ export function Places({ answer, domain, version, view, isKept }) {
   const shown = answer.retrieval?.length ? answer.retrieval : answer.belief.top;
   const of_view = answer.retrieval?.length > 0;
   return html`<section class="card"><h2>${of_view ? "Places most like the view" : "Likeliest places"}</h2>
-    ${view && html`<figure class="view"><img src=${view} alt="The view" /><figcaption class="quiet">The view</figcaption></figure>`}
-    <ol class="places">${shown.slice(0, 8).map((place) => html`<li>
+    <div class=${view ? "beside" : ""}>${view && html`<figure class="view"><img src=${view} alt="The view" /><figcaption class="quiet">The view</figcaption></figure>`}
+    <ol class="places">${shown.slice(0, 6).map((place) => html`<li>
       <${Thumbnail} domain=${domain} version=${version} isKept=${isKept} image=${place.map_image} alt=${`Map image at ${metres(place.route_position_m)}`} />
-      <div><b>${metres(place.route_position_m)}</b> ${of_view ? html`<span class="quiet number" title="Relevance: larger is more alike">relevance ${place.relevance.toFixed(2)}</span>` : html`<span class="quiet number">${percent(place.mass, 1)}</span>`}<br />
-      <span class="quiet">${place.frame ?? `map image ${place.map_image}`}</span></div></li>`)}</ol>
+      <div><b>${metres(place.route_position_m)}</b><small class="number">${of_view ? `relevance ${place.relevance.toFixed(2)}` : `${percent(place.mass, 1)} of the belief`}</small>
+      <small>${place.frame ?? `map image ${place.map_image}`}</small></div></li>`)}</ol></div>
   </section>`;
 }

@@ -253,7 +253,7 @@ export function Strip({ belief, next, route, label }) {
     ctx.restore();
   };
   const middles = edges_m.slice(1).map((edge, i) => (edge + edges_m[i]) / 2);
-  return html`<${Plot} label=${label} values=${[middles, mass.map((share) => 100 * share)]}
+  return html`<${Plot} height=${190} label=${label} values=${[middles, mass.map((share) => 100 * share)]}
     series=${[{ stroke: "blue", fill: "blue", paths: globalThis.uPlot.paths.stepped({ align: 0 }) }]} axes=${[{ label: "metres along the route", labelSize: 20, size: 36 }, { values: (_, ticks) => ticks.map((tick) => `${tick} %`) }]}
     scales=${{ x: { time: false, range: [edges_m[0], edges_m[edges_m.length - 1]] }, y: { range: (_, __, most) => [0, Math.max(most, 0.01) * 1.08] } }}
     hooks=${{ drawAxes: [drawn] }} />`;

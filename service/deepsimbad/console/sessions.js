@@ -121,6 +121,9 @@ function Live({ events, at, onPick }) {
   const title = `After ${answer.n_observations} view${answer.n_observations === 1 ? "" : "s"}`;
   return html`<div class="columns below"><div class="stack">
       <${Believed} answer=${answer} route=${route} title=${title} />
+      <${Places} answer=${answer} domain=${answer.domain} version=${answer.map_version} view=${view} isKept=${coverage.answer?.thumbnail_bytes > 0} />
+    </div><div class="stack">
+      <${Figures} answer=${answer} /><${NextMove} next=${answer.next_best_view} />
       <section class="card"><header><h2>How it came about</h2><span class="quiet">a row a step, newest below; choose one to go there</span></header>
         <${History} events=${events} current=${at} onPick=${onPick} label="The belief along the route after every step" /></section>
       <section class="card"><header><h2>Entropy and the chance to be lost</h2><span class="legend"><span><i class="swatch belief"></i>entropy, bits</span><span><i class="swatch move"></i>off the route, %</span></span></header>
@@ -128,9 +131,6 @@ function Live({ events, at, onPick }) {
           series=${[{ stroke: "blue", scale: "y" }, { stroke: "mark", scale: "lost", dash: [6, 4] }]}
           scales=${{ x: { time: false }, y: { range: (_, __, most) => [0, Math.max(1, most) * 1.05] }, lost: { range: [0, 100] } }}
           axes=${[{ label: "event", labelSize: 20, size: 36 }, {}, { scale: "lost", side: 1, grid: { show: false } }]} /></section>
-    </div><div class="stack">
-      <${Figures} answer=${answer} /><${NextMove} next=${answer.next_best_view} />
-      <${Places} answer=${answer} domain=${answer.domain} version=${answer.map_version} view=${view} isKept=${coverage.answer?.thumbnail_bytes > 0} />
     </div></div>`;
 }
 

@@ -79,8 +79,9 @@ function On({ name }) {
     </section>
     ${episode && html`<${Explained} answer=${answer} />`}
     <div class="below"></div><${Fault} problem=${problem} />
-    ${answer && html`<div class="columns below"><div class="stack"><${Believed} answer=${answer} route=${route} title=${episode ? `After ${answer.n_observations} view${answer.n_observations === 1 ? "" : "s"}` : "After this one view"} /></div>
-      <div class="stack"><${Figures} answer=${answer} /><${NextMove} next=${answer.next_best_view} /><${Places} answer=${answer} domain=${name} version=${answer.map_version ?? domain.answer?.map_version} view=${view} isKept=${coverage.answer?.thumbnail_bytes > 0} /></div></div>`}`;
+    ${answer && html`<div class="columns below"><div class="stack"><${Believed} answer=${answer} route=${route} title=${episode ? `After ${answer.n_observations} view${answer.n_observations === 1 ? "" : "s"}` : "After this one view"} />
+        <${Places} answer=${answer} domain=${name} version=${answer.map_version ?? domain.answer?.map_version} view=${view} isKept=${coverage.answer?.thumbnail_bytes > 0} /></div>
+      <div class="stack"><${Figures} answer=${answer} /><${NextMove} next=${answer.next_best_view} /></div></div>`}`;
 }
 
 // What has just happened, in the method's own order.
