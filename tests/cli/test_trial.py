@@ -48,6 +48,18 @@ class Parts(HTMLParser):
         return [attributes for name, attributes in self.parts if name == tag]
 
 
+def test_queries_are_shown_by_the_grey_levels_of_the_map(deepsimbad, pictures, tmp_path):
+    for name, gain in (("database", 16), ("queries", 4)):  # 12 bits, and the same camera at dusk
+        (tmp_path / name).mkdir()
+        for place in range(8):
+            image = cv2.imread(str(pictures / f"{place}.png")).astype(np.uint16)
+            cv2.imwrite(str(tmp_path / name / f"{place}.png"), image * (gain if place else 16))
+    shutil.copy(tmp_path / "database" / "0.png", tmp_path / "queries" / "0.png")
+    assert deepsimbad("try", "database", "queries#:1", *QUICK, "--out", "out").code == 0
+    kept = [np.load(next((tmp_path / "out").rglob(f"{role}*.npz")))["encodings"][0] for role in ("database", "queries")]
+    np.testing.assert_array_equal(*kept)
+
+
 def test_two_folders_give_figures_and_one_page_that_asks_for_nothing(deepsimbad, pictures, queries, tmp_path):
     ran = deepsimbad("try", pictures, queries, *QUICK, "--out", "out", "--json", "trial.json")
     assert (ran.code, ran.err) == (0, "")

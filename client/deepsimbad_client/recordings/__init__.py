@@ -27,6 +27,10 @@ Image = NDArray[np.uint8]  # [height, width, 3] BGR
 
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", ".pgm", ".ppm"}) | HEIC_SUFFIXES
 TURNS = {0: None, 90: cv2.ROTATE_90_CLOCKWISE, 180: cv2.ROTATE_180, 270: cv2.ROTATE_90_COUNTERCLOCKWISE}
+OTHER_SUFFIXES = frozenset(
+    {".gif", ".jp2", ".j2k", ".avif", ".jxl", ".exr", ".hdr", ".tga", ".pbm", ".raw", ".dng", ".cr2", ".nef", ".arw"}
+)
+"""Of images that are not read."""
 
 _N_PROBES, _N_SURE = 16, 3  # images that tell what all are; so many of 8 bits, and the others are too
 _MAX_PIXELS = 1 << 30  # the picture is the caller's own
@@ -71,7 +75,7 @@ class Recording:
     @property
     def left_out(self) -> dict[str, int]:
         """Reason -> how many frames are not in `frames`."""
-        return {reason: len(names) for reason, names in self.left_out_names.items()}
+        return counted(self.left_out_names)
 
     @property
     def n_whole(self) -> int:
@@ -123,6 +127,11 @@ class Recording:
 
 
 AnyRecording = TypeVar("AnyRecording", bound=Recording)
+
+
+def counted(names: Mapping[str, Sequence[str]]) -> dict[str, int]:
+    """Reason -> how many frames are left out for it."""
+    return {reason: len(frames) for reason, frames in names.items()}
 
 
 def finite_number(text: str) -> float | None:

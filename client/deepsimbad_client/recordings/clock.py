@@ -60,5 +60,5 @@ def _number(cell: str, where: str) -> Decimal | None:
     return Decimal(round((date if date.tzinfo else date.replace(tzinfo=UTC)).timestamp() * 1e6)) / 10**6
 
 
-UNKNOWN = frozenset({"", "-", "nan", "+nan", "-nan", "inf", "+inf", "-inf", "null", "none", "na", "n/a"})
+UNKNOWN = frozenset({"", "-", "nan", "+nan", "-nan", "inf", "+inf", "-inf", "null", "none", "na", "n/a", "#n/a", "--"})
 """What tables write where nothing is known."""

@@ -2,6 +2,8 @@
 
 import dataclasses
 import math
+import re
+from itertools import pairwise
 
 import numpy as np
 
@@ -10,6 +12,7 @@ from deepsimbad_client.recordings import Recording
 
 EARLY_SHARE = 0.02  # of a step, by which a frame may come before it is due
 FEWEST_OF_A_TURN, NEAR_START_M = 10, 1.0
+FEWEST_OF_A_KIND = 3
 LONGEST_PAUSE_S, SAME_PLACE_M = 3600.0, 10.0  # of one drive, unless the robot goes on where it stood
 
 
@@ -77,8 +80,30 @@ def turned_back(recording: Recording) -> Recording:
     return dataclasses.replace(recording, frames=frames, encodings=encodings)
 
 
+def _check_names(recording: Recording) -> None:
+    """Refuse frames placed evenly in the order of names that are of two kinds, each counted by itself."""
+    frames = recording.frames
+    metres = np.array([frame.position_m for frame in frames]) - frames[0].position_m
+    steps = np.array([frame.index for frame in frames]) - frames[0].index
+    if len(frames) < 2 or frames[0].x_m is not None or frames[0].timestamp_us is not None:
+        return
+    if not np.allclose(metres, steps * (metres[-1] / max(1, steps[-1]))):
+        return
+    kinds = [re.sub(r"[0-9]+", "0", frame.name) for frame in frames]
+    changes = np.flatnonzero([before != kind for before, kind in pairwise(kinds)]) + 1
+    ends = [0, *changes.tolist(), len(frames)]
+    if len(changes) and min(np.diff(ends)) >= FEWEST_OF_A_KIND and len(set(kinds)) == len(changes) + 1:
+        before, after = frames[ends[1] - 1], frames[ends[1]]
+        raise SourceError(
+            f"{recording.name}: {before.name} and {after.name} are names of two kinds: are these several drives? Name "
+            f"one of them by a slice (#:{after.index} or #{after.index}:), move them apart, or say in a positions.csv "
+            "where each image was taken"
+        )
+
+
 def check_one_drive(recording: Recording) -> None:
     """Refuse what was recorded in several goes, elsewhere each: the way between was not recorded, nor is its length."""
+    _check_names(recording)
     frames = [frame for frame in recording.frames if frame.timestamp_us is not None]
     times = [frame.timestamp_us for frame in frames if frame.timestamp_us is not None]
     if len(times) < 3:

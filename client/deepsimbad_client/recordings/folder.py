@@ -11,6 +11,7 @@ import numpy as np
 from deepsimbad_client.errors import SourceError
 from deepsimbad_client.recordings import (
     IMAGE_SUFFIXES,
+    OTHER_SUFFIXES,
     EncodedImage,
     Frame,
     Recording,
@@ -26,7 +27,7 @@ from deepsimbad_client.recordings.heic import HEIC_SUFFIXES, require_heic
 from deepsimbad_client.recordings.names import in_order, times_of
 from deepsimbad_client.recordings.nclt import TURNED_UPRIGHT, UPRIGHT_TURN, lies_on_its_side
 from deepsimbad_client.recordings.placing import UNPLACED, Placed, placed, placed_on
-from deepsimbad_client.recordings.plane import GPS_DEADBAND_M, utm
+from deepsimbad_client.recordings.plane import GPS_DEADBAND_M, utm, zone_remarks
 from deepsimbad_client.recordings.positions import POSITIONS_FILE, positions_file, read_positions
 
 
@@ -81,9 +82,9 @@ def read_folder(
     except OSError as error:
         raise SourceError(f"cannot read the folder {folder}: {error.strerror or error}") from error
     names = in_order([path.name for path in paths if path.suffix.lower() in IMAGE_SUFFIXES])
+    others = in_order([path.name for path in paths if path.suffix.lower() in OTHER_SUFFIXES])
     if not names:
-        hint = f"; for NCLT write nclt:{folder}" if (folder / "lb3").is_dir() else ""
-        raise SourceError(f"{folder} holds no images ({', '.join(sorted(IMAGE_SUFFIXES))}){hint}")
+        raise SourceError(f"{folder} holds no images ({', '.join(sorted(IMAGE_SUFFIXES))}){_hint(folder, others)}")
     if any(Path(name).suffix.lower() in HEIC_SUFFIXES for name in names):
         require_heic()
     told_us: Sequence[int | None] = times_of(names) or [None] * len(names)
@@ -104,10 +105,22 @@ def read_folder(
             f"{len(names)} images are taken {spacing_m:g} m apart: there is no {POSITIONS_FILE} and no track (.gpx, "
             ".nmea) beside them, and no EXIF among them says a place"
         )
+    if others:
+        result.left_out_names["of a format that is not read: convert to PNG"] = others
     recording = FolderRecording(
         folder.resolve().name, tuple(result.frames), result.left_out_names, remarks=result.remarks, folder=folder
     )
     return _prepared(recording, rotate)
+
+
+def _hint(folder: Path, others: Sequence[str]) -> str:
+    """What to do where a folder holds no images that are read."""
+    if (folder / "lb3").is_dir():
+        return f"; for NCLT write nclt:{folder}"
+    if others:
+        return f"; {others[0]} is of a format that is not read: convert it to PNG"
+    inner = (file.parent for file in sorted(folder.glob("*/*")) if file.suffix.lower() in IMAGE_SUFFIXES)
+    return next((f"; {path} does" for path in inner), "")
 
 
 def _prepared(recording: FolderRecording, rotate: int | None) -> FolderRecording:
@@ -150,12 +163,13 @@ def _by_exif(
     for at, name in enumerate(names):
         taken.append(read_exif(folder / name))
         on_progress((at + 1) / len(names))
-    x_m, y_m = utm(*np.array([(one.latitude, one.longitude) for one in taken], np.float64).T)
+    degrees = np.array([(one.latitude, one.longitude) for one in taken], np.float64).T
+    x_m, y_m = utm(*degrees)
     frames = []
     for name, one, told_us, x, y in zip(names, taken, times_us, x_m.tolist(), y_m.tolist(), strict=True):
         exif_us = None if one.time_us is None else one.time_us + time_offset_us
         place = (None, None) if math.isnan(x) else (x, y)
         frames.append(Frame(0, name, UNPLACED, exif_us if told_us is None else told_us, *place))
     result = placed(frames, str(folder), GPS_DEADBAND_M)
-    result.remarks.insert(0, "placed by the EXIF of the images")
+    result.remarks = ["placed by the EXIF of the images", *zone_remarks(degrees[1]), *result.remarks]
     return result

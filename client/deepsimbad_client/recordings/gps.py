@@ -16,7 +16,7 @@ from PIL import Image as Pictures
 from PIL import UnidentifiedImageError
 
 from deepsimbad_client.errors import SourceError
-from deepsimbad_client.recordings.plane import GPS_DEADBAND_M, utm
+from deepsimbad_client.recordings.plane import GPS_DEADBAND_M, utm, zone_remarks
 from deepsimbad_client.recordings.track import Track, track_of
 
 TRACK_SUFFIXES = (".gpx", ".nmea")
@@ -39,7 +39,8 @@ def read_track(path: Path) -> Track:
     track = track_of(time_us, *utm(degrees[:, 0], degrees[:, 1]), deadband_m=GPS_DEADBAND_M)
     if track is None:
         raise SourceError(f"{path}: fewer than two of its {len(fixes)} fixes with a time can be used")
-    return replace(track, n_skipped_rows=track.n_skipped_rows + len(rows) - len(fixes))
+    n_skipped_rows = track.n_skipped_rows + len(rows) - len(fixes)
+    return replace(track, n_skipped_rows=n_skipped_rows, remarks=zone_remarks(degrees[:, 1]))
 
 
 def _gpx(path: Path) -> Iterator[_Fix | None]:

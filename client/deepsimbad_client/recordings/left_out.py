@@ -19,11 +19,6 @@ class LeftOut:
         self._share = n_by_reader / max(1, recording.n_whole + n_by_reader)
         self._check()
 
-    @property
-    def counts(self) -> dict[str, int]:
-        """Reason -> how many."""
-        return {reason: len(names) for reason, names in self.names.items()}
-
     def add(self, reason: str, name: str) -> None:
         """One more frame is broken. Raises TooManyLeftOutError (more than a twentieth of the recording is left out)."""
         self.names.setdefault(reason, []).append(name)

@@ -112,6 +112,7 @@ def placed_on(
         ],
         remarks=remarks,
     )
+    result.remarks += track.remarks
     if track.n_skipped_rows:
         result.remarks.append(
             f"{track.n_skipped_rows} rows of {what} are not used (unreadable, without a place or a time, or where no "

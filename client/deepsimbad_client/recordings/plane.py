@@ -16,6 +16,19 @@ _ALPHA = (
 GPS_DEADBAND_M = 3.0  # A receiver's fix wanders by so much while it stands
 
 
+def zone_remarks(longitude: Reals) -> list[str]:
+    """What is to be said of places [n] in degrees that lie in several zones; NaN is none."""
+    zones = np.unique(np.floor(longitude[np.isfinite(longitude)] / 6)) % 60 + 31
+    if len(zones) < 2:
+        return []
+    median = np.floor(np.median(longitude[np.isfinite(longitude)]) / 6) % 60 + 31
+    numbers = ", ".join(f"{(zone - 1) % 60 + 1:.0f}" for zone in zones)
+    return [
+        f"it crosses UTM zones ({numbers}): x, y are metres of zone {(median - 1) % 60 + 1:.0f} all along, and another "
+        "drive's are comparable only where most of it lies in that zone too"
+    ]
+
+
 def utm(latitude: Reals, longitude: Reals) -> tuple[Reals, Reals]:
     """North and east [n] in metres of places [n] in degrees, all in the zone of their median; NaN stays NaN.
 

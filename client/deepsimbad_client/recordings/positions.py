@@ -20,6 +20,7 @@ import csv
 import dataclasses
 import math
 import re
+from codecs import BOM_UTF16_BE, BOM_UTF16_LE
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,7 +32,7 @@ from deepsimbad_client.recordings import Frame, finite_number
 from deepsimbad_client.recordings.clock import UNITS, UNKNOWN, times_us
 from deepsimbad_client.recordings.names import Finder
 from deepsimbad_client.recordings.placing import UNPLACED, Placed, placed_on
-from deepsimbad_client.recordings.plane import GPS_DEADBAND_M, utm
+from deepsimbad_client.recordings.plane import GPS_DEADBAND_M, utm, zone_remarks
 from deepsimbad_client.recordings.track import DEADBAND_M, track_of
 
 CLOCKS_APART_S = 0.5
@@ -91,7 +92,7 @@ class _Table:
         for row, cell in enumerate(self.cells(column) or [""] * len(self.lines)):
             values.append(finite_number(cell))
             if values[-1] is None and cell.lower() not in UNKNOWN:
-                raise SourceError(f"{self.where(row)}: {column} is {cell!r}, not a number")
+                raise SourceError(f"{self.where(row)}: {column} is {cell!r}, not a number such as 1234.5")
         return values
 
     def times_us(self) -> tuple[list[int | None], list[str]]:
@@ -124,6 +125,7 @@ def read_positions(path: Path, names: Sequence[str], name_times_us: Sequence[int
         degrees = [np.array(table.numbers(column), np.float64) for column in ("latitude", "longitude")]  # None: NaN
         plane = [[None if math.isnan(metres) else metres for metres in axis.tolist()] for axis in utm(*degrees)]
         deadband_m = GPS_DEADBAND_M
+        remarks += zone_remarks(degrees[1])
     places = zip(table.numbers("position_m"), *plane, table.numbers("heading_rad"), times, strict=True)
     rows = [
         Frame(row, "", UNPLACED if position_m is None else position_m, time_us, x_m, y_m, heading_rad)
@@ -232,7 +234,9 @@ def _read(path: Path) -> _Table:
 
 def _lines(path: Path) -> list[tuple[int, list[str]]]:
     try:
-        with path.open(encoding="utf-8-sig", newline="") as text:
+        with path.open("rb") as file:
+            encoding = "utf-16" if file.read(2) in {BOM_UTF16_LE, BOM_UTF16_BE} else "utf-8-sig"
+        with path.open(encoding=encoding, newline="") as text:
             first = text.readline()
             text.seek(0)
             delimiter = max(",;\t", key=first.count)
@@ -248,7 +252,9 @@ def _lines(path: Path) -> list[tuple[int, list[str]]]:
     except OSError as error:
         raise SourceError(f"cannot read {path}: {error.strerror or error}") from error
     except (UnicodeDecodeError, csv.Error) as error:
-        raise SourceError(f"{path} is not a csv text: {error}") from error
+        raise SourceError(f"{path} is not a csv text, save it as CSV in UTF-8: {error}") from error
+    if lines and any("\0" in cell for cell in lines[0][1]):
+        raise SourceError(f"{path} is not a csv text: save it as CSV in UTF-8")
     if not lines:
         raise SourceError(f"{path} is empty: remove it, or give a position for each image")
     return lines

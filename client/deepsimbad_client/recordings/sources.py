@@ -90,6 +90,8 @@ def open_source(
             f"{last.position_m:g} m ({last.name}), and a route's rise: --reverse takes the frames in the other order"
         )
     recording = thinned(recording, every_s, every_m)
+    if part is not None and (part.step or 1) < 0:
+        raise SourceError(f"{source}: a slice keeps the frames' order: --reverse takes them in the other one")
     recording = recording if part is None else recording.sliced(part)
     check_one_drive(recording)
     return recording
@@ -126,15 +128,13 @@ def split_slice(source: str) -> tuple[str, slice | None]:
     Raises SourceError (what follows the `#` is neither a slice nor a file's).
     """
     place, mark, ending = source.rpartition("#")
-    if not mark:
+    if not mark or Path(source.removeprefix(NCLT_PREFIX)).expanduser().exists():
         return source, None
     match = _SLICE.fullmatch(ending)
     if not match and _is_bag(source.partition("#")[0]):
         return source, None
     if match:
         return place, slice(*(None if number is None else int(number) for number in match.groups()))
-    if Path(source.removeprefix(NCLT_PREFIX)).expanduser().exists():
-        return source, None
     raise SourceError(f"{source}: a slice is #START:STOP or #START:STOP:STEP in whole frames, not #{ending}")
 
 

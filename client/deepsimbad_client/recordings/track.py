@@ -54,6 +54,7 @@ class Track:
     position_m: Reals
     n_skipped_rows: int = 0  # that held NaN, too few values, no numbers, or a place that no robot can have been at
     max_gap_s: float = MAX_GAP_S
+    remarks: Sequence[str] = ()
 
     def at(self, time_us: Times) -> Poses:
         """Interpolate at [n] times, in any order: x, y and position linearly, heading the short way round."""

@@ -251,6 +251,7 @@ class _Triplet:
         evaluator = make_evaluator(config, settings.compute())
         opened = [open_source(asked[role], spacing_m=asked["spacing_m"]) for role in _ROLES]
         fitting_number(asked["n_landmarks"], len(opened[0].frames), _N_LANDMARKS)
+        opened[2] = opened[2].shown_by(opened[1].grey_levels)  # as live views are
         recordings = []
         for stage, recording in zip(_READING_STAGES, opened, strict=True):
             progress.stage(stage)

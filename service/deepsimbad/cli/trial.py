@@ -73,6 +73,7 @@ def try_(
     measure = make_evaluator(evaluator, settings.compute())
     sources = {"database": database, "queries": queries} | ({} if landmarks is None else {"landmarks": landmarks})
     recordings = {role: opened(source, allow_missing, **reading) for role, source in sources.items()}
+    recordings["queries"] = recordings["queries"].shown_by(recordings["database"].grey_levels)  # as live views are
     names = {role: recording.name for role, recording in recordings.items()}
     tolerance_m = usual_tolerance_m(*recordings.values()) if tolerance is None else tolerance
     out = out or Path(re.sub(r"[^\w.-]+", "_", f"try-{names['database']}-{names['queries']}"))
@@ -82,7 +83,13 @@ def try_(
         with progress_bar(stages | TRIAL_STAGES | {"pictures": 2.0}, "try") as progress:
             for role, recording in recordings.items():
                 progress.stage(f"read {role}")
-                made_of = {"source": sources[role], "weights": measure.weights_sha256, **evaluator.as_dict(), **reading}
+                made_of = {
+                    "source": sources[role],
+                    "levels": recording.grey_levels,
+                    "weights": measure.weights_sha256,
+                    **evaluator.as_dict(),
+                    **reading,
+                }
                 with kept_encodings(out, role, **made_of) as kept:
                     encoded[role] = encode_recording(
                         *(recording, measure, settings.max_pixels, progress.update),

@@ -31,7 +31,7 @@ from deepsimbad.evaluators.space import seen
 from deepsimbad.jobs.fitting import Fitter
 from deepsimbad_client.errors import BrokenFrameError
 from deepsimbad_client.http import text_of
-from deepsimbad_client.recordings import Frame, Recording
+from deepsimbad_client.recordings import Frame, Recording, counted
 from deepsimbad_client.recordings.left_out import LeftOut
 from deepsimbad_client.recordings.told import as_taken
 
@@ -51,7 +51,7 @@ class EncodedRecording:
     @property
     def left_out(self) -> dict[str, int]:
         """Reason -> how many frames could not be used."""
-        return {reason: len(names) for reason, names in self.left_out_names.items()}
+        return counted(self.left_out_names)
 
 
 def encode_recording(
@@ -86,7 +86,7 @@ def encode_recording(
         )
         frames, weights_sha256 = [frames[place] for place in places], evaluator.weights_sha256
     if not frames:
-        raise InvalidSourceError(f"{recording.name} has no frame that can be used: {left_out.counts}")
+        raise InvalidSourceError(f"{recording.name} has no frame that can be used: {counted(left_out.names)}")
 
     times_us = [UNKNOWN_TIMESTAMP if frame.timestamp_us is None else frame.timestamp_us for frame in frames]
     drive = Drive(

@@ -63,4 +63,15 @@ def test_what_is_left_out_is_measured_against_all_frames_not_those_taken():
     recording = dataclasses.replace(loop(95), left_out_names={"lost": list("abc")})
     few = thinned(recording, None, 10)
     assert len(few.frames) == 10
-    assert LeftOut(few, allow_missing=False).counts == {"lost": 3}
+    assert LeftOut(few, allow_missing=False).names == {"lost": list("abc")}
+
+
+def test_names_of_two_kinds_placed_by_their_order_are_two_drives():
+    names = [f"{drive}_{k}.png" for drive in ("summer", "winter") for k in range(30)]
+    both = Recording("r", [Frame(k, name, 0.5 * k) for k, name in enumerate(names)])
+    with pytest.raises(SourceError, match=r"summer_29\.png and winter_0\.png.*#:30 or #30:"):
+        check_one_drive(both)
+    check_one_drive(both.sliced(slice(30, None)))
+    check_one_drive(Recording("r", [Frame(k, f"part{k // 30}_{k % 30}.png", 0.5 * k) for k in range(60)]))
+    placed = [Frame(k, name, k + 0.1 * (k % 3)) for k, name in enumerate(names)]
+    check_one_drive(Recording("r", placed))

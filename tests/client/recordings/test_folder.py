@@ -245,6 +245,31 @@ def test_a_broken_image_is_named_when_it_is_read(folder):
     recording.image(recording.frames[2], None)
 
 
+def test_images_of_a_format_that_is_not_read_are_left_out_by_name(folder):
+    (folder / "12.gif").write_bytes(b"GIF89a")
+    (left_out,) = open_source(str(folder)).left_out_names.values()
+    assert left_out == ["12.gif"]
+    for path in folder.glob("*.png"):
+        path.unlink()
+    with pytest.raises(SourceError, match=r"12\.gif is of a format that is not read: convert it to PNG"):
+        open_source(str(folder))
+    (folder / "12.gif").rename(folder / "notes")
+    (folder / "inner").mkdir()
+    (folder / "inner" / "1.png").write_bytes(b"")
+    with pytest.raises(SourceError, match=r"holds no images.*; \S*inner does"):
+        open_source(str(folder))
+
+
+def test_what_spreadsheets_write_is_read_or_how_to_save_it_is_said(folder):
+    table = folder / "positions.csv"
+    table.write_text("position_m\n0\n1\n2\n3\n", encoding="utf-16")
+    assert [at for _, at in placed(folder)] == [0, 1, 2, 3]
+    for body in ("position_m\n0\n".encode("utf-16-le"), "name,position_m\nstraße,0\n".encode("latin-1")):
+        table.write_bytes(body)
+        with pytest.raises(SourceError, match="save it as CSV in UTF-8"):
+            open_source(str(folder))
+
+
 def test_a_folder_without_images_says_what_it_looked_for(tmp_path):
     with pytest.raises(SourceError, match=r"holds no images \(\.bmp, \.heic"):
         open_source(str(tmp_path))

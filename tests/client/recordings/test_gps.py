@@ -187,3 +187,10 @@ def test_the_zone_is_that_of_most_places():
     x_m, y_m = utm(np.full(5, 51.0), np.array([11.9999, 12.0001, 12.0002, 12.0003, 12.0004]))
     assert y_m[0] < y_m[1] < 300_000, "all in zone 33"
     assert np.ptp(x_m) < 5
+
+
+def test_a_drive_across_a_zone_is_told(tmp_path):
+    source = pictures(tmp_path / "drive", ["0.png", "1.png", "2.png"])
+    (tmp_path / "drive" / "positions.csv").write_text("lat,lon\n51,11.9999\n51,12.0001\n51,12.0002\n")
+    (remark,) = open_source(source).remarks
+    assert "crosses UTM zones (32, 33): x, y are metres of zone 33" in remark

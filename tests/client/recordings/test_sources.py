@@ -45,6 +45,9 @@ def test_sources_end_to_end_with_a_slice(tmp_path):
     np.save(tmp_path / "run#1.npy", np.ones((3, 2)))
     assert len(open_source(f"{tmp_path}/run#1.npy").frames) == 3, "a hash in a name does no harm"
     assert len(open_source(f"{tmp_path}/run#1.npy#1:").frames) == 2
+    (tmp_path / "run#1:3").mkdir()
+    (tmp_path / "run#1:3" / "1.png").write_bytes(b"")
+    assert open_source(f"{tmp_path}/run#1:3").frames[0].name == "1.png"
 
 
 @pytest.mark.parametrize(
@@ -54,6 +57,7 @@ def test_sources_end_to_end_with_a_slice(tmp_path):
         ("", "no recording at ''"),
         ("/no/such/place", "no recording at '/no/such/place'"),
         ("e.npy#::0", "step 0"),
+        ("e.npy#::-1", "keeps the frames' order: --reverse"),
         ("e.npy#3:3", "#3:3 leaves none of the 3 frames"),
         ("e.txt", r"a \.npy or \.csv"),
     ],
