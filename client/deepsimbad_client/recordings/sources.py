@@ -92,7 +92,7 @@ def open_source(
     recording = thinned(recording, every_s, every_m)
     if part is not None and (part.step or 1) < 0:
         raise SourceError(
-            f"{source}: a slice of a negative step takes the frames backwards: --reverse does, and turns their positions too"
+            f"{source}: a slice of a negative step takes the frames backwards: --reverse does, with their positions"
         )
     recording = recording if part is None else recording.sliced(part)
     check_one_drive(recording)
