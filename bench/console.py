@@ -31,8 +31,8 @@ def lines() -> Iterator[str]:
         sys.exit("no Chromium is installed: apt-get install chromium")
     yield from ("# The console before a long route", "", "Made by `python -m bench.console`.", "", machine(), "")
     yield f"A domain of {NCLT_IMAGES:,} map images and a session on it; Chromium without a graphics card, 1440 x 900."
-    yield "The service, the robot and the browser share the machine's cores, and times are by the wall: asked are the first"
-    yield "paint and the script alone. As many steps as the page keeps (2,000) were there before."
+    yield "The service, the robot and the browser share the machine's cores, and times are by the wall: asked are the"
+    yield "first paint and the script alone. As many steps as the page keeps (2,000) were there before."
     yield ""
     turn = np.arange(NCLT_IMAGES) / 4000
     plane = {"x_m": 400 * np.cos(turn) + 60 * np.cos(9 * turn), "y_m": 400 * np.sin(turn) + 60 * np.sin(9 * turn)}
