@@ -112,20 +112,23 @@ def upload(
 
 
 @click.command()
-@click.argument("images", nargs=-1, required=True, metavar="IMAGE...")
-@domain_option
+@click.argument("words", nargs=-1, required=True, metavar="DOMAIN IMAGE...")
+@click.option("--domain", metavar="NAME", help="In place of the first word.")
 @click.option("--shortlist", type=click.IntRange(min=1), default=10, show_default=True)
 @rotate_option
 @json_flag
 @serving
 def localize(
-    client: Client, images: tuple[str, ...], domain: str, shortlist: int, rotate: int | None, json_output: bool
+    client: Client, words: tuple[str, ...], domain: str | None, shortlist: int, rotate: int | None, json_output: bool
 ) -> None:
     """Say where images were probably taken.
 
     IMAGE is a file, or a SOURCE such as nclt:ROOT/DATE#40:41 or a folder; each image is placed on its own. Where the
     domain takes them it may be a .txt that says what is seen, or a .json of {"objects": [...]}.
     """
+    domain, images = (words[0], words[1:]) if domain is None else (domain, words)
+    if not images:
+        raise click.UsageError("give DOMAIN and an IMAGE, or several")
     described = client.domain(domain)
     shortlist = min(shortlist, described.n_map_images or shortlist)
     views = _views(images, described, rotate)

@@ -94,7 +94,8 @@ def test_a_view_has_one_answer_by_every_route(tmp_path, capsys):
         on_board = client.on_board("yard")
         by_ranks = [client.localize("yard", ranked=on_board.ranks(path, m=8)) for path in paths]
         capsys.readouterr()
-        assert run(["localize", *paths, "--domain", "yard", "--server", url, "--json"]) == 0
+        assert run(["localize", "yard", *paths, "--server", url, "--json"]) == 0
+        assert run(["localize", "yard", "--server", url]) == 2
         by_command = json.loads(capsys.readouterr().out)
         assert run(["localize", str(looks), "--domain", "yard", "--server", url, "--json"]) == 0
         by_folder = json.loads(capsys.readouterr().out)
