@@ -168,6 +168,11 @@ def _measure(result: Placed, time_us: Times | None) -> None:
     usable = on_track(x_m, y_m, time_us)
     _without_spikes(result, usable, x_m, y_m)
     along_m = arc_length_m(x_m[usable], y_m[usable], None if time_us is None else time_us[usable], result.deadband_m)
+    if len(along_m) > 2 and along_m[-1] < DEADBAND_M:
+        result.remarks.append(
+            f"all frames lie within {along_m[-1]:.2g} m: the robot stood, or x_m, y_m are no metres (degrees go into "
+            "columns latitude, longitude)"
+        )
     result.frames = [
         dataclasses.replace(frame, position_m=position_m)
         for frame, position_m in zip(result.frames, along_m.tolist(), strict=True)

@@ -285,6 +285,12 @@ def test_a_number_that_is_no_time_is_named(folder, time):
         open_source(str(folder))
 
 
+def test_degrees_in_the_columns_of_metres_are_told(folder):
+    positions(folder, "x_m,y_m", *(f"{48.1 + k * 1e-5},11.5" for k in range(4)))
+    (remark,) = open_source(str(folder)).remarks
+    assert "x_m, y_m are no metres (degrees go into columns latitude, longitude)" in remark
+
+
 def test_decimal_commas_between_semicolons_are_read(folder):
     (folder / "positions.csv").write_bytes(b"\xef\xbb\xbf" + b"position_m\r\n0\r\n1\r\n2\r\n3\r\n")
     assert [at for _, at in placed(folder)] == [0, 1, 2, 3]
