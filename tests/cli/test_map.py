@@ -84,6 +84,16 @@ def test_pictures_are_kept_where_the_domain_says_so_and_go_into_backups(deepsimb
             assert np.abs(cv2.resize(whole, (128, 96)).astype(int) - shown).mean() < 12
 
 
+def test_pictures_under_a_lens_cap_are_counted(deepsimbad, pictures, tmp_path):
+    (tmp_path / "capped").mkdir()
+    for place in range(12):
+        picture = cv2.imread(str(pictures / f"{place}.png"))
+        cv2.imwrite(str(tmp_path / "capped" / f"{place}.png"), picture * (not 3 <= place < 6))
+    ran = deepsimbad("map", "route", "--training", "capped", "--evaluator", "feature_l2:gradient_grid")
+    assert ran.code == 0, ran.err
+    assert "warning: 3 of 12 pictures of the map show nothing" in ran.err
+
+
 def test_every_option_of_a_map_is_heeded(deepsimbad, drives, tmp_path):
     options = ("--n-landmarks", 12, "--list-length", 3, "--relevance", "rrf", "--training-episodes", 7, "--seed", 5)
     given = (*options, "--spacing-m", 2.5, "--closed", "--actions-m", "-2.5,0,5", "--data-dir", "here")

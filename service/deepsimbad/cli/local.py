@@ -172,6 +172,8 @@ def map_(
     metrics = result["metrics"]
     size = f"{metrics['n_map_images']} images, {metrics['n_landmarks']} landmarks"
     click.echo(f"map {result['map_version']} of {domain} is active: {size}")
+    for warning in metrics["warnings"]:
+        click.echo(f"warning: {warning}", err=True)
     season = metrics["second_season"]
     if season is not None and season["significance"] is not None and not season["accepted"]:
         click.echo(f"it learnt nothing of a second season: {season['why']}", err=True)

@@ -299,7 +299,7 @@ class _Remap:
         return seal_version(self.catalog, self.domain, map_, record_config, metrics, progress.update, job_id)
 
     def _warnings(self, inputs: _Inputs) -> list[str]:
-        """What a person should know of the drives, in sentences: pictures of two shapes or cameras are not alike."""
+        """What a person should know of the drives, in sentences: pictures not alike, or of nothing."""
         own, theirs = inputs.training.camera, f"those of traverse {self.config.training_traverse}"
         pairs: list[tuple[Drive | None, tuple[Camera | None, ...], str]]
         pairs = [(drive, (own,), theirs) for drive in (inputs.candidates, inputs.second, inputs.check)]
@@ -311,6 +311,9 @@ class _Remap:
                 why = drive.camera.unlike(filter(None, cameras), whose)
                 if why is not None:
                     warnings[f"the pictures of traverse {drive.name} are not like {whose}: {why}"] = None
+        n_frames, n_nothing = inputs.training.n_frames, int(inputs.training.shows_nothing.sum())
+        if n_nothing:
+            warnings[f"{n_nothing} of {n_frames} pictures of the map show nothing: one grey, noise or the dark"] = None
         return list(warnings)
 
     def _read(self) -> _Inputs:
