@@ -47,7 +47,8 @@ def summarise(route: Route, mass: NDArray[np.float64], n_top: int, off_route: fl
     top = shortlist(mass, n_top)
     mean_m, std_m = _moments(route, mass)
     edges_m, bins = route.histogram
-    entropy_bits, least = _entropy_and_least(mass, np.log2(np.maximum(mass, _NOTHING)), _CREDIBLE_SHARE)
+    bits, histogram = np.log2(np.maximum(mass, _NOTHING)), np.zeros(edges_m.size - 1)
+    entropy_bits, least = _entropy_and_least(mass, bits, _CREDIBLE_SHARE, bins, histogram)
     return BeliefSummary(
         mean_m=mean_m,
         mode_m=float(route.position_m[top[0]]),
@@ -57,7 +58,7 @@ def summarise(route: Route, mass: NDArray[np.float64], n_top: int, off_route: fl
         off_route=off_route,
         near_mode=near_mode(route, mass, int(top[0])) * (1 - off_route),
         histogram_edges_m=edges_m,
-        histogram_mass=np.asarray(np.bincount(bins, mass, edges_m.size - 1), np.float64),
+        histogram_mass=histogram,
         top=top,
         top_mass=mass[top],
     )
@@ -94,8 +95,14 @@ def _moments(route: Route, mass: NDArray[np.float64]) -> tuple[float, float]:
 
 
 @njit(cache=True, nogil=True)
-def _entropy_and_least(mass: NDArray[np.float64], bits: NDArray[np.float64], share: float) -> tuple[float, float]:
-    """Entropy in bits, and the least mass in the smallest set of images that holds a share.
+def _entropy_and_least(
+    mass: NDArray[np.float64],
+    bits: NDArray[np.float64],
+    share: float,
+    bins: NDArray[np.int64],
+    histogram: NDArray[np.float64],
+) -> tuple[float, float]:
+    """Entropy in bits, and the least mass in the smallest set of images that holds a share; adds to the histogram.
 
     Not all are sorted: they are summed by size, 16 classes an octave, and the class where the share is reached is.
     """
@@ -103,6 +110,7 @@ def _entropy_and_least(mass: NDArray[np.float64], bits: NDArray[np.float64], sha
     greatest, entropy = bits.max(), 0.0
     for i in range(mass.size):
         entropy -= mass[i] * bits[i]
+        histogram[bins[i]] += mass[i]
         held[min(int((greatest - bits[i]) * _PARTS), held.size - 1)] += mass[i]
     total, last = 0.0, 0
     while last < held.size - 1 and total + held[last] < share * (1 - 1e-12):
