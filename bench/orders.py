@@ -20,20 +20,21 @@ import numpy as np
 from bench.common import machine, markdown
 
 Documents = Mapping[str, dict[str, Any]]  # by landmarks-map-test
-READY = ("--evaluator", "feature_l2:none")
+READY = ("--evaluator", "feature_l2:none")  # of files of encodings
 
 
-def measured(part: str, drives: list[Path], folder: Path, options: list[str]) -> dict[str, dict[str, Any]]:
+def measured(part: str, drives: list[str], folder: Path, options: list[str]) -> dict[str, dict[str, Any]]:
     """What the experiment prints of every order."""
     folder.mkdir(parents=True, exist_ok=True)
     documents = {}
     for landmarks, training, test in itertools.permutations(drives):
-        name = "-".join(drive.stem for drive in (landmarks, training, test))
-        path = folder / f"{part}-{name}.json"
+        name = " ".join(Path(drive).stem for drive in (landmarks, training, test))
+        path = folder / f"{part}-{name.replace(' ', '-')}.json"
         if not path.exists():
-            given = ["--landmarks", landmarks, "--training", training, "--test", test, *READY]
-            given += [option.replace("MAP", str(training)) for option in options]
-            command = [sys.executable, "-m", "deepsimbad", "experiment", part, *map(str, given), "--json", str(path)]
+            given = ["--landmarks", landmarks, "--training", training, "--test", test]
+            given += READY if test.endswith(".npy") else ()
+            given += [option.replace("MAP", training) for option in options]
+            command = [sys.executable, "-m", "deepsimbad", "experiment", part, *given, "--json", str(path)]
             subprocess.run(command, check=True, stdout=subprocess.DEVNULL)  # noqa: S603 - our own command
         documents[name] = json.loads(path.read_text(encoding="utf-8"))
         print(f"{len(documents)} of 6: {name}", file=sys.stderr)
@@ -80,11 +81,16 @@ def nbv_lines(documents: Documents) -> Iterator[str]:
     ]
     yield from markdown(["planner", "views", "metres", "sure and wrong, %", "ANR, %", "ANR as in the paper, %"], rows)
     yield ""
-    rows = []
+    rows, found = [], []
     for order, document in documents.items():
         best, default, views = document["best_constant"], document["default"], document["views_to_confident"]
         low, high = document["views_difference_95"][f"{default} - {best}"]
         rows.append([order, best, f"{views[best]:.2f}", f"{views[default]:.2f}", f"{low:+.2f} .. {high:+.2f}"])
+        found.append((views[best], views[default], (high - low) / 2))
+    taken, taken_by_default, halves = np.array(found).T
+    apart, half = float((taken_by_default - taken).mean()), float(np.sqrt(np.square(halves).sum()) / len(halves))
+    together = f"{apart - half:+.2f} .. {apart + half:+.2f}"
+    rows.append(["all, as if independent", "", f"{taken.mean():.2f}", f"{taken_by_default.mean():.2f}", together])
     yield from markdown(["order", "best constant", "views it takes", "the default", "difference, 95 %"], rows)
 
 
@@ -129,7 +135,7 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     lines = {"vpr": vpr_lines, "nbv": nbv_lines, "calibration": calibration_lines}
     parser.add_argument("part", choices=lines)
-    parser.add_argument("drives", type=Path, nargs=3)
+    parser.add_argument("drives", nargs=3)
     parser.add_argument("--keep", type=Path, required=True, metavar="FOLDER")
     own, _, passed_on = " ".join(sys.argv[1:]).partition(" -- ")
     arguments = parser.parse_args(own.split())
