@@ -1,7 +1,8 @@
 """Augmented views of a picture: what another day, another light or a robot a little aside would show of the place.
 
 No change of geometry is larger than what a robot sees within a metre or two; light, contrast and colour change as far
-as seasons do. The same seed gives the same views.
+as seasons do. The same seed gives the same views. The first half of them is moved and not relit, so that what is learnt
+from these can be judged on the others: with one season known, another light has to stand for the season to come.
 """
 
 import cv2
@@ -9,7 +10,7 @@ import numpy as np
 
 from deepsimbad.evaluators.base import Image
 
-VIEWS_A_LANDMARK = 8
+VIEWS_A_LANDMARK = 8  # the first half only moved, the second relit too
 _LONGEST_SIDE = 512  # more pixels than any extractor looks at
 _LEAST_ZOOM = 0.8  # share of the picture's sides that a crop keeps
 _TURN_DEG = 3.0
@@ -25,7 +26,8 @@ def augmented(image: Image, seed: int, n_views: int = VIEWS_A_LANDMARK) -> list[
     factor = min(1.0, _LONGEST_SIDE / max(height, width))
     size = max(1, round(width * factor)), max(1, round(height * factor))
     small = image if factor == 1.0 else np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
-    return [_relit(_moved(small, rng), rng) for _ in range(n_views)]
+    moved = [_moved(small, rng) for _ in range(n_views)]
+    return [*moved[: n_views // 2], *(_relit(each, rng) for each in moved[n_views // 2 :])]
 
 
 def _moved(image: Image, rng: np.random.Generator) -> Image:

@@ -15,7 +15,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from deepsimbad.evaluators.base import Fitted, LandmarkModel, Lesson
-from deepsimbad.evaluators.lessons import Split, UnitLesson, judged
+from deepsimbad.evaluators.lessons import Split, UnitLesson, Verdict, no_better
 from deepsimbad.evaluators.trunk import Axes, Trunk
 
 _BOTTLENECK = 4
@@ -32,7 +32,7 @@ class Autoencoder(Trunk):
     kind = "autoencoder"
     axes: ClassVar[Axes] = {
         "usual": ("two", "d"), "projection": ("d", "k"), "landmarks": ("r", "k"), "into": ("r", "b", "k"),
-        "bias": ("r", "b"), "out": ("r", "b", "k"), "deviation": ("r",),
+        "bias": ("r", "b"), "out": ("r", "b", "k"), "deviation": ("r",), "beside": ("one",),
     }  # fmt: skip
 
     def fit(self, lesson: Lesson) -> Fitted:
@@ -41,19 +41,29 @@ class Autoencoder(Trunk):
         arrays, units = self.unit_lesson(lesson)
         split = Split.of(units, lesson.seed)
         every = np.arange(len(units.queries))
-        # What another season shows of some stretches; of one season, every fourth query: a landmark keeps its views.
-        unseen = split.test[split.test < units.n_second] if units.n_second else every[::4]
-        part, _ = _train(units, np.setdiff1d(every, unseen), lesson, 0.0)
-        scores, warnings = judged(self.kind, units, unseen, lambda x: _deviations(x, part))
-        trained, curve = _train(units, every, lesson, 0.5)
+        # What another season shows of some stretches; of one season, relit views: a landmark keeps its others.
+        unseen = split.test if units.has_second else np.flatnonzero(units.is_judge)[:: 4 if units.is_judge.all() else 1]
+        part, curve = _train(units, np.setdiff1d(every, unseen), lesson, 0.0)
+        verdict = Verdict.of(self.kind, units, unseen, lambda x: _deviations(x, part))
+        # A model without a landmark's second season says little of one that has it: there it warns, and stays.
+        is_l2 = not units.has_second and not verdict.is_better
+        trained, curve = (_plain(units), curve) if is_l2 else _train(units, every, lesson, 0.5)
         lesson.on_progress(1.0)
+        warnings: tuple[str, ...] = (no_better(self.kind, verdict),) if is_l2 else ()
+        if not is_l2 and not verdict.is_better:
+            warnings = (
+                f"{self.kind}_no_better: {verdict.shown}, lacking these pairs, which the map's has: measure it beside "
+                "feature_l2, which costs less",
+            )
         arrays |= {f"{self.kind}_{name}": array for name, array in trained.items()}
+        arrays[f"{self.kind}_beside"] = np.zeros(1, np.float32) if is_l2 else self.beside(lesson, arrays)
         n_bytes = sum(array[0].size for array in trained.values()) * 2
         metrics = {
             "n_dissimilarities": 2 * len(units.landmarks) * (_EPOCHS * _SAMPLES + min(len(units.own), _MOST_SCENES)),
             "bytes_per_landmark": n_bytes,
             "curve": curve,
-            **scores,
+            **verdict.scores,
+            "is_l2": is_l2,
             "seed": lesson.seed,
             "seconds": time.monotonic() - began,
         }
@@ -113,6 +123,19 @@ def _views(units: UnitLesson, queries: NDArray[np.int64], rng: np.random.Generat
         every = np.concatenate([units.own[frames], units.queries[seen]])[rng.permutation(frames.size + seen.size)]
         views[row] = every[np.arange(_SAMPLES) % len(every)]
     return views
+
+
+def _plain(units: UnitLesson) -> dict[str, NDArray[np.float32]]:
+    """The model that restores nothing: squared L2."""
+    p = units.prototypes.astype(np.float16).astype(np.float32)
+    nothing = np.zeros((len(p), 1, p.shape[1]), np.float32)
+    return {
+        "landmarks": p,
+        "into": nothing,
+        "bias": np.zeros((len(p), 1), np.float32),
+        "out": nothing,
+        "deviation": np.ones(len(p), np.float32),
+    }
 
 
 def _train(

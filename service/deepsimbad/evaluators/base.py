@@ -54,7 +54,8 @@ class Lesson:
     other: NDArray[np.float32] | None = None  # [n, d] of another drive of the same route; None: none is known
     # [k, 2] (frame, the other drive's frame) that saw one place; empty where there is no other
     places: NDArray[np.int64] = field(default_factory=lambda: np.empty((0, 2), np.int64))
-    views: NDArray[np.float32] | None = None  # [r, a, d] of augmented views of every landmark; None: no images
+    # [r, a, d] of augmented views of every landmark, the second half relit; None: no images
+    views: NDArray[np.float32] | None = None
     seed: int = 0  # of everything random
     on_progress: Callable[[float], None] = lambda _: None  # takes the share done, 0..1; may raise CancelledError
 

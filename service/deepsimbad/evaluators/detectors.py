@@ -34,9 +34,10 @@ class Detector:
         try:
             import torch
             from torchvision.models import detection
-        except ImportError as error:
+        except (ImportError, RuntimeError) as error:  # RuntimeError: torchvision of another PyTorch than this one
             raise MissingPackageError(
-                f"a package that {self._name} needs cannot be imported: {error}: pip install 'deep-simbad[detect]'"
+                f"a package that {self._name} needs cannot be imported, or is of another PyTorch: {error}: pip install "
+                "'deep-simbad[detect]'"
             ) from error
         if not self._file.is_file():
             raise MissingWeightsError(

@@ -1,14 +1,18 @@
 """What fitted evaluators of images learn from, in unit vectors, and how a fitted dissimilarity is judged.
 
-It is judged on places along the route that training did not see, beside plain L2 of the same unit vectors.
+It is judged on places along the route that training did not see, beside plain L2 of the same unit vectors: on views of
+the second season, or where one alone is known on relit views, having learnt from views that were moved: another light,
+which training did not see, stands for the season to come.
 """
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
+
+from deepsimbad.core.metrics import mean_interval
 
 _BLOCKS, _VALIDATION, _TEST = 10, (2, 7), (4, 9)  # neighbouring frames are alike, so whole stretches are held out
 _MOST_SCORED = 256  # queries
@@ -26,9 +30,15 @@ class UnitLesson:
     queries: NDArray[np.float32]  # [q, k] views whose place is known, as they would be seen live
     true: NDArray[np.int64]  # [q] which of `own` sees that place
     weight: NDArray[np.float32]  # [q] what a query counts, so that many augmented views do not outweigh a second season
-    n_second: int  # of the queries, how many are another season's, which come first
+    is_judge: NDArray[np.bool_]  # [q] views that alone tell how good a model is: another season's, or else relit ones
+    has_second: bool  # whether another season is known
     position_m: NDArray[np.float64]  # [m]
     step_m: float  # how far neighbouring frames are apart, usually
+
+    @property
+    def is_lesson(self) -> NDArray[np.bool_]:
+        """[q] views that may be learnt from: all, but of one season none that judges, where there are others."""
+        return np.full(len(self.queries), True) if self.has_second or self.is_judge.all() else ~self.is_judge
 
     @property
     def near_m(self) -> float:
@@ -61,10 +71,10 @@ class Split:
         block = np.arange(m) * _BLOCKS // m
         of_query = block[units.true]
         validation, test = (
-            np.sort(rng.permutation(np.flatnonzero(np.isin(of_query, blocks)))[:_MOST_SCORED])
+            np.sort(rng.permutation(np.flatnonzero(np.isin(of_query, blocks) & units.is_judge))[:_MOST_SCORED])
             for blocks in (_VALIDATION, _TEST)
         )
-        train = np.flatnonzero(~np.isin(of_query, (*_VALIDATION, *_TEST)))
+        train = np.flatnonzero(~np.isin(of_query, (*_VALIDATION, *_TEST)) & units.is_lesson)
         return cls(train, validation, test, np.flatnonzero(~np.isin(block, _TEST)))
 
 
@@ -74,7 +84,7 @@ class PairScores:
 
     anr: float  # %: of the others, how many come before the best-placed landmark of the place
     auc: float  # chance that a pair of one place is nearer than a pair of two
-    n_queries: int  # whose place has a landmark
+    ranks: NDArray[np.float64]  # [queries whose place has a landmark] %, whose mean is `anr`
 
     @classmethod
     def of(cls, units: UnitLesson, rows: NDArray[np.int64], measure: Measure) -> Self:
@@ -82,18 +92,22 @@ class PairScores:
         near = units.is_near(units.true[rows][:, np.newaxis], units.landmarks)
         asked = near.any(axis=1) & ~near.all(axis=1)
         if not asked.any():
-            return cls(float("nan"), float("nan"), 0)
+            return cls(float("nan"), float("nan"), np.empty(0))
         near, apart = near[asked], measure(units.queries[rows[asked]])
         best = np.where(near, apart, np.inf).min(axis=1, keepdims=True)
         before = ((apart < best) & ~near).sum(axis=1) + 0.5 * ((apart == best) & ~near).sum(axis=1)
         far = np.sort(apart[~near])
         places = np.searchsorted(far, apart[near], "left") + np.searchsorted(far, apart[near], "right")
-        auc = 1 - float(places.mean()) / (2 * far.size)
-        return cls(100 * float((before / (~near).sum(axis=1)).mean()), auc, int(asked.sum()))
+        ranks = 100 * before / (~near).sum(axis=1)
+        return cls(float(ranks.mean()), 1 - float(places.mean()) / (2 * far.size), ranks)
 
     def as_dict(self) -> dict[str, Any]:
         """The JSON form; null where nothing was scored."""
-        return {name: value if np.isfinite(value) else None for name, value in asdict(self).items()}
+        figures = {"anr": self.anr, "auc": self.auc}
+        return {
+            **{name: value if np.isfinite(value) else None for name, value in figures.items()},
+            "n_queries": self.ranks.size,
+        }
 
 
 def squared_l2(x: NDArray[np.float32], p: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -101,17 +115,30 @@ def squared_l2(x: NDArray[np.float32], p: NDArray[np.float32]) -> NDArray[np.flo
     return np.asarray(np.clip(2 - 2 * (x @ p.T), 0, 4), np.float32)
 
 
-def judged(
-    kind: str, units: UnitLesson, rows: NDArray[np.int64], measure: Measure
-) -> tuple[dict[str, Any], tuple[str, ...]]:
-    """Scores on queries that training did not see beside plain L2's, for metrics; and a warning if no better."""
-    fitted = PairScores.of(units, rows, measure)
-    plain = PairScores.of(units, rows, lambda x: squared_l2(x, units.prototypes))
-    warnings: tuple[str, ...] = ()
-    if not fitted.anr < plain.anr:
-        shown = f"ranks the right landmark at {fitted.anr:.2f} % and plain L2 at {plain.anr:.2f} %"
-        warnings = (
-            f"{kind}_no_better: on {plain.n_queries} held-out pairs the fitted model {shown}: feature_l2 does as well "
-            "here, and costs less",
+@dataclass(frozen=True)
+class Verdict:
+    """Whether a fitted model does better than plain L2 on queries that training did not see."""
+
+    is_better: bool  # with one season known, by more than chance explains
+    scores: dict[str, Any]  # both, for metrics
+    shown: str
+
+    @classmethod
+    def of(cls, kind: str, units: UnitLesson, rows: NDArray[np.int64], measure: Measure) -> Self:
+        """Of some queries."""
+        fitted = PairScores.of(units, rows, measure)
+        plain = PairScores.of(units, rows, lambda x: squared_l2(x, units.prototypes))
+        is_better = fitted.anr < plain.anr
+        if is_better and not units.has_second:
+            is_better = mean_interval(fitted.ranks - plain.ranks, 0)[1] < 0
+        pairs = "held-out pairs" if units.has_second else "held-out pairs of one season"
+        shown = (
+            f"on {plain.ranks.size} {pairs} the fitted model ranks the right landmark at {fitted.anr:.2f} % and plain "
+            f"L2 at {plain.anr:.2f} %"
         )
-    return {"held_out": {kind: fitted.as_dict(), "l2": plain.as_dict()}}, warnings
+        return cls(is_better, {"held_out": {kind: fitted.as_dict(), "l2": plain.as_dict()}}, shown)
+
+
+def no_better(kind: str, verdict: Verdict) -> str:
+    """The warning of a model that went back to plain L2."""
+    return f"{kind}_no_better: {verdict.shown}: it stays at plain L2, and feature_l2 does as well and costs less"

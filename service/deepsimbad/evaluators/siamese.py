@@ -1,18 +1,19 @@
 """The deep Siamese of the paper (II-A, 1): a pairwise network d(x, p) on what a frozen extractor gives of both.
 
 d = softplus(a linear layer, and a small MLP beside it) of (|x - p|, x * p), of unit vectors x and p. The linear layer
-begins as squared L2 and the MLP as nothing, so training begins at plain L2; the epoch that validates best stays.
+begins as squared L2 and the MLP as nothing, so training begins at plain L2; the epoch that validates best stays, and
+goes back to plain L2 where it is no better on stretches that nothing was chosen by.
 """
 
 import time
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from deepsimbad.evaluators.base import Fitted, LandmarkModel, Lesson
-from deepsimbad.evaluators.lessons import PairScores, Split, UnitLesson, judged, squared_l2
+from deepsimbad.evaluators.lessons import PairScores, Split, UnitLesson, Verdict, no_better, squared_l2
 from deepsimbad.evaluators.trunk import Axes, Trunk
 
 _HIDDEN = 32
@@ -30,6 +31,7 @@ class Siamese(Trunk):
     axes: ClassVar[Axes] = {
         "usual": ("two", "d"), "projection": ("d", "k"), "landmarks": ("r", "k"), "apart": ("k", "hidden"),
         "product": ("k", "hidden"), "bias": ("hidden",), "out": ("hidden",), "linear": ("two", "k"), "offset": ("one",),
+        "beside": ("one",),
     }  # fmt: skip
 
     def fit(self, lesson: Lesson) -> Fitted:
@@ -37,14 +39,15 @@ class Siamese(Trunk):
         began = time.monotonic()
         arrays, units = self.unit_lesson(lesson)
         split = Split.of(units, lesson.seed)
-        trained, metrics = _train(units, split, lesson)
-        scores, warnings = judged(
-            self.kind, units, split.test, lambda x: _dissimilarities(x, units.prototypes, trained)
-        )
-        arrays |= {f"{self.kind}_{name}": array for name, array in trained.items()}
+        trained, plain, metrics = _train(units, split, lesson)
+        verdict = Verdict.of(self.kind, units, split.test, lambda x: _dissimilarities(x, units.prototypes, trained))
+        kept = trained if verdict.is_better else plain
+        arrays |= {f"{self.kind}_{name}": array for name, array in kept.items()}
         arrays[f"{self.kind}_landmarks"] = units.prototypes
-        metrics |= {**scores, "seed": lesson.seed, "seconds": time.monotonic() - began}
-        return Fitted(arrays, metrics, warnings)
+        arrays[f"{self.kind}_beside"] = self.beside(lesson, arrays) if verdict.is_better else np.zeros(1, np.float32)
+        metrics |= {**verdict.scores, "is_l2": not verdict.is_better}
+        metrics |= {"seed": lesson.seed, "seconds": time.monotonic() - began}
+        return Fitted(arrays, metrics, () if verdict.is_better else (no_better(self.kind, verdict),))
 
     def own_dissimilarities(self, encodings: NDArray[np.float32], model: LandmarkModel) -> NDArray[np.float32]:
         """See `OwnDissimilarities`."""
@@ -66,8 +69,11 @@ def _dissimilarities(
     return answer
 
 
-def _train(units: UnitLesson, split: Split, lesson: Lesson) -> tuple[dict[str, NDArray[np.float32]], dict[str, Any]]:
-    """The arrays of the best epoch, by their names, and how training went."""
+_Arrays: TypeAlias = dict[str, NDArray[np.float32]]  # by name
+
+
+def _train(units: UnitLesson, split: Split, lesson: Lesson) -> tuple[_Arrays, _Arrays, dict[str, Any]]:
+    """The arrays of the best epoch, those of plain L2, and how training went."""
     import torch
 
     rng, k = np.random.default_rng(lesson.seed), units.own.shape[1]
@@ -104,7 +110,8 @@ def _train(units: UnitLesson, split: Split, lesson: Lesson) -> tuple[dict[str, N
         return (-torch.log_softmax(-d, 1)[:, 0] * weight[rows]).mean()
 
     curve: list[dict[str, Any]] = []
-    best: dict[str, NDArray[np.float32]] = {}
+    best: _Arrays = {}
+    plain: _Arrays = {}
     n_evaluated = 0
     for epoch in range(_EPOCHS + 1):
         order = rng.permutation(len(split.train))[:_MOST_QUERIES] if epoch else np.empty(0, np.int64)
@@ -123,13 +130,14 @@ def _train(units: UnitLesson, split: Split, lesson: Lesson) -> tuple[dict[str, N
             split.validation,
             lambda x, now=now: _dissimilarities(x, units.prototypes, now),  # type: ignore[misc]
         )
+        plain = plain or now
         if not best or scores.anr < min(point["anr"] for point in curve):
             best = now
         curve.append({"epoch": epoch, "loss": float(np.mean(losses)) if losses else None, "anr": scores.anr})
-        n_evaluated += len(order) * (1 + _HARD + _EASY) + scores.n_queries * len(units.landmarks)
+        n_evaluated += len(order) * (1 + _HARD + _EASY) + scores.ranks.size * len(units.landmarks)
     lesson.on_progress(1.0)
     n_train = {"n_queries": len(split.train), "n_dissimilarities": n_evaluated}
-    return best, {**n_train, "best_epoch": min(curve, key=lambda point: point["anr"])["epoch"], "curve": curve}
+    return best, plain, {**n_train, "best_epoch": min(curve, key=lambda point: point["anr"])["epoch"], "curve": curve}
 
 
 def _retrieved(units: UnitLesson, split: Split) -> NDArray[np.int64]:

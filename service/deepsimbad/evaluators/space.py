@@ -23,8 +23,9 @@ class OwnDissimilarities(ABC):
 
     def dissimilarities(self, encodings: NDArray[np.float32], model: LandmarkModel) -> NDArray[np.float32]:
         """See `Evaluator.dissimilarities`; of a composed model between unit vectors in the space of its own."""
-        own = self.own_dissimilarities(encodings, model)
-        return between_units(own, model) if is_composed(model) else own
+        if is_composed(model):
+            return between_units(self.compared(encodings, model), model)
+        return self.own_dissimilarities(encodings, model)
 
     def compared(self, encodings: NDArray[np.float32], model: LandmarkModel) -> NDArray[np.float32]:
         """See `Evaluator.compared`."""

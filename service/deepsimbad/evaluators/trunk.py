@@ -19,6 +19,7 @@ from deepsimbad.evaluators.lessons import UnitLesson
 from deepsimbad.evaluators.scenes import Form, Scene
 from deepsimbad.evaluators.space import OwnDissimilarities, check_units, check_usable
 
+_BESIDE = 0.3  # of the variance of encodings: what dissimilarities count beside them where `composed` compares
 LEAST_FRAMES = 10  # of the drive that landmarks are chosen from: ten stretches of route
 
 
@@ -100,6 +101,22 @@ class Trunk(OwnDissimilarities):
         projection = model.get(f"{self.kind}_projection")
         return described(encodings, moments, None if projection is None else np.asarray(projection, np.float32))
 
+    def compared(self, encodings: NDArray[np.float32], model: LandmarkModel) -> NDArray[np.float32]:
+        """See `Evaluator.compared`: encodings, and beside them what was fitted, where that is more than plain L2."""
+        beside = model.get(f"{self.kind}_beside")
+        if beside is None:  # a map of before: dissimilarities alone
+            return self.own_dissimilarities(encodings, model)
+        factor = float(np.asarray(beside, np.float32)[0])
+        if factor == 0:
+            return encodings
+        return np.hstack([encodings, np.float32(factor) * self.own_dissimilarities(encodings, model)])
+
+    def beside(self, lesson: Lesson, model: LandmarkModel) -> NDArray[np.float32]:
+        """[1] what dissimilarities are multiplied by beside encodings, which count for more."""
+        own = self.own_dissimilarities(checked_encodings(lesson.encodings), model)
+        variance = [float(each.var(axis=0, dtype=np.float64).sum()) for each in (lesson.encodings, own)]
+        return np.array([np.sqrt(_BESIDE * variance[0] / max(variance[1], 1e-12))], np.float32)
+
     def unit_lesson(self, lesson: Lesson) -> tuple[dict[str, NDArray[Any]], UnitLesson]:
         """The arrays that make unit vectors, and all of a lesson in such.
 
@@ -125,24 +142,36 @@ class Trunk(OwnDissimilarities):
         u = described(own, Moments.of(own), projection)
         position_m = np.arange(len(own), dtype=np.float64) if lesson.position_m is None else lesson.position_m
         step_m = float(np.median(np.abs(np.diff(position_m)))) + 1e-9
-        queries, true, weight = [], [], []
+        queries, true, weight, lit = [], [], [], []
         if lesson.other is not None and lesson.places.size:
             queries.append(described(lesson.other[lesson.places[:, 1]], usual, projection))
             true.append(lesson.places[:, 0])
             weight.append(np.ones(len(lesson.places), np.float32))
+            lit.append(np.zeros(len(lesson.places), np.bool_))
         if lesson.views is not None:
             r, a, d = lesson.views.shape
             queries.append(described(lesson.views.reshape(r * a, d), usual, projection))
             true.append(np.repeat(lesson.landmarks, a))
             weight.append(np.full(r * a, 1 / a, np.float32))
+            lit.append(np.tile(np.arange(a) >= a // 2, r))
         if not queries:
             frames = np.arange(1, len(own))
             queries += [u[frames], u[frames - 1]]
             true += [frames - 1, frames]
             weight += [np.ones(len(frames), np.float32)] * 2
+            lit += [np.ones(len(frames), np.bool_)] * 2
+        n_queries, n_second = sum(map(len, queries)), len(lesson.places) if lesson.other is not None else 0
+        is_judge = np.arange(n_queries) < n_second if n_second else np.concatenate(lit)
         return model, UnitLesson(
-            *(u, lesson.landmarks, np.concatenate(queries), np.concatenate(true).astype(np.int64)),
-            *(np.concatenate(weight), len(lesson.places) if lesson.other is not None else 0, position_m, step_m),
+            u,
+            lesson.landmarks,
+            np.concatenate(queries),
+            np.concatenate(true).astype(np.int64),
+            np.concatenate(weight),
+            is_judge,
+            n_second > 0,
+            position_m,
+            step_m,
         )
 
     def check_model(self, model: LandmarkModel, n_landmarks: int) -> None:
@@ -152,6 +181,8 @@ class Trunk(OwnDissimilarities):
             array = model.get(f"{self.kind}_{name}")
             if array is None and name == "projection":
                 lengths["k"] = lengths["d"]
+                continue
+            if array is None and name == "beside":
                 continue
             if array is None:
                 has = ", ".join(sorted(model)) or "none"
