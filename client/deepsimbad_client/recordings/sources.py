@@ -90,10 +90,6 @@ def open_source(
             f"{last.position_m:g} m ({last.name}), and a route's rise: --reverse takes the frames in the other order"
         )
     recording = thinned(recording, every_s, every_m)
-    if part is not None and (part.step or 1) < 0:
-        raise SourceError(
-            f"{source}: a slice of a negative step takes the frames backwards: --reverse does, with their positions"
-        )
     recording = recording if part is None else recording.sliced(part)
     check_one_drive(recording)
     return recording

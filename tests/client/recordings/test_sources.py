@@ -57,7 +57,6 @@ def test_sources_end_to_end_with_a_slice(tmp_path):
         ("", "no recording at ''"),
         ("/no/such/place", "no recording at '/no/such/place'"),
         ("e.npy#::0", "step 0"),
-        ("e.npy#::-1", "takes the frames backwards: --reverse"),
         ("e.npy#3:3", "#3:3 leaves none of the 3 frames"),
         ("e.txt", r"a \.npy or \.csv"),
     ],
