@@ -61,6 +61,7 @@ class Built:
     second: Drive | None = None  # the second drive, measured, where it is of the same route
     same_route: SameRoute | None = None  # whether it is, and why not; None where there is no second drive
     places: NDArray[np.float32] | None = None  # [n, k] unit vectors that the lists stand for (`composed`)
+    chosen: NDArray[np.float32] | None = None  # [r, k] landmarks before they moved to where sums of them are nearest
     by_camera: bool = False  # whether what a season changes was learnt on another route
     fitting: Mapping[str, Any] | None = None  # how the evaluator was fitted, JSON-ready; None: it was not, here
     warnings: tuple[str, ...] = ()  # of fitting
@@ -255,7 +256,7 @@ def compose_map(
     known = (training,) if other is None else (training, other)
     map_, rehearsal = taught(map_, rehearsal, seen_before, space.dissimilarities(fused), season, known)
     on_progress(1.0)
-    return Built(map_, rehearsal, own, other, verdict, fused, by_camera)
+    return Built(map_, rehearsal, own, other, verdict, fused, as_chosen.prototypes, by_camera)
 
 
 def taught(

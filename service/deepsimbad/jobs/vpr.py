@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepsimbad.core.building import Built, MapPlan, build_map
-from deepsimbad.core.composed import compose, unit_encodings
+from deepsimbad.core.composed import compose, learnt_landmarks, unit_encodings
 from deepsimbad.core.drive import Drive, SameRoute
 from deepsimbad.core.index.retrieval import relevances
 from deepsimbad.core.map import Map
@@ -185,12 +185,14 @@ def build_maps(
 
 
 def listed_anew(built: Built, list_length: int) -> Map:
-    """The map with lists of another length, and nothing learnt anew: single views are compared by no more."""
+    """The map with lists of another length, and landmarks moved for them: single views are compared by no more."""
     map_ = built.map
-    if map_.relevance is Relevance.COMPOSED and built.places is not None:
-        return replace(map_, lists=compose(built.places, map_.landmark_model["prototypes"], list_length))
-    lists = build_map(map_.relevance, built.own, list_length)
-    return replace(lists, landmark_model=map_.landmark_model, actions_m=map_.actions_m)
+    if map_.relevance is Relevance.COMPOSED and built.places is not None and built.chosen is not None:
+        prototypes = learnt_landmarks(built.places, built.chosen, list_length)
+        lists = compose(built.places, prototypes, list_length)
+        return replace(map_, lists=lists, landmark_model={**map_.landmark_model, "prototypes": prototypes})
+    listed = build_map(map_.relevance, built.own, list_length)
+    return replace(listed, landmark_model=map_.landmark_model, actions_m=map_.actions_m)
 
 
 class ViewsOf:
