@@ -174,7 +174,7 @@ def read_nclt(
     names, not_times = _images_by_time(folder)
     if not names:
         raise SourceError(f"{folder} holds no image named <utime>.tiff (nor .jpg, .png or another format)")
-    result = placed_on(truth, [(name, time) for time, name in names.items()], str(folder), "the ground truth")
+    result = placed_on(truth, [(name, time) for time, name in sorted(names.items())], str(folder), "the ground truth")
     left_out = {
         **result.left_out_names,
         f"missing in Cam{camera}": _missing(folder, names),

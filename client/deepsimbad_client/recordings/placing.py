@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 
 import numpy as np
+from numpy.typing import NDArray
 
 from deepsimbad_client.errors import SourceError
 from deepsimbad_client.recordings import Frame
@@ -14,6 +15,7 @@ from deepsimbad_client.recordings.clock import FIRST_US
 from deepsimbad_client.recordings.left_out import MOST_LEFT_OUT
 from deepsimbad_client.recordings.track import (
     DEADBAND_M,
+    SPIKE_SPEEDS,
     Reals,
     Times,
     Track,
@@ -25,6 +27,7 @@ from deepsimbad_client.recordings.track import (
 )
 
 UNPLACED = math.nan  # position_m of a frame of which the source says none
+LEAPS = 2.0  # Frames leap in an order where they go farther at once than so many of their longest steps
 STATED_SPEEDS = 100.0  # A stated position may jump by so many usual steps: somebody may have meant it
 
 
@@ -62,8 +65,8 @@ class Placed:
 def placed(frames: Sequence[Frame], where: str, deadband_m: float = DEADBAND_M) -> Placed:
     """Put frames on the route, by their stated `position_m` where any has one, else by the distance along x_m, y_m.
 
-    Frames come in the order of their times, where half of them and more are known. Indices count anew from 0. Stated
-    positions that fall along the drive stay falling.
+    Frames come in the order of their times, where half of them and more are known and that order does not leap about
+    where the given one goes on. Indices count anew from 0. Stated positions that fall along the drive stay falling.
 
     Raises SourceError (no frame has a position, or positions go to and fro).
     """
@@ -72,7 +75,7 @@ def placed(frames: Sequence[Frame], where: str, deadband_m: float = DEADBAND_M) 
     result.leave_out([_has_place(frame, stated) for frame in frames], "without a position")
     if not result.frames:
         raise SourceError(f"{where}: none of {len(frames)} frames has a position")
-    time_us = _in_time_order(result)
+    time_us = _in_time_order(result, stated)
     if stated:
         _use_stated(result, time_us, where)
     else:
@@ -93,7 +96,11 @@ def placed_on(
 
     With `together`, images whose times do not count from 1970, as the track's do, begin with the track.
     """
-    images, remarks = sorted(images, key=lambda image: image[1]), []
+    remarks, given_us = [], np.array([time for _, time in images], np.int64)
+    if (np.diff(given_us) < 0).any():
+        back = _step_back([Frame(0, name, UNPLACED) for name, _ in images], given_us)
+        remarks.append(f"{back}: they are taken in the order of their times. Was a clock set on the way?")
+    images = sorted(images, key=lambda image: image[1])
     if together and images[-1][1] < FIRST_US <= track.time_us[0]:
         images = [(name, time + int(track.time_us[0])) for name, time in images]
         remarks.append(f"{what} say the time, the images do not: they are taken to begin together")
@@ -133,8 +140,11 @@ def _has_place(frame: Frame, stated: bool) -> bool:
     return math.isfinite(frame.position_m) if stated else frame.x_m is not None and frame.y_m is not None
 
 
-def _in_time_order(result: Placed) -> Times | None:
-    """Sort the frames by time where half of them and more have one and these differ; the times, filled in between."""
+def _in_time_order(result: Placed, stated: bool) -> Times | None:
+    """Sort the frames by time where half of them and more have one and these differ; the times, filled in between.
+
+    None: they stay in their own order, for their times are too few, or wrong.
+    """
     known = [(place, frame.timestamp_us) for place, frame in enumerate(result.frames) if frame.timestamp_us is not None]
     if 2 * len(known) < len(result.frames) or len({time for _, time in known}) < 2:
         return None
@@ -149,9 +159,39 @@ def _in_time_order(result: Placed) -> Times | None:
         time_us = time_us[fits]
     order = np.argsort(time_us, kind="stable")
     if (np.diff(time_us) < 0).any():
+        leap = _leap(result.frames, order, stated)
+        if leap is not None:
+            result.frames = [dataclasses.replace(frame, timestamp_us=None) for frame in result.frames]
+            result.remarks.append(
+                f"{_step_back(result.frames, time_us)}, and {leap}: a clock was set on the way. "
+                "Frames stay in the order of their names, and their times are not used"
+            )
+            return None
         result.frames = [result.frames[place] for place in order]
         result.remarks.append("frames are taken in the order of their times, which is not that of their names")
     return np.asarray(time_us[order])
+
+
+def _leap(frames: Sequence[Frame], order: NDArray[np.intp], stated: bool) -> str | None:
+    """In words, how frames leap from place to place in an order, as they do not in their own; None: they do not."""
+    places = [(frame.position_m, 0.0) if stated else (frame.x_m, frame.y_m) for frame in frames]
+    x_m, y_m = np.array(places, np.float64).T
+    usable = on_track(x_m, y_m, None, STATED_SPEEDS if stated else SPIKE_SPEEDS)
+    if usable.mean() < 1 - MOST_LEFT_OUT:
+        return None
+    own_m, other_m = (
+        float(np.hypot(np.diff(x_m[rows]), np.diff(y_m[rows])).max())
+        for rows in (np.flatnonzero(usable), order[usable[order]])
+    )
+    if other_m <= LEAPS * own_m:
+        return None
+    return f"in the order of times they would leap by {other_m:.0f} m, by their names they go {own_m:.1f} m at most"
+
+
+def _step_back(frames: Sequence[Frame], time_us: Times) -> str:
+    at = int(np.argmin(np.diff(time_us)))
+    back_s = (time_us[at] - time_us[at + 1]) / 1e6
+    return f"{frames[at + 1].name} says {back_s:.1f} s before {frames[at].name}"
 
 
 def _filled(place: Times, time_us: Times, n: int) -> Times:

@@ -181,6 +181,23 @@ def test_times_say_how_far_and_in_which_order(folder):
     assert recording.remarks == ["10.png would be 5768299 m from 9.png"]
 
 
+@pytest.mark.parametrize("column", ["x_m,y_m", "position_m"])
+@pytest.mark.parametrize("ahead", [range(10, 20), range(10), range(12, 14)])
+def test_a_clock_set_on_the_way_leaves_frames_in_the_order_of_names(tmp_path, column, ahead):
+    for at in range(30):
+        (tmp_path / f"{at}.png").write_bytes(b"")
+    y = ",0" * (column == "x_m,y_m")
+    rows = (f"{at}{y},{1_700_000_000 + at + 3600 * (at in ahead)}" for at in range(30))
+    positions(tmp_path, f"{column},timestamp_s", *rows)
+    recording = open_source(str(tmp_path))
+    assert placed(tmp_path) == [(f"{at}.png", at) for at in range(30)]
+    assert {frame.timestamp_us for frame in recording.frames} == {None}
+    after = ahead[-1] + 1
+    (remark,) = recording.remarks
+    assert f"{after}.png says 3599.0 s before {after - 1}.png" in remark
+    assert "stay in the order of their names, and their times are not used" in remark
+
+
 def test_one_wrong_time_among_many_is_left_out_by_name(tmp_path):
     for at in range(40):
         cv2.imwrite(str(tmp_path / f"{at}.png"), np.zeros((4, 4), np.uint8))
