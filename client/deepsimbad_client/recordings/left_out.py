@@ -6,6 +6,7 @@ from deepsimbad_client.errors import TooManyLeftOutError
 from deepsimbad_client.recordings import Recording
 
 MOST_LEFT_OUT = 0.05  # of a recording's frames; more are accepted only where the caller says so
+NO_IMAGE = " without an image"  # of lines "in positions.csv", beside images "not in positions.csv"
 
 
 class LeftOut:
@@ -15,7 +16,7 @@ class LeftOut:
         """What the reader left out; raises as `add`."""
         self.names = {reason: list(names) for reason, names in recording.left_out_names.items()}
         self._recording, self._allow_missing = recording, allow_missing
-        n_by_reader = sum(map(len, self.names.values()))
+        n_by_reader = sum(map(len, self.names.values())) - _n_misspelt(self.names)
         self._share = n_by_reader / max(1, recording.n_whole + n_by_reader)
         self._check()
 
@@ -33,6 +34,15 @@ class LeftOut:
             f"{self._share:.0%} of the frames of {self._recording.name} are left out: {reasons}; more than "
             f"{MOST_LEFT_OUT:.0%} need --allow-missing"
         )
+
+
+def _n_misspelt(names: Mapping[str, Sequence[str]]) -> int:
+    """How many images that a table does not name may be those of its lines that name no image."""
+    return sum(
+        min(len(lines), len(names.get(f"not {reason.removesuffix(NO_IMAGE)}", ())))
+        for reason, lines in names.items()
+        if reason.endswith(NO_IMAGE)
+    )
 
 
 def left_out_lines(names: Mapping[str, Sequence[str]], *, verbose: bool) -> list[str]:

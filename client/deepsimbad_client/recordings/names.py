@@ -10,20 +10,24 @@ from deepsimbad_client.recordings.clock import UNITS, unit_of
 
 _DIGITS = re.compile(r"([0-9]+)")
 _DECIMALS = re.compile(r"((?:^-)?(?:(?<![0-9.])[0-9]*\.[0-9]+(?![0-9]|\.[0-9])|[0-9]+))")
+_DECIMAL_COMMA = re.compile(r"(?<=[0-9]),(?=[0-9])")
 _NUMBER = re.compile(r"-?[0-9]*\.?[0-9]+")
 
 
 def in_order(names: Sequence[str]) -> list[str]:
     """File names with numbers in them as numbers: 2.png before 10.png, 1305031103.25.png before 1305031103.5.png.
 
-    Where fractions of several lengths end in 0 they are counters (1.9 before 1.10).
+    Commas between digits count as points. Where fractions of several lengths end in 0 they are counters (1.9 before
+    1.10).
     """
-    fractions = [part.partition(".")[2] for name in names for part in _DECIMALS.split(stem(name))[1::2] if "." in part]
+    fractions = [
+        part.partition(".")[2] for name in names for part in _DECIMALS.split(_pointed(name))[1::2] if "." in part
+    ]
     counters = len(set(map(len, fractions))) > 1 and any(re.fullmatch(r"[0-9]+0", fraction) for fraction in fractions)
     numbers = _DIGITS if counters else _DECIMALS
 
     def key(name: str) -> tuple[list[tuple[Decimal, str]], str]:
-        parts = numbers.split(stem(name))
+        parts = numbers.split(_pointed(name))
         return [(Decimal(part), "") if place % 2 else (_WORD, part) for place, part in enumerate(parts)], name
 
     return sorted(names, key=key)
@@ -38,13 +42,18 @@ def stem(name: str) -> str:
     return before if before and not ending.isdigit() else name
 
 
+def _pointed(name: str) -> str:
+    """A name's stem, with points for decimal commas."""
+    return _DECIMAL_COMMA.sub(".", stem(name))
+
+
 def _number(name: str) -> Decimal | None:
-    return Decimal(stem(name)) if _NUMBER.fullmatch(stem(name)) else None
+    return Decimal(_pointed(name)) if _NUMBER.fullmatch(_pointed(name)) else None
 
 
 def times_of(names: Sequence[str]) -> list[int] | None:
     """Unix microseconds, where all names end in a time since 1970 of one unit (s, ms, us or ns); else None."""
-    tokens = [_DECIMALS.split(stem(name))[1::2] for name in names]
+    tokens = [_DECIMALS.split(_pointed(name))[1::2] for name in names]
     numbers = [Decimal(parts[-1]) for parts in tokens if parts]
     units = {unit_of(number) for number in numbers}
     unit = units.pop() if len(units) == 1 and len(numbers) == len(names) else None

@@ -30,6 +30,7 @@ import numpy as np
 from deepsimbad_client.errors import SourceError
 from deepsimbad_client.recordings import Frame, finite_number
 from deepsimbad_client.recordings.clock import UNITS, UNKNOWN, times_us
+from deepsimbad_client.recordings.left_out import NO_IMAGE
 from deepsimbad_client.recordings.names import Finder
 from deepsimbad_client.recordings.placing import UNPLACED, Placed, placed_on
 from deepsimbad_client.recordings.plane import GPS_DEADBAND_M, utm, zone_remarks
@@ -147,7 +148,7 @@ def read_positions(path: Path, names: Sequence[str], name_times_us: Sequence[int
     ]
     lost = {
         f"not in {path.name}": [name for name in names if name not in row_of],
-        f"in {path.name} without an image": without_image,
+        f"in {path.name}{NO_IMAGE}": without_image,
     }
     return Placed(
         frames, {reason: some for reason, some in lost.items() if some}, remarks + _apart(listed, frames), deadband_m

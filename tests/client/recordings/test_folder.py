@@ -2,7 +2,8 @@ import cv2
 import numpy as np
 import pytest
 
-from deepsimbad_client.errors import BrokenFrameError, InvalidArgumentError, SourceError
+from deepsimbad_client.errors import BrokenFrameError, InvalidArgumentError, SourceError, TooManyLeftOutError
+from deepsimbad_client.recordings.left_out import LeftOut
 from deepsimbad_client.recordings.sources import open_source
 
 
@@ -86,6 +87,17 @@ def test_unlisted_images_and_lines_without_an_image_are_counted(folder):
     recording = open_source(str(folder))
     assert [(frame.index, frame.name) for frame in recording.frames] == [(0, "8.png"), (1, "11.png")]
     assert recording.left_out == {"not in positions.csv": 2, "in positions.csv without an image": 3}
+
+
+def test_a_misspelt_name_is_one_frame_left_out_named_on_each_side(tmp_path):
+    for at in range(21):
+        (tmp_path / f"{at}.png").write_bytes(b"")
+    positions(tmp_path, "name,position_m", *(f"{at}{'x' * (at == 7)}.png,{at}" for at in range(21)))
+    sides = {"not in positions.csv": ["7.png"], "in positions.csv without an image": ["7x.png"]}
+    assert LeftOut(open_source(str(tmp_path)), allow_missing=False).names == sides
+    positions(tmp_path, "name,position_m", *(f"{at}{'x' * (at in (7, 8))}.png,{at}" for at in range(21)))
+    with pytest.raises(TooManyLeftOutError, match="10% of the frames"):
+        LeftOut(open_source(str(tmp_path)), allow_missing=False)
 
 
 @pytest.mark.parametrize(
