@@ -3,6 +3,7 @@
 import dataclasses
 import math
 import re
+from collections import Counter
 from itertools import pairwise
 
 import numpy as np
@@ -81,7 +82,7 @@ def turned_back(recording: Recording) -> Recording:
 
 
 def _check_names(recording: Recording) -> None:
-    """Refuse frames placed evenly in the order of names that are of two kinds, each counted by itself."""
+    """Refuse frames placed evenly in the order of names that are of two kinds, one after the other or by turns."""
     frames = recording.frames
     metres = np.array([frame.position_m for frame in frames]) - frames[0].position_m
     steps = np.array([frame.index for frame in frames]) - frames[0].index
@@ -91,6 +92,13 @@ def _check_names(recording: Recording) -> None:
         return
     kinds = [re.sub(r"[0-9]+", "0", frame.name) for frame in frames]
     changes = np.flatnonzero([before != kind for before, kind in pairwise(kinds)]) + 1
+    if 2 * len(changes) >= len(frames) and min(Counter(kinds).values()) >= FEWEST_OF_A_KIND:
+        after = frames[int(changes[0])]
+        raise SourceError(
+            f"{recording.name}: {frames[int(changes[0]) - 1].name} and {after.name} are names of several kinds by "
+            "turns: are these several drives or cameras? Move each into a folder of its own, or say in a positions.csv "
+            "where each image was taken"
+        )
     ends = [0, *changes.tolist(), len(frames)]
     if len(changes) and min(np.diff(ends)) >= FEWEST_OF_A_KIND and len(set(kinds)) == len(changes) + 1:
         before, after = frames[ends[1] - 1], frames[ends[1]]

@@ -21,6 +21,7 @@ from deepsimbad_client.recordings.track import (
     Track,
     arc_length_m,
     back_tolerance_m,
+    by_turns,
     longest_rising,
     on_track,
     rising_m,
@@ -79,7 +80,7 @@ def placed(frames: Sequence[Frame], where: str, deadband_m: float = DEADBAND_M) 
     if stated:
         _use_stated(result, time_us, where)
     else:
-        _measure(result, time_us)
+        _measure(result, time_us, where)
     result.number()
     return result
 
@@ -104,6 +105,12 @@ def placed_on(
     if together and images[-1][1] < FIRST_US <= track.time_us[0]:
         images = [(name, time + int(track.time_us[0])) for name, time in images]
         remarks.append(f"{what} say the time, the images do not: they are taken to begin together")
+    leaping = by_turns(track.x_m, track.y_m)
+    if leaping is not None:
+        raise SourceError(
+            f"{where}: rows of {what} leap to and fro from {_moment(track.time_us[leaping])} on: are these several "
+            "drives by turns? Give each a file of its own"
+        )
     time_us = np.array([time for _, time in images], dtype=np.int64)
     poses = track.at(time_us)
     if not (poses.covered & ~poses.in_gap).any():
@@ -132,8 +139,11 @@ def placed_on(
 
 
 def _span(time_us: Times) -> str:
-    ends = (datetime.fromtimestamp(int(time) / 1e6, UTC) for time in (time_us.min(), time_us.max()))
-    return " to ".join(end.isoformat(timespec="milliseconds") for end in ends)
+    return f"{_moment(time_us.min())} to {_moment(time_us.max())}"
+
+
+def _moment(time_us: np.int64) -> str:
+    return datetime.fromtimestamp(int(time_us) / 1e6, UTC).isoformat(timespec="milliseconds")
 
 
 def _has_place(frame: Frame, stated: bool) -> bool:
@@ -203,8 +213,16 @@ def _filled(place: Times, time_us: Times, n: int) -> Times:
     return np.asarray(time_us[0] + np.round(filled), np.int64)
 
 
-def _measure(result: Placed, time_us: Times | None) -> None:
+def _measure(result: Placed, time_us: Times | None, where: str) -> None:
     x_m, y_m = (np.array([getattr(frame, axis) for frame in result.frames], np.float64) for axis in ("x_m", "y_m"))
+    leaping = by_turns(x_m, y_m)
+    if leaping is not None:
+        before, after = result.frames[leaping - 1 : leaping + 1]
+        apart_m = math.hypot(x_m[leaping] - x_m[leaping - 1], y_m[leaping] - y_m[leaping - 1])
+        raise SourceError(
+            f"{where}: places leap to and fro, {before.name} and {after.name} are {apart_m:.0f} m apart: are these "
+            "several drives by turns? Move each into a folder of its own"
+        )
     usable = on_track(x_m, y_m, time_us)
     _without_spikes(result, usable, x_m, y_m)
     along_m = arc_length_m(x_m[usable], y_m[usable], None if time_us is None else time_us[usable], result.deadband_m)

@@ -21,6 +21,7 @@ MAX_GAP_S = 1.0  # Between rows of a track farther apart than this nothing is in
 FEWEST_FOR_NOISE = 16  # positions of which noise can be told
 MOST_SPIKES = 1000  # in a row, after which a track goes on
 MOST_NOISE_M = 10.0  # What leaps farther, as frames of two drives by turns, is none
+FEWEST_BY_TURNS, BACK_WITHIN, LEAP_BY_TURNS_M = 10, 4, 3.0  # of several drives' frames by turns
 SPIKE_M, SPIKE_NOISES, SPIKE_SPEEDS = 0.5, 8.0, 5.0
 SLOWEST_LIMIT_M_S, FASTEST_M_S = (
     5.0,
@@ -119,6 +120,22 @@ def noise_m(*axes: Reals) -> float:
     differences = np.abs(np.concatenate([np.diff(axis, 3) for axis in axes]))
     noise = float(np.median(differences) / 0.6745 / np.sqrt(20))  # of a normal: median / sigma; 1 + 9 + 9 + 1
     return min(noise, MOST_NOISE_M)
+
+
+def by_turns(x_m: Reals, y_m: Reals) -> int | None:
+    """Which position [n] is the first to leap elsewhere and back, where a third and more do; None: fewer do.
+
+    So do the positions of several drives by turns. White noise comes back so near in at most a ninth of all steps.
+    """
+    if len(x_m) < FEWEST_BY_TURNS:
+        return None
+    n = len(x_m) - BACK_WITHIN
+    away_m = [
+        np.hypot(x_m[apart : apart + n] - x_m[:n], y_m[apart : apart + n] - y_m[:n])
+        for apart in range(1, BACK_WITHIN + 1)
+    ]
+    leaps = (away_m[0] > LEAP_BY_TURNS_M) & (5 * np.min(away_m[1:], axis=0) < away_m[0])
+    return int(np.argmax(leaps)) + 1 if leaps.mean() >= 1 / 3 else None
 
 
 def on_track(x_m: Reals, y_m: Reals, time_us: Times | None, speeds: float = SPIKE_SPEEDS) -> NDArray[np.bool_]:

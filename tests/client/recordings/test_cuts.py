@@ -72,6 +72,10 @@ def test_names_of_two_kinds_placed_by_their_order_are_two_drives():
     with pytest.raises(SourceError, match=r"summer_29\.png and winter_0\.png.*#:30 or #30:"):
         check_one_drive(both)
     check_one_drive(both.sliced(slice(30, None)))
+    with pytest.raises(SourceError, match=r"0_left\.png and 0_right\.png are names of several kinds by turns"):
+        check_one_drive(
+            Recording("r", [Frame(k, f"{k // 2}_{('left', 'right')[k % 2]}.png", 0.5 * k) for k in range(60)])
+        )
     check_one_drive(Recording("r", [Frame(k, f"part{k // 30}_{k % 30}.png", 0.5 * k) for k in range(60)]))
     placed = [Frame(k, name, k + 0.1 * (k % 3)) for k, name in enumerate(names)]
     check_one_drive(Recording("r", placed))

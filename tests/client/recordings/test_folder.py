@@ -210,6 +210,26 @@ def test_a_clock_set_on_the_way_leaves_frames_in_the_order_of_names(tmp_path, co
     assert "stay in the order of their names, and their times are not used" in remark
 
 
+def test_two_drives_by_turns_are_refused_by_name_and_noise_is_not(tmp_path):
+    for at in range(60):
+        (tmp_path / f"{at}.png").write_bytes(b"")
+    rng = np.random.default_rng(2)
+    for turns in (np.arange(60) % 2, rng.integers(0, 2, 60)):
+        positions(tmp_path, "x_m,y_m", *(f"{at},{20 * turn}" for at, turn in enumerate(turns)))
+        with pytest.raises(SourceError, match=r"\.png are 2[0-9] m apart: are these several drives by turns"):
+            open_source(str(tmp_path))
+    rows = [f"{1_700_000_000 + at / 10},{at},{20 * (at % 2)}" for at in range(90)]
+    positions(tmp_path, "time_s,x_m,y_m", *rows)
+    for at in range(60):
+        (tmp_path / f"{at}.png").rename(tmp_path / f"{1_700_000_000 + at / 10}.png")
+    with pytest.raises(SourceError, match="rows of the positions leap to and fro from 2023-11-14"):
+        open_source(str(tmp_path))
+    for drive_m in (0, 1):
+        steps = np.arange(60)[:, None] * (drive_m, 0) + rng.normal(0, 4, (60, 2))
+        positions(tmp_path, "x_m,y_m", *(f"{x},{y}" for x, y in steps))
+        assert len(open_source(str(tmp_path)).frames) == 60
+
+
 def test_one_wrong_time_among_many_is_left_out_by_name(tmp_path):
     for at in range(40):
         cv2.imwrite(str(tmp_path / f"{at}.png"), np.zeros((4, 4), np.uint8))
