@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from PIL import Image as Pictures
+from PIL import UnidentifiedImageError
 
 from deepsimbad_client.errors import SourceError
 from deepsimbad_client.recordings import (
@@ -24,11 +26,16 @@ from deepsimbad_client.recordings import (
 )
 from deepsimbad_client.recordings.gps import TRACK_SUFFIXES, read_exif, read_track
 from deepsimbad_client.recordings.heic import HEIC_SUFFIXES, require_heic
+from deepsimbad_client.recordings.left_out import shown
 from deepsimbad_client.recordings.names import in_order, times_of
 from deepsimbad_client.recordings.nclt import TURNED_UPRIGHT, UPRIGHT_TURN, lies_on_its_side
 from deepsimbad_client.recordings.placing import UNPLACED, Placed, placed, placed_on
 from deepsimbad_client.recordings.plane import GPS_DEADBAND_M, utm, zone_remarks
 from deepsimbad_client.recordings.positions import POSITIONS_FILE, positions_file, read_positions
+
+_ORIENTATION, _MODEL = 0x0112, 0x0110  # of EXIF
+_LYING = range(5, 9)  # orientations in which width is height
+_MOST_TOLD = 4
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -124,8 +131,9 @@ def _hint(folder: Path, others: Sequence[str]) -> str:
 
 
 def _prepared(recording: FolderRecording, rotate: int | None) -> FolderRecording:
-    """The recording turned as asked, and shown by the grey levels of its images, which is said."""
+    """The recording turned as asked and shown by the grey levels of its images; these and several shapes are told."""
     paths = [recording.folder / frame.name for frame in recording.frames]
+    recording = dataclasses.replace(recording, remarks=[*recording.remarks, *_shape_remarks(paths)])
     recording = with_grey_levels(recording, lambda at: decode_deep(read_file(paths[at]), paths[at]))
     return _upright(recording, rotate)
 
@@ -173,3 +181,34 @@ def _by_exif(
     result = placed(frames, str(folder), GPS_DEADBAND_M)
     result.remarks = ["placed by the EXIF of the images", *zone_remarks(degrees[1]), *result.remarks]
     return result
+
+
+def _shape_remarks(paths: Sequence[Path]) -> list[str]:
+    """In a line, how many images are of which size and camera, those of most first; nothing where all are alike.
+
+    Pictures whose header cannot be read here are broken, or of a format that says its size elsewhere: not counted.
+    """
+    names: dict[str, list[str]] = {}
+    for path in paths:
+        shape = _shape(path)
+        if shape is not None:
+            names.setdefault(shape, []).append(path.name)
+    if len(names) < 2:
+        return []
+    most_first = sorted(names.items(), key=lambda item: -len(item[1]))
+    told = [f"{len(alike)} of {shape} ({shown(alike)})" for shape, alike in most_first[:_MOST_TOLD]]
+    others = sum(len(alike) for _, alike in most_first[_MOST_TOLD:])
+    told += [f"{others} of others"] if others else []
+    return [f"the images are not of one kind: {', '.join(told)}; those of several cameras compare badly"]
+
+
+def _shape(path: Path) -> str | None:
+    try:
+        with Pictures.open(path) as picture:
+            (width, height), exif = picture.size, picture.getexif()
+    except (OSError, UnidentifiedImageError, ValueError, SyntaxError, Pictures.DecompressionBombError):
+        return None
+    if exif.get(_ORIENTATION) in _LYING:
+        width, height = height, width
+    camera = str(exif.get(_MODEL, "")).strip(" \0")
+    return f"{width} x {height}" + (f" by {camera}" if camera else "")

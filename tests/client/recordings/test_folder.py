@@ -1,6 +1,7 @@
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from deepsimbad_client.errors import BrokenFrameError, InvalidArgumentError, SourceError, TooManyLeftOutError
 from deepsimbad_client.recordings.left_out import LeftOut
@@ -283,6 +284,23 @@ def test_a_format_nobody_posts_goes_as_png_without_loss(tmp_path):
     sent = recording.image(recording.frames[0], None)
     assert sent.content_type == "image/png"
     np.testing.assert_array_equal(cv2.imdecode(np.frombuffer(sent.body, np.uint8), cv2.IMREAD_COLOR), image)
+
+
+def test_images_of_several_shapes_are_told_by_number_and_name(folder):
+    cv2.imwrite(str(folder / "9.png"), np.zeros((16, 12, 3), np.uint8))
+    (folder / "10.png").write_bytes(b"no image")
+    remarks = [remark for remark in open_source(str(folder)).remarks if "not of one kind" in remark]
+    assert len(remarks) == 1
+    assert "2 of 16 x 12 (8.png, 11.png), 1 of 12 x 16 (9.png);" in remarks[0]
+
+
+def test_cameras_that_exif_names_and_pictures_that_it_turns(tmp_path):
+    for name, size, camera, orientation in (("1", (16, 12), "A", 1), ("2", (12, 16), "A", 6), ("3", (16, 12), "B", 1)):
+        exif = Image.Exif()
+        exif[0x0110], exif[0x0112] = camera, orientation
+        Image.new("RGB", size).save(tmp_path / f"{name}.jpg", exif=exif)
+    (remark,) = [remark for remark in open_source(str(tmp_path)).remarks if "not of one kind" in remark]
+    assert "2 of 16 x 12 by A (1.jpg, 2.jpg), 1 of 16 x 12 by B (3.jpg);" in remark
 
 
 def test_a_broken_image_is_named_when_it_is_read(folder):
