@@ -30,7 +30,22 @@ PAGES = {
     "jobs": "succeeded",
     "report": "Reports",
     "no/such/page": "There is no such page",
+    "%": "There is no such page",
 }
+
+
+DROPPED = """([name, type, bytes]) => {
+    const carried = new DataTransfer();
+    carried.items.add(new File([new Uint8Array(bytes)], name, { type }));
+    return carried;
+}"""
+
+
+def drop(page, path, kind):
+    """Let go of a file over the page's heading, beside every place that is made for it."""
+    carried = page.evaluate_handle(DROPPED, [path.name, kind, list(path.read_bytes())])
+    for event in ("dragover", "drop"):
+        page.dispatch_event("h1", event, {"dataTransfer": carried})
 
 
 def drive(client, session, drive, frames):
@@ -61,6 +76,38 @@ def test_every_page_is_whole_and_accessible(open_page, service, session, scheme)
             assert page.evaluate(TOO_WIDE) == [], where
         found = axe.run(page)
         assert found.violations_count == 0, f"{where}: {found.generate_report()}"
+
+
+@pytest.mark.parametrize(
+    ("where", "advice"),
+    [
+        ("domains/none", "Choose one under Domains"),
+        ("domains/none/upload", "Choose one under Domains"),
+        ("sessions/none", "Open one under Sessions"),
+        ("jobs/none", "Choose one under Jobs"),
+    ],
+)
+def test_what_is_not_there_is_said_once_and_what_to_do(open_page, where, advice):
+    page = open_page(where, expected="404")
+    page.get_by_role("alert").get_by_text(advice).wait_for()
+    assert page.get_by_role("alert").count() == 1
+
+
+def test_the_keyboard_goes_everywhere_in_order_and_is_seen(open_page):
+    page = open_page("report")
+    page.get_by_role("heading", name="Reports").wait_for()
+    ring = "getComputedStyle(document.activeElement)"
+    passed = []
+    for _ in range(9):
+        page.keyboard.press("Tab")
+        passed.append(page.evaluate("document.activeElement.textContent"))
+        assert page.evaluate(f"{ring}.outlineStyle") == "solid"
+        assert page.evaluate(f"parseFloat({ring}.outlineWidth)") >= 2
+    bar = ["Skip to the content", "Deep SIMBAD", "Domains", "Sessions", "Try it", "Jobs", "Reports", "Enter a key"]
+    assert passed == [*bar, "Open another"]
+    page.get_by_role("link", name="Skip to the content").press("Enter")
+    page.keyboard.press("Tab")
+    assert page.evaluate("document.activeElement.textContent") == "Open another", "past the links"
 
 
 def test_a_robot_that_drives_is_seen_and_gone_through_step_by_step(open_page, service, drives):
@@ -96,12 +143,19 @@ def test_an_image_is_tried_and_an_episode_gone_through(open_page, drives):
     page.get_by_text("After this one view").wait_for()
     assert (found := axe.run(page)).violations_count == 0, found.generate_report()
     assert page.get_by_alt_text("The view").is_visible()
+    for motion, taken in (("reduce", "0s"), ("no-preference", "0.15s")):
+        page.emulate_media(reduced_motion=motion)
+        bar = page.locator(".moves .fill").first
+        assert bar.evaluate("(bar) => getComputedStyle(bar).transitionDuration") == taken
+    page.get_by_role("button", name="key").press("Enter")
+    page.get_by_role("dialog", name="API key").press("Escape")
+    assert page.get_by_text("After this one view").is_visible(), "a dialog that is left changes nothing"
     page.get_by_role("button", name="Go through an episode, view by view").click()
     page.get_by_text("Nothing is known yet").wait_for()
     page.set_input_files("input[type=file]", drives["winter"] / "009.jpg")
     page.get_by_text("After 1 view", exact=True).wait_for()
     page.get_by_label("Metres driven since the last view").fill("2")
-    page.set_input_files("input[type=file]", drives["winter"] / "010.jpg")
+    drop(page, drives["winter"] / "010.jpg", "image/jpeg")
     page.get_by_text("After 2 views").wait_for()
     assert (found := axe.run(page)).violations_count == 0, found.generate_report()
     page.get_by_role("button", name="End the episode").press("Enter")
@@ -123,7 +177,15 @@ def test_a_folder_is_uploaded_mapped_and_rolled_back(open_page, service, drives)
     page.get_by_label("Drive that becomes the map").select_option("winter")
     page.get_by_role("button", name="Remap").click()
     page.get_by_text("Map version 2 answers now.").wait_for()
+    page.reload()  # its log is the job's, whenever somebody looks
+    page.get_by_text("Map version 2 answers now.").wait_for()
+    assert [line.split()[-1] for line in page.locator("ol li").all_inner_texts()] == ["for", "begun", "succeeded"]
     page.get_by_role("link", name="See it").click()
+    page.get_by_role("button", name="Roll back").press("Enter")
+    page.get_by_role("dialog").press("Escape")
+    page.get_by_role("dialog").wait_for(state="hidden")
+    assert page.get_by_role("button", name="Roll back").evaluate("(button) => button === document.activeElement")
+    page.get_by_role("row", name="2 active").wait_for()
     page.get_by_role("button", name="Roll back").click()
     dialog = page.get_by_role("dialog", name="Roll back made to map 1?")
     assert "no longer by map 2" in dialog.inner_text()
@@ -166,9 +228,17 @@ def test_a_lost_connection_is_said_and_mended(open_page, tmp_path, drives):
             drive(client, live, drives["winter"], range(5, 8))
         page = open_page(f"sessions/{live.session_id}", url, expected="net::ERR")
         page.get_by_text("After 3 views").wait_for()
+        other = open_page("report", url, expected="net::ERR")
+        other.get_by_role("heading", name="Reports").wait_for()
     page.get_by_text("connection lost, trying again").wait_for()
+    other.evaluate("location.hash = 'domains/route'")
+    other.get_by_role("alert").get_by_text("no_connection").first.wait_for()
+    behind = []
+    page.on("request", lambda request: behind.append(request.headers.get("last-event-id")))
     with serving(tmp_path, port) as url, Client(url) as client:
         page.get_by_text("live", exact=True).wait_for()
+        assert "3" in behind
+        other.get_by_text("How surely a place is recognised").wait_for()
         client.attach_session(live.session_id).observe(image=drives["winter"] / "008.jpg", action_m=2.0)
         page.get_by_text("After 4 views").wait_for()
         assert page.get_by_label("Step shown").get_attribute("max") == "3", "no step came twice"
@@ -230,6 +300,10 @@ def test_every_report_is_opened_in_a_frame_of_its_own(open_page, service, drives
         picture.scroll_into_view_if_needed()
         assert picture.evaluate("(picture) => picture.decode().then(() => picture.naturalWidth)") > 0
     assert inner.evaluate("(() => { try { return parent.document.title } catch { return null } })()") is None
+    page.get_by_role("button", name="Open another").click()
+    frame.get_by_text("Drop a report here").wait_for()
+    drop(page, tmp_path / "out" / "index.html", "text/html")
+    frame.get_by_text(text).first.wait_for()
     page.get_by_role("button", name="Open another").click()
     frame.get_by_text("Drop a report here").wait_for()
     (tmp_path / "notes.txt").write_text("nothing of the kind")

@@ -45,6 +45,7 @@ export function Domain({ names: [name] }) {
   useEffect(() => {
     if (answer && active !== undefined && active !== answer.map_version) domain.again(); // somebody else switched
   }, [active]);
+  if (domain.problem?.status === 404) return html`<div class="head"><h1>${name}</h1></div><${Fault} problem=${domain.problem} />`;
   return html`<div class="head"><h1>${name}</h1>
       ${answer && html`<span class="quiet">${answer.evaluator.extractor ?? answer.evaluator.kind}${answer.relevance ? `, ${answer.relevance}` : ""}${answer.closed ? ", closed route" : ""}</span>`}
       <span class="row">${answer?.map_version && html`<a class="button" href=${`#try/${name}`}>Try an image</a>`}<a class="button" href=${`#domains/${name}/upload`}>Upload a traverse</a></span></div>

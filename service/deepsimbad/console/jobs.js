@@ -22,7 +22,7 @@ export function Jobs() {
 
 export function Job({ names: [id] }) {
   const [job, setJob] = useState(null);
-  const [log, setLog] = useState([]);
+  const [stages, setStages] = useState([]); // as they were seen to begin
   const [state, setState] = useState("connecting");
   const [problem, setProblem] = useState(null);
   useEffect(() => {
@@ -31,10 +31,7 @@ export function Job({ names: [id] }) {
       signal: stop.signal,
       onEvent: (name, now) => {
         setJob(now);
-        setLog((lines) => {
-          const line = now.stage ? `${now.stage}` : now.state;
-          return lines.length && lines[lines.length - 1].line === line ? lines : [...lines, { line, at: new Date() }];
-        });
+        setStages((before) => (now.state !== "running" || !now.stage || before.at(-1)?.stage === now.stage ? before : [...before, { stage: now.stage, at: new Date() }]));
       },
       onState: (now, fault) => {
         setState(now);
@@ -51,6 +48,12 @@ export function Job({ names: [id] }) {
       setProblem(fault);
     }
   };
+  const log = !job ? [] : [
+    ["asked for", job.created_at],
+    ["begun", job.started_at],
+    ...stages.map(({ stage, at }) => [`${stage.replaceAll("_", " ")}, as seen here`, at]),
+    [job.state, job.finished_at],
+  ].filter(([, at]) => at);
   const isOver = job && !["queued", "running"].includes(job.state);
   return html`<div class="head"><h1>${job?.kind ?? "Job"}</h1>${job && html`<a href=${`#domains/${job.domain}`}>${job.domain}</a>`}<code>${id}</code>
       ${job && html`<span class=${`badge ${TONES[job.state]}`} role="status">${job.state}</span>`}</div>
@@ -68,7 +71,7 @@ export function Job({ names: [id] }) {
         <details><summary>All figures</summary><${Measured} values=${job.result.metrics} /></details></section>`}
     </div><div class="stack">
       <section class="card"><h2>Log</h2>${isOver && job.result?.metrics.seconds && html`<${Stages} seconds=${job.result.metrics.seconds} />`}
-        <ol>${log.map(({ line, at }) => html`<li><span class="quiet number">${at.toLocaleTimeString()}</span> ${line}</li>`)}</ol></section>
+        <ol>${log.map(([line, at]) => html`<li><span class="quiet number">${when(at, "medium")}</span> ${line}</li>`)}</ol></section>
       <section class="card"><h2>Asked for</h2><${Measured} values=${job.config} /></section>
     </div></div>`}`;
 }

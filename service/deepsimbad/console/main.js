@@ -7,6 +7,7 @@ import { Job, Jobs } from "./jobs.js";
 import { Session, Sessions } from "./sessions.js";
 import { Trial } from "./trial.js";
 import { Upload } from "./upload.js";
+import { useDropped } from "./parts.js";
 
 const PAGES = [
   [/^$/, Domains],
@@ -19,14 +20,31 @@ const PAGES = [
   [/^jobs\/([^/]+)$/, Job],
   [/^report$/, Report],
 ];
+// A part of an address as it was meant; one that is none stays as it is.
+function decoded(text) {
+  try {
+    return decodeURIComponent(text);
+  } catch {
+    return text;
+  }
+}
+
 const LINKS = [["", "Domains"], ["sessions", "Sessions"], ["try", "Try it"], ["jobs", "Jobs"], ["report", "Reports"]];
 
 function Report() {
-  const [n_opened, setOpened] = useState(0);
-  return html`<div class="head"><h1>Reports</h1><button onClick=${() => setOpened((n) => n + 1)}>Open another</button></div>
+  const [{ n_opened, file }, setOpened] = useState({ n_opened: 0, file: null });
+  const given = useRef(null);
+  const open = (next) => setOpened((before) => ({ n_opened: before.n_opened + 1, file: next }));
+  useDropped((files) => open(files[0]));
+  const loaded = (event) => {
+    if (!file || given.current === n_opened) return; // a report that is written there loads, too
+    given.current = n_opened;
+    event.target.contentWindow.postMessage(file, "*"); // its origin is nobody's: it cannot be named
+  };
+  return html`<div class="head"><h1>Reports</h1><button onClick=${() => open(null)}>Open another</button></div>
     <p>The page that <code>deepsimbad try</code>, <code>deepsimbad experiment paper</code> or <code>deepsimbad-client replay</code> wrote: the
-    file <code>index.html</code> of its folder. It is shown in a frame that reaches neither this page, nor your key, nor any host; it is not uploaded.</p>
-    <iframe key=${n_opened} src="console/report.html" title="The report" sandbox="allow-scripts"></iframe>`;
+    file <code>index.html</code> of its folder, chosen below or dropped anywhere on this page. It is shown in a frame that reaches neither this page, nor your key, nor any host; it is not uploaded.</p>
+    <iframe key=${n_opened} src="console/report.html" title="The report" onLoad=${loaded} sandbox="allow-scripts"></iframe>`;
 }
 
 function Missing() {
@@ -39,9 +57,9 @@ function KeyDialog({ onClose }) {
   const keep = (event) => {
     event.preventDefault();
     key.set(event.target.elements.key.value.trim());
-    onClose();
+    ref.current.close("kept");
   };
-  return html`<dialog ref=${ref} onClose=${onClose} aria-labelledby="key-title">
+  return html`<dialog ref=${ref} onClose=${() => onClose(ref.current.returnValue === "kept")} aria-labelledby="key-title">
     <h2 id="key-title">API key</h2>
     <p>Made by <code>deepsimbad keys create --scope admin</code>. It stays in this tab, and is forgotten with it.</p>
     <form onSubmit=${keep}>
@@ -68,14 +86,14 @@ function Frame() {
   }, []);
   const path = at.split("?")[0];
   const [pattern, Page] = PAGES.find(([each]) => each.test(path)) ?? [/.*/, Missing];
-  const names = (pattern.exec(path) ?? []).slice(1).map((name) => name && decodeURIComponent(name));
+  const names = (pattern.exec(path) ?? []).slice(1).map((name) => name && decoded(name));
   useEffect(() => {
-    document.title = path ? `${path.split("/").map(decodeURIComponent).join(" · ")} – Deep SIMBAD` : "Deep SIMBAD";
+    document.title = path ? `${path.split("/").map(decoded).join(" · ")} – Deep SIMBAD` : "Deep SIMBAD";
   }, [path]);
   const section = path.startsWith("domains/") ? "" : path.split("/")[0];
-  const closed = () => {
+  const closed = (isKept) => {
     setAsking(false);
-    setGeneration((n) => n + 1); // everything is asked anew, with the key there is now
+    if (isKept) setGeneration((n) => n + 1); // everything is asked anew, with the key there is now
   };
   return html`<a class="skip" href="#main" onClick=${(event) => { event.preventDefault(); main.current.focus(); }}>Skip to the content</a>
     <header class="bar">

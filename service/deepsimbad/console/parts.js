@@ -1,12 +1,12 @@
 // What several pages show alike.
 
-import { html, useEffect, useState } from "./preact.js";
+import { html, useEffect, useRef, useState } from "./preact.js";
 import { ask, json } from "./http.js";
 
 export const metres = (value, digits = 1) => (value === null || value === undefined ? "–" : `${value.toFixed(Math.abs(value) >= 100 ? 0 : digits)} m`);
 export const percent = (share, digits = 0) => `${(100 * share).toFixed(digits)} %`;
 export const bytes = (n) => (n < 1e3 ? `${n} B` : n < 1e6 ? `${(n / 1e3).toFixed(1)} kB` : n < 1e9 ? `${(n / 1e6).toFixed(1)} MB` : `${(n / 1e9).toFixed(1)} GB`);
-export const when = (text) => new Date(text).toLocaleString([], { dateStyle: "medium", timeStyle: "short" });
+export const when = (text, timeStyle = "short") => new Date(text).toLocaleString([], { dateStyle: "medium", timeStyle });
 
 export function span(seconds) {
   if (seconds === null || seconds === undefined) return "unknown";
@@ -14,7 +14,10 @@ export function span(seconds) {
   return seconds < 5400 ? `${Math.round(seconds / 60)} min` : `${(seconds / 3600).toFixed(1)} h`;
 }
 
-// What a call answers, asked again when `every_ms` has passed or `again` is called; the last answer stays on a fault.
+const RETRY_MS = 3000; // after a service that did not answer
+
+// What a call answers, asked again when `every_ms` has passed, the service did not answer, or `again` is called; the last
+// answer stays on a fault.
 export function useAnswer(path, every_ms = 0) {
   const [state, setState] = useState({ answer: null, problem: null, path: null });
   const [count, setCount] = useState(0);
@@ -23,14 +26,16 @@ export function useAnswer(path, every_ms = 0) {
     const stop = new AbortController();
     let timer;
     const look = async () => {
+      let wait_ms = every_ms;
       try {
         const answer = await json(path, { signal: stop.signal });
         setState({ answer, problem: null, path });
       } catch (problem) {
         if (problem.name === "AbortError") return;
         setState((before) => ({ answer: before.path === path ? before.answer : null, problem, path }));
+        if (problem.status === 0) wait_ms ||= RETRY_MS;
       }
-      if (every_ms) timer = setTimeout(look, document.hidden ? 5 * every_ms : every_ms);
+      if (wait_ms) timer = setTimeout(look, document.hidden ? 5 * wait_ms : wait_ms);
     };
     look();
     return () => {
@@ -43,9 +48,12 @@ export function useAnswer(path, every_ms = 0) {
 }
 
 const ADVICE = {
-  no_connection: "It is asked again in a moment.",
+  no_connection: "What is shown is asked for again by itself; what you sent, send again.",
   unauthorized: "This service asks for a key: enter one above.",
   forbidden: "The key does not open this: it takes one of the scope admin.",
+  unknown_domain: "Choose one under Domains.",
+  unknown_session: "Open one under Sessions; those that ended long ago are known no more.",
+  unknown_job: "Choose one under Jobs.",
   no_active_map: "Upload a traverse and remap, or activate a map version.",
 };
 
@@ -80,6 +88,25 @@ export function confirmed(title, sentences, button) {
     };
     dialog.showModal();
   });
+}
+
+// Files dropped anywhere on the page, which the browser would else leave the page for.
+export function useDropped(onFiles) {
+  const latest = useRef(onFiles);
+  latest.current = onFiles;
+  useEffect(() => {
+    const over = (event) => event.preventDefault();
+    const dropped = (event) => {
+      event.preventDefault();
+      if (event.dataTransfer.files.length) latest.current(event.dataTransfer.files);
+    };
+    addEventListener("dragover", over);
+    addEventListener("drop", dropped);
+    return () => {
+      removeEventListener("dragover", over);
+      removeEventListener("drop", dropped);
+    };
+  }, []);
 }
 
 // Map images' thumbnails, asked for once each, the few last ones kept.

@@ -17,7 +17,7 @@ export function Sessions() {
     location.hash = `sessions/${encodeURIComponent(event.target.elements.id.value.trim())}`;
   };
   return html`<div class="head"><h1>Sessions</h1></div>
-    ${problem?.status === 403 || problem?.status === 401 ? html`<p class="quiet">All sessions are shown to keys of the scope admin; yours opens its own, by id.</p>` : html`<${Fault} problem=${problem} />`}
+    ${problem?.status === 403 ? html`<p class="quiet">All sessions are shown to keys of the scope admin; yours opens its own, by id.</p>` : html`<${Fault} problem=${problem} />`}
     ${answer?.sessions.length === 0 && html`<div class="card empty below"><h2>No robot is driving</h2>
       <p>A session begins when a robot, or a replay, asks for one:</p><pre>deepsimbad-client replay path/to/images --domain my-route</pre></div>`}
     ${answer?.sessions.length > 0 && html`<div class="card below wide"><table>
@@ -134,17 +134,23 @@ function Live({ events, at, onPick }) {
     </div></div>`;
 }
 
-// What the robot saw last, where the service still holds it.
+// What the robot saw last, where the service still holds it; asked for once at a time, and at last for the newest.
 function useView(session_id, n_observations) {
   const [uri, setUri] = useState(null);
-  const isAsking = useRef(false);
+  const [n_asked, setAsked] = useState(0);
+  const [isAsking, isLeft, isShown] = [useRef(false), useRef(false), useRef(false)];
+  isShown.current = n_observations !== null;
   useEffect(() => {
     if (n_observations === null) return setUri(null);
-    if (isAsking.current) return undefined;
+    if (isAsking.current) {
+      isLeft.current = true;
+      return undefined;
+    }
     isAsking.current = true;
+    isLeft.current = false;
     ask(`v1/sessions/${session_id}/view`, { accept: "image/jpeg" })
       .then(async (answer) => {
-        if (answer.status === 204) return setUri(null);
+        if (answer.status === 204 || !isShown.current) return setUri(null);
         const blob = await answer.blob();
         return setUri((before) => {
           if (before) URL.revokeObjectURL(before);
@@ -153,8 +159,9 @@ function useView(session_id, n_observations) {
       }, () => setUri(null))
       .finally(() => {
         isAsking.current = false;
+        if (isLeft.current) setAsked((n) => n + 1);
       });
     return undefined;
-  }, [session_id, n_observations]);
+  }, [session_id, n_observations, n_asked]);
   return uri;
 }

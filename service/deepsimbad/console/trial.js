@@ -4,7 +4,7 @@ import { html, useEffect, useRef, useState } from "./preact.js";
 import { json } from "./http.js";
 import { useRoute } from "./domains.js";
 import { Believed, Figures, NextMove, Places } from "./answer.js";
-import { Fault, Loading, metres, useAnswer } from "./parts.js";
+import { Fault, Loading, metres, useAnswer, useDropped } from "./parts.js";
 
 export function Trial({ names: [given] }) {
   const { answer, problem } = useAnswer("v1/domains");
@@ -97,12 +97,15 @@ function Explained({ answer }) {
   </ol>`;
 }
 
-export function Drop({ onFile, isBusy, text }) {
+function Drop({ onFile, isBusy, text }) {
   const [isOver, setOver] = useState(false);
-  const take = (files) => files.length && onFile(files[0]);
+  const take = (files) => files.length && !isBusy && onFile(files[0]);
+  useDropped((files) => {
+    setOver(false);
+    take(files);
+  });
   return html`<div class=${`drop ${isOver ? "over" : ""}`}
-    onDragOver=${(event) => { event.preventDefault(); setOver(true); }} onDragLeave=${() => setOver(false)}
-    onDrop=${(event) => { event.preventDefault(); setOver(false); take(event.dataTransfer.files); }}>
+    onDragOver=${() => setOver(true)} onDragLeave=${() => setOver(false)}>
     <p><b>${text}</b></p>
     <label>or choose a file <input type="file" accept="image/*" disabled=${isBusy} onChange=${(event) => { take(event.target.files); event.target.value = ""; }} /></label>
     ${isBusy && html`<p role="status">Looking …</p>`}

@@ -1,6 +1,6 @@
 // A folder of images becomes a traverse, frame by frame, and goes on where it stopped; then a map.
 
-import { html, useRef, useState } from "./preact.js";
+import { html, useEffect, useRef, useState } from "./preact.js";
 import { ask, json } from "./http.js";
 import { Fault, Loading, metres, percent, span, useAnswer } from "./parts.js";
 
@@ -32,6 +32,7 @@ export function Upload({ names: [domain] }) {
   const [done, setDone] = useState(null);
   const [problem, setProblem] = useState(null);
   const stop = useRef(null);
+  useEffect(() => () => stop.current?.abort(), []);
   const choose = async (event) => {
     const files = [...event.target.files];
     const images = files.filter((file) => /\.(jpe?g|png|tiff?|webp)$/i.test(file.name)).sort((a, b) => inOrder(a.name, b.name));
@@ -85,6 +86,7 @@ export function Upload({ names: [domain] }) {
     stop.current = null;
   };
   const isBusy = stop.current !== null;
+  if (traverses.problem?.status === 404) return html`<div class="head"><h1>Upload</h1></div><${Fault} problem=${traverses.problem} />`;
   return html`<div class="head"><h1>Upload to <a href=${`#domains/${domain}`}>${domain}</a></h1></div>
     <${Fault} problem=${problem} /><${Fault} problem=${traverses.problem} />
     <div class="columns"><div class="stack"><section class="card"><h2>A recorded drive</h2>
