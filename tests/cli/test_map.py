@@ -243,7 +243,7 @@ def test_a_view_that_cannot_be_used_is_named(deepsimbad, pictures, tmp_path):
     deepsimbad("map", "route", "--landmarks", pictures, "--training", pictures, "--n-landmarks", 20)
     named_error(deepsimbad("localize", "route", tmp_path / "missing.png"), "missing.png")
     (tmp_path / "words.png").write_text("words")
-    named_error(deepsimbad("localize", "route", pictures / "1.png", tmp_path / "words.png"), "words.png: ", "image")
+    named_error(deepsimbad("localize", "route", pictures / "1.png", tmp_path / "words.png"), "words.png", "image")
     (tmp_path / "half.png").write_bytes((pictures / "1.png").read_bytes()[:-200])
     named_error(deepsimbad("localize", "route", tmp_path / "half.png"))
 

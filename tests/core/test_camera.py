@@ -26,6 +26,23 @@ def test_pictures_that_are_compared_badly_are_told(camera: Camera, others: list[
     assert says is None or says in str(why)
 
 
+@pytest.mark.parametrize(
+    ("camera", "others", "degrees"),
+    [
+        (Camera(1616, 1232), [NCLT], 90),
+        (Camera(404, 308, "Cam5"), [Camera(640, 480), NCLT], 0),  # of a map of both shapes nobody can tell
+        (Camera(404, 308), [Camera(800, 600)], 0),
+        (Camera(404, 308), [], 0),
+        (Camera(1600, 1200), [NCLT], 0),  # of another camera, that lies on either side
+        (Camera(1616, 1232), [Camera(3, 4)], 0),
+        (NCLT, [NCLT], 0),
+        (NCLT, [Camera(1616, 1232)], 0),
+    ],
+)
+def test_only_nclts_files_tell_which_way_they_lie(camera: Camera, others: list[Camera], degrees: int) -> None:
+    assert camera.turn_to(others) == degrees
+
+
 def test_shape_and_document() -> None:
     assert [Camera(*size).orientation for size in ((4, 3), (3, 4), (5, 5))] == ["landscape", "portrait", "square"]
     assert Camera.from_dict(NCLT.as_dict()) == NCLT

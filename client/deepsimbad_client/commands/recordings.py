@@ -1,7 +1,6 @@
 """What is done with a recording: `upload`, `localize`, `replay` and `watch`."""
 
 import json
-from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -24,13 +23,9 @@ from deepsimbad_client.commands.console import (
 )
 from deepsimbad_client.errors import UnknownDomainError
 from deepsimbad_client.http.client import Client
-from deepsimbad_client.http.models import Domain
 from deepsimbad_client.http.upload import upload as upload_recording
-from deepsimbad_client.recordings import Recording, read_file
-from deepsimbad_client.recordings.folder import single
-from deepsimbad_client.recordings.options import accounting, opened, reading, rotate_option, tell_left_out, tell_remarks
-from deepsimbad_client.recordings.sources import RECORDING_SUFFIXES
-from deepsimbad_client.recordings.told import TOLD_SUFFIXES, as_taken
+from deepsimbad_client.recordings import Recording
+from deepsimbad_client.recordings.options import accounting, opened, reading, rotate_option, tell_left_out, views
 from deepsimbad_client.replay import DEFAULT_PLANNER, Viewer
 from deepsimbad_client.replay.active import EPISODES, STEPS, Stage, active_replay
 from deepsimbad_client.replay.page import write_page
@@ -131,31 +126,12 @@ def localize(
         raise click.UsageError("give DOMAIN and an IMAGE, or several")
     described = client.domain(domain)
     shortlist = min(shortlist, described.n_map_images or shortlist)
-    views = _views(images, described, rotate)
-    answers = [(name, client.localize(domain, shortlist=shortlist, **view)) for name, view in views]
+    looks = views(images, described.takes, described.input_size, described.grey_levels, rotate)
+    answers = [(name, client.localize(domain, shortlist=shortlist, **view)) for name, view in looks]
     if json_output:
         click.echo(as_json([{"image": name, **answer.model_dump(mode="json")} for name, answer in answers]))
     else:
         show(place_table(answers))
-
-
-def _views(images: Iterable[str], domain: Domain, rotate: int | None) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Every view with its name, made ready as an upload would make it, so that it is encoded like a map's own."""
-    for name in images:
-        path = Path(name)
-        if path.is_file() and path.suffix.lower() in TOLD_SUFFIXES:
-            yield name, {"image": read_file(path), "content_type": TOLD_SUFFIXES[path.suffix.lower()]}
-            continue
-        is_image = path.is_file() and path.suffix.lower() not in RECORDING_SUFFIXES
-        if is_image:
-            recording: Recording = single(path, rotate)
-            tell_remarks(recording)
-        else:
-            recording = opened(name, rotate=rotate)
-            tell_left_out(recording.left_out_names, recording.name, verbose=False)
-        recording = as_taken(recording, domain.takes).shown_by(domain.grey_levels)
-        for row, frame in enumerate(recording.frames):
-            yield name if is_image else frame.name, recording.view(row, domain.input_size)
 
 
 def _make_domain(

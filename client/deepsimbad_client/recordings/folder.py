@@ -10,6 +10,7 @@ import numpy as np
 from PIL import Image as Pictures
 from PIL import UnidentifiedImageError
 
+from deepsimbad.core.camera import UPRIGHT_TURN
 from deepsimbad_client.errors import SourceError
 from deepsimbad_client.recordings import (
     IMAGE_SUFFIXES,
@@ -28,7 +29,7 @@ from deepsimbad_client.recordings.gps import TRACK_SUFFIXES, read_exif, read_tra
 from deepsimbad_client.recordings.heic import HEIC_SUFFIXES, require_heic
 from deepsimbad_client.recordings.left_out import shown
 from deepsimbad_client.recordings.names import in_order, times_of
-from deepsimbad_client.recordings.nclt import TURNED_UPRIGHT, UPRIGHT_TURN, lies_on_its_side
+from deepsimbad_client.recordings.nclt import TURNED_UPRIGHT, lies_on_its_side
 from deepsimbad_client.recordings.placing import UNPLACED, Placed, placed, placed_on
 from deepsimbad_client.recordings.plane import GPS_DEADBAND_M, utm, zone_remarks
 from deepsimbad_client.recordings.positions import POSITIONS_FILE, positions_file, read_positions

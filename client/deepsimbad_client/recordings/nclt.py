@@ -28,6 +28,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from deepsimbad.core.camera import NCLT_STORED_SIZE, UPRIGHT_TURN, Camera
 from deepsimbad_client.errors import BrokenFrameError, SourceError
 from deepsimbad_client.recordings import (
     IMAGE_SUFFIXES,
@@ -46,13 +47,10 @@ from deepsimbad_client.recordings.track import Reals, Track, track_of
 
 FRONT_CAMERA = 5
 N_CAMERAS = 6
-STORED_SIZE = (1616, 1232)  # (width, height) of the dataset's own images as stored; smaller copies are read too
 
 N_SIZE_PROBES = 9
-UPRIGHT_TURN = 90  # degrees clockwise, of images as stored
 TURNED_UPRIGHT = f"NCLT's images, which lie on their side as stored, are turned upright ({UPRIGHT_TURN} degrees)"
 N_COLUMNS = 7
-SHAPE_TOLERANCE = 0.01  # of width / height, by which a copy is told from other cameras' 4:3
 
 TIFF_SUFFIXES = frozenset({".tiff", ".tif"})
 _CAMERA = re.compile(r"Cam[0-5].*")
@@ -126,7 +124,7 @@ class NcltRecording(Recording):
             sizes[image.shape[1], image.shape[0]] += 1
         most = max(sizes.values(), default=0)
         commonest = [size for size, n in sizes.items() if n == most]
-        return commonest[0] if commonest and STORED_SIZE not in commonest else STORED_SIZE
+        return commonest[0] if commonest and NCLT_STORED_SIZE not in commonest else NCLT_STORED_SIZE
 
     def _stored(self, name: str) -> Image:
         path = self.folder / name
@@ -145,7 +143,7 @@ def lies_on_its_side(path: Path) -> bool:
         height, width = decode(read_file(path), path, as_stored=True).shape[:2]
     except BrokenFrameError:
         return False
-    return width > height and (in_layout or abs(width / height - STORED_SIZE[0] / STORED_SIZE[1]) < SHAPE_TOLERANCE)
+    return width > height and (in_layout or Camera(width, height).lies_like_nclt)
 
 
 def read_nclt(

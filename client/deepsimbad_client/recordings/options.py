@@ -1,6 +1,6 @@
 """What the commands of client and service ask about a recording, and how they open it."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from functools import wraps
 from pathlib import Path
 from typing import Any
@@ -9,11 +9,14 @@ import click
 from rich.console import Console
 from rich.progress import Progress
 
+from deepsimbad.evaluators.grey_levels import GreyLevels
 from deepsimbad_client.errors import InvalidArgumentError
-from deepsimbad_client.recordings import Recording
+from deepsimbad_client.recordings import Recording, read_file
 from deepsimbad_client.recordings.cuts import one_turn
+from deepsimbad_client.recordings.folder import single
 from deepsimbad_client.recordings.left_out import MOST_LEFT_OUT, LeftOut, left_out_lines
-from deepsimbad_client.recordings.sources import open_source
+from deepsimbad_client.recordings.sources import RECORDING_SUFFIXES, open_source
+from deepsimbad_client.recordings.told import TOLD_SUFFIXES, as_taken
 
 Command = Callable[..., Any]
 
@@ -103,3 +106,34 @@ def tell_left_out(names: Mapping[str, Sequence[str]], recording: str, *, verbose
     """Say on standard error what is left out of a recording."""
     for line in left_out_lines(names, verbose=verbose):
         click.echo(f"{recording}: {line}", err=True)
+
+
+def views(
+    images: Iterable[str],
+    takes: Collection[str],
+    input_size: tuple[int, int] | None,
+    levels: GreyLevels | None,
+    rotate: int | None,
+) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Every view with its name, made ready as an upload would make it, so that it is encoded like a map's own.
+
+    Files of images or of what is told, and SOURCEs, whose frames are views. Raises SourceError, BrokenFrameError.
+    """
+    said: set[str] = set()  # of many files once
+    for name in images:
+        path = Path(name)
+        if path.is_file() and path.suffix.lower() in TOLD_SUFFIXES:
+            yield name, {"image": read_file(path), "content_type": TOLD_SUFFIXES[path.suffix.lower()]}
+            continue
+        is_image = path.is_file() and path.suffix.lower() not in RECORDING_SUFFIXES
+        if is_image:
+            recording: Recording = single(path, rotate)
+            if not said.issuperset(recording.remarks):
+                tell_remarks(recording)
+            said.update(recording.remarks)
+        else:
+            recording = opened(name, rotate=rotate)
+            tell_left_out(recording.left_out_names, recording.name, verbose=False)
+        recording = as_taken(recording, takes).shown_by(levels)
+        for row, frame in enumerate(recording.frames):
+            yield name if is_image else frame.name, recording.view(row, input_size)

@@ -34,7 +34,6 @@ from deepsimbad.api.scenes import MOST_PARTS, TOLD, TOLD_BODIES, TOLD_SCHEMA, sc
 from deepsimbad.core.map import Map
 from deepsimbad.core.planners import Plan
 from deepsimbad.core.summary import DEFAULT_CONFIDENCE, BeliefSummary
-from deepsimbad.engine.decoders import remarks_on_shape
 from deepsimbad.engine.localizer import (
     Dissimilarities,
     Localization,
@@ -363,12 +362,13 @@ async def view_in(
         return PackedRanks(body), []
     levels = levels_in(snapshot.landmark_model)
     if media_type not in MEDIA_TYPES:
-        scene, picture = await scene_in(body, media_type, document, running, evaluator, Priority.LIVE, levels)
-        seen = [] if picture is None else [*picture.remarks, *remarks_on_shape(snapshot, picture.size)]
+        scene, picture = await scene_in(
+            body, media_type, document, running, evaluator, Priority.LIVE, levels, snapshot.cameras
+        )
+        seen = [] if picture is None else picture.remarks
         return NothingSeen() if scene.is_blank else scene, [*scene.remarks, *seen]
-    decoded = await running.decoders.decoded(body, evaluator, Priority.LIVE, levels)
-    remarks = [*decoded.remarks, *remarks_on_shape(snapshot, decoded.size)]
-    return NothingSeen() if decoded.is_blank else decoded.image, remarks
+    decoded = await running.decoders.decoded(body, evaluator, Priority.LIVE, levels, snapshot.cameras)
+    return NothingSeen() if decoded.is_blank else decoded.image, decoded.remarks
 
 
 def npy_response(values: NDArray[np.floating]) -> Response:

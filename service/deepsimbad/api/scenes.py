@@ -1,9 +1,10 @@
 """Views that are told: a text, objects that a detector found, and either beside an image as `multipart/form-data`."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from deepsimbad.api.requests import JSON, Services
+from deepsimbad.core.camera import Camera
 from deepsimbad.engine.decoders import Decoded
 from deepsimbad.engine.worker import Priority
 from deepsimbad.evaluators.base import Evaluator
@@ -57,6 +58,7 @@ async def scene_in(
     evaluator: Evaluator,
     priority: Priority,
     levels: GreyLevels | None,
+    cameras: Sequence[Camera] = (),
 ) -> tuple[Scene, Decoded | None]:
     """What a body tells, and the image in it.
 
@@ -75,5 +77,5 @@ async def scene_in(
     scene.of(evaluator.forms)
     if image is None:
         return scene, None
-    decoded = await running.decoders.decoded(image, evaluator, priority, levels)
+    decoded = await running.decoders.decoded(image, evaluator, priority, levels, cameras)
     return scene.beside(decoded.image), decoded

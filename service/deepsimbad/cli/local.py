@@ -1,11 +1,11 @@
 """`deepsimbad map`, `localize` and `info`: the same data directory as the server's, without a server."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from pathlib import Path
 from typing import Any
 
 import click
+import numpy as np
 from rich.table import Table
 
 from deepsimbad.cli.terminal import (
@@ -20,19 +20,21 @@ from deepsimbad.cli.terminal import (
     write_json,
 )
 from deepsimbad.core.drive import Drive
-from deepsimbad.core.map import DEFAULT_ACTIONS_M, check_actions
+from deepsimbad.core.map import DEFAULT_ACTIONS_M, Map, check_actions
 from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Relevance
-from deepsimbad.engine.decoders import remarks_on_shape
+from deepsimbad.engine.decoders import Decoded
+from deepsimbad.engine.localizer import NothingSeen, ReadyEncoding, View
 from deepsimbad.engine.localizer import localize as localize_view
 from deepsimbad.engine.maps import Maps
 from deepsimbad.engine.pictures import Pictures
 from deepsimbad.engine.worker import EvaluatorPool, Stopwatch
-from deepsimbad.errors import CancelledError, ImageTooLargeError, InvalidImageError, InvalidSourceError
+from deepsimbad.errors import CancelledError, DeepSimbadError
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.compute import available_cores
 from deepsimbad.evaluators.grey_levels import levels_in
-from deepsimbad.evaluators.image import decode_image, picture_size
+from deepsimbad.evaluators.image_files import MEDIA_TYPES, ImageFile
 from deepsimbad.evaluators.registry import EvaluatorConfig, make_evaluator
+from deepsimbad.evaluators.scenes import Scene, seen_in
 from deepsimbad.jobs.build import encode_recording
 from deepsimbad.jobs.fitting import RecordingPictures
 from deepsimbad.jobs.remap import (
@@ -48,9 +50,8 @@ from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.layout import checked_name
 from deepsimbad.store.traverses import Traverse
 from deepsimbad_client.errors import BrokenFrameError
-from deepsimbad_client.recordings import Recording, turned
-from deepsimbad_client.recordings.nclt import TURNED_UPRIGHT, UPRIGHT_TURN, lies_on_its_side
-from deepsimbad_client.recordings.options import accounting, opened, reading, rotate_option, tell_left_out
+from deepsimbad_client.recordings import Recording
+from deepsimbad_client.recordings.options import accounting, opened, reading, rotate_option, tell_left_out, views
 
 _FRAMES_A_SECOND = 150.0  # that are encoded, against which the stages of a remap are weighed
 
@@ -212,50 +213,59 @@ def _nothing_kept() -> Iterator[None]:
 
 @click.command()
 @click.argument("domain")
-@click.argument("images", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.argument("images", nargs=-1, required=True, metavar="IMAGE...")
 @rotate_option
 @click.option("--json", "as_json", is_flag=True, help="Print the full answers as one JSON list.")
 @data_dir_option
-def localize(domain: str, images: tuple[Path, ...], rotate: int | None, as_json: bool) -> None:
-    """Say where on the route each image was probably taken."""
+def localize(domain: str, images: tuple[str, ...], rotate: int | None, as_json: bool) -> None:
+    """Say where on the route each image was probably taken.
+
+    IMAGE is a file, or a SOURCE such as nclt:ROOT/DATE#40:41 or a folder; each image is placed on its own. Where the
+    domain takes them it may be a .txt that says what is seen, or a .json of {"objects": [...]}.
+    """
     from deepsimbad.api.localizations import render_localization  # noqa: PLC0415 - as below
 
     settings = given_settings()
     with Catalog.open(existing_data_dir()) as catalog:
         active = Maps(catalog).active(domain)
         evaluator = EvaluatorPool(settings.compute()).evaluator(active.record.evaluator)
-        answers, levels = [], levels_in(active.snapshot.landmark_model)
-        for path in images:
+        snapshot, answers = active.snapshot, list[tuple[str, Any]]()
+        levels = levels_in(snapshot.landmark_model)
+        for name, given in views(images, evaluator.forms, evaluator.input_size, levels, rotate):
             watch = Stopwatch()
             try:
-                body = path.read_bytes()
-            except OSError as error:
-                raise InvalidSourceError(f"cannot read {path}: {error.strerror or error}") from error
-            try:
-                view = decode_image(body, settings.max_pixels, levels=levels)
-            except (InvalidImageError, ImageTooLargeError) as error:
-                raise type(error)(f"{path}: {error.message}", **error.hints) from error
-            remarks = [] if rotate else remarks_on_shape(active.snapshot, picture_size(body))
-            if rotate is not None:
-                view = turned(view, rotate)
-            elif lies_on_its_side(path):
-                remarks = []
-                click.echo(f"{path}: {TURNED_UPRIGHT}", err=True)
-                view = turned(view, UPRIGHT_TURN)
-            watch.lap("decode")
-            localization = localize_view(active.snapshot, evaluator, view, watch=watch)
-            answers.append(render_localization(localization, watch, remarks))
+                view, remarks = _view_in(given, evaluator, snapshot, settings.max_pixels)
+                watch.lap("decode")
+                localization = localize_view(snapshot, evaluator, view, watch=watch)
+            except DeepSimbadError as error:
+                raise type(error)(f"{name}: {error.message}", **error.hints) from error
+            answers.append((name, render_localization(localization, watch, remarks)))
     if as_json:
-        write_json([{"image": str(path), **answer} for path, answer in zip(images, answers, strict=True)])
+        write_json([{"image": name, **answer} for name, answer in answers])
         return
     table = Table("image", "most like", "most likely at", "mean +- std", "95 % within", "entropy")
-    for path, answer in zip(images, answers, strict=True):
+    for name, answer in answers:
         belief = answer["belief"]
         mean, (low, high) = f"{belief['mean_m']:.1f} +- {belief['std_m']:.1f} m", belief["credible_95_m"]
         within = f"{low:.1f} .. {high:.1f} m"
         frame = belief["top"][0]["frame"] or f"image {belief['top'][0]['map_image']}"
-        table.add_row(str(path), frame, f"{belief['mode_m']:.1f} m", mean, within, f"{belief['entropy_bits']:.1f} bit")
+        table.add_row(name, frame, f"{belief['mode_m']:.1f} m", mean, within, f"{belief['entropy_bits']:.1f} bit")
     print_table(table)
+
+
+def _view_in(
+    given: Mapping[str, Any], evaluator: Evaluator, snapshot: Map, max_pixels: int
+) -> tuple[View, Sequence[str]]:
+    """A view as the engine takes it, and what a person should know of it."""
+    if "encoding" in given:
+        return ReadyEncoding(np.asarray(given["encoding"], np.float64)), ()
+    body, media_type = given["image"], given["content_type"]
+    if media_type in MEDIA_TYPES:
+        levels = levels_in(snapshot.landmark_model)
+        decoded = Decoded.of(ImageFile.read(body, max_pixels), body, evaluator, levels, snapshot.cameras)
+        return NothingSeen() if decoded.is_blank else decoded.image, decoded.remarks
+    scene = seen_in(body, media_type, evaluator, max_pixels)
+    return scene, scene.remarks if isinstance(scene, Scene) else ()
 
 
 @click.command("delete-domain")

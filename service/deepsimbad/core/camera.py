@@ -6,6 +6,9 @@ from dataclasses import asdict, dataclass
 from typing import Any, Self
 
 SAME_SHAPE = 0.05  # of an aspect ratio, up to which two are one: 4:3 and NCLT's 1616 x 1232
+NCLT_STORED_SIZE = (1616, 1232)  # (width, height) of NCLT's images, which lie on their side
+NCLT_SHAPE = 0.01  # of an aspect ratio, by which copies of them are told from other cameras' 4:3
+UPRIGHT_TURN = 90  # degrees clockwise that NCLT's images are turned by
 
 
 @dataclass(frozen=True)
@@ -27,6 +30,21 @@ class Camera:
         if self.width == self.height:
             return "square"
         return "landscape" if self.width > self.height else "portrait"
+
+    @property
+    def lies_like_nclt(self) -> bool:
+        """Whether its images have the shape of NCLT's as stored."""
+        return _is_alike(self.aspect_ratio, NCLT_STORED_SIZE[0] / NCLT_STORED_SIZE[1], NCLT_SHAPE)
+
+    def turn_to(self, others: Iterable["Camera"]) -> int:
+        """Degrees clockwise that bring its pictures to lie as those of others do; 0 where nobody can tell which way.
+
+        Only NCLT's files tell by their shape: others of the transposed shape may lie on either side.
+        """
+        others = tuple(others)
+        upright = any(Camera(other.height, other.width).lies_like_nclt for other in others)
+        lying = any(_is_alike(self.aspect_ratio, other.aspect_ratio) for other in others)
+        return UPRIGHT_TURN if self.lies_like_nclt and upright and not lying else 0
 
     def as_dict(self) -> dict[str, Any]:
         """The JSON form."""
@@ -56,5 +74,5 @@ class Camera:
         return f"they are of another shape, and so perhaps of another camera: {shapes}"
 
 
-def _is_alike(ratio: float, other: float) -> bool:
-    return abs(math.log(ratio / other)) <= math.log1p(SAME_SHAPE)
+def _is_alike(ratio: float, other: float, within: float = SAME_SHAPE) -> bool:
+    return abs(math.log(ratio / other)) <= math.log1p(within)

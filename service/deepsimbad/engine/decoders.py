@@ -1,12 +1,13 @@
 """Images of requests, decoded beside the event loop: how many at once, and what is seen of each."""
 
+from collections.abc import Sequence
 from typing import NamedTuple, Self
 
+import numpy as np
 from anyio import CapacityLimiter
 from anyio.to_thread import run_sync
 
 from deepsimbad.core.camera import Camera
-from deepsimbad.core.map import Map
 from deepsimbad.engine.worker import Priority, ready
 from deepsimbad.errors import OverloadedError
 from deepsimbad.evaluators.base import Evaluator, Image
@@ -31,9 +32,14 @@ class Decoders:
         self._large = CapacityLimiter(1)
 
     async def decoded(
-        self, body: bytes, evaluator: Evaluator, priority: Priority, levels: GreyLevels | None
+        self,
+        body: bytes,
+        evaluator: Evaluator,
+        priority: Priority,
+        levels: GreyLevels | None,
+        cameras: Sequence[Camera] = (),
     ) -> "Decoded":
-        """The image in a body at its evaluator's size; `levels` as `decode_file` takes them.
+        """The image in a body at its evaluator's size; `levels` as `decode_file` takes them, `cameras` as `Decoded.of`.
 
         Raises:
             InvalidImageError, ImageTooLargeError, EmptyBodyError, OutOfMemoryError: As `ImageFile`.
@@ -41,7 +47,7 @@ class Decoders:
             OverloadedError: The image is large, and as many large ones wait as may.
         """
         threads = self._threads[priority]
-        image = await run_sync(self._read, body, evaluator, levels, limiter=threads)
+        image = await run_sync(self._read, body, evaluator, levels, cameras, limiter=threads)
         if not isinstance(image, ImageFile):
             return image
         if self._large.statistics().tasks_waiting >= self.LARGE_WAITING:
@@ -52,18 +58,14 @@ class Decoders:
                 most_pixels_at_once=KEPT_PIXELS,
             )
         async with self._large:
-            return await run_sync(Decoded.of, image, body, evaluator, levels, limiter=threads)
+            return await run_sync(Decoded.of, image, body, evaluator, levels, cameras, limiter=threads)
 
-    def _read(self, body: bytes, evaluator: Evaluator, levels: GreyLevels | None) -> "Decoded | ImageFile":
+    def _read(
+        self, body: bytes, evaluator: Evaluator, levels: GreyLevels | None, cameras: Sequence[Camera]
+    ) -> "Decoded | ImageFile":
         """The file where its image is large, else what it decodes to."""
         file = ImageFile.read(body, self._max_pixels)
-        return file if file.n_pixels > KEPT_PIXELS else Decoded.of(file, body, evaluator, levels)
-
-
-def remarks_on_shape(snapshot: Map, size: tuple[int, int] | None) -> list[str]:
-    """What a person should know of a picture, (width, height) as it was sent, beside those of a map."""
-    why = None if size is None else Camera(*size).unlike(snapshot.cameras, "the map's")
-    return [] if why is None else [f"the view's pixels are not like the map's: {why}"]
+        return file if file.n_pixels > KEPT_PIXELS else Decoded.of(file, body, evaluator, levels, cameras)
 
 
 class Decoded(NamedTuple):
@@ -71,19 +73,34 @@ class Decoded(NamedTuple):
 
     image: Image  # [height, width, 3] uint8 BGR at its evaluator's size
     is_blank: bool  # whether it shows nothing, as it is encoded: so it is the same for a view that was sent smaller
-    size: tuple[int, int] | None  # (width, height) as it was sent, upright; None where nobody can tell
+    size: tuple[int, int] | None  # (width, height) as it was sent, upright by its file; None where nobody can tell
     levels: GreyLevels | None  # by which it is shown; None: it had 8 bits
     remarks: list[str]  # what a person should know of it
     body: bytes  # the file it came in
 
     @classmethod
-    def of(cls, file: ImageFile, body: bytes, evaluator: Evaluator, levels: GreyLevels | None) -> Self:
-        """Decode the file in a body; takes milliseconds."""
+    def of(
+        cls,
+        file: ImageFile,
+        body: bytes,
+        evaluator: Evaluator,
+        levels: GreyLevels | None,
+        cameras: Sequence[Camera] = (),
+    ) -> Self:
+        """Decode the file in a body; takes milliseconds.
+
+        Beside pictures of `cameras`, the map's: told where it lies otherwise, and turned where that is NCLT's way.
+        """
         ready(evaluator)  # where it is not, decoding is in vain
-        pixels = decode_deep(file)
+        pixels, size = decode_deep(file), picture_size(body)
         remarks = [CLIPPED] if levels is not None and clips(pixels, levels) else []
         pixels, shown_by = in_eight_bits(pixels, levels)
+        if size is not None and (turn := Camera(*size).turn_to(cameras)):
+            pixels = np.ascontiguousarray(np.rot90(pixels, -turn // 90))
+            remarks.append(f"the view lies on its side as NCLT's files do: it was turned by {turn} degrees")
+        elif size is not None and (why := Camera(*size).unlike(cameras, "the map's")) is not None:
+            remarks.append(f"the view's pixels are not like the map's: {why}")
         image = evaluator.prepare(pixels)
         shows_nothing = is_blank(image)
         remarks += [FEW_GREYS] if not shows_nothing and holds_few_greys(image) else []
-        return cls(image, shows_nothing, picture_size(body), shown_by, remarks, body)
+        return cls(image, shows_nothing, size, shown_by, remarks, body)

@@ -2,6 +2,8 @@
 
 import io
 import json
+import shutil
+from pathlib import Path
 
 import cv2
 import httpx2
@@ -22,6 +24,7 @@ from deepsimbad_client.recordings.sources import open_source
 
 from ..conftest import serving
 
+NCLT_US = 1_326_030_975_000_000
 LIMIT = 50_000_000
 EVALUATOR = {"kind": "feature_l2", "extractor": "gradient_grid"}
 
@@ -115,6 +118,59 @@ def test_a_view_has_one_answer_by_every_route(tmp_path, capsys):
         # Eight ranks are less than an encoding: they need not agree on the very best.
         best = [image.map_image for image in by_ranks[number].retrieval[:3]]
         assert expected["retrieval"][0]["map_image"] in best
+
+
+def write_nclt(root, date, n, alpha=1.0):
+    """A drive in NCLT's layout: files that lie on their side."""
+    camera = root / date / "lb3" / "Cam5"
+    camera.mkdir(parents=True)
+    (root / "ground_truth").mkdir(exist_ok=True)
+    for place in range(n):
+        lying = cv2.rotate(scene(100 + place, (308, 404)), cv2.ROTATE_90_COUNTERCLOCKWISE)
+        path = camera / f"{NCLT_US + 500_000 * place}.tiff"
+        cv2.imwrite(str(path), cv2.convertScaleAbs(lying, alpha=alpha, beta=10))
+    rows = (f"{NCLT_US - 100_000 + 10_000 * row},{(row - 10) / 50},0,0,0,0,0" for row in range(50 * n + 20))
+    (root / "ground_truth" / f"groundtruth_{date}.csv").write_text("\n".join(rows))
+    return camera
+
+
+def test_a_raw_image_of_nclt_has_one_answer_by_every_route(tmp_path, capsys):
+    """Whoever sends its bytes as they are: it is turned as the map's were, and the answer says so."""
+    write_nclt(tmp_path / "nclt", "2012-01-08", 12)
+    looks = write_nclt(tmp_path / "nclt", "2012-02-05", 12, alpha=0.8)
+    loose = tmp_path / "loose"
+    shutil.copytree(looks, loose)
+    paths, data_dir = sorted(map(str, loose.iterdir()))[2:5], str(tmp_path / "data")
+    with serving(tmp_path / "data") as url, Client(url) as client:
+        client.admin.put_domain("yard", EVALUATOR)
+        upload(client, open_source(f"nclt:{tmp_path}/nclt/2012-01-08"), "yard", "t")
+        remap(client, "yard", "t", n_landmarks=8, list_length=4)
+        answers = {"Python": [client.localize("yard", path).model_dump(mode="json") for path in paths]}
+        with client.session("yard") as session:
+            in_session = session.observe(paths[0])
+        at, header = f"{url}/v1/domains/yard/localizations", {"Content-Type": "image/tiff"}
+        posted = [httpx2.post(at, content=Path(path).read_bytes(), headers=header).json() for path in paths]
+        commands = {
+            "files": ["yard", *paths],
+            "drive": ["yard", f"nclt:{tmp_path}/nclt/2012-02-05#2:5"],
+            "camera's folder": ["yard", f"{looks}#2:5"],
+            "folder": ["yard", f"{loose}#2:5"],
+        }
+        capsys.readouterr()
+        for route, words in commands.items():
+            assert run(["localize", *words, "--server", url, "--json"]) == 0
+            answers[f"client, {route}"] = json.loads(capsys.readouterr().out)
+    for route, words in commands.items():
+        assert run_service(["localize", *words, "--data-dir", data_dir, "--json"]) == 0
+        out, err = capsys.readouterr()
+        answers[f"here, {route}"] = json.loads(out)
+        assert err.count("upright") == (route != "drive")
+    assert [answer["belief"]["mode_m"] for answer in posted] == pytest.approx([2.2, 3.2, 4.2]), "else nothing is shown"
+    for answer in (posted[0], in_session.model_dump()):
+        assert any("as NCLT's files do: it was turned by 90 degrees" in warning for warning in answer["warnings"])
+    for route, told in answers.items():
+        for answer, expected in zip(told, posted, strict=True):
+            assert (answer["belief"], answer["retrieval"]) == (expected["belief"], expected["retrieval"]), route
 
 
 def deep(seed):
