@@ -10,6 +10,7 @@ import numpy as np
 
 from deepsimbad_client.errors import SourceError
 from deepsimbad_client.recordings import Recording
+from deepsimbad_client.recordings.names import counted_anew, dates_in
 
 EARLY_SHARE = 0.02  # of a step, by which a frame may come before it is due
 FEWEST_OF_A_TURN, NEAR_START_M = 10, 1.0
@@ -90,7 +91,8 @@ def _check_names(recording: Recording) -> None:
         return
     if not np.allclose(metres, steps * (metres[-1] / max(1, steps[-1]))):
         return
-    kinds = [re.sub(r"[0-9]+", "0", frame.name) for frame in frames]
+    names = [frame.name for frame in frames]
+    kinds = [re.sub(r"[0-9]+", "0", name) for name in names]
     changes = np.flatnonzero([before != kind for before, kind in pairwise(kinds)]) + 1
     if 2 * len(changes) >= len(frames) and min(Counter(kinds).values()) >= FEWEST_OF_A_KIND:
         after = frames[int(changes[0])]
@@ -99,11 +101,14 @@ def _check_names(recording: Recording) -> None:
             "turns: are these several drives or cameras? Move each into a folder of its own, or say in a positions.csv "
             "where each image was taken"
         )
+    if len(set(kinds)) == 1 and dates_in(names) is None:
+        changes = np.array(counted_anew(names), np.intp)
     ends = [0, *changes.tolist(), len(frames)]
-    if len(changes) and min(np.diff(ends)) >= FEWEST_OF_A_KIND and len(set(kinds)) == len(changes) + 1:
+    if len(changes) and min(np.diff(ends)) >= FEWEST_OF_A_KIND and len(set(kinds)) in {1, len(changes) + 1}:
         before, after = frames[ends[1] - 1], frames[ends[1]]
+        what = "count anew" if len(set(kinds)) == 1 else "are names of two kinds"
         raise SourceError(
-            f"{recording.name}: {before.name} and {after.name} are names of two kinds: are these several drives? Name "
+            f"{recording.name}: {before.name} and {after.name} {what}: are these several drives? Name "
             f"one of them by a slice (#:{after.index} or #{after.index}:), move them apart, or say in a positions.csv "
             "where each image was taken"
         )
@@ -113,10 +118,12 @@ def check_one_drive(recording: Recording) -> None:
     """Refuse what was recorded in several goes, elsewhere each: the way between was not recorded, nor is its length."""
     _check_names(recording)
     frames = [frame for frame in recording.frames if frame.timestamp_us is not None]
-    times = [frame.timestamp_us for frame in frames if frame.timestamp_us is not None]
+    times = [frame.timestamp_us / 1e6 for frame in frames if frame.timestamp_us is not None]
+    if not frames and (dates := dates_in([frame.name for frame in recording.frames])) is not None:
+        frames, times = list(recording.frames), [date.timestamp() for date in dates]
     if len(times) < 3:
         return
-    pauses_s = np.abs(np.diff(np.array(times, np.int64))) / 1e6
+    pauses_s = np.abs(np.diff(times))
     longest = int(np.argmax(pauses_s))
     if pauses_s[longest] < max(LONGEST_PAUSE_S, 100 * float(np.median(pauses_s))):
         return

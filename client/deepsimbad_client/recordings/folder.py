@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,10 +34,12 @@ from deepsimbad_client.recordings.nclt import TURNED_UPRIGHT, lies_on_its_side
 from deepsimbad_client.recordings.placing import UNPLACED, Placed, placed, placed_on
 from deepsimbad_client.recordings.plane import GPS_DEADBAND_M, utm, zone_remarks
 from deepsimbad_client.recordings.positions import POSITIONS_FILE, positions_file, read_positions
+from deepsimbad_client.recordings.told import CAPTIONS
 
 _ORIENTATION, _MODEL = 0x0112, 0x0110  # of EXIF
 _LYING = range(5, 9)  # orientations in which width is height
 _MOST_TOLD = 4
+_TABLE = re.compile(r".*\.(csv|tsv|xlsx|ods)|.*(pos|gps).*\.(txt|json)")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -111,7 +114,7 @@ def read_folder(
         result = Placed([Frame(i, name, i * spacing_m, timestamp_us=time) for i, (name, time) in enumerate(frames)])
         result.remarks.append(
             f"{len(names)} images are taken {spacing_m:g} m apart: there is no {POSITIONS_FILE} and no track (.gpx, "
-            ".nmea) beside them, and no EXIF among them says a place"
+            f".nmea) beside them, and no EXIF among them says a place{_misnamed(paths)}"
         )
     if others:
         result.left_out_names["of a format that is not read: convert to PNG"] = others
@@ -119,6 +122,12 @@ def read_folder(
         folder.resolve().name, tuple(result.frames), result.left_out_names, remarks=result.remarks, folder=folder
     )
     return _prepared(recording, rotate)
+
+
+def _misnamed(paths: Sequence[Path]) -> str:
+    """What is to be said of files that may have been meant for `positions.csv`."""
+    names = sorted(path.name for path in paths if _TABLE.fullmatch(path.name.lower()) and path.name != CAPTIONS)
+    return f"; {shown(names)} is not read: should it be called {POSITIONS_FILE}?" if names else ""
 
 
 def _hint(folder: Path, others: Sequence[str]) -> str:

@@ -3,7 +3,9 @@
 import re
 import unicodedata
 from collections.abc import Callable, Hashable, Sequence
+from datetime import UTC, datetime
 from decimal import Decimal
+from itertools import pairwise
 from pathlib import PureWindowsPath
 
 from deepsimbad_client.recordings.clock import UNITS, unit_of
@@ -12,14 +14,24 @@ _DIGITS = re.compile(r"([0-9]+)")
 _DECIMALS = re.compile(r"((?:^-)?(?:(?<![0-9.])[0-9]*\.[0-9]+(?![0-9]|\.[0-9])|[0-9]+))")
 _DECIMAL_COMMA = re.compile(r"(?<=[0-9]),(?=[0-9])")
 _NUMBER = re.compile(r"-?[0-9]*\.?[0-9]+")
+_STAMP = re.compile(r"(?<![0-9])([0-9]{10})_([0-9]{9})(?![0-9])")  # of ROS: seconds and nanoseconds
+_HEXADECIMAL = re.compile(r"[0-9a-f]{2,}")
+_DATE = re.compile(
+    r"(?<![0-9])((?:19|20)[0-9]{2})[-_.]?([0-9]{2})[-_.]?([0-9]{2})[T _-]*([0-9]{2})[-_.:]?([0-9]{2})[-_.:]?([0-9]{2})"
+)
+_PART = re.compile(r"(part|chunk|split|chapter|clip|segment|seg)[-_ ]*[0-9]+[^a-z0-9]*", re.IGNORECASE)
+_LONGEST_STEP = 100  # of a counter; larger ones are fractions
 
 
 def in_order(names: Sequence[str]) -> list[str]:
     """File names with numbers in them as numbers: 2.png before 10.png, 1305031103.25.png before 1305031103.5.png.
 
     Commas between digits count as points. Where fractions of several lengths end in 0 they are counters (1.9 before
-    1.10).
+    1.10). Hexadecimal names of one length are in the order of their letters.
     """
+    stems = [stem(name).lower() for name in names]
+    if len(set(map(len, stems))) == 1 and all(map(_HEXADECIMAL.fullmatch, stems)) and not "".join(stems).isdigit():
+        return sorted(names, key=lambda name: (name.lower(), name))
     fractions = [
         part.partition(".")[2] for name in names for part in _DECIMALS.split(_pointed(name))[1::2] if "." in part
     ]
@@ -43,8 +55,8 @@ def stem(name: str) -> str:
 
 
 def _pointed(name: str) -> str:
-    """A name's stem, with points for decimal commas."""
-    return _DECIMAL_COMMA.sub(".", stem(name))
+    """A name's stem, with points for decimal commas, and seconds and nanoseconds one number."""
+    return _STAMP.sub(r"\1.\2", _DECIMAL_COMMA.sub(".", stem(name)))
 
 
 def _number(name: str) -> Decimal | None:
@@ -58,6 +70,37 @@ def times_of(names: Sequence[str]) -> list[int] | None:
     units = {unit_of(number) for number in numbers}
     unit = units.pop() if len(units) == 1 and len(numbers) == len(names) else None
     return None if unit is None else [round(number * UNITS[unit]) for number in numbers]
+
+
+def dates_in(names: Sequence[str]) -> list[datetime] | None:
+    """Moments, of whatever time zone, where all names hold a date and a time of day."""
+    figures = [" ".join(match.groups()) for match in map(_DATE.search, names) if match]
+    try:
+        dates = [datetime.strptime(date, "%Y %m %d %H %M %S").replace(tzinfo=UTC) for date in figures]
+    except ValueError:
+        return None
+    return dates if len(dates) == len(names) else None
+
+
+def counted_anew(names: Sequence[str]) -> list[int]:
+    """Where the last number in names begins anew behind another beginning, as in a_1_28, a_1_29, a_2_0, a_2_1.
+
+    Not where that is a clock's, or the last digits of one number, or the names say that they are parts.
+    """
+    parts = [_DECIMALS.split(_pointed(name)) for name in names]
+    if any(len(part) < 4 for part in parts):
+        return []
+    numbers = [Decimal(part[-2]) for part in parts]
+    beginnings = ["".join(part[:-2]) for part in parts]
+    places = [at for at, (before, after) in enumerate(pairwise(beginnings), 1) if before != after]
+    steps = [after - before for before, after in pairwise(numbers)]
+    is_clock = all(len(part[-2]) == len(part[-4]) == 2 and Decimal(part[-2]) < 60 for part in parts)
+    is_digit = re.fullmatch(r"10*", str(max(numbers) + 1))
+    is_part = all(map(_PART.search, beginnings)) or len(set(beginnings)) != len(places) + 1
+    if is_clock or is_digit or is_part:
+        return []
+    counts = all(step <= 0 if at in places else 0 < step <= _LONGEST_STEP for at, step in enumerate(steps, 1))
+    return places if counts else []
 
 
 class Finder:

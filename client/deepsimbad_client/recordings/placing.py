@@ -215,22 +215,11 @@ def _filled(place: Times, time_us: Times, n: int) -> Times:
 
 def _measure(result: Placed, time_us: Times | None, where: str) -> None:
     x_m, y_m = (np.array([getattr(frame, axis) for frame in result.frames], np.float64) for axis in ("x_m", "y_m"))
-    leaping = by_turns(x_m, y_m)
-    if leaping is not None:
-        before, after = result.frames[leaping - 1 : leaping + 1]
-        apart_m = math.hypot(x_m[leaping] - x_m[leaping - 1], y_m[leaping] - y_m[leaping - 1])
-        raise SourceError(
-            f"{where}: places leap to and fro, {before.name} and {after.name} are {apart_m:.0f} m apart: are these "
-            "several drives by turns? Move each into a folder of its own"
-        )
+    _refuse_turns(result, x_m, y_m, where)
     usable = on_track(x_m, y_m, time_us)
     _without_spikes(result, usable, x_m, y_m)
     along_m = arc_length_m(x_m[usable], y_m[usable], None if time_us is None else time_us[usable], result.deadband_m)
-    if len(along_m) > 2 and along_m[-1] < DEADBAND_M:
-        result.remarks.append(
-            f"all frames lie within {along_m[-1]:.2g} m: the robot stood, or x_m, y_m are no metres (degrees go into "
-            "columns latitude, longitude)"
-        )
+    _tell_standing(result, float(along_m[-1]), "x_m, y_m are no metres (degrees go into columns latitude, longitude)")
     result.frames = [
         dataclasses.replace(frame, position_m=position_m)
         for frame, position_m in zip(result.frames, along_m.tolist(), strict=True)
@@ -239,6 +228,7 @@ def _measure(result: Placed, time_us: Times | None, where: str) -> None:
 
 def _use_stated(result: Placed, time_us: Times | None, where: str) -> None:
     position_m = np.array([frame.position_m for frame in result.frames], np.float64)
+    _refuse_turns(result, position_m, np.zeros_like(position_m), where)
     usable = on_track(position_m, np.zeros_like(position_m), time_us, STATED_SPEEDS)
     _without_spikes(result, usable, position_m, np.zeros_like(position_m))
     position_m = position_m[usable]
@@ -261,10 +251,28 @@ def _use_stated(result: Placed, time_us: Times | None, where: str) -> None:
             "parts"
         )
     result.leave_out(usable.tolist(), "where the position goes back")
+    _tell_standing(result, float(np.ptp(turned_m[usable])), "position_m is not in metres")
     result.frames = [
         dataclasses.replace(frame, position_m=at)
         for frame, at in zip(result.frames, turned_m[usable].tolist(), strict=True)
     ]
+
+
+def _refuse_turns(result: Placed, x_m: Reals, y_m: Reals, where: str) -> None:
+    """Raises SourceError: places leap to and fro as those of several drives by turns do."""
+    leaping = by_turns(x_m, y_m)
+    if leaping is not None:
+        before, after = result.frames[leaping - 1 : leaping + 1]
+        apart_m = math.hypot(x_m[leaping] - x_m[leaping - 1], y_m[leaping] - y_m[leaping - 1])
+        raise SourceError(
+            f"{where}: places leap to and fro, {before.name} and {after.name} are {apart_m:.0f} m apart: are these "
+            "several drives by turns? Move each into a folder of its own"
+        )
+
+
+def _tell_standing(result: Placed, length_m: float, otherwise: str) -> None:
+    if len(result.frames) > 2 and length_m < DEADBAND_M:
+        result.remarks.append(f"all frames lie within {length_m:.2g} m: the robot stood, or {otherwise}")
 
 
 def _without_spikes(result: Placed, usable: np.ndarray, x_m: Reals, y_m: Reals) -> None:

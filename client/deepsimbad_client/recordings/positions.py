@@ -1,7 +1,7 @@
 """`positions.csv`: where the images beside it were taken.
 
 A header and one line for each image, cells between commas, or semicolons or tabs (then 0,5 is a half). Columns, in any
-order, others are ignored:
+order, others are ignored, and so is a # before the first:
 
     name          the image's file name: folders before it, letter case and its ending do not matter; without this
                   column (and without `index`) the lines go with the images in name order and there must be as many
@@ -34,7 +34,7 @@ from deepsimbad_client.recordings.left_out import NO_IMAGE
 from deepsimbad_client.recordings.names import Finder
 from deepsimbad_client.recordings.placing import UNPLACED, Placed, placed_on
 from deepsimbad_client.recordings.plane import GPS_DEADBAND_M, utm, zone_remarks
-from deepsimbad_client.recordings.track import DEADBAND_M, track_of
+from deepsimbad_client.recordings.track import DEADBAND_M, FARTHEST_M, track_of
 
 CLOCKS_APART_S = 0.5
 
@@ -88,12 +88,16 @@ class _Table:
         return [line[at] for _, line in self.lines]
 
     def numbers(self, column: str) -> list[float | None]:
-        """A column of numbers, None where nothing is known. Raises SourceError (something else stands there)."""
+        """A column of numbers, None where nothing is known. Raises SourceError (something else stands there).
+
+        What is farther than `FARTHEST_M` stands for nothing known too.
+        """
         values: list[float | None] = []
         for row, cell in enumerate(self.cells(column) or [""] * len(self.lines)):
-            values.append(finite_number(cell))
-            if values[-1] is None and cell.lower() not in UNKNOWN:
+            value = finite_number(cell)
+            if value is None and cell.lower() not in UNKNOWN:
                 raise SourceError(f"{self.where(row)}: {column} is {cell!r}, not a number such as 1234.5")
+            values.append(None if value is None or abs(value) > FARTHEST_M else value)
         return values
 
     def times_us(self) -> tuple[list[int | None], list[str]]:
@@ -185,6 +189,8 @@ def _interpolated(
 def _rows_by_name(table: _Table, names: Sequence[str]) -> tuple[dict[str, int], list[str]]:
     """Each image's row, and what rows call images that are not there."""
     spellings, indices = table.cells("name"), table.cells("index")
+    if indices is not None and spellings is None and {"1", str(len(names))} <= set(indices) and "0" not in indices:
+        raise SourceError(f"{table.path}: the index counts from 1 to {len(names)}: count from 0, or name the images")
     finder, row_of = Finder(names), dict[str, int]()
     without_image: list[str] = []
     for row in range(len(table.lines)):
@@ -208,6 +214,7 @@ def _read(path: Path) -> _Table:
     """Read the file. Raises SourceError."""
     lines = _lines(path)
     first = lines[0][1]
+    first[0] = first[0].lstrip("# ")
     columns = [_COLUMN_OF.get(cell.lower()) for cell in first]
     unit = None
     if any(columns):
@@ -230,6 +237,11 @@ def _read(path: Path) -> _Table:
     for number, cells in lines:
         if len(cells) < len(columns):
             raise SourceError(f"{path}, line {number}: {len(cells)} values where {len(columns)} are needed")
+        if any(cells[len(first) :]):
+            raise SourceError(
+                f"{path}, line {number}: {len(cells)} values, and the first line has {len(first)}; where numbers have "
+                "decimal commas, put semicolons between cells"
+            )
     return _Table(path, columns, unit, lines)
 
 

@@ -79,3 +79,31 @@ def test_names_of_two_kinds_placed_by_their_order_are_two_drives():
     check_one_drive(Recording("r", [Frame(k, f"part{k // 30}_{k % 30}.png", 0.5 * k) for k in range(60)]))
     placed = [Frame(k, name, k + 0.1 * (k % 3)) for k, name in enumerate(names)]
     check_one_drive(Recording("r", placed))
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "says"),
+    [
+        ("2012-01-22_{:03}.png", "2012-08-04_{:03}.png", "count anew"),
+        ("run 1, {}.png", "run 2, {}.png", "count anew"),
+        ("cam0_{:03}.png", "cam1_{:03}.png", "count anew"),
+        ("IMG_20120122_0830{:02}.jpg", "IMG_20120804_0830{:02}.jpg", "pass 4680.0 hours"),
+        ("2012-01-22T08-30-{:02}Z.png", "2012-01-22T12-30-{:02}Z.png", "pass 4.0 hours"),
+        ("08-30-{:02}.png", "08-31-{:02}.png", None),  # a clock
+        ("2012-01-22 08.30.{:02}.png", "2012-01-22 08.31.{:02}.png", None),
+        ("0_{:03}.png", "1_{:03}.png", None),  # 39 frames of parts of 1000
+        ("12.{:02}.png", "13.{:02}.png", None),  # a number's digits
+        ("20120122_2359{:02}.png", "20120123_0000{:02}.png", None),
+        ("chunk_1_{}.png", "chunk_2_{}.png", None),
+    ],
+)
+def test_names_that_count_anew_or_are_of_several_days_are_two_drives(first, second, says):
+    n = 40 if says else 10
+    numbers = [*range(959, 999), 999] if first.startswith("0_") else range(n)
+    names = [form.format(number) for form in (first, second) for number in numbers]
+    both = Recording("r", [Frame(k, name, 0.5 * k) for k, name in enumerate(names)])
+    if says is None:
+        check_one_drive(both)
+        return
+    with pytest.raises(SourceError, match=rf"r: .*{says}.*#:40 or #40:"):
+        check_one_drive(both)

@@ -18,7 +18,7 @@ def folder(tmp_path):
 
 
 def positions(folder, *lines):
-    (folder / "positions.csv").write_text("\n".join(lines) + "\n")
+    (folder / "positions.csv").write_text("\n".join(map(str, lines)) + "\n")
 
 
 def placed(folder):
@@ -54,6 +54,7 @@ def test_images_come_in_name_order_evenly_spaced(folder):
         ["name,position_m", "11.png,9", "8.png,0", "10,4", "9.png,1.5"],
         ["8.png,0", "9.png,1.5", "10.png,4", "11.png,9"],
         ["Index, Position_M ,weather", "0,0,rain", "1,1.5,", "3,9,sun", "2,4,x"],
+        ["#name, position_m", "11.png,9", "8.png,0", "10.png,4", "9.png,1.5"],
         ["image,route_position_m", "summer/8.png,0", "summer/9.png,1.5", "summer/10.png,4", "summer/11.png,9"],
         ["name;position_m", "8.png;0", "9.png;1.5", "10.png;4", "11.png;9"],
         ["\ufeffposition_m", "", "0", "1.5", "", "4", "9"],
@@ -127,6 +128,9 @@ def test_a_misspelt_name_is_one_frame_left_out_named_on_each_side(tmp_path):
         ),
         (["name,position_m,time", "8.png,0,noon"], r"line 2: 'noon' is not a time"),
         (["position_m,x_m,y_m", "0,0,0", "1,one,0", "2,0,0", "3,0,0"], r"line 3: x_m is 'one'"),
+        (["name,position_m", "8.png,0,5", "9.png,1,5"], r"line 2: 3 values, and the first line has 2.*semicolons"),
+        (["index,position_m", "1,0", "2,1", "3,2", "4,3"], r"counts from 1 to 4: count from 0"),
+        (["position_m", "1e308", "1e308", "-2e9", "3.4e38"], r"none of 4 frames has a position"),
     ],
 )
 def test_positions_that_make_no_sense_are_refused_with_their_line(folder, lines, message):
@@ -136,7 +140,7 @@ def test_positions_that_make_no_sense_are_refused_with_their_line(folder, lines,
 
 
 def test_a_frame_without_a_place_is_left_out_by_name(folder):
-    positions(folder, "name,position_m", "8.png,0", "9.png,", "10.png,nan", "11.png,4")
+    positions(folder, "name,position_m", "8.png,0", "9.png,-1e308", "10.png,nan", "11.png,4")
     recording = open_source(str(folder))
     assert [(frame.index, frame.name, frame.position_m) for frame in recording.frames] == [
         (0, "8.png", 0.0),
@@ -219,6 +223,9 @@ def test_two_drives_by_turns_are_refused_by_name_and_noise_is_not(tmp_path):
         positions(tmp_path, "x_m,y_m", *(f"{at},{20 * turn}" for at, turn in enumerate(turns)))
         with pytest.raises(SourceError, match=r"\.png are 2[0-9] m apart: are these several drives by turns"):
             open_source(str(tmp_path))
+    positions(tmp_path, "position_m", *(at // 2 + 50 * (at % 2) for at in range(60)))
+    with pytest.raises(SourceError, match=r"0\.png and 1\.png are 50 m apart: are these several drives by turns"):
+        open_source(str(tmp_path))
     rows = [f"{1_700_000_000 + at / 10},{at},{20 * (at % 2)}" for at in range(90)]
     positions(tmp_path, "time_s,x_m,y_m", *rows)
     for at in range(60):
@@ -356,6 +363,16 @@ def test_degrees_in_the_columns_of_metres_are_told(folder):
     positions(folder, "x_m,y_m", *(f"{48.1 + k * 1e-5},11.5" for k in range(4)))
     (remark,) = open_source(str(folder)).remarks
     assert "x_m, y_m are no metres (degrees go into columns latitude, longitude)" in remark
+
+
+def test_positions_that_all_are_one_and_tables_of_another_name_are_told(folder):
+    positions(folder, *"7777")
+    (remark,) = open_source(str(folder)).remarks
+    assert "all frames lie within 0 m: the robot stood" in remark
+    (folder / "positions.csv").rename(folder / "poses.csv")
+    (folder / "captions.csv").write_text("name,text\n")
+    (remark,) = open_source(str(folder)).remarks
+    assert remark.endswith("; poses.csv is not read: should it be called positions.csv?")
 
 
 def test_decimal_commas_between_semicolons_are_read(folder):

@@ -14,6 +14,7 @@ from deepsimbad_client.recordings.names import Finder, in_order, times_of
         ["-1.5.png", "-0.25.png", "0.125.png", ".5.png"],
         ["shot 1.9.png", "shot 1.10.png", "shot 1.11.png"],
         ["2012.01.8.png", "2012.01.22.png"],
+        ["0009.png", "000a.png", "000f.png", "0010.png"],
         ["9,75.png", "12,25.png", "12,5.png", "x_12,75.png"],
     ],
 )
@@ -43,6 +44,7 @@ def test_names_that_are_times_tell_them():
         "1305031103250.jpg",
         "left_1305031103250000.tiff",
         "f7-1305031103250000000",
+        "1305031103_250000000.png",
     ):
         assert times_of([name]) == [in_us]
     for names in (["7.png"], ["1305031103.25.png", "1305031103250.png"], ["1305031103.png", "cover.png"]):
