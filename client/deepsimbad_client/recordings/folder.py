@@ -39,7 +39,7 @@ from deepsimbad_client.recordings.told import CAPTIONS
 _ORIENTATION, _MODEL = 0x0112, 0x0110  # of EXIF
 _LYING = range(5, 9)  # orientations in which width is height
 _MOST_TOLD = 4
-_TABLE = re.compile(r".*\.(csv|tsv|xlsx|ods)|.*(pos|gps).*\.(txt|json)")
+_TABLE = re.compile(r".*\.(csv|tsv|xlsx|ods|kml|kmz|fit|tcx)|.*(pos|gps|nmea|track).*\.(txt|json|log)")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -125,9 +125,9 @@ def read_folder(
 
 
 def _misnamed(paths: Sequence[Path]) -> str:
-    """What is to be said of files that may have been meant for `positions.csv`."""
+    """What is to be said of files that may tell positions and are not read."""
     names = sorted(path.name for path in paths if _TABLE.fullmatch(path.name.lower()) and path.name != CAPTIONS)
-    return f"; {shown(names)} is not read: should it be called {POSITIONS_FILE}?" if names else ""
+    return f" ({shown(names)} is not read: it must be called {POSITIONS_FILE}, or be a .gpx or .nmea)" if names else ""
 
 
 def _hint(folder: Path, others: Sequence[str]) -> str:
@@ -189,7 +189,7 @@ def _by_exif(
         place = (None, None) if math.isnan(x) else (x, y)
         frames.append(Frame(0, name, UNPLACED, exif_us if told_us is None else told_us, *place))
     result = placed(frames, str(folder), GPS_DEADBAND_M)
-    result.remarks = ["placed by the EXIF of the images", *zone_remarks(degrees[1]), *result.remarks]
+    result.remarks = ["placed by the EXIF of the images", *zone_remarks(*degrees), *result.remarks]
     return result
 
 

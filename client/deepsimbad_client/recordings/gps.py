@@ -24,6 +24,8 @@ _GPS, _EXIF = 0x8825, 0x8769  # EXIF's folders, and tags in them
 _LATITUDE, _LONGITUDE, _GPS_TIME, _GPS_DATE = (1, 2), (3, 4), 7, 29
 _TAKEN, _SUBSECOND, _ZONE = 36867, 37521, 36881
 
+_SIDES = {"N": 1, "E": 1, "S": -1, "W": -1}
+
 _Fix = tuple[int, float, float]  # microseconds, degrees north, degrees east
 
 
@@ -38,9 +40,10 @@ def read_track(path: Path) -> Track:
     degrees = np.array([fix[1:] for fix in fixes], np.float64).reshape(-1, 2)
     track = track_of(time_us, *utm(degrees[:, 0], degrees[:, 1]), deadband_m=GPS_DEADBAND_M)
     if track is None:
-        raise SourceError(f"{path}: fewer than two of its {len(fixes)} fixes with a time can be used")
+        what = "track points" if path.suffix.lower() == ".gpx" else "RMC sentences, which alone say the date,"
+        raise SourceError(f"{path}: of its {len(rows)} {what} fewer than two hold a time and a place that can be used")
     n_skipped_rows = track.n_skipped_rows + len(rows) - len(fixes)
-    return replace(track, n_skipped_rows=n_skipped_rows, remarks=zone_remarks(degrees[:, 1]))
+    return replace(track, n_skipped_rows=n_skipped_rows, remarks=zone_remarks(degrees[:, 0], degrees[:, 1]))
 
 
 def _gpx(path: Path) -> Iterator[_Fix | None]:
@@ -63,7 +66,7 @@ def _gpx_fix(point: Any) -> _Fix | None:
 def _nmea(path: Path) -> Iterator[_Fix | None]:
     """Recommended minimum sentences (RMC), which alone say the date; None: one without a fix, or damaged."""
     for line in path.read_text(encoding="ascii", errors="replace").splitlines():
-        sentence, _, checksum = line.strip().lstrip("$").partition("*")
+        sentence, _, checksum = line.strip().rpartition("$")[2].partition("*")
         cells = sentence.split(",")
         if cells[0].endswith("RMC"):
             yield _nmea_fix(sentence, cells, checksum)
@@ -84,7 +87,7 @@ def _nmea_fix(sentence: str, cells: list[str], checksum: str) -> _Fix | None:
 def _angle(text: str, side: str) -> float:
     """Degrees of DDDMM.MMMM and N, S, E or W."""
     whole, minutes = divmod(float(text), 100)
-    return (whole + minutes / 60) * {"N": 1, "E": 1, "S": -1, "W": -1}[side]
+    return (whole + minutes / 60) * _SIDES[side]
 
 
 def _microseconds(time: datetime) -> int:
@@ -127,6 +130,7 @@ def read_exif(path: Path) -> Taken:
 
 def _exif_degrees(gps: dict[int, Any], side: int, angle: int) -> float:
     with suppress(KeyError, ValueError, TypeError, ZeroDivisionError):
-        degrees, minutes, seconds = (float(part) for part in gps[angle])
-        return (degrees + minutes / 60 + seconds / 3600) * (-1 if str(gps[side]) in {"S", "W"} else 1)
+        parts = gps[angle] if isinstance(gps[angle], tuple) else (gps[angle],)  # minutes and seconds may lack
+        degrees: float = sum(float(part) / 60**place for place, part in enumerate(parts))
+        return degrees * _SIDES[str(gps[side]).strip(" \0").upper()[:1]]
     return math.nan

@@ -1,6 +1,7 @@
 """From latitude and longitude to metres: UTM, so that two drives of one place have one plane."""
 
 import numpy as np
+from numpy.typing import NDArray
 
 from deepsimbad_client.recordings.track import Reals
 
@@ -16,12 +17,13 @@ _ALPHA = (
 GPS_DEADBAND_M = 3.0  # A receiver's fix wanders by so much while it stands
 
 
-def zone_remarks(longitude: Reals) -> list[str]:
-    """What is to be said of places [n] in degrees that lie in several zones; NaN is none."""
-    zones = np.unique(np.floor(longitude[np.isfinite(longitude)] / 6)) % 60 + 31
+def zone_remarks(latitude: Reals, longitude: Reals) -> list[str]:
+    """What is to be said of places [n] in degrees that lie in several zones."""
+    longitude = longitude[~_unknown(latitude, longitude)]
+    zones = np.unique(np.floor(longitude / 6)) % 60 + 31
     if len(zones) < 2:
         return []
-    median = np.floor(np.median(longitude[np.isfinite(longitude)]) / 6) % 60 + 31
+    median = np.floor(np.median(longitude) / 6) % 60 + 31
     numbers = ", ".join(f"{(zone - 1) % 60 + 1:.0f}" for zone in zones)
     return [
         f"it crosses UTM zones ({numbers}): x, y are metres of zone {(median - 1) % 60 + 1:.0f} all along, and another "
@@ -34,8 +36,7 @@ def utm(latitude: Reals, longitude: Reals) -> tuple[Reals, Reals]:
 
     Places south of the equator have negative norths. 0, 0 is what receivers say that know nothing: it becomes NaN.
     """
-    unknown = ~(np.isfinite(latitude) & np.isfinite(longitude)) | ((latitude == 0) & (longitude == 0))
-    unknown |= (np.abs(latitude) > 90) | (np.abs(longitude) > 180)
+    unknown = _unknown(latitude, longitude)
     if unknown.all():
         return np.full(len(latitude), np.nan), np.full(len(latitude), np.nan)
     centre = np.floor(np.median(longitude[~unknown]) / 6) * 6 + 3
@@ -49,3 +50,9 @@ def utm(latitude: Reals, longitude: Reals) -> tuple[Reals, Reals]:
         north += alpha * np.sin(2 * order * xi) * np.cosh(2 * order * eta)
         east += alpha * np.cos(2 * order * xi) * np.sinh(2 * order * eta)
     return _SCALE * _MERIDIAN_M * north, _FALSE_EAST_M + _SCALE * _MERIDIAN_M * east
+
+
+def _unknown(latitude: Reals, longitude: Reals) -> NDArray[np.bool_]:
+    """Which of places [n] in degrees are none."""
+    is_origin = (latitude == 0) & (longitude == 0)
+    return np.asarray(is_origin | ~((np.abs(latitude) <= 90) & (np.abs(longitude) <= 180)))

@@ -130,7 +130,7 @@ def read_positions(path: Path, names: Sequence[str], name_times_us: Sequence[int
         degrees = [np.array(table.numbers(column), np.float64) for column in ("latitude", "longitude")]  # None: NaN
         plane = [[None if math.isnan(metres) else metres for metres in axis.tolist()] for axis in utm(*degrees)]
         deadband_m = GPS_DEADBAND_M
-        remarks += zone_remarks(degrees[1])
+        remarks += zone_remarks(*degrees)
     places = zip(table.numbers("position_m"), *plane, table.numbers("heading_rad"), times, strict=True)
     rows = [
         Frame(row, "", UNPLACED if position_m is None else position_m, time_us, x_m, y_m, heading_rad)

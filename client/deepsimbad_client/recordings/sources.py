@@ -160,7 +160,7 @@ def _open_whole(place: str, how: _How) -> Recording:
         known = _nclt_camera(path, how) or recognised(path, how.spacing_m, how.rotate or 0)
         return known or read_folder(path, how.spacing_m, how.rotate, how.time_offset_us, how.on_progress)
     if path.suffix.lower() in VIDEO_SUFFIXES:
-        return read_video(path, how.spacing_m, how.rotate or 0, how.time_offset_us)
+        return read_video(path, how.spacing_m, how.rotate or 0, how.time_offset_us, how.on_progress)
     if path.suffix.lower() in ENCODING_SUFFIXES:
         return read_encodings(path, how.spacing_m)
     raise SourceError(

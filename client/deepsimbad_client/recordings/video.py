@@ -1,4 +1,4 @@
-"""Video files: frames by number, a second by the frame rate apart, placed by a table or a track beside them.
+"""Video files: frames by number, at the times that the file gives them, placed by a table or a track beside them.
 
 `drive.mp4` takes its positions from `drive.csv` (the columns of `positions.csv`: a line a frame, an `index`, or times
 with x_m, y_m, which begin with the video where they count from 1970), from `drive.gpx` or `drive.nmea`; without one
@@ -7,8 +7,10 @@ frames are evenly spaced.
 
 import threading
 from collections import OrderedDict
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -22,6 +24,7 @@ from deepsimbad_client.recordings.positions import read_positions
 
 VIDEO_SUFFIXES = frozenset({".mp4", ".avi", ".mov", ".mkv", ".m4v", ".webm", ".mpg", ".mpeg", ".ts", ".wmv"})
 MOST_HZ, USUAL_HZ = 1000.0, 30.0  # a rate beyond the one says nothing; the other stands for it
+N_PROBED = 64  # frames whose times tell whether all come at one rate
 N_KEPT = 32  # decoded frames, for several threads ask for neighbours in any order
 
 
@@ -82,19 +85,51 @@ def _number(frame: Frame) -> int:
     return int(frame.name.rpartition("/")[2])
 
 
-def read_video(path: Path, spacing_m: float, rotate: int = 0, time_offset_us: int = 0) -> VideoRecording:
-    """Open a video; raises SourceError (it cannot be decoded, or what lies beside it does not place its frames)."""
+def _times_us(path: Path, on_progress: Callable[[float], None]) -> tuple[list[int], int]:
+    """When each frame is shown, from the first, none where it cannot be decoded; and how many the file says it has.
+
+    Of a file whose first frames come at its rate, all do; others are gone through.
+    """
     capture = cv2.VideoCapture(str(path))
-    n_frames, rate_hz = int(capture.get(cv2.CAP_PROP_FRAME_COUNT)), capture.get(cv2.CAP_PROP_FPS)
-    if not capture.grab() or n_frames < 1:
+    n_said, rate_hz = int(capture.get(cv2.CAP_PROP_FRAME_COUNT)), capture.get(cv2.CAP_PROP_FPS)
+    step_us = 1e6 / (rate_hz if 0 < rate_hz < MOST_HZ else USUAL_HZ)
+    shown: list[int] = []
+    while len(shown) < min(n_said, N_PROBED) and capture.grab():
+        shown.append(round(1000 * capture.get(cv2.CAP_PROP_POS_MSEC)))
+    late_us = np.abs(np.array(shown) - step_us * np.arange(len(shown)))
+    if shown and late_us.max() < step_us / 2:
+        return [round(number * step_us) for number in range(n_said)], n_said
+    while capture.grab():
+        shown.append(round(1000 * capture.get(cv2.CAP_PROP_POS_MSEC)))
+        on_progress(min(1.0, len(shown) / max(1, n_said)))
+    if any(before >= after for before, after in pairwise(shown)):
+        shown = [round(number * step_us) for number in range(len(shown))]
+    return shown, n_said
+
+
+def _beside(path: Path, suffixes: Collection[str]) -> Path | None:
+    """The file of the video's name with another ending, in any letter case."""
+    stem = path.stem.lower()
+    files = (file for file in sorted(path.parent.iterdir()) if file.stem.lower() == stem and file.is_file())
+    return next((file for file in files if file.suffix.lower() in suffixes), None)
+
+
+def read_video(
+    path: Path,
+    spacing_m: float,
+    rotate: int = 0,
+    time_offset_us: int = 0,
+    on_progress: Callable[[float], None] = lambda _: None,
+) -> VideoRecording:
+    """Open a video; raises SourceError (it cannot be decoded, or what lies beside it does not place its frames)."""
+    shown_us, n_said = _times_us(path, on_progress)
+    times_us = [time + time_offset_us for time in shown_us]
+    if not times_us:
         raise SourceError(f"{path} is no video that OpenCV can decode: convert it, for example to H.264 in an .mp4")
-    capture.release()
+    n_frames = len(times_us)
     names = [f"{path.name}/{number:06d}" for number in range(n_frames)]
-    rate_hz = rate_hz if 0 < rate_hz < MOST_HZ else USUAL_HZ
-    times_us = [round(number * 1e6 / rate_hz) + time_offset_us for number in range(n_frames)]
-    table = path.with_suffix(".csv")
-    track = next((there for suffix in TRACK_SUFFIXES if (there := path.with_suffix(suffix)).is_file()), None)
-    if table.is_file():
+    table, track = _beside(path, {".csv"}), _beside(path, TRACK_SUFFIXES)
+    if table is not None:
         result = read_positions(table, names, times_us)
         result.follow(placed(result.frames, str(table), result.deadband_m))
     elif track is not None:
@@ -107,11 +142,12 @@ def read_video(path: Path, spacing_m: float, rotate: int = 0, time_offset_us: in
                 for number, (name, time_us) in enumerate(zip(names, times_us, strict=True))
             ]
         )
+        lasting = f"{n_frames} frames of {shown_us[-1] / 1e6:.1f} s are taken {spacing_m:g} m apart"
         result.remarks.append(
-            f"{n_frames} frames, {rate_hz:g} a second, are taken {spacing_m:g} m apart: --every-s takes fewer, "
-            f"{table.name} (or .gpx, .nmea) beside the video says where "
-            "they are"
+            f"{lasting}: --every-s takes fewer, {path.stem}.csv (or .gpx, .nmea) beside the video says where they are"
         )
+    if n_frames < n_said:
+        result.remarks.append(f"the file says that it has {n_said} frames, and {n_frames} can be decoded")
     return VideoRecording(
         path.stem,
         tuple(result.frames),

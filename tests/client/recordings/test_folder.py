@@ -372,7 +372,7 @@ def test_positions_that_all_are_one_and_tables_of_another_name_are_told(folder):
     (folder / "positions.csv").rename(folder / "poses.csv")
     (folder / "captions.csv").write_text("name,text\n")
     (remark,) = open_source(str(folder)).remarks
-    assert remark.endswith("; poses.csv is not read: should it be called positions.csv?")
+    assert "(poses.csv is not read: it must be called positions.csv, or be" in remark
 
 
 def test_decimal_commas_between_semicolons_are_read(folder):

@@ -98,12 +98,13 @@ def test_nmea_is_read_without_what_is_damaged_or_has_no_fix(tmp_path):
     lines = [nmea(23 + k, 51 + k / 111_270, "V" if k == 2 else "A") for k in range(30)]
     lines[3] = lines[3].replace("51", "57", 1)  # its checksum no longer fits
     lines[29] = lines[29].partition("*")[0].replace(",N,", ",,")  # says neither north nor south, and has no checksum
+    lines[4] = f"12:38:27.1 {lines[4]}"  # as loggers write
     (tmp_path / "drive" / "log.nmea").write_text("\r\n".join(["$GPGSV,1", *lines, "$GPRM"]))
     recording = open_source(source)
     assert [frame.position_m for frame in recording.frames] == pytest.approx([0, 1, 2, 3, 4], abs=0.02)
     assert "3 rows of the track are not used" in recording.remarks[1]
     (tmp_path / "drive" / "log.nmea").write_text("nothing")
-    with pytest.raises(SourceError, match="fewer than two of its 0 fixes"):
+    with pytest.raises(SourceError, match="of its 0 RMC sentences, which alone say the date, fewer than two"):
         open_source(source)
 
 
@@ -116,6 +117,8 @@ def test_exif_places_the_images_that_have_it(tmp_path):
         if place == 20:
             return {}
         along = 51 + (9 if place == 10 else 2 * place / 111_270)  # the tenth is a spike
+        if place % 3 == 0:  # without seconds
+            return {1: "n", 2: (51, (along - 51) * 60), 3: "W", 4: (9,), 29: "2011:05:10", 7: (12, 38, place)}
         return {1: "N", 2: degrees(along), 3: "W", 4: degrees(9), 29: "2011:05:10", 7: (12, 38, place)}
 
     recording = open_source(pictures(tmp_path / "drive", [f"{k}.jpg" for k in range(30)], gps=gps))
@@ -125,6 +128,14 @@ def test_exif_places_the_images_that_have_it(tmp_path):
     }
     assert recording.frames[-1].position_m == pytest.approx(58, abs=0.1)
     assert recording.frames[-1].timestamp_us == (1_305_031_080 + 29) * 1_000_000
+
+
+def test_a_fix_of_nothing_is_of_no_zone(tmp_path):
+    source = pictures(tmp_path / "drive", [f"{k}.png" for k in range(30)])
+    rows = "".join(f"{0 if k == 9 else 51 + k / 111_270},{0 if k == 9 else 9}\n" for k in range(30))
+    (tmp_path / "drive" / "positions.csv").write_text(f"lat,lon\n{rows}")
+    recording = open_source(source)
+    assert (recording.left_out, list(recording.remarks)) == ({"without a position": 1}, [])
 
 
 def test_latitude_and_longitude_stand_in_a_table_too(tmp_path):

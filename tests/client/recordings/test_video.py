@@ -1,3 +1,4 @@
+import struct
 from collections import OrderedDict
 
 import cv2
@@ -59,6 +60,42 @@ def test_frames_are_taken_by_time_or_by_distance(video):
     assert "begin together" in recording.remarks[0]
     with pytest.raises(SourceError, match="--every-s"):
         open_source(str(video), every_m=5, every_s=1)
+
+
+def with_times(mp4, entries):
+    """An .mp4 whose frames are shown at other times: its box `stts` made anew, (frames, ticks of each) an entry."""
+
+    def boxes(start, end):
+        while start < end:
+            size, kind = struct.unpack(">I4s", mp4[start : start + 8])
+            yield kind, start, size
+            start += size
+
+    chain, start, end = [], 0, len(mp4)
+    for wanted in (b"moov", b"trak", b"mdia", b"minf", b"stbl", b"stts"):
+        chain.append(next((start, size) for kind, start, size in boxes(start, end) if kind == wanted))
+        start, end = chain[-1][0] + 8, sum(chain[-1])
+    table = b"".join(struct.pack(">II", *entry) for entry in entries)
+    box = struct.pack(">I4sII", 16 + len(table), b"stts", 0, len(entries)) + table
+    start, size = chain[-1]
+    changed = bytearray(mp4[:start] + box + mp4[start + size :])
+    for outer, outer_size in chain[:-1]:
+        changed[outer : outer + 4] = struct.pack(">I", outer_size + len(box) - size)
+    return bytes(changed)
+
+
+def test_frames_of_a_changing_rate_have_the_times_at_which_they_are_shown(tmp_path):
+    path = tmp_path / "phone.mp4"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), 10, (64, 48))
+    for number in range(30):
+        writer.write(np.full((48, 64, 3), 5 * number, np.uint8))
+    writer.release()
+    path.write_bytes(with_times(path.read_bytes(), [(10, 1024), (20, 2048)]))  # of 10240 a second
+    path.with_suffix(".CSV").write_text("time_s,x_m,y_m\n" + "".join(f"{at / 10},{at},0\n" for at in range(80)))
+    recording = open_source(str(path))
+    assert [frame.position_m for frame in recording.frames] == pytest.approx([*range(10), *range(10, 30, 2)])
+    assert "the file says that it has 30 frames, and 20 can be decoded" in recording.remarks[-1]  # of three seconds
+    assert [grey(recording, frame) for frame in recording.frames[::19]] == pytest.approx([0, 95], abs=3)
 
 
 def test_lines_for_every_frame_place_them(video):
