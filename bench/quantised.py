@@ -17,10 +17,12 @@ from bench.netvlad import DRIVES, LIST_LENGTH, TOLERANCE
 from deepsimbad.core.building import Built, MapPlan, compose_map
 from deepsimbad.core.composed import list_weights, unit
 from deepsimbad.core.drive import Drive
-from deepsimbad.core.metrics import RetrievalScores
+from deepsimbad.core.metrics import RetrievalScorer, RetrievalScores
 from deepsimbad.core.relevance import Relevance
 from deepsimbad.core.route import true_images_of
-from deepsimbad.jobs.vpr import score_by_all
+from deepsimbad.evaluators.feature_l2 import FeatureL2
+from deepsimbad.jobs.build import measured, views_of
+from deepsimbad.jobs.vpr import moves_between, relevances_by_all
 
 _ROUNDS = 25  # of k-means
 N_LANDMARKS = (300, 512)
@@ -77,7 +79,12 @@ def netvlad_drives() -> dict[str, Drive]:
 def scored(built: Built, places: NDArray[np.float32], test: Drive) -> RetrievalScores:
     """One session over the test drive against restored places."""
     truth = true_images_of(test.route(), built.map.route, TOLERANCE)
-    return score_by_all(replace(built, places=places), test, truth, stateless=False)
+    views = views_of(measured(test, built.map.landmark_model, FeatureL2("none")))
+    rows = relevances_by_all(replace(built, places=places), views, moves_between(test), stateless=False)
+    scorer = RetrievalScorer()
+    for row, true_images in zip(rows, truth, strict=True):
+        scorer.add(row, true_images)
+    return scorer.result()
 
 
 def row_of(scores: list[RetrievalScores]) -> list[str]:

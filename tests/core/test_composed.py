@@ -84,7 +84,7 @@ def test_relevance_is_the_cosine_with_the_sum_of_listed_landmarks(seasons):
         for image in range(map_.n_images):
             total = sum(w * model["prototypes"][i] for w, i in zip(WEIGHTS, map_.lists[:, image], strict=True))
             expected.append(u @ total / np.linalg.norm(total))
-        query = Query(np.ones(30, np.float32), encoding=row)
+        query = Query(np.arange(1.0, 31, dtype=np.float32), encoding=row)
         live = live.observing(query)
         np.testing.assert_allclose(relevances(map_, query, live), expected, atol=1e-4)
 
@@ -102,7 +102,7 @@ def test_lengths_of_sums():
 
 def views_of(map_, encoding):
     """The same view as it may be sent."""
-    whole = Query(np.ones(map_.n_landmarks, np.float32), encoding=encoding)
+    whole = Query(np.arange(1.0, map_.n_landmarks + 1, dtype=np.float32), encoding=encoding)
     apart = (2 - 2 * products_with_landmarks(map_, whole)).astype(np.float32)
     ranks = rank_landmarks(apart)
     nearest = ranks_from_ranked_landmarks(np.argsort(apart)[:15].tolist(), map_.n_landmarks)
@@ -137,7 +137,7 @@ def test_without_a_session_dissimilarities_answer_as_their_encoding_does(seasons
 def test_an_encoding_of_another_length_is_refused(seasons):
     map_ = compose_map(PLAN, drive_of(seasons[1]), None, None, 50).map
     with pytest.raises(InvalidInputError, match="7 numbers; the map's have 24"):
-        relevances(map_, Query(np.ones(50, np.float32), encoding=np.ones(7, np.float32)))
+        relevances(map_, Query(np.arange(1.0, 51, dtype=np.float32), encoding=np.ones(7, np.float32)))
 
 
 # --- landmarks, projections, seasons -------------------------------------------------------------------------------
@@ -161,7 +161,7 @@ def test_long_encodings_are_projected_and_keep_their_neighbours():
     map_ = compose_map(PLAN, drive_of(one), None, None, 100).map
     assert map_.landmark_model["projection"].shape == (500, 96)
     hits = [
-        int(relevances(map_, Query(np.ones(100, np.float32), encoding=row)).argmax()) == place
+        int(relevances(map_, Query(np.arange(1.0, 101, dtype=np.float32), encoding=row)).argmax()) == place
         for place, row in enumerate(other.astype(np.float32))
     ]
     assert np.mean(hits) > 0.9
@@ -279,7 +279,9 @@ def test_degenerate_drives(what, seasons):
         return
     map_ = compose_map(PLAN, drive_of(encodings), drive_of(seasons[0]), None, 60).map
     map_.check()
-    assert np.isfinite(relevances(map_, Query(np.ones(60, np.float32), encoding=map_.usual_encoding[0]))).all()
+    assert np.isfinite(
+        relevances(map_, Query(np.arange(1.0, 61, dtype=np.float32), encoding=map_.usual_encoding[0]))
+    ).all()
 
 
 def test_appended_frames_are_described_by_their_own_season(seasons):
@@ -291,7 +293,7 @@ def test_appended_frames_are_described_by_their_own_season(seasons):
     assert np.array_equal(longer.lists[:, :100], before.lists)
     hits, live = 0, longer.live_statistics
     for place in range(100, 160):
-        query = Query(np.ones(60, np.float32), encoding=seasons[2][place].astype(np.float32))
+        query = Query(np.arange(1.0, 61, dtype=np.float32), encoding=seasons[2][place].astype(np.float32))
         live = live.observing(query)
         hits += abs(int(relevances(longer, query, live).argmax()) - place) <= 1
     assert hits > 40
@@ -328,7 +330,7 @@ def test_on_real_descriptors_two_seasons_make_the_difference(real_data, n_landma
         map_ = compose_map(PLAN, training, landmarks, landmarks, n_landmarks).map
         live, ranks = map_.live_statistics, []
         for at, row in enumerate(test.encodings):
-            query = Query(np.ones(n_landmarks, np.float32), encoding=row)
+            query = Query(np.arange(1.0, n_landmarks + 1, dtype=np.float32), encoding=row)
             live = live.observing(query)
             relevance = relevances(map_, query, live)
             best = relevance[max(0, at - 2) : at + 3].max()

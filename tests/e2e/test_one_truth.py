@@ -45,7 +45,7 @@ def test_a_replay_has_the_anr_of_the_experiment(service, tmp_path, relevance):
     client, _ = service
     rng = np.random.default_rng(7)
     places = rng.normal(size=(150, 32)) + np.cumsum(rng.normal(size=(150, 32)), axis=0) / 4
-    for season, spread in (("autumn", 0.8), ("spring", 0.3), ("summer", 1.5)):
+    for season, spread in (("autumn", 0.8), ("spring", 0.3), ("summer", 3.5)):
         season_of = (places + rng.normal(size=32) + spread * rng.normal(size=places.shape)).astype(np.float32)
         np.save(tmp_path / f"{season}.npy", season_of)
     autumn, spring, summer = (str(tmp_path / f"{season}.npy") for season in ("autumn", "spring", "summer"))

@@ -31,6 +31,7 @@ from deepsimbad.api.requests import (
     read_bytes,
 )
 from deepsimbad.api.scenes import MOST_PARTS, TOLD, TOLD_BODIES, TOLD_SCHEMA, scene_in
+from deepsimbad.core.index.retrieval import relevances
 from deepsimbad.core.map import Map
 from deepsimbad.core.planners import Plan
 from deepsimbad.core.summary import DEFAULT_CONFIDENCE, BeliefSummary
@@ -44,7 +45,6 @@ from deepsimbad.engine.localizer import (
     View,
     describe,
     localize,
-    retrieve,
     shortlist_length,
 )
 from deepsimbad.engine.worker import EncodedImage, Priority, Stopwatch
@@ -312,7 +312,7 @@ async def post_localization(
 
         def compare(view: View) -> NDArray[np.float32]:
             snapshot.check_landmark_model(landmark_models)
-            return retrieve(snapshot, describe(snapshot, evaluator, view))
+            return relevances(snapshot, describe(snapshot, evaluator, view))
 
         return npy_response(await running.look(evaluator, view, compare))
     watch.lap("decode")

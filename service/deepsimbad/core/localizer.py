@@ -21,7 +21,7 @@ from deepsimbad.core.index.retrieval import relevances
 from deepsimbad.core.map import Map
 from deepsimbad.core.particles import DEFAULT_N_PARTICLES, BeliefFilter, ParticleFilter
 from deepsimbad.core.planners import DEFAULT_PLANNER, Plan, PlanningView, parse_planner
-from deepsimbad.core.relevance import LiveStatistics, Query, UpdateRule, worth_of_move
+from deepsimbad.core.relevance import LiveStatistics, Query, UpdateRule
 from deepsimbad.core.summary import DEFAULT_CONFIDENCE, near_mode
 
 _LEAST_TOLD = 0.01  # of the mass that a view moves elsewhere; with less it told nothing
@@ -99,11 +99,8 @@ class ActiveLocalizer:
         jitters = not map_.goes_backward and -SIGMAS * std_m <= action_m < 0
         moved_m = 0.0 if number == 0 or jitters else action_m
 
-        live, relevance = state.live, np.zeros(map_.n_images, np.float32)
-        is_strange = query.encoding is not None and map_.is_strange(query.encoding, live)
-        if query.is_informative:
-            live = live.observing(query, worth_of_move(moved_m if number > 0 else 1.0, is_strange)) if live else None
-            relevance = relevances(map_, query, live)
+        live, is_strange = map_.after_view(state.live, query, moved_m if number > 0 else None)
+        relevance = relevances(map_, query, live)
         laps.append(self._clock())
 
         belief = state.belief.predicted(moved_m, std_m, number) if number > 0 else state.belief

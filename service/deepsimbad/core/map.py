@@ -21,9 +21,11 @@ from deepsimbad.core.relevance import (
     DEFAULT_UPDATE,
     OTHER_LIKELIHOOD_SCALE,
     LiveStatistics,
+    Query,
     Relevance,
     UpdateRule,
     is_strange,
+    worth_of_move,
 )
 from deepsimbad.core.route import Route
 from deepsimbad.errors import InvalidMapConfigError, LandmarkModelDiffersError
@@ -327,6 +329,20 @@ class Map:
             return False
         live_encodings = None if live is None else live.encodings
         return is_strange(encoding, usual.encodings, live_encodings, float(self.most_strange[0]))
+
+    def after_view(
+        self, live: LiveStatistics | None, view: Query, moved_m: float | None
+    ) -> tuple[LiveStatistics | None, bool]:
+        """A session's statistics with one view more, and whether that shows nothing of the route.
+
+        Args:
+            live: Before it; None where there are none.
+            moved_m: Metres since the view before; None: there was none.
+        """
+        is_strange = view.encoding is not None and self.is_strange(view.encoding, live)
+        if live is not None and view.is_informative:
+            live = live.observing(view, worth_of_move(1.0 if moved_m is None else moved_m, is_strange))
+        return live, is_strange
 
     @cached_property
     def lengths(self) -> NDArray[np.float32]:

@@ -102,7 +102,7 @@ def localize(
     length = shortlist_length(snapshot, n_shortlist)
     query = describe(snapshot, evaluator, view)
     watch.lap("describe")
-    relevance = retrieve(snapshot, query)
+    relevance = relevances(snapshot, query)
     watch.lap("retrieve")
     best = shortlist(relevance, length)
     watch.lap("shortlist")
@@ -118,11 +118,6 @@ def localize(
         plan = ActiveLocalizer(snapshot, LocalizerConfig()).plan(LocalizerState(belief, None, relevance, 1))
     watch.lap("plan")
     return Localization(snapshot, relevance, best, summary, plan, is_informative)
-
-
-def retrieve(snapshot: Map, query: Query) -> NDArray[np.float32]:
-    """[n] relevance of every map image to one view, by the map's statistics alone; 0 where the view shows nothing."""
-    return relevances(snapshot, query) if query.is_informative else np.zeros(snapshot.n_images, np.float32)
 
 
 def describe(snapshot: Map, evaluator: Evaluator, view: View) -> Query:

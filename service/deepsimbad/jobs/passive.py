@@ -18,7 +18,7 @@ from deepsimbad.core.localizer import ActiveLocalizer, LocalizerConfig, Localize
 from deepsimbad.core.map import Map
 from deepsimbad.core.metrics import RetrievalScorer, RetrievalScores
 from deepsimbad.core.planners import CONSTANT
-from deepsimbad.core.relevance import Query, worth_of_move
+from deepsimbad.core.relevance import Query
 from deepsimbad.errors import PastTheEndError
 
 WINDOWS = (1, 2, 5, 10, 20)  # views
@@ -87,7 +87,7 @@ def drive_in_order(
             begun[frame] = replace(localizer.start(), live=state.live)
         state = _stepped(localizer, state, view, move_m)
         whole.add(state.belief.mass, truth)
-        live = live.observing(view, worth_of_move(move_m) if frame else 1.0) if live else None
+        live, _ = map_.after_view(live, view, move_m if frame else None)
         seen.append(_Sight(float(position_m[frame]), relevances(map_, view, live), of_all))
         begun = {
             start: _stepped(localizer, each, view, move_m)

@@ -23,7 +23,7 @@ from deepsimbad.jobs.fitting import Fitter, Pictures
 from deepsimbad.jobs.progress import Progress
 from deepsimbad.jobs.remap import DEFAULT_LIST_LENGTH, DEFAULT_N_LANDMARKS
 from deepsimbad.jobs.truth import nearest_images
-from deepsimbad.jobs.vpr import BRUTE_FORCE_U, bits_per_map_image, relevances_by_all
+from deepsimbad.jobs.vpr import BRUTE_FORCE_U, bits_per_map_image, moves_between, relevances_by_all
 
 RECALL_RANKS = tuple(range(1, 26))  # N of the curve of recall@N
 TRIAL_STAGES = {"map": 3.0, "localize": 3.0}
@@ -136,11 +136,11 @@ def run_trial(
     fitter = Fitter(evaluator, pictures)
     built = build(plan, database, landmarks, landmarks, n_landmarks, evaluator, progress.update, fitter=fitter)
     progress.stage("localize")
-    seen = measured(queries, built.map.landmark_model, evaluator)
-    session = _Session(built.map, views_of(seen), queries)
+    views = views_of(measured(queries, built.map.landmark_model, evaluator))
+    session = _Session(built.map, views, queries)
     scorer, by_all, outcomes = RetrievalScorer(RECALL_RANKS), RetrievalScorer(RECALL_RANKS), []
     nearest = nearest_images(queries, database)
-    whole = relevances_by_all(built, seen, stateless=False)
+    whole = relevances_by_all(built, views, moves_between(queries), stateless=False)
     for row, (truth, of_all) in enumerate(zip(true_images, whole, strict=True)):
         relevance, mass = session.look(row)
         by_all.add(of_all, truth)

@@ -18,7 +18,7 @@ from deepsimbad.core.drive import Drive, SameRoute
 from deepsimbad.core.index.retrieval import relevances
 from deepsimbad.core.map import Map
 from deepsimbad.core.metrics import RetrievalScorer, RetrievalScores
-from deepsimbad.core.relevance import DEFAULT_RELEVANCE, LiveStatistics, Query, Relevance, worth_of_move
+from deepsimbad.core.relevance import DEFAULT_RELEVANCE, LiveStatistics, Query, Relevance
 from deepsimbad.errors import InvalidMapConfigError
 from deepsimbad.evaluators.base import Evaluator, LandmarkModel
 from deepsimbad.jobs.build import EncodedRecording, build, measured, views_of
@@ -130,11 +130,9 @@ def run_vpr(
     if _is_driven(config):
         progress.stage("drive")
         map_ = built[Relevance.COMPOSED].map
-        seen = views.seen(map_.landmark_model)
-        by_all = relevances_by_all(built[Relevance.COMPOSED], seen, stateless=False)
-        passive = drive_in_order(
-            *(map_, views.by(map_.landmark_model), seen.position_m, by_all, true_images, progress.update)
-        )
+        described, moved_m = views.by(map_.landmark_model), moves_between(test.drive)
+        by_all = relevances_by_all(built[Relevance.COMPOSED], described, moved_m, stateless=False)
+        passive = drive_in_order(map_, described, test.drive.position_m, by_all, true_images, progress.update)
     stages = {stage.replace(" ", "_") for stage in vpr_stages(config)}
     seconds = {stage: took for stage, took in progress.seconds().items() if stage in stages}
     sized = built.get(DEFAULT_RELEVANCE, built[config.relevances[0]])
@@ -204,24 +202,16 @@ class ViewsOf:
 
     def __init__(self, drive: Drive, evaluator: Evaluator) -> None:
         self.drive, self._evaluator = drive, evaluator
-        self._known: list[tuple[LandmarkModel, Drive, Query]] = []
-
-    def seen(self, model: LandmarkModel) -> Drive:
-        """The drive, measured."""
-        return self._by(model)[0]
+        self._known: list[tuple[LandmarkModel, Query]] = []
 
     def by(self, model: LandmarkModel) -> Query:
-        """A batch."""
-        return self._by(model)[1]
-
-    def _by(self, model: LandmarkModel) -> tuple[Drive, Query]:
-        """Models are the same where their arrays are."""
-        for known, drive, views in self._known:
+        """A batch. Models are the same where their arrays are."""
+        for known, views in self._known:
             if known.keys() == model.keys() and all(known[name] is model[name] for name in known):
-                return drive, views
-        drive = measured(self.drive, model, self._evaluator)
-        self._known.append((model, drive, views_of(drive)))
-        return self._known[-1][1:]
+                return views
+        views = views_of(measured(self.drive, model, self._evaluator))
+        self._known.append((model, views))
+        return views
 
 
 def score_maps(
@@ -248,10 +238,11 @@ def score_maps(
     for name in config.relevances:
         progress.stage(f"query by {name.value}")
         map_ = built[name].map
-        live, worth = None if config.stateless else map_.live_statistics, _worth_of_views(test.drive)
-        keep(name.value, _relevances_in_order(map_, test.by(map_.landmark_model), live, worth, progress.update))
+        views, moved_m = test.by(map_.landmark_model), moves_between(test.drive)
+        live = None if config.stateless else map_.live_statistics
+        keep(name.value, _relevances_in_order(map_, views, live, moved_m, progress.update))
         if name is Relevance.COMPOSED and bound:
-            keep(BRUTE_FORCE_U, relevances_by_all(built[name], test.seen(map_.landmark_model), config.stateless))
+            keep(BRUTE_FORCE_U, relevances_by_all(built[name], views, moved_m, config.stateless))
     return scores
 
 
@@ -279,43 +270,39 @@ def bits_per_map_image(map_: Map) -> float:
         return 8 * index_bytes(sealed) / map_.n_images
 
 
-def _worth_of_views(drive: Drive) -> list[float]:
-    """What each view of a drive counts for among what is usual: as much as a session's view after that move."""
-    return [1.0, *(worth_of_move(move_m) for move_m in np.diff(drive.position_m).tolist())]
+def moves_between(drive: Drive) -> list[float | None]:
+    """Metres from the view before to each; None to the first."""
+    return [None, *np.diff(drive.position_m).tolist()]
 
 
 def _relevances_in_order(
     map_: Map,
     views: Query,
     live: LiveStatistics | None,
-    worth: Sequence[float],
+    moved_m: Sequence[float | None],
     on_progress: Callable[[float], None],
 ) -> Iterator[NDArray[np.float32]]:
     """[n] of every view, one after the other."""
     # Without a session's statistics every view is compared by itself; many at once are one matrix product.
     size = _QUERIES_A_BLOCK if map_.relevance is Relevance.BRUTE_FORCE else 1
-    for first in range(0, len(worth), size):
-        asked = views.at(slice(first, first + size))
-        if size == 1:
-            asked = views.at(first)
-        live = live.observing(asked, worth[first]) if live else None
+    for first in range(0, len(moved_m), size):
+        asked = views.at(slice(first, first + size) if size > 1 else first)
+        if live is not None:
+            live, _ = map_.after_view(live, asked, moved_m[first])
         yield from np.atleast_2d(relevances(map_, asked, live))
-        on_progress(min(1.0, (first + size) / len(worth)))
+        on_progress(min(1.0, (first + size) / len(moved_m)))
 
 
-def score_by_all(
-    built: Built, test: Drive, true_images: Sequence[NDArray[np.int64]], stateless: bool
-) -> RetrievalScores:
-    """What unit vectors of places, `built.places`, score: those that lists stand for, or what else restores them."""
-    return _scores(relevances_by_all(built, test, stateless), [true_images])[0]
-
-
-def relevances_by_all(built: Built, test: Drive, stateless: bool) -> Iterator[NDArray[np.float32]]:
-    """[n] of every frame by what the lists stand for: the same unit vectors, and nothing left out."""
-    usual = built.map.live_statistics
-    if built.places is None or usual is None or usual.encodings is None:
-        raise InvalidMapConfigError("only a composed map has unit vectors")
-    encodings, projection = usual.encodings, built.map.landmark_model.get("projection")
-    for encoding, worth in zip(test.encodings, _worth_of_views(test), strict=True):
-        encodings = encodings if stateless else encodings.observing(encoding, worth)
-        yield built.places @ unit_encodings(encoding, encodings, projection)
+def relevances_by_all(
+    built: Built, views: Query, moved_m: Sequence[float | None], stateless: bool
+) -> Iterator[NDArray[np.float32]]:
+    """[n] of every view by what the lists stand for: the same unit vectors, and nothing left out."""
+    map_, places = built.map, built.places
+    live, projection = map_.live_statistics, map_.landmark_model.get("projection")
+    for number, move_m in enumerate(moved_m):
+        view = views.at(number)
+        if not stateless:
+            live, _ = map_.after_view(live, view, move_m)
+        if places is None or view.encoding is None or live is None or live.encodings is None:
+            raise InvalidMapConfigError("only a composed map has unit vectors")
+        yield np.asarray(places @ unit_encodings(view.encoding, live.encodings, projection).T, np.float32)

@@ -20,7 +20,7 @@ _SCAN_BLOCK = 256  # values that are looked at in one vectorised sweep
 
 
 def relevances(map_: Map, query: Query, live: LiveStatistics | None = None) -> NDArray[np.float32]:
-    """[n] relevance of every map image, larger is better; of a batch of views [e, n].
+    """[n] relevance of every map image, larger is better, and 0 to a view that shows nothing; of a batch [e, n].
 
     Args:
         live: A session's own statistics, in place of the map's; of a batch ranks alone, [e, r].
@@ -28,6 +28,8 @@ def relevances(map_: Map, query: Query, live: LiveStatistics | None = None) -> N
     Raises:
         InvalidInputError: The query lacks what the map's relevance compares.
     """
+    if query.ranks.ndim == 1 and not query.is_informative:
+        return np.zeros(map_.n_images, np.float32)
     return _RULES[map_.relevance](map_, query, live)
 
 
