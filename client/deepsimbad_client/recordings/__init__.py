@@ -180,7 +180,9 @@ def decode_deep(body: bytes, path: Path, *, as_stored: bool = True) -> NDArray[A
         if path.suffix.lower() in HEIC_SUFFIXES:
             return decode_heic(body)
         image = cv2.imdecode(np.frombuffer(body, np.uint8), cv2.IMREAD_COLOR_BGR | cv2.IMREAD_ANYDEPTH)
-    except (DeepSimbadError, cv2.error, OSError, ValueError) as error:
+    except cv2.error:
+        image = None
+    except (DeepSimbadError, OSError, ValueError) as error:
         raise BrokenFrameError(f"{path} cannot be read: {error}", "undecodable") from error
     if image is None or image.dtype not in {np.dtype(np.uint8), np.dtype(np.uint16)}:
         raise BrokenFrameError(f"{path} is not an image that can be decoded", "undecodable")

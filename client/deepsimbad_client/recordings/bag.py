@@ -13,6 +13,7 @@ import weakref
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -33,6 +34,7 @@ from deepsimbad_client.recordings import (
     turned,
     with_grey_levels,
 )
+from deepsimbad_client.recordings.folder import shape_in, shape_remarks
 from deepsimbad_client.recordings.placing import Placed, placed_on
 from deepsimbad_client.recordings.plane import GPS_DEADBAND_M, utm
 from deepsimbad_client.recordings.track import DEADBAND_M, Track, track_of
@@ -42,6 +44,8 @@ if TYPE_CHECKING:
 
 BAG_PREFIX = "rosbag:"
 BAG_SUFFIXES = frozenset({".bag", ".mcap", ".db3"})
+MOST_LATE_US = 1_000_000  # an image may be recorded before another one of a time so much earlier
+_MENDED_BY = "`rosbag reindex`, `ros2 bag reindex` or `mcap recover` mends what was cut off"
 METADATA = "metadata.yaml"  # in the folder that is a ROS 2 bag
 
 _COMPRESSED = "sensor_msgs/msg/CompressedImage"
@@ -57,6 +61,8 @@ _LAYOUTS: dict[str, tuple[type, int, int | None]] = {  # sample type, channels, 
     "rgb8": (np.uint8, 3, cv2.COLOR_RGB2BGR),
     "bgra8": (np.uint8, 4, cv2.COLOR_BGRA2BGR),
     "rgba8": (np.uint8, 4, cv2.COLOR_RGBA2BGR),
+    "bgr16": (np.uint16, 3, None),
+    "rgb16": (np.uint16, 3, cv2.COLOR_RGB2BGR),
     "mono16": (np.uint16, 1, None),
     "16UC1": (np.uint16, 1, None),
     "bayer_rggb8": (np.uint8, 1, cv2.COLOR_BayerRGGB2BGR),
@@ -89,6 +95,8 @@ class BagRecording(Recording):
     def image(self, frame: Frame, input_size: tuple[int, int] | None) -> EncodedImage:
         """Read a frame: a compressed one as it is, a raw one as PNG; see `Recording.image`."""
         kind, message = self._read(frame)
+        if kind == _COMPRESSED and "compresseddepth" in message.format.lower():
+            raise BrokenFrameError(f"{frame.name} is a depth image: name a camera's topic", "depth image")
         if kind == _COMPRESSED:
             return ready(bytes(message.data), Path(frame.name), input_size, self.rotate, self.grey_levels)
         image, _ = in_eight_bits(_pixels(message, frame.name), self.grey_levels)
@@ -152,9 +160,10 @@ def read_bag(
         for topic, kind, received, raw in _messages(reader, {image_topic, position_topic}):
             on_progress((received - reader.start_time) / span)
             heard.take(reader, topic, kind, received, raw, f"{path.name}{topic}/{received}")
-    images = sorted(heard.images, key=lambda image: image[1])
-    if not images:
+    if not heard.images:
         raise SourceError(f"{path}: {image_topic} holds no image that can be read")
+    remarks += heard.of_one_clock()
+    images = sorted(heard.images, key=lambda image: image[1])
     if position_topic:
         result = _placed(images, heard.rows, types[position_topic], f"{path}, {position_topic}")
     else:
@@ -166,7 +175,7 @@ def read_bag(
         path.stem,
         tuple(result.frames),
         result.left_out_names,
-        remarks=[*remarks, *result.remarks],
+        remarks=[*remarks, *result.remarks, *shape_remarks(heard.shapes)],
         path=path,
         topic=image_topic,
         received_ns=heard.received_ns,
@@ -186,7 +195,22 @@ class _Heard:
     images: list[tuple[str, int]] = field(default_factory=list)
     rows: _Rows = field(default_factory=list)
     lost: dict[str, list[str]] = field(default_factory=dict)  # images, by reason
+    shapes: list[tuple[str, str | None]] = field(default_factory=list)  # of each image
     n_lost_positions: int = 0
+
+    def of_one_clock(self) -> list[str]:
+        """What is to be said of the headers' times; where all are one, images get those of the recording."""
+        times = [time_us for _, time_us in self.images]
+        if len(times) > 2 and len(set(times)) == 1:
+            received = ((name, self.received_ns[name] // 1000 + self.time_offset_us) for name, _ in self.images)
+            self.images = sorted(received, key=lambda image: image[1])
+            return ["all headers say one time: images have the times at which they were recorded"]
+        steps_us = np.diff(times, prepend=times[0])
+        at = int(np.argmin(steps_us))
+        if steps_us[at] > -MOST_LATE_US:
+            return []
+        back = f"{self.images[at][0]} says {-steps_us[at] / 1e6:.1f} s before the image recorded before it"
+        return [f"{back}: images are taken in the order of their headers' times. Was a clock set on the way?"]
 
     def take(self, reader: "AnyReader", topic: str, kind: str, received: int, raw: bytes, name: str) -> None:
         """One more message."""
@@ -206,6 +230,9 @@ class _Heard:
             self.lost.setdefault("received at the time of another", []).append(name)
         else:
             self.received_ns[name] = received
+            is_raw = kind != _COMPRESSED
+            shape = f"{message.width} x {message.height}" if is_raw else shape_in(BytesIO(bytes(message.data)))
+            self.shapes.append((name, shape))
             self.images.append((name, time_us + self.time_offset_us))
 
 
@@ -222,12 +249,12 @@ def _opened(path: Path) -> "AnyReader":
             try:
                 super().open()
             except (AnyReaderError, OSError, ValueError, KeyError) as error:
-                raise SourceError(f"{path} cannot be read: {error}") from error
+                raise SourceError(f"{path} cannot be read: {_first_line(error)}; {_MENDED_BY}") from error
 
     try:
         return Reader([path], default_typestore=get_typestore(Stores.LATEST))
     except (AnyReaderError, OSError) as error:
-        raise SourceError(f"{path} cannot be read as a bag: {error}") from error
+        raise SourceError(f"{path} cannot be read as a bag: {_first_line(error)}") from error
 
 
 def _messages(reader: "AnyReader", topics: set[str], **between_ns: int) -> Iterator[tuple[str, str, int, bytes]]:
@@ -237,14 +264,19 @@ def _messages(reader: "AnyReader", topics: set[str], **between_ns: int) -> Itera
         for connection, received, raw in reader.messages(connections, **between_ns):
             yield connection.topic, connection.msgtype, received, raw
     except Exception as error:  # rosbags lets struct's, sqlite's and its own through
-        raise SourceError(f"{reader.paths[0]} is damaged: its messages cannot be read: {error}") from error
+        why = _first_line(error)
+        raise SourceError(f"{reader.paths[0]} is damaged: its messages cannot be read: {why}; {_MENDED_BY}") from error
 
 
 def _message(reader: "AnyReader", raw: bytes, kind: str, name: str) -> object:
     try:
         return reader.deserialize(raw, kind)
     except Exception as error:  # rosbags lets struct's, numpy's and its own through
-        raise BrokenFrameError(f"{name} cannot be read: {error}", "undecodable") from error
+        raise BrokenFrameError(f"{name} cannot be read: {_first_line(error)}", "undecodable") from error
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0]
 
 
 def _chosen(asked: str, there: list[str], what: str, path: Path, *, take_first: bool = False) -> str:

@@ -3,8 +3,9 @@
 import dataclasses
 import math
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -143,7 +144,9 @@ def _hint(folder: Path, others: Sequence[str]) -> str:
 def _prepared(recording: FolderRecording, rotate: int | None) -> FolderRecording:
     """The recording turned as asked and shown by the grey levels of its images; these and several shapes are told."""
     paths = [recording.folder / frame.name for frame in recording.frames]
-    recording = dataclasses.replace(recording, remarks=[*recording.remarks, *_shape_remarks(paths)])
+    recording = dataclasses.replace(
+        recording, remarks=[*recording.remarks, *shape_remarks((path.name, shape_in(path)) for path in paths)]
+    )
     recording = with_grey_levels(recording, lambda at: decode_deep(read_file(paths[at]), paths[at]))
     return _upright(recording, rotate)
 
@@ -193,16 +196,15 @@ def _by_exif(
     return result
 
 
-def _shape_remarks(paths: Sequence[Path]) -> list[str]:
+def shape_remarks(shapes: Iterable[tuple[str, str | None]]) -> list[str]:
     """In a line, how many images are of which size and camera, those of most first; nothing where all are alike.
 
-    Pictures whose header cannot be read here are broken, or of a format that says its size elsewhere: not counted.
+    Of each its name and what `shape_in` says; None is not counted.
     """
     names: dict[str, list[str]] = {}
-    for path in paths:
-        shape = _shape(path)
+    for name, shape in shapes:
         if shape is not None:
-            names.setdefault(shape, []).append(path.name)
+            names.setdefault(shape, []).append(name)
     if len(names) < 2:
         return []
     most_first = sorted(names.items(), key=lambda item: -len(item[1]))
@@ -212,9 +214,13 @@ def _shape_remarks(paths: Sequence[Path]) -> list[str]:
     return [f"the images are not of one kind: {', '.join(told)}; those of several cameras compare badly"]
 
 
-def _shape(path: Path) -> str | None:
+def shape_in(file: Path | BytesIO) -> str | None:
+    """Width, height and camera, by the header of a picture.
+
+    None where it cannot be read here: it is broken, or of a format that says its size elsewhere.
+    """
     try:
-        with Pictures.open(path) as picture:
+        with Pictures.open(file) as picture:
             (width, height), exif = picture.size, picture.getexif()
     except (OSError, UnidentifiedImageError, ValueError, SyntaxError, Pictures.DecompressionBombError):
         return None

@@ -135,6 +135,7 @@ def placed_on(
     result.leave_out(poses.covered.tolist(), f"before or after {what}")
     result.leave_out((~poses.in_gap[poses.covered]).tolist(), f"gap in {what}")
     result.number()
+    _tell_standing(result, result.frames[-1].position_m - result.frames[0].position_m, f"{what} are not in metres")
     return result
 
 

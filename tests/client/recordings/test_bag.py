@@ -15,6 +15,8 @@ from deepsimbad_client.recordings.sources import open_source
 
 START_NS = 1_400_000_000_000_000_000
 TYPES = get_typestore(Stores.ROS2_HUMBLE)
+IMAGE = "sensor_msgs/msg/Image"
+PIXELS = {"encoding": "mono8", "is_bigendian": 0, "data": np.zeros(12, np.uint8), "height": 3, "width": 4, "step": 4}
 PICTURE = np.random.default_rng(0).integers(0, 255, (12, 16, 3), np.uint8)
 
 
@@ -170,6 +172,7 @@ def test_one_of_several_topics_is_named(bag):
         ("rgb8", PICTURE[:, :, ::-1], PICTURE),
         ("bgra8", np.dstack((PICTURE, PICTURE[:, :, 0])), PICTURE),
         ("mono8", PICTURE[:, :, 0], PICTURE[:, :, [0, 0, 0]]),
+        ("rgb16", PICTURE[:, :, ::-1].astype(np.uint16) * 257, PICTURE),
         ("mono16", PICTURE[:, :, 0].astype(np.uint16) * 257, PICTURE[:, :, [0, 0, 0]]),
         ("16UC1", PICTURE[:, :, 0].astype(np.uint16) * 16, PICTURE[:, :, [0, 0, 0]]),
         ("bayer_rggb8", np.full((12, 16), 90, np.uint8), np.full((12, 16, 3), 90, np.uint8)),
@@ -210,6 +213,41 @@ def test_a_compressed_image_goes_as_it_is_and_a_broken_one_is_named(bag):
         recording.image(recording.frames[0], None)
 
 
+def test_headers_of_one_time_or_of_a_clock_that_was_set_are_told(bag):
+    def stuck(made):
+        for k in range(20):
+            made.write("/front", IMAGE, START_NS, late_ns=200_000_000 * k, **PIXELS)
+
+    recording = open_source(bag("bag", stuck, Bag.poses))
+    assert [frame.position_m for frame in recording.frames] == pytest.approx(np.arange(20) / 5)
+    assert "all headers say one time: images have the times at which they were recorded" in recording.remarks
+
+    def set_back(made):
+        for k in range(20):
+            back_ns = 2_000_000_000 * (k >= 10)
+            made.write("/front", IMAGE, START_NS + 200_000_000 * k - back_ns, late_ns=back_ns, **PIXELS)
+
+    recording = open_source(bag("mcap", set_back, Bag.poses))
+    assert any("says 1.8 s before the image recorded before it" in remark for remark in recording.remarks)
+
+
+def test_images_of_several_sizes_are_told_and_depth_is_no_picture(bag):
+    def several(made):
+        for k in range(4):
+            made.image(START_NS + 200_000_000 * k, pixels=PICTURE[: 12 - k % 2])
+            for topic, body in (("/jpeg", cv2.imencode(".jpg", PICTURE[k // 3 :])[1]), ("/depth", b"\0" * 40)):
+                kind = {"format": "16UC1; compressedDepth png" if topic == "/depth" else "jpeg"}
+                data = np.frombuffer(body, np.uint8)
+                made.write(topic, "sensor_msgs/msg/CompressedImage", START_NS + 200_000_000 * k, data=data, **kind)
+
+    source = bag("folder", several)
+    assert "2 of 16 x 12 (" in open_source(f"{source}#/front").remarks[-1]
+    assert "3 of 16 x 12 (" in open_source(f"{source}#/jpeg").remarks[-1]
+    recording = open_source(f"{source}#/depth")
+    with pytest.raises(BrokenFrameError, match="is a depth image: name a camera's topic"):
+        recording.image(recording.frames[0], None)
+
+
 def test_what_is_no_bag_is_named(tmp_path, monkeypatch):
     (tmp_path / "a.mcap").write_bytes(b"no bag")
     with pytest.raises(SourceError, match=r"a\.mcap cannot be read"):
@@ -240,8 +278,11 @@ def test_a_bag_damaged_in_its_middle_is_named(bag, kind):
     body = bytearray(path.read_bytes())
     body[200 : len(body) // 2] = b"\xff" * (len(body) // 2 - 200)
     path.write_bytes(body)
-    with pytest.raises(SourceError, match=r"drive\.\w+ (is damaged: its messages )?cannot be read"):
+    with pytest.raises(
+        SourceError, match=r"drive\.\w+ (is damaged: its messages )?cannot be read: .*reindex"
+    ) as refused:
         open_source(source)
+    assert len(str(refused.value).splitlines()) == 1
     if kind == "mcap":  # the other's reader holds what it has read
         with pytest.raises(BrokenFrameError, match="is damaged"):
             whole.image(whole.frames[0], None)
