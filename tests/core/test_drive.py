@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from deepsimbad.core.drive import LEAST_CORRELATION, LEAST_PLACES, SIGNIFICANCE, judge, second_season
+from deepsimbad.core.drive import LEAST_CORRELATION, LEAST_PLACES, SIGNIFICANCE, Drive, judge, second_season
 from deepsimbad.core.route import Route, same_places
 
 from .conftest import a_drive
@@ -236,3 +236,19 @@ def test_said_comparable_is_not_enough():
     own, other = map(a_drive, dissimilarities(rng, scenery(rng, 100), scenery(rng, 100)))
     season, _, found = second_season(own, False, other, True, lambda drive: drive)
     assert (season, found.accepted) == (None, False)
+
+
+def test_pictures_of_nothing_and_of_a_camera_that_hung_are_told_by_name() -> None:
+    names = np.array([f"{at}.png" for at in range(12)])
+    encodings = np.random.default_rng(0).normal(size=(12, 5)).astype(np.float32)
+    encodings[4:9] = encodings[3]  # it hung for five pictures, and stood for the last of them
+    encodings[10:] = encodings[10]  # the lens was covered
+    position_m = np.array([0.0, 1, 2, 3, 4, 5, 6, 7, 7, 8, 9, 10])
+    nothing = np.arange(12) >= 10
+    drive = Drive(position_m=position_m, encodings=encodings, frame_name=names, shows_nothing=nothing)
+    assert drive.picture_warnings("of the map") == [
+        "2 of 12 pictures of the map show nothing: one grey, noise or the dark (10.png, 11.png)",
+        "4 of 12 pictures of the map are the very same as the one before, and the robot had moved on: "
+        "did the camera hang? (4.png, 5.png, 6.png, ...)",
+    ]
+    assert drive.at(np.arange(4)).picture_warnings("of the map") == []

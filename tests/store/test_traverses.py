@@ -181,6 +181,7 @@ def test_what_frames_show_is_stored_with_them_and_levels_with_the_frame_that_gav
     with pytest.raises(InvalidEncodingError):
         summer.put_frames(replace(make_frames([5], dim=3), grey_levels=(0, 1023)))
     assert (summer.summary().n_uninformative, summer.grey_levels) == (1, None)
+    assert summer.summary().warnings == ("1 of 3 pictures show nothing: one grey, noise or the dark",)
     summer.put_frames(replace(make_frames([5]), grey_levels=(0, 4095)))
     with pytest.raises(GreyLevelsDifferError):
         summer.put_frames(replace(make_frames([6]), grey_levels=(0, 1023)))

@@ -27,6 +27,7 @@ from pathlib import Path
 
 import numpy as np
 
+from deepsimbad.core.drive import MAX_POSITION_M
 from deepsimbad_client.errors import SourceError
 from deepsimbad_client.recordings import Frame, finite_number
 from deepsimbad_client.recordings.clock import UNITS, UNKNOWN, times_us
@@ -34,7 +35,7 @@ from deepsimbad_client.recordings.left_out import NO_IMAGE
 from deepsimbad_client.recordings.names import Finder
 from deepsimbad_client.recordings.placing import UNPLACED, Placed, placed_on
 from deepsimbad_client.recordings.plane import GPS_DEADBAND_M, utm, zone_remarks
-from deepsimbad_client.recordings.track import DEADBAND_M, FARTHEST_M, track_of
+from deepsimbad_client.recordings.track import DEADBAND_M, track_of
 
 CLOCKS_APART_S = 0.5
 
@@ -90,14 +91,14 @@ class _Table:
     def numbers(self, column: str) -> list[float | None]:
         """A column of numbers, None where nothing is known. Raises SourceError (something else stands there).
 
-        What is farther than `FARTHEST_M` stands for nothing known too.
+        What is farther than `MAX_POSITION_M` stands for nothing known too.
         """
         values: list[float | None] = []
         for row, cell in enumerate(self.cells(column) or [""] * len(self.lines)):
             value = finite_number(cell)
             if value is None and cell.lower() not in UNKNOWN:
                 raise SourceError(f"{self.where(row)}: {column} is {cell!r}, not a number such as 1234.5")
-            values.append(None if value is None or abs(value) > FARTHEST_M else value)
+            values.append(None if value is None or abs(value) > MAX_POSITION_M else value)
         return values
 
     def times_us(self) -> tuple[list[int | None], list[str]]:

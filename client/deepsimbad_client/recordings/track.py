@@ -12,10 +12,11 @@ from math import hypot
 import numpy as np
 from numpy.typing import NDArray
 
+from deepsimbad.core.drive import MAX_POSITION_M
+
 DEADBAND_M = 0.25
 DEADBAND_NOISES = 6.0
 SMOOTHING_HALF_WIDTH_US = 250_000
-FARTHEST_M = 1e9  # What lies farther is no place: tables have such numbers where nothing is known
 MOST_TREMBLE_M = 0.025  # of poses; what trembles more is a receiver's, and wanders too
 WANDER_S, WANDER_M_S = 30.0, 0.4  # A standing receiver gets no farther than so fast within so long
 MAX_GAP_S = 1.0  # Between rows of a track farther apart than this nothing is interpolated: the robot may have turned
@@ -90,7 +91,7 @@ def track_of(
 
     Rows out of order are sorted, of one time the first stays, those with NaN and spikes are not used.
     """
-    usable = np.isfinite(time_us) & (np.abs(x_m) <= FARTHEST_M) & (np.abs(y_m) <= FARTHEST_M)
+    usable = np.isfinite(time_us) & (np.abs(x_m) <= MAX_POSITION_M) & (np.abs(y_m) <= MAX_POSITION_M)
     if heading_rad is None:
         heading_rad = np.full(len(x_m), np.nan)
     else:

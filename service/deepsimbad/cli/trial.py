@@ -113,7 +113,8 @@ def try_(
                 }
             )
             others = {role: drive for role, drive in drives.items() if role != "queries"}
-            document["warnings"] = [*known_drives(drives["queries"], **others), *report.warnings]
+            shown = [why for role in ("database", "queries") for why in drives[role].picture_warnings(f"of the {role}")]
+            document["warnings"] = [*known_drives(drives["queries"], **others), *report.warnings, *shown]
             progress.stage("pictures")
             places, views = (
                 Album(recordings[role], drives[role], settings.max_pixels) for role in ("database", "queries")

@@ -36,7 +36,8 @@ MAX_FRAME_INDEX = 2**53
 MAX_POSITION_M = 1e9  # either way; 25 times round the earth, and squares and spans are far from overflow
 MAX_NAME_LENGTH = 255  # characters; file systems allow no more
 FRAME_NAME = rf"[^\x00-\x1f\x7f-\x9f]{{1,{MAX_NAME_LENGTH}}}"
-_ROWS_AT_ONCE = 1024
+OF_NOTHING = "one grey, noise or the dark"  # what pictures are that show nothing
+_ROWS_AT_ONCE, _NAMED = 1024, 3
 
 SIGNIFICANCE = 0.002  # of the agreement at shift 0, up to which it counts as more than chance
 LEAST_CORRELATION = (
@@ -119,6 +120,20 @@ class Drive:
                 f"all {self.n_frames} frames of {name} have one and the same encoding, which tells no place from "
                 "another: is the lens covered, or the extractor broken? Record another drive"
             )
+
+    def picture_warnings(self, whose: str) -> list[str]:
+        """What a person should know of its pictures, called as "of the map", in sentences."""
+        moved, digests = np.diff(self.position_m, prepend=-np.inf) > 0, self.digests()
+        hung = np.append(False, digests[1:] == digests[:-1]) & moved & ~self.shows_nothing
+        told = (
+            (self.shows_nothing, f"show nothing: {OF_NOTHING}"),
+            (hung, "are the very same as the one before, and the robot had moved on: did the camera hang?"),
+        )
+        return [
+            f"{int(these.sum())} of {self.n_frames} pictures {whose} {what}{_named(self.frame_name[these])}"
+            for these, what in told
+            if these.any()
+        ]
 
     def route(self, closed: bool = False) -> Route:
         """The frames' positions as a route; x, y only where some frame knows them.
@@ -374,3 +389,9 @@ def _agreement(own: NDArray[np.float64], other: NDArray[np.float64]) -> float:
 def _normal_ranks(values: NDArray[np.float64]) -> NDArray[np.float64]:
     """Normal scores of every row's ranks."""
     return normal_scores(rank_landmarks(values), values.shape[1])
+
+
+def _named(names: NDArray[np.str_]) -> str:
+    """The first of some frames by name, in brackets; "" where none has one."""
+    known = names[names != ""].tolist()
+    return f" ({', '.join(known[:_NAMED])}{', ...' if len(known) > _NAMED else ''})" if known else ""

@@ -311,10 +311,7 @@ class _Remap:
                 why = drive.camera.unlike(filter(None, cameras), whose)
                 if why is not None:
                     warnings[f"the pictures of traverse {drive.name} are not like {whose}: {why}"] = None
-        n_frames, n_nothing = inputs.training.n_frames, int(inputs.training.shows_nothing.sum())
-        if n_nothing:
-            warnings[f"{n_nothing} of {n_frames} pictures of the map show nothing: one grey, noise or the dark"] = None
-        return list(warnings)
+        return [*warnings, *inputs.training.picture_warnings("of the map")]
 
     def _read(self) -> _Inputs:
         """Read what is needed, every traverse once.

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from sqlite_utils import Database
 
 from deepsimbad.core.camera import Camera
-from deepsimbad.core.drive import Drive
+from deepsimbad.core.drive import OF_NOTHING, Drive
 from deepsimbad.core.frames import IDENTITY, UNKNOWN_CONTENT, UNKNOWN_TIMESTAMP, differences
 from deepsimbad.errors import (
     ConflictError,
@@ -288,7 +288,9 @@ class Traverse(Spool):
             ).fetchall()
             cameras = _cameras(db)
             unlike = (camera.unlike(cameras[:1], "most") for camera in cameras[1:])
-            whys = [f"some of its pictures are not like the others: {why}" for why in unlike if why is not None]
+            whys = [f"some of its pictures are not like the others: {why}" for why in unlike if why is not None][:1]
+            if n_uninformative:
+                whys.append(f"{n_uninformative} of {n_frames} pictures show nothing: {OF_NOTHING}")
             n_spooled, spooled_bytes = spooled(db)
             return TraverseSummary(
                 name=self.name,
@@ -302,7 +304,7 @@ class Traverse(Spool):
                 spooled_bytes=spooled_bytes,
                 grey_levels=_levels(db),
                 cameras=cameras,
-                warnings=tuple(whys[:1]),
+                warnings=tuple(whys),
             )
 
     @property
