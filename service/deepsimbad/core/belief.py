@@ -22,6 +22,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from deepsimbad.core.cells import SUMS
 from deepsimbad.core.relevance import UpdateRule, mean_ranks
 from deepsimbad.core.route import Route
 from deepsimbad.errors import PastTheEndError
@@ -42,7 +43,8 @@ _DOUBTING = 0.01  # a belief that takes the robot for lost by more refuses no mo
 SIGMAS = 4.0  # a move's error is cut off here
 _AS_TOLD = 0.6  # of moves: how many err by no more than odometry says of itself
 _SLIPPING = 0.2  # of a move: how far off the others are, for a wheel slips or its size is not what it was
-_BLOCK = 2048  # cells whose sums stay in the first-level cache
+_BLOCK = 1024  # cells whose sums stay in the first-level cache
+_NOTHING = 1e-300  # what a view leaves of a belief that it does not allow, or less
 _NARROW = 0.6  # cells; a narrower normal curve is not sampled, but has its variance all the same
 
 
@@ -199,8 +201,7 @@ class GridFilter:
     @cached_property
     def _believed(self) -> NDArray[np.float64]:
         """[c] of the cells, if the robot is on the route; sums to 1."""
-        believed = self.doubt.trust @ self.masses
-        return np.asarray(believed / max(believed.sum(), 1e-300))
+        return _mixed(self.masses, _trusted(self.doubt.log_trust, self.doubt.lost))
 
     @cached_property
     def mass(self) -> NDArray[np.float64]:
@@ -232,10 +233,11 @@ class GridFilter:
         cells, doubt, reach_m = self.route.cells, self.doubt, SIGMAS * action_std_m
         shift, offset_m = cells.shifted(self.offset_m + action_m)
         some = cells.sources(shift, offset_m, reach_m if doubt.is_mixture or action_m == 0 else 0.0)
-        if not self.masses[:, some].any():  # it may still have stopped at the end
-            some = cells.sources(shift, offset_m, reach_m)
         on_route = 1 - doubt.lost
-        surviving = on_route - self.masses[:, : some.start].sum(axis=1) - self.masses[:, some.stop :].sum(axis=1)
+        surviving = self._within(some)
+        if not (surviving > LEAST_SURVIVING_SHARE * on_route).any() and not self.masses[:, some].any():
+            some = cells.sources(shift, offset_m, reach_m)  # it may still have stopped at the end
+            surviving = self._within(some)
         check_ahead(self.route, doubt, on_route, surviving, action_m)
         lost, staying, found = leaving_and_found(doubt, doubt.lost, on_route, surviving, action_m)
         total = surviving * staying + found + lost
@@ -250,6 +252,11 @@ class GridFilter:
         last = None if doubt.last is None else _carried(doubt.last, shift, cells.closed)
         return replace(self, masses=masses, offset_m=offset_m, doubt=replace(doubt, lost=lost / total, last=last))
 
+    def _within(self, some: slice) -> NDArray[np.float64]:
+        """[t] what some cells hold: all but what the others do."""
+        without = self.masses[:, : some.start].sum(axis=1) + self.masses[:, some.stop :].sum(axis=1)
+        return np.asarray(1 - self.doubt.lost - without, np.float64)
+
     def updated(self, seen: ViewEvidence, step: int) -> Self:  # noqa: ARG002
         """The belief after a view."""
         at_cells = replace(seen, values=self._at_cells(seen.values))
@@ -257,13 +264,12 @@ class GridFilter:
         if seen.is_added:
             mass = added(self._believed, at_cells.values)
             masses, doubt = np.outer(1 - self.doubt.lost, mass), self.doubt
+            moved = 0.5 * float(np.abs(mass - self._believed).sum())
         else:
-            seeing = self.masses, self.doubt.lost, self.doubt.log_trust, at_cells.likelihood(news)
-            masses, lost, log_trust = _see(*seeing)
+            likelihood = at_cells.likelihood(news)
+            masses, lost, log_trust, moved = _see(self.masses, self.doubt.lost, self.doubt.log_trust, likelihood)
             doubt = Doubt(lost, log_trust, at_cells.values)
-        after = replace(self, masses=masses, doubt=doubt)
-        moved = 0.5 * float(_apart(after._believed, self._believed))
-        return replace(after, told=max(moved, at_cells.least_told(news)))
+        return replace(self, masses=masses, doubt=doubt, told=max(moved, at_cells.least_told(news)))
 
     def _at_cells(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """[c] what is known of map images [n]; the images of one stop say what they say on average."""
@@ -317,19 +323,10 @@ def added(mass: NDArray[np.float64], seen: NDArray[np.float64]) -> NDArray[np.fl
 
 
 @njit(cache=True, nogil=True)
-def _dot(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
-    """Sum of products, in eight parts of a fixed order: one part alone would wait for every addition before it."""
-    parts = np.zeros(8)
-    whole = one.size // 8
-    for i in range(whole):
-        for part in range(8):
-            parts[part] += one[8 * i + part] * other[8 * i + part]
-    total = 0.0
-    for i in range(8 * whole, one.size):
-        total += one[i] * other[i]
-    for part in range(8):
-        total += parts[part]
-    return total
+def _trusted(log_trust: NDArray[np.float64], lost: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[t] by which masses of cells are believed, so that they sum to 1."""
+    weight = np.exp(log_trust - log_trust.max())
+    return np.asarray(weight / max((weight * (1.0 - lost)).sum(), _NOTHING))
 
 
 @njit(cache=True, nogil=True)
@@ -338,45 +335,87 @@ def _see(
     lost: NDArray[np.float64],
     log_trust: NDArray[np.float64],
     likelihood: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Multiply by likelihoods, normalise, and weigh the trusts; `likelihood` [c], of the least trust, is used up.
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], float]:
+    """Multiply by likelihoods [c] of the least trust, normalise, and weigh the trusts.
 
     Where a view allows nothing that a trust still believes, that trust keeps what it knew.
+
+    Returns:
+        Masses [t, c], lost [t], log trusts [t], and the share of what is believed that moved.
+    """
+    average, total = _likelihoods(masses, likelihood)
+    gain, lost_after, log_trust_after = np.zeros(lost.size), lost.copy(), log_trust.copy()
+    for t in range(lost.size):
+        total[t] += lost[t] * average[t]
+        if total[t] > _NOTHING:
+            gain[t] = 1.0 / total[t]
+            lost_after[t] = lost[t] * average[t] * gain[t]
+            log_trust_after[t] += np.log(total[t] / average[t])
+    weights = _trusted(log_trust, lost), _trusted(log_trust_after, lost_after)
+    after, moved = _multiplied(masses, likelihood, gain, weights[0], weights[1])
+    return after, lost_after, log_trust_after, 0.5 * moved
+
+
+@njit(cache=True, nogil=True, fastmath=SUMS)
+def _mixed(masses: NDArray[np.float64], weight: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[c] the sum of rows [t, c], each times its weight."""
+    mixed = weight[0] * masses[0]
+    for t in range(1, weight.size):
+        row, share = masses[t], weight[t]
+        for i in range(mixed.size):
+            mixed[i] += share * row[i]
+    return np.asarray(mixed)
+
+
+@njit(cache=True, nogil=True, fastmath=SUMS)
+def _likelihoods(
+    masses: NDArray[np.float64], likelihood: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """[t], [t] means of likelihoods [c], over all cells and over what each trust believes."""
+    n_trusts, n = masses.shape
+    mean, total = np.empty(n_trusts), np.empty(n_trusts)
+    powers = likelihood.copy()
+    for t in range(n_trusts):
+        row, everywhere, believed = masses[t], 0.0, 0.0
+        for i in range(n):
+            everywhere += powers[i]
+            believed += row[i] * powers[i]
+        mean[t], total[t] = everywhere / n, believed
+        for i in range(n):
+            powers[i] *= powers[i]  # the next trust is twice this one
+    return mean, total
+
+
+@njit(cache=True, nogil=True, fastmath=SUMS)
+def _multiplied(
+    masses: NDArray[np.float64],
+    likelihood: NDArray[np.float64],
+    gain: NDArray[np.float64],
+    weight: NDArray[np.float64],
+    weight_after: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], float]:
+    """Masses [t, c] times likelihoods and gains [t], and the sum of differences of what is believed.
+
+    Args:
+        gain: 0 where a trust stays as it was.
+        weight, weight_after: [t] by which masses before and after are believed.
     """
     n_trusts, n = masses.shape
-    after, ones = np.empty((n_trusts, n)), np.ones(n)
-    lost_after, log_trust_after = lost.copy(), log_trust.copy()
-    for t in range(n_trusts):
-        before, row = masses[t], after[t]
-        if t > 0:  # this trust is twice the one before
-            for i in range(n):
-                likelihood[i] *= likelihood[i]
-        average = _dot(likelihood, ones) / n
-        total = _dot(before, likelihood) + lost[t] * average
-        if total <= 0:
-            row[:] = before
-            continue
-        for i in range(n):
-            row[i] = before[i] * likelihood[i] / total
-        lost_after[t] = lost[t] * average / total
-        log_trust_after[t] += np.log(total / average)
-    return after, lost_after, log_trust_after
-
-
-@njit(cache=True, nogil=True)
-def _apart(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
-    """Sum of differences, as `_dot` sums."""
-    parts = np.zeros(8)
-    whole = one.size // 8
-    for i in range(whole):
-        for part in range(8):
-            parts[part] += abs(one[8 * i + part] - other[8 * i + part])
-    total = 0.0
-    for i in range(8 * whole, one.size):
-        total += abs(one[i] - other[i])
-    for part in range(8):
-        total += parts[part]
-    return total
+    after, moved = np.empty((n_trusts, n)), 0.0
+    for begin in range(0, n, _BLOCK):
+        powers = likelihood[begin : begin + _BLOCK].copy()
+        change = np.zeros(powers.size)
+        for t in range(n_trusts):
+            before, row = masses[t, begin : begin + _BLOCK], after[t, begin : begin + _BLOCK]
+            times, plus = gain[t], 1.0 if gain[t] == 0 else 0.0
+            share, share_after = weight[t], weight_after[t]
+            for i in range(powers.size):
+                row[i] = before[i] * (powers[i] * times + plus)
+                change[i] += share_after * row[i] - share * before[i]
+                powers[i] *= powers[i]
+        for i in range(powers.size):
+            moved += abs(change[i])
+    return after, moved
 
 
 def move_error(step_m: float, n_cells: int, std_m: float) -> NDArray[np.float64]:
@@ -398,7 +437,7 @@ def mixed_error(step_m: float, n_cells: int, *stds_m: tuple[float, float]) -> ND
     return np.asarray(np.sum([np.pad(error, (widest - error.size) // 2) for error in errors], axis=0), np.float64)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, fastmath=SUMS)
 def _moved(
     masses: NDArray[np.float64],
     move: tuple[int, int, int],
@@ -411,7 +450,8 @@ def _moved(
 
     Args:
         move: The first cell that is shifted, the first that is not any more, and by how many cells.
-        taps: [2 w + 1] the error. Of what it would carry past an end of an open route none is lost.
+        taps: [2 w + 1] the error, the same to either side. Of what it would carry past an end of an open route nothing
+            is lost.
         gain: [t] that masses are multiplied by.
         found: [t] added to every cell.
     """
@@ -443,12 +483,17 @@ def _moved(
                 on_route[n - 1 - i] /= 1.0 - taps[width + i + 1 :].sum()
         for begin in range(0, n, _BLOCK):
             row = moved[t, begin : begin + _BLOCK]
-            row[:] = found[t]
-            for tap in range(taps.size):
-                weight = taps[tap] * gain[t]
-                behind = source[begin + taps.size - 1 - tap : n + 2 * width]
+            middle = source[begin + width : n + 2 * width]
+            weight = taps[width] * gain[t]
+            for i in range(row.size):
+                row[i] = found[t] + weight * middle[i]
+            for away in range(1, width + 1, 2):  # two cells to either side at once; one that is no more weighs nothing
+                reach = min(away + 1, width)
+                near, far = taps[width + away] * gain[t], taps[width + reach] * gain[t] if reach > away else 0.0
+                left, right = source[begin + width - away :], source[begin + width + away :]
+                lefter, righter = source[begin + width - reach :], source[begin + width + reach :]
                 for i in range(row.size):
-                    row[i] += weight * behind[i]
+                    row[i] += near * (left[i] + right[i]) + far * (lefter[i] + righter[i])
     return moved
 
 

@@ -8,6 +8,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+SUMS = {"reassoc", "contract"}
+"""For kernels that sum: in parts, which a processor adds at once. The same machine sums in the same order always."""
+
 _MOST_PER_PLACE = 4  # cells, where a few places are far apart and the others near each other
 _MOST_IN_GAPS, _LEAST_STEP_M = 32768, 0.25  # more than that, but no shorter ones: gaps must not make cells coarse
 _ROUNDING = 1e-9  # of a cell
@@ -64,9 +67,8 @@ class Cells:
         return _interpolated(values, self.place_m, self.start_m + offset_m, self.step_m, self.n_cells, length_m)
 
     def to_places(self, mass: NDArray[np.float64], offset_m: float) -> NDArray[np.float64]:
-        """[p] masses of places, summing to 1, from those of cells [c]: of the stretch that is nearest to each."""
-        on_places = _within(mass, (self._bounds_m - self.start_m - offset_m) / self.step_m + 0.5, self.closed)
-        return np.asarray(on_places / max(on_places.sum(), 1e-300), np.float64)
+        """[p] masses of places from those of cells [c]: of the stretch that is nearest to each."""
+        return _within(mass, self._bounds_m, self.start_m + offset_m, self.step_m, self.closed)
 
     @cached_property
     def _bounds_m(self) -> NDArray[np.float64]:
@@ -104,17 +106,24 @@ def _interpolated(
 
 
 @njit(cache=True, nogil=True)
-def _within(mass: NDArray[np.float64], bounds: NDArray[np.float64], closed: bool) -> NDArray[np.float64]:
-    """[p] the masses between ascending bounds [p + 1], in cells from where the first begins; cells are evenly full."""
-    n = mass.size
-    within = np.empty(bounds.size - 1)
-    cell = int(np.floor(bounds[0])) if closed else 0
-    held = mass[cell % n] * (bounds[0] - cell) if closed else 0.0  # of the cell, what earlier places have
+def _within(
+    mass: NDArray[np.float64], bounds_m: NDArray[np.float64], from_m: float, step_m: float, closed: bool
+) -> NDArray[np.float64]:
+    """[p] the masses between ascending bounds [p + 1], of cells about `from_m` and on; cells are evenly full."""
+    n, a_metre = mass.size, 1.0 / step_m
+    within = np.empty(bounds_m.size - 1)
+    cell, held = 0, 0.0  # of the cell, what earlier places have
+    if closed:
+        first = (bounds_m[0] - from_m) * a_metre + 0.5
+        cell = int(np.floor(first))
+        held = mass[cell % n] * (first - cell)
+    at = cell % n
     for place in range(within.size):
-        last, total = bounds[place + 1], -held
+        last, total = (bounds_m[place + 1] - from_m) * a_metre + 0.5, -held
         while cell + 1 <= last and (closed or cell < n):
-            total += mass[cell % n]
+            total += mass[at]
             cell += 1
-        held = mass[cell % n] * max(last - cell, 0.0) if closed or cell < n else 0.0
+            at = at + 1 if at + 1 < n else 0
+        held = mass[at] * max(last - cell, 0.0) if closed or cell < n else 0.0
         within[place] = total + held
     return within

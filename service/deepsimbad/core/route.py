@@ -6,9 +6,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
-from deepsimbad.core.cells import Cells
+from deepsimbad.core.cells import SUMS, Cells
 from deepsimbad.errors import InvalidRouteError
 
 _NearPoint = Callable[[float, float], NDArray[np.intp]]
@@ -149,15 +150,35 @@ class Route:
         return np.asarray(nearest, np.intp)
 
     @cached_property
-    def histogram(self) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
-        """Edges [b + 1] of equal bins over the whole route, at most 200, and every map image's bin [n]."""
-        n_bins = min(_HISTOGRAM_BINS, self.n_images)
+    def histogram_edges_m(self) -> NDArray[np.float64]:
+        """[b + 1] of equal bins over the whole route, at most 200."""
+        n_bins = min(_HISTOGRAM_BINS, self.n_images) if self.length_m > 0 else 1
+        return np.linspace(self.start_m, self.start_m + self.length_m, n_bins + 1)
+
+    def histogram_of(self, mass: NDArray[np.float64]) -> NDArray[np.float64]:
+        """[b] what those bins hold of masses of map images [n]."""
+        return _sums_up_to(mass, self._bin_ends)
+
+    @cached_property
+    def _bin_ends(self) -> NDArray[np.intp]:
+        """[b] the map image after the last one of every bin."""
+        n_bins = self.histogram_edges_m.size - 1
         width_m = self.length_m / n_bins
         if width_m <= 0:
-            return np.array([self.start_m, self.start_m]), np.zeros(self.n_images, np.intp)
-        edges_m = np.linspace(self.start_m, self.start_m + self.length_m, n_bins + 1)
-        bins = ((self.position_m - self.start_m) / width_m).astype(np.intp)
-        return edges_m, np.minimum(bins, n_bins - 1, dtype=np.intp)
+            return np.array([self.n_images])
+        bins = np.minimum(((self.position_m - self.start_m) / width_m).astype(np.intp), n_bins - 1)
+        return np.searchsorted(bins, np.arange(n_bins), side="right")
+
+
+@njit(cache=True, nogil=True, fastmath=SUMS)
+def _sums_up_to(values: NDArray[np.float64], ends: NDArray[np.intp]) -> NDArray[np.float64]:
+    """[b] sums of the values [n] before every end [b], from the one before it on."""
+    sums, begin = np.zeros(ends.size), 0
+    for number in range(ends.size):
+        for place in range(begin, ends[number]):
+            sums[number] += values[place]
+        begin = ends[number]
+    return sums
 
 
 def true_images_of(

@@ -6,6 +6,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from deepsimbad.core.cells import SUMS
 from deepsimbad.core.index.retrieval import shortlist
 from deepsimbad.core.route import Route
 
@@ -46,9 +47,7 @@ def summarise(route: Route, mass: NDArray[np.float64], n_top: int, off_route: fl
     """Summarise masses over map images, [n], which sum to 1; `n_top` of the likeliest are listed."""
     top = shortlist(mass, n_top)
     mean_m, std_m = _moments(route, mass)
-    edges_m, bins = route.histogram
-    bits, histogram = np.log2(np.maximum(mass, _NOTHING)), np.zeros(edges_m.size - 1)
-    entropy_bits, least = _entropy_and_least(mass, bits, _CREDIBLE_SHARE, bins, histogram)
+    entropy_bits, least = _entropy_and_least(mass, np.log2(np.maximum(mass, _NOTHING)), _CREDIBLE_SHARE)
     return BeliefSummary(
         mean_m=mean_m,
         mode_m=float(route.position_m[top[0]]),
@@ -57,8 +56,8 @@ def summarise(route: Route, mass: NDArray[np.float64], n_top: int, off_route: fl
         entropy_bits=max(0.0, entropy_bits),
         off_route=off_route,
         near_mode=near_mode(route, mass, int(top[0])) * (1 - off_route),
-        histogram_edges_m=edges_m,
-        histogram_mass=histogram,
+        histogram_edges_m=route.histogram_edges_m,
+        histogram_mass=route.histogram_of(mass),
         top=top,
         top_mass=mass[top],
     )
@@ -94,24 +93,21 @@ def _moments(route: Route, mass: NDArray[np.float64]) -> tuple[float, float]:
     return float(mean), float(np.sqrt((mass * np.square(offset)).sum()))
 
 
-@njit(cache=True, nogil=True)
-def _entropy_and_least(
-    mass: NDArray[np.float64],
-    bits: NDArray[np.float64],
-    share: float,
-    bins: NDArray[np.int64],
-    histogram: NDArray[np.float64],
-) -> tuple[float, float]:
-    """Entropy in bits, and the least mass in the smallest set of images that holds a share; adds to the histogram.
+@njit(cache=True, nogil=True, fastmath=SUMS)
+def _entropy_and_least(mass: NDArray[np.float64], bits: NDArray[np.float64], share: float) -> tuple[float, float]:
+    """Entropy in bits, and the least mass in the smallest set of images that holds a share.
 
     Not all are sorted: they are summed by size, 16 classes an octave, and the class where the share is reached is.
     """
-    held = np.zeros(_OCTAVES * _PARTS)
-    greatest, entropy = bits.max(), 0.0
+    n_classes = _OCTAVES * _PARTS
+    size_class, greatest, entropy = np.empty(mass.size, np.int16), bits.max(), 0.0
     for i in range(mass.size):
         entropy -= mass[i] * bits[i]
-        histogram[bins[i]] += mass[i]
-        held[min(int((greatest - bits[i]) * _PARTS), held.size - 1)] += mass[i]
+        size_class[i] = min(int((greatest - bits[i]) * _PARTS), n_classes - 1)
+    by_turns = np.zeros((4, n_classes))  # so that an addition need not wait for the one before it
+    for i in range(mass.size):
+        by_turns[i & 3, size_class[i]] += mass[i]
+    held = by_turns[0] + by_turns[1] + by_turns[2] + by_turns[3]
     total, last = 0.0, 0
     while last < held.size - 1 and total + held[last] < share * (1 - 1e-12):
         total += held[last]
@@ -119,7 +115,7 @@ def _entropy_and_least(
     within = np.empty(mass.size)
     count = 0
     for i in range(mass.size):
-        if min(int((greatest - bits[i]) * _PARTS), held.size - 1) == last:
+        if size_class[i] == last:
             within[count] = mass[i]
             count += 1
     ascending = np.sort(within[:count])
@@ -134,7 +130,7 @@ def _pieces(route: Route, member: NDArray[np.bool_]) -> list[tuple[float, float]
     """Stretches of neighbouring members; those nearer together than a bin of the histogram are one."""
     images = np.flatnonzero(member)
     position_m = route.position_m[images]
-    bin_m = float(route.histogram[0][1] - route.histogram[0][0])
+    bin_m = float(route.histogram_edges_m[1] - route.histogram_edges_m[0])
     adjacent = (np.diff(images) == 1) | (np.diff(position_m) <= bin_m)
     starts = np.r_[0, np.flatnonzero(~adjacent) + 1]
     stops = np.r_[starts[1:], images.size]

@@ -169,7 +169,6 @@ class _Session:
         self._localizer = ActiveLocalizer(map_, LocalizerConfig(planner=f"{CONSTANT}:{CONFIDENT_WITHIN_M:g}"))
         self._state: LocalizerState = self._localizer.start()
         self._views, self._moves_m = views, np.diff(queries.position_m, prepend=queries.position_m[0])
-        self._edges_m, self._bins = map_.route.histogram
         self.belief: list[NDArray[np.float64]] = []
         self.n_forgot = 0
 
@@ -182,7 +181,7 @@ class _Session:
             anew = self._localizer.with_prior(self._state, *_anywhere(self._state))
             state, self.n_forgot = self._localizer.step(anew, view).state, self.n_forgot + 1
         self._state, mass = state, state.belief.mass
-        self.belief.append(np.asarray(np.bincount(self._bins, mass, self._edges_m.size - 1), np.float64))
+        self.belief.append(state.belief.route.histogram_of(mass))
         if state.relevance is None:
             raise ValueError("a step leaves the view's relevance")
         return state.relevance, mass
