@@ -9,11 +9,13 @@ import json
 import os
 import sqlite3
 import time
+from importlib.metadata import version
 from pathlib import Path
 
 import httpx2
 import numpy as np
 import pytest
+from click import Argument, Context, Group
 from click.testing import CliRunner
 
 from deepsimbad.cli import deepsimbad as commands
@@ -204,3 +206,23 @@ def test_help():
             assert ended.exit_code == 0, ended.output
             texts[" ".join([program.removeprefix("python -m "), *words])] = ended.output
     check("help", texts)
+
+
+def test_both_commands_have_one_order_of_words():
+    """A verb, or a noun that is listed, or a group and its verb; then the domain, then what is done to what of it."""
+    ours, theirs = (
+        {name: group.get_command(Context(group), name) for name in group.list_commands(Context(group))}
+        for group in (commands, cli)
+    )
+    assert {name for name, command in ours.items() if isinstance(command, Group)} == {"experiment", "keys", "weights"}
+    assert not any(isinstance(command, Group) for command in theirs.values())
+    for command in (*ours.values(), *theirs.values()):
+        words = [parameter.human_readable_name for parameter in command.params if isinstance(parameter, Argument)]
+        assert not any("DOMAIN" in word.upper() for word in words[1:]), f"{command.name} {words}"
+    same = set(ours) & set(theirs)
+    assert same == {"delete-domain", "localize"}
+    for name in same:
+        usage = [group[name].collect_usage_pieces(Context(group[name])) for group in (ours, theirs)]
+        assert usage[0] == usage[1]
+    versions = [CliRunner().invoke(group, ["--version"]).output for group in (commands, cli)]
+    assert versions == [f"{version('deep-simbad')}\n"] * 2

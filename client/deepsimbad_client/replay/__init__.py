@@ -273,7 +273,9 @@ class Journal(Generic[Record]):
         differing = [key for key in identity if earlier.get(key) != identity[key]]
         if differing:
             was = ", ".join(f"{key} {earlier.get(key)!r}, now {identity[key]!r}" for key in differing)
-            raise ReplayError(f"{self.folder} holds another replay ({was}): name another folder, or restart this one")
+            raise ReplayError(
+                f"{self.folder} holds another replay ({was}): name another folder (--out), or --restart this one"
+            )
         return earlier
 
     def _records(self, read: Callable[[dict[str, Any]], Record], what: str) -> list[Record]:

@@ -20,6 +20,7 @@ from deepsimbad.errors import (
     TooManyDomainsError,
     TraverseInUseError,
     UnknownMapVersionError,
+    nearest_of,
 )
 from deepsimbad.store import layout
 from deepsimbad.store.catalog_jobs import JobCatalog
@@ -417,7 +418,9 @@ def _get_map(db: Database, domain: str, version: int) -> MapRecord:
     if 1 <= version <= _MAX_INTEGER:
         row = db.execute(f"{_SELECT_MAP} WHERE domain = ? AND version = ?", [domain, version]).fetchone()
     if row is None:
-        raise UnknownMapVersionError(f"domain {domain} has no map version {version}", version=version)
+        known = db.execute("SELECT version FROM map WHERE domain = ? ORDER BY version DESC", [domain]).fetchall()
+        there = nearest_of("", (str(version) for (version,) in known))
+        raise UnknownMapVersionError(f"domain {domain} has no map version {version}{there}", version=version)
     return _map(row)
 
 
