@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from deepsimbad.core.belief import FilterKind, GridFilter, ViewEvidence
+from deepsimbad.core.belief import FilterKind, GridFilter, ViewEvidence, motion_std_m
 from deepsimbad.core.particles import ParticleFilter
 from deepsimbad.core.relevance import UpdateRule
 from deepsimbad.core.route import Route
@@ -76,14 +76,14 @@ def test_a_view_that_excludes_all_that_is_believed_changes_nothing(route):
     np.testing.assert_allclose(belief.updated(seen(relevance, UpdateRule.LOG_LIKELIHOOD), step=0).mass, belief.mass)
 
 
-def error_matrix(n, action, std, closed=False):
+def error_matrix(n, action, std, closed=False, slipping=1.0):
     """[n, n] where the mass of a cell comes to lie, of which none is lost at the ends; all in cells.
 
-    Six moves of ten err as odometry says, the others by a fifth of the way more.
+    Six moves of ten err as odometry says, the others by a fifth of the way more, or by a part of that.
     """
     apart = np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
     apart, whole, matrix = np.minimum(apart, n - apart) if closed else apart, np.abs(np.arange(-n, n + 1)), 0.0
-    for share, deviation in ((0.6, std), (0.4, np.hypot(std, 0.2 * action))):
+    for share, deviation in ((0.6, std), (0.4, np.hypot(std, 0.2 * slipping * action))):
 
         def weight(cells, deviation=deviation):
             if deviation < 0.6:
@@ -111,7 +111,7 @@ def slow_mixture(route, views, moves, shared):
                 moved[move:] = masses[t][: n - move]
                 gone = lost[t] + masses[t].sum() - moved.sum()
                 leaving = 1 - np.exp(-0.0005 * move)
-                masses[t] = moved @ error_matrix(n, move, 0.0) * (1 - leaving) + 0.02 * gone / n
+                masses[t] = moved @ error_matrix(n, move, 0.0, slipping=0.0) * (1 - leaving) + 0.02 * gone / n
                 lost[t] = 0.98 * gone + leaving * moved.sum()
         last = values
         for t, trust in enumerate((0.5, 1.0, 2.0)):
@@ -218,7 +218,8 @@ def test_a_move_equals_its_definition(closed, action, std):
                 gone += share
                 continue
         arrived[target % n if closed else min(max(target, 0), n - 1)] += share
-    spread = arrived @ error_matrix(n, action / cells.step_m, std / cells.step_m, closed)
+    slipping = min(1.0, std / np.sqrt(0.05**2 + 0.01 * abs(action)))  # odometry more exact than usual slips less
+    spread = arrived @ error_matrix(n, action / cells.step_m, std / cells.step_m, closed, slipping)
     lost = gone * 0.98 + (1 - np.exp(-0.0005 * abs(action))) * (1 - gone)
     assert moved.off_route == pytest.approx(lost, rel=1e-6, abs=1e-12)
     expected = spread * np.exp(-0.0005 * abs(action)) + 0.02 * gone / n
@@ -415,3 +416,11 @@ def test_particles_past_the_end_of_an_open_route_die():
 def test_particles_on_a_loop_come_round():
     belief = ParticleFilter.around(Route(np.arange(100.0), closed=True), 97.0, 0.5, 500, seed=0).predicted(5.0, 0.1, 1)
     assert belief.mass[[0, 1, 2, 3, 4]].sum() > 0.98
+
+
+def test_moves_said_to_be_exact_spread_nothing():
+    """And those said to be more exact than odometry usually is spread less."""
+    route = Route(np.arange(200.0))
+    before = GridFilter.around(route, 50.0, 0.01)
+    held = [before.predicted(10.0, std_m, step=1).mass[60] for std_m in (0.0, 0.1, motion_std_m(10.0))]
+    assert held[0] > 0.97 > 0.9 > held[1] > 0.75 > held[2]

@@ -279,7 +279,8 @@ async def post_observation(
         ),
     ] = 0.0,
     action_std_m: Annotated[
-        float | None, Query(description="How sure that is, a standard deviation; absent: usual odometry.")
+        float | None,
+        Query(description="How sure that is, a standard deviation; absent: usual odometry; 0: exact."),
     ] = None,
     shortlist: Shortlist = None,
     idempotency_key: Annotated[

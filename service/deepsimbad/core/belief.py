@@ -64,10 +64,14 @@ def motion_std_m(action_m: float) -> float:
 
 
 def move_stds_m(action_m: float, action_std_m: float, doubt: "Doubt") -> dict[float, float]:
-    """Deviations of a move by how probable each is: a mixture takes some to be farther off than told."""
+    """Deviations of a move by how probable each is: a mixture takes some to be farther off than told.
+
+    Where odometry says of itself that it is more exact than usual, its moves slip less by as much.
+    """
     if not doubt.is_mixture:
         return {1.0: action_std_m}
-    return {_AS_TOLD: action_std_m, 1 - _AS_TOLD: float(np.hypot(action_std_m, _SLIPPING * action_m))}
+    slip_m = _SLIPPING * action_m * min(1.0, action_std_m / motion_std_m(action_m))
+    return {_AS_TOLD: action_std_m, 1 - _AS_TOLD: float(np.hypot(action_std_m, slip_m))}
 
 
 @dataclass(frozen=True)

@@ -108,9 +108,12 @@ def drive_in_order(
 
 
 def _stepped(localizer: ActiveLocalizer, state: LocalizerState, view: Query, moved_m: float) -> LocalizerState:
-    """After a view; a move that leads past the end is refused, and the belief stays."""
+    """After a view; a move that leads past the end is refused, and the belief stays.
+
+    Sums take the odometry for exact, and so does the filter here.
+    """
     try:
-        return localizer.step(state, view, moved_m).state
+        return localizer.step(state, view, moved_m, action_std_m=0.0).state
     except PastTheEndError:
         return state
 
