@@ -31,8 +31,8 @@ def lines() -> Iterator[str]:
         sys.exit("no Chromium is installed: apt-get install chromium")
     yield from ("# The console before a long route", "", "Made by `python -m bench.console`.", "", machine(), "")
     yield f"A domain of {NCLT_IMAGES:,} map images and a session on it; Chromium without a graphics card, 1440 x 900."
-    yield "The service, the robot and the browser share the machine's cores, and times are by the wall: asked are the"
-    yield "first paint and the script alone. As many steps as the page keeps (2,000) were there before."
+    yield "The service, the robot and the browser share the machine's cores: paints are by the wall, updates are"
+    yield "processor time of the page's own thread. As many steps as the page keeps (2,000) were there before."
     yield ""
     turn = np.arange(NCLT_IMAGES) / 4000
     plane = {"x_m": 400 * np.cos(turn) + 60 * np.cos(9 * turn), "y_m": 400 * np.sin(turn) + 60 * np.sin(9 * turn)}
@@ -90,13 +90,9 @@ def _driven(browser: Any, url: str, robot: _Robot) -> list[Limit]:
     page = browser.new_context(viewport={"width": 1440, "height": 900}).new_page()
     page.goto(url)
     page.get_by_text(f"After {_N_BEFORE} views").first.wait_for()
-    page.evaluate(
-        """globalThis.longest = 0; new PerformanceObserver((list) => {
-        for (const task of list.getEntries()) longest = Math.max(longest, task.duration)
-        }).observe({type: "longtask"})"""
-    )
+    browser.start_tracing(page=page, categories=["toplevel", "devtools.timeline"])
     inspector = page.context.new_cdp_session(page)
-    inspector.send("Performance.enable")
+    inspector.send("Performance.enable", {"timeDomain": "threadTicks"})
     taken: list[dict[str, float]] = []
     for update in range(-_N_WARM_UP, _N_UPDATES):
         if update == 0:
@@ -107,13 +103,20 @@ def _driven(browser: Any, url: str, robot: _Robot) -> list[Limit]:
     page.get_by_text(f"After {_N_BEFORE + _N_WARM_UP + _N_UPDATES} views").first.wait_for()
     taken.append(_spent(inspector))
     spent = {name: 1000 * (taken[1][name] - taken[0][name]) / _N_UPDATES for name in taken[0]}
-    longest_ms = page.evaluate("longest")
+    longest_ms = _longest_task_ms(json.loads(browser.stop_tracing())["traceEvents"])
     page.context.close()
     return [
         Limit("script an update, ms", spent["ScriptDuration"], _SCRIPT_MS),
         Limit("script, style and layout an update, ms", sum(spent.values()), _SCRIPT_MS),
         Limit("longest task that held the page, ms", longest_ms, 100.0),
     ]
+
+
+def _longest_task_ms(events: list[dict[str, Any]]) -> float:
+    """Processor time of the longest task of the thread that runs the console's scripts, which paints it too."""
+    ours = {(e["pid"], e["tid"]) for e in events if e["name"] == "FunctionCall" and "/console/" in json.dumps(e)}
+    tasks = [e for e in events if e["name"].endswith("RunTask") and (e["pid"], e["tid"]) in ours]
+    return float(max(e.get("tdur", 0) for e in tasks) / 1000)
 
 
 def _spent(inspector: Any) -> dict[str, float]:

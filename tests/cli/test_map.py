@@ -69,16 +69,20 @@ def test_pictures_are_kept_where_the_domain_says_so_and_go_into_backups(deepsimb
     assert deepsimbad("map", "plain", "--training", "one", *small, "--data-dir", "here").code == 0
     assert not thumbnails_path(tmp_path / "here", "plain").exists()
     assert deepsimbad("map", "route", "--training", "one", *small, "--thumbnails", "--data-dir", "here").code == 0
-    assert deepsimbad("map", "route", "--training", "two", *small, "--data-dir", "here").code == 0, "as the domain does"
+    two = ("--landmarks", "one", "--training", "two")
+    assert deepsimbad("map", "route", *two, *small, "--data-dir", "here").code == 0, "as the domain does"
     assert deepsimbad("backup", "b.tar", "--data-dir", "here").code == 0
     assert deepsimbad("restore", "b.tar", "--data-dir", "there").code == 0
     assert deepsimbad("check", "--data-dir", "there").code == 0
     for drive, version in (("one", 1), ("two", 2)):
         map_ = contents(tmp_path / "there", version)
         map_ = dataclasses.replace(map_, domain="route", version=version)
-        for image in range(6):
-            seen = Pictures(tmp_path / "there", 1 << 24).of_image(map_, image)
-            whole = cv2.imread(str(tmp_path / drive / map_.frames[image]))
+        images = [(drive, map_.frame_digest, number, name) for number, name in enumerate(map_.frames)]
+        landmarks = [("one", map_.landmark_digest, number, name) for number, name in enumerate(map_.landmark_frame)]
+        assert (len(images), len(landmarks)) == (6, 4)
+        for of_drive, digests, number, name in images + landmarks:
+            seen = Pictures(tmp_path / "there", 1 << 24).of_frame(map_, digests, number)
+            whole = cv2.imread(str(tmp_path / of_drive / name))
             shown = cv2.imdecode(np.frombuffer(seen, np.uint8), cv2.IMREAD_COLOR)
             assert shown.shape == (96, 128, 3)
             assert np.abs(cv2.resize(whole, (128, 96)).astype(int) - shown).mean() < 12

@@ -145,6 +145,19 @@ def test_coverage_names_every_map_image_and_the_worst_stretches(client):
     problem(client.get("/v1/domains/ready/coverage?map_version=99"), 404, "unknown_map_version")
 
 
+def test_landmarks_are_known_by_the_frames_they_began_as(client):
+    described = client.get("/v1/domains/seen").json()
+    answer = client.get("/v1/domains/seen/landmarks").json()
+    columns = [answer[name] for name in ("n_map_images", "map_image", "frame", "drive")]
+    assert {len(column) for column in columns} == {described["n_landmarks"]}
+    assert sum(answer["n_map_images"]) == described["n_map_images"] * described["list_length"]
+    assert sorted(answer["map_image"]) == list(range(described["n_map_images"])), "of its own drive, all of them"
+    assert set(answer["drive"]) == {"drive"}
+    problem(client.get("/v1/domains/seen/landmarks/0/thumbnail"), 404, "unknown_thumbnail")
+    problem(client.get(f"/v1/domains/seen/landmarks/{described['n_landmarks']}/thumbnail"), 404, "unknown_thumbnail")
+    problem(client.get("/v1/domains/unmapped/landmarks"), 409, "no_active_map")
+
+
 def test_what_a_domain_shows_may_be_changed_and_nothing_else(client, domain):
     path, body = f"/v1/admin/domains/{domain}", TAKES_ENCODINGS
     assert client.get(f"/v1/domains/{domain}").json()["thumbnails"] is False

@@ -22,6 +22,7 @@ def whole(**changes):
         if row.dtype.kind != "U"
     }
     arrays |= {"frame_name": np.array([f"{i:0{i}}.png" for i in range(N)]), "frame_drive": np.array(["a", "bc"] * 4)}
+    arrays |= {"landmark_frame": np.array([*"abcd", ""]), "landmark_drive": np.full(R, "a")}
     arrays["lists"] = rng.integers(0, R, (H, N)).astype(np.uint16)
     arrays["position_m"] = np.arange(float(N))
     config = {"relevance": "composed", "n_landmarks": R, "seed": 3}

@@ -168,6 +168,7 @@ def test_a_map_knows_the_frames_it_is_made_of(first, run, catalog):
     assert after.frame_name[is_old].tolist() == [f"drive{i}.png" for i in range(40)]
     assert after.frame_name[~is_old].tolist() == [f"more{i}.png" for i in range(15)]
     assert (after.frame_drive == np.where(is_old, "drive", "more")).all()
+    assert after.landmark_digest.tolist() == contents(catalog, 1).landmark_digest.tolist(), "landmarks stay"
 
 
 def test_digests_stay_as_they_are():

@@ -53,6 +53,8 @@ def everything(make_map: MakeMap) -> Map:
         frame_digest=generator.integers(2**64, size=60, dtype=np.uint64),
         frame_name=np.array([f"{i}" * (i % 7) for i in range(60)]),
         frame_drive=np.full(60, "summer"),
+        landmark_digest=generator.integers(2**64, size=20, dtype=np.uint64),
+        landmark_frame=np.array([f"{i}" * (i % 7) for i in range(20)]),
         x_m=np.where(np.arange(60) % 7 == 0, np.nan, 1.0),
         landmark_model={
             "prototypes": generator.random((20, 8), dtype=np.float32),

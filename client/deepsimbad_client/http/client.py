@@ -32,6 +32,7 @@ from deepsimbad_client.http.models import (
     Coverage,
     Domain,
     Health,
+    Landmarks,
     Localization,
     NextBestView,
     SessionAnswer,
@@ -273,6 +274,18 @@ class ClientCalls(Face, Generic[AnySession]):
         """Where on its route a map can be trusted. Raises UnknownDomainError, NoActiveMapError, RetiredMapError."""
         call = Call("GET", f"{domain_path(domain)}/coverage", {"map_version": map_version})
         return model_of(Coverage, await self._wire.send(call))
+
+    @shared
+    async def landmarks(self, domain: str, *, map_version: int | None = None) -> Landmarks:
+        """What a map's landmarks began as. Raises UnknownDomainError, NoActiveMapError, RetiredMapError."""
+        call = Call("GET", f"{domain_path(domain)}/landmarks", {"map_version": map_version})
+        return model_of(Landmarks, await self._wire.send(call))
+
+    @shared
+    async def landmark_thumbnail(self, domain: str, landmark: int, *, map_version: int | None = None) -> bytes:
+        """A small JPEG of the frame that a landmark began as. Raises NotFoundError (the domain keeps none)."""
+        path = f"{domain_path(domain)}/landmarks/{landmark}/thumbnail"
+        return (await self._wire.send(Call("GET", path, {"map_version": map_version}))).content
 
     @shared
     async def thumbnail(self, domain: str, map_image: int, *, map_version: int | None = None) -> bytes:

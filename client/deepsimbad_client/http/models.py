@@ -156,6 +156,16 @@ class Coverage(Answer):
     chance: tuple[float | None, ...] | None
 
 
+class Landmarks(Answer):
+    """`GET /v1/domains/{domain}/landmarks`: what each began as; columns in the order of their numbers."""
+
+    map_version: int
+    n_map_images: tuple[int, ...]  # that list it
+    map_image: tuple[int | None, ...]  # that is the frame it began as
+    frame: tuple[str | None, ...]
+    drive: tuple[str | None, ...]
+
+
 class SessionState(Answer):
     """A live session between two observations."""
 

@@ -1,6 +1,6 @@
-"""Where on its route a domain's map can be trusted."""
+"""A domain's map for people to look at: where on its route it can be trusted, its landmarks, pictures of both."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -126,14 +126,67 @@ def _known(values: NDArray[np.floating] | None, digits: int) -> Metres:
     return known
 
 
-@router.get(
-    "/{domain}/map-images/{index}/thumbnail",
-    response_class=Response,
-    responses={
-        200: {"content": {"image/jpeg": {"schema": {"type": "string", "format": "binary"}}}},
-        **problems(404, 409, 410, 422),
-    },
-)
+class LandmarksAnswer(TypedDict):
+    """Every landmark of a map; columns are in the order of their numbers, from 0."""
+
+    domain: str
+    map_version: int
+    thumbnail_bytes: Annotated[int, Field(description="As in the domain's coverage.")]
+    n_map_images: Annotated[list[int], Field(description="That list it.")]
+    map_image: Annotated[list[int | None], Field(description="That is the frame it began as; null where none is.")]
+    frame: Annotated[list[FrameName], Field(description="That it began as, before sums of landmarks moved it.")]
+    drive: Annotated[list[str | None], Field(description="That it is of; null where an earlier release made it.")]
+
+
+@router.get("/{domain}/landmarks", response_model=LandmarksAnswer, responses=problems(404, 409, 410, 422))
+async def get_landmarks(domain: DomainName, running: Running, map_version: PinnedVersion = None) -> Response:
+    """A map's landmarks: the frames they began as, and how many map images list each."""
+    snapshot = await _snapshot(running, domain, map_version)
+    n_bytes = await run_sync(running.pictures.n_bytes, domain)
+    _, body = await running.written(snapshot.n_landmarks, render_landmarks, snapshot, n_bytes)
+    return Response(body, media_type=JSON)
+
+
+def render_landmarks(snapshot: Map, thumbnail_bytes: int) -> LandmarksAnswer:
+    """A map's landmarks."""
+    own, began = snapshot.frame_digest, snapshot.landmark_digest
+    image_of = {} if own is None else dict(zip(own.tolist(), range(own.size), strict=True))
+    return {
+        "domain": snapshot.domain,
+        "map_version": snapshot.version,
+        "thumbnail_bytes": thumbnail_bytes,
+        "n_map_images": np.bincount(snapshot.lists.reshape(-1), minlength=snapshot.n_landmarks).tolist(),
+        "map_image": _column(snapshot, None if began is None else [image_of.get(digest) for digest in began.tolist()]),
+        "frame": _column(snapshot, snapshot.landmark_frame),
+        "drive": _column(snapshot, snapshot.landmark_drive),
+    }
+
+
+def _column(snapshot: Map, known: Iterable[Any] | None) -> list[Any]:
+    """Of every landmark, None where unknown."""
+    return [None] * snapshot.n_landmarks if known is None else [None if value == "" else value for value in known]
+
+
+_PICTURE: dict[int | str, dict[str, Any]] = {
+    200: {"content": {"image/jpeg": {"schema": {"type": "string", "format": "binary"}}}},
+    **problems(404, 409, 410, 422),
+}
+
+
+@router.get("/{domain}/landmarks/{index}/thumbnail", response_class=Response, responses=_PICTURE)
+async def get_landmark_thumbnail(
+    domain: DomainName,
+    index: Annotated[int, PathParameter(ge=0, le=GREATEST_ID, description="The landmark's number, from 0.")],
+    running: Running,
+    map_version: PinnedVersion = None,
+) -> Response:
+    """A small picture of the frame that a landmark began as, where the domain keeps them (`thumbnails`)."""
+    snapshot = await _snapshot(running, domain, map_version)
+    content = await run_sync(running.pictures.of_frame, snapshot, snapshot.landmark_digest, index)
+    return Response(content, media_type="image/jpeg")
+
+
+@router.get("/{domain}/map-images/{index}/thumbnail", response_class=Response, responses=_PICTURE)
 async def get_thumbnail(
     domain: DomainName,
     index: Annotated[int, PathParameter(ge=0, le=GREATEST_ID, description="In route order, from 0.")],
@@ -142,5 +195,5 @@ async def get_thumbnail(
 ) -> Response:
     """A small picture of a map image, where the domain keeps them (`thumbnails`)."""
     snapshot = await _snapshot(running, domain, map_version)
-    content = await run_sync(running.pictures.of_image, snapshot, index)
+    content = await run_sync(running.pictures.of_frame, snapshot, snapshot.frame_digest, index)
     return Response(content, media_type="image/jpeg")

@@ -67,7 +67,7 @@ export function Places({ answer, domain, version, view, isKept }) {
   return html`<section class="card"><h2>${of_view ? "Places most like the view" : "Likeliest places"}</h2>
     <div class=${view ? "beside" : ""}>${view && html`<figure class="view"><img src=${view} alt="The view" /><figcaption class="quiet">The view</figcaption></figure>`}
     <ol class="places">${shown.slice(0, 6).map((place) => html`<li>
-      <${Thumbnail} domain=${domain} version=${version} isKept=${isKept} image=${place.map_image} alt=${`Map image at ${metres(place.route_position_m)}`} />
+      <${Thumbnail} domain=${domain} version=${version} isKept=${isKept} number=${place.map_image} alt=${`Map image at ${metres(place.route_position_m)}`} />
       <div><b>${metres(place.route_position_m)}</b><small class="number">${of_view ? `relevance ${place.relevance.toFixed(2)}` : `${percent(place.mass, 1)} of the belief`}</small>
       <small>${place.frame ?? `map image ${place.map_image}`}</small></div></li>`)}</ol></div>
   </section>`;

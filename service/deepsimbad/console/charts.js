@@ -6,8 +6,12 @@ const SCALE_HEIGHT = 30; // pixels under a route
 const MOST_POINTS = 3000; // of a drawn route: more cannot be told apart
 const dark = matchMedia("(prefers-color-scheme: dark)");
 
+const colours = new Map(); // of the theme there is
+dark.addEventListener("change", () => colours.clear());
+
 export function colour(name) {
-  return getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
+  if (!colours.has(name)) colours.set(name, getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim());
+  return colours.get(name);
 }
 
 function parts(text) {
@@ -40,10 +44,11 @@ export function useDrawing(ref, draw) {
 function sized(canvas) {
   const scale = devicePixelRatio || 1;
   const { width, height } = canvas.getBoundingClientRect();
-  canvas.width = Math.max(1, Math.round(width * scale));
-  canvas.height = Math.max(1, Math.round(height * scale));
+  const [across, down] = [width, height].map((side) => Math.max(1, Math.round(side * scale)));
+  if (canvas.width !== across || canvas.height !== down) [canvas.width, canvas.height] = [across, down];
   const context = canvas.getContext("2d");
   context.setTransform(scale, 0, 0, scale, 0, 0);
+  context.clearRect(0, 0, width, height);
   return { context, width, height };
 }
 
@@ -259,42 +264,64 @@ export function Strip({ belief, next, route, label }) {
     hooks=${{ drawAxes: [drawn] }} />`;
 }
 
-// A belief as a row of pixels; the one that is shown stands on a line of its own colour.
-function painted(mass, n_bins, [paper, ink, mark], isCurrent) {
-  const row = new Uint8ClampedArray(4 * n_bins);
+// A belief as a row of pixels.
+function painted(mass, [paper, ink]) {
+  const row = new Uint8ClampedArray(4 * mass.length);
   const most = Math.max(...mass);
   mass.forEach((value, bin) => {
     const share = Math.sqrt(value / most);
-    const to = isCurrent && share < 0.05 ? mark : ink;
-    const weight = isCurrent ? Math.max(share, 0.25) : share;
-    for (let part = 0; part < 3; part += 1) row[4 * bin + part] = paper[part] + (to[part] - paper[part]) * weight;
+    for (let part = 0; part < 3; part += 1) row[4 * bin + part] = paper[part] + (ink[part] - paper[part]) * share;
     row[4 * bin + 3] = 255;
   });
-  return row;
+  return new ImageData(row, mass.length, 1);
 }
 
-// How the belief came about: a row an event, newest below; a click goes there. Every row is painted once.
+const SHEET_ROWS = 4096; // more than events are kept
+const PAINTED_AT_ONCE = 100; // so that a long session's history holds no page up
+
+// How the belief came about: a row an event, newest below; a click goes there. Every row is painted once, on a sheet
+// that begins anew at its end.
 export function History({ events, current, onPick, label }) {
   const [ref, kept] = [useRef(), useRef({})];
-  useDrawing(ref, () => {
-    const canvas = ref.current;
-    const n_bins = events.reduce((most, { answer }) => Math.max(most, answer.belief.histogram.mass.length), 1);
-    const names = ["soft", "blue", "mark"].map(colour);
-    if (kept.current.of !== `${names} ${n_bins}`) kept.current = { of: `${names} ${n_bins}`, rows: new WeakMap(), colours: names.map(parts) };
-    const { rows, colours } = kept.current;
-    [canvas.width, canvas.height] = [n_bins, Math.max(1, events.length)];
-    const context = canvas.getContext("2d");
-    const image = context.createImageData(canvas.width, canvas.height);
-    events.forEach(({ answer }, row) => {
-      const { mass } = answer.belief.histogram;
-      if (!rows.has(answer)) rows.set(answer, painted(mass, n_bins, colours, false));
-      image.data.set(row === current ? painted(mass, n_bins, colours, true) : rows.get(answer), 4 * row * n_bins);
-    });
-    context.putImageData(image, 0, 0);
-  });
+  const [first, last] = [events[0].number, events[events.length - 1].number];
+  const draw = () => {
+    if (!ref.current) return;
+    const n_bins = events[0].answer.belief.histogram.mass.length;
+    const names = ["soft", "blue"].map(colour);
+    if (kept.current.of !== `${names} ${n_bins}`) {
+      const paper = Object.assign(document.createElement("canvas"), { width: n_bins, height: SHEET_ROWS });
+      kept.current = { of: `${names} ${n_bins}`, numbers: [], paper, pencil: paper.getContext("2d") };
+    }
+    const { numbers, paper, pencil } = kept.current;
+    let n_painted = 0;
+    for (let i = events.length - 1; i >= 0 && n_painted < PAINTED_AT_ONCE; i -= 1) {
+      const row = events[i].number % SHEET_ROWS;
+      if (numbers[row] === events[i].number) continue;
+      pencil.putImageData(painted(events[i].answer.belief.histogram.mass, names.map(parts)), 0, row);
+      numbers[row] = events[i].number;
+      n_painted += 1;
+    }
+    if (n_painted === PAINTED_AT_ONCE) requestAnimationFrame(draw);
+    const { context, width, height } = sized(ref.current);
+    const tall = height / (last - first + 1);
+    const top = (number) => (number - first) * tall;
+    context.imageSmoothingEnabled = tall < 1; // else rows would be left out
+    for (let from = 0, i = 1; i <= events.length; i += 1) {
+      if (i < events.length && events[i].number === events[i - 1].number + 1 && events[i].number % SHEET_ROWS) continue;
+      context.drawImage(paper, 0, events[from].number % SHEET_ROWS, n_bins, i - from, 0, top(events[from].number), width, (i - from) * tall);
+      from = i;
+    }
+    context.strokeStyle = colour("mark");
+    context.lineWidth = 2;
+    const shown = Math.min(top(events[current].number), height - 4);
+    context.strokeRect(1, Math.max(1, shown + 1), width - 2, Math.max(2, tall - 2));
+  };
+  useDrawing(ref, draw);
   const pick = (event) => {
     const box = ref.current.getBoundingClientRect();
-    onPick(Math.min(events.length - 1, Math.max(0, Math.floor(((event.clientY - box.top) / box.height) * events.length))));
+    const number = first + Math.floor(((event.clientY - box.top) / box.height) * (last - first + 1));
+    const index = events.findIndex((each) => each.number >= number);
+    onPick(index < 0 ? events.length - 1 : index);
   };
   return html`<div class="history"><canvas ref=${ref} role="img" aria-label=${label} onClick=${pick}></canvas></div>`;
 }

@@ -61,7 +61,8 @@ export function Domain({ names: [name] }) {
         <${Worst} name=${name} coverage=${coverage.answer} />
       </div>
     </div>
-    <${Versions} name=${name} maps=${maps} onSwitch=${() => { maps.again(); domain.again(); coverage.again(); }} />`;
+    <${Versions} name=${name} maps=${maps} onSwitch=${() => { maps.again(); domain.again(); coverage.again(); }} />
+    ${answer?.map_version && html`<${Landmarks} key=${answer.map_version} name=${name} version=${answer.map_version} list_length=${answer.list_length} />`}`;
 }
 
 function Covered({ name, route, coverage, domain }) {
@@ -94,11 +95,31 @@ function Worst({ name, coverage }) {
   return html`<section class="card"><h2>Worst stretches</h2>
     ${coverage.stretches.length === 0 && html`<p class="quiet">None stands out.</p>`}
     <ol class="places">${coverage.stretches.slice(0, 6).map((stretch) => html`<li>
-      <${Thumbnail} domain=${name} version=${coverage.map_version} image=${stretch.worst_map_image} alt="" isKept=${coverage.thumbnail_bytes > 0} />
+      <${Thumbnail} domain=${name} version=${coverage.map_version} number=${stretch.worst_map_image} alt="" isKept=${coverage.thumbnail_bytes > 0} />
       <div><b>${metres(stretch.from_m, 0)} – ${metres(stretch.to_m, 0)}</b><br />${percent(stretch.chance)} placed rightly<br />
         <small>worst at ${stretch.worst_frame ?? `map image ${stretch.worst_map_image}`}</small>
         <small>from ${stretch.first_frame ?? `map image ${stretch.first_map_image}`}</small><small>to ${stretch.last_frame ?? `map image ${stretch.last_map_image}`}</small></div>
     </li>`)}</ol></section>`;
+}
+
+const LANDMARKS_AT_ONCE = 12;
+
+// What the active map compares views with, those first that most places list.
+function Landmarks({ name, version, list_length }) {
+  const { answer, problem } = useAnswer(`v1/domains/${name}/landmarks?map_version=${version}`);
+  const [n_shown, setShown] = useState(LANDMARKS_AT_ONCE);
+  const order = useMemo(() => answer && answer.n_map_images.map((_, number) => number).sort((a, b) => answer.n_map_images[b] - answer.n_map_images[a]), [answer]);
+  if (!answer) return html`<${Fault} problem=${problem} />`;
+  const isKnown = answer.frame.some((frame) => frame !== null) || answer.map_image.some((image) => image !== null);
+  const n = order.length;
+  return html`<section class="card below"><header><h2>Landmarks</h2><span class="quiet">${n.toLocaleString()}, most listed first</span></header>
+    <p class="quiet">What views are compared with: every place of the route lists the ${list_length} that together are most like it. ${isKnown ? "Each began as a frame of a drive." : "Which frames they began as is not known of this map: a new one will tell."}</p>
+    <ol class="places">${order.slice(0, n_shown).map((number) => html`<li key=${number}>
+      ${isKnown && html`<${Thumbnail} domain=${name} version=${version} kind="landmarks" number=${number} alt="" isKept=${answer.thumbnail_bytes > 0} />`}
+      <div><b>Landmark ${number}</b><small class="number">listed by ${answer.n_map_images[number].toLocaleString()} place${answer.n_map_images[number] === 1 ? "" : "s"}</small>
+        ${isKnown && html`<small>${answer.frame[number] ?? (answer.map_image[number] === null ? "a frame without a name" : `map image ${answer.map_image[number]}`)}${answer.drive[number] ? ` of ${answer.drive[number]}` : ""}</small>`}</div></li>`)}</ol>
+    ${n_shown < n && html`<div class="row below"><button onClick=${() => setShown(n_shown + 4 * LANDMARKS_AT_ONCE)}>Show ${Math.min(4 * LANDMARKS_AT_ONCE, n - n_shown)} more</button></div>`}
+  </section>`;
 }
 
 const FIGURES = [

@@ -48,10 +48,13 @@ export async function json(path, options) {
   return answer.status === 204 ? null : answer.json();
 }
 
+const SLICE_MS = 10;
+
 // Server-sent events, by hand: the browser's own reader sends no key. Goes on after a cut, behind the last event.
 export async function follow(path, { onEvent, onState = () => {}, signal, after }) {
   let last = after;
   let waits_ms = 500;
+  let worked_since = performance.now();
   while (!signal.aborted) {
     try {
       const headers = last === undefined ? {} : { "Last-Event-ID": String(last) };
@@ -67,6 +70,10 @@ export async function follow(path, { onEvent, onState = () => {}, signal, after 
         const blocks = text.split(/\r?\n\r?\n/);
         text = blocks.pop();
         for (const block of blocks) {
+          if (performance.now() - worked_since > SLICE_MS) {
+            await new Promise((resume) => setTimeout(resume)); // what came at once holds no page up
+            worked_since = performance.now();
+          }
           const event = { name: "message", id: undefined, data: "" };
           for (const line of block.split(/\r?\n/)) {
             const [, field, content] = /^([a-z]+): ?(.*)$/.exec(line) ?? [];

@@ -109,7 +109,7 @@ export function useDropped(onFiles) {
   }, []);
 }
 
-// Map images' thumbnails, asked for once each, the few last ones kept.
+// Thumbnails, asked for once each, the few last ones kept.
 const pictures = new Map();
 function picture(path) {
   if (!pictures.has(path)) {
@@ -120,8 +120,9 @@ function picture(path) {
   return pictures.get(path);
 }
 
-export function Thumbnail({ domain, version, image, alt, isKept }) {
-  const path = isKept && `v1/domains/${domain}/map-images/${image}/thumbnail?map_version=${version}`;
+// The small picture of one of a map's images, or of another `kind` of it.
+export function Thumbnail({ domain, version, kind = "map-images", number, alt, isKept }) {
+  const path = isKept && `v1/domains/${domain}/${kind}/${number}/thumbnail?map_version=${version}`;
   const [uri, setUri] = useState(undefined);
   useEffect(() => {
     if (!path) return undefined;

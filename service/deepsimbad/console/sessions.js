@@ -52,7 +52,7 @@ function useEvents(id) {
     const fetchEarlier = (first) =>
       follow(path, {
         signal: behind.signal,
-        after: Math.max(0, first - 1 - MOST_EVENTS),
+        after: Math.max(0, first - MOST_EVENTS),
         onEvent: (name, answer, number) => {
           if (name !== "done" && number < first) earlier.current.push({ number, name, answer });
           if (name === "done" || number >= first - 1) behind.abort();
@@ -66,7 +66,7 @@ function useEvents(id) {
         live.current.push({ number, name, answer });
         if (live.current.length === 1 && number > 1) fetchEarlier(number);
         if (live.current.length > MOST_EVENTS) live.current.shift();
-        else if (live.current.length + earlier.current.length > MOST_EVENTS) earlier.current.shift();
+        while (earlier.current.length && live.current.length + earlier.current.length > MOST_EVENTS) earlier.current.shift();
         drawSoon();
       },
       onState: (now, fault) => {

@@ -255,6 +255,8 @@ def compose_map(
     on_progress(0.92)
     known = (training,) if other is None else (training, other)
     map_, rehearsal = taught(map_, rehearsal, seen_before, space.dissimilarities(fused), season, known)
+    if isinstance(candidates, Drive) and space.chosen is not None:
+        map_ = replace(map_, **candidates.landmark_origins(space.chosen))
     on_progress(1.0)
     return Built(map_, rehearsal, own, other, verdict, fused, as_chosen.prototypes, by_camera)
 

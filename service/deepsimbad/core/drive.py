@@ -164,6 +164,12 @@ class Drive:
             "frame_drive": np.full(self.n_frames, self.name) if self.name else None,
         }
 
+    def landmark_origins(self, frames: NDArray[np.int64]) -> dict[str, Any]:
+        """Where landmarks came from that began as some of its frames [r], as the named arrays of a map."""
+        origins = self.at(frames).origins()
+        parts = {"landmark_digest": "frame_digest", "landmark_frame": "frame_name", "landmark_drive": "frame_drive"}
+        return {name: origins[part] for name, part in parts.items() if origins[part] is not None}
+
     def checked(self) -> Self:
         """The same frames with exact dtypes, fit to be stored.
 

@@ -89,6 +89,8 @@ class Map:
         x_m, y_m: East and north, NaN where unknown.
         frame_name: What the frame of every image is called in its recording, "" where unknown.
         frame_drive: And the drive that it is of.
+        landmark_digest: Which frame every landmark began as, before sums of landmarks moved it, likewise.
+        landmark_frame, landmark_drive: What it is called, and the drive that it is of.
         q_values: The experience database.
     """
 
@@ -123,6 +125,9 @@ class Map:
     y_m: NDArray[np.float64] | None = field(default=None, metadata=_row(np.float64, "n", unknown=np.nan))
     frame_name: NDArray[np.str_] | None = field(default=None, metadata=_row(np.str_, "n", unknown=""))
     frame_drive: NDArray[np.str_] | None = field(default=None, metadata=_row(np.str_, "n", unknown=""))
+    landmark_digest: NDArray[np.uint64] | None = field(default=None, metadata=_row(np.uint64, "r"))
+    landmark_frame: NDArray[np.str_] | None = field(default=None, metadata=_row(np.str_, "r"))
+    landmark_drive: NDArray[np.str_] | None = field(default=None, metadata=_row(np.str_, "r"))
     q_values: NDArray[np.float32] | None = field(default=None, metadata=_row(np.float32, "n", "a"))
 
     def __post_init__(self) -> None:
@@ -296,6 +301,11 @@ class Map:
     def cameras(self) -> tuple[Camera, ...]:
         """Of the drives that it is made of, as far as they are known."""
         return tuple(Camera.from_dict(camera) for camera in self.config.get("cameras", ()))
+
+    def landmark_origins(self) -> dict[str, Any]:
+        """The named arrays that tell which frames its landmarks began as; none where nobody noted it."""
+        named = {name: getattr(self, name) for name in ("landmark_digest", "landmark_frame", "landmark_drive")}
+        return {name: array for name, array in named.items() if array is not None}
 
     @cached_property
     def frames(self) -> NDArray[np.object_]:

@@ -5,6 +5,9 @@ from collections import OrderedDict
 from collections.abc import Iterable
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from deepsimbad.core.map import Map
 from deepsimbad.errors import UnknownThumbnailError
 from deepsimbad.evaluators.image import thumbnail
@@ -31,12 +34,12 @@ class Pictures:
                 if (small := thumbnail(body, self._max_pixels)) is not None:
                     file.put(frame_digest, small)
 
-    def of_image(self, snapshot: Map, image: int) -> bytes:
-        """The JPEG of a map image; raises UnknownThumbnailError."""
-        if not 0 <= image < snapshot.n_images or snapshot.frame_digest is None:
-            raise UnknownThumbnailError(f"map {snapshot.version} of domain {snapshot.domain} has no picture {image}")
+    def of_frame(self, snapshot: Map, digests: NDArray[np.uint64] | None, number: int) -> bytes:
+        """The JPEG of a map image or a landmark, by the digests of all of them; raises UnknownThumbnailError."""
+        if digests is None or number >= digests.size:
+            raise UnknownThumbnailError(f"map {snapshot.version} of domain {snapshot.domain} has no picture {number}")
         with self._open(snapshot.domain) as file:
-            return file.get(int(snapshot.frame_digest[image]))
+            return file.get(int(digests[number]))
 
     def n_bytes(self, domain: str) -> int:
         """Of all small pictures of a domain."""

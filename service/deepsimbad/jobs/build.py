@@ -24,7 +24,7 @@ from deepsimbad.core.map import Map
 from deepsimbad.core.relevance import Query, Relevance
 from deepsimbad.core.route import same_places
 from deepsimbad.errors import InvalidSourceError
-from deepsimbad.evaluators.base import Evaluator, Image, LandmarkModel
+from deepsimbad.evaluators.base import Evaluator, Fitted, Image, LandmarkModel
 from deepsimbad.evaluators.image import picture_size
 from deepsimbad.evaluators.scenes import Scene, check_whole, seen_in, shows_none
 from deepsimbad.evaluators.space import seen
@@ -215,14 +215,16 @@ def build(
         second = None  # one drive under two names is one season
     if plan.relevance is Relevance.COMPOSED and evaluator.is_squared_l2:
         return compose_map(plan, training, second, landmarks, n_landmarks, on_progress, camera)
-    candidates, fitted = training if landmarks is None else landmarks, None
+    candidates = training if landmarks is None else landmarks
+    fitted: Fitted | None = None
+    origins: dict[str, Any] = {}
     if not isinstance(candidates, Drive):
         model: LandmarkModel = candidates
     else:
         other = second if candidates is training else training
         fitter = fitter or Fitter(evaluator)
-        fitted = fitter.fit(plan, candidates, n_landmarks, other, lambda share: on_progress(share / 2))
-        model = fitted.model
+        rows, fitted = fitter.fit(plan, candidates, n_landmarks, other, lambda share: on_progress(share / 2))
+        model, origins = fitted.model, candidates.landmark_origins(rows)
 
     def further(share: float) -> None:
         on_progress((1 + share) / 2)
@@ -230,9 +232,9 @@ def build(
     if plan.relevance is Relevance.COMPOSED:
         built = _composed_in_space(plan, training, second, landmarks, model, n_landmarks, evaluator, further, camera)
     else:
-        built = build_from_dissimilarities(
-            plan, training, second, model, partial(measured, evaluator=evaluator), further
-        )
+        measure = partial(measured, evaluator=evaluator)
+        built = build_from_dissimilarities(plan, training, second, model, measure, further)
+        built = replace(built, map=replace(built.map, **origins))
     return built if fitted is None else replace(built, fitting=fitted.metrics or None, warnings=fitted.warnings)
 
 

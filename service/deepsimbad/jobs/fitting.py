@@ -97,7 +97,7 @@ class Fitter:
 
     def __init__(self, evaluator: Evaluator, pictures: Pictures | None = None, seed: int = 0) -> None:
         self._evaluator, self._pictures, self._seed = evaluator, pictures, seed
-        self._last: tuple[tuple[Drive | int | None, ...], Fitted] | None = None
+        self._last: tuple[tuple[Drive | int | None, ...], tuple[NDArray[np.int64], Fitted]] | None = None
 
     def fit(
         self,
@@ -106,8 +106,8 @@ class Fitter:
         n_landmarks: int,
         other: Drive | None,
         on_progress: Callable[[float], None],
-    ) -> Fitted:
-        """Choose r of the candidates and fit the evaluator to them; see `Evaluator.fit` and `select_landmarks`.
+    ) -> tuple[NDArray[np.int64], Fitted]:
+        """Choose r of the candidates, and fit the evaluator to them; see `select_landmarks` and `Evaluator.fit`.
 
         Args:
             other: Another drive, perhaps of the same route.
@@ -120,7 +120,7 @@ class Fitter:
         to_choose = 1.0 if fitting is Fitting.NOTHING else _VIEWS_SHARE
         rows = select_landmarks(candidates.encodings, n_landmarks, lambda share: on_progress(share * to_choose))
         if fitting is Fitting.NOTHING:
-            return self._evaluator.fit(Lesson(candidates.encodings, rows))
+            return rows, self._evaluator.fit(Lesson(candidates.encodings, rows))
         views: NDArray[np.float32] | None = None
         warnings: tuple[str, ...] = ()
         if fitting is Fitting.IMAGES:
@@ -142,8 +142,8 @@ class Fitter:
         n_views = 0 if views is None else views.shape[0] * views.shape[1]
         known = {"n_views": n_views, "n_shared_places": 0 if places is None else len(places)}
         fitted = Fitted(fitted.model, {**known, **fitted.metrics}, (*warnings, *fitted.warnings))
-        self._last = asked, fitted
-        return fitted
+        self._last = asked, (rows, fitted)
+        return rows, fitted
 
     def _views(
         self, candidates: Drive, rows: NDArray[np.int64], on_progress: Callable[[float], None]

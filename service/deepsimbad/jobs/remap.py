@@ -442,6 +442,7 @@ class _Remap:
             config={**asked, **built.map.config},
             landmark_model=with_levels(built.map.landmark_model, training.grey_levels),
             **training.origins(),
+            **({} if inputs.base is None else inputs.base.landmark_origins()),
             q_values=q_values,
         )
         second_season = None

@@ -52,13 +52,18 @@ _WORTH_SMALLER_PAGES = 1.01  # of the index's bytes: with small pages all else t
 _MODEL_TABLE, _PACKED_TABLE = "landmark_model", "q_value"
 # In which table of the frozen schema an array lies, all of one layout; what is not named here, what seasons teach.
 _TABLE_OF = {
-    **dict.fromkeys(("statistics", "loadings"), "landmark_statistics"),
+    **dict.fromkeys(
+        ("statistics", "loadings", "landmark_digest", "landmark_frame", "landmark_drive"), "landmark_statistics"
+    ),
     "values": "listed_dissimilarity",
     "encodings": "map_image_encoding",
     "q_values": _PACKED_TABLE,
     **dict.fromkeys(("position_m", "timestamp_us", "x_m", "y_m", "frame_digest", "frame_name", "frame_drive"), "route"),
 }
-_TEXTS = frozenset({"frame_name", "frame_drive"})
+_TEXTS = {  # and the column of `map` that tells how many
+    **dict.fromkeys(("frame_name", "frame_drive"), "n_map_images"),
+    **dict.fromkeys(("landmark_frame", "landmark_drive"), "n_landmarks"),
+}
 _TABLES = ("calibration", "landmark_statistics", "listed_dissimilarity", "map_image_encoding", _PACKED_TABLE, "route")
 
 
@@ -148,7 +153,7 @@ def _read(db: Database, path: Path) -> Map:
         arrays |= (load_packed if table == _PACKED_TABLE else load_arrays)(db, table, checksum)
     if checksum.value != stored["checksum"]:
         raise DamagedMapError(f"{path.name} is damaged: it does not match its checksum", file=path.name)
-    arrays |= {name: unpack_texts(arrays[name], stored["n_map_images"]) for name in _TEXTS & arrays.keys()}
+    arrays |= {name: unpack_texts(arrays[name], stored[_TEXTS[name]]) for name in _TEXTS.keys() & arrays.keys()}
     shape = stored["list_length"], stored["n_map_images"]
     if postings:
         arrays["lists"] = unpack_postings(postings, *shape)

@@ -35,7 +35,7 @@ class Thumbnails(OpenFile):
         with self._reading() as db:
             row = db.execute("SELECT body FROM thumbnail WHERE frame_digest = ?", [_signed(frame_digest)]).fetchone()
         if row is None:
-            raise UnknownThumbnailError("no picture was kept of this map image")
+            raise UnknownThumbnailError("no picture was kept of this frame")
         return bytes(row[0])
 
     @property

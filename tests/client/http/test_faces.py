@@ -35,6 +35,8 @@ ASKED: dict[str, Ask] = {
     "GET /v1/domains/{domain}": lambda c, s, f: c.domain("d"),
     "GET /v1/domains/{domain}/landmark-model": lambda c, s, f: c.on_board("d"),
     "GET /v1/domains/{domain}/coverage": lambda c, s, f: c.coverage("d"),
+    "GET /v1/domains/{domain}/landmarks": lambda c, s, f: c.landmarks("d"),
+    "GET /v1/domains/{domain}/landmarks/{index}/thumbnail": lambda c, s, f: c.landmark_thumbnail("d", 3),
     "GET /v1/domains/{domain}/map-images/{index}/thumbnail": lambda c, s, f: c.thumbnail("d", 3),
     "POST /v1/domains/{domain}/localizations": lambda c, s, f: c.localize("d", ranked_landmarks=[0]),
     "POST /v1/domains/{domain}/sessions": lambda c, s, f: c.session("d"),
