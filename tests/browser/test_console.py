@@ -1,5 +1,6 @@
 """The console as people use it: every page, a robot that drives, a remap, a lost connection, a refused key."""
 
+import shutil
 import threading
 from importlib import resources
 from pathlib import Path
@@ -93,6 +94,55 @@ def test_what_is_not_there_is_said_once_and_what_to_do(open_page, where, advice)
     assert page.get_by_role("alert").count() == 1
 
 
+REACHABLE = """[...document.querySelectorAll("a[href], button, input, select, summary, iframe, [tabindex='0']")]
+    .filter((part) => !part.disabled && part.checkVisibility())"""
+REACHED = """(() => {
+    const [here, look] = [document.activeElement, getComputedStyle(document.activeElement)];
+    here.reached = true;
+    return here.matches("body, main, iframe") || (look.outlineStyle === "solid" && parseFloat(look.outlineWidth) >= 2);
+})()"""
+
+
+def test_the_keyboard_reaches_all_of_every_page(open_page, session):
+    page = open_page()
+    for where, text in {**PAGES, f"sessions/{session.session_id}": "After 3 views"}.items():
+        page.goto(page.url.partition("#")[0] + f"#{where}")
+        page.get_by_text(text).first.wait_for()
+        page.wait_for_timeout(300)
+        for _ in range(page.evaluate(f"{REACHABLE}.length") + 4):
+            page.keyboard.press("Tab")
+            assert page.evaluate(REACHED), f"{where}: the focus is not seen"
+        missed = page.evaluate(f"{REACHABLE}.filter((part) => !part.reached).map((part) => part.outerHTML)")
+        assert missed == [], where
+    slider = page.get_by_label("Step shown")
+    slider.press("ArrowLeft")
+    page.get_by_text("After 2 views").wait_for()
+    slider.press("Home")
+    page.get_by_text("After 1 view", exact=True).wait_for()
+
+
+@pytest.mark.parametrize(("motion", "takes"), [("reduce", "0s"), ("no-preference", "0.15s")])
+def test_bars_move_only_where_motion_is_not_reduced(open_page, session, motion, takes):
+    page = open_page(f"sessions/{session.session_id}", reduced_motion=motion)
+    page.get_by_text("After 3 views").wait_for()
+    moving = """[...document.querySelectorAll("*")].map((part) => getComputedStyle(part))
+        .filter((look) => look.animationName !== "none" || look.transitionDuration !== "0s")
+        .map((look) => look.transitionDuration)"""
+    assert set(page.evaluate(moving)) == ({takes} - {"0s"})
+
+
+def test_landmarks_are_shown_by_the_frames_they_began_as(open_page):
+    page = open_page("domains/route")
+    landmarks = page.locator("section").filter(has=page.get_by_role("heading", name="Landmarks"))
+    landmarks.locator("img").first.wait_for()
+    assert landmarks.get_by_role("listitem").count() == 12
+    assert "listed by" in landmarks.inner_text()
+    assert ".jpg" in landmarks.inner_text()
+    assert "of summer" in landmarks.inner_text()
+    landmarks.get_by_role("button", name=f"Show {N_FRAMES - 12} more").click()
+    assert landmarks.locator("img").nth(N_FRAMES - 1).get_attribute("src").startswith("blob:")
+
+
 def test_the_keyboard_goes_everywhere_in_order_and_is_seen(open_page):
     page = open_page("report")
     page.get_by_role("heading", name="Reports").wait_for()
@@ -179,7 +229,8 @@ def test_a_folder_is_uploaded_mapped_and_rolled_back(open_page, service, drives)
     page.get_by_text("Map version 2 answers now.").wait_for()
     page.reload()  # its log is the job's, whenever somebody looks
     page.get_by_text("Map version 2 answers now.").wait_for()
-    assert [line.split()[-1] for line in page.locator("ol li").all_inner_texts()] == ["for", "begun", "succeeded"]
+    log = [line.split("\n")[0].lower() for line in page.locator(".log li").all_inner_texts()]
+    assert log == ["asked for", "begun", "read frames", "describe", "train", "check", "succeeded"]
     page.get_by_role("link", name="See it").click()
     page.get_by_role("button", name="Roll back").press("Enter")
     page.get_by_role("dialog").press("Escape")
@@ -193,6 +244,30 @@ def test_a_folder_is_uploaded_mapped_and_rolled_back(open_page, service, drives)
     page.get_by_role("row", name="1 active").wait_for()
     with httpx2.Client(base_url=service) as caller:
         assert caller.get("/v1/domains/made").json()["map_version"] == 1
+
+
+def test_an_upload_is_paused_and_goes_on_without_what_is_no_picture(open_page, service, drives, tmp_path):
+    folder = tmp_path / "autumn"
+    shutil.copytree(drives["winter"], folder)
+    (folder / "007.jpg").write_bytes(b"no picture")
+    page = open_page(expected="422")
+    page.get_by_text("Make a domain").click()
+    page.get_by_label("Name: letters").fill("paused")
+    page.get_by_role("button", name="Make it").click()
+    held = []
+    page.route("**/frames/5?*", lambda route, _: held.append(route))
+    page.set_input_files("input[type=file]", folder)
+    page.get_by_role("button", name="Upload").click()
+    page.get_by_role("button", name="Pause").click()
+    page.get_by_role("button", name="Go on").wait_for()
+    page.unroute("**/frames/5?*")
+    page.get_by_role("button", name="Go on").click()
+    page.get_by_text(f"{N_FRAMES} of {N_FRAMES} images").wait_for()
+    page.get_by_text("007.jpg").wait_for()
+    page.get_by_text("1 refused, the others are taken").wait_for()
+    with httpx2.Client(base_url=service) as caller:
+        stored = caller.get("/v1/admin/domains/paused/traverses/autumn").json()
+        assert (stored["n_frames"], stored["missing"]) == (N_FRAMES - 1, [[7, 7]])
 
 
 def test_an_upload_goes_on_where_it_was_cut(open_page, service, drives):

@@ -51,8 +51,8 @@ class Ground:
         return float(max(np.ptp(self.line, axis=0).max() / 8, 1.0))
 
     def ahead(self, belief: Belief, next_best_view: NextBestView) -> Points:
-        """The likeliest place after the move that is asked for."""
-        return self.at(belief.mode_m + next_best_view.action_m)
+        """The likeliest place after the move that is asked for, where it is told to stop the one there is."""
+        return self.at(belief.mode_m + (0.0 if next_best_view.stop else next_best_view.action_m))
 
 
 def asked(next_best_view: NextBestView) -> str:

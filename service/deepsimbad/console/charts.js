@@ -2,7 +2,9 @@
 
 import { html, useEffect, useRef } from "./preact.js";
 
-const SCALE_HEIGHT = 30; // pixels under a route
+const LETTERS = `${Math.round(0.75 * parseFloat(getComputedStyle(document.documentElement).fontSize))}px system-ui, sans-serif`;
+const MARGIN = 40; // pixels around a route: room for the names of its ends
+const SCALE_HEIGHT = 30; // under it
 const MOST_POINTS = 3000; // of a drawn route: more cannot be told apart
 const dark = matchMedia("(prefers-color-scheme: dark)");
 
@@ -73,10 +75,10 @@ export class Route {
 
   // From metres to pixels of a picture of that size, one scale both ways.
   // Room is left for the names of its ends, and under it for the scale.
-  fitted(width, height, margin = 34) {
+  fitted(width, height, margin = MARGIN) {
     const [left, bottom, right, top] = this.box;
     const high = height - (this.isPlane ? SCALE_HEIGHT : 0);
-    const scale = Math.min((width - 2 * margin) / Math.max(right - left, 1e-6), (high - 2 * margin) / Math.max(top - bottom, 1e-6));
+    const scale = Math.min((width - 2 * margin) / Math.max(right - left, 1e-6), this.isPlane ? (high - 2 * margin) / Math.max(top - bottom, 1e-6) : Infinity);
     const x0 = (width - scale * (right - left)) / 2;
     const y0 = (high - scale * (top - bottom)) / 2;
     return { scale, place: ({ x, y }) => [x0 + scale * (x - left), high - y0 - scale * (y - bottom)] };
@@ -108,30 +110,30 @@ export class Route {
   }
 }
 
-function drawRoute(canvas, route) {
+function drawRoute(canvas, route, isCovered) {
   const { context, width, height } = sized(canvas);
   const { place, scale } = route.fitted(width, height);
-  const [line, low, high] = [colour("line"), colour("low"), colour("high")];
+  const [rail, low, high] = [colour("rail"), colour("low"), colour("high")];
   context.lineCap = "round";
   for (let i = 0; i + 1 < route.points.length; i += 1) {
     const [one, other] = [route.points[i], route.points[i + 1]];
     context.beginPath();
     context.moveTo(...place(one));
     context.lineTo(...place(other));
-    const chance = one.chance;
-    context.strokeStyle = chance === null ? line : between(low, high, chance);
+    const chance = isCovered ? one.chance : null;
+    context.strokeStyle = chance === null ? rail : between(low, high, chance);
     context.lineWidth = chance === null ? 4 : 3 + 5 * (1 - chance); // not by colour alone
     context.stroke();
   }
   context.fillStyle = context.strokeStyle = colour("quiet");
-  context.font = "12px system-ui, sans-serif";
+  context.font = LETTERS;
   context.textAlign = "center";
   context.textBaseline = "middle";
   const last = route.points.length - 1;
   for (const [name, end, inner] of [["start", 0, Math.min(8, last)], ["end", last, Math.max(0, last - 8)]]) {
     const [[x, y], [towards_x, towards_y]] = [place(route.points[end]), place(route.points[inner])];
     const away = Math.hypot(x - towards_x, y - towards_y) || 1; // names stand beyond the ends
-    context.fillText(name, x + (22 * (x - towards_x)) / away, y + (16 * (y - towards_y)) / away);
+    context.fillText(name, x + (24 * (x - towards_x)) / away, y + (16 * (y - towards_y)) / away);
   }
   context.textAlign = "start";
   context.textBaseline = "alphabetic";
@@ -188,7 +190,7 @@ function drawBelief(canvas, route, belief, next, kept) {
   });
   context.globalAlpha = 1;
   const card = colour("card");
-  if (next) dot(context, place(route.at(route.moved(belief.mode_m, next.action_m))), 5, colour("mark"), card);
+  if (next && !next.stop) dot(context, place(route.at(route.moved(belief.mode_m, next.action_m))), 5, colour("mark"), card);
   dot(context, place(route.at(belief.mode_m)), 7, colour("blue"), card);
 }
 
@@ -197,14 +199,18 @@ export function RouteMap({ route, belief, next, label }) {
   const drawn = useRef();
   useDrawing(below, () => {
     const now = `${route.start_m} ${below.current.getBoundingClientRect().width} ${below.current.getBoundingClientRect().height} ${dark.matches}`;
-    if (drawn.current?.now !== now || drawn.current.route !== route) drawRoute(below.current, route);
+    if (drawn.current?.now !== now || drawn.current.route !== route) drawRoute(below.current, route, !belief);
     drawn.current = { now, route };
     drawBelief(above.current, route, belief, next, kept.current);
   });
-  return html`<div class=${route.isPlane ? "map" : "map straight"} role="img" aria-label=${label}>
+  const [left, bottom, right, top] = route.box; // a flat route takes no more room than it needs
+  const shape = `${Math.max(right - left, 1e-6)} / ${Math.max(top - bottom, 1e-6)}`;
+  return html`<div class=${route.isPlane ? "map" : "map straight"} style=${route.isPlane ? { aspectRatio: shape } : {}} role="img" aria-label=${label}>
     <canvas ref=${below}></canvas><canvas ref=${above}></canvas>
   </div>`;
 }
+
+const PADDING = [8, 12, 0, 0]; // pixels: top, right, bottom, left; .history keeps in line with it
 
 // A chart of the library, in the page's colours, as wide as its place.
 export function Plot({ series, values, label, axes = [{}, {}], scales = { x: { time: false } }, height = 150, bands = [], hooks = {} }) {
@@ -217,9 +223,9 @@ export function Plot({ series, values, label, axes = [{}, {}], scales = { x: { t
     if (chart.current && theme.current !== look) chart.current = chart.current.destroy();
     if (!chart.current) {
       theme.current = look;
-      const axis = { stroke: ink, grid: { stroke: line, width: 1 }, ticks: { stroke: line, width: 1 }, font: "12px system-ui, sans-serif", size: 44 };
+      const axis = { stroke: ink, grid: { stroke: line, width: 1 }, ticks: { stroke: line, width: 1 }, font: LETTERS, labelFont: LETTERS, size: 44 };
       chart.current = new globalThis.uPlot({
-        width, height, scales, bands, hooks,
+        width, height, scales, bands, hooks, padding: PADDING,
         cursor: { y: false, drag: { x: false, y: false } },
         axes: axes.map((own, i) => ({ ...axis, ...(i ? {} : { size: 34 }), ...own })),
         series: [{}, ...series.map((own) => ({ width: 2, points: { show: false }, ...own, stroke: colour(own.stroke), fill: own.fill ? `${colour(own.fill)}55` : undefined }))],
@@ -252,7 +258,7 @@ export function Strip({ belief, next, route, label }) {
     ctx.fillStyle = colour("mark");
     for (const { action_m } of move?.actions ?? []) {
       const at = x(route.moved(now.mode_m, action_m));
-      const isChosen = action_m === move.action_m;
+      const isChosen = action_m === move.action_m && !move.stop;
       ctx.fillRect(at - scale, bbox.top, (isChosen ? 3 : 1) * scale, isChosen ? bbox.height : 8 * scale);
     }
     ctx.restore();

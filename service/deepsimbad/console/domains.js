@@ -3,23 +3,50 @@
 import { html, useEffect, useMemo, useState } from "./preact.js";
 import { json } from "./http.js";
 import { Route, RouteMap } from "./charts.js";
-import { Fault, Loading, Thumbnail, bytes, confirmed, metres, percent, useAnswer, when } from "./parts.js";
+import { Fault, Frame, Loading, More, Thumbnail, Wide, bytes, confirmed, metres, percent, useAnswer, useList, when } from "./parts.js";
+
+const MOST_AT_A_GLANCE = 24;
 
 export function Domains() {
   const { answer, problem } = useAnswer("v1/domains", 5000);
-  return html`<div class="head"><h1>Domains</h1></div>
+  const [wanted, setWanted] = useState("");
+  const found = answer?.domains.filter((domain) => domain.name.toLowerCase().includes(wanted.trim().toLowerCase()));
+  return html`<div class="head"><h1>Domains</h1>
+      ${answer?.domains.length > MOST_AT_A_GLANCE && html`<label class="row">Find <input type="text" value=${wanted} onInput=${(event) => setWanted(event.target.value)} /></label>`}</div>
     <${Fault} problem=${problem} />
     ${!answer && !problem && html`<${Loading} what="domains" />`}
     ${answer?.domains.length === 0 && html`<div class="card empty"><h2>Nothing is mapped yet</h2>
-      <p>Map a recorded drive, a folder of images in order, and it stands here:</p>
+      <p>Make a domain below and upload a folder of images to it, or map one beside the service:</p>
       <pre>deepsimbad map my-route --training path/to/images</pre></div>`}
-    <div class="grid">${answer?.domains.map((domain) => html`<${Card} domain=${domain} />`)}</div>`;
+    ${found?.length === 0 && answer.domains.length > 0 && html`<p class="quiet">None of ${answer.domains.length.toLocaleString()} is called so.</p>`}
+    <div class="grid">${found?.map((domain) => html`<${Card} key=${domain.name} domain=${domain} />`)}</div>
+    ${answer && html`<${New} isOpen=${answer.domains.length === 0} />`}`;
+}
+
+// A domain for images, by the service's default evaluator; other ones are made by the call.
+function New({ isOpen }) {
+  const [problem, setProblem] = useState(null);
+  const make = async (event) => {
+    event.preventDefault();
+    const { name, pictures } = event.target.elements;
+    try {
+      await json(`v1/admin/domains/${name.value}`, { method: "PUT", body: { evaluator: { kind: "feature_l2" }, thumbnails: pictures.checked } });
+      location.hash = `domains/${name.value}/upload`;
+    } catch (fault) {
+      setProblem(fault);
+    }
+  };
+  return html`<details class="below" open=${isOpen}><summary>Make a domain</summary>
+    <form class="card" onSubmit=${make}><${Fault} problem=${problem} />
+      <div class="row"><label>Name: letters, digits, . _ - <input type="text" name="name" pattern="[A-Za-z0-9][A-Za-z0-9._\\-]*" maxlength="64" required /></label>
+        <span><input type="checkbox" name="pictures" id="pictures" checked /> <label for="pictures" class="inline">Keep small pictures, to look at</label></span>
+        <button class="first">Make it</button></div></form></details>`;
 }
 
 function Card({ domain }) {
   const state = domain.map_problem ?? domain.evaluator_problem;
   return html`<a class="card" href=${`#domains/${domain.name}`}>
-    <header class="row"><h2>${domain.name}</h2>
+    <header><h2>${domain.name}</h2>
       ${state ? html`<span class="badge bad">${state}</span>` : domain.map_version === null ? html`<span class="badge so">no map yet</span>` : html`<span class="badge good">map ${domain.map_version}</span>`}</header>
     <dl class="figures">
       <div><dt>Route</dt><dd>${metres(domain.route_length_m, 0)}</dd></div>
@@ -39,7 +66,7 @@ export function useRoute(name, version) {
 
 export function Domain({ names: [name] }) {
   const { domain, coverage, route } = useRoute(name);
-  const maps = useAnswer(`v1/admin/domains/${name}/maps`, 5000);
+  const maps = useList(`v1/admin/domains/${name}/maps`, 5000);
   const { answer } = domain;
   const active = maps.answer?.maps.find((map) => map.state === "active")?.version;
   useEffect(() => {
@@ -55,10 +82,10 @@ export function Domain({ names: [name] }) {
       <div class="stack">
         ${answer?.map_version && !route && !coverage.problem && html`<${Loading} what="the route" />`}
         ${route && html`<${Covered} name=${name} route=${route} coverage=${coverage.answer} domain=${answer} />`}
+        <${Worst} name=${name} coverage=${coverage.answer} />
       </div>
       <div class="stack">
         ${answer?.map_version && html`<${Active} domain=${answer} thumbnail_bytes=${coverage.answer?.thumbnail_bytes} />`}
-        <${Worst} name=${name} coverage=${coverage.answer} />
       </div>
     </div>
     <${Versions} name=${name} maps=${maps} onSwitch=${() => { maps.again(); domain.again(); coverage.again(); }} />
@@ -94,11 +121,10 @@ function Worst({ name, coverage }) {
   if (!coverage?.chance) return null;
   return html`<section class="card"><h2>Worst stretches</h2>
     ${coverage.stretches.length === 0 && html`<p class="quiet">None stands out.</p>`}
-    <ol class="places">${coverage.stretches.slice(0, 6).map((stretch) => html`<li>
+    <ol class="places wider">${coverage.stretches.slice(0, 6).map((stretch) => html`<li>
       <${Thumbnail} domain=${name} version=${coverage.map_version} number=${stretch.worst_map_image} alt="" isKept=${coverage.thumbnail_bytes > 0} />
       <div><b>${metres(stretch.from_m, 0)} – ${metres(stretch.to_m, 0)}</b><br />${percent(stretch.chance)} placed rightly<br />
-        <small>worst at ${stretch.worst_frame ?? `map image ${stretch.worst_map_image}`}</small>
-        <small>from ${stretch.first_frame ?? `map image ${stretch.first_map_image}`}</small><small>to ${stretch.last_frame ?? `map image ${stretch.last_map_image}`}</small></div>
+        ${["worst", "first", "last"].map((which) => html`<${Frame} before=${`${which} `} name=${stretch[`${which}_frame`] ?? `map image ${stretch[`${which}_map_image`]}`} />`)}</div>
     </li>`)}</ol></section>`;
 }
 
@@ -117,7 +143,8 @@ function Landmarks({ name, version, list_length }) {
     <ol class="places">${order.slice(0, n_shown).map((number) => html`<li key=${number}>
       ${isKnown && html`<${Thumbnail} domain=${name} version=${version} kind="landmarks" number=${number} alt="" isKept=${answer.thumbnail_bytes > 0} />`}
       <div><b>Landmark ${number}</b><small class="number">listed by ${answer.n_map_images[number].toLocaleString()} place${answer.n_map_images[number] === 1 ? "" : "s"}</small>
-        ${isKnown && html`<small>${answer.frame[number] ?? (answer.map_image[number] === null ? "a frame without a name" : `map image ${answer.map_image[number]}`)}${answer.drive[number] ? ` of ${answer.drive[number]}` : ""}</small>`}</div></li>`)}</ol>
+        ${isKnown && html`<${Frame} name=${answer.frame[number] ?? (answer.map_image[number] === null ? "a frame without a name" : `map image ${answer.map_image[number]}`)} />`}
+        ${answer.drive[number] && html`<${Frame} before="of " name=${answer.drive[number]} />`}</div></li>`)}</ol>
     ${n_shown < n && html`<div class="row below"><button onClick=${() => setShown(n_shown + 4 * LANDMARKS_AT_ONCE)}>Show ${Math.min(4 * LANDMARKS_AT_ONCE, n - n_shown)} more</button></div>`}
   </section>`;
 }
@@ -159,7 +186,7 @@ function Versions({ name, maps, onSwitch }) {
   };
   return html`<section class="card below"><h2>Map versions</h2>
     <${Fault} problem=${problem} />
-    ${list.length === 0 ? html`<p class="quiet">None yet.</p>` : html`<div class="wide"><table>
+    ${list.length === 0 ? html`<p class="quiet">None yet.</p>` : html`<${Wide} label=${`Map versions of ${name}`}><table>
       <thead><tr><th>Version</th><th>State</th><th>Made</th><th class="n">Images</th><th>Relevance</th>${columns.map(([name]) => html`<th class="n">${name}</th>`)}<th><span class="hidden-text">Switch</span></th></tr></thead>
       <tbody>${list.map((map) => html`<tr>
         <td><b>${map.version}</b></td>
@@ -169,6 +196,7 @@ function Versions({ name, maps, onSwitch }) {
         <td>${map.config.relevance ?? "–"}</td>
         ${columns.map(([, figure]) => html`<td class="n">${figure(map.metrics)?.toFixed(2) ?? "–"}</td>`)}
         <td class="n">${map.version !== active && ["sealed", "retired"].includes(map.state) && html`<button class="small" disabled=${isBusy} onClick=${() => activate(map)}>${active !== null && map.version < active ? "Roll back" : "Activate"}</button>`}</td>
-      </tr>`)}</tbody></table></div>`}
+      </tr>`)}</tbody></table><//>`}
+    <${More} list=${maps} />
   </section>`;
 }

@@ -2,22 +2,26 @@
 
 import { html, useEffect, useState } from "./preact.js";
 import { follow, json } from "./http.js";
-import { Fault, Loading, confirmed, percent, span, useAnswer, when } from "./parts.js";
+import { Fault, Loading, More, Wide, confirmed, percent, span, useList, when } from "./parts.js";
 
+const STAGES = ["read_frames", "fit", "describe", "train", "check"]; // in their order, as metrics name them
+const ENDS = { succeeded: "Done", failed: "Failed", cancelled: "Cancelled" };
+const titled = (word) => word[0].toUpperCase() + word.slice(1);
 const TONES = { succeeded: "good", failed: "bad", cancelled: "plain", running: "so", queued: "plain" };
 
 export function Jobs() {
-  const { answer, problem } = useAnswer("v1/admin/jobs", 1500);
+  const list = useList("v1/admin/jobs", 1500);
+  const { answer, problem } = list;
   return html`<div class="head"><h1>Jobs</h1></div>
     <${Fault} problem=${problem} />
     ${!answer && !problem && html`<${Loading} what="jobs" />`}
     ${answer?.jobs.length === 0 && html`<div class="card empty"><h2>No job yet</h2><p>A remap makes a map of an uploaded traverse: choose a <a href="#">domain</a>, and upload one.</p></div>`}
-    ${answer?.jobs.length > 0 && html`<div class="card wide"><table>
+    ${answer?.jobs.length > 0 && html`<div class="card"><${Wide} label="Jobs"><table>
       <thead><tr><th>Job</th><th>Domain</th><th>State</th><th>Progress</th><th>Made</th></tr></thead>
       <tbody>${answer.jobs.map((job) => html`<tr><td class="name"><a href=${`#jobs/${job.job_id}`}>${job.kind} ${job.job_id.slice(0, 8)}</a></td>
         <td><a href=${`#domains/${job.domain}`}>${job.domain}</a></td><td><span class=${`badge ${TONES[job.state]}`}>${job.state}</span></td>
         <td>${job.state === "running" ? html`<progress max="1" value=${job.progress} aria-label="Progress"></progress> <small>${job.stage}</small>` : job.result ? `map ${job.result.map_version}` : job.error?.code ?? ""}</td>
-        <td>${when(job.created_at)}</td></tr>`)}</tbody></table></div>`}`;
+        <td>${when(job.created_at)}</td></tr>`)}</tbody></table><//><${More} list=${list} /></div>`}`;
 }
 
 export function Job({ names: [id] }) {
@@ -48,20 +52,23 @@ export function Job({ names: [id] }) {
       setProblem(fault);
     }
   };
+  const seconds = job?.result?.metrics.seconds; // every stage's, of a job that ended well
   const log = !job ? [] : [
     ["asked for", job.created_at],
     ["begun", job.started_at],
-    ...stages.map(({ stage, at }) => [`${stage.replaceAll("_", " ")}, as seen here`, at]),
+    ...(seconds
+      ? STAGES.filter((stage) => stage in seconds).map((stage) => [stage, null, seconds[stage]])
+      : stages.map(({ stage, at }) => [`${stage}, as seen here`, at])),
     [job.state, job.finished_at],
-  ].filter(([, at]) => at);
+  ].filter(([, at, taken_s]) => at || taken_s !== undefined);
   const isOver = job && !["queued", "running"].includes(job.state);
-  return html`<div class="head"><h1>${job?.kind ?? "Job"}</h1>${job && html`<a href=${`#domains/${job.domain}`}>${job.domain}</a>`}<code>${id}</code>
+  return html`<div class="head"><h1>${job ? titled(job.kind) : "Job"}</h1>${job && html`<a href=${`#domains/${job.domain}`}>${job.domain}</a>`}<code>${id}</code>
       ${job && html`<span class=${`badge ${TONES[job.state]}`} role="status">${job.state}</span>`}</div>
     <${Fault} problem=${problem} />
     ${state === "lost" && !isOver && html`<p class="notice so" role="status">The connection was lost; the job goes on. Trying again …</p>`}
     ${!job && !problem && html`<${Loading} what="the job" />`}
     ${job && html`<div class="columns"><div class="stack">
-      <section class="card"><h2>${isOver ? "Done" : job.stage?.replaceAll("_", " ") ?? (job.state === "queued" ? "Waiting for its turn" : "Starting")}</h2>
+      <section class="card"><h2>${isOver ? ENDS[job.state] : (job.stage && titled(job.stage.replaceAll("_", " "))) ?? (job.state === "queued" ? "Waiting for its turn" : "Starting")}</h2>
         <progress max="1" value=${job.progress} aria-label="Progress"></progress>
         <p class="number">${percent(job.progress)}${!isOver && job.eta_s !== null ? `, about ${span(job.eta_s)} left` : ""}</p>
         ${job.error && html`<p class="notice bad"><b>${job.error.detail}</b> <code>${job.error.code}</code></p>`}
@@ -70,8 +77,8 @@ export function Job({ names: [id] }) {
       ${job.result && html`<section class="card"><h2>What was measured</h2><${Headline} metrics=${job.result.metrics} />
         <details><summary>All figures</summary><${Measured} values=${job.result.metrics} /></details></section>`}
     </div><div class="stack">
-      <section class="card"><h2>Log</h2>${isOver && job.result?.metrics.seconds && html`<${Stages} seconds=${job.result.metrics.seconds} />`}
-        <ol>${log.map(([line, at]) => html`<li><span class="quiet number">${when(at, "medium")}</span> ${line}</li>`)}</ol></section>
+      <section class="card"><h2>Log</h2><ol class="log">${log.map(([line, at, taken_s]) => html`<li>
+        <span>${line.replaceAll("_", " ")}</span><span class="quiet number">${at ? when(at, "medium") : `took ${taken_s < 10 ? `${taken_s.toFixed(1)} s` : span(taken_s)}`}</span></li>`)}</ol></section>
       <section class="card"><h2>Asked for</h2><${Measured} values=${job.config} /></section>
     </div></div>`}`;
 }
@@ -88,11 +95,6 @@ function Headline({ metrics }) {
   return html`<dl class="figures">${figures.map(([name, figure]) => html`<div><dt>${name}</dt><dd>${figure}</dd></div>`)}</dl>`;
 }
 
-// How long every stage took, of a job that is over.
-function Stages({ seconds }) {
-  return html`<table><tbody>${Object.entries(seconds).map(([stage, taken_s]) => html`<tr><th scope="row">${stage.replaceAll("_", " ")}</th><td class="n">${taken_s < 10 ? `${taken_s.toFixed(1)} s` : span(taken_s)}</td></tr>`)}</tbody></table>`;
-}
-
 // Named values, those of one part after another; curves and the like are left to the call.
 function rows(values, prefix = "") {
   return Object.entries(values).flatMap(([name, value]) => {
@@ -105,5 +107,5 @@ function rows(values, prefix = "") {
 
 function Measured({ values }) {
   const text = (value) => (typeof value === "number" && !Number.isInteger(value) ? value.toPrecision(4) : typeof value === "boolean" ? (value ? "yes" : "no") : String(value));
-  return html`<div class="wide"><table><tbody>${rows(values).map(([name, value]) => html`<tr><th scope="row">${name}</th><td class="name">${text(value)}</td></tr>`)}</tbody></table></div>`;
+  return html`<${Wide} label="Figures"><table><tbody>${rows(values).map(([name, value]) => html`<tr><th scope="row">${name}</th><td class="name">${text(value)}</td></tr>`)}</tbody></table><//>`;
 }

@@ -47,6 +47,22 @@ export function useAnswer(path, every_ms = 0) {
   return { answer: isOf ? state.answer : null, problem: isOf ? state.problem : null, again: () => setCount((n) => n + 1) };
 }
 
+const MOST_LISTED = 1000; // the service gives no more at once
+
+// The same of a list, the newest of it; `more` asks for older ones where there are.
+export function useList(path, every_ms) {
+  const [limit, setLimit] = useState(100);
+  const state = useAnswer(`${path}?limit=${limit}`, every_ms);
+  const kept = useRef(null);
+  kept.current = state.answer ?? kept.current;
+  return { ...state, answer: kept.current, limit, more: () => setLimit(MOST_LISTED) };
+}
+
+export function More({ list }) {
+  if (!list.answer?.next) return null;
+  return html`<div class="row below">${list.limit < MOST_LISTED ? html`<button onClick=${list.more}>Show older ones</button>` : html`<p class="quiet">The newest ${MOST_LISTED.toLocaleString()} are shown.</p>`}</div>`;
+}
+
 const ADVICE = {
   no_connection: "What is shown is asked for again by itself; what you sent, send again.",
   unauthorized: "This service asks for a key: enter one above.",
@@ -107,6 +123,16 @@ export function useDropped(onFiles) {
       removeEventListener("drop", dropped);
     };
   }, []);
+}
+
+// What a frame is called, on one line; whole where a pointer rests.
+export function Frame({ before = "", name }) {
+  return html`<small class="frame" title=${name}>${before}${name}</small>`;
+}
+
+// A table that is perhaps wider than its place, and then scrolls by itself.
+export function Wide({ label, children }) {
+  return html`<div class="wide" role="region" aria-label=${label} tabindex="0">${children}</div>`;
 }
 
 // Thumbnails, asked for once each, the few last ones kept.

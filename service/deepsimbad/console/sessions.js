@@ -5,13 +5,14 @@ import { ask, follow } from "./http.js";
 import { History, Plot } from "./charts.js";
 import { useRoute } from "./domains.js";
 import { Believed, Figures, NextMove, Places } from "./answer.js";
-import { Fault, Loading, span, useAnswer, when } from "./parts.js";
+import { Fault, More, Wide, span, useList, when } from "./parts.js";
 
 const MOST_EVENTS = 2000; // kept of a long session, the newest
 const FRAME_MS = 80; // at most so often is the page drawn anew
 
 export function Sessions() {
-  const { answer, problem } = useAnswer("v1/admin/sessions", 2000);
+  const list = useList("v1/admin/sessions", 2000);
+  const { answer, problem } = list;
   const open = (event) => {
     event.preventDefault();
     location.hash = `sessions/${encodeURIComponent(event.target.elements.id.value.trim())}`;
@@ -20,11 +21,11 @@ export function Sessions() {
     ${problem?.status === 403 ? html`<p class="quiet">All sessions are shown to keys of the scope admin; yours opens its own, by id.</p>` : html`<${Fault} problem=${problem} />`}
     ${answer?.sessions.length === 0 && html`<div class="card empty below"><h2>No robot is driving</h2>
       <p>A session begins when a robot, or a replay, asks for one:</p><pre>deepsimbad-client replay path/to/images --domain my-route</pre></div>`}
-    ${answer?.sessions.length > 0 && html`<div class="card below wide"><table>
+    ${answer?.sessions.length > 0 && html`<div class="card"><${Wide} label="Sessions"><table>
       <thead><tr><th>Session</th><th>Domain</th><th class="n">Map</th><th class="n">Views</th><th>Begun</th><th>Ends unless it moves</th></tr></thead>
       <tbody>${answer.sessions.map((session) => html`<tr>
         <td class="name"><a href=${`#sessions/${session.session_id}`}>${session.session_id}</a></td><td>${session.domain}</td><td class="n">${session.map_version}</td>
-        <td class="n">${session.n_observations}</td><td>${when(session.created_at)}</td><td>in ${span((new Date(session.expires_at) - Date.now()) / 1000)}</td></tr>`)}</tbody></table></div>`}
+        <td class="n">${session.n_observations}</td><td>${when(session.created_at)}</td><td>in ${span((new Date(session.expires_at) - Date.now()) / 1000)}</td></tr>`)}</tbody></table><//><${More} list=${list} /></div>`}
     <form class="row below" onSubmit=${open}><label>A session by its id, also one that has ended <input type="text" name="id" required /></label><button>Open</button></form>`;
 }
 
@@ -120,17 +121,18 @@ function Live({ events, at, onPick }) {
   }, [events.length, events[0]?.number]);
   const title = `After ${answer.n_observations} view${answer.n_observations === 1 ? "" : "s"}`;
   return html`<div class="columns below"><div class="stack">
-      <${Believed} answer=${answer} route=${route} title=${title} />
+      <${Believed} answer=${answer} route=${route} title=${title}>
+        <h3>How it came about</h3><p class="quiet"><small>The belief along the route, a row a step, newest below; choose one to go there.</small></p>
+        <${History} events=${events} current=${at} onPick=${onPick} label="The belief along the route after every step" />
+      <//>
       <${Places} answer=${answer} domain=${answer.domain} version=${answer.map_version} view=${view} isKept=${coverage.answer?.thumbnail_bytes > 0} />
     </div><div class="stack">
       <${Figures} answer=${answer} /><${NextMove} next=${answer.next_best_view} />
-      <section class="card"><header><h2>How it came about</h2><span class="quiet">a row a step, newest below; choose one to go there</span></header>
-        <${History} events=${events} current=${at} onPick=${onPick} label="The belief along the route after every step" /></section>
-      <section class="card"><header><h2>Entropy and the chance to be lost</h2><span class="legend"><span><i class="swatch belief"></i>entropy, bits</span><span><i class="swatch move"></i>off the route, %</span></span></header>
+      <section class="card"><header><h2>Entropy and the chance to be lost</h2><span class="legend"><span><i class="swatch belief"></i>entropy, bits</span><span><i class="swatch lost"></i>off the route, %</span></span></header>
         <${Plot} label=${`Entropy now ${answer.belief.entropy_bits.toFixed(1)} bits`} values=${steps} height=${140}
           series=${[{ stroke: "blue", scale: "y" }, { stroke: "mark", scale: "lost", dash: [6, 4] }]}
           scales=${{ x: { time: false }, y: { range: (_, __, most) => [0, Math.max(1, most) * 1.05] }, lost: { range: [0, 100] } }}
-          axes=${[{ label: "event", labelSize: 20, size: 36 }, {}, { scale: "lost", side: 1, grid: { show: false } }]} /></section>
+          axes=${[{ label: "event", labelSize: 20, size: 36 }, {}, { scale: "lost", side: 1, grid: { show: false }, values: (_, ticks) => ticks.map((tick) => `${tick} %`) }]} /></section>
     </div></div>`;
 }
 

@@ -13,7 +13,7 @@ export function Trial({ names: [given] }) {
   if (!answer) return problem ? html`<${Fault} problem=${problem} />` : html`<${Loading} what="domains" />`;
   if (!name) return html`<div class="head"><h1>Try it</h1></div><div class="card empty"><h2>Nothing is mapped yet</h2><p><a href="#">Domains</a> says how.</p></div>`;
   return html`<div class="head"><h1>Try it</h1>
-      <label>Domain <select onChange=${(event) => { location.hash = `try/${event.target.value}`; }}>${mapped.map((domain) => html`<option value=${domain.name} selected=${domain.name === name}>${domain.name}</option>`)}</select></label></div>
+      <label class="row">Domain <select onChange=${(event) => { location.hash = `try/${event.target.value}`; }}>${mapped.map((domain) => html`<option value=${domain.name} selected=${domain.name === name}>${domain.name}</option>`)}</select></label></div>
     <${On} key=${name} name=${name} />`;
 }
 

@@ -5,6 +5,7 @@ import { ask, json } from "./http.js";
 import { Fault, Loading, metres, percent, span, useAnswer } from "./parts.js";
 
 const AT_ONCE = 4;
+const REFUSALS = [413, 415, 422]; // of one image: the drive goes on without it
 const inOrder = new Intl.Collator("en", { numeric: true }).compare;
 
 // positions.csv as recordings have it: a header, a name, metres.
@@ -24,13 +25,15 @@ export function positionsOf(text, names) {
 }
 
 export function Upload({ names: [domain] }) {
-  const traverses = useAnswer(`v1/admin/domains/${domain}/traverses`);
+  const traverses = useAnswer(`v1/admin/domains/${domain}/traverses?limit=1000`);
   const [frames, setFrames] = useState(null);
   const [leftOut, setLeftOut] = useState([]);
   const [spacing_m, setSpacing] = useState("1");
   const [name, setName] = useState("");
   const [done, setDone] = useState(null);
   const [problem, setProblem] = useState(null);
+  const [refused, setRefused] = useState([]); // images that the service does not take, and why
+  const [isBusy, setBusy] = useState(false);
   const stop = useRef(null);
   useEffect(() => () => stop.current?.abort(), []);
   const choose = async (event) => {
@@ -55,6 +58,8 @@ export function Upload({ names: [domain] }) {
     const { signal } = stop.current;
     const base = `v1/admin/domains/${domain}/traverses`;
     setProblem(null);
+    setRefused([]);
+    setBusy(true);
     try {
       await json(base, { method: "POST", body: { name } }).catch((fault) => {
         if (fault.status !== 409) throw fault; // it is gone on with
@@ -72,7 +77,12 @@ export function Upload({ names: [domain] }) {
           const { file, at_m, index } = wanted[next];
           next += 1;
           const query = `position_m=${at_m * scale}&name=${encodeURIComponent(file.name)}&replace=false`;
-          await ask(`${base}/${name}/frames/${index}?${query}`, { method: "PUT", body: file, type: file.type || "image/jpeg", signal });
+          try {
+            await ask(`${base}/${name}/frames/${index}?${query}`, { method: "PUT", body: file, type: file.type || "image/jpeg", signal });
+          } catch (fault) {
+            if (!REFUSALS.includes(fault.status)) throw fault;
+            setRefused((before) => [...before, `${file.name}: ${fault.message}`]);
+          }
           n_sent += 1;
           setDone({ n: n_before + n_sent, left_s: (((performance.now() - began) / n_sent) * (wanted.length - n_sent)) / 1000 });
         }
@@ -83,9 +93,8 @@ export function Upload({ names: [domain] }) {
       stop.current?.abort();
       if (fault.name !== "AbortError") setProblem(fault);
     }
-    stop.current = null;
+    setBusy(false);
   };
-  const isBusy = stop.current !== null;
   if (traverses.problem?.status === 404) return html`<div class="head"><h1>Upload</h1></div><${Fault} problem=${traverses.problem} />`;
   return html`<div class="head"><h1>Upload to <a href=${`#domains/${domain}`}>${domain}</a></h1></div>
     <${Fault} problem=${problem} /><${Fault} problem=${traverses.problem} />
@@ -96,11 +105,12 @@ export function Upload({ names: [domain] }) {
         ${frames && html`<p><b>${frames.list.length.toLocaleString()} images</b>${leftOut.length ? html`, <span class="badge so">${leftOut.length} without a position left out</span>: ${leftOut.slice(0, 3).join(", ")}${leftOut.length > 3 ? ", …" : ""}` : ""}</p>`}
         <div class="row below"><label>Traverse <input type="text" value=${name} pattern="[A-Za-z0-9][A-Za-z0-9._\\-]*" maxlength="64" required onInput=${(event) => setName(event.target.value)} disabled=${isBusy} /></label>
         ${frames?.isSpaced && html`<label>Metres between images <input type="number" min="0.01" step="any" value=${spacing_m} required onInput=${(event) => setSpacing(event.target.value)} disabled=${isBusy} /></label>`}
-        <button class="first" disabled=${!frames?.list.length || isBusy}>Upload</button>
+        <button class="first" disabled=${!frames?.list.length || isBusy}>${done && !isBusy && done.n < frames?.list.length ? "Go on" : "Upload"}</button>
         ${isBusy && html`<button type="button" onClick=${() => stop.current?.abort()}>Pause</button>`}</div>
       </form>
       ${done && html`<div class="below"></div><progress max=${frames.list.length} value=${done.n} aria-label="Uploaded"></progress>
         <p class="number" role="status">${done.n.toLocaleString()} of ${frames.list.length.toLocaleString()} images (${percent(done.n / frames.list.length)})${isBusy && done.left_s !== null ? `, about ${span(done.left_s)} left` : ""}</p>`}
+      ${refused.length > 0 && html`<div class="notice so" role="status"><b>${refused.length} refused, the others are taken</b><ul>${refused.slice(0, 5).map((line) => html`<li>${line}</li>`)}${refused.length > 5 && html`<li>…</li>`}</ul></div>`}
     </section></div>
     <div class="stack"><${Remap} domain=${domain} traverses=${traverses.answer?.traverses} /></div></div>`;
 }

@@ -99,7 +99,13 @@ def test_rerun_is_sent_the_route_the_belief_the_images_and_the_next_move(client,
     assert replayed(client, seen_route, tmp_path / "out", "--rerun") == 0
     store = chunk.RrdReader(str(path)).store()
     paths = {str(each) for each in store.schema().entity_paths()}
-    assert {"/world/route", "/world/belief", "/world/next_move", "/view", "/moves"} <= paths
+    world = {f"/world/{part}" for part in ("route", "belief", "likeliest", "truth", "next_move")}
+    assert world | {"/view", "/moves", "/figures/entropy_bits", "/said"} <= paths
+    assert {each.name for each in store.schema().index_columns()} >= {"view", "time"}
+    rows = {}
+    for each in store.stream().to_chunks():
+        rows[each.entity_path] = rows.get(each.entity_path, 0) + each.num_rows
+    assert {rows[f"/{path}"] for path in ("view", "moves", "world/belief", "world/next_move")} == {N_FRAMES}
 
 
 @pytest.mark.parametrize(("option", "module"), [("rerun", "rerun_viewer"), ("mcap", "mcap_file")])
