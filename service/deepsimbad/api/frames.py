@@ -11,7 +11,6 @@ from fastapi import APIRouter, Path, Query, Request, Response
 from numpy.typing import NDArray
 from pydantic import FailFast, Field, StrictFloat
 
-from deepsimbad.api.batches import read_batch
 from deepsimbad.api.localizations import IMAGE_SCHEMA, only
 from deepsimbad.api.problems import binary, declare, invalid_body, problems
 from deepsimbad.api.requests import (
@@ -32,6 +31,7 @@ from deepsimbad.api.traverses import TraverseName
 from deepsimbad.core.camera import Camera
 from deepsimbad.core.drive import FRAME_NAME, MAX_POSITION_M, Drive
 from deepsimbad.core.frames import content_digest
+from deepsimbad.engine.batches import read_batch
 from deepsimbad.engine.decoders import Decoded
 from deepsimbad.engine.localizer import ready_encodings
 from deepsimbad.engine.worker import EncodedImage, Priority

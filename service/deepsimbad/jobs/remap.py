@@ -41,9 +41,9 @@ from deepsimbad.jobs.append import (
     fuse,
     known_drives,
     refuse_known_traverse,
+    seen_twice,
 )
 from deepsimbad.jobs.build import EPISODES_A_MAP_IMAGE, build, compared, measured, train_nnql
-from deepsimbad.jobs.camera import seen_twice
 from deepsimbad.jobs.check import CheckFrames, check_map
 from deepsimbad.jobs.fitting import Fitter, Pictures, SpooledPictures
 from deepsimbad.jobs.progress import Progress
