@@ -1,7 +1,7 @@
 """Every command, curl example and Python example of README and the pages beside it is run against a live service.
 
-README's are run as printed, one after the other in a folder that holds a person's own images; only the server's address
-is another. In the pages the folder of NCLT is a rendered campus in its layout.
+README's are run as printed, one after the other in a folder that is empty but for a part of the campus that they render;
+only the server's address is another. In the pages the folder of NCLT is a rendered campus in its layout.
 """
 
 import hashlib
@@ -44,7 +44,7 @@ def furnished(folder, nclt):
 @pytest.fixture(scope="module")
 def first_hour(readme, nclt, tmp_path_factory):
     """README, from top to bottom."""
-    place = Workplace(furnished(tmp_path_factory.mktemp("first_hour"), nclt))
+    place = Workplace(tmp_path_factory.mktemp("first_hour"))
     shutil.copytree(nclt, place.folder / "nclt", copy_function=os.link)  # `campus` adds the frames that are missing
     with ExitStack() as stack:
         place.follow(readme, stack)

@@ -208,7 +208,7 @@ async def put_frame(
     },
 )
 async def get_frames(domain: DomainName, name: TraverseName, running: Running) -> Response:
-    """What is there: the places, times and digests of all frames, by which a drive is compared before it is sent."""
+    """The places, times and digests of all frames of a traverse, by which a drive is compared before it is sent."""
     await run_sync(running.catalog.domain, domain)
 
     def packed() -> bytes:

@@ -266,7 +266,7 @@ async def list_jobs(running: Running, page: Annotated[Page, page_of("jobs")], do
 
 @router.get("/{job_id}", responses=problems(404, 422))
 async def get_job(job: Annotated[JobRecord, Depends(_job)]) -> JobAnswer:
-    """One job."""
+    """A job as it stands."""
     return JobAnswer.model_validate(job)
 
 

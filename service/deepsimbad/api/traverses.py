@@ -162,7 +162,7 @@ async def list_traverses(
 
 @router.get("/{name}", responses=problems(404, 422))
 async def get_traverse(domain: DomainName, name: TraverseName, running: Running) -> TraverseAnswer:
-    """One traverse: how many frames have arrived, and which are missing."""
+    """What has arrived of a traverse, and which of its frames are missing."""
 
     def described() -> TraverseAnswer:
         running.catalog.domain(domain)
