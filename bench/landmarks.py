@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.common import duration, machine, markdown, real_recordings, timed, write_page
-from bench.netvlad import LIST_LENGTH
-from bench.quantised import composed_places, k_means, netvlad_drives, row_of, scored
+from bench.quantised import LIST_LENGTH, composed_places, k_means, netvlad_drives, row_of, scored
 from deepsimbad.core import composed
 from deepsimbad.core.building import Built, MapPlan, compose_map
 from deepsimbad.core.composed import Moments, compose, described, learnt_landmarks, unit

@@ -47,7 +47,7 @@ def main() -> None:
         "",
         "Landmarks summer 1000..1999, map summer 0..999, robot winter 0..999; the landmark drive never saw the mapped",
         "stretch, so the default planner knows of its places what the map alone expects of them. Where a second season",
-        "of the route is known, see nbv-netvlad64.md.",
+        "of the route is known, see composed.md.",
         "",
         "```",
         console.export_text().rstrip(),

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.common import machine, markdown, real_recordings, write_page
-from bench.netvlad import DRIVES, LIST_LENGTH, TOLERANCE
 from deepsimbad.core.building import Built, MapPlan, compose_map
 from deepsimbad.core.composed import list_weights, unit
 from deepsimbad.core.drive import Drive
@@ -25,6 +24,8 @@ from deepsimbad.jobs.build import measured, views_of
 from deepsimbad.jobs.vpr import moves_between, relevances_by_all
 
 _ROUNDS = 25  # of k-means
+DRIVES = ("nr", "nq", "nq2")
+LIST_LENGTH, TOLERANCE = 4, 2
 N_LANDMARKS = (300, 512)
 SEASONS = {"two seasons (f)": True, "one season (u)": False}
 

@@ -1,7 +1,7 @@
 """Every command, curl example and Python example of README and the pages beside it is run against a live service.
 
-README's are run as printed, one after the other in a folder that is empty but for a part of the campus that they render;
-only the server's address is another. In the pages the folder of NCLT is a rendered campus in its layout.
+README's are run as printed, one after the other in a folder that is empty but for a part of the campus that they
+render; only the server's address is another. In the pages the folder of NCLT is a rendered campus in its layout.
 """
 
 import hashlib

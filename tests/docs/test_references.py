@@ -111,7 +111,7 @@ def test_every_module_extra_link_and_file_named_is_there(pages):
     project = tomllib.loads((PROJECT / "pyproject.toml").read_text())["project"]
     commands = [text for page in pages for text in page.commands()]
     modules = {module for text in commands for module in re.findall(r"python -m ([\w.]+)", text)}
-    assert {"bench.nordland", "bench.netvlad"} <= modules
+    assert {"bench.nordland", "bench.orders"} <= modules
     assert [module for module in modules if importlib.util.find_spec(module) is None] == []
     extras = {extra for text in commands for extra in re.findall(r"'\.\[(\w+)\]'", text)}
     assert {"service", "replay"} <= extras <= set(project["optional-dependencies"])
