@@ -87,12 +87,12 @@ def _check_names(recording: Recording) -> None:
     frames = recording.frames
     metres = np.array([frame.position_m for frame in frames]) - frames[0].position_m
     steps = np.array([frame.index for frame in frames]) - frames[0].index
-    if len(frames) < 2 or frames[0].x_m is not None or frames[0].timestamp_us is not None:
+    if len(frames) < 2 or frames[0].x_m is not None:
         return
     if not np.allclose(metres, steps * (metres[-1] / max(1, steps[-1]))):
         return
     names = [frame.name for frame in frames]
-    kinds = [re.sub(r"[0-9]+", "0", name) for name in names]
+    kinds = [re.sub(r"[0-9]+(?:[.,][0-9]+)*", "0", name) for name in names]
     changes = np.flatnonzero([before != kind for before, kind in pairwise(kinds)]) + 1
     if 2 * len(changes) >= len(frames) and min(Counter(kinds).values()) >= FEWEST_OF_A_KIND:
         after = frames[int(changes[0])]
@@ -101,6 +101,8 @@ def _check_names(recording: Recording) -> None:
             "turns: are these several drives or cameras? Move each into a folder of its own, or say in a positions.csv "
             "where each image was taken"
         )
+    if frames[0].timestamp_us is not None:  # which tell by themselves
+        return
     if len(set(kinds)) == 1 and dates_in(names) is None:
         changes = np.array(counted_anew(names), np.intp)
     ends = [0, *changes.tolist(), len(frames)]

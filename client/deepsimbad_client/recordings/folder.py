@@ -117,6 +117,10 @@ def read_folder(
             f"{len(names)} images are taken {spacing_m:g} m apart: there is no {POSITIONS_FILE} and no track (.gpx, "
             f".nmea) beside them, and no EXIF among them says a place{_misnamed(paths)}"
         )
+    if inner := _inner(folder):
+        result.remarks.append(
+            f"folders inside are not looked at, and {shown([path.name for path in inner])} holds images"
+        )
     if others:
         result.left_out_names["of a format that is not read: convert to PNG"] = others
     recording = FolderRecording(
@@ -137,8 +141,12 @@ def _hint(folder: Path, others: Sequence[str]) -> str:
         return f"; for NCLT write nclt:{folder}"
     if others:
         return f"; {others[0]} is of a format that is not read: convert it to PNG"
-    inner = (file.parent for file in sorted(folder.glob("*/*")) if file.suffix.lower() in IMAGE_SUFFIXES)
-    return next((f"; {path} does" for path in inner), "")
+    return next((f"; {path} does" for path in _inner(folder)), "")
+
+
+def _inner(folder: Path) -> list[Path]:
+    """Folders inside that hold images."""
+    return sorted({file.parent for file in folder.glob("[!.]*/*") if file.suffix.lower() in IMAGE_SUFFIXES})
 
 
 def _prepared(recording: FolderRecording, rotate: int | None) -> FolderRecording:

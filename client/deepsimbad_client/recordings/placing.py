@@ -180,7 +180,19 @@ def _in_time_order(result: Placed, stated: bool) -> Times | None:
             return None
         result.frames = [result.frames[place] for place in order]
         result.remarks.append("frames are taken in the order of their times, which is not that of their names")
-    return np.asarray(time_us[order])
+    return _resolved(time_us[order])
+
+
+def _resolved(time_us: Times) -> Times:
+    """Rising times, those that are equal, of a clock too coarse for the frames, evenly before the next one."""
+    starts = np.flatnonzero(np.diff(time_us, prepend=time_us[0] - 1))
+    if len(starts) in {1, len(time_us)}:
+        return time_us
+    ends = np.append(starts[1:], len(time_us))
+    last_us = time_us[-1] + np.median(np.diff(time_us[starts]))
+    knots = np.append(starts, ends[-1])
+    times = np.append(time_us[starts] - time_us[0], last_us - time_us[0])
+    return np.asarray(time_us[0] + np.round(np.interp(np.arange(len(time_us)), knots, times)), np.int64)
 
 
 def _leap(frames: Sequence[Frame], order: NDArray[np.intp], stated: bool) -> str | None:

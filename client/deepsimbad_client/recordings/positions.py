@@ -26,6 +26,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from deepsimbad.core.drive import MAX_POSITION_M
 from deepsimbad_client.errors import SourceError
@@ -129,6 +130,7 @@ def read_positions(path: Path, names: Sequence[str], name_times_us: Sequence[int
     deadband_m = DEADBAND_M
     if "latitude" in table.columns and "x_m" not in table.columns:
         degrees = [np.array(table.numbers(column), np.float64) for column in ("latitude", "longitude")]  # None: NaN
+        _check_degrees(path, *degrees)
         plane = [[None if math.isnan(metres) else metres for metres in axis.tolist()] for axis in utm(*degrees)]
         deadband_m = GPS_DEADBAND_M
         remarks += zone_remarks(*degrees)
@@ -158,6 +160,17 @@ def read_positions(path: Path, names: Sequence[str], name_times_us: Sequence[int
     return Placed(
         frames, {reason: some for reason, some in lost.items() if some}, remarks + _apart(listed, frames), deadband_m
     )
+
+
+def _check_degrees(path: Path, latitude: NDArray[np.float64], longitude: NDArray[np.float64]) -> None:
+    """Raises SourceError: all places [n], NaN is none, are outside the earth's degrees."""
+    known = np.isfinite(latitude) & np.isfinite(longitude)
+    if known.any() and not (known & (np.abs(latitude) <= 90) & (np.abs(longitude) <= 180)).any():
+        first = int(np.argmax(known))
+        raise SourceError(
+            f"{path}: latitude {latitude[first]:g}, longitude {longitude[first]:g} is no place in degrees, which are "
+            "within 90 and 180: are they changed over, or of another unit?"
+        )
 
 
 def _apart(listed: Sequence[tuple[str, int | None]], frames: Sequence[Frame]) -> list[str]:

@@ -76,6 +76,9 @@ def test_names_of_two_kinds_placed_by_their_order_are_two_drives():
         check_one_drive(
             Recording("r", [Frame(k, f"{k // 2}_{('left', 'right')[k % 2]}.png", 0.5 * k) for k in range(60)])
         )
+    timed = [Frame(k, f"{1e9 + k / 2}_{'lr'[k % 2]}.png", 0.5 * k, (10**9 + k) * 10**6) for k in range(60)]
+    with pytest.raises(SourceError, match=r"0_l\.png and 1000000000\.5_r\.png are names of several kinds by turns"):
+        check_one_drive(Recording("r", timed))
     check_one_drive(Recording("r", [Frame(k, f"part{k // 30}_{k % 30}.png", 0.5 * k) for k in range(60)]))
     placed = [Frame(k, name, k + 0.1 * (k % 3)) for k, name in enumerate(names)]
     check_one_drive(Recording("r", placed))

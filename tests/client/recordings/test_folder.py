@@ -130,6 +130,7 @@ def test_a_misspelt_name_is_one_frame_left_out_named_on_each_side(tmp_path):
         (["position_m,x_m,y_m", "0,0,0", "1,one,0", "2,0,0", "3,0,0"], r"line 3: x_m is 'one'"),
         (["name,position_m", "8.png,0,5", "9.png,1,5"], r"line 2: 3 values, and the first line has 2.*semicolons"),
         (["index,position_m", "1,0", "2,1", "3,2", "4,3"], r"counts from 1 to 4: count from 0"),
+        (["lat,lon", *["148,11"] * 4], r"latitude 148, longitude 11 is no place in degrees.*changed over"),
         (["position_m", "1e308", "1e308", "-2e9", "3.4e38"], r"none of 4 frames has a position"),
     ],
 )
@@ -373,6 +374,9 @@ def test_positions_that_all_are_one_and_tables_of_another_name_are_told(folder):
     (folder / "captions.csv").write_text("name,text\n")
     (remark,) = open_source(str(folder)).remarks
     assert "(poses.csv is not read: it must be called positions.csv, or be" in remark
+    (folder / "rear").mkdir()
+    (folder / "rear" / "1.png").write_bytes(b"")
+    assert open_source(str(folder)).remarks[-1] == "folders inside are not looked at, and rear holds images"
 
 
 def test_decimal_commas_between_semicolons_are_read(folder):
@@ -386,6 +390,15 @@ def test_decimal_commas_between_semicolons_are_read(folder):
 def test_an_offset_that_is_none_is_refused(folder, offset_s):
     with pytest.raises(InvalidArgumentError, match="clocks are not so far apart"):
         open_source(str(folder), time_offset_s=offset_s)
+
+
+def test_a_clock_coarser_than_the_frames_leaves_each_its_place(tmp_path):
+    for at in range(40):
+        cv2.imwrite(str(tmp_path / f"{at}.png"), np.zeros((4, 4), np.uint8))
+    positions(tmp_path, "time_s,x_m,y_m", *(f"{1_400_000_000 + at // 5},{at},0" for at in range(40)))
+    recording = open_source(str(tmp_path))
+    assert [frame.position_m for frame in recording.frames] == pytest.approx(range(40))
+    assert recording.frames[4].timestamp_us == 1_400_000_000_000_000
 
 
 def test_one_missing_time_leaves_the_others_in_use(tmp_path):
