@@ -252,6 +252,26 @@ def test_a_view_that_cannot_be_used_is_named(deepsimbad, pictures, tmp_path):
     named_error(deepsimbad("localize", "route", tmp_path / "half.png"))
 
 
+def test_encodings_and_what_is_told_are_localized_too(deepsimbad, drives, pictures, tmp_path):
+    assert deepsimbad("map", "ready", *sources(drives), *READY, "--n-landmarks", 20).code == 0
+    answers = json.loads(deepsimbad("localize", "ready", sources(drives)[-1] + "#3:5", "--json").out)
+    assert [answer["image"][-3:] for answer in answers] == ["[3]", "[4]"]
+    assert [answer["retrieval"][0]["map_image"] for answer in answers] == [3, 4]
+    named_error(deepsimbad("localize", "ready", pictures / "1.png"), "1.png: ", "ready encodings alone")
+    drive = shutil.copytree(pictures, tmp_path / "told")
+    seen = [{"objects": [{"label": f"sign {at}", "box": [0.1, 0.1, 0.3, 0.2 + at / 50]}]} for at in range(30)]
+    lines = [json.dumps({"name": f"{at}.png", **told}) for at, told in enumerate(seen)]
+    (drive / "detections.jsonl").write_text("\n".join(lines))
+    ran = deepsimbad("map", "told", "--training", drive, "--evaluator", "objects", "--training-episodes", 0)
+    assert ran.code == 0, ran.err
+    (tmp_path / "view.json").write_text(json.dumps(seen[7]))
+    views = ("localize", "told", tmp_path / "view.json", drive / "9.png", f"{drive}#11:12")
+    answers = json.loads(deepsimbad(*views, "--json").out)
+    assert [answer["retrieval"][0]["map_image"] for answer in answers] == [7, 9, 11]
+    (tmp_path / "view.json").write_text("[1]")
+    named_error(deepsimbad(*views), "view.json: the JSON is no object")
+
+
 @pytest.mark.slow
 def test_a_damaged_map_is_named_in_one_line(deepsimbad, process, pictures, tmp_path):
     """As a process, because a library's log would bypass what this one captures."""

@@ -110,9 +110,12 @@ class Scene:
         """Of a body `text/plain`, or else `application/json`; raises InvalidSceneError."""
         try:
             text = body.decode("utf-8-sig")
-            return cls.read({"text": text} if media_type == TEXT else json.loads(text))
+            document = {"text": text} if media_type == TEXT else json.loads(text)
         except (UnicodeDecodeError, RecursionError, ValueError) as error:
             raise InvalidSceneError(f"this is no {media_type} in UTF-8 that can be read") from error
+        if not isinstance(document, dict):
+            raise InvalidSceneError("the JSON is no object: give objects, text, or both as its members")
+        return cls.read(document)
 
     @classmethod
     def of_form(cls, body: bytes) -> tuple[Self, bytes | None]:
