@@ -141,8 +141,12 @@ def fused(client):
             both = observed({"objects": objects_at(place, seed)}, encoded(picture(place)))
             url = f"/v1/admin/domains/fused/traverses/{name}/frames/{place}?position_m={place}"
             assert client.put(url, content=both.body, headers=both.headers).status_code == 201
-    job = client.remap("fused", landmark_traverse="landmarks", n_landmarks=20, same_route=True)
-    assert job["state"] == "succeeded", job
+    for relevance in ("rrf", "composed"):
+        how = {"landmark_traverse": "landmarks", "n_landmarks": 20, "same_route": True, "relevance": relevance}
+        job = client.remap("fused", **how)
+        assert job["state"] == "succeeded", job
+        told = job["result"]["metrics"].get("fitting")
+        assert (told is not None and 0 <= told["weight"] <= 1) == (relevance == "rrf")
     return "/v1/domains/fused/localizations"
 
 
@@ -154,7 +158,7 @@ def test_a_fused_view_brings_either_half_or_both(client, fused):
         client.post(fused, json={"objects": objects_at(9, 2)}),
     ]
     assert [answer.json()["informative"] for answer in answers] == [True] * 3
-    for answer in (answers[0], answers[2]):  # what an image alone tells under the default: docs/fused.md
+    for answer in answers:
         assert abs(answer.json()["retrieval"][0]["map_image"] - 9) <= 1
     blank = observed({"objects": []}, encoded(np.full((60, 80, 3), 90, np.uint8)))
     assert client.post(fused, content=blank.body, headers=blank.headers).json()["informative"] is False

@@ -133,12 +133,14 @@ class _Space:
         training: Drive,
         candidates: Drive | Mapping[str, NDArray[Any]],
         n_landmarks: int,
+        halves: Sequence[int],
         on_progress: Callable[[float], None],
     ) -> Self:
         """Before seasons are known: with landmarks chosen from a drive, or those of another map's model."""
         if isinstance(candidates, Drive):
             drives = {id(drive): drive.encodings for drive in (training, candidates)}
-            return cls.among(candidates, principal_directions(*drives.values(), on_progress=on_progress), n_landmarks)
+            directions = principal_directions(*drives.values(), halves=halves, on_progress=on_progress)
+            return cls.among(candidates, directions, n_landmarks)
         if (d := candidates["usual"].shape[1]) != training.encoding_dim:
             raise InvalidEncodingError(
                 f"encodings of {training.encoding_dim} numbers cannot be compared with landmarks of {d}"
@@ -199,6 +201,7 @@ def compose_map(
     n_landmarks: int,
     on_progress: Callable[[float], None] = lambda _: None,
     camera: Sequence[SeenTwice] = (),
+    halves: Sequence[int] = (),
 ) -> Built:
     """The same for `composed`, which chooses its landmarks where it describes: among unit encodings.
 
@@ -209,13 +212,14 @@ def compose_map(
         n_landmarks: r.
         camera: What it saw twice on other routes: what a season changes is learnt from that where this route was
             not seen twice, and landmarks are chosen here.
+        halves: See `principal_directions`.
 
     Raises:
         TooFewCandidatesError: That drive has fewer frames.
         InvalidEncodingError: The model is of other encodings.
     """
     candidates = training if landmarks is None else landmarks
-    space = _Space.first(training, candidates, n_landmarks, lambda share: on_progress(0.6 * share))
+    space = _Space.first(training, candidates, n_landmarks, halves, lambda share: on_progress(0.6 * share))
     check_list_length(plan.list_length, len(space.prototypes))
     on_progress(0.7)
     own, season, verdict = space.seen(training), None, None

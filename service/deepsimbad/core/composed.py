@@ -7,7 +7,7 @@ weighted by list position, comes nearest to it in direction; a view answers a pl
 Landmarks begin as frames and are moved to where the sums come nearer still.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any, Self
@@ -81,8 +81,10 @@ class Moments:
         """With one view more; `worth` of one that saw little new is less than 1."""
         weight = self.weight + worth
         share, value = worth / weight, row.astype(np.float64)
-        mean = self.mean + share * (value - self.mean)
-        return replace(self, weight=weight, mean=mean, square=self.square + share * (np.square(value) - self.square))
+        more, square = share * (value - self.mean), share * (np.square(value) - self.square)
+        is_told = ~np.isnan(value)  # what was not told teaches nothing
+        mean, square = self.mean + np.where(is_told, more, 0), self.square + np.where(is_told, square, 0)
+        return replace(self, weight=weight, mean=mean, square=square)
 
     def pooled(self, n_frames: float, other: "Moments", n_others: float) -> Self:
         """Those of two drives together, each counted by its frames; the weight stays this one's."""
@@ -103,8 +105,14 @@ def unit_encodings(
     encodings: NDArray[np.float32], usual: Moments, projection: NDArray[np.float32] | None
 ) -> NDArray[np.float32]:
     """u of encodings [..., d] by what is usual for them: [..., k], k = d without a projection [d, k]."""
-    standardised = ((encodings - usual.mean) / usual.std).astype(np.float32)
-    return unit(standardised if projection is None else standardised @ projection)
+    rows = standardised(encodings, usual)
+    return unit(rows if projection is None else rows @ projection)
+
+
+def standardised(encodings: NDArray[np.float32], usual: Moments) -> NDArray[np.float32]:
+    """Encodings [..., d] in deviations from what is usual; a number that was not told, NaN, is as usual."""
+    deviations = ((encodings - usual.mean) / usual.std).astype(np.float32)
+    return np.where(np.isnan(deviations), np.float32(0), deviations)
 
 
 def described(
@@ -116,7 +124,7 @@ def described(
 
 
 def principal_directions(
-    *drives: NDArray[np.float32], on_progress: Callable[[float], None] = lambda _: None
+    *drives: NDArray[np.float32], halves: Sequence[int] = (), on_progress: Callable[[float], None] = lambda _: None
 ) -> NDArray[np.float32] | None:
     """[d, k] the directions in which frames differ most, the strongest held back a little.
 
@@ -126,10 +134,14 @@ def principal_directions(
 
     Args:
         drives: [n, d] encodings of each.
+        halves: Lengths of encodings that lie side by side in one. Each has its own 96 directions, all halves of them
+            the same mean square, so that none drowns another and each is compared alone as well as may be.
 
     Returns:
         None where d is no more than 96.
     """
+    if halves:
+        return _side_by_side(halves, drives, on_progress)
     if drives[0].shape[1] <= MOST_DIMENSIONS:
         return None
     most = _MOST_FRAMES // len(drives)
@@ -148,6 +160,27 @@ def principal_directions(
     variance, vectors = np.maximum(variance[-k:], 1e-12), vectors[:, -k:]
     scale = 1 / np.sqrt(variance * len(frames) * (variance + _EVENING_OUT * variance.mean()))
     return np.asarray(weight[:, np.newaxis] * (frames.T.astype(np.float64) @ (vectors * scale)), np.float32)
+
+
+def _side_by_side(
+    halves: Sequence[int], drives: Sequence[NDArray[np.float32]], on_progress: Callable[[float], None]
+) -> NDArray[np.float32]:
+    """[d, k] the directions of every half, which are nothing to the others."""
+    blocks, first = [], 0
+    for width in halves:
+        parts = [np.ascontiguousarray(drive[:, first : first + width]) for drive in drives]
+        block = principal_directions(*parts)
+        block = np.eye(width, dtype=np.float32) if block is None else block
+        squares = [np.square(standardised(part, Moments.of(part)) @ block).sum(axis=1).mean() for part in parts]
+        blocks.append(block / np.float32(np.sqrt(max(np.mean(squares), 1e-12))))
+        first += width
+        on_progress(first / sum(halves))
+    directions = np.zeros((sum(halves), sum(block.shape[1] for block in blocks)), np.float32)
+    row = column = 0
+    for block in blocks:
+        directions[row : row + len(block), column : column + block.shape[1]] = block
+        row, column = row + len(block), column + block.shape[1]
+    return directions
 
 
 def within_place_whitening(first: NDArray[np.float32], second: NDArray[np.float32]) -> NDArray[np.float32]:

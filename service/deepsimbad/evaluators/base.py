@@ -102,6 +102,10 @@ class Evaluator(Protocol):
         """Length d of what `encode` gives; None where no images are taken. Ready encodings may have any one length."""
 
     @property
+    def halves(self) -> tuple[int, ...]:
+        """Lengths of the encodings that lie side by side in one; empty where it is one."""
+
+    @property
     def weights_sha256(self) -> str | None:
         """SHA-256 in hex that encodings are told apart by: of their weights, and of what is done with them; or None."""
 

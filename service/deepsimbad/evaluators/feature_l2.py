@@ -61,6 +61,11 @@ class FeatureL2:
         return self._extractor.encoding_dim if self.takes_images else None
 
     @property
+    def halves(self) -> tuple[int, ...]:
+        """See `Evaluator`."""
+        return ()
+
+    @property
     def weights_sha256(self) -> str | None:
         """Of the extractor's weights; None without any."""
         return self._extractor.weights_sha256 if self.takes_images else None

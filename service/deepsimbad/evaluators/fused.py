@@ -2,8 +2,8 @@
 
 A dissimilarity is the weighted mean of the halves' squared L2. Their weight is learnt with the landmarks, by how well
 either half alone and both together find the places that the other drive saw; a half that is missing of a view is all
-zeros, and left out. Where `composed` compares, within-place whitening weighs the halves number by number, and a missing
-half is taken to be as usual.
+zeros, and left out. Where `composed` compares, each half has directions of its own, of equal strength, and within-place
+whitening weighs them; a missing half is taken to be as usual, and teaches nothing of what is.
 """
 
 from collections.abc import Sequence
@@ -14,19 +14,21 @@ from numpy.typing import NDArray
 
 from deepsimbad.core.composed import is_composed
 from deepsimbad.errors import InvalidEncodingError
-from deepsimbad.evaluators.base import Evaluator, Fitted, Image, LandmarkModel, Lesson
+from deepsimbad.evaluators.base import Evaluator, Fitted, Fitting, Image, LandmarkModel, Lesson
 from deepsimbad.evaluators.feature_l2 import FeatureL2, checked_encodings
 from deepsimbad.evaluators.scenes import Form, Scene
-from deepsimbad.evaluators.space import between_units
+from deepsimbad.evaluators.space import as_usual, between_units
 
 _WEIGHT = "fused_weight"
-_TRIED = np.linspace(0.1, 0.9, 9)  # of the first half
+_TRIED = np.linspace(0, 1, 11)  # of the first half
 _EVEN = 0.5
 _NEAR_FRAMES = 2  # of a drive that count as one place
 
 
 class Fused(FeatureL2):
     """Squared L2 of two halves; each gives encodings of unit length."""
+
+    fitting = Fitting.ENCODINGS
 
     def __init__(self, halves: Sequence[Evaluator]) -> None:
         super().__init__("none")
@@ -50,7 +52,12 @@ class Fused(FeatureL2):
     @property
     def encoding_dim(self) -> int:
         """See `Evaluator`."""
-        return sum(half.encoding_dim or 0 for half in self._halves)
+        return sum(self.halves)
+
+    @property
+    def halves(self) -> tuple[int, ...]:
+        """See `Evaluator`."""
+        return tuple(half.encoding_dim or 0 for half in self._halves)
 
     @property
     def weights_sha256(self) -> str | None:
@@ -81,9 +88,8 @@ class Fused(FeatureL2):
         """See `Evaluator`: zeros in the place of a half that a view does not bring."""
         scenes = [seen if isinstance(seen, Scene) else Scene(image=seen) for seen in images]
         encodings, at = np.zeros((len(scenes), self.encoding_dim), np.float32), 0
-        for half in self._halves:
+        for half, width in zip(self._halves, self.halves, strict=True):
             rows = [row for row, scene in enumerate(scenes) if half.forms & scene.telling]
-            width = half.encoding_dim or 0
             if rows:
                 encodings[rows, at : at + width] = half.encode([scenes[row] for row in rows])
             at += width
@@ -111,7 +117,7 @@ class Fused(FeatureL2):
     def dissimilarities(self, encodings: NDArray[np.float32], model: LandmarkModel) -> NDArray[np.float32]:
         """See `Evaluator.dissimilarities`."""
         if is_composed(model):
-            return between_units(self.compared(encodings, model), model)
+            return between_units(as_usual(self.compared(encodings, model), model), model)
         super().dissimilarities(encodings, model)  # which refuses what cannot be compared
         share = float(np.asarray(model.get(_WEIGHT, [_EVEN]), np.float32)[0])
         first, second = self._apart(encodings, np.asarray(model["prototypes"], np.float32))
@@ -120,16 +126,16 @@ class Fused(FeatureL2):
         return np.asarray(np.where(has_first & has_second, both, np.where(has_first, first, second)), np.float32)
 
     def compared(self, encodings: NDArray[np.float32], model: LandmarkModel) -> NDArray[np.float32]:
-        """See `Evaluator.compared`: what a view lacks is as usual on the map."""
+        """See `Evaluator.compared`: what a view lacks is not told."""
         if not is_composed(model) or encodings.ndim != 2 or encodings.shape[1] != model["usual"].shape[1]:
             return encodings
-        usual, filled = np.asarray(model["usual"], np.float32)[0], encodings.copy()
-        for half, mean in zip(self._split(filled), self._split(usual[np.newaxis]), strict=True):
-            half[~np.any(half, axis=1)] = mean
-        return filled
+        told = checked_encodings(encodings).copy()
+        for half in self._split(told):
+            half[~np.any(half, axis=1)] = np.nan
+        return told
 
     def _split(self, encodings: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        at = self._halves[0].encoding_dim or 0
+        at = self.halves[0]
         return encodings[:, :at], encodings[:, at:]
 
     def _apart(

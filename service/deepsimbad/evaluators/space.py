@@ -16,6 +16,7 @@ class OwnDissimilarities(ABC):
     """An evaluator whose dissimilarity is no squared L2 of encodings; the composed arrays lie beside its own ones."""
 
     is_squared_l2 = False
+    halves: tuple[int, ...] = ()
 
     @abstractmethod
     def own_dissimilarities(self, encodings: NDArray[np.float32], model: LandmarkModel) -> NDArray[np.float32]:
@@ -39,7 +40,12 @@ def seen(
     if not is_composed(model):
         return evaluator.dissimilarities(encodings, model), encodings
     vectors = evaluator.compared(encodings, model)
-    return between_units(vectors, model), vectors
+    return between_units(vectors if vectors is encodings else as_usual(vectors, model), model), vectors
+
+
+def as_usual(vectors: NDArray[np.float32], model: LandmarkModel) -> NDArray[np.float32]:
+    """Vectors [n, k] to compare, with what is usual where a number was not told (NaN)."""
+    return np.where(np.isnan(vectors), np.asarray(model["usual"], np.float32)[0], vectors)
 
 
 def between_units(vectors: NDArray[np.float32], model: LandmarkModel) -> NDArray[np.float32]:

@@ -75,6 +75,7 @@ class KnownDrives:
     agree: NDArray[np.bool_]  # which of them see the same at one place as the first
     source: NDArray[np.int64]  # [n, 2] of every image, which of them and which frame of it
     candidates: Drive | None  # that landmarks were chosen from; None: unknown
+    halves: tuple[int, ...] = ()  # see `principal_directions`
 
     @classmethod
     def of(cls, map_: Map, seasons: Sequence[tuple[Drive, bool]], candidates: Drive | None) -> Self | None:
@@ -105,7 +106,7 @@ class KnownDrives:
         """
         whole = map_.landmark_model.get("projection")
         drives = {id(drive): drive.encodings for drive in (self.seasons[0], self.candidates) if drive is not None}
-        directions = principal_directions(*drives.values())
+        directions = principal_directions(*drives.values(), halves=self.halves)
         if directions is None or whole is None:
             k = self.seasons[0].encoding_dim
             return None, np.eye(k) if whole is None else np.asarray(whole, np.float64)

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from deepsimbad.core.building import Built, MapPlan, SeenTwice, build_from_dissimilarities, compose_map
 from deepsimbad.core.camera import Camera
-from deepsimbad.core.composed import is_composed
 from deepsimbad.core.descriptor import rank_landmarks
 from deepsimbad.core.drive import Drive
 from deepsimbad.core.experience.nnql import NnqlConfig, initial_q_values
@@ -171,16 +170,17 @@ def measured(
 
     Where the map compares something else than encodings, that stands for them.
     """
-    blocks, vectors = [], []
+    blocks, vectors, is_otherwise_told = [], [], False
     for start in range(0, drive.n_frames, _FRAMES_A_BLOCK):
         encodings = drive.encodings[start : start + _FRAMES_A_BLOCK]
         dissimilarities, compared = seen(evaluator, encodings, model)
         blocks.append(dissimilarities)
         vectors.append(compared)
+        is_otherwise_told = is_otherwise_told or compared is not encodings
         on_progress(min(1.0, (start + _FRAMES_A_BLOCK) / drive.n_frames))
     if not blocks:
         return replace(drive, dissimilarities=np.empty((0, 0), np.float32))
-    if is_composed(model) and not evaluator.is_squared_l2:
+    if is_otherwise_told:
         drive = drive.standing_for(np.concatenate(vectors))
     return replace(drive, dissimilarities=np.concatenate(blocks))
 
@@ -214,7 +214,7 @@ def build(
     if second is not None and np.array_equal(second.encodings, training.encodings):
         second = None  # one drive under two names is one season
     if plan.relevance is Relevance.COMPOSED and evaluator.is_squared_l2:
-        return compose_map(plan, training, second, landmarks, n_landmarks, on_progress, camera)
+        return compose_map(plan, training, second, landmarks, n_landmarks, on_progress, camera, evaluator.halves)
     candidates = training if landmarks is None else landmarks
     fitted: Fitted | None = None
     origins: dict[str, Any] = {}

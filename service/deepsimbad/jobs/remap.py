@@ -505,7 +505,8 @@ class _Remap:
         there = {key: compared(each, before.landmark_model, self.evaluator) for key, each in of_id.items()}
         candidates = None if known.candidates is None else there[id(known.candidates)]
         seasons = tuple(there[id(season)] for season in known.seasons)
-        return replace(known, seasons=seasons, candidates=candidates), there[id(drive)]
+        known = replace(known, seasons=seasons, candidates=candidates, halves=self.evaluator.halves)
+        return known, there[id(drive)]
 
 
 def refuse_impossible(config: RemapConfig, n_frames: Mapping[str, int], active: Map | None) -> None:

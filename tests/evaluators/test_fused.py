@@ -1,0 +1,107 @@
+"""Two evaluators of one domain: what their weight is learnt from, and what a half alone is worth."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from deepsimbad.core.composed import Moments, unit
+from deepsimbad.core.drive import Drive
+from deepsimbad.core.relevance import Relevance
+from deepsimbad.core.route import true_images_of
+from deepsimbad.errors import InvalidEncodingError
+from deepsimbad.evaluators.base import Lesson
+from deepsimbad.evaluators.feature_l2 import FeatureL2
+from deepsimbad.evaluators.fused import Fused
+from deepsimbad.jobs.fitting import Fitter
+from deepsimbad.jobs.progress import Progress
+from deepsimbad.jobs.vpr import ViewsOf, VprConfig, build_maps, score_maps, vpr_stages
+
+N, D, SPREAD = 150, 120, 5.0
+
+
+class Half(FeatureL2):
+    """Of ready encodings of a known length."""
+
+    encoding_dim = D
+
+
+FUSED, ALONE = Fused([Half("none"), Half("none")]), FeatureL2("none")
+
+
+def season(number, *noise):
+    """A drive of 150 m: halves [N, D] of unit length, each with so much noise; a season shifts every number."""
+    halves = []
+    for half, amount in enumerate(noise):
+        places, own = np.random.default_rng(half), np.random.default_rng(10 * number + half)
+        seen = places.normal(size=(N, D)) + amount * own.normal(size=(N, D)) + SPREAD * places.normal(size=D)
+        halves.append(unit(seen + own.normal(size=D)))
+    return Drive(position_m=np.arange(float(N)), encodings=np.hstack(halves))
+
+
+def halved(drive, half):
+    """The drive with that half alone, as `encode` gives it."""
+    encodings = np.zeros_like(drive.encodings)
+    encodings[:, half * D : (half + 1) * D] = drive.encodings[:, half * D : (half + 1) * D]
+    return replace(drive, encodings=encodings)
+
+
+def part(drive, half):
+    return replace(drive, encodings=np.ascontiguousarray(drive.encodings[:, half * D : (half + 1) * D]))
+
+
+def scored(relevance, evaluator, landmarks, training, *tests):
+    config = VprConfig(60, relevances=(relevance,))
+    built = build_maps(config, Fitter(evaluator), evaluator, landmarks, training)
+    truth = true_images_of(training.route(), training.route(), 2.0)
+    progress = Progress(vpr_stages(config))
+    scores = [score_maps(config, built, ViewsOf(test, evaluator), [truth], progress, bound=False)[0] for test in tests]
+    return built[relevance], [each[relevance].anr for each in scores]
+
+
+@pytest.mark.parametrize("worse", [0, 1])
+def test_the_weight_is_learnt_where_the_other_drive_saw_the_same_places(worse):
+    noise = [1.0, 1.0]
+    noise[worse] = 2.0
+    built, _ = scored(Relevance.RRF, FUSED, season(1, *noise), season(2, *noise))
+    weight, told = float(built.map.landmark_model["fused_weight"][0]), built.fitting
+    assert (weight < 0.5) == (worse == 0)
+    assert (told["weight"], told["n_shared_places"]) == (pytest.approx(weight), N)
+    assert told["anr"][f"{weight:.1f}"] == min(told["anr"].values())
+    assert told["anr"][f"{worse}.0"] < told["anr"][f"{1 - worse}.0"], "either half alone is among what was tried"
+    assert FUSED.fit(Lesson.of_landmarks(season(1, *noise).encodings)).model["fused_weight"] == 0.5
+
+
+def test_a_half_alone_is_answered_as_its_own_evaluator_would_and_both_are_better():
+    noise = (2.0, 2.0)
+    landmarks, training, test = (season(number, *noise) for number in (1, 2, 3))
+    built, (both, first, second) = scored(
+        Relevance.COMPOSED, FUSED, landmarks, training, test, halved(test, 0), halved(test, 1)
+    )
+    for half, alone in enumerate((first, second)):
+        _, (own,) = scored(Relevance.COMPOSED, ALONE, *(part(drive, half) for drive in (landmarks, training, test)))
+        assert own > 1, "else there is nothing to lose"
+        assert both < alone < 1.4 * own
+    view = ViewsOf(halved(test, 0), FUSED).by(built.map.landmark_model).at(0)
+    usual = built.map.live_statistics
+    live = usual.observing(view)
+    np.testing.assert_array_equal(live.encodings.std[D:], usual.encodings.std[D:], "what was not told taught something")
+    assert (live.encodings.mean[:D] != usual.encodings.mean[:D]).all()
+
+
+def test_what_an_encoder_broke_does_not_pass_for_a_half_that_is_missing():
+    built, _ = scored(Relevance.COMPOSED, FUSED, season(1, 1.0, 1.0), season(2, 1.0, 1.0))
+    model, broken = built.map.landmark_model, season(3, 1.0, 1.0).encodings[:2].copy()
+    broken[0, D:] = np.nan
+    with pytest.raises(InvalidEncodingError):
+        FUSED.dissimilarities(broken, model)
+    with pytest.raises(InvalidEncodingError):
+        ALONE.dissimilarities(broken, model)
+
+
+def test_of_numbers_some_of_which_are_not_told_the_others_count():
+    usual = Moments.of(np.random.default_rng(0).normal(size=(9, 3)).astype(np.float32))
+    after = usual.observing(np.array([1.0, np.nan, 2.0], np.float32))
+    whole = usual.observing(np.array([1.0, 0.0, 2.0], np.float32))
+    assert (after.mean[[0, 2]] == whole.mean[[0, 2]]).all()
+    assert (after.mean[1], after.square[1]) == (usual.mean[1], usual.square[1])
