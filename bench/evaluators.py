@@ -12,7 +12,8 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -20,26 +21,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.common import duration, machine, markdown, real_recordings, write_page
-from deepsimbad.core.metrics import RetrievalScores
+from deepsimbad.core.drive import Drive
+from deepsimbad.core.metrics import RetrievalScores, mean_interval
 from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Relevance
 from deepsimbad.core.route import true_images_of
 from deepsimbad.evaluators.base import Evaluator, Fitted, Fitting, LandmarkModel, Lesson
 from deepsimbad.evaluators.feature_l2 import squared_distances
 from deepsimbad.evaluators.registry import EvaluatorKind, evaluator_config, make_evaluator
 from deepsimbad.evaluators.trunk import Trunk
-from deepsimbad.jobs.build import EncodedRecording, encode_recording
-from deepsimbad.jobs.fitting import RecordingPictures
+from deepsimbad.jobs.build import encode_recording
+from deepsimbad.jobs.fitting import Fitter, RecordingPictures
 from deepsimbad.jobs.kept import kept_encodings
+from deepsimbad.jobs.nbv import BLOCK_M
 from deepsimbad.jobs.progress import Progress
 from deepsimbad.jobs.truth import read_ground_truth
-from deepsimbad.jobs.vpr import VprConfig, VprReport, run_vpr, vpr_stages
+from deepsimbad.jobs.vpr import ViewsOf, VprConfig, build_maps, score_maps, vpr_stages
 from deepsimbad_campus.season import PAPER_DATES
 from deepsimbad_campus.writer import write_campus
 from deepsimbad_client.recordings import Recording
 from deepsimbad_client.recordings.sources import open_source
 
 N_LANDMARKS, MAX_PIXELS = 200, 50_000_000
-COMPARED = (Relevance.RRF, Relevance.STANDARDISED, DEFAULT_RELEVANCE)
+COMPARED = (Relevance.RRF, DEFAULT_RELEVANCE)
 L2_IN_OWN_SPACE = "feature_l2, in its own space"
 
 
@@ -58,11 +61,47 @@ class OwnSpaceL2(Trunk):
         return squared_distances(np.ascontiguousarray(encodings), np.asarray(model["l2_landmarks"], np.float32))
 
 
-KINDS: Mapping[str, Callable[[str], Evaluator]] = {
-    "feature_l2": lambda extractor: made("feature_l2", extractor),
-    L2_IN_OWN_SPACE: OwnSpaceL2,
-    "siamese": lambda extractor: made("siamese", extractor),
-    "autoencoder": lambda extractor: made("autoencoder", extractor),
+@dataclass(frozen=True)
+class Kind:
+    """A line of a table."""
+
+    make: Callable[[str], Evaluator]  # of an extractor's name
+    encodings: tuple[str, ...] = ("feature_l2",)  # whose lie side by side
+    alone: int | None = None  # which of these a view brings; None: all
+
+
+def fused(half: str, alone: int | None = None) -> Kind:
+    """Images, and what is told."""
+    of = [{"kind": "feature_l2"}, {"kind": half}]
+    return Kind(lambda _: make_evaluator(evaluator_config({"kind": "fused", "of": of})), ("feature_l2", half), alone)
+
+
+KINDS: Mapping[str, Kind] = {
+    "feature_l2": Kind(lambda extractor: made("feature_l2", extractor)),
+    L2_IN_OWN_SPACE: Kind(OwnSpaceL2),
+    "siamese": Kind(lambda extractor: made("siamese", extractor)),
+    "autoencoder": Kind(lambda extractor: made("autoencoder", extractor)),
+}
+TOLD: Mapping[str, Kind] = {  # of the campus, which tells what it shows
+    "objects": Kind(lambda _: make_evaluator(evaluator_config({"kind": "objects"})), ("objects",)),
+    "language": Kind(lambda _: make_evaluator(evaluator_config({"kind": "language"})), ("language",)),
+    "fused: L2, objects": fused("objects"),
+    "fused: L2, language": fused("language"),
+    "fused: L2, objects; views of images alone": fused("objects", 0),
+    "fused: L2, objects; views of objects alone": fused("objects", 1),
+    "fused: L2, language; views of images alone": fused("language", 0),
+    "fused: L2, language; views of texts alone": fused("language", 1),
+}
+# A line, and those of which it should be no worse than the better
+AGAINST = {
+    "siamese": ("feature_l2",),
+    "autoencoder": ("feature_l2",),
+    "fused: L2, objects": ("feature_l2", "objects"),
+    "fused: L2, language": ("feature_l2", "language"),
+    "fused: L2, objects; views of images alone": ("feature_l2",),
+    "fused: L2, objects; views of objects alone": ("objects",),
+    "fused: L2, language; views of images alone": ("feature_l2",),
+    "fused: L2, language; views of texts alone": ("language",),
 }
 
 
@@ -89,33 +128,53 @@ class KeptPictures(RecordingPictures):
 
 
 @dataclass(frozen=True)
-class Trial:
-    """Drives of one experiment, encoded."""
+class Scored:
+    """One evaluator on one triplet."""
 
-    landmarks: EncodedRecording | None
-    training: EncodedRecording
-    test: EncodedRecording
-    pictures: KeptPictures | None  # of the drive that landmarks are chosen from
-    extractor: str
+    scores: Mapping[str, RetrievalScores]  # by relevance
+    block: NDArray[np.int64]  # [n_queries] stretch of 20 m of the test drive
+    fitting: Mapping[str, Any] | None
+
+
+@dataclass(frozen=True)
+class Trial:
+    """Drives of one experiment, by their sources."""
+
+    drives: "Drives"
+    landmarks: str | None
+    training: str
+    test: str
     ground_truth: Path | None = None
 
-    def report(self, kind: str) -> VprReport:
-        """What an evaluator scores."""
-        candidates = (self.landmarks or self.training).drive
-        config = VprConfig(min(N_LANDMARKS, candidates.n_frames), relevances=COMPARED)
-        training, test = self.training.drive, self.test.drive
+    def scored(self, kind: Kind) -> Scored:
+        """What an evaluator scores, one session over the test drive."""
+        training, test = (self.drives.of(source, kind) for source in (self.training, self.test))
+        known = None if self.landmarks is None else self.drives.of(self.landmarks, kind)
+        if kind.alone is not None:
+            first = self.drives.of(self.test, KINDS["feature_l2"]).encoding_dim
+            encodings = test.encodings.copy()
+            encodings[:, slice(first, None) if kind.alone == 0 else slice(first)] = 0
+            test = replace(test, encodings=encodings)
+        config = VprConfig(min(N_LANDMARKS, (known or training).n_frames), relevances=COMPARED)
+        evaluator = kind.make(self.drives.extractor)
+        built = build_maps(config, Fitter(evaluator, self._pictures, config.seed), evaluator, known, training)
         truth = (
             true_images_of(test.route(), training.route(), config.tolerance_m)
             if self.ground_truth is None
             else read_ground_truth(self.ground_truth, test.index, training.index)
         )
-        known = None if self.landmarks is None else self.landmarks.drive
-        progress = Progress(vpr_stages(config))
-        return run_vpr(config, KINDS[kind](self.extractor), known, training, self.test, truth, progress, self.pictures)
+        progress, views = Progress(vpr_stages(config)), ViewsOf(test, evaluator)
+        scores = score_maps(config, built, views, [truth], progress, bound=False)[0]
+        block = (test.position_m[[each.size > 0 for each in truth]] // BLOCK_M).astype(np.int64)
+        return Scored(scores, block, built[DEFAULT_RELEVANCE].fitting)
 
-    def view_s(self, kind: str) -> float:
+    @cached_property
+    def _pictures(self) -> "KeptPictures | None":
+        return None if self.drives.extractor == "none" else self.drives.pictures(self.landmarks or self.training)
+
+    def view_s(self, kind: Kind) -> float:
         """Seconds for all dissimilarities of one view, its encoding known."""
-        evaluator, drive = KINDS[kind](self.extractor), (self.landmarks or self.training).drive
+        evaluator, drive = kind.make(self.drives.extractor), self.drives.of(self.landmarks or self.training, kind)
         rows = np.linspace(0, drive.n_frames - 1, min(N_LANDMARKS, drive.n_frames)).astype(np.int64)
         model = evaluator.fit(Lesson(drive.encodings, rows)).model
         seconds = []
@@ -131,27 +190,28 @@ class Drives:
 
     def __init__(self, work: Path, extractor: str = "efficientnet_lite0") -> None:
         self._work, self.extractor = work, extractor
-        self._evaluator = made("feature_l2", extractor)
-        self._encoded: dict[str, EncodedRecording] = {}
+        self._encoded: dict[tuple[str, str], Drive] = {}
 
-    def of(self, source: str) -> EncodedRecording:
-        """A drive."""
-        if source not in self._encoded:
-            with kept_encodings(self._work, _name(source), source=source, extractor=self.extractor) as kept:
-                self._encoded[source] = encode_recording(
-                    open_source(source), self._evaluator, MAX_PIXELS, lambda _: None, kept=kept
-                )
-        return self._encoded[source]
+    def of(self, source: str, kind: Kind) -> Drive:
+        """A drive by the encodings of a kind."""
+        first, *others = (self._by(source, name) for name in kind.encodings)
+        return replace(first, encodings=np.hstack([first.encodings, *(other.encodings for other in others)]))
+
+    def _by(self, source: str, name: str) -> Drive:
+        if (source, name) not in self._encoded:
+            is_l2 = name == "feature_l2"
+            evaluator = KINDS[name].make(self.extractor) if is_l2 else TOLD[name].make(name)
+            made_of = {"extractor": self.extractor} if is_l2 else {"kind": name}
+            role = _name(source) + ("" if is_l2 else f"-{name}")
+            with kept_encodings(self._work, role, source=source, **made_of) as kept:
+                recording = open_source(source)
+                encoded = encode_recording(recording, evaluator, MAX_PIXELS, lambda _: None, kept=kept)
+            self._encoded[source, name] = encoded.drive
+        return self._encoded[source, name]
 
     def pictures(self, source: str) -> KeptPictures:
         """Its images."""
         return KeptPictures(open_source(source), self._work / f"{_name(source)}-views.npz")
-
-    def trial(self, landmarks: str | None, training: str, test: str, ground_truth: Path | None = None) -> Trial:
-        """Of three sources."""
-        of_landmarks = None if landmarks is None else self.of(landmarks)
-        pictures = None if self.extractor == "none" else self.pictures(landmarks or training)
-        return Trial(of_landmarks, self.of(training), self.of(test), pictures, self.extractor, ground_truth)
 
 
 def _name(source: str) -> str:
@@ -163,26 +223,26 @@ def campus(work: Path) -> Iterator[Trial]:
     sources = write_campus(work / "campus", list(PAPER_DATES), 300)
     drives = Drives(work)
     for first in range(4):
-        yield drives.trial(*(sources[(first + k) % 4] for k in range(3)))
+        yield Trial(drives, *(sources[(first + k) % 4] for k in range(3)))
 
 
 def netvlad64(work: Path) -> Iterator[Trial]:
     """All orders of the three domains; no images."""
     folder, drives = real_recordings() / "nordland_netvlad64", Drives(work, "none")
     for order in itertools.permutations(("nr", "nq", "nq2")):
-        yield drives.trial(*(str(folder / f"{name}.npy") for name in order))
+        yield Trial(drives, *(str(folder / f"{name}.npy") for name in order))
 
 
 def corridor(work: Path) -> Iterator[Trial]:
     """One walk on the other."""
     folder, drives = real_recordings() / "corridor", Drives(work)
-    yield drives.trial(None, str(folder / "ref"), str(folder / "query"), folder / "ground_truth_new.npy")
+    yield Trial(drives, None, str(folder / "ref"), str(folder / "query"), folder / "ground_truth_new.npy")
 
 
 def nordland(work: Path) -> Iterator[Trial]:
     """Winter on summer, frames 0..999."""
     folder, drives = real_recordings() / "nordland", Drives(work)
-    yield drives.trial(None, *(f"{folder / season}#0:1000" for season in ("summer", "winter")))
+    yield Trial(drives, None, *(f"{folder / season}#0:1000" for season in ("summer", "winter")))
 
 
 SETS = {"campus": campus, "netvlad64": netvlad64, "corridor": corridor, "nordland": nordland}
@@ -191,34 +251,65 @@ SETS = {"campus": campus, "netvlad64": netvlad64, "corridor": corridor, "nordlan
 def lines(work: Path, names: list[str]) -> Iterator[str]:
     """The page, with these sets."""
     yield from ("# Evaluators on the same sets", "", f"`python -m bench.evaluators WORK {' '.join(names)}`", "")
-    yield from (machine(), "", "ANR / R@1 in percent, mean over the triplets of a set; in brackets the worst ANR.")
-    yield "What a fitted model scores on held-out pairs stands beside plain L2 of the same unit vectors."
+    yield from (
+        machine(),
+        "",
+        "ANR / R@1 in percent, mean over the triplets of a set; in brackets ANR by triplet. One session over the",
+    )
+    yield from (
+        "test drive, tolerance 2 m (the corridor by its ground truth). `held-out`: ANR of a fitted model on pairs that",
+        "it lacks, beside plain L2's of the same unit vectors. Intervals are 95 %, by 20 m of the test drives.",
+    )
     for name in names:
         yield from ("", f"## {name}: {' '.join((SETS[name].__doc__ or '').split())}", "")
-        trials = list(SETS[name](work))
+        trials, kinds = list(SETS[name](work)), KINDS | (TOLD if name == "campus" else {})
+        results: dict[str, list[Scored]] = {}
         yield from markdown(
-            ("evaluator", *(relevance.value for relevance in COMPARED), "fitted in", "held-out ANR (L2's)", "a view"),
-            (row(trials, kind) for kind in KINDS),
+            ("evaluator", *(relevance.value for relevance in COMPARED), "fitted in", "held-out (L2's)", "a view"),
+            (row(trials, kind, results) for kind in kinds.items()),
+        )
+        yield from ("", "Differences in ANR from the better of those that it stands beside:", "")
+        yield from markdown(
+            ("evaluator", *(relevance.value for relevance in COMPARED)),
+            (
+                (kind, *(difference(relevance.value, results, kind, beside) for relevance in COMPARED))
+                for kind, beside in AGAINST.items()
+                if kind in results
+            ),
         )
 
 
-def row(trials: list[Trial], kind: str) -> tuple[str, ...]:
-    """One evaluator's figures."""
-    reports = [trial.report(kind) for trial in trials]
-    cells = [figures([report.scores[relevance.value] for report in reports]) for relevance in COMPARED]
-    fits: list[Mapping[str, Any]] = [report.fitting for report in reports if report.fitting is not None]
+def row(trials: list[Trial], kind: tuple[str, Kind], results: dict[str, list[Scored]]) -> tuple[str, ...]:
+    """One evaluator's figures, which `results` takes."""
+    name, one = kind
+    scored = results[name] = [trial.scored(one) for trial in trials]
+    cells = [figures([each.scores[relevance.value] for each in scored]) for relevance in COMPARED]
+    fits = [each.fitting for each in scored if each.fitting is not None]
     fitted = held_out = "-"
     if fits:
         fitted = f"{np.mean([fit['seconds'] for fit in fits]):.1f} s, {fits[0]['n_dissimilarities']:,} dissimilarities"
-        both = [[fit["held_out"][name]["anr"] or np.nan for fit in fits] for name in (kind, "l2")]
+        both = [[fit["held_out"][of]["anr"] or np.nan for fit in fits] for of in (name, "l2")]
         held_out = f"{np.nanmean(both[0]):.2f} ({np.nanmean(both[1]):.2f})"
-    return kind, *cells, fitted, held_out, duration(trials[0].view_s(kind))
+    return name, *cells, fitted, held_out, duration(trials[0].view_s(one)) if one.alone is None else "-"
 
 
 def figures(scores: list[RetrievalScores]) -> str:
-    """Means, and the worst."""
+    """Means, and every ANR."""
     anr = [score.anr for score in scores]
-    return f"{np.mean(anr):.2f} / {np.mean([score.recall_at[1] for score in scores]):.0f} ({max(anr):.2f})"
+    mean = f"{np.mean(anr):.2f} / {np.mean([score.recall_at[1] for score in scores]):.0f}"
+    return mean if len(anr) == 1 else f"{mean} ({', '.join(f'{each:.2f}' for each in anr)})"
+
+
+def difference(relevance: str, results: Mapping[str, list[Scored]], kind: str, beside: tuple[str, ...]) -> str:
+    """Mean difference in ANR of the same queries, with its interval."""
+    ranks = {
+        name: np.concatenate([100 * each.scores[relevance].normalised_ranks for each in results[name]])
+        for name in (kind, *beside)
+    }
+    better = min(beside, key=lambda name: float(ranks[name].mean()))
+    block = np.concatenate([10_000 * number + each.block for number, each in enumerate(results[kind])])
+    low, high = mean_interval(ranks[kind] - ranks[better], 0, block)
+    return f"{ranks[kind].mean() - ranks[better].mean():+.2f} ({low:+.2f} .. {high:+.2f}) from `{better}`"
 
 
 def main() -> None:

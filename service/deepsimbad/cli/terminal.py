@@ -104,10 +104,14 @@ def existing_data_dir() -> Path:
 
 
 def _evaluator(_context: click.Context, _parameter: click.Parameter, value: str) -> EvaluatorConfig:
-    kind, _, extractor = value.partition(":")
-    if not extractor and (remark := fallback()) is not None:
+    halves = [
+        {"kind": kind, **({"extractor": extractor} if extractor else {})}
+        for kind, _, extractor in (half.partition(":") for half in value.split("+"))
+    ]
+    takes_default = any(half["kind"] in _OF_IMAGES and "extractor" not in half for half in halves)
+    if takes_default and (remark := fallback()) is not None:
         click.echo(remark, err=True)
-    return evaluator_config({"kind": kind, **({"extractor": extractor} if extractor else {})})
+    return evaluator_config(halves[0] if len(halves) == 1 else {"kind": EvaluatorKind.FUSED.value, "of": halves})
 
 
 def _evaluators(context: click.Context, parameter: click.Parameter, value: str) -> tuple[EvaluatorConfig, ...]:
@@ -118,7 +122,12 @@ def _evaluators(context: click.Context, parameter: click.Parameter, value: str) 
     return tuple(evaluator_config({"kind": EvaluatorKind.FEATURE_L2.value, "extractor": name}) for name in extractors)
 
 
-_NAMES = f"{', '.join(EvaluatorKind)}, alone or with a colon and an extractor: {', '.join(EXTRACTOR_FORMS)}"
+_OF_IMAGES = {EvaluatorKind.FEATURE_L2, EvaluatorKind.SIAMESE, EvaluatorKind.AUTOENCODER}
+_KINDS = ", ".join(kind for kind in EvaluatorKind if kind is not EvaluatorKind.FUSED)
+_NAMES = (
+    f"{_KINDS}, alone or with a colon and an extractor: {', '.join(EXTRACTOR_FORMS)}; or two with a plus that are "
+    "fused: feature_l2+objects"
+)
 evaluator_option = click.option(  # given on as an EvaluatorConfig
     "--evaluator",
     default=EvaluatorKind.FEATURE_L2.value,

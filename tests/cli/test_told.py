@@ -1,0 +1,118 @@
+"""Recordings whose pictures are told of: every command takes them, by each evaluator that is not of pixels alone."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+from deepsimbad_client.commands import run
+
+from ..client.conftest import serving
+
+N, SPACING_M = 44, 6  # 258 m: calibration asks for 250
+THINGS = ("car", "tree", "bench", "brick building", "lamp", "person")
+OBJECTS, FUSED = "objects", "feature_l2:gradient_grid+objects"
+
+
+def told_drive(folder, seed):
+    """Pictures along a route, and beside them what a detector and a person say of each."""
+    folder.mkdir()
+    rng, detections, captions = np.random.default_rng(seed), [], ["name,text"]
+    for place in range(N):
+        name, own = f"{place:03d}.png", np.random.default_rng(1000 + place)
+        coarse = own.integers(40, 215, (6, 8, 3)) + rng.normal(0, 12, (6, 8, 3))
+        cv2.imwrite(str(folder / name), cv2.resize(np.clip(coarse, 0, 255).astype(np.uint8), (96, 72)))
+        seen = []
+        for number in range(place, place + 6):
+            at = np.random.default_rng(number)
+            x, y = np.clip(at.uniform(0.1, 0.8, 2) + rng.normal(0, 0.01, 2), 0, 0.85).tolist()
+            seen.append({"label": THINGS[at.integers(0, 6)], "box": [x, y, x + 0.1, y + 0.1], "score": 0.8})
+        detections.append(json.dumps({"name": name, "objects": seen}))
+        captions.append(f"{name},a {THINGS[place % 6]} before a {THINGS[place // 8]}")
+    (folder / "detections.jsonl").write_text("\n".join(detections))
+    (folder / "captions.csv").write_text("\n".join(captions))
+    rows = [f"{place:03d}.png,{place * SPACING_M}" for place in range(N)]
+    (folder / "positions.csv").write_text("\n".join(["name,position_m", *rows]))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def told(tmp_path_factory):
+    """Three seasons."""
+    root = tmp_path_factory.mktemp("told")
+    return [told_drive(root / name, seed) for seed, name in enumerate(("landmarks", "training", "test"))]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("what", "evaluator"),
+    [
+        *(("vpr", FUSED), ("nbv", FUSED), ("nbv", "siamese:gradient_grid")),
+        *(("calibration", OBJECTS), ("calibration", "autoencoder:gradient_grid")),
+    ],
+)
+def test_experiments_take_every_evaluator(deepsimbad, told, what, evaluator):
+    landmarks, training, test = told
+    sources = ("--landmarks", landmarks, "--training", training, "--test", test, "--evaluator", evaluator)
+    few = {
+        "vpr": ("--relevance", "rrf", "--relevance", "composed"),
+        "nbv": ("--training-episodes", 20, "--episodes", 4),
+        "calibration": (),
+    }
+    ran = deepsimbad("experiment", what, *sources, "--n-landmarks", 24, *few[what], "--json")
+    assert ran.code == 0, ran.err
+    document = json.loads(ran.out)
+    kinds = {OBJECTS: "objects", FUSED: "fused"}
+    assert document["config"]["evaluator"]["kind"] == kinds.get(evaluator, evaluator.partition(":")[0])
+    if what == "vpr":
+        assert max(document["anr"].values()) < 15
+
+
+def test_a_map_of_what_is_told_places_files_and_recordings(deepsimbad, told, tmp_path):
+    _, training, test = told
+    for domain, evaluator in (("things", OBJECTS), ("both", FUSED)):
+        ran = deepsimbad("map", domain, "--training", training, "--evaluator", evaluator, "--training-episodes", 0)
+        assert ran.code == 0, ran.err
+        ran = deepsimbad("localize", domain, f"{test}#20:23", "--json")
+        best = [answer["retrieval"][0]["map_image"] for answer in json.loads(ran.out)]
+        assert np.abs(np.array(best) - [20, 21, 22]).max() <= 1
+    line = json.loads((test / "detections.jsonl").read_text().splitlines()[20])
+    (tmp_path / "view.json").write_text(json.dumps({"objects": line["objects"]}))
+    for domain in ("things", "both"):
+        answer = json.loads(deepsimbad("localize", domain, tmp_path / "view.json", "--json").out)[0]
+        assert abs(answer["retrieval"][0]["map_image"] - 20) <= 1
+    picture = json.loads(deepsimbad("localize", "both", test / "020.png", "--json").out)[0]
+    assert abs(picture["retrieval"][0]["map_image"] - 20) <= 1
+    plain = tmp_path / "plain"
+    plain.mkdir()
+    (plain / "0.png").write_bytes((test / "020.png").read_bytes())
+    assert "has no detections.jsonl" in deepsimbad("localize", "things", plain).err
+    twice = deepsimbad("map", "twice", "--training", training, "--evaluator", "objects+objects")
+    assert "two different ones" in twice.line
+
+
+@pytest.mark.slow
+def test_the_client_uploads_replays_and_places_what_is_told(told, tmp_path, capsys):
+    landmarks, training, test = told
+    of = [{"kind": "feature_l2", "extractor": "gradient_grid"}, {"kind": "objects"}]
+    with serving(tmp_path / "data") as url:
+
+        def ran(*words):
+            code = run([*map(str, words), "--server", url])
+            said = capsys.readouterr()
+            assert code == 0, said.err
+            return said.out
+
+        domain = ("--domain", "both")
+        for name, drive in (("first", landmarks), ("second", training)):
+            evaluator = ("--evaluator", json.dumps({"kind": "fused", "of": of}))
+            ran("upload", drive, *domain, "--traverse", name, *evaluator)
+        ran("remap", *domain, "--landmark-traverse", "first", "--training-traverse", "second", "--training-episodes", 0)
+        ran("replay", f"{test}#10:30", *domain, "--out", tmp_path / "replay", "--tolerance", 2)
+        steps = [json.loads(line) for line in (tmp_path / "replay/steps.jsonl").read_text().splitlines()]
+        assert len(steps) == 20
+        assert np.mean([step["rank_percent"] for step in steps]) < 5
+        answers = json.loads(ran("localize", "both", f"{test}#20:22", test / "020.png", "--json"))
+        best = [answer["retrieval"][0]["map_image"] for answer in answers]
+        assert np.abs(np.array(best) - [20, 21, 20]).max() <= 1
