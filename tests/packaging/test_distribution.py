@@ -107,6 +107,13 @@ server.shutdown()
     assert "pip install 'deep-simbad[edge]'" in second
 
 
+def test_the_clients_commands_need_nothing_beside_their_extra():
+    """Which has no PyTorch or FastAPI: recordings take of the service what takes none of them either."""
+    lacking = ("torch", "fastapi", "sqlite_utils", "uvicorn", "rosbags", "scipy")
+    code = f"import sys; sys.modules |= dict.fromkeys({lacking}); import deepsimbad_client.commands"
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
 @pytest.mark.parametrize(
     ("command", "extra"), [(("deepsimbad-client", "domains"), "replay"), (("deepsimbad", "info", "campus"), "service")]
 )

@@ -8,7 +8,8 @@ import pytest
 from numpy.typing import NDArray
 
 from deepsimbad.core.camera import Camera
-from deepsimbad.core.drive import MAX_POSITION_M, Drive
+from deepsimbad.core.drive import Drive
+from deepsimbad.core.frames import MAX_POSITION_M
 from deepsimbad.errors import (
     DamagedFileError,
     DeepSimbadError,

@@ -28,7 +28,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from deepsimbad.core.drive import MAX_POSITION_M
+from deepsimbad.core.frames import MAX_POSITION_M
 from deepsimbad_client.errors import SourceError
 from deepsimbad_client.recordings import Frame, finite_number
 from deepsimbad_client.recordings.clock import UNITS, UNKNOWN, times_us

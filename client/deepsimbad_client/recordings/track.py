@@ -12,7 +12,7 @@ from math import hypot
 import numpy as np
 from numpy.typing import NDArray
 
-from deepsimbad.core.drive import MAX_POSITION_M
+from deepsimbad.core.frames import MAX_POSITION_M
 
 DEADBAND_M = 0.25
 DEADBAND_NOISES = 6.0

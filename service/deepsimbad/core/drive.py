@@ -27,13 +27,12 @@ from numpy.typing import NDArray
 
 from deepsimbad.core.camera import Camera
 from deepsimbad.core.descriptor import LandmarkStatistics, normal_scores, rank_landmarks
-from deepsimbad.core.frames import UNKNOWN_CONTENT, UNKNOWN_TIMESTAMP, content_digest
+from deepsimbad.core.frames import MAX_POSITION_M, UNKNOWN_CONTENT, UNKNOWN_TIMESTAMP, content_digest
 from deepsimbad.core.relevance import Query
 from deepsimbad.core.route import Route, same_places
 from deepsimbad.errors import InvalidEncodingError, InvalidInputError, InvalidMapConfigError, InvalidRouteError
 
 MAX_FRAME_INDEX = 2**53
-MAX_POSITION_M = 1e9  # either way; 25 times round the earth, and squares and spans are far from overflow
 MAX_NAME_LENGTH = 255  # characters; file systems allow no more
 FRAME_NAME = rf"[^\x00-\x1f\x7f-\x9f]{{1,{MAX_NAME_LENGTH}}}"
 OF_NOTHING = "one grey, noise or the dark"  # what pictures are that show nothing

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+MAX_POSITION_M = 1e9  # either way; 25 times round the earth, and squares and spans are far from overflow
 UNKNOWN_TIMESTAMP = -1
 UNKNOWN_CONTENT = 0
 _DIGEST_BYTES = 8
