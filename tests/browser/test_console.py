@@ -143,6 +143,32 @@ def test_landmarks_are_shown_by_the_frames_they_began_as(open_page):
     assert landmarks.locator("img").nth(N_FRAMES - 1).get_attribute("src").startswith("blob:")
 
 
+def test_a_session_longer_than_what_is_kept_is_gone_through_to_its_first_step(open_page, service, drives):
+    def keeps_four(route, _):
+        answer = route.fetch()
+        route.fulfill(response=answer, body=answer.text().replace("MOST_EVENTS = 2000", "MOST_EVENTS = 4"))
+
+    with Client(service) as client, client.session("route") as live:
+        drive(client, live, drives["winter"], range(4, 14))
+        page = open_page()
+        page.route("**/console/sessions.js", keeps_four)
+        page.goto(f"{service}/console#sessions/{live.session_id}")
+        page.reload()
+        page.get_by_text("After 10 views").wait_for()
+        page.get_by_text("Events 7 to 10").wait_for()
+        page.get_by_role("button", name="Those before").click()
+        page.get_by_text("After 6 views").wait_for()
+        page.get_by_text("Events 3 to 6").wait_for()
+        page.get_by_label("Step shown").press("Home")
+        page.get_by_text("After 3 views").wait_for()
+        page.get_by_role("button", name="One step back").click()
+        page.get_by_text("After 2 views").wait_for()
+        page.get_by_role("button", name="One step on").click()
+        page.get_by_text("After 3 views").wait_for()
+        page.get_by_role("button", name="Follow live").click()
+        page.get_by_text("After 10 views").wait_for()
+
+
 def test_the_keyboard_goes_everywhere_in_order_and_is_seen(open_page):
     page = open_page("report")
     page.get_by_role("heading", name="Reports").wait_for()
@@ -258,6 +284,7 @@ def test_an_upload_is_paused_and_goes_on_without_what_is_no_picture(open_page, s
     page.route("**/frames/5?*", lambda route, _: held.append(route))
     page.set_input_files("input[type=file]", folder)
     page.get_by_role("button", name="Upload").click()
+    page.get_by_text(f"{N_FRAMES - 1} of {N_FRAMES} images").wait_for()
     page.get_by_role("button", name="Pause").click()
     page.get_by_role("button", name="Go on").wait_for()
     page.unroute("**/frames/5?*")

@@ -13,6 +13,7 @@ from deepsimbad.core.descriptor import rank_landmarks, ranks_from_ranked_landmar
 from deepsimbad.core.drive import Drive
 from deepsimbad.core.index.retrieval import products_with_landmarks, relevances
 from deepsimbad.core.landmark_model import farthest_first
+from deepsimbad.core.rehearsal import novelty_curve
 from deepsimbad.core.relevance import Query, Relevance
 from deepsimbad.errors import InvalidInputError, InvalidMapConfigError, TooFewCandidatesError
 from deepsimbad.jobs.append import append_drive
@@ -340,3 +341,9 @@ def test_on_real_descriptors_two_seasons_make_the_difference(real_data, n_landma
     assert np.mean(shares) <= anr
     assert np.mean(firsts) >= recall
     assert max(shares) <= worst
+
+
+def test_views_a_world_apart_take_no_more_room_than_views_out_of_sight():
+    difference = np.random.default_rng(5).normal(size=(60, 4))
+    near, far = (novelty_curve(gap_m * np.arange(60), difference, 10.0) for gap_m in (100.0, 3e7))
+    assert np.array_equal(near, far)

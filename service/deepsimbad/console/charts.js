@@ -138,13 +138,14 @@ function drawRoute(canvas, route, isCovered) {
   context.textAlign = "start";
   context.textBaseline = "alphabetic";
   if (!route.isPlane) return;
-  const metres = [1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000].find((m) => m * scale >= 60) ?? 10000;
+  const ten = 10 ** Math.floor(Math.log10(60 / scale)); // the least of 1, 2, 5, 10 .. that is 60 pixels long
+  const metres = ten * [1, 2, 5, 10].find((times) => times * ten * scale >= 60);
   context.lineWidth = 2;
   context.beginPath();
   context.moveTo(14, height - 14);
   context.lineTo(14 + metres * scale, height - 14);
   context.stroke();
-  context.fillText(metres >= 1000 ? `${metres / 1000} km` : `${metres} m`, 14, height - 20);
+  context.fillText(metres >= 1000 ? `${(metres / 1000).toLocaleString()} km` : `${Number(metres.toPrecision(1))} m`, 14, height - 20);
 }
 
 // Paths of the histogram's bins along the route; made once a route and size, drawn ten times a second.

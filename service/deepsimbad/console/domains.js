@@ -48,11 +48,11 @@ function Card({ domain }) {
   return html`<a class="card" href=${`#domains/${domain.name}`}>
     <header><h2>${domain.name}</h2>
       ${state ? html`<span class="badge bad">${state}</span>` : domain.map_version === null ? html`<span class="badge so">no map yet</span>` : html`<span class="badge good">map ${domain.map_version}</span>`}</header>
-    <dl class="figures">
+    ${domain.n_map_images === null ? html`<p class="quiet">${state ? "Its map cannot serve." : "It waits for a traverse and a remap."}</p>` : html`<dl class="figures">
       <div><dt>Route</dt><dd>${metres(domain.route_length_m, 0)}</dd></div>
-      <div><dt>Map images</dt><dd>${domain.n_map_images?.toLocaleString() ?? "–"}</dd></div>
-      <div><dt>Index</dt><dd>${domain.index_bits_per_map_image ? html`${domain.index_bits_per_map_image.toFixed(1)} <small>bit/image</small>` : "–"}</dd></div>
-    </dl>
+      <div><dt>Map images</dt><dd>${domain.n_map_images.toLocaleString()}</dd></div>
+      <div><dt>Index</dt><dd>${domain.index_bits_per_map_image.toFixed(1)} <small>bit/image</small></dd></div>
+    </dl>`}
   </a>`;
 }
 

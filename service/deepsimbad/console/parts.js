@@ -3,7 +3,7 @@
 import { html, useEffect, useRef, useState } from "./preact.js";
 import { ask, json } from "./http.js";
 
-export const metres = (value, digits = 1) => (value === null || value === undefined ? "–" : `${value.toFixed(Math.abs(value) >= 100 ? 0 : digits)} m`);
+export const metres = (value, digits = 1) => (value === null || value === undefined ? "–" : `${Math.abs(value) < 1e4 ? value.toFixed(Math.abs(value) >= 100 ? 0 : digits) : Math.round(value).toLocaleString()} m`);
 export const percent = (share, digits = 0) => `${(100 * share).toFixed(digits)} %`;
 export const bytes = (n) => (n < 1e3 ? `${n} B` : n < 1e6 ? `${(n / 1e3).toFixed(1)} kB` : n < 1e9 ? `${(n / 1e6).toFixed(1)} MB` : `${(n / 1e9).toFixed(1)} GB`);
 export const when = (text, timeStyle = "short") => new Date(text).toLocaleString([], { dateStyle: "medium", timeStyle });

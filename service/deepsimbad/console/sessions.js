@@ -33,10 +33,11 @@ const WORDS = {
   connecting: ["plain", "connecting"], connected: ["good", "live"], lost: ["so", "connection lost, trying again"], ended: ["plain", "the session has ended"], refused: ["bad", "refused"],
 };
 
-// A session's events: the newest at once and as they come, those before it behind them.
-function useEvents(id) {
+// A session's events: the newest at once and as they come, those before it behind them; or as many before one of them.
+function useEvents(id, before) {
   const live = useRef([]);
   const earlier = useRef([]);
+  const older = useRef([]);
   const [, setDrawn] = useState(0);
   const [state, setState] = useState("connecting");
   const [problem, setProblem] = useState(null);
@@ -81,15 +82,46 @@ function useEvents(id) {
       clearTimeout(timer);
     };
   }, [id]);
-  return { all: [...earlier.current, ...live.current], state, problem };
+  useEffect(() => {
+    older.current = [];
+    if (before === null) return undefined;
+    const stop = new AbortController();
+    follow(`v1/sessions/${encodeURIComponent(id)}/events`, {
+      signal: stop.signal,
+      after: Math.max(0, before - 1 - MOST_EVENTS),
+      onEvent: (name, answer, number) => {
+        if (name !== "done" && number < before) older.current.push({ number, name, answer });
+        if (name === "done" || number >= before - 1) stop.abort();
+        setDrawn((n) => n + 1);
+      },
+    });
+    return () => stop.abort();
+  }, [id, before]);
+  const newest = [...earlier.current, ...live.current];
+  return { all: before !== null && older.current.length ? older.current : newest, newest, state, problem };
 }
 
 export function Session({ names: [id] }) {
-  const { all, state, problem } = useEvents(id);
+  const [before, setBefore] = useState(null); // events before the one of this number are shown; null: the newest
+  const { all, newest, state, problem } = useEvents(id, before);
   const [chosen, setChosen] = useState(null); // an event's number; null: the newest
   const found = chosen === null ? all.length - 1 : all.findIndex(({ number }) => number >= chosen);
   const at = found < 0 ? all.length - 1 : found;
-  const pick = (index) => setChosen(index >= all.length - 1 ? null : all[Math.max(0, index)].number);
+  const isNewest = all.length === 0 || all[all.length - 1] === newest[newest.length - 1];
+  const pick = (index) => {
+    if (index < 0) {
+      setBefore(all[0].number);
+      setChosen(all[0].number - 1);
+    } else if (index >= all.length && !isNewest) {
+      const [end, first] = [all[all.length - 1].number + 1, newest[0].number];
+      setBefore(end + MOST_EVENTS < first ? end + MOST_EVENTS : end < first ? first : null);
+      setChosen(end);
+    } else setChosen(isNewest && index >= all.length - 1 ? null : all[index].number);
+  };
+  const goLive = () => {
+    setBefore(null);
+    setChosen(null);
+  };
   const event = all[at];
   const [tone, word] = WORDS[state];
   return html`<div class="head"><h1>Session</h1><code>${id}</code>
@@ -97,24 +129,24 @@ export function Session({ names: [id] }) {
       <span class=${`badge ${tone}`} role="status">${word}</span></div>
     <${Fault} problem=${problem} />
     ${!event && !problem && (state === "ended" ? html`<p class="quiet">It ended before any view.</p>` : html`<p class="quiet" role="status">Waiting for its first view …</p>`)}
-    ${event && html`<${Steps} all=${all} at=${at} isLive=${chosen === null} onPick=${pick} state=${state} /><${Live} events=${all} at=${at} onPick=${pick} />`}`;
+    ${event && html`<${Steps} all=${all} at=${at} isLive=${chosen === null} isNewest=${isNewest} onPick=${pick} onLive=${goLive} state=${state} /><${Live} events=${all} at=${at} isNewest=${isNewest && at === all.length - 1} onPick=${pick} />`}`;
 }
 
-function Steps({ all, at, isLive, onPick, state }) {
+function Steps({ all, at, isLive, isNewest, onPick, onLive, state }) {
   const { number, name, answer } = all[at];
   return html`<section class="card" aria-label="Steps"><div class="steps">
-    <span class="row"><button class="small" aria-label="One step back" disabled=${at === 0} onClick=${() => onPick(at - 1)}>←</button>
-      <button class="small" aria-label="One step on" disabled=${at === all.length - 1} onClick=${() => onPick(at + 1)}>→</button></span>
+    <span class="row"><button class="small" aria-label="One step back" disabled=${all[at].number === 1} onClick=${() => onPick(at - 1)}>←</button>
+      <button class="small" aria-label="One step on" disabled=${isNewest && at === all.length - 1} onClick=${() => onPick(at + 1)}>→</button></span>
     <input type="range" min="0" max=${Math.max(all.length - 1, 1)} value=${at} aria-label="Step shown" aria-valuetext=${`event ${number}`} onInput=${(event) => onPick(Number(event.target.value))} />
     <span class="number">${name === "prior" ? `told its place, event ${number}` : `view ${answer.n_observations}`}</span>
-    <button class="small" disabled=${isLive} onClick=${() => onPick(all.length - 1)}>${state === "ended" ? "Last step" : "Follow live"}</button>
-  </div></section>`;
+    <button class="small" disabled=${isLive} onClick=${onLive}>${state === "ended" ? "Last step" : "Follow live"}</button>
+  </div>${all[0].number > 1 && html`<p class="quiet"><small>Events ${all[0].number.toLocaleString()} to ${all[all.length - 1].number.toLocaleString()}. <button class="link" onClick=${() => onPick(-1)}>Those before</button></small></p>`}</section>`;
 }
 
-function Live({ events, at, onPick }) {
+function Live({ events, at, isNewest, onPick }) {
   const { answer } = events[at];
   const { route, coverage } = useRoute(answer.domain, answer.map_version);
-  const view = useView(answer.session_id, at === events.length - 1 ? answer.n_observations : null);
+  const view = useView(answer.session_id, isNewest ? answer.n_observations : null);
   const steps = useMemo(() => {
     const numbers = events.map((event) => event.number);
     return [numbers, events.map((event) => event.answer.belief.entropy_bits), events.map((event) => 100 * event.answer.belief.off_route)];

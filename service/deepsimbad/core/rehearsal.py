@@ -136,6 +136,8 @@ def novelty_curve(at_m: NDArray[np.float64], difference: NDArray[np.floating], l
     order = np.argsort(at_m, kind="stable")
     at_m, difference = at_m[order], difference[order]
     lags_m = np.arange(int(np.ceil(longest_m)) + 1)
+    unseen_m = lags_m.size + 6 * _SMOOTHED_OVER_M  # across a longer gap no two views are compared
+    at_m = at_m[0] + np.concatenate([[0.0], np.cumsum(np.minimum(np.diff(at_m), unseen_m))])
     grid_m = np.arange(at_m[0], at_m[-1] + 0.5)
     if grid_m.size <= lags_m.size:
         return np.exp(-lags_m / _SMOOTHED_OVER_M)
