@@ -27,7 +27,7 @@ from .conftest import CHROMIUM, QUIET
 IMAGES = Path(__file__).resolve().parents[2] / "docs" / "images"
 SEASONS, N_FRAMES, N_VIEWS, STEP = ("winter", "spring", "summer"), 300, 14, 3
 DESK, PHONE = {"width": 1360, "height": 900}, {"width": 390, "height": 844}
-HEIGHT_SHOWN = 1260  # README's: down to the places that are most like a view
+HEIGHT_SHOWN = 1480  # README's: down to the places that are most like a view
 _QUALITY = 82
 
 

@@ -187,15 +187,15 @@ function Versions({ name, maps, onSwitch }) {
   return html`<section class="card below"><h2>Map versions</h2>
     <${Fault} problem=${problem} />
     ${list.length === 0 ? html`<p class="quiet">None yet.</p>` : html`<${Wide} label=${`Map versions of ${name}`}><table>
-      <thead><tr><th>Version</th><th>State</th><th>Made</th><th class="n">Images</th><th>Relevance</th>${columns.map(([name]) => html`<th class="n">${name}</th>`)}<th><span class="hidden-text">Switch</span></th></tr></thead>
+      <thead><tr><th>Version</th><th>State</th><th>Made</th><th class="n">Images</th><th>Relevance</th>${columns.map(([name]) => html`<th class="n">${name}</th>`)}</tr></thead>
       <tbody>${list.map((map) => html`<tr>
         <td><b>${map.version}</b></td>
-        <td><span class=${`badge ${map.state === "active" ? "good" : "plain"}`}>${map.state}</span></td>
+        <td><span class="row"><span class=${`badge ${map.state === "active" ? "good" : "plain"}`}>${map.state}</span>
+          ${map.version !== active && ["sealed", "retired"].includes(map.state) && html`<button class="small" disabled=${isBusy} onClick=${() => activate(map)}>${active !== null && map.version < active ? "Roll back" : "Activate"}</button>`}</span></td>
         <td>${when(map.created_at)}</td>
         <td class="n">${map.metrics.n_map_images?.toLocaleString() ?? "–"}</td>
         <td>${map.config.relevance ?? "–"}</td>
         ${columns.map(([, figure]) => html`<td class="n">${figure(map.metrics)?.toFixed(2) ?? "–"}</td>`)}
-        <td class="n">${map.version !== active && ["sealed", "retired"].includes(map.state) && html`<button class="small" disabled=${isBusy} onClick=${() => activate(map)}>${active !== null && map.version < active ? "Roll back" : "Activate"}</button>`}</td>
       </tr>`)}</tbody></table><//>`}
     <${More} list=${maps} />
   </section>`;

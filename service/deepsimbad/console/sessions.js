@@ -164,7 +164,7 @@ function Live({ events, at, isNewest, onPick }) {
         <${Plot} label=${`Entropy now ${answer.belief.entropy_bits.toFixed(1)} bits`} values=${steps} height=${140}
           series=${[{ stroke: "blue", scale: "y" }, { stroke: "mark", scale: "lost", dash: [6, 4] }]}
           scales=${{ x: { time: false }, y: { range: (_, __, most) => [0, Math.max(1, most) * 1.05] }, lost: { range: [0, 100] } }}
-          axes=${[{ label: "event", labelSize: 20, size: 36 }, {}, { scale: "lost", side: 1, grid: { show: false }, values: (_, ticks) => ticks.map((tick) => `${tick} %`) }]} /></section>
+          axes=${[{ label: "event", labelSize: 20, size: 36, incrs: [1, 2, 5, 10, 20, 50, 100, 200, 500] }, {}, { scale: "lost", side: 1, grid: { show: false }, values: (_, ticks) => ticks.map((tick) => `${tick} %`) }]} /></section>
     </div></div>`;
 }
 
