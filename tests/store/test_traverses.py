@@ -17,6 +17,7 @@ from deepsimbad.errors import (
     InvalidEncodingError,
     InvalidInputError,
     InvalidRouteError,
+    UnavailableError,
     UnknownTraverseError,
     WeightsDifferError,
 )
@@ -222,3 +223,23 @@ def test_encodings_take_half_the_bytes_where_nothing_is_lost(summer: Traverse, m
     np.testing.assert_array_equal(summer.read().encodings, rounded)
     sizes = [row["n"] for row in summer._db.query("SELECT length(body) AS n FROM encoding ORDER BY frame_index")]
     assert sizes == [2 * rounded.shape[1]] * 2 + [4 * rounded.shape[1]]
+
+
+def test_a_disk_that_fills_while_pictures_wait_is_named_and_leaves_all_as_it_was(
+    summer: Traverse, make_frames: MakeFrames
+) -> None:
+    summer.put_frames(make_frames([0, 1, 2]), pictures={0: b"waits"})
+    (n_pages,) = summer._db.conn.execute("PRAGMA page_count").fetchone()
+    summer._db.conn.execute(f"PRAGMA max_page_count = {n_pages}")
+    dim, more = summer.read().encoding_dim, make_frames([3])
+    for _ in range(2):
+        with pytest.raises(UnavailableError) as full:
+            summer.put_frames(more, pictures={3: bytes(1 << 20)})
+        assert full.value.hints["reason"] == "disk_full"
+    with pytest.raises(UnavailableError):
+        summer.keep_views({0: np.zeros((4096, dim), np.float32)})
+    about = summer.summary()
+    assert (about.n_frames, about.n_spooled, about.spooled_bytes) == (3, 1, 5)
+    assert (summer.picture(0), summer.views(0, dim)) == (b"waits", None)
+    summer._db.conn.execute("PRAGMA max_page_count = 1000000")
+    assert summer.put_frames(more, pictures={3: bytes(1 << 20)}) == (1, 0)

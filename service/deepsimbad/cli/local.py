@@ -36,7 +36,7 @@ from deepsimbad.evaluators.image_files import MEDIA_TYPES, ImageFile
 from deepsimbad.evaluators.registry import EvaluatorConfig, make_evaluator
 from deepsimbad.evaluators.scenes import Scene, seen_in
 from deepsimbad.jobs.build import encode_recording
-from deepsimbad.jobs.fitting import RecordingPictures
+from deepsimbad.jobs.fitting import RecordingPictures, learns
 from deepsimbad.jobs.remap import (
     DEFAULT_LIST_LENGTH,
     DEFAULT_N_LANDMARKS,
@@ -199,7 +199,9 @@ def _stages(
     reading = {f"read {role}": n / _FRAMES_A_SECOND for role, n in n_frames.items()}
     if keeps_pictures:
         reading |= {f"keep pictures of {role}": n / _FRAMES_A_SECOND for role, n in n_frames.items()}
-    return reading | remap_stages(config, n_frames["training"], n_frames.get("landmarks", 0), dim, measure.fitting)
+    return reading | remap_stages(
+        config, n_frames["training"], n_frames.get("landmarks", 0), dim, learns(measure, config.relevance)
+    )
 
 
 @contextmanager

@@ -23,6 +23,7 @@ _WEIGHT = "fused_weight"
 _TRIED = np.linspace(0, 1, 11)  # of the first half
 _EVEN = 0.5
 _NEAR_FRAMES = 2  # of a drive that count as one place
+_MOST_ASKED = 512  # frames of the other drive that the weight is learnt from
 
 
 class Fused(FeatureL2):
@@ -101,8 +102,10 @@ class Fused(FeatureL2):
         model = dict(self.fit_landmarks(own[lesson.landmarks]))
         weight, metrics = _EVEN, dict[str, Any]()
         if lesson.other is not None and len(lesson.places):
-            apart = self._apart(lesson.other[lesson.places[:, 1]], own)
-            scores = {share: _anr(share * apart[0] + (1 - share) * apart[1], lesson.places[:, 0]) for share in _TRIED}
+            asked = np.linspace(0, len(lesson.places) - 1, min(len(lesson.places), _MOST_ASKED)).astype(np.intp)
+            true, frames = lesson.places[asked].T
+            apart = self._apart(lesson.other[frames], own)
+            scores = {share: _anr(share * apart[0] + (1 - share) * apart[1], true) for share in _TRIED}
             weight = float(min(scores, key=lambda share: scores[share]))
             metrics = {"weight": weight, "anr": {f"{share:.1f}": score for share, score in scores.items()}}
         return Fitted({**model, _WEIGHT: np.array([weight], np.float32)}, metrics)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from deepsimbad.core.building import MapPlan
 from deepsimbad.core.drive import Drive, second_season
 from deepsimbad.core.landmark_model import select_landmarks
+from deepsimbad.core.relevance import Relevance
 from deepsimbad.evaluators.augmentation import VIEWS_A_LANDMARK, augmented
 from deepsimbad.evaluators.base import Evaluator, Fitted, Fitting, Image, Lesson
 from deepsimbad.evaluators.feature_l2 import squared_distances
@@ -23,6 +24,11 @@ from deepsimbad_client.recordings import Recording
 _LANDMARKS_AT_ONCE = 8  # whose views are encoded before they are kept
 _ANY_SIZE = 1 << 31  # pixels
 _VIEWS_SHARE, _FIT_SHARE = 0.1, 0.6  # of progress: landmarks chosen, their views encoded
+
+
+def learns(evaluator: Evaluator, relevance: Relevance) -> Fitting:
+    """What an evaluator is fitted to for maps of a relevance; `composed` compares encodings that are L2 themselves."""
+    return Fitting.NOTHING if relevance is Relevance.COMPOSED and evaluator.is_squared_l2 else evaluator.fitting
 
 
 class Pictures(Protocol):

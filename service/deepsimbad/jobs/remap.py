@@ -45,7 +45,7 @@ from deepsimbad.jobs.append import (
 )
 from deepsimbad.jobs.build import EPISODES_A_MAP_IMAGE, build, compared, measured, train_nnql
 from deepsimbad.jobs.check import CheckFrames, check_map
-from deepsimbad.jobs.fitting import Fitter, Pictures, SpooledPictures
+from deepsimbad.jobs.fitting import Fitter, Pictures, SpooledPictures, learns
 from deepsimbad.jobs.progress import Progress
 from deepsimbad.jobs.versions import activate_once, seal_version
 from deepsimbad.store.catalog import ANY, Catalog
@@ -400,7 +400,7 @@ class _Remap:
         candidates = inputs.candidates or training
         with Traverse.open(self.catalog.data_dir, self.domain, candidates.name or "") as traverse:
             fitter = Fitter(self.evaluator, SpooledPictures(traverse, candidates, self.pictures), config.seed)
-            if inputs.base is None and self.evaluator.fitting is not Fitting.NOTHING:
+            if inputs.base is None and learns(self.evaluator, config.relevance) is not Fitting.NOTHING:
                 self.progress.stage(FIT)
                 other = inputs.second if candidates is training else training
                 fitter.fit(plan, candidates, n_landmarks, other, self.progress.update)

@@ -33,6 +33,7 @@ from deepsimbad.errors import (
 from deepsimbad.evaluators.compute import Compute, available_cores
 from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
 from deepsimbad.jobs.child import JobPriority
+from deepsimbad.jobs.fitting import learns
 from deepsimbad.jobs.progress import Progress, ProgressState
 from deepsimbad.jobs.remap import REMAP_STAGES, RemapConfig, remap, stages_in
 from deepsimbad.jobs.versions import EXPERIENCE, LEARN_STAGES, ExperienceConfig, learn_online, serve_learnt, walks_of
@@ -288,7 +289,7 @@ class InThisProcess:
                 Progress({}, None, is_cancelled).check()
                 evaluator = make_evaluator(evaluator_config(catalog.domain(job.domain).evaluator), self.compute)
                 try:
-                    stages = stages_in(self.data_dir, job.domain, config, evaluator.fitting)
+                    stages = stages_in(self.data_dir, job.domain, config, learns(evaluator, config.relevance))
                 except DeepSimbadError:  # the stage that needs the traverse will say so
                     stages = REMAP_STAGES
                 progress = Progress(stages, on_progress, is_cancelled)
