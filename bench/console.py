@@ -108,7 +108,7 @@ def _driven(browser: Any, url: str, robot: _Robot) -> list[Limit]:
     return [
         Limit("script an update, ms", spent["ScriptDuration"], _SCRIPT_MS),
         Limit("script, style and layout an update, ms", sum(spent.values()), _SCRIPT_MS),
-        Limit("longest task that held the page, ms", longest_ms, 100.0),
+        Limit("longest task, ms", longest_ms, 100.0),
     ]
 
 
