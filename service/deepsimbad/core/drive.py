@@ -19,6 +19,7 @@ than chance allows, a little. So agreement must also be worth learning from.
 import re
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
+from itertools import pairwise
 from statistics import NormalDist
 from typing import Any, Self
 
@@ -122,8 +123,8 @@ class Drive:
 
     def picture_warnings(self, whose: str) -> list[str]:
         """What a person should know of its pictures, called as "of the map", in sentences."""
-        moved, digests = np.diff(self.position_m, prepend=-np.inf) > 0, self.digests()
-        hung = np.append(False, digests[1:] == digests[:-1]) & moved & ~self.shows_nothing
+        same = [False, *(np.array_equal(before, after) for before, after in pairwise(self.encodings))]
+        hung = np.array(same) & (np.diff(self.position_m, prepend=np.inf) > 0) & ~self.shows_nothing
         told = (
             (self.shows_nothing, f"show nothing: {OF_NOTHING}"),
             (hung, "are the very same as the one before, and the robot had moved on: did the camera hang?"),
