@@ -62,21 +62,26 @@ def session(service, drives):
         yield live
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_every_page_is_whole_and_accessible(open_page, service, session, scheme):
-    axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason="axe is not installed").Axe()
-    page = open_page(color_scheme=scheme, viewport=DESK, bypass_csp=True)
+@pytest.fixture
+def pages(service, session):
+    """Every page by a text of it, a session's and a job's own among them."""
     with httpx2.Client(base_url=service) as caller:
         job = caller.get("/v1/admin/jobs").json()["jobs"][0]["job_id"]
-    of_one = {f"sessions/{session.session_id}": "After 3 views", f"jobs/{job}": "What was measured"}
-    for where, text in {**PAGES, **of_one}.items():
+    return {**PAGES, f"sessions/{session.session_id}": "After 3 views", f"jobs/{job}": "What was measured"}
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_every_page_is_whole_and_accessible(open_page, pages, scheme):
+    axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason="axe is not installed").Axe()
+    page = open_page(color_scheme=scheme, viewport=DESK, bypass_csp=True)
+    for where, text in pages.items():
         page.goto(page.url.partition("#")[0] + f"#{where}")
         page.get_by_text(text).first.wait_for()
         for width in (PHONE, DESK):
             page.set_viewport_size(width)
             assert page.evaluate(TOO_WIDE) == [], where
-        found = axe.run(page)
-        assert found.violations_count == 0, f"{where}: {found.generate_report()}"
+            found = axe.run(page)
+            assert found.violations_count == 0, f"{where}: {found.generate_report()}"
 
 
 @pytest.mark.parametrize(
@@ -103,9 +108,9 @@ REACHED = """(() => {
 })()"""
 
 
-def test_the_keyboard_reaches_all_of_every_page(open_page, session):
+def test_the_keyboard_reaches_all_of_every_page(open_page, session, pages):
     page = open_page()
-    for where, text in {**PAGES, f"sessions/{session.session_id}": "After 3 views"}.items():
+    for where, text in pages.items():
         page.goto(page.url.partition("#")[0] + f"#{where}")
         page.get_by_text(text).first.wait_for()
         page.wait_for_timeout(300)
@@ -114,6 +119,7 @@ def test_the_keyboard_reaches_all_of_every_page(open_page, session):
             assert page.evaluate(REACHED), f"{where}: the focus is not seen"
         missed = page.evaluate(f"{REACHABLE}.filter((part) => !part.reached).map((part) => part.outerHTML)")
         assert missed == [], where
+    page.goto(page.url.partition("#")[0] + f"#sessions/{session.session_id}")
     slider = page.get_by_label("Step shown")
     slider.press("ArrowLeft")
     page.get_by_text("After 2 views").wait_for()
