@@ -161,11 +161,16 @@ def _msls(folder: Path, _: float) -> Recording | None:
     if not (folder / _PLACES).is_file() or not (folder / "images").is_dir():
         return None
     beside = {name: _table(folder / name) if (folder / name).is_file() else [] for name in ("seq_info.csv", "raw.csv")}
-    panoramas = {row["key"] for row in beside["raw.csv"] if row.get("pano") == "True"}
-    place_of = {
-        row["key"]: (row.get("sequence_key") or row.get("sequence_id", ""), int(row["frame_number"]))
-        for row in beside["seq_info.csv"]
-    }
+    panoramas = {row.get("key") for row in beside["raw.csv"] if row.get("pano") == "True"}
+    try:
+        place_of = {
+            row["key"]: (row.get("sequence_key") or row.get("sequence_id") or "", int(row["frame_number"]))
+            for row in beside["seq_info.csv"]
+        }
+    except (KeyError, TypeError, ValueError) as error:
+        raise SourceError(
+            f"{folder / 'seq_info.csv'}: the columns key and frame_number, a number, are needed"
+        ) from error
     rows = _table(folder / _PLACES)
     if rows and not {"key", "easting", "northing"} <= rows[0].keys():
         raise SourceError(f"{folder / _PLACES}: the columns key, easting and northing are needed")
@@ -178,7 +183,7 @@ def _msls(folder: Path, _: float) -> Recording | None:
     }
     places = []
     for row in rows:
-        north, east = finite_number(row["northing"]), finite_number(row["easting"])
+        north, east = finite_number(row["northing"] or ""), finite_number(row["easting"] or "")
         if row["key"] in panoramas:
             left_out["panorama"].append(row["key"])
         elif row["key"] not in names:

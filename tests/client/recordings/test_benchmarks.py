@@ -73,6 +73,12 @@ def test_msls_goes_by_its_tables_and_leaves_panoramas_out(tmp_path):
     assert [frame.position_m for frame in recording.frames] == [0, 10, 15]
     assert recording.left_out == {"panorama": 1, "in postprocessed.csv without an image": 1}
     assert recording.image(recording.frames[0], None).body, "images lie one folder deeper"
+    with (city / "postprocessed.csv").open("a") as rows:
+        rows.write("5,cut")  # short
+    assert len(open_source(str(city)).frames) == 3
+    (city / "seq_info.csv").write_text(",key,sequence_key,frame_number\n0,a,s,two\n")
+    with pytest.raises(SourceError, match=r"seq_info\.csv: the columns key and frame_number"):
+        open_source(str(city))
 
 
 def test_robotcar_is_placed_by_its_ins_and_its_mosaics_become_colours(tmp_path):
