@@ -111,6 +111,7 @@ def paper(
                 {season: RecordingPictures(drive, settings.max_pixels) for season, drive in recordings.items()},
             )
             progress.stage("write")
+            widths = measure.halves or (next(iter(drives.values())).encoding_dim,)
             document = {
                 **paper_document(config, results),
                 "seasons": {
@@ -133,7 +134,7 @@ def paper(
                     **{name: value for name, value in reading.items() if value is not None},
                 },
                 "bits_per_encoding": 8 * bytes_per_encoding(next(iter(drives.values()))),
-                "bits_per_unit_vector": 32 * min(MOST_DIMENSIONS, next(iter(drives.values())).encoding_dim),
+                "bits_per_unit_vector": 32 * sum(min(MOST_DIMENSIONS, width) for width in widths),
                 "machine": machine(),
                 "release": release(),
             }
