@@ -205,7 +205,7 @@ class GridFilter:
     @cached_property
     def _believed(self) -> NDArray[np.float64]:
         """[c] of the cells, if the robot is on the route; sums to 1."""
-        return _mixed(self.masses, _trusted(self.doubt.log_trust, self.doubt.lost))
+        return _mixed(self.masses, self.doubt.lost, self.doubt.log_trust)
 
     @cached_property
     def mass(self) -> NDArray[np.float64]:
@@ -236,12 +236,13 @@ class GridFilter:
         """
         cells, doubt, reach_m = self.route.cells, self.doubt, SIGMAS * action_std_m
         shift, offset_m = cells.shifted(self.offset_m + action_m)
-        some = cells.sources(shift, offset_m, reach_m if doubt.is_mixture or action_m == 0 else 0.0)
         on_route = 1 - doubt.lost
-        surviving = self._within(some)
-        if not (surviving > LEAST_SURVIVING_SHARE * on_route).any() and not self.masses[:, some].any():
-            some = cells.sources(shift, offset_m, reach_m)  # it may still have stopped at the end
-            surviving = self._within(some)
+        for beyond_m in (reach_m if doubt.is_mixture or action_m == 0 else 0.0, reach_m):
+            some = cells.sources(shift, offset_m, beyond_m)
+            without = self.masses[:, : some.start].sum(axis=1) + self.masses[:, some.stop :].sum(axis=1)
+            surviving = on_route - without
+            if (surviving > LEAST_SURVIVING_SHARE * on_route).any() or self.masses[:, some].any():
+                break  # else it may still have stopped at the end
         check_ahead(self.route, doubt, on_route, surviving, action_m)
         lost, staying, found = leaving_and_found(doubt, doubt.lost, on_route, surviving, action_m)
         total = surviving * staying + found + lost
@@ -255,11 +256,6 @@ class GridFilter:
         )
         last = None if doubt.last is None else _carried(doubt.last, shift, cells.closed)
         return replace(self, masses=masses, offset_m=offset_m, doubt=replace(doubt, lost=lost / total, last=last))
-
-    def _within(self, some: slice) -> NDArray[np.float64]:
-        """[t] what some cells hold: all but what the others do."""
-        without = self.masses[:, : some.start].sum(axis=1) + self.masses[:, some.stop :].sum(axis=1)
-        return np.asarray(1 - self.doubt.lost - without, np.float64)
 
     def updated(self, seen: ViewEvidence, step: int) -> Self:  # noqa: ARG002
         """The belief after a view."""
@@ -361,8 +357,11 @@ def _see(
 
 
 @njit(cache=True, nogil=True, fastmath=SUMS)
-def _mixed(masses: NDArray[np.float64], weight: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[c] the sum of rows [t, c], each times its weight."""
+def _mixed(
+    masses: NDArray[np.float64], lost: NDArray[np.float64], log_trust: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """[c] what the trusts believe together, if the robot is on the route; sums to 1."""
+    weight = _trusted(log_trust, lost)
     mixed = weight[0] * masses[0]
     for t in range(1, weight.size):
         row, share = masses[t], weight[t]

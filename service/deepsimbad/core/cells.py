@@ -67,7 +67,7 @@ class Cells:
         return _interpolated(values, self.place_m, self.start_m + offset_m, self.step_m, self.n_cells, length_m)
 
     def to_places(self, mass: NDArray[np.float64], offset_m: float) -> NDArray[np.float64]:
-        """[p] masses of places from those of cells [c]: of the stretch that is nearest to each."""
+        """[p] masses of places, summing to 1, from those of cells [c]: of the stretch that is nearest to each."""
         return _within(mass, self._bounds_m, self.start_m + offset_m, self.step_m, self.closed)
 
     @cached_property
@@ -109,7 +109,7 @@ def _interpolated(
 def _within(
     mass: NDArray[np.float64], bounds_m: NDArray[np.float64], from_m: float, step_m: float, closed: bool
 ) -> NDArray[np.float64]:
-    """[p] the masses between ascending bounds [p + 1], of cells about `from_m` and on; cells are evenly full."""
+    """[p] shares of masses between ascending bounds [p + 1], of cells about `from_m` and on; cells are evenly full."""
     n, a_metre = mass.size, 1.0 / step_m
     within = np.empty(bounds_m.size - 1)
     cell, held = 0, 0.0  # of the cell, what earlier places have
@@ -126,4 +126,4 @@ def _within(
             at = at + 1 if at + 1 < n else 0
         held = mass[at] * max(last - cell, 0.0) if closed or cell < n else 0.0
         within[place] = total + held
-    return within
+    return np.asarray(within / max(within.sum(), 1e-300))

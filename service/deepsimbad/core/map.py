@@ -25,12 +25,12 @@ from deepsimbad.core.relevance import (
     Relevance,
     UpdateRule,
     is_strange,
-    worth_of_move,
 )
 from deepsimbad.core.route import Route
 from deepsimbad.errors import InvalidMapConfigError, LandmarkModelDiffersError
 
 UNKNOWN_FRAME = 0  # no digest was kept of what an image was made of
+_WORTH_STRANGE = 0.5  # what a view that shows nothing of the route counts for among what is usual
 DEFAULT_ACTIONS_M = tuple(float(metres) for metres in range(1, 11))
 MOST_ACTION_M = 1000.0
 _USUAL_NOVELTY_M = 3.0  # over which views stop to err alike, where nobody measured it
@@ -351,7 +351,8 @@ class Map:
         """
         is_strange = view.encoding is not None and self.is_strange(view.encoding, live)
         if live is not None and view.is_informative:
-            live = live.observing(view, worth_of_move(1.0 if moved_m is None else moved_m, is_strange))
+            new = 1.0 if moved_m is None else min(1.0, abs(moved_m))  # a robot that stands sees nothing new
+            live = live.observing(view, new * (_WORTH_STRANGE if is_strange else 1.0))
         return live, is_strange
 
     @cached_property

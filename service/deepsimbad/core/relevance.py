@@ -29,7 +29,6 @@ class Relevance(StrEnum):
 DEFAULT_RELEVANCE = Relevance.COMPOSED
 _FAR_STD = 2.0  # deviations from what is usual
 _MOST_FAR = 3 / 16  # of a view's numbers; where places are seen, in whatever season, fewer are so far off
-_WORTH_STRANGE = 0.5  # what a view that shows nothing of the route counts for among what is usual
 _SEASON_VIEWS, _SEASON_VARIETY = 10.0, 0.65  # from which on a session's views may be of a season that is odd
 _ODDEST_SEASON = 1.5  # times as strange as a view may be
 _FARTHEST = np.float32(4.001)  # squared distance of opposite unit vectors, and its rounding
@@ -99,11 +98,6 @@ def mean_ranks(relevance: NDArray[np.floating]) -> NDArray[np.float64]:
     _, place, counts = np.unique(-relevance, return_inverse=True, return_counts=True)
     mean_rank = np.cumsum(counts) - (counts - 1) / 2
     return np.asarray(mean_rank[place], np.float64)
-
-
-def worth_of_move(action_m: float, is_strange: bool = False) -> float:
-    """What a view counts for after a move: a robot that stands sees nothing new, one a metre on does."""
-    return min(1.0, abs(action_m)) * (_WORTH_STRANGE if is_strange else 1.0)
 
 
 def strangeness(encodings: NDArray[np.floating], usual: Moments) -> NDArray[np.float64]:
