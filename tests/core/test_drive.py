@@ -252,3 +252,17 @@ def test_pictures_of_nothing_and_of_a_camera_that_hung_are_told_by_name() -> Non
         "did the camera hang? (4.png, 5.png, 6.png, ...)",
     ]
     assert drive.at(np.arange(4)).picture_warnings("of the map") == []
+
+
+def test_frames_unlike_all_others_are_told_by_name() -> None:
+    """Black with a clock in it is no picture of one grey, but its encoding is far from what is usual on the route."""
+    rng = np.random.default_rng(0)
+    encodings = rng.normal(size=(100, 400)).astype(np.float32)
+    encodings[40:43] = rng.normal(0, 4, 400) + rng.normal(0, 0.1, (3, 400))
+    names = np.array([f"{at}.png" for at in range(100)])
+    drive = Drive(position_m=np.arange(100.0), encodings=encodings, frame_name=names)
+    assert drive.picture_warnings("of the map") == [
+        "3 of 100 pictures of the map are so unlike all others that they may show nothing of the route: glare, or the "
+        "dark (40.png, 41.png, 42.png)"
+    ]
+    assert drive.at(np.arange(40)).picture_warnings("of the map") == []

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from deepsimbad.core.camera import Camera
 from deepsimbad.core.descriptor import LandmarkStatistics, normal_scores, rank_landmarks
 from deepsimbad.core.frames import MAX_POSITION_M, UNKNOWN_CONTENT, UNKNOWN_TIMESTAMP, content_digest
-from deepsimbad.core.relevance import Query
+from deepsimbad.core.relevance import Query, shows_nothing
 from deepsimbad.core.route import Route, same_places
 from deepsimbad.errors import InvalidEncodingError, InvalidInputError, InvalidMapConfigError, InvalidRouteError
 
@@ -121,12 +121,21 @@ class Drive:
                 "another: is the lens covered, or the extractor broken? Record another drive"
             )
 
+    @property
+    def is_unlike_all(self) -> NDArray[np.bool_]:
+        """[n] whether a frame shows nothing of the route, as far as encodings tell and its picture does not."""
+        return shows_nothing(self.encodings) & ~self.shows_nothing
+
     def picture_warnings(self, whose: str) -> list[str]:
         """What a person should know of its pictures, called as "of the map", in sentences."""
         same = [False, *(np.array_equal(before, after) for before, after in pairwise(self.encodings))]
         hung = np.array(same) & (np.diff(self.position_m, prepend=np.inf) > 0) & ~self.shows_nothing
         told = (
             (self.shows_nothing, f"show nothing: {OF_NOTHING}"),
+            (
+                self.is_unlike_all,
+                "are so unlike all others that they may show nothing of the route: glare, or the dark",
+            ),
             (hung, "are the very same as the one before, and the robot had moved on: did the camera hang?"),
         )
         return [

@@ -31,6 +31,7 @@ _FAR_STD = 2.0  # deviations from what is usual
 _MOST_FAR = 3 / 16  # of a view's numbers; where places are seen, in whatever season, fewer are so far off
 _SEASON_VIEWS, _SEASON_VARIETY = 10.0, 0.65  # from which on a session's views may be of a season that is odd
 _ODDEST_SEASON = 1.5  # times as strange as a view may be
+_ROWS_AT_ONCE = 1024
 _FARTHEST = np.float32(4.001)  # squared distance of opposite unit vectors, and its rounding
 
 
@@ -157,7 +158,9 @@ def _season(usual: Moments, live: Moments) -> Moments | None:
 
 def shows_nothing(drive: NDArray[np.float32]) -> NDArray[np.bool_]:
     """[n] which frames of a drive, [n, d] encodings, show nothing of its route: noise, glare, the dark."""
-    return np.asarray(strangeness(drive, Moments.of(drive)) > most_strange(drive))
+    usual, blocks = Moments.of(drive), range(0, len(drive), _ROWS_AT_ONCE)
+    seen = np.concatenate([strangeness(drive[first : first + _ROWS_AT_ONCE], usual) for first in blocks])
+    return np.asarray(seen > most_strange(drive))
 
 
 @dataclass(frozen=True)

@@ -288,7 +288,7 @@ class _Remap:
         }
         metrics = {
             "n_map_images": map_.n_images,
-            "n_uninformative": int(inputs.training.shows_nothing.sum()),
+            "n_uninformative": int((inputs.training.shows_nothing | inputs.training.is_unlike_all).sum()),
             "n_landmarks": map_.n_landmarks,
             "seconds": seconds,
             **learnt,
