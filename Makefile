@@ -28,7 +28,7 @@ install: .venv/.installed ## .venv with the service, the client and the tools fr
 demo: install ## renders a campus, maps it, localizes a drive of another season against a live server
 	@$(BIN)/python -m deepsimbad_client.commands.demo
 
-paper: install ## renders four seasons of a campus and runs the paper's section III on them, 22 minutes of processor time
+paper: install ## renders four seasons of a campus and runs the paper's section III on them, 18 minutes on two cores
 	@$(BIN)/python -m deepsimbad_campus paper-output/campus --frames 1500 --spacing-m 0.5 >&2
 	@$(BIN)/deepsimbad experiment paper --nclt paper-output/campus --out paper-output
 
