@@ -243,3 +243,21 @@ def test_a_disk_that_fills_while_pictures_wait_is_named_and_leaves_all_as_it_was
     assert (summer.picture(0), summer.views(0, dim)) == (b"waits", None)
     summer._db.conn.execute("PRAGMA max_page_count = 1000000")
     assert summer.put_frames(more, pictures={3: bytes(1 << 20)}) == (1, 0)
+
+
+def test_frames_unlike_all_others_are_counted_beside_those_whose_pictures_show_nothing(
+    summer: Traverse, make_frames: MakeFrames
+) -> None:
+    frames = make_frames(range(200), dim=64)
+    frames.encodings[150:153] += 9 * frames.encodings.std(axis=0)  # glare
+    blank = np.zeros(200, np.bool_)
+    blank[[3, 151]] = True
+    summer.put_frames(replace(frames, shows_nothing=blank))
+    summary = summer.summary()
+    assert summary.n_uninformative == 4 == (summer.read().shows_nothing | summer.read().is_unlike_all).sum()
+    assert summary.warnings == (
+        "2 of 200 pictures show nothing: one grey, noise or the dark",
+        "2 of 200 pictures are so unlike all others that they may show nothing of the route: glare, or the dark",
+    )
+    summer.put_frames(make_frames([150, 151, 152], dim=64))  # taken again
+    assert summer.summary().n_uninformative == 1

@@ -227,7 +227,7 @@ class Traverse(Answer):
     cameras: tuple[dict[str, Any], ...] = ()  # name, width, height, aspect_ratio, orientation; that of most first
     warnings: tuple[str, ...] = ()  # what a person should know of its pictures, in sentences
     digest: str | None = None  # SHA-256 over indices, contents, places and times; one drive, one digest
-    n_uninformative: int = 0  # frames whose pictures show nothing
+    n_uninformative: int = 0  # frames whose pictures show nothing, or are so unlike all others that they seem to
     n_spooled: int = 0  # pictures that wait for the domain's evaluator to be fitted
     spooled_bytes: int = 0
     grey_levels: tuple[int, int] | None = None

@@ -85,7 +85,13 @@ class TraverseAnswer(Answer):
         str | None,
         Field(description="SHA-256 over indices, contents, places and times: one drive, one digest; null: unknown."),
     ]
-    n_uninformative: Annotated[int, Field(description="Frames whose pictures show nothing: one grey, noise, the dark.")]
+    n_uninformative: Annotated[
+        int,
+        Field(
+            description="Frames whose pictures show nothing: one grey, noise, the dark; or are so unlike all others "
+            "that they may show nothing of the route: glare."
+        ),
+    ]
     n_spooled: Annotated[
         int, Field(description="Pictures that wait until a map is made of the traverse, for an evaluator to be fitted.")
     ]

@@ -7,7 +7,7 @@ weighted by list position, comes nearest to it in direction; a view answers a pl
 Landmarks begin as frames and are moved to where the sums come nearer still.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any, Self
@@ -47,14 +47,22 @@ class Moments:
 
         A number that stood still in one of the drives has so great a deviation that it says nothing.
         """
-        means, variances = [], []
-        for drive in drives:
-            means.append(drive.mean(axis=0, dtype=np.float64))
-            variance = drive.var(axis=0, dtype=np.float64)
-            greatest = variance.max() or 1.0
-            variances.append(np.where(variance <= _STILL**2 * greatest, _MUTE**2 * greatest, variance))
+        means = [drive.mean(axis=0, dtype=np.float64) for drive in drives]
+        variances = [_telling(drive.var(axis=0, dtype=np.float64)) for drive in drives]
         mean = np.mean(means, axis=0)
         return cls(PRIOR_WEIGHT_FRAMES, mean, np.mean(variances, axis=0) + np.square(mean))
+
+    @classmethod
+    def of_blocks(cls, blocks: Iterable[NDArray[np.float32]]) -> Self:
+        """As `of` one drive, whose frames come in blocks [_, d]."""
+        n_frames, total, squares = 0, np.zeros(1), np.zeros(1)
+        for block in blocks:
+            n_frames += len(block)
+            total = total + block.sum(axis=0, dtype=np.float64)
+            squares = squares + np.einsum("nd,nd->d", block, block, dtype=np.float64)
+        mean = total / max(n_frames, 1)
+        variance = np.maximum(squares / max(n_frames, 1) - np.square(mean), 0.0)
+        return cls(PRIOR_WEIGHT_FRAMES, mean, _telling(variance) + np.square(mean))
 
     @classmethod
     def counted(cls, frames: NDArray[np.float32]) -> Self:
@@ -93,6 +101,12 @@ class Moments:
             mine + (theirs - mine) * share for mine, theirs in ((self.mean, other.mean), (self.square, other.square))
         )
         return replace(self, mean=mean, square=square)
+
+
+def _telling(variance: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[d] with so great a variance in place of none that the number says nothing."""
+    greatest = variance.max() or 1.0
+    return np.where(variance <= _STILL**2 * greatest, _MUTE**2 * greatest, variance)
 
 
 def unit(vectors: NDArray[np.floating]) -> NDArray[np.float32]:

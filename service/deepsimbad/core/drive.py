@@ -36,7 +36,8 @@ from deepsimbad.errors import InvalidEncodingError, InvalidInputError, InvalidMa
 MAX_FRAME_INDEX = 2**53
 MAX_NAME_LENGTH = 255  # characters; file systems allow no more
 FRAME_NAME = rf"[^\x00-\x1f\x7f-\x9f]{{1,{MAX_NAME_LENGTH}}}"
-OF_NOTHING = "one grey, noise or the dark"  # what pictures are that show nothing
+SHOWS_NOTHING = "show nothing: one grey, noise or the dark"  # said of pictures
+UNLIKE_ALL = "are so unlike all others that they may show nothing of the route: glare, or the dark"
 _ROWS_AT_ONCE, _NAMED = 1024, 3
 
 SIGNIFICANCE = 0.002  # of the agreement at shift 0, up to which it counts as more than chance
@@ -124,18 +125,17 @@ class Drive:
     @property
     def is_unlike_all(self) -> NDArray[np.bool_]:
         """[n] whether a frame shows nothing of the route, as far as encodings tell and its picture does not."""
-        return shows_nothing(self.encodings) & ~self.shows_nothing
+        starts = range(0, self.n_frames, _ROWS_AT_ONCE)
+        unlike = shows_nothing(lambda: (self.encodings[start : start + _ROWS_AT_ONCE] for start in starts))
+        return unlike & ~self.shows_nothing
 
     def picture_warnings(self, whose: str) -> list[str]:
         """What a person should know of its pictures, called as "of the map", in sentences."""
         same = [False, *(np.array_equal(before, after) for before, after in pairwise(self.encodings))]
         hung = np.array(same) & (np.diff(self.position_m, prepend=np.inf) > 0) & ~self.shows_nothing
         told = (
-            (self.shows_nothing, f"show nothing: {OF_NOTHING}"),
-            (
-                self.is_unlike_all,
-                "are so unlike all others that they may show nothing of the route: glare, or the dark",
-            ),
+            (self.shows_nothing, SHOWS_NOTHING),
+            (self.is_unlike_all, UNLIKE_ALL),
             (hung, "are the very same as the one before, and the robot had moved on: did the camera hang?"),
         )
         return [

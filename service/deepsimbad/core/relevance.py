@@ -4,6 +4,7 @@ A relevance says how well a map image answers a view; larger is better. Four are
 `brute_force` are the paper's baselines that must store more than ids. An update says how it becomes evidence.
 """
 
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Any
@@ -31,7 +32,6 @@ _FAR_STD = 2.0  # deviations from what is usual
 _MOST_FAR = 3 / 16  # of a view's numbers; where places are seen, in whatever season, fewer are so far off
 _SEASON_VIEWS, _SEASON_VARIETY = 10.0, 0.65  # from which on a session's views may be of a season that is odd
 _ODDEST_SEASON = 1.5  # times as strange as a view may be
-_ROWS_AT_ONCE = 1024
 _FARTHEST = np.float32(4.001)  # squared distance of opposite unit vectors, and its rounding
 
 
@@ -156,11 +156,15 @@ def _season(usual: Moments, live: Moments) -> Moments | None:
     return replace(usual, mean=mean, square=np.square(mean) + np.square(usual.std))
 
 
-def shows_nothing(drive: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """[n] which frames of a drive, [n, d] encodings, show nothing of its route: noise, glare, the dark."""
-    usual, blocks = Moments.of(drive), range(0, len(drive), _ROWS_AT_ONCE)
-    seen = np.concatenate([strangeness(drive[first : first + _ROWS_AT_ONCE], usual) for first in blocks])
-    return np.asarray(seen > most_strange(drive))
+def shows_nothing(blocks: Callable[[], Iterable[NDArray[np.float32]]]) -> NDArray[np.bool_]:
+    """[n] which frames of a drive show nothing of its route: noise, glare, the dark.
+
+    Args:
+        blocks: Gives its encodings [_, d] in blocks, however often it is asked.
+    """
+    usual = Moments.of_blocks(blocks())
+    strange = [strangeness(block, usual) > most_strange(block) for block in blocks()]
+    return np.concatenate(strange) if strange else np.zeros(0, np.bool_)
 
 
 @dataclass(frozen=True)

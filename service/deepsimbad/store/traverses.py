@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 from sqlite_utils import Database
 
 from deepsimbad.core.camera import Camera
-from deepsimbad.core.drive import OF_NOTHING, Drive
+from deepsimbad.core.drive import SHOWS_NOTHING, UNLIKE_ALL, Drive
 from deepsimbad.core.frames import IDENTITY, UNKNOWN_CONTENT, UNKNOWN_TIMESTAMP, differences
+from deepsimbad.core.relevance import shows_nothing
 from deepsimbad.errors import (
     ConflictError,
     DamagedFileError,
@@ -36,6 +37,7 @@ from deepsimbad.store.arrays import is_halvable
 from deepsimbad.store.connection import (
     FileState,
     file_state,
+    look_at,
     open_database,
     open_working_file,
     write_transaction,
@@ -45,6 +47,7 @@ from deepsimbad.store.records import now, to_json
 from deepsimbad.store.spool import Spool, clear_spool, spool_pictures, spooled
 from deepsimbad_migrations.traverse.migrations import migrations
 
+_ROWS_AT_ONCE = 1024
 _NAMED_INDICES = 100  # most that an error names
 _DTYPE_OF_BYTES = {2.0: "<f2", 4.0: "<f4"}  # by the bytes of one number
 
@@ -59,7 +62,7 @@ class TraverseSummary:
     length_m: float | None  # from the least position to the greatest; None before the first frame
     span_us: tuple[int, int] | None  # the first and the last known time of a frame
     digest: str | None  # SHA-256 in hex of all that its frames are known by; None: none are there, or one is unknown
-    n_uninformative: int  # frames whose pictures show nothing
+    n_uninformative: int  # frames whose pictures show nothing, or are so unlike all others that they seem to
     n_spooled: int  # pictures that wait to be fitted
     spooled_bytes: int
     grey_levels: tuple[int, int] | None  # what is shown black and white of more than 8 bits; None: nobody said yet
@@ -270,14 +273,11 @@ class Traverse(Spool):
             return self._described(db)[0]
 
     def summary(self) -> "TraverseSummary":
-        """What has arrived, of one moment; reads no encodings."""
+        """What has arrived, of one moment; reads the encodings where the file was written to since it last did."""
+        n_blank, n_unlike_all = _uninformative(self._path, file_state(self._path))
         with self._reading() as db:
-            n_frames, n_uninformative, length_m, *span_us = db.execute(
-                """
-                SELECT count(*), count(nullif(shows_nothing, 0)), max(position_m) - min(position_m),
-                    min(timestamp_us), max(timestamp_us)
-                FROM frame
-                """
+            n_frames, length_m, *span_us = db.execute(
+                "SELECT count(*), max(position_m) - min(position_m), min(timestamp_us), max(timestamp_us) FROM frame"
             ).fetchone()
             missing = db.execute(
                 """
@@ -289,8 +289,9 @@ class Traverse(Spool):
             cameras = _cameras(db)
             unlike = (camera.unlike(cameras[:1], "most") for camera in cameras[1:])
             whys = [f"some of its pictures are not like the others: {why}" for why in unlike if why is not None][:1]
-            if n_uninformative:
-                whys.append(f"{n_uninformative} of {n_frames} pictures show nothing: {OF_NOTHING}")
+            for n_such, why in ((n_blank, SHOWS_NOTHING), (n_unlike_all, UNLIKE_ALL)):
+                if n_such:
+                    whys.append(f"{n_such} of {n_frames} pictures {why}")
             n_spooled, spooled_bytes = spooled(db)
             return TraverseSummary(
                 name=self.name,
@@ -299,7 +300,7 @@ class Traverse(Spool):
                 length_m=length_m,
                 span_us=None if span_us[0] is None else (span_us[0], span_us[1]),
                 digest=_digest(_known(db)),
-                n_uninformative=n_uninformative,
+                n_uninformative=n_blank + n_unlike_all,
                 n_spooled=n_spooled,
                 spooled_bytes=spooled_bytes,
                 grey_levels=_levels(db),
@@ -337,16 +338,10 @@ class Traverse(Spool):
                 [UNKNOWN_TIMESTAMP],
             )
             for row, (frame_index, moment_us, name, shows_nothing, *place, body) in enumerate(rows):
-                dtype = _DTYPE_OF_BYTES.get(len(body or b"") / (dim or 1))  # a single number would be broadcast
-                if dtype is None:
-                    raise DamagedFileError(
-                        f"traverse {self.name} is damaged: the encoding of frame {frame_index} has another length; "
-                        "delete it and upload it again"
-                    )
                 names.append(name)
                 index[row], timestamp_us[row], places[row] = frame_index, moment_us, place  # None becomes NaN
                 blank[row] = shows_nothing
-                encodings[row] = np.frombuffer(body, dtype)
+                encodings[row] = _unpacked(self.name, frame_index, body, dim)
         position_m, x_m, y_m = places.T.copy()
         return Drive(
             name=self.name, camera=next(iter(cameras), None), index=index, position_m=position_m,
@@ -406,8 +401,27 @@ def _digest(known: dict[str, NDArray[Any]]) -> str | None:
 
 @lru_cache(maxsize=4096)
 def _main_camera(data_dir: Path, domain: str, name: str, _: FileState) -> Camera | None:
-    with Traverse.open(data_dir, domain, name) as traverse:
-        return next(iter(traverse.summary().cameras), None)
+    with Traverse.open(data_dir, domain, name) as traverse, traverse._reading() as db:
+        return next(iter(_cameras(db)), None)
+
+
+@lru_cache(maxsize=4096)
+def _uninformative(path: Path, _: FileState) -> tuple[int, int]:
+    """How many pictures show nothing by themselves, and how many of the others as `Drive.is_unlike_all`."""
+
+    def counted(db: Database) -> tuple[int, int]:
+        (dim,) = db.execute("SELECT encoding_dim FROM traverse").fetchone()
+        frames = "FROM frame LEFT JOIN encoding USING (frame_index) ORDER BY frame_index"
+        is_blank = np.array([row[0] for row in db.execute(f"SELECT coalesce(shows_nothing, 0) {frames}")], np.bool_)
+
+        def blocks() -> Iterator[NDArray[np.float32]]:
+            rows = db.execute(f"SELECT frame_index, body {frames}")
+            while some := rows.fetchmany(_ROWS_AT_ONCE):
+                yield np.stack([_unpacked(path.stem, index, body, dim) for index, body in some])
+
+        return int(is_blank.sum()), int((shows_nothing(blocks) & ~is_blank).sum())
+
+    return look_at(path, counted)
 
 
 def _cameras(db: Database) -> tuple[Camera, ...]:
@@ -422,6 +436,17 @@ def _cameras(db: Database) -> tuple[Camera, ...]:
 
 def _packed(encoding: NDArray[np.float32]) -> bytes:
     return encoding.astype("<f2" if is_halvable(encoding) else "<f4").tobytes()
+
+
+def _unpacked(name: str, frame_index: int, body: bytes | None, dim: int | None) -> NDArray[np.float32]:
+    """[d] of a frame of the traverse; raises DamagedFileError."""
+    dtype = _DTYPE_OF_BYTES.get(len(body or b"") / (dim or 1))  # a single number would be broadcast
+    if dtype is None:
+        raise DamagedFileError(
+            f"traverse {name} is damaged: the encoding of frame {frame_index} has another length; "
+            "delete it and upload it again"
+        )
+    return np.frombuffer(body or b"", dtype).astype(np.float32)
 
 
 def _count(db: Database) -> int:
