@@ -77,6 +77,11 @@ def test_bad_objects_are_named(client, objects, raw, word):
     assert word in problem(answer, 422, "invalid_scene")["detail"]
 
 
+def test_more_objects_than_a_body_may_hold_are_413(client, objects):
+    body = {"objects": [{"label": "a", "box": [0, 0, 1, 1]}] * 10_000}
+    assert problem(client.post(objects, json=body), 413, "body_too_large")["max_bytes"] < 300_000
+
+
 def test_forms_that_a_domain_does_not_take_are_415(client, objects):
     refused = problem(client.post(objects, content=b"a tree", headers=TEXT), 415, "unsupported_media_type")
     assert "text/plain" not in refused["allowed"]
