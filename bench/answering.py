@@ -18,7 +18,7 @@ from bench.worlds import (
     scattered_lists,
     standardised_map,
 )
-from deepsimbad.core.belief import FilterKind
+from deepsimbad.core.belief.particles import FilterKind
 from deepsimbad.core.descriptor import rank_landmarks
 from deepsimbad.core.index.retrieval import relevances, shortlist
 from deepsimbad.core.localizer import ActiveLocalizer, LocalizerConfig

@@ -7,7 +7,7 @@ import numpy as np
 
 from bench.link import BINARY, Link
 from bench.soak.actor import DOMAIN, N_LANDMARKS, Actor, expect
-from deepsimbad.core.belief import FilterKind
+from deepsimbad.core.belief.particles import FilterKind
 from deepsimbad.core.localizer import ActiveLocalizer, LocalizerConfig
 from deepsimbad.engine.localizer import RankedLandmarks, describe
 from deepsimbad.engine.maps import load_snapshot

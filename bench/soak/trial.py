@@ -17,7 +17,7 @@ from bench.soak.actor import Actor, expect, make_domain
 from bench.soak.mapper import Mapper
 from bench.soak.robot import Robot
 from bench.soak.uploader import Uploader
-from deepsimbad.core.belief import FilterKind
+from deepsimbad.core.belief.particles import FilterKind
 from deepsimbad_client.http.local_server import LocalServer
 
 N_ROBOTS, SHORT_SESSION = 4, 25

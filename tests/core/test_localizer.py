@@ -8,7 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from deepsimbad.core.belief import FilterKind, GridFilter, ViewEvidence
+from deepsimbad.core.belief.evidence import ViewEvidence
+from deepsimbad.core.belief.grid import GridFilter
+from deepsimbad.core.belief.particles import FilterKind
 from deepsimbad.core.building import MapPlan, build_from_dissimilarities, compose_map
 from deepsimbad.core.descriptor import rank_landmarks
 from deepsimbad.core.drive import Drive

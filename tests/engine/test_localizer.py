@@ -5,7 +5,7 @@ from statistics import NormalDist
 import numpy as np
 import pytest
 
-from deepsimbad.core.belief import TRUSTS
+from deepsimbad.core.belief.evidence import TRUSTS
 from deepsimbad.core.relevance import OTHER_LIKELIHOOD_SCALE, Relevance
 from deepsimbad.engine.localizer import Dissimilarities, RankedLandmarks, ReadyEncoding, describe, localize
 from deepsimbad.evaluators.feature_l2 import FeatureL2

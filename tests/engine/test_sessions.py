@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from deepsimbad.core.belief import FilterKind
+from deepsimbad.core.belief.particles import FilterKind
 from deepsimbad.core.localizer import ActiveLocalizer, LocalizerConfig
 from deepsimbad.core.map import Map
 from deepsimbad.core.relevance import Relevance

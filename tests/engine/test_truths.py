@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from deepsimbad.core.belief import FilterKind
+from deepsimbad.core.belief.particles import FilterKind
 from deepsimbad.core.route import Route
 from deepsimbad.engine import session as session_module
 from deepsimbad.engine.session import Observation

@@ -9,11 +9,11 @@ import pytest
 from click.testing import CliRunner
 
 from deepsimbad.cli import deepsimbad as commands
-from deepsimbad.core.belief import FilterKind, GridFilter
+from deepsimbad.core.belief.grid import GridFilter
+from deepsimbad.core.belief.particles import FilterKind, ParticleFilter
 from deepsimbad.core.building import MapPlan
 from deepsimbad.core.drive import Drive
 from deepsimbad.core.localizer import ActiveLocalizer, LocalizerConfig
-from deepsimbad.core.particles import ParticleFilter
 from deepsimbad.core.relevance import Relevance
 from deepsimbad.errors import InvalidMapConfigError
 from deepsimbad.jobs.build import build, measured, views_of

@@ -31,10 +31,10 @@ from deepsimbad.api.requests import (
     read_bytes,
 )
 from deepsimbad.api.scenes import MOST_PARTS, TOLD, TOLD_BODIES, TOLD_SCHEMA, scene_in
+from deepsimbad.core.belief.summary import DEFAULT_CONFIDENCE, BeliefSummary
 from deepsimbad.core.index.retrieval import relevances
 from deepsimbad.core.map import Map
 from deepsimbad.core.planners import Plan
-from deepsimbad.core.summary import DEFAULT_CONFIDENCE, BeliefSummary
 from deepsimbad.engine.localizer import (
     Dissimilarities,
     Localization,

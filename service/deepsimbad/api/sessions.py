@@ -55,9 +55,9 @@ from deepsimbad.api.requests import (
     read_json,
     robot_of,
 )
-from deepsimbad.core.belief import FilterKind
+from deepsimbad.core.belief.particles import FilterKind
+from deepsimbad.core.belief.summary import DEFAULT_CONFIDENCE
 from deepsimbad.core.relevance import UpdateRule
-from deepsimbad.core.summary import DEFAULT_CONFIDENCE
 from deepsimbad.engine.session import DEFAULT_START_STD_M, Observation, SessionConfig, SessionView
 from deepsimbad.engine.worker import Stopwatch
 from deepsimbad.errors import DeepSimbadError

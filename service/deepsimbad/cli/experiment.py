@@ -22,7 +22,7 @@ from deepsimbad.cli.terminal import (
     spacing_option,
     write_json,
 )
-from deepsimbad.core.belief import FilterKind
+from deepsimbad.core.belief.particles import FilterKind
 from deepsimbad.core.drive import Drive, SameRoute
 from deepsimbad.core.landmark_model import fitting_number
 from deepsimbad.core.metrics import RetrievalScores

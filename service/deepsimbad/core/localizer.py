@@ -10,19 +10,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from deepsimbad.core.belief import (
-    SIGMAS,
-    FilterKind,
-    GridFilter,
-    ViewEvidence,
-    motion_std_m,
-)
+from deepsimbad.core.belief.evidence import ViewEvidence
+from deepsimbad.core.belief.grid import GridFilter
+from deepsimbad.core.belief.motion import SIGMAS, motion_std_m
+from deepsimbad.core.belief.particles import DEFAULT_N_PARTICLES, BeliefFilter, FilterKind, ParticleFilter
+from deepsimbad.core.belief.summary import DEFAULT_CONFIDENCE, near_mode
 from deepsimbad.core.index.retrieval import relevances
 from deepsimbad.core.map import Map
-from deepsimbad.core.particles import DEFAULT_N_PARTICLES, BeliefFilter, ParticleFilter
 from deepsimbad.core.planners import DEFAULT_PLANNER, Plan, PlanningView, parse_planner
 from deepsimbad.core.relevance import LiveStatistics, Query, UpdateRule
-from deepsimbad.core.summary import DEFAULT_CONFIDENCE, near_mode
 
 _LEAST_TOLD = 0.01  # of the mass that a view moves elsewhere; with less it told nothing
 _STAGES = ("retrieve", "predict", "update", "plan")

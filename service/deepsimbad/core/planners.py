@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from deepsimbad.core.cells import SUMS
+from deepsimbad.core.belief.cells import SUMS
 from deepsimbad.core.index.retrieval import shortlist
 from deepsimbad.core.map import Map
 from deepsimbad.core.route import Route

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from deepsimbad.core.belief import moved_along
+from deepsimbad.core.belief.evidence import moved_along
 from deepsimbad.core.descriptor import normal_scores, rank_landmarks
 from deepsimbad.core.drive import SecondSeason
 from deepsimbad.core.index.retrieval import relevances

@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from deepsimbad.core.cells import SUMS, Cells
+from deepsimbad.core.belief.cells import SUMS, Cells
 from deepsimbad.errors import InvalidRouteError
 
 _NearPoint = Callable[[float, float], NDArray[np.intp]]

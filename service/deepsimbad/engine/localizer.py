@@ -6,7 +6,9 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from deepsimbad.core.belief import GridFilter, ViewEvidence
+from deepsimbad.core.belief.evidence import ViewEvidence
+from deepsimbad.core.belief.grid import GridFilter
+from deepsimbad.core.belief.summary import BeliefSummary, summarise
 from deepsimbad.core.building import MapPlan, compose_map
 from deepsimbad.core.descriptor import rank_landmarks, ranks_from_ranked_landmarks, unpack_ranked_landmarks
 from deepsimbad.core.drive import Drive
@@ -15,7 +17,6 @@ from deepsimbad.core.localizer import ActiveLocalizer, LocalizerConfig, Localize
 from deepsimbad.core.map import Map
 from deepsimbad.core.planners import Plan
 from deepsimbad.core.relevance import Query, Relevance
-from deepsimbad.core.summary import BeliefSummary, summarise
 from deepsimbad.engine.worker import EncodedImage, Stopwatch, encode_images
 from deepsimbad.errors import (
     InvalidDissimilaritiesError,

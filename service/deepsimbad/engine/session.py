@@ -15,14 +15,15 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from deepsimbad.core.belief import SIGMAS, FilterKind, motion_std_m
+from deepsimbad.core.belief.motion import SIGMAS, motion_std_m
+from deepsimbad.core.belief.particles import FilterKind
+from deepsimbad.core.belief.summary import DEFAULT_CONFIDENCE, BeliefSummary, summarise
 from deepsimbad.core.index.retrieval import shortlist
 from deepsimbad.core.localizer import ActiveLocalizer, LocalizerConfig, LocalizerState, Step
 from deepsimbad.core.map import Map
 from deepsimbad.core.planners import Plan
 from deepsimbad.core.relevance import Query, UpdateRule
 from deepsimbad.core.route import Route
-from deepsimbad.core.summary import DEFAULT_CONFIDENCE, BeliefSummary, summarise
 from deepsimbad.engine.localizer import View, shortlist_length
 from deepsimbad.engine.worker import InferenceWorker, Priority
 from deepsimbad.errors import (

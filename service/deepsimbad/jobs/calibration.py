@@ -11,14 +11,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from deepsimbad.core.belief import FilterKind
+from deepsimbad.core.belief.particles import BeliefFilter, FilterKind
+from deepsimbad.core.belief.summary import CONFIDENT_WITHIN_M, DEFAULT_CONFIDENCE, near_mode
 from deepsimbad.core.building import Built, MapPlan
 from deepsimbad.core.drive import Drive, SameRoute
 from deepsimbad.core.localizer import ActiveLocalizer, LocalizerConfig
-from deepsimbad.core.particles import BeliefFilter
 from deepsimbad.core.planners import CONSTANT
 from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Relevance
-from deepsimbad.core.summary import CONFIDENT_WITHIN_M, DEFAULT_CONFIDENCE, near_mode
 from deepsimbad.errors import InvalidMapConfigError, PastTheEndError
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.jobs.build import build, measured, views_of

@@ -11,11 +11,11 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from deepsimbad.core.belief.summary import CONFIDENT_WITHIN_M, DEFAULT_CONFIDENCE, near_mode
 from deepsimbad.core.localizer import ActiveLocalizer, LocalizerState, Step
 from deepsimbad.core.metrics import rank_of_truth
 from deepsimbad.core.relevance import Query
 from deepsimbad.core.route import Route
-from deepsimbad.core.summary import CONFIDENT_WITHIN_M, DEFAULT_CONFIDENCE, near_mode
 
 MOST_MOVES = 20
 PENALTY_VIEWS = 20

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from deepsimbad.core.belief import moved_along
+from deepsimbad.core.belief.evidence import moved_along
 from deepsimbad.core.index.retrieval import relevances
 from deepsimbad.core.localizer import ActiveLocalizer, LocalizerConfig, LocalizerState
 from deepsimbad.core.map import Map

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from deepsimbad.core.belief.summary import CONFIDENT_WITHIN_M
 from deepsimbad.core.building import MapPlan
 from deepsimbad.core.drive import Drive
 from deepsimbad.core.landmark_model import fitting_number
@@ -15,7 +16,6 @@ from deepsimbad.core.map import Map
 from deepsimbad.core.metrics import RetrievalScorer, RetrievalScores
 from deepsimbad.core.planners import CONSTANT
 from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Query
-from deepsimbad.core.summary import CONFIDENT_WITHIN_M
 from deepsimbad.errors import PastTheEndError
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.jobs.build import build, measured, views_of

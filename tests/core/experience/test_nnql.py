@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from deepsimbad.core.belief import GridFilter, ViewEvidence
+from deepsimbad.core.belief.evidence import ViewEvidence
+from deepsimbad.core.belief.grid import GridFilter
 from deepsimbad.core.experience.nnql import (
     KnownWalk,
     NnqlConfig,

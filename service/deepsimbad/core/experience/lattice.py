@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from deepsimbad.core.belief import move_error
+from deepsimbad.core.belief.motion import move_error
 from deepsimbad.core.route import Route
 
 _TAPS_AT_ONCE = 4

@@ -12,7 +12,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from deepsimbad.core.belief import GridFilter, ViewEvidence, motion_std_m
+from deepsimbad.core.belief.evidence import ViewEvidence
+from deepsimbad.core.belief.grid import GridFilter
+from deepsimbad.core.belief.motion import motion_std_m
 from deepsimbad.core.index.retrieval import relevances, shortlist
 from deepsimbad.core.map import Map
 from deepsimbad.core.metrics import rank_of_truth

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from deepsimbad.core.belief import motion_std_m
+from deepsimbad.core.belief.motion import motion_std_m
 from deepsimbad.core.experience.lattice import NO_MOVE, Lattice, Moves, moves_along, step_beliefs, uniform_beliefs
 from deepsimbad.core.experience.nnql import NnqlConfig, Transitions, initial_q_values, learn, q_of_nearest
 from deepsimbad.core.index.retrieval import relevances, shortlist

@@ -1,166 +1,38 @@
-"""The belief over the route (II-C): predicted by moves, updated by views, on a grid or by particles.
+"""The exact belief: masses of equal cells along the route.
 
-The robot is somewhere on the route or lost: off it, or anywhere on it after having been carried. Being lost is entered
-at a small rate a metre and left to anywhere, and how well the believed places explain a view, against the map on the
-whole, decides between the two.
-
-The grid has equal cells along the route (`core.cells`). A move shifts them all, and its error is one short row of
-weights, the same everywhere; a view is heard of at cells, between two map images as the way leads to the other.
-
-Views err alike where they are near each other, so a view counts by what it says beyond the one before, carried along by
-the move; this is generalised least squares for errors that are autoregressive along the route. And how far this season
-can be trusted nobody knows before: the belief is a mixture of three, which trust a view half, once and twice as much as
-was learnt, weighed by how well each has predicted the views so far (`mixture`, ours). The paper's updates have one.
+A move shifts them all, and its error is one short row of weights, the same everywhere; a view is heard of at cells,
+between two map images as the way leads to the other.
 """
 
 from dataclasses import dataclass, replace
-from enum import StrEnum
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import Self
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from deepsimbad.core.cells import SUMS
-from deepsimbad.core.relevance import UpdateRule, mean_ranks
+from deepsimbad.core.belief.cells import SUMS
+from deepsimbad.core.belief.evidence import (
+    LOST_AT_FIX,
+    LOST_AT_START,
+    Doubt,
+    ViewEvidence,
+    added,
+)
+from deepsimbad.core.belief.motion import (
+    LEAST_SURVIVING_SHARE,
+    SIGMAS,
+    check_ahead,
+    leaving_and_found,
+    mixed_error,
+    move_stds_m,
+)
+from deepsimbad.core.relevance import UpdateRule
 from deepsimbad.core.route import Route
-from deepsimbad.errors import PastTheEndError
 
-TRUSTS = (0.5, 1.0, 2.0)
-"""How much of the learnt log-likelihood each part of a mixture believes; each twice the one before."""
-
-PRIOR_TRUST = (0.2, 0.4, 0.4)
-"""How probable each is before anything was seen: few seasons are as bad as the least trust takes them for."""
-
-TRUSTS_OF = {rule: TRUSTS if rule is UpdateRule.MIXTURE else (1.0,) for rule in UpdateRule}
-
-LOST_AT_START, LOST_AT_FIX = 0.02, 0.005  # before anything was seen: anywhere, and where somebody said it is
-LOST_A_METRE = 0.0005
-FOUND_A_VIEW = 0.02  # of what is lost, spread over the route when the robot has moved
-LEAST_SURVIVING_SHARE = 1e-9  # of a belief before a move; with less it leads past the end wherever the robot may be
-_DOUBTING = 0.01  # a belief that takes the robot for lost by more refuses no move
-SIGMAS = 4.0  # a move's error is cut off here
-_AS_TOLD = 0.6  # of moves: how many err by no more than odometry says of itself
-_SLIPPING = 0.2  # of a move: how far off the others are, for a wheel slips or its size is not what it was
 _BLOCK = 1024  # cells whose sums stay in the first-level cache
 _NOTHING = 1e-300  # what a view leaves of a belief that it does not allow, or less
-_NARROW = 0.6  # cells; a narrower normal curve is not sampled, but has its variance all the same
-
-
-class FilterKind(StrEnum):
-    """The filters that exist."""
-
-    GRID = "grid"
-    PARTICLE = "particle"
-
-
-def motion_std_m(action_m: float) -> float:
-    """Standard deviation of a move whose odometry says nothing of its own error.
-
-    Independent errors add their variances: 0.1 m per square root of a metre, and 0.05 m for standing.
-    """
-    return float(np.sqrt(0.05**2 + 0.01 * abs(action_m)))
-
-
-def move_stds_m(action_m: float, action_std_m: float, doubt: "Doubt") -> dict[float, float]:
-    """Deviations of a move by how probable each is: a mixture takes some to be farther off than told.
-
-    Where odometry says of itself that it is more exact than usual, its moves slip less by as much.
-    """
-    if not doubt.is_mixture:
-        return {1.0: action_std_m}
-    slip_m = _SLIPPING * action_m * min(1.0, action_std_m / motion_std_m(action_m))
-    return {_AS_TOLD: action_std_m, 1 - _AS_TOLD: float(np.hypot(action_std_m, slip_m))}
-
-
-@dataclass(frozen=True)
-class ViewEvidence:
-    """What one view says of every map image."""
-
-    rule: UpdateRule
-    values: NDArray[np.float64]  # [n]; log-likelihoods but for a constant, mean 0, or what additive rules add
-    shared: float = 0.0  # c', how much of its error is that of the view before; of a first view nothing
-
-    @classmethod
-    def of(cls, relevance: NDArray[np.float32], rule: UpdateRule, scale: float, shared: float = 0.0) -> Self:
-        """Of a view's relevance [n], which counts `scale` times as a log-likelihood."""
-        if rule is UpdateRule.ADDITIVE_RELEVANCE:
-            return cls(rule, np.maximum(relevance, 0).astype(np.float64))
-        if rule is UpdateRule.ADDITIVE_RECIPROCAL_RANK:
-            return cls(rule, 1.0 / mean_ranks(relevance))
-        values = relevance.astype(np.float64)
-        return cls(rule, scale * (values - values.mean()), shared if rule is UpdateRule.MIXTURE else 0.0)
-
-    def news(self, last: NDArray[np.float64] | None) -> NDArray[np.float64]:
-        """[n] what it says beyond the last view's values, carried along; None: there was none."""
-        if last is None or self.shared == 0:
-            return self.values
-        return (self.values - self.shared * last) / (1 + self.shared)
-
-    def likelihood(self, news: NDArray[np.float64]) -> NDArray[np.float64]:
-        """[n] of the least trust, the greatest 1: whatever the relevances are, none overflows."""
-        return np.asarray(np.exp(TRUSTS_OF[self.rule][0] * (news - news.max())))
-
-    def least_told(self, news: NDArray[np.float64]) -> float:
-        """The mass that its news would at least have moved elsewhere where nothing was known, when it is small."""
-        return 0.0 if self.is_added else 0.5 * TRUSTS_OF[self.rule][0] * float(np.abs(news).mean())
-
-    @property
-    def is_added(self) -> bool:
-        """Whether it is added to weights, as in the paper, and does not multiply them."""
-        return self.rule in {UpdateRule.ADDITIVE_RELEVANCE, UpdateRule.ADDITIVE_RECIPROCAL_RANK}
-
-
-@dataclass(frozen=True)
-class Doubt:
-    """What every filter knows besides places."""
-
-    lost: NDArray[np.float64]  # [t] by trust, of what that trust believes
-    log_trust: NDArray[np.float64]  # [t] how well each has predicted the views so far
-    last: NDArray[np.float64] | None = None  # [n] values of the last view, where the robot would have seen them
-
-    @classmethod
-    def at_start(cls, rule: UpdateRule, lost: float) -> Self:
-        """Before any view, lost with this probability."""
-        n = len(TRUSTS_OF[rule])
-        return cls(np.full(n, lost), np.log(PRIOR_TRUST) if n > 1 else np.zeros(n))
-
-    @property
-    def is_mixture(self) -> bool:
-        """Whether being lost is entered and left; to the paper's updates it stays as likely as at the start."""
-        return self.lost.size > 1
-
-    @property
-    def trust(self) -> NDArray[np.float64]:
-        """[t] sums to 1."""
-        weight = np.exp(self.log_trust - self.log_trust.max())
-        return np.asarray(weight / weight.sum())
-
-    @property
-    def off_route(self) -> float:
-        """Probability of being lost."""
-        return float(self.trust @ self.lost)
-
-    def arrays(self) -> dict[str, NDArray[np.float64]]:
-        """All state."""
-        arrays = {"lost": self.lost, "log_trust": self.log_trust}
-        return arrays if self.last is None else {**arrays, "last": self.last}
-
-    @classmethod
-    def from_arrays(cls, arrays: dict[str, NDArray[np.float64]]) -> Self:
-        """Restore what `arrays` gave."""
-        return cls(arrays["lost"], arrays["log_trust"], arrays.get("last"))
-
-
-def moved_along(route: Route, values: NDArray[np.float64], action_m: float) -> NDArray[np.float64]:
-    """[n] values of map images, where a robot that moves sees them next; what lies before an open route is 0."""
-    if action_m == 0 or route.length_m == 0:
-        return values
-    from_m = route.wrapped(route.position_m - action_m)
-    if route.closed:
-        return np.interp(from_m, route.position_m, values, period=route.length_m)
-    return np.interp(from_m, route.position_m, values, left=0.0, right=0.0)
 
 
 @dataclass(frozen=True)
@@ -279,49 +151,6 @@ class GridFilter:
         return self.route.cells.of_places(values, self.offset_m)
 
 
-def check_ahead(
-    route: Route, doubt: Doubt, on_route: NDArray[np.float64], surviving: NDArray[np.float64], action_m: float
-) -> None:
-    """Raise PastTheEndError where a belief that does not take the robot for lost has nowhere to go."""
-    if (surviving > LEAST_SURVIVING_SHARE * on_route).any() or (doubt.is_mixture and doubt.off_route > _DOUBTING):
-        return
-    end_m, side = (float(route.position_m[-1]), "ends") if action_m > 0 else (route.start_m, "begins")
-    raise PastTheEndError(
-        f"no place of the belief has {abs(action_m):g} m of route {'before' if action_m > 0 else 'behind'} it; "
-        f"the route {side} at {end_m:g} m",
-        route_end_m=end_m,
-    )
-
-
-def leaving_and_found(
-    doubt: Doubt,
-    lost: NDArray[np.float64],
-    on_route: NDArray[np.float64],
-    surviving: NDArray[np.float64],
-    action_m: float,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """What is lost after a move, by what the masses that survived it are multiplied, and what is found anywhere; [t].
-
-    To the paper's updates a move past the end is impossible, and nobody is lost on the way.
-    """
-    if not doubt.is_mixture:
-        return lost, on_route / surviving, np.zeros_like(lost)
-    lost = lost + on_route - surviving
-    found = FOUND_A_VIEW * lost if action_m != 0 else np.zeros_like(lost)
-    leaving = 1 - np.exp(-LOST_A_METRE * abs(action_m))
-    return lost - found + leaving * surviving, np.full(lost.size, 1 - leaving), found
-
-
-def added(mass: NDArray[np.float64], seen: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Masses [m], summing to 1, after evidence that is added, as the paper adds `v[u_k]` to its particles' weights.
-
-    Weights are taken with mean 1 for that, so that the belief that knows nothing gives every hypothesis weight 1,
-    however many there are.
-    """
-    weights = mass * mass.size + seen
-    return np.asarray(weights / weights.sum(), np.float64)
-
-
 @njit(cache=True, nogil=True)
 def _trusted(log_trust: NDArray[np.float64], lost: NDArray[np.float64]) -> NDArray[np.float64]:
     """[t] by which masses of cells are believed, so that they sum to 1."""
@@ -419,25 +248,6 @@ def _multiplied(
         for i in range(powers.size):
             moved += abs(change[i])
     return after, moved
-
-
-def move_error(step_m: float, n_cells: int, std_m: float) -> NDArray[np.float64]:
-    """[2 w + 1] a move's normal error, from w cells of `step_m` behind to w ahead."""
-    deviation = std_m / step_m
-    if deviation < _NARROW:
-        half = deviation**2 / 2 if n_cells > 1 else 0.0
-        return np.array([half, 1 - 2 * half, half]) if half > 0 else np.ones(1)
-    reach = min(int(SIGMAS * deviation), n_cells - 1)
-    weights = np.exp(-0.5 * np.square(np.arange(-reach, reach + 1) / deviation))
-    return np.asarray(weights / weights.sum())
-
-
-@lru_cache(maxsize=64)  # robots make the same moves again and again
-def mixed_error(step_m: float, n_cells: int, *stds_m: tuple[float, float]) -> NDArray[np.float64]:
-    """[2 w + 1] as `move_error`, of deviations after how probable each is; not to be written to."""
-    errors = [share * move_error(step_m, n_cells, std_m) for share, std_m in stds_m]
-    widest = max(error.size for error in errors)
-    return np.asarray(np.sum([np.pad(error, (widest - error.size) // 2) for error in errors], axis=0), np.float64)
 
 
 @njit(cache=True, nogil=True, fastmath=SUMS)

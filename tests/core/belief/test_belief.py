@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 
-from deepsimbad.core.belief import FilterKind, GridFilter, ViewEvidence, motion_std_m
-from deepsimbad.core.particles import ParticleFilter
+from deepsimbad.core.belief.evidence import ViewEvidence
+from deepsimbad.core.belief.grid import GridFilter
+from deepsimbad.core.belief.motion import motion_std_m
+from deepsimbad.core.belief.particles import FilterKind, ParticleFilter
 from deepsimbad.core.relevance import UpdateRule
 from deepsimbad.core.route import Route
 from deepsimbad.errors import PastTheEndError

@@ -5,10 +5,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deepsimbad.core.belief import GridFilter, ViewEvidence
+from deepsimbad.core.belief.evidence import ViewEvidence
+from deepsimbad.core.belief.grid import GridFilter
+from deepsimbad.core.belief.summary import summarise
 from deepsimbad.core.relevance import UpdateRule
 from deepsimbad.core.route import Route
-from deepsimbad.core.summary import summarise
 
 
 @pytest.fixture

@@ -1,6 +1,7 @@
-"""The paper's particles (II-C): the belief of `core.belief` by hypotheses, in place of a mass for every map image."""
+"""The paper's particles (II-C): the belief by hypotheses, in place of a mass for every cell."""
 
 from dataclasses import dataclass, replace
+from enum import StrEnum
 from functools import cached_property
 from typing import Self, TypeAlias
 
@@ -8,19 +9,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from deepsimbad.core.belief import (
-    LOST_AT_FIX,
-    LOST_AT_START,
-    SIGMAS,
-    Doubt,
-    GridFilter,
-    ViewEvidence,
-    added,
-    check_ahead,
-    leaving_and_found,
-    move_stds_m,
-    moved_along,
-)
+from deepsimbad.core.belief.evidence import LOST_AT_FIX, LOST_AT_START, Doubt, ViewEvidence, added, moved_along
+from deepsimbad.core.belief.grid import GridFilter
+from deepsimbad.core.belief.motion import SIGMAS, check_ahead, leaving_and_found, move_stds_m
 from deepsimbad.core.relevance import UpdateRule
 from deepsimbad.core.route import Route
 
@@ -323,6 +314,13 @@ def _onto(route: Route, position_m: NDArray[np.float64]) -> NDArray[np.float64]:
     if route.closed and route.length_m > 0:
         return route.wrapped(position_m)
     return np.clip(position_m, route.start_m, route.position_m[-1])
+
+
+class FilterKind(StrEnum):
+    """The filters that exist."""
+
+    GRID = "grid"
+    PARTICLE = "particle"
 
 
 BeliefFilter: TypeAlias = GridFilter | ParticleFilter

@@ -1,0 +1,128 @@
+"""What a view says of places, and how far it is to be trusted; of both filters.
+
+The robot is somewhere on the route or lost: off it, or anywhere on it after having been carried. How well the believed
+places explain a view, against the map on the whole, decides between the two.
+
+Views err alike where they are near each other, so a view counts by what it says beyond the one before, carried along by
+the move; this is generalised least squares for errors that are autoregressive along the route. And how far this season
+can be trusted nobody knows before: the belief is a mixture of three, which trust a view half, once and twice as much as
+was learnt, weighed by how well each has predicted the views so far (`mixture`, ours). The paper's updates have one.
+"""
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deepsimbad.core.relevance import UpdateRule, mean_ranks
+from deepsimbad.core.route import Route
+
+TRUSTS = (0.5, 1.0, 2.0)
+"""How much of the learnt log-likelihood each part of a mixture believes; each twice the one before."""
+
+PRIOR_TRUST = (0.2, 0.4, 0.4)
+"""How probable each is before anything was seen: few seasons are as bad as the least trust takes them for."""
+
+TRUSTS_OF = {rule: TRUSTS if rule is UpdateRule.MIXTURE else (1.0,) for rule in UpdateRule}
+
+LOST_AT_START, LOST_AT_FIX = 0.02, 0.005  # before anything was seen: anywhere, and where somebody said it is
+
+
+@dataclass(frozen=True)
+class ViewEvidence:
+    """What one view says of every map image."""
+
+    rule: UpdateRule
+    values: NDArray[np.float64]  # [n]; log-likelihoods but for a constant, mean 0, or what additive rules add
+    shared: float = 0.0  # c', how much of its error is that of the view before; of a first view nothing
+
+    @classmethod
+    def of(cls, relevance: NDArray[np.float32], rule: UpdateRule, scale: float, shared: float = 0.0) -> Self:
+        """Of a view's relevance [n], which counts `scale` times as a log-likelihood."""
+        if rule is UpdateRule.ADDITIVE_RELEVANCE:
+            return cls(rule, np.maximum(relevance, 0).astype(np.float64))
+        if rule is UpdateRule.ADDITIVE_RECIPROCAL_RANK:
+            return cls(rule, 1.0 / mean_ranks(relevance))
+        values = relevance.astype(np.float64)
+        return cls(rule, scale * (values - values.mean()), shared if rule is UpdateRule.MIXTURE else 0.0)
+
+    def news(self, last: NDArray[np.float64] | None) -> NDArray[np.float64]:
+        """[n] what it says beyond the last view's values, carried along; None: there was none."""
+        if last is None or self.shared == 0:
+            return self.values
+        return (self.values - self.shared * last) / (1 + self.shared)
+
+    def likelihood(self, news: NDArray[np.float64]) -> NDArray[np.float64]:
+        """[n] of the least trust, the greatest 1: whatever the relevances are, none overflows."""
+        return np.asarray(np.exp(TRUSTS_OF[self.rule][0] * (news - news.max())))
+
+    def least_told(self, news: NDArray[np.float64]) -> float:
+        """The mass that its news would at least have moved elsewhere where nothing was known, when it is small."""
+        return 0.0 if self.is_added else 0.5 * TRUSTS_OF[self.rule][0] * float(np.abs(news).mean())
+
+    @property
+    def is_added(self) -> bool:
+        """Whether it is added to weights, as in the paper, and does not multiply them."""
+        return self.rule in {UpdateRule.ADDITIVE_RELEVANCE, UpdateRule.ADDITIVE_RECIPROCAL_RANK}
+
+
+@dataclass(frozen=True)
+class Doubt:
+    """What every filter knows besides places."""
+
+    lost: NDArray[np.float64]  # [t] by trust, of what that trust believes
+    log_trust: NDArray[np.float64]  # [t] how well each has predicted the views so far
+    last: NDArray[np.float64] | None = None  # [n] values of the last view, where the robot would have seen them
+
+    @classmethod
+    def at_start(cls, rule: UpdateRule, lost: float) -> Self:
+        """Before any view, lost with this probability."""
+        n = len(TRUSTS_OF[rule])
+        return cls(np.full(n, lost), np.log(PRIOR_TRUST) if n > 1 else np.zeros(n))
+
+    @property
+    def is_mixture(self) -> bool:
+        """Whether being lost is entered and left; to the paper's updates it stays as likely as at the start."""
+        return self.lost.size > 1
+
+    @property
+    def trust(self) -> NDArray[np.float64]:
+        """[t] sums to 1."""
+        weight = np.exp(self.log_trust - self.log_trust.max())
+        return np.asarray(weight / weight.sum())
+
+    @property
+    def off_route(self) -> float:
+        """Probability of being lost."""
+        return float(self.trust @ self.lost)
+
+    def arrays(self) -> dict[str, NDArray[np.float64]]:
+        """All state."""
+        arrays = {"lost": self.lost, "log_trust": self.log_trust}
+        return arrays if self.last is None else {**arrays, "last": self.last}
+
+    @classmethod
+    def from_arrays(cls, arrays: dict[str, NDArray[np.float64]]) -> Self:
+        """Restore what `arrays` gave."""
+        return cls(arrays["lost"], arrays["log_trust"], arrays.get("last"))
+
+
+def moved_along(route: Route, values: NDArray[np.float64], action_m: float) -> NDArray[np.float64]:
+    """[n] values of map images, where a robot that moves sees them next; what lies before an open route is 0."""
+    if action_m == 0 or route.length_m == 0:
+        return values
+    from_m = route.wrapped(route.position_m - action_m)
+    if route.closed:
+        return np.interp(from_m, route.position_m, values, period=route.length_m)
+    return np.interp(from_m, route.position_m, values, left=0.0, right=0.0)
+
+
+def added(mass: NDArray[np.float64], seen: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Masses [m], summing to 1, after evidence that is added, as the paper adds `v[u_k]` to its particles' weights.
+
+    Weights are taken with mean 1 for that, so that the belief that knows nothing gives every hypothesis weight 1,
+    however many there are.
+    """
+    weights = mass * mass.size + seen
+    return np.asarray(weights / weights.sum(), np.float64)
