@@ -317,6 +317,10 @@ class EvaluatorUnavailableError(UnavailableError, code="evaluator_unavailable"):
     """A domain's extractor that cannot be loaded: its weights or a package are missing, or memory is short."""
 
 
+class SessionMovedError(UnavailableError, code="session_moved"):
+    """A session that another node moved on at the same moment; nothing was counted."""
+
+
 class DamagedMapError(UnavailableError, code="damaged_map"):
     """A map file that fails its digest or cannot be read."""
 

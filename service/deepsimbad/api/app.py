@@ -7,10 +7,10 @@ import os
 import shutil
 import threading
 import time
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from concurrent.futures import TimeoutError as TookTooLong
 from contextlib import ExitStack, asynccontextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Literal
@@ -45,7 +45,10 @@ from deepsimbad.release import release
 from deepsimbad.settings import MEBIBYTE, Settings
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.durable import service_lock
+from deepsimbad.store.objects import Objects
+from deepsimbad.store.records import KeyRecord
 from deepsimbad.store.sessions import SessionRecord, SessionStore
+from deepsimbad.store.shared_sessions import SharedSessionStore
 
 router = APIRouter(tags=["health"])
 log = logging.getLogger(__name__)
@@ -64,12 +67,21 @@ _DESCRIPTION = (
 )
 
 
-def create_app(settings: Settings, run_job: RunJob | None = None) -> FastAPI:
+@dataclass(frozen=True)
+class Elsewhere:
+    """What a service that is one of several has from others, in the place of its own."""
+
+    keys: Callable[[], Sequence[KeyRecord]] | None = None  # reads them; None: the catalog does
+    sessions: Objects | None = None  # their journals are shared there; None: they are on this disk alone
+
+
+def create_app(settings: Settings, run_job: RunJob | None = None, elsewhere: Elsewhere | None = None) -> FastAPI:
     """The service as an ASGI application; its files are opened when it starts.
 
     Args:
         settings: All it is told; it reads no environment.
         run_job: Does jobs; None: each in a process of its own (decision 0011).
+        elsewhere: What others do for it; None: nothing.
     """
     if run_job is None:
         n_threads = job_threads(settings.job_threads)
@@ -82,7 +94,7 @@ def create_app(settings: Settings, run_job: RunJob | None = None) -> FastAPI:
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         with ExitStack() as parts:
             try:
-                services = await run_sync(_start, settings, metrics, keys, run_job, parts)
+                services = await run_sync(_start, settings, metrics, keys, run_job, elsewhere or Elsewhere(), parts)
             except DeepSimbadError as error:
                 app.state.startup_error = error  # the server only reports that there was one
                 raise
@@ -133,11 +145,13 @@ async def _sweep(services: Services) -> None:
             log.exception("expired sessions could not be ended")
 
 
-def _start(settings: Settings, metrics: Metrics, keys: KeyRing, run_job: RunJob, parts: ExitStack) -> Services:
+def _start(
+    settings: Settings, metrics: Metrics, keys: KeyRing, run_job: RunJob, elsewhere: Elsewhere, parts: ExitStack
+) -> Services:
     """Open everything; `parts` closes it again, last opened first."""
     parts.enter_context(service_lock(settings.data_dir, f"{settings.host}:{settings.port}"))
     catalog = parts.enter_context(Catalog.open(settings.data_dir))
-    keys.load(catalog.keys)
+    keys.load(elsewhere.keys or catalog.keys)
     settings.check_exposure(len(keys.by_id))
     try:
         for line in catalog.discard_unfinished():
@@ -155,7 +169,10 @@ def _start(settings: Settings, metrics: Metrics, keys: KeyRing, run_job: RunJob,
     worker = InferenceWorker(max_waiting=settings.max_queue, longest_wait_s=settings.encode_wait_ms / 1000)
     parts.callback(worker.close)
     worker.submit(warm_up).result()
-    store = parts.enter_context(SessionStore.open(settings.data_dir, metrics.committed))
+    shared, data_dir, committed = elsewhere.sessions, settings.data_dir, metrics.committed
+    store = parts.enter_context(
+        SharedSessionStore.sharing(shared, data_dir, committed) if shared else SessionStore.open(data_dir, committed)
+    )
     live = Sessions(
         store,
         maps_,

@@ -9,9 +9,11 @@ import socket
 import ssl
 import sys
 import time
+from collections.abc import Callable
 from functools import lru_cache
 from itertools import islice
 from types import FrameType
+from typing import Any
 
 import uvicorn
 from fastapi import FastAPI
@@ -134,34 +136,8 @@ class _Server(uvicorn.Server):
             await self.lifespan.shutdown()
 
 
-def serve(settings: Settings, create: bool = False) -> None:
-    """Serve until a signal ends it; requests under way are finished first.
-
-    Args:
-        settings: The settings.
-        create: Whether a data directory that is not there is made.
-
-    Raises:
-        SettingsError: It would be open to other machines, the data directory is not there, or TLS files are unusable.
-        DeepSimbadError: What kept it from starting, by name.
-    """
-    if not catalog_path(settings.data_dir).is_file():  # then there is no key, and no need to make the folder first
-        settings.check_exposure(n_keys=0)
-    if not (create or settings.data_dir.exists()):
-        raise SettingsError(
-            f"there is no data directory {settings.data_dir}: make it with `deepsimbad init` or `serve --create`, or "
-            "name another with --data-dir",
-            setting="data_dir",
-        )
-    configure_logging(settings.log_level)
-    changed = {  # none of them is a secret
-        name: getattr(settings, name)
-        for name, field in Settings.model_fields.items()
-        if name != "data_dir" and getattr(settings, name) != field.default
-    }
-    where = str(settings.data_dir.resolve())
-    log.info("starting", extra={"version": release(), "data_dir": where, "settings": changed})
-    app = create_app(settings)
+def http_config(app: Callable[..., Any], settings: Settings) -> uvicorn.Config:
+    """How an application of ASGI's is served over HTTP; raises SettingsError where the TLS files are unusable."""
     config = uvicorn.Config(
         app,
         host=settings.host,
@@ -190,6 +166,38 @@ def serve(settings: Settings, create: bool = False) -> None:
             f"files that can be read, belong together and need no passphrase: {error}",
             setting="tls_certificate",
         ) from error
+    return config
+
+
+def serve(settings: Settings, create: bool = False) -> None:
+    """Serve until a signal ends it; requests under way are finished first.
+
+    Args:
+        settings: The settings.
+        create: Whether a data directory that is not there is made.
+
+    Raises:
+        SettingsError: It would be open to other machines, the data directory is not there, or TLS files are unusable.
+        DeepSimbadError: What kept it from starting, by name.
+    """
+    if not catalog_path(settings.data_dir).is_file():  # then there is no key, and no need to make the folder first
+        settings.check_exposure(n_keys=0)
+    if not (create or settings.data_dir.exists()):
+        raise SettingsError(
+            f"there is no data directory {settings.data_dir}: make it with `deepsimbad init` or `serve --create`, or "
+            "name another with --data-dir",
+            setting="data_dir",
+        )
+    configure_logging(settings.log_level)
+    changed = {  # none of them is a secret
+        name: getattr(settings, name)
+        for name, field in Settings.model_fields.items()
+        if name != "data_dir" and getattr(settings, name) != field.default
+    }
+    where = str(settings.data_dir.resolve())
+    log.info("starting", extra={"version": release(), "data_dir": where, "settings": changed})
+    app = create_app(settings)
+    config = http_config(app, settings)
 
     def is_news(record: logging.LogRecord) -> bool:
         """Whoever called gets the named error; its stack in the log would only hide it."""

@@ -4,6 +4,7 @@ Live and after a restart it is moved on by the same function, so a journal leads
 """
 
 import asyncio
+import hashlib
 import math
 from collections.abc import Awaitable, Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -49,6 +50,12 @@ _SLACK_STDS = 3.0  # a prior may lie beyond the route by so many of its deviatio
 _LARGEST_STD_M = 1e6
 _ROWS_AT_ONCE = 64  # of a journal in memory: 130 kB with 500 landmarks
 _PIECE_S = 0.01  # a live view waits no longer for a replay than this and one step
+DOMAIN_DIGITS = 8  # of a session's id
+
+
+def domain_digits(domain: str) -> str:
+    """The digits that tell a domain in the ids of its sessions, so that who has an id knows whom to ask."""
+    return hashlib.sha256(domain.encode("utf-8", "surrogatepass")).hexdigest()[:DOMAIN_DIGITS]
 
 
 @dataclass(frozen=True)

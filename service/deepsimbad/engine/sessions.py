@@ -27,6 +27,7 @@ from deepsimbad.engine.session import (
     SessionState,
     SessionView,
     check_prior,
+    domain_digits,
     replayed_until,
     view_of,
 )
@@ -120,11 +121,14 @@ class Sessions:
             IdempotencyKeyReusedError: A session of that id was begun with another configuration.
             EndedSessionError: The session of that id has ended.
         """
+        digits = domain_digits(active.record.name)
         if session_id is not None:
+            session_id = digits + session_id[len(digits) :]
             with suppress(UnknownSessionError):
                 return await self._begun_before(session_id, config)
         check_prior(active.snapshot.route, config.start_position_m, config.start_std_m)
-        return await self._finished(self._begin(active, config, session_id or secrets.token_hex(16), key_id))
+        session_id = session_id or digits + secrets.token_hex(12)
+        return await self._finished(self._begin(active, config, session_id, key_id))
 
     async def observe(
         self, session_id: str, observation: Observation, watch: Stopwatch | None = None, key_id: str | None = None
@@ -286,11 +290,23 @@ class Sessions:
             live = self._living.setdefault(session_id, LiveSession(record, record.expires_at))  # begun this moment
         if key_id is not None:
             check_owner(live.record, key_id)
+        if self._store.shares:
+            async with live.lock:
+                self._heed(live, await asyncio.to_thread(self._store.catch_up, session_id))
         if self._clock() >= live.expires_at and not live.lock.locked():
             await self._end(live, EXPIRED)
         if live.ending is not None:
             raise _ended(session_id, live.ending)
         return live
+
+    def _heed(self, live: LiveSession, record: SessionRecord) -> None:
+        """Forget what was believed of a session that another node has moved on or ended."""
+        live.expires_at = record.expires_at
+        if live.state is not None and live.state.sequence != record.n_events:
+            live.state = None
+        if record.ending is not None:
+            live.ending, live.state = record.ending, None
+            self._living.pop(record.session_id, None)
 
     async def _read(self, session_id: str, key_id: str | None) -> tuple[LiveSession, SessionState]:
         live = await self._find(session_id, key_id)
@@ -459,8 +475,7 @@ class Sessions:
             if live.ending is not None:
                 raise _ended(live.record.session_id, live.ending)
             await asyncio.wrap_future(self._store.end(live.record.number, ending, self._clock()))
-            live.ending, live.state = ending, None
-            self._living.pop(live.record.session_id, None)
+            self._heed(live, await asyncio.to_thread(self._store.find, live.record.session_id))
 
     async def _expire(self) -> None:
         for live in list(self._living.values()):

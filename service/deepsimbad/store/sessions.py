@@ -29,7 +29,11 @@ _SELECT = """
       ON latest.session = session.number
      AND latest.sequence = (SELECT max(sequence) FROM journal WHERE session = session.number)
 """
-_INSERT_ROW = """
+INSERT_SESSION = """
+    INSERT INTO session (session_id, domain, map_version, map_sha256, config, created_at, expires_at, key_id)
+    VALUES (?, ?, ?, ?, ?, ?, ?, ?)
+"""
+INSERT_ROW = """
     INSERT INTO journal (session, sequence, kind, written_at, expires_at, idempotency_key, request_digest,
                          action_m, action_std_m, ranks, dissimilarities, encoding, position_m, std_m)
     VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)
@@ -118,6 +122,8 @@ class SessionStore(OpenFile):
     done. Every method, and every future, raises UnavailableError or DamagedFileError where the file cannot be used.
     """
 
+    shares = False  # whether other nodes may have moved a session on
+
     def __init__(self, path: Path, db: Database, on_commit: Callable[[int], None]) -> None:
         super().__init__(path, db, open_database(path))
         self._commits = GroupCommit(self._writing, on_commit)
@@ -156,17 +162,7 @@ class SessionStore(OpenFile):
         """Keep a new session; answers with the number that it got, or the session that has this id already."""
 
         def write(db: Database) -> SessionRecord:
-            db.execute(
-                """
-                INSERT INTO session
-                    (session_id, domain, map_version, map_sha256, config, created_at, expires_at, key_id)
-                VALUES (?, ?, ?, ?, ?, ?, ?, ?) ON CONFLICT (session_id) DO NOTHING
-                """,
-                [
-                    *(record.session_id, record.domain, record.map_version, record.map_sha256),
-                    *(to_json(record.config), record.created_at, record.expires_at, record.key_id),
-                ],
-            )
+            db.conn.execute(f"{INSERT_SESSION} ON CONFLICT (session_id) DO NOTHING", session_columns(record))
             return _get(db, record.session_id)
 
         return self._commits.submit(write)
@@ -175,6 +171,10 @@ class SessionStore(OpenFile):
         """One session, living or ended; raises UnknownSessionError."""
         with self._reading() as db:
             return _get(db, session_id)
+
+    def catch_up(self, session_id: str) -> SessionRecord:
+        """A session, with what other nodes have written since; the caller sees to it that nobody moves it on here."""
+        return self.find(session_id)
 
     def living(self) -> list[SessionRecord]:
         """Every session that has not ended, oldest first."""
@@ -260,7 +260,7 @@ class SessionStore(OpenFile):
         """
 
         def write(db: Database) -> None:
-            db.conn.execute(_INSERT_ROW, (number, row.sequence, *_columns(row, written_at)))
+            db.conn.execute(INSERT_ROW, (number, row.sequence, *columns_of(row, written_at)))
             if snapshot is None:
                 return
             db.execute("DELETE FROM snapshot WHERE session = ?", [number])
@@ -370,8 +370,16 @@ def _true_positions(db: Database, number: int) -> NDArray[np.float64] | None:
     return None if row is None else np.frombuffer(row[0], "<f8")
 
 
-def _columns(row: JournalRow, written_at: float) -> tuple[Any, ...]:
-    """A row from its kind on, as `_INSERT_ROW` takes it."""
+def session_columns(record: SessionRecord) -> tuple[Any, ...]:
+    """A new session as `INSERT_SESSION` takes it."""
+    return (
+        *(record.session_id, record.domain, record.map_version, record.map_sha256),
+        *(to_json(record.config), record.created_at, record.expires_at, record.key_id),
+    )
+
+
+def columns_of(row: JournalRow, written_at: float) -> tuple[Any, ...]:
+    """A row from its kind on, as `INSERT_ROW` takes it."""
     if isinstance(row, PriorRow):
         return ("prior", written_at, row.expires_at, *[None] * 7, row.position_m, row.std_m)
     # Twice the ranks, which are whole or half numbers: 2 bytes each where they fit.

@@ -1,0 +1,119 @@
+"""Two services with the same maps, and the journals of their sessions in one place: any goes on where another was."""
+
+import shutil
+import time
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager
+
+import numpy as np
+import pytest
+
+from deepsimbad.api.app import Elsewhere, create_app
+from deepsimbad.jobs.runner import InThisProcess
+from deepsimbad.store.objects import Objects
+from tests.contract.conftest import N_LANDMARKS, Client, path_of, problem, service, small_settings
+
+pytest.importorskip("obstore", reason="the extra `objects` is not installed")
+
+
+@contextmanager
+def node(data_dir, url, **settings):
+    shared = Elsewhere(sessions=Objects.open(url))
+    app = create_app(small_settings(data_dir, **settings), InThisProcess(data_dir), shared)
+    with Client(app, raise_server_exceptions=False) as client:
+        yield client
+
+
+@pytest.fixture(scope="module")
+def mapped(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("mapped") / "data"
+    with service(folder) as client:
+        client.make_ready_domain("ready")
+    return folder
+
+
+@pytest.fixture
+def nodes(mapped, tmp_path):
+    """Makes a node of a given name, each with its own copy of the map."""
+    with ExitStack() as running:
+
+        def make(name, **settings):
+            shutil.copytree(mapped, tmp_path / name, dirs_exist_ok=True)
+            return running.enter_context(node(tmp_path / name, f"file://{tmp_path}/shared", **settings))
+
+        yield make
+
+
+def ranks(seed):
+    return {"ranked_landmarks": np.random.default_rng(seed).permutation(N_LANDMARKS).tolist()}
+
+
+def observe(client, path, seed, **headers):
+    answer = client.post(f"{path}/observations?action_m=2", json=ranks(seed), headers=headers)
+    assert answer.status_code == 200, answer.text
+    return answer.json()
+
+
+def told(answer):
+    """What does not depend on when it was asked, and of whom."""
+    return {name: answer[name] for name in ("n_observations", "belief", "next_best_view", "map_version")}
+
+
+def test_a_session_goes_on_anywhere_with_the_answers_of_one_service(nodes, mapped, tmp_path):
+    shutil.copytree(mapped, tmp_path / "plain")
+    with service(tmp_path / "plain") as plain:
+        alone = plain.session(seed=3)
+        expected = [told(observe(plain, alone, seed)) for seed in range(8)]
+    one, other = nodes("one"), nodes("other")
+    path = one.session(seed=3)
+    for seed, wanted in enumerate(expected):
+        here, there = (one, other) if seed % 3 else (other, one)
+        assert told(observe(here, path, seed)) == wanted
+        assert told(there.get(path).json()) == wanted
+    assert told(nodes("third").get(path).json()) == expected[-1]
+
+
+def test_what_was_counted_elsewhere_counts_once(nodes):
+    one, other = nodes("one"), nodes("other")
+    begun = one.post("/v1/domains/ready/sessions", json={}, headers={"Idempotency-Key": "a"}).json()
+    again = other.post("/v1/domains/ready/sessions", json={}, headers={"Idempotency-Key": "a"})
+    assert (again.status_code, again.json()["session_id"]) == (201, begun["session_id"])
+    path = path_of(begun)
+    first = observe(one, path, 1, **{"Idempotency-Key": "b"})
+    assert told(observe(other, path, 1, **{"Idempotency-Key": "b"})) == told(first)
+    assert other.get(path).json()["n_observations"] == 1
+
+
+def test_the_end_is_the_end_everywhere(nodes):
+    one, other = nodes("one"), nodes("other", session_ttl_s=30)
+    path, brief = one.session(), other.session()
+    observe(other, path, 1)
+    assert one.delete(path).status_code == 204
+    problem(other.get(path), 410, "ended_session")
+    problem(other.delete(path), 410, "ended_session")
+    problem(nodes("third").post(f"{path}/observations", json=ranks(1)), 410, "ended_session")
+    observe(one, brief, 1)  # lives as long as one's sessions do from now on, whatever the other believed
+    other.services.sessions._clock = lambda: time.time() + 60
+    assert told(other.get(brief).json()) == told(one.get(brief).json())
+    one.services.sessions._clock = lambda: time.time() + 4000
+    problem(one.get(brief), 410, "ended_session")
+    problem(other.get(brief), 410, "ended_session")
+    problem(one.get(f"/v1/sessions/{'0' * 32}"), 404, "unknown_session")
+
+
+def test_of_two_at_once_each_counts_or_is_told(nodes):
+    one, other = nodes("one"), nodes("other")
+    path = one.session()
+    with ThreadPoolExecutor(2) as robots:
+        for seed in range(10):
+            both = [
+                robots.submit(client.post, f"{path}/observations?action_m=2", json=ranks(seed))
+                for client in (one, other)
+            ]
+            for answer in both:
+                if answer.result().status_code != 200:
+                    document = problem(answer.result(), 503, "session_moved")
+                    assert answer.result().headers["retry-after"] == "1", document
+    n_counted = one.get(path).json()["n_observations"]
+    assert 10 <= n_counted <= 20
+    assert told(one.get(path).json()) == told(other.get(path).json()) == told(nodes("third").get(path).json())
