@@ -87,8 +87,10 @@ class Settings(BaseSettings):
     """Job event streams open at once."""
     max_connections: PositiveInt = 1024
     """Connections, or requests, open at once; with one more all are answered 503."""
-    max_domains: PositiveInt = 1000
+    max_domains: PositiveInt = 100_000
     """Domains that may exist."""
+    map_cache_bytes: PositiveInt = 1024 * MEBIBYTE
+    """Active maps held in memory, in bytes of their arrays; those asked longest ago give way, and are read again."""
     rate_limit_per_s: NonNegativeFloat = 200.0
     """Requests a second that one key may send, in the long run; 0: any number."""
     rate_limit_burst: PositiveInt = 400

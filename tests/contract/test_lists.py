@@ -118,3 +118,17 @@ def test_a_cursor_or_limit_that_cannot_be(client, path):
         for value in values:
             answer = client.get(path, params={name: value})
             assert name in problem(answer, 422, "invalid_request")["detail"], value
+
+
+@OF_FULL
+def test_domains_come_in_pages_by_name(client):
+    whole = page(client, "/v1/domains")
+    names = [domain["name"] for domain in whole["domains"]]
+    assert whole["next"] is None
+    assert names == sorted(names)
+    assert {"full", "ready"} <= set(names)
+    for limit in (1, 2, 1000):
+        assert entries(client, "/v1/domains", "domains", limit) == whole["domains"]
+    assert [domain["name"] for domain in page(client, "/v1/domains", limit=1, after="domains-full0")["domains"]] == [
+        next(name for name in names if name > "full0")
+    ]

@@ -268,3 +268,58 @@ def test_where_sessions_cannot_be_read_nothing_is_removed_and_nobody_stopped(
         assert retention_of(live).prune() == 0
         assert "old maps could not be looked for" in caplog.text
     assert with_files(mapped) == [1, 2, 3]
+
+
+# How many are in memory
+
+
+def test_maps_that_were_asked_longest_ago_give_way_and_are_read_again(catalog: Catalog, clock: Clock) -> None:
+    names = ("d", "e", "f")
+    for name in names:
+        add_domain(catalog, name)
+        add_map(catalog, name)
+    n_bytes = Maps(catalog).active("d").snapshot.n_bytes
+    maps = Maps(catalog, clock, cache_bytes=2 * n_bytes + n_bytes // 2)
+    assert maps.load_all() == []
+    assert (maps.n_loaded, maps.n_bytes) == (2, 2 * n_bytes), "a start loads what has room"
+    for name in names:
+        held = maps.active(name).snapshot
+        assert maps.active("d").snapshot.domain == "d", "who is asked stays"
+    assert [mapped.record.name for mapped in maps.loaded()] == ["d", "f"]
+    assert maps.n_bytes == 2 * n_bytes
+    maps.active("e")
+    maps.active("d")
+    assert maps.active("f").snapshot is held, "a map that somebody holds is not read again"
+    maps.forget("f")
+    assert (maps.n_loaded, maps.n_bytes) == (1, n_bytes)
+    tiny = Maps(catalog, clock, cache_bytes=1)
+    assert tiny.active("d").snapshot is tiny.active("d").snapshot, "one always has room"
+    tiny.active("e")
+    assert tiny.n_loaded == 1
+
+
+def test_a_cold_map_is_read_once_however_many_ask_for_it(mapped: Catalog, monkeypatch: pytest.MonkeyPatch) -> None:
+    maps, n_read, everybody = Maps(mapped), [], threading.Barrier(8)
+    read = maps_module.read_map
+    monkeypatch.setattr(maps_module, "read_map", lambda path: n_read.append(path) or read(path))
+    snapshots = []
+
+    def ask() -> None:
+        everybody.wait()
+        snapshots.append(maps.active("d").snapshot)
+
+    threads = [threading.Thread(target=ask) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(n_read) == 1
+    assert len({id(snapshot) for snapshot in snapshots}) == 1
+
+
+def test_a_start_stops_loading_when_its_time_is_up(mapped: Catalog, clock: Clock) -> None:
+    add_domain(mapped, "e")
+    add_map(mapped, "e")
+    maps = Maps(mapped, lambda: clock() + 10 * maps.n_loaded)
+    assert maps.load_all(within_s=5.0) == []
+    assert maps.n_loaded == 1

@@ -24,7 +24,6 @@ from deepsimbad_client.http import (
     model_of,
     observation,
     once,
-    page_of,
     session_path,
 )
 from deepsimbad_client.http.admin import Admin, AsyncAdmin
@@ -250,7 +249,7 @@ class ClientCalls(Face, Generic[AnySession]):
     @shared
     async def domains(self) -> tuple[Domain, ...]:
         """Every domain."""
-        return page_of(Domain, "domains", await self._wire.send(Call("GET", "/v1/domains")))[0]
+        return await self._wire.model_list(Domain, "domains", "/v1/domains")
 
     @shared
     async def domain(self, name: str) -> Domain:

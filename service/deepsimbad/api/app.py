@@ -56,6 +56,7 @@ log = logging.getLogger(__name__)
 LEAST_FREE_BYTES = 16 * MEBIBYTE  # with less, the next map or the write-ahead log may not fit
 TRUSTED_S = 1.0  # anybody may ask whether it is ready, and every look writes to the disk
 _WRITE_TIMEOUT_S = 2.0
+_LOADING_S = 1.0  # that a start spends on maps; what is left is loaded when it is asked for
 _ROUTERS = (  # routes are tried in this order: those that robots ask come first
     *(sessions.router, localizations.router, router, domains.router, domains.admin),
     *(traverses.router, frames.router, jobs.making, jobs.router, maps.router, sessions.listing),
@@ -133,7 +134,7 @@ async def _sweep(services: Services) -> None:
         try:
             await services.sessions.sweep()
             # A command beside the service may have deleted domains.
-            domain_names = {record.name for record in await run_sync(services.catalog.domains)}
+            domain_names = await run_sync(services.catalog.domain_names)
 
             def is_over(session: SessionRecord, domain_names: set[str] = domain_names) -> bool:
                 has_no_key = session.key_id is not None and not services.keys.still_opens(session.key_id)
@@ -163,9 +164,9 @@ def _start(
     if (missing := fallback()) is not None:
         log.warning("the default network is not installed", extra={"why": missing})
     evaluators = EvaluatorPool(settings.compute())
-    evaluators.load_all({record.name: record.evaluator for record in catalog.domains()})
-    maps_ = Maps(catalog)
-    damaged = maps_.load_all()
+    evaluators.load_all(catalog.evaluators())
+    maps_ = Maps(catalog, cache_bytes=settings.map_cache_bytes)
+    damaged = maps_.load_all(_LOADING_S)
     worker = InferenceWorker(max_waiting=settings.max_queue, longest_wait_s=settings.encode_wait_ms / 1000)
     parts.callback(worker.close)
     worker.submit(warm_up).result()
@@ -212,7 +213,7 @@ def _start(
         log.warning("runs open: no key was ever created, so whoever reaches this address may do all", extra=exposure)
     else:
         log.info("asks for keys", extra=exposure)
-    counts = {"n_domains": len(catalog.domains()), "n_maps": maps_.n_loaded, "n_sessions": live.n_living}
+    counts = {"n_domains": catalog.n_domains, "n_maps": maps_.n_loaded, "n_sessions": live.n_living}
     log.info("opened", extra={**counts, "damaged": damaged})
     return Services(
         settings=settings,

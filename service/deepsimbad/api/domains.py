@@ -1,6 +1,7 @@
 """Domains: what there are, making and removing them, the landmarks of their maps."""
 
 import logging
+from contextlib import suppress
 from http import HTTPStatus
 from typing import Annotated, Any, Self
 
@@ -10,7 +11,21 @@ from pydantic import Field, model_validator
 
 from deepsimbad.api.geopose import AnchorBody
 from deepsimbad.api.problems import binary, declare_json, problems
-from deepsimbad.api.requests import BINARY, GREATEST_ID, KEPT, Answer, DomainName, JsonBody, Running, names, read_json
+from deepsimbad.api.requests import (
+    BINARY,
+    GREATEST_ID,
+    KEPT,
+    NAME_PATTERN,
+    Answer,
+    DomainName,
+    JsonBody,
+    Next,
+    Page,
+    Running,
+    names,
+    page_of,
+    read_json,
+)
 from deepsimbad.core.map import DEFAULT_ACTIONS_M, MOST_ACTION_M, check_actions
 from deepsimbad.engine.maps import Maps
 from deepsimbad.engine.worker import EvaluatorPool, ready
@@ -107,10 +122,14 @@ class DomainAnswer(Answer):
     ]
 
 
+DomainPage = Annotated[Page, page_of("domains", NAME_PATTERN.removeprefix("^"), 1000)]
+
+
 class DomainList(Answer):
-    """All domains, by name."""
+    """Domains by name."""
 
     domains: list[DomainAnswer]
+    next: Next
 
 
 def describe_domain(record: DomainRecord, evaluators: EvaluatorPool, maps: Maps) -> DomainAnswer:
@@ -159,21 +178,19 @@ def describe_domain(record: DomainRecord, evaluators: EvaluatorPool, maps: Maps)
 # Handlers
 
 
-@router.get("", responses=problems())
-async def list_domains(request: Request, running: Running) -> DomainList:
-    """All domains, by name."""
+@router.get("", responses=problems(422))
+async def list_domains(request: Request, running: Running, page: DomainPage) -> DomainList:
+    """All domains, by name, a thousand an answer; of cold ones the maps are read."""
     opened = request.scope["state"].get("domains")  # to this key; None: all
 
     def described() -> DomainList:
-        answers = []
-        for record in running.catalog.domains():
+        answers, listed = [], running.catalog.domain_page(page.key, page.limit)
+        for record in listed.records:
             if opened is not None and record.name not in opened:
                 continue
-            try:
+            with suppress(UnknownDomainError):  # deleted since it was listed
                 answers.append(describe_domain(record, running.evaluators, running.maps))
-            except UnknownDomainError:  # deleted since it was listed
-                continue
-        return DomainList(domains=answers)
+        return DomainList(domains=answers, next=page.next(listed.last_key))
 
     return await run_sync(described)
 
@@ -269,7 +286,7 @@ async def delete_domain(domain: DomainName, running: Running) -> None:
     try:
         await run_sync(running.catalog.delete_domain, domain)
     finally:  # where only its folder could not be removed, the domain is gone all the same
-        if domain not in {record.name for record in await run_sync(running.catalog.domains)}:
+        if domain not in await run_sync(running.catalog.domain_names):
             running.maps.forget(domain)
             await running.sessions.end_those(lambda session: session.domain == domain)
             running.metrics.forget_domain(domain)

@@ -34,7 +34,7 @@ from deepsimbad.errors import DeepSimbadError
 from deepsimbad.jobs.runner import REMAP
 from deepsimbad.release import release
 from deepsimbad.store.catalog import Catalog
-from deepsimbad.store.records import DomainRecord, JobRecord, JobState, MapRecord
+from deepsimbad.store.records import JobRecord, JobState, MapRecord
 
 # A gauge beside every counter that says when it began: nobody asks.
 disable_created_metrics()  # type: ignore[no-untyped-call]
@@ -161,23 +161,23 @@ class StateCollector(Collector):
     _faults: Callable[[], Sequence[str]]
     _worker: InferenceWorker
     _sessions: Sessions
-    _domains: Sequence[DomainRecord] | None = None
+    _n_domains: int | None = None
     _jobs: Sequence[JobRecord] = ()
     _serving: Mapping[str, MapRecord] = field(default_factory=dict)
 
     def look(self) -> set[str] | None:
         """Read the catalog for the next `collect`; the names of its domains, None where it cannot be read."""
         try:
-            domains, self._jobs = self._catalog.domains(), self._catalog.jobs()
-            versions = {domain.name: domain.active_version for domain in domains}
-            self._serving = {
-                name: self._catalog.map(name, version) for name, version in versions.items() if version is not None
-            }
+            domains, self._jobs = self._catalog.domain_names(), self._catalog.jobs()
+            # Of a hundred thousand domains nobody could take in the series: those that are asked have them.
+            damaged = self._maps.damaged()  # asked first: one that is back is in memory then
+            shown = {mapped.record.name for mapped in self._maps.loaded()} | damaged.keys()
+            self._serving = self._catalog.serving_maps(shown & domains)
         except DeepSimbadError:  # `deepsimbad_ready` tells; what needs no catalog is shown all the same
-            self._domains = None
+            self._n_domains = None
             return None
-        self._domains = domains
-        return set(versions)
+        self._n_domains = len(domains)
+        return domains
 
     def collect(self) -> Iterator[GaugeMetricFamily]:
         """Every family."""
@@ -191,8 +191,9 @@ class StateCollector(Collector):
             usage = shutil.disk_usage(self._catalog.data_dir)
             yield _gauge("data_dir_free_bytes", "Free where the data directory lies.", {(): usage.free})
             yield _gauge("data_dir_size_bytes", "Size of the disk it lies on.", {(): usage.total})
-        if self._domains is not None:
-            yield _gauge("domains", "Domains there are.", {(): len(self._domains)})
+        yield _gauge("loaded_map_bytes", "Bytes of their arrays.", {(): self._maps.n_bytes})
+        if self._n_domains is not None:
+            yield _gauge("domains", "Domains there are.", {(): self._n_domains})
             yield from self._of_maps()
             yield from self._of_jobs()
 

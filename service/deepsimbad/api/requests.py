@@ -235,12 +235,12 @@ class Page(NamedTuple):
         return None if last_key is None else f"{self.list_name}-{last_key}"
 
 
-def page_of(list_name: str, key_pattern: str = "[0-9]{1,18}$") -> Any:
-    """The parameters `limit` and `after` of a list, as a `Page`."""
+def page_of(list_name: str, key_pattern: str = "[0-9]{1,18}$", usual: int = 100) -> Any:
+    """The parameters `limit`, usually so many, and `after` of a list, as a `Page`."""
     cursor = f"^{list_name}-{key_pattern}"
 
     async def page(
-        limit: Annotated[int, Query(ge=1, le=1000, description="Most entries of the answer.")] = 100,
+        limit: Annotated[int, Query(ge=1, le=1000, description="Most entries of the answer.")] = usual,
         after: Annotated[
             str | None, Query(pattern=cursor, description="`next` of the page before; absent: the first page.")
         ] = None,

@@ -263,6 +263,11 @@ class Map:
         return int(self.config["n_landmarks"])
 
     @cached_property
+    def n_bytes(self) -> int:
+        """What its arrays take in memory; what is worked out from them takes about as much as theirs of images."""
+        return sum(array.nbytes for array in (*self.arrays().values(), *self.landmark_model.values()))
+
+    @cached_property
     def relevance(self) -> Relevance:
         """What it was built for; raises KeyError or ValueError where its configuration names none that exists."""
         return Relevance(self.config["relevance"])

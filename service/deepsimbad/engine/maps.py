@@ -1,11 +1,12 @@
 """Map versions in memory: those that serve, those that sessions are pinned to, and which old files are kept."""
 
 import logging
+import math
 import threading
 import time
-from collections import Counter
+from collections import Counter, OrderedDict
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from itertools import groupby
 from weakref import WeakValueDictionary
@@ -25,11 +26,13 @@ from deepsimbad.errors import (
 from deepsimbad.store.catalog import Catalog, removed
 from deepsimbad.store.durable import storage_faults
 from deepsimbad.store.map_file import read_map, verify
-from deepsimbad.store.records import DomainRecord, KeptMap, MapState
+from deepsimbad.store.records import DomainRecord, KeptMap, MapState, now
 from deepsimbad.store.sessions import SessionStore
 
 log = logging.getLogger(__name__)
 
+CACHE_BYTES = 1 << 30  # of active maps in memory, where nobody chose
+_N_LOCKS = 64  # of loading: of two domains seldom the same
 _TRUSTED_S = 1.0  # another process (the command line) may activate a map: the catalog is asked again after this
 _DAMAGE_REMEMBERED_S = 5.0  # digesting a large damaged file for every request would be a gift to its sender
 
@@ -46,23 +49,30 @@ class Maps:
     """Map versions, loaded at first need and each once; usable from any thread.
 
     The active map of a domain is held and switched by one reference assignment; requests read one dict entry. Whoever
-    holds a snapshot keeps it whatever is activated or removed meanwhile.
+    holds a snapshot keeps it whatever is activated or removed meanwhile, or gives way to others: of active maps those
+    that were asked last stay in memory, as many as `cache_bytes` hold, and one at least.
 
     Args:
         catalog: Says which versions there are, and which serve.
         clock: Monotonic seconds.
+        cache_bytes: Of the arrays of active maps in memory.
     """
 
-    def __init__(self, catalog: Catalog, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self, catalog: Catalog, clock: Callable[[], float] = time.monotonic, cache_bytes: int = CACHE_BYTES
+    ) -> None:
         self._catalog = catalog
         self._clock = clock
-        self._active: dict[str, MappedDomain] = {}
+        self._cache_bytes = cache_bytes
+        self._n_bytes = 0
+        self._active: OrderedDict[str, MappedDomain] = OrderedDict()  # who was asked last is last
         self._checked_at: dict[str, float] = {}
         self._damaged: dict[str, tuple[int, DamagedMapError, float]] = {}  # version, why, and when that was noticed
         self._announced: dict[str, int] = {}
+        self._began_at = now()  # what was activated before is no news
         # By domain, version and digest: a domain that was deleted and made anew has other maps.
         self._held: WeakValueDictionary[tuple[str, int, str | None], Map] = WeakValueDictionary()
-        self._loading = threading.RLock()
+        self._loading = tuple(threading.RLock() for _ in range(_N_LOCKS))  # who asks for a map being read waits for it
         self._n_beginning: Counter[tuple[str, int]] = Counter()
         self._counting = threading.Lock()
 
@@ -72,6 +82,16 @@ class Maps:
     def n_loaded(self) -> int:
         """How many active maps are in memory."""
         return len(self._active)
+
+    @property
+    def n_bytes(self) -> int:
+        """And how many bytes their arrays have."""
+        return self._n_bytes
+
+    @property
+    def is_full(self) -> bool:
+        """Whether a further map would hardly have room without another's giving way."""
+        return self._n_bytes + self._n_bytes // max(len(self._active), 1) > self._cache_bytes
 
     def loaded(self) -> list[MappedDomain]:
         """The domains whose active maps are in memory, by name."""
@@ -93,7 +113,11 @@ class Maps:
         """The domain and its active map if that is known without touching a file, else None."""
         if self._clock() - self._checked_at.get(domain, float("-inf")) > _TRUSTED_S:
             return None
-        return self._active.get(domain)
+        mapped = self._active.get(domain)
+        if mapped is not None:
+            with suppress(KeyError):  # it gave way this moment
+                self._active.move_to_end(domain)
+        return mapped
 
     def active(self, domain: str) -> MappedDomain:
         """The domain and its active map; may read files.
@@ -107,46 +131,63 @@ class Maps:
 
     def refresh(self, domain: str) -> MappedDomain:
         """Ask the catalog now, and load the map it names if another is held; raises as `active` does."""
-        with self._loading:
+        with self._lock_of(domain):
             try:
                 record = self._catalog.domain(domain)
                 active = MappedDomain(record, self._current(record))
             except DeepSimbadError:
                 self._let_go(domain)
                 raise
-            self._active[domain] = active
+            self._keep(active)
             self._damaged.pop(domain, None)
-            self._announce(domain, active.snapshot.version)
             self._checked_at[domain] = self._clock()
             return active
 
     def forget(self, domain: str) -> None:
         """Let go of a deleted domain's map."""
-        with self._loading:
+        with self._lock_of(domain):
             self._let_go(domain)
             self._damaged.pop(domain, None)
             self._announced.pop(domain, None)
 
-    def load_all(self) -> list[str]:
-        """Load the active maps of all domains, and answer which domains' are damaged.
+    def load_all(self, within_s: float = math.inf) -> list[str]:
+        """Load active maps, those activated last first, and answer which domains' are damaged.
 
-        Those are logged, and so are those that could not be read; neither keeps the service from starting.
+        Those are logged, and so are those that could not be read; neither keeps the service from starting. What has
+        no room, or no time, is loaded when it is asked for.
         """
-        damaged = []
-        for record in self._catalog.domains():
-            if record.active_version is None:
-                continue
-            self._announced[record.name] = record.active_version  # it served before, which is no news
+        damaged, until = [], self._clock() + within_s
+        for domain in self._catalog.serving_domains():
+            if self.is_full or self._clock() > until:
+                break
             try:
-                self.refresh(record.name)
+                self.refresh(domain)
             except DamagedMapError:
-                damaged.append(record.name)
+                damaged.append(domain)
             except UnavailableError as error:
-                log.warning("an active map could not be read", extra={"domain": record.name, "why": error.message})
+                log.warning("an active map could not be read", extra={"domain": domain, "why": error.message})
+            except NotFoundError:
+                continue  # deleted this moment
         return damaged
 
+    def _lock_of(self, domain: str) -> threading.RLock:
+        return self._loading[hash(domain) % _N_LOCKS]
+
+    def _keep(self, mapped: MappedDomain) -> None:
+        """Hold a map; those asked longest ago give way to it."""
+        with self._counting:
+            before = self._active.pop(mapped.record.name, None)
+            self._active[mapped.record.name] = mapped
+            self._n_bytes += mapped.snapshot.n_bytes - (before.snapshot.n_bytes if before else 0)
+            while self._n_bytes > self._cache_bytes and len(self._active) > 1:
+                domain, oldest = self._active.popitem(last=False)
+                self._checked_at.pop(domain, None)
+                self._n_bytes -= oldest.snapshot.n_bytes
+
     def _let_go(self, domain: str) -> None:
-        self._active.pop(domain, None)
+        with self._counting:
+            mapped = self._active.pop(domain, None)
+            self._n_bytes -= mapped.snapshot.n_bytes if mapped else 0
         self._checked_at.pop(domain, None)
 
     def _current(self, record: DomainRecord) -> Map:
@@ -160,11 +201,14 @@ class Maps:
             if damaged_version == version and self._clock() - noticed_at < _DAMAGE_REMEMBERED_S:
                 raise DamagedMapError(why.message, **why.hints) from why
         try:
-            return self._load(domain, version, self._catalog.map(domain, version).sha256)
+            its_map = self._catalog.map(domain, version)
+            snapshot = self._load(domain, version, its_map.sha256)
         except DamagedMapError as error:
             self._damaged[domain] = version, error, self._clock()
             log.error("damaged map", extra={"domain": domain, "map_version": version}, exc_info=error)
             raise
+        self._announce(domain, version, its_map.activated_at or "")
+        return snapshot
 
     def _load(self, domain: str, version: int, digest: str | None) -> Map:
         snapshot = self._held.get((domain, version, digest))
@@ -172,15 +216,15 @@ class Maps:
             snapshot = self._held[domain, version, digest] = load_snapshot(self._catalog, domain, version)
         return snapshot
 
-    def _announce(self, domain: str, version: int) -> None:
+    def _announce(self, domain: str, version: int, activated_at: str) -> None:
         """Say in the log that another version serves than before, whoever switched it."""
         before = self._announced.get(domain)
-        if before != version:
+        if before != version and activated_at >= self._began_at:
             log.info(
                 "map activated" if before is None or version > before else "map rolled back",
                 extra={"domain": domain, "map_version": version, "before": before},
             )
-            self._announced[domain] = version
+        self._announced[domain] = version
 
     # Those that sessions are pinned to
 
@@ -224,7 +268,7 @@ class Maps:
             RetiredMapError: The version is no more.
             DamagedMapError: Its file is damaged, or missing though the version serves.
         """
-        with self._loading:
+        with self._lock_of(domain):
             try:
                 record, its_map = self._catalog.domain(domain), self._catalog.map(domain, version)
             except (UnknownDomainError, UnknownMapVersionError) as error:
@@ -271,8 +315,7 @@ class Retention:
         something else to do that must not fail for it.
         """
         try:
-            versions = [version for version in self._catalog.kept_maps() if domain in {None, version.domain}]
-            beyond = beyond_keeping(versions, self._keep_maps)
+            beyond = beyond_keeping(self._catalog.kept_maps(domain, self._keep_maps), self._keep_maps)
             pins = self._sessions.pins() if beyond else set()
         except DeepSimbadError:
             log.exception("old maps could not be looked for")

@@ -2,7 +2,7 @@
 
 import fcntl
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from enum import Enum
 from pathlib import Path
 from typing import Any, Final, Self
@@ -50,7 +50,8 @@ from deepsimbad.store.records import (
 from deepsimbad_migrations.catalog.migrations import migrations
 
 _SELECT_MAP = """
-    SELECT version, state, created_at, sha256, file_bytes, config, metrics, activated_at, retired_at, removed_at
+    SELECT version, state, created_at, sha256, file_bytes, config, metrics, activated_at, retired_at, removed_at,
+           domain
     FROM map
 """
 _MAX_INTEGER = 2**63 - 1
@@ -171,6 +172,35 @@ class Catalog(JobCatalog, KeyCatalog):
         """Every domain by name."""
         with self._reading() as db:
             return read_domains(db)
+
+    def domain_page(self, after: str | None, limit: int) -> ListPage[DomainRecord, str]:
+        """A page of domains by name, behind the name `after`."""
+        with self._reading() as db:
+            records = read_domains(db, after=after or "", limit=limit + 1)
+            return ListPage.of(((record.name, record) for record in records), limit)
+
+    @property
+    def n_domains(self) -> int:
+        """How many there are."""
+        with self._reading() as db:
+            return int(db.table("domain").count)
+
+    def domain_names(self) -> set[str]:
+        """Of every domain: of a hundred thousand in some 50 ms, where `domains` takes seconds."""
+        with self._reading() as db:
+            return {name for (name,) in db.execute("SELECT name FROM domain")}
+
+    def serving_domains(self) -> list[str]:
+        """The domains that have an active map, those whose was activated last first."""
+        with self._reading() as db:
+            rows = db.execute("SELECT domain FROM map WHERE state = 'active' ORDER BY activated_at DESC, domain")
+            return [domain for (domain,) in rows]
+
+    def evaluators(self) -> dict[str, dict[str, Any]]:
+        """Every configuration of an evaluator that is in use, by the first domain that has it."""
+        with self._reading() as db:
+            rows = db.execute("SELECT min(name), evaluator FROM domain GROUP BY evaluator ORDER BY 1")
+            return {name: from_json(evaluator) for name, evaluator in rows}
 
     def delete_domain(self, name: str, *, only_empty: bool = False) -> None:
         """Delete a domain with its jobs, maps and traverses, or leave it where it has any and `only_empty`.
@@ -327,14 +357,24 @@ class Catalog(JobCatalog, KeyCatalog):
                 db.table("map").update((domain, version), {"state": MapState.ACTIVE, "activated_at": now()})
             return _get_map(db, domain, version)
 
-    def kept_maps(self) -> list[KeptMap]:
-        """Every sealed version of all domains that still has its file, oldest first."""
+    def kept_maps(self, domain: str | None = None, more_than: int = -1) -> list[KeptMap]:
+        """The sealed versions that still have their files, by domain, oldest first.
+
+        Args:
+            domain: Of this one; None: of all.
+            more_than: Only of domains that have more than so many beside the one that serves.
+        """
         with self._reading() as db:
             rows = db.execute(
                 """
                 SELECT domain, version, state, retired_at FROM map
-                WHERE state != 'building' AND removed_at IS NULL ORDER BY domain, version
-                """
+                WHERE state != 'building' AND removed_at IS NULL AND domain IN (
+                    SELECT domain FROM map
+                    WHERE state != 'building' AND removed_at IS NULL AND domain = coalesce(?, domain)
+                    GROUP BY domain HAVING sum(state != 'active') > ?
+                ) ORDER BY domain, version
+                """,
+                [domain, more_than],
             )
             return [KeptMap(domain, version, MapState(state), *times) for domain, version, state, *times in rows]
 
@@ -399,6 +439,15 @@ class Catalog(JobCatalog, KeyCatalog):
         with self._lock:
             return self.map(domain, version)
 
+    def serving_maps(self, domains: Collection[str]) -> dict[str, MapRecord]:
+        """The active versions of these domains, as far as there are any."""
+        with self._reading() as db:
+            rows = db.execute(
+                f"{_SELECT_MAP} WHERE state = 'active' AND domain IN (SELECT value FROM json_each(?))",  # noqa: S608
+                [to_json(list(domains))],
+            )
+            return {row[-1]: _map(row) for row in rows}
+
     def map_of_job(self, domain: str, job_id: str) -> MapRecord | None:
         """The version that a job has sealed, whatever became of it since; raises UnknownDomainError."""
         records = [record for record in self.maps(domain) if record.metrics.get("job_id") == job_id]
@@ -424,8 +473,8 @@ def _get_map(db: Database, domain: str, version: int) -> MapRecord:
     return _map(row)
 
 
-def _map(row: tuple[Any, ...]) -> MapRecord:
-    version, state, created_at, sha256, file_bytes, config, metrics, *times = row
+def _map(row: Sequence[Any]) -> MapRecord:
+    version, state, created_at, sha256, file_bytes, config, metrics, *times, _ = row
     return MapRecord(
         version, MapState(state), created_at, sha256, file_bytes, from_json(config), from_json(metrics), *times
     )

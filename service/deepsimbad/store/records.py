@@ -67,18 +67,18 @@ class DomainRecord:
     options: dict[str, Any]
 
 
-def read_domains(db: Database, name: str | None = None) -> list[DomainRecord]:
-    """Every domain by name, or the one of that name if there is one."""
+_SELECT_DOMAIN = """
+    SELECT domain.name, evaluator, closed, actions_m, active.version, domain.created_at, options
+    FROM domain LEFT JOIN map AS active ON active.domain = domain.name AND active.state = 'active'
+"""
+
+
+def read_domains(db: Database, name: str | None = None, after: str = "", limit: int = -1) -> list[DomainRecord]:
+    """Every domain by name, at most `limit` behind the name `after`, or the one of that name if there is one."""
     if name is not None and not is_name(name):  # such a name cannot exist, and need not be valid Unicode either
         return []
-    rows = db.execute(
-        """
-        SELECT domain.name, evaluator, closed, actions_m, active.version, domain.created_at, options
-        FROM domain LEFT JOIN map AS active ON active.domain = domain.name AND active.state = 'active'
-        WHERE domain.name = coalesce(?, domain.name) ORDER BY domain.name
-        """,
-        [name],
-    )
+    which, given = ("> ?", after) if name is None else ("= ?", name)
+    rows = db.execute(f"{_SELECT_DOMAIN} WHERE domain.name {which} ORDER BY domain.name LIMIT ?", [given, limit])
     return [
         DomainRecord(
             name, from_json(evaluator), bool(closed), tuple(from_json(actions_m)), version, at, from_json(options)

@@ -140,7 +140,7 @@ def test_address_and_key_from_the_environment(monkeypatch):
     script.client("http://here", "given").domains()
     bare, environment, given = script.requests
     assert "authorization" not in bare.headers
-    assert environment.url == "http://elsewhere:81/below/v1/domains"
+    assert environment.url == "http://elsewhere:81/below/v1/domains?limit=200"
     assert environment.headers["authorization"] == "Bearer from-environment"
     assert (given.url.host, given.headers["authorization"]) == ("here", "Bearer given")
 
