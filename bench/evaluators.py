@@ -30,12 +30,12 @@ from deepsimbad.evaluators.feature_l2 import squared_distances
 from deepsimbad.evaluators.registry import EvaluatorKind, evaluator_config, make_evaluator
 from deepsimbad.evaluators.trunk import Trunk
 from deepsimbad.jobs.build import encode_recording
+from deepsimbad.jobs.experiments.kept import kept_encodings
+from deepsimbad.jobs.experiments.nbv import BLOCK_M
+from deepsimbad.jobs.experiments.truth import read_ground_truth
+from deepsimbad.jobs.experiments.vpr import ViewsOf, VprConfig, build_maps, score_maps, vpr_stages
 from deepsimbad.jobs.fitting import Fitter, RecordingPictures
-from deepsimbad.jobs.kept import kept_encodings
-from deepsimbad.jobs.nbv import BLOCK_M
 from deepsimbad.jobs.progress import Progress
-from deepsimbad.jobs.truth import read_ground_truth
-from deepsimbad.jobs.vpr import ViewsOf, VprConfig, build_maps, score_maps, vpr_stages
 from deepsimbad_campus.season import PAPER_DATES
 from deepsimbad_campus.writer import write_campus
 from deepsimbad_client.recordings import Recording

@@ -21,7 +21,7 @@ from deepsimbad.core.relevance import Relevance
 from deepsimbad.core.route import true_images_of
 from deepsimbad.evaluators.feature_l2 import FeatureL2
 from deepsimbad.jobs.build import measured, views_of
-from deepsimbad.jobs.vpr import moves_between, relevances_by_all
+from deepsimbad.jobs.experiments.vpr import moves_between, relevances_by_all
 
 _ROUNDS = 25  # of k-means
 DRIVES = ("nr", "nq", "nq2")

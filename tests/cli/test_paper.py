@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-import deepsimbad.jobs.paper as job
+import deepsimbad.jobs.experiments.paper as job
 import deepsimbad.jobs.progress as progress
 from deepsimbad.cli.paper_page import METHODS
 from deepsimbad.errors import CancelledError

@@ -13,9 +13,9 @@ from deepsimbad.errors import InvalidEncodingError
 from deepsimbad.evaluators.base import Lesson
 from deepsimbad.evaluators.feature_l2 import FeatureL2
 from deepsimbad.evaluators.fused import Fused
+from deepsimbad.jobs.experiments.vpr import ViewsOf, VprConfig, build_maps, score_maps, vpr_stages
 from deepsimbad.jobs.fitting import Fitter
 from deepsimbad.jobs.progress import Progress
-from deepsimbad.jobs.vpr import ViewsOf, VprConfig, build_maps, score_maps, vpr_stages
 
 N, D, SPREAD = 150, 120, 5.0
 

@@ -12,7 +12,7 @@ from deepsimbad.errors import ImageTooLargeError, InvalidRouteError, InvalidSour
 from deepsimbad.evaluators.image import decode_image
 from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
 from deepsimbad.jobs.build import encode_recording
-from deepsimbad.jobs.truth import read_ground_truth
+from deepsimbad.jobs.experiments.truth import read_ground_truth
 from deepsimbad_client.recordings import Frame, Recording
 from deepsimbad_client.recordings.sources import open_source
 

@@ -32,14 +32,14 @@ from deepsimbad.core.route import true_images_of
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.registry import EvaluatorConfig, make_evaluator
 from deepsimbad.jobs.build import EncodedRecording, encode_recording
-from deepsimbad.jobs.calibration import VIEWS, CalibrationConfig, calibration_stages, run_calibration
+from deepsimbad.jobs.experiments.calibration import VIEWS, CalibrationConfig, calibration_stages, run_calibration
+from deepsimbad.jobs.experiments.nbv import NbvConfig, NbvReport, nbv_stages, run_nbv
+from deepsimbad.jobs.experiments.passive import WINDOWS, PassiveScores
+from deepsimbad.jobs.experiments.truth import known_drives, read_ground_truth
+from deepsimbad.jobs.experiments.vpr import RANKS, VprConfig, VprReport, run_vpr, vpr_stages
 from deepsimbad.jobs.fitting import Pictures, RecordingPictures
-from deepsimbad.jobs.nbv import NbvConfig, NbvReport, nbv_stages, run_nbv
-from deepsimbad.jobs.passive import WINDOWS, PassiveScores
 from deepsimbad.jobs.progress import Progress
 from deepsimbad.jobs.remap import DEFAULT_TRAINING_EPISODES
-from deepsimbad.jobs.truth import known_drives, read_ground_truth
-from deepsimbad.jobs.vpr import RANKS, VprConfig, VprReport, run_vpr, vpr_stages
 from deepsimbad_client.recordings import Recording
 from deepsimbad_client.recordings.left_out import left_out_lines
 from deepsimbad_client.recordings.sources import open_source

@@ -25,9 +25,8 @@ from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.compute import available_cores
 from deepsimbad.evaluators.registry import EvaluatorConfig, make_evaluator
 from deepsimbad.jobs.build import EncodedRecording, encode_recording
-from deepsimbad.jobs.fitting import RecordingPictures
-from deepsimbad.jobs.kept import Kept, KeptResults, drive_digest, kept_encodings
-from deepsimbad.jobs.paper import (
+from deepsimbad.jobs.experiments.kept import Kept, KeptResults, drive_digest, kept_encodings
+from deepsimbad.jobs.experiments.paper import (
     SEASONS,
     TRIPLETS,
     PaperConfig,
@@ -35,9 +34,10 @@ from deepsimbad.jobs.paper import (
     runnable,
     seconds_to_measure,
 )
-from deepsimbad.jobs.paper_report import paper_document
+from deepsimbad.jobs.experiments.paper_report import paper_document
+from deepsimbad.jobs.experiments.vpr import bytes_per_encoding
+from deepsimbad.jobs.fitting import RecordingPictures
 from deepsimbad.jobs.progress import Shares, in_threads
-from deepsimbad.jobs.vpr import bytes_per_encoding
 from deepsimbad.release import release
 from deepsimbad_client.errors import SourceError
 from deepsimbad_client.recordings import Recording

@@ -13,9 +13,9 @@ from deepsimbad.cli.page import write_html
 from deepsimbad.cli.terminal import write_json
 from deepsimbad.core.planners import CONSTANT, DEFAULT_PLANNER, NNQL
 from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Relevance
-from deepsimbad.jobs.paper import Document
-from deepsimbad.jobs.paper_report import HOLDS
-from deepsimbad.jobs.vpr import BRUTE_FORCE_U, RANKS
+from deepsimbad.jobs.experiments.paper import Document
+from deepsimbad.jobs.experiments.paper_report import HOLDS
+from deepsimbad.jobs.experiments.vpr import BRUTE_FORCE_U, RANKS
 
 # As the paper says them, and ours; and which of the page's colours each has
 METHODS = {

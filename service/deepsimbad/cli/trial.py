@@ -20,11 +20,11 @@ from deepsimbad.core.relevance import DEFAULT_RELEVANCE
 from deepsimbad.errors import CancelledError
 from deepsimbad.evaluators.registry import EvaluatorConfig, make_evaluator
 from deepsimbad.jobs.build import EncodedRecording, encode_recording
+from deepsimbad.jobs.experiments.kept import kept_encodings
+from deepsimbad.jobs.experiments.trial import TRIAL_STAGES, TrialConfig, TrialReport, run_trial
+from deepsimbad.jobs.experiments.truth import known_drives
+from deepsimbad.jobs.experiments.vpr import BRUTE_FORCE_U
 from deepsimbad.jobs.fitting import RecordingPictures
-from deepsimbad.jobs.kept import kept_encodings
-from deepsimbad.jobs.trial import TRIAL_STAGES, TrialConfig, TrialReport, run_trial
-from deepsimbad.jobs.truth import known_drives
-from deepsimbad.jobs.vpr import BRUTE_FORCE_U
 from deepsimbad_client.recordings.options import accounting, opened, reading, tell_left_out
 
 _FRAMES_A_SECOND = 150.0  # that are encoded, against which the other stages are weighed

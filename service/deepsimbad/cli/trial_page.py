@@ -14,8 +14,8 @@ from deepsimbad.cli.page import write_html
 from deepsimbad.core.drive import Drive
 from deepsimbad.errors import ImageTooLargeError, InvalidImageError
 from deepsimbad.evaluators.image import decode_image
-from deepsimbad.jobs.trial import RECALL_RANKS, Outcome, Stretch, TrialReport
-from deepsimbad.jobs.vpr import BRUTE_FORCE_U
+from deepsimbad.jobs.experiments.trial import RECALL_RANKS, Outcome, Stretch, TrialReport
+from deepsimbad.jobs.experiments.vpr import BRUTE_FORCE_U
 from deepsimbad_client.errors import BrokenFrameError
 from deepsimbad_client.recordings import Recording
 

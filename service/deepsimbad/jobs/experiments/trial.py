@@ -19,11 +19,11 @@ from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Query
 from deepsimbad.errors import PastTheEndError
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.jobs.build import build, measured, views_of
+from deepsimbad.jobs.experiments.truth import nearest_images
+from deepsimbad.jobs.experiments.vpr import BRUTE_FORCE_U, bits_per_map_image, moves_between, relevances_by_all
 from deepsimbad.jobs.fitting import Fitter, Pictures
 from deepsimbad.jobs.progress import Progress
 from deepsimbad.jobs.remap import DEFAULT_LIST_LENGTH, DEFAULT_N_LANDMARKS
-from deepsimbad.jobs.truth import nearest_images
-from deepsimbad.jobs.vpr import BRUTE_FORCE_U, bits_per_map_image, moves_between, relevances_by_all
 
 RECALL_RANKS = tuple(range(1, 26))  # N of the curve of recall@N
 TRIAL_STAGES = {"map": 3.0, "localize": 3.0}

@@ -22,8 +22,8 @@ from deepsimbad.core.relevance import DEFAULT_RELEVANCE, LiveStatistics, Query, 
 from deepsimbad.errors import InvalidMapConfigError
 from deepsimbad.evaluators.base import Evaluator, LandmarkModel
 from deepsimbad.jobs.build import EncodedRecording, build, measured, views_of
+from deepsimbad.jobs.experiments.passive import PassiveScores, drive_in_order
 from deepsimbad.jobs.fitting import Fitter, Pictures
-from deepsimbad.jobs.passive import PassiveScores, drive_in_order
 from deepsimbad.jobs.progress import Progress
 from deepsimbad.store.arrays import is_halvable
 from deepsimbad.store.map_file import index_bytes, seal, write_map

@@ -22,7 +22,7 @@ from deepsimbad.errors import InvalidMapConfigError
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.compute import available_cores
 from deepsimbad.jobs.build import build, measured, train_nnql, views_of
-from deepsimbad.jobs.episodes import (
+from deepsimbad.jobs.experiments.episodes import (
     Chooser,
     Episode,
     EpisodeRunner,
@@ -31,9 +31,9 @@ from deepsimbad.jobs.episodes import (
     follow_plan,
     random_chooser,
 )
+from deepsimbad.jobs.experiments.truth import nearest_images
 from deepsimbad.jobs.fitting import Fitter, Pictures
 from deepsimbad.jobs.progress import Progress
-from deepsimbad.jobs.truth import nearest_images
 
 CLAIRVOYANT = "clairvoyant"
 BLOCK_M = 20.0  # starts nearer together have much the same episode

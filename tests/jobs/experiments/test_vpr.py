@@ -10,8 +10,8 @@ import pytest
 from deepsimbad.core.relevance import Relevance
 from deepsimbad.core.route import true_images_of
 from deepsimbad.jobs.build import encode_recording
+from deepsimbad.jobs.experiments.vpr import VprConfig, run_vpr, vpr_stages
 from deepsimbad.jobs.progress import Progress
-from deepsimbad.jobs.vpr import VprConfig, run_vpr, vpr_stages
 from deepsimbad_client.recordings.sources import open_source
 
 MAX_PIXELS = 1

@@ -17,7 +17,7 @@ from deepsimbad.core.localizer import ActiveLocalizer, LocalizerConfig
 from deepsimbad.core.relevance import Relevance
 from deepsimbad.errors import InvalidMapConfigError
 from deepsimbad.jobs.build import build, measured, views_of
-from deepsimbad.jobs.calibration import (
+from deepsimbad.jobs.experiments.calibration import (
     CalibrationConfig,
     Sight,
     _Course,
@@ -29,7 +29,7 @@ from deepsimbad.jobs.calibration import (
     views_until_found,
     wrong_when_confident,
 )
-from deepsimbad.jobs.episodes import TestDrive as DrivenByTest
+from deepsimbad.jobs.experiments.episodes import TestDrive as DrivenByTest
 from deepsimbad.jobs.progress import Progress
 
 QUICK = CalibrationConfig(n_landmarks=60, standing=3, carried=12)

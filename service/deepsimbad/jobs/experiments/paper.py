@@ -23,10 +23,9 @@ from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Relevance
 from deepsimbad.core.route import true_images_of
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.jobs.build import measured, views_of
-from deepsimbad.jobs.episodes import Episode, TestDrive
-from deepsimbad.jobs.fitting import Fitter, Pictures
-from deepsimbad.jobs.kept import KeptResults, code_digest, drive_digest
-from deepsimbad.jobs.nbv import (
+from deepsimbad.jobs.experiments.episodes import Episode, TestDrive
+from deepsimbad.jobs.experiments.kept import KeptResults, code_digest, drive_digest
+from deepsimbad.jobs.experiments.nbv import (
     BLOCK_M,
     CLAIRVOYANT,
     NbvConfig,
@@ -37,9 +36,8 @@ from deepsimbad.jobs.nbv import (
     starts_of,
     trained,
 )
-from deepsimbad.jobs.progress import Progress, Shares, in_threads
-from deepsimbad.jobs.truth import nearest_images
-from deepsimbad.jobs.vpr import (
+from deepsimbad.jobs.experiments.truth import nearest_images
+from deepsimbad.jobs.experiments.vpr import (
     RANKS,
     ViewsOf,
     VprConfig,
@@ -49,6 +47,8 @@ from deepsimbad.jobs.vpr import (
     score_maps,
     vpr_stages,
 )
+from deepsimbad.jobs.fitting import Fitter, Pictures
+from deepsimbad.jobs.progress import Progress, Shares, in_threads
 
 SEASONS = {"WI": "2012-01-22", "SP": "2012-03-31", "SU": "2012-08-04", "AU": "2012-11-17"}
 TRIPLETS = tuple(

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from deepsimbad.core.metrics import mean_interval
 from deepsimbad.core.planners import CONSTANT, DEFAULT_PLANNER, NNQL, RANDOM
 from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Relevance
-from deepsimbad.jobs.paper import SEASONS, SETUPS, Document, PaperConfig
-from deepsimbad.jobs.vpr import BRUTE_FORCE_U
+from deepsimbad.jobs.experiments.paper import SEASONS, SETUPS, Document, PaperConfig
+from deepsimbad.jobs.experiments.vpr import BRUTE_FORCE_U
 
 HOLDS, OTHERWISE, UNDECIDED = "holds", "does not hold", "cannot be told apart"
 _CHANCE, _NEAR_CHANCE = 50.0, 45.0  # ANR, percent

@@ -7,8 +7,8 @@ from deepsimbad.core.building import MapPlan, compose_map
 from deepsimbad.core.drive import Drive
 from deepsimbad.core.index.retrieval import relevances
 from deepsimbad.core.relevance import Relevance
-from deepsimbad.jobs import passive
 from deepsimbad.jobs.build import measured, views_of
+from deepsimbad.jobs.experiments import passive
 
 N = 60
 

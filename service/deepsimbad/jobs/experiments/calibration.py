@@ -21,10 +21,10 @@ from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Relevance
 from deepsimbad.errors import InvalidMapConfigError, PastTheEndError
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.jobs.build import build, measured, views_of
-from deepsimbad.jobs.episodes import TestDrive
+from deepsimbad.jobs.experiments.episodes import TestDrive
+from deepsimbad.jobs.experiments.truth import nearest_images
 from deepsimbad.jobs.fitting import Fitter, Pictures
 from deepsimbad.jobs.progress import Progress
-from deepsimbad.jobs.truth import nearest_images
 
 VIEWS = (1, 2, 3, 5, 10)  # after which coverage is told
 _MOVING = {f"moves of {action_m} m": float(action_m) for action_m in (1, 3, 5, 10)}  # metres a move, by stage

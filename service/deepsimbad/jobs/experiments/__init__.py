@@ -1,0 +1,1 @@
+"""Offline experiments: the paper's, and ours beside them, over recorded drives."""
