@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 
 from deepsimbad.errors import InvalidMapConfigError
-from deepsimbad.jobs.remap import RemapConfig
+from deepsimbad.jobs.remap_config import RemapConfig
 from deepsimbad.jobs.runner import JobRunner
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.records import JobRecord, JobState

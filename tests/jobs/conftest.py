@@ -12,7 +12,7 @@ from deepsimbad.core.frames import UNKNOWN_TIMESTAMP
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
 from deepsimbad.jobs.progress import Progress
-from deepsimbad.jobs.remap import REMAP_STAGES
+from deepsimbad.jobs.remap_config import REMAP_STAGES
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.traverses import Traverse
 

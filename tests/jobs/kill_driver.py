@@ -19,7 +19,8 @@ from deepsimbad.core.descriptor import rank_landmarks
 from deepsimbad.core.drive import Drive
 from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
 from deepsimbad.jobs.progress import Progress
-from deepsimbad.jobs.remap import REMAP_STAGES, RemapConfig, remap
+from deepsimbad.jobs.remap import remap
+from deepsimbad.jobs.remap_config import REMAP_STAGES, RemapConfig
 from deepsimbad.jobs.runner import InThisProcess, JobRunner
 from deepsimbad.jobs.versions import ExperienceConfig, import_map
 from deepsimbad.store.catalog import Catalog

@@ -14,7 +14,8 @@ from deepsimbad.engine.maps import load_snapshot
 from deepsimbad.errors import InvalidMapConfigError
 from deepsimbad.jobs.append import KnownDrives, fuse
 from deepsimbad.jobs.progress import Progress
-from deepsimbad.jobs.remap import REMAP_STAGES, RemapConfig, remap
+from deepsimbad.jobs.remap import remap
+from deepsimbad.jobs.remap_config import REMAP_STAGES, RemapConfig
 from deepsimbad.jobs.versions import import_map
 from deepsimbad.store.map_file import read_map
 from deepsimbad.store.traverses import Traverse

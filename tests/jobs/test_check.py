@@ -20,7 +20,8 @@ from deepsimbad.errors import (
     UnknownTraverseError,
 )
 from deepsimbad.jobs.progress import Progress
-from deepsimbad.jobs.remap import REMAP_STAGES, RemapConfig, remap
+from deepsimbad.jobs.remap import remap
+from deepsimbad.jobs.remap_config import REMAP_STAGES, RemapConfig
 from deepsimbad.store import map_file
 from deepsimbad.store.catalog import ANY
 from deepsimbad.store.records import MapState

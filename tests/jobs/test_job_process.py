@@ -25,7 +25,7 @@ from deepsimbad.errors import (
 )
 from deepsimbad.jobs import child, runner
 from deepsimbad.jobs.child import JobPriority
-from deepsimbad.jobs.remap import RemapConfig
+from deepsimbad.jobs.remap_config import RemapConfig
 from deepsimbad.jobs.runner import REMAP, BrokenJobError, InAnotherProcess, InThisProcess
 from deepsimbad.store.durable import lock_folder
 from deepsimbad.store.map_file import read_map

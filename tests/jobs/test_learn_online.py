@@ -8,7 +8,8 @@ from deepsimbad.core.experience.nnql import KnownWalk
 from deepsimbad.core.relevance import Query
 from deepsimbad.errors import CancelledError
 from deepsimbad.jobs.progress import Progress
-from deepsimbad.jobs.remap import RemapConfig, remap
+from deepsimbad.jobs.remap import remap
+from deepsimbad.jobs.remap_config import RemapConfig
 from deepsimbad.jobs.versions import LEARN_STAGES, learn_online
 from deepsimbad.store.map_file import read_map
 

@@ -14,7 +14,8 @@ from deepsimbad.errors import (
     InvalidMapConfigError,
 )
 from deepsimbad.jobs.progress import Progress
-from deepsimbad.jobs.remap import REMAP_STAGES, RemapConfig, remap, remap_stages, stages_in
+from deepsimbad.jobs.remap import remap
+from deepsimbad.jobs.remap_config import REMAP_STAGES, RemapConfig, remap_stages, stages_in
 from deepsimbad.store.catalog import ANY
 from deepsimbad.store.map_file import read_map, verify
 from deepsimbad.store.records import MapState

@@ -11,7 +11,7 @@ from deepsimbad.errors import (
     JobInterruptedError,
     UnavailableError,
 )
-from deepsimbad.jobs.remap import RemapConfig
+from deepsimbad.jobs.remap_config import RemapConfig
 from deepsimbad.jobs.runner import InThisProcess, JobRunner
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.records import JobState

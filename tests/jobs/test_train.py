@@ -13,7 +13,8 @@ from deepsimbad.core.relevance import Relevance
 from deepsimbad.errors import CancelledError
 from deepsimbad.jobs.build import HELD_OUT, SECOND_DRIVE, train_nnql
 from deepsimbad.jobs.progress import Progress
-from deepsimbad.jobs.remap import REMAP_STAGES, RemapConfig, remap
+from deepsimbad.jobs.remap import remap
+from deepsimbad.jobs.remap_config import REMAP_STAGES, RemapConfig
 from deepsimbad.store.map_file import read_map
 
 DOMAIN = "route"

@@ -35,12 +35,7 @@ from deepsimbad.api.sessions import TruePositions
 from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Relevance
 from deepsimbad.errors import DeepSimbadError, NoActiveMapError, UnavailableError, UnknownJobError
 from deepsimbad.jobs.append import refuse_known_traverse
-from deepsimbad.jobs.remap import (
-    DEFAULT_LIST_LENGTH,
-    DEFAULT_TRAINING_EPISODES,
-    RemapConfig,
-    refuse_impossible,
-)
+from deepsimbad.jobs.remap_config import DEFAULT_LIST_LENGTH, DEFAULT_TRAINING_EPISODES, RemapConfig, refuse_impossible
 from deepsimbad.jobs.runner import REMAP
 from deepsimbad.jobs.versions import EXPERIENCE, TRAVERSE_ROLES, ExperienceConfig, keep_true_positions
 from deepsimbad.store.records import JobRecord

@@ -37,13 +37,13 @@ from deepsimbad.evaluators.registry import EvaluatorConfig, make_evaluator
 from deepsimbad.evaluators.scenes import Scene, seen_in
 from deepsimbad.jobs.build import encode_recording
 from deepsimbad.jobs.fitting import RecordingPictures, learns
-from deepsimbad.jobs.remap import (
+from deepsimbad.jobs.remap import remap
+from deepsimbad.jobs.remap_config import (
     DEFAULT_LIST_LENGTH,
     DEFAULT_N_LANDMARKS,
     DEFAULT_TRAINING_EPISODES,
     RemapConfig,
     refuse_impossible,
-    remap,
     remap_stages,
 )
 from deepsimbad.store.catalog import Catalog

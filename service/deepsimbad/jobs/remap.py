@@ -4,25 +4,21 @@ A remap makes a map of its own, or appends a drive to a copy of the active one (
 again, and where nothing is fused none is described again, and what two seasons taught stays.
 """
 
-import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import cache
-from pathlib import Path
-from typing import Any, Self, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
-from deepsimbad.core.building import MapPlan, SeenTwice, check_list_length
+from deepsimbad.core.building import MapPlan, SeenTwice
 from deepsimbad.core.camera import Camera
-from deepsimbad.core.composed import is_composed
-from deepsimbad.core.descriptor import MAX_LANDMARKS
 from deepsimbad.core.drive import Drive
 from deepsimbad.core.experience.nnql import NnqlConfig
 from deepsimbad.core.landmark_model import fitting_number
 from deepsimbad.core.map import Map
-from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Relevance
+from deepsimbad.core.relevance import Relevance
 from deepsimbad.errors import (
     InvalidEncodingError,
     InvalidMapConfigError,
@@ -43,137 +39,24 @@ from deepsimbad.jobs.append import (
     refuse_known_traverse,
     seen_twice,
 )
-from deepsimbad.jobs.build import EPISODES_A_MAP_IMAGE, build, compared, measured, train_nnql
+from deepsimbad.jobs.build import build, compared, measured, train_nnql
 from deepsimbad.jobs.check import CheckFrames, check_map
 from deepsimbad.jobs.fitting import Fitter, Pictures, SpooledPictures, learns
 from deepsimbad.jobs.progress import Progress
+from deepsimbad.jobs.remap_config import (
+    DEFAULT_N_LANDMARKS,
+    FIT,
+    REMAP_STAGES,
+    RemapConfig,
+    check_alike,
+    check_filled,
+    staying,
+)
 from deepsimbad.jobs.versions import activate_once, seal_version
 from deepsimbad.store.catalog import ANY, Catalog
 from deepsimbad.store.map_file import read_map
 from deepsimbad.store.records import DomainRecord, MapRecord
 from deepsimbad.store.traverses import Traverse
-
-FIT = "fit"  # the stage of evaluators that must be fitted
-DEFAULT_N_LANDMARKS = 500
-DEFAULT_LIST_LENGTH = 4
-DEFAULT_TRAINING_EPISODES = 10_000
-
-
-@dataclass(frozen=True)
-class RemapConfig:
-    """Parameters of one remap, kept with the map."""
-
-    training_traverse: str  # the traverse that becomes the map
-    # Where landmarks are chosen; None keeps those of the active map (the paper's cheap retraining), and without one
-    # takes the training traverse's own
-    landmark_traverse: str | None = None
-    # r; None means 500 or, of a shorter landmark traverse, every frame; and as many as the active map has where its
-    # landmarks stay
-    n_landmarks: int | None = None
-    list_length: int = DEFAULT_LIST_LENGTH
-    relevance: Relevance = DEFAULT_RELEVANCE  # what the map is built for
-    # Of the experience database that NNQL plans by; 0: the map has none
-    training_episodes: int = DEFAULT_TRAINING_EPISODES
-    seed: int = 0  # of everything random in the remap
-    # Serve the new map at once, whatever was activated while it was built: the last word wins. With a gate only in
-    # place of the map it was compared with.
-    activate: bool = True
-    # Drive that the new map and the active one are compared on; None: frames of the training traverse that are held out
-    check_traverse: str | None = None
-    # By how many percentage points of ANR the new map may be worse than the active one and still take over; None:
-    # whatever it is
-    gate_margin: float | None = None
-    # Fuse the training traverse into a copy of the active map, whose images, landmarks and experience stay, or add it
-    # to them; n_landmarks, list_length and relevance are the active map's
-    append: bool = False
-    # Whether positions of the training traverse and of the second drive (the landmark traverse, else what the active
-    # map was made of) are comparable; None: only where both know x, y
-    same_route: bool | None = None
-    # Another domain, whose active map knows several seasons of its route by the same camera: what a season changes is
-    # learnt there where this route was seen in one; landmarks are chosen anew. None: nowhere else
-    camera_of: str | None = None
-
-    def __post_init__(self) -> None:
-        n_landmarks = self.n_landmarks
-        if n_landmarks is not None and not 1 <= n_landmarks <= MAX_LANDMARKS:
-            raise InvalidMapConfigError(f"n_landmarks must be within 1 and {MAX_LANDMARKS}", n_landmarks=n_landmarks)
-        if self.list_length < 1 or (n_landmarks is not None and self.list_length > n_landmarks):
-            raise InvalidMapConfigError(
-                f"list_length {self.list_length} must be at least 1 and at most n_landmarks",
-                list_length=self.list_length,
-                n_landmarks=n_landmarks,
-            )
-        if self.training_episodes < 0 or self.seed < 0:
-            raise InvalidMapConfigError("training_episodes and seed must not be negative")
-        if self.gate_margin is not None and not (math.isfinite(self.gate_margin) and self.gate_margin >= 0):
-            raise InvalidMapConfigError("gate_margin is in percentage points of ANR, finite and not negative")
-        if self.check_traverse == self.training_traverse:
-            raise InvalidMapConfigError(
-                "a map finds the frames it was made of at once: give another check_traverse, or none to hold frames out"
-            )
-        if self.camera_of is not None and (self.append or self.relevance is not Relevance.COMPOSED):
-            raise InvalidMapConfigError("camera_of is for maps that are made anew, for the relevance composed")
-        if self.append and self.landmark_traverse is not None:
-            raise InvalidMapConfigError(
-                "what is appended is described by the active map's landmarks: landmark_traverse must be null"
-            )
-
-    def as_dict(self) -> dict[str, Any]:
-        """The JSON form."""
-        return asdict(self)
-
-    @classmethod
-    def from_dict(cls, stored: dict[str, Any]) -> Self:
-        """Back from the JSON form."""
-        return cls(**{**stored, "relevance": Relevance(stored["relevance"])})
-
-
-def remap_stages(
-    config: RemapConfig, n_frames: int, n_candidates: int, encoding_dim: int, fitting: Fitting = Fitting.NOTHING
-) -> dict[str, float]:
-    """Every stage in order, with the seconds it takes on one core of 2026; what counts is their ratio.
-
-    Measured with 2,000 to 26,000 frames of 64 to 4,096 numbers (docs/results/bench.md has one of them).
-
-    Args:
-        n_candidates: Frames that landmarks are selected from; 0: they stay.
-        fitting: What the evaluator learns from.
-    """
-    n, m, dim = n_frames, n_candidates, encoding_dim
-    n_landmarks = config.n_landmarks or min(DEFAULT_N_LANDMARKS, m or DEFAULT_N_LANDMARKS)
-    n_episodes = min(config.training_episodes, EPISODES_A_MAP_IMAGE * n)
-    if config.append or config.relevance is Relevance.BRUTE_FORCE:
-        n_episodes = 0
-    fit_s = {Fitting.NOTHING: 0.0, Fitting.ENCODINGS: 10.0, Fitting.IMAGES: 10.0 + 0.3 * n_landmarks}[fitting]
-    return {
-        "read frames": 0.05 + 1e-8 * (n + m) * dim,
-        **({FIT: fit_s} if fit_s else {}),
-        "describe": 0.1 + (n + m) * (2e-8 * dim * 96 + 4e-7 * n_landmarks),
-        "train": 0.01 + n_episodes * (4e-4 + 8e-8 * n),
-        "check": 0.1 + 5e-6 * n,
-        "seal": 0.3,
-        "activate": 0.02,
-    }
-
-
-# Of a remap whose size is not known beforehand.
-REMAP_STAGES = remap_stages(RemapConfig("drive", "another"), 5_000, 5_000, 1_000)
-
-
-def stages_in(data_dir: Path, domain: str, config: RemapConfig, fitting: Fitting = Fitting.NOTHING) -> dict[str, float]:
-    """The stages of a remap of a domain's traverses, of which no encoding is read.
-
-    Raises:
-        UnknownTraverseError: There is none such.
-        DamagedFileError, UnavailableError: One cannot be read.
-    """
-    with Traverse.open(data_dir, domain, config.training_traverse) as training:
-        n_frames, dim = training.n_frames, training.encoding_dim or 0
-    n_candidates = 0
-    if config.landmark_traverse is not None:
-        with Traverse.open(data_dir, domain, config.landmark_traverse) as landmarks:
-            n_candidates = landmarks.n_frames
-    return remap_stages(config, n_frames, n_candidates, dim, fitting)
 
 
 def remap(
@@ -350,7 +233,7 @@ class _Remap:
     def _drive(self, name: str) -> Drive:
         with Traverse.open(self.catalog.data_dir, self.domain, name) as traverse:
             drive = traverse.read()
-        _check_filled(name, drive.n_frames)
+        check_filled(name, drive.n_frames)
         drive.check_differs(f"traverse {name}")
         return drive
 
@@ -384,7 +267,7 @@ class _Remap:
             if self.config.append:
                 raise InvalidMapConfigError(f"domain {record.name} has no active map that could be appended to")
             return None
-        return _staying(self.config, read_map(self.catalog.map_path(record.name, record.active_version)))
+        return staying(self.config, read_map(self.catalog.map_path(record.name, record.active_version)))
 
     def _mapped(self, inputs: _Inputs) -> _Draft:
         """The training traverse as a map of its own."""
@@ -469,7 +352,7 @@ class _Remap:
                 traverse=config.training_traverse,
                 map_version=record.version,
             )
-        _check_alike(before, config)
+        check_alike(before, config)
         fused, verdict = None, {"accepted": False, "why": inputs.known}
         if isinstance(inputs.known, KnownDrives):
             known, joining = self._in_space(before, inputs.known, drive)
@@ -507,60 +390,3 @@ class _Remap:
         seasons = tuple(there[id(season)] for season in known.seasons)
         known = replace(known, seasons=seasons, candidates=candidates, halves=self.evaluator.halves)
         return known, there[id(drive)]
-
-
-def refuse_impossible(config: RemapConfig, n_frames: Mapping[str, int], active: Map | None) -> None:
-    """Say before the job what it would end with, as far as its traverses' numbers of frames and the active map tell.
-
-    Raises:
-        InvalidMapConfigError: A traverse is empty, there are too few landmarks, or the active map's do not fit.
-    """
-    for name, n in n_frames.items():
-        _check_filled(name, n)
-    if config.append and active is not None:
-        _check_alike(active, config)
-    elif config.landmark_traverse is not None or active is None:
-        n_candidates = n_frames[config.landmark_traverse or config.training_traverse]
-        check_list_length(config.list_length, fitting_number(config.n_landmarks, n_candidates, DEFAULT_N_LANDMARKS))
-    elif config.camera_of is None:  # else it shows only there whether they stay
-        base = _staying(config, active)
-        if base is None:
-            refuse_impossible(config, n_frames, None)
-        else:
-            check_list_length(config.list_length, base.n_landmarks)
-
-
-def _check_filled(name: str, n_frames: int) -> None:
-    if n_frames == 0:
-        raise InvalidMapConfigError(f"traverse {name} has no frames yet; upload some first", traverse=name)
-
-
-def _staying(config: RemapConfig, active: Map) -> Map | None:
-    """The active map, whose landmarks stay; None: they are of another kind than is asked for."""
-    if not config.append and is_composed(active.landmark_model) != (config.relevance is Relevance.COMPOSED):
-        return None
-    if config.n_landmarks not in {None, active.n_landmarks}:
-        raise InvalidMapConfigError(
-            f"the active map has {active.n_landmarks} landmarks, not {config.n_landmarks}; give a landmark_traverse "
-            "to choose anew",
-            n_landmarks=active.n_landmarks,
-        )
-    return active
-
-
-def _check_alike(before: Map, config: RemapConfig) -> None:
-    """What describes the images of one map is the same for all of them; what is left at its default is the map's.
-
-    Raises:
-        InvalidMapConfigError: Something else is asked for than the map has.
-    """
-    asked = {
-        "n_landmarks": (config.n_landmarks, None, before.n_landmarks),
-        "list_length": (config.list_length, DEFAULT_LIST_LENGTH, before.list_length),
-        "relevance": (config.relevance.value, DEFAULT_RELEVANCE.value, before.relevance.value),
-    }
-    for name, (wanted, default, has) in asked.items():
-        if wanted not in {default, has}:
-            raise InvalidMapConfigError(
-                f"the active map has {name} {has}, not {wanted}; what is appended to it must be alike", **{name: has}
-            )

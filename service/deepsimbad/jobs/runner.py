@@ -35,7 +35,8 @@ from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
 from deepsimbad.jobs.child import JobPriority
 from deepsimbad.jobs.fitting import learns
 from deepsimbad.jobs.progress import Progress, ProgressState
-from deepsimbad.jobs.remap import REMAP_STAGES, RemapConfig, remap, stages_in
+from deepsimbad.jobs.remap import remap
+from deepsimbad.jobs.remap_config import REMAP_STAGES, RemapConfig, stages_in
 from deepsimbad.jobs.versions import EXPERIENCE, LEARN_STAGES, ExperienceConfig, learn_online, serve_learnt, walks_of
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.records import JobRecord, JobState

@@ -23,7 +23,7 @@ from deepsimbad.jobs.experiments.truth import nearest_images
 from deepsimbad.jobs.experiments.vpr import BRUTE_FORCE_U, bits_per_map_image, moves_between, relevances_by_all
 from deepsimbad.jobs.fitting import Fitter, Pictures
 from deepsimbad.jobs.progress import Progress
-from deepsimbad.jobs.remap import DEFAULT_LIST_LENGTH, DEFAULT_N_LANDMARKS
+from deepsimbad.jobs.remap_config import DEFAULT_LIST_LENGTH, DEFAULT_N_LANDMARKS
 
 RECALL_RANKS = tuple(range(1, 26))  # N of the curve of recall@N
 TRIAL_STAGES = {"map": 3.0, "localize": 3.0}
