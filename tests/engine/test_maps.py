@@ -22,6 +22,7 @@ from deepsimbad.errors import (
     UnknownDomainError,
     UnknownMapVersionError,
 )
+from deepsimbad.store import catalog as catalog_module
 from deepsimbad.store.catalog import ANY, Catalog
 from deepsimbad.store.layout import catalog_path
 from deepsimbad.store.records import KeptMap, MapState
@@ -92,7 +93,7 @@ def test_a_map_that_cannot_be_read_now_is_not_called_damaged_nor_keeps_others_fr
         add_domain(catalog, domain)
         add_map(catalog, domain)
     add_domain(catalog, "unmapped")
-    verify = maps_module.verify
+    verify = catalog_module.verify
 
     def failing(path: Path, digest: str) -> None:
         if path.parent == catalog.map_path("d", 1).parent:
@@ -101,7 +102,7 @@ def test_a_map_that_cannot_be_read_now_is_not_called_damaged_nor_keeps_others_fr
 
     catalog.map_path("e", 1).unlink()
     with monkeypatch.context() as patched:
-        patched.setattr(maps_module, "verify", failing)
+        patched.setattr(catalog_module, "verify", failing)
         assert maps.load_all() == ["e"]
         assert maps.active("f").snapshot.domain == "f"
         with pytest.raises(UnavailableError) as caught:
@@ -111,7 +112,7 @@ def test_a_map_that_cannot_be_read_now_is_not_called_damaged_nor_keeps_others_fr
     assert maps.active("d").snapshot.version == 1, "and it is not remembered"
     maps.forget("d")
     assert [mapped.record.name for mapped in maps.loaded()] == ["f"]
-    monkeypatch.setattr(maps_module, "verify", lambda path, digest: failing(catalog.map_path("d", 1), digest))
+    monkeypatch.setattr(catalog_module, "verify", lambda path, digest: failing(catalog.map_path("d", 1), digest))
     clock.now += 10
     assert maps.damaged() == {"e": 1}, "a damaged one stays so while it cannot be read"
 

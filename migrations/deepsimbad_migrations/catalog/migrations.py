@@ -106,3 +106,20 @@ def m005_domains_of_keys(db: Database) -> None:
 def m006_options_of_domains(db: Database) -> None:
     """What of a domain is shown and how, a JSON object: `thumbnails`, `anchor`."""
     db.execute("ALTER TABLE domain ADD COLUMN options TEXT NOT NULL DEFAULT '{}'")
+
+
+@migrations()
+def m007_maps_shared_as_objects(db: Database) -> None:
+    """The map store that is followed, as far as its log was read; which domains and map versions are in it."""
+    db.executescript(
+        """
+        CREATE TABLE map_store (
+            id INTEGER PRIMARY KEY CHECK (id = 1),
+            url TEXT NOT NULL,
+            store_id TEXT NOT NULL,
+            position INTEGER NOT NULL
+        );
+        ALTER TABLE domain ADD COLUMN shared INTEGER NOT NULL DEFAULT 0;
+        ALTER TABLE map ADD COLUMN shared INTEGER NOT NULL DEFAULT 0;
+        """
+    )

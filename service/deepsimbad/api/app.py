@@ -38,7 +38,7 @@ from deepsimbad.engine.sessions import Sessions
 from deepsimbad.engine.traverses import OpenTraverses, SpoolRoom
 from deepsimbad.engine.truths import Truths
 from deepsimbad.engine.worker import EvaluatorPool, InferenceWorker
-from deepsimbad.errors import DeepSimbadError, UnavailableError
+from deepsimbad.errors import DeepSimbadError, NoActiveMapError, NotFoundError, UnavailableError
 from deepsimbad.evaluators.registry import fallback
 from deepsimbad.jobs.runner import InAnotherProcess, JobRunner, RunJob, job_threads
 from deepsimbad.release import release
@@ -48,6 +48,7 @@ from deepsimbad.store.durable import service_lock
 from deepsimbad.store.objects import Objects
 from deepsimbad.store.records import KeyRecord
 from deepsimbad.store.sessions import SessionRecord, SessionStore
+from deepsimbad.store.shared_catalog import SharedCatalog, open_catalog
 from deepsimbad.store.shared_sessions import SharedSessionStore
 
 router = APIRouter(tags=["health"])
@@ -57,6 +58,7 @@ LEAST_FREE_BYTES = 16 * MEBIBYTE  # with less, the next map or the write-ahead l
 TRUSTED_S = 1.0  # anybody may ask whether it is ready, and every look writes to the disk
 _WRITE_TIMEOUT_S = 2.0
 _LOADING_S = 1.0  # that a start spends on maps; what is left is loaded when it is asked for
+_FOLLOW_S = 1.0  # between two looks into a map store's log, of one small request each
 _ROUTERS = (  # routes are tried in this order: those that robots ask come first
     *(sessions.router, localizations.router, router, domains.router, domains.admin),
     *(traverses.router, frames.router, jobs.making, jobs.router, maps.router, sessions.listing),
@@ -100,7 +102,7 @@ def create_app(settings: Settings, run_job: RunJob | None = None, elsewhere: Els
                 app.state.startup_error = error  # the server only reports that there was one
                 raise
             app.state.services = services
-            tasks = [asyncio.create_task(keys.follow()), asyncio.create_task(_sweep(services))]
+            tasks = [asyncio.create_task(task) for task in (keys.follow(), _sweep(services), _follow(services))]
             yield
             for task in tasks:
                 task.cancel()
@@ -127,6 +129,35 @@ def create_app(settings: Settings, run_job: RunJob | None = None, elsewhere: Els
     return app
 
 
+async def _follow(services: Services) -> None:
+    """Take over what other machines publish. A store that fails is told once; what is in memory goes on to serve."""
+    catalog, is_failing = services.catalog, False
+
+    def take_over(domain: str) -> None:
+        try:
+            if services.maps.serves(domain):  # else its map is fetched when it is asked for
+                services.maps.refresh(domain)
+            services.retention.prune(domain)
+        except (NotFoundError, NoActiveMapError):  # it was deleted, and perhaps made anew
+            pass
+        except DeepSimbadError:
+            log.exception("a new map cannot be served", extra={"domain": domain})
+
+    while isinstance(catalog, SharedCatalog):
+        await asyncio.sleep(_FOLLOW_S)
+        try:
+            for domain in await run_sync(catalog.follow):
+                await run_sync(take_over, domain)
+        except DeepSimbadError as error:
+            if not is_failing:
+                log.warning("the map store cannot be followed", exc_info=error)
+            is_failing = True
+        else:
+            if is_failing:
+                log.info("the map store is followed again")
+            is_failing = False
+
+
 async def _sweep(services: Services) -> None:
     """End sessions as they expire or lose their key or domain, so that their memory is free though nobody asks."""
     while True:
@@ -146,12 +177,27 @@ async def _sweep(services: Services) -> None:
             log.exception("expired sessions could not be ended")
 
 
+def _opened(settings: Settings) -> Catalog:
+    """The catalog; one that is shared knows what others published, as far as the store can be reached."""
+    catalog = open_catalog(settings.data_dir, settings.map_store, settings.map_cache_disk_bytes)
+    if isinstance(catalog, SharedCatalog):
+        try:
+            catalog.follow()
+            catalog.publish_own()
+        except UnavailableError as error:  # what is here can be served
+            log.warning("the map store cannot be followed", extra={"why": error.message})
+        except BaseException:
+            catalog.close()
+            raise
+    return catalog
+
+
 def _start(
     settings: Settings, metrics: Metrics, keys: KeyRing, run_job: RunJob, elsewhere: Elsewhere, parts: ExitStack
 ) -> Services:
     """Open everything; `parts` closes it again, last opened first."""
     parts.enter_context(service_lock(settings.data_dir, f"{settings.host}:{settings.port}"))
-    catalog = parts.enter_context(Catalog.open(settings.data_dir))
+    catalog = parts.enter_context(_opened(settings))
     keys.load(elsewhere.keys or catalog.keys)
     settings.check_exposure(len(keys.by_id))
     try:
@@ -186,6 +232,10 @@ def _start(
         keep_ended_s=settings.keep_ended_sessions_s,
     )
     parts.callback(live.close)
+    if isinstance(catalog, SharedCatalog):
+        catalog.is_in_use = lambda domain, version, digest: (
+            maps_.holds(domain, version, digest) or (domain, version) in store.pins()
+        )
     open_traverses = OpenTraverses(settings.data_dir)
     parts.callback(open_traverses.close)
 

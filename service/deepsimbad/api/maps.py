@@ -31,7 +31,6 @@ from deepsimbad.api.requests import (
 from deepsimbad.engine.maps import load_snapshot, unreadable
 from deepsimbad.errors import ConflictError, DamagedMapError, UnknownMapVersionError
 from deepsimbad.store.catalog import ANY, removed
-from deepsimbad.store.map_file import verify
 from deepsimbad.store.records import MapState
 
 router = APIRouter(prefix="/v1/admin/domains", tags=["admin: maps"])
@@ -147,9 +146,8 @@ async def get_map_file(domain: DomainName, version: MapVersion, request: Request
             raise removed(domain, version)
         if record.sha256 is None:
             raise UnknownMapVersionError(f"map {version} of domain {domain} is still being built", version=version)
-        path = running.catalog.map_path(domain, version)
         try:
-            verify(path, record.sha256)
+            path = running.catalog.map_file(domain, version)
         except DamagedMapError as error:
             raise unreadable(running.catalog, domain, version) from error
         return path, record.sha256, path.stat().st_size

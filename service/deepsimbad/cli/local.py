@@ -15,6 +15,8 @@ from deepsimbad.cli.terminal import (
     existing_data_dir,
     given_settings,
     json_option,
+    map_store_option,
+    open_given_catalog,
     print_table,
     progress_bar,
     write_json,
@@ -46,7 +48,6 @@ from deepsimbad.jobs.remap_config import (
     refuse_impossible,
     remap_stages,
 )
-from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.layout import checked_name
 from deepsimbad.store.traverses import Traverse
 from deepsimbad_client.errors import BrokenFrameError
@@ -106,6 +107,7 @@ def _actions_m(_context: click.Context, _parameter: click.Parameter, value: str 
 @reading
 @accounting
 @json_option
+@map_store_option
 @data_dir_option
 def map_(
     domain: str,
@@ -143,7 +145,7 @@ def map_(
     recordings = {role: opened(source, allow_missing, closed=closed, **reading) for role, source in sources.items()}
     left_out = {}
     refuse_impossible(config, {role: len(recording.frames) for role, recording in recordings.items()}, None)
-    with Catalog.open(settings.data_dir) as catalog:
+    with open_given_catalog() as catalog:
         record, _ = catalog.create_domain(domain, evaluator.as_dict(), closed, actions_m)
         if thumbnails is not None:
             record = catalog.set_options(domain, {"thumbnails": thumbnails})
@@ -228,7 +230,8 @@ def localize(domain: str, images: tuple[str, ...], rotate: int | None, as_json: 
     from deepsimbad.api.localizations import render_localization  # noqa: PLC0415 - as below
 
     settings = given_settings()
-    with Catalog.open(existing_data_dir()) as catalog:
+    existing_data_dir()
+    with open_given_catalog() as catalog:
         active = Maps(catalog).active(domain)
         evaluator = EvaluatorPool(settings.compute()).evaluator(active.record.evaluator)
         snapshot, answers = active.snapshot, list[tuple[str, Any]]()
@@ -276,7 +279,8 @@ def _view_in(
 @data_dir_option
 def delete_domain(domain: str) -> None:
     """Delete a domain with everything it holds."""
-    with Catalog.open(existing_data_dir()) as catalog:
+    existing_data_dir()
+    with open_given_catalog() as catalog:
         catalog.delete_domain(domain)
     click.echo(f"domain {domain} is deleted")
 
@@ -290,7 +294,8 @@ def info(domain: str, as_json: bool) -> None:
     from deepsimbad.api.domains import describe_domain  # noqa: PLC0415 - takes FastAPI, as no other command but `serve`
 
     settings = given_settings()
-    with Catalog.open(existing_data_dir()) as catalog:
+    existing_data_dir()
+    with open_given_catalog() as catalog:
         answer = describe_domain(catalog.domain(domain), EvaluatorPool(settings.compute()), Maps(catalog))
     if as_json:
         write_json(answer.model_dump())

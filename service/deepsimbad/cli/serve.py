@@ -14,6 +14,8 @@ from deepsimbad.cli.terminal import (
     given_settings,
     json_list_option,
     json_option,
+    map_store_option,
+    open_given_catalog,
     print_table,
     report,
     traced_settings,
@@ -41,6 +43,7 @@ def _address_options(command: _Command) -> _Command:
 
 @click.command()
 @data_dir_option
+@map_store_option
 @_address_options
 @click.option("--create", is_flag=True, help="Make the data directory if it is not there.")
 def serve(host: str | None, port: int | None, create: bool) -> None:
@@ -64,8 +67,8 @@ def serve(host: str | None, port: int | None, create: bool) -> None:
 @data_dir_option
 def init() -> None:
     """Make a data directory, for its owner alone; one that is there stays as it is."""
+    open_given_catalog().close()
     folder = given_settings().data_dir
-    Catalog.open(folder).close()
     click.echo(f"{folder} is a data directory", err=True)
 
 

@@ -10,6 +10,8 @@ from deepsimbad.cli.terminal import (
     existing_data_dir,
     given_settings,
     json_option,
+    map_store_option,
+    open_given_catalog,
     progress_bar,
     report,
     write_json,
@@ -17,11 +19,11 @@ from deepsimbad.cli.terminal import (
 from deepsimbad.errors import UnavailableError
 from deepsimbad.jobs.versions import import_map
 from deepsimbad.release import release
-from deepsimbad.store.backup import back_up, inspect
+from deepsimbad.store.backup import Inspection, back_up, inspect
 from deepsimbad.store.backup import restore as restore_backup
-from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.layout import catalog_path, domains_folder
 from deepsimbad.store.map_file import export_map
+from deepsimbad.store.shared_catalog import inspect_objects
 
 _file_argument = click.argument("file", type=click.Path(path_type=Path))
 
@@ -62,7 +64,8 @@ def restore(file: Path, as_json: bool) -> None:
 @data_dir_option
 def export(domain: str, file: Path, version: int | None, as_json: bool) -> None:
     """Copy a sealed map of DOMAIN into FILE, byte for byte, checked against its digest."""
-    with Catalog.open(existing_data_dir()) as catalog:
+    existing_data_dir()
+    with open_given_catalog() as catalog:
         exported = export_map(catalog, domain, version, file)
     n_bytes, digest = exported.file_bytes, exported.sha256
     document = {
@@ -81,13 +84,14 @@ def export(domain: str, file: Path, version: int | None, as_json: bool) -> None:
 @click.option("--sha256", metavar="HEX", help="Digest that the file must have.")
 @click.option("--activate/--no-activate", default=True, show_default=True, help="Whether it shall serve at once.")
 @json_option
+@map_store_option
 @data_dir_option
 def import_(file: Path, domain: str | None, sha256: str | None, activate: bool, as_json: bool) -> None:
     """Take over an exported map as its domain's next version; a running service serves it within a second or so.
 
     The domain is made where it is absent; else it must have the same evaluator, actions and kind of route.
     """
-    with Catalog.open(given_settings().data_dir) as catalog:
+    with open_given_catalog() as catalog:
         imported = import_map(catalog, file, domain, sha256, activate=activate)
     state = "active" if imported.active else "sealed"
     line = f"map {imported.map_version} of {imported.domain} is {state}: {imported.bytes} bytes"
@@ -95,10 +99,11 @@ def import_(file: Path, domain: str | None, sha256: str | None, activate: bool, 
 
 
 @click.command()
+@click.option("--objects", is_flag=True, help="Read the maps that the map store has too, all of them.")
 @json_option
 @data_dir_option
 @click.pass_context
-def check(context: click.Context, as_json: bool) -> None:
+def check(context: click.Context, objects: bool, as_json: bool) -> None:
     """Verify every file, beside a running service or without one: one line a problem, exit code 1 if one is damaged.
 
     Nothing is changed.
@@ -106,9 +111,13 @@ def check(context: click.Context, as_json: bool) -> None:
     folder = given_settings().data_dir
     if not catalog_path(folder).exists() and not domains_folder(folder).exists():
         raise UnavailableError(f"there is nothing to check in {folder}: name its folder with --data-dir")
-    with progress_bar({"read": 1.0}, "check") as progress:
+    with progress_bar({"read": 1.0, "objects": 1.0 * objects}, "check") as progress:
         progress.stage("read")
         seen = inspect(folder, progress.update)
+        if objects:
+            progress.stage("objects")
+            in_store = inspect_objects(folder, progress.update)
+            seen = Inspection(seen.n_files + in_store.n_files, seen.damaged + in_store.damaged)
     if as_json:
         write_json({"ok": not seen.damaged, **asdict(seen)})
     else:

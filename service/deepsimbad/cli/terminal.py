@@ -29,7 +29,9 @@ from deepsimbad.evaluators.registry import (
 from deepsimbad.evaluators.weights.lock import Lock
 from deepsimbad.jobs.progress import Progress, ProgressState
 from deepsimbad.settings import Settings, TracedSettings, trace_settings
+from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.layout import catalog_path
+from deepsimbad.store.shared_catalog import open_catalog
 
 _Command = TypeVar("_Command", bound=Callable[..., Any])
 
@@ -80,7 +82,7 @@ def traced_settings(**flags: object) -> TracedSettings:
         SettingsError: The file cannot be read, a name is unknown or a value cannot be used.
     """
     meta = click.get_current_context().meta
-    flags |= {name: meta.get(f"deepsimbad.{name}") for name in ("data_dir", "weights_dir")}
+    flags |= {name: meta.get(f"deepsimbad.{name}") for name in ("data_dir", "weights_dir", "map_store")}
     return trace_settings(meta.get("deepsimbad.config"), **flags)
 
 
@@ -101,6 +103,21 @@ def existing_data_dir() -> Path:
             f"there are no domains in {data_dir}: name their folder with --data-dir, or make one with `deepsimbad map`"
         )
     return data_dir
+
+
+def open_given_catalog() -> Catalog:
+    """The catalog of the data directory, which follows a map store where settings say so or it did before."""
+    settings = given_settings()
+    return open_catalog(settings.data_dir, settings.map_store, settings.map_cache_disk_bytes)
+
+
+map_store_option = click.option(
+    "--map-store",
+    metavar="URL",
+    expose_value=False,
+    callback=remember,
+    help="Objects by which machines share maps, as s3://bucket/prefix or file:///folder.  [default: as before]",
+)
 
 
 def _evaluator(_context: click.Context, _parameter: click.Parameter, value: str) -> EvaluatorConfig:

@@ -25,7 +25,7 @@ from deepsimbad.errors import (
 )
 from deepsimbad.store.catalog import Catalog, removed
 from deepsimbad.store.durable import storage_faults
-from deepsimbad.store.map_file import read_map, verify
+from deepsimbad.store.map_file import read_map
 from deepsimbad.store.records import DomainRecord, KeptMap, MapState, now
 from deepsimbad.store.sessions import SessionStore
 
@@ -134,7 +134,7 @@ class Maps:
         with self._lock_of(domain):
             try:
                 record = self._catalog.domain(domain)
-                active = MappedDomain(record, self._current(record))
+                active = MappedDomain(record, self._current_or_last(record))
             except DeepSimbadError:
                 self._let_go(domain)
                 raise
@@ -189,6 +189,18 @@ class Maps:
             mapped = self._active.pop(domain, None)
             self._n_bytes -= mapped.snapshot.n_bytes if mapped else 0
         self._checked_at.pop(domain, None)
+
+    def _current_or_last(self, record: DomainRecord) -> Map:
+        """The active map, or while its file cannot be had (a map store is away, ...) the one that served before."""
+        try:
+            return self._current(record)
+        except DamagedMapError:
+            raise
+        except UnavailableError:
+            last = self._active.get(record.name)
+            if last is None or last.record.created_at != record.created_at:
+                raise
+            return last.snapshot
 
     def _current(self, record: DomainRecord) -> Map:
         domain, version = record.name, record.active_version
@@ -273,10 +285,18 @@ class Maps:
                 record, its_map = self._catalog.domain(domain), self._catalog.map(domain, version)
             except (UnknownDomainError, UnknownMapVersionError) as error:
                 raise retired(domain, version) from error
-            is_removed = its_map.state is not MapState.ACTIVE and not self._catalog.map_path(domain, version).exists()
+            is_removed = its_map.state is not MapState.ACTIVE and not self._catalog.has_file(domain, version)
             if its_map.sha256 != digest or (is_removed and (domain, version, digest) not in self._held):
                 raise retired(domain, version)
             return MappedDomain(record, self._load(domain, version, digest))
+
+    def serves(self, domain: str) -> bool:
+        """Whether the active map of a domain is in memory."""
+        return domain in self._active
+
+    def holds(self, domain: str, version: int, digest: str) -> bool:
+        """Whether a version is in memory."""
+        return (domain, version, digest) in self._held
 
     def snapshot(self, domain: str, version: int) -> Map:
         """A sealed map version that need not serve, as a session may be pinned to one; may read files.
@@ -377,11 +397,9 @@ def load_snapshot(catalog: Catalog, domain: str, version: int) -> Map:
     record = catalog.map(domain, version)
     if record.removed_at is not None:
         raise removed(domain, version)
-    path = catalog.map_path(domain, version)
     try:
-        with storage_faults(path, DamagedMapError):
-            if record.sha256 is not None:
-                verify(path, record.sha256)
+        with storage_faults(catalog.map_path(domain, version), DamagedMapError):
+            path = catalog.map_file(domain, version)
             # A map moved here from another server says in its file what it was called there.
             snapshot = replace(read_map(path), domain=domain, version=version)
             _ = snapshot.relevance  # without one it can answer nothing

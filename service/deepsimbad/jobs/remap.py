@@ -267,7 +267,7 @@ class _Remap:
             if self.config.append:
                 raise InvalidMapConfigError(f"domain {record.name} has no active map that could be appended to")
             return None
-        return staying(self.config, read_map(self.catalog.map_path(record.name, record.active_version)))
+        return staying(self.config, read_map(self.catalog.map_file(record.name, record.active_version)))
 
     def _mapped(self, inputs: _Inputs) -> _Draft:
         """The training traverse as a map of its own."""

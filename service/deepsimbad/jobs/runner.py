@@ -41,6 +41,7 @@ from deepsimbad.jobs.versions import EXPERIENCE, LEARN_STAGES, ExperienceConfig,
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.records import JobRecord, JobState
 from deepsimbad.store.sessions import SessionStore
+from deepsimbad.store.shared_catalog import open_catalog
 
 _log = logging.getLogger(__name__)
 REMAP = "remap"  # the kind of job
@@ -286,7 +287,7 @@ class InThisProcess:
             if job.kind == EXPERIENCE:
                 return self._learn(job, Progress(LEARN_STAGES, on_progress, is_cancelled))
             config = RemapConfig.from_dict(job.config)
-            with Catalog.open(self.data_dir) as catalog:
+            with open_catalog(self.data_dir) as catalog:
                 Progress({}, None, is_cancelled).check()
                 evaluator = make_evaluator(evaluator_config(catalog.domain(job.domain).evaluator), self.compute)
                 try:
@@ -299,7 +300,7 @@ class InThisProcess:
             raise OutOfMemoryError("too little memory is left for the job") from error
 
     def _learn(self, job: JobRecord, progress: Progress) -> dict[str, Any]:
-        with Catalog.open(self.data_dir) as catalog:
+        with open_catalog(self.data_dir) as catalog:
             progress.check()
             sealed = catalog.map_of_job(job.domain, job.job_id)
             if sealed is not None:  # what it learnt is in there; a second time would count double

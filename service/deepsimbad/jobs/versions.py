@@ -192,7 +192,7 @@ def _check_landmarks(catalog: Catalog, record: SessionRecord, active: int | None
 
 def _landmarks(catalog: Catalog, domain: str, version: int) -> Mapping[str, NDArray[Any]]:
     try:
-        return read_map(catalog.map_path(domain, version)).landmark_model
+        return read_map(catalog.map_file(domain, version)).landmark_model
     except DamagedMapError as error:  # perhaps because its file was removed
         raise unreadable(catalog, domain, version) from error
 
@@ -218,7 +218,7 @@ def learn_online(
         raise NoActiveMapError(f"domain {domain} has no active map that could learn")
     progress.stage("read map")
     before = catalog.map(domain, active)
-    map_ = read_map(catalog.map_path(domain, active))
+    map_ = read_map(catalog.map_file(domain, active))
     progress.stage("learn")
     config, n_moves = NnqlConfig(), 0
     if map_.q_values is None:

@@ -27,9 +27,9 @@ from deepsimbad.errors import (
 )
 from deepsimbad.store import layout
 from deepsimbad.store.connection import check_integrity, in_todays_schema, look_at, pending_migrations
-from deepsimbad.store.durable import PRIVATE, service_lock, sha256_of, storage_faults, sync, written_aside
+from deepsimbad.store.durable import PRIVATE, service_lock, sha256_of, storage_faults, sync, verify, written_aside
 from deepsimbad.store.layout import NAME_PATTERN
-from deepsimbad.store.map_file import read_map, verify
+from deepsimbad.store.map_file import read_map
 from deepsimbad.store.records import now
 from deepsimbad_migrations.catalog.migrations import migrations as of_catalog
 from deepsimbad_migrations.map.migrations import migrations as of_map
@@ -104,14 +104,19 @@ def migrations_of(name: str) -> Migrations | None:
     return next((migrations for pattern, migrations in _MEMBERS.items() if re.fullmatch(pattern, name)), None)
 
 
-def _listed_in(path: Path) -> Listed:
-    """Read a catalog; raises DamagedFileError."""
+def _listed_in(path: Path, data_dir: Path) -> Listed:
+    """Read a catalog; of maps that a store keeps, those that have their files here. Raises DamagedFileError."""
 
     def read(db: Database) -> Listed:
         with in_todays_schema(db, of_catalog, path) as current:
-            maps = current.execute(
-                "SELECT domain, version, sha256 FROM map WHERE state != 'building' AND removed_at IS NULL"
+            rows = current.execute(
+                "SELECT domain, version, sha256, shared FROM map WHERE state != 'building' AND removed_at IS NULL"
             ).fetchall()
+            maps = [
+                (domain, version, digest)
+                for domain, version, digest, is_shared in rows
+                if not is_shared or layout.map_path(data_dir, domain, version).exists()
+            ]
             return frozenset([*maps, *current.execute("SELECT name, 0, created_at FROM domain").fetchall()])
 
     with storage_faults(path):
@@ -136,7 +141,7 @@ def back_up(data_dir: Path, file: Path, release: str, on_progress: Progress) -> 
                 if layout.sessions_path(data_dir).exists():
                     members.append(_add_copy(tar, data_dir, layout.sessions_path(data_dir), new.parent))
                 members.append(_add_copy(tar, data_dir, catalog, new.parent))
-                listed = _listed_in(new.parent / _CATALOG)
+                listed = _listed_in(new.parent / _CATALOG, data_dir)
                 try:
                     for n_done, (domain, version, digest) in enumerate(sorted(listed)):
                         on_progress(n_done / len(listed))
@@ -151,7 +156,7 @@ def back_up(data_dir: Path, file: Path, release: str, on_progress: Progress) -> 
                 info = tarfile.TarInfo(_MANIFEST)
                 info.size, info.mode, info.mtime = len(manifest), 0o600, int(time.time())
                 tar.addfile(info, io.BytesIO(manifest))
-            if listed <= _listed_in(catalog):  # else a damaged or missing file may be one that went meanwhile
+            if listed <= _listed_in(catalog, data_dir):  # else a damaged or missing file may be one that went meanwhile
                 break
         else:
             raise UnavailableError("maps come and go faster than they can be copied: try again", reason="busy")
@@ -234,7 +239,9 @@ def restore(file: Path, data_dir: Path, on_progress: Progress) -> RestoreReport:
             for n_done, member in enumerate(members):
                 on_progress(n_done / len(members))
                 _unpack(tar, file, member, staging)
-            for domain in {domain for domain, _, _ in _listed_in(staging / _CATALOG)}:  # those without files too
+            for domain in {
+                domain for domain, _, _ in _listed_in(staging / _CATALOG, staging)
+            }:  # those without files too
                 layout.traverses_folder(staging, domain).mkdir(parents=True, exist_ok=True)
                 layout.maps_folder(staging, domain).mkdir(parents=True, exist_ok=True)
             for folder, _, _ in os.walk(staging, topdown=False):
@@ -365,7 +372,7 @@ def _files(data_dir: Path) -> dict[Path, str | None]:
     for working in ("traverses/*.sqlite", "thumbnails.sqlite"):
         files |= dict.fromkeys(sorted(data_dir.glob(f"domains/*/{working}")), None)
     with suppress(DeepSimbadError):
-        for domain, version, digest in sorted(_listed_in(catalog)):
+        for domain, version, digest in sorted(_listed_in(catalog, data_dir)):
             if version > 0:
                 files[layout.map_path(data_dir, domain, version)] = digest
     return files

@@ -34,6 +34,7 @@ from deepsimbad.store.durable import (
     remove_database,
     storage_faults,
     sync,
+    verify,
 )
 from deepsimbad.store.records import (
     DomainRecord,
@@ -456,6 +457,23 @@ class Catalog(JobCatalog, KeyCatalog):
     def map_path(self, domain: str, version: int) -> Path:
         """Where the sealed file of a version lies, or will; raises InvalidInputError."""
         return layout.map_path(self.data_dir, domain, version)
+
+    def map_file(self, domain: str, version: int) -> Path:
+        """The sealed file of a version, to be read; it is what was sealed.
+
+        Raises:
+            UnknownDomainError, UnknownMapVersionError: There is no such version.
+            DamagedMapError: The file is missing, or another one.
+            UnavailableError: The disk failed, ...
+        """
+        path, digest = self.map_path(domain, version), self.map(domain, version).sha256
+        if digest is not None:
+            verify(path, digest)
+        return path
+
+    def has_file(self, domain: str, version: int) -> bool:
+        """Whether the file of a version was not removed."""
+        return self.map_path(domain, version).exists()
 
     def building_path(self, domain: str, version: int) -> Path:
         """Where a version is to be built before it is sealed; raises InvalidInputError."""

@@ -138,6 +138,23 @@ def sha256_of(path: Path) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
+def verify(path: Path, sha256: str) -> None:
+    """Check a sealed file against the digest the catalog keeps.
+
+    Raises:
+        DamagedMapError: The file is missing or not the one that was sealed.
+        UnavailableError: The disk failed, ...
+    """
+    if not path.is_file():
+        raise DamagedMapError(f"{path.name} is missing", file=path.name)
+    with storage_faults(path, DamagedMapError):
+        digest = sha256_of(path)
+    if digest != sha256:
+        raise DamagedMapError(
+            f"{path.name} is not the file that was sealed: its SHA-256 differs", file=path.name, sha256=digest
+        )
+
+
 def remove_database(path: Path) -> bool:
     """Remove a SQLite file with its side files; returns whether the file was there.
 

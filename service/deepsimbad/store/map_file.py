@@ -4,7 +4,7 @@ What the arrays mean is not known here: `core.map` names them, a table holds eac
 """
 
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -35,7 +35,7 @@ from deepsimbad.store.arrays import (
 )
 from deepsimbad.store.catalog import Catalog, removed
 from deepsimbad.store.connection import check_integrity, in_todays_schema, open_database
-from deepsimbad.store.durable import remove_database, sha256_of, storage_faults, sync, written_aside
+from deepsimbad.store.durable import remove_database, sha256_of, storage_faults, sync, verify, written_aside
 from deepsimbad.store.records import MapRecord, from_json, to_json
 from deepsimbad_migrations.map.migrations import migrations
 
@@ -272,6 +272,17 @@ def adopt(source: Path, final_path: Path, sha256: str) -> int:
     return final_path.stat().st_size
 
 
+def fetch(pieces: Iterable[bytes], final_path: Path, sha256: str) -> None:
+    """As `adopt`, of a file that comes in pieces from elsewhere, in the place of one that may be there."""
+    with storage_faults(final_path):
+        final_path.parent.mkdir(parents=True, exist_ok=True)
+        remove_database(final_path)
+    with _taking_its_name(final_path) as sealing_path:
+        with sealing_path.open("xb") as stream:
+            stream.writelines(pieces)
+        verify(sealing_path, sha256)
+
+
 @contextmanager
 def _taking_its_name(final_path: Path) -> Iterator[Path]:
     """Where to write what, at the end of the block, is made read-only, synced and given its final name, or removed."""
@@ -291,23 +302,6 @@ def _taking_its_name(final_path: Path) -> Iterator[Path]:
                 raise DamagedMapError(error.message, **error.hints) from error
             raise
         sync(final_path.parent)
-
-
-def verify(path: Path, sha256: str) -> None:
-    """Check a sealed file against the digest the catalog keeps.
-
-    Raises:
-        DamagedMapError: The file is missing or not the one that was sealed.
-        UnavailableError: The disk failed, ...
-    """
-    if not path.is_file():
-        raise DamagedMapError(f"{path.name} is missing", file=path.name)
-    with storage_faults(path, DamagedMapError):
-        digest = sha256_of(path)
-    if digest != sha256:
-        raise DamagedMapError(
-            f"{path.name} is not the file that was sealed: its SHA-256 differs", file=path.name, sha256=digest
-        )
 
 
 def export_map(catalog: Catalog, domain: str, version: int | None, file: Path) -> MapRecord:
@@ -330,11 +324,9 @@ def export_map(catalog: Catalog, domain: str, version: int | None, file: Path) -
         raise removed(domain, version)
     if record.sha256 is None:
         raise UnknownMapVersionError(f"map {version} of domain {domain} is still being built", version=version)
-    source = catalog.map_path(domain, version)
     try:
         with storage_faults(file), written_aside(file, "an export") as new:
-            verify(source, record.sha256)
-            shutil.copyfile(source, new)
+            shutil.copyfile(catalog.map_file(domain, version), new)
             verify(new, record.sha256)
             new.chmod(0o444)
     except DamagedMapError as error:

@@ -1,0 +1,453 @@
+"""A catalog that several machines share: what is published to a map store, and what is followed of its log.
+
+Every such catalog is a copy of the log as far as it was read, and changes shared domains by reading it alone.
+"""
+
+import os
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any, TypeAlias, TypeVar
+
+from sqlite_utils import Database
+
+from deepsimbad.errors import (
+    ConflictError,
+    DamagedMapError,
+    DomainDiffersError,
+    LostActivationError,
+    NotFoundError,
+    UnavailableError,
+)
+from deepsimbad.store import layout
+from deepsimbad.store.backup import Inspection
+from deepsimbad.store.catalog import ANY, AnyVersion, Catalog
+from deepsimbad.store.connection import look_at, open_database
+from deepsimbad.store.durable import empty_graves, storage_faults, sync
+from deepsimbad.store.map_file import fetch
+from deepsimbad.store.map_store import MapStore
+from deepsimbad.store.records import DomainRecord, MapRecord, MapState, from_json, now, read_domains, to_json
+
+T = TypeVar("T")
+_State: TypeAlias = dict[str, Any] | None
+_LEAST_BETWEEN_STATES = 256  # entries of the log; of many domains an eighth of their number
+_N_LOCKS = 16  # of fetching: of two files seldom the same
+
+
+def open_catalog(data_dir: Path, map_store: str | None = None, cache_bytes: int | None = None) -> Catalog:
+    """The catalog of a data directory, as `Catalog.open`; a shared one where it follows a map store, once and for all.
+
+    Args:
+        map_store: URL of the store; None: the one that the data directory follows already, if any.
+        cache_bytes: Of map files that may lie in the data directory though the store has them; None: any number.
+
+    Raises:
+        MissingPackageError, SettingsError: As `Objects.open`.
+        ConflictError: The data directory follows another store.
+        UnavailableError: A store that it does not follow yet cannot be reached.
+    """
+    followed = followed_store(data_dir)
+    if map_store is None and followed is None:
+        return Catalog.open(data_dir)
+    store = MapStore.open(map_store or str(followed))
+    catalog = SharedCatalog.open(data_dir)
+    try:
+        catalog.begin_to_follow(store, cache_bytes, is_new=store.url != followed)
+    except BaseException:
+        catalog.close()
+        raise
+    return catalog
+
+
+def followed_store(data_dir: Path) -> str | None:
+    """The URL of the map store that a data directory follows, if any; raises DamagedFileError."""
+    path = layout.catalog_path(data_dir)
+
+    def ask(db: Database) -> str | None:
+        rows = db.execute("SELECT url FROM map_store").fetchall() if "map_store" in db.table_names() else []
+        return rows[0][0] if rows else None
+
+    if not path.exists():
+        return None
+    with storage_faults(path):
+        return look_at(path, ask)
+
+
+def inspect_objects(data_dir: Path, on_progress: Callable[[float], None]) -> Inspection:
+    """Read the objects of all maps of a data directory that its store has; raises as `open_catalog`, NotFoundError."""
+    url, path = followed_store(data_dir), layout.catalog_path(data_dir)
+    if url is None:
+        raise NotFoundError(f"{data_dir} follows no map store: there are no objects to check")
+    ask = "SELECT DISTINCT sha256 FROM map WHERE shared AND removed_at IS NULL ORDER BY sha256"
+    with storage_faults(path):
+        digests = [digest for (digest,) in look_at(path, lambda db: db.execute(ask).fetchall())]
+    return Inspection(len(digests), tuple(MapStore.open(url).inspect(digests, on_progress)))
+
+
+class SharedCatalog(Catalog):
+    """A catalog that publishes what is changed through it, and follows what others publish.
+
+    A change is tried in a transaction that is undone, which tells what the domain would be; the map's object is made
+    durable, then the log's next entry is written, then it is read as by everybody else. A crash between two of these
+    leaves an object that nothing names, or an entry that the next look reads. Changes raise UnavailableError as
+    `MapStore` does, beside what `Catalog` names.
+    """
+
+    store: MapStore
+    is_in_use: Callable[[str, int, str], bool] = staticmethod(lambda _domain, _version, _sha256: False)
+    """Whether a map, by its domain, version and digest, is in memory or pinned, and keeps its file."""
+
+    def __init__(self, data_dir: Path, db: Database) -> None:
+        super().__init__(data_dir, db)
+        self._cache_bytes: int | None = None
+        self._transaction: Database | None = None
+        self._is_trying = False
+        self._fetching = tuple(threading.Lock() for _ in range(_N_LOCKS))
+        self._making_room, self._n_coming = threading.Lock(), 0
+
+    def begin_to_follow(self, store: MapStore, cache_bytes: int | None, *, is_new: bool) -> None:
+        """Take up a store; raises as `open_catalog`."""
+        self.store, self._cache_bytes = store, cache_bytes
+        if not is_new:
+            return
+        store_id = store.store_id()
+        with self._writing() as db:
+            for url, present in db.execute("SELECT url, store_id FROM map_store").fetchall():
+                if present != store_id:
+                    raise ConflictError(
+                        f"{self.data_dir} follows the map store {url}: export its maps and import them into a new data "
+                        f"directory to publish them to {store.url}",
+                        map_store=url,
+                    )
+            db.execute("INSERT OR IGNORE INTO map_store VALUES (1, ?, ?, 0)", [store.url, store_id])
+            db.execute("UPDATE map_store SET url = ?", [store.url])
+
+    # Following
+
+    def follow(self) -> list[str]:
+        """Read on in the log; answers which domains changed.
+
+        Raises:
+            DomainDiffersError: A domain that was published has the name of another that was made here.
+            DamagedFileError, UnavailableError: As `MapStore`.
+        """
+        changed = self._begin_with_state() if self._position() == 0 else []
+        for number, entry in self.store.entries(self._position()):
+            changed += self._apply(number, entry)
+        return changed
+
+    def _position(self) -> int:
+        with self._reading() as db:
+            return int(db.execute("SELECT position FROM map_store").fetchone()[0])
+
+    def _begin_with_state(self) -> list[str]:
+        state = self.store.state()
+        if state is None:
+            return []
+        with self._writing() as db:
+            for name, of_domain in state["domains"].items():
+                self._take_over(db, name, of_domain)
+            db.execute("UPDATE map_store SET position = ?", [state["position"]])
+        sync(layout.domains_folder(self.data_dir))
+        return list(state["domains"])
+
+    def _apply(self, position: int, entry: Mapping[str, Any]) -> list[str]:
+        name = str(entry["domain"])
+        with self._writing() as db:
+            if db.execute("SELECT position FROM map_store").fetchone()[0] != position - 1:
+                return []  # another process was faster
+            if entry["state"] is None:
+                db.execute("DELETE FROM domain WHERE name = ?", [name])
+                db.execute("INSERT OR IGNORE INTO doomed_folder VALUES (?)", [name])
+            else:
+                self._take_over(db, name, entry["state"])
+            db.execute("UPDATE map_store SET position = ?", [position])
+        with self._writing() as db:
+            self._finish_deletion(db, name)
+        empty_graves(layout.domains_folder(self.data_dir))
+        return [name]
+
+    def _take_over(self, db: Database, name: str, state: Mapping[str, Any]) -> None:
+        """Let a domain be what the log says; raises DomainDiffersError where another of its name was made here."""
+        about = {key: state[key] for key in ("evaluator", "closed", "actions_m")}
+        for record in read_domains(db, name):
+            present = {"evaluator": record.evaluator, "closed": record.closed, "actions_m": list(record.actions_m)}
+            if to_json(present) != to_json(about):
+                raise DomainDiffersError(
+                    f"domain {name} of {self.data_dir} has another configuration than that of the map store: delete "
+                    "one of the two first",
+                    present=present,
+                )
+        self._finish_deletion(db, name)
+        db.execute(
+            """
+            INSERT INTO domain (name, evaluator, closed, actions_m, created_at, options, shared)
+            VALUES (?, ?, ?, ?, ?, ?, 1)
+            ON CONFLICT (name) DO UPDATE SET created_at = excluded.created_at, options = excluded.options, shared = 1
+            """,
+            [
+                *(name, to_json(state["evaluator"]), int(state["closed"]), to_json(state["actions_m"])),
+                *(state["created_at"], to_json(state["options"])),
+            ],
+        )
+        layout.traverses_folder(self.data_dir, name).mkdir(parents=True, exist_ok=True)
+        layout.maps_folder(self.data_dir, name).mkdir(parents=True, exist_ok=True)
+        if state["map"] is not None:
+            self._take_over_map(db, name, **state["map"])
+
+    def _take_over_map(
+        self,
+        db: Database,
+        name: str,
+        version: int,
+        created_at: str,
+        sha256: str,
+        file_bytes: int,
+        config: Mapping[str, Any],
+        metrics: Mapping[str, Any],
+    ) -> None:
+        """Let a version serve; one of its number that was made here meanwhile gets the next free number."""
+        where = [name, version]
+        mine = db.execute("SELECT sha256, state FROM map WHERE domain = ? AND version = ?", where).fetchone()
+        db.execute("UPDATE domain SET next_version = max(next_version, ?) WHERE name = ?", [version + 1, name])
+        if mine is not None and mine[0] != sha256 and mine[1] == MapState.BUILDING:
+            db.execute("DELETE FROM map WHERE domain = ? AND version = ?", where)  # who builds it is told at the end
+        elif mine is not None and mine[0] != sha256:
+            (free,) = db.execute("SELECT next_version FROM domain WHERE name = ?", [name]).fetchone()
+            other = self.map_path(name, free)
+            other.unlink(missing_ok=True)
+            with suppress(FileNotFoundError):  # damaged before: what it was called makes no difference
+                os.link(self.map_path(name, version), other)
+            state = MapState.RETIRED if mine[1] == MapState.ACTIVE else mine[1]
+            db.execute("UPDATE map SET version = ?, state = ? WHERE domain = ? AND version = ?", [free, state, *where])
+            db.execute("UPDATE domain SET next_version = ? WHERE name = ?", [free + 1, name])
+        db.execute(
+            """
+            INSERT INTO map (domain, version, state, created_at, sha256, file_bytes, config, metrics, shared)
+            VALUES (?, ?, 'sealed', ?, ?, ?, ?, ?, 1)
+            ON CONFLICT (domain, version) DO UPDATE SET shared = 1, removed_at = NULL
+            """,
+            [name, version, created_at, sha256, file_bytes, to_json(config), to_json(metrics)],
+        )
+        super().activate(name, version, ANY)
+
+    # Publishing
+
+    def publish_own(self) -> None:
+        """Publish the domains that the store does not know yet: those made before it was followed, or as we crashed."""
+        with self._reading() as db:
+            names = [name for (name,) in db.execute("SELECT name FROM domain WHERE shared = 0 ORDER BY name")]
+        for name in names:
+            self._publish(name, lambda: None)
+
+    def create_domain(
+        self,
+        name: str,
+        evaluator: dict[str, Any],
+        closed: bool,
+        actions_m: Sequence[float],
+        max_domains: int | None = None,
+    ) -> tuple[DomainRecord, bool]:
+        """As `Catalog.create_domain`."""
+        create = super().create_domain
+        _, is_new = self._publish(name, lambda: create(name, evaluator, closed, actions_m, max_domains))
+        return self.domain(name), is_new
+
+    def set_options(self, name: str, options: Mapping[str, Any]) -> DomainRecord:
+        """As `Catalog.set_options`."""
+        change = super().set_options
+        self._publish(name, lambda: change(name, options))
+        return self.domain(name)
+
+    def delete_domain(self, name: str, *, only_empty: bool = False) -> None:
+        """As `Catalog.delete_domain`; the domain is no more anywhere."""
+        delete = super().delete_domain
+        with self._reading() as db:
+            is_shared = _is_shared_domain(db, name)
+        if is_shared:
+            self._publish(name, lambda: delete(name, only_empty=only_empty))
+        else:
+            delete(name, only_empty=only_empty)
+
+    def activate(self, domain: str, version: int, expected: int | AnyVersion | None) -> MapRecord:
+        """As `Catalog.activate`, everywhere; LostActivationError too where another node published the number first."""
+        swap, digest = super().activate, self.map(domain, version).sha256
+
+        def change() -> None:
+            if swap(domain, version, expected).sha256 != digest:
+                raise LostActivationError(
+                    f"another node made a map {version} of domain {domain} meanwhile: what was map {version} here has "
+                    "another number now",
+                    active=version,
+                    expected=None if expected is ANY else expected,
+                )
+
+        self._publish(domain, change)
+        return self.map(domain, version)
+
+    def _publish(self, name: str, change: Callable[[], T]) -> T:
+        """Make a change of a domain everywhere, unless it changes nothing; answers what the change did when tried."""
+        while True:
+            self.follow()
+            before, after, position, answer = self._tried(name, change)
+            if before == after:
+                return answer
+            if after is not None and after["map"] is not None and (before is None or before["map"] != after["map"]):
+                map_ = after["map"]
+                self.store.put_map(self.map_path(name, map_["version"]), map_["sha256"], map_["file_bytes"])
+            entry = {"domain": name, "state": after, "at": now()}
+            if self.store.append(position + 1, entry):
+                break
+        self._apply(position + 1, entry)
+        self._write_state(position + 1)
+        return answer
+
+    def _tried(self, name: str, change: Callable[[], T]) -> tuple[_State, _State, int, T]:
+        """What a domain is in the log and would be after a change, the log's last number, what the change answered."""
+        with suppress(_UndoneError), self._writing() as db:
+            before = _state_of(db, name) if _is_shared_domain(db, name) else None
+            position = int(db.execute("SELECT position FROM map_store").fetchone()[0])
+            self._is_trying = True
+            try:
+                answer = change()
+            finally:
+                self._is_trying = False
+            tried = before, _state_of(db, name), position, answer
+            raise _UndoneError
+        return tried
+
+    @contextmanager
+    def _writing(self) -> Iterator[Database]:
+        """One transaction; what is written inside another one belongs to that."""
+        with self._lock:
+            if self._transaction is not None:
+                yield self._transaction
+                return
+            with super()._writing() as db:
+                self._transaction = db
+                try:
+                    yield db
+                finally:
+                    self._transaction = None
+
+    def _finish_deletion(self, db: Database, name: str) -> None:
+        if not self._is_trying:  # a folder that was buried would not come back
+            super()._finish_deletion(db, name)
+
+    def _write_state(self, position: int) -> None:
+        """Write all domains as one object, so seldom that it costs little an entry."""
+        path, between = layout.catalog_path(self.data_dir), _LEAST_BETWEEN_STATES
+        with open_database(path, read_only=True) as db, db.atomic():  # robots' answers need the other connections
+            names = [name for (name,) in db.execute("SELECT name FROM domain WHERE shared")]
+            while between < len(names) // 8:
+                between *= 2
+            if position % between:
+                return
+            (position,) = db.execute("SELECT position FROM map_store").fetchone()
+            state = {"position": position, "domains": {name: _state_of(db, name) for name in names}}
+        self.store.put_state(state)
+
+    # Files
+
+    def map_file(self, domain: str, version: int) -> Path:
+        """As `Catalog.map_file`; a shared map that is missing or damaged here is fetched, once however many ask."""
+        record, path = self.map(domain, version), self.map_path(domain, version)
+        with self._fetching[hash(path) % _N_LOCKS]:
+            try:
+                super().map_file(domain, version)
+            except DamagedMapError:
+                if record.sha256 is None or not self._is_shared(domain, version):
+                    raise
+                with self._room_for(record.file_bytes or 0):
+                    fetch(self.store.map_pieces(record.sha256), path, record.sha256)
+            with suppress(OSError):  # a disk that may only be read
+                os.utime(path)  # files that were asked for longest ago make room first
+        return path
+
+    def has_file(self, domain: str, version: int) -> bool:
+        """As `Catalog.has_file`, here or in the store."""
+        return super().has_file(domain, version) or self._is_shared(domain, version)
+
+    def _is_shared(self, domain: str, version: int) -> bool:
+        with self._reading() as db:
+            rows = db.execute(
+                "SELECT 1 FROM map WHERE domain = ? AND version = ? AND shared AND removed_at IS NULL",
+                [domain, version],
+            )
+            return rows.fetchone() is not None
+
+    @contextmanager
+    def _room_for(self, n_bytes: int) -> Iterator[None]:
+        """So many bytes of the cache, until they are a file there; raises UnavailableError."""
+        with self._making_room:
+            if self._cache_bytes is not None:
+                self._make_room(self._n_coming + n_bytes, self._cache_bytes)
+            self._n_coming += n_bytes
+        try:
+            yield
+        finally:
+            with self._making_room:
+                self._n_coming -= n_bytes
+
+    def _make_room(self, n_bytes: int, cache_bytes: int) -> None:
+        """Remove files that can be fetched again, those asked for longest ago first, until so many bytes fit in."""
+        files = []
+        for path in layout.domains_folder(self.data_dir).glob("*/maps/*.sqlite"):
+            with suppress(FileNotFoundError):
+                files.append((path.stat().st_mtime_ns, path.stat().st_size, path))
+        excess = sum(size for _, size, _ in files) + n_bytes - cache_bytes
+        for _, size, path in sorted(files):
+            if excess <= 0:
+                return
+            domain, version = path.parent.parent.name, int(path.stem)
+            if self._is_shared(domain, version):
+                digest = self.map(domain, version).sha256 or ""
+                if not self.is_in_use(domain, version, digest):
+                    path.unlink(missing_ok=True)
+                    excess -= size
+        if excess > 0:
+            raise UnavailableError(
+                f"{n_bytes} bytes of maps have no room beside the files that are in use: raise map_cache_disk_bytes, "
+                f"which is {cache_bytes}",
+                reason="cache_full",
+                map_cache_disk_bytes=cache_bytes,
+            )
+
+
+class _UndoneError(Exception):
+    """Ends a transaction that was only tried."""
+
+
+def _is_shared_domain(db: Database, name: str) -> bool:
+    return db.execute("SELECT 1 FROM domain WHERE name = ? AND shared", [name]).fetchone() is not None
+
+
+def _state_of(db: Database, name: str) -> _State:
+    """What the log says of a domain, None where there is none."""
+    for record in read_domains(db, name):
+        row = db.execute(
+            """
+            SELECT version, created_at, sha256, file_bytes, config, metrics FROM map
+            WHERE domain = ? AND state = 'active'
+            """,
+            [name],
+        ).fetchone()
+        version, created_at, sha256, file_bytes, config, metrics = row or (None,) * 6
+        serving = {
+            "version": version,
+            "created_at": created_at,
+            "sha256": sha256,
+            "file_bytes": file_bytes,
+            "config": from_json(config),
+            "metrics": from_json(metrics),
+        }
+        return {
+            "evaluator": record.evaluator,
+            "closed": record.closed,
+            "actions_m": list(record.actions_m),
+            "options": record.options,
+            "created_at": record.created_at,
+            "map": serving if row else None,
+        }
+    return None
