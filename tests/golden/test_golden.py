@@ -39,7 +39,7 @@ COMMANDS = [
     ),
     *(["experiment", "calibration"], ["experiment", "paper"]),
     *(["backup"], ["restore"], ["export"], ["import"], ["check"], ["weights"], ["weights", "list"]),
-    *(["weights", "pull"], ["weights", "verify"]),
+    *(["weights", "pull"], ["weights", "verify"], ["ray"], ["ray", "map"]),
 ]
 CLIENT_COMMANDS = """activate campus delete-domain delete-map delete-session delete-traverse domains download jobs
 localize maps remap replay rollback sessions traverses upload watch""".split()  # noqa: SIM905 - as one writes it
@@ -245,7 +245,9 @@ def test_both_commands_have_one_order_of_words():
         {name: group.get_command(Context(group), name) for name in group.list_commands(Context(group))}
         for group in (commands, cli)
     )
-    assert {name for name, command in ours.items() if isinstance(command, Group)} == {"experiment", "keys", "weights"}
+    assert {name for name, command in ours.items() if isinstance(command, Group)} == {
+        *("experiment", "keys", "ray", "weights")
+    }
     assert not any(isinstance(command, Group) for command in theirs.values())
     for command in (*ours.values(), *theirs.values()):
         words = [parameter.human_readable_name for parameter in command.params if isinstance(parameter, Argument)]

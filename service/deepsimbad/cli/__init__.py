@@ -11,6 +11,7 @@ import click
 from deepsimbad.cli.experiment import experiment
 from deepsimbad.cli.local import delete_domain, info, localize, map_
 from deepsimbad.cli.paper import paper
+from deepsimbad.cli.ray import ray
 from deepsimbad.cli.serve import init, keys, serve, settings
 from deepsimbad.cli.storage import backup, check, export, import_, restore
 from deepsimbad.cli.trial import try_
@@ -29,7 +30,7 @@ def deepsimbad() -> None:
 
 for command in (
     *(init, serve, map_, localize, try_, info, delete_domain, experiment, keys, settings),
-    *(backup, restore, export, import_, check, weights),
+    *(backup, restore, export, import_, check, weights, ray),
 ):
     deepsimbad.add_command(command)
 experiment.add_command(paper)

@@ -1,8 +1,8 @@
 """`deepsimbad map`, `localize` and `info`: the same data directory as the server's, without a server."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from typing import Any
+from typing import Any, TypeAlias
 
 import click
 import numpy as np
@@ -37,7 +37,7 @@ from deepsimbad.evaluators.grey_levels import levels_in
 from deepsimbad.evaluators.image_files import MEDIA_TYPES, ImageFile
 from deepsimbad.evaluators.registry import EvaluatorConfig, make_evaluator
 from deepsimbad.evaluators.scenes import Scene, seen_in
-from deepsimbad.jobs.build import encode_recording
+from deepsimbad.jobs.build import EncodedBlock, encode_recording
 from deepsimbad.jobs.fitting import RecordingPictures, learns
 from deepsimbad.jobs.remap import remap
 from deepsimbad.jobs.remap_config import (
@@ -54,6 +54,8 @@ from deepsimbad_client.errors import BrokenFrameError
 from deepsimbad_client.recordings import Recording
 from deepsimbad_client.recordings.options import accounting, opened, reading, rotate_option, tell_left_out, views
 
+Encode: TypeAlias = Callable[[Recording, Evaluator, Callable[[float], None]], Iterable[EncodedBlock] | None]
+"""Encodes a recording elsewhere, telling how far it is; None: it is encoded here."""
 _FRAMES_A_SECOND = 150.0  # that are encoded, against which the stages of a remap are weighed
 
 
@@ -122,6 +124,8 @@ def map_(
     allow_missing: bool,
     verbose: bool,
     as_json: bool,
+    encode: Encode = lambda *_: None,
+    after_cancel: str = "begins again",
     **options: Any,
 ) -> None:
     """Map a route from a recording, and learn from another drive of it where --landmarks gives one.
@@ -151,11 +155,13 @@ def map_(
             record = catalog.set_options(domain, {"thumbnails": thumbnails})
         shown = Pictures(settings.data_dir, settings.max_pixels) if record.options.get("thumbnails") else None
         stages = _stages(config, recordings, measure, keeps_pictures=shown is not None)
-        with _nothing_kept(), progress_bar(stages, f"map {domain}") as progress:
+        with _nothing_kept(after_cancel), progress_bar(stages, f"map {domain}") as progress:
             for role, recording in recordings.items():
                 progress.stage(f"read {role}")
                 encoded = encode_recording(
-                    recording, measure, settings.max_pixels, progress.update, allow_missing=allow_missing
+                    *(recording, measure, settings.max_pixels, progress.update),
+                    allow_missing=allow_missing,
+                    blocks=encode(recording, measure, progress.update),
                 )
                 left_out[role] = encoded.left_out_names
                 if role in Traverse.list(catalog.data_dir, domain):
@@ -207,12 +213,12 @@ def _stages(
 
 
 @contextmanager
-def _nothing_kept() -> Iterator[None]:
+def _nothing_kept(after_cancel: str) -> Iterator[None]:
     """Say what a Ctrl-C leaves."""
     try:
         yield
     except CancelledError as error:
-        raise CancelledError(f"{error}; no map was made, and the same command begins again") from error
+        raise CancelledError(f"{error}; no map was made, and the same command {after_cancel}") from error
 
 
 @click.command()

@@ -1,13 +1,13 @@
 """From recordings to a map: encoded, landmarks chosen, every frame described, experience learnt (II-B to II-D)."""
 
 import time
-from collections.abc import Callable, Iterator, MutableMapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, MutableMapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field, replace
 from functools import cache, partial
 from statistics import median
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +34,8 @@ from deepsimbad_client.recordings import Frame, Recording, counted
 from deepsimbad_client.recordings.left_out import LeftOut
 from deepsimbad_client.recordings.told import as_taken
 
+Kept: TypeAlias = MutableMapping[str, NDArray[np.float32]]  # encodings by `Recording.stamp`
+
 _FRAMES_A_BLOCK = 1024
 EPISODES_A_MAP_IMAGE = 25  # more would visit every entry of a small map again and again
 SECOND_DRIVE, HELD_OUT = "landmark_traverse", "held_out_frames"
@@ -53,6 +55,17 @@ class EncodedRecording:
         return counted(self.left_out_names)
 
 
+@dataclass(frozen=True)
+class EncodedBlock:
+    """Neighbouring frames of a recording that were encoded together."""
+
+    places: NDArray[np.int64]  # [n] in `Recording.frames`, of those that could be read
+    encodings: NDArray[np.float32]  # [n, d]
+    shows_nothing: NDArray[np.bool_]  # [n]
+    broken: Mapping[int, str]  # place: why it could not be read
+    image_ms: float | None  # that an image took; None: none was encoded
+
+
 def encode_recording(
     recording: Recording,
     evaluator: Evaluator,
@@ -60,7 +73,8 @@ def encode_recording(
     on_progress: Callable[[float], None],
     *,
     allow_missing: bool = True,
-    kept: MutableMapping[str, NDArray[np.float32]] | None = None,
+    kept: Kept | None = None,
+    blocks: Iterable[EncodedBlock] | None = None,
 ) -> EncodedRecording:
     """Encode a recording's images as the service would, or take its ready encodings.
 
@@ -68,6 +82,7 @@ def encode_recording(
 
     Args:
         kept: Encodings by `Recording.stamp` of earlier calls, which are not made again; takes those that are.
+        blocks: All frames as they were encoded elsewhere, in the recording's order; None: they are encoded here.
 
     Raises:
         InvalidSourceError: No frame can be used.
@@ -81,7 +96,7 @@ def encode_recording(
     shows_nothing = np.zeros(len(frames), np.bool_)
     if encodings is None:
         places, encodings, shows_nothing, encode_ms = _encode_images(
-            recording, evaluator, max_pixels, left_out, on_progress, kept
+            recording, evaluator, max_pixels, left_out, on_progress, kept, blocks
         )
         frames, weights_sha256 = [frames[place] for place in places], evaluator.weights_sha256
     if not frames:
@@ -111,13 +126,67 @@ def _taken_by(recording: Recording, frame: Frame, evaluator: Evaluator) -> Camer
     return None if size is None else Camera(*size, recording.camera)
 
 
+def encode_block(
+    recording: Recording,
+    places: range,
+    evaluator: Evaluator,
+    max_pixels: int,
+    kept: Kept | None = None,
+    on_read: Callable[[int], None] = lambda _: None,
+) -> EncodedBlock:
+    """Encode frames in one batch. Which images share a batch follows from their places alone, whoever encodes them.
+
+    Args:
+        kept: As in `encode_recording`.
+        on_read: Told the place of every frame that was looked at; what it raises ends the block.
+    """
+    kept, broken = {} if kept is None else kept, {}
+    readable: list[int] = []
+    encodings = np.empty((len(places), evaluator.encoding_dim or 0), np.float32)
+    shows_nothing = np.zeros(len(places), np.bool_)
+    waiting: dict[int, Image | Scene] = {}  # by the row of its encoding
+    stamps: list[str] = []  # what these are kept by
+    began = time.perf_counter()
+    for place in places:
+        frame = recording.frames[place]
+        stamp, row = recording.stamp(frame), len(readable)
+        if (encoding := kept.get(stamp)) is not None:
+            encodings[row] = encoding
+            readable.append(place)
+        else:
+            try:
+                body = recording.image(frame, evaluator.input_size)
+            except BrokenFrameError as error:
+                broken[place] = error.reason
+            else:
+                waiting[row] = seen_in(body.body, body.content_type, evaluator, max_pixels)
+                check_whole(evaluator, waiting[row])
+                shows_nothing[row] = shows_none(waiting[row])
+                stamps.append(stamp)
+                readable.append(place)
+        on_read(place)
+    if waiting:
+        encodings[list(waiting)] = evaluator.encode(list(waiting.values()))
+        kept.update(zip(stamps, encodings[list(waiting)], strict=True))
+    image_ms = 1000 * (time.perf_counter() - began) / len(waiting) if waiting else None
+    n_read = len(readable)
+    return EncodedBlock(np.array(readable, np.int64), encodings[:n_read], shows_nothing[:n_read], broken, image_ms)
+
+
+def places_of_blocks(n_frames: int, evaluator: Evaluator) -> list[range]:
+    """The places of the frames that are encoded together."""
+    n_at_once = max(1, evaluator.largest_batch)
+    return [range(first, min(first + n_at_once, n_frames)) for first in range(0, n_frames, n_at_once)]
+
+
 def _encode_images(
     recording: Recording,
     evaluator: Evaluator,
     max_pixels: int,
     left_out: LeftOut,
     on_progress: Callable[[float], None],
-    kept: MutableMapping[str, NDArray[np.float32]] | None,
+    kept: Kept | None,
+    blocks: Iterable[EncodedBlock] | None,
 ) -> tuple[list[int], NDArray[np.float32], NDArray[np.bool_], float | None]:
     """Places of the frames that could be read, their encodings, which show nothing, the median of milliseconds.
 
@@ -125,40 +194,27 @@ def _encode_images(
     """
     if not evaluator.forms or evaluator.encoding_dim is None:
         raise InvalidSourceError("this evaluator takes ready encodings alone; give a .npy or .csv file")
-    encodings = np.empty((len(recording.frames), evaluator.encoding_dim), np.float32)
-    shows_nothing = np.zeros(len(recording.frames), np.bool_)
+    n_frames = len(recording.frames)
+    encodings = np.empty((n_frames, evaluator.encoding_dim), np.float32)
+    shows_nothing = np.zeros(n_frames, np.bool_)
     places: list[int] = []
-    kept = {} if kept is None else kept
-    waiting: list[Image | Scene] = []  # as many as are best encoded at once
-    rows: list[int] = []  # where their encodings belong
-    stamps: list[str] = []  # and what they are kept by
     took_ms: list[float] = []
-    began = time.perf_counter()
-    for place, frame in enumerate(recording.frames):
-        stamp = recording.stamp(frame)
-        if (encoding := kept.get(stamp)) is not None:
-            encodings[len(places)] = encoding
-            places.append(place)
-        else:
-            try:
-                body = recording.image(frame, evaluator.input_size)
-            except BrokenFrameError as error:
-                left_out.add(error.reason, frame.name)
-            else:
-                began = began if waiting else time.perf_counter()
-                waiting.append(seen_in(body.body, body.content_type, evaluator, max_pixels))
-                check_whole(evaluator, waiting[-1])
-                shows_nothing[len(places)] = shows_none(waiting[-1])
-                rows.append(len(places))
-                stamps.append(stamp)
-                places.append(place)
-        if waiting and (len(waiting) >= evaluator.largest_batch or place == len(recording.frames) - 1):
-            encodings[rows] = evaluator.encode(waiting)
-            kept.update(zip(stamps, encodings[rows], strict=True))
-            took_ms += [1000 * (time.perf_counter() - began) / len(waiting)] * len(waiting)
-            for pile in (waiting, rows, stamps):
-                pile.clear()
-        on_progress((place + 1) / len(recording.frames))
+
+    def on_read(place: int) -> None:
+        on_progress((place + 1) / n_frames)
+
+    if blocks is None:
+        blocks = (
+            encode_block(recording, of_block, evaluator, max_pixels, kept, on_read)
+            for of_block in places_of_blocks(n_frames, evaluator)
+        )
+    for block in blocks:
+        for place, reason in block.broken.items():
+            left_out.add(reason, recording.frames[place].name)
+        rows = slice(len(places), len(places) + len(block.places))
+        encodings[rows], shows_nothing[rows] = block.encodings, block.shows_nothing
+        places += block.places.tolist()
+        took_ms += [] if block.image_ms is None else [block.image_ms] * len(block.places)
     n_read, encode_ms = len(places), median(took_ms) if took_ms else None
     return places, encodings[:n_read], shows_nothing[:n_read], encode_ms
 

@@ -87,6 +87,8 @@ def write_map(path: Path, map_: Map, on_progress: Callable[[float], None] = lamb
                 db.execute("PRAGMA synchronous = OFF")
                 migrations.apply(db)
                 with db.atomic():
+                    # A file's bytes follow from its map alone, which says when it was made.
+                    db.execute("UPDATE _sqlite_migrations SET applied_at = ?", [map_.created_at])
                     _write(db, map_, blocks, on_progress)
         except BaseException:
             remove_database(path)

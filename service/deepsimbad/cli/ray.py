@@ -1,0 +1,64 @@
+"""`deepsimbad ray`: the service on many machines, carried by Ray."""
+
+import shutil
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import click
+
+from deepsimbad.cli.local import map_
+from deepsimbad.cli.terminal import given_settings
+from deepsimbad.errors import MissingPackageError
+from deepsimbad.evaluators.base import Evaluator
+from deepsimbad.evaluators.registry import EvaluatorConfig
+from deepsimbad.jobs.build import EncodedBlock
+from deepsimbad.store.layout import domain_folder
+from deepsimbad_client.recordings import Recording
+
+
+@click.group()
+def ray() -> None:
+    """On a cluster of Ray's: many machines, or more processes on this one."""
+
+
+_address_option = click.option(
+    "--address", help="Cluster to join, as `auto` or ray://HOST:10001.  [default: one of this machine]"
+)
+
+
+def _required() -> None:
+    try:
+        import ray  # noqa: F401, PLC0415 - an extra
+    except ImportError as error:
+        raise MissingPackageError("Ray is not installed: pip install 'deep-simbad[ray]'", package="ray") from error
+
+
+@ray.command("map", params=list(map_.params))
+@_address_option
+@click.pass_context
+def map_on_ray(
+    context: click.Context, /, domain: str, evaluator: EvaluatorConfig, address: str | None, **told: Any
+) -> None:
+    """Make the map that `deepsimbad map` would, byte for byte but for its time, while a cluster encodes.
+
+    All its machines must reach the drives under the same paths, and have the same processors for the same bytes.
+    Frames that were encoded are kept: after a kill the same command goes on.
+    """
+    _required()
+    from deepsimbad.fleet.encode import encoded_elsewhere, joined  # noqa: PLC0415 - takes Ray
+
+    settings = given_settings()
+    folder = domain_folder(settings.data_dir, domain) / "encoding"
+
+    def encode(
+        recording: Recording, measure: Evaluator, on_progress: Callable[[float], None]
+    ) -> Iterable[EncodedBlock] | None:
+        if recording.encodings is not None:
+            return None
+        joined(address)
+        given = (recording, measure, dict(evaluator.as_dict()), settings.compute(), settings.max_pixels)
+        return encoded_elsewhere(*given, folder, on_progress)
+
+    goes_on = "goes on where it stopped"
+    context.invoke(map_, encode=encode, after_cancel=goes_on, domain=domain, evaluator=evaluator, **told)
+    shutil.rmtree(folder, ignore_errors=True)

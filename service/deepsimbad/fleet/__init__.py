@@ -1,0 +1,1 @@
+"""The service on many machines, carried by Ray; nothing else imports Ray."""

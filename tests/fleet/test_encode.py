@@ -1,0 +1,132 @@
+"""`deepsimbad ray map`: encoded by a cluster, the same file as one machine makes; what was encoded is kept."""
+
+import os
+from collections.abc import Iterator
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from deepsimbad.cli import run
+from deepsimbad.errors import CancelledError, UnavailableError
+from deepsimbad.evaluators.compute import Compute
+from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
+from deepsimbad.jobs import versions
+from deepsimbad.store.catalog import Catalog
+from deepsimbad_client.recordings.folder import read_folder
+
+ray = pytest.importorskip("ray", reason="Ray is not installed: pip install 'deep-simbad[ray]'")
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]  # Ray's own
+N_FRAMES = 60
+
+from deepsimbad.fleet import encode  # noqa: E402 - takes Ray
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _cluster() -> Iterator[None]:
+    os.environ["RAY_ENABLE_UV_RUN_RUNTIME_ENV"] = "0"
+    is_ours = not ray.is_initialized()
+    if is_ours:
+        ray.init(
+            num_cpus=2,
+            include_dashboard=False,
+            object_store_memory=100_000_000,
+            log_to_driver=False,
+            logging_level="ERROR",
+        )
+    yield
+    if is_ours:
+        ray.shutdown()
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of images, two of which cannot be read, and one shows nothing."""
+    folder = tmp_path_factory.mktemp("drive")
+    for number in range(N_FRAMES):
+        coarse = np.random.default_rng(number).integers(0, 255, (6, 8, 3), np.uint8)
+        image = cv2.resize(coarse, (160, 120), interpolation=cv2.INTER_CUBIC)
+        cv2.imwrite(str(folder / f"{number:03}.png"), np.full_like(image, 128) if number == 20 else image)
+    for broken in (7, 33):
+        (folder / f"{broken:03}.png").write_bytes(b"no image")
+    return folder
+
+
+@pytest.fixture
+def packs(monkeypatch: pytest.MonkeyPatch) -> int:
+    monkeypatch.setattr(encode, "_FRAMES_A_PACK", 8)
+    return 8
+
+
+def elsewhere(drive: Path, folder: Path, on_progress: Any, kind: str = "gradient_grid") -> list[Any]:
+    configuration = evaluator_config({"kind": "feature_l2", "extractor": kind})
+    measure = make_evaluator(configuration, Compute())
+    recording = read_folder(drive, 1.0)
+    given = (recording, measure, dict(configuration.as_dict()), Compute(), 50_000_000)
+    return list(encode.encoded_elsewhere(*given, folder, on_progress))
+
+
+@pytest.mark.parametrize("extractor", ["gradient_grid", "efficientnet_lite0"])
+def test_the_map_is_the_one_that_one_machine_makes(
+    drive: Path, packs: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, extractor: str
+) -> None:
+    class Noon(datetime):
+        @classmethod
+        def now(cls, tz: Any = None) -> datetime:
+            return datetime(2026, 1, 1, 12, tzinfo=tz)
+
+    monkeypatch.setattr(versions, "datetime", Noon)  # a map says when it was made
+    monkeypatch.chdir(tmp_path)
+    options = ["--training", str(drive), "--n-landmarks", "20", "--training-episodes", "50", "--evaluator"]
+    options += [f"feature_l2:{extractor}"]
+    assert run(["map", "route", *options, "--data-dir", "one"]) == 0
+    assert run(["ray", "map", "route", *options, "--data-dir", "many"]) == 0
+    digests = []
+    for data_dir in ("one", "many"):
+        with Catalog.open(Path(data_dir)) as catalog:
+            digests.append(catalog.map("route", 1).sha256)
+            assert catalog.map("route", 1).metrics["n_map_images"] == N_FRAMES - 2
+    assert digests[0] == digests[1]
+    assert not Path("many/domains/route/encoding").exists()
+
+
+def test_what_was_encoded_before_a_kill_is_not_encoded_again(drive: Path, packs: int, tmp_path: Path) -> None:
+    def stop(share: float) -> None:
+        if share >= 0.5:
+            raise CancelledError("killed")
+
+    with pytest.raises(CancelledError):
+        elsewhere(drive, tmp_path, stop)
+    files = {path: path.stat().st_mtime_ns for path in tmp_path.glob("*/*.npz")}
+    assert N_FRAMES // packs // 2 <= len(files) < N_FRAMES // packs
+    shares: list[float] = []
+    blocks = elsewhere(drive, tmp_path, shares.append)
+    assert shares[0] >= 0.5
+    assert shares[-1] == 1
+    assert {path: path.stat().st_mtime_ns for path in files} == files
+    places = [place for block in blocks for place in block.places.tolist()]
+    assert places == [place for place in range(N_FRAMES) if place not in {7, 33}]
+    assert [place for block in blocks for place in block.broken] == [7, 33]
+    assert sum(block.shows_nothing.sum() for block in blocks) == 1
+    again: list[float] = []
+    elsewhere(drive, tmp_path, again.append)
+    assert again == [], "nothing is asked of the cluster"
+    image = drive / "050.png"
+    os.utime(image, ns=(1, 1))
+    elsewhere(drive, tmp_path, again.append)
+    assert len(again) == 2, "one pack, whose image is another now"
+
+
+def test_a_worker_that_does_not_reach_the_drive_is_named(
+    drive: Path, packs: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Unreached(encode._Encoder):
+        def __call__(self, row: dict[str, Any]) -> dict[str, Any]:
+            raise RuntimeError("no such folder")
+
+    monkeypatch.setattr(encode, "_Encoder", Unreached)
+    with pytest.raises(UnavailableError, match="could not be encoded elsewhere"):
+        elsewhere(drive, tmp_path, lambda _: None)
