@@ -193,8 +193,18 @@ class SharedCatalog(Catalog):
         )
         layout.traverses_folder(self.data_dir, name).mkdir(parents=True, exist_ok=True)
         layout.maps_folder(self.data_dir, name).mkdir(parents=True, exist_ok=True)
+        for earlier in state.get("earlier_maps", ()):  # sessions may live on them, and be rolled back to
+            self._take_over_map(db, name, **earlier)
+            db.execute(
+                """
+                UPDATE map SET state = 'retired', retired_at = ?
+                WHERE domain = ? AND version = ? AND state = 'sealed'
+                """,
+                [now(), name, earlier["version"]],
+            )
         if state["map"] is not None:
             self._take_over_map(db, name, **state["map"])
+            super().activate(name, state["map"]["version"], ANY)
 
     def _take_over_map(
         self,
@@ -207,7 +217,7 @@ class SharedCatalog(Catalog):
         config: Mapping[str, Any],
         metrics: Mapping[str, Any],
     ) -> None:
-        """Let a version serve; one of its number that was made here meanwhile gets the next free number."""
+        """Note a version of the store's; one of its number that was made here meanwhile gets the next free number."""
         where = [name, version]
         mine = db.execute("SELECT sha256, state FROM map WHERE domain = ? AND version = ?", where).fetchone()
         db.execute("UPDATE domain SET next_version = max(next_version, ?) WHERE name = ?", [version + 1, name])
@@ -230,7 +240,6 @@ class SharedCatalog(Catalog):
             """,
             [name, version, created_at, sha256, file_bytes, to_json(config), to_json(metrics)],
         )
-        super().activate(name, version, ANY)
 
     # Publishing
 
@@ -345,7 +354,10 @@ class SharedCatalog(Catalog):
             if position % between:
                 return
             (position,) = db.execute("SELECT position FROM map_store").fetchone()
-            state = {"position": position, "domains": {name: _state_of(db, name) for name in names}}
+            states = {
+                name: {**(_state_of(db, name) or {}), "earlier_maps": _maps(db, name, "retired")} for name in names
+            }
+            state = {"position": position, "domains": states}
         self.store.put_state(state)
 
     # Files
@@ -426,28 +438,28 @@ def _is_shared_domain(db: Database, name: str) -> bool:
 def _state_of(db: Database, name: str) -> _State:
     """What the log says of a domain, None where there is none."""
     for record in read_domains(db, name):
-        row = db.execute(
-            """
-            SELECT version, created_at, sha256, file_bytes, config, metrics FROM map
-            WHERE domain = ? AND state = 'active'
-            """,
-            [name],
-        ).fetchone()
-        version, created_at, sha256, file_bytes, config, metrics = row or (None,) * 6
-        serving = {
-            "version": version,
-            "created_at": created_at,
-            "sha256": sha256,
-            "file_bytes": file_bytes,
-            "config": from_json(config),
-            "metrics": from_json(metrics),
-        }
         return {
             "evaluator": record.evaluator,
             "closed": record.closed,
             "actions_m": list(record.actions_m),
             "options": record.options,
             "created_at": record.created_at,
-            "map": serving if row else None,
+            "map": next(iter(_maps(db, name, "active")), None),
         }
     return None
+
+
+def _maps(db: Database, name: str, state: str) -> list[dict[str, Any]]:
+    """What the log says of a domain's versions, those that serve, or that served and may again."""
+    rows = db.execute(
+        """
+        SELECT version, created_at, sha256, file_bytes, config, metrics FROM map
+        WHERE domain = ? AND state = ? AND removed_at IS NULL AND (shared OR state = 'active') ORDER BY version
+        """,
+        [name, state],
+    )
+    columns = ("version", "created_at", "sha256", "file_bytes")
+    return [
+        {**dict(zip(columns, row[:4], strict=True)), "config": from_json(row[4]), "metrics": from_json(row[5])}
+        for row in rows
+    ]
