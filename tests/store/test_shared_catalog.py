@@ -60,8 +60,7 @@ def node(store: tuple[str, Path], tmp_path: Path) -> Iterator[MakeNode]:
         def start(name: str, **options: Any) -> SharedCatalog:
             catalog = opened.enter_context(open_catalog(tmp_path / name, store[0], **options))
             assert isinstance(catalog, SharedCatalog)
-            catalog.follow()
-            catalog.publish_own()
+            catalog.catch_up()
             return catalog
 
         yield start
@@ -286,7 +285,7 @@ def test_a_domain_whose_creation_was_cut_short_is_published_at_the_next_start(no
     here = node("here")
     with Catalog.open(tmp_path / "here") as plain:
         make_domain(plain)
-    here.publish_own()
+    here.catch_up()
     there = node("there")
     assert there.domain("campus").name == "campus"
 

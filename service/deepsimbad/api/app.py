@@ -182,8 +182,7 @@ def _opened(settings: Settings) -> Catalog:
     catalog = open_catalog(settings.data_dir, settings.map_store, settings.map_cache_disk_bytes)
     if isinstance(catalog, SharedCatalog):
         try:
-            catalog.follow()
-            catalog.publish_own()
+            catalog.catch_up()
         except UnavailableError as error:  # what is here can be served
             log.warning("the map store cannot be followed", extra={"why": error.message})
         except BaseException:

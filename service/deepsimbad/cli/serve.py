@@ -65,8 +65,12 @@ def serve(host: str | None, port: int | None, create: bool) -> None:
 
 @click.command()
 @data_dir_option
+@map_store_option
 def init() -> None:
-    """Make a data directory, for its owner alone; one that is there stays as it is."""
+    """Make a data directory, for its owner alone; one that is there stays as it is.
+
+    With --map-store it follows that from then on, and publishes the domains that it has.
+    """
     open_given_catalog().close()
     folder = given_settings().data_dir
     click.echo(f"{folder} is a data directory", err=True)

@@ -16,7 +16,7 @@ from rich.progress import Progress as Bars
 from rich.table import Table
 
 from deepsimbad.core.relevance import Relevance
-from deepsimbad.errors import UnknownDomainError
+from deepsimbad.errors import UnavailableError, UnknownDomainError
 from deepsimbad.evaluators.registry import (
     EXTRACTOR_FORMS,
     EvaluatorConfig,
@@ -31,7 +31,7 @@ from deepsimbad.jobs.progress import Progress, ProgressState
 from deepsimbad.settings import Settings, TracedSettings, trace_settings
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.layout import catalog_path
-from deepsimbad.store.shared_catalog import open_catalog
+from deepsimbad.store.shared_catalog import SharedCatalog, open_catalog
 
 _Command = TypeVar("_Command", bound=Callable[..., Any])
 
@@ -108,7 +108,13 @@ def existing_data_dir() -> Path:
 def open_given_catalog() -> Catalog:
     """The catalog of the data directory, which follows a map store where settings say so or it did before."""
     settings = given_settings()
-    return open_catalog(settings.data_dir, settings.map_store, settings.map_cache_disk_bytes)
+    catalog = open_catalog(settings.data_dir, settings.map_store, settings.map_cache_disk_bytes)
+    if isinstance(catalog, SharedCatalog):
+        try:
+            catalog.catch_up()
+        except UnavailableError as error:  # what is here can be asked
+            click.echo(f"what others published since is not known: {error.message}", err=True)
+    return catalog
 
 
 map_store_option = click.option(

@@ -243,8 +243,9 @@ class SharedCatalog(Catalog):
 
     # Publishing
 
-    def publish_own(self) -> None:
-        """Publish the domains that the store does not know yet: those made before it was followed, or as we crashed."""
+    def catch_up(self) -> None:
+        """Follow, then publish the domains that the store does not know: made before it was followed, or cut short."""
+        self.follow()
         with self._reading() as db:
             names = [name for (name,) in db.execute("SELECT name FROM domain WHERE shared = 0 ORDER BY name")]
         for name in names:
