@@ -4,6 +4,7 @@ import shutil
 import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
+from functools import partial
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ import pytest
 from deepsimbad.api.app import Elsewhere, create_app
 from deepsimbad.jobs.runner import InThisProcess
 from deepsimbad.store.objects import Objects
+from deepsimbad.store.shared_sessions import SharedSessionStore
 from tests.contract.conftest import N_LANDMARKS, Client, path_of, problem, service, small_settings
 
 pytest.importorskip("obstore", reason="the extra `objects` is not installed")
@@ -18,7 +20,7 @@ pytest.importorskip("obstore", reason="the extra `objects` is not installed")
 
 @contextmanager
 def node(data_dir, url, **settings):
-    shared = Elsewhere(sessions=Objects.open(url))
+    shared = Elsewhere(sessions=partial(SharedSessionStore.sharing, Objects.open(url)))
     app = create_app(small_settings(data_dir, **settings), InThisProcess(data_dir), shared)
     with Client(app, raise_server_exceptions=False) as client:
         yield client

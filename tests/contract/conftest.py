@@ -1,7 +1,11 @@
-"""A running service with two mapped domains: `ready` takes encodings alone, `seen` takes images."""
+"""A running service with two mapped domains: `ready` takes encodings alone, `seen` takes images.
+
+With the variable TEST_FLEET set it is a fleet of Ray's, and the tests are the same, but for those that look inside.
+"""
 
 import io
 import json
+import os
 import time
 from contextlib import contextmanager
 
@@ -155,9 +159,28 @@ class Client(TestClient, Caller):
         return self.app.state.services
 
 
+class FleetClient(Caller):
+    """A fleet is asked over the wire; whoever would look into its processes is skipped."""
+
+    @property
+    def services(self):
+        pytest.skip("looks into the process that answers")
+
+    app = services
+
+
 @contextmanager
 def service(data_dir, run_job=None, **settings):
     """A service of the test's own, which does its small jobs in this process."""
+    if "TEST_FLEET" in os.environ:
+        from tests.fleet.running import running  # noqa: PLC0415 - Ray is an extra
+
+        with (
+            running(small_settings(data_dir, **settings), run_job=run_job or InThisProcess(data_dir)) as fleet,
+            FleetClient(base_url=fleet.url, timeout=120) as client,
+        ):
+            yield client
+        return
     app = create_app(small_settings(data_dir, **settings), run_job or InThisProcess(data_dir))
     with Client(app, raise_server_exceptions=False) as client:
         yield client

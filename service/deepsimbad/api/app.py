@@ -45,11 +45,9 @@ from deepsimbad.release import release
 from deepsimbad.settings import MEBIBYTE, Settings
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.durable import service_lock
-from deepsimbad.store.objects import Objects
 from deepsimbad.store.records import KeyRecord
 from deepsimbad.store.sessions import SessionRecord, SessionStore
 from deepsimbad.store.shared_catalog import SharedCatalog, open_catalog
-from deepsimbad.store.shared_sessions import SharedSessionStore
 
 router = APIRouter(tags=["health"])
 log = logging.getLogger(__name__)
@@ -75,7 +73,8 @@ class Elsewhere:
     """What a service that is one of several has from others, in the place of its own."""
 
     keys: Callable[[], Sequence[KeyRecord]] | None = None  # reads them; None: the catalog does
-    sessions: Objects | None = None  # their journals are shared there; None: they are on this disk alone
+    # Opens those of a data directory, told whom to tell of every transaction
+    sessions: Callable[[Path, Callable[[int], None]], SessionStore] = SessionStore.open
 
 
 def create_app(settings: Settings, run_job: RunJob | None = None, elsewhere: Elsewhere | None = None) -> FastAPI:
@@ -102,7 +101,7 @@ def create_app(settings: Settings, run_job: RunJob | None = None, elsewhere: Els
                 app.state.startup_error = error  # the server only reports that there was one
                 raise
             app.state.services = services
-            tasks = [asyncio.create_task(task) for task in (keys.follow(), _sweep(services), _follow(services))]
+            tasks = [asyncio.create_task(task) for task in (keys.follow(), _sweep(services), _keep_following(services))]
             yield
             for task in tasks:
                 task.cancel()
@@ -129,9 +128,8 @@ def create_app(settings: Settings, run_job: RunJob | None = None, elsewhere: Els
     return app
 
 
-async def _follow(services: Services) -> None:
-    """Take over what other machines publish. A store that fails is told once; what is in memory goes on to serve."""
-    catalog, is_failing = services.catalog, False
+async def follow(services: Services) -> None:
+    """Take over what other machines have published; raises as `SharedCatalog.follow`."""
 
     def take_over(domain: str) -> None:
         try:
@@ -143,11 +141,18 @@ async def _follow(services: Services) -> None:
         except DeepSimbadError:
             log.exception("a new map cannot be served", extra={"domain": domain})
 
-    while isinstance(catalog, SharedCatalog):
+    if isinstance(services.catalog, SharedCatalog):
+        for domain in await run_sync(services.catalog.follow):
+            await run_sync(take_over, domain)
+
+
+async def _keep_following(services: Services) -> None:
+    """Follow now and then. A store that fails is told once; what is in memory goes on to serve."""
+    is_failing = False
+    while isinstance(services.catalog, SharedCatalog):
         await asyncio.sleep(_FOLLOW_S)
         try:
-            for domain in await run_sync(catalog.follow):
-                await run_sync(take_over, domain)
+            await follow(services)
         except DeepSimbadError as error:
             if not is_failing:
                 log.warning("the map store cannot be followed", exc_info=error)
@@ -215,10 +220,7 @@ def _start(
     worker = InferenceWorker(max_waiting=settings.max_queue, longest_wait_s=settings.encode_wait_ms / 1000)
     parts.callback(worker.close)
     worker.submit(warm_up).result()
-    shared, data_dir, committed = elsewhere.sessions, settings.data_dir, metrics.committed
-    store = parts.enter_context(
-        SharedSessionStore.sharing(shared, data_dir, committed) if shared else SessionStore.open(data_dir, committed)
-    )
+    store = parts.enter_context(elsewhere.sessions(settings.data_dir, metrics.committed))
     live = Sessions(
         store,
         maps_,

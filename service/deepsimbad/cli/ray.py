@@ -7,7 +7,8 @@ from typing import Any
 import click
 
 from deepsimbad.cli.local import map_
-from deepsimbad.cli.terminal import given_settings
+from deepsimbad.cli.serve import address_options
+from deepsimbad.cli.terminal import data_dir_option, given_settings, map_store_option
 from deepsimbad.errors import MissingPackageError
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.registry import EvaluatorConfig
@@ -62,3 +63,24 @@ def map_on_ray(
     goes_on = "goes on where it stopped"
     context.invoke(map_, encode=encode, after_cancel=goes_on, domain=domain, evaluator=evaluator, **told)
     shutil.rmtree(folder, ignore_errors=True)
+
+
+@ray.command()
+@data_dir_option
+@map_store_option
+@address_options
+@click.option(
+    "--replicas", type=click.IntRange(min=1), default=4, show_default=True, help="Processes that have domains."
+)
+@_address_option
+def serve(host: str | None, port: int | None, replicas: int, address: str | None) -> None:
+    """Serve the domains of a map store from a cluster until interrupted; the data directory is for uploads and jobs."""
+    settings = given_settings(host=host, port=port)
+    _required()
+    from deepsimbad.fleet import application  # noqa: PLC0415 - takes Ray
+    from deepsimbad.fleet.encode import joined  # noqa: PLC0415
+
+    joined(address)
+    front = application.start(settings, replicas)
+    click.echo("ready at http://{}:{}".format(*front.address.remote().result()), err=True)
+    application.wait()

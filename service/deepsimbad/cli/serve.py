@@ -33,7 +33,8 @@ log = logging.getLogger(__name__)
 _Command = TypeVar("_Command", bound=Callable[..., Any])
 
 
-def _address_options(command: _Command) -> _Command:
+def address_options(command: _Command) -> _Command:
+    """Where a command that serves listens."""
     host = click.option("--host", help="Address to listen on.  [default: $DEEPSIMBAD_HOST, else 127.0.0.1]")
     port = click.option(
         "--port", type=int, help="Port to listen on; 0 takes a free one.  [default: $DEEPSIMBAD_PORT, else 8000]"
@@ -44,7 +45,7 @@ def _address_options(command: _Command) -> _Command:
 @click.command()
 @data_dir_option
 @map_store_option
-@_address_options
+@address_options
 @click.option("--create", is_flag=True, help="Make the data directory if it is not there.")
 def serve(host: str | None, port: int | None, create: bool) -> None:
     """Serve the domains over HTTP until interrupted. Ready when /readyz answers 200."""
@@ -79,7 +80,7 @@ def init() -> None:
 @click.command()
 @json_option
 @data_dir_option
-@_address_options
+@address_options
 def settings(as_json: bool, host: str | None, port: int | None) -> None:
     """Print every setting with its value and where it comes from: flag, environment, file or default."""
     traced = traced_settings(host=host, port=port)

@@ -29,7 +29,7 @@ _SELECT = """
       ON latest.session = session.number
      AND latest.sequence = (SELECT max(sequence) FROM journal WHERE session = session.number)
 """
-INSERT_SESSION = """
+_INSERT_SESSION = """
     INSERT INTO session (session_id, domain, map_version, map_sha256, config, created_at, expires_at, key_id)
     VALUES (?, ?, ?, ?, ?, ?, ?, ?)
 """
@@ -162,7 +162,7 @@ class SessionStore(OpenFile):
         """Keep a new session; answers with the number that it got, or the session that has this id already."""
 
         def write(db: Database) -> SessionRecord:
-            db.conn.execute(f"{INSERT_SESSION} ON CONFLICT (session_id) DO NOTHING", session_columns(record))
+            db.conn.execute(f"{_INSERT_SESSION} ON CONFLICT (session_id) DO NOTHING", session_columns(record))
             return _get(db, record.session_id)
 
         return self._commits.submit(write)
@@ -371,7 +371,7 @@ def _true_positions(db: Database, number: int) -> NDArray[np.float64] | None:
 
 
 def session_columns(record: SessionRecord) -> tuple[Any, ...]:
-    """A new session as `INSERT_SESSION` takes it."""
+    """A new session, from its id on, as the file has it."""
     return (
         *(record.session_id, record.domain, record.map_version, record.map_sha256),
         *(to_json(record.config), record.created_at, record.expires_at, record.key_id),

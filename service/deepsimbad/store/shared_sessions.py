@@ -18,7 +18,6 @@ from deepsimbad.errors import SessionMovedError, UnknownSessionError
 from deepsimbad.store.objects import Objects
 from deepsimbad.store.sessions import (
     INSERT_ROW,
-    INSERT_SESSION,
     JournalRow,
     SessionRecord,
     SessionStore,
@@ -28,10 +27,15 @@ from deepsimbad.store.sessions import (
 )
 
 _ID = re.compile(r"[0-9a-f]{32}")
+_CREATED_AT = 5  # among the columns of a session
 _AT_ONCE = 16  # objects written, and as many read
-_INSERT_ROW, _INSERT_SESSION = (
-    statement.replace("INSERT", "INSERT OR IGNORE", 1) for statement in (INSERT_ROW, INSERT_SESSION)
-)
+_INSERT_ROW = INSERT_ROW.replace("INSERT", "INSERT OR IGNORE", 1)
+# Numbers order sessions by their beginning, to ten microseconds, and are the same on every node.
+_INSERT_SESSION = """
+    INSERT OR IGNORE INTO session
+        (number, session_id, domain, map_version, map_sha256, config, created_at, expires_at, key_id)
+    VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)
+"""
 
 
 class SharedSessionStore(SessionStore):
@@ -65,9 +69,9 @@ class SharedSessionStore(SessionStore):
         """As where nothing is shared."""
 
         def write() -> SessionRecord:
-            if not self._objects.create(_name(record.session_id, 0), _packed(session_columns(record))):
-                self._pull(record.session_id, -1)
-            return SessionStore.create(self, record).result()
+            self._objects.create(_name(record.session_id, 0), _packed(session_columns(record)))
+            self._pull(record.session_id, -1)
+            return SessionStore.find(self, record.session_id)
 
         return self._writers.submit(write)
 
@@ -131,7 +135,8 @@ class SharedSessionStore(SessionStore):
         def write(db: Database) -> None:
             for sequence, columns in enumerate(map(_unpacked, bodies), after + 1):
                 if sequence == 0:
-                    db.conn.execute(_INSERT_SESSION, columns)
+                    began, tie = int(1e5 * columns[_CREATED_AT]), int(session_id[-4:], 16) % 1000
+                    db.conn.execute(_INSERT_SESSION, (1000 * began + tie, *columns))
                     continue
                 (number,) = db.execute("SELECT number FROM session WHERE session_id = ?", [session_id]).fetchone()
                 if len(columns) == 2:  # an ending

@@ -1,0 +1,63 @@
+"""The fleet as an application of Ray Serve: one that administers, replicas that have the domains, the front."""
+
+import signal
+from typing import Any
+
+from ray import serve
+from ray.serve.handle import DeploymentHandle
+from ray.serve.schema import LoggingConfig
+
+from deepsimbad.errors import SettingsError
+from deepsimbad.fleet.front import Front
+from deepsimbad.fleet.replica import Replica, replica_name
+from deepsimbad.jobs.runner import RunJob
+from deepsimbad.settings import Settings, trace_settings
+
+NAME = "deepsimbad"
+_EACH: dict[str, Any] = {
+    "num_replicas": 1,  # of every name
+    "max_ongoing_requests": 100_000,  # the door of the application counts
+    "health_check_period_s": 1.0,
+    "graceful_shutdown_timeout_s": 10.0,
+    "graceful_shutdown_wait_loop_s": 0.1,
+    "logging_config": LoggingConfig(enable_access_log=False, log_level="WARNING"),
+    "ray_actor_options": {"num_cpus": 0.25},
+}
+
+
+def build(settings: Settings, n_replicas: int, run_job: RunJob | None = None) -> serve.Application:
+    """What `serve.run` takes; every part is restarted where its process ends."""
+    if settings.map_store is None:
+        raise SettingsError(
+            "a fleet shares maps and sessions in a map store: name one with --map-store, as s3://bucket/prefix or, on "
+            "one machine, file:///folder",
+            setting="map_store",
+        )
+    whole = serve.deployment(**_EACH)(Replica)
+    admin = whole.options(name="admin").bind(settings, n_replicas, None, run_job)
+    replicas = [
+        whole.options(name=replica_name(number)).bind(settings, n_replicas, admin) for number in range(n_replicas)
+    ]
+    return serve.deployment(**_EACH)(Front).options(name="front").bind(settings, admin, *replicas)
+
+
+def start(
+    settings: Settings, n_replicas: int, run_job: RunJob | None = None, name: str = NAME
+) -> DeploymentHandle[Front]:
+    """Start the fleet in the cluster that this process has joined; returns when it answers."""
+    serve.start(proxy_location="Disabled")  # the front listens itself
+    return serve.run(build(settings, n_replicas, run_job), name=name, route_prefix=None)
+
+
+def wait() -> None:
+    """Until interrupted, and let every process finish what it has begun."""
+    try:
+        signal.pause()
+    except KeyboardInterrupt:
+        serve.shutdown()
+
+
+def from_yaml(arguments: dict[str, Any]) -> serve.Application:
+    """What `serve deploy serve.yaml` asks for: `replicas`, and any setting by its name."""
+    n_replicas = int(arguments.pop("replicas", 4))
+    return build(trace_settings(**arguments).settings, n_replicas)

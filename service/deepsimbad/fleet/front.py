@@ -1,0 +1,252 @@
+"""The front of the fleet: an HTTP server that gives every request to a replica that has its domain."""
+
+import asyncio
+import secrets
+import socket
+from collections.abc import AsyncGenerator, Awaitable, Iterable, Sequence
+from contextlib import aclosing
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import uvicorn
+from prometheus_client.exposition import CONTENT_TYPE_LATEST
+from ray.exceptions import RayError
+from ray.serve.exceptions import RayServeException
+from ray.serve.handle import DeploymentHandle
+from starlette.responses import Response
+from starlette.types import Message, Receive, Scope, Send
+
+from deepsimbad.api.problems import error_response
+from deepsimbad.api.server import configure_logging, http_config
+from deepsimbad.errors import UnavailableError
+from deepsimbad.fleet.placement import place
+from deepsimbad.fleet.replica import Replica
+from deepsimbad.settings import Settings
+
+T = TypeVar("T")
+
+WATCH_S = 2.0
+AWAY_S = 2  # that who is told to come again should wait
+_PASSED = (  # of a request's scope
+    *("type", "asgi", "http_version", "method", "path", "raw_path", "query_string", "headers"),
+    *("scheme", "client", "server", "root_path"),
+)
+
+
+class _Gone(Exception):  # noqa: N818 - nobody's error
+    """A replica ended before it answered."""
+
+
+@dataclass(eq=False)
+class _Backend:
+    """A replica as the front sees it."""
+
+    handle: DeploymentHandle[Replica]
+    n_calls: int = 0  # under way
+    gone: asyncio.Future[None] | None = None  # has a result once the process ends; None: there is none
+
+    async def watch(self) -> None:
+        """Know from when on and how long there is a process, until cancelled."""
+        while True:
+            try:
+                await self.handle.lives.remote(0)  # waits until there is one
+                self.gone = self.gone or asyncio.get_running_loop().create_future()
+                while True:
+                    await self.handle.lives.remote(WATCH_S)
+            except (RayError, RayServeException):
+                if self.gone is not None:
+                    self.gone.set_result(None)
+                self.gone = None
+                await asyncio.sleep(0.05)
+
+    async def before_gone(self, call: Awaitable[T], gone: asyncio.Future[None]) -> T:
+        """What a call answers; raises _Gone where its process ends before."""
+        asking = asyncio.ensure_future(call)
+        asking.add_done_callback(lambda done: done.cancelled() or done.exception())  # it may end unheard
+        try:
+            either: list[asyncio.Future[Any]] = [asking, gone]
+            await asyncio.wait(either, return_when=asyncio.FIRST_COMPLETED)
+            if not asking.done():  # Serve would have it wait for the next process
+                raise _Gone
+            return asking.result()
+        except (RayError, RayServeException) as error:
+            raise _Gone from error
+        finally:
+            asking.cancel()
+
+    async def ask(self, method: str, *arguments: Any) -> Any:
+        """A short answer; raises _Gone where there is nobody to give it."""
+        if self.gone is None:
+            raise _Gone
+        response = getattr(self.handle, method).remote(*arguments)
+        try:
+            return await self.before_gone(response, self.gone)
+        except BaseException:
+            response.cancel()
+            raise
+
+    async def stream(self, method: str, *arguments: Any) -> AsyncGenerator[Any]:
+        """A long answer in its parts; raises _Gone as `ask`, or where it breaks off."""
+        if (gone := self.gone) is None:
+            raise _Gone
+        parts = getattr(self.handle.options(stream=True), method).remote(*arguments)
+        try:
+            while True:
+                try:
+                    yield await self.before_gone(anext(parts), gone)
+                except StopAsyncIteration:
+                    return
+        finally:
+            parts.cancel()
+
+
+class Front:
+    """The deployment; listens where the settings say.
+
+    A request whose replica ends under it is given to the domain's other owner: observations and sessions carry a key
+    by which they count once, and the rest may be asked twice.
+    """
+
+    async def __init__(  # type: ignore[misc]  # Serve awaits it
+        self, settings: Settings, admin: DeploymentHandle[Replica], *replicas: DeploymentHandle[Replica]
+    ) -> None:
+        configure_logging(settings.log_level)
+        self._settings = settings
+        self._admin = _Backend(admin)
+        self._replicas = [_Backend(handle) for handle in replicas]
+        backends = [self._admin, *self._replicas]
+        self._watching = [asyncio.create_task(backend.watch()) for backend in backends]
+        while any(backend.gone is None for backend in backends):
+            await asyncio.sleep(0.05)
+        try:
+            listening = socket.create_server((settings.host, settings.port), backlog=2048)
+        except OSError as error:
+            where = f"{settings.host}:{settings.port}"
+            raise UnavailableError(f"cannot listen on {where}: {error.strerror or error}") from error
+        self._address: tuple[str, int] = listening.getsockname()[:2]
+        server = uvicorn.Server(http_config(self, settings))
+        self._serving = asyncio.create_task(server.serve([listening]))
+
+    async def address(self) -> tuple[str, int]:
+        """Where it listens."""
+        return self._address
+
+    def check_health(self) -> None:
+        """Raise where nothing listens any more."""
+        if self._serving.done():
+            raise RuntimeError("the HTTP server has ended")
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """One request, as ASGI has it."""
+        if scope["type"] != "http":
+            return
+        body = await self._body(scope, receive)
+        passed = {name: scope[name] for name in _PASSED if name in scope}
+        headers = dict(scope["headers"])
+        if scope["method"] == "POST" and b"idempotency-key" not in headers:
+            passed["headers"] = [*scope["headers"], (b"idempotency-key", secrets.token_hex(16).encode())]
+        answering = asyncio.create_task(self._answer(passed, body, receive, send))
+        leaving = asyncio.create_task(_left(receive))
+        await asyncio.wait({answering, leaving}, return_when=asyncio.FIRST_COMPLETED)
+        leaving.cancel()
+        if not answering.done() and scope["method"] in {"GET", "HEAD"}:  # what changes something is finished
+            answering.cancel()
+        await asyncio.gather(answering, return_exceptions=True)
+
+    async def _body(self, scope: Scope, receive: Receive) -> bytes:
+        """The body; of one that is too long so much that the replica sees it."""
+        settings = self._settings
+        is_admin = scope["path"].startswith("/v1/admin/")
+        most = settings.max_batch_bytes if is_admin else max(settings.max_image_bytes, settings.max_json_bytes)
+        declared = dict(scope["headers"]).get(b"content-length", b"0")
+        if declared.isdigit() and int(declared[:20]) > most:
+            return b""
+        parts, n_bytes = [], 0
+        while n_bytes <= most:
+            message = await receive()
+            parts.append(message.get("body", b""))
+            n_bytes += len(parts[-1])
+            if not message.get("more_body", False):
+                break
+        return b"".join(parts)
+
+    async def _answer(self, scope: Scope, body: bytes, receive: Receive, send: Send) -> None:
+        if scope["path"] == "/metrics":
+            await self._metrics(scope, receive, send)
+            return
+        has_begun = False
+        for backend in self._who(scope["path"]):
+            backend.n_calls += 1
+            try:
+                if scope["method"] not in {"GET", "HEAD"}:  # these alone may be long
+                    for message in await backend.ask("ask", scope, body):
+                        await self._before_last(message, backend)
+                        await send(message)
+                    return
+                async with aclosing(backend.stream("stream", scope, body)) as messages:
+                    async for message in messages:
+                        await self._before_last(message, backend)
+                        await send(message)
+                        has_begun = True
+                return
+            except _Gone:
+                if has_begun:
+                    raise
+            finally:
+                backend.n_calls -= 1
+        what = UnavailableError("those that know the domain are away this moment: try again", retry_after_s=AWAY_S)
+        scope["state"] = {"request_id": secrets.token_hex(8)}
+        headers = [(b"x-request-id", scope["state"]["request_id"].encode()), (b"cache-control", b"no-store")]
+
+        async def send_marked(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                message["headers"] = [*message["headers"], *headers]
+            await send(message)
+
+        await error_response(scope, what)(scope, receive, send_marked)
+
+    async def _metrics(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """The counts of all that are there."""
+        asked = (backend.ask("ask", scope, b"") for backend in (self._admin, *self._replicas))
+        answers = [
+            answer for answer in await asyncio.gather(*asked, return_exceptions=True) if isinstance(answer, list)
+        ]
+        texts = [b"".join(message.get("body", b"") for message in answer).decode() for answer in answers]
+        await Response(added_up(texts), media_type=CONTENT_TYPE_LATEST)(scope, receive, send)
+
+    async def _before_last(self, message: Message, backend: _Backend) -> None:
+        """Before an answer of the one that administers is whole, let the replicas see what it may have changed."""
+        if backend is self._admin and message["type"] == "http.response.body" and not message.get("more_body", False):
+            await asyncio.gather(*(replica.ask("follow") for replica in self._replicas), return_exceptions=True)
+
+    def _who(self, path: str) -> Sequence[_Backend]:
+        """Who may answer, the better one first."""
+        placed = place(path, len(self._replicas))
+        if placed is None:
+            return [self._admin]
+        backends = [self._replicas[number] for number in placed[0]]
+        return backends if placed[1] else sorted(backends, key=lambda backend: backend.n_calls)
+
+
+async def _left(receive: Receive) -> None:
+    """Return once the sender has gone."""
+    while (await receive())["type"] != "http.disconnect":
+        pass
+
+
+def added_up(texts: Iterable[str]) -> str:
+    """What several processes tell Prometheus as if they were one: samples of one name and labels are added."""
+    families: dict[str, dict[str, float]] = {}
+    for text in texts:
+        heading, samples = "", dict[str, float]()
+        for line in text.splitlines():
+            if line.startswith("#"):
+                heading = f"{heading}{line}\n" if line.startswith("# TYPE") else f"{line}\n"
+                samples = families.setdefault(heading, {}) if line.startswith("# TYPE") else samples
+            else:
+                name, _, value = line.rpartition(" ")
+                samples[name] = samples.get(name, 0.0) + float(value)
+    return "".join(
+        heading + "".join(f"{name} {value}\n" for name, value in samples.items())
+        for heading, samples in families.items()
+    )

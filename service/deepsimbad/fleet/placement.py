@@ -1,0 +1,39 @@
+"""Which replica a domain lives with: rendezvous hashing, so that another replica moves no domain it does not take.
+
+A domain has two owners: a hot one is not pinned to one replica, and one that dies leaves another that answers.
+"""
+
+import re
+from hashlib import blake2b
+from urllib.parse import unquote
+
+from deepsimbad.engine.session import DOMAIN_DIGITS, domain_digits
+
+N_OWNERS = 2
+_OF_DOMAIN = re.compile(r"/v1/domains/([^/]+)/(localizations|sessions)")
+_OF_SESSION = re.compile(r"/v1/sessions/([^/]+)(/.*)?")
+
+
+def owners(digits: str, n_replicas: int) -> tuple[int, ...]:
+    """The replicas that a domain lives with, by the digits that tell it; the first is nobody's more than the second."""
+    weights = {
+        replica: blake2b(f"{replica} {digits}".encode("utf-8", "surrogatepass")).digest()
+        for replica in range(n_replicas)
+    }
+    return tuple(sorted(weights, key=weights.__getitem__, reverse=True)[:N_OWNERS])
+
+
+def session_owners(session_id: str, n_replicas: int) -> tuple[int, ...]:
+    """The owners of a session's domain, the session's own before the one that takes it over."""
+    first, *rest = owners(session_id[:DOMAIN_DIGITS], n_replicas)
+    is_other = blake2b(session_id[DOMAIN_DIGITS:].encode("utf-8", "surrogatepass")).digest()[0] % 2
+    return (*rest, first) if is_other else (first, *rest)
+
+
+def place(path: str, n_replicas: int) -> tuple[tuple[int, ...], bool] | None:
+    """Who answers a decoded path, and whether in this order; None: the one that administers all domains."""
+    if (of_session := _OF_SESSION.fullmatch(path)) is not None:
+        return session_owners(of_session[1], n_replicas), True
+    if (of_domain := _OF_DOMAIN.fullmatch(path)) is not None:
+        return owners(domain_digits(unquote(of_domain[1])), n_replicas), False
+    return None

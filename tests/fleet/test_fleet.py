@@ -1,0 +1,166 @@
+"""A small fleet on a local cluster: two replicas, one that administers, the front."""
+
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+ray = pytest.importorskip("ray", reason="the extra `ray` is not installed", exc_type=ImportError)
+
+import yaml  # noqa: E402
+
+from deepsimbad.fleet.placement import session_owners  # noqa: E402
+from deepsimbad.jobs.runner import InThisProcess  # noqa: E402
+from deepsimbad.store.catalog import Catalog  # noqa: E402
+from deepsimbad.store.records import KeyScope  # noqa: E402
+from tests.contract.conftest import (  # noqa: E402
+    N_LANDMARKS,
+    RANKS,
+    Caller,
+    path_of,
+    problem,
+    service,
+    small_settings,
+    until,
+)
+from tests.fleet.running import ServeDeploySchema, from_yaml, running  # noqa: E402
+
+pytestmark = [
+    pytest.mark.slow,
+    # Ray leaves sockets and files to the collector.
+    pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning", "ignore::ResourceWarning"),
+]
+
+
+@pytest.fixture(scope="module")
+def fleet(tmp_path_factory):
+    data_dir = tmp_path_factory.mktemp("fleet") / "data"
+    with running(small_settings(data_dir), run_job=InThisProcess(data_dir)) as fleet:
+        yield fleet
+
+
+@pytest.fixture(scope="module")
+def client(fleet):
+    with Caller(base_url=fleet.url, timeout=120) as client:
+        client.make_ready_domain("ready")
+        yield client
+
+
+def ranks(seed):
+    return {"ranked_landmarks": np.random.default_rng(seed).permutation(N_LANDMARKS).tolist()}
+
+
+def told(answer):
+    return {name: answer[name] for name in ("n_observations", "belief", "next_best_view", "map_version", "retrieval")}
+
+
+def test_what_was_acknowledged_survives_the_death_of_either_owner(fleet, client, tmp_path):
+    with service(tmp_path) as plain:
+        plain.make_ready_domain("ready")
+        alone = plain.session(seed=3)
+        expected = [told(plain.post(f"{alone}/observations?action_m=2", json=ranks(seed)).json()) for seed in range(60)]
+    session = client.begin(seed=3)
+    first, second = session_owners(session["session_id"], 2)
+    for seed, wanted in enumerate(expected):
+        if seed in {10, 40}:
+            fleet.kill(f"domains-{first if seed == 10 else second}")
+        while (answer := client.post(f"{path_of(session)}/observations?action_m=2", json=ranks(seed))).is_error:
+            assert problem(answer, 503, "unavailable")["retry_after_s"] == int(answer.headers["retry-after"])
+            time.sleep(0.1)
+        assert told(answer.json()) == wanted
+        if seed == 30:  # both are back before the other one dies
+            until(lambda: fleet.pids(f"domains-{first}") and client.get("/metrics").text.count("\n"))
+            time.sleep(0.1)
+    assert client.delete(path_of(session)).status_code == 204
+    problem(client.get(path_of(session)), 410, "ended_session")
+
+
+def test_robots_go_on_while_a_replica_dies(fleet, client):
+    """Every answer is true, none is lost, and what is refused is refused as documented."""
+    faults, n_answered, stopped = [], [], threading.Event()
+
+    def robot(number):
+        with Caller(base_url=fleet.url, timeout=120) as own:
+            path, seen = path_of(own.begin(seed=number)), 0
+            while not stopped.is_set():
+                answer = own.post(f"{path}/observations?action_m=0", json=RANKS)
+                if answer.status_code == 200:
+                    seen += 1
+                    if answer.json()["n_observations"] != seen:
+                        faults.append(f"{seen} views told, {answer.json()['n_observations']} counted")
+                elif answer.status_code != 503 or "retry-after" not in answer.headers:
+                    faults.append(answer.text)
+            n_answered.append(seen)
+
+    robots = [threading.Thread(target=robot, args=[number]) for number in range(4)]
+    for thread in robots:
+        thread.start()
+    time.sleep(1)
+    dying = fleet.pids("domains-0")
+    fleet.kill("domains-0")
+    until(lambda: fleet.pids("domains-0") not in ([], dying))
+    time.sleep(1)
+    stopped.set()
+    for thread in robots:
+        thread.join()
+    assert faults == []
+    assert len(n_answered) == 4
+    assert min(n_answered) > 0
+
+
+def test_every_replica_serves_what_is_activated_and_rolled_back_before_that_is_answered(client):
+    for version in (2, 3):
+        assert client.remap("ready", landmark_traverse="drive", n_landmarks=N_LANDMARKS)["result"]["active"]
+        answers = [client.post("/v1/domains/ready/localizations", json=RANKS).json() for _ in range(8)]
+        assert {answer["map_version"] for answer in answers} == {version}
+    back = client.put("/v1/admin/domains/ready/active-map", json={"version": 1, "expected": 3})
+    assert back.status_code == 200
+    answers = [client.post("/v1/domains/ready/localizations", json=RANKS).json() for _ in range(8)]
+    assert {answer["map_version"] for answer in answers} == {1}
+
+
+def test_keys_count_everywhere(tmp_path):
+    data_dir = tmp_path / "data"
+    with Catalog.open(data_dir) as catalog:
+        _, admin = catalog.create_key(KeyScope.ADMIN)
+        record, robot = catalog.create_key(KeyScope.LOCALIZE, domains=["mine"])
+    with (
+        running(small_settings(data_dir), run_job=InThisProcess(data_dir)) as fleet,
+        Caller(base_url=fleet.url, timeout=120, headers={"X-API-Key": admin.text}) as operator,
+        Caller(base_url=fleet.url, timeout=120, headers={"X-API-Key": robot.text}) as own,
+    ):
+        for name in ("mine", "yours"):
+            operator.make_ready_domain(name)
+        session = own.session("mine")
+        problem(own.post("/v1/domains/yours/localizations", json=RANKS), 403, "forbidden")
+        problem(own.get("/v1/admin/jobs"), 403, "forbidden")
+        with Caller(base_url=fleet.url, timeout=120) as nobody:
+            problem(nobody.get(session), 401, "unauthorized")
+        with Catalog.open(data_dir) as catalog:
+            catalog.revoke_key(record.key_id)
+        until(lambda: own.get(session).status_code == 401)
+
+
+def test_the_file_for_a_cluster_is_one():
+    file = Path(__file__).parents[2] / "deploy" / "serve.yaml"
+    schema = ServeDeploySchema.model_validate(yaml.safe_load(file.read_text()))
+    (application,) = schema.applications
+    assert application.import_path == f"{from_yaml.__module__}:{from_yaml.__name__}"
+    from_yaml(dict(application.args))
+
+
+def test_the_command_serves_until_interrupted(tmp_path):
+    command = [sys.executable, "-m", "deepsimbad", "ray", "serve", "--replicas", "1", "--port", "0"]
+    places = ["--data-dir", str(tmp_path / "data"), "--map-store", f"file://{tmp_path}/store"]
+    with subprocess.Popen([*command, *places], stderr=subprocess.PIPE, text=True) as process:
+        url = next(line for line in process.stderr if line.startswith("ready at ")).split()[-1]
+        with Caller(base_url=url, timeout=120) as client:
+            assert client.get("/readyz").json()["status"] == "ready"
+        process.send_signal(signal.SIGINT)
+        process.stderr.read()
+        assert process.wait(60) == 0

@@ -1,0 +1,62 @@
+"""Which replicas a domain and its sessions live with."""
+
+from collections import Counter
+from itertools import combinations
+
+import pytest
+
+from deepsimbad.engine.session import domain_digits
+from deepsimbad.fleet.placement import owners, place, session_owners
+
+DOMAINS = [f"route-{number}" for number in range(600)]
+
+
+def owners_of(n_replicas):
+    return {domain: owners(domain_digits(domain), n_replicas) for domain in DOMAINS}
+
+
+def test_every_pair_of_replicas_has_about_as_many_domains():
+    pairs = Counter(tuple(sorted(pair)) for pair in owners_of(4).values())
+    assert set(pairs) == set(combinations(range(4), 2))
+    assert min(pairs.values()) > 0.6 * len(DOMAINS) / 6
+    assert set(owners_of(1).values()) == {(0,)}
+
+
+def test_one_replica_more_takes_its_share_and_moves_nothing_else():
+    before, after = owners_of(4), owners_of(5)
+    moved = [domain for domain in DOMAINS if set(before[domain]) != set(after[domain])]
+    assert all(4 in after[domain] for domain in moved)
+    assert len(moved) == pytest.approx(2 / 5 * len(DOMAINS), rel=0.2)
+
+
+def test_a_session_lives_with_its_domain_half_of_them_with_each_owner():
+    digits = domain_digits("ready")
+    both = owners(digits, 4)
+    firsts = Counter()
+    for number in range(400):
+        placed = session_owners(f"{digits}{number:024x}", 4)
+        assert set(placed) == set(both)
+        firsts[placed[0]] += 1
+    assert min(firsts.values()) > 150
+
+
+@pytest.mark.parametrize(
+    ("path", "expected"),
+    [
+        ("/v1/domains/ready/localizations", (owners(domain_digits("ready"), 4), False)),
+        ("/v1/domains/ready/sessions", (owners(domain_digits("ready"), 4), False)),
+        (f"/v1/sessions/{'0' * 32}", (session_owners("0" * 32, 4), True)),
+        (f"/v1/sessions/{'0' * 32}/observations", (session_owners("0" * 32, 4), True)),
+        ("/v1/domains/ready", None),
+        ("/v1/admin/domains/ready/remaps", None),
+        ("/v1/sessions", None),
+        ("/readyz", None),
+    ],
+)
+def test_a_path_tells_who_answers(path, expected):
+    assert place(path, 4) == expected
+
+
+def test_text_that_is_no_name_is_placed_too():
+    assert place("/v1/domains/\udcff/localizations", 2) is not None
+    assert place("/v1/sessions/\udcff\udcff", 2) is not None
