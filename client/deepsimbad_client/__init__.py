@@ -22,6 +22,7 @@ from deepsimbad_client.http.models import (
     SessionState,
     Traverse,
     TruthScore,
+    Whereabouts,
 )
 from deepsimbad_client.http.wire import RetryPolicy
 
@@ -47,4 +48,5 @@ __all__ = [
     "SessionState",
     "Traverse",
     "TruthScore",
+    "Whereabouts",
 ]

@@ -206,6 +206,10 @@ class NoActiveMapError(ConflictError, code="no_active_map"):
     """The domain has no active map yet."""
 
 
+class NoDomainAnswersError(ConflictError, code="no_domain_answers"):
+    """None of the domains that a view was asked of can answer it."""
+
+
 class DomainDiffersError(ConflictError, code="domain_differs"):
     """A domain of that name exists with another configuration."""
 
@@ -319,6 +323,10 @@ class EvaluatorUnavailableError(UnavailableError, code="evaluator_unavailable"):
 
 class SessionMovedError(UnavailableError, code="session_moved"):
     """A session that another node moved on at the same moment; nothing was counted."""
+
+
+class NotLoadedError(UnavailableError, code="not_loaded"):
+    """A map that was not in memory when a view was asked of many, and could not be read in time or had no room."""
 
 
 class DamagedMapError(UnavailableError, code="damaged_map"):

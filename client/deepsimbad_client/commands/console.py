@@ -25,7 +25,7 @@ from rich.progress import (
 from rich.table import Table
 
 from deepsimbad_client.http.client import Client
-from deepsimbad_client.http.models import Domain, Job, ListedSession, Localization, MapVersion, Traverse
+from deepsimbad_client.http.models import Domain, Job, ListedSession, Localization, MapVersion, Traverse, Whereabouts
 from deepsimbad_client.http.upload import CONCURRENCY, UploadReport
 from deepsimbad_client.http.wire import DEFAULT_URL, KEY_VARIABLE, URL_VARIABLE
 from deepsimbad_client.replay.active import Episode
@@ -285,6 +285,18 @@ def place_table(answers: Sequence[tuple[str, Localization]]) -> Table:
 
     headings = "image*~, most like~, likeliest [m]>!, 95 % within [m]>!" + (", x [m]>!, y [m]>!" if knows_plane else "")
     return _table("places", headings, (row(*answer) for answer in answers))
+
+
+def whereabouts_table(answers: Sequence[tuple[str, Whereabouts]]) -> Table:
+    """On which domains images probably were taken, and where there."""
+    rows = []
+    for name, answer in answers:
+        for each in answer.domains:
+            belief, chance = each.belief, f"{100 * each.probability:.1f}"
+            rows.append((name, each.domain, chance, belief.top[0].frame or "-", f"{belief.mode_m:.1f}"))
+        rows.append((name, "elsewhere", f"{100 * answer.elsewhere:.1f}", "", ""))
+    headings = "image*~, domain~, probability [%]>!, most like~, likeliest there [m]>!"
+    return _table("places", headings, rows)
 
 
 def gate_verdict(check: Mapping[str, Any]) -> str:

@@ -1,6 +1,7 @@
 """What is done with a recording: `upload`, `localize`, `replay` and `watch`."""
 
 import json
+from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from deepsimbad_client.commands.console import (
     place_table,
     serving,
     show,
+    whereabouts_table,
 )
 from deepsimbad_client.errors import UnknownDomainError
 from deepsimbad_client.http.client import Client
@@ -119,11 +121,15 @@ def localize(
     """Say where images were probably taken.
 
     IMAGE is a file, or a SOURCE such as nclt:ROOT/DATE#40:41 or a folder; each image is placed on its own. Where the
-    domain takes them it may be a .txt that says what is seen, or a .json of {"objects": [...]}.
+    domain takes them it may be a .txt that says what is seen, or a .json of {"objects": [...]}. DOMAIN may be several,
+    as a,b,c, or '*', all: then the likeliest are told.
     """
     domain, images = (words[0], words[1:]) if domain is None else (domain, words)
     if not images:
         raise click.UsageError("give DOMAIN and an IMAGE, or several")
+    if domain == "*" or "," in domain:
+        _localize_anywhere(client, domain, images, shortlist, rotate, json_output)
+        return
     described = client.domain(domain)
     shortlist = min(shortlist, described.n_map_images or shortlist)
     looks = views(images, described.takes, described.input_size, described.grey_levels, rotate)
@@ -132,6 +138,20 @@ def localize(
         click.echo(as_json([{"image": name, **answer.model_dump(mode="json")} for name, answer in answers]))
     else:
         show(place_table(answers))
+
+
+def _localize_anywhere(
+    client: Client, domains: str, images: Sequence[str], shortlist: int, rotate: int | None, json_output: bool
+) -> None:
+    names = None if domains == "*" else domains.split(",")
+    looks = views(images, ("image", "objects", "text"), None, None, rotate)
+    answers = [(name, client.localize_anywhere(domains=names, shortlist=shortlist, **view)) for name, view in looks]
+    if json_output:
+        click.echo(as_json([{"image": name, **answer.model_dump(mode="json")} for name, answer in answers]))
+        return
+    show(whereabouts_table(answers))
+    for out in {out.domain: out for _, answer in answers for out in answer.left_out}.values():
+        REMARKS.print(f"{out.domain} is left out: {out.detail}", soft_wrap=True)
 
 
 def _make_domain(

@@ -4,7 +4,7 @@ import hashlib
 import json
 import math
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from email.utils import parsedate_to_datetime
@@ -74,11 +74,11 @@ class Repeat(Enum):
 
 @dataclass(frozen=True)
 class Call:
-    """One request; absent (None) values of `params` are left out, and floats keep every digit."""
+    """One request; absent (None) values of `params` are left out, and floats keep every digit; names are repeated."""
 
     method: str
     path: str  # below the server's address, already quoted
-    params: Mapping[str, float | str | None] = field(default_factory=dict)
+    params: Mapping[str, float | str | Sequence[str] | None] = field(default_factory=dict)
     headers: Mapping[str, str] = field(default_factory=dict)
     body: bytes | None = None
     repeat: Repeat = Repeat.ALWAYS

@@ -263,6 +263,11 @@ class AdminCalls(Face):
         return await self._wire.model_list(MapVersion, "maps", f"{_domain(domain)}/maps")
 
     @shared
+    async def warm(self, domain: str) -> None:
+        """Say that a domain will soon be asked: its map is loaded meanwhile. Raises NoActiveMapError."""
+        await self._wire.send(Call("POST", f"{_domain(domain)}/warm"))
+
+    @shared
     async def activate(self, domain: str, version: int, *, expected: int | None = None) -> MapVersion:
         """Serve another version, forward or back, if `expected` (absent: whichever) is the active one now.
 

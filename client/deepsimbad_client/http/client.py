@@ -37,6 +37,7 @@ from deepsimbad_client.http.models import (
     SessionAnswer,
     SessionState,
     TruthScore,
+    Whereabouts,
 )
 from deepsimbad_client.http.wire import (
     THIN_LINK_TIMEOUT,
@@ -313,6 +314,28 @@ class ClientCalls(Face, Generic[AnySession]):
         path = f"{domain_path(domain)}/localizations"
         call = Call("POST", path, {"shortlist": shortlist}, body.headers, body.body)
         return model_of(Localization, await self._wire.send(call))
+
+    @shared
+    async def localize_anywhere(
+        self,
+        image: Image | None = None,
+        *,
+        domains: Sequence[str] | None = None,
+        shortlist: int | None = None,
+        in_full: int | None = None,
+        **view: Unpack[ViewForm],
+    ) -> Whereabouts:
+        """On which of many domains one view is, and where on them; the forms of a view are those of `localize`.
+
+        `domains` are asked (absent: all that the key opens), each as probable before as every other; `in_full` is how
+        many of the likeliest are told with their beliefs. Raises UnknownDomainError, ForbiddenError, InvalidInputError,
+        LandmarkModelDiffersError (ranks and dissimilarities are of one landmark model), ConflictError (none answers).
+        """
+        body = observation(image, **view)
+        params = {"domains": domains, "shortlist": shortlist, "in_full": in_full}
+        return model_of(
+            Whereabouts, await self._wire.send(Call("POST", "/v1/localizations", params, body.headers, body.body))
+        )
 
     @shared
     async def relevances(

@@ -135,6 +135,54 @@ class Localization(Answer):
     next_best_view: NextBestView | None = None
 
 
+class LikelyDomain(Answer):
+    """A domain that the robot may be on, and where on it then: as `Localization`."""
+
+    domain: str
+    map_version: int
+    probability: float  # that the robot is on this route
+    log_evidence: float  # by how much likelier the view is here than elsewhere, as a natural logarithm
+    belief: Belief
+    informative: bool = True  # whether the view told anything
+    retrieval: tuple[Retrieved, ...]
+    next_best_view: NextBestView | None = None
+
+
+class LikelyPlace(Place):
+    """A map image of a domain; `mass` is of all domains together."""
+
+    domain: str
+
+
+class OtherDomains(Answer):
+    """Those that answered and are not told."""
+
+    n_domains: int
+    probability: float  # of all of them together
+
+
+class LeftOutDomain(Answer):
+    """A domain that could not answer."""
+
+    domain: str
+    code: str  # of the error that its own localizations would have
+    detail: str
+
+
+class Whereabouts(Answer):
+    """The answer to one view of many domains, best first."""
+
+    timings_ms: dict[str, float]
+    domains: tuple[LikelyDomain, ...]
+    others: OtherDomains
+    elsewhere: float  # probability that it is none of them
+    top: tuple[LikelyPlace, ...]
+    informative: bool = True
+    warnings: tuple[str, ...] = ()  # what a person should know, in sentences
+    left_out: tuple[LeftOutDomain, ...] = ()  # a hundred at most
+    n_left_out: int = 0
+
+
 class Stretch(Answer):
     """A part of a route where views are placed rightly less often than elsewhere."""
 

@@ -247,7 +247,11 @@ class Wire:
                 raise InvalidArgumentError(
                     f"{headers[REQUEST_ID]!r} cannot name a request: use 1 to 64 letters, digits, '.', '_' and '-'"
                 )
-        params = {name: str(value) for name, value in call.params.items() if value is not None}
+        params = {
+            name: str(value) if isinstance(value, str | float | int) else list(value)
+            for name, value in call.params.items()
+            if value is not None
+        }
         return self.link.http.build_request(
             call.method, call.path, params=params or None, headers=headers, content=call.body
         )

@@ -23,12 +23,25 @@ from pydantic import Field
 from starlette.responses import FileResponse, JSONResponse, PlainTextResponse
 from starlette.routing import Route
 
-from deepsimbad.api import console, coverage, domains, events, frames, jobs, localizations, maps, sessions, traverses
+from deepsimbad.api import (
+    console,
+    coverage,
+    domains,
+    events,
+    frames,
+    jobs,
+    localizations,
+    maps,
+    sessions,
+    traverses,
+    whereabouts,
+)
 from deepsimbad.api.door import STOPPING, Door
 from deepsimbad.api.keys import KeyRing
 from deepsimbad.api.metrics import Metrics, StateCollector
 from deepsimbad.api.problems import install_openapi, install_problem_handlers, problems
 from deepsimbad.api.requests import Answer, Running, Services, Slots, refuse_unknown_parameters
+from deepsimbad.engine.atlas import Atlas
 from deepsimbad.engine.decoders import Decoders
 from deepsimbad.engine.events import SessionEvents
 from deepsimbad.engine.localizer import warm_up
@@ -60,7 +73,7 @@ _FOLLOW_S = 1.0  # between two looks into a map store's log, of one small reques
 _ROUTERS = (  # routes are tried in this order: those that robots ask come first
     *(sessions.router, localizations.router, router, domains.router, domains.admin),
     *(traverses.router, frames.router, jobs.making, jobs.router, maps.router, sessions.listing),
-    *(events.router, coverage.router, console.router),
+    *(whereabouts.router, events.router, coverage.router, console.router),
 )
 _DESCRIPTION = (
     "Where on a prelearned route a robot is, from what it sees; every error is an RFC 9457 problem document. "
@@ -271,6 +284,7 @@ def _start(
         metrics=metrics,
         catalog=catalog,
         maps=maps_,
+        atlas=Atlas(maps_),
         evaluators=evaluators,
         open_traverses=open_traverses,
         spools=SpoolRoom(settings.data_dir, settings.max_spool_bytes),

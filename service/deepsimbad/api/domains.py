@@ -6,7 +6,7 @@ from http import HTTPStatus
 from typing import Annotated, Any, Self
 
 from anyio.to_thread import run_sync
-from fastapi import APIRouter, Query, Request, Response
+from fastapi import APIRouter, BackgroundTasks, Query, Request, Response
 from pydantic import Field, model_validator
 
 from deepsimbad.api.geopose import AnchorBody
@@ -27,9 +27,15 @@ from deepsimbad.api.requests import (
     read_json,
 )
 from deepsimbad.core.map import DEFAULT_ACTIONS_M, MOST_ACTION_M, check_actions
-from deepsimbad.engine.maps import Maps
+from deepsimbad.engine.maps import Maps, no_active_map
 from deepsimbad.engine.worker import EvaluatorPool, ready
-from deepsimbad.errors import InvalidMapConfigError, NoActiveMapError, UnavailableError, UnknownDomainError
+from deepsimbad.errors import (
+    DeepSimbadError,
+    InvalidMapConfigError,
+    NoActiveMapError,
+    UnavailableError,
+    UnknownDomainError,
+)
 from deepsimbad.evaluators.grey_levels import GreyLevels, levels_in
 from deepsimbad.evaluators.registry import EXTRACTOR_PATTERNS, EvaluatorKind, evaluator_config
 from deepsimbad.store.records import DomainRecord
@@ -277,6 +283,22 @@ async def put_domain(domain: DomainName, request: Request, response: Response, r
     if created:
         log.info("domain made", extra={"domain": domain})
     return answer
+
+
+@admin.post("/{domain}/warm", status_code=202, response_class=Response, responses=problems(404, 409, 422))
+async def post_warm(domain: DomainName, running: Running, later: BackgroundTasks) -> Response:
+    """Say that a domain will soon be asked: its map and its evaluator are loaded behind this answer."""
+    record = await run_sync(running.catalog.domain, domain)
+    if record.active_version is None:
+        raise no_active_map(domain)
+
+    def load() -> None:
+        with suppress(DeepSimbadError):  # who asks is told, and so is the log
+            running.maps.active(domain)
+            ready(running.evaluators.evaluator(record.evaluator))
+
+    later.add_task(load)
+    return Response(status_code=HTTPStatus.ACCEPTED, background=later)
 
 
 @admin.delete("/{domain}", status_code=204, responses=problems(404, 409, 422))

@@ -1,6 +1,6 @@
 """Where a single view places the robot, from a uniform prior; and what every answer to a view is made of."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from io import BytesIO
 from typing import Annotated, Any
 
@@ -83,27 +83,32 @@ def only(name: str, items: dict[str, Any], description: str) -> dict[str, Any]:
 
 
 IMAGE_SCHEMA: dict[str, Any] = {"type": "string", "format": "binary"}
-_OBSERVATION_SCHEMA = {
-    "oneOf": [
-        only(
-            "ranked_landmarks",
-            {"type": "integer", "minimum": 0, "maximum": MAX_LANDMARKS - 1},
-            "Distinct landmark ids from 0, nearest first, 1..r of them; the rest are farther.",
-        ),
-        only("dissimilarities", {"type": "number"}, "r finite numbers in landmark order, smaller is nearer."),
-        only("encoding", {"type": "number"}, "A ready encoding, as long as those the map was made of."),
-        TOLD_SCHEMA,
-    ]
-}
+_FORMS = (
+    only(
+        "ranked_landmarks",
+        {"type": "integer", "minimum": 0, "maximum": MAX_LANDMARKS - 1},
+        "Distinct landmark ids from 0, nearest first, 1..r of them; the rest are farther.",
+    ),
+    only("dissimilarities", {"type": "number"}, "r finite numbers in landmark order, smaller is nearer."),
+    only("encoding", {"type": "number"}, "A ready encoding, as long as those the map was made of."),
+    TOLD_SCHEMA,
+)
 _RANKS_SCHEMA: dict[str, Any] = {
     **IMAGE_SCHEMA,
     "description": "The same in fewest bytes: their number m in two, big-endian, then m landmark ids, nearest first, "
     "of ceil(log2 r) bits each, most significant bit first; zero bits fill the last byte.",
 }
 OBSERVATION_TYPES = (*MEDIA_TYPES, JSON, RANKS, *TOLD_BODIES)
-OBSERVATION_BODY = declare(
-    {**dict.fromkeys(MEDIA_TYPES, IMAGE_SCHEMA), JSON: _OBSERVATION_SCHEMA, RANKS: _RANKS_SCHEMA, **TOLD_BODIES}
-)
+
+
+def observation_body(beside: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """The body of an observation in the OpenAPI document; members `beside` the view in a JSON body, by schema."""
+    forms = [{**form, "properties": {**form["properties"], **(beside or {})}} for form in _FORMS]
+    content = {**dict.fromkeys(MEDIA_TYPES, IMAGE_SCHEMA), JSON: {"oneOf": forms}, RANKS: _RANKS_SCHEMA, **TOLD_BODIES}
+    return declare(content)
+
+
+OBSERVATION_BODY = observation_body()
 Shortlist = Annotated[
     int | None, Query(ge=1, le=GREATEST_ID, description="Length of `retrieval` and `top`; absent: 10 or all.")
 ]
@@ -337,25 +342,34 @@ async def post_localization(
 
 
 async def view_in(
-    body: bytes, running: Services, media_type: str, evaluator: Evaluator, snapshot: Map
+    body: bytes,
+    running: Services,
+    media_type: str,
+    evaluator: Evaluator,
+    snapshot: Map,
+    observation: ObservationBody | None = None,
 ) -> tuple[View, list[str]]:
     """The observation in a body that has been read, and what a person should know of its picture.
 
     An image comes at its evaluator's size, shown by its map's grey levels.
+
+    Args:
+        observation: What a JSON body holds, where that is known.
     """
     document: dict[str, Any] = {}
     if media_type == JSON:
-        observation = await parse_json(body, ObservationBody, running)
-        is_told = bool(observation.model_fields_set) and observation.model_fields_set <= TOLD
-        if not is_told and len(observation.model_fields_set) != 1:
+        observation = observation or await parse_json(body, ObservationBody, running)
+        given = observation.model_fields_set & ObservationBody.model_fields.keys()
+        is_told = bool(given) and given <= TOLD
+        if not is_told and len(given) != 1:
             raise invalid_body(
                 "give exactly one of ranked_landmarks, dissimilarities, encoding; or objects, text, or both"
             )
-        if "ranked_landmarks" in observation.model_fields_set:
+        if "ranked_landmarks" in given:
             return RankedLandmarks(observation.ranked_landmarks), []
-        if "dissimilarities" in observation.model_fields_set:
+        if "dissimilarities" in given:
             return Dissimilarities(np.array(observation.dissimilarities, np.float64)), []
-        if "encoding" in observation.model_fields_set:
+        if "encoding" in given:
             return ReadyEncoding(np.array(observation.encoding, np.float64)), []
         document = observation.model_dump(include=set(TOLD))
     if media_type == RANKS:

@@ -24,6 +24,7 @@ from pydantic_core import ErrorDetails, to_json
 from deepsimbad.api.keys import KeyRing
 from deepsimbad.api.metrics import Metrics
 from deepsimbad.api.problems import InvalidRequestError, invalid_body, invalid_request
+from deepsimbad.engine.atlas import Atlas
 from deepsimbad.engine.decoders import Decoders
 from deepsimbad.engine.events import SessionEvents
 from deepsimbad.engine.localizer import View
@@ -125,6 +126,7 @@ class Services:
     metrics: Metrics
     catalog: Catalog
     maps: Maps
+    atlas: Atlas
     evaluators: EvaluatorPool
     open_traverses: OpenTraverses
     spools: SpoolRoom

@@ -35,7 +35,7 @@ _OBJECTS = {"type": "array", "items": _OBJECT, "maxItems": MOST_OBJECTS}
 _TEXT = {"type": "string", "minLength": 1, "maxLength": LONGEST_TEXT, "pattern": r"\S"}
 TOLD_SCHEMA: dict[str, Any] = {
     "type": "object",
-    "minProperties": 1,
+    "anyOf": [{"required": ["objects"]}, {"required": ["text"]}],
     "properties": {"objects": _OBJECTS, "text": _TEXT},
     "additionalProperties": False,
     "description": "What a detector found (none: the view tells nothing), and what is seen in words, where taken.",

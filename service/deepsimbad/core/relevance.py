@@ -28,7 +28,7 @@ class Relevance(StrEnum):
 
 
 DEFAULT_RELEVANCE = Relevance.COMPOSED
-_FAR_STD = 2.0  # deviations from what is usual
+FAR_STD = 2.0  # deviations from what is usual
 _MOST_FAR = 3 / 16  # of a view's numbers; where places are seen, in whatever season, fewer are so far off
 _SEASON_VIEWS, _SEASON_VARIETY = 10.0, 0.65  # from which on a session's views may be of a season that is odd
 _ODDEST_SEASON = 1.5  # times as strange as a view may be
@@ -103,7 +103,7 @@ def mean_ranks(relevance: NDArray[np.floating]) -> NDArray[np.float64]:
 
 def strangeness(encodings: NDArray[np.floating], usual: Moments) -> NDArray[np.float64]:
     """[...] which share of the numbers of encodings [..., d] is farther than two deviations from what is usual."""
-    far = np.abs(encodings - usual.mean) > _FAR_STD * usual.std
+    far = np.abs(encodings - usual.mean) > FAR_STD * usual.std
     return np.asarray(far.mean(axis=-1))
 
 

@@ -65,6 +65,7 @@ class Maps:
         self._clock = clock
         self._cache_bytes = cache_bytes
         self._n_bytes = 0
+        self._confirmed_at = -math.inf
         self._active: OrderedDict[str, MappedDomain] = OrderedDict()  # who was asked last is last
         self._checked_at: dict[str, float] = {}
         self._damaged: dict[str, tuple[int, DamagedMapError, float]] = {}  # version, why, and when that was noticed
@@ -143,6 +144,18 @@ class Maps:
             self._checked_at[domain] = self._clock()
             return active
 
+    def confirm(self) -> None:
+        """Ask the catalog once, at most once a second, which maps in memory still serve: for who looks at many."""
+        at = self._clock()
+        if at - self._confirmed_at <= _TRUSTED_S:
+            return
+        self._confirmed_at = at
+        held = self._active.copy()
+        serving = self._catalog.serving_versions(list(held))
+        for domain, mapped in held.items():
+            if serving.get(domain) == (mapped.record.created_at, mapped.snapshot.version):
+                self._checked_at[domain] = at
+
     def forget(self, domain: str) -> None:
         """Let go of a deleted domain's map."""
         with self._lock_of(domain):
@@ -205,9 +218,7 @@ class Maps:
     def _current(self, record: DomainRecord) -> Map:
         domain, version = record.name, record.active_version
         if version is None:
-            raise NoActiveMapError(
-                f"domain {domain} has no active map: upload traverses and start a remap", domain=domain
-            )
+            raise no_active_map(domain)
         if domain in self._damaged:
             damaged_version, why, noticed_at = self._damaged[domain]
             if damaged_version == version and self._clock() - noticed_at < _DAMAGE_REMEMBERED_S:
@@ -427,6 +438,11 @@ def unreadable(catalog: Catalog, domain: str, version: int) -> DeepSimbadError:
         domain=domain,
         map_version=version,
     )
+
+
+def no_active_map(domain: str) -> NoActiveMapError:
+    """What is said of a domain before its first map."""
+    return NoActiveMapError(f"domain {domain} has no active map: upload traverses and start a remap", domain=domain)
 
 
 def retired(domain: str, version: int) -> RetiredMapError:

@@ -197,6 +197,18 @@ class Catalog(JobCatalog, KeyCatalog):
             rows = db.execute("SELECT domain FROM map WHERE state = 'active' ORDER BY activated_at DESC, domain")
             return [domain for (domain,) in rows]
 
+    def serving_versions(self, domains: Sequence[str]) -> dict[str, tuple[str, int]]:
+        """When each of these domains was made, and its active version; those that have none are left out."""
+        with self._reading() as db:
+            rows = db.execute(
+                """
+                SELECT name, domain.created_at, version FROM json_each(?) JOIN domain ON name = value
+                JOIN map ON map.domain = name AND state = 'active'
+                """,
+                [to_json(domains)],
+            )
+            return {name: (created_at, version) for name, created_at, version in rows}
+
     def evaluators(self) -> dict[str, dict[str, Any]]:
         """Every configuration of an evaluator that is in use, by the first domain that has it."""
         with self._reading() as db:

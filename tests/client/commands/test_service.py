@@ -228,6 +228,20 @@ def test_places_on_the_command_line(client, encodings, tmp_path, capsys):
     shown = capsys.readouterr().out
     assert "likeliest [m]" in shown
     assert re.search(r"4\.png +│ 4\.png +│ +4\.0", shown), shown
+    client.admin.warm("places")
+    for named in ("places,route", "*"):
+        assert run([*command, "--json", named, str(folder / "4.png")]) == 0
+        (anywhere,) = json.loads(capsys.readouterr().out)
+        assert (anywhere["domains"][0]["domain"], anywhere["top"][0]["map_image"]) == ("places", 4)
+        assert "route" in [out["domain"] for out in anywhere["left_out"]]
+    assert run([*command, "places,route", str(folder / "4.png")]) == 0
+    shown = capsys.readouterr()
+    assert re.search(r"4\.png +│ places +│ +\d+\.\d +│ 4\.png", shown.out), shown.out
+    assert "elsewhere" in shown.out
+    assert "route is left out" in shown.err
+    answer = client.localize_anywhere(folder / "4.png", domains=["places", "route"], in_full=1)
+    assert [out.code for out in answer.left_out] == ["unsupported_media_type"]
+    assert answer.domains[0].probability + answer.others.probability + answer.elsewhere == pytest.approx(1)
     assert run([*command, "--domain", "places", str(folder / "9.png")]) == 1
     assert "no recording" in capsys.readouterr().err
 

@@ -1,0 +1,317 @@
+"""One view of many domains: is the true one told, with what certainty, and what does it take?
+
+    DEEPSIMBAD_REAL_DATA=... python -m bench.many_domains
+    python -m bench.many_domains --domains 100000 [--work DIR]
+
+The first writes docs/results/many-domains.md. The second makes a data directory of so many domains, starts a service
+on it and prints what start, memory, cold and warm answers take.
+"""
+
+import argparse
+import os
+import tempfile
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.common import ACTIONS_M, duration, machine, markdown, real_recordings, timed, write_page
+from bench.worlds import LIST_LENGTH, composed_map, scattered_lists
+from deepsimbad.core.atlas import Atlas, posterior
+from deepsimbad.core.building import MapPlan, compose_map
+from deepsimbad.core.composed import unit
+from deepsimbad.core.drive import Drive
+from deepsimbad.core.map import Map
+from deepsimbad.core.relevance import Relevance, shows_nothing
+from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
+from deepsimbad.jobs.build import encode_recording
+from deepsimbad.store.catalog import Catalog
+from deepsimbad.store.layout import maps_folder, traverses_folder
+from deepsimbad.store.map_file import seal, write_map
+from deepsimbad.store.records import now
+from deepsimbad_campus.writer import write_campus
+from deepsimbad_client import Client
+from deepsimbad_client.http.local_server import LocalServer
+from deepsimbad_client.recordings.sources import open_source
+
+Encodings = NDArray[np.float32]
+PLAN = MapPlan(Relevance.COMPOSED, LIST_LENGTH, ACTIONS_M, same_route=True)
+BOUNDS = (0.0, 0.5, 0.7, 0.9, 0.97, 1.0)
+N_DOMAINS, N_IMAGES, N_DISTINCT = 1000, 10_000, 2000
+
+
+@dataclass(frozen=True)
+class World:
+    """Domains, and views of which the true domain is known; None: it is none of them."""
+
+    name: str
+    maps: Mapping[str, Map]
+    views: Sequence[tuple[Encodings, str | None]]
+
+
+# Whether it is right
+
+
+def mapped(*seasons: Encodings) -> Map:
+    """A map of one season of a route, or of two."""
+    drives = [Drive(position_m=np.arange(float(len(season))), encodings=season) for season in seasons]
+    second = drives[1] if len(drives) > 1 else None
+    return compose_map(PLAN, drives[0], second, second, min(300, len(seasons[0]) // 2)).map
+
+
+def pieces(name: str, maps: Sequence[Encodings], live: Encodings, length: int, step: int = 3) -> World:
+    """Every other stretch of a route is a domain, and those between are none."""
+    stretches = range(0, len(live) - length + 1, length)
+    domains = {f"{at}": mapped(*(season[at : at + length] for season in maps)) for at in stretches[::2]}
+    views = [
+        (live[i], str(at) if str(at) in domains else None) for at in stretches for i in range(at, at + length, step)
+    ]
+    return World(name, domains, views)
+
+
+def worlds(data: Path, work: Path) -> Iterator[World]:
+    """Worlds that the constants were not chosen on: seasons have exchanged their parts, the campuses are new."""
+    nr, nq, nq2 = (np.load(data / "nordland_netvlad64" / f"{name}.npy") for name in ("nr", "nq", "nq2"))
+    yield pieces("railway by NetVLAD (64 numbers), stretches of 100, one season", (nq2,), nr, 100)
+    yield pieces("the same, two seasons", (nq2, nq), nr, 100)
+    drives = {name: encoded(str(data / name)) for name in ("nordland/summer", "nordland/winter")}
+    summer, winter = drives.values()
+    dark = shows_nothing(lambda: [summer]) | shows_nothing(lambda: [winter])
+    summer, winter = summer[~dark], winter[~dark]
+    yield pieces("railway, 64 x 32 pixels, stretches of 200, map winter, live summer", (winter,), summer, 200, 4)
+    ref, query = (encoded(str(data / "corridor" / name)) for name in ("ref", "query"))
+    campuses = []
+    for seed in (2, 3, 4):
+        folder = work / f"campus-{seed}"
+        campuses.append([encoded(source) for source in write_campus(folder, ("winter", "summer", "autumn"), 150, seed)])
+    maps = {f"campus {n}": mapped(winter, summer) for n, (winter, summer, _) in enumerate(campuses[:2])}
+    maps |= {
+        "corridor": mapped(query),
+        "railway, short": mapped(winter[:150]),
+        "railway, long": mapped(winter[300:1300]),
+    }
+    views = [
+        (view, f"campus {n}" if n < 2 else None) for n, (*_, autumn) in enumerate(campuses) for view in autumn[::3]
+    ]
+    views += [(view, "corridor") for view in ref[::3]]
+    views += [(view, "railway, short") for view in summer[:150:5]] + [
+        (view, "railway, long") for view in summer[300:1300:20]
+    ]
+    views += [(view, None) for view in summer[1500::10]]
+    yield World(
+        "routes of different kinds: two campuses in two seasons, a corridor, a short and a long railway", maps, views
+    )
+
+
+def encoded(source: str) -> Encodings:
+    """By the default extractor."""
+    evaluator = make_evaluator(evaluator_config({"kind": "feature_l2"}))
+    return encode_recording(open_source(source), evaluator, 50_000_000, lambda _: None).drive.encodings
+
+
+def quality_lines(data: Path, work: Path) -> Iterator[str]:
+    """Two tables."""
+    told: list[tuple[float, bool]] = []
+    rows = []
+    for world in worlds(data, work):
+        atlas, names = Atlas(list(world.maps.values())), list(world.maps)
+        right, on_route, off_route = [], [], []
+        for view, truth in world.views:
+            probabilities, elsewhere = posterior(dict(zip(names, atlas.log_evidences(view).tolist(), strict=True)))
+            best = max(probabilities, key=lambda name: probabilities[name])
+            if truth is None:
+                off_route.append(elsewhere)
+                continue
+            right.append(best == truth)
+            on_route.append(elsewhere)
+            told.append((probabilities[best], best == truth))
+        bar = float(np.quantile(on_route, 0.95))
+        rows.append(
+            (
+                *(world.name, len(names), len(right), f"{100 * np.mean(right):.0f} %", f"{100 / len(names):.0f} %"),
+                *(f"{np.median(on_route):.3f} / {np.median(off_route):.3f}", len(off_route)),
+                f"{100 * np.mean(np.array(off_route) > bar):.0f} %",
+            )
+        )
+    yield from markdown(
+        (
+            *("domains", "how many", "views of them", "true one likeliest", "by chance"),
+            *("median `elsewhere`: views of them / of none", "views of none", "above 95 % of the views of them"),
+        ),
+        rows,
+    )
+    yield from (
+        "",
+        "How often the likeliest domain is the true one, of all views of domains, by the probability told:",
+        "",
+    )
+    chance, is_right = np.array([p for p, _ in told]), np.array([ok for _, ok in told])
+    table = []
+    for low, high in pairwise(BOUNDS):
+        within = (chance > low) & (chance <= high)
+        if within.any():
+            mean, share = f"{100 * chance[within].mean():.0f} %", f"{100 * is_right[within].mean():.0f} %"
+            table.append((f"{low:g} .. {high:g}", int(within.sum()), mean, share))
+    yield from markdown(("told", "views", "mean told", "true"), table)
+
+
+# What it takes in one process
+
+
+def speed_lines() -> Iterator[str]:
+    """Of answers after encoding, evidences alone and the whole posterior with five domains in full."""
+    rng = np.random.default_rng(0)
+    base = composed_map(scattered_lists(N_IMAGES))
+    landmarks = base.landmark_model["prototypes"]
+
+    def maps(n: int, d: int | None, is_shared: bool) -> list[Map]:
+        """Of encodings of 96 numbers, or of d that each map projects by itself."""
+        made = []
+        for _ in range(n):
+            model: dict[str, Any] = {"prototypes": landmarks if is_shared else unit(rng.normal(size=landmarks.shape))}
+            usual = base.usual_encoding
+            if d is not None:
+                model["projection"] = rng.normal(size=(d, 96)).astype(np.float32)
+                usual = np.stack([np.zeros(d), np.ones(d)]).astype(np.float32)
+            lists = np.ascontiguousarray(np.roll(base.lists, int(rng.integers(N_IMAGES)), axis=1))
+            made.append(replace(base, lists=lists, landmark_model=model, usual_encoding=usual))
+        return made
+
+    rows = []
+    for what, n, d, is_shared in (
+        ("landmarks of their own, encodings of 96 numbers", N_DOMAINS, None, False),
+        ("one landmark model", N_DOMAINS, None, True),
+        ("8,064 numbers, projected by every domain", 100, 8064, False),
+    ):
+        atlas = Atlas(maps(n, d, is_shared))
+        names = [f"{number}" for number in range(n)]
+
+        def ask(atlas: Atlas = atlas, names: Sequence[str] = names, d: int = d or 96) -> None:
+            view = rng.normal(size=d).astype(np.float32)
+            posterior(dict(zip(names, atlas.log_evidences(view).tolist(), strict=True)))
+
+        timing = timed(ask, 60, 5)
+        rows.append((what, n, str(timing), duration(timing.median_s / n)))
+    yield from markdown((f"domains of {N_IMAGES:,} map images", "how many", "one view of all", "a domain"), rows)
+
+
+# A data directory of many domains
+
+
+def write_domains(data_dir: Path, n: int) -> None:
+    """Domains of 200 map images each, straight into catalog and folders: distinct files, later hard links."""
+    encodings = np.random.default_rng(0).normal(size=(200, 64)).astype(np.float32)
+    map_ = replace(mapped(encodings), evaluator={"kind": "feature_l2", "extractor": "none"})
+    at, digest, n_bytes = now(), "", 0
+    domains, versions = [], []
+    with Catalog.open(data_dir) as catalog:
+        for number in range(n):
+            name = f"d{number:06}"
+            path = maps_folder(data_dir, name) / "000001.sqlite"
+            path.parent.mkdir(parents=True)
+            traverses_folder(data_dir, name).mkdir()
+            if number < N_DISTINCT or number % 1000 == 0:
+                building, lists = path.with_suffix(".building"), np.roll(map_.lists, number, axis=1)
+                write_map(building, replace(map_, domain=name, version=1, lists=lists))
+                digest, n_bytes = seal(building, path)
+                distinct = path
+            else:
+                os.link(distinct, path)
+            domains.append((name, '{"extractor":"none","kind":"feature_l2"}', 0, "[1.0,2.0]", at, 2))
+            versions.append((name, 1, "active", at, digest, n_bytes, '{"relevance":"composed"}', "{}", at))
+        with catalog._writing() as db:
+            into = "domain (name, evaluator, closed, actions_m, created_at, next_version)"
+            db.conn.executemany(f"INSERT INTO {into} VALUES (?, ?, ?, ?, ?, ?)", domains)  # noqa: S608
+            into = "map (domain, version, state, created_at, sha256, file_bytes, config, metrics, activated_at)"
+            db.conn.executemany(f"INSERT INTO {into} VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)", versions)  # noqa: S608
+
+
+def directory_lines(n: int, work: Path) -> Iterator[str]:
+    """Start, memory, cold and warm answers of a service on it, beside one of a single domain."""
+    figures: dict[str, dict[int, str]] = {}
+    n_bytes = {}
+    view = np.random.default_rng(1).normal(size=64).tolist()
+    for n_made in (1, n):
+        folder = work / f"domains-{n_made}"
+        if not folder.exists():
+            write_domains(folder, n_made)
+        for _ in range(2):  # the first start of an installation compiles
+            began = time.perf_counter()
+            with LocalServer(folder) as server, Client(server.url) as client:
+                ready_s = time.perf_counter() - began
+                n_bytes[n_made] = resident_bytes(server.pid)
+
+                def ask(name: str, client: Client = client) -> None:
+                    client.localize(name, encoding=view)
+
+                warm = timed(lambda: ask("d000000"), 300, 20)
+                numbers = np.random.default_rng(2).permutation(np.arange(min(n_made, 1000), min(n_made, N_DISTINCT)))
+                cold_s = [timed(lambda: ask(f"d{number:06}"), 1, 0).median_s for number in numbers[:400]]  # noqa: B023
+                some = [f"d{number:06}" for number in numbers[:400]]
+                together = timed(lambda: client.localize_anywhere(encoding=view, domains=some), 20, 2) if some else None  # noqa: B023
+        figures.setdefault("ready after", {})[n_made] = duration(ready_s)
+        figures.setdefault("memory when ready", {})[n_made] = f"{n_bytes[n_made] / 2**20:.0f} MiB"
+        figures.setdefault("warm answer", {})[n_made] = str(warm)
+        if cold_s:
+            figures["cold answer, median / p99"] = {
+                n_made: f"{duration(float(np.median(cold_s)))} / {duration(float(np.quantile(cold_s, 0.99)))}"
+            }
+            figures["one view of 400 of them"] = {n_made: str(together)}
+    yield from (machine(), "", f"Load when it ended: {os.getloadavg()[0]:.1f}. Files lie in the system's cache.", "")
+    rows = ((what, *(found.get(count, "") for count in (1, n))) for what, found in figures.items())
+    yield from markdown(("", "one domain", f"{n:,} domains"), rows)
+    yield from ("", f"Memory of a further domain: {(n_bytes[n] - n_bytes[1]) / n / 1000:.2f} kB.")
+
+
+def resident_bytes(pid: int) -> int:
+    """Of a process."""
+    fields = Path(f"/proc/{pid}/statm").read_text(encoding="ascii").split()
+    return int(fields[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
+def page(data: Path, work: Path) -> Iterator[str]:
+    """docs/results/many-domains.md."""
+    yield from (
+        "# One view of many domains",
+        "",
+        "Made by `DEEPSIMBAD_REAL_DATA=... python -m bench.many_domains`.",
+        "",
+    )
+    yield from (machine(), "", "## Is the true domain told", "")
+    yield from (
+        "Single views, all domains as probable before. The constants of `core/atlas.py` were chosen on other",
+        "directions of the same recordings (summer mapped, winter live) and on other campuses: these maps are new,",
+        "most cameras are not.",
+        "",
+    )
+    yield from quality_lines(data, work)
+    yield from (
+        "",
+        "## What it takes",
+        "",
+        "After encoding, in one process, in as many threads as there are cores.",
+        "",
+    )
+    yield from speed_lines()
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--domains", type=int)
+    parser.add_argument("--work", type=Path)
+    parser.add_argument("--speed", action="store_true", help="print the speed alone")
+    given = parser.parse_args()
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = given.work or Path(temporary)
+        if given.speed:
+            print("\n".join(speed_lines()))
+        elif given.domains is not None:
+            for line in directory_lines(given.domains, folder):
+                print(line, flush=True)
+        else:
+            write_page("many-domains.md", page(real_recordings(), folder))

@@ -1,0 +1,304 @@
+"""Where a single view places the robot, on any of many domains."""
+
+from collections.abc import Mapping, Sequence
+from heapq import nlargest
+from typing import Annotated, Any, Literal
+
+from anyio.to_thread import run_sync
+from fastapi import APIRouter, Query, Request, Response
+from pydantic import Field
+from typing_extensions import TypedDict
+
+from deepsimbad.api.localizations import (
+    OBSERVATION_TYPES,
+    PROBABLY,
+    RANKS,
+    BeliefAnswer,
+    NextBestViewAnswer,
+    ObservationBody,
+    PlaceAnswer,
+    RetrievedAnswer,
+    Shortlist,
+    Timings,
+    observation_body,
+    render_localization,
+    view_in,
+)
+from deepsimbad.api.problems import invalid_body, problems
+from deepsimbad.api.requests import (
+    JSON,
+    NAME_PATTERN,
+    LandmarkModelTag,
+    Name,
+    Running,
+    Services,
+    insisted_on,
+    media_type_of,
+    parse_json,
+    read_bytes,
+)
+from deepsimbad.engine.atlas import MOST_IN_FULL, Part, Whereabouts, whereabouts
+from deepsimbad.engine.localizer import DEFAULT_SHORTLIST, View
+from deepsimbad.engine.maps import MappedDomain
+from deepsimbad.engine.worker import EncodedImage, Stopwatch
+from deepsimbad.errors import (
+    DeepSimbadError,
+    ForbiddenError,
+    LandmarkModelDiffersError,
+    NoDomainAnswersError,
+    UnknownDomainError,
+)
+from deepsimbad.evaluators.base import Evaluator
+from deepsimbad.evaluators.grey_levels import levels_in
+
+router = APIRouter(prefix="/v1", tags=["localization"])
+
+ALL = "*"
+MOST_NAMES = 10_000
+_ON_BOARD = {"ranked_landmarks", "dissimilarities"}
+_MOST_LISTED = 100  # of domains that could not answer
+
+# Bodies and answers
+
+
+class WhereaboutsBody(ObservationBody):
+    """A view, and the domains that it is asked of."""
+
+    most_parts = 2 * MOST_NAMES + ObservationBody.most_parts
+
+    domains: Annotated[tuple[Name, ...], Field(min_length=1, max_length=MOST_NAMES)] | Literal["*"] = "*"
+
+
+_DOMAINS_SCHEMA = {
+    "description": "Domains that the view is asked of, or `*`: all that the key opens. Absent: `*`.",
+    "oneOf": [
+        {"type": "array", "minItems": 1, "maxItems": MOST_NAMES, "items": {"type": "string", "pattern": NAME_PATTERN}},
+        {"const": ALL},
+    ],
+}
+DomainNames = Annotated[
+    list[Annotated[str, Field(pattern=rf"{NAME_PATTERN}|^\*$")]] | None,
+    Query(description="The same beside any body, once for every domain; not both.", max_length=MOST_NAMES),
+]
+InFull = Annotated[
+    int, Query(ge=1, le=MOST_IN_FULL, description="How many of the likeliest domains are told with their beliefs.")
+]
+
+
+class LikelyDomainAnswer(TypedDict):
+    """A domain that the robot may be on, and where it is then: all but `probability` as its own answer has it."""
+
+    domain: str
+    map_version: int
+    probability: Annotated[float, Field(description="That the robot is on this route.")]
+    log_evidence: Annotated[
+        float, Field(description="By how much likelier the view is here than elsewhere, as a natural logarithm.")
+    ]
+    belief: BeliefAnswer
+    informative: bool
+    retrieval: list[RetrievedAnswer]
+    next_best_view: NextBestViewAnswer | None
+
+
+class LikelyPlaceAnswer(PlaceAnswer):
+    """A map image of a domain; `mass` is of all domains and `elsewhere` together."""
+
+    domain: str
+
+
+class OthersAnswer(TypedDict):
+    """The domains that answered and are not told."""
+
+    n_domains: int
+    probability: Annotated[float, Field(description="Of all of them together.")]
+
+
+class LeftOutAnswer(TypedDict):
+    """A domain that could not answer."""
+
+    domain: str
+    code: Annotated[str, Field(description="Of the error that its own localizations would have.")]
+    detail: str
+
+
+class WhereaboutsAnswer(TypedDict):
+    """Where one view places the robot among many domains, all as probable before."""
+
+    timings_ms: Timings
+    domains: Annotated[list[LikelyDomainAnswer], Field(description="The likeliest, best first.")]
+    others: OthersAnswer
+    elsewhere: Annotated[float, Field(description="Probability that the robot is on none of these routes.")]
+    top: Annotated[list[LikelyPlaceAnswer], Field(description="Likeliest map images of all domains, best first.")]
+    informative: Annotated[bool, Field(description="Whether the view told anything, on the likeliest domain.")]
+    warnings: list[str]
+    left_out: Annotated[list[LeftOutAnswer], Field(description="At most a hundred of them, by name.")]
+    n_left_out: int
+
+
+def render_whereabouts(
+    found: Whereabouts, watch: Stopwatch, remarks: Sequence[str], n_top: int | None
+) -> WhereaboutsAnswer:
+    """The answer; the watch runs since the request arrived."""
+    domains, places = list[LikelyDomainAnswer](), list[LikelyPlaceAnswer]()
+    for name, probability in found.probabilities.items():
+        answer = render_localization(found.likeliest[name], watch)
+        domains.append(
+            {
+                "domain": name,
+                "map_version": answer["map_version"],
+                "probability": probability,
+                "log_evidence": found.log_evidences[name],
+                "belief": answer["belief"],
+                "informative": answer["informative"],
+                "retrieval": answer["retrieval"],
+                "next_best_view": answer["next_best_view"],
+            }
+        )
+        for place in answer["belief"]["top"]:
+            places.append({**place, "domain": name, "mass": probability * place["mass"]})
+    is_informative = bool(domains) and domains[0]["informative"]
+    warnings = [*remarks] + ([] if is_informative else ["the view told nothing of the place"])
+    if found.elsewhere > PROBABLY:
+        warnings.append(f"the robot is probably on none of these routes: elsewhere is {found.elsewhere:.2f}")
+    left_out = list(found.left_out.items())
+    return {
+        "domains": domains,
+        "others": {"n_domains": found.n_others, "probability": found.of_others},
+        "elsewhere": found.elsewhere,
+        "top": nlargest(n_top or DEFAULT_SHORTLIST, places, key=lambda place: place["mass"]),
+        "informative": is_informative,
+        "warnings": warnings,
+        "left_out": [_left_out(name, error) for name, error in left_out[:_MOST_LISTED]],
+        "n_left_out": len(left_out),
+        "timings_ms": watch.timings_ms(),
+    }
+
+
+def _left_out(name: str, error: DeepSimbadError) -> LeftOutAnswer:
+    return {"domain": name, "code": error.code, "detail": error.message}
+
+
+# Handlers
+
+
+@router.post(
+    "/localizations",
+    response_model=WhereaboutsAnswer,
+    responses=problems(404, 409, 413, 415, 422),
+    openapi_extra=observation_body({"domains": _DOMAINS_SCHEMA}),
+)
+async def post_whereabouts(
+    request: Request,
+    running: Running,
+    domains: DomainNames = None,
+    shortlist: Shortlist = None,
+    in_full: InFull = 5,
+    if_match: LandmarkModelTag = None,
+) -> Response:
+    """Localize one view on any of many domains, of which each is as probable as every other before it.
+
+    An image is encoded once for all domains of one evaluator whose maps are of one kind of picture. Ranked landmarks
+    and dissimilarities are of one landmark model: `If-Match` chooses the domains that have it, else all asked must.
+    """
+    watch = Stopwatch()
+    media_type = media_type_of(request, OBSERVATION_TYPES)
+    body = await read_bytes(request)
+    watch.lap("receive")
+    observation = await parse_json(body, WhereaboutsBody, running) if media_type == JSON else None
+    names, is_all = await _asked(request, running, domains, observation)
+    there, left_out = await run_sync(running.atlas.gather, names, is_all)
+    if if_match is not None and (tags := insisted_on(if_match)) is not None:
+        there, differing = await run_sync(_of_landmark_models, there, tags)
+        left_out |= differing
+    elif media_type == RANKS or (
+        observation and observation.model_fields_set & {"ranked_landmarks", "dissimilarities"}
+    ):
+        await run_sync(_check_one_landmark_model, there)
+    watch.lap("maps")
+    parts, remarks = [Part({}, {}, left_out)], list[str]()
+    for evaluator, members in _alike(running, there):
+
+        def ask(view: View, members: list[MappedDomain] = members, evaluator: Evaluator = evaluator) -> Part:
+            watch.lap("wait", {"encode": view.encode_ms} if isinstance(view, EncodedImage) else None)
+            return running.atlas.ask(members, evaluator, view, in_full, shortlist)
+
+        try:
+            view, seen = await view_in(body, running, media_type, evaluator, members[0].snapshot, observation)
+            watch.lap("decode")
+            parts.append(await running.look(evaluator, view, ask))
+        except DeepSimbadError as error:
+            parts.append(Part({}, {}, {member.record.name: error for member in members}))
+        else:
+            remarks += [remark for remark in seen if remark not in remarks]
+        watch.lap("compare")
+    found = whereabouts(parts, in_full)
+    if not found.likeliest:
+        raise _nobody(found.left_out)
+    _, answer = await running.written(in_full * (shortlist or 1), render_whereabouts, found, watch, remarks, shortlist)
+    return Response(answer, media_type=JSON)
+
+
+async def _asked(
+    request: Request, running: Services, given: list[str] | None, observation: WhereaboutsBody | None
+) -> tuple[list[str], bool]:
+    """The domains that are asked, by name, each once; and whether it is all that the key opens.
+
+    Raises:
+        ForbiddenError: The key does not open one that was named.
+    """
+    in_body = observation is not None and "domains" in observation.model_fields_set
+    if in_body and given is not None:
+        raise invalid_body("domains stand in the body and in the query: name them once")
+    named: Any = observation.domains if in_body and observation else given or ALL
+    opened = request.scope["state"].get("domains")  # to this key; None: all
+    if ALL in named:
+        there = await run_sync(running.catalog.domain_names)
+        return sorted(there if opened is None else there & set(opened)), True
+    if opened is not None and not set(named) <= set(opened):
+        raise ForbiddenError("this key is for other domains", domains=list(opened))
+    return list(dict.fromkeys(named)), False
+
+
+def _alike(running: Services, there: Sequence[MappedDomain]) -> list[tuple[Evaluator, list[MappedDomain]]]:
+    """The domains for which an image is decoded and encoded once."""
+    groups: dict[Any, tuple[Evaluator, list[MappedDomain]]] = {}
+    for mapped in there:
+        evaluator = running.evaluators.evaluator(mapped.record.evaluator)
+        key = id(evaluator), str(levels_in(mapped.snapshot.landmark_model)), mapped.snapshot.cameras
+        groups.setdefault(key, (evaluator, []))[1].append(mapped)
+    return list(groups.values())
+
+
+def _of_landmark_models(
+    there: Sequence[MappedDomain], tags: frozenset[str]
+) -> tuple[list[MappedDomain], dict[str, DeepSimbadError]]:
+    same, left_out = list[MappedDomain](), dict[str, DeepSimbadError]()
+    for mapped in there:
+        try:
+            mapped.snapshot.check_landmark_model(tags)
+            same.append(mapped)
+        except LandmarkModelDiffersError as error:
+            left_out[mapped.record.name] = error
+    return same, left_out
+
+
+def _check_one_landmark_model(there: Sequence[MappedDomain]) -> None:
+    digests = {mapped.snapshot.landmark_model_digest for mapped in there}
+    if len(digests) > 1:
+        raise LandmarkModelDiffersError(
+            f"ranks and dissimilarities are of one landmark model, and these domains have {len(digests)}: name its "
+            "digest in If-Match, and those that have it answer; or send the encoding",
+            landmark_model_digests=sorted(digests)[:_MOST_LISTED],
+        )
+
+
+def _nobody(left_out: Mapping[str, DeepSimbadError]) -> DeepSimbadError:
+    if len(left_out) == 1:
+        return next(iter(left_out.values()))
+    if not left_out:
+        return UnknownDomainError("there is no domain that could be asked")
+    first = next(iter(left_out.values()))
+    return NoDomainAnswersError(
+        f"none of {len(left_out)} domains can answer; the first says: {first.message}",
+        left_out=[dict(_left_out(name, error)) for name, error in list(left_out.items())[:_MOST_LISTED]],
+    )

@@ -1,0 +1,229 @@
+"""Which of many maps a view is of (ours), for all of them at once.
+
+Beliefs on different maps cannot be compared: each says where on its own route a robot is, if it is there. They have a
+common reference, by how much likelier a view is on a route than elsewhere,
+
+    log evidence = A k (max_x r(x) - R) - B min(1, sqrt(d / 1000)) (s - S),
+
+with r(x) the relevance of map image x (`composed`: a cosine), k its scale as a log-likelihood, and s how strange the
+view, of d numbers, is to the route (`relevance.strangeness`). R and S are what views that are as likely to be from
+elsewhere have, and A and B how much more and less tell: learnt, with what comes of it, in docs/results/many-domains.md.
+
+Every domain is as probable as every other before the view, because whoever names domains asks which of these routes it
+is, not which of their metres or images; `elsewhere`, none of them, is as probable then as a robot is to be lost.
+"""
+
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numba import njit, typed
+from numba.core.config import NUMBA_NUM_THREADS
+from numpy.typing import NDArray
+
+from deepsimbad.core.belief.cells import SUMS
+from deepsimbad.core.belief.evidence import LOST_AT_START
+from deepsimbad.core.composed import list_weights
+from deepsimbad.core.index.retrieval import relevances
+from deepsimbad.core.map import Map
+from deepsimbad.core.relevance import FAR_STD, Query, Relevance, strangeness
+from deepsimbad.errors import InvalidMapConfigError
+
+RELEVANCE_WEIGHT, USUAL_RELEVANCE = 0.74, 0.43  # A, R
+STRANGENESS_WEIGHT, USUAL_STRANGENESS = 34.0, 0.16  # B, S
+_SURE_NUMBERS = 1000.0  # of an encoding, from which on its strangeness is known well
+_BLOCK = 4096  # images whose sums stay in the first-level cache
+_AT_ONCE = 16  # maps that a thread takes
+
+
+def log_evidence(map_: Map, query: Query) -> float:
+    """By how much likelier a view is on a `composed` map's route than elsewhere, as a natural logarithm.
+
+    0 of a view that shows nothing; of one that came without its encoding relevance alone tells.
+
+    Raises:
+        InvalidMapConfigError: The map's relevances have no meaning beside another map's.
+        InvalidInputError: The query lacks what they compare.
+    """
+    if map_.relevance is not Relevance.COMPOSED:
+        raise InvalidMapConfigError(f"relevances of {map_.relevance} mean nothing beside another map's")
+    if not query.is_informative:
+        return 0.0
+    usual, strange = map_.live_statistics, None
+    if query.encoding is not None and usual is not None and usual.encodings is not None:
+        strange = np.array([strangeness(query.encoding, usual.encodings)])
+    greatest = np.array([relevances(map_, query).max()], np.float64)
+    d = 0 if query.encoding is None else query.encoding.size
+    return float(_weighed(greatest, np.array([map_.log_likelihood_scale]), strange, np.array([d]))[0])
+
+
+def posterior(log_evidences: Mapping[str, float]) -> tuple[dict[str, float], float]:
+    """How probable each domain is after a view, by its evidence, and that it is none of them.
+
+    What several processes have asked of domains of their own is put together by asking here once with all of it.
+    """
+    n = len(log_evidences)
+    prior = np.log([(1 - LOST_AT_START) / max(n, 1)] * n + [LOST_AT_START])
+    logs = np.array([*log_evidences.values(), 0.0]) + prior
+    weights = np.exp(logs - logs.max())
+    *of_domains, elsewhere = (weights / weights.sum()).tolist()
+    return dict(zip(log_evidences, of_domains, strict=True)), elsewhere
+
+
+class Atlas:
+    """Composed maps that are asked for one encoding together: the same as `log_evidence` of each, but for rounding.
+
+    Maps whose encodings are made unit vectors alike and compared with the same landmarks share that work.
+
+    Args:
+        maps: All `composed`, of encodings of one length d.
+    """
+
+    def __init__(self, maps: Sequence[Map]) -> None:
+        self.maps = tuple(maps)
+        self._scales = np.array([map_.log_likelihood_scale for map_ in maps])
+        spaces: dict[int, list[tuple[int, tuple[NDArray[Any], ...]]]] = {}
+        self._space_of = np.empty(len(maps), np.int64)
+        distinct: list[tuple[NDArray[Any], ...]] = []
+        for at, map_ in enumerate(maps):
+            space = _space(map_)
+            alike = spaces.setdefault(hash(space[3].tobytes()), [])
+            number = next((n for n, other in alike if all(map(np.array_equal, space, other))), None)
+            if number is None:
+                number = len(distinct)
+                alike.append((number, space))
+                distinct.append(space)
+            self._space_of[at] = number
+        self._spaces = tuple(_shelf(column) for column in zip(*distinct, strict=True))
+        self._lists, self._lengths = _shelf([map_.lists for map_ in maps]), _shelf([map_.lengths for map_ in maps])
+        self._n_landmarks = max(len(space[3]) for space in distinct)
+        self._n_spaces = len(distinct)
+
+    def log_evidences(self, encoding: NDArray[np.float32]) -> NDArray[np.float64]:
+        """[m] of one encoding [d]."""
+        n = len(self.maps)
+        products = np.empty((self._n_spaces, self._n_landmarks), np.float32)
+        strange, greatest = np.empty(self._n_spaces), np.empty(n)
+        deviations = np.empty((self._n_spaces, encoding.size), np.float32)
+        encoding = np.ascontiguousarray(encoding, np.float32)
+        _in_blocks(
+            self._n_spaces, lambda at, to: _compare(encoding, self._spaces, at, to, deviations, products, strange)
+        )
+        weights = list_weights(max(map_.list_length for map_ in self.maps))
+        _in_blocks(
+            n, lambda at, to: _find(self._lists, self._lengths, weights, self._space_of, products, at, to, greatest)
+        )
+        return _weighed(greatest, self._scales, strange[self._space_of], np.full(n, encoding.size))
+
+
+def _weighed(
+    greatest: NDArray[np.float64],
+    scales: NDArray[np.float64],
+    strange: NDArray[np.float64] | None,
+    n_numbers: NDArray[np.integer[Any]],
+) -> NDArray[np.float64]:
+    """[m] the formula above."""
+    logs = RELEVANCE_WEIGHT * scales * (greatest - USUAL_RELEVANCE)
+    if strange is None:
+        return logs
+    sure = np.minimum(1.0, np.sqrt(n_numbers / _SURE_NUMBERS))
+    return np.asarray(logs - STRANGENESS_WEIGHT * sure * (strange - USUAL_STRANGENESS))
+
+
+def _space(map_: Map) -> tuple[NDArray[Any], ...]:
+    """What an encoding meets before it meets lists: mean and std [d], projection [d, k] or [0, 0], landmarks [r, k]."""
+    usual = map_.live_statistics
+    if usual is None or usual.encodings is None:
+        raise InvalidMapConfigError("the map does not know what is usual for encodings")
+    model = map_.landmark_model
+    projection = model.get("projection", np.empty((0, 0), np.float32))
+    prototypes = np.asarray(model["prototypes"], np.float32)
+    return usual.encodings.mean, usual.encodings.std, np.asarray(projection, np.float32), prototypes
+
+
+def _shelf(arrays: Sequence[NDArray[Any]]) -> Any:
+    """Arrays of one type, as compiled code takes any number of them."""
+    shelf = typed.List()
+    for array in arrays:
+        same = np.ascontiguousarray(array).view()
+        same.setflags(write=False)
+        shelf.append(same)
+    return shelf
+
+
+def _in_blocks(n: int, run: Any) -> None:
+    """Run over 0..n in blocks, in as many threads as there are cores."""
+    blocks = [(at, min(at + _AT_ONCE, n)) for at in range(0, n, _AT_ONCE)]
+    if len(blocks) == 1:
+        run(0, n)
+    else:
+        for _ in _threads().map(lambda block: run(*block), blocks):
+            pass
+
+
+@cache
+def _threads() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(NUMBA_NUM_THREADS, thread_name_prefix="atlas")
+
+
+@njit(cache=True, nogil=True, fastmath=SUMS)
+def _compare(encoding, spaces, first, stop, deviations, products, strange):  # type: ignore[no-untyped-def]
+    """Products [g, r] of an encoding's unit vectors with landmarks, and its strangeness [g], of spaces first..stop."""
+    means, stds, projections, prototypes = spaces
+    for g in range(first, stop):
+        mean, std, projection, landmarks, z = means[g], stds[g], projections[g], prototypes[g], deviations[g]
+        n_far = 0
+        for i in range(encoding.size):
+            away = encoding[i] - mean[i]
+            n_far += abs(away) > FAR_STD * std[i]
+            z[i] = away / std[i]
+        strange[g] = n_far / encoding.size
+        for i in range(encoding.size):
+            if np.isnan(encoding[i]):
+                z[i] = 0.0
+        k = landmarks.shape[1]
+        u = z
+        if projection.shape[0] > 0:
+            u = np.zeros(k, np.float32)
+            for i in range(encoding.size):
+                row, weight = projection[i], z[i]
+                for j in range(k):
+                    u[j] += weight * row[j]
+        square = np.float32(0)
+        for j in range(k):
+            square += u[j] * u[j]
+        length = max(np.sqrt(square), np.float32(1e-12))
+        for r in range(len(landmarks)):
+            landmark, product = landmarks[r], np.float32(0)
+            for j in range(k):
+                product += u[j] * landmark[j]
+            products[g, r] = product / length
+
+
+@njit(cache=True, nogil=True, fastmath=SUMS | {"nnan", "nsz"})
+def _find(all_lists, all_lengths, weights, space_of, products, first, stop, greatest):  # type: ignore[no-untyped-def]
+    """The greatest relevance [m] in maps first..stop."""
+    tables, block = np.empty((weights.size, products.shape[1]), np.float32), np.empty(_BLOCK, np.float32)
+    for at in range(first, stop):
+        lists, lengths, product = all_lists[at], all_lengths[at], products[space_of[at]]
+        h, n = lists.shape
+        for j in range(h):
+            for r in range(product.size):
+                tables[j, r] = weights[j] * product[r]
+        best = np.float32(-np.inf)
+        for start in range(0, n, _BLOCK):
+            sums = block[: min(_BLOCK, n - start)]
+            table, row = tables[0], lists[0, start : start + sums.size]
+            for m in range(sums.size):
+                sums[m] = table[row[m]]
+            for j in range(1, h):
+                table, row = tables[j], lists[j, start : start + sums.size]
+                for m in range(sums.size):
+                    sums[m] += table[row[m]]
+            length = lengths[start : start + sums.size]
+            for m in range(sums.size):
+                relevance = sums[m] / length[m]
+                best = relevance if relevance > best else best
+        greatest[at] = best
