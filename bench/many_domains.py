@@ -106,6 +106,10 @@ def worlds(data: Path, work: Path) -> Iterator[World]:
     yield World(
         "routes of different kinds: two campuses in two seasons, a corridor, a short and a long railway", maps, views
     )
+    railway = {name: maps[f"railway, {name}"] for name in ("short", "long")}
+    views = [(view, "short") for view in summer[:150:5]] + [(view, "long") for view in summer[300:1300:20]]
+    views += [(view, None) for view in (*ref[::3], *campuses[0][2][::3])]
+    yield World("of these the railways alone, views of none are of the corridor and a campus", railway, views)
 
 
 def encoded(source: str) -> Encodings:

@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 from numba import njit, typed
-from numba.core.config import NUMBA_NUM_THREADS
+from numba.core.config import NUMBA_NUM_THREADS  # type: ignore[attr-defined]
 from numpy.typing import NDArray
 
 from deepsimbad.core.belief.cells import SUMS
