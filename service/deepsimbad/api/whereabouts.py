@@ -55,6 +55,7 @@ router = APIRouter(prefix="/v1", tags=["localization"])
 
 ALL = "*"
 MOST_NAMES = 10_000
+_MOST_IN_QUERY = 500  # names, of which the longest make no line too long for the server
 _ON_BOARD = {"ranked_landmarks", "dissimilarities"}
 _MOST_LISTED = 100  # of domains that could not answer
 
@@ -78,7 +79,7 @@ _DOMAINS_SCHEMA = {
 }
 DomainNames = Annotated[
     list[Annotated[str, Field(pattern=rf"{NAME_PATTERN}|^\*$")]] | None,
-    Query(description="The same beside any body, once for every domain; not both.", max_length=MOST_NAMES),
+    Query(description="The same beside any body, once for every domain; not both.", max_length=_MOST_IN_QUERY),
 ]
 InFull = Annotated[
     int, Query(ge=1, le=MOST_IN_FULL, description="How many of the likeliest domains are told with their beliefs.")
