@@ -366,6 +366,7 @@ def test_a_key_is_asked_refused_and_kept_in_the_tab_alone(open_page, tmp_path, d
             page.get_by_text(answer).first.wait_for()
         assert page.evaluate("Object.keys(localStorage).length") == 0
         assert page.context.cookies() == []
+        page.close()  # before its service ends, which it would complain of
 
 
 def tried(folder, drives, url):

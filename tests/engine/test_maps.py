@@ -67,7 +67,7 @@ def test_a_domain_made_anew_under_an_old_name_gets_its_own_map(catalog: Catalog,
     with pytest.raises(NoActiveMapError):
         maps.active("d")
     assert maps.n_loaded == 0, "what cannot serve any more is not held"
-    add_map(catalog)
+    add_map(catalog, contents=map_contents(closed=True))
     assert maps.active("d").snapshot is not before
 
 

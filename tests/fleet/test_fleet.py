@@ -130,14 +130,17 @@ def test_keys_count_everywhere(tmp_path):
         _, admin = catalog.create_key(KeyScope.ADMIN)
         record, robot = catalog.create_key(KeyScope.LOCALIZE, domains=["mine"])
     with (
-        running(small_settings(data_dir), run_job=InThisProcess(data_dir)) as fleet,
+        running(small_settings(data_dir, root_path="/robots"), run_job=InThisProcess(data_dir)) as fleet,
         Caller(base_url=fleet.url, timeout=120, headers={"X-API-Key": admin.text}) as operator,
         Caller(base_url=fleet.url, timeout=120, headers={"X-API-Key": robot.text}) as own,
     ):
         for name in ("mine", "yours"):
             operator.make_ready_domain(name)
-        session = own.session("mine")
-        problem(own.post("/v1/domains/yours/localizations", json=RANKS), 403, "forbidden")
+        begun = own.post("/v1/domains/mine/sessions", json={})
+        session = path_of(begun.json())
+        assert begun.headers["location"] == f"/robots{session}"
+        assert own.get(f"/robots{session}").json() == own.get(session).json()
+        problem(own.post("/robots/v1/domains/yours/localizations", json=RANKS), 403, "forbidden")
         problem(own.get("/v1/admin/jobs"), 403, "forbidden")
         with Caller(base_url=fleet.url, timeout=120) as nobody:
             problem(nobody.get(session), 401, "unauthorized")

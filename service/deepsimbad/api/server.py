@@ -31,6 +31,12 @@ _N_STANDARD = len(logging.makeLogRecord({}).__dict__)
 _STANDARD = frozenset(logging.makeLogRecord({}).__dict__) | {"message", "asctime", "taskName", "color_message"}
 
 
+def _given(record: logging.LogRecord) -> dict[str, Any]:
+    """What was given as `extra`, behind what every record has; libraries mark their own by an underscore."""
+    behind = islice(record.__dict__.items(), _N_STANDARD, None)
+    return {name: value for name, value in behind if name not in _STANDARD and not name.startswith("_")}
+
+
 class JsonFormatter(logging.Formatter):
     """One line a record: time, level, logger, message, and whatever was given as `extra`."""
 
@@ -42,9 +48,7 @@ class JsonFormatter(logging.Formatter):
             "logger": record.name,
             "message": record.getMessage(),
         }
-        # What was given as `extra` was put behind what every record has.
-        extra = islice(record.__dict__.items(), _N_STANDARD, None)
-        line |= {name: value for name, value in extra if name not in _STANDARD}
+        line |= _given(record)
         if record.exc_info:
             line["exception"] = self.formatException(record.exc_info)
         return _ENCODER.encode(line)
@@ -55,8 +59,7 @@ class PlainFormatter(logging.Formatter):
 
     def format(self, record: logging.LogRecord) -> str:
         """Render a record."""
-        extra = islice(record.__dict__.items(), _N_STANDARD, None)
-        told = [f"{name}={value}" for name, value in extra if name not in _STANDARD and value not in (None, {}, [])]
+        told = [f"{name}={value}" for name, value in _given(record).items() if value not in (None, {}, [])]
         level = "" if record.levelno <= logging.INFO else f"{record.levelname}: "
         at = time.strftime("%H:%M:%S", time.localtime(record.created))
         line = "  ".join([f"{at}  {level}{record.getMessage()}", *told])

@@ -32,6 +32,8 @@ _PASSED = (  # of a request's scope
     *("scheme", "client", "server", "root_path"),
 )
 
+_OF_EACH = {"requests_in_flight", "inference_queue", "loaded_maps", "loaded_map_bytes", "sessions"}  # gauges
+
 
 class _Gone(Exception):  # noqa: N818 - nobody's error
     """A replica ended before it answered."""
@@ -140,6 +142,9 @@ class Front:
         """One request, as ASGI has it."""
         if scope["type"] != "http":
             return
+        root = self._settings.root_path
+        if root and scope["path"].startswith(f"{root}/"):  # as the door does
+            scope["path"] = scope["path"].removeprefix(root)
         body = await self._body(scope, receive)
         passed = {name: scope[name] for name in _PASSED if name in scope}
         headers = dict(scope["headers"])
@@ -235,17 +240,23 @@ async def _left(receive: Receive) -> None:
 
 
 def added_up(texts: Iterable[str]) -> str:
-    """What several processes tell Prometheus as if they were one: samples of one name and labels are added."""
+    """What several processes tell Prometheus as if they were one.
+
+    What is counted, and what each has of its own, is added; of what all of them see alike the first is believed.
+    """
     families: dict[str, dict[str, float]] = {}
     for text in texts:
-        heading, samples = "", dict[str, float]()
+        heading, samples, adds = "", dict[str, float](), True
         for line in text.splitlines():
-            if line.startswith("#"):
-                heading = f"{heading}{line}\n" if line.startswith("# TYPE") else f"{line}\n"
-                samples = families.setdefault(heading, {}) if line.startswith("# TYPE") else samples
+            if line.startswith("# TYPE"):
+                _, _, family, kind = line.split()
+                adds = kind != "gauge" or family.removeprefix("deepsimbad_") in _OF_EACH
+                samples = families.setdefault(f"{heading}{line}\n", {})
+            elif line.startswith("#"):
+                heading = f"{line}\n"
             else:
                 name, _, value = line.rpartition(" ")
-                samples[name] = samples.get(name, 0.0) + float(value)
+                samples[name] = samples.get(name, 0.0) + float(value) if adds else samples.get(name, float(value))
     return "".join(
         heading + "".join(f"{name} {value}\n" for name, value in samples.items())
         for heading, samples in families.items()

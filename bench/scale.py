@@ -1,0 +1,167 @@
+"""A fleet of 100,000 domains and 10^9 map images, simulated with measured parameters: docs/results/scale.md.
+
+    python -m bench.scale
+
+Robots drive routes of which few are driven by many (Zipf), post an observation every two seconds and go on to another
+route after half an hour. A domain lives with two replicas by rendezvous hashing, a session with one of them; a replica
+is one server that answers in order of arrival and keeps maps in a cache of bounded bytes, in memory and on its disk,
+the least recently used leaving first. One replica dies in the middle and comes back empty.
+"""
+
+import heapq
+from collections import OrderedDict
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from bench.common import markdown, write_page
+from deepsimbad.fleet.placement import owners
+
+MEBIBYTE = 2**20
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """What is simulated; what was measured, and where, stands in docs/scale.md."""
+
+    n_domains: int = 100_000
+    n_images: int = 10_000  # of a domain
+    n_robots: int = 2_000
+    n_replicas: int = 16
+    hours: float = 1.0
+    every_s: float = 2.0  # a robot's observations
+    drive_s: float = 1800.0  # on one route
+    zipf: float = 1.0  # how much more often the first routes are driven
+    answer_ms: float = 4.7  # of processor time, an observation on board encoded, its map in memory
+    load_ms: float = 90.0  # a map from the replica's disk
+    fetch_ms: float = 60.0  # a map from the store to the disk: assumed, two round trips of 15 ms and 100 MB a second
+    replay_ms: float = 300.0  # a session that moves to another replica
+    map_bytes: int = 3 * MEBIBYTE  # of a file
+    loaded_bytes: int = 4 * MEBIBYTE  # of a map in memory
+    memory_bytes: int = 4096 * MEBIBYTE  # of a replica, for maps
+    disk_bytes: int = 64 * 1024 * MEBIBYTE  # likewise
+
+
+class Cache:
+    """Domains within a number of bytes, the least recently used leaving first."""
+
+    def __init__(self, n_bytes: int, each: int) -> None:
+        self._most, self._held = n_bytes // each, OrderedDict[int, None]()
+
+    def has(self, domain: int) -> bool:
+        """Whether it was there; it is from now on."""
+        was_there = domain in self._held
+        self._held[domain] = None
+        self._held.move_to_end(domain)
+        if len(self._held) > self._most:
+            self._held.popitem(last=False)
+        return was_there
+
+
+@dataclass
+class Replica:
+    """One server, its caches, and until when it works."""
+
+    memory: Cache
+    disk: Cache
+    free_at_s: float = 0.0
+    busy_s: float = 0.0
+    sessions: set[int] = field(default_factory=set)  # robots whose beliefs it holds
+
+    @classmethod
+    def empty(cls, of: Parameters) -> "Replica":
+        """As it starts."""
+        return cls(Cache(of.memory_bytes, of.loaded_bytes), Cache(of.disk_bytes, of.map_bytes))
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What robots and replicas saw."""
+
+    answer_ms: np.ndarray  # of every observation, waiting counted
+    n_loaded: int
+    n_fetched: int
+    n_moved: int  # sessions that a replica's death moved
+    busy: float  # share of the replicas' time
+
+
+def simulated(of: Parameters, seed: int = 0) -> Outcome:
+    """One run."""
+    rng = np.random.default_rng(seed)
+    popularity = np.cumsum(np.arange(1, of.n_domains + 1) ** -of.zipf)
+    end_s, dies_s = 3600 * of.hours, 1800 * of.hours
+    replicas = [Replica.empty(of) for _ in range(of.n_replicas)]
+    placed: dict[int, tuple[int, ...]] = {}
+    domain, until_s = np.zeros(of.n_robots, np.int64), np.zeros(of.n_robots)
+    due = [(float(rng.uniform(0, of.every_s)), robot) for robot in range(of.n_robots)]
+    heapq.heapify(due)
+    answer_ms, counts, has_died = [], {"loaded": 0, "fetched": 0, "moved": 0}, False
+    while due[0][0] < end_s:
+        now_s, robot = due[0]
+        if now_s >= dies_s and not has_died:
+            replicas[0], has_died = Replica.empty(of), True
+        is_new = now_s >= until_s[robot]
+        if is_new:
+            domain[robot] = np.searchsorted(popularity, rng.uniform(0, popularity[-1]))
+            until_s[robot] = now_s + of.drive_s * rng.uniform(0.5, 1.5)
+        route = int(domain[robot])
+        if route not in placed:
+            placed[route] = owners(f"{route:08x}", of.n_replicas)
+        replica = replicas[placed[route][robot % len(placed[route])]]
+        takes_ms = of.answer_ms
+        if not replica.memory.has(route):
+            takes_ms += of.load_ms
+            counts["loaded"] += 1
+            if not replica.disk.has(route):
+                takes_ms += of.fetch_ms
+                counts["fetched"] += 1
+        if robot not in replica.sessions:
+            replica.sessions.add(robot)
+            if not is_new and has_died:
+                takes_ms += of.replay_ms
+                counts["moved"] += 1
+        begins_s = max(now_s, replica.free_at_s)
+        replica.free_at_s = begins_s + takes_ms / 1000
+        replica.busy_s += takes_ms / 1000
+        answer_ms.append(1000 * (replica.free_at_s - now_s))
+        heapq.heapreplace(due, (now_s + of.every_s * rng.uniform(0.9, 1.1), robot))
+    busy = sum(replica.busy_s for replica in replicas) / (of.n_replicas * end_s)
+    return Outcome(np.array(answer_ms), counts["loaded"], counts["fetched"], counts["moved"], busy)
+
+
+def lines() -> Iterator[str]:
+    """The page."""
+    usual = Parameters()
+    runs = {
+        "as told": usual,
+        "twice the robots": replace(usual, n_robots=2 * usual.n_robots),
+        "half the memory": replace(usual, memory_bytes=usual.memory_bytes // 2),
+        "8 replicas": replace(usual, n_replicas=8),
+        "all routes alike": replace(usual, zipf=0.0),
+        "the store ten times slower": replace(usual, fetch_ms=10 * usual.fetch_ms),
+    }
+    yield from ("# 100,000 domains, 10^9 map images: a simulation", "", "`python -m bench.scale`", "")
+    yield from ((__doc__ or "").split("\n\n", 2)[2].strip(), "")
+    yield "Parameters (where they were measured: [scale.md](../scale.md)):"
+    yield from ("", *(f"- {name.replace('_', ' ')}: {value:,}" for name, value in vars(usual).items()), "")
+    yield from markdown(
+        ("run", "observations", "median", "p99", "p99.9", "worst", "busy", "from disk", "from the store", "moved"),
+        (row(name, simulated(of)) for name, of in runs.items()),
+    )
+    yield from (
+        "",
+        "Times are milliseconds from a robot's post to its answer at the replica, the network apart. `moved` are",
+    )
+    yield "sessions that lost their replica and went on from the shared journal."
+
+
+def row(name: str, seen: Outcome) -> tuple[str, ...]:
+    """One run's figures."""
+    times = (f"{np.percentile(seen.answer_ms, share):,.1f}" for share in (50, 99, 99.9, 100))
+    counts = (f"{count:,}" for count in (seen.n_loaded, seen.n_fetched, seen.n_moved))
+    return name, f"{seen.answer_ms.size:,}", *times, f"{seen.busy:.0%}", *counts
+
+
+if __name__ == "__main__":
+    write_page("scale.md", lines())
