@@ -29,7 +29,7 @@ class Parameters:
     n_images: int = 10_000  # of a domain
     n_robots: int = 2_000
     n_replicas: int = 16
-    hours: float = 1.0
+    hours: float = 0.5
     every_s: float = 2.0  # a robot's observations
     drive_s: float = 1800.0  # on one route
     zipf: float = 1.0  # how much more often the first routes are driven
