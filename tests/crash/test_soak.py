@@ -15,7 +15,7 @@ def test_a_few_kills(tmp_path: Path) -> None:
     result = soak(tmp_path / "data", n_kills=3, seed=2)
     assert len(result.ready_s) == len(result.empty_ready_s) == 3, "it was ready again every time"
     assert all(result.n_acknowledged[who] for who in ("Robot", "Uploader", "Mapper"))
-    assert result.n_remaps >= 1
+    assert result.n_remaps + result.n_interrupted >= 1
 
 
 def test_one_start_that_takes_too_long_is_told() -> None:
