@@ -10,7 +10,6 @@ from deepsimbad.core.drive import Drive
 from deepsimbad.core.index.retrieval import relevances
 from deepsimbad.core.metrics import rank_of_truth
 from deepsimbad.core.relevance import Query, Relevance
-from deepsimbad.engine import maps as maps_module
 from deepsimbad.engine.maps import load_snapshot
 from deepsimbad.errors import (
     InvalidEncodingError,
@@ -22,6 +21,7 @@ from deepsimbad.errors import (
 from deepsimbad.jobs.progress import Progress
 from deepsimbad.jobs.remap import remap
 from deepsimbad.jobs.remap_config import REMAP_STAGES, RemapConfig
+from deepsimbad.store import catalog as catalog_module
 from deepsimbad.store import map_file
 from deepsimbad.store.catalog import ANY
 from deepsimbad.store.records import MapState
@@ -289,7 +289,7 @@ def test_a_damaged_active_map_does_not_keep_its_remedy_away(remapped, seasons, c
 @pytest.mark.parametrize(
     ("module", "name", "error", "reason"),
     [
-        (maps_module, "verify", OSError(errno.EIO, "Input/output error"), "io_error"),
+        (catalog_module, "verify", OSError(errno.EIO, "Input/output error"), "io_error"),
         (map_file, "unpack_lists", MemoryError(), "out_of_memory"),
     ],
 )
