@@ -28,9 +28,9 @@ class Parameters:
 
     n_domains: int = 100_000
     n_images: int = 10_000  # of a domain
-    n_robots: int = 2_000
-    n_replicas: int = 16
-    hours: float = 1.0
+    n_robots: int = 1_000
+    n_replicas: int = 8
+    hours: float = 0.75
     away_s: float = 10.0  # until a replica that died is back
     every_s: float = 2.0  # a robot's observations
     drive_s: float = 1800.0  # on one route
@@ -146,7 +146,7 @@ def lines() -> Iterator[str]:
         "as told": usual,
         "twice the robots": replace(usual, n_robots=2 * usual.n_robots),
         "256 MiB of memory for maps": replace(usual, memory_bytes=256 * MEBIBYTE),
-        "8 replicas": replace(usual, n_replicas=8),
+        "4 replicas": replace(usual, n_replicas=4),
         "all routes alike": replace(usual, zipf=0.0),
         "the store ten times slower": replace(usual, fetch_ms=10 * usual.fetch_ms),
     }
