@@ -65,14 +65,6 @@ def test_of_many_who_create_an_object_at_once_one_does(objects: Objects) -> None
     assert wrote == [objects.get("log/1")]
 
 
-def test_what_is_deleted_is_gone(tmp_path: Path) -> None:
-    objects = Objects.open(f"file://{tmp_path}/store")  # the S3 server of the tests has no such call
-    objects.put("a", b"1")
-    objects.delete("a")
-    objects.delete("a")
-    assert objects.get("a") is None
-
-
 def test_a_bucket_that_is_gone_and_credentials_that_are_refused_are_named(
     bucket: Bucket, monkeypatch: pytest.MonkeyPatch
 ) -> None:

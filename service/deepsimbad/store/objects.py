@@ -106,14 +106,6 @@ class Objects:
             for page in self._store.list(prefix, offset=after, chunk_size=1000):
                 yield from (entry["path"] for entry in page)
 
-    def delete(self, name: str) -> None:
-        """Remove an object if there is one."""
-        try:
-            with self._faults(name):
-                self._store.delete(name)
-        except FileNotFoundError:
-            pass
-
     @contextmanager
     def _faults(self, name: str) -> Iterator[None]:
         """Name what the library raises; FileNotFoundError and AlreadyExistsError go on, as answers."""
