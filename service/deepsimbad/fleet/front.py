@@ -3,15 +3,11 @@
 import asyncio
 import secrets
 import socket
-from collections.abc import AsyncGenerator, Awaitable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import aclosing
-from dataclasses import dataclass
-from typing import Any, TypeVar
 
 import uvicorn
 from prometheus_client.exposition import CONTENT_TYPE_LATEST
-from ray.exceptions import RayError
-from ray.serve.exceptions import RayServeException
 from ray.serve.handle import DeploymentHandle
 from starlette.responses import Response
 from starlette.types import Message, Receive, Scope, Send
@@ -19,87 +15,17 @@ from starlette.types import Message, Receive, Scope, Send
 from deepsimbad.api.problems import error_response
 from deepsimbad.api.server import configure_logging, http_config
 from deepsimbad.errors import UnavailableError
+from deepsimbad.fleet.backend import AWAY_S, Backend, Gone
 from deepsimbad.fleet.placement import place
 from deepsimbad.fleet.replica import Replica
 from deepsimbad.settings import Settings
 
-T = TypeVar("T")
-
-WATCH_S = 2.0
-AWAY_S = 2  # that who is told to come again should wait
 _PASSED = (  # of a request's scope
     *("type", "asgi", "http_version", "method", "path", "raw_path", "query_string", "headers"),
     *("scheme", "client", "server", "root_path"),
 )
 
 _OF_EACH = {"requests_in_flight", "inference_queue", "loaded_maps", "loaded_map_bytes", "sessions"}  # gauges
-
-
-class _Gone(Exception):  # noqa: N818 - nobody's error
-    """A replica ended before it answered."""
-
-
-@dataclass(eq=False)
-class _Backend:
-    """A replica as the front sees it."""
-
-    handle: DeploymentHandle[Replica]
-    n_calls: int = 0  # under way
-    gone: asyncio.Future[None] | None = None  # has a result once the process ends; None: there is none
-
-    async def watch(self) -> None:
-        """Know from when on and how long there is a process, until cancelled."""
-        while True:
-            try:
-                await self.handle.lives.remote(0)  # waits until there is one
-                self.gone = self.gone or asyncio.get_running_loop().create_future()
-                while True:
-                    await self.handle.lives.remote(WATCH_S)
-            except (RayError, RayServeException):
-                if self.gone is not None:
-                    self.gone.set_result(None)
-                self.gone = None
-                await asyncio.sleep(0.05)
-
-    async def before_gone(self, call: Awaitable[T], gone: asyncio.Future[None]) -> T:
-        """What a call answers; raises _Gone where its process ends before."""
-        asking = asyncio.ensure_future(call)
-        asking.add_done_callback(lambda done: done.cancelled() or done.exception())  # it may end unheard
-        try:
-            either: list[asyncio.Future[Any]] = [asking, gone]
-            await asyncio.wait(either, return_when=asyncio.FIRST_COMPLETED)
-            if not asking.done():  # Serve would have it wait for the next process
-                raise _Gone
-            return asking.result()
-        except (RayError, RayServeException) as error:
-            raise _Gone from error
-        finally:
-            asking.cancel()
-
-    async def ask(self, method: str, *arguments: Any) -> Any:
-        """A short answer; raises _Gone where there is nobody to give it."""
-        if self.gone is None:
-            raise _Gone
-        response = getattr(self.handle, method).remote(*arguments)
-        try:
-            return await self.before_gone(response, self.gone)
-        except BaseException:
-            response.cancel()
-            raise
-
-    async def stream(self, method: str, *arguments: Any) -> AsyncGenerator[Any]:
-        """A long answer in its parts; raises _Gone as `ask`, or where it breaks off."""
-        if (gone := self.gone) is None:
-            raise _Gone
-        parts = getattr(self.handle.options(stream=True), method).remote(*arguments)
-        try:
-            while True:
-                try:
-                    yield await self.before_gone(anext(parts), gone)
-                except StopAsyncIteration:
-                    return
-        finally:
-            parts.cancel()
 
 
 class Front:
@@ -114,8 +40,8 @@ class Front:
     ) -> None:
         configure_logging(settings.log_level)
         self._settings = settings
-        self._admin = _Backend(admin)
-        self._replicas = [_Backend(handle) for handle in replicas]
+        self._admin = Backend(admin)
+        self._replicas = [Backend(handle) for handle in replicas]
         backends = [self._admin, *self._replicas]
         self._watching = [asyncio.create_task(backend.watch()) for backend in backends]
         while any(backend.gone is None for backend in backends):
@@ -194,7 +120,7 @@ class Front:
                         await send(message)
                         has_begun = True
                 return
-            except _Gone:
+            except Gone:
                 if has_begun:
                     raise
             finally:
@@ -219,12 +145,12 @@ class Front:
         texts = [b"".join(message.get("body", b"") for message in answer).decode() for answer in answers]
         await Response(added_up(texts), media_type=CONTENT_TYPE_LATEST)(scope, receive, send)
 
-    async def _before_last(self, message: Message, backend: _Backend) -> None:
+    async def _before_last(self, message: Message, backend: Backend) -> None:
         """Before an answer of the one that administers is whole, let the replicas see what it may have changed."""
         if backend is self._admin and message["type"] == "http.response.body" and not message.get("more_body", False):
             await asyncio.gather(*(replica.ask("follow") for replica in self._replicas), return_exceptions=True)
 
-    def _who(self, path: str) -> Sequence[_Backend]:
+    def _who(self, path: str) -> Sequence[Backend]:
         """Who may answer, the better one first."""
         placed = place(path, len(self._replicas))
         if placed is None:
