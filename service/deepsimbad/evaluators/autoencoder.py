@@ -1,10 +1,10 @@
 """The deep autoencoder of the paper (II-A, 2): one small anomaly model a landmark, d(x|p) how far x deviates from it.
 
 x' = p + tanh((x - p) I + b) O, learnt on views of the landmark: what makes these differ, another light or a step
-aside, is restored and counts no more; what no view of it ever showed is not. d = |x - x'|^2, over what it is for the
-landmark drive's scenes on average: a landmark that nothing deviates much from would else be near to everything, and its
-spread on its own few views says less (docs/results/evaluators.md). It begins as squared L2, with O = 0; all landmarks
-are trained at once, as batched tensors.
+aside, is restored and counts no more; what no view of it ever showed is not. d = |x - x'|^2 over its spread: the mean
+of what it is on the landmark's own views and on the landmark drive's scenes. Of the few own views alone a landmark that
+one season has shown would be far from everything (docs/results/evaluators.md). It begins as squared L2, with O = 0; all
+landmarks are trained at once, as batched tensors.
 """
 
 import time
@@ -22,7 +22,7 @@ _BOTTLENECK = 4
 _EPOCHS, _RATE, _DECAY = 150, 3e-3, 3e-3
 _SAMPLES = 16  # views of a landmark in an epoch
 _NOISE = 0.15  # length of what is added to a view
-_MOST_SCENES = 1024  # that a landmark's usual deviation is measured on
+_MOST_SCENES = 1024  # of the drive, that a landmark's spread is measured on
 _TRAINED = ("landmarks", "into", "bias", "out")
 
 
@@ -150,12 +150,17 @@ def _train(
     into = (torch.randn(r, _BOTTLENECK, k, generator=random) * 2 * k**-0.5).requires_grad_()
     bias, out = torch.zeros(r, _BOTTLENECK, requires_grad=True), torch.zeros(r, _BOTTLENECK, k, requires_grad=True)
     optimiser = torch.optim.AdamW([into, bias, out], _RATE, weight_decay=_DECAY)
+
+    def left_of(views: torch.Tensor) -> torch.Tensor:
+        """[r] mean squared lengths of what is not restored of views that are shown so."""
+        hidden = torch.tanh(torch.baddbmm(bias[:, None], views, into.transpose(1, 2)))
+        return (apart - torch.bmm(hidden, out)).square().sum(2).mean(1)
+
     curve = []
     for epoch in range(_EPOCHS):
         lesson.on_progress(done + epoch / _EPOCHS / 2)
         noisy = apart + torch.randn(apart.shape, generator=random) * (_NOISE * k**-0.5)
-        hidden = torch.tanh(torch.baddbmm(bias[:, None], noisy, into.transpose(1, 2)))
-        errors = (apart - torch.bmm(hidden, out)).square().sum(2).mean(1)  # [r]; no landmark's model moves another's
+        errors = left_of(noisy)  # [r]; no landmark's model moves another's
         optimiser.zero_grad()
         errors.sum().backward()  # type: ignore[no-untyped-call]
         optimiser.step()
@@ -164,6 +169,7 @@ def _train(
     trained = {name: layer.detach().numpy().astype(np.float16).astype(np.float32) for name, layer in layers.items()}
     trained["landmarks"] = p
     scenes = units.own[np.linspace(0, len(units.own) - 1, min(len(units.own), _MOST_SCENES)).astype(np.intp)]
-    deviation = _errors(scenes, *(trained[name] for name in _TRAINED)).mean(axis=0)
+    of_scenes = _errors(scenes, *(trained[name] for name in _TRAINED)).mean(axis=0)
+    deviation = (left_of(apart).detach().numpy() + of_scenes) / 2
     trained["deviation"] = np.maximum(deviation, 1e-6).astype(np.float32)
     return trained, curve[:: _EPOCHS // 15]
