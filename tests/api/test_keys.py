@@ -77,6 +77,20 @@ def test_a_ring_without_keys_is_open_until_the_first_and_closed_for_good(catalog
     assert not ring.is_open
 
 
+def test_who_shares_the_keys_is_told_of_a_change_before_it_counts_here(catalog):
+    ring, told = ring_of(catalog), []
+
+    async def announce():
+        told.append(len(ring.by_id))
+
+    ring.announce = announce
+    for _ in range(2):
+        catalog.create_key(KeyScope.LOCALIZE)
+        for _ in range(2):
+            asyncio.run(ring.reread())
+    assert (told, len(ring.by_id)) == ([0, 1], 2)
+
+
 def test_what_is_not_a_key_of_ours(catalog):
     record, key = catalog.create_key(KeyScope.ADMIN)
     ring = ring_of(catalog)

@@ -13,14 +13,14 @@ from deepsimbad.api.app import Elsewhere, create_app
 from deepsimbad.jobs.runner import InThisProcess
 from deepsimbad.store.objects import Objects
 from deepsimbad.store.shared_sessions import SharedSessionStore
-from tests.contract.conftest import N_LANDMARKS, Client, path_of, problem, service, small_settings
+from tests.contract.conftest import N_LANDMARKS, Client, path_of, problem, service, small_settings, until
 
 pytest.importorskip("obstore", reason="the extra `objects` is not installed")
 
 
 @contextmanager
-def node(data_dir, url, **settings):
-    shared = Elsewhere(sessions=partial(SharedSessionStore.sharing, Objects.open(url)))
+def node(data_dir, url, is_own=lambda _: False, **settings):
+    shared = Elsewhere(sessions=partial(SharedSessionStore.sharing, Objects.open(url), is_own=is_own))
     app = create_app(small_settings(data_dir, **settings), InThisProcess(data_dir), shared)
     with Client(app, raise_server_exceptions=False) as client:
         yield client
@@ -119,3 +119,63 @@ def test_of_two_at_once_each_counts_or_is_told(nodes):
     n_counted = one.get(path).json()["n_observations"]
     assert 10 <= n_counted <= 20
     assert told(one.get(path).json()) == told(other.get(path).json()) == told(nodes("third").get(path).json())
+
+
+def test_who_lives_is_known_everywhere(nodes):
+    one, other = nodes("one", max_sessions=2), nodes("other", max_sessions=2)
+    mine, yours = one.session(), other.session()
+    for client in (one, other):
+        problem(client.post("/v1/domains/ready/sessions", json={}), 429, "too_many_sessions")
+        assert client.services.session_store.pins() == {("ready", 1)}
+    assert other.delete(mine).status_code == 204
+    third = one.session()
+    for path in (yours, third):
+        assert one.delete(path).status_code == 204
+    assert other.services.session_store.pins() == set()
+    assert other.services.session_store.holders() == []
+
+
+def test_a_node_that_is_back_looks_after_its_sessions(nodes):
+    one = nodes("one", session_ttl_s=30)
+    path, extended = one.session(), one.session()
+    back = nodes("back", is_own=lambda _: True)
+    assert back.services.sessions.n_living == 2
+    observe(nodes("far", session_ttl_s=90), extended, 1)
+    back.services.sessions._clock = lambda: time.time() + 60
+    back.portal.call(back.services.sessions.sweep)
+    problem(one.get(path), 410, "ended_session")
+    assert one.get(extended).json()["n_observations"] == 1
+    assert back.services.sessions.n_living == 1
+    assert len(one.services.session_store.marks()) == 1
+
+
+def test_who_takes_a_session_over_follows_it_from_its_newest_snapshot(nodes, tmp_path):
+    one = nodes("one", snapshot_every=8)
+    path = one.session(seed=3)
+    for seed in range(20):
+        answer = observe(one, path, seed)
+    session_id = path.rpartition("/")[2]
+    until((tmp_path / "shared/snapshots" / session_id).exists)
+    other = nodes("other")
+    assert told(other.get(path).json()) == told(answer)
+    store = other.services.session_store
+    snapshot, rows = store.history(store.find(session_id).number, 20)
+    assert (snapshot.sequence, len(rows)) in {(8, 12), (16, 4)}  # nobody waits for the second to be written
+    other.delete(path)
+    assert not (tmp_path / "shared/snapshots" / session_id).exists()
+
+
+def test_truths_are_known_everywhere(nodes):
+    one, other = nodes("one"), nodes("other")
+    path = one.session()
+    for seed in range(3):
+        observe(one, path, seed)
+    assert one.post(f"{path}/truths", json={"true_positions_m": [0.0, 2.0, None]}).json()["n_scored"] == 2
+    assert other.post(f"{path}/truths", json={"true_positions_m": [None, None, 4.0]}).json()["n_scored"] == 1
+    for client in (one, other):
+        assert client.post(f"{path}/truths", json={"true_positions_m": [None, 2.5, None]}).status_code == 200
+    store = other.services.session_store
+    assert store.true_positions(store.find(path.rpartition("/")[2]).number).tolist() == [0.0, 2.5, 4.0]
+    counts = [client.get("/metrics").text for client in (one, other)]
+    assert ['live_anr_percent_count{domain="ready"} 2.0' in text for text in counts] == [True, False]
+    assert 'live_anr_percent_count{domain="ready"} 1.0' in counts[1]

@@ -26,6 +26,8 @@ JSON = {"Content-Type": "application/json"}
 JPEG = {"Content-Type": "image/jpeg"}
 TAKES_ENCODINGS = {"evaluator": {"kind": "feature_l2", "extractor": "none"}}
 NAMES = {"domain": "ready", "name": "drive", "index": "0", "version": "1", "session_id": "none", "job_id": "none"}
+IS_FLEET = "TEST_FLEET" in os.environ
+of_one_process = pytest.mark.skipif(IS_FLEET, reason="looks into the process that answers")
 RANKS = {"ranked_landmarks": list(range(N_LANDMARKS))}
 
 
@@ -166,18 +168,18 @@ class FleetClient(Caller):
     def services(self):
         pytest.skip("looks into the process that answers")
 
-    app = services
+    app = portal = services
 
 
 @contextmanager
 def service(data_dir, run_job=None, **settings):
     """A service of the test's own, which does its small jobs in this process."""
-    if "TEST_FLEET" in os.environ:
+    if IS_FLEET:
         from tests.fleet.running import running  # noqa: PLC0415 - Ray is an extra
 
         with (
             running(small_settings(data_dir, **settings), run_job=run_job or InThisProcess(data_dir)) as fleet,
-            FleetClient(base_url=fleet.url, timeout=120) as client,
+            FleetClient(base_url=fleet.url, timeout=120, follow_redirects=True) as client,
         ):
             yield client
         return

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from deepsimbad_client.http.local_server import LocalServer
 
-from .conftest import until
+from .conftest import IS_FLEET, until
 
 
 class Served(LocalServer):
@@ -23,6 +23,9 @@ class Served(LocalServer):
         super().__init__(data_dir, data_dir.parent / "log", variables)
         if program is not None:
             self.command = [sys.executable, "-c", program, str(data_dir)]
+        elif IS_FLEET:
+            told = ["--replicas", "2", "--data-dir", str(data_dir), "--map-store", f"file://{data_dir}-store"]
+            self.command = [sys.executable, "-m", "deepsimbad", "ray", "serve", *told]
 
     def connect(self):
         return socket.create_connection(("127.0.0.1", self.port), timeout=30)

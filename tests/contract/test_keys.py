@@ -12,7 +12,7 @@ from deepsimbad.cli import run as deepsimbad
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.records import KeyScope
 
-from .conftest import RANKS, path_of, problem, service, until
+from .conftest import RANKS, of_one_process, path_of, problem, service, until
 
 WITHOUT_KEY = {
     "/console",
@@ -110,6 +110,7 @@ def test_without_a_key_one_does_not_even_learn_what_is_there(keyed):
         assert with_key.status_code == 404 or bare.status_code == 401, path
 
 
+@of_one_process  # whose log it reads
 def test_a_robot_localizes_with_its_key_and_the_log_names_it_without_the_secret(keyed, caplog):
     client, robot, secret = keyed.client, keyed.robot, keyed.robot["X-API-Key"]
     with caplog.at_level(logging.INFO, "deepsimbad"):

@@ -5,7 +5,9 @@ import re
 
 import pytest
 
-from .conftest import JSON, RANKS, path_of, service
+from .conftest import JSON, RANKS, of_one_process, path_of, service
+
+pytestmark = of_one_process  # and reads its log
 
 ALL = ("request_id", "peer", "method", "path", "status", "key_id", "domain", "session_id", "job_id", "code")
 

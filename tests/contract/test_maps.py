@@ -7,7 +7,7 @@ import io
 import numpy as np
 import pytest
 
-from .conftest import DIM, N_READY, RANKS, TAKES_ENCODINGS, problem, ready_encodings, service, until
+from .conftest import DIM, IS_FLEET, N_READY, RANKS, TAKES_ENCODINGS, problem, ready_encodings, service, until
 
 SAME = {"same_route": True}
 
@@ -251,6 +251,7 @@ def test_a_download_goes_on_only_with_the_same_bytes(client):
         assert answer.headers.get_list("cache-control") == ["private, no-cache"], "its asker may keep it"
 
 
+@pytest.mark.skipif(IS_FLEET, reason="has another, which is sent")
 def test_a_damaged_file_is_not_sent(client, domain, data_dir):
     path = data_dir / "domains" / domain / "maps" / "000001.sqlite"
     path.chmod(0o644)

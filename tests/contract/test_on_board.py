@@ -144,7 +144,7 @@ def test_on_board_and_by_image_one_answer_where_ranks_are_compared(client, tmp_p
     client.put("/v1/admin/domains/ranked", json={"evaluator": {"kind": "feature_l2"}})
     client.upload_pictures("ranked", "drive")
     client.remap("ranked", landmark_traverse="drive", n_landmarks=N_SEEN, list_length=3, relevance="standardised")
-    robot = Client("http://testserver", transport=client._transport)
+    robot = Client(str(client.base_url), transport=client._transport)
     encoder = robot.on_board("ranked")
     assert (encoder.map_version, encoder.n_landmarks) == (1, N_SEEN)
     path = tmp_path / "view.jpg"
@@ -162,7 +162,7 @@ def test_on_board_and_by_image_one_answer_where_ranks_are_compared(client, tmp_p
 
 
 def test_ranks_find_the_place_on_a_map_that_compares_encodings(client):
-    robot = Client("http://testserver", transport=client._transport)
+    robot = Client(str(client.base_url), transport=client._transport)
     encoder = robot.on_board("seen")
     for number in (5, 3):
         ranked = encoder.ranks(encoded(picture(number)))
@@ -170,7 +170,7 @@ def test_ranks_find_the_place_on_a_map_that_compares_encodings(client):
 
 
 def test_the_client_names_other_landmarks(client):
-    robot = Client("http://testserver", transport=client._transport)
+    robot = Client(str(client.base_url), transport=client._transport)
     ranked = robot.on_board("ready").ranks(encoding=np.arange(8))
     assert robot.localize("ready", ranked=ranked).map_version == 1
     with pytest.raises(LandmarkModelDiffersError, match="on_board") as caught:

@@ -8,6 +8,7 @@ from http import HTTPStatus
 from http.server import ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 from localbucket import S3Error, S3Handler
 
@@ -39,6 +40,16 @@ def served_bucket(root: Path) -> Iterator[Bucket]:
             else:
                 self._read_body()
                 self._send_error(S3Error(HTTPStatus.FORBIDDEN, "AccessDenied", "Access Denied"))
+
+        def _post_request(self, bucket: str, key: str) -> None:
+            if key or "delete" not in self.query:
+                super()._post_request(bucket, key)
+                return
+            done = ElementTree.Element("DeleteResult")
+            for named in ElementTree.fromstring(self._read_body()).findall(".//{*}Key"):
+                self._object_path(bucket, str(named.text)).unlink(missing_ok=True)
+                ElementTree.SubElement(ElementTree.SubElement(done, "Deleted"), "Key").text = named.text
+            self._send_xml(done)
 
     folder = root / BUCKET
     folder.mkdir()

@@ -47,6 +47,9 @@ def test_an_object_is_written_whole_and_read_as_it_was(objects: Objects, tmp_pat
     objects.put("domains/b", b"")
     assert sorted(objects.names("domains/", after="domains/a")) == ["domains/b"]
     assert list(objects.names("nothing/")) == []
+    for _ in range(2):
+        objects.delete("domains/b")
+        assert objects.get("domains/b") is None
 
 
 def test_of_many_who_create_an_object_at_once_one_does(objects: Objects) -> None:

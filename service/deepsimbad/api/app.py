@@ -144,19 +144,29 @@ def create_app(settings: Settings, run_job: RunJob | None = None, elsewhere: Els
 async def follow(services: Services) -> None:
     """Take over what other machines have published; raises as `SharedCatalog.follow`."""
 
-    def take_over(domain: str) -> None:
+    def take_over(domain: str) -> bool:
+        """Whether there still is such a domain."""
         try:
+            services.catalog.domain(domain)
             if services.maps.serves(domain):  # else its map is fetched when it is asked for
                 services.maps.refresh(domain)
             services.retention.prune(domain)
-        except (NotFoundError, NoActiveMapError):  # it was deleted, and perhaps made anew
+        except NotFoundError:
+            services.maps.forget(domain)
+            services.metrics.forget_domain(domain)
+            return False
+        except NoActiveMapError:  # it was made anew
             pass
         except DeepSimbadError:
             log.exception("a new map cannot be served", extra={"domain": domain})
+        return True
 
     if isinstance(services.catalog, SharedCatalog):
+        gone = set()
         for domain in await run_sync(services.catalog.follow):
-            await run_sync(take_over, domain)
+            if not await run_sync(take_over, domain):
+                gone.add(domain)
+        await services.sessions.end_those(lambda session: session.domain in gone)
 
 
 async def _keep_following(services: Services) -> None:
@@ -174,6 +184,7 @@ async def _keep_following(services: Services) -> None:
             if is_failing:
                 log.info("the map store is followed again")
             is_failing = False
+        services.metrics.map_store_failing(is_failing)
 
 
 async def _sweep(services: Services) -> None:
@@ -248,7 +259,7 @@ def _start(
     parts.callback(live.close)
     if isinstance(catalog, SharedCatalog):
         catalog.is_in_use = lambda domain, version, digest: (
-            maps_.holds(domain, version, digest) or (domain, version) in store.pins()
+            maps_.holds(domain, version, digest) or (domain, version) in SessionStore.pins(store)  # of those read here
         )
     open_traverses = OpenTraverses(settings.data_dir)
     parts.callback(open_traverses.close)

@@ -7,7 +7,7 @@ import math
 import re
 import time
 from collections import OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Awaitable, Callable, Sequence
 
 from anyio.to_thread import run_sync
 from starlette.types import Scope
@@ -29,11 +29,13 @@ _HOW = "send a key as `Authorization: Bearer <key>` or `X-API-Key: <key>`; `deep
 class KeyRing:
     """The keys as the catalog had them a moment ago; `by_id` holds all that were ever created.
 
-    Where there is none the service is open. Once a key was seen it is closed for good, whatever is read.
+    Where there is none the service is open. Once a key was seen it is closed for good, whatever is read. Who shares the
+    keys is told by `announce` that they have changed, before that counts here.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
+        self.announce: Callable[[], Awaitable[object]] | None = None
         self._read: Callable[[], Sequence[KeyRecord]] = tuple
         self._read_at = -math.inf
         self.by_id: dict[str, KeyRecord] = {}
@@ -57,6 +59,8 @@ class KeyRing:
             log.warning("the keys cannot be read: %s", error)
             return
         was_open = not self.by_id
+        if self.announce is not None and list(records) != list(self.by_id.values()):
+            await self.announce()
         self._keep(records)
         if was_open and self.by_id:
             log.info("the first key was created: from now on a key is asked")

@@ -53,6 +53,7 @@ class Metrics:
     Attributes:
         request_began: Counts a request as being answered.
         committed: Takes the number of writes in one transaction of the sessions' file.
+        map_store_failing: Takes whether a map store cannot be followed now.
     """
 
     def __init__(self) -> None:
@@ -87,6 +88,8 @@ class Metrics:
             "deepsimbad_requests_in_flight", "Requests being answered now.", registry=self._registry
         )
         self.request_began = self._in_flight.inc
+        what = "1 where the map store could not be followed the last time."
+        self.map_store_failing = Gauge("deepsimbad_map_store_failing", what, registry=self._registry).set
         ProcessCollector(registry=self._registry)
         self._state: StateCollector | None = None
         self._domains: set[str] = set()  # that have series here

@@ -309,10 +309,13 @@ def key_id_of(request: Request) -> str | None:
 
 
 def id_under_key(request: Request, kind: str, domain: str, key: str | None) -> str | None:
-    """The id of what a request makes, which follows from its idempotency key and its API key; None without one."""
-    if key is None:
-        return None
-    return hashlib.sha256(f"{kind}\n{key_id_of(request) or ''}\n{domain}\n{key}".encode()).hexdigest()[:32]
+    """The id of what a request makes; None where it has no idempotency key."""
+    return None if key is None else derived_id(kind, key_id_of(request), domain, key)
+
+
+def derived_id(kind: str, key_id: str | None, domain: str, key: str) -> str:
+    """The id that follows from an API key and an idempotency key."""
+    return hashlib.sha256(f"{kind}\n{key_id or ''}\n{domain}\n{key}".encode("utf-8", "surrogatepass")).hexdigest()[:32]
 
 
 # Bodies

@@ -5,7 +5,7 @@ import math
 import secrets
 import time
 from collections import Counter
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -221,9 +221,11 @@ class Sessions:
     async def _begin(
         self, active: MappedDomain, config: SessionConfig, session_id: str, key_id: str | None
     ) -> SessionView:
-        if self._crowd(key_id) is not None:
+        crowd = self._crowd(key_id, await self._holders())
+        if crowd is not None:
             await self._expire()
-        if (crowd := self._crowd(key_id)) is not None:
+            crowd = self._crowd(key_id, await self._holders())
+        if crowd is not None:
             raise crowd
         self._beginning[key_id] += 1
         try:
@@ -255,16 +257,22 @@ class Sessions:
         finally:
             self._beginning[key_id] -= 1
 
-    def _crowd(self, key_id: str | None) -> TooManySessionsError | None:
+    async def _holders(self) -> list[str | None]:
+        """The API key of every session that lives, wherever it does."""
+        if self._store.shares:
+            return await asyncio.to_thread(self._store.holders)
+        return [live.record.key_id for live in self._living.values()]
+
+    def _crowd(self, key_id: str | None, holders: Sequence[str | None]) -> TooManySessionsError | None:
         """What is said where as many sessions live as may, of all or of one key."""
         rivals = list(self._living.values())
         limit, most, whose = "max_sessions", self._max_sessions, "sessions"
-        if len(rivals) + self._beginning.total() < most:
+        if len(holders) + self._beginning.total() < most:
             if key_id is None:
                 return None
             rivals = [live for live in rivals if live.record.key_id == key_id]
             limit, most, whose = "max_sessions_per_key", self._max_sessions_per_key, "sessions of this key"
-            if len(rivals) + self._beginning[key_id] < most:
+            if holders.count(key_id) + self._beginning[key_id] < most:
                 return None
         soonest_s = min((live.expires_at for live in rivals), default=0.0) - self._clock()
         hints = {limit: most, "limit": limit, "retry_after_s": max(1, min(_LONGEST_RETRY_S, math.ceil(soonest_s)))}
@@ -292,7 +300,7 @@ class Sessions:
             check_owner(live.record, key_id)
         if self._store.shares:
             async with live.lock:
-                self._heed(live, await asyncio.to_thread(self._store.catch_up, session_id))
+                self._heed(live, await asyncio.to_thread(self._store.find, session_id))
         if self._clock() >= live.expires_at and not live.lock.locked():
             await self._end(live, EXPIRED)
         if live.ending is not None:

@@ -50,7 +50,8 @@ def start(
 
 
 def wait() -> None:
-    """Until interrupted, and let every process finish what it has begun."""
+    """Until interrupted or told to end, and let every process finish what it has begun."""
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         signal.pause()
     except KeyboardInterrupt:

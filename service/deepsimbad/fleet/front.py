@@ -12,20 +12,29 @@ from ray.serve.handle import DeploymentHandle
 from starlette.responses import Response
 from starlette.types import Message, Receive, Scope, Send
 
+from deepsimbad.api.keys import presented_key
 from deepsimbad.api.problems import error_response
 from deepsimbad.api.server import configure_logging, http_config
-from deepsimbad.errors import UnavailableError
+from deepsimbad.errors import UnauthorizedError, UnavailableError
 from deepsimbad.fleet.backend import AWAY_S, Backend, Gone
 from deepsimbad.fleet.placement import place
 from deepsimbad.fleet.replica import Replica
 from deepsimbad.settings import Settings
+from deepsimbad.store.catalog_keys import ApiKey
 
 _PASSED = (  # of a request's scope
     *("type", "asgi", "http_version", "method", "path", "raw_path", "query_string", "headers"),
     *("scheme", "client", "server", "root_path"),
 )
 
-_OF_EACH = {"requests_in_flight", "inference_queue", "loaded_maps", "loaded_map_bytes", "sessions"}  # gauges
+_OF_EACH = {  # gauges
+    "requests_in_flight",
+    "inference_queue",
+    "loaded_maps",
+    "loaded_map_bytes",
+    "sessions",
+    "map_store_failing",
+}
 
 
 class Front:
@@ -71,7 +80,8 @@ class Front:
         root = self._settings.root_path
         if root and scope["path"].startswith(f"{root}/"):  # as the door does
             scope["path"] = scope["path"].removeprefix(root)
-        body = await self._body(scope, receive)
+        if (body := await self._body(scope, receive)) is None:
+            return
         passed = {name: scope[name] for name in _PASSED if name in scope}
         headers = dict(scope["headers"])
         if scope["method"] == "POST" and b"idempotency-key" not in headers:
@@ -84,8 +94,8 @@ class Front:
             answering.cancel()
         await asyncio.gather(answering, return_exceptions=True)
 
-    async def _body(self, scope: Scope, receive: Receive) -> bytes:
-        """The body; of one that is too long so much that the replica sees it."""
+    async def _body(self, scope: Scope, receive: Receive) -> bytes | None:
+        """The body; of one that is too long so much that the replica sees it; None: its sender has gone."""
         settings = self._settings
         is_admin = scope["path"].startswith("/v1/admin/")
         most = settings.max_batch_bytes if is_admin else max(settings.max_image_bytes, settings.max_json_bytes)
@@ -95,6 +105,8 @@ class Front:
         parts, n_bytes = [], 0
         while n_bytes <= most:
             message = await receive()
+            if message["type"] == "http.disconnect":
+                return None
             parts.append(message.get("body", b""))
             n_bytes += len(parts[-1])
             if not message.get("more_body", False):
@@ -106,7 +118,7 @@ class Front:
             await self._metrics(scope, receive, send)
             return
         has_begun = False
-        for backend in self._who(scope["path"]):
+        for backend in self._who(scope):
             backend.n_calls += 1
             try:
                 if scope["method"] not in {"GET", "HEAD"}:  # these alone may be long
@@ -150,13 +162,23 @@ class Front:
         if backend is self._admin and message["type"] == "http.response.body" and not message.get("more_body", False):
             await asyncio.gather(*(replica.ask("follow") for replica in self._replicas), return_exceptions=True)
 
-    def _who(self, path: str) -> Sequence[Backend]:
+    def _who(self, scope: Scope) -> Sequence[Backend]:
         """Who may answer, the better one first."""
-        placed = place(path, len(self._replicas))
+        word = dict(scope["headers"]).get(b"idempotency-key")
+        placed = place(scope["path"], len(self._replicas), _key_id(scope), word and word.decode("latin-1"))
         if placed is None:
             return [self._admin]
         backends = [self._replicas[number] for number in placed[0]]
         return backends if placed[1] else sorted(backends, key=lambda backend: backend.n_calls)
+
+
+def _key_id(scope: Scope) -> str | None:
+    """Of the key that is presented; whether it opens anything is not asked here."""
+    try:
+        key = ApiKey.parse(presented_key(scope))
+    except UnauthorizedError:
+        return None
+    return key.key_id if key else None
 
 
 async def _left(receive: Receive) -> None:

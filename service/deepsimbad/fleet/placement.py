@@ -7,6 +7,7 @@ import re
 from hashlib import blake2b
 from urllib.parse import unquote
 
+from deepsimbad.api.requests import derived_id
 from deepsimbad.engine.session import DOMAIN_DIGITS, domain_digits
 
 N_OWNERS = 2
@@ -30,10 +31,24 @@ def session_owners(session_id: str, n_replicas: int) -> tuple[int, ...]:
     return (*rest, first) if is_other else (first, *rest)
 
 
-def place(path: str, n_replicas: int) -> tuple[tuple[int, ...], bool] | None:
-    """Who answers a decoded path, and whether in this order; None: the one that administers all domains."""
+def place(
+    path: str, n_replicas: int, key_id: str | None = None, word: str | None = None
+) -> tuple[tuple[int, ...], bool] | None:
+    """Who answers a decoded path, and whether in this order; None: the one that administers all domains.
+
+    Args:
+        path: As it is routed.
+        n_replicas: That there are.
+        key_id: Of the API key that is presented, if any.
+        word: The idempotency key; with both of them the id of a session that is begun is known.
+    """
     if (of_session := _OF_SESSION.fullmatch(path)) is not None:
         return session_owners(of_session[1], n_replicas), True
     if (of_domain := _OF_DOMAIN.fullmatch(path)) is not None:
-        return owners(domain_digits(unquote(of_domain[1])), n_replicas), False
+        domain = unquote(of_domain[1])
+        digits = domain_digits(domain)
+        if of_domain[2] == "sessions" and word is not None:
+            session_id = digits + derived_id("session", key_id, domain, word)[DOMAIN_DIGITS:]
+            return session_owners(session_id, n_replicas), True
+        return owners(digits, n_replicas), False
     return None

@@ -1,13 +1,16 @@
 """One service of the fleet: the whole application in a process of Ray Serve's, asked by ASGI in place of a socket."""
 
 import asyncio
+import fcntl
+import os
 import shutil
 import tempfile
+from collections import defaultdict
 from collections.abc import AsyncIterator, Sequence
-from contextlib import AsyncExitStack
+from contextlib import AsyncExitStack, suppress
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import cast
 
 import anyio
 from ray import serve
@@ -20,15 +23,18 @@ from deepsimbad.api.app import Elsewhere, create_app, follow
 from deepsimbad.api.requests import Services
 from deepsimbad.api.server import configure_logging
 from deepsimbad.errors import UnavailableError
+from deepsimbad.fleet.placement import session_owners
 from deepsimbad.jobs.runner import RunJob
 from deepsimbad.settings import Settings
+from deepsimbad.store.durable import lock_folder
 from deepsimbad.store.objects import Objects
 from deepsimbad.store.records import KeyRecord, ListPage
-from deepsimbad.store.sessions import ListedSession, SessionStore
+from deepsimbad.store.sessions import ListedSession, SessionRecord
 from deepsimbad.store.shared_sessions import SharedSessionStore
 
 _TIMEOUT_S = 5.0  # of what one asks of another
 _MESSAGES = 8  # of an answer that may wait to be fetched
+_PREFIX = "deepsimbad-replica-"  # of folders, before the process's number
 
 
 def replica_name(number: int) -> str:
@@ -36,24 +42,50 @@ def replica_name(number: int) -> str:
     return f"domains-{number}"
 
 
-class _AllSessions(SessionStore):
-    """The sessions of one that has none of its own: what the replicas list."""
+def _clear_away() -> None:
+    """Remove the folders of replicas that were killed: their process is gone, and nobody holds them."""
+    for folder in Path(tempfile.gettempdir()).glob(f"{_PREFIX}*"):
+        with suppress(OSError, ValueError):  # another user's, or none of ours
+            try:
+                os.kill(int(folder.name.removeprefix(_PREFIX).partition("-")[0]), 0)
+            except ProcessLookupError:
+                if (descriptor := lock_folder(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)) is not None:
+                    shutil.rmtree(folder, ignore_errors=True)
+                    os.close(descriptor)
+
+
+class _AllSessions(SharedSessionStore):
+    """The sessions as the one that administers sees them: it looks after none, and lists them all."""
 
     replicas: "Sequence[DeploymentHandle[Replica]]" = ()
+
+    def living(self) -> list[SessionRecord]:
+        """None, though copies of some be here."""
+        return []
 
     def newest_living(
         self, domain: str | None, before: int | None, limit: int, at: float
     ) -> ListPage[ListedSession, int]:
-        """As each of the replicas has them; of a session that two know, the one that knows more of it is believed."""
-        asked = [replica.newest.remote(domain, before, limit, at) for replica in self.replicas]
+        """Those that live, each as the replica has it that looks after it."""
+        marks = [mark for mark in self.marks() if domain in {None, mark.domain}]
+        newest = sorted((mark.number, mark.session_id) for mark in marks if before is None or mark.number < before)[
+            ::-1
+        ]
+        by_owner = defaultdict[int, list[str]](list)
+        for _, session_id in newest[:limit]:
+            by_owner[session_owners(session_id, len(self.replicas))[0]].append(session_id)
+        asked = [self.replicas[owner].listed.remote(session_ids) for owner, session_ids in by_owner.items()]
         try:
-            pages: list[ListPage[ListedSession, int]] = [page.result(timeout_s=_TIMEOUT_S) for page in asked]
+            listed = [entry for answer in asked for entry in answer.result(timeout_s=_TIMEOUT_S)]
         except (TimeoutError, RayError, RayServeException) as error:
             raise UnavailableError("a replica is away, so its sessions cannot be listed: try again") from error
-        listed = sorted((entry for page in pages for entry in page.records), key=lambda entry: entry.n_observations)
-        newest = sorted({entry.session.number: entry for entry in listed}.items(), reverse=True)
-        has_more = len(newest) > limit or any(page.last_key is not None for page in pages)
-        return ListPage(tuple(entry for _, entry in newest[:limit]), newest[:limit][-1][0] if has_more else None)
+        living = {
+            entry.session.number: entry
+            for entry in listed
+            if entry.session.ending is None and entry.session.expires_at > at
+        }
+        last = newest[limit - 1][0] if len(newest) > limit else None
+        return ListPage(tuple(living[number] for number in sorted(living, reverse=True)), last)
 
 
 class Replica:
@@ -75,10 +107,12 @@ class Replica:
     ) -> None:
         configure_logging(settings.log_level)
         self._parts = AsyncExitStack()
+        objects = Objects.open(str(settings.map_store))
         if admin is None:
-            elsewhere = Elsewhere(sessions=_AllSessions.open)
+            elsewhere = Elsewhere(sessions=partial(_AllSessions.sharing, objects))
         else:
-            folder = Path(tempfile.mkdtemp(prefix="deepsimbad-replica-"))
+            _clear_away()
+            folder = Path(tempfile.mkdtemp(prefix=f"{_PREFIX}{os.getpid()}-"))
             self._parts.callback(shutil.rmtree, folder, ignore_errors=True)
             settings = settings.model_copy(update={"data_dir": folder})
 
@@ -86,12 +120,28 @@ class Replica:
                 records: Sequence[KeyRecord] = admin.keys.remote().result(timeout_s=_TIMEOUT_S)
                 return records
 
-            elsewhere = Elsewhere(keys, partial(SharedSessionStore.sharing, Objects.open(str(settings.map_store))))
+            name = serve.get_replica_context().deployment
+            elsewhere = Elsewhere(
+                keys,
+                partial(
+                    SharedSessionStore.sharing,
+                    objects,
+                    is_own=lambda session_id: replica_name(session_owners(session_id, n_replicas)[0]) == name,
+                ),
+            )
         self._app = create_app(settings, run_job, elsewhere)
         await self._parts.enter_async_context(self._app.router.lifespan_context(self._app))
         self._services: Services = self._app.state.services
         if isinstance(store := self._services.session_store, _AllSessions):
-            store.replicas = [serve.get_deployment_handle(replica_name(number)) for number in range(n_replicas)]
+            replicas = [serve.get_deployment_handle(replica_name(number)) for number in range(n_replicas)]
+            store.replicas = replicas
+
+            async def announce() -> None:
+                told = asyncio.gather(*(replica.reread_keys.remote() for replica in replicas), return_exceptions=True)
+                with suppress(TimeoutError):  # who is away reads them at its start
+                    await asyncio.wait_for(told, _TIMEOUT_S)
+
+            self._services.keys.announce = announce
 
     async def __del__(self) -> None:
         await self._parts.aclose()
@@ -103,9 +153,14 @@ class Replica:
         """Every API key that was ever created."""
         return self._services.catalog.keys()
 
-    async def newest(self, *page: Any) -> ListPage[ListedSession, int]:
-        """As `SessionStore.newest_living`."""
-        return await asyncio.to_thread(self._services.session_store.newest_living, *page)
+    async def reread_keys(self) -> None:
+        """Let the keys count as they are by now."""
+        await self._services.keys.reread()
+
+    async def listed(self, session_ids: Sequence[str]) -> list[ListedSession]:
+        """As `SharedSessionStore.listed`."""
+        store = cast("SharedSessionStore", self._services.session_store)
+        return await asyncio.to_thread(store.listed, session_ids)
 
     async def follow(self) -> None:
         """Take over now what the others have published."""

@@ -1,7 +1,7 @@
 """Objects that several machines share, in S3, GCS, Azure or a folder, and the errors of a store that fails."""
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
@@ -105,6 +105,11 @@ class Objects:
         with self._faults(prefix):
             for page in self._store.list(prefix, offset=after, chunk_size=1000):
                 yield from (entry["path"] for entry in page)
+
+    def delete(self, name: str) -> None:
+        """Remove an object, if there is one."""
+        with suppress(FileNotFoundError), self._faults(name):
+            self._store.delete(name)
 
     @contextmanager
     def _faults(self, name: str) -> Iterator[None]:

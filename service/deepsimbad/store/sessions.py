@@ -1,7 +1,7 @@
 """The file of live sessions and their journals: whatever was acknowledged survives kill -9 and a power cut."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass
 from pathlib import Path
@@ -123,6 +123,7 @@ class SessionStore(OpenFile):
     """
 
     shares = False  # whether other nodes may have moved a session on
+    _insert_row = INSERT_ROW
 
     def __init__(self, path: Path, db: Database, on_commit: Callable[[int], None]) -> None:
         super().__init__(path, db, open_database(path))
@@ -172,15 +173,16 @@ class SessionStore(OpenFile):
         with self._reading() as db:
             return _get(db, session_id)
 
-    def catch_up(self, session_id: str) -> SessionRecord:
-        """A session, with what other nodes have written since; the caller sees to it that nobody moves it on here."""
-        return self.find(session_id)
-
     def living(self) -> list[SessionRecord]:
         """Every session that has not ended, oldest first."""
         with self._reading() as db:
             rows = db.execute(f"{_SELECT} WHERE session.ended_at IS NULL ORDER BY session.number")
             return [_session(row) for row in rows]
+
+    def holders(self) -> list[str | None]:
+        """The API key (None: none) of every session that has not ended."""
+        with self._reading() as db:
+            return [key_id for (key_id,) in db.execute("SELECT key_id FROM session WHERE ended_at IS NULL")]
 
     def pins(self) -> set[tuple[str, int]]:
         """Domain and map version of every session that has not ended."""
@@ -260,17 +262,9 @@ class SessionStore(OpenFile):
         """
 
         def write(db: Database) -> None:
-            db.conn.execute(INSERT_ROW, (number, row.sequence, *columns_of(row, written_at)))
-            if snapshot is None:
-                return
-            db.execute("DELETE FROM snapshot WHERE session = ?", [number])
-            for name, array in snapshot.arrays.items():
-                numbers = np.ascontiguousarray(array, array.dtype.newbyteorder("<"))
-                shape = to_json(list(array.shape))
-                db.conn.execute(
-                    "INSERT INTO snapshot (session, name, sequence, dtype, shape, body) VALUES (?, ?, ?, ?, ?, ?)",
-                    (number, name, snapshot.sequence, numbers.dtype.str, shape, numbers.tobytes()),
-                )
+            db.conn.execute(self._insert_row, (number, row.sequence, *columns_of(row, written_at)))
+            if snapshot is not None:
+                replace_snapshot(db, number, snapshot_columns(snapshot))
 
         return self._commits.submit(write)
 
@@ -393,6 +387,24 @@ def columns_of(row: JournalRow, written_at: float) -> tuple[Any, ...]:
         None if encoding is None else np.ascontiguousarray(encoding, "<f4").tobytes(),
         *(None, None),
     )
+
+
+def snapshot_columns(snapshot: StateSnapshot) -> list[tuple[Any, ...]]:
+    """A snapshot's arrays as the file has them."""
+    numbers = {
+        name: np.ascontiguousarray(array, array.dtype.newbyteorder("<")) for name, array in snapshot.arrays.items()
+    }
+    return [
+        (name, snapshot.sequence, array.dtype.str, to_json(list(snapshot.arrays[name].shape)), array.tobytes())
+        for name, array in numbers.items()
+    ]
+
+
+def replace_snapshot(db: Database, number: int, columns: Iterable[Sequence[Any]]) -> None:
+    """Let these be a session's snapshot."""
+    db.execute("DELETE FROM snapshot WHERE session = ?", [number])
+    statement = "INSERT INTO snapshot (session, name, sequence, dtype, shape, body) VALUES (?, ?, ?, ?, ?, ?)"
+    db.conn.executemany(statement, [(number, *of_array) for of_array in columns])
 
 
 def _row(row: tuple[Any, ...]) -> JournalRow:

@@ -1,17 +1,24 @@
 """Sessions that several nodes share: what is written is an object of all first, then a row of the node's own file.
 
 `sessions/<id>/0000000000` is a session as it began, every following object a row of its journal, the last its ending.
-Objects are created and never replaced: of two nodes that would write one row, one is told, and reads it.
+Objects of it are created and never replaced: of two nodes that would write one row, one is told, and reads it. Beside
+it stand, as long as it lives, an empty object whose name says whose it is (`living/...`), which is what lists, limits
+and the removal of maps ask, and now and then its newest snapshot (`snapshots/<id>`), so that whoever takes it over
+follows few rows. `truths/<id>` are the true positions that were told of it.
 """
 
 import base64
 import json
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
+import numpy as np
+from numpy.typing import NDArray
 from sqlite_utils import Database
 
 from deepsimbad.errors import SessionMovedError, UnknownSessionError
@@ -19,23 +26,55 @@ from deepsimbad.store.objects import Objects
 from deepsimbad.store.sessions import (
     INSERT_ROW,
     JournalRow,
+    ListedSession,
     SessionRecord,
     SessionStore,
     StateSnapshot,
     columns_of,
+    replace_snapshot,
     session_columns,
+    snapshot_columns,
 )
 
 _ID = re.compile(r"[0-9a-f]{32}")
 _CREATED_AT = 5  # among the columns of a session
 _AT_ONCE = 16  # objects written, and as many read
-_INSERT_ROW = INSERT_ROW.replace("INSERT", "INSERT OR IGNORE", 1)
+_MANY_ROWS = 16  # from so many on a snapshot is looked for
+_NO_KEY = "-"
 # Numbers order sessions by their beginning, to ten microseconds, and are the same on every node.
 _INSERT_SESSION = """
     INSERT OR IGNORE INTO session
         (number, session_id, domain, map_version, map_sha256, config, created_at, expires_at, key_id)
     VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)
 """
+
+
+@dataclass(frozen=True)
+class Mark:
+    """That a session lives, and whose it is: all of it is the name of an object."""
+
+    domain: str
+    map_version: int
+    key_id: str | None
+    number: int
+    session_id: str
+
+    @classmethod
+    def of(cls, record: SessionRecord) -> Self:
+        """A session's."""
+        return cls(record.domain, record.map_version, record.key_id, record.number, record.session_id)
+
+    @classmethod
+    def parse(cls, name: str) -> Self:
+        """The one that an object's name is."""
+        _, domain, version, key_id, last = name.split("/")
+        number, _, session_id = last.partition("-")
+        return cls(domain, int(version), None if key_id == _NO_KEY else key_id, int(number), session_id)
+
+    @property
+    def name(self) -> str:
+        """Of its object."""
+        return f"living/{self.domain}/{self.map_version}/{self.key_id or _NO_KEY}/{self.number}-{self.session_id}"
 
 
 class SharedSessionStore(SessionStore):
@@ -45,15 +84,30 @@ class SharedSessionStore(SessionStore):
     """
 
     shares = True
+    _insert_row = INSERT_ROW.replace("INSERT", "INSERT OR IGNORE", 1)  # who looked meanwhile has copied it already
     _objects: Objects
+    _is_own: Callable[[str], bool]
     _writers: ThreadPoolExecutor
     _readers: ThreadPoolExecutor
 
     @classmethod
-    def sharing(cls, objects: Objects, data_dir: Path, on_commit: Callable[[int], None]) -> Self:
-        """Open a node's own file; its sessions are read from the objects as they are asked for."""
+    def sharing(
+        cls,
+        objects: Objects,
+        data_dir: Path,
+        on_commit: Callable[[int], None],
+        is_own: Callable[[str], bool] = lambda _: False,
+    ) -> Self:
+        """Open a node's own file; its sessions are read from the objects as they are asked for.
+
+        Args:
+            objects: Where they are shared.
+            data_dir: Of the file.
+            on_commit: As `SessionStore.open`.
+            is_own: Whether this node is the one that looks after a session, by its id: that it expires, say.
+        """
         store = cls.open(data_dir, on_commit)
-        store._objects = objects
+        store._objects, store._is_own = objects, is_own
         store._db.execute("PRAGMA synchronous = OFF")  # the objects are what has to survive
         store._writers = ThreadPoolExecutor(_AT_ONCE, "shared journal")
         store._readers = ThreadPoolExecutor(_AT_ONCE, "shared journal, read")
@@ -65,29 +119,73 @@ class SharedSessionStore(SessionStore):
         self._readers.shutdown()
         super().close()
 
+    # Who lives
+
+    def marks(self) -> list[Mark]:
+        """Of all sessions that live anywhere; a request a thousand."""
+        return [Mark.parse(name) for name in self._objects.names("living/")]
+
+    def holders(self) -> list[str | None]:
+        """As where nothing is shared, of all nodes."""
+        return [mark.key_id for mark in self.marks()]
+
+    def pins(self) -> set[tuple[str, int]]:
+        """As where nothing is shared, of all nodes."""
+        return {(mark.domain, mark.map_version) for mark in self.marks()}
+
+    def living(self) -> list[SessionRecord]:
+        """As where nothing is shared, and those of which this node is the one that looks after them, as they began."""
+        names = [_name(mark.session_id, 0) for mark in self.marks() if self._is_own(mark.session_id)]
+        begun = [_unpacked(body) for body in self._readers.map(self._objects.get, names) if body is not None]
+
+        def write(db: Database) -> None:
+            for columns in begun:
+                _insert_session(db, columns)
+
+        self._commits.submit(write).result()
+        return super().living()
+
+    def listed(self, session_ids: Sequence[str]) -> list[ListedSession]:
+        """Sessions as they are by now, to be told in a list; what is unknown is left out."""
+
+        def look(session_id: str) -> list[ListedSession]:
+            try:
+                record = self.find(session_id)
+            except UnknownSessionError:
+                return []
+            return [ListedSession(record, self.n_observations(record.number))]
+
+        with ThreadPoolExecutor(_AT_ONCE) as looks:
+            return [entry for entries in looks.map(look, session_ids) for entry in entries]
+
+    # One session
+
     def create(self, record: SessionRecord) -> Future[SessionRecord]:
         """As where nothing is shared."""
 
         def write() -> SessionRecord:
-            self._objects.create(_name(record.session_id, 0), _packed(session_columns(record)))
-            self._pull(record.session_id, -1)
+            columns = session_columns(record)
+            if self._objects.create(_name(record.session_id, 0), _packed(columns)):
+                self._copy(record.session_id, -1, [columns])
+            else:
+                self._pull(record.session_id, -1)
             return SessionStore.find(self, record.session_id)
 
         return self._writers.submit(write)
 
     def find(self, session_id: str) -> SessionRecord:
-        """One session, living or ended, from wherever it was; raises UnknownSessionError."""
+        """One session, living or ended, with what any node has written of it; raises UnknownSessionError."""
+        n_events = -1
         try:
-            return super().find(session_id)
+            record = super().find(session_id)
         except UnknownSessionError:
             if _ID.fullmatch(session_id) is None:
                 raise
-        self._pull(session_id, -1)
-        return super().find(session_id)
-
-    def catch_up(self, session_id: str) -> SessionRecord:
-        """A session that is in the file, with what other nodes have written since."""
-        self._pull(session_id, super().find(session_id).n_events)
+        else:
+            if record.ending is not None:
+                return record
+            n_events = record.n_events
+        self._pull(session_id, n_events)
         return super().find(session_id)
 
     def append(
@@ -96,8 +194,13 @@ class SharedSessionStore(SessionStore):
         """As where nothing is shared."""
 
         def write() -> None:
-            self._create(self._id(number), row.sequence, columns_of(row, written_at))
+            session_id = self._id(number)
+            self._create(session_id, row.sequence, columns_of(row, written_at))
             SessionStore.append(self, number, row, written_at, snapshot).result()
+            if snapshot is not None:
+                body = _packed(snapshot_columns(snapshot))
+                with suppress(RuntimeError):  # nobody waits for it, nor does the end of the node
+                    self._writers.submit(self._objects.put, _snapshot_name(session_id), body)
 
         return self._writers.submit(write)
 
@@ -105,11 +208,30 @@ class SharedSessionStore(SessionStore):
         """As where nothing is shared; False where another node has ended it, or moved it on since it was to expire."""
 
         def write() -> bool:
-            record = self.catch_up(self._id(number))
+            record = self.find(self._id(number))
             if record.ending is not None or (ending == "expired" and ended_at < record.expires_at):
                 return False
             self._create(record.session_id, record.n_events + 1, [ending, ended_at])
-            return SessionStore.end(self, number, ending, ended_at).result()
+            has_ended = SessionStore.end(self, number, ending, ended_at).result()
+            self._unmark(record)
+            return has_ended
+
+        return self._writers.submit(write)
+
+    def save_true_positions(
+        self, number: int, position_m: NDArray[np.float64], received_at: float
+    ) -> Future[NDArray[np.float64] | None]:
+        """As where nothing is shared; of two that are told of one session at once, by two nodes, one may be lost."""
+
+        def write() -> NDArray[np.float64] | None:
+            save, name = super(SharedSessionStore, self).save_true_positions, f"truths/{self._id(number)}"
+            if (shared := self._objects.get(name)) is not None:
+                save(number, np.frombuffer(shared, "<f8"), received_at).result()
+            before = save(number, position_m, received_at).result()
+            merged = self.true_positions(number)
+            assert merged is not None
+            self._objects.put(name, merged.tobytes())
+            return before
 
         return self._writers.submit(write)
 
@@ -124,6 +246,13 @@ class SharedSessionStore(SessionStore):
                 f"session {session_id} was moved on elsewhere this moment: try again", retry_after_s=1
             )
 
+    def _unmark(self, record: SessionRecord) -> None:
+        """It has ended: nothing but its journal is needed any more."""
+        self._objects.delete(Mark.of(record).name)
+        self._objects.delete(_snapshot_name(record.session_id))
+
+    # Copies
+
     def _pull(self, session_id: str, after: int) -> None:
         """Copy the objects of a session that follow one into the file."""
         # One that is missing is quicker to ask for than a list, and is what is answered nearly always.
@@ -131,25 +260,45 @@ class SharedSessionStore(SessionStore):
             return
         names = sorted(self._objects.names(f"sessions/{session_id}/", _name(session_id, after + 1)))
         bodies = [next_one, *(body for body in self._readers.map(self._objects.get, names) if body is not None)]
+        self._copy(session_id, after, [_unpacked(body) for body in bodies])
+
+    def _copy(self, session_id: str, after: int, rows: Sequence[Sequence[Any]]) -> None:
+        """Write what follows an object of a session into the file, and see to it that what says it lives is true."""
+        snapshot = self._objects.get(_snapshot_name(session_id)) if len(rows) > _MANY_ROWS else None
 
         def write(db: Database) -> None:
-            for sequence, columns in enumerate(map(_unpacked, bodies), after + 1):
+            for sequence, columns in enumerate(rows, after + 1):
                 if sequence == 0:
-                    began, tie = int(1e5 * columns[_CREATED_AT]), int(session_id[-4:], 16) % 1000
-                    db.conn.execute(_INSERT_SESSION, (1000 * began + tie, *columns))
+                    _insert_session(db, columns)
                     continue
                 (number,) = db.execute("SELECT number FROM session WHERE session_id = ?", [session_id]).fetchone()
                 if len(columns) == 2:  # an ending
                     statement = "UPDATE session SET ending = ?, ended_at = ? WHERE number = ?"
                     db.conn.execute(statement, (*columns, number))
                 else:
-                    db.conn.execute(_INSERT_ROW, (number, sequence, *columns))
+                    db.conn.execute(self._insert_row, (number, sequence, *columns))
+            if snapshot is not None:
+                replace_snapshot(db, number, _unpacked(snapshot))
 
         self._commits.submit(write).result()
+        record = super().find(session_id)
+        if record.ending is not None:
+            self._unmark(record)
+        elif after < 0:  # who wrote it may have ended before it was marked
+            self._objects.put(Mark.of(record).name, b"")
+
+
+def _insert_session(db: Database, columns: Sequence[Any]) -> None:
+    began, tie = int(1e5 * columns[_CREATED_AT]), int(columns[0][-4:], 16) % 1000
+    db.conn.execute(_INSERT_SESSION, (1000 * began + tie, *columns))
 
 
 def _name(session_id: str, sequence: int) -> str:
     return f"sessions/{session_id}/{sequence:010d}"
+
+
+def _snapshot_name(session_id: str) -> str:
+    return f"snapshots/{session_id}"
 
 
 def _packed(columns: Any) -> bytes:
