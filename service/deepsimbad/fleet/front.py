@@ -5,6 +5,7 @@ import secrets
 import socket
 from collections.abc import Iterable, Sequence
 from contextlib import aclosing
+from http import HTTPStatus
 
 import uvicorn
 from prometheus_client.exposition import CONTENT_TYPE_LATEST
@@ -154,6 +155,11 @@ class Front:
         answers = [
             answer for answer in await asyncio.gather(*asked, return_exceptions=True) if isinstance(answer, list)
         ]
+        for answer in answers:
+            if answer[0]["status"] != HTTPStatus.OK:
+                for message in answer:
+                    await send(message)
+                return
         texts = [b"".join(message.get("body", b"") for message in answer).decode() for answer in answers]
         await Response(added_up(texts), media_type=CONTENT_TYPE_LATEST)(scope, receive, send)
 
