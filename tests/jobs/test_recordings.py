@@ -12,6 +12,7 @@ from deepsimbad.errors import ImageTooLargeError, InvalidRouteError, InvalidSour
 from deepsimbad.evaluators.image import decode_image
 from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
 from deepsimbad.jobs.build import encode_recording
+from deepsimbad.jobs.experiments.kept import kept_encodings
 from deepsimbad.jobs.experiments.truth import read_ground_truth
 from deepsimbad_client.recordings import Frame, Recording
 from deepsimbad_client.recordings.sources import open_source
@@ -55,6 +56,18 @@ def test_the_readers_own_count_is_kept(folder, judge):
     assert encoded.left_out["not in positions.csv"] == 3
     assert encoded.left_out["in positions.csv without an image"] == 1
     assert sum(encoded.left_out.values()) == 5
+
+
+def test_what_an_earlier_run_kept_says_which_images_show_nothing_too(folder, judge, tmp_path_factory):
+    cv2.imwrite(str(folder / "4.png"), np.zeros((90, 160, 3), np.uint8))
+    recording, out = open_source(str(folder)), tmp_path_factory.mktemp("out")
+    with kept_encodings(out, "queries", source=str(folder)) as kept:
+        first = encode_recording(recording, judge, MAX_PIXELS, lambda _: None, kept=kept)
+    with kept_encodings(out, "queries", source=str(folder)) as kept:
+        again = encode_recording(recording, judge, MAX_PIXELS, lambda _: None, kept=kept)
+    assert again.encode_ms is None, "nothing was encoded"
+    assert again.drive.shows_nothing.tolist() == [False, False, False, True, False]
+    assert first.drive.shows_nothing.tolist() == again.drive.shows_nothing.tolist()
 
 
 def test_a_recording_of_broken_frames_alone_is_named(folder, judge):

@@ -24,8 +24,8 @@ from deepsimbad.errors import CancelledError, InvalidSourceError
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.compute import available_cores
 from deepsimbad.evaluators.registry import EvaluatorConfig, make_evaluator
-from deepsimbad.jobs.build import EncodedRecording, encode_recording
-from deepsimbad.jobs.experiments.kept import Kept, KeptResults, drive_digest, kept_encodings
+from deepsimbad.jobs.build import EncodedRecording, Kept, encode_recording
+from deepsimbad.jobs.experiments.kept import KeptResults, drive_digest, kept_encodings
 from deepsimbad.jobs.experiments.paper import (
     SEASONS,
     TRIPLETS,
@@ -204,7 +204,8 @@ def _encoded(
     encoded: dict[str, EncodedRecording] = {}
 
     def encode(season: str) -> None:
-        recording, report, all_kept = recordings[season], shares.report(season), Kept()
+        recording, report = recordings[season], shares.report(season)
+        all_kept: Kept = {}
         encodes = partial(encode_recording, evaluator=evaluator, max_pixels=max_pixels)
         n, date, took_ms = len(recording.frames), SEASONS[season], list[float | None]()
         for first in range(0, n if recording.encodings is None else 0, _FRAMES_AT_ONCE):
@@ -215,7 +216,7 @@ def _encoded(
 
             with kept_encodings(out / "encodings", f"{date}-{first}", source=date, **made_of) as kept:
                 took_ms.append(encodes(part, kept=kept, on_progress=so_far).encode_ms)
-            all_kept |= kept
+            all_kept.update(kept)
         whole = encodes(recording, kept=all_kept, on_progress=lambda _: None)
         encoded[season] = replace(whole, encode_ms=_encode_ms(out, season, whole.drive, took_ms, made_of))
         report(1.0)

@@ -34,7 +34,8 @@ from deepsimbad_client.recordings import Frame, Recording, counted
 from deepsimbad_client.recordings.left_out import LeftOut
 from deepsimbad_client.recordings.told import as_taken
 
-Kept: TypeAlias = MutableMapping[str, NDArray[np.float32]]  # encodings by `Recording.stamp`
+Kept: TypeAlias = MutableMapping[str, tuple[NDArray[np.float32], bool]]
+"""Encodings [d], and whether the image shows nothing, by `Recording.stamp`."""
 
 _FRAMES_A_BLOCK = 1024
 EPISODES_A_MAP_IMAGE = 25  # more would visit every entry of a small map again and again
@@ -150,8 +151,8 @@ def encode_block(
     for place in places:
         frame = recording.frames[place]
         stamp, row = recording.stamp(frame), len(readable)
-        if (encoding := kept.get(stamp)) is not None:
-            encodings[row] = encoding
+        if stamp in kept:
+            encodings[row], shows_nothing[row] = kept[stamp]
             readable.append(place)
         else:
             try:
@@ -167,7 +168,9 @@ def encode_block(
         on_read(place)
     if waiting:
         encodings[list(waiting)] = evaluator.encode(list(waiting.values()))
-        kept.update(zip(stamps, encodings[list(waiting)], strict=True))
+        kept.update(
+            {stamp: (encodings[row], bool(shows_nothing[row])) for stamp, row in zip(stamps, waiting, strict=True)}
+        )
     image_ms = 1000 * (time.perf_counter() - began) / len(waiting) if waiting else None
     n_read = len(readable)
     return EncodedBlock(np.array(readable, np.int64), encodings[:n_read], shows_nothing[:n_read], broken, image_ms)

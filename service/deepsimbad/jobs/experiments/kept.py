@@ -10,15 +10,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 import deepsimbad
 from deepsimbad.core.drive import Drive
+from deepsimbad.jobs.build import Kept
 from deepsimbad.store.arrays import is_halvable
 from deepsimbad_client.recordings import stamp_of
-
-Kept = dict[str, NDArray[np.float32]]
-"""Encodings [d] by `Recording.stamp`."""
 
 
 @contextmanager
@@ -46,20 +43,22 @@ def _read(file: Path, identity: str) -> Kept:
         with np.load(file) as arrays:
             if str(arrays["identity"]) != identity:
                 return {}
-            encodings = arrays["encodings"].astype(np.float32)
-            return dict(zip(arrays["stamps"].tolist(), encodings, strict=True))
+            frames = zip(arrays["encodings"].astype(np.float32), arrays["shows_nothing"].tolist(), strict=True)
+            return dict(zip(arrays["stamps"].tolist(), frames, strict=True))
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
         return {}  # not there, or damaged: images are encoded again
 
 
 def _write(file: Path, identity: str, kept: Kept) -> None:
     """By another name first, so that what is there is always whole."""
-    encodings = np.stack(list(kept.values()))
+    encodings = np.stack([encoding for encoding, _ in kept.values()])
+    shows_nothing = np.array([is_blank for _, is_blank in kept.values()])
     encodings = encodings.astype(np.float16) if is_halvable(encodings) else encodings
     file.parent.mkdir(parents=True, exist_ok=True)
     part = file.with_suffix(".part")
     with part.open("wb") as body:
-        np.savez(body, identity=np.array(identity), stamps=np.array(list(kept)), encodings=encodings)
+        stamps = np.array(list(kept))
+        np.savez(body, identity=np.array(identity), stamps=stamps, encodings=encodings, shows_nothing=shows_nothing)
     part.replace(file)
 
 
