@@ -31,6 +31,13 @@ of_one_process = pytest.mark.skipif(IS_FLEET, reason="looks into the process tha
 RANKS = {"ranked_landmarks": list(range(N_LANDMARKS))}
 
 
+def pytest_collection_modifyitems(items):
+    """Ray leaves sockets and files to the collector."""
+    for item in items if IS_FLEET else ():
+        item.add_marker(pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"))
+        item.add_marker(pytest.mark.filterwarnings("ignore::ResourceWarning"))
+
+
 def small_settings(data_dir, **more):
     limits = {"max_image_bytes": 200_000, "max_json_bytes": 50_000, "max_batch_bytes": 500_000, "max_pixels": 300_000}
     return Settings(data_dir=data_dir, event_poll_s=0.01, **{**limits, **more})
@@ -175,10 +182,12 @@ class FleetClient(Caller):
 def service(data_dir, run_job=None, **settings):
     """A service of the test's own, which does its small jobs in this process."""
     if IS_FLEET:
+        if run_job is not None:
+            pytest.skip("does its jobs in the process of the test")
         from tests.fleet.running import running  # noqa: PLC0415 - Ray is an extra
 
         with (
-            running(small_settings(data_dir, **settings), run_job=run_job or InThisProcess(data_dir)) as fleet,
+            running(small_settings(data_dir, **settings), run_job=InThisProcess(data_dir)) as fleet,
             FleetClient(base_url=fleet.url, timeout=120, follow_redirects=True) as client,
         ):
             yield client
@@ -186,6 +195,13 @@ def service(data_dir, run_job=None, **settings):
     app = create_app(small_settings(data_dir, **settings), run_job or InThisProcess(data_dir))
     with Client(app, raise_server_exceptions=False) as client:
         yield client
+
+
+@pytest.fixture
+def one_process():
+    """For what takes hold of the process that answers, or of its threads."""
+    if IS_FLEET:
+        pytest.skip("takes hold of the process that answers")
 
 
 @pytest.fixture(scope="session")

@@ -21,6 +21,7 @@ from .conftest import (
     TAKES_ENCODINGS,
     encoded,
     npz,
+    of_one_process,
     path_of,
     picture,
     problem,
@@ -61,6 +62,7 @@ def test_a_deleted_domain_is_gone_and_its_name_free(client, domain):
     assert client.get(f"/v1/domains/{domain}").json()["closed"] is True
 
 
+@of_one_process
 def test_a_domain_whose_folder_cannot_be_removed_is_gone_with_its_sessions(client, domain, monkeypatch):
     def fail(folder):
         raise OSError(errno.EIO, "Input/output error", str(folder))

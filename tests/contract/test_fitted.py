@@ -10,7 +10,7 @@ from deepsimbad.evaluators.feature_l2 import FeatureL2
 from deepsimbad.jobs.runner import InThisProcess
 from deepsimbad_client.http.on_board import OnBoardEncoder
 
-from .conftest import encoded, problem, service
+from .conftest import encoded, of_one_process, problem, service
 
 N, AT = 40, (0.3, 0.75)  # of a fit: while views are encoded, and in mid-training
 PNG = {"Content-Type": "image/png"}
@@ -93,6 +93,7 @@ def test_images_wait_are_fitted_and_deleted_and_the_map_answers_every_kind_of_vi
     assert appended["result"]["metrics"]["fused"]["accepted"], appended
 
 
+@of_one_process
 @pytest.mark.slow
 def test_views_that_were_kept_serve_the_next_fit_and_without_any_it_says_so(client, monkeypatch):
     make(client, "kept")

@@ -75,7 +75,7 @@ def test_not_ready_while_stopping(tmp_path):
 
 
 @pytest.fixture
-def breakable(tmp_path, monkeypatch):
+def breakable(one_process, tmp_path, monkeypatch):
     monkeypatch.setattr(application, "TRUSTED_S", -1.0)  # look every time
     with service(tmp_path) as client:
         yield client

@@ -8,7 +8,7 @@ import signal
 import httpx2
 import pytest
 
-from .conftest import JPEG, until
+from .conftest import JPEG, of_one_process, until
 from .served import Served
 
 MEBIBYTE = 1024 * 1024
@@ -58,6 +58,7 @@ def test_a_head_is_answered_and_leaves_no_error_in_the_log(server):
     assert '"ERROR"' not in server.log_path.read_text()
 
 
+@of_one_process  # whose log it reads
 def test_a_sender_who_leaves_early_is_no_fault_of_ours_and_it_ends_well_when_asked(server):
     with server.connect() as connection:
         connection.sendall(HEAD + b"X-Request-ID: left\r\nContent-Length: 1000\r\n\r\nabc")

@@ -11,7 +11,7 @@ READY = "/v1/domains/ready/localizations"
 
 
 @pytest.fixture
-def busy(tmp_path):
+def busy(one_process, tmp_path):
     with service(tmp_path, max_queue=1, max_event_streams=1, max_uploads=1) as client:
         client.make_ready_domain("ready")
         yield client

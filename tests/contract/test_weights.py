@@ -10,7 +10,7 @@ import pytest
 from deepsimbad.engine import worker
 from deepsimbad.errors import InvalidWeightsError
 
-from .conftest import JPEG, N_SEEN, RANKS, TAKES_ENCODINGS, encoded, picture, problem, service
+from .conftest import JPEG, N_SEEN, RANKS, TAKES_ENCODINGS, encoded, of_one_process, picture, problem, service, until
 
 EVALUATOR = {"kind": "feature_l2", "extractor": "onnx:eyes.onnx"}
 DOMAIN = "/v1/admin/domains/street"
@@ -112,7 +112,7 @@ def test_a_domain_whose_weights_are_gone_says_so_and_the_others_go_on(tmp_path, 
         weights.write_bytes(body)  # brought back, without a restart
         problem(view(client), 503, "evaluator_unavailable")
         monkeypatch.setattr(worker, "RETRY_AFTER_S", 0.0)  # later
-        assert view(client).status_code == 200
+        until(lambda: view(client).status_code == 200)
 
 
 def test_a_domain_is_not_made_of_weights_that_cannot_be_loaded(tmp_path):
@@ -144,6 +144,7 @@ def test_what_is_left_out_is_as_the_domain_has_it(client):
     problem(client.put("/v1/admin/domains/old", json=TAKES_ENCODINGS), 409, "domain_differs")
 
 
+@of_one_process
 def test_weights_that_cannot_be_read_keep_no_service_from_starting(tmp_path, weights, monkeypatch):
     def refused_by_the_disk(_path):
         raise PermissionError(13, "Permission denied")

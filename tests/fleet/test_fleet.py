@@ -1,8 +1,10 @@
 """A small fleet on a local cluster: two replicas, one that administers, the front."""
 
+import re
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from pathlib import Path
@@ -55,6 +57,10 @@ def ranks(seed):
     return {"ranked_landmarks": np.random.default_rng(seed).permutation(N_LANDMARKS).tolist()}
 
 
+def n_sessions(client):
+    return float(re.search(r"^deepsimbad_sessions (\S+)$", client.get("/metrics").text, re.MULTILINE)[1])
+
+
 def told(answer):
     return {name: answer[name] for name in ("n_observations", "belief", "next_best_view", "map_version", "retrieval")}
 
@@ -64,7 +70,9 @@ def test_what_was_acknowledged_survives_the_death_of_either_owner(fleet, client,
         plain.make_ready_domain("ready")
         alone = plain.session(seed=3)
         expected = [told(plain.post(f"{alone}/observations?action_m=2", json=ranks(seed)).json()) for seed in range(60)]
+    n_before = n_sessions(client)
     session = client.begin(seed=3)
+    assert n_sessions(client) == n_before + 1
     first, second = session_owners(session["session_id"], 2)
     for seed, wanted in enumerate(expected):
         if seed in {10, 40}:
@@ -101,9 +109,11 @@ def test_robots_go_on_while_a_replica_dies(fleet, client):
     for thread in robots:
         thread.start()
     time.sleep(1)
+    until(lambda: fleet.pids("domains-0"))  # it may have died before
     dying = fleet.pids("domains-0")
     fleet.kill("domains-0")
     until(lambda: fleet.pids("domains-0") not in ([], dying))
+    until(lambda: not list(Path(tempfile.gettempdir()).glob(f"deepsimbad-replica-{dying[0]}-*")))
     time.sleep(1)
     stopped.set()
     for thread in robots:
@@ -157,13 +167,13 @@ def test_the_file_for_a_cluster_is_one():
     from_yaml(dict(application.args))
 
 
-def test_the_command_serves_until_interrupted(tmp_path):
+def test_the_command_serves_until_told_to_end(tmp_path):
     command = [sys.executable, "-m", "deepsimbad", "ray", "serve", "--replicas", "1", "--port", "0"]
     places = ["--data-dir", str(tmp_path / "data"), "--map-store", f"file://{tmp_path}/store"]
     with subprocess.Popen([*command, *places], stderr=subprocess.PIPE, text=True) as process:
         url = next(line for line in process.stderr if line.startswith("ready at ")).split()[-1]
         with Caller(base_url=url, timeout=120) as client:
             assert client.get("/readyz").json()["status"] == "ready"
-        process.send_signal(signal.SIGINT)
+        process.send_signal(signal.SIGTERM)
         process.stderr.read()
         assert process.wait(60) == 0

@@ -5,6 +5,7 @@ from itertools import combinations
 
 import pytest
 
+from deepsimbad.api.requests import derived_id
 from deepsimbad.engine.session import domain_digits
 from deepsimbad.fleet.placement import owners, place, session_owners
 
@@ -57,6 +58,15 @@ def test_a_path_tells_who_answers(path, expected):
     assert place(path, 4) == expected
 
 
+def test_a_session_begins_with_the_owner_that_keeps_it():
+    for word in ("a", "b", "c"):
+        session_id = domain_digits("ready") + derived_id("session", "key", "ready", word)[8:]
+        expected = (session_owners(session_id, 4), True)
+        assert place("/v1/domains/ready/sessions", 4, "key", word) == expected
+        assert place("/v1/domains/ready/localizations", 4, "key", word) == (owners(domain_digits("ready"), 4), False)
+
+
 def test_text_that_is_no_name_is_placed_too():
     assert place("/v1/domains/\udcff/localizations", 2) is not None
+    assert place("/v1/domains/\udcff/sessions", 2, None, "\udcff") is not None
     assert place("/v1/sessions/\udcff\udcff", 2) is not None

@@ -161,11 +161,13 @@ async def follow(services: Services) -> None:
             log.exception("a new map cannot be served", extra={"domain": domain})
         return True
 
+    def catch_up(catalog: SharedCatalog) -> set[str]:
+        """The domains that are no more."""
+        with catalog.following:  # who asks meanwhile waits until what has been read is served
+            return {domain for domain in catalog.follow() if not take_over(domain)}
+
     if isinstance(services.catalog, SharedCatalog):
-        gone = set()
-        for domain in await run_sync(services.catalog.follow):
-            if not await run_sync(take_over, domain):
-                gone.add(domain)
+        gone = await run_sync(catch_up, services.catalog)
         await services.sessions.end_those(lambda session: session.domain in gone)
 
 

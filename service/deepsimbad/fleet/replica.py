@@ -7,6 +7,7 @@ import shutil
 import tempfile
 from collections import defaultdict
 from collections.abc import AsyncIterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import AsyncExitStack, suppress
 from functools import partial
 from pathlib import Path
@@ -33,6 +34,7 @@ from deepsimbad.store.sessions import ListedSession, SessionRecord
 from deepsimbad.store.shared_sessions import SharedSessionStore
 
 _TIMEOUT_S = 5.0  # of what one asks of another
+_THREADS = 64
 _MESSAGES = 8  # of an answer that may wait to be fetched
 _PREFIX = "deepsimbad-replica-"  # of folders, before the process's number
 
@@ -106,6 +108,8 @@ class Replica:
         run_job: RunJob | None = None,
     ) -> None:
         configure_logging(settings.log_level)
+        # Whoever takes a session over waits for many objects, which should keep nobody else waiting.
+        asyncio.get_running_loop().set_default_executor(ThreadPoolExecutor(_THREADS))
         self._parts = AsyncExitStack()
         objects = Objects.open(str(settings.map_store))
         if admin is None:

@@ -101,6 +101,7 @@ class SharedCatalog(Catalog):
     def __init__(self, data_dir: Path, db: Database) -> None:
         super().__init__(data_dir, db)
         self._cache_bytes: int | None = None
+        self.following = threading.Lock()  # held by who follows and does what follows from it
         self._transaction: Database | None = None
         self._is_trying = False
         self._fetching = tuple(threading.Lock() for _ in range(_N_LOCKS))
