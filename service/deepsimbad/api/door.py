@@ -158,9 +158,8 @@ class _Request:
         self._began = time.perf_counter()
         self._was_counted = False
         self._turn = ExitStack()  # closed twice it ends once
-        self._is_batch = scope["method"] == "POST" and _BATCH_PATH.fullmatch(scope["path"]) is not None
         self._n_bytes = self._n_held = 0  # of the body, so far
-        self._most_bytes = door.settings.max_json_bytes
+        self._most_bytes, self._is_batch = most_body_bytes(scope, door.settings)
         self._headers = dict(scope["headers"])
         request_id = self._headers.get(b"x-request-id", b"")
         if not _REQUEST_ID.fullmatch(request_id):
@@ -197,11 +196,7 @@ class _Request:
 
     def _check_size(self) -> None:
         """Judge how the body will come, and whether there is room for it."""
-        settings, headers = self._door.settings, self._headers
-        if self._is_batch:
-            self._most_bytes = settings.max_batch_bytes
-        elif headers.get(b"content-type", b"").lower().startswith(b"image/"):
-            self._most_bytes = settings.max_image_bytes
+        headers = self._headers
         declared = headers.get(b"content-length", b"0").strip()
         if not declared.isdigit() or len(declared) > _LONGEST_LENGTH:
             raise InvalidInputError("Content-Length is not a number")
@@ -289,6 +284,14 @@ class _Request:
     def _too_large(self, what: str) -> BodyTooLargeError:
         most = self._most_bytes
         return BodyTooLargeError(f"{what}; at most {most} are taken here, send less at once", max_bytes=most)
+
+
+def most_body_bytes(scope: Scope, settings: Settings) -> tuple[int, bool]:
+    """How long the body of a request may be, and whether it is a batch, which goes to the disk as it comes."""
+    if scope["method"] == "POST" and _BATCH_PATH.fullmatch(scope["path"]) is not None:
+        return settings.max_batch_bytes, True
+    is_image = dict(scope["headers"]).get(b"content-type", b"").lower().startswith(b"image/")
+    return settings.max_image_bytes if is_image else settings.max_json_bytes, False
 
 
 @lru_cache(maxsize=64)

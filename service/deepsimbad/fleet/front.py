@@ -13,6 +13,7 @@ from ray.serve.handle import DeploymentHandle
 from starlette.responses import Response
 from starlette.types import Message, Receive, Scope, Send
 
+from deepsimbad.api.door import most_body_bytes
 from deepsimbad.api.keys import presented_key
 from deepsimbad.api.problems import error_response
 from deepsimbad.api.server import configure_logging, http_config
@@ -97,9 +98,7 @@ class Front:
 
     async def _body(self, scope: Scope, receive: Receive) -> bytes | None:
         """The body; of one that is too long so much that the replica sees it; None: its sender has gone."""
-        settings = self._settings
-        is_admin = scope["path"].startswith("/v1/admin/")
-        most = settings.max_batch_bytes if is_admin else max(settings.max_image_bytes, settings.max_json_bytes)
+        most, _ = most_body_bytes(scope, self._settings)
         declared = dict(scope["headers"]).get(b"content-length", b"0")
         if declared.isdigit() and int(declared[:20]) > most:
             return b""
