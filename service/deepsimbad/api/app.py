@@ -52,7 +52,9 @@ from deepsimbad.engine.traverses import OpenTraverses, SpoolRoom
 from deepsimbad.engine.truths import Truths
 from deepsimbad.engine.worker import EvaluatorPool, InferenceWorker
 from deepsimbad.errors import DeepSimbadError, NoActiveMapError, NotFoundError, UnavailableError
-from deepsimbad.evaluators.registry import fallback
+from deepsimbad.evaluators.base import Evaluator
+from deepsimbad.evaluators.compute import Compute
+from deepsimbad.evaluators.registry import EvaluatorConfig, fallback, make_evaluator
 from deepsimbad.jobs.runner import InAnotherProcess, JobRunner, RunJob, job_threads
 from deepsimbad.release import release
 from deepsimbad.settings import MEBIBYTE, Settings
@@ -88,6 +90,7 @@ class Elsewhere:
     keys: Callable[[], Sequence[KeyRecord]] | None = None  # reads them; None: the catalog does
     # Opens those of a data directory, told whom to tell of every transaction
     sessions: Callable[[Path, Callable[[int], None]], SessionStore] = SessionStore.open
+    make_evaluator: Callable[[EvaluatorConfig, Compute | None], Evaluator] = make_evaluator
 
 
 def create_app(settings: Settings, run_job: RunJob | None = None, elsewhere: Elsewhere | None = None) -> FastAPI:
@@ -239,7 +242,7 @@ def _start(
         log.warning("nothing was discarded at start", extra={"why": error.message})  # who only reads is answered
     if (missing := fallback()) is not None:
         log.warning("the default network is not installed", extra={"why": missing})
-    evaluators = EvaluatorPool(settings.compute())
+    evaluators = EvaluatorPool(settings.compute(), elsewhere.make_evaluator)
     evaluators.load_all(catalog.evaluators())
     maps_ = Maps(catalog, cache_bytes=settings.map_cache_bytes)
     damaged = maps_.load_all(_LOADING_S)

@@ -26,6 +26,7 @@ from deepsimbad.api.metrics import Metrics
 from deepsimbad.api.problems import InvalidRequestError, invalid_body, invalid_request
 from deepsimbad.engine.atlas import Atlas
 from deepsimbad.engine.decoders import Decoders
+from deepsimbad.engine.distant import encoded_elsewhere
 from deepsimbad.engine.events import SessionEvents
 from deepsimbad.engine.localizer import View
 from deepsimbad.engine.maps import MappedDomain, Maps, Retention
@@ -156,7 +157,8 @@ class Services:
     async def look(
         self, evaluator: Evaluator, view: View, run: Callable[[View], T], priority: Priority = Priority.LIVE
     ) -> T:
-        """Run a function of a view on the inference worker, which encodes an image before."""
+        """Run a function of a view on the inference worker, which encodes an image before, or another process does."""
+        view = await encoded_elsewhere(evaluator, view, priority)
         return await asyncio.wrap_future(self.worker.look(evaluator, view, run, priority))
 
     async def written(self, n_listed: int, render: Callable[..., T], *given: Any) -> tuple[T, bytes]:

@@ -72,8 +72,24 @@ def map_on_ray(
 @click.option(
     "--replicas", type=click.IntRange(min=1), default=4, show_default=True, help="Processes that have domains."
 )
+@click.option(
+    "--encoders",
+    type=click.IntRange(min=0),
+    default=1,
+    show_default=True,
+    help="Processes that have the networks for all; 0: every replica has its own.",
+)
+@click.option(
+    "--encoder-gpus",
+    type=click.FloatRange(min=0),
+    default=0.0,
+    show_default=True,
+    help="GPUs that each of these takes, as 0.5.",
+)
 @_address_option
-def serve(host: str | None, port: int | None, replicas: int, address: str | None) -> None:
+def serve(
+    host: str | None, port: int | None, replicas: int, encoders: int, encoder_gpus: float, address: str | None
+) -> None:
     """Serve the domains of a map store from a cluster until interrupted; the data directory is for uploads and jobs."""
     settings = given_settings(host=host, port=port)
     _required()
@@ -81,6 +97,6 @@ def serve(host: str | None, port: int | None, replicas: int, address: str | None
     from deepsimbad.fleet.encode import joined  # noqa: PLC0415
 
     joined(address)
-    front = application.start(settings, replicas)
+    front = application.start(settings, replicas, encoders=application.Encoders(encoders, encoder_gpus))
     click.echo("ready at http://{}:{}".format(*front.address.remote().result()), err=True)
     application.wait()

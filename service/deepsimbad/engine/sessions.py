@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from deepsimbad.core.planners import Plan
 from deepsimbad.core.relevance import Relevance
+from deepsimbad.engine.distant import encoded_elsewhere
 from deepsimbad.engine.localizer import View, describe
 from deepsimbad.engine.maps import MappedDomain, Maps
 from deepsimbad.engine.session import (
@@ -356,6 +357,7 @@ class Sessions:
             watch.lap("wait")
             view, remarks = await observation.view(engine.evaluator, engine.snapshot)
             watch.lap("decode")
+            view = await encoded_elsewhere(engine.evaluator, view)
             step = partial(self._step, live, state, observation, self._clock() + self._ttl_s, watch)
             try:
                 answer = await self._published(live, self._worker.look(engine.evaluator, view, step), watch)

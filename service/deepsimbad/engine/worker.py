@@ -26,7 +26,7 @@ from deepsimbad.errors import (
 )
 from deepsimbad.evaluators.base import Evaluator, Image
 from deepsimbad.evaluators.compute import Compute
-from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
+from deepsimbad.evaluators.registry import EvaluatorConfig, evaluator_config, make_evaluator
 from deepsimbad.evaluators.scenes import Scene
 
 T = TypeVar("T")
@@ -41,8 +41,13 @@ _failures: WeakKeyDictionary[Evaluator, tuple[float, InvalidInputError]] = WeakK
 class EvaluatorPool:
     """Evaluators by configuration, made at first need: one copy of a network, whoever uses it."""
 
-    def __init__(self, compute: Compute | None = None) -> None:
+    def __init__(
+        self,
+        compute: Compute | None = None,
+        make: Callable[[EvaluatorConfig, Compute | None], Evaluator] = make_evaluator,
+    ) -> None:
         self._compute = compute or Compute()
+        self._make = make
         self._evaluators: dict[str, Evaluator] = {}
         self._lock = threading.Lock()
 
@@ -56,7 +61,7 @@ class EvaluatorPool:
         key = json.dumps(config.as_dict(), sort_keys=True)
         with self._lock:
             if key not in self._evaluators:
-                self._evaluators[key] = make_evaluator(config, self._compute)
+                self._evaluators[key] = self._make(config, self._compute)
             return self._evaluators[key]
 
     def load_all(self, configs: Mapping[str, Mapping[str, Any]]) -> None:

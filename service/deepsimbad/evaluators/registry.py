@@ -107,6 +107,12 @@ class EvaluatorConfig:
     extractor: str  # of those that the kind can use; of `fused` none
     of: tuple["EvaluatorConfig", ...] = ()  # of `fused`, its two halves
 
+    @property
+    def has_network(self) -> bool:
+        """Whether what it encodes by has weights."""
+        needs_none = {"", ExtractorName.NONE, ExtractorName.GRADIENT_GRID}
+        return self.extractor not in needs_none or any(half.has_network for half in self.of)
+
     def as_dict(self) -> dict[str, Any]:
         """The canonical JSON form: equal configurations give equal dicts."""
         if self.of:

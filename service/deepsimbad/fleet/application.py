@@ -1,6 +1,7 @@
 """The fleet as an application of Ray Serve: one that administers, replicas that have the domains, the front."""
 
 import signal
+from dataclasses import dataclass
 from typing import Any
 
 from ray import serve
@@ -8,6 +9,7 @@ from ray.serve.handle import DeploymentHandle
 from ray.serve.schema import LoggingConfig
 
 from deepsimbad.errors import SettingsError
+from deepsimbad.fleet.encoder import Encoder
 from deepsimbad.fleet.front import Front
 from deepsimbad.fleet.replica import Replica, replica_name
 from deepsimbad.jobs.runner import RunJob
@@ -25,7 +27,17 @@ _EACH: dict[str, Any] = {
 }
 
 
-def build(settings: Settings, n_replicas: int, run_job: RunJob | None = None) -> serve.Application:
+@dataclass(frozen=True)
+class Encoders:
+    """How many processes have the networks for all; with none every replica has its own."""
+
+    number: int = 1
+    num_gpus: float = 0.0  # that each of them takes of its machine's, as Ray counts them
+
+
+def build(
+    settings: Settings, n_replicas: int, run_job: RunJob | None = None, encoders: Encoders = Encoders()
+) -> serve.Application:
     """What `serve.run` takes; every part is restarted where its process ends."""
     if settings.map_store is None:
         raise SettingsError(
@@ -34,19 +46,29 @@ def build(settings: Settings, n_replicas: int, run_job: RunJob | None = None) ->
             setting="map_store",
         )
     whole = serve.deployment(**_EACH)(Replica)
-    admin = whole.options(name="admin").bind(settings, n_replicas, None, run_job)
+    encoder = None
+    if encoders.number:
+        takes = {**_EACH["ray_actor_options"], "num_gpus": encoders.num_gpus}
+        of_networks = {**_EACH, "num_replicas": encoders.number, "ray_actor_options": takes}
+        encoder = serve.deployment(**of_networks)(Encoder).options(name="encoder").bind(settings)
+    admin = whole.options(name="admin").bind(settings, n_replicas, encoder, None, run_job)
     replicas = [
-        whole.options(name=replica_name(number)).bind(settings, n_replicas, admin) for number in range(n_replicas)
+        whole.options(name=replica_name(number)).bind(settings, n_replicas, encoder, admin)
+        for number in range(n_replicas)
     ]
     return serve.deployment(**_EACH)(Front).options(name="front").bind(settings, admin, *replicas)
 
 
 def start(
-    settings: Settings, n_replicas: int, run_job: RunJob | None = None, name: str = NAME
+    settings: Settings,
+    n_replicas: int,
+    run_job: RunJob | None = None,
+    name: str = NAME,
+    encoders: Encoders = Encoders(),
 ) -> DeploymentHandle[Front]:
     """Start the fleet in the cluster that this process has joined; returns when it answers."""
     serve.start(proxy_location="Disabled")  # the front listens itself
-    return serve.run(build(settings, n_replicas, run_job), name=name, route_prefix=None)
+    return serve.run(build(settings, n_replicas, run_job, encoders), name=name, route_prefix=None)
 
 
 def wait() -> None:
@@ -59,6 +81,7 @@ def wait() -> None:
 
 
 def from_yaml(arguments: dict[str, Any]) -> serve.Application:
-    """What `serve deploy serve.yaml` asks for: `replicas`, and any setting by its name."""
+    """What `serve deploy serve.yaml` asks for: `replicas`, `encoders`, `encoder_gpus`, any setting by its name."""
     n_replicas = int(arguments.pop("replicas", 4))
-    return build(trace_settings(**arguments).settings, n_replicas)
+    encoders = Encoders(int(arguments.pop("encoders", 1)), float(arguments.pop("encoder_gpus", 0.0)))
+    return build(trace_settings(**arguments).settings, n_replicas, encoders=encoders)

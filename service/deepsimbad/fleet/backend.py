@@ -41,6 +41,12 @@ class Backend:
                 self.gone = None
                 await asyncio.sleep(0.05)
 
+    async def there(self, within_s: float) -> None:
+        """Return once there is a process, or after a while."""
+        until = asyncio.get_running_loop().time() + within_s
+        while self.gone is None and asyncio.get_running_loop().time() < until:
+            await asyncio.sleep(0.05)
+
     async def before_gone(self, call: Awaitable[T], gone: asyncio.Future[None]) -> T:
         """What a call answers; raises Gone where its process ends before."""
         asking = asyncio.ensure_future(call)

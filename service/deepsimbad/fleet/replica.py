@@ -9,6 +9,7 @@ from collections import defaultdict
 from collections.abc import AsyncIterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AsyncExitStack, suppress
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import cast
@@ -23,7 +24,10 @@ from starlette.types import Message, Scope
 from deepsimbad.api.app import Elsewhere, create_app, follow
 from deepsimbad.api.requests import Services
 from deepsimbad.api.server import configure_logging
+from deepsimbad.engine.distant import by_encoder
 from deepsimbad.errors import UnavailableError
+from deepsimbad.fleet.backend import Backend
+from deepsimbad.fleet.encoder import AskedEncoder, Encoder
 from deepsimbad.fleet.placement import session_owners
 from deepsimbad.jobs.runner import RunJob
 from deepsimbad.settings import Settings
@@ -95,8 +99,9 @@ class Replica:
 
     Args:
         settings: Of the whole fleet, which shares what is in its map store.
+        n_replicas: How many there are beside the one that administers.
+        encoder: Has the networks; None: each has its own.
         admin: The one that has the data directory, and runs jobs; None: this is it.
-        n_replicas: How many there are beside that one.
         run_job: As `create_app`.
     """
 
@@ -104,6 +109,7 @@ class Replica:
         self,
         settings: Settings,
         n_replicas: int,
+        encoder: DeploymentHandle[Encoder] | None = None,
         admin: "DeploymentHandle[Replica] | None" = None,
         run_job: RunJob | None = None,
     ) -> None:
@@ -133,6 +139,12 @@ class Replica:
                     is_own=lambda session_id: replica_name(session_owners(session_id, n_replicas)[0]) == name,
                 ),
             )
+        if encoder is not None:
+            backend = Backend(encoder)
+            self._watching = asyncio.create_task(backend.watch())
+            await backend.there(_TIMEOUT_S)
+            asked = AskedEncoder(backend, asyncio.get_running_loop())
+            elsewhere = replace(elsewhere, make_evaluator=by_encoder(asked))
         self._app = create_app(settings, run_job, elsewhere)
         await self._parts.enter_async_context(self._app.router.lifespan_context(self._app))
         self._services: Services = self._app.state.services

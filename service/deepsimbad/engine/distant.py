@@ -1,0 +1,99 @@
+"""Evaluators whose networks another process has: a view travels there, its encoding back, and maps stay here."""
+
+import asyncio
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future
+from dataclasses import dataclass
+from typing import Any, Protocol, Self, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deepsimbad.engine.worker import EncodedImage, Priority
+from deepsimbad.evaluators.base import Evaluator, Image
+from deepsimbad.evaluators.compute import Compute
+from deepsimbad.evaluators.fused import Fused
+from deepsimbad.evaluators.image import resized
+from deepsimbad.evaluators.registry import EvaluatorConfig, make_evaluator
+from deepsimbad.evaluators.scenes import Scene
+
+
+@dataclass(frozen=True)
+class NetworkFacts:
+    """What is known of an evaluator by its network alone; see `Evaluator`."""
+
+    input_size: tuple[int, int] | None
+    encoding_dim: int | None
+    halves: tuple[int, ...]
+    weights_sha256: str | None
+    largest_batch: int
+
+    @classmethod
+    def of(cls, evaluator: Evaluator) -> Self:
+        """Of one that is loaded."""
+        return cls(**{name: getattr(evaluator, name) for name in cls.__dataclass_fields__})
+
+
+class Encoder(Protocol):
+    """Who has the networks; its promises fail as the evaluator would, or with UnavailableError while it is away."""
+
+    def facts(self, config: EvaluatorConfig) -> Future[NetworkFacts]:
+        """Of an evaluator, once it is loaded there."""
+
+    def prepared(self, config: EvaluatorConfig, image: Image) -> Future[Image]:
+        """As `Evaluator.prepare`."""
+
+    def encoded(self, config: EvaluatorConfig, view: Image | Scene, priority: Priority) -> Future[EncodedImage]:
+        """One view, in a batch with others'."""
+
+
+class EncodedElsewhere:
+    """An `Evaluator` of whose network facts alone are here; what needs none of it is the near one's."""
+
+    def __init__(self, near: Evaluator, config: EvaluatorConfig, encoder: Encoder) -> None:
+        self._near, self._config, self._encoder = near, config, encoder
+        self._facts: NetworkFacts | None = None
+
+    def __getattr__(self, name: str) -> Any:
+        if name in NetworkFacts.__dataclass_fields__:
+            self.load()
+            return getattr(self._facts, name)
+        return getattr(self._near, name)
+
+    def load(self) -> None:
+        """See `Evaluator`."""
+        self._facts = self._facts or self._encoder.facts(self._config).result()
+
+    def prepare(self, image: Image) -> Image:
+        """See `Evaluator`; an image that keeps its aspect, or may be none, travels."""
+        size: tuple[int, int] | None = self.input_size
+        is_image = image.dtype == np.uint8 and image.shape[2:] == (3,) and image.size > 0
+        return resized(image, size) if size and is_image else self._encoder.prepared(self._config, image).result()
+
+    def encode(self, images: Sequence[Image | Scene]) -> NDArray[np.float32]:
+        """See `Evaluator`."""
+        promised = [self.encoded(image, Priority.LIVE) for image in images]
+        return np.array([each.result().values for each in promised], np.float32).reshape(len(images), self.encoding_dim)
+
+    def encoded(self, view: Image | Scene, priority: Priority) -> Future[EncodedImage]:
+        """A view's encoding to come."""
+        return self._encoder.encoded(self._config, view, priority)
+
+
+def by_encoder(encoder: Encoder) -> Callable[[EvaluatorConfig, Compute | None], Evaluator]:
+    """What makes evaluators as `make_evaluator` does, those that have a network with that of an encoder."""
+
+    def make(config: EvaluatorConfig, compute: Compute | None = None) -> Evaluator:
+        if not config.has_network:
+            return make_evaluator(config, compute)
+        near = Fused([make(half, compute) for half in config.of]) if config.of else make_evaluator(config, compute)
+        return cast("Evaluator", EncodedElsewhere(near, config, encoder))
+
+    return make
+
+
+async def encoded_elsewhere(evaluator: Evaluator, view: Any, priority: Priority = Priority.LIVE) -> Any:
+    """The encoding in the place of a view where another process has the network; others as they are given."""
+    if isinstance(evaluator, EncodedElsewhere) and isinstance(view, np.ndarray | Scene):
+        return await asyncio.wrap_future(evaluator.encoded(view, priority))
+    return view

