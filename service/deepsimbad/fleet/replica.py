@@ -25,7 +25,7 @@ from deepsimbad.api.app import Elsewhere, create_app, follow
 from deepsimbad.api.requests import Services
 from deepsimbad.api.server import configure_logging
 from deepsimbad.engine.distant import by_encoder
-from deepsimbad.errors import UnavailableError
+from deepsimbad.errors import DeepSimbadError, UnavailableError
 from deepsimbad.fleet.backend import Backend
 from deepsimbad.fleet.encoder import AskedEncoder, Encoder
 from deepsimbad.fleet.placement import session_owners
@@ -184,6 +184,9 @@ class Replica:
 
     async def lives(self, seconds: float) -> None:
         """Answer after a while, so that whoever waits for it learns at once of this process's end."""
+        if seconds == 0:  # nobody told it what was published while it started
+            with suppress(DeepSimbadError):
+                await self.follow()
         await asyncio.sleep(seconds)
 
     async def ask(self, scope: Scope, body: bytes) -> list[Message]:
