@@ -25,11 +25,13 @@ from tests.contract.conftest import (  # noqa: E402
     N_LANDMARKS,
     N_SEEN,
     RANKS,
+    TAKES_ENCODINGS,
     Caller,
     encoded,
     path_of,
     picture,
     problem,
+    ready_encodings,
     service,
     small_settings,
     until,
@@ -162,6 +164,47 @@ def test_the_encoder_has_the_network_and_while_it_is_away_only_who_needs_it_is_t
     assert client.post("/v1/domains/ready/localizations", json=RANKS).status_code == 200
     until(lambda: fleet.pids("encoder") not in ([], living))
     until(lambda: client.post(f"{session}/observations", **view).json().get("n_observations") == 1)
+
+
+def test_one_view_is_asked_of_the_owners_of_all_domains_and_the_answer_is_the_plain_services(fleet, client, tmp_path):
+    names = ["ready", *(f"road-{number}" for number in range(5))]
+    view = {"encoding": ready_encodings()[9].tolist()}
+
+    def asked(each, **body):
+        answer = each.post("/v1/localizations?in_full=3", json={**view, **body})
+        assert answer.status_code == 200, answer.text
+        return {name: value for name, value in answer.json().items() if name != "timings_ms"}
+
+    with service(tmp_path) as plain:
+        plain.make_ready_domain("ready")
+        for each in (plain, client):
+            for number, name in enumerate(names[1:]):
+                each.put(f"/v1/admin/domains/{name}", json=TAKES_ENCODINGS)
+                encodings = ready_encodings() + np.float32(0.2 * number)
+                each.upload(name, "drive", encodings, 2.0 * np.arange(len(encodings)))
+                config = {"landmark_traverse": "drive", "n_landmarks": N_LANDMARKS, "list_length": 4}
+                assert each.remap(name, **config)["result"]["active"]
+            each.put("/v1/admin/domains/unmapped", json=TAKES_ENCODINGS)
+        expected = asked(plain, domains=[*names, "unmapped"])
+        problem(plain.post("/v1/localizations", json={**view, "domains": ["nowhere"]}), 404, "unknown_domain")
+    version = client.get("/v1/domains/ready").json()["map_version"]
+    for domain in expected["domains"]:
+        domain["map_version"] = version if domain["domain"] == "ready" else 1
+
+    def compared():
+        answer = asked(client, domains=[*names, "unmapped"])
+        for mine, wanted in zip(answer["domains"], expected["domains"], strict=True):
+            for member in ("probability", "log_evidence"):
+                assert mine.pop(member) == pytest.approx(wanted[member], rel=1e-5, abs=1e-7)
+            assert mine == {name: value for name, value in wanted.items() if name in mine}
+        assert answer["elsewhere"] == pytest.approx(expected["elsewhere"], rel=1e-5, abs=1e-9)
+        assert answer["others"]["probability"] == pytest.approx(expected["others"]["probability"], rel=1e-5, abs=1e-7)
+        assert answer["left_out"] == expected["left_out"]
+
+    compared()
+    problem(client.post("/v1/localizations", json={**view, "domains": ["nowhere"]}), 404, "unknown_domain")
+    fleet.kill("domains-1")
+    compared()
 
 
 def mapped_by(fleet, deployment):

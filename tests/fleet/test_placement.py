@@ -48,6 +48,7 @@ def test_a_session_lives_with_its_domain_half_of_them_with_each_owner():
         ("/v1/domains/ready/sessions", (owners(domain_digits("ready"), 4), False)),
         (f"/v1/sessions/{'0' * 32}", (session_owners("0" * 32, 4), True)),
         (f"/v1/sessions/{'0' * 32}/observations", (session_owners("0" * 32, 4), True)),
+        ("/v1/localizations", ((0, 1, 2, 3), False)),
         ("/v1/domains/ready", None),
         ("/v1/admin/domains/ready/remaps", None),
         ("/v1/sessions", None),

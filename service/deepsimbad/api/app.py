@@ -41,7 +41,7 @@ from deepsimbad.api.keys import KeyRing
 from deepsimbad.api.metrics import Metrics, StateCollector
 from deepsimbad.api.problems import install_openapi, install_problem_handlers, problems
 from deepsimbad.api.requests import Answer, Running, Services, Slots, refuse_unknown_parameters
-from deepsimbad.engine.atlas import Atlas
+from deepsimbad.engine.atlas import Atlas, Owners
 from deepsimbad.engine.decoders import Decoders
 from deepsimbad.engine.events import SessionEvents
 from deepsimbad.engine.localizer import warm_up
@@ -90,6 +90,7 @@ class Elsewhere:
     keys: Callable[[], Sequence[KeyRecord]] | None = None  # reads them; None: the catalog does
     # Opens those of a data directory, told whom to tell of every transaction
     sessions: Callable[[Path, Callable[[int], None]], SessionStore] = SessionStore.open
+    owners: Owners | None = None  # of domains, where one view is asked of many
     make_evaluator: Callable[[EvaluatorConfig, Compute | None], Evaluator] = make_evaluator
 
 
@@ -317,6 +318,7 @@ def _start(
         faults=readiness.faults,
         uploads=Slots(settings.max_uploads, "batches of frames are on their way", "max_uploads"),
         event_streams=Slots(settings.max_event_streams, "event streams are open", "max_event_streams"),
+        owners=elsewhere.owners,
     )
 
 

@@ -24,7 +24,7 @@ from pydantic_core import ErrorDetails, to_json
 from deepsimbad.api.keys import KeyRing
 from deepsimbad.api.metrics import Metrics
 from deepsimbad.api.problems import InvalidRequestError, invalid_body, invalid_request
-from deepsimbad.engine.atlas import Atlas
+from deepsimbad.engine.atlas import Atlas, Owners
 from deepsimbad.engine.decoders import Decoders
 from deepsimbad.engine.distant import encoded_elsewhere
 from deepsimbad.engine.events import SessionEvents
@@ -117,6 +117,7 @@ class Services:
     Attributes:
         faults: What keeps the service from being ready, a sentence each; may wait for the disk.
         stopping: Set when shutdown begins; streams end on it.
+        owners: Who has the domains where one view is asked of many; None: `atlas` does.
         spools: How much waits to be fitted, and may.
         batches: The thread that reads batches into memory.
         long_work: The thread that reads long bodies and writes long answers: two would end no sooner.
@@ -144,6 +145,7 @@ class Services:
     faults: Callable[[], tuple[str, ...]]
     uploads: Slots
     event_streams: Slots
+    owners: Owners | None = None
     stopping: threading.Event = field(default_factory=threading.Event)
     batches: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(1))
     long_work: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(1))

@@ -38,7 +38,7 @@ from deepsimbad.api.requests import (
     read_bytes,
 )
 from deepsimbad.engine.atlas import MOST_IN_FULL, Part, Whereabouts, whereabouts
-from deepsimbad.engine.localizer import DEFAULT_SHORTLIST, View
+from deepsimbad.engine.localizer import DEFAULT_SHORTLIST, Localization, View
 from deepsimbad.engine.maps import MappedDomain
 from deepsimbad.engine.worker import EncodedImage, Stopwatch
 from deepsimbad.errors import (
@@ -142,7 +142,8 @@ def render_whereabouts(
     """The answer; the watch runs since the request arrived."""
     domains, places = list[LikelyDomainAnswer](), list[LikelyPlaceAnswer]()
     for name, probability in found.probabilities.items():
-        answer = render_localization(found.likeliest[name], watch)
+        likely: Any = found.likeliest[name]
+        answer = render_localization(likely, watch) if isinstance(likely, Localization) else likely
         domains.append(
             {
                 "domain": name,
@@ -207,7 +208,9 @@ async def post_whereabouts(
     watch.lap("receive")
     observation = await parse_json(body, WhereaboutsBody, running) if media_type == JSON else None
     names, is_all = await _asked(request, running, domains, observation)
-    there, left_out = await run_sync(running.atlas.gather, names, is_all)
+    owners = running.owners
+    gathering = run_sync(running.atlas.gather, names, is_all) if owners is None else owners.gather(names, is_all)
+    there, left_out = await gathering
     if if_match is not None and (tags := insisted_on(if_match)) is not None:
         there, differing = await run_sync(_of_landmark_models, there, tags)
         left_out |= differing
@@ -226,7 +229,11 @@ async def post_whereabouts(
         try:
             view, seen = await view_in(body, running, media_type, evaluator, members[0].snapshot, observation)
             watch.lap("decode")
-            parts.append(await running.look(evaluator, view, ask))
+            if owners is None:
+                parts.append(await running.look(evaluator, view, ask))
+            else:
+                encoded: View = await running.look(evaluator, view, lambda encoded: encoded)
+                parts += await owners.ask(members, encoded, in_full, shortlist)
         except DeepSimbadError as error:
             parts.append(Part({}, {}, {member.record.name: error for member in members}))
         else:

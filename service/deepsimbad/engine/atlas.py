@@ -8,17 +8,20 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any, Protocol, Self
 
 import numpy as np
 
 from deepsimbad.core import atlas
+from deepsimbad.core.camera import Camera
 from deepsimbad.core.map import Map
 from deepsimbad.core.relevance import Relevance
 from deepsimbad.engine.localizer import Localization, ReadyEncoding, View, describe, localize, ready_encodings
 from deepsimbad.engine.maps import MappedDomain, Maps
 from deepsimbad.engine.worker import EncodedImage
 from deepsimbad.errors import DeepSimbadError, NotFoundError, NotLoadedError
-from deepsimbad.evaluators.base import Evaluator
+from deepsimbad.evaluators.base import Evaluator, LandmarkModel
+from deepsimbad.evaluators.grey_levels import levels_in, with_levels
 
 log = logging.getLogger(__name__)
 
@@ -31,7 +34,8 @@ class Part:
     """What a view is to some domains."""
 
     log_evidences: Mapping[str, float]  # by domain, against elsewhere
-    likeliest: Mapping[str, Localization]  # on the few with the most
+    # On the few with the most; of another process what it would answer, for maps stay where they are
+    likeliest: Mapping[str, Localization | Mapping[str, Any]]
     left_out: Mapping[str, DeepSimbadError]  # why others could not answer
 
 
@@ -41,11 +45,42 @@ class Whereabouts:
 
     probabilities: Mapping[str, float]  # of the few that are told in full, the likeliest first
     log_evidences: Mapping[str, float]  # theirs
-    likeliest: Mapping[str, Localization]  # and where on them, if the robot is there
+    likeliest: Mapping[str, Localization | Mapping[str, Any]]  # and where on them, if the robot is there
     n_others: int
     of_others: float  # their probability, all together
     elsewhere: float  # that it is none of them
     left_out: Mapping[str, DeepSimbadError]
+
+
+@dataclass(frozen=True)
+class MapHead:
+    """What a view is made for a map by, in the place of a map that stays where it is; see `Map`."""
+
+    domain: str
+    version: int
+    landmark_model: LandmarkModel  # its grey levels alone
+    cameras: tuple[Camera, ...]
+    landmark_model_digest: str
+
+    check_landmark_model = Map.check_landmark_model
+
+    @classmethod
+    def of(cls, map_: Map) -> Self:
+        """Of a map; works out the digest at first need."""
+        levels = with_levels({}, levels_in(map_.landmark_model))
+        return cls(map_.domain, map_.version, levels, map_.cameras, map_.landmark_model_digest)
+
+
+class Owners(Protocol):
+    """Other processes that have the domains, asked as an `Atlas` is; a domain whose owners are away is left out."""
+
+    async def gather(self, names: Sequence[str], is_all: bool) -> tuple[list[MappedDomain], dict[str, DeepSimbadError]]:
+        """As `Atlas.gather`; of the maps there is a `MapHead`."""
+
+    async def ask(
+        self, domains: Sequence[MappedDomain], view: View, n_in_full: int, n_shortlist: int | None
+    ) -> list[Part]:
+        """As `Atlas.ask`, of a view that is encoded."""
 
 
 def whereabouts(parts: Sequence[Part], n_in_full: int) -> Whereabouts:

@@ -42,6 +42,8 @@ def place(
         key_id: Of the API key that is presented, if any.
         word: The idempotency key; with both of them the id of a session that is begun is known.
     """
+    if path == "/v1/localizations":  # whoever is asked asks the owners
+        return tuple(range(n_replicas)), False
     if (of_session := _OF_SESSION.fullmatch(path)) is not None:
         return session_owners(of_session[1], n_replicas), True
     if (of_domain := _OF_DOMAIN.fullmatch(path)) is not None:

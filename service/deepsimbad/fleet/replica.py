@@ -6,13 +6,13 @@ import os
 import shutil
 import tempfile
 from collections import defaultdict
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import AsyncIterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AsyncExitStack, suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import anyio
 from ray import serve
@@ -22,12 +22,19 @@ from ray.serve.handle import DeploymentHandle
 from starlette.types import Message, Scope
 
 from deepsimbad.api.app import Elsewhere, create_app, follow
+from deepsimbad.api.localizations import render_localization
 from deepsimbad.api.requests import Services
 from deepsimbad.api.server import configure_logging
+from deepsimbad.core.map import Map
+from deepsimbad.engine.atlas import MapHead, Part
 from deepsimbad.engine.distant import by_encoder
-from deepsimbad.errors import DeepSimbadError, UnavailableError
+from deepsimbad.engine.localizer import Localization, View
+from deepsimbad.engine.maps import MappedDomain
+from deepsimbad.engine.worker import Stopwatch
+from deepsimbad.errors import DeepSimbadError, NotLoadedError, UnavailableError
 from deepsimbad.fleet.backend import Backend
 from deepsimbad.fleet.encoder import AskedEncoder, Encoder
+from deepsimbad.fleet.owners import AskedOwners
 from deepsimbad.fleet.placement import session_owners
 from deepsimbad.jobs.runner import RunJob
 from deepsimbad.settings import Settings
@@ -117,6 +124,7 @@ class Replica:
         # Whoever takes a session over waits for many objects, which should keep nobody else waiting.
         asyncio.get_running_loop().set_default_executor(ThreadPoolExecutor(_THREADS))
         self._parts = AsyncExitStack()
+        self._watching = list[asyncio.Task[None]]()
         objects = Objects.open(str(settings.map_store))
         if admin is None:
             elsewhere = Elsewhere(sessions=partial(_AllSessions.sharing, objects))
@@ -139,9 +147,12 @@ class Replica:
                     is_own=lambda session_id: replica_name(session_owners(session_id, n_replicas)[0]) == name,
                 ),
             )
+            others = [Backend(serve.get_deployment_handle(replica_name(number))) for number in range(n_replicas)]
+            self._watching += [asyncio.create_task(backend.watch()) for backend in others]
+            elsewhere = replace(elsewhere, owners=AskedOwners(others))
         if encoder is not None:
             backend = Backend(encoder)
-            self._watching = asyncio.create_task(backend.watch())
+            self._watching.append(asyncio.create_task(backend.watch()))
             await backend.there(_TIMEOUT_S)
             asked = AskedEncoder(backend, asyncio.get_running_loop())
             elsewhere = replace(elsewhere, make_evaluator=by_encoder(asked))
@@ -177,6 +188,41 @@ class Replica:
         """As `SharedSessionStore.listed`."""
         store = cast("SharedSessionStore", self._services.session_store)
         return await asyncio.to_thread(store.listed, session_ids)
+
+    async def answer(self, method: str, *arguments: Any) -> Any:
+        """What `gathered` or `part` answers, or the error of ours that it raises."""
+        try:
+            return await getattr(self, method)(*arguments)
+        except DeepSimbadError as error:
+            return error.with_traceback(None)
+
+    async def gathered(
+        self, names: Sequence[str], is_all: bool
+    ) -> tuple[list[MappedDomain], dict[str, DeepSimbadError]]:
+        """As `Atlas.gather`, of each map its head."""
+
+        def heads() -> tuple[list[MappedDomain], dict[str, DeepSimbadError]]:
+            there, left_out = self._services.atlas.gather(names, is_all)
+            return [replace(mapped, snapshot=cast("Map", MapHead.of(mapped.snapshot))) for mapped in there], left_out
+
+        return await asyncio.to_thread(heads)
+
+    async def part(self, domains: Sequence[MappedDomain], view: View, n_in_full: int, n_shortlist: int | None) -> Part:
+        """What a view is to domains of one evaluator whose heads were gathered; where on them as it is answered."""
+        services, versions = self._services, {mapped.record.name: mapped.snapshot.version for mapped in domains}
+        there, left_out = await asyncio.to_thread(services.atlas.gather, list(versions), True)
+        same = [mapped for mapped in there if mapped.snapshot.version == versions[mapped.record.name]]
+        for name in versions.keys() - {mapped.record.name for mapped in same} - left_out.keys():
+            left_out[name] = NotLoadedError("its map was switched this moment: ask again")
+        evaluator = services.evaluators.evaluator(domains[0].record.evaluator)
+        part = await services.look(
+            evaluator, view, lambda view: services.atlas.ask(same, evaluator, view, n_in_full, n_shortlist)
+        )
+        likeliest = {
+            name: cast("Mapping[str, Any]", render_localization(cast("Localization", each), Stopwatch()))
+            for name, each in part.likeliest.items()
+        }
+        return Part(part.log_evidences, likeliest, {**left_out, **part.left_out})
 
     async def follow(self) -> None:
         """Take over now what the others have published."""
