@@ -19,8 +19,8 @@ NNQL, INFORMED, RANDOM, CONSTANT = "nnql", "informed", "random", "constant"
 DEFAULT_PLANNER = INFORMED
 NNQL_NEIGHBOURS = 4  # k of the paper
 _DISCOUNT, _SWEEPS = 0.9, 60
-_NOTHING = 1e-12  # of a belief: a place that holds less moves no average
-_ROWS_AT_ONCE = 256
+_NOTHING = 1e-12  # of a belief: places that hold less move no average
+_IMAGES_AT_ONCE = 256  # few enough for single precision
 _MOST_PRICES = 8  # whose tables are kept: of 26,000 images each takes 2 MB
 
 
@@ -82,7 +82,7 @@ def plan_by_information(view: PlanningView) -> Plan:
     longest_first = np.lexsort((-actions_m, -np.abs(actions_m)))
     if table is None:
         return Plan(INFORMED, float(actions_m[longest_first[0]]))
-    both = _averaged(view.mass, table)
+    both = _averaged(view.mass, table.T)
     values, bits = both[: actions_m.size], both[actions_m.size :]
     best = longest_first[np.argmax(values[longest_first])]
     return Plan(INFORMED, float(actions_m[best]), values, bits=bits)
@@ -105,7 +105,7 @@ def information_ahead(map_: Map, price_bits_per_m: float) -> NDArray[np.float32]
         leads_to, bits = _leads_to(map_.route, actions_m), map_.view_bits.astype(np.float64)
         values = _swept(leads_to, bits, news, price_bits_per_m * np.abs(actions_m))
         first = news * np.where(leads_to < 0, bits.mean(), bits[leads_to])
-        table = np.hstack([values, first.astype(np.float32)])
+        table = np.asfortranarray(np.hstack([values, first.astype(np.float32)]))  # as it is summed
         if len(tables) >= _MOST_PRICES:
             tables.pop(next(iter(tables)), None)
         tables[price_bits_per_m] = table
@@ -145,19 +145,18 @@ _PLANNERS: dict[str, Planner] = {INFORMED: plan_by_information, NNQL: plan_by_ex
 
 
 @njit(cache=True, nogil=True, fastmath=SUMS)
-def _averaged(mass: NDArray[np.float64], rows: NDArray[np.float32]) -> NDArray[np.float64]:
-    """[a] rows averaged by mass. A loop of our own: BLAS would wake its threads for this."""
-    averages = np.zeros(rows.shape[1])
-    for begin in range(0, mass.size, _ROWS_AT_ONCE):
-        some = np.zeros(rows.shape[1], np.float32)  # few enough rows for single precision
-        for image in range(begin, min(begin + _ROWS_AT_ONCE, mass.size)):
-            share = np.float32(mass[image])
-            if share < _NOTHING:
-                continue
-            row = rows[image]
-            for place in range(some.size):
-                some[place] += share * row[place]
-        averages += some
+def _averaged(mass: NDArray[np.float64], columns: NDArray[np.float32]) -> NDArray[np.float64]:
+    """[a] columns [a, n] averaged by mass. A loop of our own: BLAS would wake its threads for this."""
+    averages = np.zeros(len(columns))
+    for begin in range(0, mass.size, _IMAGES_AT_ONCE):
+        shares = mass[begin : begin + _IMAGES_AT_ONCE].astype(np.float32)
+        if shares.sum() < _NOTHING:
+            continue
+        for place in range(averages.size):
+            column, some = columns[place, begin : begin + _IMAGES_AT_ONCE], np.float32(0)
+            for image in range(shares.size):
+                some += shares[image] * column[image]
+            averages[place] += some
     return averages
 
 

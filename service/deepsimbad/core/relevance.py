@@ -178,10 +178,10 @@ class LiveStatistics:
     def observing(self, query: Query, worth: float = 1.0) -> "LiveStatistics":
         """With one view more, which counts in its own comparison; `worth` of one that saw little new is less than 1."""
         if self.encodings is not None and query.encoding is not None:
-            return replace(self, encodings=self.encodings.observing(query.encoding, worth))
+            return LiveStatistics(self.ranks, self.encodings.observing(query.encoding, worth), self.products)
         if self.products is not None and query.products is not None:
-            return replace(self, products=self.products.observing(query.products, worth))
-        return replace(self, ranks=self.ranks.observing(query.ranks, worth))
+            return LiveStatistics(self.ranks, self.encodings, self.products.observing(query.products, worth))
+        return LiveStatistics(self.ranks.observing(query.ranks, worth), self.encodings, self.products)
 
     def to_arrays(self) -> dict[str, NDArray[np.float64]]:
         """All that changes, to be restored bit for bit."""

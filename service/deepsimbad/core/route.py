@@ -136,6 +136,14 @@ class Route:
         """[n] direction of travel in the plane at every map image, from x towards y; NaN where unknown."""
         return _headings(self)
 
+    @cached_property
+    def turn(self) -> NDArray[np.float64]:
+        """[2, n] cosine and sine of how far round a closed route every map image is; [2, 0] of an open one."""
+        if not self.closed or self.length_m <= 0:
+            return np.empty((2, 0))
+        angle = 2 * np.pi / self.length_m * (self.position_m - self.start_m)
+        return np.stack([np.cos(angle), np.sin(angle)])
+
     def nearest_image(self, position_m: NDArray[np.float64]) -> NDArray[np.intp]:
         """The map image nearest to each position along the route; of two equally near the earlier."""
         images_m = self.position_m
@@ -175,9 +183,10 @@ def _sums_up_to(values: NDArray[np.float64], ends: NDArray[np.intp]) -> NDArray[
     """[b] sums of the values [n] before every end [b], from the one before it on."""
     sums, begin = np.zeros(ends.size), 0
     for number in range(ends.size):
-        for place in range(begin, ends[number]):
-            sums[number] += values[place]
-        begin = ends[number]
+        total, some = 0.0, values[begin : ends[number]]
+        for place in range(some.size):
+            total += some[place]
+        sums[number], begin = total, ends[number]
     return sums
 
 

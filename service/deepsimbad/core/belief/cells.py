@@ -105,7 +105,7 @@ def _interpolated(
     return into
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, fastmath=SUMS)
 def _within(
     mass: NDArray[np.float64], bounds_m: NDArray[np.float64], from_m: float, step_m: float, closed: bool
 ) -> NDArray[np.float64]:

@@ -13,8 +13,10 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
+from deepsimbad.core.belief.cells import SUMS
 from deepsimbad.core.relevance import UpdateRule, mean_ranks
 from deepsimbad.core.route import Route
 
@@ -44,27 +46,52 @@ class ViewEvidence:
             return cls(rule, np.maximum(relevance, 0).astype(np.float64))
         if rule is UpdateRule.ADDITIVE_RECIPROCAL_RANK:
             return cls(rule, 1.0 / mean_ranks(relevance))
-        values = relevance.astype(np.float64)
-        return cls(rule, scale * (values - values.mean()), shared if rule is UpdateRule.MIXTURE else 0.0)
+        return cls(rule, _centred(relevance, scale), shared if rule is UpdateRule.MIXTURE else 0.0)
 
-    def news(self, last: NDArray[np.float64] | None) -> NDArray[np.float64]:
-        """[n] what it says beyond the last view's values, carried along; None: there was none."""
-        if last is None or self.shared == 0:
-            return self.values
-        return (self.values - self.shared * last) / (1 + self.shared)
+    def likelihood(
+        self, values: NDArray[np.float64], last: NDArray[np.float64] | None
+    ) -> tuple[NDArray[np.float64], float]:
+        """What its values, of map images or at cells [m], say beyond the last view's, carried along.
 
-    def likelihood(self, news: NDArray[np.float64]) -> NDArray[np.float64]:
-        """[n] of the least trust, the greatest 1: whatever the relevances are, none overflows."""
-        return np.asarray(np.exp(TRUSTS_OF[self.rule][0] * (news - news.max())))
+        Args:
+            last: None: there was none.
 
-    def least_told(self, news: NDArray[np.float64]) -> float:
-        """The mass that its news would at least have moved elsewhere where nothing was known, when it is small."""
-        return 0.0 if self.is_added else 0.5 * TRUSTS_OF[self.rule][0] * float(np.abs(news).mean())
+        Returns:
+            [m] of the least trust, the greatest 1: whatever the relevances are, none overflows. And the mass that it
+            would at least have moved elsewhere where nothing was known, when that is small.
+        """
+        trust = TRUSTS_OF[self.rule][0]
+        exponent, size = _news(values, *((values, 0.0) if last is None else (last, self.shared)))
+        exponent -= exponent.max()
+        exponent *= trust
+        return np.exp(exponent, out=exponent), 0.5 * trust * size
 
     @property
     def is_added(self) -> bool:
         """Whether it is added to weights, as in the paper, and does not multiply them."""
         return self.rule in {UpdateRule.ADDITIVE_RELEVANCE, UpdateRule.ADDITIVE_RECIPROCAL_RANK}
+
+
+@njit(cache=True, nogil=True, fastmath=SUMS)
+def _centred(relevance: NDArray[np.float32], scale: float) -> NDArray[np.float64]:
+    """[n] so many times what a relevance is above its mean."""
+    total = 0.0
+    for i in range(relevance.size):
+        total += relevance[i]
+    mean, values = total / relevance.size, np.empty(relevance.size)
+    for i in range(relevance.size):
+        values[i] = scale * (relevance[i] - mean)
+    return values
+
+
+@njit(cache=True, nogil=True, fastmath=SUMS)
+def _news(values: NDArray[np.float64], last: NDArray[np.float64], shared: float) -> tuple[NDArray[np.float64], float]:
+    """[n] what values say beyond the last ones, of whose error they share so much; and its mean size."""
+    news, size = np.empty(values.size), 0.0
+    for i in range(values.size):
+        news[i] = (values[i] - shared * last[i]) / (1 + shared)
+        size += abs(news[i])
+    return news, size / values.size
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ A move shifts them all, and its error is one short row of weights, the same ever
 between two map images as the way leads to the other.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Self
 
@@ -93,7 +93,7 @@ class GridFilter:
         """Probability that the robot is not where any of this could be right."""
         return self.doubt.off_route
 
-    def predicted(self, action_m: float, action_std_m: float, step: int) -> Self:  # noqa: ARG002 - nothing is random
+    def predicted(self, action_m: float, action_std_m: float, step: int) -> "GridFilter":  # noqa: ARG002 - nothing is random
         """The belief after a move.
 
         It ends where an open route ends, within its error; what certainly leads past the end is lost.
@@ -127,21 +127,19 @@ class GridFilter:
             cells.closed,
         )
         last = None if doubt.last is None else _carried(doubt.last, shift, cells.closed)
-        return replace(self, masses=masses, offset_m=offset_m, doubt=replace(doubt, lost=lost / total, last=last))
+        return GridFilter(self.route, masses, offset_m, Doubt(lost / total, doubt.log_trust, last))
 
-    def updated(self, seen: ViewEvidence, step: int) -> Self:  # noqa: ARG002
+    def updated(self, seen: ViewEvidence, step: int) -> "GridFilter":  # noqa: ARG002
         """The belief after a view."""
-        at_cells = replace(seen, values=self._at_cells(seen.values))
-        news = at_cells.news(self.doubt.last)
+        at_cells = self._at_cells(seen.values)
         if seen.is_added:
-            mass = added(self._believed, at_cells.values)
-            masses, doubt = np.outer(1 - self.doubt.lost, mass), self.doubt
-            moved = 0.5 * float(np.abs(mass - self._believed).sum())
+            mass, doubt = added(self._believed, at_cells), self.doubt
+            masses, told = np.outer(1 - doubt.lost, mass), 0.5 * float(np.abs(mass - self._believed).sum())
         else:
-            likelihood = at_cells.likelihood(news)
+            likelihood, least_told = seen.likelihood(at_cells, self.doubt.last)
             masses, lost, log_trust, moved = _see(self.masses, self.doubt.lost, self.doubt.log_trust, likelihood)
-            doubt = Doubt(lost, log_trust, at_cells.values)
-        return replace(self, masses=masses, doubt=doubt, told=max(moved, at_cells.least_told(news)))
+            doubt, told = Doubt(lost, log_trust, at_cells), max(moved, least_told)
+        return GridFilter(self.route, masses, self.offset_m, doubt, told)
 
     def _at_cells(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """[c] what is known of map images [n]; the images of one stop say what they say on average."""

@@ -126,14 +126,14 @@ class ParticleFilter:
     def updated(self, seen: ViewEvidence, step: int) -> Self:
         """As `GridFilter.updated`; the paper's particles are drawn anew at once where their weights ask for it."""
         images = self.route.nearest_image(self.position_m)
-        trust, news = self.doubt.trust, seen.news(self.doubt.last)
+        trust, least_told = self.doubt.trust, 0.0
         if seen.is_added:
             on_route = 1 - self.doubt.lost
             weights = np.outer(on_route, added(trust @ self.weights / on_route.mean(), seen.values[images]))
             weighed = replace(self, weights=weights, found=np.zeros_like(self.found))
             after = weighed if self.doubt.is_mixture else weighed._evened_out(step)
         else:
-            least = seen.likelihood(news)
+            least, least_told = seen.likelihood(seen.values, self.doubt.last)
             average = _averages(least, trust.size)
             weights, found, lost = (
                 self.weights * _by_trust(least[images], trust.size),
@@ -147,7 +147,7 @@ class ParticleFilter:
             weighed = replace(self, weights=weights / total[:, np.newaxis], found=found / total, doubt=doubt)
             after = weighed._placed(least, step) if doubt.is_mixture else weighed._evened_out(step)
         moved = 0.5 * float(np.abs(weighed._believed - self._believed).sum())
-        return replace(after, told=max(moved, seen.least_told(news)))
+        return replace(after, told=max(moved, least_told))
 
     @property
     def _believed(self) -> NDArray[np.float64]:

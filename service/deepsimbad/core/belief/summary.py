@@ -14,7 +14,7 @@ CONFIDENT_WITHIN_M = 5.0  # of the mode, to either side
 DEFAULT_CONFIDENCE = 0.99
 _CREDIBLE_SHARE = 0.95
 _OCTAVES = 64  # of masses below the greatest; what is smaller is nothing
-_NOTHING = 1e-300
+_NO_BITS = -2000.0  # of what holds nothing; it must stay finite
 _PARTS = 16  # that each octave is cut into
 
 
@@ -46,13 +46,14 @@ class BeliefSummary:
 def summarise(route: Route, mass: NDArray[np.float64], n_top: int, off_route: float) -> BeliefSummary:
     """Summarise masses over map images, [n], which sum to 1; `n_top` of the likeliest are listed."""
     top = shortlist(mass, n_top)
-    mean_m, std_m = _moments(route, mass)
-    entropy_bits, least = _entropy_and_least(mass, np.log2(np.maximum(mass, _NOTHING)), _CREDIBLE_SHARE)
+    mean_m, std_m = _moments(mass, route.position_m, route.turn, route.length_m)
+    with np.errstate(divide="ignore"):
+        entropy_bits, least = _entropy_and_least(mass, np.log2(mass), _CREDIBLE_SHARE)
     return BeliefSummary(
         mean_m=mean_m,
         mode_m=float(route.position_m[top[0]]),
         std_m=std_m,
-        credible_95_sets_m=_pieces(route, mass >= least),
+        credible_95_sets_m=_pieces(route, mass, least),
         entropy_bits=max(0.0, entropy_bits),
         off_route=off_route,
         near_mode=near_mode(route, mass, int(top[0])) * (1 - off_route),
@@ -79,18 +80,26 @@ def near_mode(route: Route, mass: NDArray[np.float64], mode: int) -> float:
     return near
 
 
-def _moments(route: Route, mass: NDArray[np.float64]) -> tuple[float, float]:
-    # Sums, not dot products: BLAS would wake its threads for a vector this short.
-    position = route.position_m
-    if route.closed and route.length_m > 0:
-        turn = 2 * np.pi / route.length_m
-        resultant = (mass * np.exp(1j * turn * (position - route.start_m))).sum()
-        mean = route.start_m + (np.angle(resultant) / turn) % route.length_m
-        offset = route.offset_m(position, float(mean))
-    else:
-        mean = (mass * position).sum()
-        offset = position - mean
-    return float(mean), float(np.sqrt((mass * np.square(offset)).sum()))
+@njit(cache=True, nogil=True, fastmath=SUMS)
+def _moments(
+    mass: NDArray[np.float64], position_m: NDArray[np.float64], turn: NDArray[np.float64], length_m: float
+) -> tuple[float, float]:
+    """Mean and standard deviation of the position; circular where `turn` [2, n] has a direction for every image."""
+    mean_m, x, y, square = 0.0, 0.0, 0.0, 0.0
+    if turn.shape[1] == 0:
+        for i in range(mass.size):
+            mean_m += mass[i] * position_m[i]
+        for i in range(mass.size):
+            square += mass[i] * (position_m[i] - mean_m) ** 2
+        return mean_m, np.sqrt(square)
+    for i in range(mass.size):
+        x += mass[i] * turn[0, i]
+        y += mass[i] * turn[1, i]
+    mean_m = position_m[0] + length_m * (np.arctan2(y, x) / (2 * np.pi) % 1.0)
+    for i in range(mass.size):
+        apart_m = abs(position_m[i] - mean_m)
+        square += mass[i] * min(apart_m, length_m - apart_m) ** 2
+    return mean_m, np.sqrt(square)
 
 
 @njit(cache=True, nogil=True, fastmath=SUMS)
@@ -102,8 +111,8 @@ def _entropy_and_least(mass: NDArray[np.float64], bits: NDArray[np.float64], sha
     n_classes = _OCTAVES * _PARTS
     size_class, greatest, entropy = np.empty(mass.size, np.int16), bits.max(), 0.0
     for i in range(mass.size):
-        entropy -= mass[i] * bits[i]
-        size_class[i] = min(int((greatest - bits[i]) * _PARTS), n_classes - 1)
+        entropy -= mass[i] * max(bits[i], _NO_BITS)
+        size_class[i] = int(min((greatest - bits[i]) * _PARTS, n_classes - 1.0))
     by_turns = np.zeros((4, n_classes))  # so that an addition need not wait for the one before it
     for i in range(mass.size):
         by_turns[i & 3, size_class[i]] += mass[i]
@@ -126,19 +135,32 @@ def _entropy_and_least(mass: NDArray[np.float64], bits: NDArray[np.float64], sha
     return entropy, ascending[0] if count else mass.max()
 
 
-def _pieces(route: Route, member: NDArray[np.bool_]) -> list[tuple[float, float]]:
-    """Stretches of neighbouring members; those nearer together than a bin of the histogram are one."""
-    images = np.flatnonzero(member)
-    position_m = route.position_m[images]
-    bin_m = float(route.histogram_edges_m[1] - route.histogram_edges_m[0])
-    adjacent = (np.diff(images) == 1) | (np.diff(position_m) <= bin_m)
-    starts = np.r_[0, np.flatnonzero(~adjacent) + 1]
-    stops = np.r_[starts[1:], images.size]
-    pieces = [(float(position_m[a]), float(position_m[b - 1])) for a, b in zip(starts, stops, strict=True)]
+def _pieces(route: Route, mass: NDArray[np.float64], least: float) -> list[tuple[float, float]]:
+    """Stretches of neighbours that hold at least so much; those nearer together than a bin of the histogram are one."""
+    ends = _stretches(mass, least, route.position_m, route.histogram_edges_m[1] - route.histogram_edges_m[0])
+    first_m, last_m = route.position_m[ends].tolist()
+    pieces = list(zip(first_m, last_m, strict=True))
     if not route.closed or len(pieces) == 1:
         return pieces
-    if images[0] == 0 and images[-1] == member.size - 1:  # one piece crosses the start
+    if ends[0, 0] == 0 and ends[1, -1] == mass.size - 1:  # one piece crosses the start
         pieces = [*pieces[1:-1], (pieces[-1][0], pieces[0][1])]
     gaps_m = [(b[0] - a[1]) % route.length_m for a, b in zip([pieces[-1], *pieces[:-1]], pieces, strict=True)]
     first = int(np.argmax(gaps_m))
     return [*pieces[first:], *pieces[:first]]
+
+
+@njit(cache=True, nogil=True)
+def _stretches(
+    mass: NDArray[np.float64], least: float, position_m: NDArray[np.float64], gap_m: float
+) -> NDArray[np.int64]:
+    """[2, s] first and last image of every stretch."""
+    ends, n = np.empty((2, mass.size), np.int64), 0
+    for image in range(mass.size):
+        if mass[image] < least:
+            continue
+        last = ends[1, n - 1]
+        if n > 0 and (last == image - 1 or position_m[image] - position_m[last] <= gap_m):
+            ends[1, n - 1] = image
+        else:
+            ends[:, n], n = image, n + 1
+    return ends[:, :n]
