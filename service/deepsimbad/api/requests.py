@@ -8,7 +8,7 @@ import asyncio
 import hashlib
 import re
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Coroutine, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cache
@@ -16,9 +16,10 @@ from typing import Annotated, Any, ClassVar, NamedTuple, TypeVar, cast
 
 from anyio import CapacityLimiter
 from anyio.to_thread import run_sync
-from fastapi import Depends, Header, Path, Query, Request, params
+from fastapi import Depends, Header, Path, Query, Request, Response, params
 from fastapi.dependencies.utils import get_dependant, get_flat_params
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from fastapi.routing import APIRoute
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 from pydantic_core import ErrorDetails, to_json
 
 from deepsimbad.api.keys import KeyRing
@@ -211,6 +212,39 @@ async def refuse_unknown_parameters(request: Request) -> None:
         what = nearest_of(named[0], allowed) if allowed else ": this call takes none"
         what = f"there is no query parameter {named[0]}{what}"
         raise UnknownParameterError(what, unknown=named[:_MOST_NAMES], allowed=list(allowed))
+
+
+class QuickRoute(APIRoute):
+    """A route whose parameters are read by one validator; what that does not take the framework refuses, by name.
+
+    Of routes that depend on nothing and answer by a response of their own. The framework's way, a parameter at a time,
+    is a fifth of what the event loop does for an observation.
+    """
+
+    def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
+        """The framework's handler, with a shorter way before it."""
+        at_length, taken = super().get_route_handler(), self.dependant
+        if taken.dependencies or taken.call is None:
+            return at_length
+        fields = [*taken.path_params, *taken.query_params, *taken.header_params]
+        typed: dict[str, Any] = {each.name: (each.field_info.annotation, each.field_info) for each in fields}
+        kind, answer = create_model("Parameters", **typed), taken.call
+        queries = {each.alias for each in taken.query_params}
+        headers = [(each.alias, each.alias.lower().encode()) for each in taken.header_params]
+
+        async def quickly(request: Request) -> Response:
+            given: dict[str, Any] = dict(request.query_params)
+            if not given.keys() <= queries:
+                return await at_length(request)
+            sent = dict(reversed(request.scope["headers"]))  # the first of several counts
+            given |= {alias: sent[name].decode("latin-1") for alias, name in headers if name in sent}
+            try:
+                parameters = kind.model_validate(given | request.path_params)
+            except ValidationError:
+                return await at_length(request)
+            return cast("Response", await answer(request=request, **vars(parameters)))
+
+        return quickly
 
 
 Running = Annotated[Services, Depends(services_of)]

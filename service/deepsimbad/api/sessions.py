@@ -41,6 +41,7 @@ from deepsimbad.api.requests import (
     Next,
     OfDomain,
     Page,
+    QuickRoute,
     Running,
     Services,
     SessionId,
@@ -64,7 +65,7 @@ from deepsimbad.errors import DeepSimbadError
 from deepsimbad.evaluators.image_files import MEDIA_TYPES
 from deepsimbad.store.sessions import IdempotencyKey, ListedSession
 
-router = APIRouter(prefix="/v1", tags=["sessions"])
+router = APIRouter(prefix="/v1", tags=["sessions"], route_class=QuickRoute)
 listing = APIRouter(prefix="/v1/admin/sessions", tags=["admin: sessions"])
 
 MAX_OBSERVATIONS_FED_BACK = 100_000
