@@ -1,10 +1,11 @@
 """One kept connection to a service that may die at any moment."""
 
-import http.client
 import io
 import json
+import socket
 import time
 from collections.abc import Mapping
+from http.client import BAD_REQUEST
 from typing import Any, Self
 from urllib.parse import urlsplit
 
@@ -36,13 +37,43 @@ class Link:
     """Bare HTTP/1.1, so that the sender costs the machine as little as may be and repeats nothing by itself."""
 
     def __init__(self, url: str) -> None:
-        self._connection = http.client.HTTPConnection(urlsplit(url).netloc, timeout=120)
+        parts = urlsplit(url)
+        self._address, self._host = (parts.hostname or "", parts.port or 80), parts.netloc
+        self._stream: Any = None  # of bytes, both ways; None: not connected
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *exception: object) -> None:
-        self._connection.close()
+        self._close()
+
+    def _close(self) -> None:
+        if self._stream is not None:
+            self._stream.close()
+            self._stream = None
+
+    def _exchange(self, request: bytes) -> tuple[int, dict[bytes, bytes], bytes]:
+        """Status, headers and body of the answer; raises OSError or ValueError where none comes whole."""
+        if self._stream is None:
+            with socket.create_connection(self._address, timeout=120) as connection:
+                connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+                self._stream = connection.makefile("rwb", buffering=1 << 16)
+        stream = self._stream
+        stream.write(request)
+        stream.flush()
+        status = int(stream.readline().split()[1])
+        headers = {}
+        for line in iter(stream.readline, b"\r\n"):
+            if not line:
+                raise ValueError("the answer ended early")
+            name, _, value = line.partition(b": ")
+            headers[name.lower()] = value.rstrip()
+        body = stream.read(n_bytes := int(headers.get(b"content-length", 0)))
+        if len(body) < n_bytes or b"transfer-encoding" in headers:
+            raise ValueError("no whole answer of a length told before")
+        if headers.get(b"connection") == b"close":
+            self._close()
+        return status, headers, body
 
     def ask(
         self, method: str, path: str, body: bytes | Mapping[str, Any] = b"", headers: Mapping[str, str] | None = None
@@ -56,17 +87,17 @@ class Link:
         sent = {} if headers is None else dict(headers)
         if isinstance(body, Mapping):
             body, sent = json.dumps(body).encode(), {"Content-Type": JSON, **sent}
+        lines = [f"{method} {path} HTTP/1.1", f"Host: {self._host}", f"Content-Length: {len(body)}"]
+        lines += [f"{name}: {value}" for name, value in sent.items()]
         try:
-            self._connection.request(method, path, body, sent)
-            response = self._connection.getresponse()
-            answer = response.read()
-        except (OSError, http.client.HTTPException) as error:
-            self._connection.close()
+            status, about, answer = self._exchange("\r\n".join([*lines, "", ""]).encode() + body)
+        except (OSError, ValueError, IndexError) as error:
+            self._close()
             raise GoneError(f"{method} {path}: {error!r}") from error
-        is_json = (response.getheader("Content-Type") or "").partition(";")[0].endswith("json")
-        if response.status >= http.client.BAD_REQUEST:
+        is_json = about.get(b"content-type", b"").partition(b";")[0].endswith(b"json")
+        if status >= BAD_REQUEST:
             problem = json.loads(answer) if is_json else {"body": repr(answer[:200])}
-            raise RefusedError(f"{method} {path}", response.status, problem)
+            raise RefusedError(f"{method} {path}", status, problem)
         return json.loads(answer) if is_json and answer else answer or None
 
     def upload(

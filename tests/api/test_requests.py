@@ -1,15 +1,21 @@
-"""Long bodies are read beside the event loop, and none that is longer than anything here."""
+"""Long bodies are read beside the event loop, none that is longer than anything here; parameters by one validator."""
 
 import threading
 from types import SimpleNamespace
+from typing import Annotated
 
+import httpx2
 import pytest
 from anyio import CapacityLimiter
+from fastapi import APIRouter, FastAPI, Header, Path, Query, Request
+from fastapi.routing import APIRoute
+from pydantic import Field
+from starlette.responses import JSONResponse
 
 from deepsimbad.api import requests
 from deepsimbad.api.frames import FrameBody
 from deepsimbad.api.problems import InvalidRequestError
-from deepsimbad.api.requests import MAX_NUMBERS, parse_json
+from deepsimbad.api.requests import MAX_NUMBERS, QuickRoute, parse_json
 
 pytestmark = pytest.mark.anyio
 
@@ -39,3 +45,39 @@ async def test_a_body_of_too_many_numbers_is_refused_before_it_is_parsed(running
     assert len((await parse_json(most % b"", FrameBody, running)).encoding) == MAX_NUMBERS
     with pytest.raises(InvalidRequestError, match="numbers"):
         await parse_json(most % b",1", FrameBody, running)
+
+
+@pytest.mark.parametrize(
+    ("query", "headers"),
+    [
+        ("", []),
+        ("metres=3&most=7", [("Word", "w-1")]),
+        ("metres=1e3&metres=-2.5", [("word", "first"), ("WORD", "second")]),
+        ("metres=%20%201&most=", []),
+        ("metres=nan&most=0", []),
+        ("most=5.0", [("Word", "é".encode())]),
+        ("metres=true", [("Word", "")]),
+        ("word=w&Word=w", []),
+        ("metres=1_0", [("Word", " ")]),
+    ],
+)
+@pytest.mark.parametrize("name", ["some", "a b", "no;ne"])
+async def test_a_quick_route_takes_and_refuses_what_the_framework_does(query, headers, name):
+    async def heard(
+        request: Request,
+        name: Annotated[str, Path(pattern="^[a-z ]+$")],
+        metres: Annotated[float, Query()] = 0.5,
+        most: Annotated[int | None, Query(ge=1)] = None,
+        word: Annotated[Annotated[str, Field(pattern="^[!-~]+$")] | None, Header(alias="Word")] = None,
+    ) -> JSONResponse:
+        return JSONResponse(repr([name, metres, most, word]))
+
+    answers = []
+    for kind in (APIRoute, QuickRoute):
+        app, router = FastAPI(), APIRouter(route_class=kind)
+        router.get("/{name}", response_model=None)(heard)
+        app.include_router(router)
+        async with httpx2.AsyncClient(transport=httpx2.ASGITransport(app), base_url="http://robot") as robot:
+            answer = await robot.get(f"/{name}?{query}", headers=headers)
+        answers.append((answer.status_code, answer.json()))
+    assert answers[0] == answers[1]

@@ -8,7 +8,6 @@ import logging
 import re
 import secrets
 import time
-from contextlib import ExitStack
 from functools import lru_cache
 from urllib.parse import urlsplit
 
@@ -157,7 +156,7 @@ class _Request:
         self._send = send
         self._began = time.perf_counter()
         self._was_counted = False
-        self._turn = ExitStack()  # closed twice it ends once
+        self._n_turns = 0  # that it has, of those who are under way
         self._n_bytes = self._n_held = 0  # of the body, so far
         self._most_bytes, self._is_batch = most_body_bytes(scope, door.settings)
         self._headers = dict(scope["headers"])
@@ -241,8 +240,8 @@ class _Request:
     async def send(self, message: Message) -> None:
         """Give a part of the answer on; its first ends the request's turn."""
         if message["type"] == "http.response.start":
-            self._turn.close()
-            self.status = message["status"]
+            self._door.under_way.give_back(self._n_turns)
+            self._n_turns, self.status = 0, message["status"]
             headers = {**self._own_headers, **dict(message.get("headers", ()))}
             if headers.get(b"location", b"").startswith(b"/"):
                 headers[b"location"] = self._door.settings.root_path.encode() + headers[b"location"]
@@ -251,7 +250,7 @@ class _Request:
 
     def end(self) -> None:
         """The answer has gone, or nobody waits for it: give back what was taken, and tell of it."""
-        self._turn.close()
+        self._door.under_way.give_back(self._n_turns)
         self._door.body_bytes.give_back(self._n_held)
         seconds = time.perf_counter() - self._began
         scope, metrics = self._scope, self._door.metrics
@@ -278,8 +277,7 @@ class _Request:
 
     def _count(self) -> None:
         self._door.under_way.take()
-        self._was_counted = True
-        self._turn.callback(self._door.under_way.give_back)
+        self._was_counted, self._n_turns = True, 1
 
     def _too_large(self, what: str) -> BodyTooLargeError:
         most = self._most_bytes

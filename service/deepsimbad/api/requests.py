@@ -236,10 +236,13 @@ class QuickRoute(APIRoute):
             given: dict[str, Any] = dict(request.query_params)
             if not given.keys() <= queries:
                 return await at_length(request)
+            given |= request.path_params
             sent = dict(reversed(request.scope["headers"]))  # the first of several counts
-            given |= {alias: sent[name].decode("latin-1") for alias, name in headers if name in sent}
+            for alias, name in headers:
+                if name in sent:
+                    given[alias] = sent[name].decode("latin-1")
             try:
-                parameters = kind.model_validate(given | request.path_params)
+                parameters = kind.model_validate(given)
             except ValidationError:
                 return await at_length(request)
             return cast("Response", await answer(request=request, **vars(parameters)))

@@ -9,7 +9,7 @@ Landmarks begin as frames and are moved to where the sums come nearer still.
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, cached_property
 from typing import Any, Self
 
 import numpy as np
@@ -76,7 +76,7 @@ class Moments:
         mean, std = statistics.astype(np.float64)
         return cls(PRIOR_WEIGHT_FRAMES, mean, np.square(std) + np.square(mean))
 
-    @property
+    @cached_property
     def std(self) -> NDArray[np.float64]:
         """[d] float64."""
         return np.sqrt(np.maximum(self.square - np.square(self.mean), 1e-300))

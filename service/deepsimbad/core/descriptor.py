@@ -13,7 +13,7 @@ take the expected moments as an EM step would.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from statistics import NormalDist
 from typing import Self
 
@@ -217,7 +217,7 @@ class LandmarkStatistics:
         """From a map's stored mean and standard deviation, [r] each, and loadings."""
         return cls(weight, mean, np.square(std) + np.square(mean), loadings)
 
-    @property
+    @cached_property
     def std(self) -> NDArray[np.float64]:
         """[r] float64. A landmark that never moved is given the spread that normal scores have, 1."""
         std = np.sqrt(np.maximum(self.square - np.square(self.mean), 0.0))

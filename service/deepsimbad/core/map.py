@@ -247,17 +247,17 @@ class Map:
         }
         return replace(self, **merged)
 
-    @property
+    @cached_property
     def n_images(self) -> int:
         """n."""
         return int(self.lists.shape[1])
 
-    @property
+    @cached_property
     def list_length(self) -> int:
         """h."""
         return int(self.lists.shape[0])
 
-    @property
+    @cached_property
     def n_landmarks(self) -> int:
         """r."""
         return int(self.config["n_landmarks"])
@@ -370,7 +370,7 @@ class Map:
         """What `planners.information_ahead` has worked out, by price."""
         return {}
 
-    @property
+    @cached_property
     def log_likelihood_scale(self) -> float:
         """What a relevance, less its mean over the map, counts as a log-likelihood."""
         if self.likelihood_scale is not None:

@@ -7,6 +7,7 @@ A relevance says how well a map image answers a view; larger is better. Four are
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -49,14 +50,14 @@ class Query:
         """A view that shows nothing, a wall of grey: all landmarks share the mean rank."""
         return cls(np.full(n_landmarks, (n_landmarks + 1) / 2, np.float32))
 
-    @property
+    @cached_property
     def products(self) -> NDArray[np.float32] | None:
         """Products of unit vectors, from their squared distances; None where the dissimilarities are none such."""
         if self.dissimilarities is None or self.dissimilarities.min() < 0 or self.dissimilarities.max() > _FARTHEST:
             return None
         return np.asarray(1 - self.dissimilarities / 2, np.float32)
 
-    @property
+    @cached_property
     def is_informative(self) -> bool:
         """Whether some landmark is nearer than another; a view that says nothing must not move a belief."""
         return bool(self.ranks.min() < self.ranks.max())

@@ -58,7 +58,7 @@ class Route:
             if array is not None:
                 array.setflags(write=False)
 
-    @property
+    @cached_property
     def n_images(self) -> int:
         """n."""
         return int(self.position_m.size)

@@ -10,6 +10,7 @@ was learnt, weighed by how well each has predicted the views so far (`mixture`, 
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Self
 
 import numpy as np
@@ -61,9 +62,7 @@ class ViewEvidence:
             would at least have moved elsewhere where nothing was known, when that is small.
         """
         trust = TRUSTS_OF[self.rule][0]
-        exponent, size = _news(values, *((values, 0.0) if last is None else (last, self.shared)))
-        exponent -= exponent.max()
-        exponent *= trust
+        exponent, size = _news(values, *((values, 0.0) if last is None else (last, self.shared)), trust)
         return np.exp(exponent, out=exponent), 0.5 * trust * size
 
     @property
@@ -85,12 +84,23 @@ def _centred(relevance: NDArray[np.float32], scale: float) -> NDArray[np.float64
 
 
 @njit(cache=True, nogil=True, fastmath=SUMS)
-def _news(values: NDArray[np.float64], last: NDArray[np.float64], shared: float) -> tuple[NDArray[np.float64], float]:
-    """[n] what values say beyond the last ones, of whose error they share so much; and its mean size."""
-    news, size = np.empty(values.size), 0.0
+def _news(
+    values: NDArray[np.float64], last: NDArray[np.float64], shared: float, trust: float
+) -> tuple[NDArray[np.float64], float]:
+    """What values [m] say beyond the last ones, of whose error they share so much.
+
+    Returns:
+        [m] `trust` times that, less the greatest of them; and its mean size.
+    """
+    news, size, by_turns = np.empty(values.size), 0.0, np.full(4, -np.inf)  # as in `_entropy_and_least`
     for i in range(values.size):
         news[i] = (values[i] - shared * last[i]) / (1 + shared)
         size += abs(news[i])
+    for i in range(values.size):
+        by_turns[i & 3] = max(by_turns[i & 3], news[i])
+    greatest = by_turns.max()
+    for i in range(values.size):
+        news[i] = trust * (news[i] - greatest)
     return news, size / values.size
 
 
@@ -113,13 +123,13 @@ class Doubt:
         """Whether being lost is entered and left; to the paper's updates it stays as likely as at the start."""
         return self.lost.size > 1
 
-    @property
+    @cached_property
     def trust(self) -> NDArray[np.float64]:
         """[t] sums to 1."""
         weight = np.exp(self.log_trust - self.log_trust.max())
         return np.asarray(weight / weight.sum())
 
-    @property
+    @cached_property
     def off_route(self) -> float:
         """Probability of being lost."""
         return float(self.trust @ self.lost)

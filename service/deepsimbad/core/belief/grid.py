@@ -308,13 +308,15 @@ def _moved(
     return moved
 
 
+@njit(cache=True, nogil=True)
 def _carried(values: NDArray[np.float64], shift: int, closed: bool) -> NDArray[np.float64]:
     """[c] what was seen at cells, where a robot that moves has it next; what lies before an open route is 0."""
+    carried, n = np.zeros_like(values), values.size
+    turn = shift % n if closed else min(max(shift, -n), n)
+    if turn >= 0:
+        carried[turn:] = values[: n - turn]
+    else:
+        carried[:turn] = values[-turn:]
     if closed:
-        return np.roll(values, shift)
-    carried = np.zeros_like(values)
-    if 0 <= shift < values.size:
-        carried[shift:] = values[: values.size - shift]
-    elif -values.size < shift < 0:
-        carried[:shift] = values[-shift:]
+        carried[:turn] = values[n - turn :]
     return carried

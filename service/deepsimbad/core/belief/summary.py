@@ -14,7 +14,7 @@ CONFIDENT_WITHIN_M = 5.0  # of the mode, to either side
 DEFAULT_CONFIDENCE = 0.99
 _CREDIBLE_SHARE = 0.95
 _OCTAVES = 64  # of masses below the greatest; what is smaller is nothing
-_NO_BITS = -2000.0  # of what holds nothing; it must stay finite
+_NOTHING = 1e-300
 _PARTS = 16  # that each octave is cut into
 
 
@@ -45,19 +45,20 @@ class BeliefSummary:
 
 def summarise(route: Route, mass: NDArray[np.float64], n_top: int, off_route: float) -> BeliefSummary:
     """Summarise masses over map images, [n], which sum to 1; `n_top` of the likeliest are listed."""
-    top = shortlist(mass, n_top)
-    mean_m, std_m = _moments(mass, route.position_m, route.turn, route.length_m)
-    with np.errstate(divide="ignore"):
-        entropy_bits, least = _entropy_and_least(mass, np.log2(mass), _CREDIBLE_SHARE)
+    top, edges_m = shortlist(mass, n_top), route.histogram_edges_m
+    bits = np.log2(np.maximum(mass, _NOTHING))
+    mean_m, std_m, entropy_bits, ends = _figures(
+        mass, bits, route.position_m, route.turn, route.length_m, edges_m[1] - edges_m[0]
+    )
     return BeliefSummary(
         mean_m=mean_m,
         mode_m=float(route.position_m[top[0]]),
         std_m=std_m,
-        credible_95_sets_m=_pieces(route, mass, least),
+        credible_95_sets_m=_pieces(route, ends),
         entropy_bits=max(0.0, entropy_bits),
         off_route=off_route,
         near_mode=near_mode(route, mass, int(top[0])) * (1 - off_route),
-        histogram_edges_m=route.histogram_edges_m,
+        histogram_edges_m=edges_m,
         histogram_mass=route.histogram_of(mass),
         top=top,
         top_mass=mass[top],
@@ -78,6 +79,25 @@ def near_mode(route: Route, mass: NDArray[np.float64], mode: int) -> float:
         )
         near += float(mass[first:last].sum())
     return near
+
+
+@njit(cache=True, nogil=True)
+def _figures(
+    mass: NDArray[np.float64],
+    bits: NDArray[np.float64],
+    position_m: NDArray[np.float64],
+    turn: NDArray[np.float64],
+    length_m: float,
+    bin_m: float,
+) -> tuple[float, float, float, NDArray[np.int64]]:
+    """All that is summed over the map, in one call: between two the interpreter would have to be waited for.
+
+    Returns:
+        Mean, standard deviation, entropy, and [2, s] ends of the stretches of the smallest set.
+    """
+    mean_m, std_m = _moments(mass, position_m, turn, length_m)
+    entropy_bits, least = _entropy_and_least(mass, bits, _CREDIBLE_SHARE)
+    return mean_m, std_m, entropy_bits, _stretches(mass, least, position_m, bin_m)
 
 
 @njit(cache=True, nogil=True, fastmath=SUMS)
@@ -111,7 +131,7 @@ def _entropy_and_least(mass: NDArray[np.float64], bits: NDArray[np.float64], sha
     n_classes = _OCTAVES * _PARTS
     size_class, greatest, entropy = np.empty(mass.size, np.int16), bits.max(), 0.0
     for i in range(mass.size):
-        entropy -= mass[i] * max(bits[i], _NO_BITS)
+        entropy -= mass[i] * bits[i]
         size_class[i] = int(min((greatest - bits[i]) * _PARTS, n_classes - 1.0))
     by_turns = np.zeros((4, n_classes))  # so that an addition need not wait for the one before it
     for i in range(mass.size):
@@ -135,14 +155,13 @@ def _entropy_and_least(mass: NDArray[np.float64], bits: NDArray[np.float64], sha
     return entropy, ascending[0] if count else mass.max()
 
 
-def _pieces(route: Route, mass: NDArray[np.float64], least: float) -> list[tuple[float, float]]:
-    """Stretches of neighbours that hold at least so much; those nearer together than a bin of the histogram are one."""
-    ends = _stretches(mass, least, route.position_m, route.histogram_edges_m[1] - route.histogram_edges_m[0])
+def _pieces(route: Route, ends: NDArray[np.int64]) -> list[tuple[float, float]]:
+    """The stretches of the smallest set, from and to, in the order in which they are told."""
     first_m, last_m = route.position_m[ends].tolist()
     pieces = list(zip(first_m, last_m, strict=True))
     if not route.closed or len(pieces) == 1:
         return pieces
-    if ends[0, 0] == 0 and ends[1, -1] == mass.size - 1:  # one piece crosses the start
+    if ends[0, 0] == 0 and ends[1, -1] == route.n_images - 1:  # one piece crosses the start
         pieces = [*pieces[1:-1], (pieces[-1][0], pieces[0][1])]
     gaps_m = [(b[0] - a[1]) % route.length_m for a, b in zip([pieces[-1], *pieces[:-1]], pieces, strict=True)]
     first = int(np.argmax(gaps_m))
@@ -153,7 +172,7 @@ def _pieces(route: Route, mass: NDArray[np.float64], least: float) -> list[tuple
 def _stretches(
     mass: NDArray[np.float64], least: float, position_m: NDArray[np.float64], gap_m: float
 ) -> NDArray[np.int64]:
-    """[2, s] first and last image of every stretch."""
+    """[2, s] first and last of neighbours that hold at least so much; those nearer together than a gap are one."""
     ends, n = np.empty((2, mass.size), np.int64), 0
     for image in range(mass.size):
         if mass[image] < least:
