@@ -1,6 +1,7 @@
 """`deepsimbad ray map`: encoded by a cluster, the same file as one machine makes; what was encoded is kept."""
 
 import os
+import shutil
 from collections.abc import Iterator
 from datetime import datetime
 from pathlib import Path
@@ -16,13 +17,16 @@ from deepsimbad.evaluators.compute import Compute
 from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
 from deepsimbad.jobs import versions
 from deepsimbad.store.catalog import Catalog
+from deepsimbad.store.map_file import read_map
 from deepsimbad_client.recordings.folder import read_folder
+from tests.store.bucket import BUCKET, served_bucket
 
 ray = pytest.importorskip("ray", reason="Ray is not installed: pip install 'deep-simbad[ray]'")
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]  # Ray's own
 N_FRAMES = 60
 
 from deepsimbad.fleet import encode  # noqa: E402 - takes Ray
+from deepsimbad.fleet.drives import stored_drive  # noqa: E402
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -91,6 +95,65 @@ def test_the_map_is_the_one_that_one_machine_makes(
             assert catalog.map("route", 1).metrics["n_map_images"] == N_FRAMES - 2
     assert digests[0] == digests[1]
     assert not Path("many/domains/route/encoding").exists()
+
+
+def test_a_drive_in_an_object_store_is_copied_and_makes_the_same_map(
+    drive: Path, packs: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    options = ["--n-landmarks", "20", "--training-episodes", "0", "--evaluator", "feature_l2:gradient_grid"]
+    assert run(["map", "route", "--training", f"{drive}#5:", *options, "--data-dir", "one"]) == 0
+    with served_bucket(tmp_path) as bucket:
+        for name, value in bucket.environment.items():
+            monkeypatch.setenv(name, value)
+        url = f"s3://{BUCKET}/drives/{drive.name}"
+        many = ["ray", "map", "route", *options, "--data-dir", "many", "--training"]
+        assert run([*many, f"{url}#5:"]) == 1
+        assert "no objects" in capsys.readouterr().err
+        shutil.copytree(drive, bucket.folder / "drives" / drive.name)
+        monkeypatch.setattr(encode, "encoded_elsewhere", lambda *_: pytest.fail("killed"))
+        with pytest.raises(pytest.fail.Exception):
+            run([*many, f"{url}#5:"])
+        monkeypatch.undo()
+        monkeypatch.chdir(tmp_path)
+        for name, value in bucket.environment.items():
+            monkeypatch.setenv(name, value)
+        bucket.requests.clear()
+        copied = next(Path("many/copied-drives").glob(f"*/{drive.name}"))
+        (copied / "031.png").unlink()
+        os.utime(copied / "032.png", (1, 1))
+        assert run([*many, f"{url}#5:"]) == 0
+        fetched = [request for request in bucket.requests if ".png" in request]
+        assert sorted(request.rpartition("/")[2] for request in fetched) == ["031.png", "032.png"]
+        maps = []
+        for data_dir in ("one", "many"):
+            with Catalog.open(Path(data_dir)) as catalog:
+                maps.append(read_map(catalog.map_file("route", 1)))
+        for name in ("lists", "frames"):
+            np.testing.assert_array_equal(getattr(maps[0], name), getattr(maps[1], name))
+        assert not copied.exists()
+        monkeypatch.setenv("AWS_ACCESS_KEY_ID", "stranger")
+        assert run([*many, url]) == 1
+        assert "credentials" in capsys.readouterr().err
+
+
+def test_who_lacks_an_image_of_a_stored_drive_copies_it(
+    drive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with served_bucket(tmp_path) as bucket:
+        for name, value in bucket.environment.items():
+            monkeypatch.setenv(name, value)
+        shutil.copytree(drive, bucket.folder / "drives" / "seen")
+        stored, part = stored_drive(f"s3://{BUCKET}/drives/seen/#1:9", tmp_path / "copies")
+        assert (stored.folder.name, part) == ("seen", "#1:9")
+        stored.copy(lambda _: None)
+        recording = stored.of(read_folder(stored.folder, 1.0))
+        stamps = [recording.stamp(frame) for frame in recording.frames]
+        shutil.rmtree(stored.folder)
+        assert [recording.stamp(frame) for frame in recording.frames] == stamps
+        shutil.rmtree(stored.folder)
+        assert recording.image(recording.frames[3], None).body == (drive / "003.png").read_bytes()
+    assert stored_drive(str(drive), tmp_path) is None
 
 
 def test_what_was_encoded_before_a_kill_is_not_encoded_again(drive: Path, packs: int, tmp_path: Path) -> None:

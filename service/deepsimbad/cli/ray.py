@@ -2,19 +2,21 @@
 
 import shutil
 from collections.abc import Callable, Iterable
+from pathlib import Path
 from typing import Any
 
 import click
 
 from deepsimbad.cli.local import map_
 from deepsimbad.cli.serve import address_options
-from deepsimbad.cli.terminal import data_dir_option, given_settings, map_store_option
+from deepsimbad.cli.terminal import data_dir_option, given_settings, map_store_option, progress_bar
 from deepsimbad.errors import MissingPackageError
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.registry import EvaluatorConfig
 from deepsimbad.jobs.build import EncodedBlock
 from deepsimbad.store.layout import domain_folder
 from deepsimbad_client.recordings import Recording
+from deepsimbad_client.recordings.folder import FolderRecording
 
 
 @click.group()
@@ -42,14 +44,24 @@ def map_on_ray(
 ) -> None:
     """Make the map that `deepsimbad map` would, byte for byte but for its time, while a cluster encodes.
 
-    All its machines must reach the drives under the same paths, and have the same processors for the same bytes.
+    All its machines must reach the drives under the same paths, and have the same processors for the same bytes. A
+    SOURCE may also be a folder of images in an object store, as s3://BUCKET/FOLDER: what is missing is copied.
     Frames that were encoded are kept: after a kill the same command goes on.
     """
     _required()
+    from deepsimbad.fleet.drives import StoredDrive, stored_drive  # noqa: PLC0415
     from deepsimbad.fleet.encode import encoded_elsewhere, joined  # noqa: PLC0415 - takes Ray
 
     settings = given_settings()
     folder = domain_folder(settings.data_dir, domain) / "encoding"
+    copied, copies = (settings.data_dir / "copied-drives").resolve(), dict[Path, StoredDrive]()
+    for role in ("landmarks", "training"):
+        if told[role] is not None and (stored := stored_drive(told[role], copied)) is not None:
+            drive, part = stored
+            with progress_bar({"fetch": 1.0}, f"fetch {drive.url}") as progress:
+                progress.stage("fetch")
+                drive.copy(progress.update)
+            told[role], copies[drive.folder] = f"{drive.folder}{part}", drive
 
     def encode(
         recording: Recording, measure: Evaluator, on_progress: Callable[[float], None]
@@ -57,12 +69,15 @@ def map_on_ray(
         if recording.encodings is not None:
             return None
         joined(address)
+        if isinstance(recording, FolderRecording) and recording.folder in copies:
+            recording = copies[recording.folder].of(recording)
         given = (recording, measure, dict(evaluator.as_dict()), settings.compute(), settings.max_pixels)
         return encoded_elsewhere(*given, folder, on_progress)
 
     goes_on = "goes on where it stopped"
     context.invoke(map_, encode=encode, after_cancel=goes_on, domain=domain, evaluator=evaluator, **told)
-    shutil.rmtree(folder, ignore_errors=True)
+    for done in (folder, *copies):
+        shutil.rmtree(done, ignore_errors=True)
 
 
 @ray.command()

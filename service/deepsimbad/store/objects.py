@@ -1,7 +1,9 @@
 """Objects that several machines share, in S3, GCS, Azure or a folder, and the errors of a store that fails."""
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
@@ -21,6 +23,23 @@ _CLIENT = {
     "allow_http": True,  # where an endpoint's URL says so
 }
 _PIECE_BYTES = 1 << 20
+
+
+@dataclass(frozen=True)
+class Entry:
+    """An object as it is listed."""
+
+    name: str
+    n_bytes: int
+    modified_s: float  # Unix time
+
+    def is_copied(self, path: Path) -> bool:
+        """Whether a file is its copy, as far as size and time tell."""
+        try:
+            status = path.stat()
+        except OSError:
+            return False
+        return status.st_size == self.n_bytes and abs(status.st_mtime - self.modified_s) < 1
 
 
 class Objects:
@@ -102,9 +121,24 @@ class Objects:
 
     def names(self, prefix: str, after: str | None = None) -> Iterator[str]:
         """The names below a prefix, which ends at a `/`, that follow one; a thousand a request, in no stated order."""
+        return (entry.name for entry in self.entries(prefix, after))
+
+    def entries(self, prefix: str, after: str | None = None) -> "Iterator[Entry]":
+        """As `names`, and what is listed of each."""
         with self._faults(prefix):
             for page in self._store.list(prefix, offset=after, chunk_size=1000):
-                yield from (entry["path"] for entry in page)
+                for each in page:
+                    yield Entry(each["path"], each["size"], each["last_modified"].timestamp())
+
+    def copy(self, name: str, to: Path) -> None:
+        """An object as a file of its time, there whole or not at all; raises FileNotFoundError."""
+        part = to.with_name(f".{to.name}.{os.getpid()}.part")
+        with self._faults(name):
+            given = self._store.get(name)
+            part.write_bytes(given.bytes().to_bytes())
+            modified = given.meta["last_modified"].timestamp()
+        os.utime(part, (modified, modified))
+        part.replace(to)
 
     def delete(self, name: str) -> None:
         """Remove an object, if there is one."""
