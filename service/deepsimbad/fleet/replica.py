@@ -45,6 +45,7 @@ from deepsimbad.store.sessions import ListedSession, SessionRecord
 from deepsimbad.store.shared_sessions import SharedSessionStore
 
 _TIMEOUT_S = 5.0  # of what one asks of another
+_START_S = 60.0  # that a replica waits for the one that administers, whose keys it reads
 _THREADS = 64
 _MESSAGES = 8  # of an answer that may wait to be fetched
 _PREFIX = "deepsimbad-replica-"  # of folders, before the process's number
@@ -129,6 +130,8 @@ class Replica:
         if admin is None:
             elsewhere = Elsewhere(sessions=partial(_AllSessions.sharing, objects))
         else:
+            with suppress(TimeoutError):
+                await asyncio.wait_for(admin.lives.remote(0), _START_S)
             _clear_away()
             folder = Path(tempfile.mkdtemp(prefix=f"{_PREFIX}{os.getpid()}-"))
             self._parts.callback(shutil.rmtree, folder, ignore_errors=True)
