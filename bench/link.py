@@ -5,6 +5,7 @@ import json
 import socket
 import time
 from collections.abc import Mapping
+from contextlib import suppress
 from http.client import BAD_REQUEST
 from typing import Any, Self
 from urllib.parse import urlsplit
@@ -49,7 +50,8 @@ class Link:
 
     def _close(self) -> None:
         if self._stream is not None:
-            self._stream.close()
+            with suppress(OSError):  # what a service that died never took is written once more
+                self._stream.close()
             self._stream = None
 
     def _exchange(self, request: bytes) -> tuple[int, dict[bytes, bytes], bytes]:
