@@ -59,13 +59,13 @@ def replica_name(number: int) -> str:
 def _clear_away() -> None:
     """Remove the folders of replicas that were killed: their process is gone, and nobody holds them."""
     for folder in Path(tempfile.gettempdir()).glob(f"{_PREFIX}*"):
-        with suppress(OSError, ValueError):  # another user's, or none of ours
-            try:
-                os.kill(int(folder.name.removeprefix(_PREFIX).partition("-")[0]), 0)
-            except ProcessLookupError:
-                if (descriptor := lock_folder(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)) is not None:
-                    shutil.rmtree(folder, ignore_errors=True)
-                    os.close(descriptor)
+        with suppress(OSError):  # another user's
+            process = Path("/proc", folder.name.removeprefix(_PREFIX).partition("-")[0], "exe")
+            if process.exists():  # of one that ended and is not yet reaped it does not
+                continue
+            if (descriptor := lock_folder(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)) is not None:
+                shutil.rmtree(folder, ignore_errors=True)
+                os.close(descriptor)
 
 
 class _AllSessions(SharedSessionStore):
