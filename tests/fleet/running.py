@@ -24,6 +24,7 @@ _names = (f"fleet-{number}" for number in itertools.count())
 @cache
 def cluster():
     """Begun once; it ends with the process."""
+    os.environ.setdefault("RAY_worker_niceness", "0")  # as the command has it
     ray.init(
         num_cpus=100,  # that are counted, not used
         include_dashboard=False,

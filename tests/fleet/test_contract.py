@@ -13,7 +13,7 @@ import pytest
 pytest.importorskip("ray", reason="the extra `ray` is not installed", exc_type=ImportError)
 
 ROOT = Path(__file__).parents[2]
-FILES = ("lists", "truths", "localizations", "bad_input")
+FILES = ("lists", "truths", "localizations")
 
 
 @pytest.mark.slow

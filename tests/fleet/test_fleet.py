@@ -102,7 +102,8 @@ def test_robots_go_on_while_a_replica_dies(fleet, client):
         with Caller(base_url=fleet.url, timeout=120) as own:
             path, seen = path_of(own.begin(seed=number)), 0
             while not stopped.is_set():
-                answer = own.post(f"{path}/observations?action_m=0", json=RANKS)
+                # What is refused may have been counted: who asks again says that it is the same.
+                answer = own.post(f"{path}/observations?action_m=0", json=RANKS, headers={"Idempotency-Key": f"{seen}"})
                 if answer.status_code == 200:
                     seen += 1
                     if answer.json()["n_observations"] != seen:

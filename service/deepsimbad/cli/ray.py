@@ -1,5 +1,6 @@
 """`deepsimbad ray`: the service on many machines, carried by Ray."""
 
+import os
 import shutil
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -111,6 +112,7 @@ def serve(
     from deepsimbad.fleet import application  # noqa: PLC0415 - takes Ray
     from deepsimbad.fleet.encode import joined  # noqa: PLC0415
 
+    os.environ.setdefault("RAY_worker_niceness", "0")  # robots wait: Ray's own, 15, leaves processors to all else
     joined(address)
     front = application.start(settings, replicas, encoders=application.Encoders(encoders, encoder_gpus))
     click.echo("ready at http://{}:{}".format(*front.address.remote().result()), err=True)
