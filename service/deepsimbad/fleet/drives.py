@@ -14,7 +14,7 @@ from pathlib import Path
 
 from deepsimbad.store.objects import Objects
 from deepsimbad_client.errors import SourceError
-from deepsimbad_client.recordings import EncodedImage, Frame, Recording
+from deepsimbad_client.recordings import EncodedImage, Frame
 from deepsimbad_client.recordings.folder import FolderRecording
 
 _URL = re.compile(r"((?:s3|gs|az)://[^#]+?)/*(#.*)?")
@@ -27,11 +27,6 @@ class StoredDrive:
 
     url: str
     folder: Path
-
-    @property
-    def source(self) -> str:
-        """SOURCE of the copy."""
-        return str(self.folder)
 
     def copy(self, on_progress: Callable[[float], None]) -> None:
         """Make the copy what is there now; folders inside are not looked at.
@@ -52,10 +47,8 @@ class StoredDrive:
             for n_done, _ in enumerate(threads.map(lambda name: objects.copy(name, self.folder / name), changed)):
                 on_progress((n_done + 1) / len(changed))
 
-    def of(self, recording: Recording) -> Recording:
+    def of(self, recording: FolderRecording) -> FolderRecording:
         """The copy's recording, for processes that may lack it."""
-        if not isinstance(recording, FolderRecording):
-            return recording
         known = {each.name: getattr(recording, each.name) for each in dataclasses.fields(recording)}
         return _FetchedFolder(**known, url=self.url)
 
