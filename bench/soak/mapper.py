@@ -51,6 +51,11 @@ class Mapper(Actor):
             self._asking = False
             self.n_acknowledged += 1
 
+    def finish(self, link: Link) -> None:
+        """Nobody kills any more: the remap under way, or one asked for now if none has ended yet, comes to its end."""
+        while self._job is not None or not self._ended:
+            self.act(link)
+
     def _end(self, link: Link, job: dict[str, Any]) -> None:
         self._job, self._ended[job["job_id"]] = None, job
         if job["state"] == "succeeded":

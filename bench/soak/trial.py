@@ -84,6 +84,7 @@ def soak(data_dir: Path, n_kills: int, seed: int, on_kill: Callable[[int], None]
                     actor.check(link)
             on_kill(kill + 1)
         with Link(server.url) as link:
+            mapper.finish(link)
             for robot in robots:
                 robot.check_bits(link, data_dir)
         uploader.check_bits(data_dir)
