@@ -14,6 +14,7 @@ NEEDED = (
     "prometheus_client",
     "pydantic_settings",
     "sqlite_utils",
+    "threadpoolctl",
     "uvicorn",
 )
 

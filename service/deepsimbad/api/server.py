@@ -17,6 +17,7 @@ from typing import Any
 
 import uvicorn
 from fastapi import FastAPI
+from threadpoolctl import threadpool_limits
 
 from deepsimbad.api.app import create_app
 from deepsimbad.errors import SettingsError, UnavailableError
@@ -201,6 +202,9 @@ def serve(settings: Settings, create: bool = False) -> None:
     log.info("starting", extra={"version": release(), "data_dir": where, "settings": changed})
     app = create_app(settings)
     config = http_config(app, settings)
+    # A product of a view with its landmarks is short, and wakes OpenBLAS's threads, which then spin for 20 ms on the
+    # core that the next view wants. Jobs compute in processes of their own.
+    threadpool_limits(1, user_api="blas")
 
     def is_news(record: logging.LogRecord) -> bool:
         """Whoever called gets the named error; its stack in the log would only hide it."""

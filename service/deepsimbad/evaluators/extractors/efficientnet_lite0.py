@@ -6,6 +6,7 @@ by itself, and beside them stands the gradient grid. Chosen by measurement: docs
 
 import math
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -42,6 +43,7 @@ class EfficientNetLite0:
 
     def __init__(self, network: NetworkExtractor) -> None:
         self._network, self._gradients = network, GradientGrid()
+        self._beside = ThreadPoolExecutor(1, "gradient grid")
         self.weights_sha256 = network.weights_sha256
 
     @property
@@ -57,8 +59,9 @@ class EfficientNetLite0:
         """See `Extractor`."""
         encodings = np.empty((len(images), self.encoding_dim), np.float32)
         at_size = [self.prepare(image) for image in images]
+        gradients = self._beside.submit(self._gradients.encode, at_size)
         encodings[:, :_NETWORK_DIM] = self._network.encode(at_size)
-        encodings[:, _NETWORK_DIM:] = self._gradients.encode(at_size)
+        encodings[:, _NETWORK_DIM:] = gradients.result()
         encodings[:, _NETWORK_DIM:] *= _GRADIENT_SHARE
         encodings /= math.hypot(1.0, _GRADIENT_SHARE)
         return encodings.astype(np.float16).astype(np.float32)  # as every network's
