@@ -24,7 +24,6 @@ from deepsimbad_client.http.local_server import LocalServer
 
 MOST_SECONDS, MOST_SECONDS_UNDER_LOAD, MOST_MEDIAN_RATIO, MOST_P99_RATIO = 60.0, 120.0, 1.5, 3.0
 _DOMAIN, _CAMERA_DOMAIN = "bench", "camera"
-_STAGES = ("read_frames", "select_landmarks", "describe", "train", "check")
 
 
 @dataclass(frozen=True)
@@ -137,7 +136,7 @@ def report(figures: RemapFigures) -> Iterator[str]:
         f"landmarks, {size.episodes:,} episodes"
     )
     yield ""
-    stages = {stage.replace("_", " "): alone.stages[stage] for stage in _STAGES}
+    stages = {stage.replace("_", " "): seconds for stage, seconds in alone.stages.items()}
     rest = {"its process, digest of the frames, seal, activate": alone.seconds - sum(stages.values())}
     everything = {**stages, **rest, "from the request to the end of the job": alone.seconds}
     yield from markdown(("stage", "seconds"), [(name, f"{seconds:.1f}") for name, seconds in everything.items()])
