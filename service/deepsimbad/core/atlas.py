@@ -34,8 +34,8 @@ from deepsimbad.errors import InvalidMapConfigError
 RELEVANCE_WEIGHT, USUAL_RELEVANCE = 0.74, 0.43  # A, R
 STRANGENESS_WEIGHT, USUAL_STRANGENESS = 34.0, 0.16  # B, S
 _SURE_NUMBERS = 1000.0  # of an encoding, from which on its strangeness is known well
-_BLOCK = 4096  # images whose sums stay in the first-level cache
-_AT_ONCE = 16  # maps that a thread takes
+_BLOCK = 2048  # images whose sums stay in the first-level cache
+_AT_ONCE = 64  # maps that a thread takes
 
 
 def log_evidence(map_: Map, query: Query) -> float:
@@ -195,35 +195,47 @@ def _compare(encoding, spaces, first, stop, deviations, products, strange):  # t
         for j in range(k):
             square += u[j] * u[j]
         length = max(np.sqrt(square), np.float32(1e-12))
-        for r in range(len(landmarks)):
-            landmark, product = landmarks[r], np.float32(0)
+        last = len(landmarks) - 1
+        for r in range(0, last + 1, 4):  # four at once, of which the last may be one and the same
+            at_b, at_c, at_d = min(r + 1, last), min(r + 2, last), min(r + 3, last)
+            a, b, c, d = landmarks[r], landmarks[at_b], landmarks[at_c], landmarks[at_d]
+            of_a = of_b = of_c = of_d = np.float32(0)
             for j in range(k):
-                product += u[j] * landmark[j]
-            products[g, r] = product / length
+                of_a += u[j] * a[j]
+                of_b += u[j] * b[j]
+                of_c += u[j] * c[j]
+                of_d += u[j] * d[j]
+            products[g, r], products[g, at_b] = of_a / length, of_b / length
+            products[g, at_c], products[g, at_d] = of_c / length, of_d / length
 
 
 @njit(cache=True, nogil=True, fastmath=SUMS | {"nnan", "nsz"})
 def _find(all_lists, all_lengths, weights, space_of, products, first, stop, greatest):  # type: ignore[no-untyped-def]
-    """The greatest relevance [m] in maps first..stop."""
-    tables, block = np.empty((weights.size, products.shape[1]), np.float32), np.empty(_BLOCK, np.float32)
+    """The greatest relevance [m] in maps first..stop; four places of the lists at once, the last four with the rest."""
+    n_places = -(-weights.size // 4) * 4
+    tables = np.empty((n_places, products.shape[1]), np.float32)
+    before = np.zeros(_BLOCK, np.float32)
     for at in range(first, stop):
         lists, lengths, product = all_lists[at], all_lengths[at], products[space_of[at]]
         h, n = lists.shape
         for j in range(h):
             for r in range(product.size):
                 tables[j, r] = weights[j] * product[r]
+        tables[h:] = 0  # places that this map's lists have not weigh nothing
         best = np.float32(-np.inf)
         for start in range(0, n, _BLOCK):
-            sums = block[: min(_BLOCK, n - start)]
-            table, row = tables[0], lists[0, start : start + sums.size]
-            for m in range(sums.size):
-                sums[m] = table[row[m]]
-            for j in range(1, h):
-                table, row = tables[j], lists[j, start : start + sums.size]
-                for m in range(sums.size):
-                    sums[m] += table[row[m]]
-            length = lengths[start : start + sums.size]
-            for m in range(sums.size):
-                relevance = sums[m] / length[m]
-                best = relevance if relevance > best else best
+            here = slice(start, min(start + _BLOCK, n))
+            length, sums = lengths[here], before[: here.stop - start]
+            sums[:] = 0
+            for j in range(0, n_places, 4):
+                a, b, c, d = tables[j], tables[j + 1], tables[j + 2], tables[j + 3]
+                u, v = lists[min(j, h - 1), here], lists[min(j + 1, h - 1), here]
+                x, y = lists[min(j + 2, h - 1), here], lists[min(j + 3, h - 1), here]
+                if j + 4 < n_places:
+                    for m in range(sums.size):
+                        sums[m] += a[u[m]] + b[v[m]] + c[x[m]] + d[y[m]]
+                else:
+                    for m in range(sums.size):
+                        relevance = (sums[m] + a[u[m]] + b[v[m]] + c[x[m]] + d[y[m]]) / length[m]
+                        best = relevance if relevance > best else best
         greatest[at] = best
