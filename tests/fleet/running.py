@@ -66,7 +66,8 @@ def running(settings: Settings, n_replicas=2, run_job=None):
     try:
         with warnings.catch_warnings(action="ignore"):
             cluster()
-            address = application.start(settings, n_replicas, run_job, name).address.remote().result()
+            front = application.start(settings, n_replicas, run_job, name, application.Encoders(1))
+            address = front.address.remote().result()
         yield Fleet(name, address)
     finally:
         with warnings.catch_warnings(action="ignore"):

@@ -91,9 +91,7 @@ def map_on_ray(
 @click.option(
     "--encoders",
     type=click.IntRange(min=0),
-    default=1,
-    show_default=True,
-    help="Processes that have the networks for all; 0: every replica has its own.",
+    help="Processes that have the networks for all; 0: each replica its own.  [default: 1 with --encoder-gpus, else 0]",
 )
 @click.option(
     "--encoder-gpus",
@@ -104,7 +102,7 @@ def map_on_ray(
 )
 @_address_option
 def serve(
-    host: str | None, port: int | None, replicas: int, encoders: int, encoder_gpus: float, address: str | None
+    host: str | None, port: int | None, replicas: int, encoders: int | None, encoder_gpus: float, address: str | None
 ) -> None:
     """Serve the domains of a map store from a cluster until interrupted; the data directory is for uploads and jobs."""
     settings = given_settings(host=host, port=port)

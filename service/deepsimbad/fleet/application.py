@@ -31,8 +31,13 @@ _EACH: dict[str, Any] = {
 class Encoders:
     """How many processes have the networks for all; with none every replica has its own."""
 
-    number: int = 1
+    asked: int | None = None  # None: one where it has a GPU; on processors it costs more than it spares
     num_gpus: float = 0.0  # that each of them takes of its machine's, as Ray counts them
+
+    @property
+    def number(self) -> int:
+        """How many there are."""
+        return int(self.num_gpus > 0) if self.asked is None else self.asked
 
 
 def build(
@@ -83,5 +88,5 @@ def wait() -> None:
 def from_yaml(arguments: dict[str, Any]) -> serve.Application:
     """What `serve deploy serve.yaml` asks for: `replicas`, `encoders`, `encoder_gpus`, any setting by its name."""
     n_replicas = int(arguments.pop("replicas", 4))
-    encoders = Encoders(int(arguments.pop("encoders", 1)), float(arguments.pop("encoder_gpus", 0.0)))
+    encoders = Encoders(arguments.pop("encoders", None), float(arguments.pop("encoder_gpus", 0.0)))
     return build(trace_settings(**arguments).settings, n_replicas, encoders=encoders)
