@@ -1,23 +1,15 @@
 """One service of the fleet: the whole application in a process of Ray Serve's, asked by ASGI in place of a socket."""
 
 import asyncio
-import fcntl
-import os
 import shutil
-import tempfile
-from collections import defaultdict
 from collections.abc import AsyncIterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AsyncExitStack, suppress
+from contextlib import AsyncExitStack, aclosing, suppress
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from typing import Any, cast
 
-import anyio
 from ray import serve
-from ray.exceptions import RayError
-from ray.serve.exceptions import RayServeException
 from ray.serve.handle import DeploymentHandle
 from starlette.types import Message, Scope
 
@@ -31,75 +23,29 @@ from deepsimbad.engine.distant import by_encoder
 from deepsimbad.engine.localizer import Localization, View
 from deepsimbad.engine.maps import MappedDomain
 from deepsimbad.engine.worker import Stopwatch
-from deepsimbad.errors import DeepSimbadError, NotLoadedError, UnavailableError
+from deepsimbad.errors import DeepSimbadError, NotLoadedError
+from deepsimbad.fleet.all_sessions import AllSessions
+from deepsimbad.fleet.asgi import asked
 from deepsimbad.fleet.backend import Backend
 from deepsimbad.fleet.encoder import AskedEncoder, Encoder
+from deepsimbad.fleet.folders import new_folder
 from deepsimbad.fleet.owners import AskedOwners
 from deepsimbad.fleet.placement import session_owners
 from deepsimbad.jobs.runner import RunJob
 from deepsimbad.settings import Settings
-from deepsimbad.store.durable import lock_folder
 from deepsimbad.store.objects import Objects
-from deepsimbad.store.records import KeyRecord, ListPage
-from deepsimbad.store.sessions import ListedSession, SessionRecord
+from deepsimbad.store.records import KeyRecord
+from deepsimbad.store.sessions import ListedSession
 from deepsimbad.store.shared_sessions import SharedSessionStore
 
 _TIMEOUT_S = 5.0  # of what one asks of another
 _START_S = 60.0  # that a replica waits for the one that administers, whose keys it reads
 _THREADS = 64
-_MESSAGES = 8  # of an answer that may wait to be fetched
-_PREFIX = "deepsimbad-replica-"  # of folders, before the process's number
 
 
 def replica_name(number: int) -> str:
     """Of the deployment: who answers for a domain is told by name, so that a restart moves nothing."""
     return f"domains-{number}"
-
-
-def _clear_away() -> None:
-    """Remove the folders of replicas that were killed: their process is gone, and nobody holds them."""
-    for folder in Path(tempfile.gettempdir()).glob(f"{_PREFIX}*"):
-        with suppress(OSError):  # another user's
-            process = Path("/proc", folder.name.removeprefix(_PREFIX).partition("-")[0], "exe")
-            if process.exists():  # of one that ended and is not yet reaped it does not
-                continue
-            if (descriptor := lock_folder(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)) is not None:
-                shutil.rmtree(folder, ignore_errors=True)
-                os.close(descriptor)
-
-
-class _AllSessions(SharedSessionStore):
-    """The sessions as the one that administers sees them: it looks after none, and lists them all."""
-
-    replicas: "Sequence[DeploymentHandle[Replica]]" = ()
-
-    def living(self) -> list[SessionRecord]:
-        """None, though copies of some be here."""
-        return []
-
-    def newest_living(
-        self, domain: str | None, before: int | None, limit: int, at: float
-    ) -> ListPage[ListedSession, int]:
-        """Those that live, each as the replica has it that looks after it."""
-        marks = [mark for mark in self.marks() if domain in {None, mark.domain}]
-        newest = sorted((mark.number, mark.session_id) for mark in marks if before is None or mark.number < before)[
-            ::-1
-        ]
-        by_owner = defaultdict[int, list[str]](list)
-        for _, session_id in newest[:limit]:
-            by_owner[session_owners(session_id, len(self.replicas))[0]].append(session_id)
-        asked = [self.replicas[owner].listed.remote(session_ids) for owner, session_ids in by_owner.items()]
-        try:
-            listed = [entry for answer in asked for entry in answer.result(timeout_s=_TIMEOUT_S)]
-        except (TimeoutError, RayError, RayServeException) as error:
-            raise UnavailableError("a replica is away, so its sessions cannot be listed: try again") from error
-        living = {
-            entry.session.number: entry
-            for entry in listed
-            if entry.session.ending is None and entry.session.expires_at > at
-        }
-        last = newest[limit - 1][0] if len(newest) > limit else None
-        return ListPage(tuple(living[number] for number in sorted(living, reverse=True)), last)
 
 
 class Replica:
@@ -128,12 +74,11 @@ class Replica:
         self._watching = list[asyncio.Task[None]]()
         objects = Objects.open(str(settings.map_store))
         if admin is None:
-            elsewhere = Elsewhere(sessions=partial(_AllSessions.sharing, objects))
+            elsewhere = Elsewhere(sessions=partial(AllSessions.sharing, objects))
         else:
             with suppress(TimeoutError):
                 await asyncio.wait_for(admin.lives.remote(0), _START_S)
-            _clear_away()
-            folder = Path(tempfile.mkdtemp(prefix=f"{_PREFIX}{os.getpid()}-"))
+            folder = new_folder()
             self._parts.callback(shutil.rmtree, folder, ignore_errors=True)
             settings = settings.model_copy(update={"data_dir": folder})
 
@@ -157,12 +102,12 @@ class Replica:
             backend = Backend(encoder)
             self._watching.append(asyncio.create_task(backend.watch()))
             await backend.there(_TIMEOUT_S)
-            asked = AskedEncoder(backend, asyncio.get_running_loop())
-            elsewhere = replace(elsewhere, make_evaluator=by_encoder(asked))
+            asking = AskedEncoder(backend, asyncio.get_running_loop())
+            elsewhere = replace(elsewhere, make_evaluator=by_encoder(asking))
         self._app = create_app(settings, run_job, elsewhere)
         await self._parts.enter_async_context(self._app.router.lifespan_context(self._app))
         self._services: Services = self._app.state.services
-        if isinstance(store := self._services.session_store, _AllSessions):
+        if isinstance(store := self._services.session_store, AllSessions):
             replicas = [serve.get_deployment_handle(replica_name(number)) for number in range(n_replicas)]
             store.replicas = replicas
 
@@ -244,22 +189,6 @@ class Replica:
 
     async def stream(self, scope: Scope, body: bytes) -> AsyncIterator[Message]:
         """An answer as the application sends it."""
-        parts = [{"type": "http.request", "body": body, "more_body": False}]
-        send, messages = anyio.create_memory_object_stream[Message](_MESSAGES)
-
-        async def receive() -> Message:
-            if not parts:
-                await asyncio.Event().wait()  # nobody leaves; who does is heard of by cancelling
-            return parts.pop()
-
-        async def answer() -> None:
-            async with send:
-                await self._app(scope, receive, send.send)
-
-        answering = asyncio.create_task(answer())
-        try:
+        async with aclosing(asked(self._app, scope, body)) as messages:
             async for message in messages:
                 yield message
-        finally:
-            messages.close()
-            answering.cancel()
