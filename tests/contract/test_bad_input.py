@@ -7,7 +7,8 @@ import zlib
 import numpy as np
 import pytest
 
-from deepsimbad.store.catalog import ANY, Catalog
+from deepsimbad.store.catalog import Catalog
+from deepsimbad.store.catalog_maps import ANY
 
 from .conftest import (
     DIM,

@@ -21,7 +21,8 @@ from deepsimbad.engine.sessions import Sessions
 from deepsimbad.engine.worker import EvaluatorPool, InferenceWorker
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.feature_l2 import FeatureL2
-from deepsimbad.store.catalog import ANY, Catalog
+from deepsimbad.store.catalog import Catalog
+from deepsimbad.store.catalog_maps import ANY
 from deepsimbad.store.map_file import seal, write_map
 from deepsimbad.store.sessions import IdempotencyKey, SessionStore
 

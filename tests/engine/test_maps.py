@@ -22,8 +22,9 @@ from deepsimbad.errors import (
     UnknownDomainError,
     UnknownMapVersionError,
 )
-from deepsimbad.store import catalog as catalog_module
-from deepsimbad.store.catalog import ANY, Catalog
+from deepsimbad.store import catalog_maps
+from deepsimbad.store.catalog import Catalog
+from deepsimbad.store.catalog_maps import ANY
 from deepsimbad.store.layout import catalog_path
 from deepsimbad.store.records import KeptMap, MapState
 
@@ -93,7 +94,7 @@ def test_a_map_that_cannot_be_read_now_is_not_called_damaged_nor_keeps_others_fr
         add_domain(catalog, domain)
         add_map(catalog, domain)
     add_domain(catalog, "unmapped")
-    verify = catalog_module.verify
+    verify = catalog_maps.verify
 
     def failing(path: Path, digest: str) -> None:
         if path.parent == catalog.map_path("d", 1).parent:
@@ -102,7 +103,7 @@ def test_a_map_that_cannot_be_read_now_is_not_called_damaged_nor_keeps_others_fr
 
     catalog.map_path("e", 1).unlink()
     with monkeypatch.context() as patched:
-        patched.setattr(catalog_module, "verify", failing)
+        patched.setattr(catalog_maps, "verify", failing)
         assert maps.load_all() == ["e"]
         assert maps.active("f").snapshot.domain == "f"
         with pytest.raises(UnavailableError) as caught:
@@ -112,7 +113,7 @@ def test_a_map_that_cannot_be_read_now_is_not_called_damaged_nor_keeps_others_fr
     assert maps.active("d").snapshot.version == 1, "and it is not remembered"
     maps.forget("d")
     assert [mapped.record.name for mapped in maps.loaded()] == ["f"]
-    monkeypatch.setattr(catalog_module, "verify", lambda path, digest: failing(catalog.map_path("d", 1), digest))
+    monkeypatch.setattr(catalog_maps, "verify", lambda path, digest: failing(catalog.map_path("d", 1), digest))
     clock.now += 10
     assert maps.damaged() == {"e": 1}, "a damaged one stays so while it cannot be read"
 
@@ -248,7 +249,7 @@ def test_a_crash_between_the_mark_and_the_file_is_finished_at_the_next_start(
 
     with running(mapped) as live:
         with monkeypatch.context() as patched:
-            patched.setattr("deepsimbad.store.catalog.remove_database", dies)
+            patched.setattr("deepsimbad.store.catalog_maps.remove_database", dies)
             with pytest.raises(KeyboardInterrupt):
                 retention_of(live).remove("d", 1)
         assert mapped.map("d", 1).removed_at is not None

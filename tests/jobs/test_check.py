@@ -21,9 +21,8 @@ from deepsimbad.errors import (
 from deepsimbad.jobs.progress import Progress
 from deepsimbad.jobs.remap import remap
 from deepsimbad.jobs.remap_config import REMAP_STAGES, RemapConfig
-from deepsimbad.store import catalog as catalog_module
-from deepsimbad.store import map_file
-from deepsimbad.store.catalog import ANY
+from deepsimbad.store import catalog_maps, map_file
+from deepsimbad.store.catalog_maps import ANY
 from deepsimbad.store.records import MapState
 from deepsimbad.store.traverses import Traverse
 
@@ -289,7 +288,7 @@ def test_a_damaged_active_map_does_not_keep_its_remedy_away(remapped, seasons, c
 @pytest.mark.parametrize(
     ("module", "name", "error", "reason"),
     [
-        (catalog_module, "verify", OSError(errno.EIO, "Input/output error"), "io_error"),
+        (catalog_maps, "verify", OSError(errno.EIO, "Input/output error"), "io_error"),
         (map_file, "unpack_lists", MemoryError(), "out_of_memory"),
     ],
 )

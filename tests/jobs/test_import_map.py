@@ -21,7 +21,8 @@ from deepsimbad.errors import (
     UnknownMapVersionError,
 )
 from deepsimbad.jobs.versions import import_map
-from deepsimbad.store.catalog import ANY, Catalog
+from deepsimbad.store.catalog import Catalog
+from deepsimbad.store.catalog_maps import ANY
 from deepsimbad.store.map_file import export_map, seal, write_map
 from deepsimbad.store.records import MapState
 from deepsimbad.store.traverses import Traverse

@@ -16,7 +16,7 @@ from deepsimbad.errors import (
 from deepsimbad.jobs.progress import Progress
 from deepsimbad.jobs.remap import remap
 from deepsimbad.jobs.remap_config import REMAP_STAGES, RemapConfig, remap_stages, stages_in
-from deepsimbad.store.catalog import ANY
+from deepsimbad.store.catalog_maps import ANY
 from deepsimbad.store.map_file import read_map, verify
 from deepsimbad.store.records import MapState
 from deepsimbad.store.traverses import Traverse

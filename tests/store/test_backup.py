@@ -28,7 +28,8 @@ from deepsimbad.errors import (
     UnavailableError,
 )
 from deepsimbad.store.backup import Inspection, back_up, inspect, migrations_of, restore
-from deepsimbad.store.catalog import ANY, Catalog
+from deepsimbad.store.catalog import Catalog
+from deepsimbad.store.catalog_maps import ANY
 from deepsimbad.store.durable import service_lock
 from deepsimbad.store.map_file import read_map, seal, verify, write_map
 from deepsimbad.store.sessions import ObservedRow, SessionRecord, SessionStore

@@ -24,7 +24,8 @@ from deepsimbad.errors import (
 )
 from deepsimbad.store import map_store, shared_catalog
 from deepsimbad.store.backup import back_up, inspect, restore
-from deepsimbad.store.catalog import ANY, Catalog
+from deepsimbad.store.catalog import Catalog
+from deepsimbad.store.catalog_maps import ANY
 from deepsimbad.store.layout import map_path
 from deepsimbad.store.map_file import read_map, seal, write_map
 from deepsimbad.store.records import MapRecord, MapState

@@ -30,7 +30,7 @@ from deepsimbad.api.requests import (
 )
 from deepsimbad.engine.maps import load_snapshot, unreadable
 from deepsimbad.errors import ConflictError, DamagedMapError, UnknownMapVersionError
-from deepsimbad.store.catalog import ANY, removed
+from deepsimbad.store.catalog_maps import ANY, removed
 from deepsimbad.store.records import MapState
 
 router = APIRouter(prefix="/v1/admin/domains", tags=["admin: maps"])

@@ -23,7 +23,8 @@ from deepsimbad.errors import (
     UnknownDomainError,
     UnknownMapVersionError,
 )
-from deepsimbad.store.catalog import Catalog, removed
+from deepsimbad.store.catalog import Catalog
+from deepsimbad.store.catalog_maps import removed
 from deepsimbad.store.durable import storage_faults
 from deepsimbad.store.map_file import read_map
 from deepsimbad.store.records import DomainRecord, KeptMap, MapState, now

@@ -53,7 +53,8 @@ from deepsimbad.jobs.remap_config import (
     staying,
 )
 from deepsimbad.jobs.versions import activate_once, seal_version
-from deepsimbad.store.catalog import ANY, Catalog
+from deepsimbad.store.catalog import Catalog
+from deepsimbad.store.catalog_maps import ANY
 from deepsimbad.store.map_file import read_map
 from deepsimbad.store.records import DomainRecord, MapRecord
 from deepsimbad.store.traverses import Traverse

@@ -29,7 +29,8 @@ from deepsimbad.errors import (
 )
 from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
 from deepsimbad.jobs.progress import Progress
-from deepsimbad.store.catalog import ANY, AnyVersion, Catalog
+from deepsimbad.store.catalog import Catalog
+from deepsimbad.store.catalog_maps import ANY, AnyVersion
 from deepsimbad.store.durable import sha256_of
 from deepsimbad.store.layout import is_name
 from deepsimbad.store.map_file import adopt, index_bytes, read_map, seal, write_map

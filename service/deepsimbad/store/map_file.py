@@ -33,7 +33,8 @@ from deepsimbad.store.arrays import (
     save_packed,
     unpack_texts,
 )
-from deepsimbad.store.catalog import Catalog, removed
+from deepsimbad.store.catalog import Catalog
+from deepsimbad.store.catalog_maps import removed
 from deepsimbad.store.connection import check_integrity, in_todays_schema, open_database
 from deepsimbad.store.durable import remove_database, sha256_of, storage_faults, sync, verify, written_aside
 from deepsimbad.store.records import MapRecord, from_json, to_json

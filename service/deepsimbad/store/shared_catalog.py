@@ -22,7 +22,8 @@ from deepsimbad.errors import (
 )
 from deepsimbad.store import layout
 from deepsimbad.store.backup import Inspection
-from deepsimbad.store.catalog import ANY, AnyVersion, Catalog
+from deepsimbad.store.catalog import Catalog
+from deepsimbad.store.catalog_maps import ANY, AnyVersion
 from deepsimbad.store.connection import look_at, open_database
 from deepsimbad.store.durable import empty_graves, storage_faults, sync
 from deepsimbad.store.map_file import fetch

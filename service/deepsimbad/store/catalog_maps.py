@@ -1,0 +1,331 @@
+"""What the catalog says of map versions: which are built, sealed, active, retired, and where their files lie."""
+
+import fcntl
+import os
+from collections.abc import Callable, Collection, Sequence
+from enum import Enum
+from pathlib import Path
+from typing import Any, Final
+
+from sqlite_utils import Database
+
+from deepsimbad.errors import (
+    DamagedMapError,
+    LostActivationError,
+    MapInUseError,
+    RetiredMapError,
+    UnknownMapVersionError,
+    nearest_of,
+)
+from deepsimbad.store import layout
+from deepsimbad.store.connection import OpenFile, open_database
+from deepsimbad.store.durable import lock_folder, remove_database, sync, verify
+from deepsimbad.store.records import (
+    KeptMap,
+    ListPage,
+    MapRecord,
+    MapState,
+    from_json,
+    get_domain,
+    now,
+    to_json,
+)
+
+_SELECT_MAP = """
+    SELECT version, state, created_at, sha256, file_bytes, config, metrics, activated_at, retired_at, removed_at,
+           domain
+    FROM map
+"""
+_MAX_INTEGER = 2**63 - 1
+
+
+class AnyVersion(Enum):
+    """To activate a map whatever is active now."""
+
+    ANY = "any"
+
+
+ANY: Final = AnyVersion.ANY
+
+
+class MapCatalog(OpenFile):
+    """The map versions of all domains, and the locks of those that this process builds."""
+
+    def __init__(self, data_dir: Path, db: Database) -> None:
+        path = layout.catalog_path(data_dir)
+        super().__init__(path, db, open_database(path))  # a robot's answer needs the catalog: it waits for no writer
+        self.data_dir = data_dir
+        self._building: dict[tuple[str, int], int] = {}  # descriptors of locked folders
+
+    def close(self) -> None:
+        """Close the file. Maps that are being built through this object count as abandoned from here on."""
+        with self._lock:
+            for domain, version in list(self._building):
+                self._give_up_building(domain, version)
+            super().close()
+
+    def begin_map(self, domain: str, config: dict[str, Any]) -> int:
+        """Take the next version number for a map to be built; raises UnknownDomainError.
+
+        Numbers count from 1 and are never used again. Until the version is sealed or discarded the domain's folder of
+        maps is locked, shared: the kernel ends that with the process, so that others can tell what was abandoned.
+        """
+        with self._writing() as db:
+            get_domain(db, domain)
+            (version,) = db.execute("SELECT next_version FROM domain WHERE name = ?", [domain]).fetchone()
+            db.table("domain").update(domain, {"next_version": version + 1})
+            row = {"domain": domain, "version": version, "state": MapState.BUILDING, "created_at": now()}
+            db.table("map").insert({**row, "config": to_json(config), "metrics": "{}"})
+            descriptor = lock_folder(layout.maps_folder(self.data_dir, domain), fcntl.LOCK_SH)
+            assert descriptor is not None
+            self._building[domain, version] = descriptor
+        return int(version)
+
+    def seal_map(self, domain: str, version: int, sha256: str, file_bytes: int, metrics: dict[str, Any]) -> MapRecord:
+        """Note that the sealed file of a version lies at `map_path`.
+
+        Raises:
+            UnknownMapVersionError: The version is not being built.
+            DamagedMapError: The file is missing or has another size.
+        """
+        path = self.map_path(domain, version)
+        with self._writing() as db:
+            _check_is_building(db, domain, version)
+            if not path.is_file() or path.stat().st_size != file_bytes:
+                raise DamagedMapError(f"{path.name} is not the file that was sealed", file=path.name)
+            sealed = {"state": MapState.SEALED, "sha256": sha256, "file_bytes": file_bytes, "metrics": to_json(metrics)}
+            db.table("map").update((domain, version), sealed)
+            record = _get_map(db, domain, version)
+        self._give_up_building(domain, version)
+        return record
+
+    def discard_map(self, domain: str, version: int) -> None:
+        """Forget a version that was being built, files first; raises UnknownMapVersionError."""
+        with self._writing() as db:
+            _check_is_building(db, domain, version)
+            self._discard(db, domain, version)
+        self._give_up_building(domain, version)
+
+    def discard_abandoned_maps(self) -> list[str]:
+        """Discard the maps that dead processes were building; returns one line for each.
+
+        Those of a domain wait for the next time while a living process builds one of it.
+        """
+        with self._writing() as db:
+            building = db.execute("SELECT domain, version FROM map WHERE state = 'building'").fetchall()
+            alive = {domain for domain, _ in building if self._is_built(domain)}
+            abandoned = [(domain, version) for domain, version in building if domain not in alive]
+            for domain, version in abandoned:
+                self._discard(db, domain, version)
+        return [f"discarded the unfinished map {version} of domain {domain}" for domain, version in abandoned]
+
+    def _discard(self, db: Database, domain: str, version: int) -> None:
+        path = self.map_path(domain, version)
+        for file in (self.building_path(domain, version), path.with_suffix(".sealing"), path):
+            remove_database(file)
+        db.table("map").delete((domain, version))
+
+    def _is_built(self, domain: str) -> bool:
+        """Whether a living process builds a map of a domain."""
+        try:
+            descriptor = lock_folder(layout.maps_folder(self.data_dir, domain), fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except FileNotFoundError:
+            return False
+        if descriptor is not None:
+            os.close(descriptor)
+        return descriptor is None
+
+    def _give_up_building(self, domain: str, version: int) -> None:
+        descriptor = self._building.pop((domain, version), None)
+        if descriptor is not None:
+            os.close(descriptor)
+
+    def activate(self, domain: str, version: int, expected: int | AnyVersion | None) -> MapRecord:
+        """Let a version serve, forward or back, if the active one is still `expected` (None: none; `ANY`).
+
+        Raises:
+            UnknownDomainError: There is no such domain.
+            UnknownMapVersionError: There is no such version, or it is still being built.
+            RetiredMapError: Its file was removed.
+            LostActivationError: Another version was activated meanwhile.
+        """
+        with self._writing() as db:
+            active = get_domain(db, domain).active_version
+            chosen = _get_map(db, domain, version)
+            if chosen.removed_at is not None:
+                raise removed(domain, version)
+            if chosen.state is MapState.BUILDING:
+                raise UnknownMapVersionError(
+                    f"map version {version} of domain {domain} is still being built", version=version
+                )
+            if expected is not ANY and active != expected:
+                raise LostActivationError(
+                    f"domain {domain} serves {_named(active)}, not {_named(expected)}: look again before you swap",
+                    active=active,
+                    expected=expected,
+                )
+            if active != version:
+                # Which one served last must be known though the clock was set back: it is the one to roll back to.
+                (latest,) = db.execute("SELECT max(retired_at) FROM map WHERE domain = ?", [domain]).fetchone()
+                if active is not None:
+                    retired = {"state": MapState.RETIRED, "retired_at": now(behind=latest)}
+                    db.table("map").update((domain, active), retired)
+                db.table("map").update((domain, version), {"state": MapState.ACTIVE, "activated_at": now()})
+            return _get_map(db, domain, version)
+
+    def kept_maps(self, domain: str | None = None, more_than: int = -1) -> list[KeptMap]:
+        """The sealed versions that still have their files, by domain, oldest first.
+
+        Args:
+            domain: Of this one; None: of all.
+            more_than: Only of domains that have more than so many beside the one that serves.
+        """
+        with self._reading() as db:
+            rows = db.execute(
+                """
+                SELECT domain, version, state, retired_at FROM map
+                WHERE state != 'building' AND removed_at IS NULL AND domain IN (
+                    SELECT domain FROM map
+                    WHERE state != 'building' AND removed_at IS NULL AND domain = coalesce(?, domain)
+                    GROUP BY domain HAVING sum(state != 'active') > ?
+                ) ORDER BY domain, version
+                """,
+                [domain, more_than],
+            )
+            return [KeptMap(domain, version, MapState(state), *times) for domain, version, state, *times in rows]
+
+    def remove_map(self, domain: str, version: int, is_pinned: Callable[[], bool]) -> None:
+        """Remove the file of a version; its row stays, retired.
+
+        `is_pinned` is asked while nothing changes in this catalog: who pins a version first, and then finds it here
+        without `removed_at`, keeps it. It must not wait for anyone who waits for the catalog.
+
+        Raises:
+            UnknownDomainError, UnknownMapVersionError: There is no such version.
+            RetiredMapError: It was removed before.
+            MapInUseError: It serves, is being built, or is pinned.
+        """
+        with self._writing() as db:
+            get_domain(db, domain)
+            record = _get_map(db, domain, version)
+            if record.removed_at is not None:
+                raise removed(domain, version)
+            named, why = f"map {version} of domain {domain}", None
+            if record.state is MapState.ACTIVE:
+                why = f"{named} serves: activate another version first"
+            elif record.state is MapState.BUILDING:
+                why = f"{named} is being built: cancel the job that builds it"
+            elif is_pinned():
+                why = f"a session lives on {named}: end it or wait for its end"
+            if why is not None:
+                raise MapInUseError(why, map_version=version)
+            db.table("map").update((domain, version), {"state": MapState.RETIRED, "removed_at": now()})
+        with self._lock:  # marked first: after a crash between the two the next start removes the file
+            self._unlink(domain, version)
+
+    def _unlink(self, domain: str, version: int) -> bool:
+        path = self.map_path(domain, version)
+        was_there = path.parent.is_dir() and remove_database(path)
+        if was_there:
+            sync(path.parent)
+        return was_there
+
+    def newest_maps(self, domain: str, before: int | None, limit: int) -> ListPage[MapRecord, int]:
+        """A page of a domain's map versions, newest first, behind version `before`; raises UnknownDomainError."""
+        with self._reading() as db:
+            get_domain(db, domain)
+            rows = db.execute(
+                f"{_SELECT_MAP} WHERE domain = ? AND version < ? ORDER BY version DESC LIMIT ?",
+                [domain, _MAX_INTEGER if before is None else before, limit + 1],
+            )
+            return ListPage.of(((record.version, record) for record in map(_map, rows)), limit)
+
+    def maps(self, domain: str) -> list[MapRecord]:
+        """Every map version, oldest first; raises UnknownDomainError."""
+        return list(reversed(self.newest_maps(domain, None, _MAX_INTEGER - 1).records))
+
+    def map(self, domain: str, version: int) -> MapRecord:
+        """One map version; raises UnknownDomainError, UnknownMapVersionError."""
+        with self._reading() as db:
+            get_domain(db, domain)
+            return _get_map(db, domain, version)
+
+    def settled_map(self, domain: str, version: int) -> MapRecord:
+        """As `map`, behind every change that this process is about to make: a removal is done, or has not begun."""
+        with self._lock:
+            return self.map(domain, version)
+
+    def serving_maps(self, domains: Collection[str]) -> dict[str, MapRecord]:
+        """The active versions of these domains, as far as there are any."""
+        with self._reading() as db:
+            rows = db.execute(
+                f"{_SELECT_MAP} WHERE state = 'active' AND domain IN (SELECT value FROM json_each(?))",  # noqa: S608
+                [to_json(list(domains))],
+            )
+            return {row[-1]: _map(row) for row in rows}
+
+    def map_of_job(self, domain: str, job_id: str) -> MapRecord | None:
+        """The version that a job has sealed, whatever became of it since; raises UnknownDomainError."""
+        records = [record for record in self.maps(domain) if record.metrics.get("job_id") == job_id]
+        return records[-1] if records else None
+
+    def map_path(self, domain: str, version: int) -> Path:
+        """Where the sealed file of a version lies, or will; raises InvalidInputError."""
+        return layout.map_path(self.data_dir, domain, version)
+
+    def map_file(self, domain: str, version: int) -> Path:
+        """The sealed file of a version, to be read; it is what was sealed.
+
+        Raises:
+            UnknownDomainError, UnknownMapVersionError: There is no such version.
+            DamagedMapError: The file is missing, or another one.
+            UnavailableError: The disk failed, ...
+        """
+        path, digest = self.map_path(domain, version), self.map(domain, version).sha256
+        if digest is not None:
+            verify(path, digest)
+        return path
+
+    def has_file(self, domain: str, version: int) -> bool:
+        """Whether the file of a version was not removed."""
+        return self.map_path(domain, version).exists()
+
+    def building_path(self, domain: str, version: int) -> Path:
+        """Where a version is to be built before it is sealed; raises InvalidInputError."""
+        return self.map_path(domain, version).with_suffix(".building")
+
+
+def _get_map(db: Database, domain: str, version: int) -> MapRecord:
+    row = None
+    if 1 <= version <= _MAX_INTEGER:
+        row = db.execute(f"{_SELECT_MAP} WHERE domain = ? AND version = ?", [domain, version]).fetchone()
+    if row is None:
+        known = db.execute("SELECT version FROM map WHERE domain = ? ORDER BY version DESC", [domain]).fetchall()
+        there = nearest_of("", (str(version) for (version,) in known))
+        raise UnknownMapVersionError(f"domain {domain} has no map version {version}{there}", version=version)
+    return _map(row)
+
+
+def _map(row: Sequence[Any]) -> MapRecord:
+    version, state, created_at, sha256, file_bytes, config, metrics, *times, _ = row
+    return MapRecord(
+        version, MapState(state), created_at, sha256, file_bytes, from_json(config), from_json(metrics), *times
+    )
+
+
+def _check_is_building(db: Database, domain: str, version: int) -> None:
+    if _get_map(db, domain, version).state is not MapState.BUILDING:
+        raise UnknownMapVersionError(f"domain {domain} is not building a map version {version}", version=version)
+
+
+def removed(domain: str, version: int) -> RetiredMapError:
+    """What is said of a version whose file is no more."""
+    return RetiredMapError(
+        f"map {version} of domain {domain} was retired and its file removed: it cannot serve again",
+        domain=domain,
+        map_version=version,
+    )
+
+
+def _named(version: object) -> str:
+    return "no map" if version is None else f"map version {version}"
