@@ -8,7 +8,10 @@ import sys
 import threading
 import time
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
+
+import numpy as np
 
 from deepsimbad_client.http.local_server import LocalServer
 
@@ -41,33 +44,59 @@ class Served(LocalServer):
                     received += more
         return bytes(received)
 
+    @cached_property
+    def answering(self):
+        """The processes that answer: this one, or those of the fleet that it began."""
+        if not IS_FLEET:
+            return [self.pid]
+        parents, titled = {}, []
+        for process in Path("/proc").glob("[0-9]*"):
+            with contextlib.suppress(OSError):
+                parents[int(process.name)] = told(process, "PPid")
+                if (process / "cmdline").read_bytes().startswith(b"ray::ServeReplica:"):
+                    titled.append(int(process.name))
+
+        def is_ours(pid):
+            while pid not in {0, self.pid}:
+                pid = parents.get(pid, 0)
+            return pid == self.pid
+
+        return [pid for pid in titled if is_ours(pid)]
+
     def forget_peak(self):
         """Let the peak of memory be what it is now."""
-        Path(f"/proc/{self.pid}/clear_refs").write_text("5")
+        for pid in self.answering:
+            Path(f"/proc/{pid}/clear_refs").write_text("5")
 
     def mib(self, name="VmRSS"):
-        """Memory held now; `VmHWM`: its peak."""
-        for line in Path(f"/proc/{self.pid}/status").read_text().splitlines():
-            if line.startswith(f"{name}:"):
-                return int(line.split()[1]) / 1024
-        raise AssertionError(f"no {name}")
+        """Memory held now by each process that answers; `VmHWM`: its peak."""
+        return np.array([told(Path(f"/proc/{pid}"), name) for pid in self.answering]) / 1024
 
     @contextlib.contextmanager
     def within(self, most_mib):
-        """What is done inside costs no more memory, not for a moment."""
+        """What is done inside costs no process more memory, not for a moment."""
         self.forget_peak()
         before = self.mib()
         yield
-        assert self.mib("VmHWM") - before < most_mib
+        assert max(self.mib("VmHWM") - before) < most_mib
 
     @property
     def n_sockets(self):
         """Open sockets: connections, and the few of its own."""
         n_open = 0
-        for descriptor in Path(f"/proc/{self.pid}/fd").iterdir():
-            with contextlib.suppress(FileNotFoundError):
-                n_open += str(descriptor.readlink()).startswith("socket:")
+        for pid in self.answering:
+            for descriptor in Path(f"/proc/{pid}/fd").iterdir():
+                with contextlib.suppress(FileNotFoundError):
+                    n_open += str(descriptor.readlink()).startswith("socket:")
         return n_open
+
+
+def told(process, name):
+    """A number of a process's status."""
+    for line in (process / "status").read_text().splitlines():
+        if line.startswith(f"{name}:"):
+            return int(line.split()[1])
+    raise AssertionError(f"no {name}")
 
 
 @dataclass

@@ -2,6 +2,7 @@
 
 import re
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
@@ -234,6 +235,10 @@ def test_keys_count_everywhere(tmp_path):
         problem(own.get("/v1/admin/jobs"), 403, "forbidden")
         with Caller(base_url=fleet.url, timeout=120) as nobody:
             problem(nobody.get(session), 401, "unauthorized")
+        host = fleet.url.removeprefix("http://").rpartition(":")
+        with socket.create_connection((host[0], int(host[2])), timeout=120) as stranger:  # whose body nobody waits for
+            stranger.sendall(f"POST {session}/observations HTTP/1.1\r\nHost: a\r\nContent-Length: 9\r\n\r\n".encode())
+            assert stranger.recv(65536).startswith(b"HTTP/1.1 401 ")
         with Catalog.open(data_dir) as catalog:
             catalog.revoke_key(record.key_id)
         until(lambda: own.get(session).status_code == 401)

@@ -10,17 +10,18 @@ from http import HTTPStatus
 import uvicorn
 from prometheus_client.exposition import CONTENT_TYPE_LATEST
 from ray.serve.handle import DeploymentHandle
+from starlette.requests import ClientDisconnect
 from starlette.responses import Response
 from starlette.types import Message, Receive, Scope, Send
 
-from deepsimbad.api.door import most_body_bytes
-from deepsimbad.api.keys import presented_key
+from deepsimbad.api.keys import KeyRing, presented_key
 from deepsimbad.api.problems import error_response
 from deepsimbad.api.server import configure_logging, http_config
-from deepsimbad.errors import UnauthorizedError, UnavailableError
+from deepsimbad.errors import DeepSimbadError, UnauthorizedError, UnavailableError
 from deepsimbad.fleet.backend import AWAY_S, Backend, Gone
+from deepsimbad.fleet.bodies import Bodies
 from deepsimbad.fleet.placement import place
-from deepsimbad.fleet.replica import Replica
+from deepsimbad.fleet.replica import Replica, keys_of
 from deepsimbad.settings import Settings
 from deepsimbad.store.catalog_keys import ApiKey
 
@@ -57,6 +58,10 @@ class Front:
         self._watching = [asyncio.create_task(backend.watch()) for backend in backends]
         while any(backend.gone is None for backend in backends):
             await asyncio.sleep(0.05)
+        self._keys = KeyRing()
+        await asyncio.to_thread(self._keys.load, keys_of(admin))
+        self._bodies = Bodies(settings, self._keys)
+        self._watching.append(asyncio.create_task(self._keys.follow()))
         try:
             listening = socket.create_server((settings.host, settings.port), backlog=2048)
         except OSError as error:
@@ -70,6 +75,10 @@ class Front:
         """Where it listens."""
         return self._address
 
+    async def reread_keys(self) -> None:
+        """Let the keys count as they are by now."""
+        await self._keys.reread()
+
     def check_health(self) -> None:
         """Raise where nothing listens any more."""
         if self._serving.done():
@@ -82,8 +91,15 @@ class Front:
         root = self._settings.root_path
         if root and scope["path"].startswith(f"{root}/"):  # as the door does
             scope["path"] = scope["path"].removeprefix(root)
-        if (body := await self._body(scope, receive)) is None:
-            return
+        try:
+            async with self._bodies.of(scope, receive) as body:
+                await self._pass_on(scope, body, receive, send)
+        except DeepSimbadError as error:
+            await _refuse(scope, error, receive, send)
+        except ClientDisconnect:  # nobody is left to be answered
+            pass
+
+    async def _pass_on(self, scope: Scope, body: bytes, receive: Receive, send: Send) -> None:
         passed = {name: scope[name] for name in _PASSED if name in scope}
         headers = dict(scope["headers"])
         if scope["method"] == "POST" and b"idempotency-key" not in headers:
@@ -95,23 +111,6 @@ class Front:
         if not answering.done() and scope["method"] in {"GET", "HEAD"}:  # what changes something is finished
             answering.cancel()
         await asyncio.gather(answering, return_exceptions=True)
-
-    async def _body(self, scope: Scope, receive: Receive) -> bytes | None:
-        """The body; of one that is too long so much that the replica sees it; None: its sender has gone."""
-        most, _ = most_body_bytes(scope, self._settings)
-        declared = dict(scope["headers"]).get(b"content-length", b"0")
-        if declared.isdigit() and int(declared[:20]) > most:
-            return b""
-        parts, n_bytes = [], 0
-        while n_bytes <= most:
-            message = await receive()
-            if message["type"] == "http.disconnect":
-                return None
-            parts.append(message.get("body", b""))
-            n_bytes += len(parts[-1])
-            if not message.get("more_body", False):
-                break
-        return b"".join(parts)
 
     async def _answer(self, scope: Scope, body: bytes, receive: Receive, send: Send) -> None:
         if scope["path"] == "/metrics":
@@ -137,16 +136,8 @@ class Front:
                     raise
             finally:
                 backend.n_calls -= 1
-        what = UnavailableError("those that know the domain are away this moment: try again", retry_after_s=AWAY_S)
-        scope["state"] = {"request_id": secrets.token_hex(8)}
-        headers = [(b"x-request-id", scope["state"]["request_id"].encode()), (b"cache-control", b"no-store")]
-
-        async def send_marked(message: Message) -> None:
-            if message["type"] == "http.response.start":
-                message["headers"] = [*message["headers"], *headers]
-            await send(message)
-
-        await error_response(scope, what)(scope, receive, send_marked)
+        away = UnavailableError("those that know the domain are away this moment: try again", retry_after_s=AWAY_S)
+        await _refuse(scope, away, receive, send)
 
     async def _metrics(self, scope: Scope, receive: Receive, send: Send) -> None:
         """The counts of all that are there."""
@@ -175,6 +166,19 @@ class Front:
             return [self._admin]
         backends = [self._replicas[number] for number in placed[0]]
         return backends if placed[1] else sorted(backends, key=lambda backend: backend.n_calls)
+
+
+async def _refuse(scope: Scope, error: DeepSimbadError, receive: Receive, send: Send) -> None:
+    """Answer in place of a replica."""
+    scope["state"] = {"request_id": secrets.token_hex(8)}
+    headers = [(b"x-request-id", scope["state"]["request_id"].encode()), (b"cache-control", b"no-store")]
+
+    async def send_marked(message: Message) -> None:
+        if message["type"] == "http.response.start":
+            message["headers"] = [*message["headers"], *headers]
+        await send(message)
+
+    await error_response(scope, error)(scope, receive, send_marked)
 
 
 def _key_id(scope: Scope) -> str | None:

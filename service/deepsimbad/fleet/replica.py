@@ -2,7 +2,7 @@
 
 import asyncio
 import shutil
-from collections.abc import AsyncIterator, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AsyncExitStack, aclosing, suppress
 from dataclasses import replace
@@ -48,6 +48,16 @@ def replica_name(number: int) -> str:
     return f"domains-{number}"
 
 
+def keys_of(admin: "DeploymentHandle[Replica]") -> Callable[[], Sequence[KeyRecord]]:
+    """What reads the keys of the one that has them, in a thread of its own."""
+
+    def read() -> Sequence[KeyRecord]:
+        records: Sequence[KeyRecord] = admin.keys.remote().result(timeout_s=_TIMEOUT_S)
+        return records
+
+    return read
+
+
 class Replica:
     """The service as it is anywhere else, but that its sessions and keys are shared.
 
@@ -81,14 +91,9 @@ class Replica:
             folder = new_folder()
             self._parts.callback(shutil.rmtree, folder, ignore_errors=True)
             settings = settings.model_copy(update={"data_dir": folder})
-
-            def keys() -> Sequence[KeyRecord]:
-                records: Sequence[KeyRecord] = admin.keys.remote().result(timeout_s=_TIMEOUT_S)
-                return records
-
             name = serve.get_replica_context().deployment
             elsewhere = Elsewhere(
-                keys,
+                keys_of(admin),
                 partial(
                     SharedSessionStore.sharing,
                     objects,
@@ -112,7 +117,8 @@ class Replica:
             store.replicas = replicas
 
             async def announce() -> None:
-                told = asyncio.gather(*(replica.reread_keys.remote() for replica in replicas), return_exceptions=True)
+                asked = (each.reread_keys.remote() for each in (*replicas, serve.get_deployment_handle("front")))
+                told = asyncio.gather(*asked, return_exceptions=True)
                 with suppress(TimeoutError):  # who is away reads them at its start
                     await asyncio.wait_for(told, _TIMEOUT_S)
 
