@@ -4,7 +4,7 @@ They compare unit vectors of its encodings, standardised and projected (`core.co
 their own drive, views by what is usual on every drive that is known.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 
 from deepsimbad.core.composed import Moments, described, is_composed, principal_directions
 from deepsimbad.errors import InvalidEncodingError, TooFewToFitError
-from deepsimbad.evaluators.base import Fitting, Image, LandmarkModel, Lesson
+from deepsimbad.evaluators.base import Fitting, LandmarkModel, Lesson
 from deepsimbad.evaluators.compute import Compute
 from deepsimbad.evaluators.feature_l2 import FeatureL2, checked_encodings
 from deepsimbad.evaluators.lessons import UnitLesson
-from deepsimbad.evaluators.scenes import Form, Scene
 from deepsimbad.evaluators.space import OwnDissimilarities, check_units, check_usable
 
 _BESIDE = 0.3  # of the variance of encodings: what dissimilarities count beside them where `composed` compares
@@ -27,65 +26,15 @@ Axes: TypeAlias = Mapping[str, tuple[str, ...]]
 """Of fitted arrays by name: r, d, k, or another length that is the same everywhere; `two` is 2, `one` 1."""
 
 
-class Trunk(OwnDissimilarities):
-    """Images and their encodings, by a `FeatureL2`; `kind` is the prefix of the arrays that are fitted."""
+class Trunk(OwnDissimilarities, FeatureL2):
+    """Images and their encodings as of a `FeatureL2`; `kind` is the prefix of the arrays that are fitted."""
 
     kind: ClassVar[str]
     axes: ClassVar[Axes]
 
     def __init__(self, extractor: str, compute: Compute | None = None) -> None:
-        self._trunk, self._compute = FeatureL2(extractor, compute), compute or Compute()
-
-    @property
-    def fitting(self) -> Fitting:
-        """See `Evaluator`: ready encodings have no images."""
-        return Fitting.IMAGES if self.takes_images else Fitting.ENCODINGS
-
-    @property
-    def forms(self) -> frozenset[Form]:
-        """See `Evaluator`."""
-        return self._trunk.forms
-
-    def lacking(self, forms: frozenset[Form]) -> frozenset[Form]:
-        """See `Evaluator`."""
-        return self._trunk.lacking(forms)
-
-    @property
-    def takes_images(self) -> bool:
-        """See `Evaluator`."""
-        return self._trunk.takes_images
-
-    @property
-    def input_size(self) -> tuple[int, int] | None:
-        """See `Evaluator`."""
-        return self._trunk.input_size
-
-    @property
-    def encoding_dim(self) -> int | None:
-        """See `Evaluator`."""
-        return self._trunk.encoding_dim
-
-    @property
-    def weights_sha256(self) -> str | None:
-        """See `Evaluator`: of the extractor; what is fitted lies in the map."""
-        return self._trunk.weights_sha256
-
-    @property
-    def largest_batch(self) -> int:
-        """See `Evaluator`."""
-        return self._trunk.largest_batch
-
-    def load(self) -> None:
-        """See `Evaluator`."""
-        self._trunk.load()
-
-    def prepare(self, image: Image) -> Image:
-        """See `Evaluator`."""
-        return self._trunk.prepare(image)
-
-    def encode(self, images: Sequence[Image | Scene]) -> NDArray[np.float32]:
-        """See `Evaluator`."""
-        return self._trunk.encode(images)
+        super().__init__(extractor, compute)
+        self.fitting = Fitting.IMAGES if self.takes_images else Fitting.ENCODINGS  # ready encodings have no images
 
     def units(self, encodings: NDArray[np.float32], model: LandmarkModel) -> NDArray[np.float32]:
         """[n, k] unit vectors of scenes; raises InvalidEncodingError."""
