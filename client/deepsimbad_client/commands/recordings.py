@@ -30,10 +30,9 @@ from deepsimbad_client.recordings import Recording
 from deepsimbad_client.recordings.options import accounting, opened, reading, rotate_option, tell_left_out, views
 from deepsimbad_client.replay import DEFAULT_PLANNER, Viewer
 from deepsimbad_client.replay.active import EPISODES, STEPS, Stage, active_replay
-from deepsimbad_client.replay.page import write_page
 from deepsimbad_client.replay.passive import TOLERANCE_M
 from deepsimbad_client.replay.passive import replay as passive_replay
-from deepsimbad_client.replay.report import active_tables, summarise, summarise_active, table, write_summary
+from deepsimbad_client.replay.report import active_tables, summarise, summarise_active, table, write_page, write_summary
 from deepsimbad_client.replay.watch import watch_episode, watch_session
 
 IMAGE_EVALUATOR = {"kind": "feature_l2"}

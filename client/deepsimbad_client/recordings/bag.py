@@ -35,8 +35,8 @@ from deepsimbad_client.recordings import (
     with_grey_levels,
 )
 from deepsimbad_client.recordings.folder import shape_in, shape_remarks
+from deepsimbad_client.recordings.gps import GPS_DEADBAND_M, utm
 from deepsimbad_client.recordings.placing import Placed, placed_on
-from deepsimbad_client.recordings.plane import GPS_DEADBAND_M, utm
 from deepsimbad_client.recordings.track import DEADBAND_M, Track, track_of
 
 if TYPE_CHECKING:

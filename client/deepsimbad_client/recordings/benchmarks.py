@@ -34,9 +34,9 @@ from deepsimbad_client.recordings import (
     turned,
 )
 from deepsimbad_client.recordings.folder import FolderRecording
+from deepsimbad_client.recordings.gps import GPS_DEADBAND_M, utm
 from deepsimbad_client.recordings.names import in_order, times_of
 from deepsimbad_client.recordings.placing import UNPLACED, placed, placed_on
-from deepsimbad_client.recordings.plane import GPS_DEADBAND_M, utm
 from deepsimbad_client.recordings.track import track_of
 from deepsimbad_client.recordings.video import read_video
 

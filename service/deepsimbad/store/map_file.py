@@ -12,8 +12,7 @@ from typing import Any
 from numpy.typing import NDArray
 from sqlite_utils import Database
 
-from deepsimbad.core.index.packing import pack_lists, unpack_lists
-from deepsimbad.core.index.postings import unpack_postings
+from deepsimbad.core.index.packing import pack_lists, unpack_lists, unpack_postings
 from deepsimbad.core.map import Map
 from deepsimbad.errors import (
     ConflictError,

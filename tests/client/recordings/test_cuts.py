@@ -5,9 +5,8 @@ import numpy as np
 import pytest
 
 from deepsimbad_client.errors import SourceError
-from deepsimbad_client.recordings import Frame, Recording
+from deepsimbad_client.recordings import Frame, LeftOut, Recording
 from deepsimbad_client.recordings.cuts import check_one_drive, one_turn, thinned
-from deepsimbad_client.recordings.left_out import LeftOut
 
 
 def loop(n, noise_m=0.0):

@@ -4,7 +4,7 @@ import pytest
 from PIL import Image
 
 from deepsimbad_client.errors import MissingExtraError, SourceError
-from deepsimbad_client.recordings.plane import GPS_DEADBAND_M, utm
+from deepsimbad_client.recordings.gps import GPS_DEADBAND_M, utm
 from deepsimbad_client.recordings.sources import open_source
 from deepsimbad_client.recordings.track import arc_length_m
 

@@ -6,8 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from deepsimbad.core.index import packing
-from deepsimbad.core.index.packing import pack_lists, unpack_lists
-from deepsimbad.core.index.postings import unpack_postings
+from deepsimbad.core.index.packing import pack_lists, unpack_lists, unpack_postings
 
 RNG = np.random.default_rng(0)
 PROTOTYPES = RNG.normal(size=(60, 16)).astype(np.float32)
