@@ -6,7 +6,7 @@ import zipfile
 import numpy as np
 import pytest
 
-from deepsimbad.engine.batches import read_batch
+from deepsimbad.engine.traverses import read_batch
 from deepsimbad.errors import InvalidBatchError, TooLargeError
 
 from .conftest import DIM, JSON, NPZ, npz, problem

@@ -12,9 +12,8 @@ from rich.progress import Progress
 from deepsimbad.evaluators.grey_levels import GreyLevels
 from deepsimbad_client.errors import InvalidArgumentError
 from deepsimbad_client.recordings import MOST_LEFT_OUT, LeftOut, Recording, left_out_lines, read_file
-from deepsimbad_client.recordings.cuts import one_turn
 from deepsimbad_client.recordings.folder import single
-from deepsimbad_client.recordings.sources import RECORDING_SUFFIXES, open_source
+from deepsimbad_client.recordings.sources import RECORDING_SUFFIXES, one_turn, open_source
 from deepsimbad_client.recordings.told import TOLD_SUFFIXES, as_taken
 
 Command = Callable[..., Any]

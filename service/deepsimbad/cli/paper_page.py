@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from deepsimbad.cli.page import write_html
-from deepsimbad.cli.terminal import write_json
+from deepsimbad.cli.terminal import write_html, write_json
 from deepsimbad.core.planners import CONSTANT, DEFAULT_PLANNER, NNQL
 from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Relevance
 from deepsimbad.jobs.experiments.paper import Document

@@ -1,4 +1,4 @@
-"""What the commands share: options and settings that come in; progress, tables and JSON that go out."""
+"""What the commands share: options and settings that come in; progress, tables, JSON and pages that go out."""
 
 import json
 import math
@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import click
+from jinja2 import Environment, PackageLoader, StrictUndefined
 from rich.console import Console
 from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from rich.progress import Progress as Bars
@@ -231,3 +232,14 @@ def _finite(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [_finite(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def write_html(file: Path, template: str, **values: Any) -> Path:
+    """Render a template beside this file: one file with everything in it, no script, both colour themes."""
+    page = Environment(
+        loader=PackageLoader("deepsimbad.cli", "."), autoescape=True, undefined=StrictUndefined, trim_blocks=True
+    )
+    text = page.get_template(template).render(**values)
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(text, encoding="utf-8")
+    return file

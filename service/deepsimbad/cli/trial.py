@@ -1,10 +1,19 @@
-"""`deepsimbad try`: two drives are enough. One is mapped, the other localized on it, and a page shows how that went."""
+"""`deepsimbad try`: two drives are enough. One is mapped, the other localized on it, and a page shows how that went.
+
+The page is one HTML file with everything in it, for any screen and both colour themes; no script.
+"""
 
 import re
+from base64 import b64encode
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import click
+import cv2
+import numpy as np
+from numpy.typing import NDArray
 from rich.table import Table
 
 from deepsimbad.cli.experiment import json_file_option, tell, tolerance_option, true_images, usual_tolerance_m
@@ -14,17 +23,29 @@ from deepsimbad.cli.terminal import (
     given_settings,
     print_table,
     progress_bar,
+    write_html,
 )
-from deepsimbad.cli.trial_page import Album, write_page
+from deepsimbad.core.drive import Drive
 from deepsimbad.core.relevance import DEFAULT_RELEVANCE
-from deepsimbad.errors import CancelledError
+from deepsimbad.errors import CancelledError, ImageTooLargeError, InvalidImageError
+from deepsimbad.evaluators.image import decode_image
 from deepsimbad.evaluators.registry import EvaluatorConfig, make_evaluator
 from deepsimbad.jobs.build import EncodedRecording, encode_recording
 from deepsimbad.jobs.experiments.kept import kept_encodings
-from deepsimbad.jobs.experiments.trial import TRIAL_STAGES, TrialConfig, TrialReport, run_trial
+from deepsimbad.jobs.experiments.trial import (
+    RECALL_RANKS,
+    TRIAL_STAGES,
+    Outcome,
+    Stretch,
+    TrialConfig,
+    TrialReport,
+    run_trial,
+)
 from deepsimbad.jobs.experiments.truth import known_drives
 from deepsimbad.jobs.experiments.vpr import BRUTE_FORCE_U
 from deepsimbad.jobs.fitting import RecordingPictures
+from deepsimbad_client.errors import BrokenFrameError
+from deepsimbad_client.recordings import Recording
 from deepsimbad_client.recordings.options import accounting, opened, reading, tell_left_out
 
 _FRAMES_A_SECOND = 150.0  # that are encoded, against which the other stages are weighed
@@ -151,3 +172,177 @@ def _print(document: dict[str, Any], report: TrialReport) -> None:
         f"page: {document['page']}",
         numbers=True,
     )
+
+
+_LONGEST_PX, _JPEG_QUALITY = 200, 72  # of the pictures
+MOST_BYTES = 1_500_000  # of pictures in a page, which text makes a third more of
+_MOST_ROWS = 400  # queries whose belief is drawn; of a long drive every few
+_MOST_STRETCHES = 5
+_TRUTH_AT = 0.02  # of the route to either side, where the lines beside the truth run
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A small copy of a frame."""
+
+    uri: str
+    width: int
+    height: int
+
+
+class Album:
+    """Names and small pictures of a drive's frames.
+
+    Attributes:
+        name: The drive's.
+        n_bytes: Of all pictures so far.
+    """
+
+    def __init__(self, recording: Recording, drive: Drive, max_pixels: int) -> None:
+        frames = {frame.index: frame for frame in recording.frames}
+        self._frames = [frames[index] for index in drive.index.tolist()]
+        self._recording, self.name = recording, recording.name
+        self._max_pixels = max_pixels
+        self.has_pictures = recording.encodings is None
+        self.n_bytes = 0
+
+    def shown(self, row: int) -> dict[str, Any]:
+        """One frame: its name, and its picture or None."""
+        return {"name": self._frames[row].name, "picture": self._picture(row) if self.has_pictures else None}
+
+    def _picture(self, row: int) -> Picture | None:
+        try:
+            image = decode_image(self._recording.image(self._frames[row], None).body, self._max_pixels)
+        except (BrokenFrameError, InvalidImageError, ImageTooLargeError):
+            return None
+        scale = min(1.0, _LONGEST_PX / max(image.shape[:2]))
+        width, height = (max(1, round(scale * side)) for side in (image.shape[1], image.shape[0]))
+        small = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+        body = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1].tobytes()
+        self.n_bytes += len(body)
+        return Picture(f"data:image/jpeg;base64,{b64encode(body).decode()}", width, height)
+
+
+def write_page(
+    file: Path,
+    document: dict[str, Any],
+    report: TrialReport,
+    places: Album,
+    queries: Album,
+    on_progress: Callable[[float], None],
+) -> Path:
+    """Write the page; `document` is the trial's JSON, and the albums hold the frames of both drives."""
+    cards = _cards(report, places, queries, on_progress)
+    return write_html(
+        file,
+        "trial_page.html",
+        **document,
+        whole=BRUTE_FORCE_U,
+        list_length=report.map.list_length,
+        cards=cards,
+        outcomes=report.outcomes,
+        has_pictures=queries.has_pictures,
+        recall=_recall(report),
+        misses=_misses(report),
+        stretches=_linked(report.stretches[:_MOST_STRETCHES], cards),
+        names=(queries.name, places.name),
+        belief=_belief(report),
+    )
+
+
+def _cards(
+    report: TrialReport, places: Album, queries: Album, on_progress: Callable[[float], None]
+) -> list[dict[str, Any]]:
+    """Queries, worst first, as many as there is room for."""
+    scored = [(row, outcome) for row, outcome in enumerate(report.outcomes) if outcome.rank is not None]
+    scored.sort(key=lambda at: (at[1].rank, at[1].error_m), reverse=True)
+    cards = []
+    for row, outcome in scored:
+        n_bytes = places.n_bytes + queries.n_bytes
+        if n_bytes > MOST_BYTES:
+            break
+        cards.append(_card(row, outcome, report, places, queries))
+        on_progress(max(len(cards) / len(scored), n_bytes / MOST_BYTES))
+    return cards
+
+
+def _card(row: int, outcome: Outcome, report: TrialReport, places: Album, queries: Album) -> dict[str, Any]:
+    is_wrong, truth = outcome.is_wrong, outcome.true_image
+    return {
+        "row": row,
+        "position_m": float(report.queries.position_m[row]),
+        "outcome": outcome,
+        "query": queries.shown(row),
+        "best": places.shown(outcome.best_image),
+        "truth": places.shown(truth) if is_wrong and truth is not None else None,
+    }
+
+
+def _linked(stretches: Sequence[Stretch], cards: Sequence[dict[str, Any]]) -> list[tuple[Stretch, int | None]]:
+    """Each with its worst query that has a card."""
+    wrong = [(card["position_m"], card["row"]) for card in cards if card["truth"]]
+    return [
+        (stretch, next((row for at_m, row in wrong if stretch.from_m <= at_m <= stretch.to_m), None))
+        for stretch in stretches
+    ]
+
+
+def _recall(report: TrialReport) -> dict[str, Any]:
+    """Two curves over N, in percent of the plot."""
+    curves = {name: [score.recall_at[n] for n in RECALL_RANKS] for name, score in report.scores.items()}
+    lowest = min((value for curve in curves.values() for value in curve if np.isfinite(value)), default=0.0)
+    floor = float(max(0, min(80, 10 * (lowest // 10) - 10)))
+    span = RECALL_RANKS[-1] - RECALL_RANKS[0]
+    points = {
+        name: " ".join(
+            f"{100 * (n - RECALL_RANKS[0]) / span:.2f},{100 * (100 - value) / (100 - floor):.2f}"
+            for n, value in zip(RECALL_RANKS, curve, strict=True)
+        )
+        for name, curve in curves.items()
+    }
+    return {"points": points, "floor": floor, "last": RECALL_RANKS[-1], "curves": curves}
+
+
+def _misses(report: TrialReport) -> dict[str, Any]:
+    """How far every wrong first answer is off, along the query drive, by the square root."""
+    at_m = report.queries.position_m
+    errors = {row: each.error_m for row, each in enumerate(report.outcomes) if each.is_wrong and each.error_m}
+    most_m = max(errors.values(), default=0.0)
+    length_m = max(float(at_m[-1] - at_m[0]), 1e-9)
+    lines = "".join(
+        f"M{100 * (at_m[row] - at_m[0]) / length_m:.2f},100V{100 - 100 * (error_m / most_m) ** 0.5:.1f}"
+        for row, error_m in errors.items()
+    )
+    return {"lines": lines, "most_m": most_m, "from_m": float(at_m[0]), "to_m": float(at_m[-1])}
+
+
+def _belief(report: TrialReport) -> dict[str, Any]:
+    """The belief as an image to mask a colour with, queries from left to right; and where the truth lies."""
+    n_queries, route = len(report.outcomes), report.map.route
+    rows = np.arange(0, n_queries, -(-n_queries // _MOST_ROWS))
+    masses = report.belief[rows]
+    alpha = np.round(255 * (masses / max(float(masses.max()), 1e-9)) ** 0.4).astype(np.uint8)
+    image = np.zeros((*alpha.T.shape, 4), np.uint8)
+    image[..., 3] = np.flipud(alpha.T)
+    png = cv2.imencode(".png", image)[1].tobytes()
+    return {
+        "uri": f"data:image/png;base64,{b64encode(png).decode()}",
+        "truths": [_path(rows, report, side) for side in (-_TRUTH_AT, _TRUTH_AT)],
+        "n_rows": len(rows),
+        "from_m": route.start_m,
+        "to_m": route.start_m + route.length_m,
+    }
+
+
+def _path(rows: NDArray[np.int64], report: TrialReport, side: float) -> str:
+    """A line through the true places, broken where there are none."""
+    route, path, pen = report.map.route, [], "M"
+    for column, row in enumerate(rows.tolist()):
+        truth = report.outcomes[row].true_image
+        if truth is None:
+            pen = "M"
+            continue
+        along = (float(route.position_m[truth]) - route.start_m) / max(route.length_m, 1e-9)
+        path.append(f"{pen}{100 * (column + 0.5) / len(rows):.2f},{100 * (1 - along - side):.2f}")
+        pen = "L"
+    return "".join(path)

@@ -6,7 +6,7 @@ import pytest
 
 from deepsimbad_client.errors import SourceError
 from deepsimbad_client.recordings import Frame, LeftOut, Recording
-from deepsimbad_client.recordings.cuts import check_one_drive, one_turn, thinned
+from deepsimbad_client.recordings.sources import check_one_drive, one_turn, thinned
 
 
 def loop(n, noise_m=0.0):
