@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from deepsimbad.core.building import MapPlan, build_from_dissimilarities, compose_map
-from deepsimbad.core.coverage import placed_rightly, worst_stretches
 from deepsimbad.core.drive import Drive, SecondSeason
-from deepsimbad.core.rehearsal import own_views
+from deepsimbad.core.rehearsal import own_views, placed_rightly, worst_stretches
 from deepsimbad.core.relevance import Relevance
 
 N, D = 120, 32

@@ -14,9 +14,8 @@ from typing_extensions import TypedDict
 from deepsimbad.api.localizations import FrameName
 from deepsimbad.api.problems import problems
 from deepsimbad.api.requests import GREATEST_ID, JSON, DomainName, Running, Services
-from deepsimbad.core.coverage import worst_stretches
 from deepsimbad.core.map import Map
-from deepsimbad.core.rehearsal import WITHIN_M
+from deepsimbad.core.rehearsal import WITHIN_M, worst_stretches
 
 router = APIRouter(prefix="/v1/domains", tags=["domains"])
 

@@ -23,12 +23,11 @@ from deepsimbad.core.composed import (
     unit,
     within_place_whitening,
 )
-from deepsimbad.core.coverage import placed_rightly
 from deepsimbad.core.descriptor import LandmarkStatistics, common_factors, nearest_landmarks, rank_landmarks
 from deepsimbad.core.drive import Drive, SameRoute, SecondSeason, second_season
 from deepsimbad.core.landmark_model import farthest_first
 from deepsimbad.core.map import Map
-from deepsimbad.core.rehearsal import own_views, rehearsed, view_bits
+from deepsimbad.core.rehearsal import own_views, placed_rightly, rehearsed, view_bits
 from deepsimbad.core.relevance import Relevance, most_strange
 from deepsimbad.core.route import Route
 from deepsimbad.errors import InvalidEncodingError, InvalidMapConfigError

@@ -14,10 +14,9 @@ from deepsimbad.core.building import MapPlan
 from deepsimbad.core.drive import Drive, second_season
 from deepsimbad.core.landmark_model import select_landmarks
 from deepsimbad.core.relevance import Relevance
-from deepsimbad.evaluators.augmentation import VIEWS_A_LANDMARK, augmented
 from deepsimbad.evaluators.base import Evaluator, Fitted, Fitting, Image, Lesson
 from deepsimbad.evaluators.feature_l2 import squared_distances
-from deepsimbad.evaluators.image import decode_image
+from deepsimbad.evaluators.image import VIEWS_A_LANDMARK, augmented, decode_image
 from deepsimbad.store.traverses import Traverse
 from deepsimbad_client.recordings import Recording
 
