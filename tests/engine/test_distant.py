@@ -62,7 +62,7 @@ def test_all_is_as_the_network_beside_has_it_and_none_is_loaded_here(beside, raw
     near = make_evaluator(evaluator_config(raw))
     scenes = [Scene(image=near.prepare(picture(seed))) for seed in range(3)]
     expected = near.encode(scenes)
-    lesson = Lesson.of_landmarks(expected)
+    lesson = Lesson(expected, np.arange(len(expected)))
     model, wanted = near.fit(lesson).model, near.dissimilarities(expected, near.fit(lesson).model)
     facts = {name: getattr(near, name) for name in NetworkFacts.__dataclass_fields__}
     config = evaluator_config(raw)

@@ -49,7 +49,7 @@ def evaluator(request, small_weights):
 
 
 def _fitted(evaluator, landmarks):
-    return evaluator.fit(Lesson.of_landmarks(landmarks)).model
+    return evaluator.fit(Lesson(landmarks, np.arange(len(landmarks)))).model
 
 
 def _images(n, seed=0):
@@ -264,7 +264,7 @@ def test_training_is_cancelled_between_batches_and_asks_for_frames_enough(kind):
     assert len(shares) > 5
     assert shares == sorted(shares)
     with pytest.raises(TooFewToFitError, match="feature_l2"):
-        evaluator.fit(Lesson.of_landmarks(places[:9]))
+        evaluator.fit(Lesson(places[:9], np.arange(9)))
 
 
 def test_a_fitted_model_that_is_no_better_than_plain_l2_says_so():

@@ -69,7 +69,8 @@ def test_the_weight_is_learnt_where_the_other_drive_saw_the_same_places(worse):
     assert (told["weight"], told["n_shared_places"]) == (pytest.approx(weight), N)
     assert told["anr"][f"{weight:.1f}"] == min(told["anr"].values())
     assert told["anr"][f"{worse}.0"] < told["anr"][f"{1 - worse}.0"], "either half alone is among what was tried"
-    assert FUSED.fit(Lesson.of_landmarks(season(1, *noise).encodings)).model["fused_weight"] == 0.5
+    alone = Lesson(season(1, *noise).encodings, np.arange(N))
+    assert FUSED.fit(alone).model["fused_weight"] == 0.5
 
 
 def test_a_half_alone_is_answered_as_its_own_evaluator_would_and_both_are_better():

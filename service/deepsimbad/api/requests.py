@@ -180,8 +180,8 @@ async def services_of(request: Request) -> Services:
     return cast("Services", request.app.state.services)
 
 
-def prefers(request: Request, media_type: str, other: str = JSON) -> bool:
-    """Whether `Accept` asks for one type of answer rather than for another."""
+def prefers(request: Request, media_type: str) -> bool:
+    """Whether `Accept` asks for one type of answer rather than for JSON."""
     quality_of = {}
     for part in request.headers.get("accept", "").split(","):
         name, *parameters = (piece.strip().lower() for piece in part.split(";"))
@@ -190,7 +190,7 @@ def prefers(request: Request, media_type: str, other: str = JSON) -> bool:
             quality_of[name] = float(quality)
         except ValueError:
             quality_of[name] = 0.0
-    return quality_of.get(media_type, 0.0) > quality_of.get(other, 0.0)
+    return quality_of.get(media_type, 0.0) > quality_of.get(JSON, 0.0)
 
 
 # Parameters

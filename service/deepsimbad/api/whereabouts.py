@@ -56,7 +56,6 @@ router = APIRouter(prefix="/v1", tags=["localization"])
 ALL = "*"
 MOST_NAMES = 10_000
 _MOST_IN_QUERY = 500  # names, of which the longest make no line too long for the server
-_ON_BOARD = {"ranked_landmarks", "dissimilarities"}
 _MOST_LISTED = 100  # of domains that could not answer
 
 # Bodies and answers

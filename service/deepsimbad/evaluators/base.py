@@ -59,11 +59,6 @@ class Lesson:
     seed: int = 0  # of everything random
     on_progress: Callable[[float], None] = lambda _: None  # takes the share done, 0..1; may raise CancelledError
 
-    @classmethod
-    def of_landmarks(cls, encodings: NDArray[np.float32]) -> "Lesson":
-        """Of landmarks [r, d] about which nothing else is known."""
-        return cls(encodings, np.arange(len(encodings)))
-
 
 @dataclass(frozen=True)
 class Fitted:

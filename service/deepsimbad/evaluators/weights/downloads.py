@@ -149,7 +149,7 @@ def pull_hub(folder: Path, wish: HubWish, tell: Tell) -> HubRecord:
     return record
 
 
-def fetch(url: str, to: Path, tell: Tell, sha256: str | None = None, advice: str = "") -> str:
+def fetch(url: str, to: Path, tell: Tell, sha256: str | None = None) -> str:
     """Download a file.
 
     What has come waits in `NAME.part`, and beside it which version of the file it is the beginning of, so that a later
@@ -158,7 +158,6 @@ def fetch(url: str, to: Path, tell: Tell, sha256: str | None = None, advice: str
     Args:
         to: Where it shall lie; what lies there is replaced.
         sha256: Its digest in hex, or the first digits of it; None: not known.
-        advice: What to do where it cannot be fetched; empty: to put the file where it shall lie.
 
     Returns:
         Its SHA-256, in hex.
@@ -168,7 +167,7 @@ def fetch(url: str, to: Path, tell: Tell, sha256: str | None = None, advice: str
         InvalidWeightsError: It has another digest, or is larger than any file of weights.
     """
     to.parent.mkdir(parents=True, exist_ok=True)
-    return _Download(url, to, tell, sha256, advice).run()
+    return _Download(url, to, tell, sha256).run()
 
 
 def resolve_commit(repository: str, advice: str) -> str:
@@ -227,9 +226,9 @@ def check_digest(name: str, sha256: str, wanted: str | None, then: str) -> None:
 class _Download:
     """One file on its way."""
 
-    def __init__(self, url: str, to: Path, tell: Tell, sha256: str | None, advice: str) -> None:
+    def __init__(self, url: str, to: Path, tell: Tell, sha256: str | None) -> None:
         self._url, self._to, self._tell, self._sha256 = url, to, tell, sha256
-        self._advice = advice or f"fetch it where there is a network, put it at {to} and pull again"
+        self._advice = f"fetch it where there is a network, put it at {to} and pull again"
         self._part = to.with_name(f"{to.name}.part")
         self._version = to.with_name(f"{to.name}.part.etag")
         self._n_received = 0
