@@ -11,6 +11,7 @@ import pytest
 
 from deepsimbad.api.app import Elsewhere, create_app
 from deepsimbad.jobs.runner import InThisProcess
+from deepsimbad.store import shared_sessions
 from deepsimbad.store.objects import Objects
 from deepsimbad.store.shared_sessions import SharedSessionStore
 from tests.contract.conftest import N_LANDMARKS, Client, path_of, problem, service, small_settings, until
@@ -133,6 +134,30 @@ def test_who_lives_is_known_everywhere(nodes):
         assert one.delete(path).status_code == 204
     assert other.services.session_store.pins() == set()
     assert other.services.session_store.holders() == []
+
+
+def test_a_beginning_asks_who_began_since_and_at_the_limit_who_lives(nodes, monkeypatch):
+    monkeypatch.setattr(shared_sessions, "_KEPT_S", 1e9)
+    one, other = nodes("one", max_sessions=3), nodes("other", max_sessions=3)
+    store, asked_after = one.services.session_store, []
+    list_names = store._objects.names
+
+    def names(prefix, after=None):
+        asked_after.append(after)
+        return list_names(prefix, after)
+
+    monkeypatch.setattr(store._objects, "names", names)
+    first, _, _ = one.session(), other.session(), one.session()
+    assert len(store.holders(may_have_ended=True)) == 3
+    assert None not in asked_after, "all were listed at the start"
+    problem(one.post("/v1/domains/ready/sessions", json={}), 429, "too_many_sessions")
+    assert asked_after.count(None) == 1
+    other.delete(first)
+    one.session()
+    assert asked_after.count(None) == 2, "three lived when all were listed"
+    monkeypatch.setattr(shared_sessions, "_KEPT_S", -1)
+    assert len(store.holders(may_have_ended=True)) == 3
+    assert asked_after[-1] is None
 
 
 def test_a_node_that_is_back_looks_after_its_sessions(nodes):

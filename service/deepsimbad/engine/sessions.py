@@ -222,7 +222,7 @@ class Sessions:
     async def _begin(
         self, active: MappedDomain, config: SessionConfig, session_id: str, key_id: str | None
     ) -> SessionView:
-        crowd = self._crowd(key_id, await self._holders())
+        crowd = self._crowd(key_id, await self._holders(may_have_ended=True))
         if crowd is not None:
             await self._expire()
             crowd = self._crowd(key_id, await self._holders())
@@ -258,10 +258,10 @@ class Sessions:
         finally:
             self._beginning[key_id] -= 1
 
-    async def _holders(self) -> list[str | None]:
-        """The API key of every session that lives, wherever it does."""
+    async def _holders(self, *, may_have_ended: bool = False) -> list[str | None]:
+        """The API key of every session that lives, wherever it does; see `SessionStore.holders`."""
         if self._store.shares:
-            return await asyncio.to_thread(self._store.holders)
+            return await asyncio.to_thread(partial(self._store.holders, may_have_ended=may_have_ended))
         return [live.record.key_id for live in self._living.values()]
 
     def _crowd(self, key_id: str | None, holders: Sequence[str | None]) -> TooManySessionsError | None:

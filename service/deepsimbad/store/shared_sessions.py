@@ -9,7 +9,9 @@ follows few rows. `truths/<id>` are the true positions that were told of it.
 
 import base64
 import json
+import math
 import re
+import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
@@ -41,6 +43,8 @@ _CREATED_AT = 5  # among the columns of a session
 _AT_ONCE = 16  # objects written, and as many read
 _MANY_ROWS = 16  # from so many on a snapshot is looked for
 _NO_KEY = "-"
+_KEPT_S = 60.0  # that a list of who lives stands, to which those are added that began since
+_LATE_S = 60.0  # by which clocks may differ, or a mark be written after its session's beginning
 # Numbers order sessions by their beginning, to ten microseconds, and are the same on every node.
 _INSERT_SESSION = """
     INSERT OR IGNORE INTO session
@@ -67,14 +71,14 @@ class Mark:
     @classmethod
     def parse(cls, name: str) -> Self:
         """The one that an object's name is."""
-        _, domain, version, key_id, last = name.split("/")
-        number, _, session_id = last.partition("-")
+        _, number, session_id, domain, version, key_id = name.split("/")
         return cls(domain, int(version), None if key_id == _NO_KEY else key_id, int(number), session_id)
 
     @property
     def name(self) -> str:
         """Of its object."""
-        return f"living/{self.domain}/{self.map_version}/{self.key_id or _NO_KEY}/{self.number}-{self.session_id}"
+        whose = f"{self.domain}/{self.map_version}/{self.key_id or _NO_KEY}"
+        return f"living/{_digits(self.number)}/{self.session_id}/{whose}"
 
 
 class SharedSessionStore(SessionStore):
@@ -89,6 +93,7 @@ class SharedSessionStore(SessionStore):
     _is_own: Callable[[str], bool]
     _writers: ThreadPoolExecutor
     _readers: ThreadPoolExecutor
+    _listed: tuple[float, dict[str, Mark]]  # when all who live were, and by the names of their objects
 
     @classmethod
     def sharing(
@@ -107,7 +112,7 @@ class SharedSessionStore(SessionStore):
             is_own: Whether this node is the one that looks after a session, by its id: that it expires, say.
         """
         store = cls.open(data_dir, on_commit)
-        store._objects, store._is_own = objects, is_own
+        store._objects, store._is_own, store._listed = objects, is_own, (-math.inf, {})
         store._db.execute("PRAGMA synchronous = OFF")  # the objects are what has to survive
         store._writers = ThreadPoolExecutor(_AT_ONCE, "shared journal")
         store._readers = ThreadPoolExecutor(_AT_ONCE, "shared journal, read")
@@ -123,11 +128,25 @@ class SharedSessionStore(SessionStore):
 
     def marks(self) -> list[Mark]:
         """Of all sessions that live anywhere; a request a thousand."""
-        return [Mark.parse(name) for name in self._objects.names("living/")]
+        began, marks = time.time(), self._list()
+        self._listed = began, marks
+        return list(marks.values())
 
-    def holders(self) -> list[str | None]:
-        """As where nothing is shared, of all nodes."""
-        return [mark.key_id for mark in self.marks()]
+    def _list(self, after: str | None = None) -> dict[str, Mark]:
+        return {name: Mark.parse(name) for name in self._objects.names("living/", after)}
+
+    def holders(self, *, may_have_ended: bool = False) -> list[str | None]:
+        """As where nothing is shared, of all nodes.
+
+        Args:
+            may_have_ended: Whether some may be among them that lived when all were listed, a minute ago at most: then
+                only who began since is asked for, which is a request however many live.
+        """
+        listed_at, marks = self._listed
+        if not may_have_ended or time.time() - listed_at > _KEPT_S:
+            return [mark.key_id for mark in self.marks()]
+        begun = self._list(f"living/{_digits(_number_at(listed_at - _LATE_S))}")
+        return [mark.key_id for mark in (marks | begun).values()]
 
     def pins(self) -> set[tuple[str, int]]:
         """As where nothing is shared, of all nodes."""
@@ -289,8 +308,18 @@ class SharedSessionStore(SessionStore):
 
 
 def _insert_session(db: Database, columns: Sequence[Any]) -> None:
-    began, tie = int(1e5 * columns[_CREATED_AT]), int(columns[0][-4:], 16) % 1000
-    db.conn.execute(_INSERT_SESSION, (1000 * began + tie, *columns))
+    number = _number_at(columns[_CREATED_AT]) + int(columns[0][-4:], 16) % 1000
+    db.conn.execute(_INSERT_SESSION, (number, *columns))
+
+
+def _number_at(created_at: float) -> int:
+    """The least of a session that begins then."""
+    return 1000 * int(1e5 * created_at)
+
+
+def _digits(number: int) -> str:
+    """In the order of names as of numbers."""
+    return f"{number:019d}"
 
 
 def _name(session_id: str, sequence: int) -> str:
