@@ -4,6 +4,7 @@ import fcntl
 import logging
 import os
 import signal
+import sys
 from pathlib import Path
 
 import pytest
@@ -23,6 +24,9 @@ os.environ["DEEPSIMBAD_JOB_PRIORITY"] = (
 )
 os.environ["GOMP_SPINCOUNT"] = "1000"  # every core is busy: threads that spin would keep each other waiting
 os.environ.pop("COLUMNS", None)  # a parallel run sets one, too narrow for the tables that a pipe gets
+# Without bytecode every process would compile the sources, and the asserts of all tests, anew: they begin many.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
 
 # A run in the background of a script ignores Ctrl-C, and so would every process that the tests begin and interrupt.
 signal.signal(signal.SIGINT, signal.default_int_handler)

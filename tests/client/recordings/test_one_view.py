@@ -44,26 +44,27 @@ def on_its_side(image):
     return stream.getvalue()
 
 
-FILES = {
-    "photo.jpg": cv2.imencode(".jpg", scene(0))[1].tobytes(),
-    "small.jpg": cv2.imencode(".jpg", scene(1, (150, 140)), [cv2.IMWRITE_JPEG_QUALITY, 40])[1].tobytes(),
-    "photo.png": cv2.imencode(".png", scene(2))[1].tobytes(),
-    "photo.tiff": cv2.imencode(".tiff", scene(3))[1].tobytes(),
-    "photo.webp": cv2.imencode(".webp", scene(4))[1].tobytes(),
-    "low.png": cv2.imencode(".png", scene(5, (300, 90)))[1].tobytes(),
-    "turned.jpg": on_its_side(scene(6)),
-    "large.jpg": cv2.imencode(".jpg", scene(7, (4000, 3000)))[1].tobytes(),
-}
+FILES = ("photo.jpg", "small.jpg", "photo.png", "photo.tiff", "photo.webp", "low.png", "turned.jpg", "large.jpg")
+SIZES = {"small.jpg": (150, 140), "low.png": (300, 90), "large.jpg": (4000, 3000)}
+
+
+def file_of(name):
+    """The bytes, made where they are needed: every process of a run imports this module."""
+    image = scene(FILES.index(name), SIZES.get(name, (320, 240)))
+    if name == "turned.jpg":
+        return on_its_side(image)
+    quality = [cv2.IMWRITE_JPEG_QUALITY, 40] if name == "small.jpg" else []
+    return cv2.imencode(Path(name).suffix, image, quality)[1].tobytes()
 
 
 @pytest.mark.parametrize("name", FILES)
 def test_what_is_sent_encodes_to_the_pixels_of_the_whole_picture(name, tmp_path):
-    (tmp_path / name).write_bytes(FILES[name])
+    (tmp_path / name).write_bytes(whole := file_of(name))
     recording, evaluator = open_source(str(tmp_path)), FeatureL2("gradient_grid")
-    pixels = decode_image(FILES[name], LIMIT)
+    pixels = decode_image(whole, LIMIT)
     for size in ((128, 128), (224, 224), (130, 97)):
         sent = recording.image(recording.frames[0], size)
-        assert len(sent.body) <= max(len(FILES[name]), 3 * size[0] * size[1])
+        assert len(sent.body) <= max(len(whole), 3 * size[0] * size[1])
         np.testing.assert_array_equal(resized(decode_image(sent.body, LIMIT), size), resized(pixels, size))
     sent = recording.image(recording.frames[0], evaluator.input_size)
     np.testing.assert_array_equal(evaluator.prepare(decode_image(sent.body, LIMIT)), evaluator.prepare(pixels))
