@@ -332,7 +332,7 @@ def test_damaged_files(files, data):
 
 
 @pytest.mark.slow
-@settings(FUZZ, max_examples=3000)
+@settings(FUZZ, max_examples=1000)
 @given(data=st.data())
 def test_damaged_headers_at_length(files, data):
     body = bytearray(files[data.draw(st.sampled_from(sorted(files)))])
