@@ -31,7 +31,7 @@ class Served(LocalServer):
             self.command = [sys.executable, "-m", "deepsimbad", "ray", "serve", *told]
 
     def connect(self):
-        return socket.create_connection(("127.0.0.1", self.port), timeout=30)
+        return socket.create_connection(("127.0.0.1", self.port), timeout=120)
 
     def tell(self, message):
         """Send bytes on a new connection; returns all that comes until it is closed."""
@@ -101,7 +101,7 @@ def told(process, name):
 
 @dataclass
 class Robot:
-    """Localizes and observes without a pause on a connection of its own, and notes what went wrong."""
+    """Localizes and observes all along on a connection of its own, and notes what went wrong."""
 
     served: Served
     n_answered: int = 0
@@ -110,7 +110,7 @@ class Robot:
     turn: threading.Lock = field(default_factory=threading.Lock)  # held by whoever wants it to ask nothing
 
     def drive(self):
-        connection = http.client.HTTPConnection("127.0.0.1", self.served.port, timeout=30)
+        connection = http.client.HTTPConnection("127.0.0.1", self.served.port, timeout=120)
 
         def ask(path, body):
             connection.request("POST", path, json.dumps(body), {"Content-Type": "application/json"})
@@ -127,7 +127,7 @@ class Robot:
                     ask("/v1/domains/ready/localizations", {"ranked_landmarks": [3, 1, 2]})
                     ask(f"/v1/sessions/{session_id}/observations", {"ranked_landmarks": [1, 2]})
                 self.n_answered += 2
-                time.sleep(0.002)
+                time.sleep(0.02)  # others need the processor too
         except Exception as error:
             self.faults.append(repr(error))
         finally:

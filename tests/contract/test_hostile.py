@@ -55,7 +55,7 @@ def robot(served):
     robot = Robot(served)
     thread = threading.Thread(target=robot.drive)
     thread.start()
-    robot.answered_more(200)
+    robot.answered_more(100)
     before = served.mib()
     yield robot
     robot.stopped.set()
@@ -69,7 +69,7 @@ def _others_are_unaffected(served, robot, request):
     n_sockets = served.n_sockets
     with served.within(MOST_LARGE_MIB if "just_under_the_limit" in request.node.name else MOST_PEAK_MIB):
         yield
-        robot.answered_more(20)
+        robot.answered_more(6)
     until(lambda: served.n_sockets <= n_sockets + 2)
 
 
@@ -219,7 +219,7 @@ def test_unfinished_bodies_on_many_connections_take_nobodys_turn(served, robot):
     with contextlib.ExitStack() as stack:
         for _ in range(4 * MAX_REQUESTS):
             stack.enter_context(served.connect()).sendall(request("POST", READY, Content_Length="1000000") + b"{")
-        robot.answered_more(100)
+        robot.answered_more(20)
 
 
 def test_bodies_that_stop_before_their_end_share_the_room_that_there_is(served, robot):
@@ -235,7 +235,7 @@ def test_bodies_that_stop_before_their_end_share_the_room_that_there_is(served, 
             wait_for.register(connection, select.POLLIN)
         n_held = MAX_BODY_MEMORY // len(body)
         until(lambda: len(wait_for.poll(0)) >= len(slow) - n_held)
-        robot.answered_more(20)
+        robot.answered_more(6)
         assert len(wait_for.poll(0)) == len(slow) - n_held
     until(lambda: ask(served, "POST", READY, body) == (422, "invalid_request"))
 
@@ -247,7 +247,7 @@ def test_batches_that_stop_before_their_end_are_not_held_in_memory(served, robot
             batch = request("POST", BATCH, bytes(60 * MEBIBYTE), **kind)
             stack.enter_context(served.connect()).sendall(batch[:-9])
         until(lambda: ask(served, "POST", BATCH, b"1", **kind) == (503, "overloaded"))
-        robot.answered_more(20)
+        robot.answered_more(6)
     until(lambda: ask(served, "POST", BATCH, b"1", **kind) == (422, "invalid_batch"))
 
 
