@@ -87,6 +87,26 @@ def test_what_was_counted_elsewhere_counts_once(nodes):
     assert other.get(path).json()["n_observations"] == 1
 
 
+def test_what_another_node_counts_in_the_same_moment_counts_once(nodes, monkeypatch):
+    one, other = nodes("one"), nodes("other")
+    path, objects = one.session(), one.services.session_store._objects
+    create, quicker = objects.create, []
+
+    def create_too_late(name, content):
+        if not quicker:
+            quicker.append(observe(other, path, 1, **{"Idempotency-Key": word}))
+        return create(name, content)
+
+    word = "same"
+    monkeypatch.setattr(objects, "create", create_too_late)
+    assert told(observe(one, path, 1, **{"Idempotency-Key": "same"})) == told(quicker[0])
+    quicker.clear()
+    word = "another"
+    late = one.post(f"{path}/observations?action_m=2", json=ranks(1), headers={"Idempotency-Key": "late"})
+    problem(late, 503, "session_moved")
+    assert other.get(path).json()["n_observations"] == 2
+
+
 def test_the_end_is_the_end_everywhere(nodes):
     one, other = nodes("one"), nodes("other", session_ttl_s=30)
     path, brief = one.session(), other.session()

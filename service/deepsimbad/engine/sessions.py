@@ -38,6 +38,7 @@ from deepsimbad.errors import (
     DeepSimbadError,
     EndedSessionError,
     IdempotencyKeyReusedError,
+    SessionMovedError,
     TooManySessionsError,
     UnknownSessionError,
 )
@@ -143,9 +144,17 @@ class Sessions:
             InvalidInputError: The move, the view or the shortlist cannot be.
             LandmarkModelDiffersError: The view was ranked by another landmark model than that of the session's map.
             IdempotencyKeyReusedError: The key named another observation.
+            SessionMovedError: Another node counted another observation this moment.
         """
-        live = await self._find(session_id, key_id)
-        return await self._finished(self._observe(live, observation, watch or Stopwatch()))
+        live, watch = await self._find(session_id, key_id), watch or Stopwatch()
+        try:
+            return await self._finished(self._observe(live, observation, watch))
+        except SessionMovedError:
+            live = await self._find(session_id, key_id)  # with what another node has written
+            number, idempotency = live.record.number, observation.idempotency
+            if idempotency is None or await asyncio.to_thread(self._store.named, number, idempotency.key) is None:
+                raise
+            return await self._finished(self._observe(live, observation, watch))  # which was this observation
 
     async def set_prior(
         self, session_id: str, position_m: float, std_m: float, key_id: str | None = None

@@ -30,6 +30,7 @@ _PASSED = (  # of a request's scope
     *("scheme", "client", "server", "root_path"),
 )
 
+_PATIENCE_S = 10.0  # that a request waits where both owners are away; one that has ended is back in half of it
 _OF_EACH = {  # gauges
     "requests_in_flight",
     "inference_queue",
@@ -43,8 +44,8 @@ _OF_EACH = {  # gauges
 class Front:
     """The deployment; listens where the settings say.
 
-    A request whose replica ends under it is given to the domain's other owner: observations and sessions carry a key
-    by which they count once, and the rest may be asked twice.
+    A request whose replica ends under it is given to the domain's other owner, or to either once it is back:
+    observations and sessions carry a key by which they count once, and the rest may be asked twice.
     """
 
     async def __init__(  # type: ignore[misc]  # Serve awaits it
@@ -116,28 +117,39 @@ class Front:
         if scope["path"] == "/metrics":
             await self._metrics(scope, receive, send)
             return
+        who = self._who(scope)
+        patience_s = 0.0 if who == [self._admin] else _PATIENCE_S  # who asks for health is told at once
+        until = asyncio.get_running_loop().time() + patience_s
+        while not await self._is_answered(who, scope, body, send):
+            if asyncio.get_running_loop().time() >= until:
+                what = "those that know the domain are away this moment: try again"
+                await _refuse(scope, UnavailableError(what, retry_after_s=AWAY_S), receive, send)
+                return
+            await asyncio.sleep(0.05)
+
+    async def _is_answered(self, who: Sequence[Backend], scope: Scope, body: bytes, send: Send) -> bool:
+        """Let the first that is there answer; False: all are away, or ended under it."""
         has_begun = False
-        for backend in self._who(scope):
+        for backend in who:
             backend.n_calls += 1
             try:
                 if scope["method"] not in {"GET", "HEAD"}:  # these alone may be long
                     for message in await backend.ask("ask", scope, body):
                         await self._before_last(message, backend)
                         await send(message)
-                    return
+                    return True
                 async with aclosing(backend.stream("stream", scope, body)) as messages:
                     async for message in messages:
                         await self._before_last(message, backend)
                         await send(message)
                         has_begun = True
-                return
+                return True
             except Gone:
                 if has_begun:
                     raise
             finally:
                 backend.n_calls -= 1
-        away = UnavailableError("those that know the domain are away this moment: try again", retry_after_s=AWAY_S)
-        await _refuse(scope, away, receive, send)
+        return False
 
     async def _metrics(self, scope: Scope, receive: Receive, send: Send) -> None:
         """The counts of all that are there."""
