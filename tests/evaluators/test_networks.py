@@ -7,7 +7,7 @@ import torch
 from deepsimbad.evaluators.compute import Compute, Device, Runtime
 from deepsimbad.evaluators.extractors.netvlad import netvlad, read_netvlad
 from deepsimbad.evaluators.extractors.squeezenet import CELLS, ENCODING_DIM, TAKEN, squeezenet
-from deepsimbad.evaluators.nets import SqueezeNet
+from deepsimbad.evaluators.nets.squeezenet import SqueezeNet
 from deepsimbad.evaluators.runtimes import has_onnxruntime
 from deepsimbad.evaluators.weights.squeezenet_families import read_squeezenet
 

@@ -69,7 +69,7 @@ class Autoencoder(Trunk):
         return Fitted(arrays, metrics, warnings)
 
     def own_dissimilarities(self, encodings: NDArray[np.float32], model: LandmarkModel) -> NDArray[np.float32]:
-        """See `Trunk`."""
+        """See `OwnDissimilarities`."""
         names = (*_TRAINED, "deviation")
         trained = {name: np.ascontiguousarray(model[f"{self.kind}_{name}"], np.float32) for name in names}
         return _deviations(self.units(encodings, model), trained)

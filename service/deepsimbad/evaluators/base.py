@@ -12,7 +12,7 @@ augmented views of every landmark. Without them (the spool is gone, encodings ca
 where it is any other, a scene's *dissimilarities to all fitted landmarks* take the encoding's place, as II-A has it:
 D(x, R) is a vector space, each landmark a dimension. `compared` gives the one or the other. All else, standardising by
 season, places as sums, lists, live statistics, is the same for all evaluators (docs/decisions/0029-own-space.md).
-`evaluators.trunk.Trunk` does this for an evaluator that says its `own_dissimilarities`.
+`evaluators.space.OwnDissimilarities` does this for an evaluator that says its `own_dissimilarities`.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence

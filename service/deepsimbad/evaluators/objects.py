@@ -5,17 +5,15 @@ cells by buckets, each object shared out among the cells nearest to its middle. 
 its bucket like any other.
 """
 
-import threading
 import zlib
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from deepsimbad.errors import InvalidWeightsError, MissingPackageError, MissingWeightsError
 from deepsimbad.evaluators.base import Image, named_lack_of_memory
 from deepsimbad.evaluators.compute import Compute
+from deepsimbad.evaluators.detectors import Detector
 from deepsimbad.evaluators.feature_l2 import FeatureL2
 from deepsimbad.evaluators.scenes import Form, Objects, Scene
 
@@ -113,59 +111,3 @@ def _shared_out(middle: NDArray[np.float64], n_cells: int) -> NDArray[np.float64
     """[n, cells] how much of an object each of a row of cells gets: the two nearest share it."""
     at = np.clip(middle * n_cells - 0.5, 0, n_cells - 1)
     return np.asarray(np.clip(1 - np.abs(np.arange(n_cells) - at[:, np.newaxis]), 0, None))
-
-
-_WEIGHTS_ENUM = "FasterRCNN_ResNet50_FPN_V2_Weights"  # of torchvision: it knows the labels' names
-_LEAST_SCORE = 0.3
-
-
-class Detector:
-    """A detector, loaded at first need; `name` is `fasterrcnn_resnet50_fpn_v2:FILE`."""
-
-    def __init__(self, name: str, compute: Compute) -> None:
-        self._name, _, file = name.partition(":")
-        self._file = compute.weights_dir / file
-        self._loading = threading.Lock()
-        self._loaded: tuple[Any, list[str]] | None = None
-
-    def load(self) -> tuple[Any, list[str]]:
-        """The network and its labels; raises MissingPackageError, MissingWeightsError, InvalidWeightsError."""
-        with self._loading:
-            if self._loaded is None:
-                self._loaded = self._made()
-            return self._loaded
-
-    def _made(self) -> tuple[Any, list[str]]:
-        try:
-            import torch
-            from torchvision.models import detection
-        except (ImportError, RuntimeError) as error:  # RuntimeError: torchvision of another PyTorch than this one
-            raise MissingPackageError(
-                f"a package that {self._name} needs cannot be imported, or is of another PyTorch: {error}: pip install "
-                "'deep-simbad[detect]'"
-            ) from error
-        if not self._file.is_file():
-            raise MissingWeightsError(
-                f"there are no weights {self._file.name} in {self._file.parent}: put torchvision's file of "
-                f"{self._name} there"
-            )
-        network = getattr(detection, self._name)(weights=None, weights_backbone=None)
-        try:
-            network.load_state_dict(torch.load(self._file, map_location="cpu", weights_only=True))
-        except Exception as error:  # a file of anything raises anything
-            raise InvalidWeightsError(f"{self._file.name} holds no weights of {self._name}: {error}") from error
-        return network.eval(), list(getattr(detection, _WEIGHTS_ENUM).DEFAULT.meta["categories"])
-
-    def find(self, image: Image) -> Objects:
-        """The objects in an image."""
-        import torch
-
-        network, names = self.load()
-        height, width = image.shape[:2]
-        pixels = torch.from_numpy(np.ascontiguousarray(image[..., ::-1].transpose(2, 0, 1))).float() / 255
-        with torch.inference_mode():
-            found = network([pixels])[0]
-        boxes, scores, labels = (found[part].cpu().numpy() for part in ("boxes", "scores", "labels"))
-        boxes = np.clip(boxes.astype(np.float64) / (width, height, width, height), 0, 1)
-        kept = (scores >= _LEAST_SCORE) & (boxes[:, 0] < boxes[:, 2]) & (boxes[:, 1] < boxes[:, 3])
-        return Objects(tuple(names[label] for label in labels[kept]), boxes[kept], scores[kept].astype(np.float64))

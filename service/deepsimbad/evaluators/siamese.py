@@ -49,7 +49,7 @@ class Siamese(Trunk):
         return Fitted(arrays, metrics, () if verdict.is_better else (no_better(self.kind, verdict),))
 
     def own_dissimilarities(self, encodings: NDArray[np.float32], model: LandmarkModel) -> NDArray[np.float32]:
-        """See `Trunk`."""
+        """See `OwnDissimilarities`."""
         trained = {name: np.asarray(model[f"{self.kind}_{name}"], np.float32) for name in _TRAINED}
         landmarks = np.asarray(model[f"{self.kind}_landmarks"], np.float32)
         return _dissimilarities(self.units(encodings, model), landmarks, trained)

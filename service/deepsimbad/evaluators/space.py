@@ -1,5 +1,7 @@
 """Where `composed` compares: unit vectors of encodings, or of dissimilarities to all landmarks (II-A)."""
 
+from abc import ABC, abstractmethod
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -8,6 +10,27 @@ from deepsimbad.errors import InvalidEncodingError
 from deepsimbad.evaluators.base import Evaluator, LandmarkModel
 
 _MOST_DEVIATIONS = 1e12  # from what is usual; the square of more has no place in float32
+
+
+class OwnDissimilarities(ABC):
+    """An evaluator whose dissimilarity is no squared L2 of encodings; the composed arrays lie beside its own ones."""
+
+    is_squared_l2 = False
+    halves: tuple[int, ...] = ()
+
+    @abstractmethod
+    def own_dissimilarities(self, encodings: NDArray[np.float32], model: LandmarkModel) -> NDArray[np.float32]:
+        """[n, r] float32 to the fitted landmarks, at least 0 and finite; raises as `Evaluator.dissimilarities`."""
+
+    def dissimilarities(self, encodings: NDArray[np.float32], model: LandmarkModel) -> NDArray[np.float32]:
+        """See `Evaluator.dissimilarities`; of a composed model between unit vectors in the space of its own."""
+        if is_composed(model):
+            return between_units(self.compared(encodings, model), model)
+        return self.own_dissimilarities(encodings, model)
+
+    def compared(self, encodings: NDArray[np.float32], model: LandmarkModel) -> NDArray[np.float32]:
+        """See `Evaluator.compared`."""
+        return self.own_dissimilarities(encodings, model)
 
 
 def seen(

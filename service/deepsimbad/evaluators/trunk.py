@@ -8,7 +8,6 @@ unit vectors: on views of the second season, or where one alone is known on reli
 were moved: another light, which training did not see, stands for the season to come.
 """
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, Self, TypeAlias
@@ -22,7 +21,7 @@ from deepsimbad.errors import InvalidEncodingError, TooFewToFitError
 from deepsimbad.evaluators.base import Fitting, LandmarkModel, Lesson
 from deepsimbad.evaluators.compute import Compute
 from deepsimbad.evaluators.feature_l2 import FeatureL2, checked_encodings
-from deepsimbad.evaluators.space import between_units, check_units, check_usable
+from deepsimbad.evaluators.space import OwnDissimilarities, check_units, check_usable
 
 _BESIDE = 0.3  # of the variance of encodings: what dissimilarities count beside them where `composed` compares
 LEAST_FRAMES = 10  # of the drive that landmarks are chosen from: ten stretches of route
@@ -32,13 +31,8 @@ Axes: TypeAlias = Mapping[str, tuple[str, ...]]
 """Of fitted arrays by name: r, d, k, or another length that is the same everywhere; `two` is 2, `one` 1."""
 
 
-class Trunk(FeatureL2, ABC):
-    """Images and their encodings as of a `FeatureL2`; `kind` is the prefix of the arrays that are fitted.
-
-    The dissimilarity is no squared L2 of encodings; the composed arrays lie beside its own ones.
-    """
-
-    is_squared_l2 = False
+class Trunk(OwnDissimilarities, FeatureL2):
+    """Images and their encodings as of a `FeatureL2`; `kind` is the prefix of the arrays that are fitted."""
 
     kind: ClassVar[str]
     axes: ClassVar[Axes]
@@ -46,16 +40,6 @@ class Trunk(FeatureL2, ABC):
     def __init__(self, extractor: str, compute: Compute | None = None) -> None:
         super().__init__(extractor, compute)
         self.fitting = Fitting.IMAGES if self.takes_images else Fitting.ENCODINGS  # ready encodings have no images
-
-    @abstractmethod
-    def own_dissimilarities(self, encodings: NDArray[np.float32], model: LandmarkModel) -> NDArray[np.float32]:
-        """[n, r] float32 to the fitted landmarks, at least 0 and finite; raises as `Evaluator.dissimilarities`."""
-
-    def dissimilarities(self, encodings: NDArray[np.float32], model: LandmarkModel) -> NDArray[np.float32]:
-        """See `Evaluator.dissimilarities`; of a composed model between unit vectors in the space of its own."""
-        if is_composed(model):
-            return between_units(self.compared(encodings, model), model)
-        return self.own_dissimilarities(encodings, model)
 
     def units(self, encodings: NDArray[np.float32], model: LandmarkModel) -> NDArray[np.float32]:
         """[n, k] unit vectors of scenes; raises InvalidEncodingError."""

@@ -36,7 +36,7 @@ def squeezenet(file: str, compute: Compute) -> NetworkExtractor:
 
 
 def _module(path: Path) -> "nn.Module":
-    from deepsimbad.evaluators.nets import SpatialGrid
+    from deepsimbad.evaluators.nets.spatial_grid import SpatialGrid
     from deepsimbad.evaluators.weights.squeezenet_families import read_squeezenet
 
     weights = read_squeezenet(path)

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from deepsimbad.errors import InvalidWeightsError
-from deepsimbad.evaluators.nets import FIRST_FIRE, LAST_FIRE, SqueezeNet
+from deepsimbad.evaluators.nets.squeezenet import FIRST_FIRE, LAST_FIRE, SqueezeNet
 from deepsimbad.evaluators.weights.files import check_size, fill, load_checkpoint
 
 _FIRES = range(FIRST_FIRE, LAST_FIRE + 1)
