@@ -202,9 +202,6 @@ def serve(settings: Settings, create: bool = False) -> None:
     log.info("starting", extra={"version": release(), "data_dir": where, "settings": changed})
     app = create_app(settings)
     config = http_config(app, settings)
-    # A product of a view with its landmarks is short, and wakes OpenBLAS's threads, which then spin for 20 ms on the
-    # core that the next view wants. Jobs compute in processes of their own.
-    threadpool_limits(1, user_api="blas")
 
     def is_news(record: logging.LogRecord) -> bool:
         """Whoever called gets the named error; its stack in the log would only hide it."""
@@ -212,7 +209,10 @@ def serve(settings: Settings, create: bool = False) -> None:
 
     logging.getLogger("uvicorn.error").addFilter(is_news)
     try:
-        _Server(config, app).run()
+        # A product of a view with its landmarks is short, and wakes OpenBLAS's threads, which then spin for 20 ms on
+        # the core that the next view wants. Jobs compute in processes of their own.
+        with threadpool_limits(1, user_api="blas"):
+            _Server(config, app).run()
     except SystemExit as ended:  # how uvicorn says that it could not start
         why = ended.__context__
         if isinstance(why, OSError):
