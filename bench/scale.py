@@ -35,10 +35,10 @@ class Parameters:
     every_s: float = 2.0  # a robot's observations
     drive_s: float = 1800.0  # on one route
     zipf: float = 1.0  # how much more often the first routes are driven
-    answer_ms: float = 4.7  # of processor time, an observation on board encoded, its map in memory
+    answer_ms: float = 4.0  # of processor time, an observation on board encoded, its map in memory
     load_ms: float = 90.0  # a map from the replica's disk
     fetch_ms: float = 60.0  # a map from the store to the disk: assumed, two round trips of 15 ms and 100 MB a second
-    replay_ms: float = 300.0  # a session that moves to another replica
+    replay_ms: float = 100.0  # a session of 450 observations that moves to another replica
     map_bytes: int = 3 * MEBIBYTE  # of a file
     loaded_bytes: int = 4 * MEBIBYTE  # of a map in memory
     memory_bytes: int = 4096 * MEBIBYTE  # of a replica, for maps
