@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from deepsimbad.core.atlas import Atlas, log_evidence, posterior
+from deepsimbad.core.atlas import Atlas, _find, _shelf, log_evidence, posterior
 from deepsimbad.core.building import MapPlan, compose_map
 from deepsimbad.core.drive import Drive
 from deepsimbad.core.relevance import Query, Relevance
@@ -76,3 +76,16 @@ def test_what_cannot_be_compared():
     view = query_of(map_, np.zeros(24, np.float32))
     with pytest.raises(InvalidMapConfigError, match="rrf"):
         log_evidence(replace(map_, config={**map_.config, "relevance": "rrf"}), view)
+
+
+def test_the_greatest_relevance_is_found_for_lists_of_any_lengths_beside_each_other():
+    rng, r = np.random.default_rng(5), 20
+    sizes = ((4, 30), (1, 2049), (6, 5), (3, 1), (9, 4100), (4, 2048))
+    lists = [rng.integers(0, r, size).astype(np.uint16) for size in sizes]
+    lengths = [rng.uniform(0.5, 2, n).astype(np.float32) for _, n in sizes]
+    weights, products = rng.uniform(0.1, 1, 9).astype(np.float32), rng.normal(size=(2, r)).astype(np.float32)
+    space_of, greatest = np.array([0, 1, 0, 1, 0, 1]), np.empty(len(sizes))
+    _find(_shelf(lists), _shelf(lengths), weights, space_of, products, 0, len(sizes), greatest)
+    for found, ids, length, space in zip(greatest, lists, lengths, space_of, strict=True):
+        relevance = (weights[: len(ids), None] * products[space][ids]).sum(axis=0) / length
+        assert found == pytest.approx(relevance.max(), rel=1e-5)
