@@ -109,8 +109,13 @@ def test_domains_and_what_serves_appear_at_others_and_files_are_fetched_by_need(
     there.map_file("campus", 2)
     there.activate("campus", 1, 2)  # anybody may roll back
     here.follow()
+    add_map(here, seed=2)
+    here.activate("campus", 3, 1)
+    there.activate("campus", 3, 3)  # though nobody has told it yet that there is one
+    there.activate("campus", 1, 3)
+    here.follow()
     assert here.domain("campus").active_version == there.domain("campus").active_version == 1
-    assert [record.state for record in there.maps("campus")] == [MapState.ACTIVE, MapState.RETIRED]
+    assert [record.state for record in there.maps("campus")] == [MapState.ACTIVE, MapState.RETIRED, MapState.RETIRED]
     there.delete_domain("campus")
     assert not there.map_path("campus", 1).exists()
     here.follow()

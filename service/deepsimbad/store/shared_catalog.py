@@ -243,6 +243,14 @@ class SharedCatalog(Catalog):
             [name, version, created_at, sha256, file_bytes, to_json(config), to_json(metrics)],
         )
 
+    def map_anywhere(self, domain: str, version: int) -> MapRecord:
+        """As `map`; for one that is unknown here the log is read."""
+        try:
+            return self.map(domain, version)
+        except NotFoundError:
+            self.follow()
+            return self.map(domain, version)
+
     # Publishing
 
     def catch_up(self) -> None:
@@ -284,7 +292,7 @@ class SharedCatalog(Catalog):
 
     def activate(self, domain: str, version: int, expected: int | AnyVersion | None) -> MapRecord:
         """As `Catalog.activate`, everywhere; LostActivationError too where another node published the number first."""
-        swap, digest = super().activate, self.map(domain, version).sha256
+        swap, digest = super().activate, self.map_anywhere(domain, version).sha256
 
         def change() -> None:
             if swap(domain, version, expected).sha256 != digest:
