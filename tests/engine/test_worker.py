@@ -1,12 +1,12 @@
 """The inference worker: who goes first, and what becomes of errors."""
 
+import asyncio
 import threading
 from collections.abc import Iterator
 
 import numpy as np
 import pytest
 
-from deepsimbad.engine.localizer import NothingSeen
 from deepsimbad.engine.worker import EncodedImage, InferenceWorker, Priority
 from deepsimbad.errors import InvalidImageError, InvalidInputError, OverloadedError, UnavailableError
 
@@ -86,17 +86,32 @@ def grey(level: int) -> np.ndarray:
     return np.full((4, 4, 3), level, np.uint8)
 
 
-def looked(worker, eyes, levels, priority=Priority.LIVE):
-    """Answers to come of images that all wait before the worker gets to the first."""
-    gate = threading.Event()
-    worker.submit(gate.wait)
-    answers = [worker.look(eyes, grey(level), lambda seen: seen, priority) for level in levels]
-    return gate, answers
+class Shut:
+    """An evaluator that keeps the thread that encodes until it is opened."""
+
+    largest_batch, weights_sha256 = 1, None
+
+    def __init__(self) -> None:
+        self.begun, self.gate = threading.Event(), threading.Event()
+
+    def encode(self, images):
+        self.begun.set()
+        assert self.gate.wait(60)
+        return np.zeros((len(images), 1), np.float32)
+
+
+def behind_one(worker):
+    """A thing to open before any image that is handed in now is encoded."""
+    shut = Shut()
+    worker.encode(shut, grey(0))
+    assert shut.begun.wait(60)
+    return shut.gate
 
 
 def test_images_that_wait_are_encoded_together_as_many_as_pay(worker: InferenceWorker) -> None:
-    eyes = Eyes(largest_batch=4)
-    gate, answers = looked(worker, eyes, range(10))
+    eyes, gate = Eyes(largest_batch=4), behind_one(worker)
+    answers = [worker.encode(eyes, grey(level)) for level in range(10)]
+    assert worker.n_waiting == 10
     gate.set()
     seen = [answer.result(60) for answer in answers]
     assert all(isinstance(view, EncodedImage) and view.weights_sha256 == eyes.weights_sha256 for view in seen)
@@ -108,8 +123,7 @@ def test_images_that_wait_are_encoded_together_as_many_as_pay(worker: InferenceW
 def test_where_batches_do_not_pay_nobody_waits_for_company() -> None:
     worker, eyes = InferenceWorker(longest_wait_s=3600), Eyes(largest_batch=1)
     try:
-        gate, answers = looked(worker, eyes, range(3))
-        gate.set()
+        answers = [worker.encode(eyes, grey(level)) for level in range(3)]
         assert [answer.result(60).values[0] for answer in answers] == [0, 1, 2]
         assert eyes.batches == [1, 1, 1]
     finally:
@@ -119,44 +133,45 @@ def test_where_batches_do_not_pay_nobody_waits_for_company() -> None:
 def test_an_image_waits_for_company_no_longer_than_it_may() -> None:
     worker, eyes = InferenceWorker(longest_wait_s=0.02), Eyes(largest_batch=64)
     try:
-        assert worker.look(eyes, grey(7), lambda seen: seen.values[0]).result(60) == 7
+        assert worker.encode(eyes, grey(7)).result(60).values[0] == 7
         assert eyes.batches == [1]
     finally:
         worker.close()
 
 
 def test_an_evaluator_that_gives_too_few_encodings_fails_its_views_and_no_others(worker: InferenceWorker) -> None:
-    eyes = Eyes(largest_batch=3)
+    eyes, gate = Eyes(largest_batch=3), behind_one(worker)
     eyes.encode = lambda images: np.zeros((len(images) - 1, 1), np.float32)
-    gate, answers = looked(worker, eyes, range(3))
+    answers = [worker.encode(eyes, grey(level)) for level in range(3)]
     gate.set()
     for answer in answers:
         with pytest.raises(ValueError, match="shorter"):
             answer.result(60)
-    assert worker.submit(lambda: 7).result(60) == 7
+    assert worker.encode(Eyes(largest_batch=3), grey(7)).result(60).values[0] == 7
 
 
 def test_a_batch_takes_live_views_first_and_is_of_one_evaluator(worker: InferenceWorker) -> None:
-    eyes, others, order = Eyes(3), Eyes(3), []
-    gate = threading.Event()
-    worker.submit(gate.wait)
+    eyes, others, order, gate = Eyes(3), Eyes(3), [], behind_one(worker)
 
     def look(at, level, priority):
-        return worker.look(at, grey(level), lambda seen: order.append((priority.name, int(seen.values[0]))), priority)
+        answer = worker.encode(at, grey(level), priority)
+        answer.add_done_callback(lambda done: order.append((priority.name, int(done.result().values[0]))))
+        return answer
 
     frames = [look(eyes, level, Priority.BATCH) for level in (1, 2)]
     live = [look(eyes, 3, Priority.LIVE), look(others, 4, Priority.LIVE), look(eyes, 5, Priority.LIVE)]
     gate.set()
     for answer in (*frames, *live):
         answer.result(60)
+    worker.close()  # and so the last callback has run
     assert order == [("LIVE", 3), ("LIVE", 4), ("LIVE", 5), ("BATCH", 1), ("BATCH", 2)]
     assert eyes.batches == [1, 3]  # the other evaluator's view came in between, and keeps its place
     assert others.batches == [1]
 
 
 def test_one_bad_image_fails_alone_and_a_cancelled_one_is_not_encoded(worker: InferenceWorker) -> None:
-    eyes = Eyes(largest_batch=4)
-    gate, answers = looked(worker, eyes, [1, 255, 3, 4])
+    eyes, gate = Eyes(largest_batch=4), behind_one(worker)
+    answers = [worker.encode(eyes, grey(level)) for level in (1, 255, 3, 4)]
     assert answers[3].cancel()  # and is not encoded
     gate.set()
     assert [answers[place].result(60).values[0] for place in (0, 2)] == [1, 3]
@@ -165,22 +180,23 @@ def test_one_bad_image_fails_alone_and_a_cancelled_one_is_not_encoded(worker: In
         answers[1].result(60)
 
 
-def test_what_needs_no_encoding_is_passed_on_as_it_is(worker: InferenceWorker) -> None:
-    eyes, nothing = Eyes(4), NothingSeen()
-    assert worker.look(eyes, nothing, lambda seen: seen).result(60) is nothing
-    assert eyes.batches == []
+def test_images_and_long_work_do_not_wait_for_each_other(worker: InferenceWorker) -> None:
+    gate = behind_one(worker)
+    assert worker.submit(lambda: 7).result(60) == 7
+    for _ in range(16):
+        worker.encode(Eyes(1), grey(1))
+    with pytest.raises(OverloadedError):
+        worker.encode(Eyes(1), grey(1))
+    gate.set()
+    held = threading.Event()
+    worker.submit(held.wait)
+    assert worker.encode(Eyes(1), grey(7), Priority.BATCH).result(60).values[0] == 7
+    held.set()
 
 
-def test_slow_answers_fill_the_queue_that_is_counted() -> None:
-    worker, eyes, gate = InferenceWorker(max_waiting=3), Eyes(largest_batch=1), threading.Event()
-    answers = []
-    try:
-        looks = (worker.look(eyes, grey(n), lambda seen: (gate.wait(60), seen)[1]) for n in range(100))
-        with pytest.raises(OverloadedError):
-            answers.extend(looks)
-        assert len(answers) < 30
-        gate.set()
-        assert [answer.result(60).values[0] for answer in answers] == list(range(len(answers)))
-    finally:
-        gate.set()
-        worker.close()
+def test_what_is_short_runs_where_it_is_asked_for(worker: InferenceWorker) -> None:
+    async def where(*, is_short: bool) -> str:
+        return await worker.computed(lambda: threading.current_thread().name, is_short=is_short)
+
+    assert asyncio.run(where(is_short=True)) == threading.current_thread().name
+    assert asyncio.run(where(is_short=False)) == "inference"

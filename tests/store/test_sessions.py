@@ -1,5 +1,6 @@
 """The file of live sessions: what is acknowledged is committed, in order, and one bad write harms no other."""
 
+import asyncio
 import sqlite3
 import threading
 import time
@@ -275,8 +276,36 @@ def test_a_write_may_be_on_the_disk_before_its_sender_goes_on(
         def put(self, write: Any) -> None:
             waiting.put(write)
             if write is not None:
-                wait([write[1]], timeout=60)
+                wait([done for _, done in write], timeout=60)
 
     monkeypatch.setattr(store._commits, "_waiting", Preempted())
     store.append(number, observed(1), 101.0).result(60)
     assert store.living()[0].n_events == 1
+
+
+def test_what_an_event_loop_appends_at_one_turn_is_one_transaction(tmp_path: Path) -> None:
+    commits: list[int] = []
+
+    async def append_at_once(store: SessionStore, numbers: list[int]) -> None:
+        writes = [store.append(number, observed(1), 1.0) for number in numbers]
+        assert not any(write.done() for write in writes)
+        await asyncio.gather(*map(asyncio.wrap_future, writes))
+
+    with SessionStore.open(tmp_path, commits.append) as store:
+        numbers = [store.create(replace(RECORD, session_id=f"s{n}")).result().number for n in range(20)]
+        commits.clear()
+        asyncio.run(append_at_once(store, numbers))
+        assert commits == [20]
+        assert all(store.journal(number) for number in numbers)
+
+
+def test_what_was_appended_before_the_end_is_on_the_disk_though_its_turn_never_ended(tmp_path: Path) -> None:
+    async def append_and_close(store: SessionStore, number: int) -> None:
+        store.append(number, observed(1), 1.0)
+        store.close()
+
+    store = SessionStore.open(tmp_path)
+    number = store.create(RECORD).result().number
+    asyncio.run(append_and_close(store, number))
+    with SessionStore.open(tmp_path) as again:
+        assert len(again.journal(number)) == 1

@@ -172,7 +172,7 @@ async def put_frame(
         else:
             scene, picture = await scene_in(body, media_type, document, running, evaluator, Priority.BATCH, levels)
         check_whole(evaluator, scene)
-        encoded = cast("EncodedImage", await running.look(evaluator, scene, lambda seen: seen, Priority.BATCH))
+        encoded = cast("EncodedImage", await running.encoded(evaluator, scene, Priority.BATCH))
         return await run_sync(store_seen, encoded, scene.is_blank, picture)
 
     frame = await parse_json(body, FrameBody, running) if media_type == JSON else FrameBody()

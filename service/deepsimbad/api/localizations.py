@@ -44,6 +44,7 @@ from deepsimbad.engine.localizer import (
     ReadyEncoding,
     View,
     describe,
+    is_short,
     localize,
     shortlist_length,
 )
@@ -313,21 +314,21 @@ async def post_localization(
     watch.lap("receive")
     evaluator = running.evaluators.evaluator(active.record.evaluator)
     view, remarks = await view_in(body, running, media_type, evaluator, snapshot)
+    snapshot.check_landmark_model(landmark_models)
+    watch.lap("decode")
+    view = await running.encoded(evaluator, view)
     if prefers(request, BINARY):
 
-        def compare(view: View) -> NDArray[np.float32]:
-            snapshot.check_landmark_model(landmark_models)
+        def compare() -> NDArray[np.float32]:
             return relevances(snapshot, describe(snapshot, evaluator, view))
 
-        return npy_response(await running.look(evaluator, view, compare))
-    watch.lap("decode")
+        return npy_response(await running.worker.computed(compare, is_short=is_short(snapshot)))
 
-    def look(view: View) -> Localization:
+    def look() -> Localization:
         watch.lap("wait", {"encode": view.encode_ms} if isinstance(view, EncodedImage) else None)
-        snapshot.check_landmark_model(landmark_models)
         return localize(snapshot, evaluator, view, shortlist, watch)
 
-    localization = await running.look(evaluator, view, look)
+    localization = await running.worker.computed(look, is_short=is_short(snapshot))
     if wants_geopose(request):
         record = await run_sync(running.catalog.domain, domain)  # as it is now
         anchor = record.options.get("anchor")

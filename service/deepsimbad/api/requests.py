@@ -4,7 +4,6 @@ Handlers read their bodies through this file and not through the framework, whos
 deeply nested JSON with 400, and takes NaN.
 """
 
-import asyncio
 import hashlib
 import re
 import threading
@@ -26,7 +25,7 @@ from deepsimbad.api.keys import KeyRing
 from deepsimbad.api.metrics import Metrics
 from deepsimbad.api.problems import InvalidRequestError, invalid_body, invalid_request
 from deepsimbad.engine.atlas import Atlas, Owners
-from deepsimbad.engine.distant import encoded_elsewhere
+from deepsimbad.engine.distant import encoded
 from deepsimbad.engine.events import SessionEvents
 from deepsimbad.engine.localizer import View
 from deepsimbad.engine.maps import MappedDomain, Maps, Retention
@@ -156,12 +155,9 @@ class Services:
         mapped = self.maps.peek(domain)
         return mapped if mapped is not None else await run_sync(self.maps.active, domain)
 
-    async def look(
-        self, evaluator: Evaluator, view: View, run: Callable[[View], T], priority: Priority = Priority.LIVE
-    ) -> T:
-        """Run a function of a view on the inference worker, which encodes an image before, or another process does."""
-        view = await encoded_elsewhere(evaluator, view, priority)
-        return await asyncio.wrap_future(self.worker.look(evaluator, view, run, priority))
+    async def encoded(self, evaluator: Evaluator, view: View, priority: Priority = Priority.LIVE) -> View:
+        """An `EncodedImage` in the place of an image or a scene; other views as they are."""
+        return cast("View", await encoded(self.worker, evaluator, view, priority))
 
     async def written(self, n_listed: int, render: Callable[..., T], *given: Any) -> tuple[T, bytes]:
         """What `render` makes of what is given, and its JSON, without checking again what we computed.

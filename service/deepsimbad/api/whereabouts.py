@@ -1,6 +1,7 @@
 """Where a single view places the robot, on any of many domains."""
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from heapq import nlargest
 from typing import Annotated, Any, Literal
 
@@ -38,7 +39,7 @@ from deepsimbad.api.requests import (
     read_bytes,
 )
 from deepsimbad.engine.atlas import MOST_IN_FULL, Part, Whereabouts, whereabouts
-from deepsimbad.engine.localizer import DEFAULT_SHORTLIST, Localization, View
+from deepsimbad.engine.localizer import DEFAULT_SHORTLIST, Localization
 from deepsimbad.engine.maps import MappedDomain
 from deepsimbad.engine.worker import EncodedImage, Stopwatch
 from deepsimbad.errors import (
@@ -220,19 +221,16 @@ async def post_whereabouts(
     watch.lap("maps")
     parts, remarks = [Part({}, {}, left_out)], list[str]()
     for evaluator, members in _alike(running, there):
-
-        def ask(view: View, members: list[MappedDomain] = members, evaluator: Evaluator = evaluator) -> Part:
-            watch.lap("wait", {"encode": view.encode_ms} if isinstance(view, EncodedImage) else None)
-            return running.atlas.ask(members, evaluator, view, in_full, shortlist)
-
         try:
             view, seen = await view_in(body, running, media_type, evaluator, members[0].snapshot, observation)
             watch.lap("decode")
+            view = await running.encoded(evaluator, view)
+            watch.lap("wait", {"encode": view.encode_ms} if isinstance(view, EncodedImage) else None)
             if owners is None:
-                parts.append(await running.look(evaluator, view, ask))
+                ask = partial(running.atlas.ask, members, evaluator, view, in_full, shortlist)
+                parts.append(await running.worker.computed(ask))
             else:
-                encoded: View = await running.look(evaluator, view, lambda encoded: encoded)
-                parts += await owners.ask(members, encoded, in_full, shortlist)
+                parts += await owners.ask(members, view, in_full, shortlist)
         except DeepSimbadError as error:
             parts.append(Part({}, {}, {member.record.name: error for member in members}))
         else:

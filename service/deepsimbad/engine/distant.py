@@ -9,7 +9,7 @@ from typing import Any, Protocol, Self, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from deepsimbad.engine.worker import EncodedImage, Priority
+from deepsimbad.engine.worker import EncodedImage, InferenceWorker, Priority
 from deepsimbad.evaluators.base import Evaluator, Image
 from deepsimbad.evaluators.compute import Compute
 from deepsimbad.evaluators.fused import Fused
@@ -92,8 +92,10 @@ def by_encoder(encoder: Encoder) -> Callable[[EvaluatorConfig, Compute | None], 
     return make
 
 
-async def encoded_elsewhere(evaluator: Evaluator, view: Any, priority: Priority = Priority.LIVE) -> Any:
-    """The encoding in the place of a view where another process has the network; others as they are given."""
-    if isinstance(evaluator, EncodedElsewhere) and isinstance(view, np.ndarray | Scene):
+async def encoded(worker: InferenceWorker, evaluator: Evaluator, view: Any, priority: Priority = Priority.LIVE) -> Any:
+    """An `EncodedImage` in the place of an image or a scene, by whoever has the network; other views as they are."""
+    if not isinstance(view, np.ndarray | Scene):
+        return view
+    if isinstance(evaluator, EncodedElsewhere):
         return await asyncio.wrap_future(evaluator.encoded(view, priority))
-    return view
+    return await asyncio.wrap_future(worker.encode(evaluator, view, priority))

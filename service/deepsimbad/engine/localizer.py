@@ -32,6 +32,8 @@ from deepsimbad.evaluators.space import seen
 
 DEFAULT_SHORTLIST = 10
 _LARGEST_DISSIMILARITY = 1e15
+_BY_INDEX = frozenset(Relevance) - {Relevance.SIMBAD, Relevance.BRUTE_FORCE}  # the others read all encodings or more
+_MOST_AT_ONCE = 1 << 15  # map images
 
 # The forms in which a view reaches the engine
 
@@ -119,6 +121,11 @@ def localize(
         plan = ActiveLocalizer(snapshot, LocalizerConfig()).plan(LocalizerState(belief, None, relevance, 1))
     watch.lap("plan")
     return Localization(snapshot, relevance, best, summary, plan, is_informative)
+
+
+def is_short(snapshot: Map) -> bool:
+    """Whether a view of a map takes a millisecond or two, and no more, once it is encoded."""
+    return snapshot.relevance in _BY_INDEX and snapshot.n_images <= _MOST_AT_ONCE
 
 
 def describe(snapshot: Map, evaluator: Evaluator, view: View) -> Query:

@@ -6,7 +6,7 @@ import secrets
 import time
 from collections import Counter
 from collections.abc import Callable, Coroutine, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from deepsimbad.core.planners import Plan
 from deepsimbad.core.relevance import Relevance
-from deepsimbad.engine.distant import encoded_elsewhere
-from deepsimbad.engine.localizer import View, describe
+from deepsimbad.engine.distant import encoded
+from deepsimbad.engine.localizer import View, describe, is_short
 from deepsimbad.engine.maps import MappedDomain, Maps
 from deepsimbad.engine.session import (
     LiveSession,
@@ -366,10 +366,10 @@ class Sessions:
             watch.lap("wait")
             view, remarks = await observation.view(engine.evaluator, engine.snapshot)
             watch.lap("decode")
-            view = await encoded_elsewhere(engine.evaluator, view)
-            step = partial(self._step, live, state, observation, self._clock() + self._ttl_s, watch)
+            view = await encoded(self._worker, engine.evaluator, view)
+            step = partial(self._step, live, state, observation, self._clock() + self._ttl_s, watch, view)
             try:
-                answer = await self._published(live, self._worker.look(engine.evaluator, view, step), watch)
+                answer = await self._published(live, step, watch, is_short=is_short(engine.snapshot))
             except _CountedBefore as before:
                 answer = await self._repeated(live, state, before.sequence, observation.n_shortlist)
                 watch.lap("summarise")
@@ -384,7 +384,7 @@ class Sessions:
         watch: Stopwatch,
         view: View,
     ) -> "_Move":
-        """On the worker: move on by the next row; raises _CountedBefore."""
+        """Move on by the next row; raises _CountedBefore."""
         watch.lap("wait", {"encode": view.encode_ms} if isinstance(view, EncodedImage) else None)
         idempotency, snapshot = observation.idempotency, state.engine.snapshot
         if idempotency is not None:
@@ -416,7 +416,7 @@ class Sessions:
     def _move_on(
         self, live: LiveSession, before: SessionState, row: JournalRow, n_shortlist: int | None, watch: Stopwatch
     ) -> "_Move":
-        """On the worker: the state after a row, which is on its way to the disk while the answer is summed up."""
+        """The state after a row, summed up, and the row on its way to the disk."""
         after = before.after(row)
         if after.step is not None:
             watch.lap("plan", after.step.timings_ms)
@@ -424,37 +424,23 @@ class Sessions:
         if before.sequence > 0 and before.sequence % self._snapshot_every == 0:
             # Of the state before the row, so that a restart replays at least the last row and has its whole step.
             snapshot = before.snapshot()
-        written = self._store.append(live.record.number, row, self._clock(), snapshot)
-        try:
-            answer = view_of(live, row.expires_at, after, n_shortlist)
-        except Exception as error:  # the row counts all the same, and is on the disk before the session is read again
-            wait([written])
-            raise RuntimeError("a session that moved cannot be summed up") from error
+        answer = view_of(live, row.expires_at, after, n_shortlist)
         watch.lap("summarise")
-        return _Move(after, answer, written)
+        return _Move(after, answer, self._store.append(live.record.number, row, self._clock(), snapshot))
 
-    async def _published(self, live: LiveSession, moving: "Future[_Move]", watch: Stopwatch) -> SessionView:
-        """The answer after a move, once it is on the disk and the session has moved; the event loop is woken once."""
-        on_disk: Future[None] = Future()
-        on_disk.set_running_or_notify_cancel()
-
-        def settle(done: Future[Any]) -> None:
-            if (error := done.exception()) is not None:
-                on_disk.set_exception(error)
-            elif done is moving:
-                moving.result().written.add_done_callback(settle)
-            else:
-                on_disk.set_result(None)
-
-        moving.add_done_callback(settle)
+    async def _published(
+        self, live: LiveSession, move_on: "Callable[[], _Move]", watch: Stopwatch, *, is_short: bool = False
+    ) -> SessionView:
+        """Move a session on; its answer, once that is on the disk."""
+        is_written = False
         try:
-            await asyncio.wrap_future(on_disk)
+            move = await self._worker.computed(move_on, is_short=is_short)
+            is_written = True
+            await asyncio.wrap_future(move.written)
         except BaseException as error:
-            was_refused = isinstance(error, DeepSimbadError | _CountedBefore) and moving.exception() is error
-            if not was_refused:
+            if is_written or not isinstance(error, DeepSimbadError | _CountedBefore):
                 live.state = None  # what the file holds is the truth: it is read again at the next touch
             raise
-        move = moving.result()
         live.expires_at, live.state = move.answer.expires_at, move.after
         watch.lap("commit")
         return move.answer
@@ -483,8 +469,7 @@ class Sessions:
             check_prior(state.engine.snapshot.route, position_m, std_m)
             row = PriorRow(state.sequence + 1, self._clock() + self._ttl_s, position_m, std_m)
             watch = Stopwatch()
-            moving = self._worker.submit(lambda: self._move_on(live, state, row, None, watch))
-            return await self._published(live, moving, watch)
+            return await self._published(live, lambda: self._move_on(live, state, row, None, watch), watch)
 
     # Ending
 

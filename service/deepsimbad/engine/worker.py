@@ -1,11 +1,12 @@
-"""Where views are encoded and scored: the evaluators of all domains, the thread that runs them, and its stopwatch."""
+"""Where views are encoded: the evaluators of all domains, the threads that run them, and the stopwatch of an answer."""
 
+import asyncio
 import itertools
 import json
 import logging
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 from dataclasses import dataclass, field
 from enum import IntEnum
 from queue import Empty, PriorityQueue
@@ -34,7 +35,6 @@ T = TypeVar("T")
 log = logging.getLogger(__name__)
 
 RETRY_AFTER_S = 30.0  # an extractor that cannot be loaded is not tried again before: to read its weights takes seconds
-_MOST_UNSCORED = 8  # encoded images whose answers are not yet made
 _failures: WeakKeyDictionary[Evaluator, tuple[float, InvalidInputError]] = WeakKeyDictionary()
 
 
@@ -133,74 +133,33 @@ class Priority(IntEnum):
 class _Work:
     priority: Priority
     arrival: int
-    run: Callable[[Any], Any] = field(compare=False)
-    view: Any = field(default=None, compare=False)
-    encoder: Evaluator | None = field(default=None, compare=False)  # of an image
+    run: Callable[[], Any] = field(compare=False, default=lambda: None)
+    evaluator: Evaluator | None = field(default=None, compare=False)
+    view: Image | Scene | None = field(default=None, compare=False)
     answer: Future[Any] = field(default_factory=Future, compare=False)
 
-    def finish(self) -> None:
-        try:
-            result = self.run(self.view)
-        except BaseException as error:
-            self.answer.set_exception(error)
-        else:
-            self.answer.set_result(result)
 
+class _Line:
+    """A thread that does what waits in line, live work first, each in order of arrival."""
 
-class InferenceWorker:
-    """Runs submitted functions one at a time, live ones first.
-
-    One thread, because encoders and scoring already use the cores they need: two at once would only make both late.
-    A batch must be submitted in pieces short enough that a live view can wait for one. Images that wait are encoded
-    together where the machine gains by it; what is made of them runs in a thread beside it, so that the next images
-    are encoded meanwhile.
-
-    Args:
-        max_waiting: How many functions of one priority may wait; None: any number.
-        longest_wait_s: How long an image may wait for others to fill a batch, where one larger than 1 gains anything.
-    """
-
-    def __init__(self, max_waiting: int | None = None, longest_wait_s: float = 0.0) -> None:
+    def __init__(self, name: str, max_waiting: int | None) -> None:
         self._max_waiting = max_waiting
-        self._longest_wait_s = longest_wait_s
         self._n_waiting = dict.fromkeys(Priority, 0)
         self._queue: PriorityQueue[_Work] = PriorityQueue()
         self._arrivals = itertools.count()
         self._open = True
         self._lock = threading.Lock()
-        self._unscored = threading.Semaphore(_MOST_UNSCORED)
-        self._scorer = ThreadPoolExecutor(1, "inference of images")
-        self._thread = threading.Thread(target=self._work, name="inference", daemon=True)
-        self._thread.start()
+        self.thread = threading.Thread(target=self._work, name=name, daemon=True)
+        self.thread.start()
 
     @property
     def n_waiting(self) -> int:
-        """How many functions wait."""
+        """How much waits."""
         return self._queue.qsize()
 
-    @property
-    def is_alive(self) -> bool:
-        """Whether the thread is there to run them."""
-        return self._thread.is_alive()
-
-    def submit(self, run: Callable[[], T], priority: Priority = Priority.LIVE) -> Future[T]:
-        """Queue a function; as `look`."""
-        return self.look(None, None, lambda _: run(), priority)
-
-    def look(
-        self, evaluator: Evaluator | None, view: object, run: Callable[[Any], T], priority: Priority = Priority.LIVE
-    ) -> Future[T]:
-        """Queue a function of a view, given an `EncodedImage` in the place of an image or a scene, others as they are.
-
-        Returns:
-            Its result or error to come; cancelling it before it began takes it off the queue.
-
-        Raises:
-            UnavailableError: The worker has been closed.
-            OverloadedError: As many wait as may.
-        """
-        encoder = evaluator if isinstance(view, np.ndarray | Scene) else None
-        work = _Work(priority, next(self._arrivals), run, view, encoder)
+    def join(self, priority: Priority, **what: Any) -> Future[Any]:
+        """Stand in line; raises UnavailableError and OverloadedError."""
+        work = _Work(priority, next(self._arrivals), **what)
         with self._lock:
             if not self._open:
                 raise UnavailableError("the service is shutting down")
@@ -213,66 +172,133 @@ class InferenceWorker:
         return work.answer
 
     def close(self) -> None:
-        """Finish what is queued, then end the thread."""
+        """Finish what is in line, then end the thread."""
         with self._lock:
             if not self._open:
                 return
             self._open = False
-            self._queue.put(_Work(Priority._CLOSE, next(self._arrivals), lambda _: None))
-        self._thread.join()
-        self._scorer.shutdown()
+            self._queue.put(_Work(Priority._CLOSE, next(self._arrivals)))
+        self.thread.join()
 
     def _work(self) -> None:
         while (first := self._queue.get()).priority is not Priority._CLOSE:
-            encoder = first.encoder
-            batch = [first] if encoder is None else self._with_company(first, encoder.largest_batch)
+            some = self._with_company(first)
             del first
             with self._lock:
-                for work in batch:
+                for work in some:
                     self._n_waiting[work.priority] -= 1
-            for work in batch.copy():
-                if not work.answer.set_running_or_notify_cancel():
-                    batch.remove(work)
-            if encoder is not None and batch:
-                batch = _encoded(encoder, batch)
-            while batch:  # emptied, or the last answer's arrays live until the next query
-                work = batch.pop(0)
-                if work.encoder is None:
-                    work.finish()
-                else:
-                    self._unscored.acquire()  # where scoring is slower, images wait in the queue, which is counted
-                    self._scorer.submit(work.finish).add_done_callback(lambda _: self._unscored.release())
-                del work
+            self._do([work for work in some if work.answer.set_running_or_notify_cancel()])
+            del some, work  # or the last answer's arrays live until the next is asked for
 
-    def _with_company(self, first: _Work, largest: int) -> list[_Work]:
-        """An image with those that are encoded together with it, taken off the queue."""
-        batch = [first]
-        until = monotonic() + self._longest_wait_s
-        while len(batch) < largest:
+    def _with_company(self, first: _Work) -> list[_Work]:
+        """Work, with what is done together with it, taken off the line."""
+        return [first]
+
+    def _do(self, some: list[_Work]) -> None:
+        """Give every one its answer."""
+        for work in some:
+            try:
+                result = work.run()
+            except BaseException as error:
+                work.answer.set_exception(error)
+            else:
+                work.answer.set_result(result)
+
+
+class _EncodingLine(_Line):
+    """Images that wait are encoded together, where the machine gains by it."""
+
+    def __init__(self, name: str, max_waiting: int | None, longest_wait_s: float) -> None:
+        self._longest_wait_s = longest_wait_s
+        super().__init__(name, max_waiting)
+
+    def _with_company(self, first: _Work) -> list[_Work]:
+        assert first.evaluator is not None
+        some, until = [first], monotonic() + self._longest_wait_s
+        while len(some) < first.evaluator.largest_batch:
             left_s = until - monotonic()
             try:
                 following = self._queue.get(timeout=left_s) if left_s > 0 else self._queue.get_nowait()
             except Empty:
                 break
-            if following.encoder is not first.encoder:
+            if following.evaluator is not first.evaluator:
                 self._queue.put(following)  # in its old place: the order is by priority and arrival
                 break
-            batch.append(following)
-        return batch
+            some.append(following)
+        return some
+
+    def _do(self, some: list[_Work]) -> None:
+        """Those that cannot be encoded fail, and alone."""
+        if not some:
+            return
+        assert some[0].evaluator is not None
+        try:
+            encoded = encode_images(some[0].evaluator, [work.view for work in some if work.view is not None])
+            answers = list(zip(some, encoded, strict=True))
+        except BaseException as error:
+            if len(some) == 1:
+                some[0].answer.set_exception(error)
+                return
+            for work in some:
+                self._do([work])
+            return
+        for work, image in answers:
+            work.answer.set_result(image)
 
 
-def _encoded(encoder: Evaluator, batch: list[_Work]) -> list[_Work]:
-    """The batch with encodings in the place of its images; those that cannot be encoded fail, and alone."""
-    try:
-        encoded = list(zip(batch, encode_images(encoder, [work.view for work in batch]), strict=True))
-    except BaseException as error:
-        if len(batch) > 1:
-            return [alone for work in batch for alone in _encoded(encoder, [work])]
-        batch[0].answer.set_exception(error)
-        return []
-    for work, image in encoded:
-        work.view = image
-    return batch
+class InferenceWorker:
+    """Encodes images in one thread and does long work in another, live work first.
+
+    One thread each, because networks and long sums already use the cores they need: two at once would only make both
+    late. Long work of little hurry must be submitted in pieces that a live view can wait for. What is short belongs on
+    the event loop: to hand a millisecond of work to another thread costs as much again, since the two then wait for
+    each other's hold of the interpreter.
+
+    Args:
+        max_waiting: How much of one priority may wait for a thread; None: any number.
+        longest_wait_s: How long an image may wait for others to fill a batch, where one larger than 1 gains anything.
+    """
+
+    def __init__(self, max_waiting: int | None = None, longest_wait_s: float = 0.0) -> None:
+        self._encoding = _EncodingLine("encoding", max_waiting, longest_wait_s)
+        self._long_work = _Line("inference", max_waiting)
+
+    @property
+    def n_waiting(self) -> int:
+        """How many images and functions wait."""
+        return self._encoding.n_waiting + self._long_work.n_waiting
+
+    @property
+    def is_alive(self) -> bool:
+        """Whether the threads are there."""
+        return self._encoding.thread.is_alive() and self._long_work.thread.is_alive()
+
+    def submit(self, run: Callable[[], T], priority: Priority = Priority.LIVE) -> Future[T]:
+        """Queue a function.
+
+        Returns:
+            Its result or error to come; cancelling it before it began takes it off the queue.
+
+        Raises:
+            UnavailableError: The worker has been closed.
+            OverloadedError: As many wait as may.
+        """
+        return self._long_work.join(priority, run=run)
+
+    def encode(
+        self, evaluator: Evaluator, view: Image | Scene, priority: Priority = Priority.LIVE
+    ) -> Future[EncodedImage]:
+        """Queue an image or a scene to be encoded; as `submit`."""
+        return self._encoding.join(priority, evaluator=evaluator, view=view)
+
+    async def computed(self, run: Callable[[], T], *, is_short: bool = False) -> T:
+        """The result of a function, which runs here and now where it is short."""
+        return run() if is_short else await asyncio.wrap_future(self.submit(run))
+
+    def close(self) -> None:
+        """Finish what is queued, then end the threads."""
+        self._encoding.close()
+        self._long_work.close()
 
 
 @dataclass

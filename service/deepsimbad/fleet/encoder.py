@@ -55,10 +55,7 @@ class Encoder:
     async def encoded(self, config: EvaluatorConfig, view: Image | Scene, priority: Priority) -> EncodedImage:
         """See `engine.distant.Encoder`."""
         evaluator = await asyncio.to_thread(ready, self._of(config))
-        encoded: EncodedImage = await asyncio.wrap_future(
-            self._worker.look(evaluator, view, lambda encoded: encoded, priority)
-        )
-        return encoded
+        return await asyncio.wrap_future(self._worker.encode(evaluator, view, priority))
 
     def _of(self, config: EvaluatorConfig) -> Evaluator:
         return self._evaluators.evaluator(config.as_dict())

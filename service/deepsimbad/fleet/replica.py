@@ -169,9 +169,7 @@ class Replica:
         for name in versions.keys() - {mapped.record.name for mapped in same} - left_out.keys():
             left_out[name] = NotLoadedError("its map was switched this moment: ask again")
         evaluator = services.evaluators.evaluator(domains[0].record.evaluator)
-        part = await services.look(
-            evaluator, view, lambda view: services.atlas.ask(same, evaluator, view, n_in_full, n_shortlist)
-        )
+        part = await services.worker.computed(lambda: services.atlas.ask(same, evaluator, view, n_in_full, n_shortlist))
         likeliest = {
             name: cast("Mapping[str, Any]", render_localization(cast("Localization", each), Stopwatch()))
             for name, each in part.likeliest.items()

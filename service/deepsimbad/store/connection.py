@@ -1,5 +1,6 @@
 """How every SQLite file is opened, brought to today's schema, read and written."""
 
+import asyncio
 import sqlite3
 import threading
 from collections.abc import Callable, Iterator
@@ -16,8 +17,9 @@ from deepsimbad.store.durable import storage_faults
 
 T = TypeVar("T")
 FileState: TypeAlias = tuple[int, ...]
+_Write: TypeAlias = tuple[Callable[[Database], Any], Future[Any]]
 
-MAX_BATCH = 256  # writes in one transaction
+MAX_BATCH = 256  # writes in one transaction; with so many no more are added
 _STRANGE_SCHEMA = "SELECT 1 FROM sqlite_schema WHERE type NOT IN ('table', 'index') OR rootpage = 0 LIMIT 1"
 
 
@@ -229,46 +231,68 @@ class GroupCommit:
     ) -> None:
         self._transaction = transaction
         self._on_commit = on_commit
-        self._waiting: SimpleQueue[tuple[Callable[[Database], Any], Future[Any]] | None] = SimpleQueue()
+        self._waiting: SimpleQueue[list[_Write] | None] = SimpleQueue()
+        self._of_this_turn: list[_Write] = []
         self._is_open = True
         self._lock = threading.Lock()
         self.thread = threading.Thread(target=self._work, name="commits", daemon=True)
         self.thread.start()
 
-    def submit(self, run: Callable[[Database], T]) -> Future[T]:
+    def submit(self, run: Callable[[Database], T], *, by_turns: bool = False) -> Future[T]:
         """Queue a write that is made inside a transaction, perhaps a second time in another one.
 
         Its future has a result once it is on the disk, or its error, and then nothing of it was kept.
+
+        Args:
+            run: The write.
+            by_turns: Whether it is handed over with all that the event loop submits so at this turn, where one runs
+                here: then it cannot be waited for before the turn ends.
         """
         done: Future[T] = Future()
         done.set_running_or_notify_cancel()  # whoever stops waiting does not undo it; before the thread can end it
+        try:
+            loop = asyncio.get_running_loop() if by_turns else None
+        except RuntimeError:
+            loop = None
         with self._lock:
             if not self._is_open:
                 raise UnavailableError("the service is shutting down")
-            self._waiting.put((run, done))
+            if loop is None:
+                self._waiting.put([(run, done)])
+                return done
+            if not self._of_this_turn:
+                loop.call_soon(self._hand_over)  # behind all that is ready now
+            self._of_this_turn.append((run, done))
         return done
+
+    def _hand_over(self) -> None:
+        with self._lock:
+            self._waiting.put(self._of_this_turn)
+            self._of_this_turn = []
 
     def close(self) -> None:
         """Commit what waits, then end the thread."""
         with self._lock:
-            if self._is_open:
-                self._is_open = False
-                self._waiting.put(None)
+            was_open, self._is_open = self._is_open, False
+        if was_open:
+            self._hand_over()
+            self._waiting.put(None)
         self.thread.join()
 
     def _work(self) -> None:
-        while (write := self._waiting.get()) is not None:
-            batch = [write]
+        while (writes := self._waiting.get()) is not None:
+            batch = writes
             while len(batch) < MAX_BATCH and not self._waiting.empty():
-                write = self._waiting.get()
-                if write is None:
+                writes = self._waiting.get()
+                if writes is None:
                     break
-                batch.append(write)
-            self._commit(batch)
-            if write is None:
+                batch += writes
+            if batch:
+                self._commit(batch)
+            if writes is None:
                 return
 
-    def _commit(self, batch: list[tuple[Callable[[Database], Any], Future[Any]]]) -> None:
+    def _commit(self, batch: list[_Write]) -> None:
         try:
             with self._transaction() as db:
                 results = []

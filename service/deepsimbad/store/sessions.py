@@ -262,7 +262,8 @@ class SessionStore(OpenFile):
     ) -> Future[None]:
         """Write the next row of a session's journal, and with it a snapshot of the state after an earlier row.
 
-        The future raises InvalidInputError where a row of that sequence number, or idempotency key, is there.
+        What an event loop appends at one turn is written together. The future raises InvalidInputError where a row of
+        that sequence number, or idempotency key, is there.
         """
 
         def write(db: Database) -> None:
@@ -270,7 +271,7 @@ class SessionStore(OpenFile):
             if snapshot is not None:
                 replace_snapshot(db, number, snapshot_columns(snapshot))
 
-        return self._commits.submit(write)
+        return self._commits.submit(write, by_turns=True)
 
     def history(self, number: int, until: int) -> tuple[StateSnapshot | None, list[JournalRow]]:
         """What makes up the state after a row: the snapshot, if it is from before that row, and the rows since."""
